@@ -1,0 +1,47 @@
+"""UltraG-Ray scenes: 3D Gaussians with a physics-based ray model, rendered as ultrasound.
+
+    from ultragray import GaussianScene, LinearProbe, render
+
+The names that need torch are imported on first use, so that a process which only checks poses stays light.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+from .errors import UltragrayError
+from .pose import check_poses, pose_from_position_quaternion, quaternion_from_pose
+from .probe import ConvexProbe, LinearProbe, Probe
+from .scene_info import SceneHeader, SceneInfo, read_header
+
+if TYPE_CHECKING:
+    from .render import Frames, render
+    from .scene import GaussianScene
+
+__version__ = "0.1.0"
+__all__ = [
+    "ConvexProbe",
+    "Frames",
+    "GaussianScene",
+    "LinearProbe",
+    "Probe",
+    "SceneHeader",
+    "SceneInfo",
+    "UltragrayError",
+    "check_poses",
+    "pose_from_position_quaternion",
+    "quaternion_from_pose",
+    "read_header",
+    "render",
+]
+
+_NEEDS_TORCH = {"Frames": "render", "GaussianScene": "scene", "render": "render"}
+
+
+def __getattr__(name: str) -> Any:
+    if name in _NEEDS_TORCH:
+        value = getattr(importlib.import_module(f".{_NEEDS_TORCH[name]}", __name__), name)
+        globals()[name] = value
+        return value
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,0 +1,190 @@
+"""Every error of the project, in one tree.
+
+UltragrayError
+├── InvalidArgument                 the caller gave something that cannot be used; names the field
+│   ├── InvalidPose                 not a rigid probe→scene transform
+│   ├── InvalidProbe                a probe that no transducer could have
+│   ├── InvalidImageSize            height or width outside the limits
+│   ├── UnknownOutput               an output other than bmode, echo, transmittance, coverage
+│   └── TooManyPoses                more poses in one request than the limit
+├── BodyTooLarge                    a request body over the limit
+├── NotAcceptable                   the Accept header cannot hold what was asked for
+├── UnsupportedMediaType            a request body that is not JSON
+├── RouteNotFound                   no such path
+├── MethodNotAllowed                the path exists, the method does not
+├── SceneNotFound                   no scene of that name
+├── SceneFileInvalid                a scene file that is truncated, foreign or inconsistent
+├── CheckpointInvalid               a released checkpoint, or its conf.json or poses, that cannot be imported
+├── SceneTooLarge                   a scene that does not fit the memory budget at all
+├── BackendUnavailable              a render backend that cannot run here
+├── QueueFull                       too many frames wait already
+├── DeadlineExceeded                the deadline passed before the frame was rendered
+├── NotReady                        the service is starting
+├── Draining                        the service is stopping
+└── RenderFailed                    a worker could not render the frame
+
+Each class carries a `reason` that never changes (clients match on it), the HTTP status and the gRPC status that the front
+doors answer with: this module is the one table that maps both.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+
+class UltragrayError(Exception):
+    """Base of all errors; `str(error)` is one sentence for a person."""
+
+    reason: ClassVar[str] = "INTERNAL"
+    http_status: ClassVar[int] = 500
+    grpc_status: ClassVar[str] = "INTERNAL"
+    title: ClassVar[str] = "Internal error"
+
+    def __init__(self, detail: str, *, field: str | None = None) -> None:
+        super().__init__(detail)
+        self.detail = detail
+        self.field = field
+
+    def __reduce__(self) -> tuple[object, ...]:  # crosses the pipe from a worker unchanged
+        return _rebuild, (type(self), self.detail, self.field)
+
+
+def _rebuild(cls: type[UltragrayError], detail: str, field: str | None) -> UltragrayError:
+    return cls(detail, field=field)
+
+
+class InvalidArgument(UltragrayError, ValueError):
+    """A value that cannot be used. `field` is the path of the value as the caller wrote it."""
+
+    reason = "INVALID_ARGUMENT"
+    http_status = 422
+    grpc_status = "INVALID_ARGUMENT"
+    title = "Invalid argument"
+
+
+class InvalidPose(InvalidArgument):
+    reason = "INVALID_POSE"
+    title = "Not a rigid probe-to-scene transform"
+
+
+class InvalidProbe(InvalidArgument):
+    reason = "INVALID_PROBE"
+    title = "Invalid probe"
+
+
+class InvalidImageSize(InvalidArgument):
+    reason = "INVALID_IMAGE_SIZE"
+    title = "Invalid image size"
+
+
+class UnknownOutput(InvalidArgument):
+    reason = "UNKNOWN_OUTPUT"
+    title = "Unknown output"
+
+
+class TooManyPoses(InvalidArgument):
+    reason = "TOO_MANY_POSES"
+    title = "Too many poses"
+
+
+class BodyTooLarge(UltragrayError):
+    reason = "BODY_TOO_LARGE"
+    http_status = 413
+    grpc_status = "INVALID_ARGUMENT"
+    title = "Request body too large"
+
+
+class NotAcceptable(UltragrayError):
+    reason = "NOT_ACCEPTABLE"
+    http_status = 406
+    grpc_status = "INVALID_ARGUMENT"
+    title = "Accept header cannot be satisfied"
+
+
+class UnsupportedMediaType(UltragrayError):
+    reason = "UNSUPPORTED_MEDIA_TYPE"
+    http_status = 415
+    grpc_status = "INVALID_ARGUMENT"
+    title = "Unsupported media type"
+
+
+class RouteNotFound(UltragrayError):
+    reason = "ROUTE_NOT_FOUND"
+    http_status = 404
+    grpc_status = "UNIMPLEMENTED"
+    title = "No such route"
+
+
+class MethodNotAllowed(UltragrayError):
+    reason = "METHOD_NOT_ALLOWED"
+    http_status = 405
+    grpc_status = "UNIMPLEMENTED"
+    title = "Method not allowed"
+
+
+class SceneNotFound(UltragrayError):
+    reason = "SCENE_NOT_FOUND"
+    http_status = 404
+    grpc_status = "NOT_FOUND"
+    title = "No such scene"
+
+
+class SceneFileInvalid(UltragrayError):
+    reason = "SCENE_FILE_INVALID"
+    http_status = 422
+    grpc_status = "FAILED_PRECONDITION"
+    title = "Invalid scene file"
+
+
+class CheckpointInvalid(UltragrayError):
+    reason = "CHECKPOINT_INVALID"
+    http_status = 422
+    grpc_status = "INVALID_ARGUMENT"
+    title = "Invalid checkpoint"
+
+
+class SceneTooLarge(UltragrayError):
+    reason = "SCENE_TOO_LARGE"
+    http_status = 507
+    grpc_status = "RESOURCE_EXHAUSTED"
+    title = "Scene exceeds the memory budget"
+
+
+class BackendUnavailable(UltragrayError):
+    reason = "BACKEND_UNAVAILABLE"
+    http_status = 501
+    grpc_status = "UNIMPLEMENTED"
+    title = "Render backend unavailable"
+
+
+class QueueFull(UltragrayError):
+    reason = "QUEUE_FULL"
+    http_status = 429
+    grpc_status = "RESOURCE_EXHAUSTED"
+    title = "Too many frames are waiting"
+
+
+class DeadlineExceeded(UltragrayError):
+    reason = "DEADLINE_EXCEEDED"
+    http_status = 504
+    grpc_status = "DEADLINE_EXCEEDED"
+    title = "Deadline exceeded"
+
+
+class NotReady(UltragrayError):
+    reason = "NOT_READY"
+    http_status = 503
+    grpc_status = "UNAVAILABLE"
+    title = "Service is starting"
+
+
+class Draining(UltragrayError):
+    reason = "DRAINING"
+    http_status = 503
+    grpc_status = "UNAVAILABLE"
+    title = "Service is stopping"
+
+
+class RenderFailed(UltragrayError):
+    reason = "RENDER_FAILED"
+    title = "Rendering failed"

@@ -1,0 +1,188 @@
+"""Probes: where each pixel lies in the probe frame.
+
+Convention. Probe frame, right-handed: x lateral (image columns, left to right), y elevation, z axial (depth, image rows).
+Origin: centre of the transducer face (linear) or apex of the fan (convex). Images are [H, W]: H depth samples, W scan
+lines; sample i lies at depth near + (far − near)·(i+½)/H along its scan line, so the geometry in mm does not depend on H.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, ClassVar, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from .errors import InvalidProbe
+
+FloatArray: TypeAlias = npt.NDArray[np.float64]
+
+MAX_LENGTH_MM = 10_000.0
+
+
+def _check_number(field: str, value: object, *, low: float, high: float, low_open: bool) -> float:
+    bracket = "(" if low_open else "["
+    expected = f"a finite number in {bracket}{low:g}, {high:g}]"
+    if isinstance(value, bool) or not isinstance(value, (int, float, np.floating, np.integer)):
+        raise InvalidProbe(f"{field} must be {expected}, got {value!r}", field=field)
+    number = float(value)
+    if not math.isfinite(number) or number > high or number < low or (low_open and number == low):
+        raise InvalidProbe(f"{field} must be {expected}, got {number!r}", field=field)
+    return number
+
+
+class _Planes:
+    """What both probes share: near and far depth in mm, on rows of equal thickness."""
+
+    near_mm: float
+    far_mm: float
+
+    def _check_planes(self) -> None:
+        near = _check_number("near_mm", self.near_mm, low=0.0, high=MAX_LENGTH_MM, low_open=False)
+        far = _check_number("far_mm", self.far_mm, low=0.0, high=MAX_LENGTH_MM, low_open=True)
+        if far <= near:
+            raise InvalidProbe(f"far_mm must be greater than near_mm ({near:g}), got {far:g}", field="far_mm")
+        object.__setattr__(self, "near_mm", near)
+        object.__setattr__(self, "far_mm", far)
+
+    @property
+    def scan_line_length_mm(self) -> float:
+        return self.far_mm - self.near_mm
+
+    def depths_mm(self, height: int) -> FloatArray:  # [H]
+        """Depth of each row along its scan line, in mm."""
+        return self.near_mm + self.scan_line_length_mm * (np.arange(height) + 0.5) / height
+
+    def cull_far_mm(self, height: int) -> float:
+        """Depth beyond which a Gaussian's mean is culled: the top edge of the last row (infinite for one row)."""
+        if height == 1:
+            return math.inf
+        return self.near_mm + self.scan_line_length_mm * (height - 1) / height
+
+
+@dataclass(frozen=True)
+class LinearProbe(_Planes):
+    """A linear array: parallel scan lines along +z, the face centred on the origin.
+
+    Raises InvalidProbe unless 0 < width_mm, 0 <= near_mm < far_mm, all finite and at most 10 m.
+    """
+
+    width_mm: float
+    near_mm: float
+    far_mm: float
+
+    kind: ClassVar[str] = "linear"
+
+    def __post_init__(self) -> None:
+        width = _check_number("width_mm", self.width_mm, low=0.0, high=MAX_LENGTH_MM, low_open=True)
+        object.__setattr__(self, "width_mm", width)
+        self._check_planes()
+
+    def scan_lines(self, width: int) -> tuple[FloatArray, FloatArray]:  # [W, 3] mm, [W, 3]
+        """Origin (mm) and unit direction of each scan line, in the probe frame."""
+        origins = np.zeros((width, 3))
+        origins[:, 0] = self.width_mm * ((np.arange(width) + 0.5) / width - 0.5)
+        return origins, np.tile(np.array([0.0, 0.0, 1.0]), (width, 1))
+
+    def corners_mm(self) -> FloatArray:  # [4, 3]
+        """Corners of the image plane in the probe frame: both edges at near and far."""
+        half = self.width_mm / 2
+        return np.array([(x, 0.0, z) for z in (self.near_mm, self.far_mm) for x in (-half, half)])
+
+
+@dataclass(frozen=True)
+class ConvexProbe(_Planes):
+    """A curved array: scan lines fan out from the apex, `near_mm` is the radius of the face.
+
+    `opening_angle_deg` is the full angle of the fan. Raises InvalidProbe unless it lies in (0, 175] and
+    0 <= near_mm < far_mm.
+    """
+
+    opening_angle_deg: float
+    near_mm: float
+    far_mm: float
+
+    kind: ClassVar[str] = "convex"
+
+    def __post_init__(self) -> None:
+        angle = _check_number("opening_angle_deg", self.opening_angle_deg, low=0.0, high=175.0, low_open=True)
+        object.__setattr__(self, "opening_angle_deg", angle)
+        self._check_planes()
+
+    def angles_rad(self, width: int) -> FloatArray:  # [W]
+        """Angle of each scan line from the z axis, positive towards +x, in radians."""
+        return math.radians(self.opening_angle_deg) * ((np.arange(width) + 0.5) / width - 0.5)
+
+    def scan_lines(self, width: int) -> tuple[FloatArray, FloatArray]:  # [W, 3] mm, [W, 3]
+        """Origin (mm) and unit direction of each scan line, in the probe frame."""
+        theta = self.angles_rad(width)
+        return np.zeros((width, 3)), np.stack([np.sin(theta), np.zeros(width), np.cos(theta)], axis=1)
+
+    def corners_mm(self) -> FloatArray:  # [6, 3]
+        """Corners of the fan in the probe frame: left edge, middle and right edge at near and far."""
+        half = math.radians(self.opening_angle_deg) / 2
+        return np.array(
+            [
+                (r * math.sin(t), 0.0, r * math.cos(t))
+                for r in (self.near_mm, self.far_mm)
+                for t in (-half, 0.0, half)
+            ]
+        )
+
+    def scan_convert(self, frame: npt.NDArray[Any], pixel_mm: float) -> npt.NDArray[np.float32]:
+        """A frame [H, W] of range and angle as a picture [rows, columns] in mm, `pixel_mm` square, 0 outside the fan.
+
+        The picture spans the fan's bounding box; interpolation is bilinear.
+        """
+        height, width = frame.shape
+        half = math.radians(self.opening_angle_deg) / 2
+        reach = self.far_mm * (1.0 if half >= math.pi / 2 else math.sin(half))
+        top = self.near_mm * math.cos(half) if half < math.pi / 2 else self.far_mm * math.cos(half)
+        columns = max(1, math.ceil(2 * reach / pixel_mm))
+        rows = max(1, math.ceil((self.far_mm - top) / pixel_mm))
+        x = (np.arange(columns) + 0.5) * pixel_mm - columns * pixel_mm / 2
+        z = top + (np.arange(rows) + 0.5) * pixel_mm
+        radius = np.hypot(x[None, :], z[:, None])  # [rows, columns]
+        theta = np.arctan2(x[None, :], z[:, None])
+        i = (radius - self.near_mm) / self.scan_line_length_mm * height - 0.5
+        j = (theta / (2 * half) + 0.5) * width - 0.5
+        inside = (np.abs(theta) <= half) & (radius >= self.near_mm) & (radius <= self.far_mm)
+        i = np.clip(i, 0, height - 1)
+        j = np.clip(j, 0, width - 1)
+        i0 = np.minimum(i.astype(np.intp), max(0, height - 2))
+        j0 = np.minimum(j.astype(np.intp), max(0, width - 2))
+        i1, j1 = np.minimum(i0 + 1, height - 1), np.minimum(j0 + 1, width - 1)
+        fi, fj = i - i0, j - j0
+        upper = frame[i0, j0] * (1 - fj) + frame[i0, j1] * fj
+        lower = frame[i1, j0] * (1 - fj) + frame[i1, j1] * fj
+        return np.where(inside, upper * (1 - fi) + lower * fi, 0.0).astype(np.float32)
+
+
+Probe: TypeAlias = LinearProbe | ConvexProbe
+
+_KINDS: dict[str, type[LinearProbe] | type[ConvexProbe]] = {"linear": LinearProbe, "convex": ConvexProbe}
+
+
+def probe_to_dict(probe: Probe) -> dict[str, Any]:
+    """The probe as a JSON object: `{"kind": "linear", "width_mm": …, "near_mm": …, "far_mm": …}`."""
+    return {"kind": probe.kind, **asdict(probe)}
+
+
+def probe_from_dict(document: Mapping[str, Any]) -> Probe:
+    """Inverse of `probe_to_dict`. Raises InvalidProbe for an unknown kind, a missing or a surplus key."""
+    if not isinstance(document, Mapping) or document.get("kind") not in _KINDS:
+        raise InvalidProbe(f'probe must be an object with kind "linear" or "convex", got {document!r}', field="kind")
+    cls = _KINDS[document["kind"]]
+    expected = {"kind", *cls.__dataclass_fields__}
+    if set(document) != expected:
+        raise InvalidProbe(f"probe of kind {cls.kind} must have the keys {sorted(expected)}, got {sorted(document)}")
+    return cls(**{key: value for key, value in document.items() if key != "kind"})
+
+
+def stretch_released_far(near: float, far_released: float, height: int) -> float:
+    """The far plane of ours that puts H rows where the released code's grid (i+½)/(H−1) has them (same unit)."""
+    if height < 2:
+        raise InvalidProbe(f"the released depth grid needs at least 2 rows, got {height}", field="height")
+    return near + (far_released - near) * height / (height - 1)

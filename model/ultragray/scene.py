@@ -1,0 +1,164 @@
+"""GaussianScene: the Gaussians of a trained scene and what they mean.
+
+Convention. Inside a scene lengths are in cm and the origin is the scene's centre; on every public surface they are in mm
+in the frame of the training sweep: p_cm = (p_mm − centre_mm) / 10.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor
+
+from .errors import InvalidArgument
+from .files import atomic_path
+from .pose import check_poses
+from .probe import FloatArray
+from .scene_info import (
+    MAX_SH_DEGREE,
+    METADATA_KEY,
+    SceneInfo,
+    expected_shapes,
+    info_to_json,
+    read_header,
+    scene_file_invalid,
+    with_summary,
+)
+
+PARAMETERS = ("means", "scales", "quats", "transmittances", "sh0", "shN")
+
+
+@dataclass(eq=False)
+class GaussianScene:
+    """Raw parameters (PHYSICS.md §2), as a released checkpoint's `splats` holds them, and the scene's description.
+
+    The tensors share one floating dtype and one device. `GaussianScene.from_splats` checks them; use that.
+    """
+
+    means: Tensor  # [N, 3] cm
+    scales: Tensor  # [N, 3] log cm
+    quats: Tensor  # [N, 4] wxyz, any norm but 0
+    transmittances: Tensor  # [N] logit
+    sh0: Tensor  # [N, 1, 1]
+    shN: Tensor  # [N, K-1, 1]  # noqa: N815 (the released name)
+    info: SceneInfo = field(default_factory=SceneInfo)
+    training_poses: FloatArray = field(default_factory=lambda: np.zeros((0, 4, 4)))  # [P, 4, 4] mm
+
+    @classmethod
+    def from_splats(
+        cls,
+        splats: Mapping[str, Tensor],
+        *,
+        info: SceneInfo | None = None,
+        training_poses: Any = None,  # [P, 4, 4] mm
+    ) -> GaussianScene:
+        """A scene of raw released parameters, lengths in cm; the graph of the tensors is kept.
+
+        Raises InvalidArgument, naming the tensor, for a missing key, a wrong shape, mixed dtypes or devices, or values
+        that are not finite.
+        """
+        missing = [name for name in PARAMETERS if name not in splats and name != "shN"]
+        if missing:
+            raise InvalidArgument(f"splats must hold {', '.join(PARAMETERS)}; missing {', '.join(missing)}", field="splats")
+        tensors = {name: splats[name] for name in PARAMETERS if name in splats}
+        for name, tensor in tensors.items():
+            if not isinstance(tensor, Tensor) or not tensor.is_floating_point():
+                raise InvalidArgument(f"splats[{name!r}] must be a floating tensor, got {type(tensor).__name__}", field=name)
+        means = tensors["means"]
+        count = means.shape[0] if means.ndim else 0
+        if "shN" not in tensors:
+            tensors["shN"] = means.new_zeros((count, 0, 1))
+        shn = tensors["shN"]
+        degree = {0: 0, 3: 1, 8: 2, 15: 3}.get(shn.shape[1] if shn.ndim == 3 else -1)
+        if degree is None:
+            raise InvalidArgument(
+                f"splats['shN'] must be [N, K-1, 1] with K-1 in 0, 3, 8, 15, got {list(shn.shape)}", field="shN"
+            )
+        for name, shape in expected_shapes(count, degree).items():
+            tensor = tensors[name]
+            if tuple(tensor.shape) != shape:
+                raise InvalidArgument(
+                    f"splats[{name!r}] must have shape {list(shape)}, got {list(tensor.shape)}", field=name
+                )
+            if tensor.dtype != means.dtype or tensor.device != means.device:
+                raise InvalidArgument(
+                    f"splats[{name!r}] must be {means.dtype} on {means.device} like means, got {tensor.dtype} on "
+                    f"{tensor.device}",
+                    field=name,
+                )
+            if not bool(torch.isfinite(tensor).all()):
+                raise InvalidArgument(f"splats[{name!r}] must be finite, got NaN or infinity", field=name)
+        if count and bool((tensors["quats"].detach().norm(dim=-1) == 0).any()):
+            raise InvalidArgument("splats['quats'] must not be zero", field="quats")
+        poses = np.zeros((0, 4, 4)) if training_poses is None else check_poses(training_poses, field="training_poses")
+        summary = with_summary(info or SceneInfo(), means.detach().cpu().double().numpy(), degree)
+        return cls(**tensors, info=summary, training_poses=poses)
+
+    @property
+    def gaussian_count(self) -> int:
+        return self.info.gaussian_count
+
+    @property
+    def sh_degree(self) -> int:
+        return self.info.sh_degree
+
+    @property
+    def splats(self) -> dict[str, Tensor]:
+        """The six raw parameter tensors by their released names."""
+        return {name: getattr(self, name) for name in PARAMETERS}
+
+    def to(self, target: torch.dtype | torch.device | str) -> GaussianScene:
+        """The same scene with its tensors in another dtype or on another device."""
+        moved = {name: tensor.to(target) for name, tensor in self.splats.items()}
+        return GaussianScene(**moved, info=self.info, training_poses=self.training_poses)
+
+    def poses_to_scene_cm(self, poses: FloatArray) -> FloatArray:  # [C, 4, 4] mm -> [C, 4, 4] cm
+        """Poses in the sweep's frame (mm) as poses in the scene's own (cm, about its centre)."""
+        inside = poses.copy()
+        inside[:, :3, 3] = (poses[:, :3, 3] - np.asarray(self.info.centre_mm)) / 10.0
+        return inside
+
+    def to_bytes(self) -> bytes:
+        """The scene file: deterministic, so that its SHA-256 names the scene."""
+        tensors = {name: t.detach().to("cpu", torch.float32).contiguous() for name, t in self.splats.items()}
+        tensors["training_poses"] = torch.from_numpy(np.ascontiguousarray(self.training_poses))
+        return save(tensors, metadata={METADATA_KEY: info_to_json(self.info)})
+
+    def save(self, path: str | Path) -> None:
+        """Writes the scene file whole or not at all. Raises OSError where it cannot be written."""
+        data = self.to_bytes()
+        with atomic_path(path) as temporary:
+            temporary.write_bytes(data)
+
+    @classmethod
+    def load(cls, path: str | Path) -> GaussianScene:
+        """Reads a scene file. Never runs code; raises SceneFileInvalid, naming the file and the reason."""
+        header = read_header(path)
+        try:
+            with safe_open(path, framework="pt") as bundle:
+                splats = {name: bundle.get_tensor(name) for name in PARAMETERS}
+            scene = cls.from_splats(splats, info=header.info, training_poses=header.training_poses)
+        except (OSError, SafetensorError, ValueError) as error:
+            raise scene_file_invalid(path, error) from error
+        return scene
+
+
+def file_sha256(path: str | Path) -> str:
+    """The hash that names a scene in every frame rendered from it: SHA-256 of its file, hexadecimal."""
+    with Path(path).open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest() if hasattr(hashlib, "file_digest") else _sha256(file)
+
+
+def _sha256(file: Any) -> str:  # Python 3.10 has no hashlib.file_digest
+    digest = hashlib.sha256()
+    while block := file.read(1 << 20):
+        digest.update(block)
+    return digest.hexdigest()

@@ -1,0 +1,181 @@
+"""What a scene file says about itself, readable without torch: the header of the safetensors bundle.
+
+The file is one safetensors bundle. Tensors: means [N, 3] cm, scales [N, 3] log cm, quats [N, 4] wxyz, transmittances [N]
+logit, sh0 [N, 1, 1], shN [N, K−1, 1], all float32, and training_poses [P, 4, 4] float64 mm. Its metadata holds one entry,
+`ultragray`, a JSON object with the fields of SceneInfo.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from safetensors import SafetensorError, safe_open
+
+from .errors import InvalidArgument, SceneFileInvalid
+from .pose import check_poses
+from .probe import FloatArray, Probe, probe_from_dict, probe_to_dict
+
+FORMAT_VERSION = 1
+METADATA_KEY = "ultragray"
+INTENSITIES = ("released", "sigmoid")
+MAX_SH_DEGREE = 3
+
+Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class SceneInfo:
+    """A scene's own description. Positions are in mm; `bounds` and `centre` in the frame of the training sweep."""
+
+    centre_mm: Vector = (0.0, 0.0, 0.0)
+    probe: Probe | None = None
+    image_height: int | None = None  # H of the training images
+    image_width: int | None = None  # W
+    intensity: str = "released"  # activation of PHYSICS.md §2: released or sigmoid
+    sh_degree: int = 0
+    gaussian_count: int = 0
+    bounds_min_mm: Vector = (0.0, 0.0, 0.0)  # of the Gaussians' means
+    bounds_max_mm: Vector = (0.0, 0.0, 0.0)
+    dataset_name: str | None = None
+    dataset_sha256: str | None = None
+    metrics: dict[str, float] = field(default_factory=dict)
+    training: dict[str, Any] = field(default_factory=dict)  # the configuration the scene was made with
+
+    def __post_init__(self) -> None:
+        for name in ("centre_mm", "bounds_min_mm", "bounds_max_mm"):
+            object.__setattr__(self, name, _vector(name, getattr(self, name)))
+        if self.intensity not in INTENSITIES:
+            raise InvalidArgument(
+                f"intensity must be one of {', '.join(INTENSITIES)}, got {self.intensity!r}", field="intensity"
+            )
+        for name in ("image_height", "image_width"):
+            value = getattr(self, name)
+            if value is not None and (not isinstance(value, int) or isinstance(value, bool) or value < 1):
+                raise InvalidArgument(f"{name} must be a positive integer, got {value!r}", field=name)
+        for name in ("metrics", "training"):
+            if not isinstance(getattr(self, name), dict):
+                raise InvalidArgument(f"{name} must be an object, got {getattr(self, name)!r}", field=name)
+
+
+def _vector(name: str, value: Any) -> Vector:
+    try:
+        x, y, z = (float(v) for v in value)
+    except (TypeError, ValueError):
+        raise InvalidArgument(f"{name} must be three numbers, got {value!r}", field=name) from None
+    if not all(map(math.isfinite, (x, y, z))):
+        raise InvalidArgument(f"{name} must be finite, got {value!r}", field=name)
+    return (x, y, z)
+
+
+def info_to_json(info: SceneInfo) -> str:
+    """The metadata entry of a scene file."""
+    document = {
+        "format_version": FORMAT_VERSION,
+        **asdict(info),
+        "probe": None if info.probe is None else probe_to_dict(info.probe),
+    }
+    return json.dumps(document, allow_nan=False, sort_keys=True)
+
+
+def info_from_json(text: str) -> SceneInfo:
+    """Inverse of `info_to_json`. Raises ValueError (InvalidArgument among them), saying what is wrong."""
+    document = json.loads(text)
+    if not isinstance(document, dict):
+        raise ValueError("its metadata is not a JSON object")
+    version = document.pop("format_version", None)
+    if version != FORMAT_VERSION:
+        raise ValueError(f"its format_version is {version!r}, this release reads {FORMAT_VERSION}")
+    unknown = set(document) - set(SceneInfo.__dataclass_fields__)
+    if unknown:
+        raise ValueError(f"its metadata has unknown keys {sorted(unknown)}")
+    if document.get("probe") is not None:
+        document["probe"] = probe_from_dict(document["probe"])
+    return SceneInfo(**document)
+
+
+def expected_shapes(count: int, sh_degree: int) -> dict[str, tuple[int, ...]]:
+    """Shapes of the six parameter tensors for N = `count` Gaussians."""
+    return {
+        "means": (count, 3),
+        "scales": (count, 3),
+        "quats": (count, 4),
+        "transmittances": (count,),
+        "sh0": (count, 1, 1),
+        "shN": (count, (sh_degree + 1) ** 2 - 1, 1),
+    }
+
+
+@dataclass(frozen=True)
+class SceneHeader:
+    """What `read_header` finds: the description and the training poses, no Gaussians."""
+
+    info: SceneInfo
+    training_poses: FloatArray  # [P, 4, 4] mm, probe→scene
+    file_bytes: int
+
+
+def read_header(path: str | Path) -> SceneHeader:
+    """The description of a scene file, without loading its Gaussians and without torch.
+
+    Raises SceneFileInvalid, naming the file and the reason, for anything that is not a complete scene file.
+    """
+    path = Path(path)
+    try:
+        size = path.stat().st_size
+        with safe_open(path, framework="numpy") as bundle:
+            metadata = bundle.metadata() or {}
+            if METADATA_KEY not in metadata:
+                raise ValueError("it is a safetensors file, but not one of ultragray's")
+            info = info_from_json(metadata[METADATA_KEY])
+            _check_tensors(bundle, info)
+            poses = check_poses(bundle.get_tensor("training_poses"), field="training_poses")
+    except (OSError, SafetensorError, ValueError, TypeError, RecursionError) as error:
+        raise scene_file_invalid(path, error) from error
+    return SceneHeader(info=info, training_poses=poses, file_bytes=size)
+
+
+def _check_tensors(bundle: Any, info: SceneInfo) -> None:
+    names = set(bundle.keys())
+    if not isinstance(info.sh_degree, int) or not 0 <= info.sh_degree <= MAX_SH_DEGREE:
+        raise ValueError(f"its sh_degree is {info.sh_degree!r}, expected 0 to {MAX_SH_DEGREE}")
+    shapes = expected_shapes(info.gaussian_count, info.sh_degree)
+    if names != {*shapes, "training_poses"}:
+        raise ValueError(f"its tensors are {sorted(names)}, expected {sorted([*shapes, 'training_poses'])}")
+    for name, shape in shapes.items():
+        part = bundle.get_slice(name)
+        if tuple(part.get_shape()) != shape or part.get_dtype() != "F32":
+            raise ValueError(
+                f"its tensor {name} is {part.get_dtype()} {list(part.get_shape())}, expected F32 {list(shape)}"
+            )
+    if bundle.get_slice("training_poses").get_dtype() != "F64":
+        raise ValueError("its tensor training_poses is not F64")
+
+
+def scene_file_invalid(path: str | Path, error: Exception) -> SceneFileInvalid:
+    """The one sentence for a scene file that cannot be read."""
+    if isinstance(error, FileNotFoundError):
+        return SceneFileInvalid(f"{path}: no such file")
+    if isinstance(error, RecursionError):
+        return SceneFileInvalid(f"{path}: not a scene file: its metadata nests too deeply")
+    return SceneFileInvalid(f"{path}: not a scene file that can be read: {error}")
+
+
+def with_summary(info: SceneInfo, means_cm: FloatArray, sh_degree: int) -> SceneInfo:  # means [N, 3]
+    """`info` with the count, degree and bounds of the Gaussians it goes with."""
+    centre = np.asarray(info.centre_mm)
+    if len(means_cm):
+        low, high = centre + 10.0 * means_cm.min(axis=0), centre + 10.0 * means_cm.max(axis=0)
+    else:
+        low = high = centre
+    return replace(
+        info,
+        gaussian_count=len(means_cm),
+        sh_degree=sh_degree,
+        bounds_min_mm=_vector("bounds_min_mm", low),
+        bounds_max_mm=_vector("bounds_max_mm", high),
+    )
