@@ -2,17 +2,88 @@
 
 from __future__ import annotations
 
-import torch
+import math
+from collections.abc import Sequence
 
+import numpy as np
+import torch
+from torch import Tensor
+
+from . import _cpu
+from .errors import BackendUnavailable
 from .probe import ConvexProbe, FloatArray, Probe
-from .reference import Fields
 from .scene import GaussianScene
-from . import reference
+
+INSTRUCTION_SETS: tuple[str, ...] = tuple(_cpu.instruction_sets())  # what this processor can run, best first
 
 
 def supports(scene: GaussianScene) -> bool:
-    return False
+    """Whether this backend can render the scene: float32 on the CPU, no gradient wanted."""
+    tensors = scene.splats.values()
+    differentiable = torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
+    return scene.means.device.type == "cpu" and scene.means.dtype == torch.float32 and not differentiable
 
 
-def render_fields(scene: GaussianScene, probe: Probe, poses_cm: FloatArray, height: int, width: int) -> Fields:
-    return reference.render_fields(scene, probe, poses_cm, height, width)
+def render_outputs(
+    scene: GaussianScene,
+    probe: Probe,
+    poses_cm: FloatArray,  # [C, 4, 4] about the scene's centre
+    height: int,
+    width: int,
+    outputs: Sequence[str],
+    *,
+    instruction_set: str = "auto",
+) -> dict[str, Tensor]:
+    """The outputs by name, each [C, H, W] float32. Raises BackendUnavailable for a scene it does not support."""
+    if not supports(scene):
+        raise BackendUnavailable(
+            f"backend cpu renders float32 scenes on the CPU without gradients, got {scene.means.dtype} on "
+            f"{scene.means.device}",
+            field="backend",
+        )
+    if instruction_set != "auto" and instruction_set not in INSTRUCTION_SETS:
+        raise BackendUnavailable(
+            f"instruction_set must be auto or one of {', '.join(INSTRUCTION_SETS)}, got {instruction_set!r}",
+            field="instruction_set",
+        )
+    frames = {name: torch.empty((len(poses_cm), height, width)) for name in outputs}
+    planes = {name: frames[name].numpy() if name in frames else None for name in _PLANES}
+    convex = isinstance(probe, ConvexProbe)
+    _cpu.render(
+        _prepared(scene),
+        convex=convex,
+        width_cm=0.0 if isinstance(probe, ConvexProbe) else probe.width_mm / 10.0,
+        opening_rad=math.radians(probe.opening_angle_deg) if isinstance(probe, ConvexProbe) else 0.0,
+        near_cm=probe.near_mm / 10.0,
+        far_cm=probe.far_mm / 10.0,
+        cull_far_cm=probe.cull_far_mm(height) / 10.0,
+        poses=np.ascontiguousarray(poses_cm),
+        height=height,
+        width=width,
+        threads=torch.get_num_threads(),
+        instruction_set=instruction_set,
+        **planes,
+    )
+    return frames
+
+
+_PLANES = ("bmode", "echo", "transmittance", "coverage")
+
+
+def _prepared(scene: GaussianScene) -> _cpu.PreparedScene:
+    """The scene as the kernel wants it, kept with the scene until one of its tensors changes."""
+    key = tuple((t.data_ptr(), t._version) for t in scene.splats.values())
+    if scene.cache.get("cpu_key") != key:
+        raw = {name: tensor.detach().contiguous() for name, tensor in scene.splats.items()}
+        scene.cache["cpu"] = _cpu.PreparedScene(
+            raw["means"].numpy(),
+            raw["scales"].numpy(),
+            raw["quats"].numpy(),
+            raw["transmittances"].numpy(),
+            raw["sh0"].reshape(-1).numpy(),
+            raw["shN"].reshape(scene.gaussian_count, -1).numpy() if scene.sh_degree else np.empty((scene.gaussian_count, 0), np.float32),
+            scene.sh_degree,
+            scene.info.intensity == "sigmoid",
+        )
+        scene.cache["cpu_key"] = key
+    return scene.cache["cpu"]

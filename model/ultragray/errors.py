@@ -7,6 +7,7 @@ UltragrayError
 │   ├── InvalidImageSize            height or width outside the limits
 │   ├── UnknownOutput               an output other than bmode, echo, transmittance, coverage
 │   └── TooManyPoses                more poses in one request than the limit
+├── Unauthenticated                 no API key, or an unknown one, where the service asks for one
 ├── BodyTooLarge                    a request body over the limit
 ├── NotAcceptable                   the Accept header cannot hold what was asked for
 ├── UnsupportedMediaType            a request body that is not JSON
@@ -21,6 +22,7 @@ UltragrayError
 ├── DeadlineExceeded                the deadline passed before the frame was rendered
 ├── NotReady                        the service is starting
 ├── Draining                        the service is stopping
+├── StartupFailed                   the service cannot start: a port in use, no data folder, a scene to preload that is bad
 └── RenderFailed                    a worker could not render the frame
 
 Each class carries a `reason` that never changes (clients match on it), the HTTP status and the gRPC status that the front
@@ -85,6 +87,13 @@ class UnknownOutput(InvalidArgument):
 class TooManyPoses(InvalidArgument):
     reason = "TOO_MANY_POSES"
     title = "Too many poses"
+
+
+class Unauthenticated(UltragrayError):
+    reason = "UNAUTHENTICATED"
+    http_status = 401
+    grpc_status = "UNAUTHENTICATED"
+    title = "Authentication required"
 
 
 class BodyTooLarge(UltragrayError):
@@ -183,6 +192,11 @@ class Draining(UltragrayError):
     http_status = 503
     grpc_status = "UNAVAILABLE"
     title = "Service is stopping"
+
+
+class StartupFailed(UltragrayError):
+    reason = "STARTUP_FAILED"
+    title = "Service cannot start"
 
 
 class RenderFailed(UltragrayError):

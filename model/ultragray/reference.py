@@ -7,6 +7,7 @@ thresholds and culls are held fixed, everything else carries its true gradient (
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -24,26 +25,39 @@ ELEMENTS_PER_CHUNK = 1 << 22
 
 
 class Fields(NamedTuple):
-    """What every backend returns, each [C, H, W]: S = Σ w, ΣI·w, and the transmittance T."""
+    """S = Σ w, ΣI·w and the transmittance T of one pose, each [H, W]."""
 
     weight_sum: Tensor
     weighted_intensity: Tensor
     transmittance: Tensor
 
 
-def render_fields(
+def render_outputs(
     scene: GaussianScene,
     probe: Probe,
     poses_cm: FloatArray,  # [C, 4, 4] about the scene's centre
     height: int,
     width: int,
-) -> Fields:
-    """S, ΣI·w and T for each pose, [C, H, W]."""
-    views = [_render_pose(scene, probe, scene.means.new_tensor(pose), height, width) for pose in poses_cm]
-    if not views:
-        empty = scene.means.new_zeros((0, height, width))
-        return Fields(empty, empty, empty)
-    return Fields(*(torch.stack(field) for field in zip(*views, strict=True)))
+    outputs: Sequence[str],
+) -> dict[str, Tensor]:
+    """The outputs by name, each [C, H, W] in the dtype of the scene's tensors."""
+    views = [
+        combine(_render_pose(scene, probe, scene.means.new_tensor(pose), height, width)) for pose in poses_cm
+    ]
+    empty = scene.means.new_zeros((0, height, width))
+    return {name: torch.stack([view[name] for view in views]) if views else empty for name in outputs}
+
+
+def combine(fields: Fields) -> dict[str, Tensor]:
+    """B = E·T, E = γ·ΣI·w/(S + 1e-8), T, and γ = 1 − exp(−S)."""
+    coverage = -torch.expm1(-fields.weight_sum)
+    echo = coverage * fields.weighted_intensity / (fields.weight_sum + 1e-8)
+    return {
+        "bmode": echo * fields.transmittance,
+        "echo": echo,
+        "transmittance": fields.transmittance,
+        "coverage": coverage,
+    }
 
 
 def _render_pose(scene: GaussianScene, probe: Probe, pose: Tensor, height: int, width: int) -> Fields:  # [H, W] each

@@ -6,18 +6,16 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from . import cpu, reference
 from .errors import BackendUnavailable, InvalidArgument
 from .pose import check_poses
 from .probe import FloatArray, Probe
-from .reference import Fields
 from .request import OUTPUTS, check_image_size, check_outputs
 from .scene import GaussianScene
 
-Backend = Callable[[GaussianScene, Probe, FloatArray, int, int], Fields]
+Backend = Callable[[GaussianScene, Probe, FloatArray, int, int, Sequence[str]], dict[str, Tensor]]
 
 
 @dataclass(frozen=True)
@@ -56,26 +54,13 @@ def render(
     if probe is None:
         raise InvalidArgument("probe must be given: this scene does not know the one it was trained with", field="probe")
     poses_cm = scene.poses_to_scene_cm(check_poses(poses))
-    fields = _backend(backend, scene)(scene, probe, poses_cm, height, width)
-    return _combine(fields, chosen)
+    return Frames(**_backend(backend, scene)(scene, probe, poses_cm, height, width, chosen))
 
 
 def _backend(name: str, scene: GaussianScene) -> Backend:
-    backends: dict[str, Backend] = {"reference": reference.render_fields, "cpu": cpu.render_fields}
+    backends: dict[str, Backend] = {"reference": reference.render_outputs, "cpu": cpu.render_outputs}
     if name == "auto":
         name = "cpu" if cpu.supports(scene) else "reference"
     if name not in backends:
         raise BackendUnavailable(f"backend must be one of auto, {', '.join(backends)}, got {name!r}", field="backend")
     return backends[name]
-
-
-def _combine(fields: Fields, outputs: Sequence[str]) -> Frames:
-    coverage = -torch.expm1(-fields.weight_sum)
-    echo = coverage * fields.weighted_intensity / (fields.weight_sum + 1e-8)
-    values = {
-        "bmode": echo * fields.transmittance,
-        "echo": echo,
-        "transmittance": fields.transmittance,
-        "coverage": coverage,
-    }
-    return Frames(**{name: values[name] for name in outputs})

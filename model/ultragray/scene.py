@@ -51,6 +51,7 @@ class GaussianScene:
     shN: Tensor  # [N, K-1, 1]  # noqa: N815 (the released name)
     info: SceneInfo = field(default_factory=SceneInfo)
     training_poses: FloatArray = field(default_factory=lambda: np.zeros((0, 4, 4)))  # [P, 4, 4] mm
+    cache: dict[str, Any] = field(default_factory=dict, repr=False)  # what a backend prepared for this scene
 
     @classmethod
     def from_splats(

@@ -1,0 +1,60 @@
+# make serve   sets everything up and serves (HTTP 8000, gRPC 50051) in the foreground
+# make test    sets everything up and runs the tests
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+KERNEL_SOURCES := $(wildcard model/kernels/*) CMakeLists.txt pyproject.toml
+PYTHON_SOURCES := model service workers proto tests benchmarks
+ARGS ?=
+
+.DEFAULT_GOAL := help
+.PHONY: help serve test test-faults check format bench proto clean
+
+help:  ## say what there is
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
+
+serve: $(VENV)/installed  ## set up, then serve the demo scene and every *.ugr in ./data (ARGS="--help" for options)
+	@exec $(BIN)/ultragray serve $(ARGS)
+
+test: $(VENV)/installed-dev  ## set up, then run the tests (ARGS="-k probe" for some)
+	$(BIN)/pytest $(ARGS)
+
+test-faults: $(VENV)/installed-dev  ## half a minute of load with a worker killed every second
+	ULTRAGRAY_FAULT_SECONDS=30 $(BIN)/pytest tests/workers/test_faults.py -s $(ARGS)
+
+check: $(VENV)/installed-dev  ## lint, types, formatting
+	$(BIN)/ruff check $(PYTHON_SOURCES)
+	$(BIN)/ruff format --check $(PYTHON_SOURCES)
+	$(BIN)/mypy
+	$(BIN)/clang-format --dry-run --Werror model/kernels/*.[ch]pp model/kernels/*.inl
+
+format: $(VENV)/installed-dev  ## rewrite the sources in the project's format
+	$(BIN)/ruff check --fix $(PYTHON_SOURCES)
+	$(BIN)/ruff format $(PYTHON_SOURCES)
+	$(BIN)/clang-format -i model/kernels/*.[ch]pp model/kernels/*.inl
+
+bench: $(VENV)/installed  ## measure the kernel and the service; the table is printed, the JSON written
+	$(BIN)/ultragray bench --output benchmarks/results.json $(ARGS)
+
+proto: $(VENV)/installed-dev  ## regenerate the gRPC stubs
+	$(BIN)/python proto/generate.py
+
+clean:  ## remove what was built
+	rm -rf $(VENV) build
+
+$(VENV)/python: Makefile
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' || \
+		{ echo "Python 3.10 or newer is needed; choose one with: make PYTHON=/path/to/python3"; exit 1; }
+	@echo "Creating the virtual environment in $(VENV) ..."
+	@$(PYTHON) -m venv $(VENV)
+	@touch $@
+
+$(VENV)/installed: $(VENV)/python $(KERNEL_SOURCES)
+	@echo "Installing the libraries and compiling the kernel (a minute or two the first time) ..."
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable .
+	@touch $@
+
+$(VENV)/installed-dev: $(VENV)/installed
+	@echo "Installing the test and lint tools ..."
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	@touch $@

@@ -1,0 +1,199 @@
+// From slices to pixels: S, sum of I*w and T on a strip of scan lines (PHYSICS.md §3, §5.3).
+//
+// kLanes neighbouring scan lines form a vector and the loop runs down the rows. In depth steps of du standard deviations the
+// echo weight is a Gaussian progression, w(k+1) = w(k) r(k) and r(k+1) = r(k) q, which costs two products a row instead of an
+// exponential; it is restarted every few rows so that rounding stays under 1e-4 of w. The absorption is exp(-m2/2) sigma G(u)
+// with one polynomial for G, or its quadrature itself where depth 0 clips the window.
+
+namespace {
+
+constexpr float kMinPsi = 0.0039292930f;  // -log(1 - 1/255): alpha reaches 1/255
+constexpr float kMaxWeight = 0.999f;
+constexpr float kMaxM2Attenuation = 9.0f;
+constexpr float kFullG = 2.8906850f;   // G(u) for u >= 3
+constexpr float kNegligible = 20.0f;   // w < 5e-5 beyond m2 + u2
+constexpr float kNode = 0.7745966692f; // Gauss-Legendre: nodes 0, +-sqrt(0.6)
+constexpr int kRestartRows = 32;
+
+// G of PHYSICS.md §3 for unclipped windows, within 3.2e-4 (a minimax fit; constant beyond the ends).
+inline Floats absorption_profile(Floats u) {
+    const Floats v = (minimum(maximum(u, splat(-3.34f)), splat(3.0f)) + 0.17f) * (1.0f / 3.17f);
+    Floats p = splat(-1.17912165f);
+    p = p * v - 1.08363338f;
+    p = p * v + 4.49129112f;
+    p = p * v + 4.48426945f;
+    p = p * v - 6.86307471f;
+    p = p * v - 8.09939924f;
+    p = p * v + 5.18377769f;
+    p = p * v + 8.18838f;
+    p = p * v - 2.00312422f;
+    p = p * v - 5.11385445f;
+    p = p * v + 0.737662447f;
+    p = p * v + 3.06877651f;
+    return p * v + 1.0784183f;
+}
+
+// G where depth 0, at u = zero, clips the window (or not): the three-point Gauss-Legendre rule of §3.
+inline Floats clipped_profile(Floats u, Floats zero) {
+    const Floats centre = minimum(maximum(zero, Floats{}), u);
+    const Floats low = maximum(centre - 3.0f, zero), high = minimum(centre + 3.0f, u);
+    const Floats half = 0.5f * (high - low), middle = 0.5f * (high + low);
+    const Floats before = middle - kNode * half, after = middle + kNode * half;
+    const Floats sum = (8.0f / 9.0f) * exponential(-0.5f * middle * middle) +
+                       (5.0f / 9.0f) * (exponential(-0.5f * before * before) + exponential(-0.5f * after * after));
+    const Floats depth = u - zero, point = 0.5f * (u + zero);
+    const Mask degenerate = either(less_equal(depth * depth, splat(1e-8f)), less_equal(high, low));
+    return select(degenerate, depth * exponential(-0.5f * point * point), half * sum);
+}
+
+enum class Profile {
+    Thin,     // psi small: alpha by a short series
+    Thick,    // any psi
+    Clipped,  // the window may reach depth 0
+};
+
+// kLanes scan lines across one slice; depth is u, in standard deviations from s*.
+struct Group {
+    Floats u;        // at row `base`
+    Floats du;       // per row
+    Floats m2;
+    Floats window2;  // u2 up to here has w >= 1/255; negative: the lane is not touched
+    Floats peak;     // exp(-m2/2) sigma where m2 <= 9, else 0: psi = peak * G(u)
+    Floats zero;     // u at depth 0
+    int base;
+};
+
+template <Profile profile>
+inline void draw_rows(const Group& g, const Slice& s, const Strip& strip, int column, int top, int end) {
+    const float fastest = largest(g.du);
+    const int period = fastest * kRestartRows > 8.0f ? (fastest < 8.0f ? int(8.0f / fastest) : 1) : kRestartRows;
+    const Floats q = exponential(-g.du * g.du);
+    const Floats intensity = splat(s.intensity), absorb = splat(s.absorb);
+    for (int block = top; block < end; block += period) {
+        Floats steps = splat(float(block - g.base));
+        Floats u = g.u + steps * g.du;
+        Floats w = exponential(-0.5f * (g.m2 + u * u));
+        Floats r = exponential(-g.du * (u + 0.5f * g.du));
+        const int stop = block + period < end ? block + period : end;
+        for (int i = block; i < stop; ++i) {
+            const Floats psi = g.peak * (profile == Profile::Clipped ? clipped_profile(u, g.zero) : absorption_profile(u));
+            const Mask counted = either(less_equal(u * u, g.window2), less_equal(splat(kMinPsi), psi));
+            Floats alpha;
+            if (profile == Profile::Thin)
+                alpha = psi * (1.0f - psi * (0.5f - psi * (1.0f / 6.0f)));
+            else
+                alpha = minimum(1.0f - exponential(-psi), splat(kMaxWeight));
+            const Floats weight = keep(counted, minimum(w, splat(kMaxWeight)));
+            const int64_t at = int64_t(i) * strip.stride + column;
+            store(strip.weight + at, load<Floats>(strip.weight + at) + weight);
+            store(strip.intensity + at, load<Floats>(strip.intensity + at) + intensity * weight);
+            store(strip.local + at, load<Floats>(strip.local + at) * (1.0f - absorb * keep(counted, alpha)));
+            w *= r;
+            r *= q;
+            steps += 1.0f;
+            u = g.u + steps * g.du;  // not u += du: a window's edge must not drift
+        }
+    }
+}
+
+inline void draw_group(const View& view, const Slice& s, const Strip& strip, int column) {
+    const int line = strip.first + column;
+    const Doubles dx = load<Doubles>(view.dir_x + line), dz = load<Doubles>(view.dir_z + line);
+    const Doubles x = s.mean_x - load<Doubles>(view.line_x + line);
+    const Doubles across = dx * s.mean_z - dz * x;
+    const Doubles spread = 1.0 / (dx * dx * s.cov_zz - 2.0 * dx * dz * s.cov_xz + dz * dz * s.cov_xx);
+    const Doubles star = spread * (dx * (s.cov_zz * x - s.cov_xz * s.mean_z) + dz * (s.cov_xx * s.mean_z - s.cov_xz * x));
+    const Floats m2_line = to_floats(across * across * spread);
+    const Floats variance = to_floats((s.cov_xx * s.cov_zz - s.cov_xz * s.cov_xz) * spread);
+
+    Group g;
+    g.m2 = s.m2_plane + m2_line;
+    const Floats sigma = square_root(variance);
+    const Floats inverse_sigma = 1.0f / sigma;
+    const double bound = view.height - 1;
+    const double base = (s.mean_z - view.near) / view.row_step;  // near the centre: u stays exact where it matters
+    g.base = static_cast<int>(base > 0 ? (base < bound ? base : bound) : 0);
+    g.u = to_floats((view.near + view.row_step * (g.base + 0.5)) - star) * inverse_sigma;
+    g.du = float(view.row_step) * inverse_sigma;
+    g.window2 = float(kMaxM2) - g.m2;
+    const Mask touched = less_equal(Floats{}, g.window2);
+    if (!any(touched)) return;
+    const Mask absorbs = both(touched, less_equal(g.m2, splat(kMaxM2Attenuation)));
+    g.peak = keep(absorbs, exponential(-0.5f * g.m2) * sigma);
+    g.zero = -to_floats(star) * inverse_sigma;
+    const Floats full = g.peak * kFullG;
+    const Mask opaque = less_equal(splat(kMinPsi), full);
+
+    const Floats window = square_root(maximum(g.window2, Floats{}));
+    const Floats whole = 3.0f + maximum(g.zero, Floats{});  // the window ends here even where the mean lies before the face
+    const Floats tail = maximum(whole, square_root(maximum(kNegligible - g.m2, Floats{})));
+    const Floats inverse_du = 1.0f / g.du;
+    const Floats first_row = (-window - g.u) * inverse_du, last_row = (select(opaque, tail, window) - g.u) * inverse_du;
+    const float top_row = smallest(select(touched, first_row, splat(1e9f))) + float(g.base);
+    const float end_row = largest(select(touched, last_row, splat(-1e9f))) + float(g.base);
+    const float thickest = largest(full);
+    // An opaque Gaussian this wide absorbs 1/255 above the rows where its weight reaches that.
+    const bool early = thickest > 4.0f;
+    const int top = early || top_row < 0.0f ? 0 : top_row > float(bound) ? view.height : static_cast<int>(top_row);
+    const int end = end_row < 0.0f ? 0 : end_row > float(bound) ? view.height : static_cast<int>(end_row) + 1;
+    if (top < end) {
+        const float nearest = largest(select(touched, g.zero, splat(-1e9f)));
+        if (nearest > -6.4f || early)
+            draw_rows<Profile::Clipped>(g, s, strip, column, top, end);
+        else if (thickest > 0.2f)
+            draw_rows<Profile::Thick>(g, s, strip, column, top, end);
+        else
+            draw_rows<Profile::Thin>(g, s, strip, column, top, end);
+    }
+    if (end < view.height && any(opaque)) {
+        const Floats below = g.peak * clipped_profile(whole, g.zero);
+        const Floats alpha = minimum(1.0f - exponential(-below), splat(kMaxWeight));
+        const Mask passes = less_equal(splat(kMinPsi), below);
+        const int64_t at = int64_t(end) * strip.stride + column;
+        store(strip.below + at, load<Floats>(strip.below + at) * (1.0f - s.absorb * keep(passes, alpha)));
+    }
+}
+
+void draw(const View& view, const Slice* slices, int64_t count, const Strip& strip) {
+    for (int64_t i = 0; i < count; ++i) {
+        const Slice& s = slices[i];
+        int from = s.first - strip.first, to = s.last - strip.first;
+        if (to < 0 || from >= strip.lines) continue;
+        from = from > 0 ? from : 0;
+        to = to < strip.lines ? to : strip.lines - 1;
+        for (int column = from; column <= to; column += kLanes) draw_group(view, s, strip, column);
+    }
+}
+
+// B = E T, E = (1 - exp(-S)) sum(I w) / (S + 1e-8), and the cumulative product of the steps down each scan line.
+void finish(const View& view, const Strip& strip, const FramePointers& frame) {
+    const auto put = [&](float* plane, int row, int column, Floats value) {
+        if (plane == nullptr) return;
+        float* to = plane + int64_t(row) * view.lines + strip.first + column;
+        if (column + kLanes <= strip.lines) {
+            store(to, value);
+        } else {
+            float lanes[kLanes];
+            store(lanes, value);
+            for (int k = 0; column + k < strip.lines; ++k) to[k] = lanes[k];
+        }
+    };
+    for (int column = 0; column < strip.lines; column += kLanes) {
+        Floats passed = splat(1.0f);
+        for (int row = 0; row < view.height; ++row) {
+            const int64_t at = int64_t(row) * strip.stride + column;
+            passed *= load<Floats>(strip.below + at);
+            const Floats transmittance = load<Floats>(strip.local + at) * passed;
+            const Floats sum = load<Floats>(strip.weight + at);
+            const Floats series = sum * (1.0f - 0.5f * sum);  // 1 - exp loses digits where S is small
+            const Floats coverage = select(less_equal(sum, splat(1e-3f)), series, 1.0f - exponential(-sum));
+            const Floats echo = coverage * load<Floats>(strip.intensity + at) / (sum + 1e-8f);
+            put(frame.bmode, row, column, echo * transmittance);
+            put(frame.echo, row, column, echo);
+            put(frame.transmittance, row, column, transmittance);
+            put(frame.coverage, row, column, coverage);
+        }
+    }
+}
+
+}  // namespace

@@ -1,0 +1,110 @@
+// The CPU renderer's data and the seam between what is compiled once and what is compiled per instruction set.
+// Lengths are centimetres. C poses, N Gaussians, H depth samples, W scan lines (PHYSICS.md §1-§5).
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+
+namespace ultragray {
+
+inline constexpr int kMaxShCoefficients = 16;
+inline constexpr int kClusterSize = 32;
+inline constexpr int kMaxLanes = 16;  // of the widest instruction set; buffers are padded by this many columns
+
+enum class Intensity : int32_t { Released = 0, Sigmoid = 1 };
+
+// One Gaussian, activated. Records are sorted along a space-filling curve.
+struct Gaussian {
+    float mean[3];   // cm
+    float scale[3];  // cm
+    float quat[4];   // unit, wxyz
+    float absorb;    // 1 - tau
+    float reach;     // distance beyond which the Gaussian has w and alpha under 1/255, cm
+};
+
+// kClusterSize consecutive Gaussians: a box around their means and the largest reach among them.
+struct Cluster {
+    float centre[3];
+    float half[3];
+    float reach;
+};
+
+struct SceneView {
+    const Gaussian* gaussians;  // [N]
+    const float* sh;            // [N, K]
+    const Cluster* clusters;    // [ceil(N / kClusterSize)]
+    int64_t count;
+    int64_t cluster_count;
+    int sh_degree;
+    Intensity intensity;
+};
+
+// One pose and the probe's scan lines.
+struct View {
+    double axes[3][3];  // rows: the probe's lateral, elevation and axial axes in the scene's frame
+    double origin[3];
+    const double* line_x;  // [W + kMaxLanes] lateral origin of each scan line
+    const double* dir_x;   // [W + kMaxLanes] direction of each scan line in the image plane
+    const double* dir_z;
+    double near, cull_far, row_step;  // row i lies at near + row_step * (i + 1/2)
+    double width;                     // linear: of the face
+    double opening;                   // convex: full angle, radians
+    bool convex;
+    int height, lines;
+};
+
+// A Gaussian cut by the image plane: a 2D Gaussian there, and what it adds.
+struct Slice {
+    double mean_x, mean_z;
+    double cov_xx, cov_xz, cov_zz;
+    float m2_plane;   // squared Mahalanobis distance of the plane from the mean
+    float intensity;  // I
+    float absorb;     // 1 - tau
+    int32_t first, last;  // scan lines it may touch
+};
+
+// A growable array of slices that code compiled for any instruction set may append to.
+class SliceList {
+   public:
+    SliceList() = default;
+    SliceList(const SliceList&) = delete;
+    SliceList& operator=(const SliceList&) = delete;
+    ~SliceList();
+    Slice* append(int n);  // room for n more; call shrink_by for those not written
+    void shrink_by(int n) { size_ -= n; }
+    void clear() { size_ = 0; }
+    const Slice* data() const { return data_; }
+    int64_t size() const { return size_; }
+
+   private:
+    Slice* data_ = nullptr;
+    int64_t size_ = 0, capacity_ = 0;
+};
+
+// The outputs of one pose, each [H, W] or null where it was not asked for.
+struct FramePointers {
+    float *bmode, *echo, *transmittance, *coverage;
+};
+
+// Accumulators of a strip of scan lines, rows of `stride` floats.
+struct Strip {
+    float *weight, *intensity, *local, *below;  // S, sum of I*w, T inside footprints, T steps at the rows below them
+    int stride;
+    int first, lines;
+};
+
+// What each instruction set provides.
+struct Kernels {
+    const char* name;
+    void (*slice)(const SceneView&, const View&, int64_t first_cluster, int64_t last_cluster, SliceList&);
+    void (*draw)(const View&, const Slice*, int64_t count, const Strip&);
+    void (*finish)(const View&, const Strip&, const FramePointers&);
+};
+
+const Kernels& kernels_baseline();
+#if defined(ULTRAGRAY_X86)
+const Kernels& kernels_avx2();
+const Kernels& kernels_avx512();
+#endif
+
+}  // namespace ultragray

@@ -1,0 +1,16 @@
+#include "kernel.hpp"
+#include "simd.hpp"
+
+using namespace ultragray;
+
+#include "slice.inl"
+#include "draw.inl"
+
+namespace ultragray {
+
+const Kernels& kernels_baseline() {
+    static constexpr Kernels kernels{"baseline", slice_clusters, draw, finish};
+    return kernels;
+}
+
+}  // namespace ultragray

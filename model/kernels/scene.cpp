@@ -1,0 +1,117 @@
+#include "scene.hpp"
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <numeric>
+
+namespace ultragray {
+namespace {
+
+constexpr double kReach = 3.3290429;  // sqrt(-2 log(1/255)): w < 1/255 beyond this many standard deviations
+
+Gaussian activate(const RawSplats& raw, int64_t i) {
+    Gaussian g;
+    double norm = 0, largest = 0;
+    for (int d = 0; d < 4; ++d) norm += double(raw.quats[4 * i + d]) * raw.quats[4 * i + d];
+    for (int d = 0; d < 4; ++d) g.quat[d] = static_cast<float>(raw.quats[4 * i + d] / std::sqrt(norm));
+    for (int d = 0; d < 3; ++d) {
+        g.mean[d] = raw.means[3 * i + d];
+        const double scale = std::exp(double(raw.scales[3 * i + d]));
+        g.scale[d] = static_cast<float>(scale);
+        largest = std::max(largest, scale);
+    }
+    g.absorb = static_cast<float>(1.0 / (1.0 + std::exp(double(raw.transmittances[i]))));
+    g.reach = static_cast<float>(largest * kReach * (1 + 1e-5));
+    return g;
+}
+
+// Interleaves the low 10 bits of three integers.
+uint32_t interleave(const std::array<uint32_t, 3>& cell) {
+    uint32_t key = 0;
+    for (int bit = 0; bit < 10; ++bit)
+        for (int d = 0; d < 3; ++d) key |= ((cell[d] >> bit) & 1u) << (3 * bit + d);
+    return key;
+}
+
+// Position along a Morton curve, wide Gaussians apart from the rest: one of them would widen its whole cluster.
+std::vector<uint64_t> curve_keys(const std::vector<Gaussian>& gaussians) {
+    std::array<float, 3> low{}, high{};
+    std::vector<float> reaches;
+    for (size_t i = 0; i < gaussians.size(); ++i) {
+        for (int d = 0; d < 3; ++d) {
+            low[d] = i ? std::min(low[d], gaussians[i].mean[d]) : gaussians[i].mean[d];
+            high[d] = i ? std::max(high[d], gaussians[i].mean[d]) : gaussians[i].mean[d];
+        }
+        reaches.push_back(gaussians[i].reach);
+    }
+    std::nth_element(reaches.begin(), reaches.begin() + reaches.size() / 2, reaches.end());
+    const float typical = reaches[reaches.size() / 2];
+    std::vector<uint64_t> keys;
+    for (const Gaussian& g : gaussians) {
+        std::array<uint32_t, 3> cell;
+        for (int d = 0; d < 3; ++d) {
+            const float extent = high[d] - low[d];
+            cell[d] = extent > 0 ? static_cast<uint32_t>(1023.0f * ((g.mean[d] - low[d]) / extent)) : 0;
+        }
+        const float octaves = std::log2(g.reach / typical);
+        const uint64_t size_class = octaves > 1.0f ? static_cast<uint64_t>(std::min(octaves, 30.0f)) : 0;
+        keys.push_back(size_class << 32 | interleave(cell));
+    }
+    return keys;
+}
+
+Cluster enclose(const Gaussian* gaussians, int64_t count) {
+    Cluster cluster{};
+    for (int d = 0; d < 3; ++d) {
+        float low = gaussians[0].mean[d], high = low;
+        for (int64_t i = 1; i < count; ++i) {
+            low = std::min(low, gaussians[i].mean[d]);
+            high = std::max(high, gaussians[i].mean[d]);
+        }
+        cluster.centre[d] = 0.5f * (low + high);
+        cluster.half[d] = 0.5f * (high - low) * (1 + 1e-5f);
+    }
+    for (int64_t i = 0; i < count; ++i) cluster.reach = std::max(cluster.reach, gaussians[i].reach);
+    return cluster;
+}
+
+}  // namespace
+
+PreparedScene::PreparedScene(const RawSplats& raw) : sh_degree_(raw.sh_degree), intensity_(raw.intensity) {
+    if (raw.count == 0) return;
+    std::vector<Gaussian> activated;
+    for (int64_t i = 0; i < raw.count; ++i) activated.push_back(activate(raw, i));
+    const std::vector<uint64_t> keys = curve_keys(activated);
+    std::vector<int64_t> order(raw.count);
+    std::iota(order.begin(), order.end(), 0);
+    std::stable_sort(order.begin(), order.end(), [&](int64_t a, int64_t b) { return keys[a] < keys[b]; });
+
+    const int terms = (sh_degree_ + 1) * (sh_degree_ + 1);
+    gaussians_.reserve(raw.count);
+    sh_.reserve(raw.count * terms);
+    for (const int64_t i : order) {
+        gaussians_.push_back(activated[i]);
+        sh_.push_back(raw.sh0[i]);
+        sh_.insert(sh_.end(), raw.shn + i * (terms - 1), raw.shn + (i + 1) * (terms - 1));
+    }
+    for (int64_t first = 0; first < raw.count; first += kClusterSize)
+        clusters_.push_back(enclose(&gaussians_[first], std::min<int64_t>(kClusterSize, raw.count - first)));
+}
+
+SceneView PreparedScene::view() const {
+    return {gaussians_.data(),
+            sh_.data(),
+            clusters_.data(),
+            static_cast<int64_t>(gaussians_.size()),
+            static_cast<int64_t>(clusters_.size()),
+            sh_degree_,
+            intensity_};
+}
+
+int64_t PreparedScene::bytes() const {
+    return gaussians_.capacity() * sizeof(Gaussian) + sh_.capacity() * sizeof(float) +
+           clusters_.capacity() * sizeof(Cluster);
+}
+
+}  // namespace ultragray

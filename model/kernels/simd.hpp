@@ -1,0 +1,103 @@
+// Vectors of kLanes floats by the compiler's vector extension; each instruction set compiles its own copy (see kernel_*.cpp).
+// Everything here has internal linkage: code for a wider instruction set must never be shared with the others.
+#pragma once
+
+#include <cstdint>
+#include <cstring>
+#if defined(__AVX512F__)
+#include <immintrin.h>
+#endif
+
+namespace {
+
+#if defined(__AVX512F__)
+constexpr int kLanes = 16;
+#elif defined(__AVX2__)
+constexpr int kLanes = 8;
+#else
+constexpr int kLanes = 4;
+#endif
+
+typedef float Floats __attribute__((vector_size(kLanes * sizeof(float))));
+typedef int32_t Ints __attribute__((vector_size(kLanes * sizeof(int32_t))));
+typedef double Doubles __attribute__((vector_size(kLanes * sizeof(double))));
+
+inline Floats splat(float x) { return x - Floats{}; }
+inline Doubles splat_double(double x) { return x - Doubles{}; }
+inline Floats to_floats(Doubles x) { return __builtin_convertvector(x, Floats); }
+
+template <class Vector, class Scalar>
+inline Vector load(const Scalar* p) {
+    Vector v;
+    std::memcpy(&v, p, sizeof v);
+    return v;
+}
+
+template <class Vector, class Scalar>
+inline void store(Scalar* p, Vector v) {
+    std::memcpy(p, &v, sizeof v);
+}
+
+#if defined(__AVX512F__)
+// Masks live in their own registers there; the vector extension would move them through vectors.
+typedef __mmask16 Mask;
+inline Mask less_equal(Floats a, Floats b) { return _mm512_cmp_ps_mask((__m512)a, (__m512)b, _CMP_LE_OQ); }
+inline Mask both(Mask a, Mask b) { return a & b; }
+inline Mask either(Mask a, Mask b) { return a | b; }
+inline bool any(Mask m) { return m != 0; }
+inline Floats select(Mask m, Floats a, Floats b) { return (Floats)_mm512_mask_blend_ps(m, (__m512)b, (__m512)a); }
+inline Floats keep(Mask m, Floats a) { return (Floats)_mm512_maskz_mov_ps(m, (__m512)a); }
+inline Floats minimum(Floats a, Floats b) { return (Floats)_mm512_min_ps((__m512)a, (__m512)b); }
+inline Floats maximum(Floats a, Floats b) { return (Floats)_mm512_max_ps((__m512)a, (__m512)b); }
+inline Floats square_root(Floats a) { return (Floats)_mm512_sqrt_ps((__m512)a); }
+inline float smallest(Floats a) { return _mm512_reduce_min_ps((__m512)a); }
+inline float largest(Floats a) { return _mm512_reduce_max_ps((__m512)a); }
+#else
+typedef Ints Mask;
+inline Mask less_equal(Floats a, Floats b) { return a <= b; }
+inline Mask both(Mask a, Mask b) { return a & b; }
+inline Mask either(Mask a, Mask b) { return a | b; }
+inline bool any(Mask m) {
+    int32_t lanes[kLanes], found = 0;
+    store(lanes, m);
+    for (int k = 0; k < kLanes; ++k) found |= lanes[k];
+    return found != 0;
+}
+inline Floats select(Mask m, Floats a, Floats b) { return (Floats)((m & (Ints)a) | (~m & (Ints)b)); }
+inline Floats keep(Mask m, Floats a) { return (Floats)(m & (Ints)a); }
+inline Floats minimum(Floats a, Floats b) { return select(less_equal(a, b), a, b); }
+inline Floats maximum(Floats a, Floats b) { return select(less_equal(a, b), b, a); }
+inline Floats square_root(Floats a) {
+    for (int k = 0; k < kLanes; ++k) a[k] = __builtin_sqrtf(a[k]);
+    return a;
+}
+inline float smallest(Floats a) {
+    float found = a[0];
+    for (int k = 1; k < kLanes; ++k) found = a[k] < found ? a[k] : found;
+    return found;
+}
+inline float largest(Floats a) {
+    float found = a[0];
+    for (int k = 1; k < kLanes; ++k) found = a[k] > found ? a[k] : found;
+    return found;
+}
+#endif
+
+// exp(x) within 2 units in the last place for x in [-87, 88]; clamped outside: 1e-38 below, 1.6e38 above.
+inline Floats exponential(Floats x) {
+    x = minimum(maximum(x, splat(-87.0f)), splat(88.0f));
+    const Floats shifted = x * 1.44269504089f + 12582912.0f;  // 1.5 * 2^23 rounds to an integer in the low bits
+    const Floats n = shifted - 12582912.0f;
+    const Floats r = (x - n * 0.693359375f) + n * 2.12194440e-4f;
+    Floats p = splat(1.9875691500e-4f);
+    p = p * r + 1.3981999507e-3f;
+    p = p * r + 8.3334519073e-3f;
+    p = p * r + 4.1665795894e-2f;
+    p = p * r + 1.6666665459e-1f;
+    p = p * r + 5.0000001201e-1f;
+    p = p * r * r + r + 1.0f;
+    const Ints exponent = ((Ints)shifted << 23) + (127 << 23);  // the low bits of `shifted` hold n
+    return p * (Floats)exponent;
+}
+
+}  // namespace

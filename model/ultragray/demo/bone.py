@@ -1,0 +1,120 @@
+"""Lumbar vertebrae: cortical bone that reflects like a mirror and lets nothing through.
+
+One vertebra is a signed distance (mm, negative inside) in its own frame: x lateral, y caudal, z depth, the origin below the
+middle of its level on the skin. It repeats every 35 mm along y, as the lumbar spine does.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..probe import FloatArray
+from .splats import Splats, scattered, splats
+
+LEVEL_SPACING_MM = 35.0
+BODY_DEPTH_MM = 54.0  # posterior wall of the vertebral bodies
+LAMINA_SLOPE = 0.33  # a lamina rises towards its caudal edge: the saw-tooth of paramedian views
+BLEND_MM = 2.0  # radius with which the parts run into each other
+CORTEX_MM = 0.8
+
+
+def distance_mm(points: FloatArray) -> FloatArray:  # [N, 3] -> [N]
+    """Signed distance to the nearest vertebra's posterior parts."""
+    x, z = np.abs(points[:, 0]), points[:, 2]
+    y = local_y(points[:, 1])
+    local = np.stack([x, y, z], axis=1)
+    crest = _capsule(local, (0.0, -3.0, 16.5), (0.0, 10.5, 16.0), 2.9)
+    blade = _box(local, (0.0, 3.5, 24.0), (0.6, 8.0, 9.0), 1.6)
+    ramp = np.stack([x, y, z + LAMINA_SLOPE * y], axis=1)
+    lamina = _extruded_along_y(ramp, (1.0, 30.5), (13.0, 35.0), 2.0, middle=1.0, half=8.0)
+    pillar = _capsule(local, (15.5, -14.0, 39.5), (13.5, 13.0, 33.0), 3.4)
+    transverse = _capsule(local, (14.0, -9.0, 41.0), (29.0, -11.0, 43.0), 3.2)
+    joined = _blend(_blend(crest, blade), lamina)
+    return _blend(_blend(joined, pillar), transverse)
+
+
+def local_y(y: FloatArray) -> FloatArray:
+    """Position along the spine relative to the nearest level, in [−17.5, 17.5) mm."""
+    return (y + LEVEL_SPACING_MM / 2) % LEVEL_SPACING_MM - LEVEL_SPACING_MM / 2
+
+
+def _capsule(p: FloatArray, start: tuple[float, ...], end: tuple[float, ...], radius: float) -> FloatArray:
+    a, axis = np.asarray(start), np.asarray(end) - np.asarray(start)
+    t = np.clip((p - a) @ axis / (axis @ axis), 0.0, 1.0)
+    return np.linalg.norm(p - a - t[:, None] * axis, axis=1) - radius
+
+
+def _box(p: FloatArray, middle: tuple[float, ...], half: tuple[float, ...], radius: float) -> FloatArray:
+    q = np.abs(p - np.asarray(middle)) - np.asarray(half)
+    return np.linalg.norm(np.maximum(q, 0.0), axis=1) + np.minimum(q.max(axis=1), 0.0) - radius
+
+
+def _extruded_along_y(
+    p: FloatArray, start: tuple[float, float], end: tuple[float, float], radius: float, *, middle: float, half: float
+) -> FloatArray:
+    """A bar through two (x, z) points, drawn out along y."""
+    section = np.stack([p[:, 0], np.zeros(len(p)), p[:, 2]], axis=1)
+    across = _capsule(section, (start[0], 0.0, start[1]), (end[0], 0.0, end[1]), 0.0)
+    return np.hypot(across, np.maximum(np.abs(p[:, 1] - middle) - half, 0.0)) - radius
+
+
+def _blend(a: FloatArray, b: FloatArray) -> FloatArray:
+    """The union of two solids, its edges rounded."""
+    overlap = np.maximum(BLEND_MM - np.abs(a - b), 0.0)
+    return np.minimum(a, b) - overlap * overlap / (4.0 * BLEND_MM)
+
+
+def _gradient(points: FloatArray) -> FloatArray:  # [N, 3] unit, outwards
+    step = 1e-3
+    differences = [distance_mm(points + step * axis) - distance_mm(points - step * axis) for axis in np.eye(3)]
+    gradient = np.stack(differences, axis=1)
+    return gradient / np.maximum(np.linalg.norm(gradient, axis=1, keepdims=True), 1e-12)
+
+
+def vertebrae(rng: np.random.Generator, low_y_mm: float, high_y_mm: float) -> Splats:
+    """The bright shell that faces the probe, and the dark absorbing bone behind it."""
+    low, high = (-32.0, low_y_mm, 12.0), (32.0, high_y_mm, 48.0)
+    return Splats.join(_cortex(rng, low, high), _marrow(rng, low, high))
+
+
+def _cortex(rng: np.random.Generator, low: tuple[float, ...], high: tuple[float, ...]) -> Splats:
+    points = scattered(rng, low, high, (1.0, 1.0, 1.0))
+    points = points[np.abs(distance_mm(points)) < 0.7 * CORTEX_MM]
+    for _ in range(2):  # project onto the surface
+        points = points - distance_mm(points)[:, None] * _gradient(points)
+    outward = _gradient(points)
+    seen = outward[:, 2] < 0.35
+    points, outward = points[seen], outward[seen]
+    points = points + outward * rng.normal(0.0, 0.1, (len(points), 1))
+    facing = rng.uniform(0.9, 0.985, len(points))
+    return splats(points, (0.75, 0.75, 0.3), facing=facing, edge_on=0.12, tau=0.5, normals=outward)
+
+
+def _marrow(rng: np.random.Generator, low: tuple[float, ...], high: tuple[float, ...]) -> Splats:
+    points = scattered(rng, low, high, (1.2, 1.2, 0.8))
+    points = points[distance_mm(points) < -CORTEX_MM - 0.3]
+    return splats(points, (0.7, 0.7, 0.45), facing=0.02, tau=0.01)
+
+
+class Shadow:
+    """The depth below which bone hides everything from any probe on the skin, on a grid over x and y."""
+
+    STEP_MM = 1.0
+
+    def __init__(self, half_width_mm: float, half_length_mm: float, *, reach_mm: int) -> None:
+        self.low_mm = np.array([-half_width_mm, -half_length_mm])
+        x = np.arange(-half_width_mm, half_width_mm + self.STEP_MM, self.STEP_MM)
+        y = np.arange(-half_length_mm, half_length_mm + self.STEP_MM, self.STEP_MM)
+        z = np.arange(12.0, 48.0, self.STEP_MM)
+        grid = np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1)
+        solid = distance_mm(grid.reshape(-1, 3)).reshape(grid.shape[:3]) < 0.0
+        depth = np.where(solid.any(axis=2), z[solid.argmax(axis=2)], np.inf)
+        for axis in (0, 1):  # a tilted beam comes in from the side: only where there is bone all around
+            depth = np.max([np.roll(depth, k, axis) for k in range(-reach_mm, reach_mm + 1)], axis=0)
+        self.depth_mm = depth
+
+    def hides(self, points: FloatArray) -> FloatArray:  # [N, 3] -> [N] bool
+        i, j = np.clip(
+            np.round((points[:, :2] - self.low_mm) / self.STEP_MM).astype(int), 0, np.array(self.depth_mm.shape) - 1
+        ).T
+        return points[:, 2] > self.depth_mm[i, j]

@@ -1,0 +1,168 @@
+"""conf.json of the released trainer: planes and width in centimetres, angle in degrees.
+
+Keys that start with `_` are comments; keys that an import does not need are ignored.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .errors import CheckpointInvalid, InvalidProbe
+from .probe import ConvexProbe, LinearProbe, Probe, stretch_released_far
+
+MAX_CONFIG_BYTES = 1 << 20
+
+
+@dataclass(frozen=True)
+class TrainingImages:
+    """The shape of an images file [N, H, W]."""
+
+    path: Path
+    count: int
+    height: int
+    width: int
+
+
+@dataclass(frozen=True)
+class ReleasedConfig:
+    """What an import needs from conf.json, in mm and degrees. Exactly one of width and angle is given."""
+
+    path: Path
+    near_mm: float
+    far_mm: float  # as released: on the grid (i+½)/(H−1)
+    width_mm: float | None
+    opening_angle_deg: float | None
+    dataset_name: str | None
+    images: TrainingImages | None
+    images_missing: str  # why `images` is None, as a clause
+
+    def released_probe(self) -> Probe:
+        """The probe with the planes as released."""
+        return self._probe(self.far_mm)
+
+    def probe(self, image_height: int) -> Probe:
+        """The probe of ours for training images of `image_height` rows: the stretch of PHYSICS.md §3."""
+        try:
+            return self._probe(stretch_released_far(self.near_mm, self.far_mm, image_height))
+        except InvalidProbe as error:
+            raise CheckpointInvalid(f"{self.path}: {error}") from error
+
+    def _probe(self, far_mm: float) -> Probe:
+        try:
+            if self.width_mm is not None:
+                return LinearProbe(self.width_mm, self.near_mm, far_mm)
+            return ConvexProbe(
+                opening_angle_deg=self.opening_angle_deg or 0.0, near_mm=self.near_mm, far_mm=far_mm
+            )
+        except InvalidProbe as error:
+            raise CheckpointInvalid(f"{self.path}: {error}") from error
+
+
+def read_released_config(path: str | Path) -> ReleasedConfig:
+    """Reads conf.json and the shape of its images file. Raises CheckpointInvalid, naming the file."""
+    path = Path(path)
+    document = _read_object(path)
+    width_cm = _optional_number(path, document, "ultrasound_opening_width")
+    angle_deg = _optional_number(path, document, "ultrasound_opening_angle")
+    if (width_cm is None) == (angle_deg is None):
+        raise CheckpointInvalid(
+            f"{path}: it must have exactly one of ultrasound_opening_width (linear, cm) and "
+            f"ultrasound_opening_angle (convex, degrees), got {'neither' if width_cm is None else 'both'}"
+        )
+    images, images_missing = _find_images(path, document)
+    config = ReleasedConfig(
+        path=path,
+        near_mm=10.0 * _number(path, document, "ultrasound_near_plane"),
+        far_mm=10.0 * _number(path, document, "ultrasound_far_plane"),
+        width_mm=None if width_cm is None else 10.0 * width_cm,
+        opening_angle_deg=angle_deg,
+        dataset_name=_dataset_name(path, document),
+        images=images,
+        images_missing=images_missing,
+    )
+    config.released_probe()  # refuses planes, widths and angles that no probe has
+    return config
+
+
+def _read_object(path: Path) -> Mapping[str, Any]:
+    try:
+        if not path.is_file():
+            raise CheckpointInvalid(f"{path}: no such file")
+        if path.stat().st_size > MAX_CONFIG_BYTES:
+            raise CheckpointInvalid(f"{path}: too large for a conf.json: over {MAX_CONFIG_BYTES} bytes")
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise CheckpointInvalid(f"{path}: not JSON that can be read: {error}") from error
+    except RecursionError as error:
+        raise CheckpointInvalid(f"{path}: it nests too deeply") from error
+    if not isinstance(document, dict):
+        raise CheckpointInvalid(f"{path}: it must be a JSON object, got {type(document).__name__}")
+    return document
+
+
+def _optional_number(path: Path, document: Mapping[str, Any], key: str) -> float | None:
+    return None if document.get(key) is None else _number(path, document, key)
+
+
+def _number(path: Path, document: Mapping[str, Any], key: str) -> float:
+    value = document.get(key)
+    if value is None:
+        raise CheckpointInvalid(f"{path}: it lacks {key}")
+    try:
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(float(value)):
+            raise ValueError
+        return float(value)
+    except (ValueError, OverflowError):
+        raise CheckpointInvalid(f"{path}: {key} must be a finite number, got {str(value)[:40]}") from None
+
+
+def _dataset_name(path: Path, document: Mapping[str, Any]) -> str | None:
+    """The folder that holds the dataset: `data/liver/images_train.npy` names `liver`."""
+    named = document.get("images_file_train")
+    folder = Path(named).parent.name if isinstance(named, str) else ""
+    return folder or path.resolve().parent.name or None
+
+
+def _find_images(path: Path, document: Mapping[str, Any]) -> tuple[TrainingImages | None, str]:
+    named = document.get("images_file_train")
+    if named is None:
+        return None, f"{path} names no images_file_train"
+    if not isinstance(named, str):
+        raise CheckpointInvalid(f"{path}: images_file_train must be a path, got {str(named)[:40]}")
+    for candidate in _candidates(path, named):
+        if _is_file(candidate):
+            return _read_shape(candidate), ""
+    return None, f"the file {named[:200]!r} that {path} names was not found"
+
+
+def _candidates(path: Path, named: str) -> Iterator[Path]:
+    """The path as written, from conf.json's folder and each folder above it, and by name beside conf.json."""
+    folder = path.resolve().parent
+    for base in (folder, *folder.parents):
+        yield base / named
+    yield folder / Path(named).name
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except (OSError, ValueError):  # a name too long, or with a null byte
+        return False
+
+
+def _read_shape(path: Path) -> TrainingImages:
+    try:
+        array = np.load(path, mmap_mode="r", allow_pickle=False)  # reads the header only
+    except (OSError, ValueError, EOFError) as error:
+        raise CheckpointInvalid(f"{path}: not an array of images that can be read: {error}") from error
+    if not isinstance(array, np.ndarray) or array.ndim != 3 or 0 in array.shape:
+        shape = list(array.shape) if isinstance(array, np.ndarray) else "an archive"
+        raise CheckpointInvalid(f"{path}: images must have shape [N, H, W], got {shape}")
+    count, height, width = array.shape
+    return TrainingImages(path=path, count=count, height=height, width=width)
