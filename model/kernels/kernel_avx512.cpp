@@ -1,4 +1,5 @@
 #include "kernel.hpp"
+#include "profile.hpp"
 #include "simd.hpp"
 
 using namespace ultragray;

@@ -10,6 +10,7 @@ fascia are brightest face on, bone lets nothing through, blood and cerebrospinal
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -26,21 +27,21 @@ DEMO_PROBE = LinearProbe(width_mm=60.0, near_mm=0.0, far_mm=60.0)
 DEMO_IMAGE_SIDE = 512
 DEMO_POSE_COUNT = 121
 CENTRE_MM = (0.0, 0.0, 30.0)
-SWEEP_MM = 76.0
+SWEEP_MM = 72.0
 _SEED = 20261120
 
 
 def build_demo_scene() -> GaussianScene:
     """The demo scene, bit for bit the same on every call."""
     filling = (tissue.speckle, tissue.skin, tissue.fat_septa, tissue.fasciae, tissue.perimysium, tissue.muscle_septa)
-    walls = (tissue.vessel, tissue.ligaments)
+    walls = (tissue.vessel, tissue.ligaments, tissue.cauda_equina)
     generators = (np.random.default_rng([_SEED, layer]) for layer in itertools.count())
     soft = Splats.join(
         tissue.outside_fluid(Splats.join(*(layer(next(generators)) for layer in filling))),
         *(layer(next(generators)) for layer in walls),
     )
     hard = bone.vertebrae(next(generators), -tissue.HALF_LENGTH_MM, tissue.HALF_LENGTH_MM)
-    everything = Splats.join(_around_bone_and_fluid(soft), hard)
+    everything = _as_grown(Splats.join(_outside_bone(soft), hard))
     info = SceneInfo(
         centre_mm=CENTRE_MM,
         probe=DEMO_PROBE,
@@ -55,14 +56,23 @@ def build_demo_scene() -> GaussianScene:
     )
 
 
-def _around_bone_and_fluid(soft: Splats) -> Splats:
+def _outside_bone(soft: Splats) -> Splats:
     points = soft.centres_mm
     shadow = bone.Shadow(tissue.HALF_WIDTH_MM, tissue.HALF_LENGTH_MM, reach_mm=3)
     return soft.where((bone.distance_mm(points) > 0.4) & ~shadow.hides(points))
 
 
+def _as_grown(drawn: Splats) -> Splats:
+    """The anatomy with small bends everywhere but on the skin: nothing in a body is straight or symmetric."""
+    x, y, z = drawn.centres_mm.T
+    rise = np.clip(z / 8.0, 0.0, 1.0)
+    bent_x = x + rise * (0.9 * np.sin(y / 27.0 + 0.4) + 0.4 * np.sin(z / 7.0 + x / 11.0))
+    bent_z = z + rise * (0.45 * np.sin(x / 6.3 + y / 19.0 + 0.7) + 0.25 * np.sin(x / 2.9 + y / 7.0) + 0.02 * x)
+    return replace(drawn, centres_mm=np.stack([bent_x, y, bent_z], axis=1))
+
+
 def demo_poses(count: int) -> FloatArray:  # [C, 4, 4] mm
-    """A freehand sweep of `count` frames along the spine, y from −38 to 38 mm; the middle one of an odd count is the identity.
+    """A freehand sweep of `count` frames along the spine, y from −36 to 36 mm; the middle one of an odd count is the identity.
 
     Raises InvalidArgument for a negative count.
     """

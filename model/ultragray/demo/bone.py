@@ -15,7 +15,6 @@ LEVEL_SPACING_MM = 35.0
 BODY_DEPTH_MM = 54.0  # posterior wall of the vertebral bodies
 LAMINA_SLOPE = 0.33  # a lamina rises towards its caudal edge: the saw-tooth of paramedian views
 BLEND_MM = 2.0  # radius with which the parts run into each other
-CORTEX_MM = 0.8
 
 
 def distance_mm(points: FloatArray) -> FloatArray:  # [N, 3] -> [N]
@@ -26,9 +25,9 @@ def distance_mm(points: FloatArray) -> FloatArray:  # [N, 3] -> [N]
     crest = _capsule(local, (0.0, -3.0, 16.5), (0.0, 10.5, 16.0), 2.9)
     blade = _box(local, (0.0, 3.5, 24.0), (0.6, 8.0, 9.0), 1.6)
     ramp = np.stack([x, y, z + LAMINA_SLOPE * y], axis=1)
-    lamina = _extruded_along_y(ramp, (1.0, 30.5), (13.0, 35.0), 2.0, middle=1.0, half=8.0)
-    pillar = _capsule(local, (15.5, -14.0, 39.5), (13.5, 13.0, 33.0), 3.4)
-    transverse = _capsule(local, (14.0, -9.0, 41.0), (29.0, -11.0, 43.0), 3.2)
+    lamina = _extruded_along_y(ramp, (1.0, 31.0), (13.0, 36.0), 3.0, middle=1.0, half=7.5)
+    pillar = _capsule(local, (16.0, -16.0, 39.5), (14.0, 13.5, 34.0), 4.0)
+    transverse = _capsule(local, (14.0, -9.0, 41.0), (28.0, -11.0, 43.0), 3.6)
     joined = _blend(_blend(crest, blade), lamina)
     return _blend(_blend(joined, pillar), transverse)
 
@@ -72,28 +71,28 @@ def _gradient(points: FloatArray) -> FloatArray:  # [N, 3] unit, outwards
 
 
 def vertebrae(rng: np.random.Generator, low_y_mm: float, high_y_mm: float) -> Splats:
-    """The bright shell that faces the probe, and the dark absorbing bone behind it."""
-    low, high = (-32.0, low_y_mm, 12.0), (32.0, high_y_mm, 48.0)
-    return Splats.join(_cortex(rng, low, high), _marrow(rng, low, high))
-
-
-def _cortex(rng: np.random.Generator, low: tuple[float, ...], high: tuple[float, ...]) -> Splats:
+    """The bright outer face of the cortex, the dense bone behind it that absorbs, and the marrow that absorbs the rest."""
+    low, high = (-34.0, low_y_mm, 12.0), (34.0, high_y_mm, 48.0)
     points = scattered(rng, low, high, (1.0, 1.0, 1.0))
-    points = points[np.abs(distance_mm(points)) < 0.7 * CORTEX_MM]
-    for _ in range(2):  # project onto the surface
+    distances = distance_mm(points)
+    face, outward = _project(points[np.abs(distances) < 0.55])
+    face = face + outward * rng.normal(0.0, 0.1, (len(face), 1))
+    facing = rng.uniform(0.94, 0.99, len(face))
+    marrow = points[distances < -2.2]
+    return Splats.join(
+        splats(face, (0.75, 0.75, 0.42), facing=facing, edge_on=0.3, tau=0.9, normals=outward),
+        splats(face - 1.5 * outward, (0.9, 0.9, 0.6), facing=0.02, tau=0.01, normals=outward),
+        splats(marrow, (0.85, 0.85, 0.8), facing=0.02, tau=0.01),
+    )
+
+
+def _project(points: FloatArray) -> tuple[FloatArray, FloatArray]:  # [N, 3] -> [M, 3], [M, 3]
+    """Points near the surface moved onto it, with the outward normals; without those on faces turned from the probe."""
+    for _ in range(2):
         points = points - distance_mm(points)[:, None] * _gradient(points)
     outward = _gradient(points)
     seen = outward[:, 2] < 0.35
-    points, outward = points[seen], outward[seen]
-    points = points + outward * rng.normal(0.0, 0.1, (len(points), 1))
-    facing = rng.uniform(0.9, 0.985, len(points))
-    return splats(points, (0.75, 0.75, 0.3), facing=facing, edge_on=0.12, tau=0.5, normals=outward)
-
-
-def _marrow(rng: np.random.Generator, low: tuple[float, ...], high: tuple[float, ...]) -> Splats:
-    points = scattered(rng, low, high, (1.2, 1.2, 0.8))
-    points = points[distance_mm(points) < -CORTEX_MM - 0.3]
-    return splats(points, (0.7, 0.7, 0.45), facing=0.02, tau=0.01)
+    return points[seen], outward[seen]
 
 
 class Shadow:

@@ -1,0 +1,35 @@
+#include "profile.hpp"
+
+#include <algorithm>
+#include <cmath>
+
+namespace ultragray {
+namespace {
+
+double absorption_profile(double u) {
+    const double low = std::min(u, 0.0) - 3.0, high = std::min(u, low + 6.0);
+    const double half = 0.5 * (high - low), middle = 0.5 * (high + low), node = half * std::sqrt(0.6);
+    const auto density = [](double t) { return std::exp(-0.5 * t * t); };
+    return half * (8.0 * density(middle) + 5.0 * (density(middle - node) + density(middle + node))) / 9.0;
+}
+
+// Interpolates at the Chebyshev nodes of each step: next to the best parabola there.
+ProfileTable make_table() {
+    ProfileTable table;
+    for (int k = 0; k < ProfileTable::kSteps; ++k) {
+        const double centre = -3.3 + 0.2 * k, node = 0.1 * std::sqrt(0.75);
+        const double left = absorption_profile(centre - node), mid = absorption_profile(centre);
+        const double right = absorption_profile(centre + node);
+        const double slope = (right - left) / (2 * node), bend = (right - 2 * mid + left) / (2 * node * node);
+        table.parabola[0][k] = static_cast<float>(mid - slope * centre + bend * centre * centre);
+        table.parabola[1][k] = static_cast<float>(slope - 2 * bend * centre);
+        table.parabola[2][k] = static_cast<float>(bend);
+    }
+    return table;
+}
+
+}  // namespace
+
+const ProfileTable kProfile = make_table();
+
+}  // namespace ultragray

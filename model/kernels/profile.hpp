@@ -1,0 +1,13 @@
+// G(u) of PHYSICS.md §3 as parabolas: the value of the three-point Gauss-Legendre rule over the unclipped window.
+#pragma once
+
+namespace ultragray {
+
+struct ProfileTable {
+    static constexpr int kSteps = 32;
+    alignas(64) float parabola[3][kSteps];  // coefficients of 1, u, u² on [-3.4 + 0.2 k, -3.2 + 0.2 k]
+};
+
+extern const ProfileTable kProfile;
+
+}  // namespace ultragray
