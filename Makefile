@@ -27,6 +27,7 @@ check: $(VENV)/installed-dev  ## lint, types, formatting
 	$(BIN)/ruff format --check $(PYTHON_SOURCES)
 	$(BIN)/mypy
 	$(BIN)/clang-format --dry-run --Werror model/kernels/*.[ch]pp model/kernels/*.inl
+	$(BIN)/hadolint docker/Dockerfile.cpu docker/Dockerfile.cuda
 
 format: $(VENV)/installed-dev  ## rewrite the sources in the project's format
 	$(BIN)/ruff check --fix $(PYTHON_SOURCES)

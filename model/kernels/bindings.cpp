@@ -34,8 +34,15 @@ NB_MODULE(_cpu, m) {
                     transmittances.shape(0) != size_t(n) || sh0.shape(0) != size_t(n) || shn.shape(0) != size_t(n) ||
                     shn.shape(1) != rest)
                     throw std::invalid_argument("the parameters' shapes do not agree");
-                const RawSplats raw{means.data(), scales.data(),  quats.data(), transmittances.data(), sh0.data(),
-                                    shn.data(),   n, sh_degree, sigmoid ? Intensity::Sigmoid : Intensity::Released};
+                const RawSplats raw{means.data(),
+                                    scales.data(),
+                                    quats.data(),
+                                    transmittances.data(),
+                                    sh0.data(),
+                                    shn.data(),
+                                    n,
+                                    sh_degree,
+                                    sigmoid ? Intensity::Sigmoid : Intensity::Released};
                 nb::gil_scoped_release release;
                 new (self) PreparedScene(raw);
             },

@@ -1,18 +1,18 @@
 // From slices to pixels: S, sum of I*w and T on a strip of scan lines (PHYSICS.md §3, §5.3).
 //
 // kLanes neighbouring scan lines form a vector and the loop runs down the rows. In depth steps of du standard deviations the
-// echo weight is a Gaussian progression, w(k+1) = w(k) r(k) and r(k+1) = r(k) q, which costs two products a row instead of an
-// exponential; it is restarted every few rows so that rounding stays under 1e-4 of w. The absorption is exp(-m2/2) sigma G(u)
-// with one polynomial for G, or its quadrature itself where depth 0 clips the window.
+// echo weight is a Gaussian progression, w(k+1) = w(k) r(k) and r(k+1) = r(k) q, which costs two products a row instead of
+// an exponential; it is restarted every few rows so that rounding stays under 1e-4 of w. The absorption is exp(-m2/2) sigma
+// G(u) with one polynomial for G, or its quadrature itself where depth 0 clips the window.
 
 namespace {
 
 constexpr float kMinPsi = 0.0039292930f;  // -log(1 - 1/255): alpha reaches 1/255
 constexpr float kMaxWeight = 0.999f;
 constexpr float kMaxM2Attenuation = 9.0f;
-constexpr float kFullG = 2.8906850f;   // G(u) for u >= 3
-constexpr float kNegligible = 20.0f;   // w < 5e-5 beyond m2 + u2
-constexpr float kNode = 0.7745966692f; // Gauss-Legendre: nodes 0, +-sqrt(0.6)
+constexpr float kFullG = 2.8906850f;    // G(u) for u >= 3
+constexpr float kNegligible = 20.0f;    // w < 5e-5 beyond m2 + u2
+constexpr float kNode = 0.7745966692f;  // Gauss-Legendre: nodes 0, +-sqrt(0.6)
 constexpr int kRestartRows = 32;
 
 // G of PHYSICS.md §3 for unclipped windows, constant beyond the ends of its fit.
@@ -68,8 +68,8 @@ enum class Profile {
 
 // kLanes scan lines across one slice; depth is u, in standard deviations from s*.
 struct Group {
-    Floats u;        // at row `base`
-    Floats du;       // per row
+    Floats u;   // at row `base`
+    Floats du;  // per row
     Floats m2;
     Floats window2;  // u2 up to here has w >= 1/255; negative: the lane is not touched
     Floats peak;     // exp(-m2/2) sigma where m2 <= 9, else 0: psi = peak * G(u)

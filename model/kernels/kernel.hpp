@@ -57,15 +57,15 @@ struct View {
 struct Slice {
     double mean_x, mean_z;
     double cov_xx, cov_xz, cov_zz;
-    float m2_plane;   // squared Mahalanobis distance of the plane from the mean
-    float intensity;  // I
-    float absorb;     // 1 - tau
+    float m2_plane;       // squared Mahalanobis distance of the plane from the mean
+    float intensity;      // I
+    float absorb;         // 1 - tau
     int32_t first, last;  // scan lines it may touch
 };
 
 // A growable array of slices that code compiled for any instruction set may append to.
 class SliceList {
-   public:
+ public:
     SliceList() = default;
     SliceList(const SliceList&) = delete;
     SliceList& operator=(const SliceList&) = delete;
@@ -76,7 +76,7 @@ class SliceList {
     const Slice* data() const { return data_; }
     int64_t size() const { return size_; }
 
-   private:
+ private:
     Slice* data_ = nullptr;
     int64_t size_ = 0, capacity_ = 0;
 };

@@ -4,8 +4,8 @@
 
 using namespace ultragray;
 
-#include "slice.inl"
 #include "draw.inl"
+#include "slice.inl"
 
 namespace ultragray {
 

@@ -15,9 +15,9 @@
 namespace ultragray {
 namespace {
 
-constexpr int kStripLines = 64;          // four accumulators of 512 rows stay within a 1 MB cache
+constexpr int kStripLines = 64;  // four accumulators of 512 rows stay within a 1 MB cache
 constexpr int64_t kClustersPerTask = 2048;
-constexpr int kPosesAtOnce = 16;         // bounds the memory that slices take
+constexpr int kPosesAtOnce = 16;  // bounds the memory that slices take
 
 std::vector<const Kernels*> available_kernels() {
     std::vector<const Kernels*> found;
@@ -89,7 +89,7 @@ View make_view(const ProbeGeometry& probe, const ScanLines& lines, const double*
 
 // One allocation of the four accumulators of a strip.
 class StripBuffer {
-   public:
+ public:
     StripBuffer(int height, int lines) : stride_(lines + kMaxLanes), rows_(height) {
         floats_ = static_cast<float*>(::operator new(4 * plane() * sizeof(float), std::align_val_t(64)));
     }
@@ -103,7 +103,7 @@ class StripBuffer {
         return {floats_, floats_ + plane(), floats_ + 2 * plane(), floats_ + 3 * plane(), stride_, first, lines};
     }
 
-   private:
+ private:
     int64_t plane() const { return int64_t(stride_) * rows_; }
     int stride_, rows_;
     float* floats_;

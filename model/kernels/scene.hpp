@@ -16,12 +16,12 @@ struct RawSplats {
 };
 
 class PreparedScene {
-   public:
+ public:
     explicit PreparedScene(const RawSplats& raw);
     SceneView view() const;
     int64_t bytes() const;
 
-   private:
+ private:
     std::vector<Gaussian> gaussians_;
     std::vector<float> sh_;
     std::vector<Cluster> clusters_;

@@ -1,5 +1,6 @@
-// Vectors of kLanes floats by the compiler's vector extension; each instruction set compiles its own copy (see kernel_*.cpp).
-// Everything here has internal linkage: code for a wider instruction set must never be shared with the others.
+// Vectors of kLanes floats by the compiler's vector extension; each instruction set compiles its own copy (see
+// kernel_*.cpp). Everything here has internal linkage: code for a wider instruction set must never be shared with the
+// others.
 #pragma once
 
 #include <cstdint>

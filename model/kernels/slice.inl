@@ -1,5 +1,5 @@
-// From Gaussians to slices: which of them the image plane cuts, and the 2D Gaussian each leaves there (PHYSICS.md §5.2, §5.4).
-// Computed in double: m2 and s* lose digits to cancellation otherwise, and a threshold that flips is a visible pixel.
+// From Gaussians to slices: which of them the image plane cuts, and the 2D Gaussian each leaves there (PHYSICS.md §5.2,
+// §5.4). Computed in double: m2 and s* lose digits to cancellation otherwise, and a threshold that flips is a visible pixel.
 
 namespace {
 
@@ -105,8 +105,7 @@ void slice_candidates(const SceneView& scene, const View& view, const Candidates
     const Floats vx = to_floats(offset[0]), vy = to_floats(offset[1]), vz = to_floats(offset[2]);
     const Floats length2 = vx * vx + vy * vy + vz * vz;
     const Floats inverse_length = 1.0f / square_root(maximum(length2, splat(1e-36f)));
-    const Floats value =
-        spherical_harmonics(scene, c, vx * inverse_length, vy * inverse_length, vz * inverse_length);
+    const Floats value = spherical_harmonics(scene, c, vx * inverse_length, vy * inverse_length, vz * inverse_length);
     const Floats intensity = activate(scene.intensity, value);
 
     Slice* next = out.append(c.count);

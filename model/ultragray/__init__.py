@@ -16,7 +16,7 @@ from .probe import ConvexProbe, LinearProbe, Probe
 from .scene_info import SceneHeader, SceneInfo, read_header
 
 if TYPE_CHECKING:
-    from .render import Frames, render
+    from .rendering import Frames, render
     from .scene import GaussianScene
 
 __version__ = "0.1.0"
@@ -36,7 +36,7 @@ __all__ = [
     "render",
 ]
 
-_NEEDS_TORCH = {"Frames": "render", "GaussianScene": "scene", "render": "render"}
+_NEEDS_TORCH = {"Frames": "rendering", "GaussianScene": "scene", "render": "rendering"}
 
 
 def __getattr__(name: str) -> Any:

@@ -129,9 +129,7 @@ def _centre_mm(
     try:
         x, y, z = (float(value) for value in center_mm)
     except (TypeError, ValueError):
-        raise InvalidArgument(
-            f"center_mm must be three numbers, got {center_mm!r}", field="center_mm"
-        ) from None
+        raise InvalidArgument(f"center_mm must be three numbers, got {center_mm!r}", field="center_mm") from None
     if not all(map(math.isfinite, (x, y, z))):
         raise InvalidArgument(f"center_mm must be finite, got {center_mm!r}", field="center_mm")
     return (x, y, z)
@@ -142,9 +140,7 @@ def _read_checkpoint(path: Path) -> tuple[int | None, dict[str, Tensor]]:
     document = _load_without_code(path)
     splats = document.get("splats", document) if isinstance(document, Mapping) else document
     if not isinstance(splats, Mapping):
-        raise CheckpointInvalid(
-            f"{path}: not a checkpoint of the released trainer: it holds a {type(splats).__name__}"
-        )
+        raise CheckpointInvalid(f"{path}: not a checkpoint of the released trainer: it holds a {type(splats).__name__}")
     missing = [name for name in PARAMETERS if name not in splats]
     if missing:
         raise CheckpointInvalid(
@@ -154,9 +150,7 @@ def _read_checkpoint(path: Path) -> tuple[int | None, dict[str, Tensor]]:
     _check_tensors(path, tensors)
     step = document.get("step") if splats is not document else None
     known_step = step if isinstance(step, int) and not isinstance(step, bool) else None
-    return known_step, {
-        name: tensor.detach().to(torch.float32).contiguous() for name, tensor in tensors.items()
-    }
+    return known_step, {name: tensor.detach().to(torch.float32).contiguous() for name, tensor in tensors.items()}
 
 
 def _load_without_code(path: Path) -> Any:

@@ -81,9 +81,10 @@ def _prepared(scene: GaussianScene) -> _cpu.PreparedScene:
             raw["quats"].numpy(),
             raw["transmittances"].numpy(),
             raw["sh0"].reshape(-1).numpy(),
-            raw["shN"].reshape(scene.gaussian_count, -1).numpy() if scene.sh_degree else np.empty((scene.gaussian_count, 0), np.float32),
+            raw["shN"].squeeze(-1).numpy(),
             scene.sh_degree,
             scene.info.intensity == "sigmoid",
         )
         scene.cache["cpu_key"] = key
-    return scene.cache["cpu"]
+    prepared: _cpu.PreparedScene = scene.cache["cpu"]
+    return prepared

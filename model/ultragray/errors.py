@@ -22,11 +22,11 @@ UltragrayError
 ├── DeadlineExceeded                the deadline passed before the frame was rendered
 ├── NotReady                        the service is starting
 ├── Draining                        the service is stopping
-├── StartupFailed                   the service cannot start: a port in use, no data folder, a scene to preload that is bad
+├── StartupFailed                   the service cannot start, such as on a port in use
 └── RenderFailed                    a worker could not render the frame
 
-Each class carries a `reason` that never changes (clients match on it), the HTTP status and the gRPC status that the front
-doors answer with: this module is the one table that maps both.
+Each class carries a `reason` that never changes (clients match on it), the HTTP status and the gRPC status that the
+front doors answer with: this module is the one table that maps both.
 """
 
 from __future__ import annotations

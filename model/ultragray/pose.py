@@ -22,19 +22,34 @@ MAX_POSITION_MM = 1e6
 def check_poses(poses: Any, *, field: str = "poses") -> FloatArray:  # [C, 4, 4]
     """Rigid transforms [C, 4, 4] (or one [4, 4]) as exact float64, mm.
 
-    A rotation within 1e-3 of a proper one (largest entry of RᵀR − 1) is replaced by the nearest proper rotation. Raises
-    InvalidPose, naming the pose, for anything else: wrong shape, non-finite, scaled, sheared, mirrored, a last row other
-    than 0 0 0 1, or a position beyond a kilometre.
+    A rotation within 1e-3 of a proper one (largest entry of RᵀR − 1) is replaced by the nearest proper rotation.
+    Raises InvalidPose, naming the pose, for anything else: wrong shape, non-finite, scaled, sheared, mirrored, a last
+    row other than 0 0 0 1, or a position beyond a kilometre.
     """
     array = _as_float64(poses, field)
-    single = array.ndim == 2
-    if single:
-        array = array[None]
+    if array.ndim == 2:
+        array, names = array[None], [field]
+    else:
+        names = [f"{field}[{c}]" for c in range(len(array))] if array.ndim else []
     if array.ndim != 3 or array.shape[1:] != (4, 4):
-        raise InvalidPose(f"{field} must have shape [C, 4, 4] or [4, 4], got {list(array.shape)}", field=field)
-    return np.stack([_check_pose(pose, field if single else f"{field}[{c}]") for c, pose in enumerate(array)]) if len(
-        array
-    ) else array
+        given = list(array.shape[1:] if names == [field] else array.shape)
+        raise InvalidPose(f"{field} must have shape [C, 4, 4] or [4, 4], got {given}", field=field)
+    rotations, positions = array[:, :3, :3], array[:, :3, 3]
+    finite = np.isfinite(array).all(axis=(1, 2))
+    with np.errstate(invalid="ignore", over="ignore"):  # NaN and infinity are told below
+        grams = rotations.transpose(0, 2, 1) @ rotations  # RᵀR, [C, 3, 3]
+        deviations = np.abs(grams - np.eye(3)).max(axis=(1, 2), initial=0.0)
+        rigid = finite & (np.abs(array[:, 3] - (0, 0, 0, 1)).max(axis=1, initial=0.0) <= ROTATION_TOLERANCE)
+        rigid &= np.abs(positions).max(axis=1, initial=0.0) <= MAX_POSITION_MM
+        rigid &= deviations <= ROTATION_TOLERANCE
+        rigid &= np.einsum("ci,ci->c", np.cross(rotations[..., 0], rotations[..., 1]), rotations[..., 2]) > 0
+    for c in np.flatnonzero(~rigid)[:1]:
+        raise _why_not_rigid(array[c], float(deviations[c]), names[c])
+    left, _, right = np.linalg.svd(rotations)
+    exact = np.tile(np.eye(4), (len(array), 1, 1))
+    exact[:, :3, :3] = left @ right
+    exact[:, :3, 3] = positions
+    return exact
 
 
 def _as_float64(value: Any, field: str) -> FloatArray:
@@ -46,32 +61,25 @@ def _as_float64(value: Any, field: str) -> FloatArray:
         raise InvalidPose(f"{field} must be a regular array of numbers, got ragged rows", field=field) from None
     if array.dtype.kind not in "fiu":
         raise InvalidPose(f"{field} must hold real numbers, got {array.dtype}", field=field)
-    return array.astype(np.float64)
+    return np.asarray(array, dtype=np.float64)
 
 
-def _check_pose(pose: FloatArray, field: str) -> FloatArray:  # [4, 4]
-    if not np.isfinite(pose).all():
-        raise InvalidPose(f"{field} must be finite, got NaN or infinity", field=field)
-    if not np.allclose(pose[3], (0, 0, 0, 1), rtol=0, atol=ROTATION_TOLERANCE):
-        raise InvalidPose(f"{field} must end in the row 0 0 0 1, got {_numbers(pose[3])}", field=field)
+def _why_not_rigid(pose: FloatArray, deviation: float, field: str) -> InvalidPose:  # [4, 4]
     rotation, position = pose[:3, :3], pose[:3, 3]
-    if np.abs(position).max() > MAX_POSITION_MM:
-        raise InvalidPose(f"{field} must lie within {MAX_POSITION_MM:g} mm, got {_numbers(position)}", field=field)
-    deviation = np.abs(rotation.T @ rotation - np.eye(3)).max()
-    if deviation > ROTATION_TOLERANCE:
-        lengths = np.linalg.norm(rotation, axis=0)
-        raise InvalidPose(
-            f"{field} must hold a rotation: the largest entry of RᵀR − 1 must be at most {ROTATION_TOLERANCE:g}, got "
-            f"{deviation:.3g} (axis lengths {_numbers(lengths)})",
-            field=field,
+    if not np.isfinite(pose).all():
+        reason = "be finite, got NaN or infinity"
+    elif np.abs(pose[3] - (0, 0, 0, 1)).max() > ROTATION_TOLERANCE:
+        reason = f"end in the row 0 0 0 1, got {_numbers(pose[3])}"
+    elif np.abs(position).max() > MAX_POSITION_MM:
+        reason = f"lie within {MAX_POSITION_MM:g} mm, got {_numbers(position)}"
+    elif deviation > ROTATION_TOLERANCE:
+        reason = (
+            f"hold a rotation: the largest entry of RᵀR − 1 must be at most {ROTATION_TOLERANCE:g}, got "
+            f"{deviation:.3g} (axis lengths {_numbers(np.linalg.norm(rotation, axis=0))})"
         )
-    if np.linalg.det(rotation) < 0:
-        raise InvalidPose(f"{field} must hold a rotation with determinant +1, got a mirrored one (−1)", field=field)
-    exact = np.eye(4)
-    left, _, right = np.linalg.svd(rotation)
-    exact[:3, :3] = left @ right
-    exact[:3, 3] = position
-    return exact
+    else:
+        reason = "hold a rotation with determinant +1, got a mirrored one (−1)"
+    return InvalidPose(f"{field} must {reason}", field=field)
 
 
 def _numbers(values: Any) -> str:
@@ -103,7 +111,8 @@ def pose_from_position_quaternion(
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
     pose[:3, 3] = position_mm
-    return check_poses(pose, field=field)[0]
+    exact: FloatArray = check_poses(pose, field=field)[0]
+    return exact
 
 
 def quaternion_from_pose(pose: FloatArray) -> tuple[float, float, float, float]:
@@ -127,11 +136,14 @@ def quaternion_from_pose(pose: FloatArray) -> tuple[float, float, float, float]:
 
 def position_distances_mm(poses: FloatArray, others: FloatArray) -> FloatArray:  # [C, 4, 4], [P, 4, 4] -> [C, P]
     """Distance between the probe origins, in mm."""
-    return np.linalg.norm(poses[:, None, :3, 3] - others[None, :, :3, 3], axis=-1)
+    offsets = poses[:, None, :3, 3] - others[None, :, :3, 3]
+    distances: FloatArray = np.linalg.norm(offsets, axis=-1)
+    return distances
 
 
 def rotation_angles_deg(poses: FloatArray, others: FloatArray) -> FloatArray:  # [C, 4, 4], [P, 4, 4] -> [C, P]
     """Angle of the rotation from one probe orientation to the other, in degrees."""
     difference = poses[:, None, :3, :3] - others[None, :, :3, :3]
-    half_chord = np.linalg.norm(difference, axis=(-2, -1)) / (2 * math.sqrt(2))  # = sin(angle/2)
-    return np.degrees(2 * np.arcsin(np.clip(half_chord, 0.0, 1.0)))
+    half_chord = np.linalg.norm(difference, axis=(-2, -1)) / math.sqrt(8.0)  # sin(angle / 2)
+    angles: FloatArray = np.degrees(2.0 * np.arcsin(np.clip(half_chord, 0.0, 1.0)))
+    return angles

@@ -1,8 +1,9 @@
 """Probes: where each pixel lies in the probe frame.
 
-Convention. Probe frame, right-handed: x lateral (image columns, left to right), y elevation, z axial (depth, image rows).
-Origin: centre of the transducer face (linear) or apex of the fan (convex). Images are [H, W]: H depth samples, W scan
-lines; sample i lies at depth near + (far − near)·(i+½)/H along its scan line, so the geometry in mm does not depend on H.
+Convention. Probe frame, right-handed: x lateral (image columns, left to right), y elevation, z axial (depth, image
+rows). Origin: centre of the transducer face (linear) or apex of the fan (convex). Images are [H, W]: H depth samples,
+W scan lines; sample i lies at depth near + (far − near)·(i+½)/H along its scan line, so the geometry in mm does not
+depend on H.
 """
 
 from __future__ import annotations
@@ -124,11 +125,7 @@ class ConvexProbe(_Planes):
         """Corners of the fan in the probe frame: left edge, middle and right edge at near and far."""
         half = math.radians(self.opening_angle_deg) / 2
         return np.array(
-            [
-                (r * math.sin(t), 0.0, r * math.cos(t))
-                for r in (self.near_mm, self.far_mm)
-                for t in (-half, 0.0, half)
-            ]
+            [(r * math.sin(t), 0.0, r * math.cos(t)) for r in (self.near_mm, self.far_mm) for t in (-half, 0.0, half)]
         )
 
     def scan_convert(self, frame: npt.NDArray[Any], pixel_mm: float) -> npt.NDArray[np.float32]:

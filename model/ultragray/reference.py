@@ -1,7 +1,8 @@
 """The forward model of PHYSICS.md §3 in plain torch: the definition that every fast backend is tested against.
 
-Written for reading. It computes in the dtype and on the device of the scene's tensors and is differentiable by autograd;
-thresholds and culls are held fixed, everything else carries its true gradient (PHYSICS.md §4). Lengths are in cm.
+Written for reading. It computes in the dtype and on the device of the scene's tensors and is differentiable by
+autograd; thresholds and culls are held fixed, everything else carries its true gradient (PHYSICS.md §4). Lengths are in
+cm.
 """
 
 from __future__ import annotations
@@ -41,9 +42,7 @@ def render_outputs(
     outputs: Sequence[str],
 ) -> dict[str, Tensor]:
     """The outputs by name, each [C, H, W] in the dtype of the scene's tensors."""
-    views = [
-        combine(_render_pose(scene, probe, scene.means.new_tensor(pose), height, width)) for pose in poses_cm
-    ]
+    views = [combine(_render_pose(scene, probe, scene.means.new_tensor(pose), height, width)) for pose in poses_cm]
     empty = scene.means.new_zeros((0, height, width))
     return {name: torch.stack([view[name] for view in views]) if views else empty for name in outputs}
 
@@ -75,10 +74,12 @@ def _render_pose(scene: GaussianScene, probe: Probe, pose: Tensor, height: int, 
     weighted_intensity = like.new_zeros((height, width))
     transmittance = like.new_ones((height, width))
     kept = torch.nonzero(_inside_planes(probe, means, height))[:, 0]
-    for ids in kept.split(max(1, ELEMENTS_PER_CHUNK // (9 * width))):
+    for ids in torch.split(kept, max(1, ELEMENTS_PER_CHUNK // (9 * width))):
         rays = _intersect(means[ids], inverse_root[ids], origins, directions)  # [n, W]
-        touching = torch.nonzero((rays.m2 <= -2.0 * math.log(MIN_WEIGHT)).any(dim=1))[:, 0]  # else w and α are below 1/255
-        for part in touching.split(max(1, ELEMENTS_PER_CHUNK // (height * width))):
+        touching = torch.nonzero((rays.m2 <= -2.0 * math.log(MIN_WEIGHT)).any(dim=1))[
+            :, 0
+        ]  # else w and α are below 1/255
+        for part in torch.split(touching, max(1, ELEMENTS_PER_CHUNK // (height * width))):
             weight, alpha = _weight_and_alpha(Rays(*(r[part] for r in rays)), depths)  # [n, H, W]
             counted = (weight >= MIN_WEIGHT) | (alpha >= MIN_WEIGHT)
             weight = torch.where(counted, weight, 0.0)

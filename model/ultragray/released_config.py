@@ -57,9 +57,7 @@ class ReleasedConfig:
         try:
             if self.width_mm is not None:
                 return LinearProbe(self.width_mm, self.near_mm, far_mm)
-            return ConvexProbe(
-                opening_angle_deg=self.opening_angle_deg or 0.0, near_mm=self.near_mm, far_mm=far_mm
-            )
+            return ConvexProbe(opening_angle_deg=self.opening_angle_deg or 0.0, near_mm=self.near_mm, far_mm=far_mm)
         except InvalidProbe as error:
             raise CheckpointInvalid(f"{self.path}: {error}") from error
 

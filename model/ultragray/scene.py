@@ -1,7 +1,7 @@
 """GaussianScene: the Gaussians of a trained scene and what they mean.
 
-Convention. Inside a scene lengths are in cm and the origin is the scene's centre; on every public surface they are in mm
-in the frame of the training sweep: p_cm = (p_mm − centre_mm) / 10.
+Convention. Inside a scene lengths are in cm and the origin is the scene's centre; on every public surface they are in
+mm in the frame of the training sweep: p_cm = (p_mm − centre_mm) / 10.
 """
 
 from __future__ import annotations
@@ -23,7 +23,6 @@ from .files import atomic_path
 from .pose import check_poses
 from .probe import FloatArray
 from .scene_info import (
-    MAX_SH_DEGREE,
     METADATA_KEY,
     SceneInfo,
     expected_shapes,
@@ -63,16 +62,20 @@ class GaussianScene:
     ) -> GaussianScene:
         """A scene of raw released parameters, lengths in cm; the graph of the tensors is kept.
 
-        Raises InvalidArgument, naming the tensor, for a missing key, a wrong shape, mixed dtypes or devices, or values
-        that are not finite.
+        Raises InvalidArgument, naming the tensor, for a missing key, a wrong shape, mixed dtypes or devices, or
+        values that are not finite.
         """
         missing = [name for name in PARAMETERS if name not in splats and name != "shN"]
         if missing:
-            raise InvalidArgument(f"splats must hold {', '.join(PARAMETERS)}; missing {', '.join(missing)}", field="splats")
-        tensors = {name: splats[name] for name in PARAMETERS if name in splats}
+            raise InvalidArgument(
+                f"splats must hold {', '.join(PARAMETERS)}; missing {', '.join(missing)}", field="splats"
+            )
+        tensors: dict[str, Any] = {name: splats[name] for name in PARAMETERS if name in splats}
         for name, tensor in tensors.items():
             if not isinstance(tensor, Tensor) or not tensor.is_floating_point():
-                raise InvalidArgument(f"splats[{name!r}] must be a floating tensor, got {type(tensor).__name__}", field=name)
+                raise InvalidArgument(
+                    f"splats[{name!r}] must be a floating tensor, got {type(tensor).__name__}", field=name
+                )
         means = tensors["means"]
         count = means.shape[0] if means.ndim else 0
         if "shN" not in tensors:
@@ -81,7 +84,8 @@ class GaussianScene:
         degree = {0: 0, 3: 1, 8: 2, 15: 3}.get(shn.shape[1] if shn.ndim == 3 else -1)
         if degree is None:
             raise InvalidArgument(
-                f"splats['shN'] must be [N, K-1, 1] with K-1 in 0, 3, 8, 15, got {list(shn.shape)}", field="shN"
+                f"splats['shN'] must be [N, K-1, 1] with K-1 in 0, 3, 8, 15, got {list(shn.shape)}",
+                field="shN",
             )
         for name, shape in expected_shapes(count, degree).items():
             tensor = tensors[name]
@@ -118,7 +122,7 @@ class GaussianScene:
 
     def to(self, target: torch.dtype | torch.device | str) -> GaussianScene:
         """The same scene with its tensors in another dtype or on another device."""
-        moved = {name: tensor.to(target) for name, tensor in self.splats.items()}
+        moved: dict[str, Any] = {name: tensor.to(target) for name, tensor in self.splats.items()}
         return GaussianScene(**moved, info=self.info, training_poses=self.training_poses)
 
     def poses_to_scene_cm(self, poses: FloatArray) -> FloatArray:  # [C, 4, 4] mm -> [C, 4, 4] cm

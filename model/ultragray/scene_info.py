@@ -1,8 +1,8 @@
 """What a scene file says about itself, readable without torch: the header of the safetensors bundle.
 
-The file is one safetensors bundle. Tensors: means [N, 3] cm, scales [N, 3] log cm, quats [N, 4] wxyz, transmittances [N]
-logit, sh0 [N, 1, 1], shN [N, K−1, 1], all float32, and training_poses [P, 4, 4] float64 mm. Its metadata holds one entry,
-`ultragray`, a JSON object with the fields of SceneInfo.
+The file is one safetensors bundle. Tensors: means [N, 3] cm, scales [N, 3] log cm, quats [N, 4] wxyz, transmittances
+[N] logit, sh0 [N, 1, 1], shN [N, K−1, 1], all float32, and training_poses [P, 4, 4] float64 mm. Its metadata holds one
+entry, `ultragray`, a JSON object with the fields of SceneInfo.
 """
 
 from __future__ import annotations
@@ -51,7 +51,8 @@ class SceneInfo:
             object.__setattr__(self, name, _vector(name, getattr(self, name)))
         if self.intensity not in INTENSITIES:
             raise InvalidArgument(
-                f"intensity must be one of {', '.join(INTENSITIES)}, got {self.intensity!r}", field="intensity"
+                f"intensity must be one of {', '.join(INTENSITIES)}, got {self.intensity!r}",
+                field="intensity",
             )
         for name in ("image_height", "image_width"):
             value = getattr(self, name)

@@ -1,10 +1,11 @@
-"""The demo scene that comes with the code: an in-silico lumbar spine, made in a second and the same every time.
+"""The demo scene that comes with the code: an in-silico lumbar spine, made in a second, the same every time.
 
-Frame, mm. x to the patient's right, y caudal, z from the skin into the body; the origin lies on the skin over the middle
-vertebra, so that a probe at the origin with quaternion w=1 sees it in cross-section. The levels are 35 mm apart.
+Frame, mm. x to the patient's right, y caudal, z from the skin into the body; the origin lies on the skin over
+the middle vertebra, so that a probe at the origin with quaternion w=1 sees it in cross-section. The vertebrae
+are 35 mm apart.
 
-Nothing is trained: each tissue is drawn directly as Gaussians. What depends on how the real thing is seen, does: bone and
-fascia are brightest face on, bone lets nothing through, blood and cerebrospinal fluid give no echo.
+Nothing is trained: each tissue is drawn directly as Gaussians. Bone and fascia are brightest face on, bone
+lets nothing through, blood gives no echo and cerebrospinal fluid next to none.
 """
 
 from __future__ import annotations
@@ -13,7 +14,6 @@ import itertools
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 
 from ..errors import InvalidArgument
 from ..pose import check_poses
@@ -33,8 +33,10 @@ _SEED = 20261120
 
 def build_demo_scene() -> GaussianScene:
     """The demo scene, bit for bit the same on every call."""
-    filling = (tissue.speckle, tissue.skin, tissue.fat_septa, tissue.fasciae, tissue.perimysium, tissue.muscle_septa)
+    sheets = (tissue.skin, tissue.fat_septa, tissue.fasciae, tissue.muscle_septa)
+    filling = (tissue.speckle, tissue.perimysium, *sheets)
     walls = (tissue.vessel, tissue.ligaments, tissue.cauda_equina)
+    # A stream of its own for each layer: a change to one leaves the others alone.
     generators = (np.random.default_rng([_SEED, layer]) for layer in itertools.count())
     soft = Splats.join(
         tissue.outside_fluid(Splats.join(*(layer(next(generators)) for layer in filling))),
@@ -58,7 +60,7 @@ def build_demo_scene() -> GaussianScene:
 
 def _outside_bone(soft: Splats) -> Splats:
     points = soft.centres_mm
-    shadow = bone.Shadow(tissue.HALF_WIDTH_MM, tissue.HALF_LENGTH_MM, reach_mm=3)
+    shadow = bone.Shadow(tissue.HALF_WIDTH_MM, tissue.HALF_LENGTH_MM)
     return soft.where((bone.distance_mm(points) > 0.4) & ~shadow.hides(points))
 
 
@@ -67,21 +69,23 @@ def _as_grown(drawn: Splats) -> Splats:
     x, y, z = drawn.centres_mm.T
     rise = np.clip(z / 8.0, 0.0, 1.0)
     bent_x = x + rise * (0.9 * np.sin(y / 27.0 + 0.4) + 0.4 * np.sin(z / 7.0 + x / 11.0))
-    bent_z = z + rise * (0.45 * np.sin(x / 6.3 + y / 19.0 + 0.7) + 0.25 * np.sin(x / 2.9 + y / 7.0) + 0.02 * x)
+    ripple = 0.45 * np.sin(x / 6.3 + y / 19.0 + 0.7) + 0.25 * np.sin(x / 2.9 + y / 7.0)
+    bent_z = z + rise * (ripple + 0.02 * x)
     return replace(drawn, centres_mm=np.stack([bent_x, y, bent_z], axis=1))
 
 
 def demo_poses(count: int) -> FloatArray:  # [C, 4, 4] mm
-    """A freehand sweep of `count` frames along the spine, y from −36 to 36 mm; the middle one of an odd count is the identity.
+    """A freehand sweep of `count` frames along the spine, y from −36 to 36 mm, slightly tilted.
 
-    Raises InvalidArgument for a negative count.
+    The middle frame of an odd count is the identity. Raises InvalidArgument for a negative count.
     """
     if count < 0:
         raise InvalidArgument(f"count must be at least 0, got {count}", field="count")
     u = np.linspace(-1.0, 1.0, count) if count > 1 else np.zeros(count)
     poses = np.tile(np.eye(4), (count, 1, 1))
-    tilt, rock, turn = np.radians(4.0) * np.sin(5.0 * u), np.radians(3.0) * np.sin(7.0 * u), np.radians(2.0) * np.sin(3.0 * u)
-    poses[:, :3, :3] = _rotations(0, tilt) @ _rotations(1, rock) @ _rotations(2, turn)
+    swings_deg = (4.0 * np.sin(5.0 * u), 3.0 * np.sin(7.0 * u), 2.0 * np.sin(3.0 * u))  # about x, y, z
+    about_x, about_y, about_z = (_rotations(axis, np.radians(swing)) for axis, swing in enumerate(swings_deg))
+    poses[:, :3, :3] = about_x @ about_y @ about_z
     poses[:, 0, 3] = 1.5 * np.sin(4.0 * u)
     poses[:, 1, 3] = SWEEP_MM / 2 * u
     return check_poses(poses, field="poses")

@@ -1,38 +1,40 @@
 """Lumbar vertebrae: cortical bone that reflects like a mirror and lets nothing through.
 
-One vertebra is a signed distance (mm, negative inside) in its own frame: x lateral, y caudal, z depth, the origin below the
-middle of its level on the skin. It repeats every 35 mm along y, as the lumbar spine does.
+One vertebra is a signed distance (mm, negative inside) in its own frame: x lateral, y caudal, z depth, the
+origin on the skin over the middle of its level. It repeats every 35 mm along y, as the lumbar spine does.
 """
 
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 
 from ..probe import FloatArray
-from .splats import Splats, scattered, splats
+from .splats import Splats, normalised, scattered
 
 LEVEL_SPACING_MM = 35.0
 BODY_DEPTH_MM = 54.0  # posterior wall of the vertebral bodies
 LAMINA_SLOPE = 0.33  # a lamina rises towards its caudal edge: the saw-tooth of paramedian views
+DEPTHS_MM = (12.0, 48.0)  # of the posterior parts
 BLEND_MM = 2.0  # radius with which the parts run into each other
 
 
 def distance_mm(points: FloatArray) -> FloatArray:  # [N, 3] -> [N]
     """Signed distance to the nearest vertebra's posterior parts."""
     x, z = np.abs(points[:, 0]), points[:, 2]
-    y = local_y(points[:, 1])
+    y = _local_y(points[:, 1])
     local = np.stack([x, y, z], axis=1)
-    crest = _capsule(local, (0.0, -3.0, 16.5), (0.0, 10.5, 16.0), 2.9)
+    crest = _capsule(local, (0.0, -3.0, 17.6), (0.0, 10.0, 17.0), 3.5)
     blade = _box(local, (0.0, 3.5, 24.0), (0.6, 8.0, 9.0), 1.6)
     ramp = np.stack([x, y, z + LAMINA_SLOPE * y], axis=1)
-    lamina = _extruded_along_y(ramp, (1.0, 31.0), (13.0, 36.0), 3.0, middle=1.0, half=7.5)
+    lamina = _extruded_along_y(ramp, (1.0, 31.4), (13.0, 36.4), 3.4, middle=1.0, half=7.5)
     pillar = _capsule(local, (16.0, -16.0, 39.5), (14.0, 13.5, 34.0), 4.0)
     transverse = _capsule(local, (14.0, -9.0, 41.0), (28.0, -11.0, 43.0), 3.6)
     joined = _blend(_blend(crest, blade), lamina)
     return _blend(_blend(joined, pillar), transverse)
 
 
-def local_y(y: FloatArray) -> FloatArray:
+def _local_y(y: FloatArray) -> FloatArray:
     """Position along the spine relative to the nearest level, in [−17.5, 17.5) mm."""
     return (y + LEVEL_SPACING_MM / 2) % LEVEL_SPACING_MM - LEVEL_SPACING_MM / 2
 
@@ -40,16 +42,24 @@ def local_y(y: FloatArray) -> FloatArray:
 def _capsule(p: FloatArray, start: tuple[float, ...], end: tuple[float, ...], radius: float) -> FloatArray:
     a, axis = np.asarray(start), np.asarray(end) - np.asarray(start)
     t = np.clip((p - a) @ axis / (axis @ axis), 0.0, 1.0)
-    return np.linalg.norm(p - a - t[:, None] * axis, axis=1) - radius
+    distance: FloatArray = np.linalg.norm(p - a - t[:, None] * axis, axis=1)
+    return distance - radius
 
 
 def _box(p: FloatArray, middle: tuple[float, ...], half: tuple[float, ...], radius: float) -> FloatArray:
-    q = np.abs(p - np.asarray(middle)) - np.asarray(half)
-    return np.linalg.norm(np.maximum(q, 0.0), axis=1) + np.minimum(q.max(axis=1), 0.0) - radius
+    q: FloatArray = np.abs(p - np.asarray(middle)) - np.asarray(half)
+    distance: FloatArray = np.linalg.norm(np.maximum(q, 0.0), axis=1) + np.minimum(q.max(axis=1), 0.0)
+    return distance - radius
 
 
 def _extruded_along_y(
-    p: FloatArray, start: tuple[float, float], end: tuple[float, float], radius: float, *, middle: float, half: float
+    p: FloatArray,
+    start: tuple[float, float],
+    end: tuple[float, float],
+    radius: float,
+    *,
+    middle: float,
+    half: float,
 ) -> FloatArray:
     """A bar through two (x, z) points, drawn out along y."""
     section = np.stack([p[:, 0], np.zeros(len(p)), p[:, 2]], axis=1)
@@ -65,14 +75,13 @@ def _blend(a: FloatArray, b: FloatArray) -> FloatArray:
 
 def _gradient(points: FloatArray) -> FloatArray:  # [N, 3] unit, outwards
     step = 1e-3
-    differences = [distance_mm(points + step * axis) - distance_mm(points - step * axis) for axis in np.eye(3)]
-    gradient = np.stack(differences, axis=1)
-    return gradient / np.maximum(np.linalg.norm(gradient, axis=1, keepdims=True), 1e-12)
+    shifts = step * np.eye(3)
+    return normalised(np.stack([distance_mm(points + s) - distance_mm(points - s) for s in shifts], axis=1))
 
 
 def vertebrae(rng: np.random.Generator, low_y_mm: float, high_y_mm: float) -> Splats:
-    """The bright outer face of the cortex, the dense bone behind it that absorbs, and the marrow that absorbs the rest."""
-    low, high = (-34.0, low_y_mm, 12.0), (34.0, high_y_mm, 48.0)
+    """The bright face of the cortex, the dense bone behind it that absorbs, and the marrow."""
+    low, high = (-34.0, low_y_mm, DEPTHS_MM[0]), (34.0, high_y_mm, DEPTHS_MM[1])
     points = scattered(rng, low, high, (1.0, 1.0, 1.0))
     distances = distance_mm(points)
     face, outward = _project(points[np.abs(distances) < 0.55])
@@ -80,14 +89,14 @@ def vertebrae(rng: np.random.Generator, low_y_mm: float, high_y_mm: float) -> Sp
     facing = rng.uniform(0.94, 0.99, len(face))
     marrow = points[distances < -2.2]
     return Splats.join(
-        splats(face, (0.75, 0.75, 0.42), facing=facing, edge_on=0.3, tau=0.9, normals=outward),
-        splats(face - 1.5 * outward, (0.9, 0.9, 0.6), facing=0.02, tau=0.01, normals=outward),
-        splats(marrow, (0.85, 0.85, 0.8), facing=0.02, tau=0.01),
+        Splats.of(face, (0.75, 0.75, 0.42), facing=facing, edge_on=0.3, tau=0.9, normals=outward),
+        Splats.of(face - 1.5 * outward, (1.1, 1.1, 0.6), facing=0.02, tau=0.01, normals=outward),
+        Splats.of(marrow, (0.85, 0.85, 0.8), facing=0.02, tau=0.01),
     )
 
 
 def _project(points: FloatArray) -> tuple[FloatArray, FloatArray]:  # [N, 3] -> [M, 3], [M, 3]
-    """Points near the surface moved onto it, with the outward normals; without those on faces turned from the probe."""
+    """Points near the surface moved onto it, with outward normals; none on faces turned from the probe."""
     for _ in range(2):
         points = points - distance_mm(points)[:, None] * _gradient(points)
     outward = _gradient(points)
@@ -96,24 +105,24 @@ def _project(points: FloatArray) -> tuple[FloatArray, FloatArray]:  # [N, 3] -> 
 
 
 class Shadow:
-    """The depth below which bone hides everything from any probe on the skin, on a grid over x and y."""
+    """The depth below which bone hides everything from a probe on the skin, over a grid of x and y."""
 
     STEP_MM = 1.0
+    REACH = 3  # grid steps: a tilted beam comes in from the side, so bone must cover the surroundings too
 
-    def __init__(self, half_width_mm: float, half_length_mm: float, *, reach_mm: int) -> None:
+    def __init__(self, half_width_mm: float, half_length_mm: float) -> None:
         self.low_mm = np.array([-half_width_mm, -half_length_mm])
         x = np.arange(-half_width_mm, half_width_mm + self.STEP_MM, self.STEP_MM)
         y = np.arange(-half_length_mm, half_length_mm + self.STEP_MM, self.STEP_MM)
-        z = np.arange(12.0, 48.0, self.STEP_MM)
+        z = np.arange(*DEPTHS_MM, self.STEP_MM)
         grid = np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1)
         solid = distance_mm(grid.reshape(-1, 3)).reshape(grid.shape[:3]) < 0.0
         depth = np.where(solid.any(axis=2), z[solid.argmax(axis=2)], np.inf)
-        for axis in (0, 1):  # a tilted beam comes in from the side: only where there is bone all around
-            depth = np.max([np.roll(depth, k, axis) for k in range(-reach_mm, reach_mm + 1)], axis=0)
+        for axis in (0, 1):
+            depth = np.max([np.roll(depth, k, axis) for k in range(-self.REACH, self.REACH + 1)], axis=0)
         self.depth_mm = depth
 
-    def hides(self, points: FloatArray) -> FloatArray:  # [N, 3] -> [N] bool
-        i, j = np.clip(
-            np.round((points[:, :2] - self.low_mm) / self.STEP_MM).astype(int), 0, np.array(self.depth_mm.shape) - 1
-        ).T
-        return points[:, 2] > self.depth_mm[i, j]
+    def hides(self, points: FloatArray) -> npt.NDArray[np.bool_]:  # [N, 3] -> [N]
+        cells = np.round((points[:, :2] - self.low_mm) / self.STEP_MM).astype(int)
+        i, j = np.clip(cells, 0, np.array(self.depth_mm.shape) - 1).T
+        return np.asarray(points[:, 2] > self.depth_mm[i, j])

@@ -1,4 +1,4 @@
-"""Soft tissue of the back, from the skin to the vertebral bodies: layers in mm, x to the right, y caudal, z into the body."""
+"""Soft tissue of the back, from the skin to the vertebral bodies, in the frame of the demo scene, mm."""
 
 from __future__ import annotations
 
@@ -6,17 +6,14 @@ from collections.abc import Callable
 from functools import partial
 
 import numpy as np
-import numpy.typing as npt
 
 from ..probe import FloatArray
 from . import bone
-from .splats import Splats, Surface, scattered, speckle_levels, splats, spread_over
-
-Mask = npt.NDArray[np.bool_]
+from .splats import Splats, Surface, scattered, speckle_levels, spread_over
 
 HALF_WIDTH_MM = 33.0
 HALF_LENGTH_MM = 45.0
-DEPTH_MM = 60.0
+DEPTH_MM = 62.0
 
 SKIN_MM = 1.7
 VESSEL_RADIUS_MM = 2.7
@@ -27,7 +24,7 @@ TAU_INTERFACE = 0.97
 
 
 def fascia_depth_mm(x: FloatArray) -> FloatArray:
-    """The thoracolumbar fascia: over the two muscle bellies, and down to the spinous processes between them."""
+    """The thoracolumbar fascia: over the two muscle bellies, down to the spinous processes between them."""
     return 10.0 - 1.6 * np.exp(-(((np.abs(x) - 14.0) / 9.0) ** 2)) + 2.0 * np.exp(-((x / 5.0) ** 2))
 
 
@@ -46,44 +43,54 @@ def outside_fluid(gaussians: Splats) -> Splats:
     x, y, z = gaussians.centres_mm.T
     vessel_x, vessel_z = vessel_centre_mm(y)
     in_vessel = np.hypot(x - vessel_x, z - vessel_z) < VESSEL_RADIUS_MM + 0.3
-    in_sac = np.hypot(x / SAC_HALF_WIDTH_MM, (z - SAC_DEPTH_MM) / SAC_HALF_DEPTH_MM) < 1.05
-    return gaussians.where(~in_vessel & ~in_sac)
+    return gaussians.where(~in_vessel & (_sac_radius(gaussians.centres_mm) > 1.05))
+
+
+def _sac_radius(points: FloatArray) -> FloatArray:  # [N, 3] -> [N]
+    """Distance from the axis of the dural sac, 1 on its wall."""
+    radius: FloatArray = np.hypot(points[:, 0] / SAC_HALF_WIDTH_MM, (points[:, 2] - SAC_DEPTH_MM) / SAC_HALF_DEPTH_MM)
+    return radius
 
 
 def speckle(rng: np.random.Generator) -> Splats:
-    """The echo of all that is too small to resolve, each tissue at its own level; coarser with depth, as a beam spreads."""
+    """The echo of all that is too small to resolve, at each tissue's level; coarser with depth."""
     low, high = (-HALF_WIDTH_MM, -HALF_LENGTH_MM, 0.0), (HALF_WIDTH_MM, HALF_LENGTH_MM, DEPTH_MM)
     points = scattered(rng, low, high, (1.2, 3.8, 0.76))
     x, z = points[:, 0], points[:, 2]
     level = np.select(
         [z < SKIN_MM, z < fascia_depth_mm(x), (np.abs(x) < 2.5) & (z < 33.0), z < deep_fascia_depth_mm(x)],
-        [1.0, 0.42, 0.58, 0.42 + 0.13 * _fascicles(points)],  # skin, fat, interspinous ligament, muscle
-        0.37 + 0.10 * _fascicles(points),
+        [1.0, 0.42, 0.60, 0.45 + 0.13 * _fascicles(points)],  # skin, fat, interspinous ligament, muscle
+        0.40 + 0.10 * _fascicles(points),
     )
     sigmas = np.stack([0.40 + 0.006 * z, 1.1 + 0.012 * z, np.full(len(z), 0.26)], axis=1)
-    return splats(points, sigmas, facing=speckle_levels(rng, level, len(z)), tau=TAU_SOFT)
+    return Splats.of(points, sigmas, facing=speckle_levels(rng, level, len(z)), tau=TAU_SOFT)
 
 
 def _fascicles(points: FloatArray) -> FloatArray:  # [N, 3] -> [N] in [-1, 1]
     """Bundles of muscle fibres: patches of some millimetres, drawn out along the spine."""
     x, y, z = points.T
     warped = z + 0.25 * np.abs(x) + 1.5 * np.sin(x / 3.1 + y / 31.0)
-    return np.sin(warped / 1.3 + np.sin(y / 23.0)) * np.cos(x / 2.3 + 0.8 * np.sin(z / 2.7))
+    bundles: FloatArray = np.sin(warped / 1.3 + np.sin(y / 23.0)) * np.cos(x / 2.3 + 0.8 * np.sin(z / 2.7))
+    return bundles
 
 
 def cauda_equina(rng: np.random.Generator) -> Splats:
     """Nerve roots that float in the dural sac."""
     points = scattered(rng, (-8.0, -HALF_LENGTH_MM, 41.0), (8.0, HALF_LENGTH_MM, 53.0), (2.0, 5.0, 1.6))
-    inside = np.hypot(points[:, 0] / SAC_HALF_WIDTH_MM, (points[:, 2] - SAC_DEPTH_MM) / SAC_HALF_DEPTH_MM) < 0.85
-    points = points[inside]
-    return splats(points, (0.6, 2.5, 0.3), facing=speckle_levels(rng, 0.2, len(points)), tau=TAU_SOFT)
+    points = points[_sac_radius(points) < 0.85]
+    return Splats.of(points, (0.6, 2.5, 0.3), facing=speckle_levels(rng, 0.2, len(points)), tau=TAU_SOFT)
 
 
 def skin(rng: np.random.Generator) -> Splats:
     """The entry echo and the border to the fat."""
     entry = _layer(rng, lambda x, y: 0.4 + 0.0 * x, cells=(70, 40), level=1.1, edge_on=0.95, thickness_mm=0.2)
     dermis = _layer(
-        rng, lambda x, y: SKIN_MM + 0.1 * np.sin(x / 4.0), cells=(60, 36), level=0.95, edge_on=0.9, thickness_mm=0.16
+        rng,
+        lambda x, y: SKIN_MM + 0.1 * np.sin(x / 4.0),
+        cells=(60, 36),
+        level=0.95,
+        edge_on=0.9,
+        thickness_mm=0.16,
     )
     return Splats.join(entry, dermis)
 
@@ -108,14 +115,17 @@ def fat_septa(rng: np.random.Generator) -> Splats:
 
 
 def _wave(depth: float, phase: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
-    swing = np.sin(x / 4.0 + phase[0]) + 0.8 * np.sin(x / 2.1 + y / 17.0 + phase[1]) + np.sin(y / 9.0 + phase[2])
+    swing: FloatArray = np.sin(x / 4.0 + phase[0]) + 0.8 * np.sin(x / 2.1 + y / 17.0 + phase[1])
+    swing += np.sin(y / 9.0 + phase[2])
     return depth + 0.4 * swing
 
 
 def fasciae(rng: np.random.Generator) -> Splats:
     """The two leaves of the thoracolumbar fascia, and its middle layer."""
     outer = _layer(rng, lambda x, y: fascia_depth_mm(x), cells=(105, 42), level=1.2, edge_on=0.7, thickness_mm=0.19)
-    inner = _layer(rng, lambda x, y: fascia_depth_mm(x) + 1.0, cells=(85, 36), level=1.0, edge_on=0.6, thickness_mm=0.13)
+    inner = _layer(
+        rng, lambda x, y: fascia_depth_mm(x) + 1.0, cells=(85, 36), level=1.0, edge_on=0.6, thickness_mm=0.13
+    )
     middle = _layer(rng, lambda x, y: deep_fascia_depth_mm(x), cells=(85, 36), level=1.0, edge_on=0.6, thickness_mm=0.2)
     return Splats.join(outer, inner, middle.where(np.abs(middle.centres_mm[:, 0]) > 15.0))
 
@@ -154,11 +164,11 @@ def _interface(
     points, normals = spread_over(rng, surface, cells)
     points = points + normals * rng.normal(0.0, 0.4 * sigmas_mm[2], (len(points), 1))
     facing = speckle_levels(rng, level, len(points))
-    return splats(points, sigmas_mm, facing=facing, edge_on=edge_on * facing, tau=TAU_INTERFACE, normals=normals)
+    return Splats.of(points, sigmas_mm, facing=facing, edge_on=edge_on * facing, tau=TAU_INTERFACE, normals=normals)
 
 
 def perimysium(rng: np.random.Generator) -> Splats:
-    """Connective tissue around bundles of muscle fibres: short bright strokes across the spine, long lines along it."""
+    """Connective tissue around muscle fibres: short strokes across the spine, long lines along it."""
     strokes, beads, repeats = 1900, 5, 2
     shape = (strokes, beads, repeats)
     one = (strokes, 1, 1)
@@ -166,7 +176,8 @@ def perimysium(rng: np.random.Generator) -> Splats:
     y = rng.uniform(-HALF_LENGTH_MM, HALF_LENGTH_MM, one)
     z = rng.uniform(10.0, DEPTH_MM, one)
     side, medial = np.sign(x), np.exp(-((x / 13.0) ** 2))
-    angle = side * (0.12 + 0.35 * medial) + rng.normal(0.0, 0.18, one)  # down towards the flank, more so in multifidus
+    slope = side * (0.12 + 0.35 * medial)  # down to the flank, most in multifidus
+    angle = slope + rng.normal(0.0, 0.18, one)
     length = np.clip(rng.lognormal(1.1, 0.5, one), 1.2, 7.0)
     level = rng.uniform(0.55, 1.1, one)
 
@@ -182,9 +193,10 @@ def perimysium(rng: np.random.Generator) -> Splats:
 
     tilt = each(angle)
     normals = np.stack([-np.sin(tilt), np.zeros(len(tilt)), np.cos(tilt)], axis=1)
-    sigmas = np.stack([each(0.2 + 0.65 * length / beads), each(np.full(one, 3.6)), each(np.full(one, 0.18))], axis=1)
+    reach = each(0.2 + 0.65 * length / beads)
+    sigmas = np.stack([reach, np.full(len(reach), 3.6), np.full(len(reach), 0.18)], axis=1)
     facing = speckle_levels(rng, each(level), len(points))
-    lines = splats(points, sigmas, facing=facing, edge_on=0.6 * facing, tau=TAU_INTERFACE, normals=normals)
+    lines = Splats.of(points, sigmas, facing=facing, edge_on=0.6 * facing, tau=TAU_INTERFACE, normals=normals)
     return lines.where(points[:, 2] > fascia_depth_mm(points[:, 0]) + 1.5)
 
 

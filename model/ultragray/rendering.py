@@ -44,15 +44,18 @@ def render(
     """Frames [C, height, width] of a scene seen by `probe` (None: the probe the scene was trained with) from `poses`.
 
     Poses are rigid probe→scene transforms in mm, in the frame of the sweep that the scene was trained from.
-    Backends: `reference` computes in the dtype of the scene's tensors and is differentiable; `cpu` computes in float32 on
-    as many threads as torch.get_num_threads(); `auto` takes `cpu` for float32 scenes on the CPU that need no gradient.
+    Backends: `reference` computes in the dtype of the scene's tensors and is differentiable; `cpu` computes in float32
+    on as many threads as torch.get_num_threads(); `auto` takes `cpu` for float32 scenes on the CPU that need no
+    gradient.
     Raises InvalidPose, InvalidImageSize, UnknownOutput, InvalidArgument, BackendUnavailable.
     """
     chosen = check_outputs(outputs)
     check_image_size(height, width)
     probe = probe if probe is not None else scene.info.probe
     if probe is None:
-        raise InvalidArgument("probe must be given: this scene does not know the one it was trained with", field="probe")
+        raise InvalidArgument(
+            "probe must be given: this scene does not know the one it was trained with", field="probe"
+        )
     poses_cm = scene.poses_to_scene_cm(check_poses(poses))
     return Frames(**_backend(backend, scene)(scene, probe, poses_cm, height, width, chosen))
 

@@ -1,0 +1,160 @@
+"""`ultragray bench`: what a frame costs in the kernel and through each front door, here and now.
+
+Machines drift, so every time is also given in yards, a fixed piece of work timed in the same run (PHYSICS.md §5).
+"""
+
+from __future__ import annotations
+
+import json
+import platform
+from dataclasses import asdict, dataclass
+from datetime import datetime, timezone
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import grpc
+import numpy as np
+import torch
+from rich.console import Console
+from rich.table import Table
+
+import ultragray
+from ultragray import cpu
+from ultragray.files import atomic_path
+
+from .bench_kernel import BenchScene, bench_scenes, measure_kernel, time_yard_ms
+from .bench_served import measure_served
+
+
+@dataclass(frozen=True)
+class Row:
+    """One measurement; times are per frame."""
+
+    what: str
+    gaussians: int
+    image: str  # H x W
+    threads: int
+    poses: int  # rendered together
+    p50_ms: float
+    p99_ms: float
+    p50_yards: float
+    frames_per_s: float
+    above_kernel_ms: float | None = None  # p50 over that of the kernel's single pose at the same thread count
+
+
+def run_bench(output: Path | None, quick: bool) -> None:
+    """Prints the table; writes it as JSON to `output`. `quick` takes few repetitions and leaves the large scene out."""
+    console = Console()
+    repeats = 20 if quick else 100
+    threads = torch.get_num_threads()
+    yards = [time_yard_ms()]
+    rows: list[Row] = []
+    memory_mb: dict[str, float] = {}
+    for scene in bench_scenes(quick):
+        console.print(f"{scene.gaussian_count:,} Gaussians: kernel ...", style="dim")
+        timings = measure_kernel(scene, sorted({1, threads}), repeats)
+        yards.append(time_yard_ms())
+        yard = float(np.median(yards[-2:]))
+        for timing in timings:
+            rows.append(_row(scene, yard, timing.what, timing.threads, timing.poses, timing.frame_ms))
+        kernel_p50 = next(row.p50_ms for row in rows[-len(timings) :] if row.threads == threads and row.poses == 1)
+        console.print(f"{scene.gaussian_count:,} Gaussians: served ...", style="dim")
+        served = measure_served(scene, repeats)
+        memory_mb[str(scene.gaussian_count)] = served.worker_memory_mb
+        yards.append(time_yard_ms())
+        yard = float(np.median(yards[-2:]))
+        for front_door in served.front_doors:
+            row = _row(scene, yard, front_door.what, threads, 1, front_door.latency_ms)
+            rows.append(
+                Row(
+                    **{
+                        **asdict(row),
+                        "frames_per_s": front_door.frames_per_s,
+                        "above_kernel_ms": row.p50_ms - kernel_p50,
+                    }
+                )
+            )
+    document = {
+        "machine": _machine(threads),
+        "yard_ms": float(np.median(yards)),
+        "worker_memory_mb": memory_mb,
+        "rows": [asdict(row) for row in rows],
+    }
+    _print_table(console, rows, document)
+    if output is not None:
+        with atomic_path(output) as temporary:
+            temporary.write_text(json.dumps(document, indent=1) + "\n")
+        console.print(f"written to {output}")
+
+
+def _row(scene: BenchScene, yard_ms: float, what: str, threads: int, poses: int, frame_ms: list[float]) -> Row:
+    p50, p99 = (float(np.percentile(frame_ms, q)) for q in (50, 99))
+    return Row(
+        what=what,
+        gaussians=scene.gaussian_count,
+        image=f"{scene.height}x{scene.width}",
+        threads=threads,
+        poses=poses,
+        p50_ms=p50,
+        p99_ms=p99,
+        p50_yards=p50 / yard_ms,
+        frames_per_s=1000.0 / p50,
+    )
+
+
+def _machine(threads: int) -> dict[str, Any]:
+    return {
+        "processor": _processor(),
+        "threads": threads,
+        "instruction_set": cpu.INSTRUCTION_SETS[0],
+        "system": platform.platform(),
+        "python": platform.python_version(),
+        "ultragray": ultragray.__version__,
+        "torch": torch.__version__,
+        "numpy": np.__version__,
+        "grpc": grpc.__version__,
+        "uvicorn": version("uvicorn"),
+        "measured_at": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+    }
+
+
+def _processor() -> str:
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.exists():
+        for line in cpuinfo.read_text().splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
+
+
+def _print_table(console: Console, rows: list[Row], document: dict[str, Any]) -> None:
+    machine = document["machine"]
+    table = Table(
+        title=f"{machine['processor']}, {machine['threads']} threads, {machine['instruction_set']}; "
+        f"yard {document['yard_ms']:.1f} ms"
+    )
+    for name in ("what", "Gaussians", "image", "threads", "poses"):
+        table.add_column(name, justify="left" if name == "what" else "right")
+    for name in ("p50 ms", "p99 ms", "p50 yards", "frames/s", "above kernel ms"):
+        table.add_column(name, justify="right")
+    for row in rows:
+        table.add_row(
+            row.what,
+            f"{row.gaussians:,}",
+            row.image,
+            str(row.threads),
+            str(row.poses),
+            f"{row.p50_ms:.2f}",
+            f"{row.p99_ms:.2f}",
+            f"{row.p50_yards:.3f}",
+            f"{row.frames_per_s:.0f}",
+            "" if row.above_kernel_ms is None else f"{row.above_kernel_ms:.2f}",
+        )
+    console.print(table)
+    for count, memory in document["worker_memory_mb"].items():
+        console.print(f"worker memory with {int(count):,} Gaussians: {memory:.0f} MB")
+    versions = ", ".join(
+        f"{name} {machine[name]}" for name in ("ultragray", "torch", "numpy", "grpc", "uvicorn", "python")
+    )
+    console.print(versions, style="dim")

@@ -1,0 +1,167 @@
+"""Fixtures shared by all tests: golden files, random scenes, and the rule by which two renders agree."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from ultragray import ConvexProbe, Frames, GaussianScene, LinearProbe, Probe, SceneInfo
+from ultragray.probe import FloatArray, stretch_released_far
+from ultragray.rendering import Frames
+from ultragray.request import OUTPUTS
+from ultragray.scene import PARAMETERS
+
+SHARED = Path(__file__).resolve().parents[2] / "shared"
+LARGEST_FLIP = 5e-3  # a threshold that flips moves a pixel by about 1/255
+
+
+def shared_folder(name: str) -> Path:
+    folder = SHARED / name
+    if not folder.is_dir():
+        pytest.skip(f"../shared/{name} is not there: it holds the released implementation's files")
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def one_torch_thread() -> Iterator[None]:
+    """Small tensors gain nothing from more, and threads of several processes that spin cost seconds."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture
+def golden_folder() -> Path:
+    return shared_folder("golden")
+
+
+@pytest.fixture
+def data_folder() -> Path:
+    return shared_folder("data")
+
+
+@dataclass(frozen=True)
+class Golden:
+    """One golden file as ours: the depth stretch is applied, poses are in mm."""
+
+    arrays: Mapping[str, np.ndarray]
+    probe: Probe
+    poses: FloatArray  # [C, 4, 4] mm
+    height: int
+    width: int
+    expected: Mapping[str, np.ndarray]  # by output, [C, H, W] float64
+    stable: np.ndarray  # [C, H, W] bool
+
+    def scene(self, dtype: torch.dtype) -> GaussianScene:
+        return GaussianScene.from_splats({name: torch.from_numpy(self.arrays[name]).to(dtype) for name in PARAMETERS})
+
+
+@pytest.fixture
+def golden(golden_folder: Path) -> Callable[[str], Golden]:
+    def load(name: str) -> Golden:
+        with np.load(golden_folder / f"{name}.npz") as file:
+            arrays = dict(file)
+        height, width = int(arrays["height"]), int(arrays["width"])
+        near_cm = float(arrays["near_plane"])
+        far_cm = stretch_released_far(near_cm, float(arrays["far_plane"]), height)
+        probe: Probe
+        if "opening_width" in arrays:
+            probe = LinearProbe(float(arrays["opening_width"]) * 10, near_cm * 10, far_cm * 10)
+        else:
+            probe = ConvexProbe(
+                opening_angle_deg=float(arrays["opening_angle"]), near_mm=near_cm * 10, far_mm=far_cm * 10
+            )
+        poses = arrays["camtoworlds"].astype(np.float64)
+        poses[:, :3, 3] *= 10.0
+        weight_sum = arrays["echo_alpha"].astype(np.float64)
+        expected = {
+            "bmode": arrays["ultrasound"],
+            "echo": arrays["echo"],
+            "transmittance": arrays["transmittance"],
+            "coverage": -np.expm1(-weight_sum),
+        }
+        return Golden(arrays, probe, poses, height, width, expected, ~arrays["unstable"])
+
+    return load
+
+
+@pytest.fixture(scope="session")
+def random_scene() -> Callable[..., GaussianScene]:
+    def make(
+        count: int = 200,
+        *,
+        seed: int = 0,
+        extent_cm: tuple[float, float, float] = (3.0, 1.0, 4.0),
+        centre_cm: tuple[float, float, float] = (0.0, 0.0, 2.0),
+        sigma_cm: tuple[float, float] = (0.03, 0.2),  # each axis is drawn log-uniformly between these
+        sh_degree: int = 1,
+        intensity: str = "released",
+        transmittance_logit: tuple[float, float] = (0.0, 4.0),
+        dtype: torch.dtype = torch.float32,
+        info: Mapping[str, Any] | None = None,
+    ) -> GaussianScene:
+        rng = np.random.default_rng(seed)
+        low, high = np.log(sigma_cm)
+        splats = {
+            "means": (rng.random((count, 3)) - 0.5) * extent_cm + centre_cm,
+            "scales": rng.uniform(low, high, (count, 3)),
+            "quats": rng.normal(size=(count, 4)),
+            "transmittances": rng.uniform(*transmittance_logit, count),
+            "sh0": rng.uniform(-1.5, 0.5, (count, 1, 1)),
+            "shN": rng.normal(size=(count, (sh_degree + 1) ** 2 - 1, 1)) * 0.2,
+        }
+        tensors = {name: torch.from_numpy(v.astype(np.float32)).to(dtype) for name, v in splats.items()}
+        return GaussianScene.from_splats(tensors, info=SceneInfo(intensity=intensity, **(info or {})))
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def random_poses() -> Callable[..., FloatArray]:
+    def make(count: int, *, seed: int = 0, tilt_deg: float = 20.0, shift_mm: float = 3.0) -> FloatArray:
+        """[count, 4, 4]: rotations by up to `tilt_deg` about random axes, shifts by up to `shift_mm`."""
+        rng = np.random.default_rng(seed)
+        poses = np.tile(np.eye(4), (count, 1, 1))
+        for pose in poses:
+            axis = rng.normal(size=3)
+            x, y, z = axis / np.linalg.norm(axis)
+            cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+            angle = math.radians(rng.uniform(-tilt_deg, tilt_deg))
+            pose[:3, :3] = np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
+            pose[:3, 3] = rng.uniform(-shift_mm, shift_mm, 3)
+        return poses
+
+    return make
+
+
+@pytest.fixture
+def assert_agrees() -> Callable[..., None]:
+    """Within `tolerance` but for one stable pixel in 10,000, and that one within a flipped threshold."""
+
+    def check(
+        frames: Frames, expected: Mapping[str, Any], *, tolerance: float, stable: np.ndarray | None = None
+    ) -> None:
+        for name in OUTPUTS:
+            got = getattr(frames, name)
+            want = np.asarray(expected[name], dtype=np.float64)
+            assert tuple(got.shape) == want.shape
+            difference = np.abs(got.double().numpy() - want)
+            if stable is not None:
+                difference = difference[stable]
+            assert np.isfinite(difference).all(), f"{name} is not finite"
+            beyond = difference > tolerance
+            assert beyond.sum() <= difference.size / 10_000, (
+                f"{name}: {beyond.sum()} of {difference.size} pixels differ by more than {tolerance}, "
+                f"the worst by {difference.max():.3g}"
+            )
+            assert difference.max(initial=0.0) <= LARGEST_FLIP, f"{name}: {difference.max():.3g}"
+
+    return check
