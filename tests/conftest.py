@@ -14,7 +14,6 @@ import torch
 
 from ultragray import ConvexProbe, Frames, GaussianScene, LinearProbe, Probe, SceneInfo
 from ultragray.probe import FloatArray, stretch_released_far
-from ultragray.rendering import Frames
 from ultragray.request import OUTPUTS
 from ultragray.scene import PARAMETERS
 

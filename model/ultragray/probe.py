@@ -169,9 +169,10 @@ def probe_to_dict(probe: Probe) -> dict[str, Any]:
 
 def probe_from_dict(document: Mapping[str, Any]) -> Probe:
     """Inverse of `probe_to_dict`. Raises InvalidProbe for an unknown kind, a missing or a surplus key."""
-    if not isinstance(document, Mapping) or document.get("kind") not in _KINDS:
+    kind = document.get("kind") if isinstance(document, Mapping) else None
+    if not isinstance(kind, str) or kind not in _KINDS:
         raise InvalidProbe(f'probe must be an object with kind "linear" or "convex", got {document!r}', field="kind")
-    cls = _KINDS[document["kind"]]
+    cls = _KINDS[kind]
     expected = {"kind", *cls.__dataclass_fields__}
     if set(document) != expected:
         raise InvalidProbe(f"probe of kind {cls.kind} must have the keys {sorted(expected)}, got {sorted(document)}")

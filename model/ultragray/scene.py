@@ -6,7 +6,6 @@ mm in the frame of the training sweep: p_cm = (p_mm − centre_mm) / 10.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -154,16 +153,3 @@ class GaussianScene:
         except (OSError, SafetensorError, ValueError) as error:
             raise scene_file_invalid(path, error) from error
         return scene
-
-
-def file_sha256(path: str | Path) -> str:
-    """The hash that names a scene in every frame rendered from it: SHA-256 of its file, hexadecimal."""
-    with Path(path).open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest() if hasattr(hashlib, "file_digest") else _sha256(file)
-
-
-def _sha256(file: Any) -> str:  # Python 3.10 has no hashlib.file_digest
-    digest = hashlib.sha256()
-    while block := file.read(1 << 20):
-        digest.update(block)
-    return digest.hexdigest()

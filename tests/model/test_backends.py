@@ -12,7 +12,6 @@ import torch
 
 from ultragray import ConvexProbe, Frames, GaussianScene, LinearProbe, Probe, cpu, render
 from ultragray.errors import BackendUnavailable
-from ultragray.rendering import Frames, render
 from ultragray.request import OUTPUTS
 
 RENDERERS = ("reference", "cpu", *(f"cpu-{name}" for name in cpu.INSTRUCTION_SETS))

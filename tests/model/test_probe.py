@@ -1,0 +1,142 @@
+"""Probes: geometry by hand-computed values, limits, JSON, scan conversion, the released depth stretch."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ultragray import ConvexProbe, LinearProbe, Probe
+from ultragray.errors import InvalidProbe
+from ultragray.probe import probe_from_dict, probe_to_dict, stretch_released_far
+
+LINEAR = LinearProbe(width_mm=40.0, near_mm=10.0, far_mm=50.0)
+CONVEX = ConvexProbe(opening_angle_deg=60.0, near_mm=50.0, far_mm=150.0)
+
+
+def test_rows_are_centres_of_equal_slices() -> None:
+    np.testing.assert_allclose(LINEAR.depths_mm(4), [15.0, 25.0, 35.0, 45.0])
+    np.testing.assert_allclose(CONVEX.depths_mm(1), [100.0])
+    assert LINEAR.scan_line_length_mm == 40.0
+
+
+def test_the_cull_ends_at_the_top_edge_of_the_last_row() -> None:
+    assert LINEAR.cull_far_mm(4) == pytest.approx(40.0)
+    assert LINEAR.cull_far_mm(1) == math.inf
+
+
+def test_linear_scan_lines_are_parallel() -> None:
+    origins, directions = LINEAR.scan_lines(4)
+    np.testing.assert_allclose(origins, [[-15, 0, 0], [-5, 0, 0], [5, 0, 0], [15, 0, 0]])
+    np.testing.assert_array_equal(directions, np.tile([0.0, 0.0, 1.0], (4, 1)))
+
+
+def test_convex_scan_lines_fan_out_from_the_apex() -> None:
+    origins, directions = CONVEX.scan_lines(3)
+    assert not origins.any()
+    angles = np.radians([-20.0, 0.0, 20.0])
+    np.testing.assert_allclose(directions, np.stack([np.sin(angles), 0 * angles, np.cos(angles)], 1), atol=1e-15)
+
+
+def test_corners() -> None:
+    np.testing.assert_allclose(LINEAR.corners_mm(), [[-20, 0, 10], [20, 0, 10], [-20, 0, 50], [20, 0, 50]])
+    corners = CONVEX.corners_mm()
+    assert corners.shape == (6, 3)
+    np.testing.assert_allclose(np.linalg.norm(corners, axis=1), [50, 50, 50, 150, 150, 150])
+    np.testing.assert_allclose(np.degrees(np.arctan2(corners[:, 0], corners[:, 2])), [-30, 0, 30] * 2, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("make", "field"),
+    [
+        (lambda: LinearProbe(0.0, 0.0, 50.0), "width_mm"),
+        (lambda: LinearProbe(-1.0, 0.0, 50.0), "width_mm"),
+        (lambda: LinearProbe(math.nan, 0.0, 50.0), "width_mm"),
+        (lambda: LinearProbe("40", 0.0, 50.0), "width_mm"),  # type: ignore[arg-type]
+        (lambda: LinearProbe(True, 0.0, 50.0), "width_mm"),
+        (lambda: LinearProbe(1e5, 0.0, 50.0), "width_mm"),
+        (lambda: LinearProbe(40.0, -0.1, 50.0), "near_mm"),
+        (lambda: LinearProbe(40.0, 50.0, 50.0), "far_mm"),
+        (lambda: LinearProbe(40.0, 60.0, 50.0), "far_mm"),
+        (lambda: LinearProbe(40.0, 0.0, math.inf), "far_mm"),
+        (lambda: LinearProbe(40.0, 0.0, 0.0), "far_mm"),
+        (lambda: ConvexProbe(near_mm=50.0, far_mm=150.0, opening_angle_deg=0.0), "opening_angle_deg"),
+        (lambda: ConvexProbe(near_mm=50.0, far_mm=150.0, opening_angle_deg=175.1), "opening_angle_deg"),
+        (lambda: ConvexProbe(near_mm=50.0, far_mm=50.0, opening_angle_deg=60.0), "far_mm"),
+    ],
+)
+def test_probes_that_no_transducer_could_have_are_refused(make: Any, field: str) -> None:
+    with pytest.raises(InvalidProbe, match=f"^{field} must be") as caught:
+        make()
+    assert caught.value.field == field
+
+
+def test_integers_become_floats_and_the_repr_is_what_one_writes() -> None:
+    assert repr(LinearProbe(width_mm=40, near_mm=0, far_mm=50)) == (
+        "LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)"
+    )
+    assert eval(repr(CONVEX)) == CONVEX
+
+
+@pytest.mark.parametrize("probe", [LINEAR, CONVEX])
+def test_json_round_trip(probe: Probe) -> None:
+    assert probe_from_dict(probe_to_dict(probe)) == probe
+    assert probe_to_dict(probe)["kind"] == probe.kind
+
+
+@pytest.mark.parametrize(
+    "document",
+    [
+        {"kind": "phased", "width_mm": 40, "near_mm": 0, "far_mm": 50},
+        {"width_mm": 40, "near_mm": 0, "far_mm": 50},
+        {"kind": "linear", "near_mm": 0, "far_mm": 50},
+        {"kind": "linear", "width_mm": 40, "near_mm": 0, "far_mm": 50, "opening_angle_deg": 60},
+        {"kind": "convex", "width_mm": 40, "near_mm": 0, "far_mm": 50},
+        [],
+        None,
+        "linear",
+        {"kind": ["linear"]},
+    ],
+)
+def test_json_that_is_no_probe_is_refused(document: Any) -> None:
+    with pytest.raises(InvalidProbe):
+        probe_from_dict(document)
+
+
+def test_the_stretch_puts_our_rows_on_the_released_grid() -> None:
+    """The released code has row i at near + (far − near)·(i+½)/(H−1)."""
+    near, far, height = 10.0, 50.0, 9
+    stretched = LinearProbe(40.0, near, stretch_released_far(near, far, height))
+    np.testing.assert_allclose(stretched.depths_mm(height), near + (far - near) * (np.arange(height) + 0.5) / 8)
+    assert stretched.cull_far_mm(height) == pytest.approx(far)
+    with pytest.raises(InvalidProbe, match="at least 2 rows"):
+        stretch_released_far(near, far, 1)
+
+
+def test_scan_conversion_puts_range_and_angle_where_they_are() -> None:
+    """A frame whose pixels hold their own range, then their own angle, shows them at the right places."""
+    height, width, pixel_mm = 200, 180, 0.5
+    ranges = np.tile(CONVEX.depths_mm(height)[:, None], (1, width))
+    angles = np.tile(np.degrees(CONVEX.angles_rad(width))[None], (height, 1))
+    shown_range = CONVEX.scan_convert(ranges, pixel_mm)
+    shown_angle = CONVEX.scan_convert(angles, pixel_mm)
+    rows, columns = shown_range.shape
+    assert columns == math.ceil(2 * 150 * math.sin(math.radians(30)) / pixel_mm)
+    assert rows == math.ceil((150 - 50 * math.cos(math.radians(30))) / pixel_mm)
+    x = (np.arange(columns) + 0.5) * pixel_mm - columns * pixel_mm / 2
+    z = 50 * math.cos(math.radians(30)) + (np.arange(rows) + 0.5) * pixel_mm
+    r = np.hypot(x[None], z[:, None])
+    theta = np.degrees(np.arctan2(x[None], z[:, None]))
+    well_inside = (r > 51) & (r < 149) & (np.abs(theta) < 29.5)
+    np.testing.assert_allclose(shown_range[well_inside], r[well_inside], atol=0.01)
+    np.testing.assert_allclose(shown_angle[well_inside], theta[well_inside], atol=0.01)
+    outside = (r < 50) | (r > 150) | (np.abs(theta) > 30)
+    assert not shown_range[outside].any()
+
+
+def test_scan_conversion_of_one_pixel() -> None:
+    picture = CONVEX.scan_convert(np.ones((1, 1)), 5.0)
+    assert picture.dtype == np.float32
+    assert set(np.unique(picture)) == {0.0, 1.0}

@@ -1,0 +1,106 @@
+"""The scene's own description: JSON round trip, limits, and headers that are read without torch."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ultragray import ConvexProbe, GaussianScene, LinearProbe, SceneInfo, read_header
+from ultragray.errors import InvalidArgument
+from ultragray.scene_info import info_from_json, info_to_json, with_summary
+
+FULL = SceneInfo(
+    centre_mm=(1.0, 2.0, 3.0),
+    probe=ConvexProbe(opening_angle_deg=60.0, near_mm=50.0, far_mm=200.0),
+    image_height=256,
+    image_width=192,
+    intensity="sigmoid",
+    sh_degree=2,
+    gaussian_count=7,
+    bounds_min_mm=(-1.0, -2.0, -3.0),
+    bounds_max_mm=(4.0, 5.0, 6.0),
+    dataset_name="Leber “links”",
+    dataset_sha256="ab" * 32,
+    metrics={"psnr_db": 26.9},
+    training={"steps": 30000, "nested": {"rates": [1, 2]}},
+)
+
+
+@pytest.mark.parametrize("info", [FULL, SceneInfo(), SceneInfo(probe=LinearProbe(40.0, 0.0, 50.0))])
+def test_json_round_trip(info: SceneInfo) -> None:
+    assert info_from_json(info_to_json(info)) == info
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"format_version": 2}, "format_version is 2"),
+        ({"format_version": None}, "format_version"),
+        ({"surprise": 1}, r"unknown keys \['surprise'\]"),
+        ({"centre_mm": [1, 2]}, "centre_mm must be three numbers"),
+        ({"centre_mm": [1, 2, None]}, "centre_mm must be three numbers"),
+        ({"centre_mm": [1, 2, float("inf")]}, "centre_mm must be finite"),
+        ({"intensity": "linear"}, "released, sigmoid"),
+        ({"image_height": 0}, "image_height must be a positive integer"),
+        ({"image_width": 1.5}, "image_width must be a positive integer"),
+        ({"metrics": [1]}, "metrics must be an object"),
+        ({"training": None}, "training must be an object"),
+        ({"probe": {"kind": "linear"}}, "keys"),
+    ],
+)
+def test_a_wrong_entry_is_named(change: dict[str, Any], message: str) -> None:
+    document = {**json.loads(info_to_json(FULL)), **change}
+    with pytest.raises(ValueError, match=message):
+        info_from_json(json.dumps(document))
+
+
+@pytest.mark.parametrize("text", ["", "[]", "null", "{", '{"format_version": 1,}'])
+def test_other_text_is_refused(text: str) -> None:
+    with pytest.raises(ValueError, match=r"."):
+        info_from_json(text)
+
+
+def test_nan_cannot_be_written() -> None:
+    with pytest.raises(ValueError, match="JSON"):
+        info_to_json(SceneInfo(metrics={"psnr_db": float("nan")}))
+    with pytest.raises(InvalidArgument, match="centre_mm must be finite"):
+        SceneInfo(centre_mm=(0.0, float("nan"), 0.0))
+
+
+def test_the_summary_is_in_the_frame_of_the_sweep() -> None:
+    info = with_summary(SceneInfo(centre_mm=(100.0, 0.0, -50.0)), np.array([[1.0, 2, 3], [-1, 0, 5]]), 1)
+    assert info.gaussian_count == 2
+    assert info.sh_degree == 1
+    assert info.bounds_min_mm == (90.0, 0.0, -20.0)
+    assert info.bounds_max_mm == (110.0, 20.0, 0.0)
+    empty = with_summary(SceneInfo(centre_mm=(1.0, 2.0, 3.0)), np.zeros((0, 3)), 0)
+    assert empty.bounds_min_mm == empty.bounds_max_mm == (1.0, 2.0, 3.0)
+
+
+def test_a_header_is_read_without_torch(
+    tmp_path: Path, random_scene: Callable[..., GaussianScene], random_poses: Callable[..., Any]
+) -> None:
+    scene = random_scene(9, sh_degree=2, info={"centre_mm": (1.0, 2.0, 3.0), "dataset_name": "x"})
+    poses = random_poses(4)
+    path = tmp_path / "a.ugr"
+    GaussianScene.from_splats(scene.splats, info=scene.info, training_poses=poses).save(path)
+    header = read_header(path)
+    assert header.info == scene.info
+    assert header.file_bytes == path.stat().st_size
+    np.testing.assert_allclose(header.training_poses, poses, atol=1e-12)
+    program = (
+        "import sys, ultragray; "
+        f"print(ultragray.read_header({str(path)!r}).info.gaussian_count, 'torch' in sys.modules)"
+    )
+    model = Path(sys.modules["ultragray"].__file__ or "").parents[1]
+    answer = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True, env={"PYTHONPATH": str(model)}
+    )
+    assert answer.stdout.split() == ["9", "False"]
