@@ -26,6 +26,8 @@ from ultragray.files import atomic_path
 from .bench_kernel import BenchScene, bench_scenes, measure_kernel, time_yard_ms
 from .bench_served import measure_served
 
+TABLE_WIDTH = 110  # columns, where no terminal says
+
 
 @dataclass(frozen=True)
 class Row:
@@ -46,6 +48,8 @@ class Row:
 def run_bench(output: Path | None, quick: bool) -> None:
     """Prints the table; writes it as JSON to `output`. `quick` takes few repetitions and leaves the large scene out."""
     console = Console()
+    if not console.is_terminal:
+        console = Console(width=TABLE_WIDTH)
     repeats = 20 if quick else 100
     threads = torch.get_num_threads()
     yards = [time_yard_ms()]

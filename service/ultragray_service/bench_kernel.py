@@ -85,14 +85,15 @@ def measure_kernel(bench: BenchScene, thread_counts: Sequence[int], repeats: int
         for threads in thread_counts:
             torch.set_num_threads(threads)
             for poses in (1, BATCH):
-                poses_cm = scene.poses_to_scene_cm(bench_poses(poses))
-                count = max(10, repeats // poses)
+                poses_cm = scene.poses_to_scene_cm(bench_poses(max(repeats, 10 * poses)))
                 frame_ms = []
-                for _ in range(count + 3):
+                for first in range(0, len(poses_cm) - poses + 1, poses):
                     started = time.perf_counter()
-                    cpu.render_outputs(scene, PROBE, poses_cm, bench.height, bench.width, ("bmode",))
+                    cpu.render_outputs(
+                        scene, PROBE, poses_cm[first : first + poses], bench.height, bench.width, ("bmode",)
+                    )
                     frame_ms.append(1000.0 * (time.perf_counter() - started) / poses)
-                timings.append(KernelTiming("kernel", threads, poses, frame_ms[3:]))
+                timings.append(KernelTiming("kernel", threads, poses, frame_ms[1:]))
     finally:
         torch.set_num_threads(before)
     return timings

@@ -1,0 +1,68 @@
+"""`ultragray serve`: the settings of the command line, and a folder that has something to serve."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from ultragray.errors import InvalidArgument
+from ultragray.scene_info import read_header
+from ultragray_workers.scenes import SUFFIX, SceneStore
+
+from .server import run
+from .settings import load_settings
+
+DEMO_NAME = "demo"
+
+
+def serve_scenes(scenes: Iterable[Path], options: Mapping[str, Any]) -> None:
+    """Serves the given scene files, or the data folder of the settings; returns when the service has stopped.
+
+    Given files are served by their stem from a folder of links that lasts as long as the service. A data
+    folder without a scene gets the demo scene. Raises InvalidArgument, SceneFileInvalid, StartupFailed and
+    OSError.
+    """
+    files = list(scenes)
+    if not files:
+        settings = load_settings(**options)
+        ensure_scenes(settings.data_folder)
+        run(settings)
+        return
+    if "data_folder" in options:
+        raise InvalidArgument("scenes and --data-folder cannot be given together", field="data_folder")
+    with tempfile.TemporaryDirectory(prefix="ultragray-scenes-") as folder:
+        link_scenes(files, Path(folder))
+        run(load_settings(**{**options, "data_folder": Path(folder)}))
+
+
+def ensure_scenes(folder: Path) -> None:
+    """Puts the demo scene into a data folder that is missing or holds no scene, and says so on stderr."""
+    if SceneStore(folder).names():
+        return
+    from ultragray.demo import build_demo_scene
+
+    typer.echo(f"{folder} holds no scenes: building the demo scene…", err=True)
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{DEMO_NAME}{SUFFIX}"
+    scene = build_demo_scene()
+    scene.save(path)
+    typer.echo(f"wrote {path}: {scene.info.dataset_name}, {scene.gaussian_count:,} Gaussians", err=True)
+
+
+def link_scenes(files: Iterable[Path], folder: Path) -> None:
+    """Links scene files into `folder`; refuses what could not be served under its own name."""
+    for file in files:
+        read_header(file)
+        link = folder / f"{file.stem}{SUFFIX}"
+        if link.is_symlink():
+            raise InvalidArgument(f"scenes must have different names, {file.stem!r} comes twice", field="scenes")
+        link.symlink_to(file.resolve())
+        if file.stem not in SceneStore(folder).names():
+            raise InvalidArgument(
+                f"scenes are served by name, at most 128 letters, digits, '.', '_', '-'; got {file.stem!r}",
+                field="scenes",
+            )
