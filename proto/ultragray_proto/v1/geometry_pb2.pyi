@@ -1,0 +1,79 @@
+from google.protobuf.internal import containers as _containers
+from google.protobuf import descriptor as _descriptor
+from google.protobuf import message as _message
+from collections.abc import Iterable as _Iterable, Mapping as _Mapping
+from typing import ClassVar as _ClassVar, Optional as _Optional, Union as _Union
+
+DESCRIPTOR: _descriptor.FileDescriptor
+
+class Position(_message.Message):
+    __slots__ = ("x", "y", "z")
+    X_FIELD_NUMBER: _ClassVar[int]
+    Y_FIELD_NUMBER: _ClassVar[int]
+    Z_FIELD_NUMBER: _ClassVar[int]
+    x: float
+    y: float
+    z: float
+    def __init__(self, x: _Optional[float] = ..., y: _Optional[float] = ..., z: _Optional[float] = ...) -> None: ...
+
+class Quaternion(_message.Message):
+    __slots__ = ("w", "x", "y", "z")
+    W_FIELD_NUMBER: _ClassVar[int]
+    X_FIELD_NUMBER: _ClassVar[int]
+    Y_FIELD_NUMBER: _ClassVar[int]
+    Z_FIELD_NUMBER: _ClassVar[int]
+    w: float
+    x: float
+    y: float
+    z: float
+    def __init__(self, w: _Optional[float] = ..., x: _Optional[float] = ..., y: _Optional[float] = ..., z: _Optional[float] = ...) -> None: ...
+
+class Matrix(_message.Message):
+    __slots__ = ("values",)
+    VALUES_FIELD_NUMBER: _ClassVar[int]
+    values: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, values: _Optional[_Iterable[float]] = ...) -> None: ...
+
+class Placement(_message.Message):
+    __slots__ = ("position_mm", "quaternion")
+    POSITION_MM_FIELD_NUMBER: _ClassVar[int]
+    QUATERNION_FIELD_NUMBER: _ClassVar[int]
+    position_mm: Position
+    quaternion: Quaternion
+    def __init__(self, position_mm: _Optional[_Union[Position, _Mapping]] = ..., quaternion: _Optional[_Union[Quaternion, _Mapping]] = ...) -> None: ...
+
+class Pose(_message.Message):
+    __slots__ = ("matrix", "placement")
+    MATRIX_FIELD_NUMBER: _ClassVar[int]
+    PLACEMENT_FIELD_NUMBER: _ClassVar[int]
+    matrix: Matrix
+    placement: Placement
+    def __init__(self, matrix: _Optional[_Union[Matrix, _Mapping]] = ..., placement: _Optional[_Union[Placement, _Mapping]] = ...) -> None: ...
+
+class LinearProbe(_message.Message):
+    __slots__ = ("width_mm", "near_mm", "far_mm")
+    WIDTH_MM_FIELD_NUMBER: _ClassVar[int]
+    NEAR_MM_FIELD_NUMBER: _ClassVar[int]
+    FAR_MM_FIELD_NUMBER: _ClassVar[int]
+    width_mm: float
+    near_mm: float
+    far_mm: float
+    def __init__(self, width_mm: _Optional[float] = ..., near_mm: _Optional[float] = ..., far_mm: _Optional[float] = ...) -> None: ...
+
+class ConvexProbe(_message.Message):
+    __slots__ = ("opening_angle_deg", "near_mm", "far_mm")
+    OPENING_ANGLE_DEG_FIELD_NUMBER: _ClassVar[int]
+    NEAR_MM_FIELD_NUMBER: _ClassVar[int]
+    FAR_MM_FIELD_NUMBER: _ClassVar[int]
+    opening_angle_deg: float
+    near_mm: float
+    far_mm: float
+    def __init__(self, opening_angle_deg: _Optional[float] = ..., near_mm: _Optional[float] = ..., far_mm: _Optional[float] = ...) -> None: ...
+
+class Probe(_message.Message):
+    __slots__ = ("linear", "convex")
+    LINEAR_FIELD_NUMBER: _ClassVar[int]
+    CONVEX_FIELD_NUMBER: _ClassVar[int]
+    linear: LinearProbe
+    convex: ConvexProbe
+    def __init__(self, linear: _Optional[_Union[LinearProbe, _Mapping]] = ..., convex: _Optional[_Union[ConvexProbe, _Mapping]] = ...) -> None: ...

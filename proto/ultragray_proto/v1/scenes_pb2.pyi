@@ -1,0 +1,147 @@
+from ultragray_proto.v1 import geometry_pb2 as _geometry_pb2
+from google.protobuf.internal import containers as _containers
+from google.protobuf import descriptor as _descriptor
+from google.protobuf import message as _message
+from collections.abc import Iterable as _Iterable, Mapping as _Mapping
+from typing import ClassVar as _ClassVar, Optional as _Optional, Union as _Union
+
+DESCRIPTOR: _descriptor.FileDescriptor
+
+class ListScenesRequest(_message.Message):
+    __slots__ = ("page_size", "page_token")
+    PAGE_SIZE_FIELD_NUMBER: _ClassVar[int]
+    PAGE_TOKEN_FIELD_NUMBER: _ClassVar[int]
+    page_size: int
+    page_token: str
+    def __init__(self, page_size: _Optional[int] = ..., page_token: _Optional[str] = ...) -> None: ...
+
+class ListScenesResponse(_message.Message):
+    __slots__ = ("scenes", "next_page_token")
+    SCENES_FIELD_NUMBER: _ClassVar[int]
+    NEXT_PAGE_TOKEN_FIELD_NUMBER: _ClassVar[int]
+    scenes: _containers.RepeatedCompositeFieldContainer[SceneEntry]
+    next_page_token: str
+    def __init__(self, scenes: _Optional[_Iterable[_Union[SceneEntry, _Mapping]]] = ..., next_page_token: _Optional[str] = ...) -> None: ...
+
+class SceneEntry(_message.Message):
+    __slots__ = ("name", "loaded", "gaussian_count", "image_height", "image_width", "file_bytes", "error")
+    NAME_FIELD_NUMBER: _ClassVar[int]
+    LOADED_FIELD_NUMBER: _ClassVar[int]
+    GAUSSIAN_COUNT_FIELD_NUMBER: _ClassVar[int]
+    IMAGE_HEIGHT_FIELD_NUMBER: _ClassVar[int]
+    IMAGE_WIDTH_FIELD_NUMBER: _ClassVar[int]
+    FILE_BYTES_FIELD_NUMBER: _ClassVar[int]
+    ERROR_FIELD_NUMBER: _ClassVar[int]
+    name: str
+    loaded: bool
+    gaussian_count: int
+    image_height: int
+    image_width: int
+    file_bytes: int
+    error: Error
+    def __init__(self, name: _Optional[str] = ..., loaded: _Optional[bool] = ..., gaussian_count: _Optional[int] = ..., image_height: _Optional[int] = ..., image_width: _Optional[int] = ..., file_bytes: _Optional[int] = ..., error: _Optional[_Union[Error, _Mapping]] = ...) -> None: ...
+
+class GetSceneRequest(_message.Message):
+    __slots__ = ("scene",)
+    SCENE_FIELD_NUMBER: _ClassVar[int]
+    scene: str
+    def __init__(self, scene: _Optional[str] = ...) -> None: ...
+
+class Scene(_message.Message):
+    __slots__ = ("name", "loaded", "loaded_processes", "file_bytes", "gaussian_count", "sh_degree", "intensity", "centre_mm", "bounds_min_mm", "bounds_max_mm", "probe", "image_height", "image_width", "training_poses", "metrics", "dataset_name", "dataset_sha256")
+    class MetricsEntry(_message.Message):
+        __slots__ = ("key", "value")
+        KEY_FIELD_NUMBER: _ClassVar[int]
+        VALUE_FIELD_NUMBER: _ClassVar[int]
+        key: str
+        value: float
+        def __init__(self, key: _Optional[str] = ..., value: _Optional[float] = ...) -> None: ...
+    NAME_FIELD_NUMBER: _ClassVar[int]
+    LOADED_FIELD_NUMBER: _ClassVar[int]
+    LOADED_PROCESSES_FIELD_NUMBER: _ClassVar[int]
+    FILE_BYTES_FIELD_NUMBER: _ClassVar[int]
+    GAUSSIAN_COUNT_FIELD_NUMBER: _ClassVar[int]
+    SH_DEGREE_FIELD_NUMBER: _ClassVar[int]
+    INTENSITY_FIELD_NUMBER: _ClassVar[int]
+    CENTRE_MM_FIELD_NUMBER: _ClassVar[int]
+    BOUNDS_MIN_MM_FIELD_NUMBER: _ClassVar[int]
+    BOUNDS_MAX_MM_FIELD_NUMBER: _ClassVar[int]
+    PROBE_FIELD_NUMBER: _ClassVar[int]
+    IMAGE_HEIGHT_FIELD_NUMBER: _ClassVar[int]
+    IMAGE_WIDTH_FIELD_NUMBER: _ClassVar[int]
+    TRAINING_POSES_FIELD_NUMBER: _ClassVar[int]
+    METRICS_FIELD_NUMBER: _ClassVar[int]
+    DATASET_NAME_FIELD_NUMBER: _ClassVar[int]
+    DATASET_SHA256_FIELD_NUMBER: _ClassVar[int]
+    name: str
+    loaded: bool
+    loaded_processes: int
+    file_bytes: int
+    gaussian_count: int
+    sh_degree: int
+    intensity: str
+    centre_mm: _geometry_pb2.Position
+    bounds_min_mm: _geometry_pb2.Position
+    bounds_max_mm: _geometry_pb2.Position
+    probe: _geometry_pb2.Probe
+    image_height: int
+    image_width: int
+    training_poses: TrainingPoses
+    metrics: _containers.ScalarMap[str, float]
+    dataset_name: str
+    dataset_sha256: str
+    def __init__(self, name: _Optional[str] = ..., loaded: _Optional[bool] = ..., loaded_processes: _Optional[int] = ..., file_bytes: _Optional[int] = ..., gaussian_count: _Optional[int] = ..., sh_degree: _Optional[int] = ..., intensity: _Optional[str] = ..., centre_mm: _Optional[_Union[_geometry_pb2.Position, _Mapping]] = ..., bounds_min_mm: _Optional[_Union[_geometry_pb2.Position, _Mapping]] = ..., bounds_max_mm: _Optional[_Union[_geometry_pb2.Position, _Mapping]] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., image_height: _Optional[int] = ..., image_width: _Optional[int] = ..., training_poses: _Optional[_Union[TrainingPoses, _Mapping]] = ..., metrics: _Optional[_Mapping[str, float]] = ..., dataset_name: _Optional[str] = ..., dataset_sha256: _Optional[str] = ...) -> None: ...
+
+class TrainingPoses(_message.Message):
+    __slots__ = ("count", "position_min_mm", "position_max_mm", "first", "middle", "last")
+    COUNT_FIELD_NUMBER: _ClassVar[int]
+    POSITION_MIN_MM_FIELD_NUMBER: _ClassVar[int]
+    POSITION_MAX_MM_FIELD_NUMBER: _ClassVar[int]
+    FIRST_FIELD_NUMBER: _ClassVar[int]
+    MIDDLE_FIELD_NUMBER: _ClassVar[int]
+    LAST_FIELD_NUMBER: _ClassVar[int]
+    count: int
+    position_min_mm: _geometry_pb2.Position
+    position_max_mm: _geometry_pb2.Position
+    first: _geometry_pb2.Matrix
+    middle: _geometry_pb2.Matrix
+    last: _geometry_pb2.Matrix
+    def __init__(self, count: _Optional[int] = ..., position_min_mm: _Optional[_Union[_geometry_pb2.Position, _Mapping]] = ..., position_max_mm: _Optional[_Union[_geometry_pb2.Position, _Mapping]] = ..., first: _Optional[_Union[_geometry_pb2.Matrix, _Mapping]] = ..., middle: _Optional[_Union[_geometry_pb2.Matrix, _Mapping]] = ..., last: _Optional[_Union[_geometry_pb2.Matrix, _Mapping]] = ...) -> None: ...
+
+class LoadSceneRequest(_message.Message):
+    __slots__ = ("scene",)
+    SCENE_FIELD_NUMBER: _ClassVar[int]
+    scene: str
+    def __init__(self, scene: _Optional[str] = ...) -> None: ...
+
+class LoadSceneResponse(_message.Message):
+    __slots__ = ("scene", "loaded_processes")
+    SCENE_FIELD_NUMBER: _ClassVar[int]
+    LOADED_PROCESSES_FIELD_NUMBER: _ClassVar[int]
+    scene: str
+    loaded_processes: int
+    def __init__(self, scene: _Optional[str] = ..., loaded_processes: _Optional[int] = ...) -> None: ...
+
+class UnloadSceneRequest(_message.Message):
+    __slots__ = ("scene",)
+    SCENE_FIELD_NUMBER: _ClassVar[int]
+    scene: str
+    def __init__(self, scene: _Optional[str] = ...) -> None: ...
+
+class UnloadSceneResponse(_message.Message):
+    __slots__ = ("scene", "loaded_processes")
+    SCENE_FIELD_NUMBER: _ClassVar[int]
+    LOADED_PROCESSES_FIELD_NUMBER: _ClassVar[int]
+    scene: str
+    loaded_processes: int
+    def __init__(self, scene: _Optional[str] = ..., loaded_processes: _Optional[int] = ...) -> None: ...
+
+class Error(_message.Message):
+    __slots__ = ("reason", "field", "detail")
+    REASON_FIELD_NUMBER: _ClassVar[int]
+    FIELD_FIELD_NUMBER: _ClassVar[int]
+    DETAIL_FIELD_NUMBER: _ClassVar[int]
+    reason: str
+    field: str
+    detail: str
+    def __init__(self, reason: _Optional[str] = ..., field: _Optional[str] = ..., detail: _Optional[str] = ...) -> None: ...
