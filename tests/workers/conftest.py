@@ -1,0 +1,148 @@
+"""Scenes in a folder, pools over them, and a look at which processes there are."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import io
+import os
+import time
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
+from pathlib import Path
+from typing import Any, TypeVar
+
+import cv2
+import numpy as np
+import pytest
+
+from ultragray import GaussianScene, LinearProbe, render
+from ultragray_workers import Encoding, PoolConfig, RenderPool, RenderRequest, RenderResult, SceneStore
+
+PROBE = LinearProbe(width_mm=30.0, near_mm=0.0, far_mm=40.0)
+TIME_LIMIT_S = 60.0
+
+T = TypeVar("T")
+OpenPool = Callable[..., contextlib.AbstractAsyncContextManager[RenderPool]]
+
+
+@pytest.fixture
+def scene_folder(tmp_path: Path, random_scene: Callable[..., GaussianScene]) -> Path:
+    """Scenes `a` and `b`, which look different, trained with frames of 24x32."""
+    info = {"probe": PROBE, "image_height": 24, "image_width": 32}
+    random_scene(50, seed=1, info=info).save(tmp_path / "a.ugr")
+    random_scene(50, seed=2, info=info).save(tmp_path / "b.ugr")
+    return tmp_path
+
+
+@pytest.fixture
+def open_pool(scene_folder: Path) -> OpenPool:
+    @contextlib.asynccontextmanager
+    async def open_(**settings: Any) -> AsyncIterator[RenderPool]:
+        pool = RenderPool(SceneStore(scene_folder), PoolConfig(**{"threads_per_process": 1, **settings}))
+        await pool.start()
+        try:
+            yield pool
+        finally:
+            await pool.close()
+
+    return open_
+
+
+@pytest.fixture
+def expect_frames(scene_folder: Path) -> Callable[[RenderRequest, RenderResult], None]:
+    """Asserts that a result is what a direct render() of its request gives."""
+
+    def check(request: RenderRequest, result: RenderResult) -> None:
+        scene = GaussianScene.load(scene_folder / f"{request.scene}.ugr")
+        direct = render(
+            scene, request.probe, request.poses, height=result.height, width=result.width, outputs=request.outputs
+        )
+        floats = np.stack([getattr(direct, name).numpy() for name in request.outputs])  # [O, C, H, W]
+        bytes_ = np.round(np.clip(floats, 0, 1) * np.float32(255)).astype(np.uint8)
+        if request.encoding is Encoding.UINT8:
+            assert result.data == bytes_.tobytes()
+        elif request.encoding is Encoding.FLOAT32:
+            assert result.data == floats.astype("<f4").tobytes()
+        elif request.encoding is Encoding.PNG:
+            assert result.data.startswith(b"\x89PNG")
+            decoded = cv2.imdecode(np.frombuffer(result.data, np.uint8), cv2.IMREAD_UNCHANGED)
+            np.testing.assert_array_equal(decoded, bytes_[0, 0])
+        elif request.encoding is Encoding.JPEG:
+            assert result.data.startswith(b"\xff\xd8")
+            decoded = cv2.imdecode(np.frombuffer(result.data, np.uint8), cv2.IMREAD_UNCHANGED)
+            assert decoded.shape == bytes_[0, 0].shape
+            assert np.abs(decoded.astype(float) - bytes_[0, 0]).mean() < 6
+        else:
+            with np.load(io.BytesIO(result.data)) as archive:
+                assert set(archive) == {*request.outputs, "poses", "scene", "scene_sha256", "renderer"}
+                for number, name in enumerate(request.outputs):
+                    assert archive[name].dtype == np.float32
+                    np.testing.assert_array_equal(archive[name], floats[number])
+                np.testing.assert_array_equal(archive["poses"], request.poses)
+                assert str(archive["scene"]) == request.scene
+                assert str(archive["scene_sha256"]) == result.scene_sha256
+                assert str(archive["renderer"]) == result.renderer
+
+    return check
+
+
+@pytest.fixture(autouse=True)
+def nothing_left_behind() -> Iterator[None]:
+    """Every test must end with the processes and open files it began with."""
+    descriptors = open_channels_and_memories()
+    yield
+    give_up = time.monotonic() + 2.0
+    while pool_processes() and time.monotonic() < give_up:
+        time.sleep(0.01)
+    assert pool_processes() == {}
+    assert open_channels_and_memories() == descriptors
+
+
+def open_channels_and_memories() -> list[str]:
+    links = []
+    for descriptor in Path("/proc/self/fd").iterdir():
+        with contextlib.suppress(FileNotFoundError):
+            links.append(os.readlink(descriptor))
+    return sorted(link for link in links if link.startswith(("socket:", "/memfd:")))
+
+
+def pool_processes() -> dict[int, str]:
+    """Workers and templates of this test run, by process id: `ug-worker`, `ug-template`, or `python` at the start."""
+    found = {}
+    for folder in Path("/proc").iterdir():
+        if not folder.name.isdigit():
+            continue
+        try:
+            in_group = os.getpgid(int(folder.name)) == os.getpgid(0)
+            if in_group and b"ultragray_workers.template" in (folder / "cmdline").read_bytes():
+                found[int(folder.name)] = (folder / "comm").read_text().strip()
+        except (FileNotFoundError, ProcessLookupError):
+            continue
+    return found
+
+
+@pytest.fixture
+def until() -> Callable[..., Coroutine[Any, Any, None]]:
+    async def wait(condition: Callable[[], bool], timeout_s: float = 20.0) -> None:
+        """Returns once the condition holds."""
+        give_up = time.monotonic() + timeout_s
+        while not condition():
+            assert time.monotonic() < give_up, "the condition never held"
+            await asyncio.sleep(0.005)
+
+    return wait
+
+
+@pytest.fixture
+def run() -> Callable[[Coroutine[Any, Any, T]], T]:
+    """asyncio.run with a limit, so that a lost request fails its test instead of hanging it."""
+
+    def run_(coroutine: Coroutine[Any, Any, T]) -> T:
+        return asyncio.run(asyncio.wait_for(coroutine, TIME_LIMIT_S))
+
+    return run_
+
+
+@pytest.fixture
+def processes() -> Callable[[], dict[int, str]]:
+    return pool_processes

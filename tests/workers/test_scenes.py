@@ -1,0 +1,59 @@
+"""The folder of scene files."""
+
+from __future__ import annotations
+
+import pytest
+
+from ultragray.errors import SceneFileInvalid, SceneNotFound
+from ultragray_workers import SceneStore
+from ultragray_workers.scenes import resident_bytes
+
+
+def test_names_are_the_files_whose_names_can_stand_in_a_url(scene_folder):
+    store = SceneStore(scene_folder)
+    assert store.names() == ["a", "b"]
+    for other in ("-x.ugr", "with space.ugr", "a.txt", ".hidden.ugr", "x" * 129 + ".ugr"):
+        (scene_folder / other).write_bytes(b"")
+    (scene_folder / "folder.ugr").mkdir()
+    (scene_folder / "v1.2_b-c.ugr").write_bytes(b"")  # comes without a restart
+    assert store.names() == ["a", "b", "v1.2_b-c"]
+
+
+def test_a_folder_that_does_not_exist_has_no_scenes(tmp_path):
+    store = SceneStore(tmp_path / "missing")
+    assert store.names() == []
+    with pytest.raises(SceneNotFound, match="there are no scenes yet"):
+        store.header("a")
+
+
+@pytest.mark.parametrize("name", ["c", "", "../a", "/etc/passwd", "a.ugr", "a/../a", "a\0", "x" * 200])
+def test_unknown_and_impossible_names_are_not_found(scene_folder, name):
+    with pytest.raises(SceneNotFound, match="known scenes: a, b"):
+        SceneStore(scene_folder).path(name)
+
+
+def test_headers_are_read_again_only_when_the_file_changes(scene_folder):
+    store = SceneStore(scene_folder)
+    assert store.cached_header("a") is None
+    first = store.header("a")
+    assert first.info.gaussian_count == 50
+    assert store.header("a") is first
+    assert store.cached_header("a") is first
+    (scene_folder / "b.ugr").replace(scene_folder / "a.ugr")
+    assert store.cached_header("a") is None
+    assert store.header("a") is not first
+    (scene_folder / "a.ugr").unlink()
+    assert store.cached_header("a") is None
+    with pytest.raises(SceneNotFound):
+        store.header("a")
+
+
+def test_an_invalid_file_is_named_with_the_reason(scene_folder):
+    (scene_folder / "bad.ugr").write_bytes(b"not a scene")
+    with pytest.raises(SceneFileInvalid, match="bad.ugr"):
+        SceneStore(scene_folder).header("bad")
+
+
+def test_a_loaded_scene_costs_two_and_a_half_times_its_parameters(scene_folder):
+    info = SceneStore(scene_folder).header("a").info  # 50 Gaussians of degree 1: 15 floats each
+    assert resident_bytes(info) == 2.5 * 50 * 15 * 4

@@ -1,0 +1,213 @@
+"""Brings together what waits and who is idle, and follows each request until it is done or has failed."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+from collections.abc import Awaitable, Iterable
+
+from ultragray.errors import RenderFailed, UltragrayError
+
+from .launcher import Launcher
+from .memory import MemoryPool
+from .messages import Answer, ForkWorker, LoadJob, PackJob, Rendered, RenderJob, RenderPart, UnloadJob
+from .slot import Assignment, Command, Slot
+from .waiting import Packing, Part, Ticket, WaitingQueue, Work
+
+_MAX_DEATHS = 5
+
+
+class SceneChangedError(Exception):
+    """The parts of one request were rendered from two contents of a scene file: to be rendered anew."""
+
+
+class Dispatcher:
+    """The worker processes and the queue before them, in the event loop's thread."""
+
+    def __init__(self, launcher: Launcher, settings: ForkWorker, processes: int, waiting: WaitingQueue) -> None:
+        self.slots = [Slot(launcher, settings, self) for _ in range(processes)]
+        self._waiting = waiting
+        self._memories = MemoryPool()
+
+    async def start(self) -> None:
+        """Returns when every process has rendered a frame. Raises BackendUnavailable, RenderFailed."""
+        await _all([slot.start() for slot in self.slots])
+
+    def submit(self, ticket: Ticket) -> None:
+        """Queues a ticket; `ticket.done` tells when its frames lie in its memory. Raises QueueFull."""
+        self._waiting.add(ticket)
+        self._dispatch()
+
+    def discard(self, ticket: Ticket) -> None:
+        """Forgets a ticket, rendered or not: drops what still waits and takes its memory back."""
+        self._waiting.remove(ticket)
+        for memory in (ticket.memory, ticket.archive):
+            if memory is None:
+                continue
+            if ticket.in_flight:  # a worker may still write to it
+                os.close(memory)
+            else:
+                self._memories.release(memory)
+
+    async def close(self) -> None:
+        """Returns when all worker processes are gone. Fail the tickets first."""
+        await asyncio.gather(*(slot.close() for slot in self.slots))
+        self._memories.close()
+
+    async def command_all(self, job: LoadJob | UnloadJob) -> None:
+        """Has every process do a job. Raises what the first of them reports, after all have reported."""
+        loop = asyncio.get_running_loop()
+        commands = [Command(job, loop.create_future()) for _ in self.slots]
+        for slot, command in zip(self.slots, commands, strict=True):
+            slot.commands.append(command)
+        self._dispatch()
+        await _all([command.done for command in commands])
+
+    def _dispatch(self) -> None:
+        """Gives every idle worker something to do: commands first, then what waits."""
+        for slot in self.slots:
+            while slot.idle and slot.commands:
+                command = slot.commands.popleft()
+                if not command.done.done():
+                    slot.assign(command.job, Assignment(command=command))
+        idle = [slot for slot in self.slots if slot.idle]
+        while idle and (batch := self._waiting.take_batch()):
+            scene = batch[0].ticket.request.scene
+            slot = next((slot for slot in idle if scene in slot.resident), idle[0])
+            idle.remove(slot)
+            self._assign(slot, batch)
+
+    def _assign(self, slot: Slot, batch: list[Work]) -> None:
+        parts = [work for work in batch if isinstance(work, Part)]
+        for work in batch:
+            work.ticket.in_flight += 1
+            work.ticket.batch_size = max(work.ticket.batch_size, sum(part.frames for part in parts))
+            if work.ticket.memory is None:
+                work.ticket.memory = self._memories.acquire()
+        assignment = Assignment(parts=dict(enumerate(batch)))
+        ticket = batch[0].ticket
+        if parts:
+            slot.assign(_render_job(ticket, parts), assignment, _descriptors(part.ticket.memory for part in parts))
+        else:
+            if ticket.archive is None:
+                ticket.archive = self._memories.acquire()
+            slot.assign(_pack_job(ticket), assignment, _descriptors((ticket.memory, ticket.archive)))
+
+    def on_idle(self) -> None:
+        """A slot has a worker without work."""
+        self._dispatch()
+
+    def on_answer(self, assignment: Assignment, answer: Answer) -> None:
+        """A worker has done a part, or a command."""
+        outcome = answer.outcome
+        if assignment.command is not None:
+            if isinstance(outcome, UltragrayError):
+                assignment.command.fail(outcome)
+            elif not assignment.command.done.done():
+                assignment.command.done.set_result(None)
+            return
+        work = assignment.parts.pop(answer.part)
+        ticket = work.ticket
+        ticket.in_flight -= 1
+        if ticket.done.done():
+            return
+        if isinstance(outcome, Rendered):
+            self._advance(ticket, work, outcome)
+        else:
+            self._fail_ticket(ticket, outcome or RenderFailed("a worker answered nothing"))
+
+    def on_death(self, slot: Slot, assignment: Assignment) -> None:
+        """A worker died with work it had not answered: that is done again, unless it has killed too many."""
+        failure = RenderFailed(f"the worker process died {_MAX_DEATHS} times while it was rendering this")
+        if (command := assignment.command) is not None and not command.done.done():
+            command.attempts += 1
+            if command.attempts >= _MAX_DEATHS:
+                command.fail(failure)
+            else:
+                slot.commands.appendleft(command)
+        for work in reversed(assignment.parts.values()):
+            work.ticket.in_flight -= 1
+            if work.ticket.done.done():
+                continue
+            if work.attempts + 1 >= _MAX_DEATHS:
+                self._fail_ticket(work.ticket, failure)
+                continue
+            for again in reversed(work.for_retry()):
+                self._waiting.put_first(again)
+        self._dispatch()
+
+    def _advance(self, ticket: Ticket, work: Work, outcome: Rendered) -> None:
+        """Takes a step of a ticket as done; completes it after its last."""
+        if isinstance(work, Packing):
+            ticket.done.set_result(_summary([*ticket.rendered, outcome]))
+            return
+        ticket.rendered.append(outcome)
+        ticket.rendered_poses += work.frames
+        if ticket.rendered_poses < len(ticket.request.poses):
+            return
+        if len({rendered.scene_sha256 for rendered in ticket.rendered}) > 1:
+            self._fail_ticket(ticket, SceneChangedError())
+        elif ticket.needs_packing:
+            self._waiting.put_first(Packing(ticket))
+            self._dispatch()
+        else:
+            ticket.done.set_result(_summary(ticket.rendered))
+
+    def _fail_ticket(self, ticket: Ticket, error: Exception) -> None:
+        self._waiting.remove(ticket)
+        ticket.fail(error)
+
+
+async def _all(outcomes: Iterable[Awaitable[None]]) -> None:
+    """Waits for all of them, then raises the first error."""
+    for outcome in await asyncio.gather(*outcomes, return_exceptions=True):
+        if isinstance(outcome, BaseException):
+            raise outcome
+
+
+def _summary(steps: list[Rendered]) -> Rendered:
+    """The steps of one request as one; the last step knows the size of the reply."""
+    return Rendered(
+        size=steps[-1].size,
+        scene_sha256=steps[-1].scene_sha256,
+        renderer=steps[-1].renderer,
+        started=min(step.started for step in steps),
+        render_ms=sum(step.render_ms for step in steps),
+        encode_ms=sum(step.encode_ms for step in steps),
+    )
+
+
+def _render_job(ticket: Ticket, parts: list[Part]) -> RenderJob:
+    return RenderJob(
+        scene=ticket.request.scene,
+        path=ticket.path,
+        probe=ticket.probe,
+        height=ticket.height,
+        width=ticket.width,
+        parts=tuple(
+            RenderPart(
+                poses=part.ticket.request.poses[part.first : part.stop],
+                outputs=part.ticket.request.outputs,
+                encoding=part.ticket.request.encoding,
+                first=part.first,
+                total=len(part.ticket.request.poses),
+            )
+            for part in parts
+        ),
+    )
+
+
+def _pack_job(ticket: Ticket) -> PackJob:
+    return PackJob(
+        scene=ticket.request.scene,
+        scene_sha256=ticket.rendered[0].scene_sha256,
+        renderer=ticket.rendered[0].renderer,
+        poses=ticket.request.poses,
+        outputs=ticket.request.outputs,
+        height=ticket.height,
+        width=ticket.width,
+    )
+
+
+def _descriptors(memories: Iterable[int | None]) -> list[int]:
+    return [memory for memory in memories if memory is not None]

@@ -1,0 +1,66 @@
+"""Frames as bytes: the pixel work, done in the worker processes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, BinaryIO
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from ultragray.errors import RenderFailed
+from ultragray.probe import FloatArray
+
+from .types import Encoding
+
+JPEG_QUALITY = 90
+
+FrameArray = npt.NDArray[np.float32]
+ByteArray = npt.NDArray[np.uint8]
+
+
+def to_uint8(frames: FrameArray) -> ByteArray:
+    """round(255·clip(x, 0, 1)), the same shape."""
+    levels = np.multiply(frames, np.float32(255.0))
+    np.clip(levels, 0.0, 255.0, out=levels)
+    np.rint(levels, out=levels)
+    return levels.astype(np.uint8)
+
+
+def encode_pixels(frames: FrameArray, encoding: Encoding) -> npt.NDArray[np.generic]:  # [C, H, W] -> [C, H, W]
+    """Frames in the pixel type of an encoding, C order, little endian."""
+    pixel_type = encoding.pixel_type
+    pixels: npt.NDArray[Any] = to_uint8(frames) if pixel_type == np.uint8 else frames
+    return np.ascontiguousarray(pixels, dtype=pixel_type)
+
+
+def encode_image(frame: FrameArray, encoding: Encoding) -> ByteArray:  # [H, W] -> [bytes]
+    """A frame as the bytes of a grey PNG (at OpenCV's default settings) or JPEG file."""
+    suffix, options = (".png", []) if encoding is Encoding.PNG else (".jpg", [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    written, data = cv2.imencode(suffix, to_uint8(frame), options)
+    if not written:
+        raise RenderFailed(f"a frame of {frame.shape[0]}x{frame.shape[1]} pixels could not be written as {suffix[1:]}")
+    return data.astype(np.uint8, copy=False)
+
+
+def write_npz(
+    file: BinaryIO,
+    frames: Mapping[str, FrameArray],  # each [C, H, W]
+    poses: FloatArray,  # [C, 4, 4] mm
+    *,
+    scene: str,
+    scene_sha256: str,
+    renderer: str,
+) -> int:
+    """Writes an .npz archive at the start of `file` and returns its size in bytes."""
+    file.seek(0)
+    arrays: dict[str, Any] = {
+        **frames,
+        "poses": np.asarray(poses, dtype=np.float64),
+        "scene": np.array(scene),
+        "scene_sha256": np.array(scene_sha256),
+        "renderer": np.array(renderer),
+    }
+    np.savez(file, **arrays)
+    return file.tell()

@@ -1,0 +1,100 @@
+"""The scene files of a data folder, and what a loaded scene costs. Free of torch."""
+
+from __future__ import annotations
+
+import os
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from ultragray.errors import SceneNotFound
+from ultragray.scene_info import SceneHeader, SceneInfo, read_header, scene_file_invalid
+
+SUFFIX = ".ugr"
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
+_NAMES_IN_MESSAGE = 5
+
+# What the kernel prepares of a scene once (axes, activations, bounds) takes about 1.5 times the raw parameters.
+_RESIDENT_PER_RAW_BYTE = 2.5
+
+
+def resident_bytes(info: SceneInfo) -> int:
+    """Memory of a loaded scene in a worker: its raw float32 parameters and what the kernel prepares of them."""
+    floats_per_gaussian = 3 + 3 + 4 + 1 + (info.sh_degree + 1) ** 2  # means, scales, quats, transmittances, SH
+    return int(_RESIDENT_PER_RAW_BYTE * 4 * floats_per_gaussian * info.gaussian_count)
+
+
+@dataclass(frozen=True)
+class FileVersion:
+    """Tells one content of a file from the next, without reading it."""
+
+    mtime_ns: int
+    size: int
+    inode: int
+
+    @classmethod
+    def of(cls, path: str | Path) -> FileVersion:
+        status = os.stat(path)
+        return cls(mtime_ns=status.st_mtime_ns, size=status.st_size, inode=status.st_ino)
+
+
+class SceneStore:
+    """The scenes of one folder: `NAME.ugr` is the scene NAME. Files may come, change and go at any time."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = Path(folder)
+        self._headers: dict[str, tuple[FileVersion, SceneHeader]] = {}
+
+    def names(self) -> list[str]:
+        """The names of all scenes, sorted; files whose name could not stand in a URL are left out."""
+        try:
+            entries = list(self.folder.iterdir())
+        except (FileNotFoundError, NotADirectoryError):
+            return []
+        return sorted(
+            entry.stem
+            for entry in entries
+            if entry.suffix == SUFFIX and _NAME.fullmatch(entry.stem) and entry.is_file()
+        )
+
+    def path(self, name: str) -> Path:
+        """The file of a scene. Raises SceneNotFound, also for a name that no scene can have."""
+        if _NAME.fullmatch(name) and (path := self.file(name)).is_file():
+            return path
+        raise self._not_found(name)
+
+    def file(self, name: str) -> Path:
+        """Where the file of a scene lies, whether or not it exists."""
+        return self.folder / f"{name}{SUFFIX}"
+
+    def header(self, name: str) -> SceneHeader:
+        """A scene's description and training poses. Raises SceneNotFound, SceneFileInvalid."""
+        path = self.path(name)
+        try:
+            version = FileVersion.of(path)  # before reading, so that a change meanwhile counts as newer
+        except FileNotFoundError:
+            raise self._not_found(name) from None
+        except OSError as error:
+            raise scene_file_invalid(path, error) from error
+        cached = self._headers.get(name)
+        if cached is not None and cached[0] == version:
+            return cached[1]
+        header = read_header(path)
+        self._headers[name] = (version, header)
+        return header
+
+    def cached_header(self, name: str) -> SceneHeader | None:
+        """The description if it was read before and the file is unchanged, at the cost of one stat."""
+        cached = self._headers.get(name)
+        if cached is None:
+            return None
+        try:
+            return cached[1] if cached[0] == FileVersion.of(self.file(name)) else None
+        except OSError:
+            return None
+
+    def _not_found(self, name: str) -> SceneNotFound:
+        known = self.names()
+        shown = ", ".join(known[:_NAMES_IN_MESSAGE]) + (", …" if len(known) > _NAMES_IN_MESSAGE else "")
+        hint = f"known scenes: {shown}" if known else "there are no scenes yet"
+        return SceneNotFound(f"there is no scene {name[:128]!r}; {hint}", field="scene")

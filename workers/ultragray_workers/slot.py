@@ -1,0 +1,173 @@
+"""One place in the pool: a worker process, what it is doing, and its replacement when it dies."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+from ultragray.errors import Draining, RenderFailed, UltragrayError
+
+from .launcher import Launcher
+from .messages import Answer, ForkWorker, Hello, Job, LoadJob, UnloadJob
+from .peer import Peer
+from .waiting import Work
+
+logger = logging.getLogger(__name__)
+
+_START_ATTEMPTS = 3
+_FIRST_RETRY_DELAY_S = 0.05
+_LAST_RETRY_DELAY_S = 5.0
+
+
+@dataclass(eq=False)
+class Command:
+    """Something one certain slot is to do, whichever process fills it by then."""
+
+    job: LoadJob | UnloadJob
+    done: asyncio.Future[None]
+    attempts: int = 0  # workers that died with it
+
+    def fail(self, error: UltragrayError) -> None:
+        if not self.done.done():
+            self.done.set_exception(error)
+
+
+@dataclass(eq=False)
+class Assignment:
+    """What a worker is busy with: the parts of a batch that it has not answered yet, or a command."""
+
+    parts: dict[int, Work] = field(default_factory=dict)
+    command: Command | None = None
+
+
+class SlotListener(Protocol):
+    """The pool, as its slots see it."""
+
+    def on_answer(self, assignment: Assignment, answer: Answer) -> None: ...
+
+    def on_death(self, slot: Slot, assignment: Assignment) -> None: ...
+
+    def on_idle(self) -> None: ...
+
+
+class Slot:
+    def __init__(self, launcher: Launcher, settings: ForkWorker, listener: SlotListener) -> None:
+        self.resident: tuple[str, ...] = ()  # scenes its worker holds
+        self.commands: deque[Command] = deque()
+        self.replacements = 0
+        self._launcher = launcher
+        self._settings = settings
+        self._listener = listener
+        self._peer: Peer | None = None
+        self._greeted = False  # its worker has said Hello and works
+        self._assignment: Assignment | None = None
+        self._settled = asyncio.Event()  # it has once been ready, or could not be started
+        self._failed_starts = 0
+        self._start_error: UltragrayError | None = None
+        self._retry: asyncio.TimerHandle | None = None
+        self._closing = False
+
+    @property
+    def alive(self) -> bool:
+        return self._greeted
+
+    @property
+    def pid(self) -> int | None:
+        """The process at work here; None while there is none."""
+        return self._peer.pid if self._greeted and self._peer is not None else None
+
+    @property
+    def idle(self) -> bool:
+        return self._greeted and self._assignment is None
+
+    @property
+    def busy(self) -> bool:
+        return self._assignment is not None
+
+    async def start(self) -> None:
+        """Returns when the first worker is ready. Raises what keeps it from starting."""
+        self._launch()
+        await self._settled.wait()
+        if self._start_error is not None:
+            raise self._start_error
+
+    def _launch(self) -> None:
+        self._retry = None
+        self._start_error = None
+        self._peer = self._launcher.launch(self._settings, self._on_message, self._on_gone)
+
+    def assign(self, job: Job, assignment: Assignment, descriptors: Sequence[int] = ()) -> None:
+        """Gives the idle worker a job."""
+        assert self._peer is not None
+        self._assignment = assignment
+        self._peer.send(job, descriptors)
+
+    async def close(self) -> None:
+        """Returns when the process is gone; the commands it had not answered fail."""
+        self._closing = True
+        if self._retry is not None:
+            self._retry.cancel()
+        if self._peer is not None:
+            await self._peer.stop()
+        stopping = Draining("the service is stopping")
+        if not self._settled.is_set():
+            self._start_error = stopping
+            self._settled.set()
+        while self.commands:
+            self.commands.popleft().fail(stopping)
+
+    def _on_message(self, message: Hello | Answer) -> None:
+        assert self._peer is not None
+        if isinstance(message, Hello):
+            self._peer.pid = message.pid
+            if message.error is not None:
+                self._start_error = message.error  # the process exits now
+                return
+            self._greeted = True
+            self._failed_starts = 0
+            self._settled.set()
+            self._listener.on_idle()
+            return
+        self.resident = message.resident
+        assignment = self._assignment
+        assert assignment is not None
+        if message.last:
+            self._assignment = None
+        self._listener.on_answer(assignment, message)
+        if message.last:
+            self._listener.on_idle()
+
+    def _on_gone(self) -> None:
+        worked, self._greeted = self._greeted, False
+        assignment, self._assignment = self._assignment, None
+        self.resident = ()
+        if self._closing:
+            if assignment is not None:
+                self._listener.on_death(self, assignment)
+            return
+        if worked:
+            logger.warning("a render worker died (process %s); replacing it", self._peer and self._peer.pid)
+            self.replacements += 1
+            self._launch()
+        else:
+            self._start_again_later()
+        if assignment is not None:
+            self._listener.on_death(self, assignment)
+
+    def _start_again_later(self) -> None:
+        self._failed_starts += 1
+        known = self._start_error is not None
+        if self._start_error is None:
+            self._start_error = RenderFailed(
+                "a worker process ended before it was ready; its reason is on the service's standard error"
+            )
+        if not self._settled.is_set() and (known or self._failed_starts >= _START_ATTEMPTS):
+            self._settled.set()
+            return
+        delay_s = min(_LAST_RETRY_DELAY_S, _FIRST_RETRY_DELAY_S * 2.0 ** (self._failed_starts - 1))
+        logger.warning("a render worker could not start: %s; trying again in %.2f s", self._start_error, delay_s)
+        self._retry = asyncio.get_running_loop().call_later(delay_s, self._launch)

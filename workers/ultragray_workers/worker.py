@@ -1,0 +1,248 @@
+"""The worker process: takes jobs from its channel one at a time, renders, encodes, answers. Imports torch."""
+
+from __future__ import annotations
+
+import logging
+import mmap
+import os
+import select
+import signal
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+import ultragray
+from ultragray import GaussianScene, LinearProbe, Probe, cpu, render
+from ultragray.errors import RenderFailed, UltragrayError
+from ultragray.probe import FloatArray
+
+from .channel import Channel
+from .encoding import FrameArray, encode_image, encode_pixels, write_npz
+from .memory import write_at
+from .messages import (
+    Answer,
+    ForkWorker,
+    Hello,
+    Job,
+    LoadJob,
+    PackJob,
+    Rendered,
+    RenderJob,
+    RenderPart,
+    UnloadJob,
+)
+from .scene_cache import LoadedScene, SceneCache
+from .types import Encoding
+
+MAX_DETAIL_LENGTH = 2000
+
+logger = logging.getLogger(__name__)
+
+
+def run_worker(channel: Channel, settings: ForkWorker) -> None:
+    """Serves the channel until the service hangs up or dies."""
+    signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+    threading.Thread(target=_exit_with_service, args=(channel.fileno(),), daemon=True).start()
+    torch.set_num_threads(settings.threads)
+    torch.set_grad_enabled(False)
+    worker = _Worker(channel, settings)
+    try:
+        worker.warm_up()
+    except Exception as error:
+        channel.send(Hello(os.getpid(), error=_as_reported(error)))
+        return
+    channel.send(Hello(os.getpid()))
+    while True:
+        try:
+            job, descriptors = channel.receive()
+        except (EOFError, ConnectionError):
+            return
+        worker.do(job, descriptors)
+
+
+def _exit_with_service(channel_descriptor: int) -> None:
+    """Ends this process, in the middle of a frame if need be, when the service hangs up or dies."""
+    poll = select.poll()
+    poll.register(channel_descriptor, select.POLLRDHUP)
+    poll.poll()
+    os._exit(0)
+
+
+class _Worker:
+    def __init__(self, channel: Channel, settings: ForkWorker) -> None:
+        self._channel = channel
+        self._backend = settings.backend
+        self._scenes = SceneCache(settings.memory_budget_bytes)
+
+    def warm_up(self) -> None:
+        """Renders and encodes a small frame, so that the first request does not pay for first uses."""
+        shapes = {"means": (1, 3), "scales": (1, 3), "transmittances": (1,), "sh0": (1, 1, 1)}
+        splats = {name: torch.zeros(shape) for name, shape in shapes.items()} | {"quats": torch.ones(1, 4)}
+        frames = self._render_small(GaussianScene.from_splats(splats))
+        encode_image(frames["bmode"][0], Encoding.PNG)
+
+    def do(self, job: Job, descriptors: list[int]) -> None:
+        """Does one job and answers it, whatever happens."""
+        try:
+            if isinstance(job, RenderJob):
+                for index, outcome in enumerate(self._render_parts(job, descriptors)):
+                    self._answer(index, outcome, last=index == len(job.parts) - 1)
+            else:
+                self._answer(0, self._do_other(job, descriptors), last=True)
+        finally:
+            for descriptor in descriptors:
+                os.close(descriptor)
+
+    def _answer(self, part: int, outcome: Rendered | UltragrayError | None, *, last: bool) -> None:
+        self._channel.send(Answer(part=part, outcome=outcome, last=last, resident=self._scenes.names()))
+
+    def _do_other(self, job: PackJob | LoadJob | UnloadJob, descriptors: list[int]) -> Rendered | UltragrayError | None:
+        try:
+            if isinstance(job, PackJob):
+                return _pack(job, *descriptors)
+            if isinstance(job, LoadJob):
+                self._render_small(self._scenes.get(job.scene, job.path).scene)  # lets the kernel prepare the scene
+            else:
+                self._scenes.drop(job.scene)
+        except Exception as error:
+            return _as_reported(error)
+        return None
+
+    def _render_parts(self, job: RenderJob, memories: Sequence[int]) -> Iterator[Rendered | UltragrayError]:
+        """One outcome per part, each as soon as its frames are written."""
+        try:
+            loaded = self._scenes.get(job.scene, job.path)
+        except Exception as error:
+            yield from [_as_reported(error)] * len(job.parts)
+            return
+        outputs = tuple(dict.fromkeys(name for part in job.parts for name in part.outputs))
+        poses = np.concatenate([part.poses for part in job.parts])  # [C, 4, 4]
+        started = time.monotonic()
+        try:
+            frames = self._render(loaded.scene, job.probe, poses, job.height, job.width, outputs)
+        except Exception as error:
+            if len(job.parts) == 1:
+                yield _as_reported(error)
+                return
+            for part, memory in zip(job.parts, memories, strict=True):  # alone: it may be one that fails
+                yield from self._render_parts(replace(job, parts=(part,)), [memory])
+            return
+        rendered = Rendered(
+            size=0,
+            scene_sha256=loaded.sha256,
+            renderer=self._renderer(loaded),
+            started=started,
+            render_ms=_since_ms(started),
+            encode_ms=0.0,
+        )
+        begin = 0
+        for part, memory in zip(job.parts, memories, strict=True):
+            end = begin + len(part.poses)
+            yield _write_part(
+                job.scene, part, {name: frames[name][begin:end] for name in part.outputs}, memory, rendered
+            )
+            begin = end
+
+    def _render(
+        self,
+        scene: GaussianScene,
+        probe: Probe,
+        poses: FloatArray,  # [C, 4, 4] mm
+        height: int,
+        width: int,
+        outputs: tuple[str, ...],
+    ) -> dict[str, FrameArray]:  # each [C, H, W]
+        frames = render(scene, probe, poses, height=height, width=width, outputs=outputs, backend=self._backend)
+        return {name: getattr(frames, name).to("cpu", torch.float32).numpy() for name in outputs}
+
+    def _render_small(self, scene: GaussianScene) -> dict[str, FrameArray]:  # each [1, 16, 16]
+        probe = LinearProbe(width_mm=10.0, near_mm=0.0, far_mm=10.0)
+        return self._render(scene, probe, np.eye(4)[None], 16, 16, ("bmode",))
+
+    def _renderer(self, loaded: LoadedScene) -> str:
+        backend = self._backend
+        if backend == "auto":
+            backend = "cpu" if cpu.supports(loaded.scene) else "reference"
+        return f"ultragray/{ultragray.__version__} {backend}"
+
+
+def _write_part(
+    scene: str,
+    part: RenderPart,
+    frames: dict[str, FrameArray],  # each [C, H, W]
+    memory: int,
+    rendered: Rendered,
+) -> Rendered | UltragrayError:
+    """Encodes a part into its request's memory: a whole file, or its share of the pixels."""
+    started = time.monotonic()
+    try:
+        if part.encoding.is_image_file:
+            image = encode_image(frames[part.outputs[0]][0], part.encoding)
+            write_at(memory, image.data, 0)
+            size = image.nbytes
+        elif part.encoding is Encoding.NPZ and len(part.poses) == part.total:
+            with os.fdopen(os.dup(memory), "wb") as file:
+                size = write_npz(
+                    file,
+                    frames,
+                    part.poses,
+                    scene=scene,
+                    scene_sha256=rendered.scene_sha256,
+                    renderer=rendered.renderer,
+                )
+        else:
+            size = 0
+            for number, name in enumerate(part.outputs):
+                pixels = encode_pixels(frames[name], part.encoding)
+                frame_bytes = pixels[0].nbytes
+                write_at(memory, pixels.data.cast("B"), (number * part.total + part.first) * frame_bytes)
+                size += part.total * frame_bytes
+    except Exception as error:
+        return _as_reported(error)
+    return replace(rendered, size=size, encode_ms=_since_ms(started))
+
+
+def _pack(job: PackJob, pixels_memory: int, archive_memory: int) -> Rendered:
+    """The .npz of float32 frames that parts left in memory, output after output."""
+    started = time.monotonic()
+    shape = (len(job.outputs), len(job.poses), job.height, job.width)
+    with (
+        mmap.mmap(pixels_memory, 4 * int(np.prod(shape)), prot=mmap.PROT_READ) as pixels,
+        os.fdopen(os.dup(archive_memory), "wb") as file,
+    ):
+        frames = np.frombuffer(pixels, dtype="<f4").reshape(shape)
+        size = write_npz(
+            file,
+            dict(zip(job.outputs, frames, strict=True)),
+            job.poses,
+            scene=job.scene,
+            scene_sha256=job.scene_sha256,
+            renderer=job.renderer,
+        )
+        del frames  # the map cannot be closed while an array looks into it
+    return Rendered(
+        size=size,
+        scene_sha256=job.scene_sha256,
+        renderer=job.renderer,
+        started=started,
+        render_ms=0.0,
+        encode_ms=_since_ms(started),
+    )
+
+
+def _as_reported(error: Exception) -> UltragrayError:
+    """The error as the service gets it: ours as they are, all others as RenderFailed and in the log."""
+    if not isinstance(error, UltragrayError):
+        logger.error("rendering failed", exc_info=error)
+        return RenderFailed(f"rendering failed: {type(error).__name__}: {error}"[:MAX_DETAIL_LENGTH])
+    if len(error.detail) > MAX_DETAIL_LENGTH:  # such as the tensor names of a hostile file
+        return type(error)(error.detail[:MAX_DETAIL_LENGTH] + "…", field=error.field)
+    return error
+
+
+def _since_ms(started: float) -> float:
+    return (time.monotonic() - started) * 1000.0
