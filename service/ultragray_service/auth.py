@@ -1,0 +1,34 @@
+"""API keys: the same rule for both front doors."""
+
+from __future__ import annotations
+
+import hmac
+from collections.abc import Sequence
+
+from pydantic import SecretStr
+from ultragray.errors import Unauthenticated
+
+
+class KeyGuard:
+    """Knows the keys. Without keys everyone may pass."""
+
+    def __init__(self, keys: Sequence[SecretStr]) -> None:
+        self._keys = [key.get_secret_value().encode() for key in keys]
+
+    def check(self, authorization: str | None, x_api_key: str | None) -> None:
+        """Raises Unauthenticated unless `Authorization: Bearer KEY` or `X-API-Key: KEY` has a known key."""
+        if not self._keys:
+            return
+        offered = x_api_key
+        if offered is None and authorization is not None:
+            scheme, _, token = authorization.partition(" ")
+            offered = token.strip() if scheme.lower() == "bearer" else None
+        if offered is None:
+            raise Unauthenticated(
+                "an API key is required: send Authorization: Bearer KEY, or X-API-Key: KEY",
+                field="Authorization",
+            )
+        candidate = offered.encode()
+        # Every key is compared, so that the time tells nothing about which one came close.
+        if not sum([hmac.compare_digest(candidate, key) for key in self._keys]):
+            raise Unauthenticated("the API key is not known", field="Authorization")

@@ -1,0 +1,45 @@
+"""What routes ask for."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from fastapi import Depends, Path
+from starlette.requests import HTTPConnection
+
+from ..state import Service
+from .problems import PROBLEM_TYPE, Problem
+
+
+def _service(connection: HTTPConnection) -> Service:
+    service = connection.app.state.service
+    assert isinstance(service, Service)
+    return service
+
+
+ServiceDep = Annotated[Service, Depends(_service)]
+SceneName = Annotated[
+    str, Path(description="Name of the scene: its file name without .ugr.", examples=["demo"])
+]
+
+
+def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
+    """The documentation of error answers, for `responses=`."""
+    content = {PROBLEM_TYPE: {"schema": {"$ref": f"#/components/schemas/{Problem.__name__}"}}}
+    return {status: {"description": _MEANINGS[status], "content": content} for status in statuses}
+
+
+_MEANINGS = {
+    401: "No API key, or an unknown one (UNAUTHENTICATED), where the service asks for one.",
+    404: "No such scene (SCENE_NOT_FOUND).",
+    406: "The Accept header allows no type that can hold the request (NOT_ACCEPTABLE).",
+    413: "The body is over the limit (BODY_TOO_LARGE).",
+    415: "The body is not JSON (UNSUPPORTED_MEDIA_TYPE).",
+    422: "A value cannot be used: INVALID_ARGUMENT, INVALID_POSE, INVALID_PROBE, INVALID_IMAGE_SIZE, "
+    "UNKNOWN_OUTPUT, TOO_MANY_POSES, SCENE_FILE_INVALID. `field` names it.",
+    429: "Too many frames wait (QUEUE_FULL); retry after the seconds of Retry-After.",
+    500: "Rendering failed (RENDER_FAILED, INTERNAL).",
+    503: "The service is starting or stopping (NOT_READY, DRAINING); retry after the seconds of Retry-After.",
+    504: "The deadline passed before the frame was rendered (DEADLINE_EXCEEDED).",
+    507: "The scene does not fit the memory budget (SCENE_TOO_LARGE).",
+}

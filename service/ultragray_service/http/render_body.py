@@ -1,0 +1,70 @@
+"""Reading a render request: the body as bytes, its checks, its poses."""
+
+from __future__ import annotations
+
+from pydantic import ValidationError
+from starlette.requests import Request
+from ultragray.errors import InvalidArgument, InvalidPose, UnsupportedMediaType
+from ultragray.pose import pose_from_position_quaternion
+from ultragray.probe import FloatArray, Probe
+
+from ..requests import check_pose_count, field_under, gather_poses, one_pose
+from .problems import invalid_argument
+from .schemas import PoseBody, RenderBody
+
+
+async def read_render_body(request: Request) -> RenderBody:
+    """The body, each field of the right type. Raises UnsupportedMediaType, BodyTooLarge, InvalidArgument."""
+    content_type = request.headers.get("content-type", "application/json")
+    media_type = content_type.partition(";")[0].strip().lower()
+    if media_type != "application/json" and not media_type.endswith("+json"):
+        raise UnsupportedMediaType(
+            f"Content-Type must be application/json, got {content_type!r}", field="Content-Type"
+        )
+    if request.headers.get("content-encoding", "identity").lower() != "identity":
+        raise UnsupportedMediaType("the body must not be compressed", field="Content-Encoding")
+    try:
+        return RenderBody.model_validate_json(await request.body())
+    except ValidationError as error:
+        raise invalid_argument(error.errors(include_url=False)[0]) from None
+
+
+def poses_as_written(body: RenderBody, limit: int) -> list[tuple[str, PoseBody]]:
+    """The poses, each with the path it has in the body. Raises InvalidArgument, TooManyPoses."""
+    if (body.pose is None) == (body.poses is None):
+        raise InvalidArgument("the body must hold exactly one of pose and poses", field="pose")
+    if body.pose is not None:
+        return [("pose", body.pose)]
+    poses = body.poses or []
+    check_pose_count(len(poses), limit)
+    return [(f"poses[{index}]", pose) for index, pose in enumerate(poses)]
+
+
+async def checked_poses(written: list[tuple[str, PoseBody]]) -> FloatArray:  # [C, 4, 4] mm
+    """The exact poses. Raises InvalidPose, naming the pose."""
+    return await gather_poses(len(written), lambda index: _checked_pose(*written[index]))
+
+
+def _checked_pose(path: str, pose: PoseBody) -> FloatArray:  # [4, 4] mm
+    if pose.matrix is not None:
+        if pose.position_mm is not None or pose.quaternion is not None:
+            raise InvalidPose(
+                f"{path} must hold either matrix, or position_mm and quaternion, not both", field=path
+            )
+        return one_pose(pose.matrix, field=f"{path}.matrix")
+    if pose.position_mm is None and pose.quaternion is None:
+        raise InvalidPose(f"{path} must hold either matrix, or position_mm and quaternion", field=path)
+    if pose.position_mm is None:
+        raise InvalidPose(f"{path}.position_mm is required beside quaternion", field=f"{path}.position_mm")
+    if pose.quaternion is None:
+        raise InvalidPose(f"{path}.quaternion is required beside position_mm", field=f"{path}.quaternion")
+    p, q = pose.position_mm, pose.quaternion
+    return pose_from_position_quaternion((p.x, p.y, p.z), (q.w, q.x, q.y, q.z), field=path)
+
+
+def asked_probe(body: RenderBody) -> Probe | None:
+    """The probe of the body. Raises InvalidProbe, naming the number."""
+    if body.probe is None:
+        return None
+    with field_under("probe"):
+        return body.probe.probe()

@@ -1,0 +1,23 @@
+"""Is the process alive; would it render."""
+
+from __future__ import annotations
+
+from fastapi import APIRouter
+
+from ..deps import ServiceDep, problems
+from ..schemas import Live, Ready
+
+router = APIRouter(prefix="/v1/health", tags=["health"])
+
+
+@router.get("/live")
+async def live() -> Live:
+    """200 as long as the process runs."""
+    return Live()
+
+
+@router.get("/ready", responses=problems(503))
+async def ready(service: ServiceDep) -> Ready:
+    """200 while frames are rendered; 503 while the service starts (NOT_READY) or stops (DRAINING)."""
+    service.require_ready()
+    return Ready()

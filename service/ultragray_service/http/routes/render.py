@@ -1,0 +1,109 @@
+"""Frames for poses. The Accept header chooses the form; the workers encode: no pixel is touched here."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from fastapi import APIRouter
+from starlette.requests import Request
+from starlette.responses import Response
+from ultragray.probe import probe_to_dict
+from ultragray.request import check_outputs
+from ultragray_workers.types import Encoding, Priority, RenderResult
+
+from ...requests import RenderSpec
+from ..accept import JPEG, NPZ, PNG, RAW, choose
+from ..deps import SceneName, ServiceDep, problems
+from ..disconnect import finish_or_abandon
+from ..examples import RENDER_EXAMPLES
+from ..render_body import asked_probe, checked_poses, poses_as_written, read_render_body
+from ..schemas import RenderBody
+
+router = APIRouter(prefix="/v1/scenes", tags=["render"])
+
+_DTYPES = {Encoding.FLOAT32: "float32", Encoding.NPZ: "float32"}
+
+RENDER_HEADERS = {
+    "X-Ultragray-Scene": "Name of the scene.",
+    "X-Ultragray-Scene-Sha256": "SHA-256 of the scene file.",
+    "X-Ultragray-Renderer": "Name, version and backend of the renderer.",
+    "X-Ultragray-Shape": "Outputs, poses, height, width: 1,1,512,512.",
+    "X-Ultragray-Dtype": "uint8 or float32 (little endian).",
+    "X-Ultragray-Outputs": "Outputs in the order of the data, with commas.",
+    "X-Ultragray-Pose": "One pose only: the 4x4 matrix that was used, JSON. Of many, npz holds `poses`.",
+    "X-Ultragray-Probe": "The probe that was used, JSON.",
+    "X-Ultragray-Queue-Ms": "Waiting time.",
+    "X-Ultragray-Render-Ms": "Render time of the batch that the poses were in.",
+    "X-Ultragray-Encode-Ms": "Encoding time.",
+    "X-Request-Id": "Id of the request: the one that was sent, or a new one.",
+    "Server-Timing": "The three times, for browsers.",
+}
+
+_OPENAPI: dict[str, Any] = {
+    "requestBody": {
+        "required": True,
+        "content": {
+            "application/json": {
+                "schema": {"$ref": f"#/components/schemas/{RenderBody.__name__}"},
+                "examples": RENDER_EXAMPLES,
+            }
+        },
+    },
+}
+_BINARY = {"schema": {"type": "string", "format": "binary"}}
+_ANSWER: dict[int | str, dict[str, Any]] = {
+    200: {
+        "description": "The frames. image/png and image/jpeg: one pose, one output. application/octet-stream "
+        "(parameter dtype=uint8 or float32): the outputs one after another, each [C, H, W]. application/x-npz "
+        "holds one float32 array [C, H, W] per output, `poses` [C, 4, 4], and the strings scene, scene_sha256 and "
+        "renderer. `*/*` gives PNG where it can hold the request, else npz.",
+        "content": {PNG: _BINARY, JPEG: _BINARY, RAW: _BINARY, NPZ: _BINARY},
+        "headers": {
+            name: {"description": text, "schema": {"type": "string"}} for name, text in RENDER_HEADERS.items()
+        },
+    }
+}
+
+
+@router.post(
+    "/{scene}/render",
+    response_class=Response,
+    openapi_extra=_OPENAPI,
+    responses=_ANSWER | problems(401, 404, 406, 413, 415, 422, 429, 500, 503, 504, 507),
+)
+async def render(request: Request, service: ServiceDep, scene: SceneName) -> Response:
+    """One frame per pose and output. Poses: probe to scene, in mm, in the frame of the training sweep."""
+    body = await read_render_body(request)
+    planner = service.planner
+    deadline = planner.deadline(None if body.timeout_ms is None else body.timeout_ms / 1000)
+    written = poses_as_written(body, planner.max_poses_at_once)
+    outputs = check_outputs(body.outputs)
+    choice = choose(
+        request.headers.get("accept", ""), frames=len(written), outputs=len(outputs), dtype=body.dtype
+    )
+    spec = RenderSpec(scene, asked_probe(body), body.height, body.width, outputs, choice.encoding)
+    planned = await planner.plan(spec, Priority.INTERACTIVE if body.poses is None else Priority.BATCH)
+    prepared = planner.with_poses(planned, await checked_poses(written), deadline)
+    result = await finish_or_abandon(service.render(prepared), request.receive, deadline)
+    return Response(result.data, 200, _headers(result), choice.media_type)
+
+
+def _headers(result: RenderResult) -> dict[str, str]:
+    queue, render_time, encode = (f"{ms:.3f}" for ms in (result.queue_ms, result.render_ms, result.encode_ms))
+    headers = {
+        "X-Ultragray-Scene": result.scene,
+        "X-Ultragray-Scene-Sha256": result.scene_sha256,
+        "X-Ultragray-Renderer": result.renderer,
+        "X-Ultragray-Shape": f"{len(result.outputs)},{len(result.poses)},{result.height},{result.width}",
+        "X-Ultragray-Dtype": _DTYPES.get(result.encoding, "uint8"),
+        "X-Ultragray-Outputs": ",".join(result.outputs),
+        "X-Ultragray-Probe": json.dumps(probe_to_dict(result.probe)),
+        "X-Ultragray-Queue-Ms": queue,
+        "X-Ultragray-Render-Ms": render_time,
+        "X-Ultragray-Encode-Ms": encode,
+        "Server-Timing": f"queue;dur={queue}, render;dur={render_time}, encode;dur={encode}",
+    }
+    if len(result.poses) == 1:
+        headers["X-Ultragray-Pose"] = json.dumps(result.poses[0].tolist())
+    return headers

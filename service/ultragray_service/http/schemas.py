@@ -1,0 +1,202 @@
+"""The JSON of requests and answers."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+from ultragray.pose import quaternion_from_pose
+from ultragray.probe import ConvexProbe, FloatArray, LinearProbe, Probe
+
+
+class RequestModel(BaseModel):
+    """Bodies are taken at their word: no coercion, no unknown keys, no NaN or infinity."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, frozen=True)
+
+
+class PositionBody(RequestModel):
+    """A point in the scene frame, mm."""
+
+    x: float
+    y: float
+    z: float
+
+
+class QuaternionBody(RequestModel):
+    """A rotation from the probe to the scene, unit norm within 1e-3."""
+
+    w: float
+    x: float
+    y: float
+    z: float
+
+
+MatrixRow = Annotated[list[float], Field(min_length=4, max_length=4)]
+MatrixRows = Annotated[list[MatrixRow], Field(min_length=4, max_length=4)]
+
+
+class PoseBody(RequestModel):
+    """A rigid probe-to-scene transform: `matrix` (4x4, mm), or `position_mm` and `quaternion`."""
+
+    matrix: MatrixRows | None = None
+    position_mm: PositionBody | None = None
+    quaternion: QuaternionBody | None = None
+
+
+class LinearProbeBody(RequestModel):
+    """Parallel scan lines; 0 <= near_mm < far_mm."""
+
+    kind: Literal["linear"]
+    width_mm: float
+    near_mm: float
+    far_mm: float
+
+    def probe(self) -> Probe:
+        """Raises InvalidProbe."""
+        return LinearProbe(width_mm=self.width_mm, near_mm=self.near_mm, far_mm=self.far_mm)
+
+
+class ConvexProbeBody(RequestModel):
+    """A fan of scan lines; near_mm is the radius of the face from the apex."""
+
+    kind: Literal["convex"]
+    opening_angle_deg: float
+    near_mm: float
+    far_mm: float
+
+    def probe(self) -> Probe:
+        """Raises InvalidProbe."""
+        return ConvexProbe(opening_angle_deg=self.opening_angle_deg, near_mm=self.near_mm, far_mm=self.far_mm)
+
+
+ProbeBody = Annotated[LinearProbeBody | ConvexProbeBody, Field(discriminator="kind")]
+
+
+class RenderBody(RequestModel):
+    """What to render. Exactly one of `pose` and `poses`; all else has a default from the scene."""
+
+    pose: PoseBody | None = Field(None, description="One pose; rendered before frames of `poses` that wait.")
+    poses: list[PoseBody] | None = Field(None, description="Many poses, answered together, in order.")
+    height: int | None = Field(
+        None, description="Depth samples. Default: that of the training images, else 512."
+    )
+    width: int | None = Field(None, description="Scan lines. Default: that of the training images, else 512.")
+    probe: ProbeBody | None = Field(None, description="Instead of the scene's own.")
+    outputs: list[str] = Field(["bmode"], description="Some of bmode, echo, transmittance, coverage.")
+    dtype: Literal["uint8", "float32"] | None = Field(
+        None,
+        description="Of application/octet-stream; a dtype in the Accept header goes first. Default: uint8.",
+    )
+    timeout_ms: float | None = Field(
+        None, gt=0, le=3_600_000, description="A frame that still waits after this time is dropped (504)."
+    )
+
+
+class PoseOut(BaseModel):
+    """A pose in both forms."""
+
+    matrix: list[list[float]]
+    position_mm: PositionBody
+    quaternion: QuaternionBody
+
+    @classmethod
+    def of(cls, pose: FloatArray) -> PoseOut:  # [4, 4]
+        """The JSON of a pose in mm."""
+        w, x, y, z = quaternion_from_pose(pose)
+        return cls(
+            matrix=pose.tolist(),
+            position_mm=position_body(pose[:3, 3]),
+            quaternion=QuaternionBody(w=w, x=x, y=y, z=z),
+        )
+
+
+def position_body(point: FloatArray | tuple[float, float, float]) -> PositionBody:
+    """The JSON of a point [3] in mm."""
+    x, y, z = (float(value) for value in point)
+    return PositionBody(x=x, y=y, z=z)
+
+
+class SceneError(BaseModel):
+    """Why a scene file cannot be read."""
+
+    reason: str
+    detail: str
+
+
+class SceneEntry(BaseModel):
+    """A scene in the list. A file that cannot be read has `error`, and null for what is in the file."""
+
+    name: str
+    loaded: bool
+    gaussian_count: int | None = None
+    image_height: int | None = None
+    image_width: int | None = None
+    file_bytes: int | None = None
+    error: SceneError | None = None
+
+
+class ScenePage(BaseModel):
+    """One page of scenes by name."""
+
+    scenes: list[SceneEntry]
+    next_page_token: str = Field(description="Empty on the last page.")
+
+
+class Bounds(BaseModel):
+    """A box in the scene frame, mm."""
+
+    min_mm: PositionBody
+    max_mm: PositionBody
+
+
+class TrainingPosesOut(BaseModel):
+    """The poses that the scene has seen; frames far from them extrapolate."""
+
+    count: int
+    position_min_mm: PositionBody | None = None
+    position_max_mm: PositionBody | None = None
+    first: PoseOut | None = None
+    middle: PoseOut | None = None
+    last: PoseOut | None = None
+
+
+class SceneOut(BaseModel):
+    """All that a scene says about itself."""
+
+    name: str
+    loaded: bool
+    loaded_processes: int
+    file_bytes: int
+    gaussian_count: int
+    sh_degree: int
+    intensity: str
+    centre_mm: PositionBody
+    bounds: Bounds = Field(description="Of the Gaussians' means.")
+    probe: ProbeBody | None
+    image_height: int | None
+    image_width: int | None
+    training_poses: TrainingPosesOut
+    metrics: dict[str, float]
+    dataset_name: str | None
+    dataset_sha256: str | None
+
+
+class SceneLoaded(BaseModel):
+    """What :load and :unload left behind."""
+
+    scene: str
+    loaded: bool
+    loaded_processes: int
+
+
+class Live(BaseModel):
+    """The process runs."""
+
+    status: Literal["live"] = "live"
+
+
+class Ready(BaseModel):
+    """Frames are rendered."""
+
+    status: Literal["ready"] = "ready"

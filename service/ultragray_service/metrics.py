@@ -1,0 +1,116 @@
+"""Prometheus metrics. Queue time is kept apart from render time and encode time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from prometheus_client import CollectorRegistry, Counter, Histogram, ProcessCollector, generate_latest
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
+from prometheus_client.registry import Collector
+from ultragray_workers.pool import RenderPool
+from ultragray_workers.types import RenderResult
+
+_SECONDS = (
+    0.0005,
+    0.001,
+    0.002,
+    0.004,
+    0.006,
+    0.008,
+    0.012,
+    0.016,
+    0.024,
+    0.032,
+    0.064,
+    0.125,
+    0.25,
+    0.5,
+    1,
+    2,
+    5,
+    10,
+    30,
+)
+_POSES = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1024)
+
+
+class _PoolCollector(Collector):
+    """Reads the pool's state when it is scraped."""
+
+    def __init__(self, pool: RenderPool) -> None:
+        self._pool = pool
+
+    def collect(self) -> Iterator[Metric]:
+        statistics = self._pool.statistics()
+        yield GaugeMetricFamily("ultragray_waiting_frames", "Frames that wait.", value=statistics.waiting_frames)
+        yield GaugeMetricFamily("ultragray_busy_processes", "Processes that render now.", value=statistics.busy)
+        yield GaugeMetricFamily(
+            "ultragray_processes_alive", "Render processes alive.", value=statistics.processes_alive
+        )
+        yield CounterMetricFamily(
+            "ultragray_process_restarts",
+            "Render processes replaced after they died.",
+            value=statistics.restarts_total,
+        )
+        yield GaugeMetricFamily(
+            "ultragray_loaded_scenes", "Scenes that a process holds.", value=len(self._pool.loaded())
+        )
+
+
+class Metrics:
+    """One registry per service."""
+
+    def __init__(self, pool: RenderPool) -> None:
+        self.registry = CollectorRegistry()
+        self._requests = Counter(
+            "ultragray_requests",
+            "Requests answered; a stream counts once, at its end.",
+            ["door", "route", "status"],
+            registry=self.registry,
+        )
+        self._request_seconds = Histogram(
+            "ultragray_request_seconds",
+            "From the arrival of a request to the end of its answer.",
+            ["door", "route"],
+            buckets=_SECONDS,
+            registry=self.registry,
+        )
+        self._frame_errors = Counter(
+            "ultragray_stream_frame_errors",
+            "Messages of a stream that were answered with an error.",
+            ["reason"],
+            registry=self.registry,
+        )
+        self._frames = Counter("ultragray_frames", "Frames rendered.", registry=self.registry)
+        self._queue = self._histogram("queue", "Waiting time of a request before it was rendered.")
+        self._render = self._histogram("render", "Render time of the batch that a request was in.")
+        self._encode = self._histogram("encode", "Encoding time of a request's frames.")
+        self._batch = Histogram(
+            "ultragray_batch_poses", "Poses rendered together.", buckets=_POSES, registry=self.registry
+        )
+        self.registry.register(_PoolCollector(pool))
+        ProcessCollector(registry=self.registry)
+
+    def _histogram(self, stage: str, documentation: str) -> Histogram:
+        return Histogram(f"ultragray_{stage}_seconds", documentation, buckets=_SECONDS, registry=self.registry)
+
+    def count_request(self, door: str, route: str, status: str, seconds: float) -> None:
+        """One answered request of `door` http or grpc."""
+        self._requests.labels(door, route, status).inc()
+        self._request_seconds.labels(door, route).observe(seconds)
+
+    def count_frame_error(self, reason: str) -> None:
+        """One message of a stream that was answered with an error."""
+        self._frame_errors.labels(reason).inc()
+
+    def observe_result(self, result: RenderResult) -> None:
+        """One rendered request of the pool."""
+        self._frames.inc(len(result.poses))
+        self._queue.observe(result.queue_ms / 1000)
+        self._render.observe(result.render_ms / 1000)
+        self._encode.observe(result.encode_ms / 1000)
+        self._batch.observe(result.batch_size)
+
+    def exposition(self) -> bytes:
+        """The text that Prometheus scrapes."""
+        return generate_latest(self.registry)

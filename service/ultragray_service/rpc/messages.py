@@ -1,0 +1,144 @@
+"""Between the messages of the wire and the values of the library."""
+
+from __future__ import annotations
+
+import numpy as np
+from ultragray.errors import InvalidArgument, InvalidPose, InvalidProbe, UltragrayError, UnknownOutput
+from ultragray.pose import pose_from_position_quaternion
+from ultragray.probe import ConvexProbe, FloatArray, LinearProbe, Probe
+from ultragray_proto.v1 import geometry_pb2, rendering_pb2, scenes_pb2
+from ultragray_workers.types import Encoding, RenderResult
+
+from ..requests import RenderSpec, field_under, one_pose
+
+OUTPUT_NAMES = {
+    rendering_pb2.OUTPUT_BMODE: "bmode",
+    rendering_pb2.OUTPUT_ECHO: "echo",
+    rendering_pb2.OUTPUT_TRANSMITTANCE: "transmittance",
+    rendering_pb2.OUTPUT_COVERAGE: "coverage",
+}
+_OUTPUT_NUMBERS = {name: number for number, name in OUTPUT_NAMES.items()}
+
+ENCODINGS = {
+    rendering_pb2.ENCODING_UNSPECIFIED: Encoding.UINT8,
+    rendering_pb2.ENCODING_UINT8: Encoding.UINT8,
+    rendering_pb2.ENCODING_FLOAT32: Encoding.FLOAT32,
+    rendering_pb2.ENCODING_PNG: Encoding.PNG,
+    rendering_pb2.ENCODING_JPEG: Encoding.JPEG,
+}
+_ENCODING_NUMBERS = {
+    encoding: number for number, encoding in ENCODINGS.items() if number != rendering_pb2.ENCODING_UNSPECIFIED
+}
+
+
+def pose_from_message(message: geometry_pb2.Pose, field: str) -> FloatArray:  # [4, 4] mm
+    """The exact pose. Raises InvalidPose, naming the part of `field` to blame."""
+    form = message.WhichOneof("form")
+    if form == "matrix":
+        values = message.matrix.values
+        if len(values) != 16:
+            raise InvalidPose(
+                f"{field}.matrix.values must hold 16 numbers, row by row, got {len(values)}",
+                field=f"{field}.matrix.values",
+            )
+        return one_pose(np.array(values).reshape(4, 4), field=f"{field}.matrix")
+    if form != "placement":
+        raise InvalidPose(f"{field} must hold matrix or placement", field=field)
+    placement = message.placement
+    for part in ("position_mm", "quaternion"):
+        if not placement.HasField(part):
+            raise InvalidPose(f"{field}.placement.{part} is required", field=f"{field}.placement.{part}")
+    p, q = placement.position_mm, placement.quaternion
+    return pose_from_position_quaternion((p.x, p.y, p.z), (q.w, q.x, q.y, q.z), field=f"{field}.placement")
+
+
+def probe_from_message(message: geometry_pb2.Probe) -> Probe:
+    """Raises InvalidProbe; its field is a path below the probe."""
+    kind = message.WhichOneof("kind")
+    if kind == "linear":
+        linear = message.linear
+        with field_under("linear"):
+            return LinearProbe(width_mm=linear.width_mm, near_mm=linear.near_mm, far_mm=linear.far_mm)
+    if kind == "convex":
+        convex = message.convex
+        with field_under("convex"):
+            return ConvexProbe(
+                opening_angle_deg=convex.opening_angle_deg, near_mm=convex.near_mm, far_mm=convex.far_mm
+            )
+    raise InvalidProbe("kind must be linear or convex, got none", field="kind")
+
+
+def probe_message(probe: Probe) -> geometry_pb2.Probe:
+    """The message of a probe."""
+    if isinstance(probe, LinearProbe):
+        linear = geometry_pb2.LinearProbe(width_mm=probe.width_mm, near_mm=probe.near_mm, far_mm=probe.far_mm)
+        return geometry_pb2.Probe(linear=linear)
+    convex = geometry_pb2.ConvexProbe(
+        opening_angle_deg=probe.opening_angle_deg, near_mm=probe.near_mm, far_mm=probe.far_mm
+    )
+    return geometry_pb2.Probe(convex=convex)
+
+
+def matrix_message(pose: FloatArray) -> geometry_pb2.Matrix:  # [4, 4]
+    """The message of a pose in mm."""
+    return geometry_pb2.Matrix(values=pose.ravel().tolist())
+
+
+def position_message(point: FloatArray | tuple[float, float, float]) -> geometry_pb2.Position:
+    """The message of a point [3] in mm."""
+    x, y, z = (float(value) for value in point)
+    return geometry_pb2.Position(x=x, y=y, z=z)
+
+
+def spec_from_message(message: rendering_pb2.RenderSettings) -> RenderSpec:
+    """What the settings ask for. Raises InvalidArgument; its field is a path below the settings."""
+    if message.encoding not in ENCODINGS:
+        raise InvalidArgument(
+            f"encoding must be one of the enum Encoding, got {message.encoding}", field="encoding"
+        )
+    for number in message.outputs:
+        if number not in OUTPUT_NAMES:
+            raise UnknownOutput(
+                f"outputs must be some of {', '.join(_enum_names())}, got number {number}", field="outputs"
+            )
+    probe = None
+    if message.HasField("probe"):
+        with field_under("probe"):
+            probe = probe_from_message(message.probe)
+    return RenderSpec(
+        scene=message.scene,
+        probe=probe,
+        height=message.height if message.HasField("height") else None,
+        width=message.width if message.HasField("width") else None,
+        outputs=tuple(OUTPUT_NAMES[number] for number in message.outputs) or ("bmode",),
+        encoding=ENCODINGS[message.encoding],
+    )
+
+
+def _enum_names() -> list[str]:
+    return [rendering_pb2.Output.Name(number) for number in OUTPUT_NAMES]
+
+
+def frame_message(result: RenderResult, sequence: int) -> rendering_pb2.Frame:
+    """The frame of a result of one pose."""
+    return rendering_pb2.Frame(
+        sequence=sequence,
+        scene=result.scene,
+        scene_sha256=result.scene_sha256,
+        renderer=result.renderer,
+        pose=matrix_message(result.poses[0]),
+        probe=probe_message(result.probe),
+        height=result.height,
+        width=result.width,
+        outputs=[_OUTPUT_NUMBERS[name] for name in result.outputs],
+        encoding=_ENCODING_NUMBERS[result.encoding],
+        data=result.data,
+        timings=rendering_pb2.Timings(
+            queue_ms=result.queue_ms, render_ms=result.render_ms, encode_ms=result.encode_ms
+        ),
+    )
+
+
+def error_message(error: UltragrayError) -> scenes_pb2.Error:
+    """The three facts of an error."""
+    return scenes_pb2.Error(reason=error.reason, field=error.field or "", detail=error.detail)

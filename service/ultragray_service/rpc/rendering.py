@@ -1,0 +1,83 @@
+"""RenderService: one frame, a batch of frames."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections import deque
+
+import grpc
+from ultragray.errors import InvalidArgument, QueueFull
+from ultragray_proto.v1 import rendering_pb2
+from ultragray_workers.types import Priority, RenderRequest, RenderResult
+
+from ..requests import check_pose_count, gather_poses
+from ..state import Service
+from .messages import frame_message, pose_from_message
+from .planning import plan_settings
+from .stream import FrameStream
+
+_RETRY_S = 0.02
+
+
+class RenderService:
+    """The methods of ultragray.v1.RenderService."""
+
+    def __init__(self, service: Service) -> None:
+        self._service = service
+
+    async def Render(  # noqa: N802
+        self, request: rendering_pb2.RenderRequest, context: grpc.aio.ServicerContext
+    ) -> rendering_pb2.Frame:
+        deadline = self._service.planner.deadline(context.time_remaining())
+        planned = await plan_settings(self._service, request, Priority.INTERACTIVE)
+        if not request.HasField("pose"):
+            raise InvalidArgument("pose is required", field="pose")
+        pose = pose_from_message(request.pose, "pose")
+        prepared = self._service.planner.with_poses(planned, pose[None], deadline)
+        return frame_message(await self._service.render(prepared), 0)
+
+    async def RenderBatch(  # noqa: N802
+        self, request: rendering_pb2.RenderBatchRequest, context: grpc.aio.ServicerContext
+    ) -> None:
+        planner = self._service.planner
+        check_pose_count(len(request.poses), planner.max_poses)
+        planned = await plan_settings(self._service, request, Priority.BATCH)
+        poses = await gather_poses(
+            len(request.poses), lambda index: pose_from_message(request.poses[index], f"poses[{index}]")
+        )
+        window = min(2 * self._service.settings.max_batch_poses, self._service.settings.queue_limit_frames)
+        in_flight: deque[asyncio.Task[RenderResult]] = deque()
+        started = 0
+        try:
+            for sequence in range(len(poses)):
+                while started < len(poses) and len(in_flight) < window:
+                    deadline = planner.deadline(context.time_remaining())
+                    prepared = planner.with_poses(planned, poses[started : started + 1], deadline)
+                    render = (
+                        self._service.render(prepared) if started == 0 else self._render_when_room(prepared)
+                    )
+                    in_flight.append(asyncio.ensure_future(render))
+                    started += 1
+                result = await in_flight[0]
+                in_flight.popleft()
+                await context.write(frame_message(result, sequence))
+        finally:
+            for task in in_flight:
+                task.cancel()
+            await asyncio.gather(*in_flight, return_exceptions=True)
+
+    async def RenderStream(  # noqa: N802
+        self, messages: object, context: grpc.aio.ServicerContext
+    ) -> None:
+        await FrameStream(self._service, context).run()
+
+    async def _render_when_room(self, request: RenderRequest) -> RenderResult:
+        """Renders a frame of a batch that was let in already: a full queue delays it."""
+        while True:
+            try:
+                return await self._service.render(request)
+            except QueueFull:
+                if request.deadline is not None and time.monotonic() + _RETRY_S >= request.deadline:
+                    raise
+            await asyncio.sleep(_RETRY_S)

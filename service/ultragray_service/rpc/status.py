@@ -1,0 +1,47 @@
+"""Every error as google.rpc.Status, with the reason and the field that HTTP tells."""
+
+from __future__ import annotations
+
+from typing import NoReturn
+
+import grpc
+from google.protobuf.any_pb2 import Any as AnyMessage  # type: ignore[import-untyped]
+from google.protobuf.duration_pb2 import Duration  # type: ignore[import-untyped]
+from google.rpc.error_details_pb2 import BadRequest, ErrorInfo, RetryInfo
+from google.rpc.status_pb2 import Status
+from ultragray.errors import InvalidArgument, UltragrayError
+
+from ..logs import request_id
+
+ERROR_DOMAIN = "ultragray"
+RETRY_DELAY_S = 1
+REQUEST_ID_KEY = "x-request-id"
+_DETAILS_KEY = "grpc-status-details-bin"
+_RETRY_STATUSES = (429, 503)
+
+
+def status_of(error: UltragrayError) -> Status:
+    """The status, with ErrorInfo (domain, reason, metadata `field`), BadRequest and RetryInfo where apt."""
+    code = getattr(grpc.StatusCode, error.grpc_status)
+    info = ErrorInfo(
+        reason=error.reason, domain=ERROR_DOMAIN, metadata={"field": error.field} if error.field else {}
+    )
+    details = [info]
+    if error.field and isinstance(error, InvalidArgument):
+        violation = BadRequest.FieldViolation(field=error.field, description=error.detail)
+        details.append(BadRequest(field_violations=[violation]))
+    if error.http_status in _RETRY_STATUSES:
+        details.append(RetryInfo(retry_delay=Duration(seconds=RETRY_DELAY_S)))
+    status = Status(code=code.value[0], message=error.detail)
+    for detail in details:
+        packed = AnyMessage()
+        packed.Pack(detail)
+        status.details.append(packed)
+    return status
+
+
+async def abort(context: grpc.aio.ServicerContext, error: UltragrayError) -> NoReturn:
+    """Ends the call with `error`."""
+    details = ((_DETAILS_KEY, status_of(error).SerializeToString()), (REQUEST_ID_KEY, request_id.get()))
+    await context.abort(getattr(grpc.StatusCode, error.grpc_status), error.detail, details)
+    raise AssertionError("abort always raises")

@@ -1,0 +1,88 @@
+"""What can be set, with units, defaults and limits: environment variables ULTRAGRAY_ + upper-case name."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, SecretStr, ValidationError, field_validator
+from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
+from ultragray.errors import InvalidArgument
+from ultragray.request import MAX_IMAGE_SIDE
+from ultragray_workers.pool import MAX_BATCH_POSES
+
+ENVIRONMENT_PREFIX = "ULTRAGRAY_"
+
+Words = Annotated[tuple[str, ...], NoDecode]
+Secrets = Annotated[tuple[SecretStr, ...], NoDecode]
+
+
+class Settings(BaseSettings):
+    """The settings of one service. Lists are written with commas: `ULTRAGRAY_PRELOAD=liver,spine`."""
+
+    model_config = SettingsConfigDict(env_prefix=ENVIRONMENT_PREFIX, extra="ignore", frozen=True)
+
+    host: str = Field("127.0.0.1", min_length=1, description="Address that both servers listen on; 0.0.0.0 for all.")
+    http_port: int = Field(8000, ge=0, le=65535, description="Port of HTTP; 0 takes a free one.")
+    grpc_port: int = Field(50051, ge=0, le=65535, description="Port of gRPC; 0 takes a free one.")
+    data_folder: Path = Field(Path("data"), description="Folder of the scene files (*.ugr). Must exist.")
+    preload: Words = Field((), description="Scenes loaded before the service is ready.")
+
+    processes: int = Field(1, ge=1, le=256, description="Render processes.")
+    threads_per_process: int = Field(0, ge=0, le=1024, description="Render threads each; 0: cores // processes.")
+    backend: Literal["auto", "cpu", "reference"] = Field("auto", description="Render backend.")
+    queue_limit_frames: int = Field(256, ge=1, le=100_000, description="Frames that may wait; beyond: QUEUE_FULL.")
+    max_batch_poses: int = Field(
+        16, ge=1, le=MAX_BATCH_POSES, description="Poses of one scene that are rendered together."
+    )
+    memory_budget_mb: int = Field(4096, ge=16, le=16_777_216, description="MiB of scenes held by each process.")
+
+    max_poses_per_request: int = Field(1024, ge=1, le=100_000, description="Poses in one request or batch.")
+    max_image_side: int = Field(2048, ge=1, le=MAX_IMAGE_SIDE, description="Largest height and width, pixels.")
+    max_request_pixels: int = Field(
+        2**26,
+        ge=1,
+        le=2**32,
+        description="Pixels that one answer may hold: poses x height x width x outputs.",
+    )
+    max_body_bytes: int = Field(8 * 2**20, ge=1024, le=2**30, description="Largest HTTP request body, bytes.")
+
+    default_timeout_s: float = Field(30.0, gt=0, le=3600, description="Deadline of a request that names none, seconds.")
+    drain_timeout_s: float = Field(
+        10.0, ge=0, le=3600, description="How long waiting frames may take at a stop, seconds."
+    )
+
+    api_keys: Secrets = Field((), description="Where set, every request but health needs one of these keys.")
+    cors_origins: Words = Field((), description="Origins whose pages may call HTTP; * for all.")
+    log_level: Literal["debug", "info", "warning", "error"] = Field("info", description="Least level that is logged.")
+
+    @field_validator("preload", "cors_origins", "api_keys", mode="before")
+    @classmethod
+    def _split_commas(cls, value: Any) -> Any:
+        if isinstance(value, str):
+            return tuple(word.strip() for word in value.split(",") if word.strip())
+        return value
+
+    @field_validator("api_keys")
+    @classmethod
+    def _refuse_short_keys(cls, keys: tuple[SecretStr, ...]) -> tuple[SecretStr, ...]:
+        if any(len(key.get_secret_value()) < 16 for key in keys):
+            raise ValueError("each key must have at least 16 characters")
+        return keys
+
+
+def load_settings(**overrides: Any) -> Settings:
+    """Settings of the environment, `overrides` on top.
+
+    Raises InvalidArgument that names the setting and its limits.
+    """
+    try:
+        return Settings(**overrides)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        name = str(first["loc"][0]) if first["loc"] else "settings"
+        given = "" if name == "api_keys" else f", got {first['input']!r}"
+        raise InvalidArgument(
+            f"{name} (environment variable {ENVIRONMENT_PREFIX}{name.upper()}): {first['msg']}{given}",
+            field=name,
+        ) from None

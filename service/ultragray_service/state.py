@@ -1,0 +1,112 @@
+"""The one place of the service's state: settings, scenes, pool, metrics, and the phase of its life."""
+
+from __future__ import annotations
+
+import asyncio
+from enum import Enum
+
+from ultragray.errors import Draining, NotReady, StartupFailed, UltragrayError
+from ultragray_workers.pool import PoolConfig, RenderPool
+from ultragray_workers.scenes import SceneStore
+from ultragray_workers.types import RenderRequest, RenderResult
+
+from .auth import KeyGuard
+from .catalog import SceneCatalog, scene_to_blame
+from .metrics import Metrics
+from .requests import RequestPlanner
+from .settings import Settings
+
+
+class Phase(Enum):
+    """Where the service is in its life."""
+
+    STARTING = "starting"
+    SERVING = "serving"
+    DRAINING = "draining"
+
+
+class Service:
+    """What both front doors share."""
+
+    def __init__(self, settings: Settings) -> None:
+        if not settings.data_folder.is_dir():
+            raise StartupFailed(
+                f"data_folder must be an existing folder, got {str(settings.data_folder)!r}",
+                field="data_folder",
+            )
+        store = SceneStore(settings.data_folder)
+        self.settings = settings
+        self.catalog = SceneCatalog(store)
+        self.planner = RequestPlanner(settings, self.catalog)
+        self.guard = KeyGuard(settings.api_keys)
+        self.pool = RenderPool(
+            store,
+            PoolConfig(
+                processes=settings.processes,
+                threads_per_process=settings.threads_per_process,
+                queue_limit_frames=settings.queue_limit_frames,
+                max_batch_poses=settings.max_batch_poses,
+                memory_budget_bytes=settings.memory_budget_mb * 2**20,
+                backend=settings.backend,
+            ),
+        )
+        self.metrics = Metrics(self.pool)
+        self.pool.on_rendered = self.metrics.observe_result
+        self.phase = Phase.STARTING
+        self.draining = asyncio.Event()
+
+    @property
+    def ready(self) -> bool:
+        """Whether a frame asked for now would be rendered."""
+        return self.phase is Phase.SERVING and self.pool.ready
+
+    def require_ready(self) -> None:
+        """Raises NotReady or Draining, saying why no frame would be rendered now."""
+        self._require_serving()
+        if not self.pool.ready:
+            raise NotReady("no render process is alive at the moment")
+
+    def _require_serving(self) -> None:
+        if self.phase is Phase.STARTING:
+            raise NotReady("the service is starting")
+        if self.phase is Phase.DRAINING:
+            raise Draining("the service is stopping")
+
+    async def start(self) -> None:
+        """Starts the pool and loads the scenes to preload. Raises StartupFailed."""
+        await self.pool.start()
+        for name in self.settings.preload:
+            try:
+                await self.pool.load(name)
+            except UltragrayError as error:
+                raise StartupFailed(f"scene {name!r} cannot be preloaded: {error.detail}", field="preload") from error
+        if self.phase is Phase.STARTING:
+            self.phase = Phase.SERVING
+
+    async def render(self, request: RenderRequest) -> RenderResult:
+        """Renders. Raises what RenderPool.render raises; cancelling drops a request that still waits."""
+        self._require_serving()
+        with scene_to_blame():
+            return await self.pool.render(request)
+
+    async def load(self, scene: str) -> int:
+        """Loads a scene into every process; how many hold it.
+
+        Raises SceneNotFound, SceneFileInvalid, SceneTooLarge.
+        """
+        self._require_serving()
+        with scene_to_blame():
+            await self.pool.load(scene)
+        return self.pool.loaded().get(scene, 0)
+
+    async def unload(self, scene: str) -> int:
+        """Frees a scene; how many processes still hold it. Raises SceneNotFound."""
+        self._require_serving()
+        with scene_to_blame():
+            await self.pool.unload(scene)
+        return self.pool.loaded().get(scene, 0)
+
+    def begin_draining(self) -> None:
+        """From now on frames are refused with Draining; streams end after the frames they have in flight."""
+        self.phase = Phase.DRAINING
+        self.draining.set()

@@ -1,0 +1,209 @@
+"""A real service in a process of its own, on free ports."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import grpc
+import httpx
+import numpy as np
+import pytest
+import torch
+
+from ultragray import GaussianScene, LinearProbe, SceneInfo
+from ultragray_proto.v1 import geometry_pb2, rendering_pb2, rendering_pb2_grpc, scenes_pb2_grpc
+
+ROOT = Path(__file__).resolve().parents[2]
+SOURCE_FOLDERS = ("model", "proto", "workers", "service")
+START_TIMEOUT_S = 60.0
+STOP_TIMEOUT_S = 30.0
+
+HEIGHT, WIDTH = 64, 48  # of the training images of the test scene
+
+
+class RunningService:
+    """`python -m ultragray_service` and the addresses it told in its log."""
+
+    def __init__(self, data_folder: Path, log_path: Path, environment: dict[str, str]) -> None:
+        self.data_folder = data_folder
+        self.log_path = log_path
+        settings = {
+            "ULTRAGRAY_DATA_FOLDER": str(data_folder),
+            "ULTRAGRAY_HTTP_PORT": "0",
+            "ULTRAGRAY_GRPC_PORT": "0",
+            "ULTRAGRAY_THREADS_PER_PROCESS": "1",
+            "PYTHONPATH": os.pathsep.join(str(ROOT / folder) for folder in SOURCE_FOLDERS),
+        }
+        with log_path.open("wb") as log:
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", "ultragray_service"],
+                env={**os.environ, **settings, **environment},
+                stderr=log,
+                cwd=log_path.parent,
+            )
+
+    def log(self) -> list[dict[str, Any]]:
+        return [json.loads(line) for line in self.log_path.read_text().splitlines() if line.startswith("{")]
+
+    def wait_until_serving(self) -> None:
+        end = time.monotonic() + START_TIMEOUT_S
+        while time.monotonic() < end:
+            for record in self.log():
+                if "grpc" in record:
+                    self.http, self.grpc = record["http"], record["grpc"]
+                    return
+            assert self.process.poll() is None, self.log_path.read_text()
+            time.sleep(0.05)
+        raise AssertionError(f"not serving after {START_TIMEOUT_S} s: {self.log_path.read_text()}")
+
+    def terminate(self) -> int:
+        if self.process.poll() is None:
+            self.process.send_signal(signal.SIGTERM)
+        try:
+            return self.process.wait(STOP_TIMEOUT_S)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+            raise
+
+    def channel(self) -> grpc.Channel:
+        return grpc.insecure_channel(self.grpc, options=[("grpc.max_receive_message_length", -1)])
+
+
+StartService = Callable[..., RunningService]
+
+
+def make_scene(gaussians: int = 400, *, probe: LinearProbe | None = None, seed: int = 0) -> GaussianScene:
+    """A cloud about the image plane, centred 20 mm deep, with five training poses 1 mm apart along y."""
+    rng = np.random.default_rng(seed)
+
+    def tensor(values: Any) -> torch.Tensor:
+        return torch.tensor(values, dtype=torch.float32)
+
+    poses = np.tile(np.eye(4), (5, 1, 1))
+    poses[:, 1, 3] = np.arange(5.0)
+    return GaussianScene.from_splats(
+        {
+            "means": tensor(rng.uniform(-2, 2, (gaussians, 3)) * [1, 0.1, 1]),
+            "scales": tensor(rng.normal(-2.0, 0.3, (gaussians, 3))),
+            "quats": tensor(rng.normal(size=(gaussians, 4))),
+            "transmittances": tensor(rng.normal(4, 1, gaussians)),
+            "sh0": tensor(rng.normal(1.0, 1.0, (gaussians, 1, 1))),
+        },
+        info=SceneInfo(
+            centre_mm=(0, 0, 20),
+            probe=probe,
+            image_height=HEIGHT,
+            image_width=WIDTH,
+            metrics={"psnr": 20.5},
+            dataset_name="synthetic",
+        ),
+        training_poses=poses,
+    )
+
+
+DEMO_PROBE = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=40.0)
+
+
+@pytest.fixture(scope="session")
+def demo_scene() -> GaussianScene:
+    return make_scene(probe=DEMO_PROBE)
+
+
+@pytest.fixture(scope="session")
+def data_folder(tmp_path_factory: pytest.TempPathFactory, demo_scene: GaussianScene) -> Path:
+    """Two scenes that render, one that needs a probe to be named, and three files that are no scenes."""
+    folder = tmp_path_factory.mktemp("data")
+    demo_scene.save(folder / "demo.ugr")
+    make_scene(seed=1, probe=DEMO_PROBE).save(folder / "second.ugr")
+    make_scene(20).save(folder / "probeless.ugr")
+    whole = (folder / "demo.ugr").read_bytes()
+    (folder / "truncated.ugr").write_bytes(whole[: len(whole) // 2])
+    (folder / "foreign.ugr").write_bytes(b"\x89PNG not a scene")
+    (folder / "empty.ugr").write_bytes(b"")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def start_service(tmp_path_factory: pytest.TempPathFactory, data_folder: Path) -> Iterator[StartService]:
+    """Starts services with settings as keywords: `start_service(max_image_side=128)`; all are stopped at the end."""
+    started: list[RunningService] = []
+
+    def start(*, wait: bool = True, **settings: object) -> RunningService:
+        environment = {f"ULTRAGRAY_{name.upper()}": str(value) for name, value in settings.items()}
+        service = RunningService(data_folder, tmp_path_factory.mktemp("service") / "log", environment)
+        started.append(service)
+        if wait:
+            service.wait_until_serving()
+        return service
+
+    yield start
+    for service in started:
+        service.terminate()
+
+
+@pytest.fixture(scope="session")
+def service(start_service: StartService) -> RunningService:
+    """The service that most tests share."""
+    return start_service(
+        max_image_side=600, max_poses_per_request=40, queue_limit_frames=64, max_request_pixels=4_000_000
+    )
+
+
+@pytest.fixture(scope="session")
+def http(service: RunningService) -> Iterator[httpx.Client]:
+    with httpx.Client(base_url=service.http, timeout=30) as client:
+        yield client
+
+
+@pytest.fixture(scope="session")
+def channel(service: RunningService) -> Iterator[grpc.Channel]:
+    with service.channel() as channel:
+        yield channel
+
+
+@pytest.fixture(scope="session")
+def renders(channel: grpc.Channel) -> rendering_pb2_grpc.RenderServiceStub:
+    return rendering_pb2_grpc.RenderServiceStub(channel)
+
+
+@pytest.fixture(scope="session")
+def scenes(channel: grpc.Channel) -> scenes_pb2_grpc.SceneServiceStub:
+    return scenes_pb2_grpc.SceneServiceStub(channel)
+
+
+@pytest.fixture
+def pose_body() -> dict[str, Any]:
+    """The identity 1 mm off centre, as HTTP takes it."""
+    return {"position_mm": {"x": 1.0, "y": 0.0, "z": 0.0}, "quaternion": {"w": 1.0, "x": 0.0, "y": 0.0, "z": 0.0}}
+
+
+@pytest.fixture
+def pose_matrix() -> Any:
+    """The same pose, [4, 4] mm."""
+    matrix = np.eye(4)
+    matrix[0, 3] = 1.0
+    return matrix
+
+
+@pytest.fixture
+def pose_message() -> geometry_pb2.Pose:
+    """The same pose, as gRPC takes it."""
+    return geometry_pb2.Pose(
+        placement=geometry_pb2.Placement(
+            position_mm=geometry_pb2.Position(x=1.0), quaternion=geometry_pb2.Quaternion(w=1.0)
+        )
+    )
+
+
+@pytest.fixture
+def settings_message() -> rendering_pb2.RenderSettings:
+    return rendering_pb2.RenderSettings(scene="demo")

@@ -1,0 +1,198 @@
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import grpc
+import httpx
+import pytest
+
+from ultragray_proto.v1 import rendering_pb2, rendering_pb2_grpc
+
+from .conftest import ROOT, SOURCE_FOLDERS, RunningService, StartService
+from .test_grpc_render import Conversation, error_info, moved
+
+IDENTITY = {"position_mm": {"x": 0, "y": 0, "z": 0}, "quaternion": {"w": 1, "x": 0, "y": 0, "z": 0}}
+SMALL = {"height": 80, "width": 80}
+SLOW = {"backend": "reference", "max_batch_poses": 1}  # so that frames still wait when a test looks
+
+
+def render(service: RunningService, client: httpx.Client, **body: Any) -> httpx.Response:
+    return client.post(f"{service.http}/v1/scenes/demo/render", json={"pose": IDENTITY, **body}, timeout=30)
+
+
+def wait_for_frames(service: RunningService) -> None:
+    end = time.monotonic() + 10
+    while time.monotonic() < end:
+        lines = httpx.get(f"{service.http}/metrics").text.splitlines()
+        if any(line.startswith("ultragray_waiting_frames ") and float(line.split()[1]) for line in lines):
+            return
+        time.sleep(0.01)
+    raise AssertionError("no frame ever waited")
+
+
+def waiting_frames(service: RunningService) -> float:
+    lines = httpx.get(f"{service.http}/metrics").text.splitlines()
+    return next(float(line.split()[1]) for line in lines if line.startswith("ultragray_waiting_frames "))
+
+
+def test_sigterm_answers_what_is_in_flight_and_exits_cleanly(start_service: StartService) -> None:
+    service = start_service(**SLOW)
+    frames = rendering_pb2.RenderSettings(scene="demo", **SMALL)
+    with service.channel() as channel, httpx.Client() as client, ThreadPoolExecutor(8) as threads:
+        stub = rendering_pb2_grpc.RenderServiceStub(channel)
+        conversation = Conversation(stub)
+        conversation.send(settings=frames)
+        for sequence in range(4):
+            conversation.send(sequence, pose=moved(0))
+        pending = [threads.submit(render, service, client, **SMALL) for _ in range(4)]
+        request = rendering_pb2.RenderRequest(settings=frames, pose=moved(0))
+        unary = stub.Render.future(request, timeout=30)
+        wait_for_frames(service)
+        service.process.send_signal(signal.SIGTERM)
+        assert [answer.result().status_code for answer in pending] == [200] * 4
+        assert unary.result().data
+        answered = []
+        with pytest.raises(grpc.RpcError) as caught:
+            for frame in conversation.call:
+                answered.append(frame.sequence)
+        assert answered == [0, 1, 2, 3]
+        assert caught.value.code() is grpc.StatusCode.UNAVAILABLE
+        assert error_info(caught.value)[0].reason == "DRAINING"
+        assert service.process.wait(30) == 0
+        with pytest.raises(httpx.ConnectError):
+            client.get(f"{service.http}/v1/health/live")
+
+
+def test_sigint_stops_an_idle_service_at_once(start_service: StartService) -> None:
+    service = start_service()
+    with httpx.Client() as idle, service.channel() as channel:
+        idle.get(f"{service.http}/v1/health/live")
+        grpc.channel_ready_future(channel).result(5)
+        began = time.monotonic()
+        service.process.send_signal(signal.SIGINT)
+        assert service.process.wait(30) == 0
+    assert time.monotonic() - began < 5
+    assert service.log()[-1]["message"] == "stopped"
+
+
+def test_sigterm_while_starting(start_service: StartService) -> None:
+    service = start_service(wait=False)
+    end = time.monotonic() + 20
+    while not service.log() and time.monotonic() < end:
+        time.sleep(0.02)
+    assert service.terminate() == 0
+    assert not any("grpc" in record for record in service.log()), "it was ready before it was stopped"
+
+
+def test_a_full_queue_is_told_with_a_time_to_retry(start_service: StartService) -> None:
+    service = start_service(**SLOW, queue_limit_frames=2)
+    with httpx.Client() as client, ThreadPoolExecutor(12) as threads:
+        answers = list(threads.map(lambda _: render(service, client, **SMALL), range(12)))
+        statuses = [answer.status_code for answer in answers]
+        assert set(statuses) == {200, 429}
+        refused = next(answer for answer in answers if answer.status_code == 429)
+        assert refused.json()["reason"] == "QUEUE_FULL"
+        assert int(refused.headers["retry-after"]) >= 1
+        with service.channel() as channel:
+            stub = rendering_pb2_grpc.RenderServiceStub(channel)
+            settings = rendering_pb2.RenderSettings(scene="demo", **SMALL)
+            batch = rendering_pb2.RenderBatchRequest(settings=settings, poses=[moved(0)] * 10)
+            assert len(list(stub.RenderBatch(batch, timeout=60))) == 10  # a batch waits for room by itself
+            stream = Conversation(stub)
+            stream.send(settings=settings)
+            for sequence in range(8):
+                stream.send(sequence, pose=moved(0))
+            frames = stream.finish()
+            assert [frame.sequence for frame in frames] == list(range(8))
+            assert {frame.error.reason for frame in frames} == {"", "QUEUE_FULL"}
+        assert render(service, client).status_code == 200
+
+
+def test_frames_of_a_client_that_has_gone_are_dropped(start_service: StartService) -> None:
+    service = start_service(**SLOW)
+    with httpx.Client() as client:
+        host, port = service.http.removeprefix("http://").split(":")
+        body = (
+            b'{"height": 80, "width": 80, "poses": ['
+            + b", ".join(
+                [b'{"position_mm": {"x": 0, "y": 0, "z": 0}, "quaternion": {"w": 1, "x": 0, "y": 0, "z": 0}}'] * 100
+            )
+            + b"]}"
+        )
+        head = (
+            f"POST /v1/scenes/demo/render HTTP/1.1\r\nHost: {host}\r\nContent-Type: application/json\r\n"
+            f"Content-Length: {len(body)}\r\n\r\n"
+        )
+        with socket.create_connection((host, int(port))) as connection:
+            connection.sendall(head.encode() + body)
+            wait_for_frames(service)
+        end = time.monotonic() + 3
+        while waiting_frames(service) and time.monotonic() < end:
+            time.sleep(0.02)
+        assert waiting_frames(service) == 0
+        assert render(service, client).status_code == 200
+
+
+def test_interactive_frames_go_before_a_batch(start_service: StartService) -> None:
+    service = start_service(**SLOW)
+    with service.channel() as channel, httpx.Client() as client:
+        stub = rendering_pb2_grpc.RenderServiceStub(channel)
+        settings = rendering_pb2.RenderSettings(scene="demo", **SMALL)
+        batch = rendering_pb2.RenderBatchRequest(settings=settings, poses=[moved(0)] * 12)
+        received: list[int] = []
+        reader = threading.Thread(target=lambda: received.extend(f.sequence for f in stub.RenderBatch(batch)))
+        reader.start()
+        wait_for_frames(service)
+        assert render(service, client, **SMALL).status_code == 200
+        done_before = len(received)
+        reader.join()
+        assert done_before <= 4
+        assert received == list(range(12))
+
+
+def test_a_port_in_use_is_one_clear_error(start_service: StartService, service: RunningService) -> None:
+    http_port, grpc_port = service.http.rsplit(":", 1)[1], service.grpc.rsplit(":", 1)[1]
+    for settings, name in (({"http_port": http_port}, "HTTP"), ({"grpc_port": grpc_port}, "gRPC")):
+        second = start_service(wait=False, **settings)
+        assert second.process.wait(30) == 1
+        said = second.log_path.read_text().splitlines()
+        assert f"{name} cannot listen on 127.0.0.1:" in said[-1]
+        assert "Traceback" not in second.log_path.read_text()
+
+
+@pytest.mark.parametrize(
+    ("settings", "expected"),
+    [
+        ({"data_folder": "/nonexistent"}, "data_folder must be an existing folder"),
+        ({"preload": "demo,nowhere"}, "'nowhere' cannot be preloaded"),
+        ({"processes": "none"}, "ULTRAGRAY_PROCESSES"),
+    ],
+)
+def test_bad_settings_are_one_clear_error(start_service: StartService, settings: dict[str, str], expected: str) -> None:
+    service = start_service(wait=False, **settings)
+    assert service.process.wait(60) == 1
+    said = service.log_path.read_text()
+    assert expected in said.splitlines()[-1]
+    assert "Traceback" not in said
+
+
+def test_the_service_process_never_imports_torch() -> None:
+    code = "import sys, ultragray_service.server; sys.exit('torch' in sys.modules)"
+    path = os.pathsep.join(str(ROOT / folder) for folder in SOURCE_FOLDERS)
+    subprocess.run([sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": path}, check=True)
+
+
+def test_a_running_service_holds_no_torch(service: RunningService) -> None:
+    maps = Path(f"/proc/{service.process.pid}/maps")
+    if not maps.exists():
+        pytest.skip("needs /proc")
+    assert "libtorch" not in maps.read_text()

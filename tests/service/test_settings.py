@@ -1,0 +1,55 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from ultragray.errors import InvalidArgument
+from ultragray_service.settings import load_settings
+
+
+def test_environment_sets_and_overrides_win(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ULTRAGRAY_HTTP_PORT", "9000")
+    monkeypatch.setenv("ULTRAGRAY_GRPC_PORT", "9001")
+    monkeypatch.setenv("ULTRAGRAY_PRELOAD", "liver, spine")
+    monkeypatch.setenv("ULTRAGRAY_DATA_FOLDER", "/scenes")
+    settings = load_settings(grpc_port=9002)
+    assert (settings.http_port, settings.grpc_port) == (9000, 9002)
+    assert settings.preload == ("liver", "spine")
+    assert settings.data_folder == Path("/scenes")
+
+
+def test_defaults() -> None:
+    settings = load_settings()
+    assert (settings.host, settings.http_port, settings.grpc_port) == ("127.0.0.1", 8000, 50051)
+    assert settings.max_poses_per_request == 1024
+    assert settings.max_body_bytes == 8 * 2**20
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("http_port", "65536"),
+        ("http_port", "eighty"),
+        ("processes", "0"),
+        ("default_timeout_s", "0"),
+        ("max_image_side", "99999"),
+        ("max_batch_poses", "0"),
+        ("backend", "gpu"),
+        ("log_level", "loud"),
+    ],
+)
+def test_bad_values_name_the_variable(monkeypatch: pytest.MonkeyPatch, name: str, value: str) -> None:
+    monkeypatch.setenv(f"ULTRAGRAY_{name.upper()}", value)
+    with pytest.raises(InvalidArgument, match=f"ULTRAGRAY_{name.upper()}.*{value}") as caught:
+        load_settings()
+    assert caught.value.field == name
+
+
+def test_short_keys_are_refused_and_no_key_is_shown(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ULTRAGRAY_API_KEYS", "hunter2")
+    with pytest.raises(InvalidArgument) as caught:
+        load_settings()
+    assert "hunter2" not in str(caught.value)
+    monkeypatch.setenv("ULTRAGRAY_API_KEYS", "0123456789abcdef")
+    assert "0123456789abcdef" not in repr(load_settings())

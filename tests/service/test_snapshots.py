@@ -1,0 +1,95 @@
+"""The public interface, pinned. After a wanted change: ULTRAGRAY_UPDATE_SNAPSHOTS=1 pytest tests/service/test_snapshots.py"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+from google.protobuf.descriptor import Descriptor, FileDescriptor
+
+from ultragray import errors
+from ultragray_proto.v1 import geometry_pb2, rendering_pb2, scenes_pb2
+from ultragray_service.settings import Settings
+
+FOLDER = Path(__file__).parent / "snapshots"
+WORDS_ONLY = {"description", "title", "summary", "examples", "example", "operationId"}
+
+
+def check(name: str, current: Any) -> None:
+    path = FOLDER / f"{name}.json"
+    text = json.dumps(current, indent=1, sort_keys=True, ensure_ascii=False) + "\n"
+    if os.environ.get("ULTRAGRAY_UPDATE_SNAPSHOTS") == "1":
+        FOLDER.mkdir(exist_ok=True)
+        path.write_text(text)
+    assert json.loads(path.read_text()) == json.loads(text), f"the public interface differs from {path}"
+
+
+def without_words(value: Any, *, named: bool = False) -> Any:
+    """`value` without prose; the keys of a `named` mapping are names, not keywords."""
+    if isinstance(value, dict):
+        return {
+            key: without_words(item, named=key in ("properties", "schemas", "paths", "headers", "responses"))
+            for key, item in value.items()
+            if named or key not in WORDS_ONLY
+        }
+    if isinstance(value, list):
+        return [without_words(item) for item in value]
+    return value
+
+
+def test_http(http: httpx.Client) -> None:
+    document = http.get("/openapi.json").json()
+    check("openapi", without_words({"paths": document["paths"], "schemas": document["components"]["schemas"]}))
+
+
+def fields(message: Descriptor) -> dict[str, Any]:
+    return {field.name: [field.number, field.type, bool(field.is_repeated)] for field in message.fields} | {
+        nested.name: fields(nested) for nested in message.nested_types
+    }
+
+
+def contract(file: FileDescriptor) -> dict[str, Any]:
+    return {
+        "messages": {name: fields(message) for name, message in file.message_types_by_name.items()},
+        "enums": {
+            name: {value.name: value.number for value in enum.values} for name, enum in file.enum_types_by_name.items()
+        },
+        "services": {
+            name: {
+                method.name: {
+                    "input": method.input_type.full_name,
+                    "output": method.output_type.full_name,
+                    "streams": [method.client_streaming, method.server_streaming],
+                }
+                for method in service.methods
+            }
+            for name, service in file.services_by_name.items()
+        },
+    }
+
+
+def test_grpc() -> None:
+    files = (geometry_pb2, scenes_pb2, rendering_pb2)
+    check("proto", {module.DESCRIPTOR.name: contract(module.DESCRIPTOR) for module in files})
+
+
+def error_classes(cls: type[errors.UltragrayError]) -> Iterator[type[errors.UltragrayError]]:
+    yield cls
+    for child in cls.__subclasses__():
+        yield from error_classes(child)
+
+
+def test_reasons() -> None:
+    classes = [cls for cls in error_classes(errors.UltragrayError) if cls.__module__ == errors.__name__]
+    table = {cls.reason: {"http": cls.http_status, "grpc": cls.grpc_status} for cls in classes}
+    assert len(table) == len(classes), "two errors share a reason"
+    check("reasons", table)
+
+
+def test_settings() -> None:
+    schema = Settings.model_json_schema()
+    check("settings", without_words(schema["properties"], named=True))
