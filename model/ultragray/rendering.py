@@ -8,7 +8,7 @@ from typing import Any
 
 from torch import Tensor
 
-from . import cpu, reference
+from . import __version__, cpu, reference
 from .errors import BackendUnavailable, InvalidArgument
 from .pose import check_poses
 from .probe import FloatArray, Probe
@@ -57,13 +57,23 @@ def render(
             "probe must be given: this scene does not know the one it was trained with", field="probe"
         )
     poses_cm = scene.poses_to_scene_cm(check_poses(poses))
-    return Frames(**_backend(backend, scene)(scene, probe, poses_cm, height, width, chosen))
+    backend = choose_backend(backend, scene)
+    return Frames(**_BACKENDS[backend](scene, probe, poses_cm, height, width, chosen))
 
 
-def _backend(name: str, scene: GaussianScene) -> Backend:
-    backends: dict[str, Backend] = {"reference": reference.render_outputs, "cpu": cpu.render_outputs}
+_BACKENDS: dict[str, Backend] = {"reference": reference.render_outputs, "cpu": cpu.render_outputs}
+
+
+def choose_backend(name: str, scene: GaussianScene) -> str:
+    """The backend that `name` (auto: the best) means for a scene. Raises BackendUnavailable for an unknown name."""
     if name == "auto":
-        name = "cpu" if cpu.supports(scene) else "reference"
-    if name not in backends:
-        raise BackendUnavailable(f"backend must be one of auto, {', '.join(backends)}, got {name!r}", field="backend")
-    return backends[name]
+        return "cpu" if cpu.supports(scene) else "reference"
+    if name not in _BACKENDS:
+        raise BackendUnavailable(f"backend must be one of auto, {', '.join(_BACKENDS)}, got {name!r}", field="backend")
+    return name
+
+
+def renderer_name(backend: str, scene: GaussianScene) -> str:
+    """What renders a scene, as every frame says it: `ultragray/0.1.0 cpu-avx512`."""
+    chosen = choose_backend(backend, scene)
+    return f"ultragray/{__version__} {f'cpu-{cpu.INSTRUCTION_SETS[0]}' if chosen == 'cpu' else chosen}"

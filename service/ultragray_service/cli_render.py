@@ -19,13 +19,11 @@ import torch
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
 
-import ultragray
-from ultragray import cpu
 from ultragray.errors import InvalidArgument
 from ultragray.files import atomic_path, file_sha256
 from ultragray.pose_file import load_poses
 from ultragray.probe import ConvexProbe, Probe, probe_from_dict
-from ultragray.rendering import render
+from ultragray.rendering import render, renderer_name
 from ultragray.request import check_image_size, check_outputs
 from ultragray.scene import GaussianScene
 from ultragray_workers.encoding import encode_image
@@ -87,7 +85,7 @@ def render_to_files(options: RenderOptions) -> str:
         "poses": poses,
         "scene": options.scene.stem,
         "scene_sha256": file_sha256(options.scene),
-        "renderer": f"ultragray/{ultragray.__version__} {_backend_name(options.backend, scene)}",
+        "renderer": renderer_name(options.backend, scene),
     }
     sink = (
         _npz_sink(options.output, outputs, (len(poses), height, width), labels)
@@ -121,10 +119,6 @@ def _parse_probe(text: str) -> Probe:
         return probe_from_dict(json.loads(text))
     except (json.JSONDecodeError, RecursionError) as error:
         raise InvalidArgument(f"--probe must be a JSON object: {error}", field="probe") from error
-
-
-def _backend_name(backend: str, scene: GaussianScene) -> str:
-    return ("cpu" if cpu.supports(scene) else "reference") if backend == "auto" else backend
 
 
 def _drawing(pixel_mm: float | None, probe: Probe, to_npz: bool) -> Callable[[FrameArray], FrameArray]:

@@ -20,7 +20,7 @@ import torch
 from typer.testing import CliRunner, Result
 
 import ultragray
-from ultragray import ConvexProbe, GaussianScene, LinearProbe, render
+from ultragray import ConvexProbe, GaussianScene, LinearProbe, cpu, render
 from ultragray.errors import InvalidArgument, SceneFileInvalid
 from ultragray.files import file_sha256
 from ultragray_service import cli_render
@@ -113,7 +113,7 @@ def test_render_writes_an_npz_that_can_be_replayed(scene_file: Path, pose_file: 
         assert set(frames) == {"bmode", "transmittance", "poses", "scene", "scene_sha256", "renderer"}
         assert str(frames["scene"]) == "scene"
         assert str(frames["scene_sha256"]) == file_sha256(scene_file)
-        assert str(frames["renderer"]) == f"ultragray/{ultragray.__version__} cpu"
+        assert str(frames["renderer"]) == f"ultragray/{ultragray.__version__} cpu-{cpu.INSTRUCTION_SETS[0]}"
         again = render(GaussianScene.load(scene_file), None, frames["poses"], height=16, width=12)
         for name in ("bmode", "transmittance"):
             assert frames[name].dtype == np.float32

@@ -50,7 +50,7 @@ def test_headers_are_read_again_only_when_the_file_changes(scene_folder):
 
 def test_an_invalid_file_is_named_with_the_reason(scene_folder):
     (scene_folder / "bad.ugr").write_bytes(b"not a scene")
-    with pytest.raises(SceneFileInvalid, match="bad.ugr"):
+    with pytest.raises(SceneFileInvalid, match=r"bad\.ugr"):
         SceneStore(scene_folder).header("bad")
 
 

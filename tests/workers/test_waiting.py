@@ -106,10 +106,12 @@ def test_lost_work_comes_first_and_suspects_go_alone(make_ticket):
         queue.add(ticket)
     for again in reversed(part.for_retry()):
         queue.put_first(again)
-    assert taken(queue) == [(lost, 0, 2), (lost, 2, 4)]  # in halves now
-    queue.put_first(Part(lost, 0, 2, attempts=2))
+    assert taken(queue) == [(lost, 0, 2), (others[0], 0, 1), (others[1], 0, 1)]
+    assert taken(queue) == [(lost, 2, 4)]
+    for work in (Part(others[0], 0, 1), Part(lost, 0, 2, attempts=2), Part(others[1], 0, 1)):
+        queue.put_first(work)
+    assert taken(queue) == [(others[1], 0, 1), (others[0], 0, 1)]
     assert taken(queue) == [(lost, 0, 2)]
-    assert taken(queue) == [(others[0], 0, 1), (others[1], 0, 1)]
 
 
 def test_what_is_past_its_deadline_is_dropped(make_ticket):

@@ -64,7 +64,7 @@ class RenderResult:
 
     scene: str
     scene_sha256: str
-    renderer: str  # such as "ultragray/0.1.0 cpu"
+    renderer: str  # such as "ultragray/0.1.0 cpu-avx512"
     poses: FloatArray  # [C, 4, 4] mm, as used
     probe: Probe
     height: int

@@ -15,10 +15,10 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-import ultragray
-from ultragray import GaussianScene, LinearProbe, Probe, cpu, render
+from ultragray import GaussianScene, LinearProbe, Probe, render
 from ultragray.errors import RenderFailed, UltragrayError
 from ultragray.probe import FloatArray
+from ultragray.rendering import renderer_name
 
 from .channel import Channel
 from .encoding import FrameArray, encode_image, encode_pixels, write_npz
@@ -35,7 +35,7 @@ from .messages import (
     RenderPart,
     UnloadJob,
 )
-from .scene_cache import LoadedScene, SceneCache
+from .scene_cache import SceneCache
 from .types import Encoding
 
 MAX_DETAIL_LENGTH = 2000
@@ -134,7 +134,7 @@ class _Worker:
         rendered = Rendered(
             size=0,
             scene_sha256=loaded.sha256,
-            renderer=self._renderer(loaded),
+            renderer=renderer_name(self._backend, loaded.scene),
             started=started,
             render_ms=_since_ms(started),
             encode_ms=0.0,
@@ -162,12 +162,6 @@ class _Worker:
     def _render_small(self, scene: GaussianScene) -> dict[str, FrameArray]:  # each [1, 16, 16]
         probe = LinearProbe(width_mm=10.0, near_mm=0.0, far_mm=10.0)
         return self._render(scene, probe, np.eye(4)[None], 16, 16, ("bmode",))
-
-    def _renderer(self, loaded: LoadedScene) -> str:
-        backend = self._backend
-        if backend == "auto":
-            backend = "cpu" if cpu.supports(loaded.scene) else "reference"
-        return f"ultragray/{ultragray.__version__} {backend}"
 
 
 def _write_part(
