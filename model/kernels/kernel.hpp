@@ -7,6 +7,7 @@
 
 namespace ultragray {
 
+inline constexpr double kMaxM2 = 11.0825270903;  // -2 log(1/255): w < 1/255 beyond, and alpha too
 inline constexpr int kMaxShCoefficients = 16;
 inline constexpr int kClusterSize = 32;
 inline constexpr int kMaxLanes = 16;  // of the widest instruction set; buffers are padded by this many columns

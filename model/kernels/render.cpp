@@ -16,7 +16,7 @@ namespace ultragray {
 namespace {
 
 constexpr int kStripLines = 64;  // four accumulators of 512 rows stay within a 1 MB cache
-constexpr int64_t kClustersPerTask = 2048;
+constexpr int64_t kClustersPerTask = 512;
 constexpr int kPosesAtOnce = 16;  // bounds the memory that slices take
 
 std::vector<const Kernels*> available_kernels() {

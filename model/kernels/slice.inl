@@ -3,8 +3,6 @@
 
 namespace {
 
-constexpr double kMaxM2 = 11.0825270903;  // w < 1/255 beyond: -2 log(1/255)
-
 struct Candidates {
     int64_t ids[kLanes];
     int count = 0;

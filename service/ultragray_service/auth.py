@@ -6,6 +6,7 @@ import hmac
 from collections.abc import Sequence
 
 from pydantic import SecretStr
+
 from ultragray.errors import Unauthenticated
 
 

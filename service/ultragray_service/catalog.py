@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
+
 from ultragray.errors import InvalidArgument, SceneFileInvalid, SceneNotFound, SceneTooLarge, UltragrayError
 from ultragray.probe import FloatArray
 from ultragray.scene_info import SceneHeader

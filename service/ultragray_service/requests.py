@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+
 from ultragray.errors import InvalidArgument, InvalidImageSize, InvalidProbe, TooManyPoses, UltragrayError
 from ultragray.pose import check_poses
 from ultragray.probe import FloatArray, Probe

@@ -12,6 +12,7 @@ from typing import Any
 
 import uvicorn
 import uvloop
+
 from ultragray.errors import StartupFailed
 
 from .http.app import create_app

@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, SecretStr, ValidationError, field_validator
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
+
 from ultragray.errors import InvalidArgument
 from ultragray.request import MAX_IMAGE_SIDE
 from ultragray_workers.pool import MAX_BATCH_POSES
@@ -42,7 +43,7 @@ class Settings(BaseSettings):
     max_request_pixels: int = Field(
         2**26,
         ge=1,
-        le=2**32,
+        le=2**28,
         description="Pixels that one answer may hold: poses x height x width x outputs.",
     )
     max_body_bytes: int = Field(8 * 2**20, ge=1024, le=2**30, description="Largest HTTP request body, bytes.")

@@ -3,7 +3,7 @@ from __future__ import annotations
 import httpx
 import pytest
 
-from .conftest import HEIGHT, WIDTH, RunningService
+from .conftest import HEIGHT, WIDTH, RunningService, StartService
 
 NAMES = ["demo", "empty", "foreign", "probeless", "second", "truncated"]
 
@@ -85,3 +85,13 @@ def test_metrics_count_frames_and_keep_the_three_times_apart(http: httpx.Client)
     assert sample(after, "ultragray_waiting_frames") == 0
     assert sample(after, "ultragray_loaded_scenes") >= 1
     assert 'ultragray_requests_total{door="http",route="/v1/scenes/{scene}/render",status="200"}' in after
+
+
+def test_pages_of_allowed_origins_may_call(start_service: StartService) -> None:
+    service = start_service(cors_origins="https://console.example")
+    asked = {"Access-Control-Request-Method": "POST", "Access-Control-Request-Headers": "content-type"}
+    for origin, allowed in (("https://console.example", True), ("https://other.example", False)):
+        answer = httpx.options(f"{service.http}/v1/scenes/demo/render", headers={"Origin": origin, **asked})
+        assert (answer.headers.get("access-control-allow-origin") == origin) is allowed
+    answer = httpx.get(f"{service.http}/v1/scenes", headers={"Origin": "https://console.example"})
+    assert "X-Ultragray-Shape" in answer.headers["access-control-expose-headers"]

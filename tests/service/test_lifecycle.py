@@ -60,11 +60,9 @@ def test_sigterm_answers_what_is_in_flight_and_exits_cleanly(start_service: Star
         service.process.send_signal(signal.SIGTERM)
         assert [answer.result().status_code for answer in pending] == [200] * 4
         assert unary.result().data
-        answered = []
+        assert [next(conversation.call).sequence for _ in range(4)] == [0, 1, 2, 3]
         with pytest.raises(grpc.RpcError) as caught:
-            for frame in conversation.call:
-                answered.append(frame.sequence)
-        assert answered == [0, 1, 2, 3]
+            next(conversation.call)
         assert caught.value.code() is grpc.StatusCode.UNAVAILABLE
         assert error_info(caught.value)[0].reason == "DRAINING"
         assert service.process.wait(30) == 0
@@ -82,6 +80,23 @@ def test_sigint_stops_an_idle_service_at_once(start_service: StartService) -> No
         assert service.process.wait(30) == 0
     assert time.monotonic() - began < 5
     assert service.log()[-1]["message"] == "stopped"
+
+
+def test_a_second_signal_stops_at_once(start_service: StartService) -> None:
+    service = start_service(**SLOW)
+    with httpx.Client() as client, ThreadPoolExecutor(4) as threads:
+        pending = [threads.submit(render, service, client, height=256, width=256) for _ in range(4)]
+        wait_for_frames(service)
+        service.process.send_signal(signal.SIGTERM)
+        while not any("stopping" in record["message"] for record in service.log()):
+            time.sleep(0.02)
+        began = time.monotonic()
+        service.process.send_signal(signal.SIGTERM)
+        assert service.process.wait(30) == 0
+        assert time.monotonic() - began < 3
+        for answer in pending:
+            error = answer.exception()
+            assert isinstance(error, httpx.TransportError) if error else answer.result().status_code == 503
 
 
 def test_sigterm_while_starting(start_service: StartService) -> None:

@@ -1,4 +1,7 @@
-"""The public interface, pinned. After a wanted change: ULTRAGRAY_UPDATE_SNAPSHOTS=1 pytest tests/service/test_snapshots.py"""
+"""The public interface, pinned.
+
+After a wanted change: ULTRAGRAY_UPDATE_SNAPSHOTS=1 pytest tests/service/test_snapshots.py, and read the difference.
+"""
 
 from __future__ import annotations
 

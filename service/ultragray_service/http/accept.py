@@ -54,8 +54,7 @@ def parse_accept(header: str) -> list[MediaRange]:
         name, *parameters = (part.strip() for part in entry.split(";"))
         kind, slash, subtype = name.lower().partition("/")
         values = {
-            key.strip().lower(): value.strip().strip('"')
-            for key, _, value in (p.partition("=") for p in parameters)
+            key.strip().lower(): value.strip().strip('"') for key, _, value in (p.partition("=") for p in parameters)
         }
         try:
             quality = float(values.get("q", "1"))

@@ -9,6 +9,7 @@ from fastapi.exceptions import RequestValidationError
 from pydantic.json_schema import models_json_schema
 from starlette.exceptions import HTTPException
 from starlette.middleware.cors import CORSMiddleware
+
 from ultragray import __version__
 from ultragray.errors import UltragrayError
 

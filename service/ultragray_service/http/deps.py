@@ -11,16 +11,14 @@ from ..state import Service
 from .problems import PROBLEM_TYPE, Problem
 
 
-def _service(connection: HTTPConnection) -> Service:
+async def _service(connection: HTTPConnection) -> Service:  # async: FastAPI runs plain functions in a thread
     service = connection.app.state.service
     assert isinstance(service, Service)
     return service
 
 
 ServiceDep = Annotated[Service, Depends(_service)]
-SceneName = Annotated[
-    str, Path(description="Name of the scene: its file name without .ugr.", examples=["demo"])
-]
+SceneName = Annotated[str, Path(description="Name of the scene: its file name without .ugr.", examples=["demo"])]
 
 
 def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:

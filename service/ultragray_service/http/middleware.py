@@ -8,6 +8,7 @@ import time
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
 from ultragray.errors import BodyTooLarge, UltragrayError, Unauthenticated
 
 from ..auth import KeyGuard
@@ -54,9 +55,7 @@ class RequestContext:
             _log.exception("unexpected error", extra={"fields": {"path": scope["path"]}})
             if status:
                 raise
-            await problem_response(UltragrayError("an unexpected error, see the log"))(
-                scope, receive, send_with_id
-            )
+            await problem_response(UltragrayError("an unexpected error, see the log"))(scope, receive, send_with_id)
         finally:
             seconds = time.perf_counter() - started
             route = getattr(scope.get("route"), "path", "unmatched")

@@ -11,6 +11,7 @@ from pydantic import BaseModel, Field
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import Response
+
 from ultragray.errors import (
     InvalidArgument,
     InvalidImageSize,
@@ -102,9 +103,7 @@ def invalid_argument(first: Mapping[str, Any]) -> InvalidArgument:
     kind = str(first["type"])
     root = str(first["loc"][0]) if first["loc"] else ""
     if kind == "json_invalid":
-        return InvalidArgument(
-            f"the body must be JSON: {first.get('ctx', {}).get('error', 'it cannot be read')}"
-        )
+        return InvalidArgument(f"the body must be JSON: {first.get('ctx', {}).get('error', 'it cannot be read')}")
     if kind == "missing":
         detail = f"{path} is required"
     elif kind == "extra_forbidden":

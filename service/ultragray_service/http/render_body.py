@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pydantic import ValidationError
 from starlette.requests import Request
+
 from ultragray.errors import InvalidArgument, InvalidPose, UnsupportedMediaType
 from ultragray.pose import pose_from_position_quaternion
 from ultragray.probe import FloatArray, Probe
@@ -18,9 +19,7 @@ async def read_render_body(request: Request) -> RenderBody:
     content_type = request.headers.get("content-type", "application/json")
     media_type = content_type.partition(";")[0].strip().lower()
     if media_type != "application/json" and not media_type.endswith("+json"):
-        raise UnsupportedMediaType(
-            f"Content-Type must be application/json, got {content_type!r}", field="Content-Type"
-        )
+        raise UnsupportedMediaType(f"Content-Type must be application/json, got {content_type!r}", field="Content-Type")
     if request.headers.get("content-encoding", "identity").lower() != "identity":
         raise UnsupportedMediaType("the body must not be compressed", field="Content-Encoding")
     try:
@@ -48,9 +47,7 @@ async def checked_poses(written: list[tuple[str, PoseBody]]) -> FloatArray:  # [
 def _checked_pose(path: str, pose: PoseBody) -> FloatArray:  # [4, 4] mm
     if pose.matrix is not None:
         if pose.position_mm is not None or pose.quaternion is not None:
-            raise InvalidPose(
-                f"{path} must hold either matrix, or position_mm and quaternion, not both", field=path
-            )
+            raise InvalidPose(f"{path} must hold either matrix, or position_mm and quaternion, not both", field=path)
         return one_pose(pose.matrix, field=f"{path}.matrix")
     if pose.position_mm is None and pose.quaternion is None:
         raise InvalidPose(f"{path} must hold either matrix, or position_mm and quaternion", field=path)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
+
 from ultragray.pose import quaternion_from_pose
 from ultragray.probe import ConvexProbe, FloatArray, LinearProbe, Probe
 
@@ -78,9 +79,7 @@ class RenderBody(RequestModel):
 
     pose: PoseBody | None = Field(None, description="One pose; rendered before frames of `poses` that wait.")
     poses: list[PoseBody] | None = Field(None, description="Many poses, answered together, in order.")
-    height: int | None = Field(
-        None, description="Depth samples. Default: that of the training images, else 512."
-    )
+    height: int | None = Field(None, description="Depth samples. Default: that of the training images, else 512.")
     width: int | None = Field(None, description="Scan lines. Default: that of the training images, else 512.")
     probe: ProbeBody | None = Field(None, description="Instead of the scene's own.")
     outputs: list[str] = Field(["bmode"], description="Some of bmode, echo, transmittance, coverage.")

@@ -9,6 +9,7 @@ from collections.abc import Awaitable, Callable
 from typing import Any
 
 import grpc
+
 from ultragray.errors import UltragrayError, Unauthenticated
 
 from ..auth import KeyGuard

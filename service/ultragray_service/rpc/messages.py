@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+
 from ultragray.errors import InvalidArgument, InvalidPose, InvalidProbe, UltragrayError, UnknownOutput
 from ultragray.pose import pose_from_position_quaternion
 from ultragray.probe import ConvexProbe, FloatArray, LinearProbe, Probe
@@ -62,9 +63,7 @@ def probe_from_message(message: geometry_pb2.Probe) -> Probe:
     if kind == "convex":
         convex = message.convex
         with field_under("convex"):
-            return ConvexProbe(
-                opening_angle_deg=convex.opening_angle_deg, near_mm=convex.near_mm, far_mm=convex.far_mm
-            )
+            return ConvexProbe(opening_angle_deg=convex.opening_angle_deg, near_mm=convex.near_mm, far_mm=convex.far_mm)
     raise InvalidProbe("kind must be linear or convex, got none", field="kind")
 
 
@@ -93,9 +92,7 @@ def position_message(point: FloatArray | tuple[float, float, float]) -> geometry
 def spec_from_message(message: rendering_pb2.RenderSettings) -> RenderSpec:
     """What the settings ask for. Raises InvalidArgument; its field is a path below the settings."""
     if message.encoding not in ENCODINGS:
-        raise InvalidArgument(
-            f"encoding must be one of the enum Encoding, got {message.encoding}", field="encoding"
-        )
+        raise InvalidArgument(f"encoding must be one of the enum Encoding, got {message.encoding}", field="encoding")
     for number in message.outputs:
         if number not in OUTPUT_NAMES:
             raise UnknownOutput(
@@ -133,9 +130,7 @@ def frame_message(result: RenderResult, sequence: int) -> rendering_pb2.Frame:
         outputs=[_OUTPUT_NUMBERS[name] for name in result.outputs],
         encoding=_ENCODING_NUMBERS[result.encoding],
         data=result.data,
-        timings=rendering_pb2.Timings(
-            queue_ms=result.queue_ms, render_ms=result.render_ms, encode_ms=result.encode_ms
-        ),
+        timings=rendering_pb2.Timings(queue_ms=result.queue_ms, render_ms=result.render_ms, encode_ms=result.encode_ms),
     )
 
 

@@ -13,9 +13,7 @@ from .messages import spec_from_message
 
 async def plan_settings(
     service: Service,
-    message: rendering_pb2.RenderRequest
-    | rendering_pb2.RenderBatchRequest
-    | rendering_pb2.RenderStreamRequest,
+    message: rendering_pb2.RenderRequest | rendering_pb2.RenderBatchRequest | rendering_pb2.RenderStreamRequest,
     priority: Priority,
 ) -> RenderRequest:
     """The checked settings of a message, still without poses.

@@ -7,6 +7,7 @@ import time
 from collections import deque
 
 import grpc
+
 from ultragray.errors import InvalidArgument, QueueFull
 from ultragray_proto.v1 import rendering_pb2
 from ultragray_workers.types import Priority, RenderRequest, RenderResult
@@ -54,9 +55,7 @@ class RenderService:
                 while started < len(poses) and len(in_flight) < window:
                     deadline = planner.deadline(context.time_remaining())
                     prepared = planner.with_poses(planned, poses[started : started + 1], deadline)
-                    render = (
-                        self._service.render(prepared) if started == 0 else self._render_when_room(prepared)
-                    )
+                    render = self._service.render(prepared) if started == 0 else self._render_when_room(prepared)
                     in_flight.append(asyncio.ensure_future(render))
                     started += 1
                 result = await in_flight[0]

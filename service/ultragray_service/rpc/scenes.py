@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import grpc
+
 from ultragray.scene_info import SceneHeader
 from ultragray_proto.v1 import scenes_pb2
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import grpc
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
+
 from ultragray_proto.v1 import rendering_pb2, rendering_pb2_grpc, scenes_pb2, scenes_pb2_grpc
 
 from ..state import Service
@@ -53,9 +54,7 @@ class GrpcServer:
 
     async def tell_health(self, *, serving: bool) -> None:
         """What grpc.health.v1 answers from now on."""
-        code = (
-            health_pb2.HealthCheckResponse.SERVING if serving else health_pb2.HealthCheckResponse.NOT_SERVING
-        )
+        code = health_pb2.HealthCheckResponse.SERVING if serving else health_pb2.HealthCheckResponse.NOT_SERVING
         for name in ("", *SERVICE_NAMES):
             await self._health.set(name, code)
 

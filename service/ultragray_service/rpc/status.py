@@ -9,6 +9,7 @@ from google.protobuf.any_pb2 import Any as AnyMessage  # type: ignore[import-unt
 from google.protobuf.duration_pb2 import Duration  # type: ignore[import-untyped]
 from google.rpc.error_details_pb2 import BadRequest, ErrorInfo, RetryInfo
 from google.rpc.status_pb2 import Status
+
 from ultragray.errors import InvalidArgument, UltragrayError
 
 from ..logs import request_id
@@ -23,9 +24,7 @@ _RETRY_STATUSES = (429, 503)
 def status_of(error: UltragrayError) -> Status:
     """The status, with ErrorInfo (domain, reason, metadata `field`), BadRequest and RetryInfo where apt."""
     code = getattr(grpc.StatusCode, error.grpc_status)
-    info = ErrorInfo(
-        reason=error.reason, domain=ERROR_DOMAIN, metadata={"field": error.field} if error.field else {}
-    )
+    info = ErrorInfo(reason=error.reason, domain=ERROR_DOMAIN, metadata={"field": error.field} if error.field else {})
     details = [info]
     if error.field and isinstance(error, InvalidArgument):
         violation = BadRequest.FieldViolation(field=error.field, description=error.detail)

@@ -8,6 +8,7 @@ from collections.abc import Coroutine
 from typing import Any
 
 import grpc
+
 from ultragray.errors import Draining, InvalidArgument, UltragrayError
 from ultragray_proto.v1 import rendering_pb2
 from ultragray_workers.types import Priority, RenderRequest

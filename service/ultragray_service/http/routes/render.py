@@ -8,6 +8,7 @@ from typing import Any
 from fastapi import APIRouter
 from starlette.requests import Request
 from starlette.responses import Response
+
 from ultragray.probe import probe_to_dict
 from ultragray.request import check_outputs
 from ultragray_workers.types import Encoding, Priority, RenderResult
@@ -59,9 +60,7 @@ _ANSWER: dict[int | str, dict[str, Any]] = {
         "holds one float32 array [C, H, W] per output, `poses` [C, 4, 4], and the strings scene, scene_sha256 and "
         "renderer. `*/*` gives PNG where it can hold the request, else npz.",
         "content": {PNG: _BINARY, JPEG: _BINARY, RAW: _BINARY, NPZ: _BINARY},
-        "headers": {
-            name: {"description": text, "schema": {"type": "string"}} for name, text in RENDER_HEADERS.items()
-        },
+        "headers": {name: {"description": text, "schema": {"type": "string"}} for name, text in RENDER_HEADERS.items()},
     }
 }
 
@@ -79,9 +78,7 @@ async def render(request: Request, service: ServiceDep, scene: SceneName) -> Res
     deadline = planner.deadline(None if body.timeout_ms is None else body.timeout_ms / 1000)
     written = poses_as_written(body, planner.max_poses_at_once)
     outputs = check_outputs(body.outputs)
-    choice = choose(
-        request.headers.get("accept", ""), frames=len(written), outputs=len(outputs), dtype=body.dtype
-    )
+    choice = choose(request.headers.get("accept", ""), frames=len(written), outputs=len(outputs), dtype=body.dtype)
     spec = RenderSpec(scene, asked_probe(body), body.height, body.width, outputs, choice.encoding)
     planned = await planner.plan(spec, Priority.INTERACTIVE if body.poses is None else Priority.BATCH)
     prepared = planner.with_poses(planned, await checked_poses(written), deadline)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Annotated
 
 from fastapi import APIRouter, Query
+
 from ultragray.probe import probe_to_dict
 from ultragray.scene_info import SceneHeader
 
