@@ -17,6 +17,7 @@ from .probe import FloatArray
 
 ROTATION_TOLERANCE = 1e-3
 EXACT = 1e-14
+_IDENTITY = np.eye(4)
 MAX_POSITION_MM = 1e6
 
 
@@ -35,22 +36,21 @@ def check_poses(poses: Any, *, field: str = "poses") -> FloatArray:  # [C, 4, 4]
     if array.ndim != 3 or array.shape[1:] != (4, 4):
         given = list(array.shape[1:] if names == [field] else array.shape)
         raise InvalidPose(f"{field} must have shape [C, 4, 4] or [4, 4], got {given}", field=field)
-    rotations, positions = array[:, :3, :3], array[:, :3, 3]
-    finite = np.isfinite(array).all(axis=(1, 2))
-    with np.errstate(invalid="ignore", over="ignore"):  # NaN and infinity are told below
-        grams = rotations.transpose(0, 2, 1) @ rotations  # RᵀR, [C, 3, 3]
-        deviations = np.abs(grams - np.eye(3)).max(axis=(1, 2), initial=0.0)
-        rigid = finite & (np.abs(array[:, 3] - (0, 0, 0, 1)).max(axis=1, initial=0.0) <= ROTATION_TOLERANCE)
-        rigid &= np.abs(positions).max(axis=1, initial=0.0) <= MAX_POSITION_MM
-        rigid &= deviations <= ROTATION_TOLERANCE
-        rigid &= np.einsum("ci,ci->c", np.cross(rotations[..., 0], rotations[..., 1]), rotations[..., 2]) > 0
-    for c in np.flatnonzero(~rigid)[:1]:
-        raise _why_not_rigid(array[c], float(deviations[c]), names[c])
-    left, _, right = np.linalg.svd(rotations)
-    exact = np.tile(np.eye(4), (len(array), 1, 1))
-    proper = deviations <= EXACT  # left as they are: a pose that was used once comes back to the bit
-    exact[:, :3, :3] = np.where(proper[:, None, None], rotations, left @ right)
-    exact[:, :3, 3] = positions
+    rotations = array[:, :3, :3]
+    with np.errstate(all="ignore"):  # NaN and infinity fail the comparisons and are told below
+        deviations = np.abs(rotations.transpose(0, 2, 1) @ rotations - _IDENTITY[:3, :3]).max(axis=(1, 2), initial=0.0)
+        rigid = (deviations <= ROTATION_TOLERANCE) & (np.linalg.det(rotations) > 0)
+        rigid &= np.abs(array[:, 3] - _IDENTITY[3]).max(axis=1, initial=0.0) <= ROTATION_TOLERANCE
+        rigid &= np.abs(array[:, :3, 3]).max(axis=1, initial=0.0) <= MAX_POSITION_MM
+    if not rigid.all():
+        first = int(np.argmin(rigid))
+        raise _why_not_rigid(array[first], float(deviations[first]), names[first])
+    exact: FloatArray = array.copy()
+    exact[:, 3] = _IDENTITY[3]
+    rough = deviations > EXACT  # the others stay as they are: a pose that was used once comes back to the bit
+    if rough.any():
+        left, _, right = np.linalg.svd(rotations[rough])
+        exact[rough, :3, :3] = left @ right
     return exact
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import gc
 import logging
 import signal
 import socket
@@ -53,6 +54,7 @@ async def serve(settings: Settings) -> None:
         _log.info("starting the render processes")
         try:
             if await signals.unless_stopped(service.start()):
+                gc.freeze()  # what lives this long is never garbage: shorter pauses
                 _tell_where(settings, http_socket.getsockname()[1], grpc_port)
                 await signals.stop.wait()
             _log.info("stopping: frames that wait are answered first")

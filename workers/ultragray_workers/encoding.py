@@ -22,10 +22,9 @@ ByteArray = npt.NDArray[np.uint8]
 
 def to_uint8(frames: FrameArray) -> ByteArray:
     """round(255·clip(x, 0, 1)), the same shape."""
-    levels = np.multiply(frames, np.float32(255.0))
-    np.clip(levels, 0.0, 255.0, out=levels)
-    np.rint(levels, out=levels)
-    return levels.astype(np.uint8)
+    rows = np.maximum(frames, 0.0).reshape(-1, frames.shape[-1])  # convertScaleAbs takes absolute values
+    levels: ByteArray = cv2.convertScaleAbs(rows, alpha=255.0)
+    return levels.reshape(frames.shape)
 
 
 def encode_pixels(frames: FrameArray, encoding: Encoding) -> npt.NDArray[np.generic]:  # [C, H, W] -> [C, H, W]
