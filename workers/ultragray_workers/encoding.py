@@ -23,8 +23,7 @@ ByteArray = npt.NDArray[np.uint8]
 def to_uint8(frames: FrameArray) -> ByteArray:
     """round(255·clip(x, 0, 1)), the same shape."""
     rows = np.maximum(frames, 0.0).reshape(-1, frames.shape[-1])  # convertScaleAbs takes absolute values
-    levels: ByteArray = cv2.convertScaleAbs(rows, alpha=255.0)
-    return levels.reshape(frames.shape)
+    return cv2.convertScaleAbs(rows, alpha=255.0).astype(np.uint8, copy=False).reshape(frames.shape)
 
 
 def encode_pixels(frames: FrameArray, encoding: Encoding) -> npt.NDArray[np.generic]:  # [C, H, W] -> [C, H, W]
