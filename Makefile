@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 KERNEL_SOURCES := $(wildcard model/kernels/*) CMakeLists.txt pyproject.toml
-PYTHON_SOURCES := model service workers proto tests benchmarks
+PYTHON_SOURCES := model service workers proto tests
 ARGS ?=
 
 .DEFAULT_GOAL := help
