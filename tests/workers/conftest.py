@@ -86,15 +86,22 @@ def expect_frames(scene_folder: Path) -> Callable[[RenderRequest, RenderResult],
     return check
 
 
+@pytest.fixture
+def processes() -> Callable[[], dict[int, str]]:
+    """The workers and templates that this test has started and that live, by process id."""
+    before = set(_pool_processes())  # servers of other tests
+    return lambda: {pid: name for pid, name in _pool_processes().items() if pid not in before}
+
+
 @pytest.fixture(autouse=True)
-def nothing_left_behind() -> Iterator[None]:
+def nothing_left_behind(processes: Callable[[], dict[int, str]]) -> Iterator[None]:
     """Every test must end with the processes and open files it began with."""
     descriptors = open_channels_and_memories()
     yield
     give_up = time.monotonic() + 2.0
-    while pool_processes() and time.monotonic() < give_up:
+    while processes() and time.monotonic() < give_up:
         time.sleep(0.01)
-    assert pool_processes() == {}
+    assert processes() == {}
     assert open_channels_and_memories() == descriptors
 
 
@@ -106,7 +113,7 @@ def open_channels_and_memories() -> list[str]:
     return sorted(link for link in links if link.startswith(("socket:", "/memfd:")))
 
 
-def pool_processes() -> dict[int, str]:
+def _pool_processes() -> dict[int, str]:
     """Workers and templates of this test run, by process id: `ug-worker`, `ug-template`, or `python` at the start."""
     found = {}
     for folder in Path("/proc").iterdir():
@@ -141,8 +148,3 @@ def run() -> Callable[[Coroutine[Any, Any, T]], T]:
         return asyncio.run(asyncio.wait_for(coroutine, TIME_LIMIT_S))
 
     return run_
-
-
-@pytest.fixture
-def processes() -> Callable[[], dict[int, str]]:
-    return pool_processes
