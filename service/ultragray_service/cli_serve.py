@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import tempfile
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -43,14 +44,21 @@ def ensure_scenes(folder: Path) -> None:
     """Puts the demo scene into a data folder that is missing or holds no scene, and says so on stderr."""
     if SceneStore(folder).names():
         return
-    from ultragray.demo import build_demo_scene
-
     typer.echo(f"{folder} holds no scenes: building the demo scene…", err=True)
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{DEMO_NAME}{SUFFIX}"
-    scene = build_demo_scene()
-    scene.save(path)
-    typer.echo(f"wrote {path}: {scene.info.dataset_name}, {scene.gaussian_count:,} Gaussians", err=True)
+    # In a process of its own: it needs torch, which the service never loads.
+    building = multiprocessing.get_context("spawn").Process(target=_write_demo, args=(path,))
+    building.start()
+    building.join()
+    info = read_header(path).info
+    typer.echo(f"wrote {path}: {info.dataset_name}, {info.gaussian_count:,} Gaussians", err=True)
+
+
+def _write_demo(path: Path) -> None:
+    from ultragray.demo import build_demo_scene
+
+    build_demo_scene().save(path)
 
 
 def link_scenes(files: Iterable[Path], folder: Path) -> None:
