@@ -22,6 +22,7 @@ using Planes = nb::ndarray<float, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
 }  // namespace
 
 NB_MODULE(_cpu, m) {
+    nb::set_leak_warnings(false);  // a scene that a script still holds when it ends is no leak
     nb::class_<PreparedScene>(m, "PreparedScene")
         .def(
             "__init__",

@@ -11,7 +11,10 @@ constexpr float kMinPsi = 0.0039292930f;  // -log(1 - 1/255): alpha reaches 1/25
 constexpr float kMaxWeight = 0.999f;
 constexpr float kMaxM2Attenuation = 9.0f;
 constexpr float kFullG = 2.8906850f;    // G(u) for u >= 3
-constexpr float kNegligible = 20.0f;    // w < 5e-5 beyond m2 + u2
+constexpr float kNegligible = 24.0f;    // w < 7e-6 beyond m2 + u2: dozens of such tails on a pixel still do not show
+constexpr float kEarlySigma = 1.8f;     // an opaque Gaussian wider than this, cm, absorbs 1/255 above the rows where w does
+constexpr float kMinVariance = 1e-32f;  // cm2; thinner ones touch no row
+
 constexpr float kNode = 0.7745966692f;  // Gauss-Legendre: nodes 0, +-sqrt(0.6)
 constexpr int kRestartRows = 32;
 
@@ -71,15 +74,18 @@ struct Group {
     Floats u;   // at row `base`
     Floats du;  // per row
     Floats m2;
-    Floats window2;  // u2 up to here has w >= 1/255; negative: the lane is not touched
+    Floats window2;  // u2 up to here has w >= 1/255
+    Floats sigma;    // along the line, cm
     Floats peak;     // exp(-m2/2) sigma where m2 <= 9, else 0: psi = peak * G(u)
     Floats zero;     // u at depth 0
+    Mask touched;    // the line comes close enough for w to reach 1/255
+    Mask opaque;     // alpha reaches 1/255 below the Gaussian
     int base;
 };
 
 template <Profile profile>
 inline void draw_rows(const Group& g, const Slice& s, const Strip& strip, int column, int top, int end) {
-    const float fastest = largest(g.du);
+    const float fastest = largest(keep(g.touched, g.du));
     const int period = fastest * kRestartRows > 8.0f ? (fastest < 8.0f ? int(8.0f / fastest) : 1) : kRestartRows;
     const Floats q = exponential(-g.du * g.du);
     const Floats intensity = splat(s.intensity), absorb = splat(s.absorb);
@@ -110,56 +116,55 @@ inline void draw_rows(const Group& g, const Slice& s, const Strip& strip, int co
     }
 }
 
-inline void draw_group(const View& view, const Slice& s, const Strip& strip, int column) {
-    const int line = strip.first + column;
+inline Group cross(const View& view, const Slice& s, int line) {
     const Doubles dx = load<Doubles>(view.dir_x + line), dz = load<Doubles>(view.dir_z + line);
     const Doubles x = s.mean_x - load<Doubles>(view.line_x + line);
     const Doubles across = dx * s.mean_z - dz * x;
     const Doubles spread = 1.0 / (dx * dx * s.cov_zz - 2.0 * dx * dz * s.cov_xz + dz * dz * s.cov_xx);
     const Doubles star = spread * (dx * (s.cov_zz * x - s.cov_xz * s.mean_z) + dz * (s.cov_xx * s.mean_z - s.cov_xz * x));
-    const Floats m2_line = to_floats(across * across * spread);
     const Floats variance = to_floats((s.cov_xx * s.cov_zz - s.cov_xz * s.cov_xz) * spread);
+    const double bound = view.height - 1;
+    const double base = (s.depth - view.near) / view.row_step;  // near the centre: u stays exact where it matters
 
     Group g;
-    g.m2 = s.m2_plane + m2_line;
-    const Floats sigma = square_root(variance);
-    const Floats inverse_sigma = 1.0f / sigma;
-    const double bound = view.height - 1;
-    const double base = (s.mean_z - view.near) / view.row_step;  // near the centre: u stays exact where it matters
     g.base = static_cast<int>(base > 0 ? (base < bound ? base : bound) : 0);
+    g.m2 = s.m2_plane + to_floats(across * across * spread);
+    g.window2 = float(kMaxM2) - g.m2;
+    g.touched = both(less_equal(Floats{}, g.window2), less_equal(splat(kMinVariance), variance));
+    g.sigma = square_root(maximum(variance, splat(kMinVariance)));
+    const Floats inverse_sigma = 1.0f / g.sigma;
     g.u = to_floats((view.near + view.row_step * (g.base + 0.5)) - star) * inverse_sigma;
     g.du = float(view.row_step) * inverse_sigma;
-    g.window2 = float(kMaxM2) - g.m2;
-    const Mask touched = less_equal(Floats{}, g.window2);
-    if (!any(touched)) return;
-    const Mask absorbs = both(touched, less_equal(g.m2, splat(kMaxM2Attenuation)));
-    g.peak = keep(absorbs, exponential(-0.5f * g.m2) * sigma);
     g.zero = -to_floats(star) * inverse_sigma;
-    const Floats full = g.peak * kFullG;
-    const Mask opaque = less_equal(splat(kMinPsi), full);
+    const Mask absorbs = both(g.touched, less_equal(g.m2, splat(kMaxM2Attenuation)));
+    g.peak = keep(absorbs, exponential(-0.5f * g.m2) * g.sigma);
+    g.opaque = less_equal(splat(kMinPsi), g.peak * kFullG);
+    return g;
+}
 
+inline void draw_group(const View& view, const Slice& s, const Strip& strip, int column) {
+    const Group g = cross(view, s, strip.first + column);
+    if (!any(g.touched)) return;
     const Floats window = square_root(maximum(g.window2, Floats{}));
     const Floats whole = 3.0f + maximum(g.zero, Floats{});  // the window ends here even where the mean lies before the face
     const Floats tail = maximum(whole, square_root(maximum(kNegligible - g.m2, Floats{})));
-    const Floats inverse_du = 1.0f / g.du;
-    const Floats first_row = (-window - g.u) * inverse_du, last_row = (select(opaque, tail, window) - g.u) * inverse_du;
-    const float top_row = smallest(select(touched, first_row, splat(1e9f))) + float(g.base);
-    const float end_row = largest(select(touched, last_row, splat(-1e9f))) + float(g.base);
-    const float thickest = largest(full);
-    // An opaque Gaussian this wide absorbs 1/255 above the rows where its weight reaches that.
-    const bool early = thickest > 4.0f;
-    const int top = early || top_row < 0.0f ? 0 : top_row > float(bound) ? view.height : static_cast<int>(top_row);
-    const int end = end_row < 0.0f ? 0 : end_row > float(bound) ? view.height : static_cast<int>(end_row) + 1;
+    const Floats first_row = (-window - g.u) / g.du, last_row = (select(g.opaque, tail, window) - g.u) / g.du;
+    const float top_row = smallest(select(g.touched, first_row, splat(1e9f))) + float(g.base);
+    const float end_row = largest(select(g.touched, last_row, splat(-1e9f))) + float(g.base);
+    const bool early = largest(keep(g.opaque, g.sigma)) > kEarlySigma;
+    const float bound = float(view.height - 1);
+    const int top = early || !(top_row > 0.0f) ? 0 : top_row > bound ? view.height : static_cast<int>(top_row);
+    const int end = !(end_row >= 0.0f) ? 0 : end_row > bound ? view.height : static_cast<int>(end_row) + 1;
     if (top < end) {
-        const float nearest = largest(select(touched, g.zero, splat(-1e9f)));
+        const float nearest = largest(select(g.touched, g.zero, splat(-1e9f)));
         if (nearest > -6.4f || early)
             draw_rows<Profile::Clipped>(g, s, strip, column, top, end);
-        else if (thickest > 0.2f)
+        else if (largest(g.peak) * kFullG > 0.2f)
             draw_rows<Profile::Thick>(g, s, strip, column, top, end);
         else
             draw_rows<Profile::Thin>(g, s, strip, column, top, end);
     }
-    if (end < view.height && any(opaque)) {
+    if (end < view.height && any(g.opaque)) {
         const Floats below = g.peak * clipped_profile(whole, g.zero);
         const Floats alpha = minimum(1.0f - exponential(-below), splat(kMaxWeight));
         const Mask passes = less_equal(splat(kMinPsi), below);

@@ -58,6 +58,7 @@ struct View {
 struct Slice {
     double mean_x, mean_z;
     double cov_xx, cov_xz, cov_zz;
+    double depth;         // of the mean along its scan line
     float m2_plane;       // squared Mahalanobis distance of the plane from the mean
     float intensity;      // I
     float absorb;         // 1 - tau
@@ -72,7 +73,7 @@ class SliceList {
     SliceList& operator=(const SliceList&) = delete;
     ~SliceList();
     Slice* append(int n);  // room for n more; call shrink_by for those not written
-    void shrink_by(int n) { size_ -= n; }
+    void shrink_by(int n);
     void clear() { size_ = 0; }
     const Slice* data() const { return data_; }
     int64_t size() const { return size_; }

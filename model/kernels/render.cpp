@@ -10,6 +10,7 @@
 #include <mutex>
 #include <new>
 #include <stdexcept>
+#include <system_error>
 #include <thread>
 
 namespace ultragray {
@@ -17,12 +18,14 @@ namespace {
 
 constexpr int kStripLines = 64;  // four accumulators of 512 rows stay within a 1 MB cache
 constexpr int64_t kClustersPerTask = 512;
-constexpr int kPosesAtOnce = 16;  // bounds the memory that slices take
+constexpr int kPosesAtOnce = 8;  // bounds the memory that slices take
 
 std::vector<const Kernels*> available_kernels() {
     std::vector<const Kernels*> found;
 #if defined(ULTRAGRAY_X86)
-    if (__builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512dq")) found.push_back(&kernels_avx512());
+    if (__builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl") &&
+        __builtin_cpu_supports("avx512bw"))
+        found.push_back(&kernels_avx512());
     if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma")) found.push_back(&kernels_avx2());
 #endif
     found.push_back(&kernels_baseline());
@@ -67,7 +70,13 @@ void run_phases(Phase& first, Phase& second, int threads) {
         take_all(second);
     };
     std::vector<std::thread> helpers;
-    for (int t = 1; t < std::min(threads, std::max(first.count, second.count)); ++t) helpers.emplace_back(work);
+    const int wanted = std::min(threads, std::max(first.count, second.count)) - 1;
+    helpers.reserve(std::max(0, wanted));
+    try {
+        for (int t = 0; t < wanted; ++t) helpers.emplace_back(work);
+    } catch (const std::system_error&) {
+        // No more threads to be had: those that run do the work.
+    }
     work();
     for (std::thread& helper : helpers) helper.join();
     if (failure) std::rethrow_exception(failure);
@@ -143,6 +152,8 @@ Slice* SliceList::append(int n) {
     size_ += n;
     return data_ + size_ - n;
 }
+
+void SliceList::shrink_by(int n) { size_ -= n; }
 
 std::vector<std::string> instruction_sets() {
     std::vector<std::string> names;

@@ -8,7 +8,8 @@
 namespace ultragray {
 namespace {
 
-constexpr double kReach = 3.3290429;  // sqrt(-2 log(1/255)): w < 1/255 beyond this many standard deviations
+constexpr double kMinScale = 1e-15, kMaxScale = 1e15;  // cm; keeps squares within float
+constexpr double kReach = 3.3290429;                   // sqrt(-2 log(1/255)): w < 1/255 beyond this many standard deviations
 
 Gaussian activate(const RawSplats& raw, int64_t i) {
     Gaussian g;
@@ -17,7 +18,7 @@ Gaussian activate(const RawSplats& raw, int64_t i) {
     for (int d = 0; d < 4; ++d) g.quat[d] = static_cast<float>(raw.quats[4 * i + d] / std::sqrt(norm));
     for (int d = 0; d < 3; ++d) {
         g.mean[d] = raw.means[3 * i + d];
-        const double scale = std::exp(double(raw.scales[3 * i + d]));
+        const double scale = std::clamp(std::exp(double(raw.scales[3 * i + d])), kMinScale, kMaxScale);
         g.scale[d] = static_cast<float>(scale);
         largest = std::max(largest, scale);
     }

@@ -110,9 +110,11 @@ void slice_candidates(const SceneView& scene, const View& view, const Candidates
     int written = 0;
     for (int k = 0; k < c.count; ++k) {
         if (!(m2[k] <= kMaxM2) || !inside_planes(view, mu[0][k], mu[2][k])) continue;
+        if (!(cov_xx[k] > 0 && cov_xx[k] * cov_zz[k] > cov_xz[k] * cov_xz[k])) continue;  // thinner than double can tell
         Slice& s = next[written];
         s.mean_x = mean_x[k], s.mean_z = mean_z[k];
         s.cov_xx = cov_xx[k], s.cov_xz = cov_xz[k], s.cov_zz = cov_zz[k];
+        s.depth = view.convex ? __builtin_sqrt(s.mean_x * s.mean_x + s.mean_z * s.mean_z) : s.mean_z;
         touched_lines(view, kMaxM2 - m2[k], s);
         if (s.first > s.last) continue;
         s.m2_plane = static_cast<float>(m2[k]);
@@ -127,7 +129,8 @@ void slice_clusters(const SceneView& scene, const View& view, int64_t first, int
     const float ny[3] = {float(view.axes[1][0]), float(view.axes[1][1]), float(view.axes[1][2])};
     const float o[3] = {float(view.origin[0]), float(view.origin[1]), float(view.origin[2])};
     // The culls here only save work; they are widened by what float32 may be off.
-    const float slack = 1e-5f * (1.0f + __builtin_fabsf(o[0]) + __builtin_fabsf(o[1]) + __builtin_fabsf(o[2]));
+    const float far = view.cull_far < 1e6 ? float(view.cull_far) : 1e6f;  // infinite for one row
+    const float slack = 1e-6f * (1.0f + far + __builtin_fabsf(o[0]) + __builtin_fabsf(o[1]) + __builtin_fabsf(o[2]));
     Candidates found;
     for (int64_t i = first; i < last; ++i) {
         const Cluster& cluster = scene.clusters[i];

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -46,7 +47,7 @@ def render_outputs(
             f"instruction_set must be auto or one of {', '.join(INSTRUCTION_SETS)}, got {instruction_set!r}",
             field="instruction_set",
         )
-    frames = {name: torch.empty((len(poses_cm), height, width)) for name in outputs}
+    frames = {name: torch.empty((len(poses_cm), height, width), dtype=torch.float32, device="cpu") for name in outputs}
     planes = {name: frames[name].numpy() if name in frames else None for name in _PLANES}
     convex = isinstance(probe, ConvexProbe)
     _cpu.render(
@@ -70,21 +71,45 @@ def render_outputs(
 _PLANES = ("bmode", "echo", "transmittance", "coverage")
 
 
+class _Prepared(NamedTuple):
+    """A prepared scene, and what it was prepared from: holding the tensors keeps their identity from being reused."""
+
+    tensors: tuple[Tensor, ...]
+    versions: tuple[int, ...]
+    intensity: str
+    scene: _cpu.PreparedScene
+
+
 def _prepared(scene: GaussianScene) -> _cpu.PreparedScene:
-    """The scene as the kernel wants it, kept with the scene until one of its tensors changes."""
-    key = tuple((t.data_ptr(), t._version) for t in scene.splats.values())
-    if scene.cache.get("cpu_key") != key:
-        raw = {name: tensor.detach().contiguous() for name, tensor in scene.splats.items()}
-        scene.cache["cpu"] = _cpu.PreparedScene(
-            raw["means"].numpy(),
-            raw["scales"].numpy(),
-            raw["quats"].numpy(),
-            raw["transmittances"].numpy(),
-            raw["sh0"].reshape(-1).numpy(),
-            raw["shN"].squeeze(-1).numpy(),
-            scene.sh_degree,
-            scene.info.intensity == "sigmoid",
-        )
-        scene.cache["cpu_key"] = key
-    prepared: _cpu.PreparedScene = scene.cache["cpu"]
-    return prepared
+    """The scene as the kernel wants it, kept with the scene until one of its tensors changes.
+
+    A change that torch does not count (through `.data`) is not noticed.
+    """
+    tensors = tuple(scene.splats.values())
+    if any(t.is_inference() for t in tensors):  # their changes are not counted
+        return _prepare(scene)
+    versions = tuple(t._version for t in tensors)
+    kept: _Prepared | None = scene.cache.get("cpu")
+    if (
+        kept is None
+        or kept.versions != versions
+        or kept.intensity != scene.info.intensity
+        or any(a is not b for a, b in zip(kept.tensors, tensors, strict=True))
+    ):
+        kept = _Prepared(tensors, versions, scene.info.intensity, _prepare(scene))
+        scene.cache["cpu"] = kept  # one assignment: threads may render the scene at the same time
+    return kept.scene
+
+
+def _prepare(scene: GaussianScene) -> _cpu.PreparedScene:
+    raw = {name: tensor.detach().contiguous() for name, tensor in scene.splats.items()}
+    return _cpu.PreparedScene(
+        raw["means"].numpy(),
+        raw["scales"].numpy(),
+        raw["quats"].numpy(),
+        raw["transmittances"].numpy(),
+        raw["sh0"].reshape(-1).numpy(),
+        raw["shN"].squeeze(-1).numpy(),
+        scene.sh_degree,
+        scene.info.intensity == "sigmoid",
+    )

@@ -73,12 +73,11 @@ def _render_pose(scene: GaussianScene, probe: Probe, pose: Tensor, height: int, 
     weight_sum = like.new_zeros((height, width))
     weighted_intensity = like.new_zeros((height, width))
     transmittance = like.new_ones((height, width))
-    kept = torch.nonzero(_inside_planes(probe, means, height))[:, 0]
+    (kept,) = torch.nonzero(_inside_planes(probe, means, height), as_tuple=True)
     for ids in torch.split(kept, max(1, ELEMENTS_PER_CHUNK // (9 * width))):
         rays = _intersect(means[ids], inverse_root[ids], origins, directions)  # [n, W]
-        touching = torch.nonzero((rays.m2 <= -2.0 * math.log(MIN_WEIGHT)).any(dim=1))[
-            :, 0
-        ]  # else w and α are below 1/255
+        near_enough = (rays.m2 <= -2.0 * math.log(MIN_WEIGHT)).any(dim=1)  # else w and α are below 1/255
+        (touching,) = torch.nonzero(near_enough, as_tuple=True)
         for part in torch.split(touching, max(1, ELEMENTS_PER_CHUNK // (height * width))):
             weight, alpha = _weight_and_alpha(Rays(*(r[part] for r in rays)), depths)  # [n, H, W]
             counted = (weight >= MIN_WEIGHT) | (alpha >= MIN_WEIGHT)
@@ -103,7 +102,7 @@ def _inside_planes(probe: Probe, means: Tensor, height: int) -> Tensor:  # [N, 3
 
 def _inverse_root_covariance(scene: GaussianScene, rotation: Tensor) -> Tensor:  # [N, 3, 3]
     """L with LᵀL = A = Σ⁻¹ in the probe frame: rotate into the Gaussian's own axes, divide by its scales."""
-    w, x, y, z = torch.nn.functional.normalize(scene.quats, dim=-1).unbind(-1)
+    w, x, y, z = (scene.quats / scene.quats.norm(dim=-1, keepdim=True)).unbind(-1)
     axes = torch.stack(
         [
             *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),

@@ -31,6 +31,7 @@ from .scene_info import (
     with_summary,
 )
 
+MAX_POSITION_CM = 1e6
 PARAMETERS = ("means", "scales", "quats", "transmittances", "sh0", "shN")
 
 
@@ -49,7 +50,9 @@ class GaussianScene:
     shN: Tensor  # [N, K-1, 1]  # noqa: N815 (the released name)
     info: SceneInfo = field(default_factory=SceneInfo)
     training_poses: FloatArray = field(default_factory=lambda: np.zeros((0, 4, 4)))  # [P, 4, 4] mm
-    cache: dict[str, Any] = field(default_factory=dict, repr=False)  # what a backend prepared for this scene
+    cache: dict[str, Any] = field(
+        default_factory=dict, init=False, repr=False
+    )  # what a backend prepared for this scene
 
     @classmethod
     def from_splats(
@@ -100,6 +103,8 @@ class GaussianScene:
                 )
             if not bool(torch.isfinite(tensor).all()):
                 raise InvalidArgument(f"splats[{name!r}] must be finite, got NaN or infinity", field=name)
+        if count and float(means.detach().abs().max()) > MAX_POSITION_CM:
+            raise InvalidArgument(f"splats['means'] must lie within {MAX_POSITION_CM:g} cm", field="means")
         if count and bool((tensors["quats"].detach().norm(dim=-1) == 0).any()):
             raise InvalidArgument("splats['quats'] must not be zero", field="quats")
         poses = np.zeros((0, 4, 4)) if training_poses is None else check_poses(training_poses, field="training_poses")

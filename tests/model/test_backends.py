@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -301,3 +302,41 @@ def test_an_unknown_backend_is_named(random_scene: Callable[..., GaussianScene])
 def test_an_unknown_instruction_set_is_named(random_scene: Callable[..., GaussianScene]) -> None:
     with pytest.raises(BackendUnavailable, match="mmx"):
         cpu.render_outputs(random_scene(1), LINEAR, np.eye(4)[None], 4, 4, OUTPUTS, instruction_set="mmx")
+
+
+def single(mean: Sequence[float], scales: Sequence[float], copies: int = 1, **splats: Any) -> GaussianScene:
+    """Equal Gaussians at `mean` (cm) with raw `scales` (log cm), opaque black unless `splats` says otherwise."""
+    raw = {
+        "means": torch.tensor([mean] * copies, dtype=torch.float32),
+        "scales": torch.tensor([scales] * copies, dtype=torch.float32),
+        "quats": torch.tensor([[1.0, 0.3, -0.2, 0.5]] * copies),
+        "transmittances": torch.full((copies,), -30.0),
+        "sh0": torch.zeros(copies, 1, 1),
+    }
+    return GaussianScene.from_splats({**raw, **splats})
+
+
+EXTREMES = {
+    "a sheet without thickness": single((0, 0, 2), (-1, -1, -60)),
+    "a needle without thickness": single((0, 0, 2), (-1, -20, -20)),
+    "a point": single((0, 0, 2), (-100, -100, -100)),
+    "wider than float32 can square": single((0, 0, 2), (45, 45, 45)),
+    "wider than float32": single((0, 0, 2), (100, 100, 100)),
+    "a quaternion near zero": single((0, 0, 2), (-1, -2, -3), quats=torch.tensor([[1e-14, 2e-15, 0, 3e-15]])),
+    "one at the probe's origin": single((0, 0, 0), (-1, -1, -1)),
+    "many in one place": single((0, 0, 1), (-1.2, -1.2, -1.2), copies=30, transmittances=torch.zeros(30)),
+    "absorbing above the rows where it echoes": single(
+        (0, 0.88, 4), (math.log(0.3), math.log(0.3), math.log(10)), quats=torch.tensor([[1.0, 0, 0, 0]])
+    ),
+}
+
+
+@pytest.mark.parametrize("instruction_set", cpu.INSTRUCTION_SETS)
+@pytest.mark.parametrize("name", EXTREMES)
+def test_extreme_gaussians(name: str, instruction_set: str, assert_agrees: Callable[..., None]) -> None:
+    scene = EXTREMES[name]
+    probe = LinearProbe(width_mm=20.0, near_mm=0.0, far_mm=80.0)
+    planes = cpu.render_outputs(scene, probe, np.eye(4)[None], 40, 40, OUTPUTS, instruction_set=instruction_set)
+    exact = render(scene.to(torch.float64), probe, np.eye(4), height=40, width=40, backend="reference")
+    expected = {output: getattr(exact, output).numpy() for output in OUTPUTS}
+    assert_agrees(Frames(**planes), expected, tolerance=5e-4)

@@ -6,6 +6,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -106,3 +107,34 @@ def test_only_what_was_asked_for_comes_back(random_scene: SceneMaker) -> None:
     assert frames.transmittance is None
     assert frames.echo is not None
     assert frames.echo.shape == (2, 8, 9)
+
+
+def test_a_scene_that_shares_tensors_has_its_own_preparation(random_scene: SceneMaker) -> None:
+    scene = random_scene(count=50)
+    render(scene, PROBE, poses(1), height=16, width=16)
+    sigmoid = replace(scene, info=replace(scene.info, intensity="sigmoid"))
+    echo = render(sigmoid, PROBE, poses(1), height=16, width=16, outputs=("echo",)).echo
+    exact = render(sigmoid.to(torch.float64), PROBE, poses(1), height=16, width=16, outputs=("echo",)).echo
+    assert echo is not None
+    assert exact is not None
+    assert (echo - exact).abs().max() < 5e-4
+
+
+def test_a_replaced_tensor_is_noticed(random_scene: SceneMaker) -> None:
+    scene = random_scene(count=50)
+    for _ in range(6):  # the allocator may hand out an address again
+        scene.means = scene.means + 0.05
+        fresh = GaussianScene.from_splats(scene.splats)
+        size = {"height": 16, "width": 16, "outputs": ("bmode",)}
+        assert torch.equal(render(scene, PROBE, poses(1), **size).bmode, render(fresh, PROBE, poses(1), **size).bmode)
+
+
+def test_torch_defaults_and_inference_mode_do_not_matter(random_scene: SceneMaker) -> None:
+    before = render(random_scene(count=50), PROBE, poses(1), height=16, width=16).bmode
+    torch.set_default_dtype(torch.float64)
+    try:
+        assert torch.equal(render(random_scene(count=50), PROBE, poses(1), height=16, width=16).bmode, before)
+    finally:
+        torch.set_default_dtype(torch.float32)
+    with torch.inference_mode():
+        assert torch.equal(render(random_scene(count=50), PROBE, poses(1), height=16, width=16).bmode, before)
