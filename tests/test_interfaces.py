@@ -44,6 +44,7 @@ from ultragray_service.cli import USER_ERROR
 from ultragray_service.cli import app as command_line
 from ultragray_service.http import accept, middleware, problems
 from ultragray_service.http.app import create_app
+from ultragray_service.http.docs import DOCS_PATH
 from ultragray_service.http.routes import render as render_route
 from ultragray_service.http.schemas import RenderBody
 from ultragray_service.logs import JsonFormatter, request_id
@@ -194,7 +195,7 @@ def test_routes(service: Service, openapi: dict[str, Any]) -> None:
         for method, operation in operations.items()
     }
     app = create_app(service)
-    found |= {f"GET {path}": [200] for path in (app.docs_url, app.openapi_url)}
+    found |= {f"GET {path}": [200] for path in (DOCS_PATH, app.openapi_url)}
     assert {name: [int(n) for n in numbers(statuses)] for name, (statuses, _) in table("Routes").items()} == found
 
 

@@ -76,9 +76,9 @@ def read_released_config(path: str | Path) -> ReleasedConfig:
     images, images_missing = _find_images(path, document)
     config = ReleasedConfig(
         path=path,
-        near_mm=10.0 * _number(path, document, "ultrasound_near_plane"),
-        far_mm=10.0 * _number(path, document, "ultrasound_far_plane"),
-        width_mm=None if width_cm is None else 10.0 * width_cm,
+        near_mm=_to_mm(_number(path, document, "ultrasound_near_plane")),
+        far_mm=_to_mm(_number(path, document, "ultrasound_far_plane")),
+        width_mm=None if width_cm is None else _to_mm(width_cm),
         opening_angle_deg=angle_deg,
         dataset_name=_dataset_name(path, document),
         images=images,
@@ -164,3 +164,7 @@ def _read_shape(path: Path) -> TrainingImages:
         raise CheckpointInvalid(f"{path}: images must have shape [N, H, W], got {shape}")
     count, height, width = array.shape
     return TrainingImages(path=path, count=count, height=height, width=width)
+
+
+def _to_mm(length_cm: float) -> float:
+    return round(10.0 * length_cm, 9)  # 3.79269 cm is 37.9269 mm, not 37.926899999999996

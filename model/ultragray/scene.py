@@ -131,7 +131,7 @@ class GaussianScene:
 
     def poses_to_scene_cm(self, poses: FloatArray) -> FloatArray:  # [C, 4, 4] mm -> [C, 4, 4] cm
         """Poses in the sweep's frame (mm) as poses in the scene's own (cm, about its centre)."""
-        inside = poses.copy()
+        inside: FloatArray = poses.copy()
         inside[:, :3, 3] = (poses[:, :3, 3] - np.asarray(self.info.centre_mm)) / 10.0
         return inside
 

@@ -70,7 +70,7 @@ def serve(
     data_folder: Annotated[
         Path | None,
         typer.Option(
-            help="Folder of scene files (*.ugr); where it holds none, the demo scene is made in it. "
+            help="Existing folder of scene files (*.ugr); where it holds none, the demo scene is made in it. "
             "[ULTRAGRAY_DATA_FOLDER]",
             show_default="data",
         ),

@@ -15,7 +15,7 @@ from ultragray.scene_info import read_header
 from ultragray_workers.scenes import SUFFIX, SceneStore
 
 from .server import run
-from .settings import load_settings
+from .settings import Settings, load_settings
 
 DEMO_NAME = "demo"
 
@@ -24,12 +24,14 @@ def serve_scenes(scenes: Iterable[Path], options: Mapping[str, Any]) -> None:
     """Serves the given scene files, or the data folder of the settings; returns when the service has stopped.
 
     Given files are served by their stem from a folder of links that lasts as long as the service. A data
-    folder without a scene gets the demo scene. Raises InvalidArgument, SceneFileInvalid, StartupFailed and
-    OSError.
+    folder without a scene gets the demo scene; the default one is made.
+    Raises InvalidArgument, SceneFileInvalid, StartupFailed and OSError.
     """
     files = list(scenes)
     if not files:
         settings = load_settings(**options)
+        if settings.data_folder == Settings.model_fields["data_folder"].default:
+            settings.data_folder.mkdir(exist_ok=True)  # any other folder must exist: its name may be mistyped
         ensure_scenes(settings.data_folder)
         run(settings)
         return
@@ -41,11 +43,15 @@ def serve_scenes(scenes: Iterable[Path], options: Mapping[str, Any]) -> None:
 
 
 def ensure_scenes(folder: Path) -> None:
-    """Puts the demo scene into a data folder that is missing or holds no scene, and says so on stderr."""
+    """Puts the demo scene into a data folder that holds no scene, and says so on stderr.
+
+    Raises InvalidArgument where there is no such folder.
+    """
+    if not folder.is_dir():
+        raise InvalidArgument(f"data_folder must be an existing folder, got {str(folder)!r}", field="data_folder")
     if SceneStore(folder).names():
         return
     typer.echo(f"{folder} holds no scenes: building the demo scene…", err=True)
-    folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{DEMO_NAME}{SUFFIX}"
     # In a process of its own: it needs torch, which the service never loads.
     building = multiprocessing.get_context("spawn").Process(target=_write_demo, args=(path,))

@@ -287,7 +287,10 @@ def test_demo_writes_the_demo_scene(tmp_path: Path) -> None:
 
 
 def test_a_data_folder_without_scenes_gets_the_demo(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    folder = tmp_path / "new" / "data"
+    folder = tmp_path / "data"
+    with pytest.raises(InvalidArgument, match="existing folder"):  # its name may be mistyped
+        ensure_scenes(folder)
+    folder.mkdir()
     ensure_scenes(folder)
     assert [p.name for p in folder.iterdir()] == ["demo.ugr"]
     assert "building the demo scene" in capsys.readouterr().err

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import re
+
 import httpx
 import pytest
 
@@ -95,3 +97,18 @@ def test_pages_of_allowed_origins_may_call(start_service: StartService) -> None:
         assert (answer.headers.get("access-control-allow-origin") == origin) is allowed
     answer = httpx.get(f"{service.http}/v1/scenes", headers={"Origin": "https://console.example"})
     assert "X-Ultragray-Shape" in answer.headers["access-control-expose-headers"]
+
+
+def test_the_docs_need_nothing_from_outside(http: httpx.Client) -> None:
+    assert http.get("/").headers["location"] == "/docs"
+    page = http.get("/docs").text
+    assets = re.findall(r'(?:src|href)="([^"]+)"', page)
+    assert len(assets) >= 3
+    for asset in assets:
+        assert asset.startswith("/docs/static/")
+        assert http.get(asset).status_code == 200
+
+
+@pytest.mark.parametrize("path", ["/v1/health/live", "/v1/health/ready"])
+def test_health_answers_head(http: httpx.Client, path: str) -> None:  # what load balancers send
+    assert http.head(path).status_code == 200

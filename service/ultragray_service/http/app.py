@@ -15,6 +15,7 @@ from ultragray.errors import UltragrayError
 
 from ..state import Service
 from . import problems
+from .docs import add_docs
 from .middleware import LimitBody, RequestContext, RequireKey
 from .routes import health, metrics, render, scenes
 from .schemas import RenderBody
@@ -38,7 +39,7 @@ def create_app(service: Service) -> FastAPI:
         title="UltraG-Ray",
         version=__version__,
         description=_DESCRIPTION,
-        docs_url="/docs",
+        docs_url=None,  # see add_docs
         redoc_url=None,
         redirect_slashes=False,
     )
@@ -46,6 +47,7 @@ def create_app(service: Service) -> FastAPI:
     # render comes first: its route is the one that must be found fast
     for module in (render, scenes, health, metrics):
         app.include_router(module.router)
+    add_docs(app)
     app.add_exception_handler(UltragrayError, problems.answer_ultragray_error)
     app.add_exception_handler(HTTPException, problems.answer_http_exception)
     app.add_exception_handler(RequestValidationError, problems.answer_validation_error)

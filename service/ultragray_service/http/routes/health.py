@@ -10,12 +10,14 @@ from ..schemas import Live, Ready
 router = APIRouter(prefix="/v1/health", tags=["health"])
 
 
+@router.head("/live", include_in_schema=False)
 @router.get("/live")
 async def live() -> Live:
     """200 as long as the process runs."""
     return Live()
 
 
+@router.head("/ready", include_in_schema=False)
 @router.get("/ready", responses=problems(503))
 async def ready(service: ServiceDep) -> Ready:
     """200 while frames are rendered; 503 while the service starts (NOT_READY) or stops (DRAINING)."""
