@@ -50,7 +50,7 @@ def run_bench(output: Path | None, quick: bool) -> None:
     console = Console()
     if not console.is_terminal:
         console = Console(width=TABLE_WIDTH)
-    repeats = 20 if quick else 100
+    repeats = 20 if quick else 200
     threads = torch.get_num_threads()
     yards = [time_yard_ms()]
     rows: list[Row] = []

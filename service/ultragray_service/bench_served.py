@@ -27,6 +27,7 @@ from .bench_kernel import BenchScene, bench_poses
 
 SCENE = "bench"
 IN_FLIGHT = 8
+WARM_UP = 20  # first requests of a connection, not counted
 START_TIMEOUT_S = 120.0
 
 
@@ -49,7 +50,7 @@ class Served:
 
 def measure_served(bench: BenchScene, repeats: int) -> Served:
     """Raises NotReady where the server does not come up."""
-    poses = bench_poses(repeats)
+    poses = bench_poses(repeats + WARM_UP)
     with tempfile.TemporaryDirectory(prefix="ultragray-bench-") as folder:
         bench.scene.save(Path(folder) / f"{SCENE}.ugr")
         with _server(Path(folder)) as (http_port, grpc_port, pid):
@@ -126,7 +127,7 @@ def _grpc_stream(port: int, poses: FloatArray) -> FrontDoor:  # [C, 4, 4]
             _check(frame)
             room.release()
         rate = len(poses) / (time.perf_counter() - started)
-    return FrontDoor("gRPC stream", latency_ms, rate)
+    return FrontDoor("gRPC stream", latency_ms[WARM_UP:], rate)
 
 
 class _Turns:
@@ -183,13 +184,13 @@ def _http(what: str, port: int, poses: FloatArray, media_type: str) -> FrontDoor
 
 
 def _one_by_one(what: str, poses: FloatArray, render: Callable[[FloatArray], object]) -> FrontDoor:
-    render(poses[0])
     latency_ms = []
     for pose in poses:
         started = time.perf_counter()
         render(pose)
         latency_ms.append(1000.0 * (time.perf_counter() - started))
-    return FrontDoor(what, latency_ms, 1000.0 * len(latency_ms) / sum(latency_ms))
+    counted = latency_ms[WARM_UP:]
+    return FrontDoor(what, counted, 1000.0 * len(counted) / sum(counted))
 
 
 def _descendants(pid: int) -> list[int]:

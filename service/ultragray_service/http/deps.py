@@ -18,7 +18,9 @@ async def _service(connection: HTTPConnection) -> Service:  # async: FastAPI run
 
 
 ServiceDep = Annotated[Service, Depends(_service)]
-SceneName = Annotated[str, Path(description="Name of the scene: its file name without .ugr.", examples=["demo"])]
+_NAME_MEANS = "Name of the scene: its file name without .ugr."
+SceneName = Annotated[str, Path(description=_NAME_MEANS, examples=["demo"])]
+SCENE_NAME = {"description": _NAME_MEANS, "schema": {"type": "string", "title": "Scene", "examples": ["demo"]}}
 
 
 def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
