@@ -1,4 +1,4 @@
-// From slices to pixels: S, sum of I*w and T on a strip of scan lines (PHYSICS.md §3, §5.3).
+// From slices to pixels: S, sum of I*w and T on a strip of scan lines (docs/physics.md §3, §5.3).
 //
 // kLanes neighbouring scan lines form a vector and the loop runs down the rows. In depth steps of du standard deviations the
 // echo weight is a Gaussian progression, w(k+1) = w(k) r(k) and r(k+1) = r(k) q, which costs two products a row instead of
@@ -18,7 +18,7 @@ constexpr float kMinVariance = 1e-32f;  // cm2; thinner ones touch no row
 constexpr float kNode = 0.7745966692f;  // Gauss-Legendre: nodes 0, +-sqrt(0.6)
 constexpr int kRestartRows = 32;
 
-// G of PHYSICS.md §3 for unclipped windows, constant beyond the ends of its fit.
+// G of docs/physics.md §3 for unclipped windows, constant beyond the ends of its fit.
 #if defined(__AVX512F__)
 // Parabolas on steps of 0.2 from -3.4 to 3 (the kink at 0 lies between two), looked up within registers: within 3e-5.
 inline Floats absorption_profile(Floats u) {

@@ -1,5 +1,5 @@
 // The CPU renderer's data and the seam between what is compiled once and what is compiled per instruction set.
-// Lengths are centimetres. C poses, N Gaussians, H depth samples, W scan lines (PHYSICS.md §1-§5).
+// Lengths are centimetres. C poses, N Gaussians, H depth samples, W scan lines (docs/physics.md §1-§5).
 #pragma once
 
 #include <cstddef>

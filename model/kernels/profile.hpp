@@ -1,4 +1,4 @@
-// G(u) of PHYSICS.md §3 as parabolas: the value of the three-point Gauss-Legendre rule over the unclipped window.
+// G(u) of docs/physics.md §3 as parabolas: the value of the three-point Gauss-Legendre rule over the unclipped window.
 #pragma once
 
 namespace ultragray {

@@ -1,4 +1,4 @@
-// A scene made ready for rendering: activated, sorted along a space-filling curve, clustered (PHYSICS.md §2, §5.4).
+// A scene made ready for rendering: activated, sorted along a space-filling curve, clustered (docs/physics.md §2, §5.4).
 #pragma once
 
 #include <vector>

@@ -1,4 +1,4 @@
-"""Import of checkpoints that the released UltraG-Ray trainer wrote (PHYSICS.md §1, §2, §3, §6).
+"""Import of checkpoints that the released UltraG-Ray trainer wrote (docs/physics.md §1, §2, §3, §6).
 
 A released checkpoint holds the six raw parameter tensors and nothing about where they are: its unit is
 the centimetre, its origin the mean of the image corners of the training frames, and its depth grid is

@@ -1,8 +1,8 @@
-"""The forward model of PHYSICS.md §3 in plain torch: the definition that every fast backend is tested against.
+"""The forward model of docs/physics.md §3 in plain torch: the definition that every fast backend is tested against.
 
 Written for reading. It computes in the dtype and on the device of the scene's tensors and is differentiable by
-autograd; thresholds and culls are held fixed, everything else carries its true gradient (PHYSICS.md §4). Lengths are in
-cm.
+autograd; thresholds and culls are held fixed, everything else carries its true gradient (docs/physics.md §4). Lengths
+are in cm.
 """
 
 from __future__ import annotations
@@ -156,7 +156,7 @@ def _weight_and_alpha(rays: Rays, depths: Tensor) -> tuple[Tensor, Tensor]:  # [
 
 
 def intensity(scene: GaussianScene, origin: Tensor) -> Tensor:  # [3] cm -> [N]
-    """Echo intensity I of each Gaussian seen from a probe at `origin`, by the scene's activation (PHYSICS.md §2)."""
+    """Echo intensity I of each Gaussian seen from a probe at `origin`, by its activation (docs/physics.md §2)."""
     offset = scene.means - origin
     length = offset.norm(dim=-1, keepdim=True)
     v = torch.where(length > 0, offset / torch.where(length > 0, length, 1.0), 0.0)

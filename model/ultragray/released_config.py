@@ -47,7 +47,7 @@ class ReleasedConfig:
         return self._probe(self.far_mm)
 
     def probe(self, image_height: int) -> Probe:
-        """The probe of ours for training images of `image_height` rows: the stretch of PHYSICS.md §3."""
+        """The probe of ours for training images of `image_height` rows: the stretch of docs/physics.md §3."""
         try:
             return self._probe(stretch_released_far(self.near_mm, self.far_mm, image_height))
         except InvalidProbe as error:

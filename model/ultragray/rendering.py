@@ -22,7 +22,7 @@ Backend = Callable[[GaussianScene, Probe, FloatArray, int, int, Sequence[str]], 
 class Frames:
     """Rendered frames, each [C, H, W] in [0, 1] or None where it was not asked for.
 
-    bmode B = E·T, echo E, transmittance T, coverage γ = 1 − exp(−S) (PHYSICS.md §3).
+    bmode B = E·T, echo E, transmittance T, coverage γ = 1 − exp(−S) (docs/physics.md §3).
     """
 
     bmode: Tensor | None = None

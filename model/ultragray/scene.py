@@ -37,7 +37,7 @@ PARAMETERS = ("means", "scales", "quats", "transmittances", "sh0", "shN")
 
 @dataclass(eq=False)
 class GaussianScene:
-    """Raw parameters (PHYSICS.md §2), as a released checkpoint's `splats` holds them, and the scene's description.
+    """Raw parameters (docs/physics.md §2), as a released checkpoint's `splats` holds them, and the scene's description.
 
     The tensors share one floating dtype and one device. `GaussianScene.from_splats` checks them; use that.
     """

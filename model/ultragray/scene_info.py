@@ -36,7 +36,7 @@ class SceneInfo:
     probe: Probe | None = None
     image_height: int | None = None  # H of the training images
     image_width: int | None = None  # W
-    intensity: str = "released"  # activation of PHYSICS.md §2: released or sigmoid
+    intensity: str = "released"  # activation of docs/physics.md §2: released or sigmoid
     sh_degree: int = 0
     gaussian_count: int = 0
     bounds_min_mm: Vector = (0.0, 0.0, 0.0)  # of the Gaussians' means

@@ -1,6 +1,6 @@
 """`ultragray bench`: what a frame costs in the kernel and through each front door, here and now.
 
-Machines drift, so every time is also given in yards, a fixed piece of work timed in the same run (PHYSICS.md §5).
+Machines drift, so every time is also given in yards, a fixed piece of work timed in the same run (docs/physics.md §5).
 """
 
 from __future__ import annotations

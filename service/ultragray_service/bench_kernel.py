@@ -100,7 +100,7 @@ def measure_kernel(bench: BenchScene, thread_counts: Sequence[int], repeats: int
 
 
 def time_yard_ms() -> float:
-    """The median time of 36 million float32 exponentials by torch on one thread, ms (PHYSICS.md §5)."""
+    """The median time of 36 million float32 exponentials by torch on one thread, ms (docs/physics.md §5)."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     x = -torch.rand(7_200_000)

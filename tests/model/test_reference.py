@@ -1,4 +1,4 @@
-"""The reference against PHYSICS.md §2 and §3 written out a second time: scalars in Python, pixel by pixel."""
+"""The reference against docs/physics.md §2 and §3 written out a second time: scalars in Python, pixel by pixel."""
 
 from __future__ import annotations
 
@@ -174,7 +174,7 @@ def test_one_gaussian(probe: Probe, mean_cm: tuple[float, float, float], sigma_c
 
 
 def test_the_worked_value_in_the_middle_of_a_gaussian() -> None:
-    """At its centre w = 0.999 (clamped), S = 0.999, and a fully crossed one has ψ = 1.153·√(2π)·σ (PHYSICS.md §3)."""
+    """At its centre w = S = 0.999 (clamped), and a fully crossed one has ψ = 1.153·√(2π)·σ (docs/physics.md §3)."""
     scene = one_gaussian((0.0, 0.0, 1.5), (0.1, 0.1, 0.1), transmittance_logit=0.0, sh=(0.0,))
     probe = LinearProbe(width_mm=20.0, near_mm=0.0, far_mm=30.0)
     frames = render(scene, probe, HERE, height=3, width=1, backend="reference")

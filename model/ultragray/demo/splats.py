@@ -105,7 +105,7 @@ def spread_over(
 
 
 def parameters(gaussians: Splats, centre_mm: tuple[float, float, float]) -> dict[str, Tensor]:
-    """Raw scene parameters (PHYSICS.md §2) for the `sigmoid` intensity, SH degree 1, in cm about `centre_mm`.
+    """Raw scene parameters (docs/physics.md §2) for the `sigmoid` intensity, SH degree 1, in cm about `centre_mm`.
 
     sigmoid(4·(base + slope·cos)), cos that of the view to the normal, is `edge_on` at 0 and `facing` at 1.
     """
