@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from ultragray.errors import NotAcceptable
-from ultragray_service.http.accept import JPEG, NPZ, PNG, RAW, choose
+from ultragray_service.http.accept import JPEG, NPZ, PNG, RAW, Choice, choose
 from ultragray_workers.types import Encoding
 
 
@@ -49,3 +49,9 @@ def test_what_cannot_be_made_is_refused(accept: str) -> None:
 def test_the_header_goes_before_the_dtype_of_the_body() -> None:
     assert choose(RAW, frames=1, outputs=1, dtype="float32").encoding is Encoding.FLOAT32
     assert choose(f"{RAW};dtype=uint8", frames=1, outputs=1, dtype="float32").encoding is Encoding.UINT8
+
+
+def test_a_dtype_in_the_body_asks_for_raw_where_the_header_leaves_the_choice() -> None:
+    for accept in ("", "*/*"):
+        assert choose(accept, frames=1, outputs=1, dtype="float32") == Choice(RAW, Encoding.FLOAT32)
+    assert choose("image/png", frames=1, outputs=1, dtype="float32").media_type == PNG

@@ -68,11 +68,14 @@ def parse_accept(header: str) -> list[MediaRange]:
 def choose(accept: str, *, frames: int, outputs: int, dtype: str | None) -> Choice:
     """The media type for `frames` poses of `outputs` outputs; `dtype` is that of the body, for raw pixels.
 
-    Among types of equal quality: PNG first for one image, npz first for several. A dtype in the Accept header
-    goes before that of the body. Raises NotAcceptable, saying which types can hold the request.
+    Among types of equal quality: raw first where the body names a dtype, else PNG for one image and npz for several.
+    A dtype in the Accept header goes before that of the body.
+    Raises NotAcceptable, saying which types can hold the request.
     """
     single = frames == 1 and outputs == 1
     able: Sequence[str] = (PNG, JPEG, RAW, NPZ) if single else (NPZ, RAW)
+    if dtype is not None:  # only raw pixels have one
+        able = (RAW, *(media_type for media_type in able if media_type != RAW))
     ranges = parse_accept(accept) if accept.strip() else [MediaRange("*", "*", None, 1.0)]
     best: tuple[float, str, MediaRange] | None = None
     for media_type in able:
