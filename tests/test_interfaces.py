@@ -39,7 +39,7 @@ from ultragray import (
     scene_info,
 )
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2, scenes_pb2
-from ultragray_service import catalog, requests
+from ultragray_service import catalog
 from ultragray_service.cli import USER_ERROR
 from ultragray_service.cli import app as command_line
 from ultragray_service.http import accept, middleware, problems
@@ -53,7 +53,7 @@ from ultragray_service.rpc import status, stream
 from ultragray_service.settings import ENVIRONMENT_PREFIX, Settings, load_settings
 from ultragray_service.state import Service
 from ultragray_workers import encoding as pixels
-from ultragray_workers import pool, scenes
+from ultragray_workers import scenes
 from ultragray_workers.types import Encoding, RenderResult
 
 DOCUMENT = (Path(__file__).resolve().parents[1] / "docs" / "interfaces.md").read_text(encoding="utf-8")
@@ -424,18 +424,17 @@ def test_fixed_limits() -> None:
         "Largest length of a probe": probe.MAX_LENGTH_MM,
         "Largest opening angle": 175,
         "Largest height and width of the library": request.MAX_IMAGE_SIDE,
-        "Height and width where the scene knows none": requests.DEFAULT_IMAGE_SIDE,
+        "Height and width where the scene knows none": scene_info.DEFAULT_IMAGE_SIDE,
         "Largest spherical-harmonic degree": scene_info.MAX_SH_DEGREE,
         "Scenes on one page, default": catalog.DEFAULT_PAGE_SIZE,
         "Scenes on one page": catalog.MAX_PAGE_SIZE,
         "Frames in flight in one `RenderStream`": stream.MAX_FRAMES_IN_FLIGHT,
         "gRPC message received": grpc_server.MAX_RECEIVE_BYTES,
         "JPEG quality": pixels.JPEG_QUALITY,
-        "Retry after": problems.RETRY_AFTER_S,
+        "Retry after": errors.QueueFull.retry_after_s,
         "Shortest API key": 16,
     }
-    assert pool.DEFAULT_IMAGE_SIDE == requests.DEFAULT_IMAGE_SIDE
-    assert status.RETRY_DELAY_S == problems.RETRY_AFTER_S
+    assert errors.NotReady.retry_after_s == errors.Draining.retry_after_s == errors.QueueFull.retry_after_s
     ConvexProbe(175, 1, 2)
     with pytest.raises(errors.InvalidProbe):
         ConvexProbe(math.nextafter(175, 180), 1, 2)

@@ -41,6 +41,7 @@ class UltragrayError(Exception):
     http_status: ClassVar[int] = 500
     grpc_status: ClassVar[str] = "INTERNAL"
     title: ClassVar[str] = "Internal error"
+    retry_after_s: ClassVar[int | None] = None  # when the same request may succeed; None: not by waiting
 
     def __init__(self, detail: str, *, field: str | None = None) -> None:
         super().__init__(detail)
@@ -171,6 +172,7 @@ class QueueFull(UltragrayError):
     http_status = 429
     grpc_status = "RESOURCE_EXHAUSTED"
     title = "Too many frames are waiting"
+    retry_after_s = 1
 
 
 class DeadlineExceeded(UltragrayError):
@@ -185,6 +187,7 @@ class NotReady(UltragrayError):
     http_status = 503
     grpc_status = "UNAVAILABLE"
     title = "Service is starting"
+    retry_after_s = 1
 
 
 class Draining(UltragrayError):
@@ -192,6 +195,7 @@ class Draining(UltragrayError):
     http_status = 503
     grpc_status = "UNAVAILABLE"
     title = "Service is stopping"
+    retry_after_s = 1
 
 
 class StartupFailed(UltragrayError):

@@ -9,7 +9,7 @@ from typing import Any
 from torch import Tensor
 
 from . import __version__, cpu, reference
-from .errors import BackendUnavailable, InvalidArgument
+from .errors import BackendUnavailable
 from .pose import check_poses
 from .probe import FloatArray, Probe
 from .request import OUTPUTS, check_image_size, check_outputs
@@ -47,15 +47,11 @@ def render(
     Backends: `reference` computes in the dtype of the scene's tensors and is differentiable; `cpu` computes in float32
     on as many threads as torch.get_num_threads(); `auto` takes `cpu` for float32 scenes on the CPU that need no
     gradient.
-    Raises InvalidPose, InvalidImageSize, UnknownOutput, InvalidArgument, BackendUnavailable.
+    Raises InvalidPose, InvalidProbe, InvalidImageSize, UnknownOutput, BackendUnavailable.
     """
     chosen = check_outputs(outputs)
     check_image_size(height, width)
-    probe = probe if probe is not None else scene.info.probe
-    if probe is None:
-        raise InvalidArgument(
-            "probe must be given: this scene does not know the one it was trained with", field="probe"
-        )
+    probe = scene.info.probe_or(probe)
     poses_cm = scene.poses_to_scene_cm(check_poses(poses))
     backend = choose_backend(backend, scene)
     return Frames(**_BACKENDS[backend](scene, probe, poses_cm, height, width, chosen))

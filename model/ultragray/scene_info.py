@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from safetensors import SafetensorError, safe_open
 
-from .errors import InvalidArgument, SceneFileInvalid
+from .errors import InvalidArgument, InvalidProbe, SceneFileInvalid
 from .pose import check_poses
 from .probe import FloatArray, Probe, probe_from_dict, probe_to_dict
 
@@ -24,6 +24,7 @@ FORMAT_VERSION = 1
 METADATA_KEY = "ultragray"
 INTENSITIES = ("released", "sigmoid")
 MAX_SH_DEGREE = 3
+DEFAULT_IMAGE_SIDE = 512
 
 Vector = tuple[float, float, float]
 
@@ -61,6 +62,22 @@ class SceneInfo:
         for name in ("metrics", "training"):
             if not isinstance(getattr(self, name), dict):
                 raise InvalidArgument(f"{name} must be an object, got {getattr(self, name)!r}", field=name)
+
+    def probe_or(self, asked: Probe | None) -> Probe:
+        """The probe asked for, else the one the scene was trained with. Raises InvalidProbe where neither is known."""
+        probe = asked or self.probe
+        if probe is None:
+            raise InvalidProbe(
+                "probe must be given: the scene does not know the one it was trained with", field="probe"
+            )
+        return probe
+
+    def image_size_or(self, height: int | None, width: int | None) -> tuple[int, int]:
+        """Height and width as asked for, else those of the training images, else 512."""
+        return (
+            height if height is not None else self.image_height or DEFAULT_IMAGE_SIDE,
+            width if width is not None else self.image_width or DEFAULT_IMAGE_SIDE,
+        )
 
 
 def _vector(name: str, value: Any) -> Vector:

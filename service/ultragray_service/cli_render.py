@@ -19,7 +19,7 @@ import torch
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
 
-from ultragray.errors import InvalidArgument
+from ultragray.errors import InvalidArgument, InvalidProbe
 from ultragray.files import atomic_path, file_sha256
 from ultragray.pose_file import load_poses
 from ultragray.probe import ConvexProbe, Probe, probe_from_dict
@@ -31,7 +31,6 @@ from ultragray_workers.types import Encoding
 
 from .cli_output import check_writable
 
-DEFAULT_SIDE = 512
 CHUNK_BYTES = 64 << 20  # of float32 pixels rendered at once
 OTHER_FILES = (".npy", ".zip", ".png", ".jpg", ".jpeg", ".ugr")
 
@@ -66,16 +65,14 @@ def render_to_files(options: RenderOptions) -> str:
     given_probe = None if options.probe_json is None else _parse_probe(options.probe_json)
     given_poses = None if options.poses is None else load_poses(options.poses)
     scene = GaussianScene.load(options.scene)
-    probe = given_probe or scene.info.probe
-    if probe is None:
-        raise InvalidArgument(
-            "--probe must be given: the scene does not know the one it was trained with", field="probe"
-        )
+    try:
+        probe = scene.info.probe_or(given_probe)
+    except InvalidProbe as error:
+        raise InvalidProbe(f"--{error.detail}", field="probe") from None  # as the option is called here
     poses = scene.training_poses if given_poses is None else given_poses
     if not len(poses):
         raise InvalidArgument("--poses must be given: the scene holds no training poses", field="poses")
-    height = options.height if options.height is not None else scene.info.image_height or DEFAULT_SIDE
-    width = options.width if options.width is not None else scene.info.image_width or DEFAULT_SIDE
+    height, width = scene.info.image_size_or(options.height, options.width)
     check_image_size(height, width)
     draw = _drawing(options.scan_convert_mm, probe, to_npz)
     if options.threads:

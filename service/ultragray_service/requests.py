@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ultragray.errors import InvalidArgument, InvalidImageSize, InvalidProbe, TooManyPoses, UltragrayError
+from ultragray.errors import InvalidArgument, InvalidImageSize, TooManyPoses, UltragrayError
 from ultragray.pose import check_poses
 from ultragray.probe import FloatArray, Probe
 from ultragray.request import check_image_size, check_outputs
@@ -20,8 +20,7 @@ from ultragray_workers.types import Encoding, Priority, RenderRequest
 from .catalog import SceneCatalog
 from .settings import Settings
 
-DEFAULT_IMAGE_SIDE = 512
-_POSES_CHECKED_INLINE = 16  # 0.1 ms each; more go to a thread, so that the loop keeps answering
+_POSES_CHECKED_INLINE = 16  # more go to a thread, so that the loop keeps answering
 
 
 @dataclass(frozen=True)
@@ -61,15 +60,8 @@ class RequestPlanner:
         """
         outputs = check_outputs(spec.outputs)
         header = await self._catalog.header(spec.scene)
-        info = header.info
-        probe = spec.probe or info.probe
-        if probe is None:
-            raise InvalidProbe(
-                f"probe must be given: scene {spec.scene} does not know the one it was trained with",
-                field="probe",
-            )
-        height = info.image_height or DEFAULT_IMAGE_SIDE if spec.height is None else spec.height
-        width = info.image_width or DEFAULT_IMAGE_SIDE if spec.width is None else spec.width
+        probe = header.info.probe_or(spec.probe)
+        height, width = header.info.image_size_or(spec.height, spec.width)
         check_image_size(height, width, limit=self._settings.max_image_side)
         if spec.encoding in (Encoding.PNG, Encoding.JPEG) and len(outputs) != 1:
             raise InvalidArgument(

@@ -28,7 +28,6 @@ from .waiting import Ticket, WaitingQueue
 
 logger = logging.getLogger(__name__)
 
-DEFAULT_IMAGE_SIDE = 512
 MAX_BATCH_POSES = 128  # file descriptors that go along with one message
 MAX_REPLY_BYTES = 2**31 - 2**20
 _MAX_SCENE_CHANGES = 3
@@ -230,15 +229,8 @@ class RenderPool:
 
     def _ticket(self, request: RenderRequest, header: SceneHeader) -> Ticket:
         """The request with its open choices made from the scene's own description."""
-        info = header.info
-        probe = request.probe or info.probe
-        if probe is None:
-            raise InvalidArgument(
-                f"probe must be given: scene {request.scene!r} does not know the one it was trained with",
-                field="probe",
-            )
-        height = request.height or info.image_height or DEFAULT_IMAGE_SIDE
-        width = request.width or info.image_width or DEFAULT_IMAGE_SIDE
+        probe = header.info.probe_or(request.probe)
+        height, width = header.info.image_size_or(request.height, request.width)
         poses, outputs = len(request.poses), len(request.outputs)
         if poses == 0:
             raise InvalidArgument("poses must hold at least one pose, got none", field="poses")

@@ -57,7 +57,7 @@ class RenderRequest:
 class RenderResult:
     """Frames, and all it takes to render them again.
 
-    `data` holds, by encoding: uint8 (round(255·clip(x, 0, 1))) and float32: the outputs one after another, each
+    `data` holds, by encoding: uint8 (round(255·x)) and float32: the outputs one after another, each
     [C, H, W] in C order, little endian; png and jpeg: one image file [H, W]; npz: an archive with one float32
     array [C, H, W] per output, `poses` [C, 4, 4] float64 mm, and the strings `scene`, `scene_sha256`, `renderer`.
     """

@@ -26,8 +26,6 @@ from ultragray.errors import (
 from ..logs import request_id
 
 PROBLEM_TYPE = "application/problem+json"
-RETRY_AFTER_S = 1
-_RETRY_STATUSES = (429, 503)
 
 _CLASS_OF_FIELD: dict[str, type[InvalidArgument]] = {
     "pose": InvalidPose,
@@ -65,8 +63,8 @@ def problem_response(error: UltragrayError, headers: Mapping[str, str] | None = 
         request_id=request_id.get(),
     )
     all_headers = dict(headers or {})
-    if error.http_status in _RETRY_STATUSES:
-        all_headers["Retry-After"] = str(RETRY_AFTER_S)
+    if error.retry_after_s is not None:
+        all_headers["Retry-After"] = str(error.retry_after_s)
     if error.http_status == 401:
         all_headers["WWW-Authenticate"] = "Bearer"
     content = json.dumps(document.model_dump(), ensure_ascii=False)

@@ -74,6 +74,15 @@ class ConvexProbeBody(RequestModel):
 ProbeBody = Annotated[LinearProbeBody | ConvexProbeBody, Field(discriminator="kind")]
 
 
+def probe_body(probe: Probe) -> LinearProbeBody | ConvexProbeBody:
+    """The JSON of a probe."""
+    if isinstance(probe, LinearProbe):
+        return LinearProbeBody(kind="linear", width_mm=probe.width_mm, near_mm=probe.near_mm, far_mm=probe.far_mm)
+    return ConvexProbeBody(
+        kind="convex", opening_angle_deg=probe.opening_angle_deg, near_mm=probe.near_mm, far_mm=probe.far_mm
+    )
+
+
 class RenderBody(RequestModel):
     """What to render. Exactly one of `pose` and `poses`; all else has a default from the scene."""
 

@@ -15,10 +15,8 @@ from ultragray.errors import InvalidArgument, UltragrayError
 from ..logs import request_id
 
 ERROR_DOMAIN = "ultragray"
-RETRY_DELAY_S = 1
 REQUEST_ID_KEY = "x-request-id"
 _DETAILS_KEY = "grpc-status-details-bin"
-_RETRY_STATUSES = (429, 503)
 
 
 def status_of(error: UltragrayError) -> Status:
@@ -29,8 +27,8 @@ def status_of(error: UltragrayError) -> Status:
     if error.field and isinstance(error, InvalidArgument):
         violation = BadRequest.FieldViolation(field=error.field, description=error.detail)
         details.append(BadRequest(field_violations=[violation]))
-    if error.http_status in _RETRY_STATUSES:
-        details.append(RetryInfo(retry_delay=Duration(seconds=RETRY_DELAY_S)))
+    if error.retry_after_s is not None:
+        details.append(RetryInfo(retry_delay=Duration(seconds=error.retry_after_s)))
     status = Status(code=code.value[0], message=error.detail)
     for detail in details:
         packed = AnyMessage()

@@ -6,7 +6,6 @@ from typing import Annotated
 
 from fastapi import APIRouter, Query
 
-from ultragray.probe import probe_to_dict
 from ultragray.scene_info import SceneHeader
 
 from ...catalog import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE, CatalogEntry, finite_metrics, summarise_training
@@ -21,6 +20,7 @@ from ..schemas import (
     ScenePage,
     TrainingPosesOut,
     position_body,
+    probe_body,
 )
 
 router = APIRouter(prefix="/v1/scenes", tags=["scenes"])
@@ -91,7 +91,7 @@ def _scene(name: str, header: SceneHeader, loaded_processes: int) -> SceneOut:
         intensity=info.intensity,
         centre_mm=position_body(info.centre_mm),
         bounds=Bounds(min_mm=position_body(info.bounds_min_mm), max_mm=position_body(info.bounds_max_mm)),
-        probe=None if info.probe is None else probe_to_dict(info.probe),  # type: ignore[arg-type]
+        probe=None if info.probe is None else probe_body(info.probe),
         image_height=info.image_height,
         image_width=info.image_width,
         training_poses=_training_poses(header),
