@@ -16,6 +16,10 @@ UltragrayError
 ├── SceneNotFound                   no scene of that name
 ├── SceneFileInvalid                a scene file that is truncated, foreign or inconsistent
 ├── CheckpointInvalid               a released checkpoint, or its conf.json or poses, that cannot be imported
+├── DatasetInvalid                  a tracked sweep that cannot be used; names the file, the frame and the reason
+├── TrainingDiverged                a training whose loss or parameters are no longer finite
+├── TrainingStateInvalid            a training folder that cannot be resumed from
+├── MemoryExceeded                  a training that would not fit into memory
 ├── SceneTooLarge                   a scene that does not fit the memory budget at all
 ├── BackendUnavailable              a render backend that cannot run here
 ├── QueueFull                       too many frames wait already
@@ -151,6 +155,34 @@ class CheckpointInvalid(UltragrayError):
     http_status = 422
     grpc_status = "INVALID_ARGUMENT"
     title = "Invalid checkpoint"
+
+
+class DatasetInvalid(UltragrayError):
+    reason = "DATASET_INVALID"
+    http_status = 422
+    grpc_status = "INVALID_ARGUMENT"
+    title = "Invalid dataset"
+
+
+class TrainingDiverged(UltragrayError):
+    reason = "TRAINING_DIVERGED"
+    http_status = 422
+    grpc_status = "FAILED_PRECONDITION"
+    title = "Training diverged"
+
+
+class TrainingStateInvalid(UltragrayError):
+    reason = "TRAINING_STATE_INVALID"
+    http_status = 422
+    grpc_status = "FAILED_PRECONDITION"
+    title = "Training cannot be resumed"
+
+
+class MemoryExceeded(UltragrayError):
+    reason = "MEMORY_EXCEEDED"
+    http_status = 507
+    grpc_status = "RESOURCE_EXHAUSTED"
+    title = "Training exceeds the memory budget"
 
 
 class SceneTooLarge(UltragrayError):

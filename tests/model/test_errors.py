@@ -62,6 +62,10 @@ def test_errors_cross_a_pipe_unchanged(cls: type[UltragrayError]) -> None:
         ("NotAcceptable", "NOT_ACCEPTABLE", 406, "INVALID_ARGUMENT"),
         ("BodyTooLarge", "BODY_TOO_LARGE", 413, "INVALID_ARGUMENT"),
         ("CheckpointInvalid", "CHECKPOINT_INVALID", 422, "INVALID_ARGUMENT"),
+        ("DatasetInvalid", "DATASET_INVALID", 422, "INVALID_ARGUMENT"),
+        ("TrainingDiverged", "TRAINING_DIVERGED", 422, "FAILED_PRECONDITION"),
+        ("TrainingStateInvalid", "TRAINING_STATE_INVALID", 422, "FAILED_PRECONDITION"),
+        ("MemoryExceeded", "MEMORY_EXCEEDED", 507, "RESOURCE_EXHAUSTED"),
     ],
 )
 def test_what_clients_match_on_never_changes(name: str, reason: str, http_status: int, grpc_status: str) -> None:

@@ -1,0 +1,1 @@
+"""Training: a tracked sweep becomes a scene."""
