@@ -5,6 +5,7 @@
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>
 
+#include <array>
 #include <optional>
 
 #include "render.hpp"
@@ -17,7 +18,29 @@ namespace {
 using Vector = nb::ndarray<const float, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 using Matrix = nb::ndarray<const float, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 using Poses = nb::ndarray<const double, nb::shape<-1, 4, 4>, nb::c_contig, nb::device::cpu>;
-using Planes = nb::ndarray<float, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
+using FreeVector = nb::ndarray<float, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
+using FreeMatrix = nb::ndarray<float, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
+using OptionalPlanes = std::optional<nb::ndarray<float, nb::ndim<3>, nb::c_contig, nb::device::cpu>>;
+
+// B, E, T and coverage, each [C, H, W] or null.
+Outputs planes_of(const std::array<OptionalPlanes, 4>& arrays, size_t count, int height, int width) {
+    std::array<float*, 4> planes{};
+    for (size_t k = 0; k < planes.size(); ++k) {
+        if (!arrays[k]) continue;
+        if (arrays[k]->shape(0) != count || arrays[k]->shape(1) != size_t(height) || arrays[k]->shape(2) != size_t(width))
+            throw std::invalid_argument("an output's shape is not [C, height, width]");
+        planes[k] = arrays[k]->data();
+    }
+    return {planes[0], planes[1], planes[2], planes[3]};
+}
+
+// The arguments that rendering and recording share.
+#define RENDER_ARGUMENTS                                                                                              \
+    nb::arg("scene"), nb::arg("convex"), nb::arg("width_cm"), nb::arg("opening_rad"), nb::arg("near_cm"),              \
+        nb::arg("far_cm"), nb::arg("cull_far_cm"), nb::arg("poses").noconvert(), nb::arg("height"), nb::arg("width"),  \
+        nb::arg("threads"), nb::arg("instruction_set"), nb::arg("bmode").noconvert().none(),                          \
+        nb::arg("echo").noconvert().none(), nb::arg("transmittance").noconvert().none(),                              \
+        nb::arg("coverage").noconvert().none()
 
 }  // namespace
 
@@ -27,7 +50,7 @@ NB_MODULE(_cpu, m) {
         .def(
             "__init__",
             [](PreparedScene* self, Matrix means, Matrix scales, Matrix quats, Vector transmittances, Vector sh0, Matrix shn,
-               int sh_degree, bool sigmoid) {
+               int sh_degree, bool sigmoid, bool sorted, int threads) {
                 const int64_t n = means.shape(0);
                 const size_t rest = size_t(sh_degree + 1) * (sh_degree + 1) - 1;
                 if (sh_degree < 0 || sh_degree > 3 || means.shape(1) != 3 || scales.shape(0) != size_t(n) ||
@@ -45,36 +68,55 @@ NB_MODULE(_cpu, m) {
                                     sh_degree,
                                     sigmoid ? Intensity::Sigmoid : Intensity::Released};
                 nb::gil_scoped_release release;
-                new (self) PreparedScene(raw);
+                new (self) PreparedScene(raw, sorted ? Order::Sorted : Order::AsGiven, threads);
             },
             nb::arg("means").noconvert(), nb::arg("scales").noconvert(), nb::arg("quats").noconvert(),
             nb::arg("transmittances").noconvert(), nb::arg("sh0").noconvert(), nb::arg("shn").noconvert(),
-            nb::arg("sh_degree"), nb::arg("sigmoid"))
+            nb::arg("sh_degree"), nb::arg("sigmoid"), nb::arg("sorted"), nb::arg("threads"))
         .def_prop_ro("bytes", &PreparedScene::bytes);
 
     m.def(
         "render",
         [](const PreparedScene& scene, bool convex, double width_cm, double opening_rad, double near_cm, double far_cm,
            double cull_far_cm, Poses poses, int height, int width, int threads, const std::string& instruction_set,
-           std::optional<Planes> bmode, std::optional<Planes> echo, std::optional<Planes> transmittance,
-           std::optional<Planes> coverage) {
-            const size_t count = poses.shape(0);
-            const auto plane = [&](std::optional<Planes>& array) -> float* {
-                if (!array) return nullptr;
-                if (array->shape(0) != count || array->shape(1) != size_t(height) || array->shape(2) != size_t(width))
-                    throw std::invalid_argument("an output's shape is not [C, height, width]");
-                return array->data();
-            };
-            const Outputs outputs{plane(bmode), plane(echo), plane(transmittance), plane(coverage)};
+           OptionalPlanes bmode, OptionalPlanes echo, OptionalPlanes transmittance, OptionalPlanes coverage) {
+            const Outputs outputs = planes_of({bmode, echo, transmittance, coverage}, poses.shape(0), height, width);
             const ProbeGeometry probe{convex, width_cm, opening_rad, near_cm, far_cm, cull_far_cm};
             nb::gil_scoped_release release;
-            render(scene, probe, poses.data(), int(count), height, width, threads, instruction_set, outputs);
+            render(scene, probe, poses.data(), int(poses.shape(0)), height, width, threads, instruction_set, outputs);
         },
-        nb::arg("scene"), nb::arg("convex"), nb::arg("width_cm"), nb::arg("opening_rad"), nb::arg("near_cm"),
-        nb::arg("far_cm"), nb::arg("cull_far_cm"), nb::arg("poses").noconvert(), nb::arg("height"), nb::arg("width"),
-        nb::arg("threads"), nb::arg("instruction_set"), nb::arg("bmode").noconvert().none(),
-        nb::arg("echo").noconvert().none(), nb::arg("transmittance").noconvert().none(),
-        nb::arg("coverage").noconvert().none());
+        RENDER_ARGUMENTS);
+
+    nb::class_<Recording>(m, "Recording")
+        .def(
+            "__init__",
+            [](Recording* self, const PreparedScene& scene, bool convex, double width_cm, double opening_rad, double near_cm,
+               double far_cm, double cull_far_cm, Poses poses, int height, int width, int threads,
+               const std::string& instruction_set, OptionalPlanes bmode, OptionalPlanes echo, OptionalPlanes transmittance,
+               OptionalPlanes coverage) {
+                const Outputs outputs = planes_of({bmode, echo, transmittance, coverage}, poses.shape(0), height, width);
+                const ProbeGeometry probe{convex, width_cm, opening_rad, near_cm, far_cm, cull_far_cm};
+                nb::gil_scoped_release release;
+                new (self) Recording(scene, probe, poses.data(), int(poses.shape(0)), height, width, threads, instruction_set,
+                                     outputs);
+            },
+            nb::keep_alive<1, 2>(), RENDER_ARGUMENTS)
+        .def(
+            "differentiate",
+            [](const Recording& self, int threads, size_t count, int height, int width, OptionalPlanes bmode,
+               OptionalPlanes echo, OptionalPlanes transmittance, OptionalPlanes coverage, FreeMatrix means,
+               FreeMatrix scales, FreeMatrix quats, FreeVector transmittances, FreeVector sh0, FreeMatrix shn) {
+                const Outputs gradients = planes_of({bmode, echo, transmittance, coverage}, count, height, width);
+                const RawGradients out{means.data(),          scales.data(), quats.data(),
+                                       transmittances.data(), sh0.data(),    shn.data()};
+                nb::gil_scoped_release release;
+                self.differentiate(gradients, out, threads);
+            },
+            nb::arg("threads"), nb::arg("count"), nb::arg("height"), nb::arg("width"), nb::arg("bmode").noconvert().none(),
+            nb::arg("echo").noconvert().none(), nb::arg("transmittance").noconvert().none(),
+            nb::arg("coverage").noconvert().none(), nb::arg("means").noconvert(), nb::arg("scales").noconvert(),
+            nb::arg("quats").noconvert(), nb::arg("transmittances").noconvert(), nb::arg("sh0").noconvert(),
+            nb::arg("shn").noconvert());
 
     m.def("instruction_sets", &instruction_sets);
 }

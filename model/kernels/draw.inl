@@ -78,6 +78,7 @@ struct Group {
     Floats sigma;    // along the line, cm
     Floats peak;     // exp(-m2/2) sigma where m2 <= 9, else 0: psi = peak * G(u)
     Floats zero;     // u at depth 0
+    Floats across, spread;  // distance of the slice's mean from the line, 1 / its variance in that direction
     Mask touched;    // the line comes close enough for w to reach 1/255
     Mask opaque;     // alpha reaches 1/255 below the Gaussian
     int base;
@@ -129,6 +130,7 @@ inline Group cross(const View& view, const Slice& s, int line) {
     Group g;
     g.base = static_cast<int>(base > 0 ? (base < bound ? base : bound) : 0);
     g.m2 = s.m2_plane + to_floats(across * across * spread);
+    g.across = to_floats(across), g.spread = to_floats(spread);
     g.window2 = float(kMaxM2) - g.m2;
     g.touched = both(less_equal(Floats{}, g.window2), less_equal(splat(kMinVariance), variance));
     g.sigma = square_root(maximum(variance, splat(kMinVariance)));
@@ -142,9 +144,14 @@ inline Group cross(const View& view, const Slice& s, int line) {
     return g;
 }
 
-inline void draw_group(const View& view, const Slice& s, const Strip& strip, int column) {
-    const Group g = cross(view, s, strip.first + column);
-    if (!any(g.touched)) return;
+// The rows of a group where its slice counts, and how its absorption is to be computed there.
+struct Extent {
+    int top, end;
+    Profile profile;
+    Floats whole;  // u from which on the Gaussian is fully crossed
+};
+
+inline Extent extent_of(const View& view, const Group& g) {
     const Floats window = square_root(maximum(g.window2, Floats{}));
     const Floats whole = 3.0f + maximum(g.zero, Floats{});  // the window ends here even where the mean lies before the face
     const Floats tail = maximum(whole, square_root(maximum(kNegligible - g.m2, Floats{})));
@@ -153,19 +160,30 @@ inline void draw_group(const View& view, const Slice& s, const Strip& strip, int
     const float end_row = largest(select(g.touched, last_row, splat(-1e9f))) + float(g.base);
     const bool early = largest(keep(g.opaque, g.sigma)) > kEarlySigma;
     const float bound = float(view.height - 1);
-    const int top = early || !(top_row > 0.0f) ? 0 : top_row > bound ? view.height : static_cast<int>(top_row);
-    const int end = !(end_row >= 0.0f) ? 0 : end_row > bound ? view.height : static_cast<int>(end_row) + 1;
-    if (top < end) {
-        const float nearest = largest(select(g.touched, g.zero, splat(-1e9f)));
-        if (nearest > -6.4f || early)
-            draw_rows<Profile::Clipped>(g, s, strip, column, top, end);
-        else if (largest(g.peak) * kFullG > 0.2f)
-            draw_rows<Profile::Thick>(g, s, strip, column, top, end);
-        else
-            draw_rows<Profile::Thin>(g, s, strip, column, top, end);
-    }
+    const float nearest = largest(select(g.touched, g.zero, splat(-1e9f)));
+    const bool thick = largest(g.peak) * kFullG > 0.2f;
+    return {early || !(top_row > 0.0f) ? 0 : top_row > bound ? view.height : static_cast<int>(top_row),
+            !(end_row >= 0.0f)  ? 0
+            : end_row > bound   ? view.height
+                                : static_cast<int>(end_row) + 1,
+            nearest > -6.4f || early ? Profile::Clipped
+            : thick                  ? Profile::Thick
+                                     : Profile::Thin,
+            whole};
+}
+
+inline void draw_group(const View& view, const Slice& s, const Strip& strip, int column) {
+    const Group g = cross(view, s, strip.first + column);
+    if (!any(g.touched)) return;
+    const Extent extent = extent_of(view, g);
+    const int top = extent.top, end = extent.end;
+    if (top < end) switch (extent.profile) {
+            case Profile::Thin: draw_rows<Profile::Thin>(g, s, strip, column, top, end); break;
+            case Profile::Thick: draw_rows<Profile::Thick>(g, s, strip, column, top, end); break;
+            case Profile::Clipped: draw_rows<Profile::Clipped>(g, s, strip, column, top, end); break;
+        }
     if (end < view.height && any(g.opaque)) {
-        const Floats below = g.peak * clipped_profile(whole, g.zero);
+        const Floats below = g.peak * clipped_profile(extent.whole, g.zero);
         const Floats alpha = minimum(1.0f - exponential(-below), splat(kMaxWeight));
         const Mask passes = less_equal(splat(kMinPsi), below);
         const int64_t at = int64_t(end) * strip.stride + column;
@@ -185,7 +203,7 @@ void draw(const View& view, const Slice* slices, int64_t count, const Strip& str
 }
 
 // B = E T, E = (1 - exp(-S)) sum(I w) / (S + 1e-8), and the cumulative product of the steps down each scan line.
-void finish(const View& view, const Strip& strip, const FramePointers& frame) {
+void finish(const View& view, const Strip& strip, const FramePointers& frame, const SavedPlanes& saved) {
     const auto put = [&](float* plane, int row, int column, Floats value) {
         if (plane == nullptr) return;
         float* to = plane + int64_t(row) * view.lines + strip.first + column;
@@ -211,6 +229,11 @@ void finish(const View& view, const Strip& strip, const FramePointers& frame) {
             put(frame.echo, row, column, echo);
             put(frame.transmittance, row, column, transmittance);
             put(frame.coverage, row, column, coverage);
+            if (saved.weight == nullptr) continue;
+            const int64_t kept = int64_t(row) * saved.stride + strip.first + column;
+            store(saved.weight + kept, sum);
+            store(saved.intensity + kept, load<Floats>(strip.intensity + at));
+            store(saved.transmittance + kept, transmittance);
         }
     }
 }

@@ -63,6 +63,7 @@ struct Slice {
     float intensity;      // I
     float absorb;         // 1 - tau
     int32_t first, last;  // scan lines it may touch
+    int32_t gaussian;     // its place in the scene
 };
 
 // A growable array of slices that code compiled for any instruction set may append to.
@@ -88,6 +89,27 @@ struct FramePointers {
     float *bmode, *echo, *transmittance, *coverage;
 };
 
+// What the backward pass needs of one pose, rows of `stride` floats; null where no gradient is wanted.
+struct SavedPlanes {
+    float *weight, *intensity, *transmittance;  // S, sum of I*w, T
+    int stride;
+};
+
+// The gradient of the loss with respect to S, the sum of I*w and log T of each pixel, and with respect to a factor of T on all
+// pixels of a scan line from this row down (the suffix sum of the former). Rows of `stride` floats, zero beyond the last line.
+struct PixelGradients {
+    float *weight, *intensity, *log_transmittance, *below;
+    int stride;
+};
+
+// The gradient with respect to one activated Gaussian.
+struct GaussianGradient {
+    float mean[3];
+    float log_scale[3];
+    float quat[4];
+    float absorb;
+};
+
 // Accumulators of a strip of scan lines, rows of `stride` floats.
 struct Strip {
     float *weight, *intensity, *local, *below;  // S, sum of I*w, T inside footprints, T steps at the rows below them
@@ -100,7 +122,12 @@ struct Kernels {
     const char* name;
     void (*slice)(const SceneView&, const View&, int64_t first_cluster, int64_t last_cluster, SliceList&);
     void (*draw)(const View&, const Slice*, int64_t count, const Strip&);
-    void (*finish)(const View&, const Strip&, const FramePointers&);
+    void (*finish)(const View&, const Strip&, const FramePointers&, const SavedPlanes&);
+    // The backward pass: pixels of `lines` scan lines from `first` on, then slices; [N] and sh [N, K] are added to.
+    void (*differentiate)(const View&, int first, int lines, const SavedPlanes&, const FramePointers& gradients,
+                          const PixelGradients&);
+    void (*gather)(const SceneView&, const View&, const Slice*, int64_t count, const PixelGradients&, GaussianGradient*,
+                   float* sh);
 };
 
 const Kernels& kernels_baseline();

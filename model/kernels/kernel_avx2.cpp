@@ -4,13 +4,14 @@
 
 using namespace ultragray;
 
-#include "draw.inl"
 #include "slice.inl"
+#include "draw.inl"
+#include "gather.inl"
 
 namespace ultragray {
 
 const Kernels& kernels_avx2() {
-    static constexpr Kernels kernels{"avx2", slice_clusters, draw, finish};
+    static constexpr Kernels kernels{"avx2", slice_clusters, draw, finish, differentiate, gather};
     return kernels;
 }
 

@@ -13,13 +13,24 @@ double absorption_profile(double u) {
     return half * (8.0 * density(middle) + 5.0 * (density(middle - node) + density(middle + node))) / 9.0;
 }
 
+double absorption_slope(double u) {
+    const double low = std::min(u, 0.0) - 3.0, high = std::min(u, low + 6.0), moves = u < 0.0 ? 1.0 : 0.0;
+    const double half = 0.5 * (high - low), middle = 0.5 * (high + low);
+    double slope = 0;
+    for (const double node : {0.0, -std::sqrt(0.6), std::sqrt(0.6)}) {
+        const double t = middle + half * node, density = std::exp(-0.5 * t * t), weight = (node == 0.0 ? 8.0 : 5.0) / 9.0;
+        slope += weight * density * (0.5 * (1.0 - moves) - half * t * 0.5 * (1.0 + node + moves * (1.0 - node)));
+    }
+    return slope;
+}
+
 // Interpolates at the Chebyshev nodes of each step: next to the best parabola there.
-ProfileTable make_table() {
+ProfileTable make_table(double (*function)(double)) {
     ProfileTable table;
     for (int k = 0; k < ProfileTable::kSteps; ++k) {
         const double centre = -3.3 + 0.2 * k, node = 0.1 * std::sqrt(0.75);
-        const double left = absorption_profile(centre - node), mid = absorption_profile(centre);
-        const double right = absorption_profile(centre + node);
+        const double left = function(centre - node), mid = function(centre);
+        const double right = function(centre + node);
         const double slope = (right - left) / (2 * node), bend = (right - 2 * mid + left) / (2 * node * node);
         table.parabola[0][k] = static_cast<float>(mid - slope * centre + bend * centre * centre);
         table.parabola[1][k] = static_cast<float>(slope - 2 * bend * centre);
@@ -30,6 +41,7 @@ ProfileTable make_table() {
 
 }  // namespace
 
-const ProfileTable kProfile = make_table();
+const ProfileTable kProfile = make_table(absorption_profile);
+const ProfileTable kProfileSlope = make_table(absorption_slope);
 
 }  // namespace ultragray

@@ -1,4 +1,4 @@
-// G(u) of docs/physics.md §3 as parabolas: the value of the three-point Gauss-Legendre rule over the unclipped window.
+// G(u) of docs/physics.md §3, the three-point Gauss-Legendre rule over the unclipped window, and its derivative, as parabolas.
 #pragma once
 
 namespace ultragray {
@@ -9,5 +9,6 @@ struct ProfileTable {
 };
 
 extern const ProfileTable kProfile;
+extern const ProfileTable kProfileSlope;  // to be taken as 0 for u > 3
 
 }  // namespace ultragray

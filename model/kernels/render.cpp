@@ -1,23 +1,19 @@
 #include "render.hpp"
 
 #include <algorithm>
-#include <atomic>
 #include <cmath>
 #include <cstdlib>
-#include <exception>
-#include <functional>
 #include <memory>
-#include <mutex>
 #include <new>
 #include <stdexcept>
-#include <system_error>
-#include <thread>
+
+#include "threads.hpp"
 
 namespace ultragray {
 namespace {
 
 constexpr int kStripLines = 64;  // four accumulators of 512 rows stay within a 1 MB cache
-constexpr int64_t kClustersPerTask = 512;
+constexpr int64_t kClustersPerTask = 128;
 constexpr int kPosesAtOnce = 8;  // bounds the memory that slices take
 
 std::vector<const Kernels*> available_kernels() {
@@ -37,49 +33,6 @@ const Kernels& choose_kernels(const std::string& name) {
     for (const Kernels* kernels : available)
         if (name == "auto" || name == kernels->name) return *kernels;
     throw std::invalid_argument("this processor cannot run the instruction set " + name);
-}
-
-// Tasks 0 … count − 1, taken by several threads.
-struct Phase {
-    int count;
-    std::function<void(int)> task;
-    std::atomic<int> next{0}, done{0};
-};
-
-// Runs all tasks of `first`, then all of `second`, on up to `threads` threads, the caller's among them: one start of threads
-// for both, because that costs as much as a tenth of a small frame. The first exception is rethrown.
-void run_phases(Phase& first, Phase& second, int threads) {
-    std::exception_ptr failure;
-    std::mutex failure_lock;
-    std::atomic<bool> failed{false};
-    const auto take_all = [&](Phase& phase) {
-        for (int i = phase.next++; i < phase.count; i = phase.next++) {
-            try {
-                if (!failed) phase.task(i);
-            } catch (...) {
-                const std::lock_guard<std::mutex> guard(failure_lock);
-                if (!failure) failure = std::current_exception();
-                failed = true;
-            }
-            ++phase.done;
-        }
-    };
-    const auto work = [&] {
-        take_all(first);
-        while (first.done < first.count) std::this_thread::yield();
-        take_all(second);
-    };
-    std::vector<std::thread> helpers;
-    const int wanted = std::min(threads, std::max(first.count, second.count)) - 1;
-    helpers.reserve(std::max(0, wanted));
-    try {
-        for (int t = 0; t < wanted; ++t) helpers.emplace_back(work);
-    } catch (const std::system_error&) {
-        // No more threads to be had: those that run do the work.
-    }
-    work();
-    for (std::thread& helper : helpers) helper.join();
-    if (failure) std::rethrow_exception(failure);
 }
 
 // Scan lines in the image plane, padded so that a vector may start at any of them.
@@ -137,6 +90,93 @@ FramePointers frame_of(const Outputs& outputs, int64_t offset) {
     return {at(outputs.bmode), at(outputs.echo), at(outputs.transmittance), at(outputs.coverage)};
 }
 
+// Some poses on their way from Gaussians to pixels.
+class Batch {
+ public:
+    Batch(const PreparedScene& scene, const ProbeGeometry& probe, const double* poses, int count, int height, int width,
+          const Kernels& kernels)
+        : kernels_(kernels), scene_(scene.view()), lines_(probe, width) {
+        for (int c = 0; c < count; ++c) views_.push_back(make_view(probe, lines_, poses + 16 * c, height, width));
+        slices_ = std::vector<SliceList>(int64_t(count) * parts());
+    }
+    Batch(const Batch&) = delete;
+    Batch& operator=(const Batch&) = delete;
+
+    void render(const Outputs& outputs, const std::vector<SavedPlanes>& saved, int threads) {
+        Phase slicing{count() * parts(), [&](int task) {
+                          const int64_t begin = task % parts() * kClustersPerTask;
+                          const int64_t end = std::min(begin + kClustersPerTask, scene_.cluster_count);
+                          kernels_.slice(scene_, views_[task / parts()], begin, end, slices_[task]);
+                      }};
+        Phase drawing{count() * strips(), [&](int task) {
+                          const int c = task / strips();
+                          draw(c, task % strips() * kStripLines, outputs, saved.empty() ? SavedPlanes{} : saved[c]);
+                      }};
+        run_phases(slicing, drawing, threads);
+    }
+
+    // Gradients are added to; no two tasks share a Gaussian, and each adds in the order of the poses.
+    void differentiate(const std::vector<SavedPlanes>& saved, const Outputs& gradients,
+                       const std::vector<PixelGradients>& pixels, GaussianGradient* gaussians, float* sh, int threads) const {
+        Phase by_pixel{count() * strips(), [&](int task) {
+                           const int c = task / strips(), first = task % strips() * kStripLines;
+                           const View& view = views_[c];
+                           kernels_.differentiate(view, first, std::min(kStripLines, view.lines - first), saved[c],
+                                                  frame_of(gradients, c * frame_size()), pixels[c]);
+                       }};
+        Phase by_gaussian{parts(), [&](int part) {
+                              for (int c = 0; c < count(); ++c) {
+                                  const SliceList& list = slices_[int64_t(c) * parts() + part];
+                                  kernels_.gather(scene_, views_[c], list.data(), list.size(), pixels[c], gaussians, sh);
+                              }
+                          }};
+        run_phases(by_pixel, by_gaussian, threads);
+    }
+
+ private:
+    int count() const { return static_cast<int>(views_.size()); }
+    int parts() const { return static_cast<int>((scene_.cluster_count + kClustersPerTask - 1) / kClustersPerTask); }
+    int strips() const { return (views_[0].lines + kStripLines - 1) / kStripLines; }
+    int64_t frame_size() const { return int64_t(views_[0].height) * views_[0].lines; }
+
+    void draw(int c, int first, const Outputs& outputs, const SavedPlanes& saved) const {
+        const View& view = views_[c];
+        thread_local std::unique_ptr<StripBuffer> buffer;
+        thread_local int buffer_height = 0;
+        if (!buffer || buffer_height != view.height) {
+            buffer.reset();
+            buffer = std::make_unique<StripBuffer>(view.height, kStripLines);
+            buffer_height = view.height;
+        }
+        const Strip strip = buffer->clear(first, std::min(kStripLines, view.lines - first));
+        for (int part = 0; part < parts(); ++part) {
+            const SliceList& list = slices_[int64_t(c) * parts() + part];
+            kernels_.draw(view, list.data(), list.size(), strip);
+        }
+        kernels_.finish(view, strip, frame_of(outputs, c * frame_size()), saved);
+    }
+
+    const Kernels& kernels_;
+    const SceneView scene_;
+    const ScanLines lines_;
+    std::vector<View> views_;
+    std::vector<SliceList> slices_;  // [poses, parts]
+};
+
+// `count` planes for each pose, side by side in one allocation.
+class Planes {
+ public:
+    Planes(int poses, int count, int height, int stride) : plane_(int64_t(height) * stride), count_(count) {
+        floats_.reset(new float[poses * count * plane_]);
+    }
+    float* at(int pose, int plane) const { return floats_.get() + (int64_t(pose) * count_ + plane) * plane_; }
+
+ private:
+    int64_t plane_;
+    int count_;
+    std::unique_ptr<float[]> floats_;
+};
+
 }  // namespace
 
 SliceList::~SliceList() { std::free(data_); }
@@ -164,41 +204,53 @@ std::vector<std::string> instruction_sets() {
 void render(const PreparedScene& scene, const ProbeGeometry& probe, const double* poses, int count, int height, int width,
             int threads, const std::string& instruction_set, const Outputs& outputs) {
     const Kernels& kernels = choose_kernels(instruction_set);
-    const SceneView gaussians = scene.view();
-    const ScanLines lines(probe, width);
-    const int parts = static_cast<int>((gaussians.cluster_count + kClustersPerTask - 1) / kClustersPerTask);
-    const int strips = (width + kStripLines - 1) / kStripLines;
     const int64_t frame_size = int64_t(height) * width;
-
     for (int first = 0; first < count; first += kPosesAtOnce) {
-        const int views = std::min(kPosesAtOnce, count - first);
-        std::vector<View> view;
-        for (int c = 0; c < views; ++c) view.push_back(make_view(probe, lines, poses + 16 * (first + c), height, width));
-
-        std::vector<SliceList> slices(int64_t(views) * parts);
-        Phase slicing{views * parts, [&](int task) {
-                          const int64_t begin = task % parts * kClustersPerTask;
-                          const int64_t end = std::min(begin + kClustersPerTask, gaussians.cluster_count);
-                          kernels.slice(gaussians, view[task / parts], begin, end, slices[task]);
-                      }};
-        Phase drawing{views * strips, [&](int task) {
-                          thread_local std::unique_ptr<StripBuffer> buffer;
-                          thread_local int buffer_height = 0;
-                          if (!buffer || buffer_height != height) {
-                              buffer.reset();
-                              buffer = std::make_unique<StripBuffer>(height, kStripLines);
-                              buffer_height = height;
-                          }
-                          const int c = task / strips, line = task % strips * kStripLines;
-                          const Strip strip = buffer->clear(line, std::min(kStripLines, width - line));
-                          for (int part = 0; part < parts; ++part) {
-                              const SliceList& list = slices[c * parts + part];
-                              kernels.draw(view[c], list.data(), list.size(), strip);
-                          }
-                          kernels.finish(view[c], strip, frame_of(outputs, (first + c) * frame_size));
-                      }};
-        run_phases(slicing, drawing, threads);
+        Batch batch(scene, probe, poses + 16 * first, std::min(kPosesAtOnce, count - first), height, width, kernels);
+        const FramePointers from = frame_of(outputs, first * frame_size);
+        batch.render({from.bmode, from.echo, from.transmittance, from.coverage}, {}, threads);
     }
+}
+
+struct Recording::State {
+    Batch batch;
+    Planes planes;
+    std::vector<SavedPlanes> saved;
+    int count, height, stride;
+};
+
+Recording::Recording(const PreparedScene& scene, const ProbeGeometry& probe, const double* poses, int count, int height,
+                     int width, int threads, const std::string& instruction_set, const Outputs& outputs)
+    : scene_(scene) {
+    if (count == 0) return;
+    const int stride = (width + kMaxLanes - 1) / kMaxLanes * kMaxLanes + kMaxLanes;
+    state_.reset(new State{{scene, probe, poses, count, height, width, choose_kernels(instruction_set)},
+                           {count, 3, height, stride},
+                           {},
+                           count,
+                           height,
+                           stride});
+    const Planes& planes = state_->planes;
+    for (int c = 0; c < count; ++c)
+        state_->saved.push_back({planes.at(c, 0), planes.at(c, 1), planes.at(c, 2), stride});
+    state_->batch.render(outputs, state_->saved, threads);
+}
+
+Recording::~Recording() = default;
+
+void Recording::differentiate(const Outputs& gradients, const RawGradients& out, int threads) const {
+    const SceneView scene = scene_.view();
+    const int terms = (scene.sh_degree + 1) * (scene.sh_degree + 1);
+    std::vector<GaussianGradient> gaussians(scene.count);
+    std::vector<float> sh(scene.count * terms);
+    if (state_) {
+        const Planes planes(state_->count, 4, state_->height, state_->stride);
+        std::vector<PixelGradients> pixels;
+        for (int c = 0; c < state_->count; ++c)
+            pixels.push_back({planes.at(c, 0), planes.at(c, 1), planes.at(c, 2), planes.at(c, 3), state_->stride});
+        state_->batch.differentiate(state_->saved, gradients, pixels, gaussians.data(), sh.data(), threads);
+    }
+    scene_.to_raw(gaussians.data(), sh.data(), out, threads);
 }
 
 }  // namespace ultragray

@@ -1,6 +1,7 @@
 // Frames of many poses on many threads.
 #pragma once
 
+#include <memory>
 #include <string>
 #include <vector>
 
@@ -16,7 +17,7 @@ struct ProbeGeometry {
     double near, far, cull_far;
 };
 
-// Output planes, each [C, H, W] or null.
+// Planes of many poses, each [C, H, W] or null.
 struct Outputs {
     float *bmode, *echo, *transmittance, *coverage;
 };
@@ -25,6 +26,24 @@ struct Outputs {
 // Throws std::bad_alloc, or std::invalid_argument for an instruction set that this processor lacks.
 void render(const PreparedScene& scene, const ProbeGeometry& probe, const double* poses, int count, int height, int width,
             int threads, const std::string& instruction_set, const Outputs& outputs);
+
+// Frames that remember what their gradients need. The scene must be unsorted and outlive the recording.
+class Recording {
+ public:
+    // As `render`.
+    Recording(const PreparedScene& scene, const ProbeGeometry& probe, const double* poses, int count, int height, int width,
+              int threads, const std::string& instruction_set, const Outputs& outputs);
+    ~Recording();
+
+    // From the gradients of a loss with respect to the outputs (null: zero) to those with respect to the raw parameters, which
+    // are overwritten. The result does not depend on the number of threads.
+    void differentiate(const Outputs& gradients, const RawGradients& out, int threads) const;
+
+ private:
+    struct State;
+    const PreparedScene& scene_;
+    std::unique_ptr<State> state_;  // null for no poses
+};
 
 // The instruction sets this processor can run, best first; "auto" takes the first.
 std::vector<std::string> instruction_sets();

@@ -5,17 +5,25 @@
 #include <cmath>
 #include <numeric>
 
+#include "threads.hpp"
+
 namespace ultragray {
 namespace {
 
 constexpr double kMinScale = 1e-15, kMaxScale = 1e15;  // cm; keeps squares within float
 constexpr double kReach = 3.3290429;                   // sqrt(-2 log(1/255)): w < 1/255 beyond this many standard deviations
 
+double quat_norm(const RawSplats& raw, int64_t i) {
+    double squares = 0;
+    for (int d = 0; d < 4; ++d) squares += double(raw.quats[4 * i + d]) * raw.quats[4 * i + d];
+    return std::sqrt(squares);
+}
+
 Gaussian activate(const RawSplats& raw, int64_t i) {
     Gaussian g;
-    double norm = 0, largest = 0;
-    for (int d = 0; d < 4; ++d) norm += double(raw.quats[4 * i + d]) * raw.quats[4 * i + d];
-    for (int d = 0; d < 4; ++d) g.quat[d] = static_cast<float>(raw.quats[4 * i + d] / std::sqrt(norm));
+    double largest = 0;
+    const double norm = quat_norm(raw, i);
+    for (int d = 0; d < 4; ++d) g.quat[d] = static_cast<float>(raw.quats[4 * i + d] / norm);
     for (int d = 0; d < 3; ++d) {
         g.mean[d] = raw.means[3 * i + d];
         const double scale = std::clamp(std::exp(double(raw.scales[3 * i + d])), kMinScale, kMaxScale);
@@ -79,25 +87,68 @@ Cluster enclose(const Gaussian* gaussians, int64_t count) {
 
 }  // namespace
 
-PreparedScene::PreparedScene(const RawSplats& raw) : sh_degree_(raw.sh_degree), intensity_(raw.intensity) {
+PreparedScene::PreparedScene(const RawSplats& raw, Order order, int threads)
+    : sh_degree_(raw.sh_degree), intensity_(raw.intensity) {
     if (raw.count == 0) return;
-    std::vector<Gaussian> activated;
-    for (int64_t i = 0; i < raw.count; ++i) activated.push_back(activate(raw, i));
-    const std::vector<uint64_t> keys = curve_keys(activated);
-    std::vector<int64_t> order(raw.count);
-    std::iota(order.begin(), order.end(), 0);
-    std::stable_sort(order.begin(), order.end(), [&](int64_t a, int64_t b) { return keys[a] < keys[b]; });
-
-    const int terms = (sh_degree_ + 1) * (sh_degree_ + 1);
-    gaussians_.reserve(raw.count);
-    sh_.reserve(raw.count * terms);
-    for (const int64_t i : order) {
-        gaussians_.push_back(activated[i]);
-        sh_.push_back(raw.sh0[i]);
-        sh_.insert(sh_.end(), raw.shn + i * (terms - 1), raw.shn + (i + 1) * (terms - 1));
+    std::vector<Gaussian> activated(raw.count);
+    quat_norms_.resize(raw.count);
+    run_ranges(
+        raw.count,
+        [&](int64_t begin, int64_t end) {
+            for (int64_t i = begin; i < end; ++i) {
+                activated[i] = activate(raw, i);
+                quat_norms_[i] = static_cast<float>(quat_norm(raw, i));
+            }
+        },
+        threads);
+    std::vector<int64_t> places(raw.count);
+    std::iota(places.begin(), places.end(), 0);
+    if (order == Order::Sorted) {
+        const std::vector<uint64_t> keys = curve_keys(activated);
+        std::stable_sort(places.begin(), places.end(), [&](int64_t a, int64_t b) { return keys[a] < keys[b]; });
     }
-    for (int64_t first = 0; first < raw.count; first += kClusterSize)
-        clusters_.push_back(enclose(&gaussians_[first], std::min<int64_t>(kClusterSize, raw.count - first)));
+
+    const int64_t terms = (sh_degree_ + 1) * (sh_degree_ + 1);
+    gaussians_.resize(raw.count);
+    sh_.resize(raw.count * terms);
+    clusters_.resize((raw.count + kClusterSize - 1) / kClusterSize);
+    run_ranges(
+        static_cast<int64_t>(clusters_.size()),
+        [&](int64_t begin, int64_t end) {
+            for (int64_t cluster = begin; cluster < end; ++cluster) {
+                const int64_t first = cluster * kClusterSize, last = std::min(first + kClusterSize, raw.count);
+                for (int64_t i = first; i < last; ++i) {
+                    gaussians_[i] = activated[places[i]];
+                    sh_[i * terms] = raw.sh0[places[i]];
+                    std::copy_n(raw.shn + places[i] * (terms - 1), terms - 1, &sh_[i * terms + 1]);
+                }
+                clusters_[cluster] = enclose(&gaussians_[first], last - first);
+            }
+        },
+        threads);
+}
+
+void PreparedScene::to_raw(const GaussianGradient* gaussians, const float* sh, const RawGradients& out, int threads) const {
+    const int64_t terms = (sh_degree_ + 1) * (sh_degree_ + 1);
+    run_ranges(
+        static_cast<int64_t>(gaussians_.size()),
+        [&](int64_t begin, int64_t end) {
+            for (int64_t i = begin; i < end; ++i) {
+                const GaussianGradient& by = gaussians[i];
+                const Gaussian& g = gaussians_[i];
+                float along = 0;
+                for (int d = 0; d < 4; ++d) along += by.quat[d] * g.quat[d];
+                for (int d = 0; d < 4; ++d) out.quats[4 * i + d] = (by.quat[d] - along * g.quat[d]) / quat_norms_[i];
+                for (int d = 0; d < 3; ++d) {
+                    out.means[3 * i + d] = by.mean[d];
+                    out.scales[3 * i + d] = by.log_scale[d];
+                }
+                out.transmittances[i] = -by.absorb * g.absorb * (1.0f - g.absorb);
+                out.sh0[i] = sh[i * terms];
+                std::copy_n(sh + i * terms + 1, terms - 1, out.shn + i * (terms - 1));
+            }
+        },
+        threads);
 }
 
 SceneView PreparedScene::view() const {
@@ -111,7 +162,7 @@ SceneView PreparedScene::view() const {
 }
 
 int64_t PreparedScene::bytes() const {
-    return gaussians_.capacity() * sizeof(Gaussian) + sh_.capacity() * sizeof(float) +
+    return gaussians_.capacity() * sizeof(Gaussian) + (sh_.capacity() + quat_norms_.capacity()) * sizeof(float) +
            clusters_.capacity() * sizeof(Cluster);
 }
 

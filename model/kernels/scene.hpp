@@ -15,15 +15,26 @@ struct RawSplats {
     Intensity intensity;
 };
 
+// Gradients with respect to them, of the same shapes.
+struct RawGradients {
+    float *means, *scales, *quats, *transmittances, *sh0, *shn;
+};
+
+// Sorted: for rendering many frames. AsGiven: for one training step, where sorting would cost more than it saves.
+enum class Order { Sorted, AsGiven };
+
 class PreparedScene {
  public:
-    explicit PreparedScene(const RawSplats& raw);
+    PreparedScene(const RawSplats& raw, Order order, int threads);
     SceneView view() const;
+    // From gradients with respect to activated Gaussians, [N] and sh [N, K], to raw ones. Only for a scene in its given order.
+    void to_raw(const GaussianGradient* gaussians, const float* sh, const RawGradients& out, int threads) const;
     int64_t bytes() const;
 
  private:
     std::vector<Gaussian> gaussians_;
     std::vector<float> sh_;
+    std::vector<float> quat_norms_;  // in the given order
     std::vector<Cluster> clusters_;
     int sh_degree_;
     Intensity intensity_;

@@ -8,11 +8,20 @@ struct Candidates {
     int count = 0;
 };
 
-inline Floats spherical_harmonics(const SceneView& scene, const Candidates& c, Floats x, Floats y, Floats z) {
-    const int degree = scene.sh_degree, terms = (degree + 1) * (degree + 1);
-    Floats sh[kMaxShCoefficients] = {};
+struct Harmonics {
+    Floats coefficients[kMaxShCoefficients];
+};
+
+inline Harmonics load_harmonics(const SceneView& scene, const Candidates& c) {
+    const int terms = (scene.sh_degree + 1) * (scene.sh_degree + 1);
+    Harmonics sh{};
     for (int k = 0; k < c.count; ++k)
-        for (int t = 0; t < terms; ++t) sh[t][k] = scene.sh[c.ids[k] * terms + t];
+        for (int t = 0; t < terms; ++t) sh.coefficients[t][k] = scene.sh[c.ids[k] * terms + t];
+    return sh;
+}
+
+inline Floats spherical_harmonics(const Harmonics& harmonics, int degree, Floats x, Floats y, Floats z) {
+    const Floats* sh = harmonics.coefficients;
     Floats value = 0.28209479177387814f * sh[0];
     if (degree >= 1) value += 0.4886025119029199f * (z * sh[2] - y * sh[1] - x * sh[3]);
     if (degree >= 2) {
@@ -66,7 +75,18 @@ inline bool inside_planes(const View& view, double x, double z) {
     return depth >= view.near && depth <= view.cull_far && (!view.convex || z > 0);
 }
 
-void slice_candidates(const SceneView& scene, const View& view, const Candidates& c, SliceList& out) {
+// kLanes Gaussians seen in the probe frame.
+struct Placed {
+    Doubles quat[4];
+    Doubles offset[3];   // of the mean from the probe's origin, in the scene's axes
+    Doubles mu[3];       // the mean, in the probe's axes
+    Doubles axes[3][3];  // columns: the Gaussian's own axes, in the scene's
+    Doubles scale[3];
+    Doubles spoke[3][3];  // each own axis times its scale, in the probe's axes
+    Doubles xx, xy, xz, yy, yz, zz;  // covariance: the sum of the spokes' outer products
+};
+
+inline Placed place(const SceneView& scene, const View& view, const Candidates& c) {
     float mean[3][kLanes] = {}, scale[3][kLanes] = {}, quat[4][kLanes] = {};
     for (int k = 0; k < c.count; ++k) {
         const Gaussian& g = scene.gaussians[c.ids[k]];
@@ -74,42 +94,54 @@ void slice_candidates(const SceneView& scene, const View& view, const Candidates
         for (int d = 0; d < 4; ++d) quat[d][k] = g.quat[d];
     }
     const auto widen = [](const float* p) { return __builtin_convertvector(load<Floats>(p), Doubles); };
-    Doubles offset[3], mu[3];
-    for (int d = 0; d < 3; ++d) offset[d] = widen(mean[d]) - view.origin[d];
+    Placed p{};
+    for (int d = 0; d < 3; ++d) p.offset[d] = widen(mean[d]) - view.origin[d];
     for (int d = 0; d < 3; ++d)
-        mu[d] = view.axes[d][0] * offset[0] + view.axes[d][1] * offset[1] + view.axes[d][2] * offset[2];
+        p.mu[d] = view.axes[d][0] * p.offset[0] + view.axes[d][1] * p.offset[1] + view.axes[d][2] * p.offset[2];
 
-    const Doubles w = widen(quat[0]), x = widen(quat[1]), y = widen(quat[2]), z = widen(quat[3]);
-    const Doubles axes[3][3] = {
-        {1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)},
-        {2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)},
-        {2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)},
-    };
-    Doubles xx{}, xy{}, xz{}, yy{}, yz{}, zz{};
-    for (int k = 0; k < 3; ++k) {  // covariance = sum over the Gaussian's own axes
-        const Doubles s = widen(scale[k]);
-        Doubles p[3];
+    for (int d = 0; d < 4; ++d) p.quat[d] = widen(quat[d]);
+    const Doubles w = p.quat[0], x = p.quat[1], y = p.quat[2], z = p.quat[3];
+    p.axes[0][0] = 1 - 2 * (y * y + z * z), p.axes[0][1] = 2 * (x * y - w * z), p.axes[0][2] = 2 * (x * z + w * y);
+    p.axes[1][0] = 2 * (x * y + w * z), p.axes[1][1] = 1 - 2 * (x * x + z * z), p.axes[1][2] = 2 * (y * z - w * x);
+    p.axes[2][0] = 2 * (x * z - w * y), p.axes[2][1] = 2 * (y * z + w * x), p.axes[2][2] = 1 - 2 * (x * x + y * y);
+    for (int k = 0; k < 3; ++k) {
+        p.scale[k] = widen(scale[k]);
         for (int d = 0; d < 3; ++d)
-            p[d] = s * (view.axes[d][0] * axes[0][k] + view.axes[d][1] * axes[1][k] + view.axes[d][2] * axes[2][k]);
-        xx += p[0] * p[0], xy += p[0] * p[1], xz += p[0] * p[2];
-        yy += p[1] * p[1], yz += p[1] * p[2], zz += p[2] * p[2];
+            p.spoke[k][d] = p.scale[k] * (view.axes[d][0] * p.axes[0][k] + view.axes[d][1] * p.axes[1][k] +
+                                          view.axes[d][2] * p.axes[2][k]);
+        const Doubles* s = p.spoke[k];
+        p.xx += s[0] * s[0], p.xy += s[0] * s[1], p.xz += s[0] * s[2];
+        p.yy += s[1] * s[1], p.yz += s[1] * s[2], p.zz += s[2] * s[2];
     }
-    const Doubles inverse_yy = 1.0 / yy, shift = -mu[1] * inverse_yy;  // condition on the plane, y = 0
-    const Doubles m2 = mu[1] * mu[1] * inverse_yy;
-    const Doubles mean_x = mu[0] + xy * shift, mean_z = mu[2] + yz * shift;
-    const Doubles cov_xx = xx - xy * xy * inverse_yy, cov_xz = xz - xy * yz * inverse_yy;
-    const Doubles cov_zz = zz - yz * yz * inverse_yy;
+    return p;
+}
 
-    const Floats vx = to_floats(offset[0]), vy = to_floats(offset[1]), vz = to_floats(offset[2]);
-    const Floats length2 = vx * vx + vy * vy + vz * vz;
-    const Floats inverse_length = 1.0f / square_root(maximum(length2, splat(1e-36f)));
-    const Floats value = spherical_harmonics(scene, c, vx * inverse_length, vy * inverse_length, vz * inverse_length);
+// The direction of view, 0 at the probe's own origin.
+struct Direction {
+    Floats x, y, z, inverse_length;
+};
+
+inline Direction direction_of(const Doubles offset[3]) {
+    const Floats x = to_floats(offset[0]), y = to_floats(offset[1]), z = to_floats(offset[2]);
+    const Floats inverse_length = 1.0f / square_root(maximum(x * x + y * y + z * z, splat(1e-36f)));
+    return {x * inverse_length, y * inverse_length, z * inverse_length, inverse_length};
+}
+
+void slice_candidates(const SceneView& scene, const View& view, const Candidates& c, SliceList& out) {
+    const Placed p = place(scene, view, c);
+    const Doubles inverse_yy = 1.0 / p.yy, shift = -p.mu[1] * inverse_yy;  // condition on the plane, y = 0
+    const Doubles m2 = p.mu[1] * p.mu[1] * inverse_yy;
+    const Doubles mean_x = p.mu[0] + p.xy * shift, mean_z = p.mu[2] + p.yz * shift;
+    const Doubles cov_xx = p.xx - p.xy * p.xy * inverse_yy, cov_xz = p.xz - p.xy * p.yz * inverse_yy;
+    const Doubles cov_zz = p.zz - p.yz * p.yz * inverse_yy;
+    const Direction v = direction_of(p.offset);
+    const Floats value = spherical_harmonics(load_harmonics(scene, c), scene.sh_degree, v.x, v.y, v.z);
     const Floats intensity = activate(scene.intensity, value);
 
     Slice* next = out.append(c.count);
     int written = 0;
     for (int k = 0; k < c.count; ++k) {
-        if (!(m2[k] <= kMaxM2) || !inside_planes(view, mu[0][k], mu[2][k])) continue;
+        if (!(m2[k] <= kMaxM2) || !inside_planes(view, p.mu[0][k], p.mu[2][k])) continue;
         if (!(cov_xx[k] > 0 && cov_xx[k] * cov_zz[k] > cov_xz[k] * cov_xz[k])) continue;  // thinner than double can tell
         Slice& s = next[written];
         s.mean_x = mean_x[k], s.mean_z = mean_z[k];
@@ -120,6 +152,7 @@ void slice_candidates(const SceneView& scene, const View& view, const Candidates
         s.m2_plane = static_cast<float>(m2[k]);
         s.intensity = intensity[k];
         s.absorb = scene.gaussians[c.ids[k]].absorb;
+        s.gaussian = static_cast<int32_t>(c.ids[k]);
         ++written;
     }
     out.shrink_by(c.count - written);

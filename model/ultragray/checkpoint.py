@@ -3,7 +3,7 @@
 A released checkpoint holds the six raw parameter tensors and nothing about where they are: its unit is
 the centimetre, its origin the mean of the image corners of the training frames, and its depth grid is
 stretched by H/(H−1). The dataset it was trained on (conf.json, poses_train.npy, images_train.npy) says the
-rest; the imported scene then answers poses in the tracker's own frame, in mm.
+rest; the imported scene then answers poses in the tracker's own frame, in mm. The way back is `checkpoint_export`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from torch import Tensor
 from .errors import CheckpointInvalid, InvalidArgument
 from .pose_file import load_poses
 from .probe import FloatArray
-from .released_config import ReleasedConfig, read_released_config
+from .released_config import ReleasedConfig, read_released_config, released_centre_mm
 from .scene import PARAMETERS, GaussianScene
 from .scene_info import SceneInfo, Vector
 
@@ -45,9 +45,10 @@ def import_checkpoint(
     `config` is the dataset's conf.json. Where the scene lies comes from exactly one of: `poses`, the training
     poses (poses_train.npy or .json: [P, 4, 4] or [P, 3, 4], camera-to-world, mm), which the scene then also
     stores; `center_mm`, the scene centre in the tracker's frame; `centered`, which leaves poses relative to
-    the centre. The height of the training images comes from the images file that conf.json names, or from
-    `image_height`. Raises CheckpointInvalid, naming the file and the reason; InvalidArgument for options that
-    do not go together. The checkpoint is read with `weights_only=True`: it never runs code.
+    the centre. The height of the training images comes from `image_height`, from conf.json's own key of that name
+    (which `export_checkpoint` writes), or from the images file that conf.json names. Raises CheckpointInvalid, naming
+    the file and the reason; InvalidArgument for options that do not go together. The checkpoint is read with
+    `weights_only=True`: it never runs code.
     """
     given = [name for name, used in _placements(poses, center_mm, centered).items() if used]
     if len(given) != 1:
@@ -84,6 +85,8 @@ def _placements(poses: object, center_mm: object, centered: bool) -> dict[str, b
 
 def _image_size(released: ReleasedConfig, image_height: int | None) -> tuple[int, int | None]:
     """Height and, where it is known, width of the training images."""
+    if image_height is None and released.image_height is not None:
+        return released.image_height, released.image_width
     if image_height is None:
         if released.images is None:
             raise InvalidArgument(
@@ -121,8 +124,7 @@ def _centre_mm(
 ) -> Vector:
     """The origin of the released scene in the tracker's frame: the mean training image corner (§6)."""
     if training_poses is not None:
-        corner = released.released_probe().corners_mm().mean(axis=0)  # [3]
-        x, y, z = (training_poses[:, :3, :3] @ corner + training_poses[:, :3, 3]).mean(axis=0).tolist()
+        x, y, z = released_centre_mm(released.released_probe(), training_poses).tolist()
         return (x, y, z)
     if center_mm is None:
         return (0.0, 0.0, 0.0)

@@ -1,28 +1,27 @@
-"""The CPU backend: the C++ kernel of docs/physics.md §5 behind the signature that all backends share."""
+"""The CPU backend: the C++ kernel of docs/physics.md §5, forward and backward, behind the signature that all backends share."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from . import _cpu
 from .errors import BackendUnavailable
 from .probe import ConvexProbe, FloatArray, Probe
-from .scene import GaussianScene
+from .scene import PARAMETERS, GaussianScene
 
 INSTRUCTION_SETS: tuple[str, ...] = tuple(_cpu.instruction_sets())  # what this processor can run, best first
 
 
 def supports(scene: GaussianScene) -> bool:
-    """Whether this backend can render the scene: float32 on the CPU, no gradient wanted."""
-    tensors = scene.splats.values()
-    differentiable = torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
-    return scene.means.device.type == "cpu" and scene.means.dtype == torch.float32 and not differentiable
+    """Whether this backend can render the scene: float32 on the CPU."""
+    return scene.means.device.type == "cpu" and scene.means.dtype == torch.float32
 
 
 def render_outputs(
@@ -35,11 +34,13 @@ def render_outputs(
     *,
     instruction_set: str = "auto",
 ) -> dict[str, Tensor]:
-    """The outputs by name, each [C, H, W] float32. Raises BackendUnavailable for a scene it does not support."""
+    """The outputs by name, each [C, H, W] float32; differentiable once with respect to every parameter.
+
+    Raises BackendUnavailable for a scene it does not support.
+    """
     if not supports(scene):
         raise BackendUnavailable(
-            f"backend cpu renders float32 scenes on the CPU without gradients, got {scene.means.dtype} on "
-            f"{scene.means.device}",
+            f"backend cpu renders float32 scenes on the CPU, got {scene.means.dtype} on {scene.means.device}",
             field="backend",
         )
     if instruction_set != "auto" and instruction_set not in INSTRUCTION_SETS:
@@ -47,28 +48,87 @@ def render_outputs(
             f"instruction_set must be auto or one of {', '.join(INSTRUCTION_SETS)}, got {instruction_set!r}",
             field="instruction_set",
         )
-    frames = {name: torch.empty((len(poses_cm), height, width), dtype=torch.float32, device="cpu") for name in outputs}
-    planes = {name: frames[name].numpy() if name in frames else None for name in _PLANES}
-    convex = isinstance(probe, ConvexProbe)
-    _cpu.render(
-        _prepared(scene),
-        convex=convex,
-        width_cm=0.0 if isinstance(probe, ConvexProbe) else probe.width_mm / 10.0,
-        opening_rad=math.radians(probe.opening_angle_deg) if isinstance(probe, ConvexProbe) else 0.0,
-        near_cm=probe.near_mm / 10.0,
-        far_cm=probe.far_mm / 10.0,
-        cull_far_cm=probe.cull_far_mm(height) / 10.0,
-        poses=np.ascontiguousarray(poses_cm),
-        height=height,
-        width=width,
-        threads=torch.get_num_threads(),
-        instruction_set=instruction_set,
-        **planes,
-    )
-    return frames
+    view = _view_arguments(probe, poses_cm, height, width, instruction_set)
+    if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in scene.splats.values()):
+        frames = _Render.apply(scene.info.intensity, view, tuple(outputs), *scene.splats.values())
+        return dict(zip(outputs, frames, strict=True))
+    planes = _empty_planes(view, outputs)
+    _cpu.render(_prepared(scene), **view, **_arrays(planes))
+    return planes
 
 
 _PLANES = ("bmode", "echo", "transmittance", "coverage")
+
+
+def _view_arguments(
+    probe: Probe, poses_cm: FloatArray, height: int, width: int, instruction_set: str
+) -> dict[str, Any]:
+    convex = isinstance(probe, ConvexProbe)
+    return {
+        "convex": convex,
+        "width_cm": 0.0 if isinstance(probe, ConvexProbe) else probe.width_mm / 10.0,
+        "opening_rad": math.radians(probe.opening_angle_deg) if isinstance(probe, ConvexProbe) else 0.0,
+        "near_cm": probe.near_mm / 10.0,
+        "far_cm": probe.far_mm / 10.0,
+        "cull_far_cm": probe.cull_far_mm(height) / 10.0,
+        "poses": np.ascontiguousarray(poses_cm),
+        "height": height,
+        "width": width,
+        "threads": torch.get_num_threads(),
+        "instruction_set": instruction_set,
+    }
+
+
+def _empty_planes(view: dict[str, Any], names: Sequence[str]) -> dict[str, Tensor]:  # [C, H, W] each
+    shape = (len(view["poses"]), view["height"], view["width"])
+    return {name: torch.empty(shape, dtype=torch.float32, device="cpu") for name in names}
+
+
+def _arrays(planes: dict[str, Tensor]) -> dict[str, Any]:
+    return {name: planes[name].numpy() if name in planes else None for name in _PLANES}
+
+
+class _Render(torch.autograd.Function):
+    """The kernel's backward pass (docs/physics.md §4) as torch sees it."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, intensity: str, view: dict[str, Any], names: tuple[str, ...], *splats: Tensor
+    ) -> tuple[Tensor, ...]:
+        planes = _empty_planes(view, names)
+        scene = _prepare(dict(zip(PARAMETERS, splats, strict=True)), intensity, as_given=True)
+        ctx.recording = _cpu.Recording(scene, **view, **_arrays(planes))
+        ctx.names, ctx.shape = names, (len(view["poses"]), view["height"], view["width"])
+        ctx.shapes = [tensor.shape for tensor in splats]
+        ctx.set_materialize_grads(False)
+        return tuple(planes.values())
+
+    @staticmethod
+    @once_differentiable  # type: ignore[untyped-decorator]
+    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
+        wanted = {
+            name: gradient.contiguous()
+            for name, gradient in zip(ctx.names, gradients, strict=True)
+            if gradient is not None
+        }
+        means, scales, quats, transmittances, sh0, shn = (
+            torch.empty(shape, dtype=torch.float32, device="cpu") for shape in ctx.shapes
+        )
+        count, height, width = ctx.shape
+        ctx.recording.differentiate(
+            threads=torch.get_num_threads(),
+            count=count,
+            height=height,
+            width=width,
+            **_arrays(wanted),
+            means=means.numpy(),
+            scales=scales.numpy(),
+            quats=quats.numpy(),
+            transmittances=transmittances.numpy(),
+            sh0=sh0.view(-1).numpy(),
+            shn=shn.squeeze(-1).numpy(),
+        )
+        return (None, None, None, means, scales, quats, transmittances, sh0, shn)
 
 
 class _Prepared(NamedTuple):
@@ -87,7 +147,7 @@ def _prepared(scene: GaussianScene) -> _cpu.PreparedScene:
     """
     tensors = tuple(scene.splats.values())
     if any(t.is_inference() for t in tensors):  # their changes are not counted
-        return _prepare(scene)
+        return _prepare(scene.splats, scene.info.intensity)
     versions = tuple(t._version for t in tensors)
     kept: _Prepared | None = scene.cache.get("cpu")
     if (
@@ -96,13 +156,13 @@ def _prepared(scene: GaussianScene) -> _cpu.PreparedScene:
         or kept.intensity != scene.info.intensity
         or any(a is not b for a, b in zip(kept.tensors, tensors, strict=True))
     ):
-        kept = _Prepared(tensors, versions, scene.info.intensity, _prepare(scene))
+        kept = _Prepared(tensors, versions, scene.info.intensity, _prepare(scene.splats, scene.info.intensity))
         scene.cache["cpu"] = kept  # one assignment: threads may render the scene at the same time
     return kept.scene
 
 
-def _prepare(scene: GaussianScene) -> _cpu.PreparedScene:
-    raw = {name: tensor.detach().contiguous() for name, tensor in scene.splats.items()}
+def _prepare(splats: Mapping[str, Tensor], intensity: str, *, as_given: bool = False) -> _cpu.PreparedScene:
+    raw = {name: tensor.detach().contiguous() for name, tensor in splats.items()}
     return _cpu.PreparedScene(
         raw["means"].numpy(),
         raw["scales"].numpy(),
@@ -110,6 +170,8 @@ def _prepare(scene: GaussianScene) -> _cpu.PreparedScene:
         raw["transmittances"].numpy(),
         raw["sh0"].reshape(-1).numpy(),
         raw["shN"].squeeze(-1).numpy(),
-        scene.sh_degree,
-        scene.info.intensity == "sigmoid",
+        sh_degree=math.isqrt(raw["shN"].shape[1] + 1) - 1,
+        sigmoid=intensity == "sigmoid",
+        sorted=not as_given,
+        threads=torch.get_num_threads(),
     )

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from .errors import InvalidPose
 from .pose import check_poses
@@ -20,13 +21,26 @@ def load_poses(path: str | Path) -> FloatArray:  # [P, 4, 4]
     InvalidPose, naming the file, the pose and what was expected; never runs code from the file.
     """
     path = Path(path)
+    array = read_pose_array(path)
     try:
-        poses = check_poses(_with_last_row(_read(path)), field="poses")
-    except (OSError, ValueError, EOFError, RecursionError, MemoryError) as error:
-        raise InvalidPose(f"{path}: {_reason(error)}", field="poses") from error
+        poses = check_poses(array, field="poses")
+    except InvalidPose as error:
+        raise InvalidPose(f"{path}: {error}", field="poses") from error
     if not len(poses):
         raise InvalidPose(f"{path}: it holds no poses", field="poses")
     return poses
+
+
+def read_pose_array(path: str | Path) -> npt.NDArray[Any]:
+    """What a `.npy` or `.json` file holds, the last row completed, not yet checked for being poses.
+
+    For a caller that checks them itself, frame by frame. Raises InvalidPose, naming a file that cannot be read.
+    """
+    path = Path(path)
+    try:
+        return _with_last_row(_read(path))
+    except (OSError, ValueError, EOFError, RecursionError, MemoryError) as error:
+        raise InvalidPose(f"{path}: {_reason(error)}", field="poses") from error
 
 
 def _read(path: Path) -> Any:
@@ -39,7 +53,7 @@ def _read(path: Path) -> Any:
     raise ValueError("poses are read from .npy and .json files")
 
 
-def _with_last_row(poses: Any) -> Any:
+def _with_last_row(poses: Any) -> npt.NDArray[Any]:
     array = np.asarray(poses)
     if array.ndim not in (2, 3) or array.shape[-2:] != (3, 4) or array.dtype.kind not in "fiu":
         return array
@@ -48,8 +62,6 @@ def _with_last_row(poses: Any) -> Any:
 
 
 def _reason(error: BaseException) -> str:
-    if isinstance(error, InvalidPose):
-        return str(error)
     if isinstance(error, FileNotFoundError):
         return "no such file"
     if isinstance(error, RecursionError):

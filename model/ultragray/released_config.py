@@ -1,6 +1,7 @@
 """conf.json of the released trainer: planes and width in centimetres, angle in degrees.
 
-Keys that start with `_` are comments; keys that an import does not need are ignored.
+Keys that start with `_` are comments; keys that an import does not need are ignored. `image_height` and `image_width`
+are keys of ours, which the released code ignores: an exported checkpoint comes without its training images.
 """
 
 from __future__ import annotations
@@ -13,15 +14,17 @@ from typing import Any
 
 import numpy as np
 
+from .datasets.images import frame_size
 from .errors import CheckpointInvalid, InvalidProbe
-from .probe import ConvexProbe, LinearProbe, Probe, stretch_released_far
+from .probe import ConvexProbe, FloatArray, LinearProbe, Probe, stretch_released_far
 
 MAX_CONFIG_BYTES = 1 << 20
+FILE_KEYS = ("images_file_train", "poses_file_train", "images_file_val", "poses_file_val")
 
 
 @dataclass(frozen=True)
 class TrainingImages:
-    """The shape of an images file [N, H, W]."""
+    """The shape of an images file."""
 
     path: Path
     count: int
@@ -31,7 +34,7 @@ class TrainingImages:
 
 @dataclass(frozen=True)
 class ReleasedConfig:
-    """What an import needs from conf.json, in mm and degrees. Exactly one of width and angle is given."""
+    """What a reader needs from conf.json, in mm and degrees. Exactly one of width and angle is given."""
 
     path: Path
     near_mm: float
@@ -39,8 +42,16 @@ class ReleasedConfig:
     width_mm: float | None
     opening_angle_deg: float | None
     dataset_name: str | None
+    files: Mapping[str, str]  # those of FILE_KEYS that it has, as written
     images: TrainingImages | None
     images_missing: str  # why `images` is None, as a clause
+    image_height: int | None  # H and W of the training images, where conf.json itself says so
+    image_width: int | None
+
+    def find(self, key: str) -> Path | None:
+        """The file that a key names: as written, beside conf.json by its name, or from a folder above. None: not there."""
+        named = self.files.get(key)
+        return None if named is None else _find(self.path, named)
 
     def released_probe(self) -> Probe:
         """The probe with the planes as released."""
@@ -62,6 +73,13 @@ class ReleasedConfig:
             raise CheckpointInvalid(f"{self.path}: {error}") from error
 
 
+def released_centre_mm(released_probe: Probe, poses: FloatArray) -> FloatArray:  # [P, 4, 4] mm -> [3]
+    """The origin of a scene trained from these poses: the mean corner of its images (docs/physics.md §6)."""
+    corner = released_probe.corners_mm().mean(axis=0)  # [3]
+    centre: FloatArray = (poses[:, :3, :3] @ corner + poses[:, :3, 3]).mean(axis=0)
+    return centre
+
+
 def read_released_config(path: str | Path) -> ReleasedConfig:
     """Reads conf.json and the shape of its images file. Raises CheckpointInvalid, naming the file."""
     path = Path(path)
@@ -73,16 +91,20 @@ def read_released_config(path: str | Path) -> ReleasedConfig:
             f"{path}: it must have exactly one of ultrasound_opening_width (linear, cm) and "
             f"ultrasound_opening_angle (convex, degrees), got {'neither' if width_cm is None else 'both'}"
         )
-    images, images_missing = _find_images(path, document)
+    files = _named_files(path, document)
+    images, images_missing = _find_images(path, files)
     config = ReleasedConfig(
         path=path,
         near_mm=_to_mm(_number(path, document, "ultrasound_near_plane")),
         far_mm=_to_mm(_number(path, document, "ultrasound_far_plane")),
         width_mm=None if width_cm is None else _to_mm(width_cm),
         opening_angle_deg=angle_deg,
-        dataset_name=_dataset_name(path, document),
+        dataset_name=_dataset_name(path, files),
+        files=files,
         images=images,
         images_missing=images_missing,
+        image_height=_optional_count(path, document, "image_height", at_least=2),
+        image_width=_optional_count(path, document, "image_width", at_least=1),
     )
     config.released_probe()  # refuses planes, widths and angles that no probe has
     return config
@@ -120,31 +142,45 @@ def _number(path: Path, document: Mapping[str, Any], key: str) -> float:
         raise CheckpointInvalid(f"{path}: {key} must be a finite number, got {str(value)[:40]}") from None
 
 
-def _dataset_name(path: Path, document: Mapping[str, Any]) -> str | None:
+def _optional_count(path: Path, document: Mapping[str, Any], key: str, *, at_least: int) -> int | None:
+    value = document.get(key)
+    if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < at_least):
+        raise CheckpointInvalid(f"{path}: {key} must be an integer of at least {at_least}, got {str(value)[:40]}")
+    return value
+
+
+def _named_files(path: Path, document: Mapping[str, Any]) -> dict[str, str]:
+    named = {key: document[key] for key in FILE_KEYS if document.get(key) is not None}
+    for key, value in named.items():
+        if not isinstance(value, str):
+            raise CheckpointInvalid(f"{path}: {key} must be a path, got {str(value)[:40]}")
+    return named
+
+
+def _dataset_name(path: Path, files: Mapping[str, str]) -> str | None:
     """The folder that holds the dataset: `data/liver/images_train.npy` names `liver`."""
-    named = document.get("images_file_train")
-    folder = Path(named).parent.name if isinstance(named, str) else ""
-    return folder or path.resolve().parent.name or None
+    return Path(files.get("images_file_train", "")).parent.name or path.resolve().parent.name or None
 
 
-def _find_images(path: Path, document: Mapping[str, Any]) -> tuple[TrainingImages | None, str]:
-    named = document.get("images_file_train")
+def _find_images(path: Path, files: Mapping[str, str]) -> tuple[TrainingImages | None, str]:
+    named = files.get("images_file_train")
     if named is None:
         return None, f"{path} names no images_file_train"
-    if not isinstance(named, str):
-        raise CheckpointInvalid(f"{path}: images_file_train must be a path, got {str(named)[:40]}")
-    for candidate in _candidates(path, named):
-        if _is_file(candidate):
-            return _read_shape(candidate), ""
-    return None, f"the file {named[:200]!r} that {path} names was not found"
+    found = _find(path, named)
+    return (None, f"the file {named[:200]!r} that {path} names was not found") if found is None else (_shape(found), "")
+
+
+def _find(path: Path, named: str) -> Path | None:
+    return next((candidate for candidate in _candidates(path, named) if _is_file(candidate)), None)
 
 
 def _candidates(path: Path, named: str) -> Iterator[Path]:
-    """The path as written, from conf.json's folder and each folder above it, and by name beside conf.json."""
+    """The path as written from conf.json's folder, then by name beside it, then as written from each folder above."""
     folder = path.resolve().parent
-    for base in (folder, *folder.parents):
+    yield folder / named
+    yield folder / Path(named).name  # before the folders above: a copied dataset must not find its original
+    for base in folder.parents:
         yield base / named
-    yield folder / Path(named).name
 
 
 def _is_file(path: Path) -> bool:
@@ -154,16 +190,18 @@ def _is_file(path: Path) -> bool:
         return False
 
 
-def _read_shape(path: Path) -> TrainingImages:
+def _shape(path: Path) -> TrainingImages:
     try:
         array = np.load(path, mmap_mode="r", allow_pickle=False)  # reads the header only
     except (OSError, ValueError, EOFError) as error:
         raise CheckpointInvalid(f"{path}: not an array of images that can be read: {error}") from error
-    if not isinstance(array, np.ndarray) or array.ndim != 3 or 0 in array.shape:
+    size = frame_size(array.shape) if isinstance(array, np.ndarray) else None
+    if size is None:
         shape = list(array.shape) if isinstance(array, np.ndarray) else "an archive"
-        raise CheckpointInvalid(f"{path}: images must have shape [N, H, W], got {shape}")
-    count, height, width = array.shape
-    return TrainingImages(path=path, count=count, height=height, width=width)
+        raise CheckpointInvalid(
+            f"{path}: images must have shape [N, H, W], [N, H, W, 1, 3 or 4] or [N, 1, H, W], got {shape}"
+        )
+    return TrainingImages(path=path, count=len(array), height=size[0], width=size[1])
 
 
 def _to_mm(length_cm: float) -> float:

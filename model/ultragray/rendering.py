@@ -44,9 +44,9 @@ def render(
     """Frames [C, height, width] of a scene seen by `probe` (None: the probe the scene was trained with) from `poses`.
 
     Poses are rigid probe→scene transforms in mm, in the frame of the sweep that the scene was trained from.
-    Backends: `reference` computes in the dtype of the scene's tensors and is differentiable; `cpu` computes in float32
-    on as many threads as torch.get_num_threads(); `auto` takes `cpu` for float32 scenes on the CPU that need no
-    gradient.
+    Backends: `reference` computes in the dtype of the scene's tensors; `cpu` computes in float32 on as many threads as
+    torch.get_num_threads(); `auto` takes `cpu` for float32 scenes on the CPU. Both are differentiable with respect to
+    the scene's tensors (`cpu` once); the gradients are the true ones (docs/physics.md §4).
     Raises InvalidPose, InvalidProbe, InvalidImageSize, UnknownOutput, BackendUnavailable.
     """
     chosen = check_outputs(outputs)

@@ -35,6 +35,7 @@ class Sweep:
     probe: Probe
     frame_numbers: IntArray  # [F] of each frame in its source
     source: str
+    notes: tuple[str, ...] = ()  # what reading it left out or assumed, for a person
 
     def __post_init__(self) -> None:
         images, count = self.images, len(self.images)
@@ -59,7 +60,7 @@ class Sweep:
         except InvalidPose:
             for number, pose in zip(self.frame_numbers, self.poses, strict=True):
                 try:
-                    check_poses(pose)
+                    check_poses(pose, field="its pose")
                 except InvalidPose as error:
                     raise DatasetInvalid(f"{self.source}: frame {number}: {error}") from error
             raise

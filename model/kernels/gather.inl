@@ -1,0 +1,365 @@
+// The backward pass (docs/physics.md §4, §5.6): from the loss's gradients on pixels to those on Gaussians. Every slice reads its
+// own footprint, so nothing is added to from two sides. Thresholds and culls are held fixed; all else is the true gradient.
+
+namespace {
+
+// (1 - exp(-S)) S / (S (S + 1e-8)) is the factor of sum(I w) in E; its value and its derivative by S.
+struct EchoFactor {
+    Floats value, slope;
+};
+
+inline EchoFactor echo_factor(Floats sum) {
+    const Floats inverse = 1.0f / maximum(sum, splat(1e-30f)), guarded = 1.0f / (sum + 1e-8f);
+    const Floats left = exponential(-sum);
+    const Mask small = less_equal(sum, splat(0.03f));  // differences of nearly equal numbers there
+    const Floats ratio = select(small, 1.0f - sum * (0.5f - sum * (1.0f / 6.0f - sum * (1.0f / 24.0f))), (1.0f - left) * inverse);
+    const Floats ratio_slope =
+        select(small, sum * (1.0f / 3.0f - sum * (0.125f - sum * (1.0f / 30.0f))) - 0.5f, (left - ratio) * inverse);
+    const Floats share = sum * guarded;
+    return {ratio * share, ratio_slope * share + ratio * (1e-8f * guarded * guarded)};
+}
+
+void differentiate(const View& view, int first, int lines, const SavedPlanes& saved, const FramePointers& gradients,
+                   const PixelGradients& out) {
+    const auto take = [&](const float* plane, int row, int line) {
+        if (plane == nullptr) return Floats{};
+        const float* from = plane + int64_t(row) * view.lines + line;
+        if (line + kLanes <= view.lines) return load<Floats>(from);
+        float lanes[kLanes] = {};
+        for (int k = 0; line + k < view.lines; ++k) lanes[k] = from[k];
+        return load<Floats>(lanes);
+    };
+    for (int line = first; line < first + lines; line += kLanes) {
+        Floats below{};
+        for (int row = view.height - 1; row >= 0; --row) {
+            const int64_t at = int64_t(row) * saved.stride + line;
+            const Floats sum = load<Floats>(saved.weight + at), weighted = load<Floats>(saved.intensity + at);
+            const Floats transmittance = load<Floats>(saved.transmittance + at);
+            const Floats by_bmode = take(gradients.bmode, row, line);
+            const EchoFactor factor = echo_factor(sum);
+            const Floats by_echo = take(gradients.echo, row, line) + by_bmode * transmittance;
+            const Floats echo = factor.value * weighted;
+            const Floats by_log = (take(gradients.transmittance, row, line) + by_bmode * echo) * transmittance;
+            const Floats by_coverage = take(gradients.coverage, row, line);
+            below += by_log;
+            const int64_t to = int64_t(row) * out.stride + line;
+            store(out.weight + to, by_echo * weighted * factor.slope + by_coverage * exponential(-sum));
+            store(out.intensity + to, by_echo * factor.value);
+            store(out.log_transmittance + to, by_log);
+            store(out.below + to, below);
+        }
+    }
+    if (first + lines < view.lines) return;
+    for (int row = 0; row < view.height; ++row)  // groups reach beyond the last line
+        for (int64_t k = int64_t(row) * out.stride + view.lines; k < int64_t(row + 1) * out.stride; ++k)
+            out.weight[k] = out.intensity[k] = out.log_transmittance[k] = out.below[k] = 0.0f;
+}
+
+// G and its derivatives by u and by where depth 0 lies.
+struct ProfileSlopes {
+    Floats value, by_u, by_zero;
+};
+
+inline ProfileSlopes clipped_slopes(Floats u, Floats zero) {
+    const Floats one = splat(1.0f), start = maximum(zero, Floats{});
+    const Mask above = less_equal(u, start);  // the centre of the window is at u itself
+    const Floats centre = minimum(start, u);
+    const Floats centre_by_u = keep(above, one), centre_by_zero = select(above, Floats{}, keep(less_equal(Floats{}, zero), one));
+    const Mask cut = less_equal(centre - 3.0f, zero), open = less_equal(u, centre + 3.0f);
+    const Floats low = maximum(centre - 3.0f, zero), high = minimum(centre + 3.0f, u);
+    const Floats low_by_u = select(cut, Floats{}, centre_by_u), low_by_zero = select(cut, one, centre_by_zero);
+    const Floats high_by_u = select(open, one, centre_by_u), high_by_zero = select(open, Floats{}, centre_by_zero);
+
+    const Floats half = 0.5f * (high - low), middle = 0.5f * (high + low);
+    Floats sum{}, by_half{}, by_middle{};
+    const auto add = [&](float node, float weight) {
+        const Floats t = middle + node * half, density = weight * exponential(-0.5f * t * t);
+        sum += density, by_middle -= half * t * density, by_half -= half * node * t * density;
+    };
+    add(0.0f, 8.0f / 9.0f), add(-kNode, 5.0f / 9.0f), add(kNode, 5.0f / 9.0f);
+    by_half += sum;
+    const Floats by_low = 0.5f * (by_middle - by_half), by_high = 0.5f * (by_middle + by_half);
+
+    const Floats depth = u - zero, point = 0.5f * (u + zero), density = exponential(-0.5f * point * point);
+    const Mask degenerate = either(less_equal(depth * depth, splat(1e-8f)), less_equal(high, low));
+    const Floats bend = 0.5f * depth * point * density;
+    return {select(degenerate, depth * density, half * sum),
+            select(degenerate, density - bend, by_low * low_by_u + by_high * high_by_u),
+            select(degenerate, -density - bend, by_low * low_by_zero + by_high * high_by_zero)};
+}
+
+inline Floats profile_slope(Floats u) {
+    const Mask crossing = less_equal(u, splat(3.0f));
+#if defined(__AVX512F__)
+    const Floats at = minimum(maximum(u, splat(-3.3999f)), splat(2.9999f));
+    const __m512i step = (__m512i)((at * 5.0f + 16.5f) + 12582912.0f);
+    const auto coefficient = [&](int power) {
+        const float* row = kProfileSlope.parabola[power];
+        return (Floats)_mm512_permutex2var_ps(_mm512_loadu_ps(row), step, _mm512_loadu_ps(row + 16));
+    };
+    return keep(crossing, (coefficient(2) * at + coefficient(1)) * at + coefficient(0));
+#else
+    return keep(crossing, clipped_slopes(minimum(maximum(u, splat(-8.0f)), splat(3.0f)), splat(-1e3f)).by_u);
+#endif
+}
+
+// Sums over the rows of a group, each a derivative of the loss with respect to what it is named after.
+struct LineSums {
+    Floats intensity{}, absorb{};
+    Floats u{}, u_times_u{};  // by u of each row; that times u
+    Floats weight{}, psi{};   // by each weight and psi, times its value
+    Floats zero{};
+};
+
+template <Profile profile>
+inline void gather_rows(const Group& g, const Slice& s, const PixelGradients& pixels, int line, int top, int end,
+                        LineSums& sums) {
+    const float fastest = largest(keep(g.touched, g.du));
+    const int period = fastest * kRestartRows > 8.0f ? (fastest < 8.0f ? int(8.0f / fastest) : 1) : kRestartRows;
+    const Floats q = exponential(-g.du * g.du);
+    const Floats intensity = splat(s.intensity), absorb = splat(s.absorb);
+    for (int block = top; block < end; block += period) {
+        Floats steps = splat(float(block - g.base));
+        Floats u = g.u + steps * g.du;
+        Floats w = exponential(-0.5f * (g.m2 + u * u));
+        Floats r = exponential(-g.du * (u + 0.5f * g.du));
+        const int stop = block + period < end ? block + period : end;
+        for (int i = block; i < stop; ++i) {
+            ProfileSlopes shape;
+            if (profile == Profile::Clipped)
+                shape = clipped_slopes(u, g.zero);
+            else
+                shape = {absorption_profile(u), profile_slope(u), Floats{}};
+            const Floats psi = g.peak * shape.value;
+            const Mask counted = either(less_equal(u * u, g.window2), less_equal(splat(kMinPsi), psi));
+            Floats alpha;
+            if (profile == Profile::Thin)
+                alpha = psi * (1.0f - psi * (0.5f - psi * (1.0f / 6.0f)));
+            else
+                alpha = 1.0f - exponential(-psi);
+            const Floats capped = minimum(alpha, splat(kMaxWeight));
+
+            const int64_t at = int64_t(i) * pixels.stride + line;
+            const Floats by_intensity = load<Floats>(pixels.intensity + at);
+            const Floats weight = keep(counted, minimum(w, splat(kMaxWeight)));
+            sums.intensity += by_intensity * weight;
+            const Floats by_weight = load<Floats>(pixels.weight + at) + intensity * by_intensity;
+            const Floats weighed = keep(less_equal(w, splat(kMaxWeight)), by_weight * weight);
+            sums.weight += weighed;
+
+            const Floats by_factor = keep(counted, load<Floats>(pixels.log_transmittance + at) / (1.0f - absorb * capped));
+            sums.absorb -= by_factor * capped;
+            const Floats by_psi = keep(less_equal(alpha, splat(kMaxWeight)), -absorb * by_factor * (1.0f - alpha));
+            sums.psi += psi * by_psi;
+            const Floats by_u = by_psi * g.peak * shape.by_u - u * weighed;
+            sums.u += by_u;
+            sums.u_times_u += by_u * u;
+            if (profile == Profile::Clipped) sums.zero += by_psi * g.peak * shape.by_zero;
+            w *= r;
+            r *= q;
+            steps += 1.0f;
+            u = g.u + steps * g.du;
+        }
+    }
+}
+
+// With respect to a slice, summed over lanes.
+struct SliceGradient {
+    Floats mean_x{}, mean_z{}, cov_xx{}, cov_xz{}, cov_zz{}, m2_plane{}, intensity{}, absorb{};
+};
+
+inline void gather_group(const View& view, const Slice& s, const PixelGradients& pixels, int line, SliceGradient& out) {
+    const Group g = cross(view, s, line);
+    if (!any(g.touched)) return;
+    const Extent extent = extent_of(view, g);
+    const int top = extent.top, end = extent.end;
+    LineSums sums;
+    if (top < end) switch (extent.profile) {
+            case Profile::Thin: gather_rows<Profile::Thin>(g, s, pixels, line, top, end, sums); break;
+            case Profile::Thick: gather_rows<Profile::Thick>(g, s, pixels, line, top, end, sums); break;
+            case Profile::Clipped: gather_rows<Profile::Clipped>(g, s, pixels, line, top, end, sums); break;
+        }
+    if (end < view.height && any(g.opaque)) {
+        // Beyond `whole` the profile is constant in u.
+        const ProfileSlopes shape = clipped_slopes(extent.whole + 1.0f, g.zero);
+        const Floats psi = g.peak * shape.value;
+        const Mask passes = less_equal(splat(kMinPsi), psi);
+        const Floats alpha = 1.0f - exponential(-psi), capped = minimum(alpha, splat(kMaxWeight));
+        const Floats steps = load<Floats>(pixels.below + int64_t(end) * pixels.stride + line);
+        const Floats by_factor = keep(passes, steps / (1.0f - s.absorb * capped));
+        sums.absorb -= by_factor * capped;
+        const Floats by_psi = keep(less_equal(alpha, splat(kMaxWeight)), -s.absorb * by_factor * (1.0f - alpha));
+        sums.psi += psi * by_psi;
+        sums.zero += by_psi * g.peak * shape.by_zero;
+    }
+
+    // u = (s - s*) / sigma, zero = -s* / sigma, psi = exp(-m2/2) sigma G(u, zero).
+    const Floats inverse_sigma = 1.0f / g.sigma;
+    const Floats by_star = -(sums.u + sums.zero) * inverse_sigma;
+    const Floats by_variance = 0.5f * (sums.psi - sums.u_times_u - sums.zero * g.zero) * inverse_sigma * inverse_sigma;
+    const Floats by_m2 = -0.5f * (sums.weight + sums.psi);
+
+    // With a the line's normal in the plane and e its direction: m2 = across2 / q, s* = e.mean - k across / q and
+    // variance = det / q, where q = a.C a, k = a.C e and det = det C.
+    const Floats dx = to_floats(load<Doubles>(view.dir_x + line)), dz = to_floats(load<Doubles>(view.dir_z + line));
+    const Floats xx = splat(float(s.cov_xx)), xz = splat(float(s.cov_xz)), zz = splat(float(s.cov_zz));
+    const Floats k = dx * dz * (zz - xx) + xz * (dx * dx - dz * dz);
+    const Floats variance = g.sigma * g.sigma, slant = g.across * g.spread;
+    const Floats by_det = by_variance * g.spread;
+    const Floats by_k = -by_star * slant;
+    const Floats by_across = 2.0f * by_m2 * slant - by_star * k * g.spread;
+    const Floats by_q = (by_star * k * slant - by_variance * variance) * g.spread - by_m2 * slant * slant;
+    const auto add = [&](Floats& sum, Floats value) { sum += keep(g.touched, value); };
+    add(out.mean_x, dx * by_star - dz * by_across);
+    add(out.mean_z, dz * by_star + dx * by_across);
+    add(out.cov_xx, by_q * dz * dz - by_k * dx * dz + by_det * zz);
+    add(out.cov_xz, by_k * (dx * dx - dz * dz) - 2.0f * (by_q * dx * dz + by_det * xz));
+    add(out.cov_zz, by_q * dx * dx + by_k * dx * dz + by_det * xx);
+    add(out.m2_plane, by_m2);
+    add(out.intensity, sums.intensity);
+    add(out.absorb, sums.absorb);
+}
+
+inline float total(Floats a) {
+#if defined(__AVX512F__)
+    return _mm512_reduce_add_ps((__m512)a);
+#else
+    float sum = 0;
+    for (int k = 0; k < kLanes; ++k) sum += a[k];
+    return sum;
+#endif
+}
+
+// The same for kLanes slices, one a lane.
+struct SliceGradients {
+    float mean_x[kLanes], mean_z[kLanes], cov_xx[kLanes], cov_xz[kLanes], cov_zz[kLanes], m2_plane[kLanes];
+    float intensity[kLanes], absorb[kLanes];
+};
+
+inline void gather_slice(const View& view, const Slice& s, const PixelGradients& pixels, SliceGradients& out, int lane) {
+    SliceGradient sum;
+    for (int line = s.first; line <= s.last; line += kLanes) gather_group(view, s, pixels, line, sum);
+    out.mean_x[lane] = total(sum.mean_x), out.mean_z[lane] = total(sum.mean_z);
+    out.cov_xx[lane] = total(sum.cov_xx), out.cov_xz[lane] = total(sum.cov_xz), out.cov_zz[lane] = total(sum.cov_zz);
+    out.m2_plane[lane] = total(sum.m2_plane);
+    out.intensity[lane] = total(sum.intensity), out.absorb[lane] = total(sum.absorb);
+}
+
+// What intensity passes back: by each coefficient, and by the mean through the direction of view.
+struct HarmonicsGradient {
+    Floats coefficients[kMaxShCoefficients];
+    Floats mean[3];
+};
+
+inline HarmonicsGradient differentiate_harmonics(const SceneView& scene, const Harmonics& harmonics, const Direction& v,
+                                                 Floats by_intensity) {
+    const int degree = scene.sh_degree;
+    const Floats *sh = harmonics.coefficients, x = v.x, y = v.y, z = v.z;
+    const Floats value = spherical_harmonics(harmonics, degree, x, y, z), activated = activate(scene.intensity, value);
+    const Mask inside = both(less_equal(splat(0.5f), value + 1.0f), less_equal(value + 1.0f, splat(0.999f)));
+    const Floats slope = scene.intensity == Intensity::Sigmoid ? 4.0f * activated * (1.0f - activated) : keep(inside, splat(1.0f));
+    const Floats by_value = by_intensity * slope;
+
+    HarmonicsGradient out{};
+    Floats* c = out.coefficients;
+    Floats gx{}, gy{}, gz{};
+    c[0] = splat(0.28209479177387814f);
+    if (degree >= 1) {
+        const float k = 0.4886025119029199f;
+        c[1] = -k * y, c[2] = k * z, c[3] = -k * x;
+        gx = -k * sh[3], gy = -k * sh[1], gz = k * sh[2];
+    }
+    if (degree >= 2) {
+        const float k = 1.0925484305920792f, l = 0.31539156525252005f;
+        c[4] = k * x * y, c[5] = -k * y * z, c[6] = l * (2.0f * z * z - x * x - y * y);
+        c[7] = -k * x * z, c[8] = 0.5f * k * (x * x - y * y);
+        gx += k * (y * sh[4] - z * sh[7] + x * sh[8]) - 2.0f * l * x * sh[6];
+        gy += k * (x * sh[4] - z * sh[5] - y * sh[8]) - 2.0f * l * y * sh[6];
+        gz += 4.0f * l * z * sh[6] - k * (y * sh[5] + x * sh[7]);
+    }
+    if (degree >= 3) {
+        const float a = 0.5900435899266435f, b = 2.890611442640554f, d = 0.4570457994644658f, e = 0.3731763325901154f;
+        const Floats xx = x * x, yy = y * y, zz = z * z;
+        c[9] = -a * y * (3.0f * xx - yy), c[10] = b * x * y * z, c[11] = -d * y * (4.0f * zz - xx - yy);
+        c[12] = e * z * (2.0f * zz - 3.0f * xx - 3.0f * yy), c[13] = -d * x * (4.0f * zz - xx - yy);
+        c[14] = 0.5f * b * z * (xx - yy), c[15] = -a * x * (xx - 3.0f * yy);
+        gx += b * (y * z * sh[10] + x * z * sh[14]) - 6.0f * a * x * y * sh[9] - 3.0f * a * (xx - yy) * sh[15];
+        gx += d * (2.0f * x * y * sh[11] - (4.0f * zz - 3.0f * xx - yy) * sh[13]) - 6.0f * e * x * z * sh[12];
+        gy += b * (x * z * sh[10] - y * z * sh[14]) + 6.0f * a * x * y * sh[15] - 3.0f * a * (xx - yy) * sh[9];
+        gy += d * (2.0f * x * y * sh[13] - (4.0f * zz - xx - 3.0f * yy) * sh[11]) - 6.0f * e * y * z * sh[12];
+        gz += b * (x * y * sh[10] + 0.5f * (xx - yy) * sh[14]) - 8.0f * d * z * (y * sh[11] + x * sh[13]);
+        gz += e * (6.0f * zz - 3.0f * xx - 3.0f * yy) * sh[12];
+    }
+    for (int t = 0; t < (degree + 1) * (degree + 1); ++t) c[t] *= by_value;
+    const Floats along = x * gx + y * gy + z * gz;  // turning the direction does not change its length
+    const Floats rate = keep(less_equal(v.inverse_length, splat(1e15f)), by_value * v.inverse_length);
+    out.mean[0] = rate * (gx - x * along), out.mean[1] = rate * (gy - y * along), out.mean[2] = rate * (gz - z * along);
+    return out;
+}
+
+// From kLanes slices to their Gaussians: `place` and the conditioning on the plane, backwards.
+inline void differentiate_slices(const SceneView& scene, const View& view, const Candidates& c, const SliceGradients& by,
+                                 GaussianGradient* gradients, float* sh_gradients) {
+    const auto widen = [](const float* p) { return __builtin_convertvector(load<Floats>(p), Doubles); };
+    const Placed p = place(scene, view, c);
+    const Doubles mean_x = widen(by.mean_x), mean_z = widen(by.mean_z), m2 = widen(by.m2_plane);
+    const Doubles cov_xx = widen(by.cov_xx), cov_xz = widen(by.cov_xz), cov_zz = widen(by.cov_zz);
+    const Doubles inverse = 1.0 / p.yy, height = p.mu[1] * inverse, tilt_x = p.xy * inverse, tilt_z = p.yz * inverse;
+    const Doubles by_mu[3] = {mean_x, 2.0 * height * m2 - tilt_x * mean_x - tilt_z * mean_z, mean_z};
+    const Doubles by_xy = -2.0 * tilt_x * cov_xx - tilt_z * cov_xz - height * mean_x;
+    const Doubles by_yz = -2.0 * tilt_z * cov_zz - tilt_x * cov_xz - height * mean_z;
+    const Doubles by_yy = tilt_x * tilt_x * cov_xx + tilt_x * tilt_z * cov_xz + tilt_z * tilt_z * cov_zz - height * height * m2 +
+                          height * (tilt_x * mean_x + tilt_z * mean_z);
+
+    Doubles by_axes[3][3], by_log_scale[3];  // by_axes[d][k]: axis k along d, in the scene's axes
+    for (int k = 0; k < 3; ++k) {
+        const Doubles* s = p.spoke[k];
+        const Doubles by_spoke[3] = {2.0 * s[0] * cov_xx + s[1] * by_xy + s[2] * cov_xz,
+                                     2.0 * s[1] * by_yy + s[0] * by_xy + s[2] * by_yz,
+                                     2.0 * s[2] * cov_zz + s[0] * cov_xz + s[1] * by_yz};
+        by_log_scale[k] = by_spoke[0] * s[0] + by_spoke[1] * s[1] + by_spoke[2] * s[2];
+        for (int d = 0; d < 3; ++d)
+            by_axes[d][k] = p.scale[k] * (view.axes[0][d] * by_spoke[0] + view.axes[1][d] * by_spoke[1] +
+                                          view.axes[2][d] * by_spoke[2]);
+    }
+    const Doubles w = p.quat[0], x = p.quat[1], y = p.quat[2], z = p.quat[3];
+    const auto& m = by_axes;
+    const Doubles by_quat[4] = {
+        2.0 * (x * (m[2][1] - m[1][2]) + y * (m[0][2] - m[2][0]) + z * (m[1][0] - m[0][1])),
+        2.0 * (w * (m[2][1] - m[1][2]) + y * (m[0][1] + m[1][0]) + z * (m[0][2] + m[2][0]) - 2.0 * x * (m[1][1] + m[2][2])),
+        2.0 * (w * (m[0][2] - m[2][0]) + x * (m[0][1] + m[1][0]) + z * (m[1][2] + m[2][1]) - 2.0 * y * (m[0][0] + m[2][2])),
+        2.0 * (w * (m[1][0] - m[0][1]) + x * (m[0][2] + m[2][0]) + y * (m[1][2] + m[2][1]) - 2.0 * z * (m[0][0] + m[1][1])),
+    };
+    const HarmonicsGradient harmonics = differentiate_harmonics(scene, load_harmonics(scene, c), direction_of(p.offset),
+                                                                load<Floats>(by.intensity));
+    Doubles by_mean[3];
+    for (int d = 0; d < 3; ++d)
+        by_mean[d] = view.axes[0][d] * by_mu[0] + view.axes[1][d] * by_mu[1] + view.axes[2][d] * by_mu[2] +
+                     __builtin_convertvector(harmonics.mean[d], Doubles);
+
+    const int terms = (scene.sh_degree + 1) * (scene.sh_degree + 1);
+    for (int k = 0; k < c.count; ++k) {
+        GaussianGradient& to = gradients[c.ids[k]];
+        for (int d = 0; d < 3; ++d) to.mean[d] += float(by_mean[d][k]), to.log_scale[d] += float(by_log_scale[d][k]);
+        for (int d = 0; d < 4; ++d) to.quat[d] += float(by_quat[d][k]);
+        to.absorb += by.absorb[k];
+        float* sh = sh_gradients + c.ids[k] * terms;
+        for (int t = 0; t < terms; ++t) sh[t] += harmonics.coefficients[t][k];
+    }
+}
+
+void gather(const SceneView& scene, const View& view, const Slice* slices, int64_t count, const PixelGradients& pixels,
+            GaussianGradient* gradients, float* sh_gradients) {
+    for (int64_t first = 0; first < count; first += kLanes) {
+        Candidates c;
+        SliceGradients by{};
+        for (; c.count < kLanes && first + c.count < count; ++c.count) {
+            const Slice& s = slices[first + c.count];
+            gather_slice(view, s, pixels, by, c.count);
+            c.ids[c.count] = s.gaussian;
+        }
+        differentiate_slices(scene, view, c, by, gradients, sh_gradients);
+    }
+}
+
+}  // namespace

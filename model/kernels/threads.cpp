@@ -1,0 +1,54 @@
+#include "threads.hpp"
+
+#include <algorithm>
+#include <exception>
+#include <mutex>
+#include <system_error>
+#include <thread>
+#include <vector>
+
+namespace ultragray {
+
+void run_phases(Phase& first, Phase& second, int threads) {
+    std::exception_ptr failure;
+    std::mutex failure_lock;
+    std::atomic<bool> failed{false};
+    const auto take_all = [&](Phase& phase) {
+        for (int i = phase.next++; i < phase.count; i = phase.next++) {
+            try {
+                if (!failed) phase.task(i);
+            } catch (...) {
+                const std::lock_guard<std::mutex> guard(failure_lock);
+                if (!failure) failure = std::current_exception();
+                failed = true;
+            }
+            ++phase.done;
+        }
+    };
+    const auto work = [&] {
+        take_all(first);
+        while (first.done < first.count) std::this_thread::yield();
+        take_all(second);
+    };
+    std::vector<std::thread> helpers;
+    const int wanted = std::min(threads, std::max(first.count, second.count)) - 1;
+    helpers.reserve(std::max(0, wanted));
+    try {
+        for (int t = 0; t < wanted; ++t) helpers.emplace_back(work);
+    } catch (const std::system_error&) {
+        // No more threads to be had: those that run do the work.
+    }
+    work();
+    for (std::thread& helper : helpers) helper.join();
+    if (failure) std::rethrow_exception(failure);
+}
+
+void run_ranges(int64_t count, const std::function<void(int64_t, int64_t)>& task, int threads) {
+    constexpr int64_t kRange = 8192;
+    Phase ranges{static_cast<int>((count + kRange - 1) / kRange),
+                 [&](int i) { task(i * kRange, std::min((i + 1) * kRange, count)); }};
+    Phase nothing{0, {}};
+    run_phases(ranges, nothing, threads);
+}
+
+}  // namespace ultragray

@@ -1,0 +1,65 @@
+"""How each tissue of the phantom scatters and absorbs, and the probe's pulse and beam."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from ...probe import FloatArray
+from .anatomy import Tissue
+
+FREQUENCY_MHZ = 5.0
+WAVELENGTH_MM = 1.54 / FREQUENCY_MHZ
+PULSE_SIGMA_MM = 0.17  # of the echo's envelope, along depth
+FOCUS_MM = 32.0
+
+
+@dataclass(frozen=True)
+class Acoustics:
+    """Attenuation one way in dB/(cm·MHz); backscattered amplitude in dB over that of muscle."""
+
+    attenuation: float
+    backscatter_db: float
+
+
+ACOUSTICS: dict[Tissue, Acoustics] = {
+    Tissue.OUTSIDE: Acoustics(0.0, -math.inf),
+    Tissue.SKIN: Acoustics(0.9, 14.0),
+    Tissue.FAT: Acoustics(0.5, -4.0),
+    Tissue.FASCIA: Acoustics(0.8, 4.0),
+    Tissue.MUSCLE: Acoustics(0.6, 0.0),
+    Tissue.LIGAMENT: Acoustics(0.8, 4.0),
+    Tissue.BONE: Acoustics(20.0, 16.0),
+    Tissue.BLOOD: Acoustics(0.15, -34.0),
+    Tissue.FLUID: Acoustics(0.02, -28.0),
+    Tissue.DISC: Acoustics(0.9, -2.0),
+}
+COMPENSATED = 0.6  # dB/(cm·MHz) that the scanner's time-gain compensation expects
+
+
+def round_trip_db_per_mm() -> FloatArray:  # [tissues]
+    """What each tissue takes from an echo over a millimetre of depth, there and back."""
+    return np.array([0.2 * FREQUENCY_MHZ * ACOUSTICS[tissue].attenuation for tissue in Tissue])
+
+
+def backscatter_amplitudes() -> FloatArray:  # [tissues]
+    """Amplitude of each tissue's scatterers over those of muscle."""
+    return np.array([10.0 ** (ACOUSTICS[tissue].backscatter_db / 20.0) for tissue in Tissue])
+
+
+def lateral_sigma_mm(depth_mm: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
+    """Width of the beam in the image plane, there and back."""
+    return np.hypot(0.34, 0.011 * (depth_mm - FOCUS_MM))
+
+
+def elevation_sigma_mm(depth_mm: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
+    """Thickness of the slice: 1.4 mm at half amplitude in the focus of the lens, more before and behind."""
+    return np.hypot(0.6, 0.022 * (depth_mm - FOCUS_MM))
+
+
+def compensated_db_per_mm() -> float:
+    """What the time-gain compensation adds over a millimetre of depth."""
+    return 0.2 * FREQUENCY_MHZ * COMPENSATED

@@ -1,0 +1,167 @@
+"""Sequences recorded with PLUS: tracked 2D images in MetaImage or NRRD files.
+
+The pose of a frame follows from its transforms and the device set's calibration: from `Image` to `Reference` where that is tracked,
+else to `Tracker`; usually inv(ReferenceToTracker) · ProbeToTracker · ImageToProbe.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import DatasetInvalid, InvalidPose
+from ..pose import check_poses
+from ..probe import FloatArray
+from .calibration import poses_from_image_transforms
+from .frame_ranges import parse_frame_ranges
+from .images import grey_frames, parse_crop
+from .meta_image import read_meta_image
+from .nrrd import read_nrrd
+from .orientation import UNKNOWN, orient_frames
+from .sequence import StoredSequence
+from .sweep import Sweep
+from .transforms import TransformName, find_path, parse_matrix, read_device_set, transform_name
+
+_READERS = {".mha": read_meta_image, ".mhd": read_meta_image, ".nrrd": read_nrrd, ".nhdr": read_nrrd}
+SEQUENCE_SUFFIXES = tuple(_READERS)
+IMAGE, WORLDS = "Image", ("Reference", "Tracker", "World")
+_TRANSFORM, _STATUS = "Transform", "TransformStatus"
+_IMAGE_STATUSES = ("ImageStatus", "Status")  # as MetaImage and NRRD sequences call it
+
+
+def read_plus_sweep(
+    path: Path, *, device_set: Path | None = None, frames: str | None = None, crop: str | None = None
+) -> tuple[Sweep, int]:
+    """The frames of a sequence that have a valid pose, and the number of frames in the file.
+
+    `frames` (ranges, `parse_frame_ranges`) chooses among them, `crop` is "columns,rows" of the image after it was
+    brought to x lateral, y depth. Transforms of the device set go before those of the same name in the sequence.
+    Frames whose status is not OK are left out, and the sweep's notes say so; a sequence without statuses is taken to
+    be valid. Raises DatasetInvalid, naming the file, the frame and the reason; InvalidArgument for `frames` and
+    `crop` that do not fit.
+    """
+    stored = _READERS[path.suffix.lower()](path)
+    frame_count = len(stored.pixels)
+    chosen = range(frame_count) if frames is None else parse_frame_ranges(frames, frame_count, option="--frames")
+    _check_image_type(stored)
+    orientation = _field(stored, "UltrasoundImageOrientation").upper()
+    fixed = {} if device_set is None else read_device_set(device_set)
+    way = _way_to_world(stored, fixed, device_set)
+    numbers, transforms = _image_transforms(stored, chosen, way, fixed)
+    images = orient_frames(grey_frames(stored.pixels, str(path)), orientation, path)
+    box = parse_crop(crop, *images.shape[1:])
+    poses, probe = poses_from_image_transforms(transforms, box, numbers, path)
+    sweep = Sweep(
+        images=np.ascontiguousarray(images[numbers, box.top : box.bottom, box.left : box.right]),
+        poses=poses,
+        probe=probe,
+        frame_numbers=numbers,
+        source=str(path),
+        notes=_notes(orientation, crop, images.shape[1:], sorted(set(chosen) - set(numbers.tolist())), stored, way),
+    )
+    return sweep, frame_count
+
+
+def _field(stored: StoredSequence, name: str) -> str:
+    """A field of the file; NRRD sequences write `ultrasound image orientation`."""
+    for key, value in stored.fields.items():
+        if key.replace(" ", "").lower() == name.lower():
+            return value
+    return ""
+
+
+def _check_image_type(stored: StoredSequence) -> None:
+    kind = _field(stored, "UltrasoundImageType").upper()
+    if kind not in ("", "XX", "BRIGHTNESS", "RGB_COLOR"):
+        raise DatasetInvalid(f"{stored.path}: images must be B-mode (BRIGHTNESS or RGB_COLOR), got {kind[:40]}")
+
+
+def _way_to_world(
+    stored: StoredSequence, fixed: Mapping[TransformName, FloatArray], device_set: Path | None
+) -> list[tuple[TransformName, bool]]:
+    """The transforms from Image to the frame that poses are given in, by name: the same for every frame."""
+    names = {
+        name
+        for fields in stored.frame_fields
+        for key in fields
+        if key.endswith(_TRANSFORM) and (name := transform_name(key.removesuffix(_TRANSFORM)))
+    }
+    for world in WORLDS:
+        way = find_path([*names, *fixed], IMAGE, world)
+        if way is not None:
+            return way
+    known = ", ".join(sorted("To".join(name) for name in {*names, *fixed})) or "none"
+    hint = "" if device_set else " (give the device set that holds ImageToProbe with --device-set)"
+    raise DatasetInvalid(
+        f"{stored.path}: no transforms lead from {IMAGE} to {', '.join(WORLDS[:-1])} or {WORLDS[-1]}; there are {known}"
+        f"{hint}"
+    )
+
+
+def _image_transforms(
+    stored: StoredSequence,
+    chosen: range | list[int],
+    way: list[tuple[TransformName, bool]],
+    fixed: Mapping[TransformName, FloatArray],
+) -> tuple[np.ndarray, FloatArray]:  # [F], [F, 4, 4]
+    """Numbers of the chosen frames that are valid, and their transforms from pixels to the world."""
+    valid = [number for number in chosen if _is_valid(stored.frame_fields[number], way, fixed)]
+    if not valid:
+        raise DatasetInvalid(
+            f"{stored.path}: none of its {len(chosen)} frames has a valid {_tracked(way, fixed)}: "
+            "every status is other than OK, or the transforms are missing"
+        )
+    transforms = np.tile(np.eye(4), (len(valid), 1, 1))
+    for place, number in enumerate(valid):
+        for name, inverted in way:
+            step = fixed[name] if name in fixed else _measured(stored, number, name)
+            transforms[place] = (np.linalg.inv(step) if inverted else step) @ transforms[place]
+    return np.array(valid, np.int64), transforms
+
+
+def _is_valid(
+    fields: Mapping[str, str], way: list[tuple[TransformName, bool]], fixed: Mapping[TransformName, FloatArray]
+) -> bool:
+    statuses = [fields.get(key, "OK") for key in _IMAGE_STATUSES]
+    for name, _ in way:
+        if name not in fixed:
+            key = "To".join(name)
+            statuses.append(fields.get(key + _STATUS, "OK") if key + _TRANSFORM in fields else "MISSING")
+    return all(status.upper() == "OK" for status in statuses)
+
+
+def _measured(stored: StoredSequence, number: int, name: TransformName) -> FloatArray:  # [4, 4]
+    key = "To".join(name)
+    where = f"{stored.path}: frame {number}: {key}"
+    matrix = parse_matrix(stored.frame_fields[number][key + _TRANSFORM], where)
+    if IMAGE in name:  # holds the size of a pixel
+        return matrix
+    try:
+        return check_poses(matrix, field=key)[0]
+    except InvalidPose as error:
+        raise DatasetInvalid(f"{stored.path}: frame {number}: {error}") from error
+
+
+def _tracked(way: list[tuple[TransformName, bool]], fixed: Mapping[TransformName, FloatArray]) -> str:
+    return " and ".join("To".join(name) for name, _ in way if name not in fixed) or "image"
+
+
+def _notes(
+    orientation: str,
+    crop: str | None,
+    size: tuple[int, ...],
+    left_out: list[int],
+    stored: StoredSequence,
+    way: list[tuple[TransformName, bool]],
+) -> tuple[str, ...]:
+    notes = []
+    if left_out:
+        listed = ", ".join(map(str, left_out[:10])) + (", …" if len(left_out) > 10 else "")
+        notes.append(f"{len(left_out)} frames without a valid pose or image were left out: {listed}")
+    if orientation in UNKNOWN:
+        notes.append("the file does not say how its images are oriented: taken as MF, columns lateral, rows depth")
+    if crop is None:
+        notes.append(f"no crop was given: the whole image of {size[1]} x {size[0]} pixels is taken as ultrasound")
+    return tuple(notes)

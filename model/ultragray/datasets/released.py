@@ -1,0 +1,122 @@
+"""Datasets in the layout of the released trainer: conf.json, images_*.npy, poses_*.npy or .json.
+
+conf.json says where the planes are, in centimetres and degrees (`ultragray.released_config`); poses are in mm. Rows lie where
+Sweep puts them, as measured from the image: the stretch of docs/physics.md §3 belongs to released checkpoints only.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import CheckpointInvalid, DatasetInvalid, InvalidArgument, InvalidPose
+from ..files import atomic_path
+from ..pose_file import read_pose_array
+from ..probe import FloatArray, LinearProbe, Probe
+from ..released_config import ReleasedConfig, read_released_config
+from .images import grey_frames
+from .sweep import ByteArray, Dataset, Sweep
+
+CONFIG_NAME = "conf.json"
+
+
+def read_released(path: str | Path) -> Dataset:
+    """The dataset that a conf.json describes; `path` is that file, or the folder that holds it.
+
+    Images are uint8 or floats in [0, 1], [N, H, W], [N, 1, H, W] or in colour [N, H, W, 3 or 4]; poses [N, 4, 4] or
+    [N, 3, 4], probe→tracker, mm. Where conf.json names no held-out files there are no held-out frames. Raises
+    DatasetInvalid, naming the file, the frame and the reason.
+    """
+    path = Path(path)
+    if path.is_dir():
+        path = path / CONFIG_NAME
+    try:
+        config = read_released_config(path)
+        probe = config.released_probe()
+    except CheckpointInvalid as error:
+        raise DatasetInvalid(error.detail) from error
+    train = _read_part(config, "train", probe)
+    has_val = bool({"images_file_val", "poses_file_val"} & set(config.files))
+    val = _read_part(config, "val", probe) if has_val else train.select([])
+    return Dataset(name=config.dataset_name or path.resolve().parent.name, train=train, val=val)
+
+
+def _read_part(config: ReleasedConfig, part: str, probe: Probe) -> Sweep:
+    images_path, poses_path = (_file(config, f"{kind}_file_{part}") for kind in ("images", "poses"))
+    images, poses = _read_images(images_path), _read_poses(poses_path)
+    if len(images) != len(poses):
+        raise DatasetInvalid(f"{images_path} holds {len(images)} images, but {poses_path} {len(poses)} poses")
+    return Sweep(images=images, poses=poses, probe=probe, frame_numbers=np.arange(len(images)), source=str(images_path))
+
+
+def _file(config: ReleasedConfig, key: str) -> Path:
+    if key not in config.files:
+        raise DatasetInvalid(f"{config.path}: it lacks {key}")
+    found = config.find(key)
+    if found is None:
+        raise DatasetInvalid(f"{config.path}: {key} names {config.files[key][:200]!r}, which was not found")
+    return found
+
+
+def _read_images(path: Path) -> ByteArray:  # [F, H, W]
+    try:
+        frames = np.load(path, mmap_mode="r", allow_pickle=False)  # a truncated file is noticed before it is read
+    except (OSError, ValueError, EOFError) as error:
+        raise DatasetInvalid(f"{path}: not an array of images that can be read: {error}") from error
+    if not isinstance(frames, np.ndarray):
+        raise DatasetInvalid(f"{path}: not an array of images, but an archive of several")
+    return grey_frames(frames, str(path))
+
+
+def _read_poses(path: Path) -> FloatArray:  # [F, 4, 4]
+    try:
+        poses = read_pose_array(path)
+    except InvalidPose as error:
+        raise DatasetInvalid(error.detail) from error
+    if poses.dtype.kind not in "fiu" or poses.ndim != 3 or poses.shape[1:] != (4, 4):
+        raise DatasetInvalid(
+            f"{path}: poses must be numbers [N, 4, 4] or [N, 3, 4], got {poses.dtype} {list(poses.shape)}"
+        )
+    return np.array(poses, np.float64)
+
+
+def write_released(dataset: Dataset, folder: str | Path) -> None:
+    """Writes the dataset in this layout; conf.json comes last, so that a folder which has it is complete.
+
+    Our reader gives the same dataset back (`Dataset.sha256`) where the planes are whole multiples of 1e-9 mm. Paths in
+    conf.json are written as the released trainer expects them, from the folder that holds `data/`. Raises
+    InvalidArgument where the folder already holds a dataset.
+    """
+    folder = Path(folder)
+    if (folder / CONFIG_NAME).exists():
+        raise InvalidArgument(f"{folder} already holds a dataset: choose another folder", field="output")
+    folder.mkdir(parents=True, exist_ok=True)
+    name = folder.resolve().name
+    document: dict[str, Any] = {}
+    for part, sweep in (("train", dataset.train), ("val", dataset.val)):
+        if len(sweep):
+            for kind, array in (("images", sweep.images), ("poses", sweep.poses)):
+                file_name = f"{kind}_{part}.npy"
+                with atomic_path(folder / file_name) as temporary, temporary.open("wb") as file:
+                    np.save(file, array, allow_pickle=False)
+                document[f"{kind}_file_{part}"] = f"data/{name}/{file_name}"
+    document |= {"result_dir": f"results/{name}", **_planes(dataset.probe), "_source": dataset.name}
+    with atomic_path(folder / CONFIG_NAME) as temporary:
+        temporary.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+
+
+def _planes(probe: Probe) -> dict[str, float]:
+    planes = {
+        "ultrasound_near_plane": _to_cm(probe.near_mm),
+        "ultrasound_far_plane": _to_cm(probe.far_mm),
+    }
+    if isinstance(probe, LinearProbe):
+        return planes | {"ultrasound_opening_width": _to_cm(probe.width_mm)}
+    return planes | {"ultrasound_opening_angle": probe.opening_angle_deg}
+
+
+def _to_cm(length_mm: float) -> float:
+    return round(length_mm / 10.0, 10)

@@ -1,0 +1,185 @@
+"""TrainingConfig: everything that decides how a scene is trained, in one typed object.
+
+The same fields come from the command line, from a TOML file and from Python, and are stored in the scene. What follows
+from the data (spacing of the frames, size of a pixel) is None unless it is set; fractions are of the whole run, so that
+a run of any length keeps the shape of its schedules.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+import typing
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from ..errors import InvalidArgument
+from ..scene_info import INTENSITIES, MAX_SH_DEGREE
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+RELEASED_STEPS = 30_000  # the length of run that the released rates are tuned for
+MAX_TRANSMITTANCE_RATE = 2e-2  # beyond, short runs get worse again
+STARTS = ("informed", "random")
+GROWTHS = ("even", "threshold")
+
+
+@dataclass(frozen=True)
+class TrainingConfig:
+    """How to train. The defaults are the preset `fast`; `TrainingConfig.preset` gives the others.
+
+    Rates are Adam's, for batches of one frame: the trainer multiplies them by √batch_size. Raises InvalidArgument,
+    naming the field, for a value outside its range.
+    """
+
+    steps: int = 1500
+    batch_size: int = 8  # frames of one step; fewer where the dataset has fewer
+    seed: int = 0
+    initial_gaussians: int = 30_000
+    max_gaussians: int = 60_000
+    start: str = "informed"  # Gaussians begin on pixels of the frames; `random`: anywhere in a cube
+    initial_scale_mm: float | None = None  # standard deviation; None: from the spacing of frames and pixels
+    initial_transmittance: float = 0.99
+    intensity: str = "sigmoid"  # activation, docs/physics.md §2
+    sh_degree: int = 1
+    sh_start: float = 1_000 / RELEASED_STEPS  # where degree 1 joins; degree d at d times that
+    transmittance: bool = True  # False: nothing absorbs
+    out_of_plane_mm: float | None = None  # full range of the shift along elevation; None: from the spacing; 0: off
+    means_rate: float = 2e-4  # times the scene's scale, cm
+    scales_rate: float = 1e-2
+    quats_rate: float = 1e-2
+    transmittance_rate: float | None = None  # None: 5e-4 · 30,000 / steps, at most 2e-2
+    sh0_rate: float = 1e-2
+    shn_rate: float = 2e-5
+    final_rate: float = 0.1  # every rate decays exponentially to this share
+    scale_penalty: float = 1e-3  # λ of λ·mean(exp(scales)), cm
+    refinements: int = 7  # how often Gaussians are added and pruned
+    refinement_end: float = 17_500 / RELEASED_STEPS  # the last refinement
+    growth: str = "even"  # `threshold`: all above growth_gradient; `even`: the best, evenly up to max_gaussians
+    growth_gradient: float = 5e-6  # mean ‖∂L/∂mean‖ of a Gaussian that is refined
+    split_scale: float = 0.01  # × scene scale: above, a Gaussian is split, below, duplicated
+    split_intensity: float = 1.0  # factor on sh0 of the halves
+    prune_above: float = 0.1  # × scene scale, of the largest standard deviation
+    prune_below: float = 1e-5
+    memory_gb: float | None = None  # None: what the machine has to give
+
+    def __post_init__(self) -> None:
+        hints = typing.get_type_hints(type(self))
+        for item in fields(self):
+            _check_type(item.name, getattr(self, item.name), hints[item.name])
+        for name, (low, high) in _RANGES.items():
+            value = getattr(self, name)
+            if value is not None and not low <= value <= high:
+                raise InvalidArgument(f"{name} must be between {low:g} and {high:g}, got {value!r}", field=name)
+        for name, choices in (("start", STARTS), ("intensity", INTENSITIES), ("growth", GROWTHS)):
+            if getattr(self, name) not in choices:
+                raise InvalidArgument(
+                    f"{name} must be one of {', '.join(choices)}, got {getattr(self, name)!r}", field=name
+                )
+        if self.initial_gaussians > self.max_gaussians:
+            raise InvalidArgument(
+                f"initial_gaussians must be at most max_gaussians ({self.max_gaussians}), got {self.initial_gaussians}",
+                field="initial_gaussians",
+            )
+
+    @classmethod
+    def preset(cls, name: str, **overrides: Any) -> TrainingConfig:
+        """The preset `fast` or `paper` with some fields set otherwise.
+
+        Where only max_gaussians is set, the run starts with half of it. Raises InvalidArgument for an unknown preset
+        or field.
+        """
+        if name not in PRESETS:
+            raise InvalidArgument(f"preset must be one of {', '.join(PRESETS)}, got {name!r}", field="preset")
+        values = {**PRESETS[name], **overrides}
+        if "max_gaussians" in overrides and "initial_gaussians" not in overrides:
+            limit = overrides["max_gaussians"]
+            values["initial_gaussians"] = (limit + 1) // 2 if isinstance(limit, int) else limit
+        return cls.from_dict(values)
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> TrainingConfig:
+        """Inverse of `to_dict`; what is left out keeps its default. Raises InvalidArgument, naming unknown keys."""
+        unknown = sorted(set(values) - {item.name for item in fields(cls)})
+        if unknown:
+            raise InvalidArgument(f"a training has no setting {', '.join(unknown)}", field=unknown[0])
+        return cls(**values)
+
+    def to_dict(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+PRESETS: dict[str, dict[str, Any]] = {
+    "fast": {},
+    "paper": {
+        "steps": RELEASED_STEPS,
+        "initial_gaussians": 500_000,
+        "max_gaussians": 500_000,
+        "start": "random",
+        "initial_scale_mm": 0.5,
+        "intensity": "released",
+        "out_of_plane_mm": 2.0,
+        "means_rate": 1e-4,
+        "scales_rate": 5e-3,
+        "quats_rate": 5e-3,
+        "transmittance_rate": 5e-4,
+        "sh0_rate": 5e-3,
+        "shn_rate": 1e-5,
+        "growth": "threshold",
+        "split_intensity": 3.0,
+    },
+}
+
+_RATES = ("means_rate", "scales_rate", "quats_rate", "transmittance_rate", "sh0_rate", "shn_rate")
+_RANGES: dict[str, tuple[float, float]] = {
+    "steps": (1, 10_000_000),
+    "batch_size": (1, 1_024),
+    "seed": (0, 2**63 - 1),
+    "initial_gaussians": (1, 100_000_000),
+    "max_gaussians": (1, 100_000_000),
+    "initial_scale_mm": (1e-3, 1e3),
+    "initial_transmittance": (0.5, 0.9999),
+    "sh_degree": (0, MAX_SH_DEGREE),
+    "sh_start": (0.0, 1.0),
+    "out_of_plane_mm": (0.0, 100.0),
+    **dict.fromkeys(_RATES, (0.0, 1.0)),
+    "final_rate": (1e-6, 1.0),
+    "scale_penalty": (0.0, 100.0),
+    "refinements": (0, 1_000),
+    "refinement_end": (0.0, 1.0),
+    "growth_gradient": (0.0, 1e6),
+    "split_scale": (0.0, 10.0),
+    "split_intensity": (-10.0, 10.0),
+    "prune_above": (0.0, 100.0),
+    "prune_below": (0.0, 1.0),
+    "memory_gb": (1e-3, 1e6),
+}
+
+
+def _check_type(name: str, value: Any, hint: Any) -> None:
+    kinds = typing.get_args(hint) or (hint,)
+    allowed = {*kinds, int} if float in kinds else set(kinds)
+    if type(value) not in allowed or (isinstance(value, float) and not math.isfinite(value)):
+        words = {int: "an integer", float: "a finite number", str: "a word", bool: "true or false", type(None): "none"}
+        expected = " or ".join(words[kind] for kind in kinds)
+        raise InvalidArgument(f"{name} must be {expected}, got {value!r}", field=name)
+
+
+def read_config_file(path: str | Path) -> dict[str, Any]:
+    """The settings of a TOML file, by name; `preset` may be among them.
+
+    Raises InvalidArgument, naming the file, where it is not TOML or holds a table; OSError where it cannot be read.
+    """
+    try:
+        values = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InvalidArgument(f"{path}: not a TOML file: {error}", field="config") from error
+    tables = [name for name, value in values.items() if isinstance(value, dict)]
+    if tables:
+        raise InvalidArgument(f"{path}: settings stand by themselves, not in a table [{tables[0]}]", field="config")
+    return values

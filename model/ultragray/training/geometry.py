@@ -1,0 +1,67 @@
+"""The lengths of a dataset that training follows: how large the scene is, how far apart frames and pixels are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..datasets.sweep import Dataset, Sweep
+from ..probe import FloatArray
+
+SCALE_MARGIN = 1.1  # of the released recipe
+MIN_OUT_OF_PLANE_MM = 2.0  # likewise: the thickness of a slice
+FRAMES_AT_ONCE = 64
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """Lengths of a dataset.
+
+    The scene scale is 1.1 × the largest distance of a corner of a training image from the centre.
+    """
+
+    centre_mm: FloatArray  # [3]
+    scene_scale_cm: float
+    frame_spacing_mm: float
+    pixel_mm: float  # geometric mean of the axial and the lateral size
+
+    @classmethod
+    def of(cls, dataset: Dataset) -> Geometry:
+        centre = dataset.centre_mm
+        reach_mm = float(np.linalg.norm(dataset.train.corners_mm() - centre, axis=-1).max())
+        axial, lateral = dataset.train.pixel_mm
+        return cls(
+            centre_mm=centre,
+            scene_scale_cm=SCALE_MARGIN * reach_mm / 10.0,
+            frame_spacing_mm=frame_spacing_mm(dataset.train),
+            pixel_mm=(axial * lateral) ** 0.5,
+        )
+
+    @property
+    def initial_scale_mm(self) -> float:
+        """Standard deviation at the start: three quarters of a frame spacing, and no less than a pixel."""
+        return max(0.75 * self.frame_spacing_mm, self.pixel_mm)
+
+    @property
+    def out_of_plane_mm(self) -> float:
+        """Full range of the out-of-plane shift: 2 mm, or 2.5 spacings where frames lie further apart."""
+        return max(MIN_OUT_OF_PLANE_MM, 2.5 * self.frame_spacing_mm)
+
+
+def frame_spacing_mm(sweep: Sweep) -> float:
+    """Median over the frames of the distance to the nearest other frame, along the elevation axis.
+
+    Nearest by the mean distance of corresponding image corners; the distance is the mean over the corners of what of
+    it lies across the image plane. 0 for a probe that was held still.
+    """
+    corners, elevations = sweep.corners_mm(), sweep.poses[:, :3, 1]  # [F, K, 3], [F, 3]
+    count = len(corners)
+    gaps: list[float] = []
+    for start in range(0, count, FRAMES_AT_ONCE):
+        some = np.arange(start, min(start + FRAMES_AT_ONCE, count))
+        travel = np.linalg.norm(corners[some, None] - corners[None], axis=-1).mean(axis=-1)  # [f, F]
+        travel[some - start, some] = np.inf
+        offsets = corners[travel.argmin(axis=1)] - corners[some]  # [f, K, 3]
+        gaps.extend(np.abs(np.einsum("fkc,fc->fk", offsets, elevations[some])).mean(axis=1).tolist())
+    return float(np.median(gaps))

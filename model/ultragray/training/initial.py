@@ -1,0 +1,73 @@
+"""The Gaussians that a training starts from, as raw parameters (docs/physics.md §2), lengths in cm."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..datasets.sweep import Dataset
+from ..probe import ConvexProbe
+from ..scene import PARAMETERS
+from ..scene_info import expected_shapes
+from .config import TrainingConfig
+from .geometry import Geometry
+from .intensity import sh0_of_intensity
+
+NO_ABSORPTION_LOGIT = 30.0  # τ = 1 to the last bit of a float32
+RELEASED_INTENSITY = 0.6  # of the released start: sh0 = (0.1 − 0.5) / 0.28209
+RELEASED_CUBE = 0.8  # half-side of the released start, × scene scale
+
+
+def initial_parameters(
+    dataset: Dataset, geometry: Geometry, config: TrainingConfig, generator: torch.Generator
+) -> dict[str, Tensor]:
+    """The six raw tensors, float32, drawn with `generator` alone.
+
+    `random` draws means uniformly in the released cube, with one intensity for all. `informed` draws pixels of the
+    training frames uniformly and puts a Gaussian on each, with that pixel's brightness as its intensity, off the plane
+    by a normal deviate of half a frame spacing.
+    """
+    count = config.initial_gaussians
+    if config.start == "random":
+        means = (2.0 * torch.rand((count, 3), generator=generator) - 1.0) * RELEASED_CUBE * geometry.scene_scale_cm
+        brightness = torch.full((count,), RELEASED_INTENSITY)
+    else:
+        means, brightness = _on_pixels(dataset, geometry, count, generator)
+    scale_mm = config.initial_scale_mm or geometry.initial_scale_mm
+    logit = math.log(config.initial_transmittance / (1.0 - config.initial_transmittance))
+    shapes = expected_shapes(count, config.sh_degree)
+    quats = torch.zeros(shapes["quats"])
+    quats[:, 0] = 1.0
+    parameters = {
+        "means": means,
+        "scales": torch.full(shapes["scales"], math.log(scale_mm / 10.0)),
+        "quats": quats,
+        "transmittances": torch.full(shapes["transmittances"], logit if config.transmittance else NO_ABSORPTION_LOGIT),
+        "sh0": sh0_of_intensity(brightness, config.intensity).reshape(shapes["sh0"]),
+        "shN": torch.zeros(shapes["shN"]),
+    }
+    return {name: parameters[name].contiguous() for name in PARAMETERS}
+
+
+def _on_pixels(
+    dataset: Dataset, geometry: Geometry, count: int, generator: torch.Generator
+) -> tuple[Tensor, Tensor]:  # [N, 3] cm, [N] in [0, 1]
+    sweep, probe = dataset.train, dataset.probe
+    frame = torch.randint(len(sweep), (count,), generator=generator).numpy()
+    across, deep = torch.rand((2, count), generator=generator, dtype=torch.float64).numpy()  # share of the image
+    elevation_mm = torch.randn(count, generator=generator, dtype=torch.float64).numpy() * geometry.frame_spacing_mm / 2
+    depth_mm = probe.near_mm + deep * probe.scan_line_length_mm
+    if isinstance(probe, ConvexProbe):
+        angle = np.radians(probe.opening_angle_deg) * (across - 0.5)
+        points_mm = np.stack([depth_mm * np.sin(angle), elevation_mm, depth_mm * np.cos(angle)], axis=1)
+    else:
+        points_mm = np.stack([probe.width_mm * (across - 0.5), elevation_mm, depth_mm], axis=1)
+    poses = sweep.poses[frame]
+    tracked_mm = np.einsum("nij,nj->ni", poses[:, :3, :3], points_mm) + poses[:, :3, 3]
+    rows, columns = (deep * sweep.height).astype(np.int64), (across * sweep.width).astype(np.int64)
+    brightness = sweep.images[frame, rows, columns].astype(np.float32) / 255.0
+    means = torch.from_numpy((tracked_mm - geometry.centre_mm) / 10.0).float()
+    return means, torch.from_numpy(brightness)

@@ -1,0 +1,32 @@
+"""What a rendered frame costs: half L1, half structural dissimilarity."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
+from torch import Tensor
+
+SSIM_WINDOW = 11
+SSIM_SIGMA = 1.5
+SSIM_C1 = 0.01**2
+SSIM_C2 = 0.03**2
+
+
+def image_loss(rendered: Tensor, truth: Tensor) -> Tensor:  # [C, H, W], [C, H, W] in [0, 1] -> scalar
+    """0.5·mean|rendered − truth| + 0.5·(1 − SSIM), both sides at least 11 pixels."""
+    return 0.5 * (rendered - truth).abs().mean() + 0.5 * (1.0 - ssim(rendered, truth))
+
+
+def ssim(x: Tensor, y: Tensor) -> Tensor:  # [C, H, W], [C, H, W] -> scalar
+    """Mean structural similarity: Gaussian window 11x11, σ = 1.5, only where the window lies inside (valid padding)."""
+    offsets = torch.arange(SSIM_WINDOW, dtype=x.dtype, device=x.device) - SSIM_WINDOW // 2
+    window = torch.exp(-0.5 * (offsets / SSIM_SIGMA).square())
+    window = window / window.sum()
+    fields = torch.stack([x, y, x * x, y * y, x * y]).flatten(0, 1)[:, None]  # [5·C, 1, H, W]
+    blurred = F.conv2d(F.conv2d(fields, window[None, None, :, None]), window[None, None, None, :])
+    mean_x, mean_y, square_x, square_y, product = blurred[:, 0].chunk(5)
+    variances = square_x + square_y - mean_x.square() - mean_y.square()
+    covariance = product - mean_x * mean_y
+    luminance = (2.0 * mean_x * mean_y + SSIM_C1) / (mean_x.square() + mean_y.square() + SSIM_C1)
+    similarity: Tensor = luminance * (2.0 * covariance + SSIM_C2) / (variances + SSIM_C2)
+    return similarity.mean()

@@ -1,0 +1,70 @@
+"""How far a training is, and the journal that keeps it: one JSON object a step in `metrics.jsonl`."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ..files import atomic_path
+
+SMOOTHING = 0.05  # weight of the newest step in the mean time of a step
+
+
+@dataclass(frozen=True)
+class Progress:
+    """After a step. `val_psnr_db` is the latest over some held-out frames; None before the first, or without any."""
+
+    step: int  # steps done
+    steps: int
+    loss: float
+    gaussian_count: int
+    steps_per_s: float
+    seconds_left: float
+    val_psnr_db: float | None
+
+
+class StepTimer:
+    """The time that steps take, smoothed."""
+
+    def __init__(self, elapsed_s: float = 0.0) -> None:
+        self.elapsed_s = elapsed_s  # of all steps, those before a resume too
+        self._step_s: float | None = None
+
+    def add(self, seconds: float) -> None:
+        self.elapsed_s += seconds
+        self._step_s = seconds if self._step_s is None else self._step_s + SMOOTHING * (seconds - self._step_s)
+
+    def rate(self) -> float:
+        """Steps a second; 0 before the first."""
+        return 1.0 / self._step_s if self._step_s else 0.0
+
+
+class Journal:
+    """Appends to a JSONL file; a line is in the file when `write` returns."""
+
+    def __init__(self, path: Path, *, steps_done: int) -> None:
+        """Begins the file anew, or goes on after the lines of the first `steps_done` steps."""
+        with atomic_path(path) as temporary:
+            temporary.write_text("".join(_lines_until(path, steps_done)), encoding="utf-8")
+        self._file = path.open("a", encoding="utf-8")
+
+    def write(self, line: dict[str, Any]) -> None:
+        self._file.write(json.dumps(line, allow_nan=False) + "\n")
+        self._file.flush()
+
+    def close(self) -> None:
+        self._file.close()
+
+
+def _lines_until(path: Path, steps_done: int) -> list[str]:
+    """The complete lines of steps up to `steps_done`: a killed run may have written more, and half a line."""
+    if not steps_done or not path.exists():
+        return []
+    kept = []
+    for line in path.read_text(encoding="utf-8").splitlines(keepends=True):
+        if not line.endswith("\n") or json.loads(line)["step"] > steps_done:
+            break
+        kept.append(line)
+    return kept

@@ -1,0 +1,338 @@
+"""train(): a dataset becomes a scene."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Callable
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..datasets.sweep import Dataset
+from ..errors import BackendUnavailable, DatasetInvalid, TrainingDiverged, TrainingStateInvalid
+from ..files import atomic_path
+from ..rendering import render
+from ..scene import PARAMETERS, GaussianScene
+from ..scene_info import SceneInfo
+from .checkpointing import CheckpointHeader, check_same_run, read_checkpoint, write_checkpoint
+from .config import TrainingConfig
+from .geometry import Geometry
+from .initial import initial_parameters
+from .intensity import project_sh0
+from .losses import SSIM_WINDOW, image_loss
+from .memory import check_memory
+from .optimizer import Optimizer
+from .progress import Journal, Progress, StepTimer
+from .refinement import PullStatistics, refine
+from .sampling import BatchSampler, out_of_plane_shift_mm, shift_out_of_plane
+from .schedule import Schedule
+
+CHECKPOINT_FILE = "checkpoint.safetensors"
+JOURNAL_FILE = "metrics.jsonl"
+CONFIG_FILE = "config.json"
+STEPS_PER_CHECK = 100  # of the parameters being finite; the loss is looked at after every step
+VALIDATIONS = 20  # in a run
+VALIDATION_FRAMES = 8
+
+
+def train(
+    dataset: Dataset,
+    config: TrainingConfig | None = None,
+    *,
+    folder: Path | None = None,
+    resume: bool = False,
+    report: Callable[[Progress], None] | None = None,
+    should_stop: Callable[[], bool] | None = None,
+    device: str = "cpu",
+    backend: str = "auto",
+    checkpoint_interval_s: float = 30.0,
+    tensorboard: bool = False,
+) -> GaussianScene:
+    """The scene trained from `dataset.train`, measured on `dataset.val` where that has frames.
+
+    The same dataset, configuration and machine give the same scene, bit for bit on one thread. `folder` keeps
+    checkpoints, the journal and the configuration; with `resume` the run goes on from its checkpoint and ends in the
+    scene that an undisturbed run gives. `report` is called after every step. When `should_stop` turns true, the run
+    ends after the step at hand with a checkpoint and the scene as it is; `scene.info.training["step"]` says how far
+    it came.
+    Raises TrainingDiverged (the last good checkpoint stays), TrainingStateInvalid, MemoryExceeded, DatasetInvalid,
+    BackendUnavailable.
+    """
+    trainer = Trainer(dataset, config or TrainingConfig(), folder=folder, device=device, backend=backend)
+    if resume:
+        trainer.restore()
+    return trainer.run(report, should_stop, checkpoint_interval_s)
+
+
+class Trainer:
+    """One run: its parameters and everything that changes with them."""
+
+    def __init__(
+        self, dataset: Dataset, config: TrainingConfig, *, folder: Path | None, device: str, backend: str
+    ) -> None:
+        if min(dataset.train.height, dataset.train.width) < SSIM_WINDOW:
+            raise DatasetInvalid(
+                f"{dataset.train.source}: images must have at least {SSIM_WINDOW} rows and columns, got "
+                f"{dataset.train.height}x{dataset.train.width}"
+            )
+        check_memory(dataset, config)
+        self.dataset, self.config, self.folder = dataset, config, folder
+        self._device, self._backend = _torch_device(device), backend
+        self._geometry = Geometry.of(dataset)
+        self._images = torch.tensor(dataset.train.images, device=self._device)  # [F, H, W] uint8
+        self._out_of_plane_mm = (
+            self._geometry.out_of_plane_mm if config.out_of_plane_mm is None else config.out_of_plane_mm
+        )
+        x, y, z = self._geometry.centre_mm.tolist()
+        self._info = SceneInfo(
+            centre_mm=(x, y, z),
+            probe=dataset.probe,
+            image_height=dataset.train.height,
+            image_width=dataset.train.width,
+            intensity=config.intensity,
+            dataset_name=dataset.name,
+            dataset_sha256=dataset.sha256,
+        )
+        self._generator = torch.Generator().manual_seed(config.seed)
+        self._sampler = BatchSampler(len(dataset.train), config.batch_size, self._generator)
+        self._schedule = Schedule(
+            config, scene_scale_cm=self._geometry.scene_scale_cm, batch_size=self._sampler.batch_size
+        )
+        self.step = 0  # steps done
+        self._timer = StepTimer()
+        self._val_psnr_db: float | None = None
+        self._begin_with(initial_parameters(dataset, self._geometry, config, self._generator))
+
+    def _begin_with(self, parameters: dict[str, Tensor]) -> None:
+        self.parameters = self._trainable(parameters)
+        self._optimizer = Optimizer(self.parameters, batch_size=self._sampler.batch_size)
+        self._pull = PullStatistics.empty(len(parameters["means"]), self._device)
+
+    def _trainable(self, parameters: dict[str, Tensor]) -> dict[str, Tensor]:
+        fixed = set() if self.config.transmittance else {"transmittances"}
+        return {
+            name: tensor.detach().to(self._device).requires_grad_(name not in fixed and tensor.numel() > 0)
+            for name, tensor in parameters.items()
+        }
+
+    def run(
+        self,
+        report: Callable[[Progress], None] | None,
+        should_stop: Callable[[], bool] | None,
+        checkpoint_interval_s: float,
+    ) -> GaussianScene:
+        """Steps to the end, or until `should_stop`; see `train`."""
+        journal = self._open_folder()
+        saved_at = time.monotonic()
+        try:
+            while self.step < self.config.steps:
+                progress = self._timed_step(journal)
+                if report is not None:
+                    report(progress)
+                stopping = should_stop is not None and should_stop()
+                if stopping or self.step == self.config.steps:
+                    break
+                if time.monotonic() - saved_at >= checkpoint_interval_s:
+                    self.save_checkpoint()
+                    saved_at = time.monotonic()
+            self.save_checkpoint()
+        finally:
+            if journal is not None:
+                journal.close()
+        return self.scene()
+
+    def _open_folder(self) -> Journal | None:
+        if self.folder is None:
+            return None
+        checkpoint = self.folder / CHECKPOINT_FILE
+        if self.step == 0 and checkpoint.exists():
+            raise TrainingStateInvalid(
+                f"{checkpoint}: there is an unfinished run: resume it, or remove {self.folder} to begin anew"
+            )
+        self.folder.mkdir(parents=True, exist_ok=True)
+        with atomic_path(self.folder / CONFIG_FILE) as temporary:
+            temporary.write_text(json.dumps(self.config.to_dict(), indent=2) + "\n", encoding="utf-8")
+        return Journal(self.folder / JOURNAL_FILE, steps_done=self.step)
+
+    def _timed_step(self, journal: Journal | None) -> Progress:
+        started = time.perf_counter()
+        loss = self.take_step()
+        line: dict[str, Any] = {"step": self.step, "loss": loss, "gaussians": self.gaussian_count}
+        if len(self.dataset.val) and self.step % math.ceil(self.config.steps / VALIDATIONS) == 0:
+            self._val_psnr_db = line["val_psnr_db"] = self._validate()
+        self._timer.add(time.perf_counter() - started)
+        if journal is not None:
+            journal.write({**line, "elapsed_s": round(self._timer.elapsed_s, 3)})
+        rate = self._timer.rate()
+        return Progress(
+            step=self.step,
+            steps=self.config.steps,
+            loss=loss,
+            gaussian_count=self.gaussian_count,
+            steps_per_s=rate,
+            seconds_left=(self.config.steps - self.step) / rate if rate else math.inf,
+            val_psnr_db=self._val_psnr_db,
+        )
+
+    @property
+    def gaussian_count(self) -> int:
+        return len(self.parameters["means"])
+
+    def take_step(self) -> float:
+        """One batch, one update, and the refinement that is due after it; returns the loss."""
+        batch = self._sampler.next_batch()
+        poses = self.dataset.train.poses[batch.numpy()]
+        if self._out_of_plane_mm:
+            poses = shift_out_of_plane(poses, out_of_plane_shift_mm(self._out_of_plane_mm, self._generator))
+        truth = self._images[batch.to(self._device)].float().div_(255.0)
+        image = image_loss(self._rendered(poses, self._schedule.sh_degree(self.step)), truth)
+        if not image.requires_grad:
+            raise self._diverged("no Gaussian is left in view of the frames")
+        image.backward()  # type: ignore[no-untyped-call]
+        with torch.no_grad():
+            loss = float(image) + self._add_scale_penalty()
+            if not math.isfinite(loss):
+                raise self._diverged(f"the loss is {loss}")
+            means_gradient = self.parameters["means"].grad
+            assert means_gradient is not None
+            self._pull.add(means_gradient)
+            self._optimizer.step(self._schedule.rates(self.step))
+            project_sh0(self.parameters["sh0"], self.config.intensity)
+        self.step += 1
+        if self.step % STEPS_PER_CHECK == 0:
+            self._check_finite()
+        due = self._schedule.refinement(self.step)
+        if due is not None:
+            self._refine(self._schedule.gaussian_limit(due))
+        return loss
+
+    def _rendered(self, poses: Any, sh_degree: int) -> Tensor:  # [C, 4, 4] mm -> [C, H, W]
+        scene = self._view(sh_degree)
+        sweep = self.dataset.train
+        frames = render(
+            scene,
+            self.dataset.probe,
+            poses,
+            height=sweep.height,
+            width=sweep.width,
+            outputs=("bmode",),
+            backend=self._backend,
+        )
+        assert frames.bmode is not None
+        return frames.bmode
+
+    def _view(self, sh_degree: int) -> GaussianScene:
+        """The parameters as a scene, without the checks of `from_splats`, which read every value."""
+        harmonics = (sh_degree + 1) ** 2 - 1
+        tensors: dict[str, Any] = {**self.parameters, "shN": self.parameters["shN"][:, :harmonics]}
+        info = replace(self._info, sh_degree=sh_degree, gaussian_count=self.gaussian_count)
+        return GaussianScene(**tensors, info=info)
+
+    def _add_scale_penalty(self) -> float:
+        """λ·mean(exp(scales)); its gradient is added to that of the scales."""
+        scales = self.parameters["scales"]
+        deviations = scales.exp()
+        assert scales.grad is not None
+        scales.grad.add_(deviations, alpha=self.config.scale_penalty / deviations.numel())
+        return self.config.scale_penalty * float(deviations.mean())
+
+    def _refine(self, limit: int) -> None:
+        with torch.no_grad():
+            refined = refine(
+                self.parameters,
+                self._pull.mean(),
+                limit=limit,
+                scene_scale_cm=self._geometry.scene_scale_cm,
+                config=self.config,
+                generator=self._generator,
+            )
+            if not len(refined.parameters["means"]):
+                raise self._diverged("refinement pruned every Gaussian")
+            project_sh0(refined.parameters["sh0"], self.config.intensity)
+        self.parameters = self._trainable(refined.parameters)
+        self._optimizer.replace(self.parameters, refined.kept)
+        self._pull = PullStatistics.empty(self.gaussian_count, self._device)
+
+    def _check_finite(self) -> None:
+        for name, tensor in self.parameters.items():
+            if not bool(torch.isfinite(tensor.detach()).all()):
+                raise self._diverged(f"{name} are no longer finite")
+
+    def _diverged(self, what: str) -> TrainingDiverged:
+        path = None if self.folder is None else self.folder / CHECKPOINT_FILE
+        kept = f"; the last good checkpoint is kept in {path}" if path is not None and path.exists() else ""
+        return TrainingDiverged(f"training diverged in step {self.step + 1}: {what}{kept}")
+
+    def _validate(self) -> float:
+        """Mean PSNR over some of the held-out frames, dB."""
+        val = self.dataset.val
+        chosen = np.linspace(0, len(val) - 1, min(len(val), VALIDATION_FRAMES)).round().astype(np.int64)
+        truth = torch.tensor(val.images[chosen], device=self._device).float().div_(255.0)
+        with torch.no_grad():
+            rendered = self._rendered(val.poses[chosen], self._schedule.sh_degree(self.step))
+            errors = (rendered - truth).square().mean(dim=(1, 2)).clamp(min=1e-10)
+            return float((-10.0 * errors.log10()).mean())
+
+    def save_checkpoint(self) -> None:
+        """Writes what a resumed run needs, where the run has a folder. Raises TrainingDiverged rather than keep NaN."""
+        self._check_finite()
+        if self.folder is None:
+            return
+        tensors = {
+            **{f"parameter.{name}": tensor for name, tensor in self.parameters.items()},
+            **{f"adam.{name}": tensor for name, tensor in self._optimizer.tensors().items()},
+            "pull.total": self._pull.total,
+            "pull.seen": self._pull.seen,
+            "waiting": self._sampler.waiting,
+            "generator": self._generator.get_state(),
+        }
+        assert self._info.dataset_sha256 is not None
+        header = CheckpointHeader(self.step, self._timer.elapsed_s, self._info.dataset_sha256, self.config)
+        write_checkpoint(self.folder / CHECKPOINT_FILE, header, tensors)
+
+    def restore(self) -> None:
+        """Takes over the run of the folder's checkpoint. Raises TrainingStateInvalid where it is another run's."""
+        if self.folder is None:
+            raise TrainingStateInvalid("a run without a folder cannot be resumed")
+        path = self.folder / CHECKPOINT_FILE
+        header, tensors = read_checkpoint(path)
+        assert self._info.dataset_sha256 is not None
+        check_same_run(path, header, self.config, self._info.dataset_sha256)
+        try:
+            self._begin_with({name: tensors[f"parameter.{name}"] for name in PARAMETERS})
+            prefix = "adam."
+            self._optimizer.load({k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)})
+            self._pull = PullStatistics(tensors["pull.total"].to(self._device), tensors["pull.seen"].to(self._device))
+            self._sampler.waiting = tensors["waiting"]
+            self._generator.set_state(tensors["generator"])
+        except (KeyError, RuntimeError, TypeError) as error:
+            raise TrainingStateInvalid(f"{path}: its tensors are not those of a training: {error}") from error
+        self.step = header.step
+        self._timer = StepTimer(header.elapsed_s)
+
+    def scene(self) -> GaussianScene:
+        """The scene as it is; a finished run's is measured on the held-out frames."""
+        splats = {name: tensor.detach().cpu() for name, tensor in self.parameters.items()}
+        training = {**self.config.to_dict(), "step": self.step}
+        info = replace(self._info, training=training)
+        scene = GaussianScene.from_splats(splats, info=info, training_poses=self.dataset.train.poses)
+        if len(self.dataset.val) and self.step == self.config.steps:
+            from ..evaluation import evaluate
+
+            scene.info.metrics.update(asdict(evaluate(scene, self.dataset.val, backend=self._backend).mean))
+        return scene
+
+
+def _torch_device(name: str) -> torch.device:
+    try:
+        device = torch.device(name)
+        torch.zeros(1, device=device)
+    except (RuntimeError, AssertionError) as error:
+        raise BackendUnavailable(f"device {name!r} cannot be used here", field="device") from error
+    return device
