@@ -28,9 +28,11 @@ from ultragray import (
     LinearProbe,
     SceneInfo,
     checkpoint,
+    checkpoint_export,
     demo,
     errors,
     files,
+    ply,
     pose,
     pose_file,
     probe,
@@ -38,10 +40,13 @@ from ultragray import (
     request,
     scene_info,
 )
+from ultragray.datasets import Dataset, Sweep, checks, pictures, plus, released, source
+from ultragray.training import TrainingConfig
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2, scenes_pb2
 from ultragray_service import catalog
 from ultragray_service.cli import USER_ERROR
 from ultragray_service.cli import app as command_line
+from ultragray_service.cli_train import INTERRUPTED
 from ultragray_service.http import accept, middleware, problems
 from ultragray_service.http.app import create_app
 from ultragray_service.http.docs import DOCS_PATH
@@ -58,6 +63,7 @@ from ultragray_workers.types import Encoding, RenderResult
 
 DOCUMENT = (Path(__file__).resolve().parents[1] / "docs" / "interfaces.md").read_text(encoding="utf-8")
 PROTO_MODULES = (geometry_pb2, rendering_pb2, scenes_pb2)
+LIBRARY_MODULES = (checkpoint, checkpoint_export, demo, files, ply, pose, pose_file, probe, rendering)
 MEMBERS_OF = (GaussianScene, LinearProbe, ConvexProbe, errors.UltragrayError)
 
 
@@ -131,12 +137,22 @@ def test_members() -> None:
 def test_other_modules() -> None:
     found = {
         f"{module.__name__}.{call_of(value)}"
-        for module in (checkpoint, demo, files, pose, pose_file, probe, rendering)
+        for module in (*LIBRARY_MODULES, checks, pictures, plus, released, source)
         for name, value in vars(module).items()
         if inspect.isfunction(value) and value.__module__ == module.__name__
         if not name.startswith("_") and name not in ultragray.__all__
     }
     assert set(table("Other modules")) == found
+
+
+def test_dataset_configuration(tmp_path: Path) -> None:
+    images = np.arange(2 * 3 * 4, dtype=np.uint8).reshape(2, 3, 4)
+    found: set[str] = set()
+    for number, one in enumerate((LinearProbe(40, 0, 50), ConvexProbe(60, 10, 50))):
+        sweep = Sweep(images, np.tile(np.eye(4), (2, 1, 1)), one, np.arange(2), "here")
+        released.write_released(Dataset("name", sweep, sweep), tmp_path / str(number))
+        found |= set(json.loads((tmp_path / str(number) / "conf.json").read_text()))
+    assert set(table("Dataset configuration")) == {key for key in found if not key.startswith("_")}
 
 
 # Scene file and frames
@@ -161,6 +177,35 @@ def test_scene_file(tmp_path: Path) -> None:
     assert documented_arrays("Tensors", {"N": 5, "K-1": 3, "P": 2}) == found
     defaults = json.loads(scene_info.info_to_json(SceneInfo()))
     assert {key: json.loads(code(default)[0]) for key, (default, _) in table("Metadata keys").items()} == defaults
+
+
+def test_ply_file(tmp_path: Path) -> None:
+    splats = {name: torch.ones(shape) for name, shape in scene_info.expected_shapes(5, 1).items()}
+    ply.write_ply(GaussianScene.from_splats(splats), tmp_path / "scene.ply")
+    header = (tmp_path / "scene.ply").read_bytes().split(b"end_header")[0].decode()
+    element, found = "", []
+    for line in header.splitlines():
+        match line.split():
+            case ["element", name, _]:
+                element = name
+            case ["property", kind, name]:
+                found.append((name, element, kind))
+    documented = [
+        (name, code(element)[0], code(kind)[0]) for names, element, kind, _ in rows("PLY file") for name in code(names)
+    ]
+    assert documented == found
+
+
+def test_exported_checkpoint(tmp_path: Path) -> None:
+    splats = {name: torch.ones(shape) for name, shape in scene_info.expected_shapes(5, 1).items()}
+    info = SceneInfo(probe=LinearProbe(40, 0, 50))
+    scene = GaussianScene.from_splats(splats, info=info, training_poses=np.eye(4)[None])
+    written = checkpoint_export.export_checkpoint(scene, tmp_path / "ckpt_29999.pt").files
+    documented = table("Exported checkpoint")
+    assert set(documented) == {path.name for path in written}
+    assert code(documented["ckpt_29999.pt"][0]) == list(torch.load(tmp_path / "ckpt_29999.pt", weights_only=True))
+    keys = set(code(documented["conf.json"][0]))
+    assert keys == {*json.loads((tmp_path / "conf.json").read_text()), "ultrasound_opening_angle"}
 
 
 def test_frames() -> None:
@@ -377,6 +422,9 @@ def test_settings() -> None:
 def test_command_line() -> None:
     commands = typer.main.get_command(command_line).commands  # type: ignore[attr-defined]
     assert list(table("Command line")) == list(commands)
+    for name in [name for name in commands if hasattr(commands[name], "commands")]:
+        group = commands.pop(name)
+        commands |= {f"{name} {command}": value for command, value in group.commands.items()}
     for name, command in commands.items():
         documented = [code(first) for first, _ in rows(f"ultragray {name}")]
         assert documented == [
@@ -385,8 +433,16 @@ def test_command_line() -> None:
         ], name
 
 
+def test_training_settings() -> None:
+    presets = [TrainingConfig.preset(name).to_dict() for name in ("fast", "paper")]
+    documented = {
+        name: [json.loads(code(cell)[0]) for cell in cells[:2]] for name, cells in table("Training settings").items()
+    }
+    assert documented == {name: [preset[name] for preset in presets] for name in presets[0]}
+
+
 def test_exit_codes() -> None:
-    assert set(table("Exit codes")) == {"0", "1", str(USER_ERROR)}
+    assert set(table("Exit codes")) == {"0", "1", str(USER_ERROR), str(INTERRUPTED)}
 
 
 # Metrics, logs, limits

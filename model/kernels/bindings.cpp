@@ -8,6 +8,7 @@
 #include <array>
 #include <optional>
 
+#include "loss.hpp"
 #include "render.hpp"
 
 namespace nb = nanobind;
@@ -20,7 +21,9 @@ using Matrix = nb::ndarray<const float, nb::ndim<2>, nb::c_contig, nb::device::c
 using Poses = nb::ndarray<const double, nb::shape<-1, 4, 4>, nb::c_contig, nb::device::cpu>;
 using FreeVector = nb::ndarray<float, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 using FreeMatrix = nb::ndarray<float, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
-using OptionalPlanes = std::optional<nb::ndarray<float, nb::ndim<3>, nb::c_contig, nb::device::cpu>>;
+using ImageBatch = nb::ndarray<const float, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
+using FreePlanes = nb::ndarray<float, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
+using OptionalPlanes = std::optional<FreePlanes>;
 
 // B, E, T and coverage, each [C, H, W] or null.
 Outputs planes_of(const std::array<OptionalPlanes, 4>& arrays, size_t count, int height, int width) {
@@ -36,8 +39,8 @@ Outputs planes_of(const std::array<OptionalPlanes, 4>& arrays, size_t count, int
 
 // The arguments that rendering and recording share.
 #define RENDER_ARGUMENTS                                                                                              \
-    nb::arg("scene"), nb::arg("convex"), nb::arg("width_cm"), nb::arg("opening_rad"), nb::arg("near_cm"),              \
-        nb::arg("far_cm"), nb::arg("cull_far_cm"), nb::arg("poses").noconvert(), nb::arg("height"), nb::arg("width"),  \
+    nb::arg("scene"), nb::arg("convex"), nb::arg("width_cm"), nb::arg("opening_rad"), nb::arg("near_cm"),             \
+        nb::arg("far_cm"), nb::arg("cull_far_cm"), nb::arg("poses").noconvert(), nb::arg("height"), nb::arg("width"), \
         nb::arg("threads"), nb::arg("instruction_set"), nb::arg("bmode").noconvert().none(),                          \
         nb::arg("echo").noconvert().none(), nb::arg("transmittance").noconvert().none(),                              \
         nb::arg("coverage").noconvert().none()
@@ -97,8 +100,8 @@ NB_MODULE(_cpu, m) {
                 const Outputs outputs = planes_of({bmode, echo, transmittance, coverage}, poses.shape(0), height, width);
                 const ProbeGeometry probe{convex, width_cm, opening_rad, near_cm, far_cm, cull_far_cm};
                 nb::gil_scoped_release release;
-                new (self) Recording(scene, probe, poses.data(), int(poses.shape(0)), height, width, threads, instruction_set,
-                                     outputs);
+                new (self) Recording(scene, probe, poses.data(), int(poses.shape(0)), height, width, threads,
+                                     instruction_set, outputs);
             },
             nb::keep_alive<1, 2>(), RENDER_ARGUMENTS)
         .def(
@@ -117,6 +120,21 @@ NB_MODULE(_cpu, m) {
             nb::arg("coverage").noconvert().none(), nb::arg("means").noconvert(), nb::arg("scales").noconvert(),
             nb::arg("quats").noconvert(), nb::arg("transmittances").noconvert(), nb::arg("sh0").noconvert(),
             nb::arg("shn").noconvert());
+
+    m.def(
+        "image_loss",
+        [](ImageBatch x, ImageBatch y, FreePlanes gradient, int threads, const std::string& instruction_set) {
+            const size_t count = x.shape(0), height = x.shape(1), width = x.shape(2);
+            for (size_t d = 0; d < 3; ++d)
+                if (y.shape(d) != x.shape(d) || gradient.shape(d) != x.shape(d))
+                    throw std::invalid_argument("the images' shapes do not agree");
+            if (count == 0 || height < 11 || width < 11) throw std::invalid_argument("images must be at least 11x11 pixels");
+            nb::gil_scoped_release release;
+            return image_loss(x.data(), y.data(), int(count), int(height), int(width), threads, instruction_set,
+                              gradient.data());
+        },
+        nb::arg("x").noconvert(), nb::arg("y").noconvert(), nb::arg("gradient").noconvert(), nb::arg("threads"),
+        nb::arg("instruction_set"));
 
     m.def("instruction_sets", &instruction_sets);
 }

@@ -74,13 +74,13 @@ struct Group {
     Floats u;   // at row `base`
     Floats du;  // per row
     Floats m2;
-    Floats window2;  // u2 up to here has w >= 1/255
-    Floats sigma;    // along the line, cm
-    Floats peak;     // exp(-m2/2) sigma where m2 <= 9, else 0: psi = peak * G(u)
-    Floats zero;     // u at depth 0
+    Floats window2;         // u2 up to here has w >= 1/255
+    Floats sigma;           // along the line, cm
+    Floats peak;            // exp(-m2/2) sigma where m2 <= 9, else 0: psi = peak * G(u)
+    Floats zero;            // u at depth 0
     Floats across, spread;  // distance of the slice's mean from the line, 1 / its variance in that direction
-    Mask touched;    // the line comes close enough for w to reach 1/255
-    Mask opaque;     // alpha reaches 1/255 below the Gaussian
+    Mask touched;           // the line comes close enough for w to reach 1/255
+    Mask opaque;            // alpha reaches 1/255 below the Gaussian
     int base;
 };
 
@@ -162,10 +162,12 @@ inline Extent extent_of(const View& view, const Group& g) {
     const float bound = float(view.height - 1);
     const float nearest = largest(select(g.touched, g.zero, splat(-1e9f)));
     const bool thick = largest(g.peak) * kFullG > 0.2f;
-    return {early || !(top_row > 0.0f) ? 0 : top_row > bound ? view.height : static_cast<int>(top_row),
-            !(end_row >= 0.0f)  ? 0
-            : end_row > bound   ? view.height
-                                : static_cast<int>(end_row) + 1,
+    return {early || !(top_row > 0.0f) ? 0
+            : top_row > bound          ? view.height
+                                       : static_cast<int>(top_row),
+            !(end_row >= 0.0f) ? 0
+            : end_row > bound  ? view.height
+                               : static_cast<int>(end_row) + 1,
             nearest > -6.4f || early ? Profile::Clipped
             : thick                  ? Profile::Thick
                                      : Profile::Thin,
@@ -178,9 +180,15 @@ inline void draw_group(const View& view, const Slice& s, const Strip& strip, int
     const Extent extent = extent_of(view, g);
     const int top = extent.top, end = extent.end;
     if (top < end) switch (extent.profile) {
-            case Profile::Thin: draw_rows<Profile::Thin>(g, s, strip, column, top, end); break;
-            case Profile::Thick: draw_rows<Profile::Thick>(g, s, strip, column, top, end); break;
-            case Profile::Clipped: draw_rows<Profile::Clipped>(g, s, strip, column, top, end); break;
+            case Profile::Thin:
+                draw_rows<Profile::Thin>(g, s, strip, column, top, end);
+                break;
+            case Profile::Thick:
+                draw_rows<Profile::Thick>(g, s, strip, column, top, end);
+                break;
+            case Profile::Clipped:
+                draw_rows<Profile::Clipped>(g, s, strip, column, top, end);
+                break;
         }
     if (end < view.height && any(g.opaque)) {
         const Floats below = g.peak * clipped_profile(extent.whole, g.zero);

@@ -1,5 +1,6 @@
-// The backward pass (docs/physics.md §4, §5.6): from the loss's gradients on pixels to those on Gaussians. Every slice reads its
-// own footprint, so nothing is added to from two sides. Thresholds and culls are held fixed; all else is the true gradient.
+// The backward pass (docs/physics.md §4, §5.6): from the loss's gradients on pixels to those on Gaussians. Every slice reads
+// its own footprint, so nothing is added to from two sides. Thresholds and culls are held fixed; all else is the true
+// gradient.
 
 namespace {
 
@@ -12,7 +13,8 @@ inline EchoFactor echo_factor(Floats sum) {
     const Floats inverse = 1.0f / maximum(sum, splat(1e-30f)), guarded = 1.0f / (sum + 1e-8f);
     const Floats left = exponential(-sum);
     const Mask small = less_equal(sum, splat(0.03f));  // differences of nearly equal numbers there
-    const Floats ratio = select(small, 1.0f - sum * (0.5f - sum * (1.0f / 6.0f - sum * (1.0f / 24.0f))), (1.0f - left) * inverse);
+    const Floats ratio =
+        select(small, 1.0f - sum * (0.5f - sum * (1.0f / 6.0f - sum * (1.0f / 24.0f))), (1.0f - left) * inverse);
     const Floats ratio_slope =
         select(small, sum * (1.0f / 3.0f - sum * (0.125f - sum * (1.0f / 30.0f))) - 0.5f, (left - ratio) * inverse);
     const Floats share = sum * guarded;
@@ -64,7 +66,8 @@ inline ProfileSlopes clipped_slopes(Floats u, Floats zero) {
     const Floats one = splat(1.0f), start = maximum(zero, Floats{});
     const Mask above = less_equal(u, start);  // the centre of the window is at u itself
     const Floats centre = minimum(start, u);
-    const Floats centre_by_u = keep(above, one), centre_by_zero = select(above, Floats{}, keep(less_equal(Floats{}, zero), one));
+    const Floats centre_by_u = keep(above, one),
+                 centre_by_zero = select(above, Floats{}, keep(less_equal(Floats{}, zero), one));
     const Mask cut = less_equal(centre - 3.0f, zero), open = less_equal(u, centre + 3.0f);
     const Floats low = maximum(centre - 3.0f, zero), high = minimum(centre + 3.0f, u);
     const Floats low_by_u = select(cut, Floats{}, centre_by_u), low_by_zero = select(cut, one, centre_by_zero);
@@ -175,9 +178,15 @@ inline void gather_group(const View& view, const Slice& s, const PixelGradients&
     const int top = extent.top, end = extent.end;
     LineSums sums;
     if (top < end) switch (extent.profile) {
-            case Profile::Thin: gather_rows<Profile::Thin>(g, s, pixels, line, top, end, sums); break;
-            case Profile::Thick: gather_rows<Profile::Thick>(g, s, pixels, line, top, end, sums); break;
-            case Profile::Clipped: gather_rows<Profile::Clipped>(g, s, pixels, line, top, end, sums); break;
+            case Profile::Thin:
+                gather_rows<Profile::Thin>(g, s, pixels, line, top, end, sums);
+                break;
+            case Profile::Thick:
+                gather_rows<Profile::Thick>(g, s, pixels, line, top, end, sums);
+                break;
+            case Profile::Clipped:
+                gather_rows<Profile::Clipped>(g, s, pixels, line, top, end, sums);
+                break;
         }
     if (end < view.height && any(g.opaque)) {
         // Beyond `whole` the profile is constant in u.
@@ -257,7 +266,8 @@ inline HarmonicsGradient differentiate_harmonics(const SceneView& scene, const H
     const Floats *sh = harmonics.coefficients, x = v.x, y = v.y, z = v.z;
     const Floats value = spherical_harmonics(harmonics, degree, x, y, z), activated = activate(scene.intensity, value);
     const Mask inside = both(less_equal(splat(0.5f), value + 1.0f), less_equal(value + 1.0f, splat(0.999f)));
-    const Floats slope = scene.intensity == Intensity::Sigmoid ? 4.0f * activated * (1.0f - activated) : keep(inside, splat(1.0f));
+    const Floats slope =
+        scene.intensity == Intensity::Sigmoid ? 4.0f * activated * (1.0f - activated) : keep(inside, splat(1.0f));
     const Floats by_value = by_intensity * slope;
 
     HarmonicsGradient out{};
@@ -308,8 +318,8 @@ inline void differentiate_slices(const SceneView& scene, const View& view, const
     const Doubles by_mu[3] = {mean_x, 2.0 * height * m2 - tilt_x * mean_x - tilt_z * mean_z, mean_z};
     const Doubles by_xy = -2.0 * tilt_x * cov_xx - tilt_z * cov_xz - height * mean_x;
     const Doubles by_yz = -2.0 * tilt_z * cov_zz - tilt_x * cov_xz - height * mean_z;
-    const Doubles by_yy = tilt_x * tilt_x * cov_xx + tilt_x * tilt_z * cov_xz + tilt_z * tilt_z * cov_zz - height * height * m2 +
-                          height * (tilt_x * mean_x + tilt_z * mean_z);
+    const Doubles by_yy = tilt_x * tilt_x * cov_xx + tilt_x * tilt_z * cov_xz + tilt_z * tilt_z * cov_zz -
+                          height * height * m2 + height * (tilt_x * mean_x + tilt_z * mean_z);
 
     Doubles by_axes[3][3], by_log_scale[3];  // by_axes[d][k]: axis k along d, in the scene's axes
     for (int k = 0; k < 3; ++k) {
@@ -319,8 +329,8 @@ inline void differentiate_slices(const SceneView& scene, const View& view, const
                                      2.0 * s[2] * cov_zz + s[0] * cov_xz + s[1] * by_yz};
         by_log_scale[k] = by_spoke[0] * s[0] + by_spoke[1] * s[1] + by_spoke[2] * s[2];
         for (int d = 0; d < 3; ++d)
-            by_axes[d][k] = p.scale[k] * (view.axes[0][d] * by_spoke[0] + view.axes[1][d] * by_spoke[1] +
-                                          view.axes[2][d] * by_spoke[2]);
+            by_axes[d][k] =
+                p.scale[k] * (view.axes[0][d] * by_spoke[0] + view.axes[1][d] * by_spoke[1] + view.axes[2][d] * by_spoke[2]);
     }
     const Doubles w = p.quat[0], x = p.quat[1], y = p.quat[2], z = p.quat[3];
     const auto& m = by_axes;
@@ -330,8 +340,8 @@ inline void differentiate_slices(const SceneView& scene, const View& view, const
         2.0 * (w * (m[0][2] - m[2][0]) + x * (m[0][1] + m[1][0]) + z * (m[1][2] + m[2][1]) - 2.0 * y * (m[0][0] + m[2][2])),
         2.0 * (w * (m[1][0] - m[0][1]) + x * (m[0][2] + m[2][0]) + y * (m[1][2] + m[2][1]) - 2.0 * z * (m[0][0] + m[1][1])),
     };
-    const HarmonicsGradient harmonics = differentiate_harmonics(scene, load_harmonics(scene, c), direction_of(p.offset),
-                                                                load<Floats>(by.intensity));
+    const HarmonicsGradient harmonics =
+        differentiate_harmonics(scene, load_harmonics(scene, c), direction_of(p.offset), load<Floats>(by.intensity));
     Doubles by_mean[3];
     for (int d = 0; d < 3; ++d)
         by_mean[d] = view.axes[0][d] * by_mu[0] + view.axes[1][d] * by_mu[1] + view.axes[2][d] * by_mu[2] +

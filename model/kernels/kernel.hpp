@@ -4,6 +4,7 @@
 
 #include <cstddef>
 #include <cstdint>
+#include <string>
 
 namespace ultragray {
 
@@ -95,8 +96,9 @@ struct SavedPlanes {
     int stride;
 };
 
-// The gradient of the loss with respect to S, the sum of I*w and log T of each pixel, and with respect to a factor of T on all
-// pixels of a scan line from this row down (the suffix sum of the former). Rows of `stride` floats, zero beyond the last line.
+// The gradient of the loss with respect to S, the sum of I*w and log T of each pixel, and with respect to a factor of T on
+// all pixels of a scan line from this row down (the suffix sum of the former). Rows of `stride` floats, zero beyond the last
+// line.
 struct PixelGradients {
     float *weight, *intensity, *log_transmittance, *below;
     int stride;
@@ -117,6 +119,17 @@ struct Strip {
     int first, lines;
 };
 
+// Sums over an image of |x - y|, and over its windows of SSIM.
+struct ImageLoss {
+    double l1, ssim;
+};
+
+// Floats that image_loss needs as scratch, and the length of its rows.
+inline int loss_stride(int width) { return (width + 10 + kMaxLanes - 1) / kMaxLanes * kMaxLanes + kMaxLanes; }
+inline int64_t loss_scratch(int height, int width) {
+    return (int64_t(height) + 10 + 1) * 5 * loss_stride(width) + kMaxLanes;
+}
+
 // What each instruction set provides.
 struct Kernels {
     const char* name;
@@ -128,7 +141,13 @@ struct Kernels {
                           const PixelGradients&);
     void (*gather)(const SceneView&, const View&, const Slice*, int64_t count, const PixelGradients&, GaussianGradient*,
                    float* sh);
+    // Writes `by_l1` times the gradient of sum |x - y| plus `by_ssim` times that of the sum of SSIM; `window` sums to 1.
+    ImageLoss (*image_loss)(const float* x, const float* y, int height, int width, const float* window, float* scratch,
+                            float by_l1, float by_ssim, float* gradient);
 };
+
+// The kernels of an instruction set that this processor can run; "auto" takes the best. Throws std::invalid_argument.
+const Kernels& choose_kernels(const std::string& name);
 
 const Kernels& kernels_baseline();
 #if defined(ULTRAGRAY_X86)

@@ -4,14 +4,15 @@
 
 using namespace ultragray;
 
-#include "slice.inl"
 #include "draw.inl"
 #include "gather.inl"
+#include "loss.inl"
+#include "slice.inl"
 
 namespace ultragray {
 
 const Kernels& kernels_baseline() {
-    static constexpr Kernels kernels{"baseline", slice_clusters, draw, finish, differentiate, gather};
+    static constexpr Kernels kernels{"baseline", slice_clusters, draw, finish, differentiate, gather, image_loss};
     return kernels;
 }
 

@@ -1,4 +1,5 @@
-// G(u) of docs/physics.md §3, the three-point Gauss-Legendre rule over the unclipped window, and its derivative, as parabolas.
+// G(u) of docs/physics.md §3, the three-point Gauss-Legendre rule over the unclipped window, and its derivative, as
+// parabolas.
 #pragma once
 
 namespace ultragray {

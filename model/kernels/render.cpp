@@ -28,13 +28,6 @@ std::vector<const Kernels*> available_kernels() {
     return found;
 }
 
-const Kernels& choose_kernels(const std::string& name) {
-    static const std::vector<const Kernels*> available = available_kernels();
-    for (const Kernels* kernels : available)
-        if (name == "auto" || name == kernels->name) return *kernels;
-    throw std::invalid_argument("this processor cannot run the instruction set " + name);
-}
-
 // Scan lines in the image plane, padded so that a vector may start at any of them.
 struct ScanLines {
     std::vector<double> x, dir_x, dir_z;
@@ -117,7 +110,8 @@ class Batch {
 
     // Gradients are added to; no two tasks share a Gaussian, and each adds in the order of the poses.
     void differentiate(const std::vector<SavedPlanes>& saved, const Outputs& gradients,
-                       const std::vector<PixelGradients>& pixels, GaussianGradient* gaussians, float* sh, int threads) const {
+                       const std::vector<PixelGradients>& pixels, GaussianGradient* gaussians, float* sh,
+                       int threads) const {
         Phase by_pixel{count() * strips(), [&](int task) {
                            const int c = task / strips(), first = task % strips() * kStripLines;
                            const View& view = views_[c];
@@ -195,6 +189,13 @@ Slice* SliceList::append(int n) {
 
 void SliceList::shrink_by(int n) { size_ -= n; }
 
+const Kernels& choose_kernels(const std::string& name) {
+    static const std::vector<const Kernels*> available = available_kernels();
+    for (const Kernels* kernels : available)
+        if (name == "auto" || name == kernels->name) return *kernels;
+    throw std::invalid_argument("this processor cannot run the instruction set " + name);
+}
+
 std::vector<std::string> instruction_sets() {
     std::vector<std::string> names;
     for (const Kernels* kernels : available_kernels()) names.push_back(kernels->name);
@@ -231,8 +232,7 @@ Recording::Recording(const PreparedScene& scene, const ProbeGeometry& probe, con
                            height,
                            stride});
     const Planes& planes = state_->planes;
-    for (int c = 0; c < count; ++c)
-        state_->saved.push_back({planes.at(c, 0), planes.at(c, 1), planes.at(c, 2), stride});
+    for (int c = 0; c < count; ++c) state_->saved.push_back({planes.at(c, 0), planes.at(c, 1), planes.at(c, 2), stride});
     state_->batch.render(outputs, state_->saved, threads);
 }
 

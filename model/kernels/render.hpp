@@ -35,8 +35,8 @@ class Recording {
               int threads, const std::string& instruction_set, const Outputs& outputs);
     ~Recording();
 
-    // From the gradients of a loss with respect to the outputs (null: zero) to those with respect to the raw parameters, which
-    // are overwritten. The result does not depend on the number of threads.
+    // From the gradients of a loss with respect to the outputs (null: zero) to those with respect to the raw parameters,
+    // which are overwritten. The result does not depend on the number of threads.
     void differentiate(const Outputs& gradients, const RawGradients& out, int threads) const;
 
  private:

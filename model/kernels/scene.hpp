@@ -27,7 +27,8 @@ class PreparedScene {
  public:
     PreparedScene(const RawSplats& raw, Order order, int threads);
     SceneView view() const;
-    // From gradients with respect to activated Gaussians, [N] and sh [N, K], to raw ones. Only for a scene in its given order.
+    // From gradients with respect to activated Gaussians, [N] and sh [N, K], to raw ones. Only for a scene in its given
+    // order.
     void to_raw(const GaussianGradient* gaussians, const float* sh, const RawGradients& out, int threads) const;
     int64_t bytes() const;
 

@@ -82,7 +82,7 @@ struct Placed {
     Doubles mu[3];       // the mean, in the probe's axes
     Doubles axes[3][3];  // columns: the Gaussian's own axes, in the scene's
     Doubles scale[3];
-    Doubles spoke[3][3];  // each own axis times its scale, in the probe's axes
+    Doubles spoke[3][3];             // each own axis times its scale, in the probe's axes
     Doubles xx, xy, xz, yy, yz, zz;  // covariance: the sum of the spokes' outer products
 };
 

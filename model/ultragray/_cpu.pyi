@@ -1,39 +1,28 @@
-import numpy as np
-import numpy.typing as npt
+"""The extension module built from model/kernels; see cpu.py and training/cpu_loss.py for what the arguments mean."""
 
-_Floats = npt.NDArray[np.float32]
+from typing import Any
 
 class PreparedScene:
     def __init__(
         self,
-        means: _Floats,
-        scales: _Floats,
-        quats: _Floats,
-        transmittances: _Floats,
-        sh0: _Floats,
-        shn: _Floats,
+        means: Any,
+        scales: Any,
+        quats: Any,
+        transmittances: Any,
+        sh0: Any,
+        shn: Any,
         sh_degree: int,
         sigmoid: bool,
+        sorted: bool,
+        threads: int,
     ) -> None: ...
     @property
     def bytes(self) -> int: ...
 
-def render(
-    scene: PreparedScene,
-    convex: bool,
-    width_cm: float,
-    opening_rad: float,
-    near_cm: float,
-    far_cm: float,
-    cull_far_cm: float,
-    poses: npt.NDArray[np.float64],
-    height: int,
-    width: int,
-    threads: int,
-    instruction_set: str,
-    bmode: _Floats | None,
-    echo: _Floats | None,
-    transmittance: _Floats | None,
-    coverage: _Floats | None,
-) -> None: ...
+class Recording:
+    def __init__(self, scene: PreparedScene, **arguments: Any) -> None: ...
+    def differentiate(self, **arguments: Any) -> None: ...
+
+def render(scene: PreparedScene, **arguments: Any) -> None: ...
+def image_loss(x: Any, y: Any, gradient: Any, threads: int, instruction_set: str) -> float: ...
 def instruction_sets() -> list[str]: ...

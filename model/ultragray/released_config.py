@@ -49,7 +49,7 @@ class ReleasedConfig:
     image_width: int | None
 
     def find(self, key: str) -> Path | None:
-        """The file that a key names: as written, beside conf.json by its name, or from a folder above. None: not there."""
+        """The file that a key names: as written, by its name beside conf.json, or from a folder above."""
         named = self.files.get(key)
         return None if named is None else _find(self.path, named)
 

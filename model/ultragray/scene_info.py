@@ -83,7 +83,7 @@ class SceneInfo:
 def _vector(name: str, value: Any) -> Vector:
     try:
         x, y, z = (float(v) for v in value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise InvalidArgument(f"{name} must be three numbers, got {value!r}", field=name) from None
     if not all(map(math.isfinite, (x, y, z))):
         raise InvalidArgument(f"{name} must be finite, got {value!r}", field=name)

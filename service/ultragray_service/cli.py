@@ -1,4 +1,4 @@
-"""The command line: `ultragray serve | render | info | import-checkpoint | demo | bench`.
+"""The command line: `ultragray serve | render | info | import-checkpoint | train | export | import-ply | demo | bench`.
 
 Only names and help live here; what a command needs (torch, FastAPI) is imported when it runs, so that
 `--help` is instant.
@@ -14,6 +14,8 @@ from typer.core import TyperGroup
 
 import ultragray
 from ultragray.errors import InvalidArgument, UltragrayError
+
+from . import cli_convert, cli_dataset, cli_train
 
 USER_ERROR = 2  # the exit code of a mistake that the caller can mend
 
@@ -237,6 +239,12 @@ def import_checkpoint(
     typer.echo(
         f"wrote {output}: {scene.gaussian_count:,} Gaussians about ({x:.2f}, {y:.2f}, {z:.2f}) mm, {scene.info.probe}"
     )
+
+
+app.add_typer(cli_dataset.dataset_app, name="dataset")
+app.command()(cli_train.train)
+app.command()(cli_convert.export)
+app.command()(cli_convert.import_ply)
 
 
 @app.command()

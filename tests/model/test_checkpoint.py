@@ -188,6 +188,17 @@ def test_the_image_height_can_be_given(dataset: Dataset) -> None:
         dataset.import_it()
 
 
+def test_a_config_may_name_the_image_size_itself(dataset: Dataset) -> None:
+    dataset.write_config(image_height=101, image_width=1)
+    scene = dataset.import_it()
+    assert (scene.info.image_height, scene.info.image_width) == (101, 1)
+    assert scene.info.probe is not None
+    assert scene.info.probe.far_mm == pytest.approx(5 + 40 * 101 / 100)
+    assert dataset.import_it(image_height=51).info.image_height == 51
+    dataset.images.unlink()
+    assert dataset.import_it().info == scene.info
+
+
 @pytest.mark.parametrize("height", [1, 0, -5, 2.5, True])
 def test_an_image_height_that_no_grid_has_is_refused(dataset: Dataset, height: Any) -> None:
     with pytest.raises(InvalidArgument, match="image_height must be an integer of at least 2"):
@@ -223,6 +234,10 @@ def test_poses_that_are_not_the_training_poses_are_noticed(dataset: Dataset, cap
         ({"ultrasound_opening_width": [3]}, "ultrasound_opening_width must be a finite number"),
         ({"ultrasound_opening_width": 0}, "width_mm must be"),
         ({"images_file_train": 5}, "images_file_train must be a path"),
+        ({"image_height": 1}, "image_height must be an integer of at least 2, got 1"),
+        ({"image_width": 0}, "image_width must be an integer of at least 1, got 0"),
+        ({"image_height": "256"}, "image_height must be an integer"),
+        ({"image_width": True}, "image_width must be an integer"),
     ],
 )
 def test_a_wrong_config_is_named(dataset: Dataset, changes: dict[str, Any], message: str) -> None:

@@ -95,10 +95,6 @@ def test_what_it_cannot_render_is_refused(random_scene: SceneMaker) -> None:
         render(scene.to(torch.float64), PROBE, poses(1), height=8, width=8, backend="cpu")
     with pytest.raises(BackendUnavailable, match="instruction_set must be auto or one of"):
         cpu.render_outputs(scene, PROBE, poses(1), 8, 8, ("bmode",), instruction_set="sse9")
-    scene.means.requires_grad_(True)
-    with pytest.raises(BackendUnavailable, match="without gradients"):
-        render(scene, PROBE, poses(1), height=8, width=8, backend="cpu")
-    assert render(scene, PROBE, poses(1), height=8, width=8, outputs=("bmode",)).bmode.requires_grad
 
 
 def test_only_what_was_asked_for_comes_back(random_scene: SceneMaker) -> None:

@@ -1,8 +1,8 @@
 """UltrasoundImageOrientation of PLUS: where a stored image's axes point.
 
-Two letters say where columns and rows of the stored image go: M or U, towards the marked or the unmarked side of the probe; F or
-N, away from the transducer (far) or towards it (near). FM: along a row goes depth, scan lines are rows. A third letter, A or D, is
-about stacks of slices and does not matter here. XX or nothing: unknown, taken as MF.
+Two letters say where the columns and then the rows of the stored image go: M or U, towards the marked or the unmarked
+side of the probe; F or N, away from the transducer (far) or towards it (near). FM: depth goes along a row.
+A third letter, A or D, is about stacks of slices and does not matter here. XX or nothing: unknown, taken as MF.
 """
 
 from __future__ import annotations

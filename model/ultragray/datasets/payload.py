@@ -14,7 +14,9 @@ MAX_PIXEL_BYTES = 4 << 30
 _ZLIB_OR_GZIP = 47  # zlib's window bits for either kind of header
 
 
-def read_payload(header: Path, file_name: str | None, offset: int, shape: tuple[int, ...], *, deflated: bool) -> ByteArray:
+def read_payload(
+    header: Path, file_name: str | None, offset: int, shape: tuple[int, ...], *, deflated: bool
+) -> ByteArray:
     """uint8 pixels of `shape`, from `offset` of the header's file, or of `file_name` beside it.
 
     Raises DatasetInvalid, naming the file, where there are fewer or more bytes than the shape holds, or the deflated
@@ -33,7 +35,7 @@ def read_payload(header: Path, file_name: str | None, offset: int, shape: tuple[
         return np.fromfile(path, np.uint8, expected, offset=offset).reshape(shape)
     with path.open("rb") as file:
         file.seek(offset)
-        pixels = _inflate(file.read(expected + (1 << 20)), path, expected)  # incompressible pixels grow by far less
+        pixels = _inflate(file.read(expected + expected // 256 + (1 << 16)), path, expected)  # incompressible pixels grow by far less
     if len(pixels) != expected:
         raise DatasetInvalid(_wrong_size(path, header, len(pixels), expected))
     return np.frombuffer(pixels, np.uint8).reshape(shape)
@@ -45,10 +47,8 @@ def _inflate(data: bytes, path: Path, expected: int) -> bytes:
         pixels = inflater.decompress(data, expected + 1)
     except zlib.error as error:
         raise DatasetInvalid(f"{path}: its compressed pixels are damaged: {error}") from error
-    if not inflater.eof and len(pixels) < expected:
-        raise DatasetInvalid(
-            f"{path}: truncated: its compressed pixels end after {len(pixels)} of {expected} bytes"
-        )
+    if not inflater.eof and len(pixels) <= expected:
+        raise DatasetInvalid(f"{path}: truncated: its compressed pixels end after {len(pixels)} of {expected} bytes")
     return pixels
 
 

@@ -1,7 +1,7 @@
 """Sequences recorded with PLUS: tracked 2D images in MetaImage or NRRD files.
 
-The pose of a frame follows from its transforms and the device set's calibration: from `Image` to `Reference` where that is tracked,
-else to `Tracker`; usually inv(ReferenceToTracker) · ProbeToTracker · ImageToProbe.
+The pose of a frame follows from its transforms and the device set's calibration: from `Image` to `Reference` where that
+is tracked, else to `Tracker`; usually inv(ReferenceToTracker) · ProbeToTracker · ImageToProbe.
 """
 
 from __future__ import annotations
@@ -139,7 +139,8 @@ def _measured(stored: StoredSequence, number: int, name: TransformName) -> Float
     if IMAGE in name:  # holds the size of a pixel
         return matrix
     try:
-        return check_poses(matrix, field=key)[0]
+        exact: FloatArray = check_poses(matrix, field=key)[0]
+        return exact
     except InvalidPose as error:
         raise DatasetInvalid(f"{stored.path}: frame {number}: {error}") from error
 

@@ -1,7 +1,7 @@
 """Datasets in the layout of the released trainer: conf.json, images_*.npy, poses_*.npy or .json.
 
-conf.json says where the planes are, in centimetres and degrees (`ultragray.released_config`); poses are in mm. Rows lie where
-Sweep puts them, as measured from the image: the stretch of docs/physics.md §3 belongs to released checkpoints only.
+conf.json says where the planes are, in centimetres and degrees (`ultragray.released_config`); poses are in mm. Rows lie
+where Sweep puts them, as measured from the image: the stretch of docs/physics.md §3 is for released checkpoints only.
 """
 
 from __future__ import annotations

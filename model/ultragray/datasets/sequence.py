@@ -39,9 +39,7 @@ def header_lines(file: BinaryIO, path: Path) -> Iterator[str]:
         yield line.decode("utf-8", errors="replace").rstrip("\r\n")
 
 
-def split_fields(
-    entries: Mapping[str, str], frame_count: int
-) -> tuple[dict[str, str], tuple[Mapping[str, str], ...]]:
+def split_fields(entries: Mapping[str, str], frame_count: int) -> tuple[dict[str, str], tuple[Mapping[str, str], ...]]:
     """The fields of the file, and those of each of its frames; fields of frames beyond them are left out."""
     fields: dict[str, str] = {}
     frames: tuple[dict[str, str], ...] = tuple({} for _ in range(frame_count))

@@ -1,7 +1,7 @@
 """Sweep and Dataset: tracked B-mode frames, checked once and trusted afterwards.
 
-Convention. Images are uint8 [F, H, W], rows of equal thickness between the probe's near and far (docs/physics.md §3); poses are
-rigid probe→tracker transforms [F, 4, 4] in mm. A scene trained from a dataset answers poses in the same tracker frame.
+Convention. Images are uint8 [F, H, W], rows of equal thickness between the probe's near and far (docs/physics.md §3);
+poses are rigid probe→tracker transforms [F, 4, 4] in mm. A scene trained from a dataset answers poses in that frame.
 """
 
 from __future__ import annotations

@@ -183,3 +183,11 @@ def read_config_file(path: str | Path) -> dict[str, Any]:
     if tables:
         raise InvalidArgument(f"{path}: settings stand by themselves, not in a table [{tables[0]}]", field="config")
     return values
+
+
+def parse_value(text: str) -> Any:
+    """A value as TOML writes it; what is not TOML is a word."""
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text

@@ -1,10 +1,15 @@
-"""What a rendered frame costs: half L1, half structural dissimilarity."""
+"""What a rendered frame costs: half L1, half structural dissimilarity.
+
+Written in torch for any device and dtype; float32 images on the CPU take the C++ kernel, which gives the same.
+"""
 
 from __future__ import annotations
 
 import torch
 import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
+
+from .cpu_loss import image_loss as kernel_image_loss
 
 SSIM_WINDOW = 11
 SSIM_SIGMA = 1.5
@@ -14,6 +19,13 @@ SSIM_C2 = 0.03**2
 
 def image_loss(rendered: Tensor, truth: Tensor) -> Tensor:  # [C, H, W], [C, H, W] in [0, 1] -> scalar
     """0.5·mean|rendered − truth| + 0.5·(1 − SSIM), both sides at least 11 pixels."""
+    if rendered.device.type == "cpu" and rendered.dtype == torch.float32:
+        return kernel_image_loss(rendered, truth)
+    return plain_image_loss(rendered, truth)
+
+
+def plain_image_loss(rendered: Tensor, truth: Tensor) -> Tensor:  # [C, H, W], [C, H, W] -> scalar
+    """The definition of `image_loss`."""
     return 0.5 * (rendered - truth).abs().mean() + 0.5 * (1.0 - ssim(rendered, truth))
 
 

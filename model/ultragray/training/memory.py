@@ -11,9 +11,11 @@ from .config import TrainingConfig
 
 BASE_BYTES = 400 << 20  # the process with torch loaded, and the scratch memory of its kernels
 RAW_FLOATS = 3 + 3 + 4 + 1 + 1  # of a Gaussian, without the harmonics above degree 0
-COPIES = 4 + 4 + 1  # parameters, gradients and two moments; the copies that a refinement makes; the kernel's own
+COPIES = (
+    16  # parameters, gradients, moments; the copies of refinements and checkpoints; the kernel's own (measured: 14)
+)
 STATISTICS = 2
-PIXEL_FLOATS = 48  # of a pixel of a batch: the outputs, and the blurred products of SSIM with their gradients
+PIXEL_FLOATS = 32  # of a pixel of a batch: the outputs and what the backward pass keeps of them (measured: 17)
 GIB = 1 << 30
 CONTROL_GROUP_FILES = (  # limit and use, in versions 2 and 1
     ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory.current"),

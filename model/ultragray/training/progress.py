@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from ..files import atomic_path
 
@@ -50,8 +50,8 @@ class Journal:
             temporary.write_text("".join(_lines_until(path, steps_done)), encoding="utf-8")
         self._file = path.open("a", encoding="utf-8")
 
-    def write(self, line: dict[str, Any]) -> None:
-        self._file.write(json.dumps(line, allow_nan=False) + "\n")
+    def write(self, line: Mapping[str, float]) -> None:
+        self._file.write(json.dumps(dict(line), allow_nan=False) + "\n")
         self._file.flush()
 
     def close(self) -> None:

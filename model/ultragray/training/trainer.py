@@ -2,25 +2,34 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import time
-from collections.abc import Callable
-from dataclasses import asdict, replace
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ..datasets.sweep import Dataset
+from ..datasets.sweep import Dataset, Sweep
 from ..errors import BackendUnavailable, DatasetInvalid, TrainingDiverged, TrainingStateInvalid
 from ..files import atomic_path
+from ..metrics import frame_metrics, mean_metrics
 from ..rendering import render
 from ..scene import PARAMETERS, GaussianScene
 from ..scene_info import SceneInfo
-from .checkpointing import CheckpointHeader, check_same_run, read_checkpoint, write_checkpoint
+from .board import Board
+from .checkpointing import (
+    CheckpointHeader,
+    check_same_run,
+    read_checkpoint,
+    read_checkpoint_header,
+    write_checkpoint,
+)
 from .config import TrainingConfig
 from .geometry import Geometry
 from .initial import initial_parameters
@@ -39,6 +48,8 @@ CONFIG_FILE = "config.json"
 STEPS_PER_CHECK = 100  # of the parameters being finite; the loss is looked at after every step
 VALIDATIONS = 20  # in a run
 VALIDATION_FRAMES = 8
+
+Log: TypeAlias = Callable[[dict[str, float]], None]
 
 
 def train(
@@ -67,7 +78,17 @@ def train(
     trainer = Trainer(dataset, config or TrainingConfig(), folder=folder, device=device, backend=backend)
     if resume:
         trainer.restore()
-    return trainer.run(report, should_stop, checkpoint_interval_s)
+    with trainer.logs(tensorboard) as log:
+        trainer.run(log, report, should_stop, checkpoint_interval_s)
+    return trainer.scene()
+
+
+def scene_of_checkpoint(dataset: Dataset, folder: Path) -> GaussianScene:
+    """The scene as it was at the last checkpoint of a run. Raises TrainingStateInvalid."""
+    config = read_checkpoint_header(folder / CHECKPOINT_FILE).config
+    trainer = Trainer(dataset, config, folder=folder, device="cpu", backend="auto")
+    trainer.restore()
+    return trainer.scene()
 
 
 class Trainer:
@@ -121,35 +142,12 @@ class Trainer:
             for name, tensor in parameters.items()
         }
 
-    def run(
-        self,
-        report: Callable[[Progress], None] | None,
-        should_stop: Callable[[], bool] | None,
-        checkpoint_interval_s: float,
-    ) -> GaussianScene:
-        """Steps to the end, or until `should_stop`; see `train`."""
-        journal = self._open_folder()
-        saved_at = time.monotonic()
-        try:
-            while self.step < self.config.steps:
-                progress = self._timed_step(journal)
-                if report is not None:
-                    report(progress)
-                stopping = should_stop is not None and should_stop()
-                if stopping or self.step == self.config.steps:
-                    break
-                if time.monotonic() - saved_at >= checkpoint_interval_s:
-                    self.save_checkpoint()
-                    saved_at = time.monotonic()
-            self.save_checkpoint()
-        finally:
-            if journal is not None:
-                journal.close()
-        return self.scene()
-
-    def _open_folder(self) -> Journal | None:
+    @contextlib.contextmanager
+    def logs(self, tensorboard: bool) -> Iterator[Log]:
+        """What takes the metrics of each step: the files of the run's folder, where it has one."""
         if self.folder is None:
-            return None
+            yield lambda line: None
+            return
         checkpoint = self.folder / CHECKPOINT_FILE
         if self.step == 0 and checkpoint.exists():
             raise TrainingStateInvalid(
@@ -158,17 +156,47 @@ class Trainer:
         self.folder.mkdir(parents=True, exist_ok=True)
         with atomic_path(self.folder / CONFIG_FILE) as temporary:
             temporary.write_text(json.dumps(self.config.to_dict(), indent=2) + "\n", encoding="utf-8")
-        return Journal(self.folder / JOURNAL_FILE, steps_done=self.step)
+        with contextlib.ExitStack() as stack:
+            sinks: list[Journal | Board] = [Journal(self.folder / JOURNAL_FILE, steps_done=self.step)]
+            stack.callback(sinks[0].close)
+            if tensorboard:
+                sinks.append(Board(self.folder, steps_done=self.step))
+                stack.callback(sinks[1].close)
 
-    def _timed_step(self, journal: Journal | None) -> Progress:
+            def log(line: dict[str, float]) -> None:
+                for sink in sinks:
+                    sink.write(line)
+
+            yield log
+
+    def run(
+        self,
+        log: Log,
+        report: Callable[[Progress], None] | None,
+        should_stop: Callable[[], bool] | None,
+        checkpoint_interval_s: float,
+    ) -> None:
+        """Steps to the end, or until `should_stop`; see `train`."""
+        saved_at = time.monotonic()
+        while self.step < self.config.steps:
+            progress = self._timed_step(log)
+            if report is not None:
+                report(progress)
+            if should_stop is not None and should_stop():
+                break
+            if self.step < self.config.steps and time.monotonic() - saved_at >= checkpoint_interval_s:
+                self.save_checkpoint()
+                saved_at = time.monotonic()
+        self.save_checkpoint()
+
+    def _timed_step(self, log: Log) -> Progress:
         started = time.perf_counter()
         loss = self.take_step()
-        line: dict[str, Any] = {"step": self.step, "loss": loss, "gaussians": self.gaussian_count}
+        line: dict[str, float] = {"step": self.step, "loss": loss, "gaussians": self.gaussian_count}
         if len(self.dataset.val) and self.step % math.ceil(self.config.steps / VALIDATIONS) == 0:
             self._val_psnr_db = line["val_psnr_db"] = self._validate()
         self._timer.add(time.perf_counter() - started)
-        if journal is not None:
-            journal.write({**line, "elapsed_s": round(self._timer.elapsed_s, 3)})
+        log({**line, "elapsed_s": round(self._timer.elapsed_s, 3)})
         rate = self._timer.rate()
         return Progress(
             step=self.step,
@@ -192,8 +220,6 @@ class Trainer:
             poses = shift_out_of_plane(poses, out_of_plane_shift_mm(self._out_of_plane_mm, self._generator))
         truth = self._images[batch.to(self._device)].float().div_(255.0)
         image = image_loss(self._rendered(poses, self._schedule.sh_degree(self.step)), truth)
-        if not image.requires_grad:
-            raise self._diverged("no Gaussian is left in view of the frames")
         image.backward()  # type: ignore[no-untyped-call]
         with torch.no_grad():
             loss = float(image) + self._add_scale_penalty()
@@ -271,11 +297,12 @@ class Trainer:
 
     def _validate(self) -> float:
         """Mean PSNR over some of the held-out frames, dB."""
-        val = self.dataset.val
-        chosen = np.linspace(0, len(val) - 1, min(len(val), VALIDATION_FRAMES)).round().astype(np.int64)
-        truth = torch.tensor(val.images[chosen], device=self._device).float().div_(255.0)
+        count = len(self.dataset.val)
+        chosen = np.linspace(0, count - 1, min(count, VALIDATION_FRAMES)).round().astype(np.int64)
+        val = self.dataset.val.select(chosen)
+        truth = torch.tensor(val.images, device=self._device).float().div_(255.0)
         with torch.no_grad():
-            rendered = self._rendered(val.poses[chosen], self._schedule.sh_degree(self.step))
+            rendered = self._rendered(val.poses, self._schedule.sh_degree(self.step))
             errors = (rendered - truth).square().mean(dim=(1, 2)).clamp(min=1e-10)
             return float((-10.0 * errors.log10()).mean())
 
@@ -319,14 +346,22 @@ class Trainer:
     def scene(self) -> GaussianScene:
         """The scene as it is; a finished run's is measured on the held-out frames."""
         splats = {name: tensor.detach().cpu() for name, tensor in self.parameters.items()}
-        training = {**self.config.to_dict(), "step": self.step}
-        info = replace(self._info, training=training)
+        info = replace(self._info, training={**self.config.to_dict(), "step": self.step})
         scene = GaussianScene.from_splats(splats, info=info, training_poses=self.dataset.train.poses)
         if len(self.dataset.val) and self.step == self.config.steps:
-            from ..evaluation import evaluate
-
-            scene.info.metrics.update(asdict(evaluate(scene, self.dataset.val, backend=self._backend).mean))
+            scene.info.metrics.update(_held_out_metrics(scene, self.dataset.val, self._backend))
         return scene
+
+
+def _held_out_metrics(scene: GaussianScene, val: Sweep, backend: str) -> dict[str, float]:
+    found = []
+    for start in range(0, len(val), VALIDATION_FRAMES):
+        part = val.select(np.arange(start, min(start + VALIDATION_FRAMES, len(val))))
+        size = {"height": val.height, "width": val.width}
+        frames = render(scene, val.probe, part.poses, **size, outputs=("bmode",), backend=backend)
+        assert frames.bmode is not None
+        found += frame_metrics(frames.bmode, torch.tensor(part.images) / 255.0)
+    return mean_metrics(found).to_dict()
 
 
 def _torch_device(name: str) -> torch.device:

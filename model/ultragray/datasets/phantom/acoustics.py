@@ -6,15 +6,17 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from ...probe import FloatArray
 from .anatomy import Tissue
+from .bone import Floats
 
+SPEED_MM_PER_US = 1.54
 FREQUENCY_MHZ = 5.0
-WAVELENGTH_MM = 1.54 / FREQUENCY_MHZ
+FREQUENCIES_MHZ = (3.8, 5.0, 6.2)  # whose echoes a scanner averages for smoother speckle
 PULSE_SIGMA_MM = 0.17  # of the echo's envelope, along depth
 FOCUS_MM = 32.0
+ELEVATION_REACH = 2.5  # standard deviations of the slice
 
 
 @dataclass(frozen=True)
@@ -50,16 +52,24 @@ def backscatter_amplitudes() -> FloatArray:  # [tissues]
     return np.array([10.0 ** (ACOUSTICS[tissue].backscatter_db / 20.0) for tissue in Tissue])
 
 
-def lateral_sigma_mm(depth_mm: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
-    """Width of the beam in the image plane, there and back."""
-    return np.hypot(0.34, 0.011 * (depth_mm - FOCUS_MM))
-
-
-def elevation_sigma_mm(depth_mm: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
-    """Thickness of the slice: 1.4 mm at half amplitude in the focus of the lens, more before and behind."""
-    return np.hypot(0.6, 0.022 * (depth_mm - FOCUS_MM))
-
-
 def compensated_db_per_mm() -> float:
     """What the time-gain compensation adds over a millimetre of depth."""
     return 0.2 * FREQUENCY_MHZ * COMPENSATED
+
+
+def lateral_sigma_mm(depth_mm: Floats) -> Floats:
+    """Width of the beam in the image plane, there and back."""
+    sigma: Floats = np.hypot(0.34, 0.011 * (depth_mm - FOCUS_MM))
+    return sigma
+
+
+def elevation_sigma_mm(depth_mm: Floats) -> Floats:
+    """Thickness of the slice: 1.4 mm at half amplitude in the focus of the lens, more before and behind."""
+    sigma: Floats = np.hypot(0.6, 0.022 * (depth_mm - FOCUS_MM))
+    return sigma
+
+
+def elevation_weight(elevation_mm: Floats, depth_mm: Floats) -> Floats:
+    """What the beam leaves of an echo from beside the image plane."""
+    sigmas = elevation_mm / elevation_sigma_mm(depth_mm)
+    return np.where(np.abs(sigmas) < ELEVATION_REACH, np.exp(-0.5 * sigmas * sigmas), 0.0)

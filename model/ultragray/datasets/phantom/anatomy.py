@@ -11,8 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from ...errors import InvalidArgument
-from ...probe import FloatArray
 from . import bone
+from .bone import Floats
 
 LabelArray = npt.NDArray[np.uint8]
 
@@ -38,7 +38,7 @@ class Tissue(IntEnum):
     DISC = 9
 
 
-def tissue_at(points_mm: FloatArray) -> LabelArray:  # [N, 3] -> [N]
+def tissue_at(points_mm: Floats) -> LabelArray:  # [N, 3] -> [N]
     """The `Tissue` at each point of the phantom's frame, mm. Raises InvalidArgument for another shape."""
     points_mm = np.asarray(points_mm)
     if points_mm.ndim != 2 or points_mm.shape[1] != 3:
@@ -46,7 +46,7 @@ def tissue_at(points_mm: FloatArray) -> LabelArray:  # [N, 3] -> [N]
     return tissue_drawn(straightened(points_mm))
 
 
-def tissue_drawn(points: FloatArray) -> LabelArray:  # [N, 3] -> [N]
+def tissue_drawn(points: Floats) -> LabelArray:  # [N, 3] -> [N]
     """The tissue at each point of the straight, symmetric drawing."""
     x, _, z = points.T
     fascia = fascia_depth_mm(x)
@@ -64,7 +64,7 @@ def tissue_drawn(points: FloatArray) -> LabelArray:  # [N, 3] -> [N]
     return labels
 
 
-def straightened(points: FloatArray) -> FloatArray:  # [N, 3] -> [N, 3]
+def straightened(points: Floats) -> Floats:  # [N, 3] -> [N, 3]
     """Takes the small bends out: nothing in a body is straight or symmetric, but for the skin under a probe."""
     x, y, z = points.T
     rise = np.clip(z / 8.0, 0.0, 1.0)
@@ -73,31 +73,34 @@ def straightened(points: FloatArray) -> FloatArray:  # [N, 3] -> [N, 3]
     return np.stack([x - rise * sideways, y, z - rise * (ripple + 0.02 * x)], axis=1)
 
 
-def fascia_depth_mm(x: FloatArray) -> FloatArray:
+def fascia_depth_mm(x: Floats) -> Floats:
     """The thoracolumbar fascia: over the two muscle bellies, down to the spinous processes between them."""
-    return 10.0 - 1.6 * np.exp(-(((np.abs(x) - 14.0) / 9.0) ** 2)) + 2.0 * np.exp(-((x / 5.0) ** 2))
+    depth: Floats = 10.0 - 1.6 * np.exp(-(((np.abs(x) - 14.0) / 9.0) ** 2)) + 2.0 * np.exp(-((x / 5.0) ** 2))
+    return depth
 
 
-def deep_fascia_depth_mm(x: FloatArray) -> FloatArray:
+def deep_fascia_depth_mm(x: Floats) -> Floats:
     """The middle layer of that fascia, in front of the erector spinae."""
     return 42.5 + 0.02 * (np.abs(x) - 22.0) ** 2
 
 
-def canal_roof_mm(x: FloatArray) -> FloatArray:
+def canal_roof_mm(x: Floats) -> Floats:
     """The yellow ligament between the laminae."""
     return 36.0 + 0.28 * np.sqrt(x * x + 4.0)
 
 
-def vessel_distance_mm(points: FloatArray) -> FloatArray:  # [N, 3] -> [N]
+def vessel_distance_mm(points: Floats) -> Floats:  # [N, 3] -> [N]
     """Distance from the wall of a vessel that winds along the right erector spinae, negative inside."""
     x, y, z = points.T
     centre_x, centre_z = 20.0 + 1.5 * np.sin(y / 14.0), 23.0 + 1.2 * np.sin(y / 19.0)
-    return np.hypot(x - centre_x, z - centre_z) - VESSEL_RADIUS_MM
+    distance: Floats = np.hypot(x - centre_x, z - centre_z) - VESSEL_RADIUS_MM
+    return distance
 
 
-def sac_distance_mm(points: FloatArray) -> FloatArray:  # [N, 3] -> [N]
+def sac_distance_mm(points: Floats) -> Floats:  # [N, 3] -> [N]
     """Distance from the wall of the dural sac to first order, negative inside."""
     x, z = points[:, 0] / SAC_HALF_WIDTH_MM, (points[:, 2] - SAC_DEPTH_MM) / SAC_HALF_DEPTH_MM
     radius = np.hypot(x, z)
     steepness = np.hypot(x / SAC_HALF_WIDTH_MM, z / SAC_HALF_DEPTH_MM) / np.maximum(radius, 1e-9)
-    return (radius - 1.0) / np.maximum(steepness, 1e-9)
+    distance: Floats = (radius - 1.0) / np.maximum(steepness, 1e-9)
+    return distance

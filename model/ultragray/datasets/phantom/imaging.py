@@ -8,6 +8,7 @@ with the pulse along depth and with the beam, which widens away from its focus, 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,16 +19,15 @@ from ...probe import FloatArray, LinearProbe
 from ..sweep import ByteArray, IntArray
 from . import acoustics
 from .anatomy import Tissue, tissue_at
-from .scatterers import Float32Array, ScattererField, Scatterers
+from .bone import Floats
+from .scatterers import PER_MM3, Float32Array, ScattererField, Scatterers
 
 Complex64Array = npt.NDArray[np.complex64]
 
-FINER = 2  # grid cells a pixel, each way
+CELLS_PER_ROW = 2  # the pulse is shorter than the beam is wide
 MARGIN_MM = 2.0  # around the image, for what the beam and the pulse still reach
-ELEVATION_REACH = 2.5  # standard deviations of the slice
 DYNAMIC_RANGE_DB = 60.0
-MUSCLE_GREY = 0.37
-MUSCLE_POWER = 0.02
+MUSCLE_GREY = 0.23  # of muscle's scatterers at their mean power; fibres and fascia are brighter
 
 
 def simulate(poses: npt.ArrayLike, *, probe: LinearProbe, height: int, width: int) -> ByteArray:  # [F, H, W]
@@ -36,7 +36,8 @@ def simulate(poses: npt.ArrayLike, *, probe: LinearProbe, height: int, width: in
     Raises InvalidPose for poses that are not rigid.
     """
     field, grid = ScattererField(), Grid.of(probe, height, width)
-    frames = np.zeros((len(checked := check_poses(poses)), height, width), dtype=np.uint8)
+    checked = check_poses(poses)
+    frames = np.zeros((len(checked), height, width), dtype=np.uint8)
     for frame, pose in zip(frames, checked, strict=True):
         frame[:] = _compressed(_power(field, grid, pose))
     return frames
@@ -51,7 +52,8 @@ def bone_attenuation_db(
     """
     grid = Grid.of(probe, height, width)
     per_mm = acoustics.round_trip_db_per_mm()[Tissue.BONE]
-    maps = np.zeros((len(checked := check_poses(poses)), height, width), dtype=np.float32)
+    checked = check_poses(poses)
+    maps = np.zeros((len(checked), height, width), dtype=np.float32)
     for attenuation, pose in zip(maps, checked, strict=True):
         bone = grid.tissue(pose) == Tissue.BONE
         attenuation[:] = grid.pixels(grid.above(per_mm * bone))
@@ -60,7 +62,7 @@ def bone_attenuation_db(
 
 @dataclass(frozen=True)
 class Grid:
-    """Cells finer than the pixels of an image and reaching beyond it: R rows of depth, C columns."""
+    """Two cells a pixel, one above the other, and a margin around the image: R rows of depth, C scan lines."""
 
     probe: LinearProbe
     height: int
@@ -71,13 +73,13 @@ class Grid:
     @classmethod
     def of(cls, probe: LinearProbe, height: int, width: int) -> Grid:
         """The grid of an image of H rows and W scan lines."""
-        cell_mm = (probe.scan_line_length_mm / (FINER * height), probe.width_mm / (FINER * width))
+        cell_mm = (probe.scan_line_length_mm / (CELLS_PER_ROW * height), probe.width_mm / width)
         depth_margin, lateral_margin = (math.ceil(MARGIN_MM / size) for size in cell_mm)
         return cls(probe, height, width, cell_mm, (depth_margin, lateral_margin))
 
     @property
     def shape(self) -> tuple[int, int]:
-        return FINER * self.height + 2 * self.margins[0], FINER * self.width + 2 * self.margins[1]
+        return CELLS_PER_ROW * self.height + 2 * self.margins[0], self.width + 2 * self.margins[1]
 
     @property
     def first_mm(self) -> tuple[float, float]:
@@ -86,11 +88,11 @@ class Grid:
         return depth, -0.5 * self.probe.width_mm - self.margins[1] * self.cell_mm[1]
 
     @property
-    def depths_mm(self) -> FloatArray:  # [R]
+    def depths_mm(self) -> Floats:  # [R]
         return self.first_mm[0] + (np.arange(self.shape[0]) + 0.5) * self.cell_mm[0]
 
     @property
-    def laterals_mm(self) -> FloatArray:  # [C]
+    def laterals_mm(self) -> Floats:  # [C]
         return self.first_mm[1] + (np.arange(self.shape[1]) + 0.5) * self.cell_mm[1]
 
     def cells(self, x: Float32Array, z: Float32Array) -> tuple[npt.NDArray[np.bool_], IntArray]:  # [N], [M]
@@ -102,10 +104,10 @@ class Grid:
         return inside, row[inside] * columns + column[inside]
 
     def tissue(self, pose: FloatArray) -> npt.NDArray[np.uint8]:  # [R, C]
-        """What lies in each cell of the image plane; the columns of one scan line share it."""
-        x = self.laterals_mm.reshape(-1, FINER).mean(axis=1)
-        plane = pose[:3, 3] + self.depths_mm[:, None, None] * pose[:3, 2] + x[:, None] * pose[:3, 0]  # [R, C / 2, 3]
-        return np.repeat(tissue_at(plane.reshape(-1, 3)).reshape(plane.shape[:2]), FINER, axis=1)
+        """What lies in the middle of each cell."""
+        across = pose[:3, 3] + self.laterals_mm[:, None] * pose[:3, 0]
+        middles = across + self.depths_mm[:, None, None] * pose[:3, 2]  # [R, C, 3]
+        return tissue_at(middles.reshape(-1, 3).astype(np.float32)).reshape(self.shape)
 
     def above(self, per_mm: FloatArray) -> FloatArray:  # [R, C] -> [R, C]
         """The sum of something over each scan line, from the probe's face down to the middle of each cell."""
@@ -113,31 +115,42 @@ class Grid:
         total: FloatArray = self.cell_mm[0] * (np.cumsum(seen, axis=0) - 0.5 * seen)
         return total
 
-    def pixels(self, values: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:  # [R, C] -> [H, W]
+    def pixels(self, values: Floats) -> Floats:  # [R, C] -> [H, W]
         """The mean over the cells of each pixel."""
         top, left = self.margins
-        image = values[top : top + FINER * self.height, left : left + FINER * self.width]
-        mean: npt.NDArray[np.floating] = image.reshape(self.height, FINER, self.width, FINER).mean(axis=(1, 3))
+        image = values[top : top + CELLS_PER_ROW * self.height, left : left + self.width]
+        mean: Floats = image.reshape(self.height, CELLS_PER_ROW, self.width).mean(axis=1)
         return mean
 
 
-def _power(field: ScattererField, grid: Grid, pose: FloatArray) -> npt.NDArray[np.floating]:  # [H, W]
-    """Mean square of the envelope over each pixel, about 1 in muscle."""
-    echoes = _echoes(field, grid, pose)
+def _power(field: ScattererField, grid: Grid, pose: FloatArray) -> Floats:  # [H, W]
+    """Mean square of the envelope over each pixel and the frequencies of the scanner, 1 in muscle."""
     gain_db = acoustics.compensated_db_per_mm() * grid.depths_mm[:, None]
     loss_db = grid.above(acoustics.round_trip_db_per_mm()[grid.tissue(pose)])
-    echoes *= (10.0 ** ((gain_db - loss_db) / 20.0)).astype(np.float32)
-    return grid.pixels(np.abs(_blurred(echoes, grid)) ** 2) / MUSCLE_POWER
+    sensitivity = (10.0 ** ((gain_db - loss_db) / 20.0)).astype(np.float32)
+    looks = [np.abs(_blurred(echoes * sensitivity, grid)) ** 2 for echoes in _echoes(field, grid, pose)]
+    return grid.pixels(np.mean(looks, axis=0))
 
 
-def _echoes(field: ScattererField, grid: Grid, pose: FloatArray) -> Complex64Array:  # [R, C]
-    """The scatterers of the slice on the grid, as phasors at the pulse's frequency."""
+def _echoes(field: ScattererField, grid: Grid, pose: FloatArray) -> Iterator[Complex64Array]:  # [R, C]
+    """The scatterers of the slice on the grid, as phasors at each frequency."""
     depths, laterals = grid.depths_mm, grid.laterals_mm
-    reach = ELEVATION_REACH * float(acoustics.elevation_sigma_mm(depths).max())
+    reach = acoustics.ELEVATION_REACH * float(acoustics.elevation_sigma_mm(depths).max())
     low, high = np.array([laterals[0], -reach, depths[0]]), np.array([laterals[-1], reach, depths[-1]])
     scatterers = field.slice(pose, low, high)
-    tissue = _binned(grid, pose, scatterers.points_mm, scatterers.amplitudes)
-    return tissue + _binned(grid, pose, scatterers.surface_mm, _reflected(scatterers, pose))
+    points = np.concatenate([scatterers.points_mm, scatterers.surface_mm])
+    amplitudes = np.concatenate([scatterers.amplitudes, _reflected(scatterers, pose)])
+    local = (points - pose[:3, 3].astype(np.float32)) @ pose[:3, :3].astype(np.float32)
+    inside, cells = grid.cells(local[:, 0], local[:, 2])
+    _, y, z = local[inside].T
+    weights = amplitudes[inside] * acoustics.elevation_weight(y, z)
+    count = grid.shape[0] * grid.shape[1]
+    for frequency in acoustics.FREQUENCIES_MHZ:
+        phase = np.float32(4.0 * math.pi * frequency / acoustics.SPEED_MM_PER_US) * z
+        echoes = np.empty(count, dtype=np.complex64)
+        echoes.real = np.bincount(cells, weights * np.cos(phase), count)
+        echoes.imag = np.bincount(cells, weights * np.sin(phase), count)
+        yield echoes.reshape(grid.shape)
 
 
 def _reflected(scatterers: Scatterers, pose: FloatArray) -> Float32Array:  # [M]
@@ -148,36 +161,25 @@ def _reflected(scatterers: Scatterers, pose: FloatArray) -> Float32Array:  # [M]
     return reflected
 
 
-def _binned(grid: Grid, pose: FloatArray, points: Float32Array, amplitudes: Float32Array) -> Complex64Array:  # [R, C]
-    local = (points - pose[:3, 3].astype(np.float32)) @ pose[:3, :3].astype(np.float32)
-    sigma = acoustics.elevation_sigma_mm(local[:, 2])
-    inside, cells = grid.cells(local[:, 0], local[:, 2])
-    inside_slice = np.abs(local[inside, 1]) < ELEVATION_REACH * sigma[inside]
-    chosen, cells = np.flatnonzero(inside)[inside_slice], cells[inside_slice]
-    _, y, z = local[chosen].T
-    weights = amplitudes[chosen] * np.exp(-0.5 * (y / sigma[chosen]) ** 2)
-    phase = (4.0 * math.pi / acoustics.WAVELENGTH_MM) * z
-    count = grid.shape[0] * grid.shape[1]
-    real = np.bincount(cells, weights * np.cos(phase), count)
-    imaginary = np.bincount(cells, weights * np.sin(phase), count)
-    return (real + 1j * imaginary).astype(np.complex64).reshape(grid.shape)
-
-
 def _blurred(echoes: Complex64Array, grid: Grid) -> Complex64Array:  # [R, C]
-    """Echoes under the pulse and under the beam, at unit mean power for scatterers of unit density and amplitude."""
+    """Echoes under the pulse and the beam, at unit mean power where the scatterers' amplitudes are standard normal."""
     rows, columns = echoes.shape
     down = 2.0 * math.pi * np.fft.fftfreq(rows, grid.cell_mm[0])  # rad/mm
     across = 2.0 * math.pi * np.fft.fftfreq(columns, grid.cell_mm[1])
     sigma = acoustics.lateral_sigma_mm(grid.depths_mm)
     pulse = np.exp(-0.5 * (acoustics.PULSE_SIGMA_MM * down) ** 2)[:, None]
     beam = np.exp(-0.5 * (sigma[:, None] * across) ** 2)
-    # A wider beam meets more scatterers: the gain that keeps their power the same.
-    even = np.sqrt(sigma / acoustics.elevation_sigma_mm(grid.depths_mm))[:, None]
-    echoes = np.fft.ifft(np.fft.fft(echoes, axis=0) * pulse.astype(np.float32), axis=0)
-    echoes = np.fft.ifft(np.fft.fft(echoes, axis=1) * (even * beam).astype(np.float32), axis=1)
-    return echoes
+    # Σ amplitude² over the scatterers of one pixel, for kernels of unit sum: what a wider beam gathers is divided out.
+    elevation = acoustics.elevation_sigma_mm(grid.depths_mm)
+    cell = grid.cell_mm[0] * grid.cell_mm[1]
+    gathered = PER_MM3 * cell**2 * elevation / (4.0 * math.sqrt(math.pi) * sigma * acoustics.PULSE_SIGMA_MM)
+    beam /= np.sqrt(gathered)[:, None]
+    pulsed = np.fft.ifft(np.fft.fft(echoes, axis=0) * pulse.astype(np.float32), axis=0)
+    blurred = np.fft.ifft(np.fft.fft(pulsed, axis=1) * beam.astype(np.float32), axis=1)
+    return blurred.astype(np.complex64)
 
 
-def _compressed(power: npt.NDArray[np.floating]) -> ByteArray:  # [H, W]
+def _compressed(power: Floats) -> ByteArray:  # [H, W]
     grey = MUSCLE_GREY + 10.0 * np.log10(power + 1e-12) / DYNAMIC_RANGE_DB
-    return np.round(255.0 * np.clip(grey, 0.0, 1.0)).astype(np.uint8)
+    frame: ByteArray = np.round(255.0 * np.clip(grey, 0.0, 1.0)).astype(np.uint8)
+    return frame

@@ -2,36 +2,45 @@
 
 from __future__ import annotations
 
-import itertools
-
 import numpy as np
 
-from ...probe import FloatArray
+from ..sweep import IntArray
+from .bone import Floats, Triple
 
 _PERIOD = 32  # lattice cells, a power of two
+_LAST = _PERIOD - 1
 
 
 class LatticeNoise:
     """Values in [−1, 1] at the nodes of a lattice with cells of a given size, interpolated smoothly between them."""
 
-    def __init__(self, seed: int, cell_mm: tuple[float, float, float]) -> None:
-        self._nodes = np.random.default_rng(seed).uniform(-1.0, 1.0, _PERIOD**3)
-        self._cell_mm = np.asarray(cell_mm)
+    def __init__(self, seed: int, cell_mm: Triple) -> None:
+        nodes = np.random.default_rng(seed).uniform(-1.0, 1.0, (_PERIOD, _PERIOD, _PERIOD))
+        self._nodes = nodes.astype(np.float32)
+        self._cell_mm = cell_mm
 
-    def __call__(self, points: FloatArray) -> FloatArray:  # [N, 3] -> [N]
+    def __call__(self, points: Floats) -> Floats:  # [N, 3] -> [N]
         """The noise at each point, mm."""
-        scaled = points / self._cell_mm
+        (i, u), (j, v), (k, w) = (self._cell(points[:, axis] / size) for axis, size in enumerate(self._cell_mm))
+        nodes = self._nodes
+
+        def along_z(i: IntArray, j: IntArray) -> Floats:
+            near = nodes[i, j, k]
+            value: Floats = near + w * (nodes[i, j, (k + 1) & _LAST] - near)
+            return value
+
+        def along_y(i: IntArray) -> Floats:
+            near = along_z(i, j)
+            value: Floats = near + v * (along_z(i, (j + 1) & _LAST) - near)
+            return value
+
+        near = along_y(i)
+        value: Floats = near + u * (along_y((i + 1) & _LAST) - near)
+        return value
+
+    @staticmethod
+    def _cell(scaled: Floats) -> tuple[IntArray, Floats]:
+        """The node before each place, and how far the place is on the way to the next."""
         whole = np.floor(scaled)
         part = scaled - whole
-        part *= part * (3.0 - 2.0 * part)
-        low = whole.astype(np.int64) & (_PERIOD - 1)
-        high = (low + 1) & (_PERIOD - 1)
-        value = np.zeros(len(points))
-        for corner in itertools.product((0, 1), repeat=3):
-            node = np.zeros(len(points), dtype=np.int64)
-            weight = np.ones(len(points))
-            for axis, upper in enumerate(corner):
-                node = node * _PERIOD + (high if upper else low)[:, axis]
-                weight = weight * (part[:, axis] if upper else 1.0 - part[:, axis])
-            value += weight * self._nodes[node]
-        return value
+        return whole.astype(np.int64) & _LAST, part * part * (3.0 - 2.0 * part)

@@ -14,16 +14,17 @@ import numpy.typing as npt
 from ...probe import FloatArray
 from . import anatomy
 from .acoustics import backscatter_amplitudes
+from .bone import Floats
 from .interfaces import INTERFACES, Interface, fascicles
 
 Float32Array = npt.NDArray[np.float32]
 
 BLOCK_MM = 8.0
-PER_MM3 = 10.0  # about six in a cell of the beam's resolution: speckle is fully developed
+PER_MM3 = 8.0  # about five in a cell of the beam's resolution: speckle is fully developed
 BAND_MM = 0.4  # scatterers this near to an interface are repeated on it
 _SEED = 20261121
 _OFFSET = 1 << 20  # seeds are not negative
-_GRADIENT_STEP_MM = 1e-3
+_GRADIENT_STEP_MM = 1e-2
 
 
 @dataclass(frozen=True)
@@ -62,6 +63,10 @@ class Scatterers:
         return cls(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
 
 
+_NUMBERS, _VECTORS = np.zeros(0, dtype=np.float32), np.zeros((0, 3), dtype=np.float32)
+NOTHING = Scatterers(_VECTORS, _NUMBERS, _VECTORS, _VECTORS, _NUMBERS, _NUMBERS, _NUMBERS)
+
+
 class ScattererField:
     """The scatterers of the phantom, each block made when a frame first needs it."""
 
@@ -69,9 +74,9 @@ class ScattererField:
         self._blocks: dict[tuple[int, int, int], Scatterers] = {}
 
     def slice(self, pose: FloatArray, low_mm: FloatArray, high_mm: FloatArray) -> Scatterers:
-        """The scatterers of the slice between two elevations, in the blocks that touch a box [3], [3] of a pose [4, 4]."""
+        """The scatterers between two elevations, in the blocks that touch a box [3], [3] of the frame of a pose."""
         blocks = (self._block(index) for index in _blocks_near(pose, low_mm, high_mm))
-        return Scatterers.join([block.between(pose, low_mm[1], high_mm[1]) for block in blocks])
+        return Scatterers.join([NOTHING, *(block.between(pose, low_mm[1], high_mm[1]) for block in blocks)])
 
     def _block(self, index: tuple[int, int, int]) -> Scatterers:
         if index not in self._blocks:
@@ -95,7 +100,7 @@ def _blocks_near(pose: FloatArray, low_mm: FloatArray, high_mm: FloatArray) -> I
 def _made(index: tuple[int, int, int]) -> Scatterers:
     rng = np.random.default_rng([_SEED, *(i + _OFFSET for i in index)])
     count = round(PER_MM3 * BLOCK_MM**3)
-    points = (np.asarray(index) + rng.random((count, 3))) * BLOCK_MM
+    points: Float32Array = ((np.asarray(index) + rng.random((count, 3))) * BLOCK_MM).astype(np.float32)
     drawn = anatomy.straightened(points)
     labels = anatomy.tissue_drawn(drawn)
     amplitudes = backscatter_amplitudes()[labels] * rng.normal(0.0, 1.0, count)
@@ -113,8 +118,8 @@ def _made(index: tuple[int, int, int]) -> Scatterers:
 
 
 def _on(
-    interface: Interface, rng: np.random.Generator, points: FloatArray, drawn: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:  # [M, 3], [M, 3], [M], [M], [M]
+    interface: Interface, rng: np.random.Generator, points: Floats, drawn: Floats
+) -> tuple[Floats, ...]:  # [M, 3], [M, 3], [M], [M], [M]
     """The scatterers near an interface moved onto it, with its normals there and their amplitudes."""
     low, high = interface.depths_mm
     near = np.flatnonzero((points[:, 2] > low) & (points[:, 2] < high))
@@ -138,8 +143,8 @@ def _on(
     )
 
 
-def _gradient(interface: Interface, points: FloatArray, level: FloatArray) -> FloatArray:  # [M, 3], [M] -> [M, 3]
+def _gradient(interface: Interface, points: Floats, level: Floats) -> Floats:  # [M, 3], [M] -> [M, 3]
     """Of the interface's function, in the phantom's frame."""
-    shifted = (points + _GRADIENT_STEP_MM * axis for axis in np.eye(3))
+    shifted = (points + _GRADIENT_STEP_MM * axis for axis in np.eye(3, dtype=np.float32))
     steps = [interface.level(anatomy.straightened(there)) - level for there in shifted]
     return np.stack(steps, axis=1) / _GRADIENT_STEP_MM

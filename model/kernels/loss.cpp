@@ -1,0 +1,34 @@
+#include "loss.hpp"
+
+#include <cmath>
+#include <memory>
+#include <vector>
+
+#include "render.hpp"
+#include "threads.hpp"
+
+namespace ultragray {
+
+double image_loss(const float* x, const float* y, int count, int height, int width, int threads,
+                  const std::string& instruction_set, float* gradient) {
+    const Kernels& kernels = choose_kernels(instruction_set);
+    float window[11], sum = 0;
+    for (int t = 0; t < 11; ++t) sum += window[t] = std::exp(-0.5f * float((t - 5) * (t - 5)) / (1.5f * 1.5f));
+    for (float& weight : window) weight /= sum;
+    const double pixels = double(count) * height * width, windows = double(count) * (height - 10) * (width - 10);
+    std::vector<ImageLoss> losses(count);
+    Phase images{count, [&](int i) {
+                     thread_local std::vector<float> scratch;
+                     scratch.resize(loss_scratch(height, width));
+                     const int64_t at = int64_t(i) * height * width;
+                     losses[i] = kernels.image_loss(x + at, y + at, height, width, window, scratch.data(),
+                                                    float(0.5 / pixels), float(-0.5 / windows), gradient + at);
+                 }};
+    Phase nothing{0, {}};
+    run_phases(images, nothing, threads);
+    ImageLoss total{0, 0};
+    for (const ImageLoss& loss : losses) total.l1 += loss.l1, total.ssim += loss.ssim;
+    return 0.5 * total.l1 / pixels + 0.5 * (1.0 - total.ssim / windows);
+}
+
+}  // namespace ultragray

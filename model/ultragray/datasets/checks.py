@@ -1,0 +1,236 @@
+"""What is in a dataset, in numbers, and what looks wrong about it.
+
+What cannot be used at all is refused when a dataset is read (`Sweep`, `Dataset`);
+warnings leave the choice to a person.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from ..pose import rotation_angles_deg
+from ..probe import FloatArray, Probe, probe_to_dict
+from .sweep import Dataset, Sweep
+from .swept_volume import swept_volume
+
+JUMP_FACTOR = 5.0  # times the usual step
+JUMP_SPREADS = 8.0  # standard deviations, estimated from the median
+SMALLEST_JUMP_MM = 1.0
+SATURATED_SHARE = 0.05
+DARKEST_PEAK = 16  # of 255
+SAME_POSE_MM = 1e-6
+MAX_TILT_FRAMES = 300
+
+
+@dataclass(frozen=True)
+class SweepReport:
+    """One part of a dataset. A step goes from a frame to the next; its length is the mean travel of the corners."""
+
+    source: str
+    frames: int
+    height: int
+    width: int
+    pixel_axial_mm: float
+    pixel_lateral_mm: float
+    extent_min_mm: tuple[float, float, float]  # of the corners, tracker frame
+    extent_max_mm: tuple[float, float, float]
+    path_mm: float  # travel of the probe's origin
+    step_median_mm: float
+    step_max_mm: float
+    step_max_deg: float
+    tilt_deg: float  # largest angle between two frames
+    tilt_range_deg: tuple[float, float, float]  # about the lateral, elevation and axial axis of the middle frame
+    swept_ml: float  # voxels that a frame crosses
+    coverage: float  # their share of the box around the frames, along the axes of the middle frame
+    voxel_mm: float
+    warnings: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class DatasetReport:
+    """A whole dataset; `val` is None where nothing is held out."""
+
+    name: str
+    sha256: str
+    probe: Probe
+    train: SweepReport
+    val: SweepReport | None
+    val_distance_median_mm: float | None  # to the nearest training frame: mean distance of the corners
+    val_distance_max_mm: float | None
+    val_angle_max_deg: float | None  # to that nearest frame
+    warnings: tuple[str, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """The report as JSON can hold it."""
+        return {**asdict(self), "probe": probe_to_dict(self.probe)}
+
+
+def check_dataset(dataset: Dataset) -> DatasetReport:
+    """Describes both parts and how far the held-out frames lie from the training frames."""
+    distances, angles = _nearest_training_frames(dataset)
+    return DatasetReport(
+        name=dataset.name,
+        sha256=dataset.sha256,
+        probe=dataset.probe,
+        train=check_sweep(dataset.train),
+        val=check_sweep(dataset.val) if len(dataset.val) else None,
+        val_distance_median_mm=float(np.median(distances)) if len(distances) else None,
+        val_distance_max_mm=float(distances.max()) if len(distances) else None,
+        val_angle_max_deg=float(angles.max()) if len(angles) else None,
+        warnings=tuple(_dataset_warnings(dataset)),
+    )
+
+
+def check_sweep(sweep: Sweep) -> SweepReport:
+    """Describes the frames of a sweep (at least one) and lists what looks wrong, with frame numbers."""
+    corners = sweep.corners_mm()
+    steps_mm = _corner_travel(corners[:-1], corners[1:])
+    steps_deg = np.array([rotation_angles_deg(a[None], b[None])[0, 0] for a, b in pairwise(sweep.poses)])
+    thinned = sweep.poses[:: -(-len(sweep) // MAX_TILT_FRAMES)]
+    swept = swept_volume(sweep)
+    axial_mm, lateral_mm = sweep.pixel_mm
+    origins = sweep.poses[:, :3, 3]
+    return SweepReport(
+        source=sweep.source,
+        frames=len(sweep),
+        height=sweep.height,
+        width=sweep.width,
+        pixel_axial_mm=axial_mm,
+        pixel_lateral_mm=lateral_mm,
+        extent_min_mm=_vector(corners.min(axis=(0, 1))),
+        extent_max_mm=_vector(corners.max(axis=(0, 1))),
+        path_mm=float(np.linalg.norm(np.diff(origins, axis=0), axis=1).sum()),
+        step_median_mm=float(np.median(steps_mm)) if len(steps_mm) else 0.0,
+        step_max_mm=float(steps_mm.max(initial=0.0)),
+        step_max_deg=float(steps_deg.max(initial=0.0)),
+        tilt_deg=float(rotation_angles_deg(thinned, thinned).max()),
+        tilt_range_deg=_vector(np.ptp(_rotations_from_middle_deg(sweep.poses), axis=0)),
+        swept_ml=swept.swept_ml,
+        coverage=swept.coverage,
+        voxel_mm=swept.voxel_mm,
+        warnings=(*_jumps(sweep, steps_mm), *_repeats(sweep), *_odd_images(sweep)),
+    )
+
+
+def _corner_travel(corners: FloatArray, others: FloatArray) -> FloatArray:  # [..., P, 3] twice -> [...]
+    travel: FloatArray = np.linalg.norm(corners - others, axis=-1).mean(axis=-1)
+    return travel
+
+
+def _vector(values: FloatArray) -> tuple[float, float, float]:
+    x, y, z = (float(value) for value in values)
+    return x, y, z
+
+
+def _rotations_from_middle_deg(poses: FloatArray) -> FloatArray:  # [F, 3]
+    """Rotation vectors, in degrees, from the middle frame's orientation, along its axes."""
+    relative = poses[len(poses) // 2, :3, :3].T @ poses[:, :3, :3]
+    skew = np.stack(
+        [
+            relative[:, 2, 1] - relative[:, 1, 2],
+            relative[:, 0, 2] - relative[:, 2, 0],
+            relative[:, 1, 0] - relative[:, 0, 1],
+        ],
+        axis=1,
+    )
+    sine = np.linalg.norm(skew, axis=1) / 2
+    angle = np.arctan2(sine, (np.trace(relative, axis1=1, axis2=2) - 1) / 2)
+    rotations: FloatArray = np.degrees(skew / 2 * (angle / np.maximum(sine, 1e-12))[:, None])
+    return rotations
+
+
+def _nearest_training_frames(dataset: Dataset) -> tuple[FloatArray, FloatArray]:  # [V] mm, [V] degrees
+    train_corners = dataset.train.corners_mm()
+    distances, angles = np.zeros(len(dataset.val)), np.zeros(len(dataset.val))
+    for place, corners in enumerate(dataset.val.corners_mm()):
+        travel = _corner_travel(train_corners, corners)
+        nearest = int(np.argmin(travel))
+        distances[place] = travel[nearest]
+        angles[place] = rotation_angles_deg(dataset.val.poses[[place]], dataset.train.poses[[nearest]])[0, 0]
+    return distances, angles
+
+
+def _jumps(sweep: Sweep, steps_mm: FloatArray) -> list[str]:
+    """Steps far longer than usual: a frame off its two neighbours, or a gap such as between two sweeps."""
+    gaps = np.abs(np.diff(sweep.frame_numbers)).clip(min=1)
+    speeds = steps_mm / gaps
+    if len(speeds) < 3:
+        return []
+    usual = float(np.median(speeds))
+    spread = 1.4826 * float(np.median(np.abs(speeds - usual)))
+    limit = max(JUMP_FACTOR * usual, usual + JUMP_SPREADS * spread, SMALLEST_JUMP_MM)
+    jumps = [int(place) for place in np.flatnonzero(speeds > limit)]
+    numbers, told, skip = sweep.frame_numbers, [], -1
+    for place in jumps:
+        if place == skip:
+            continue
+        if place + 1 in jumps:
+            told.append(
+                f"frame {numbers[place + 1]} lies {steps_mm[place]:.1f} mm off the frame before and "
+                f"{steps_mm[place + 1]:.1f} mm off the one after it, where {usual:.2g} mm are usual: a wrong pose?"
+            )
+            skip = place + 1
+        else:
+            told.append(
+                f"a jump of {steps_mm[place]:.1f} mm from frame {numbers[place]} to {numbers[place + 1]}, where "
+                f"{usual:.2g} mm are usual: another sweep, or lost tracking?"
+            )
+    return told
+
+
+def _repeats(sweep: Sweep) -> list[str]:
+    poses = np.round(sweep.poses / SAME_POSE_MM).astype(np.int64)
+    told = []
+    for places in _groups(poses):
+        if len({sweep.images[place].tobytes() for place in places}) == 1:
+            told.append(f"frames {_list(sweep, places)} are the same frame: one pose, one image")
+        else:
+            told.append(f"frames {_list(sweep, places)} share one pose, but show different images: tracking stalled?")
+    for places in _groups(sweep.images):
+        if len({poses[place].tobytes() for place in places}) > 1:
+            told.append(f"frames {_list(sweep, places)} show one image at different poses: a frozen picture?")
+    return told
+
+
+def _groups(arrays: np.ndarray) -> list[list[int]]:
+    """Places whose arrays are equal, in groups of two and more."""
+    places: dict[bytes, list[int]] = {}
+    for place, array in enumerate(arrays):
+        places.setdefault(array.tobytes(), []).append(place)
+    return [group for group in places.values() if len(group) > 1]
+
+
+def _odd_images(sweep: Sweep) -> list[str]:
+    def where(is_odd: Callable[[np.ndarray], bool]) -> list[int]:
+        return [place for place, image in enumerate(sweep.images) if is_odd(image)]
+
+    told = []
+    if dark := where(lambda image: bool(image.max() < DARKEST_PEAK)):
+        told.append(f"frames {_list(sweep, dark)} are nearly black: no pixel reaches {DARKEST_PEAK} of 255")
+    if bright := where(lambda image: float(np.mean(image == 255)) > SATURATED_SHARE):
+        told.append(f"frames {_list(sweep, bright)} are saturated: over {SATURATED_SHARE:.0%} of the pixels are 255")
+    return told
+
+
+def _dataset_warnings(dataset: Dataset) -> list[str]:
+    told = list(dict.fromkeys((*dataset.train.notes, *dataset.val.notes)))
+    known = set(_contents(dataset.train))
+    leaked = [place for place, frame in enumerate(_contents(dataset.val)) if frame in known]
+    if leaked:
+        told.append(f"held-out frames {_list(dataset.val, leaked)} are also training frames: metrics will flatter")
+    return told
+
+
+def _contents(sweep: Sweep) -> list[tuple[bytes, bytes]]:
+    return [(image.tobytes(), pose.tobytes()) for image, pose in zip(sweep.images, sweep.poses, strict=True)]
+
+
+def _list(sweep: Sweep, places: Sequence[int]) -> str:
+    """Frame numbers as text, at most ten of them."""
+    numbers = [str(sweep.frame_numbers[place]) for place in places]
+    return ", ".join(numbers[:10]) + (f" and {len(numbers) - 10} more" if len(numbers) > 10 else "")

@@ -1,0 +1,106 @@
+"""A picture of a dataset: its image planes in space, and a contact sheet of its frames."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from ..files import atomic_path
+from ..probe import ConvexProbe, FloatArray
+from .sweep import Dataset, Sweep
+
+TRAIN_COLOUR, VAL_COLOUR = "#1f77b4", "#d62728"
+MAX_PLANES = 60  # outlines of one part; the path of the probe shows every frame
+SHEET_COLUMNS, MAX_SHEET_FRAMES = 8, 24
+MAX_TILE_PIXELS = 256
+VIEWS_DEG = ((20.0, -60.0), (20.0, 30.0))  # elevation and azimuth of the eye
+
+
+def draw_dataset(dataset: Dataset, path: str | Path) -> None:
+    """Writes a PNG: the planes seen from two sides, below them frames at even distances, held-out ones in red.
+
+    Axes are those of the tracker, in mm. Frames of a convex probe are drawn as fans.
+    """
+    shown = _sheet_frames(dataset)
+    rows = math.ceil(len(shown) / SHEET_COLUMNS)
+    tile = _tile(*shown[0][:2])
+    tile_height = 14.0 / SHEET_COLUMNS * tile.shape[0] / tile.shape[1] + 0.25
+    figure = Figure(figsize=(14.0, 7.0 + rows * tile_height), dpi=100, layout="constrained")
+    FigureCanvasAgg(figure)
+    parts = figure.add_gridspec(2, 1, height_ratios=[7.0, rows * tile_height])
+    above, below = figure.add_subfigure(parts[0]), figure.add_subfigure(parts[1])
+    above.suptitle(f"{dataset.name}: {len(dataset.train)} training frames (blue), {len(dataset.val)} held out (red)")
+    for place, (elevation, azimuth) in enumerate(VIEWS_DEG):
+        _draw_planes(above.add_subplot(1, 2, place + 1, projection="3d"), dataset, elevation, azimuth)
+    grid = below.subplots(rows, SHEET_COLUMNS, squeeze=False).ravel()
+    for axes in grid:
+        axes.set_axis_off()
+    for axes, (sweep, frame, colour) in zip(grid, shown, strict=False):
+        axes.imshow(_tile(sweep, frame), cmap="gray", vmin=0, vmax=255)
+        part = "train" if colour == TRAIN_COLOUR else "val"
+        axes.set_title(f"{part} {sweep.frame_numbers[frame]}", color=colour, fontsize=9, pad=2)
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, format="png")
+
+
+def _sheet_frames(dataset: Dataset) -> list[tuple[Sweep, int, str]]:
+    """Frames at even distances, held-out ones at most a third of them."""
+    val_count = min(len(dataset.val), MAX_SHEET_FRAMES // 3)
+    train_count = min(len(dataset.train), MAX_SHEET_FRAMES - val_count)
+    return [
+        (sweep, int(frame), colour)
+        for sweep, count, colour in (
+            (dataset.train, train_count, TRAIN_COLOUR),
+            (dataset.val, val_count, VAL_COLOUR),
+        )
+        for frame in np.linspace(0, len(sweep) - 1, count).round()
+    ]
+
+
+def _tile(sweep: Sweep, frame: int) -> np.ndarray:  # [rows, columns]
+    """A frame with square pixels, no side longer than MAX_TILE_PIXELS."""
+    image = sweep.images[frame]
+    if isinstance(sweep.probe, ConvexProbe):
+        return sweep.probe.scan_convert(image, 2.0 * sweep.probe.far_mm / MAX_TILE_PIXELS)
+    axial_mm, lateral_mm = sweep.pixel_mm
+    pixel_mm = max(axial_mm * sweep.height, lateral_mm * sweep.width) / MAX_TILE_PIXELS
+    rows, columns = (
+        np.minimum((np.arange(max(1, round(size * own / pixel_mm))) + 0.5) * pixel_mm / own, size - 1).astype(np.intp)
+        for size, own in ((sweep.height, axial_mm), (sweep.width, lateral_mm))
+    )
+    return np.asarray(image[np.ix_(rows, columns)])
+
+
+def _draw_planes(axes: Any, dataset: Dataset, elevation_deg: float, azimuth_deg: float) -> None:
+    corners = [part.corners_mm() for part in (dataset.train, dataset.val)]
+    for part, part_corners, colour in zip(
+        (dataset.train, dataset.val), corners, (TRAIN_COLOUR, VAL_COLOUR), strict=True
+    ):
+        if not len(part):
+            continue
+        faces = part_corners[:, : part_corners.shape[1] // 2].mean(axis=1)  # middle of the near edge
+        axes.plot(*faces.T, ".", color=colour, markersize=3)
+        thinned = part_corners[:: -(-len(part) // MAX_PLANES)]
+        axes.plot(*_outlines(thinned).T, color=colour, linewidth=0.5, alpha=0.5)
+    every = np.concatenate([part.reshape(-1, 3) for part in corners])
+    low, high = every.min(axis=0), every.max(axis=0)
+    middle, half = (low + high) / 2, max(float((high - low).max()) / 2, 1.0)
+    for name, centre in zip("xyz", middle, strict=True):
+        getattr(axes, f"set_{name}lim")(centre - half, centre + half)
+        getattr(axes, f"set_{name}label")(f"{name}, mm")
+    axes.set_box_aspect((1, 1, 1))
+    axes.view_init(elev=elevation_deg, azim=azimuth_deg)
+
+
+def _outlines(corners: FloatArray) -> FloatArray:  # [F, P, 3] -> [F * (P + 2), 3]
+    """Closed outlines, along the near edge and back along the far edge; NaN lifts the pen between them."""
+    half = corners.shape[1] // 2
+    order = [*range(half), *reversed(range(half, 2 * half)), 0]
+    lifts = np.full((len(corners), 1, 3), np.nan)
+    outlines: FloatArray = np.concatenate([corners[:, order], lifts], axis=1).reshape(-1, 3)
+    return outlines

@@ -1,0 +1,53 @@
+"""How much of the space around a sweep its image planes cross."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..probe import FloatArray, Probe
+from .sweep import Sweep
+
+VOXEL_MM = 1.0
+MAX_VOXELS = 8_000_000
+MAX_POINTS = 200_000  # of one image plane
+
+
+@dataclass(frozen=True)
+class SweptVolume:
+    """Voxels crossed by any image plane, in the box around all planes along the axes of the middle frame."""
+
+    swept_ml: float
+    coverage: float  # crossed voxels / voxels of the box
+    voxel_mm: float
+
+
+def swept_volume(sweep: Sweep) -> SweptVolume:
+    """Counts the voxels of 1 mm (more for volumes over eight litres) that image planes of the sweep cross."""
+    axes = sweep.poses[len(sweep) // 2, :3, :3]
+    corners = sweep.corners_mm() @ axes
+    low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
+    voxel_mm = max(VOXEL_MM, float(np.prod(np.maximum(high - low, VOXEL_MM)) / MAX_VOXELS) ** (1 / 3))
+    counts = np.maximum(np.ceil((high - low) / voxel_mm - 1e-9), 1).astype(np.int64)
+    crossed = np.zeros(counts.prod(), bool)
+    points = _plane_points(sweep.probe, voxel_mm / 2)
+    for pose in sweep.poses:
+        places = ((points @ pose[:3, :3].T + pose[:3, 3]) @ axes - low) / voxel_mm
+        x, y, z = np.clip(places.astype(np.int64), 0, counts - 1).T
+        crossed[(x * counts[1] + y) * counts[2] + z] = True
+    share = float(crossed.mean())
+    return SweptVolume(swept_ml=float(crossed.sum()) * voxel_mm**3 / 1000.0, coverage=share, voxel_mm=voxel_mm)
+
+
+def _plane_points(probe: Probe, spacing_mm: float) -> FloatArray:  # [P, 3]
+    """Points on the image plane, at most `spacing_mm` apart where their number allows."""
+    left, right = probe.corners_mm()[[-2, -1]] if probe.kind == "linear" else probe.corners_mm()[[-3, -1]]
+    arc_mm = float(np.linalg.norm(right - left)) * (1.0 if probe.kind == "linear" else math.pi / 2)
+    lines, samples = (max(2, math.ceil(side / spacing_mm)) for side in (arc_mm, probe.scan_line_length_mm))
+    thinning = max(1.0, math.sqrt(lines * samples / MAX_POINTS))
+    lines, samples = math.ceil(lines / thinning), math.ceil(samples / thinning)
+    origins, directions = probe.scan_lines(lines)
+    points: FloatArray = origins[:, None] + probe.depths_mm(samples)[None, :, None] * directions[:, None]
+    return points.reshape(-1, 3)

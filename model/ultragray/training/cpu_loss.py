@@ -1,0 +1,38 @@
+"""The image part of the training loss by the C++ kernel (docs/physics.md §6): forward and gradient in one pass."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from .. import _cpu
+
+
+def image_loss(rendered: Tensor, truth: Tensor, *, instruction_set: str = "auto") -> Tensor:
+    """0.5·mean|rendered − truth| + 0.5·(1 − SSIM) of float32 images [C, H, W] on the CPU, sides of at least 11 pixels.
+
+    SSIM is taken with a Gaussian window of 11x11 pixels, σ = 1.5, where the window lies inside the image.
+    Differentiable with respect to `rendered`. Raises ValueError for smaller images.
+    """
+    loss: Tensor = _ImageLoss.apply(rendered, truth, instruction_set)
+    return loss
+
+
+class _ImageLoss(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, rendered: Tensor, truth: Tensor, instruction_set: str) -> Tensor:
+        x = rendered.detach().contiguous()
+        gradient = torch.empty_like(x)
+        value = _cpu.image_loss(
+            x.numpy(), truth.contiguous().numpy(), gradient.numpy(), torch.get_num_threads(), instruction_set
+        )
+        ctx.gradient = gradient
+        return x.new_tensor(value)
+
+    @staticmethod
+    @once_differentiable  # type: ignore[untyped-decorator]
+    def backward(ctx: Any, by_loss: Tensor) -> tuple[Tensor, None, None]:
+        return ctx.gradient * by_loss, None, None

@@ -1,0 +1,284 @@
+"""`ultragray train`: a dataset becomes a scene file; the run can be stopped and resumed."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from ultragray.errors import InvalidArgument, TrainingDiverged
+
+from .cli_output import check_writable
+from .cli_source import (
+    Crop,
+    DatasetArgument,
+    DeviceSet,
+    Frames,
+    ImageSize,
+    TrainFrames,
+    ValFrames,
+    read_dataset,
+)
+
+if TYPE_CHECKING:
+    from ultragray.scene import GaussianScene
+    from ultragray.training import TrainingConfig
+
+INTERRUPTED = 130  # the exit code of a run that Ctrl-C or SIGTERM stopped
+METRIC_NAMES = {"psnr_db": "PSNR, dB", "ms_ssim": "MS-SSIM", "gms": "GMS", "gmsd": "GMSD"}
+
+
+def train(
+    dataset: DatasetArgument,
+    output: Annotated[Path, typer.Option("--output", "-o", help="Scene file to write (.ugr).", show_default=False)],
+    preset: Annotated[
+        str | None,
+        typer.Option(help="fast, or paper: the released recipe.", show_default="fast"),
+    ] = None,
+    config: Annotated[
+        Path | None,
+        typer.Option(help="TOML file of settings: any field of TrainingConfig, and preset.", show_default=False),
+    ] = None,
+    setting: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="NAME=VALUE", help="Any field of TrainingConfig; repeat.", show_default=False),
+    ] = None,
+    steps: Annotated[
+        int | None, typer.Option(help="Steps of one batch; every schedule follows.", show_default="preset")
+    ] = None,
+    max_gaussians: Annotated[
+        int | None, typer.Option(help="Gaussians at the end; it starts with half of them.", show_default="preset")
+    ] = None,
+    initial_gaussians: Annotated[
+        int | None, typer.Option(help="Gaussians at the start.", show_default="preset")
+    ] = None,
+    batch_size: Annotated[int | None, typer.Option(help="Frames of one step.", show_default="8")] = None,
+    seed: Annotated[int | None, typer.Option(help="Of every random choice.", show_default="0")] = None,
+    start: Annotated[
+        str | None, typer.Option(help="informed (on pixels of the frames) or random.", show_default="preset")
+    ] = None,
+    intensity: Annotated[
+        str | None, typer.Option(help="Activation: released, or sigmoid, without its floor.", show_default="preset")
+    ] = None,
+    sh_degree: Annotated[int | None, typer.Option(help="Spherical harmonics, 0 to 3.", show_default="1")] = None,
+    out_of_plane_mm: Annotated[
+        float | None,
+        typer.Option(
+            "--out-of-plane",
+            metavar="MM",
+            help="Full range of the shift of a batch along elevation; 0: none.",
+            show_default="from the spacing of the frames",
+        ),
+    ] = None,
+    no_transmittance: Annotated[bool, typer.Option("--no-transmittance", help="Nothing absorbs: no shadows.")] = False,
+    folder: Annotated[
+        Path | None,
+        typer.Option(help="Folder of the run: checkpoint, metrics.jsonl, config.json.", show_default="OUTPUT.run"),
+    ] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint in the run's folder.")] = False,
+    checkpoint_every: Annotated[
+        float, typer.Option(metavar="SECONDS", min=0.0, help="How often a checkpoint is written.")
+    ] = 30.0,
+    tensorboard: Annotated[bool, typer.Option("--tensorboard", help="Also write TensorBoard events.")] = False,
+    device: Annotated[str, typer.Option(help="cpu, or a device of torch such as cuda.")] = "cpu",
+    backend: Annotated[str, typer.Option(help="auto, cpu or reference.")] = "auto",
+    threads: Annotated[int, typer.Option(min=0, help="Threads; 0: all cores.")] = 0,
+    train_frames: TrainFrames = None,
+    val_frames: ValFrames = None,
+    frames: Frames = None,
+    device_set: DeviceSet = None,
+    crop: Crop = None,
+    image_size: ImageSize = None,
+) -> None:
+    """Train a scene from a tracked sweep. Ctrl-C leaves a usable scene; --resume goes on."""
+    flags = {
+        "steps": steps,
+        "max_gaussians": max_gaussians,
+        "initial_gaussians": initial_gaussians,
+        "batch_size": batch_size,
+        "seed": seed,
+        "start": start,
+        "intensity": intensity,
+        "sh_degree": sh_degree,
+        "out_of_plane_mm": out_of_plane_mm,
+        "transmittance": False if no_transmittance else None,
+    }
+    given = {
+        **_from_file(config),
+        **_from_settings(setting or []),
+        **{name: value for name, value in flags.items() if value is not None},
+        **({} if preset is None else {"preset": preset}),
+    }
+    check_writable(output)
+    run = RunOptions(
+        output=output,
+        folder=folder or output.with_name(f"{output.name}.run"),
+        resume=resume,
+        checkpoint_interval_s=checkpoint_every,
+        tensorboard=tensorboard,
+        device=device,
+        backend=backend,
+    )
+    chosen = _config_of(run, given)
+    if threads:
+        import torch
+
+        torch.set_num_threads(threads)
+    _train(read_dataset(dataset, train_frames, val_frames, frames, device_set, crop, image_size), chosen, run)
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """Where and how a run takes place; none of it changes the scene on one thread."""
+
+    output: Path
+    folder: Path
+    resume: bool
+    checkpoint_interval_s: float
+    tensorboard: bool
+    device: str
+    backend: str
+
+
+def _from_file(path: Path | None) -> dict[str, Any]:
+    if path is None:
+        return {}
+    from ultragray.training.config import read_config_file
+
+    return read_config_file(path)
+
+
+def _from_settings(settings: list[str]) -> dict[str, Any]:
+    """NAME=VALUE pairs, the value as in TOML; a bare word is itself."""
+    from ultragray.training.config import parse_value
+
+    found = {}
+    for text in settings:
+        name, equals, value = text.partition("=")
+        if not equals:
+            raise InvalidArgument(f"--set takes NAME=VALUE, got {text!r}", field="set")
+        found[name.strip()] = parse_value(value.strip())
+    return found
+
+
+def _config_of(run: RunOptions, given: Mapping[str, Any]) -> TrainingConfig:
+    """The preset with what was given; of a resumed run the one it was begun with, and what was given again."""
+    from ultragray.training import TrainingConfig
+    from ultragray.training.checkpointing import read_checkpoint_header
+    from ultragray.training.trainer import CHECKPOINT_FILE
+
+    values = dict(given)
+    preset = values.pop("preset", None)
+    if run.resume and preset is None:
+        stored = read_checkpoint_header(run.folder / CHECKPOINT_FILE).config
+        return TrainingConfig.from_dict({**stored.to_dict(), **values})
+    return TrainingConfig.preset(preset or "fast", **values)
+
+
+def _train(dataset: Any, config: TrainingConfig, run: RunOptions) -> None:
+    from ultragray.training import train as train_scene
+    from ultragray.training.trainer import CHECKPOINT_FILE, scene_of_checkpoint
+
+    started = time.monotonic()
+    try:
+        with _stop_on_signal() as should_stop, _progress_bar() as report:
+            scene = train_scene(
+                dataset,
+                config,
+                folder=run.folder,
+                resume=run.resume,
+                report=report,
+                should_stop=should_stop,
+                device=run.device,
+                backend=run.backend,
+                checkpoint_interval_s=run.checkpoint_interval_s,
+                tensorboard=run.tensorboard,
+            )
+    except TrainingDiverged as error:
+        if not (run.folder / CHECKPOINT_FILE).exists():
+            raise
+        scene = scene_of_checkpoint(dataset, run.folder)
+        scene.save(run.output)
+        step = scene.info.training["step"]
+        raise TrainingDiverged(f"{error.detail}; {run.output} is the scene after step {step}") from error
+    scene.save(run.output)
+    elapsed_s = time.monotonic() - started
+    done = scene.info.training["step"]
+    if done < config.steps:
+        typer.echo(
+            f"stopped after step {done:,} of {config.steps:,}; wrote {run.output} as it is; go on with the same "
+            "command and --resume",
+            err=True,
+        )
+        raise typer.Exit(INTERRUPTED)
+    (run.folder / CHECKPOINT_FILE).unlink()
+    _print_metrics(scene)
+    typer.echo(f"wrote {run.output}: {scene.gaussian_count:,} Gaussians, {done:,} steps, {elapsed_s:.0f} s")
+
+
+@contextlib.contextmanager
+def _stop_on_signal() -> Iterator[Callable[[], bool]]:
+    """Whether SIGINT or SIGTERM came. A second one ends the process at once, as it would without this."""
+    received: list[int] = []
+    before: dict[signal.Signals, Any] = {}
+
+    def remember(number: int, frame: object) -> None:
+        received.append(number)
+        for name, handler in before.items():
+            signal.signal(name, handler)
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        before[number] = signal.signal(number, remember)
+    try:
+        yield lambda: bool(received)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def _progress_bar() -> Iterator[Callable[[Any], None]]:
+    """A bar with rate, loss and time left on a terminal's stderr; elsewhere a line for every tenth of the run."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+
+    console = Console(stderr=True)
+    columns = ("training", BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[told]}"))
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
+        task = progress.add_task("", total=None, told="")
+
+        def report(state: Any) -> None:
+            if console.is_terminal:
+                progress.update(task, completed=state.step, total=state.steps, told=_told(state))
+            elif state.step * 10 // state.steps > (state.step - 1) * 10 // state.steps:
+                sys.stderr.write(f"step {state.step:,} of {state.steps:,}: {_told(state)}\n")
+
+        yield report
+
+
+def _told(state: Any) -> str:
+    held_out = "" if state.val_psnr_db is None else f" · held out {state.val_psnr_db:.2f} dB"
+    minutes, seconds = divmod(round(state.seconds_left), 60)
+    return (
+        f"loss {state.loss:.4f} · {state.gaussian_count:,} Gaussians · {state.steps_per_s:.1f} steps/s · "
+        f"{minutes}:{seconds:02d} left{held_out}"
+    )
+
+
+def _print_metrics(scene: GaussianScene) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    metrics = scene.info.metrics
+    if not metrics:
+        return
+    table = Table("held out", *(METRIC_NAMES[name] for name in metrics))
+    table.add_row("mean", *(f"{value:.2f}" if name == "psnr_db" else f"{value:.3f}" for name, value in metrics.items()))
+    Console().print(table)

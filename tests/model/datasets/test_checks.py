@@ -1,0 +1,123 @@
+"""What a report says about a sweep, and what it warns of."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ultragray import LinearProbe
+from ultragray.datasets import Dataset, Sweep
+from ultragray.datasets.checks import check_dataset, check_sweep
+from ultragray.datasets.source import load_dataset
+
+
+def test_a_straight_sweep(make_sweep: Callable[..., Sweep]) -> None:
+    report = check_sweep(make_sweep(11, step_mm=0.5))
+    assert (report.frames, report.height, report.width) == (11, 20, 16)
+    assert report.pixel_axial_mm == pytest.approx(2.5)
+    assert report.pixel_lateral_mm == pytest.approx(2.5)
+    assert report.extent_min_mm == pytest.approx((-15, 0, 7))
+    assert report.extent_max_mm == pytest.approx((25, 5, 57))
+    assert report.path_mm == pytest.approx(5)
+    assert report.step_median_mm == report.step_max_mm == pytest.approx(0.5)
+    assert report.tilt_deg == pytest.approx(0)
+    assert report.coverage == pytest.approx(1.0)  # frames closer than the voxels of 1 mm
+    assert report.swept_ml == pytest.approx(40 * 5 * 50 / 1000)
+    assert report.warnings == ()
+
+
+def test_tilts_are_told_by_axis(make_sweep: Callable[..., Sweep]) -> None:
+    poses = np.tile(np.eye(4), (5, 1, 1))
+    for pose, degrees in zip(poses, (-20, -10, 0, 10, 15), strict=True):
+        angle = np.radians(degrees)
+        pose[1:3, 1:3] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]  # about x, the lateral axis
+    report = check_sweep(make_sweep(5, poses=poses))
+    assert report.tilt_deg == pytest.approx(35)
+    assert report.tilt_range_deg == pytest.approx((35, 0, 0), abs=1e-9)
+    assert report.step_max_deg == pytest.approx(10)
+
+
+def warnings_of(sweep: Sweep) -> str:
+    return "\n".join(check_sweep(sweep).warnings)
+
+
+def test_a_pose_off_its_neighbours_is_named(make_sweep: Callable[..., Sweep]) -> None:
+    poses = make_sweep(12).poses.copy()
+    poses[7, 0, 3] += 20.0
+    text = warnings_of(make_sweep(12, poses=poses, frame_numbers=np.arange(100, 112)))
+    assert text.startswith("frame 107 lies 20.0 mm off the frame before and 20.0 mm off the one after it")
+    assert "\n" not in text
+
+
+def test_a_gap_is_named_but_frames_that_were_left_out_are_none(make_sweep: Callable[..., Sweep]) -> None:
+    sweep = make_sweep(40)
+    assert check_sweep(sweep.select([*range(10), *range(25, 40)])).warnings == ()  # fifteen frames, fifteen millimetres
+    gap = make_sweep(25, poses=sweep.poses[[*range(10), *range(25, 40)]])
+    assert warnings_of(gap).startswith("a jump of 16.0 mm from frame 9 to 10, where 1 mm are usual")
+
+
+def test_repeats_are_named(make_sweep: Callable[..., Sweep]) -> None:
+    sweep = make_sweep(8)
+    stalled = sweep.poses.copy()
+    stalled[5] = stalled[4]
+    assert warnings_of(make_sweep(8, poses=stalled)) == (
+        "frames 4, 5 share one pose, but show different images: tracking stalled?"
+    )
+    frozen = sweep.images.copy()
+    frozen[3] = frozen[2] = frozen[1]
+    assert warnings_of(make_sweep(8, images=frozen)) == (
+        "frames 1, 2, 3 show one image at different poses: a frozen picture?"
+    )
+    assert warnings_of(sweep.select([0, 1, 2, 2, 3])) == "frames 2, 2 are the same frame: one pose, one image"
+
+
+def test_dark_and_saturated_images_are_named(make_sweep: Callable[..., Sweep]) -> None:
+    images = make_sweep(6).images.copy()
+    images[1] //= 32
+    images[4][:2] = 255
+    assert check_sweep(make_sweep(6, images=images)).warnings == (
+        "frames 1 are nearly black: no pixel reaches 16 of 255",
+        "frames 4 are saturated: over 5% of the pixels are 255",
+    )
+
+
+def test_held_out_frames_are_measured_from_the_nearest_training_frame(make_sweep: Callable[..., Sweep]) -> None:
+    sweep = make_sweep(10, notes=("something was assumed",))
+    report = check_dataset(Dataset("one", sweep.select([0, 1, 2, 3, 9]), sweep.select([3, 5, 6])))
+    assert report.val_distance_median_mm == pytest.approx(2.0)
+    assert report.val_distance_max_mm == pytest.approx(3.0)
+    assert report.val_angle_max_deg == pytest.approx(0.0)
+    assert report.warnings == (
+        "something was assumed",
+        "held-out frames 3 are also training frames: metrics will flatter",
+    )
+    document = json.loads(json.dumps(report.to_dict()))
+    assert document["probe"] == {"kind": "linear", "width_mm": 40.0, "near_mm": 0.0, "far_mm": 50.0}
+    assert document["train"]["frames"] == 5
+
+
+def test_nothing_held_out(make_sweep: Callable[..., Sweep]) -> None:
+    sweep = make_sweep(4)
+    report = check_dataset(Dataset("one", sweep, sweep.select([])))
+    assert report.val is None
+    assert report.val_distance_max_mm is None
+
+
+@pytest.mark.parametrize(
+    ("name", "frames", "tilt_deg", "warnings"),
+    [("spine_phantom", 17, 2.0, 0), ("ultranerf_liver", 180, 14.9, 1)],  # the latter is two sweeps: one jump
+)
+def test_real_sets(data_folder: Path, name: str, frames: int, tilt_deg: float, warnings: int) -> None:
+    report = check_dataset(load_dataset(data_folder / name)).train
+    assert report.frames == frames
+    assert report.tilt_deg == pytest.approx(tilt_deg, abs=0.1)
+    assert len(report.warnings) == warnings
+
+
+def test_one_frame_can_be_described(make_sweep: Callable[..., Sweep]) -> None:
+    report = check_sweep(make_sweep(1, probe=LinearProbe(40, 0, 50)))
+    assert (report.step_median_mm, report.tilt_deg) == (0.0, 0.0)

@@ -1,0 +1,78 @@
+"""Stored frames as grey uint8, crops and box resizing."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ultragray.datasets.images import CropBox, grey_frames, parse_crop, parse_image_size, resize_frames
+from ultragray.errors import DatasetInvalid, InvalidArgument
+
+
+def test_every_layout_becomes_grey() -> None:
+    grey = np.random.default_rng(0).integers(0, 256, (3, 5, 7), dtype=np.uint8)
+    for stored in (
+        grey,
+        grey[:, None],
+        grey[..., None],
+        np.repeat(grey[..., None], 3, axis=-1),
+        np.concatenate([np.repeat(grey[..., None], 3, axis=-1), np.full((3, 5, 7, 1), 9, np.uint8)], axis=-1),
+        (grey / 255.0).astype(np.float32),
+        (grey / 255.0)[:, None],
+    ):
+        np.testing.assert_array_equal(grey_frames(stored, "file"), grey)
+
+
+def test_colours_become_their_luma() -> None:
+    colours = np.zeros((3, 1, 2, 3), np.uint8)
+    for channel in range(3):
+        colours[channel, ..., channel] = 200
+    assert grey_frames(colours, "file")[:, 0, 0].tolist() == [60, 117, 23]  # .299, .587, .114 of 200
+
+
+@pytest.mark.parametrize(
+    ("frames", "message"),
+    [
+        (np.zeros((2, 3), np.uint8), r"must be \[N, H, W\].*got \[2, 3\]"),
+        (np.zeros((2, 3, 4, 5), np.uint8), r"got \[2, 3, 4, 5\]"),
+        (np.zeros((2, 0, 4), np.uint8), r"got \[2, 0, 4\]"),
+        (np.zeros((2, 3, 4), np.int16), "got int16"),
+        (np.zeros((2, 3, 4), bool), "got bool"),
+        (np.array([0.5, np.nan]).repeat(6).reshape(2, 2, 3), "frame 1 holds NaN"),
+        (np.array([np.inf, 0.5]).repeat(6).reshape(2, 2, 3), "frame 0 holds NaN or infinity"),
+        (np.array([0.5, 200.0]).repeat(6).reshape(2, 2, 3), "frame 1 must be uint8 or lie in .* from 200 to 200"),
+        (np.array([0.5, -0.1]).repeat(6).reshape(2, 2, 3), "frame 1 must be uint8 or lie in"),
+    ],
+)
+def test_other_images_are_refused(frames: np.ndarray, message: str) -> None:
+    with pytest.raises(DatasetInvalid, match=f"^file: .*{message}"):
+        grey_frames(frames, "file")
+
+
+def test_a_box_is_the_mean_of_what_it_covers() -> None:
+    image = np.zeros((1, 4, 6), np.uint8)
+    image[0, :2, 3:6] = 90
+    np.testing.assert_array_equal(resize_frames(image, 2, 2), [[[0, 90], [0, 0]]])
+    third = resize_frames(image, 4, 2)[0, 0]  # columns of 1.5 pixels: the edge at column 3 stays where it is
+    assert third.tolist() == [0, 0, 90, 90]
+
+
+def test_crops() -> None:
+    assert parse_crop(None, 616, 820) == CropBox(0, 820, 0, 616)
+    box = parse_crop("188:632, 12:600", 616, 820)
+    assert box == CropBox(188, 632, 12, 600)
+    assert (box.width, box.height) == (444, 588)
+    assert parse_crop(":10,5:", 616, 820) == CropBox(0, 10, 5, 616)
+
+
+@pytest.mark.parametrize("text", ["", "1:2", "188-632,12-600", "0:821,0:616", "0:820,0:617", "5:5,0:616", "9:3,0:616"])
+def test_crops_outside_the_image_are_refused(text: str) -> None:
+    with pytest.raises(InvalidArgument, match=r"^--crop must"):
+        parse_crop(text, 616, 820)
+
+
+def test_image_sizes() -> None:
+    assert parse_image_size("192x256") == (192, 256)
+    for text in ("192", "0x5", "5x0", "x", "99999x9", "-1x5"):
+        with pytest.raises(InvalidArgument, match=r"^--image-size must be width x height"):
+            parse_image_size(text)

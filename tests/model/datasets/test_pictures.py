@@ -1,0 +1,46 @@
+"""The picture of a dataset shows its planes and its frames."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from ultragray import ConvexProbe, LinearProbe, Probe
+from ultragray.datasets import Dataset, Sweep
+from ultragray.datasets.pictures import draw_dataset
+
+
+def pixels_of(picture: np.ndarray, colour: tuple[int, int, int]) -> int:  # RGB
+    return int((np.abs(picture.astype(int) - colour[::-1]).max(axis=-1) < 40).sum())
+
+
+@pytest.mark.parametrize(
+    "probe",
+    [LinearProbe(40, 0, 50), ConvexProbe(opening_angle_deg=60, near_mm=20, far_mm=70)],
+    ids=["linear", "convex"],
+)
+def test_both_parts_are_drawn(make_sweep: Callable[..., Sweep], tmp_path: Path, probe: Probe) -> None:
+    sweep = make_sweep(12, probe=probe)
+    blue, red = (31, 119, 180), (214, 39, 40)
+    draw_dataset(Dataset("both", sweep.select(range(8)), sweep.select(range(8, 12))), tmp_path / "both.png")
+    draw_dataset(Dataset("one", sweep, sweep.select([])), tmp_path / "one.png")
+    both, one = (cv2.imread(str(tmp_path / f"{name}.png")) for name in ("both", "one"))
+    assert both is not None
+    assert one is not None
+    assert both.shape[1] == 1400
+    assert pixels_of(both, blue) > 200
+    assert pixels_of(both, red) > 200
+    assert pixels_of(one, red) < pixels_of(both, red) / 10
+    assert np.ptp(both[-150:], axis=-1).max() < 200  # the contact sheet lies below, grey but for the titles
+    assert both[-150:].std() > 20
+
+
+def test_a_picture_that_fails_leaves_nothing(make_sweep: Callable[..., Sweep], tmp_path: Path) -> None:
+    sweep = make_sweep(3)
+    with pytest.raises(OSError, match="missing"):
+        draw_dataset(Dataset("one", sweep, sweep.select([])), tmp_path / "missing" / "one.png")
+    assert list(tmp_path.iterdir()) == []

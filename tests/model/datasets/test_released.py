@@ -1,0 +1,182 @@
+"""The released layout: whatever it may hold is read alike, what cannot be used is named, and writing gives it back."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ultragray import ConvexProbe, LinearProbe
+from ultragray.datasets import Dataset, Sweep
+from ultragray.datasets.released import read_released, write_released
+from ultragray.errors import DatasetInvalid, InvalidArgument
+
+
+@dataclass
+class Layout:
+    folder: Path
+    images: np.ndarray
+    poses: np.ndarray
+    document: dict[str, Any]
+
+    def configure(self, **changes: Any) -> None:
+        self.document |= changes
+        kept = {key: value for key, value in self.document.items() if value is not None}
+        (self.folder / "conf.json").write_text(json.dumps(kept))
+
+    def save(self, name: str, array: np.ndarray) -> None:
+        np.save(self.folder / name, array)
+
+
+@pytest.fixture
+def layout(tmp_path: Path, make_sweep: Callable[..., Sweep]) -> Layout:
+    sweep = make_sweep(6)
+    folder = tmp_path / "data" / "tiny"
+    folder.mkdir(parents=True)
+    names = [f"{kind}_{part}" for kind in ("images", "poses") for part in ("train", "val")]
+    document = {name.replace("_", "_file_"): f"data/tiny/{name}.npy" for name in names}
+    planes = {"ultrasound_near_plane": 0.5, "ultrasound_far_plane": 4.5, "ultrasound_opening_width": 3.79269}
+    made = Layout(folder, sweep.images, sweep.poses, {**document, **planes, "_note": {"a": "comment"}})
+    made.configure()
+    for part, chosen in (("train", slice(4)), ("val", slice(4, 6))):
+        made.save(f"images_{part}.npy", made.images[chosen])
+        made.save(f"poses_{part}.npy", made.poses[chosen])
+    return made
+
+
+def test_a_folder_or_its_conf_json(layout: Layout) -> None:
+    dataset = read_released(layout.folder)
+    assert dataset.name == "tiny"
+    assert dataset.probe == LinearProbe(width_mm=37.9269, near_mm=5.0, far_mm=45.0)  # in mm, and not stretched
+    np.testing.assert_array_equal(dataset.train.images, layout.images[:4])
+    np.testing.assert_array_equal(dataset.val.images, layout.images[4:])
+    np.testing.assert_array_equal(dataset.train.poses, layout.poses[:4])
+    assert dataset.train.source == str(layout.folder / "images_train.npy")
+    assert dataset.train.frame_numbers.tolist() == [0, 1, 2, 3]
+    assert read_released(layout.folder / "conf.json").sha256 == dataset.sha256
+
+
+def test_poses_may_be_json_or_three_rows_and_images_floats(layout: Layout) -> None:
+    expected = read_released(layout.folder).sha256
+    layout.save("poses_train.npy", layout.poses[:4, :3])
+    assert read_released(layout.folder).sha256 == expected
+    (layout.folder / "p.json").write_text(json.dumps(layout.poses[:4].tolist()))
+    layout.configure(poses_file_train="data/tiny/p.json")
+    assert read_released(layout.folder).sha256 == expected
+    layout.save("images_train.npy", (layout.images[:4, ..., None].repeat(3, axis=-1) / 255.0).astype(np.float32))
+    assert read_released(layout.folder).sha256 == expected
+
+
+def test_nothing_needs_to_be_held_out(layout: Layout) -> None:
+    layout.configure(images_file_val=None, poses_file_val=None)
+    dataset = read_released(layout.folder)
+    assert (len(dataset.train), len(dataset.val)) == (4, 0)
+
+
+def test_a_convex_probe(layout: Layout) -> None:
+    layout.configure(ultrasound_opening_width=None, ultrasound_opening_angle=60.56)
+    assert read_released(layout.folder).probe == ConvexProbe(opening_angle_deg=60.56, near_mm=5.0, far_mm=45.0)
+
+
+def test_a_copied_folder_reads_its_own_files(layout: Layout) -> None:
+    copy = layout.folder.parent / "copy"
+    copy.mkdir()
+    for path in layout.folder.iterdir():
+        (copy / path.name).write_bytes(path.read_bytes())
+    np.save(copy / "images_train.npy", 255 - layout.images[:4])
+    np.testing.assert_array_equal(read_released(copy).train.images, 255 - layout.images[:4])
+
+
+def nan_pose(layout: Layout) -> None:
+    layout.poses[2, 0, 3] = np.nan
+    layout.save("poses_train.npy", layout.poses[:4])
+
+
+def mirrored_pose(layout: Layout) -> None:
+    layout.poses[3, 0, 0] = -1.0
+    layout.save("poses_train.npy", layout.poses[:4])
+
+
+def constant_image(layout: Layout) -> None:
+    layout.images[1] = 7
+    layout.save("images_train.npy", layout.images[:4])
+
+
+def nan_image(layout: Layout) -> None:
+    floats = layout.images[:4] / 255.0
+    floats[3, 2, 1] = np.nan
+    layout.save("images_train.npy", floats)
+
+
+def truncated_images(layout: Layout) -> None:
+    path = layout.folder / "images_train.npy"
+    path.write_bytes(path.read_bytes()[:-100])
+
+
+def truncated_poses(layout: Layout) -> None:
+    path = layout.folder / "poses_val.npy"
+    path.write_bytes(path.read_bytes()[:-1])
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (nan_pose, r"images_train\.npy: frame 2: its pose must be finite"),
+        (mirrored_pose, r"images_train\.npy: frame 3: its pose must .*mirrored"),
+        (constant_image, r"images_train\.npy: frame 1 is constant: every pixel is 7"),
+        (nan_image, r"images_train\.npy: frame 3 holds NaN"),
+        (truncated_images, r"images_train\.npy: not an array of images that can be read"),
+        (truncated_poses, r"poses_val\.npy: not a file of poses that can be read"),
+        (lambda it: it.save("images_train.npy", it.images[0]), r"images_train\.npy: images must have shape"),
+        (lambda it: it.save("images_val.npy", it.images[0]), r"images_val\.npy: images must be \[N, H, W\]"),
+        (
+            lambda it: it.save("poses_train.npy", it.poses[:4, :2]),
+            r"poses_train\.npy: poses must be .*\[4, 2, 4\]",
+        ),
+        (lambda it: it.save("poses_train.npy", it.poses[:3]), r"images_train\.npy holds 4 images, but .* 3 poses"),
+        (lambda it: it.save("images_val.npy", it.images[4:, :9]), r"training frames are \[20, 16\].*\[9, 16\]"),
+        (
+            lambda it: [it.save("images_train.npy", it.images[:1]), it.save("poses_train.npy", it.poses[:1])],
+            r"images_train\.npy: a scene needs at least two training frames, got 1",
+        ),
+        (lambda it: (it.folder / "poses_val.npy").unlink(), r"conf\.json: poses_file_val names .*not found"),
+        (lambda it: (it.folder / "images_train.npy").unlink(), r"conf\.json: images_file_train names .*not found"),
+        (lambda it: it.configure(poses_file_val=None), r"conf\.json: it lacks poses_file_val"),
+        (lambda it: it.configure(poses_file_train=None), r"conf\.json: it lacks poses_file_train"),
+        (lambda it: it.configure(poses_file_val=3), r"conf\.json: poses_file_val must be a path"),
+        (lambda it: it.configure(ultrasound_far_plane=0.1), r"conf\.json: far_mm must be greater"),
+        (lambda it: (it.folder / "conf.json").write_text("{"), r"conf\.json: not JSON"),
+        (lambda it: (it.folder / "conf.json").unlink(), r"conf\.json: no such file"),
+    ],
+)
+def test_bad_data_is_one_clear_error(layout: Layout, spoil: Callable[[Layout], Any], message: str) -> None:
+    spoil(layout)
+    with pytest.raises(DatasetInvalid, match=message):
+        read_released(layout.folder)
+
+
+@pytest.mark.parametrize("val_count", [0, 2])
+@pytest.mark.parametrize("probe", [LinearProbe(37.926892386, 0.1, 46.454218238), ConvexProbe(60.56, 1 / 8, 60)])
+def test_what_is_written_is_read_back(
+    tmp_path: Path, make_sweep: Callable[..., Sweep], random_poses: Callable[..., Any], probe: Any, val_count: int
+) -> None:
+    sweep = make_sweep(7, poses=random_poses(7, tilt_deg=170.0), probe=probe)
+    dataset = Dataset("other", sweep, sweep.select(range(val_count)))
+    write_released(dataset, tmp_path / "made" / "here")
+    read = read_released(tmp_path / "made" / "here")
+    assert read.sha256 == dataset.sha256
+    assert read.name == "here"
+    assert len(read.val) == val_count
+
+
+def test_a_dataset_is_not_overwritten(layout: Layout) -> None:
+    dataset = read_released(layout.folder)
+    before = {path.name: path.read_bytes() for path in layout.folder.iterdir()}
+    with pytest.raises(InvalidArgument, match="already holds a dataset"):
+        write_released(dataset, layout.folder)
+    assert {path.name: path.read_bytes() for path in layout.folder.iterdir()} == before

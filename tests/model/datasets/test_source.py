@@ -1,0 +1,72 @@
+"""Every kind of source behind one call."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from ultragray.datasets import Dataset, Sweep, phantom
+from ultragray.datasets.released import write_released
+from ultragray.datasets.source import SourceOptions, load_dataset
+from ultragray.errors import DatasetInvalid, InvalidArgument
+
+
+@pytest.fixture
+def folder(tmp_path: Path, make_sweep: Callable[..., Sweep]) -> Path:
+    sweep = make_sweep(10)
+    write_released(Dataset("made", sweep.select(range(8)), sweep.select([8, 9])), tmp_path / "tiny")
+    return tmp_path / "tiny"
+
+
+def test_the_released_layout(folder: Path) -> None:
+    dataset = load_dataset(folder)
+    assert (dataset.name, len(dataset.train), len(dataset.val)) == ("tiny", 8, 2)
+    assert load_dataset(str(folder / "conf.json")).sha256 == dataset.sha256
+    split = load_dataset(folder, SourceOptions(train_frames="0:4", val_frames="4:8", image_size="8x10"))
+    assert (len(split.train), len(split.val)) == (4, 4)
+    assert split.train.images.shape == (4, 10, 8)
+    assert split.val.frame_numbers.tolist() == [4, 5, 6, 7]
+    assert split.probe == dataset.probe
+
+
+def test_a_sequence(tmp_path: Path, plus_files: SimpleNamespace, device_set: Path) -> None:
+    stored = plus_files.speckle(12, 30, 20)
+    path = plus_files.write_mha(tmp_path / "name.igs.mha", stored, plus_files.tracked_fields(12))
+    dataset = load_dataset(path, SourceOptions(device_set=device_set, crop="0:20,10:30", image_size="10x20"))
+    assert dataset.name == "name"
+    assert dataset.val.frame_numbers.tolist() == [2, 7]
+    assert dataset.train.images.shape == (10, 20, 10)
+    expected = stored[0, 10:30].reshape(20, 10, 2).mean(axis=-1)
+    assert np.abs(dataset.train.images[0] - expected).max() <= 0.5
+    chosen = load_dataset(path, SourceOptions(device_set=device_set, frames="2:8", train_frames="0:6"))
+    assert chosen.train.frame_numbers.tolist() == [2, 3, 4, 5]
+    assert chosen.val.frame_numbers.tolist() == [6, 7]
+
+
+def test_the_word_phantom(monkeypatch: pytest.MonkeyPatch, make_sweep: Callable[..., Sweep]) -> None:
+    made = Dataset("phantom", make_sweep(6), make_sweep(2))
+    monkeypatch.setattr(phantom, "load_phantom", lambda: made)
+    assert load_dataset("phantom").sha256 == made.sha256
+    assert len(load_dataset("phantom", SourceOptions(train_frames="0:3")).train) == 3
+
+
+def test_sources_that_are_none_are_refused(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(DatasetInvalid, match="nowhere: no such file or folder"):
+        load_dataset(tmp_path / "nowhere")
+    with pytest.raises(DatasetInvalid, match=r"missing/conf\.json: no such file|missing: no such"):
+        load_dataset(tmp_path / "missing")
+    with pytest.raises(DatasetInvalid, match=r"a\.txt: a dataset is a folder with conf\.json"):
+        (tmp_path / "a.txt").write_text("")
+        load_dataset(tmp_path / "a.txt")
+    for options in (SourceOptions(crop="0:1,0:1"), SourceOptions(frames="0"), SourceOptions(device_set=folder)):
+        with pytest.raises(InvalidArgument, match="is for PLUS sequences, tiny is none"):
+            load_dataset(folder, options)
+
+
+def test_one_training_frame_is_not_enough(folder: Path) -> None:
+    with pytest.raises(DatasetInvalid, match="at least two training frames, got 1"):
+        load_dataset(folder, SourceOptions(train_frames="3"))

@@ -1,0 +1,57 @@
+"""Checkpoint files: whole, checked, and of one run only."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from ultragray.errors import TrainingStateInvalid
+from ultragray.training import TrainingConfig
+from ultragray.training.checkpointing import (
+    METADATA_KEY,
+    CheckpointHeader,
+    check_same_run,
+    read_checkpoint,
+    read_checkpoint_header,
+    write_checkpoint,
+)
+
+HEADER = CheckpointHeader(step=7, elapsed_s=1.5, dataset_sha256="ab" * 32, config=TrainingConfig(steps=9))
+
+
+def test_round_trip(tmp_path: Path) -> None:
+    tensors = {"a": torch.randn(3, 2), "b": torch.arange(4)}
+    write_checkpoint(tmp_path / "c", HEADER, tensors)
+    header, found = read_checkpoint(tmp_path / "c")
+    assert header == HEADER == read_checkpoint_header(tmp_path / "c")
+    assert all(torch.equal(found[name], tensor) for name, tensor in tensors.items())
+    assert [path.name for path in tmp_path.iterdir()] == ["c"]
+
+
+def test_refuses_what_is_no_checkpoint(tmp_path: Path) -> None:
+    path = tmp_path / "c"
+    with pytest.raises(TrainingStateInvalid, match="no such file: there is nothing to resume"):
+        read_checkpoint(path)
+    save_file({"a": torch.ones(1)}, path)
+    with pytest.raises(TrainingStateInvalid, match="c: not a checkpoint of a training"):
+        read_checkpoint(path)
+    save_file({"a": torch.ones(1)}, path, metadata={METADATA_KEY: '{"format_version": 99}'})
+    with pytest.raises(TrainingStateInvalid, match="its format_version is 99, this release reads 1"):
+        read_checkpoint(path)
+    write_checkpoint(path, HEADER, {"a": torch.ones(100)})
+    path.write_bytes(path.read_bytes()[:-7])
+    with pytest.raises(TrainingStateInvalid, match="not a checkpoint that can be read"):
+        read_checkpoint(path)
+
+
+def test_refuses_another_run() -> None:
+    path = Path("c")
+    check_same_run(path, HEADER, replace(HEADER.config, memory_gb=3.0), HEADER.dataset_sha256)
+    with pytest.raises(TrainingStateInvalid, match="it belongs to another dataset"):
+        check_same_run(path, HEADER, HEADER.config, "cd" * 32)
+    with pytest.raises(TrainingStateInvalid, match="other settings: steps is 9 there, 10 here"):
+        check_same_run(path, HEADER, replace(HEADER.config, steps=10), HEADER.dataset_sha256)

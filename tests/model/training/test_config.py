@@ -1,0 +1,73 @@
+"""TrainingConfig: presets, overrides, and one sentence for what cannot be."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ultragray.errors import InvalidArgument
+from ultragray.training.config import TrainingConfig, parse_value, read_config_file
+
+
+def test_presets() -> None:
+    paper = TrainingConfig.preset("paper")
+    assert (paper.steps, paper.max_gaussians, paper.initial_gaussians) == (30_000, 500_000, 500_000)
+    assert (paper.intensity, paper.start, paper.transmittance_rate) == ("released", "random", 5e-4)
+    assert TrainingConfig.preset("fast") == TrainingConfig()
+    with pytest.raises(InvalidArgument, match="preset must be one of fast, paper, got 'slow'"):
+        TrainingConfig.preset("slow")
+
+
+def test_half_of_the_gaussians_start_where_only_the_end_is_given() -> None:
+    assert TrainingConfig.preset("paper", max_gaussians=60_000).initial_gaussians == 30_000
+    assert TrainingConfig.preset("paper", max_gaussians=60_000, initial_gaussians=7).initial_gaussians == 7
+
+
+def test_survives_json() -> None:
+    config = TrainingConfig.preset("paper", steps=7, out_of_plane_mm=0)
+    assert TrainingConfig.from_dict(json.loads(json.dumps(config.to_dict()))) == config
+
+
+@pytest.mark.parametrize(
+    ("settings", "sentence"),
+    [
+        ({"stepz": 3}, "a training has no setting stepz"),
+        ({"steps": 0}, "steps must be between 1 and 1e+07, got 0"),
+        ({"steps": 2.5}, "steps must be an integer, got 2.5"),
+        ({"steps": True}, "steps must be an integer, got True"),
+        ({"steps": None}, "steps must be an integer, got None"),
+        ({"means_rate": float("nan")}, "means_rate must be a finite number, got nan"),
+        ({"out_of_plane_mm": "wide"}, "out_of_plane_mm must be a finite number or none, got 'wide'"),
+        ({"transmittance": 0}, "transmittance must be true or false, got 0"),
+        ({"intensity": "linear"}, "intensity must be one of released, sigmoid, got 'linear'"),
+        ({"start": "warm"}, "start must be one of informed, random, got 'warm'"),
+        ({"max_gaussians": 5, "initial_gaussians": 6}, "initial_gaussians must be at most max_gaussians (5), got 6"),
+        ({"max_gaussians": "many"}, "initial_gaussians must be an integer, got 'many'"),
+        ({"sh_degree": 4}, "sh_degree must be between 0 and 3, got 4"),
+    ],
+)
+def test_refuses(settings: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(InvalidArgument) as caught:
+        TrainingConfig.preset("fast", **settings)
+    assert caught.value.detail == sentence
+    assert caught.value.field in sentence
+
+
+def test_file(tmp_path: Path) -> None:
+    path = tmp_path / "run.toml"
+    path.write_text('preset = "paper"\nsteps = 100\nmeans_rate = 1e-4\n')
+    assert read_config_file(path) == {"preset": "paper", "steps": 100, "means_rate": 1e-4}
+    path.write_text("steps = = 1")
+    with pytest.raises(InvalidArgument, match=r"run\.toml: not a TOML file: "):
+        read_config_file(path)
+    path.write_text("[rates]\nmeans = 1")
+    with pytest.raises(InvalidArgument, match=r"run\.toml: settings stand by themselves, not in a table \[rates\]"):
+        read_config_file(path)
+
+
+def test_values() -> None:
+    values = [parse_value(text) for text in ("3", "1e-4", "true", "random", '"random"', "")]
+    assert values == [3, 1e-4, True, "random", "random", ""]

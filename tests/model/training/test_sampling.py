@@ -1,0 +1,42 @@
+"""Batches go round the frames; poses are shifted along their own elevation."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+
+from ultragray.probe import FloatArray
+from ultragray.training.sampling import BatchSampler, out_of_plane_shift_mm, shift_out_of_plane
+
+
+def test_every_frame_is_seen_equally_often() -> None:
+    sampler = BatchSampler(10, 4, torch.Generator().manual_seed(0))
+    batches = [sampler.next_batch() for _ in range(5)]
+    assert [len(batch) for batch in batches] == [4] * 5
+    assert Counter(torch.cat(batches).tolist()) == dict.fromkeys(range(10), 2)
+    assert torch.cat(batches[:2]).tolist() != sorted(torch.cat(batches[:2]).tolist())
+
+
+def test_batch_holds_each_frame_once_at_most() -> None:
+    assert sorted(BatchSampler(3, 8, torch.Generator()).next_batch().tolist()) == [0, 1, 2]
+
+
+def test_shifts_follow_the_squared_cosine() -> None:
+    generator = torch.Generator().manual_seed(0)
+    shifts = np.array([out_of_plane_shift_mm(2.0, generator) for _ in range(4000)])
+    assert np.abs(shifts).max() <= 1.0
+    assert abs(shifts.mean()) < 0.03
+    # The density 2·cos²(πx) on [−½, ½] has the variance 1/12 − 1/(2π²); the full range is 2 mm.
+    assert shifts.std() == pytest.approx(2.0 * (1 / 12 - 1 / (2 * np.pi**2)) ** 0.5, rel=0.05)
+
+
+def test_shift_is_along_elevation(random_poses: Callable[..., FloatArray]) -> None:
+    poses = random_poses(4)
+    shifted = shift_out_of_plane(poses, 1.5)
+    in_probe = np.einsum("cji,cj->ci", poses[:, :3, :3], shifted[:, :3, 3] - poses[:, :3, 3])
+    assert np.allclose(in_probe, (0.0, 1.5, 0.0))
+    assert np.array_equal(shifted[:, :3, :3], poses[:, :3, :3])

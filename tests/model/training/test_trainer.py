@@ -1,0 +1,195 @@
+"""train(): it learns, it repeats itself bit for bit, and nothing that stops it loses the work."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from ultragray import GaussianScene
+from ultragray.datasets.sweep import Dataset
+from ultragray.errors import BackendUnavailable, DatasetInvalid, TrainingDiverged, TrainingStateInvalid
+from ultragray.training import Progress, TrainingConfig, train, trainer
+from ultragray.training.geometry import Geometry
+
+Datasets = Callable[..., Dataset]
+Configs = Callable[..., TrainingConfig]
+
+
+def learned(dataset: Dataset, config: TrainingConfig, **options: Any) -> tuple[GaussianScene, list[Progress]]:
+    seen: list[Progress] = []
+    return train(dataset, config, report=seen.append, **options), seen
+
+
+@pytest.mark.parametrize("intensity", ["released", "sigmoid"])
+def test_learns(tiny_dataset: Datasets, tiny_config: Configs, intensity: str) -> None:
+    _, seen = learned(tiny_dataset(), tiny_config(intensity=intensity, steps=60, refinements=0))
+    first, last = (sum(progress.loss for progress in some) for some in (seen[:8], seen[-8:]))
+    assert last < 0.8 * first
+
+
+def test_reports_every_step(tiny_dataset: Datasets, tiny_config: Configs) -> None:
+    scene, seen = learned(tiny_dataset(), tiny_config())
+    assert [progress.step for progress in seen] == list(range(1, 25))
+    assert {progress.steps for progress in seen} == {24}
+    assert seen[-1].seconds_left == 0
+    assert seen[-1].val_psnr_db == pytest.approx(scene.info.metrics["psnr_db"], abs=1e-4)
+    assert [progress.gaussian_count for progress in seen[::4]] == [30, 40, 50, 50, 60, 60]
+    assert scene.gaussian_count == 60
+
+
+def test_scene_says_what_it_is(tiny_dataset: Datasets, tiny_config: Configs, tmp_path: Path) -> None:
+    dataset, config = tiny_dataset(), tiny_config()
+    scene, _ = learned(dataset, config)
+    scene.save(tmp_path / "scene.ugr")
+    info = GaussianScene.load(tmp_path / "scene.ugr").info
+    assert info.probe == dataset.probe
+    assert (info.image_height, info.image_width) == (20, 16)
+    assert info.centre_mm == pytest.approx(Geometry.of(dataset).centre_mm.tolist())
+    assert (info.dataset_name, info.dataset_sha256) == ("tiny", dataset.sha256)
+    assert (info.intensity, info.sh_degree) == ("sigmoid", 1)
+    assert info.training == {**config.to_dict(), "step": 24}
+    assert set(info.metrics) == {"psnr_db", "ms_ssim", "gms", "gmsd"}
+    assert np.array_equal(scene.training_poses, dataset.train.poses)
+
+
+def test_same_seed_same_scene(tiny_dataset: Datasets, tiny_config: Configs) -> None:
+    first, second, other = (train(tiny_dataset(), tiny_config(seed=seed)).to_bytes() for seed in (1, 1, 2))
+    assert first == second
+    assert first != other
+
+
+def test_resumed_run_ends_in_the_same_scene(tiny_dataset: Datasets, tiny_config: Configs, tmp_path: Path) -> None:
+    """Stopped at every third step, which is before, at and after refinements and rounds of frames."""
+    dataset, config = tiny_dataset(), tiny_config(steps=12)
+    expected = train(dataset, config)
+    count = 0
+
+    def every_third() -> bool:
+        nonlocal count
+        count += 1
+        return count % 3 == 0
+
+    scene = train(dataset, config, folder=tmp_path, should_stop=every_third)
+    assert scene.info.training["step"] == 3
+    while scene.info.training["step"] < 12:
+        scene = train(dataset, config, folder=tmp_path, resume=True, should_stop=every_third)
+    assert scene.to_bytes() == expected.to_bytes()
+    lines = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
+    assert [line["step"] for line in lines] == list(range(1, 13))
+    assert json.loads((tmp_path / "config.json").read_text()) == config.to_dict()
+
+
+PROGRAM = """
+import sys; sys.path[:0] = {path!r}
+import importlib.util, pathlib, torch
+spec = importlib.util.spec_from_file_location("tiny", {conftest!r})
+tiny = importlib.util.module_from_spec(spec); spec.loader.exec_module(tiny)
+from ultragray.training import train
+torch.set_num_threads(1)
+train(tiny.make_tiny_dataset(), tiny.make_tiny_config(), folder=pathlib.Path({folder!r}), checkpoint_interval_s=0.0)
+"""
+
+
+def test_killed_run_that_is_resumed_ends_in_the_same_scene(
+    tiny_dataset: Datasets, tiny_config: Configs, tmp_path: Path
+) -> None:
+    conftest = str(Path(__file__).with_name("conftest.py"))
+    program = PROGRAM.format(path=sys.path, conftest=conftest, folder=str(tmp_path))
+    process = subprocess.Popen([sys.executable, "-c", program], env={**os.environ, "OMP_NUM_THREADS": "1"})
+    journal, lines_before = tmp_path / "metrics.jsonl", random.randint(2, 18)
+    try:
+        deadline = time.monotonic() + 60
+        while not journal.exists() or journal.read_bytes().count(b"\n") < lines_before:
+            assert process.poll() is None, "the training ended before it could be killed"
+            assert time.monotonic() < deadline
+            time.sleep(0.002)
+    finally:
+        process.kill()
+    assert process.wait() == -signal.SIGKILL
+    seen: list[Progress] = []
+    scene = train(tiny_dataset(), tiny_config(), folder=tmp_path, resume=True, report=seen.append)
+    assert seen[0].step >= lines_before  # it went on rather than began again
+    assert scene.to_bytes() == train(tiny_dataset(), tiny_config()).to_bytes()
+    lines = [json.loads(line)["step"] for line in journal.read_text().splitlines()]
+    assert lines == list(range(1, 25))
+
+
+def test_folder_of_another_run_is_refused(tiny_dataset: Datasets, tiny_config: Configs, tmp_path: Path) -> None:
+    dataset, config = tiny_dataset(), tiny_config()
+    with pytest.raises(TrainingStateInvalid, match="no such file: there is nothing to resume"):
+        train(dataset, config, folder=tmp_path, resume=True)
+    train(dataset, config, folder=tmp_path, should_stop=lambda: True)
+    with pytest.raises(TrainingStateInvalid, match="there is an unfinished run: resume it, or remove"):
+        train(dataset, config, folder=tmp_path)
+    with pytest.raises(TrainingStateInvalid, match="seed is 0 there, 5 here"):
+        train(dataset, replace(config, seed=5), folder=tmp_path, resume=True)
+    with pytest.raises(TrainingStateInvalid, match="another dataset"):
+        train(tiny_dataset(spacing_mm=0.9), config, folder=tmp_path, resume=True)
+
+
+def test_divergence_keeps_the_last_good_checkpoint(
+    tiny_dataset: Datasets, tiny_config: Configs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    true_loss, calls = trainer.image_loss, 0
+
+    def loss_that_breaks(rendered: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
+        nonlocal calls
+        calls += 1
+        return true_loss(rendered, truth) * (float("nan") if calls == 6 else 1.0)
+
+    monkeypatch.setattr(trainer, "image_loss", loss_that_breaks)
+    with pytest.raises(TrainingDiverged, match="in step 6: the loss is nan; the last good checkpoint is kept"):
+        train(tiny_dataset(), tiny_config(), folder=tmp_path, checkpoint_interval_s=0.0)
+    scene = trainer.scene_of_checkpoint(tiny_dataset(), tmp_path)
+    assert scene.info.training["step"] == 5
+
+
+def test_parameters_that_are_not_finite_never_reach_a_checkpoint(
+    tiny_dataset: Datasets, tiny_config: Configs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def spoil(sh0: torch.Tensor, intensity: str) -> None:
+        sh0[3] = float("inf")
+
+    monkeypatch.setattr(trainer, "project_sh0", spoil)
+    with pytest.raises(TrainingDiverged, match="sh0 are no longer finite"):
+        train(tiny_dataset(), tiny_config(), folder=tmp_path, checkpoint_interval_s=0.0)
+    assert not (tmp_path / "checkpoint.safetensors").exists()
+
+
+def test_without_transmittance_nothing_absorbs(tiny_dataset: Datasets, tiny_config: Configs) -> None:
+    scene, _ = learned(tiny_dataset(), tiny_config(transmittance=False))
+    assert bool((torch.sigmoid(scene.transmittances) == 1.0).all())
+
+
+def test_harmonics_are_learned_once_they_join(tiny_dataset: Datasets, tiny_config: Configs) -> None:
+    late = train(tiny_dataset(), tiny_config(sh_start=1.0))
+    assert bool((late.shN == 0).all())
+    assert bool((train(tiny_dataset(), tiny_config()).shN != 0).any())
+    assert train(tiny_dataset(), tiny_config(sh_degree=0)).sh_degree == 0
+
+
+def test_released_intensities_stay_where_they_have_a_gradient(tiny_dataset: Datasets, tiny_config: Configs) -> None:
+    scene = train(tiny_dataset(), tiny_config(intensity="released", sh0_rate=0.5))
+    value = 0.28209479 * scene.sh0 + 1.0
+    assert 0.5 < float(value.min()) < 0.51
+    assert float(value.max()) < 0.999
+
+
+def test_refuses_what_cannot_be_trained(tiny_dataset: Datasets, tiny_config: Configs) -> None:
+    with pytest.raises(DatasetInvalid, match="images must have at least 11 rows and columns, got 10x16"):
+        train(tiny_dataset(height=10), tiny_config())
+    with pytest.raises(BackendUnavailable, match="device 'warp' cannot be used here"):
+        train(tiny_dataset(), tiny_config(), device="warp")

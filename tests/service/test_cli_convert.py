@@ -1,0 +1,89 @@
+"""`ultragray export` and `ultragray import-ply`: files of other programs, and back."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from ultragray import GaussianScene, LinearProbe
+from ultragray_service.cli import app
+
+
+def run(*arguments: object) -> Result:
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+def refused(*arguments: object) -> str:
+    result = run(*arguments)
+    assert result.exit_code == 2, result.output
+    assert result.stderr.startswith("error: ")
+    assert result.stderr.count("\n") == 1
+    return result.stderr
+
+
+@pytest.fixture
+def make_file(tmp_path: Path, random_scene: Callable[..., GaussianScene], random_poses: Callable[..., Any]) -> Any:
+    def make(**options: Any) -> Path:
+        info = {"probe": LinearProbe(30.0, 0.0, 40.0), "image_height": 24, "image_width": 20}
+        made = random_scene(60, info=info, **options)
+        path = tmp_path / "scene.ugr"
+        GaussianScene.from_splats(made.splats, info=made.info, training_poses=random_poses(5)).save(path)
+        return path
+
+    return make
+
+
+def test_a_ply_and_back_is_the_same_file(make_file: Callable[..., Path], tmp_path: Path) -> None:
+    scene = make_file(intensity="sigmoid")
+    result = run("export", scene, "-o", tmp_path / "a.ply")
+    assert (result.exit_code, result.stderr) == (0, "")
+    assert "60 Gaussians, 5 training poses" in result.stdout
+    assert run("import-ply", tmp_path / "a.ply", "-o", tmp_path / "b.ugr").exit_code == 0
+    assert (tmp_path / "b.ugr").read_bytes() == scene.read_bytes()
+
+
+def test_a_checkpoint_and_back_by_the_documented_commands(make_file: Callable[..., Path], tmp_path: Path) -> None:
+    folder = tmp_path / "released"
+    result = run("export", make_file(), "-o", folder / "ckpt_0.pt")
+    assert (result.exit_code, result.stderr) == (0, "")
+    assert all(str(folder / name) in result.stdout for name in ("ckpt_0.pt", "conf.json", "poses_train.npy"))
+    back = run(
+        *("import-checkpoint", folder / "ckpt_0.pt", "--config", folder / "conf.json"),
+        *("--poses", folder / "poses_train.npy", "-o", tmp_path / "back.ugr"),
+    )
+    assert back.exit_code == 0, back.output
+    assert "60 Gaussians" in back.stdout
+
+
+def test_what_the_released_format_cannot_hold_is_noted(make_file: Callable[..., Path], tmp_path: Path) -> None:
+    result = run("export", make_file(intensity="sigmoid"), "-o", tmp_path / "out" / "ckpt.pt")
+    assert result.exit_code == 0
+    assert result.stderr.startswith("note: its intensities are `sigmoid`")
+
+
+def test_mistakes_are_told_in_one_line(make_file: Callable[..., Path], tmp_path: Path) -> None:
+    scene = make_file()
+    assert "must end in .ply or .pt, got 'a.stl'" in refused("export", scene, "-o", tmp_path / "a.stl")
+    assert "does not" in refused("export", scene, "-o", tmp_path / "none" / "a.ply")
+    assert "does not" in refused("export", scene, "-o", tmp_path / "none" / "none" / "ckpt.pt")
+    assert "no such file" in refused("export", tmp_path / "none.ugr", "-o", tmp_path / "a.ply")
+    assert "no such file" in refused("import-ply", tmp_path / "none.ply", "-o", tmp_path / "b.ugr")
+    assert "does not begin like a PLY" in refused("import-ply", scene, "-o", tmp_path / "b.ugr")
+    (tmp_path / "conf.json").write_text("{}")
+    assert "folder of its own" in refused("export", scene, "-o", tmp_path / "ckpt.pt")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["conf.json", "scene.ugr"]
+
+
+def test_help_imports_nothing_heavy() -> None:
+    program = (
+        f"import sys; sys.path[:0] = {sys.path!r}; from ultragray_service import cli_convert; "
+        "print(sorted({'torch', 'numpy.testing', 'cv2', 'safetensors.torch'} & set(sys.modules)))"
+    )
+    answer = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert answer.stdout.strip() == "[]"

@@ -1,0 +1,174 @@
+"""`ultragray train`: from a folder of frames to a scene file, with every way that a run may be stopped."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from typer.testing import CliRunner, Result
+
+from ultragray import GaussianScene, LinearProbe
+from ultragray.training import TrainingConfig, trainer
+from ultragray_service.cli import app
+
+SMALL = ("--steps", 24, "--max-gaussians", 60, "--threads", 1)
+
+
+@pytest.fixture
+def dataset(tmp_path: Path) -> Path:
+    """A folder in the released layout: a ball in noise, 9 training and 2 held-out frames."""
+    folder = tmp_path / "sweep"
+    folder.mkdir()
+    rng = np.random.default_rng(0)
+    x, z = np.meshgrid(np.linspace(-1, 1, 16), np.linspace(0, 1, 20))
+    ball = 140.0 * np.exp(-(x**2 + (z - 0.4) ** 2) / 0.1) + 50.0
+    for part, count in (("train", 9), ("val", 2)):
+        poses = np.tile(np.eye(4), (count, 1, 1))
+        poses[:, 1, 3] = np.linspace(-4.0, 4.0, count) + 0.1
+        np.save(folder / f"poses_{part}.npy", poses)
+        images = np.clip(ball + rng.normal(0.0, 4.0, (count, 20, 16)), 0, 255).astype(np.uint8)
+        np.save(folder / f"images_{part}.npy", images)
+    keys = {"ultrasound_near_plane": 0.0, "ultrasound_far_plane": 2.5, "ultrasound_opening_width": 2.0}
+    files = {f"{kind}_file_{part}": f"{kind}_{part}.npy" for kind in ("images", "poses") for part in ("train", "val")}
+    (folder / "conf.json").write_text(json.dumps({**files, **keys}))
+    return folder
+
+
+def run(*arguments: object) -> Result:
+    return CliRunner().invoke(app, ["train", *map(str, arguments)])
+
+
+def refused(*arguments: object) -> str:
+    """The one line that a mistake gives."""
+    result = run(*arguments)
+    assert result.exit_code == 2, result.output
+    errors = [line for line in result.stderr.splitlines() if not line.startswith("step ")]
+    assert len(errors) == 1
+    assert errors[0].startswith("error: ")
+    return errors[0]
+
+
+def test_trains_a_scene(dataset: Path, tmp_path: Path) -> None:
+    output = tmp_path / "scene.ugr"
+    result = run(dataset, "-o", output, *SMALL)
+    assert result.exit_code == 0, result.output
+    scene = GaussianScene.load(output)
+    assert scene.gaussian_count == 60
+    assert scene.info.probe == LinearProbe(width_mm=20.0, near_mm=0.0, far_mm=25.0)
+    assert scene.info.training["step"] == 24
+    assert f"{scene.info.metrics['psnr_db']:.2f}" in result.stdout
+    assert f"wrote {output}: 60 Gaussians, 24 steps" in result.stdout
+    assert sum(line.startswith("step ") for line in result.stderr.splitlines()) == 10
+    folder = tmp_path / "scene.ugr.run"
+    assert sorted(path.name for path in folder.iterdir()) == ["config.json", "metrics.jsonl"]
+    assert len((folder / "metrics.jsonl").read_text().splitlines()) == 24
+
+
+def test_settings_come_from_file_set_and_options(dataset: Path, tmp_path: Path) -> None:
+    """What stands nearer to the command goes first: options, --set, the file, the preset."""
+    file = tmp_path / "run.toml"
+    file.write_text('preset = "paper"\nsteps = 3\nmax_gaussians = 40\nmeans_rate = 3e-4\nquats_rate = 1e-3\n')
+    settings = ("--config", file, "--set", "steps=2", "--set", "quats_rate=2e-3", "--set", "start=informed")
+    options = ("--seed", 5, "--steps", 1, "--no-transmittance", "--out-of-plane", 0, "--intensity", "sigmoid")
+    result = run(dataset, "-o", tmp_path / "scene.ugr", *settings, *options)
+    assert result.exit_code == 0, result.output
+    training = GaussianScene.load(tmp_path / "scene.ugr").info.training
+    assert training.pop("step") == 1
+    expected = TrainingConfig.preset(
+        "paper",
+        steps=1,
+        max_gaussians=40,
+        means_rate=3e-4,
+        quats_rate=2e-3,
+        start="informed",
+        seed=5,
+        transmittance=False,
+        out_of_plane_mm=0,
+        intensity="sigmoid",
+    )
+    assert TrainingConfig.from_dict(training) == expected
+    assert run(dataset, "-o", tmp_path / "b.ugr", "--config", file, "--preset", "fast").exit_code == 0
+    assert GaussianScene.load(tmp_path / "b.ugr").info.training["intensity"] == TrainingConfig().intensity
+
+
+def test_mistakes_give_one_line(dataset: Path, tmp_path: Path) -> None:
+    output = tmp_path / "scene.ugr"
+    assert "a training has no setting stepz" in refused(dataset, "-o", output, "--set", "stepz=3")
+    assert "--set takes NAME=VALUE, got 'steps'" in refused(dataset, "-o", output, "--set", "steps")
+    assert "steps must be between 1 and" in refused(dataset, "-o", output, "--steps", 0)
+    assert "no such file: there is nothing to resume" in refused(dataset, "-o", output, "--resume")
+    assert "GiB: lower max_gaussians" in refused(dataset, "-o", output, *SMALL, "--set", "memory_gb=0.01")
+    assert not output.exists()
+    assert not (tmp_path / "scene.ugr.run").exists()
+
+
+def start(*arguments: object) -> subprocess.Popen[str]:
+    program = f"import sys; sys.path[:0] = {sys.path!r}; from ultragray_service.cli import app; app()"
+    command = [sys.executable, "-c", program, "train", *map(str, arguments)]
+    return subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env={**os.environ, "OMP_NUM_THREADS": "1"})
+
+
+def wait_for_lines(path: Path, count: int, process: subprocess.Popen[str]) -> None:
+    deadline = time.monotonic() + 60
+    while not path.exists() or path.read_bytes().count(b"\n") < count:
+        assert process.poll() is None, "the training ended early"
+        assert time.monotonic() < deadline
+        time.sleep(0.002)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_stopped_run_leaves_a_scene_and_goes_on(dataset: Path, tmp_path: Path, number: signal.Signals) -> None:
+    output, small = tmp_path / "scene.ugr", ("--steps", 300, "--max-gaussians", 60, "--threads", 1)
+    process = start(dataset, "-o", output, *small)
+    wait_for_lines(tmp_path / "scene.ugr.run" / "metrics.jsonl", 5, process)
+    process.send_signal(number)
+    _, told = process.communicate(timeout=60)
+    assert process.returncode == 130
+    stopped_at = GaussianScene.load(output).info.training["step"]
+    assert 5 <= stopped_at < 300
+    assert f"stopped after step {stopped_at} of 300; wrote {output} as it is" in told
+    assert "unfinished run: resume it, or remove" in refused(dataset, "-o", output, *small)
+    assert "steps is 300 there, 50 here" in refused(dataset, "-o", output, "--resume", "--steps", 50)
+    resumed = run(dataset, "-o", output, "--resume")  # the settings are those of the run
+    assert resumed.exit_code == 0, resumed.output
+    assert run(dataset, "-o", tmp_path / "undisturbed.ugr", *small).exit_code == 0
+    assert output.read_bytes() == (tmp_path / "undisturbed.ugr").read_bytes()
+
+
+def test_divergence_leaves_the_last_good_scene(dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    true_loss, calls = trainer.image_loss, 0
+
+    def loss_that_breaks(rendered: torch.Tensor, truth: torch.Tensor) -> Any:
+        nonlocal calls
+        calls += 1
+        return true_loss(rendered, truth) * (float("nan") if calls == 6 else 1.0)
+
+    monkeypatch.setattr(trainer, "image_loss", loss_that_breaks)
+    output = tmp_path / "scene.ugr"
+    told = refused(dataset, "-o", output, *SMALL, "--checkpoint-every", 0)
+    assert "diverged in step 6: the loss is nan" in told
+    assert f"{output} is the scene after step 5" in told
+    assert GaussianScene.load(output).info.training["step"] == 5
+
+
+def test_tensorboard_that_is_missing_is_said(dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
+    told = refused(dataset, "-o", tmp_path / "scene.ugr", *SMALL, "--tensorboard")
+    assert "TensorBoard is not installed: pip install 'ultragray[tensorboard]'" in told
+
+
+def test_help_needs_no_torch() -> None:
+    program = (
+        f"import sys; sys.path[:0] = {sys.path!r}; import ultragray_service.cli; assert 'torch' not in sys.modules"
+    )
+    found = subprocess.run([sys.executable, "-c", program], check=True, capture_output=True, text=True)
+    assert found.stdout == "False\n"
