@@ -27,11 +27,15 @@ from ultragray import (
     GaussianScene,
     LinearProbe,
     SceneInfo,
+    baselines,
     checkpoint,
     checkpoint_export,
+    compounding,
     demo,
     errors,
+    evaluation,
     files,
+    metrics,
     ply,
     pose,
     pose_file,
@@ -39,6 +43,7 @@ from ultragray import (
     rendering,
     request,
     scene_info,
+    side_by_side,
 )
 from ultragray.datasets import Dataset, Sweep, checks, pictures, plus, released, source
 from ultragray.training import TrainingConfig
@@ -64,6 +69,7 @@ from ultragray_workers.types import Encoding, RenderResult
 DOCUMENT = (Path(__file__).resolve().parents[1] / "docs" / "interfaces.md").read_text(encoding="utf-8")
 PROTO_MODULES = (geometry_pb2, rendering_pb2, scenes_pb2)
 LIBRARY_MODULES = (checkpoint, checkpoint_export, demo, files, ply, pose, pose_file, probe, rendering)
+MEASURING_MODULES = (baselines, compounding, evaluation, metrics, side_by_side)
 MEMBERS_OF = (GaussianScene, LinearProbe, ConvexProbe, errors.UltragrayError)
 
 
@@ -137,7 +143,7 @@ def test_members() -> None:
 def test_other_modules() -> None:
     found = {
         f"{module.__name__}.{call_of(value)}"
-        for module in (*LIBRARY_MODULES, checks, pictures, plus, released, source)
+        for module in (*LIBRARY_MODULES, *MEASURING_MODULES, checks, pictures, plus, released, source)
         for name, value in vars(module).items()
         if inspect.isfunction(value) and value.__module__ == module.__name__
         if not name.startswith("_") and name not in ultragray.__all__

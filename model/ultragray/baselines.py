@@ -8,14 +8,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
 
 from .compounding import METHODS as VOLUME_METHODS
 from .compounding import VOXEL_MM, compound, pixel_positions_mm
-from .datasets.sweep import IntArray, Sweep
+from .datasets.sweep import Dataset, IntArray, Sweep
 from .errors import InvalidArgument
+from .evaluation import Evaluation, evaluate_frames, require_frames
 from .pose import check_poses
 from .probe import ConvexProbe, FloatArray
 
@@ -37,6 +39,17 @@ def predict(sweep: Sweep, poses: FloatArray, method: str, *, voxel_mm: float = V
     return compound(sweep, method, voxel_mm).reslice(sweep.probe, poses, sweep.height, sweep.width)
 
 
+def evaluate_baselines(
+    dataset: Dataset, methods: Sequence[str] = BASELINES, voxel_mm: float = VOXEL_MM
+) -> dict[str, Evaluation]:
+    """What each method reaches on the held-out frames. Raises DatasetInvalid where there are none."""
+    require_frames(dataset.val)
+    return {
+        method: evaluate_frames(predict(dataset.train, dataset.val.poses, method, voxel_mm=voxel_mm), dataset.val)
+        for method in methods
+    }
+
+
 def corner_distances_mm(sweep: Sweep, poses: FloatArray) -> FloatArray:  # [C, F]
     """Mean distance between the corners of the image planes at poses [C, 4, 4] and those of the sweep's frames, mm."""
     corners = sweep.probe.corners_mm()
@@ -47,7 +60,8 @@ def corner_distances_mm(sweep: Sweep, poses: FloatArray) -> FloatArray:  # [C, F
 
 def nearest_frames(sweep: Sweep, poses: FloatArray) -> IntArray:  # [C]
     """The place of the sweep's nearest frame for each pose, by `corner_distances_mm`."""
-    return corner_distances_mm(sweep, poses).argmin(axis=1)
+    nearest: IntArray = corner_distances_mm(sweep, poses).argmin(axis=1)
+    return nearest
 
 
 def interpolate_planes(sweep: Sweep, poses: FloatArray) -> FrameArray:  # [C, H, W] in [0, 1]
@@ -87,7 +101,7 @@ def _between(sweep: Sweep, points: FloatArray, frames: IntArray) -> FloatArray: 
 
 
 def _sample(sweep: Sweep, frame: int, local: FloatArray) -> tuple[npt.NDArray[np.bool_], FloatArray]:  # [P, 3] mm
-    """Which points, in the probe frame and projected onto y = 0, fall into the image; their bilinear values in [0, 1]."""
+    """Which points (probe frame) fall into the image when projected onto y = 0; their bilinear values in [0, 1]."""
     probe, height, width = sweep.probe, sweep.height, sweep.width
     if isinstance(probe, ConvexProbe):
         depth = np.hypot(local[:, 0], local[:, 2])

@@ -1,9 +1,9 @@
 """Compounding: the classical way from a tracked sweep to a volume, and from the volume to any plane.
 
-Every pixel of every frame goes to its nearest voxel of an isotropic grid, which keeps the median, mean or maximum of what it
-received. Empty voxels in the gaps between frames are filled from their neighbours, layer by layer; what lies farther from
-every frame than half such a gap stays unknown. A plane is read by trilinear interpolation between the known voxels and is 0 where
-none is near.
+Every pixel of every frame goes to its nearest voxel of an isotropic grid, which keeps the median, mean or maximum of
+what it received. Empty voxels in the gaps between frames are filled from their neighbours, layer by layer; what lies
+farther from every frame than half such a gap, or 3 mm, stays unknown. A plane is read by trilinear interpolation
+between the known voxels and is 0 where none is near.
 """
 
 from __future__ import annotations
@@ -29,14 +29,15 @@ VOXEL_MM = 0.5
 MAX_VOXELS = 1 << 26
 MAX_SAMPLES = 1 << 24  # sorted at once
 NEIGHBOUR_WEIGHT = 0.25  # of a voxel that shares an edge, against one that shares a face; squared: only a corner
+LEAST_REACH_MM = 3.0  # empty voxels are filled at least this far from a frame
 TYPICAL_GAP = 0.95  # quantile: a jump of the tracker is no gap to fill
-MAX_LAYERS = 16
+MAX_LAYERS = 24
 SLAB_VOXELS = 1 << 18  # filled at once: they stay in the cache
 
 
 @dataclass(frozen=True, eq=False)
 class Volume:
-    """A grid of voxels. Voxel (x, y, z) has its centre at `origin_mm + axes @ (x, y, z) · voxel_mm` in the tracker's frame."""
+    """A grid: voxel (x, y, z) has its centre at `origin_mm + axes @ (x, y, z) · voxel_mm` in the tracker's frame."""
 
     values: Tensor  # [X, Y, Z] float32 in [0, 1], 0 where unknown
     known: Tensor  # [X, Y, Z] float32, 1 or 0
@@ -71,10 +72,17 @@ def compound(sweep: Sweep, method: str = "median", voxel_mm: float = VOXEL_MM) -
         raise InvalidArgument(f"method must be one of {', '.join(METHODS)}, got {method!r}", field="method")
     if not (math.isfinite(voxel_mm) and voxel_mm > 0):
         raise InvalidArgument(f"voxel_mm must be a positive length in mm, got {voxel_mm!r}", field="voxel_mm")
-    left, _, right = np.linalg.svd(sweep.poses[:, :3, :3].mean(axis=0))
-    axes = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right  # along the mean frame: the tightest box
-    points = pixel_positions_mm(sweep.probe, sweep.height, sweep.width)
-    origin_mm, counts = _grid(sweep, axes, points, voxel_mm)
+    axes = mean_axes(sweep.poses)  # the tightest box
+    low, high = _extent_mm(sweep, axes)
+    counts = _counts(high - low, voxel_mm)
+    if math.prod(counts) > MAX_VOXELS:
+        span = " x ".join(f"{side:.0f}" for side in high - low)
+        raise InvalidArgument(
+            f"voxel_mm must be at least {affordable_voxel_mm(sweep, voxel_mm):g} for {sweep.source}, whose frames span "
+            f"{span} mm, got {voxel_mm:g}",
+            field="voxel_mm",
+        )
+    origin_mm = axes @ low
     values = np.zeros(math.prod(counts), np.float32)
     known = np.zeros(math.prod(counts), np.float32)
     for voxels, folded in _folded(sweep, axes, origin_mm, voxel_mm, counts, method):
@@ -84,6 +92,22 @@ def compound(sweep: Sweep, method: str = "median", voxel_mm: float = VOXEL_MM) -
         torch.from_numpy(values).view(counts), torch.from_numpy(known).view(counts), _layers(sweep, voxel_mm)
     )
     return Volume(*filled, axes=axes, origin_mm=origin_mm, voxel_mm=voxel_mm)
+
+
+def affordable_voxel_mm(sweep: Sweep, wanted_mm: float = VOXEL_MM) -> float:
+    """The voxel that was wanted, or the smallest (to 0.01 mm) with which a grid around the sweep fits into memory."""
+    low, high = _extent_mm(sweep, mean_axes(sweep.poses))
+    voxel_mm = wanted_mm
+    while math.prod(_counts(high - low, voxel_mm)) > MAX_VOXELS:
+        voxel_mm = math.floor(voxel_mm * 100.0 + 1.0) / 100.0
+    return voxel_mm
+
+
+def mean_axes(poses: FloatArray) -> FloatArray:  # [F, 4, 4] -> [3, 3]
+    """The rotation nearest to the mean of the poses' rotations."""
+    left, _, right = np.linalg.svd(poses[:, :3, :3].mean(axis=0))
+    mean: FloatArray = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
+    return mean
 
 
 def pixel_positions_mm(probe: Probe, height: int, width: int) -> FloatArray:  # [H·W, 3], row by row
@@ -105,26 +129,17 @@ def _on_grid(
     return places
 
 
-def _grid(
-    sweep: Sweep, axes: FloatArray, points: FloatArray, voxel_mm: float
-) -> tuple[FloatArray, tuple[int, int, int]]:
-    """Position of the first voxel, mm, and the number of voxels along each axis."""
-    image = points.reshape(sweep.height, sweep.width, 3)
+def _extent_mm(sweep: Sweep, axes: FloatArray) -> tuple[FloatArray, FloatArray]:  # [3], [3]
+    """Least and greatest coordinate of the sweep's pixels along `axes`."""
+    image = pixel_positions_mm(sweep.probe, sweep.height, sweep.width).reshape(sweep.height, sweep.width, 3)
     edge = np.concatenate([image[[0, -1]].reshape(-1, 3), image[:, [0, -1]].reshape(-1, 3)])
-    seen = np.concatenate([_on_grid(edge, pose, axes, np.zeros(3), 1.0) for pose in sweep.poses])
-    low, high = seen.min(axis=0), seen.max(axis=0)
-    x, y, z = (int(count) for count in np.ceil((high - low) / voxel_mm) + 1)
-    if x * y * z > MAX_VOXELS:
-        enough_mm = voxel_mm
-        while math.prod(float(n) for n in np.ceil((high - low) / enough_mm) + 1) > MAX_VOXELS:
-            enough_mm *= 1.05
-        span = " x ".join(f"{side:.0f}" for side in high - low)
-        raise InvalidArgument(
-            f"voxel_mm must be at least {math.ceil(enough_mm * 100) / 100:g} for {sweep.source}: its frames span {span} mm, which at "
-            f"{voxel_mm:g} mm is {x * y * z / 1e6:,.0f} million voxels of at most {MAX_VOXELS // 10**6}",
-            field="voxel_mm",
-        )
-    return axes @ low, (x, y, z)
+    seen = [_on_grid(edge, pose, axes, np.zeros(3), 1.0) for pose in sweep.poses]
+    return np.min([places.min(axis=0) for places in seen], axis=0), np.max([p.max(axis=0) for p in seen], axis=0)
+
+
+def _counts(span_mm: FloatArray, voxel_mm: float) -> tuple[int, int, int]:
+    x, y, z = (int(count) for count in np.ceil(span_mm / voxel_mm) + 1)
+    return x, y, z
 
 
 def _folded(
@@ -159,12 +174,14 @@ def _folded(
 
 
 def _layers(sweep: Sweep, voxel_mm: float) -> int:
-    """Layers of voxels that reach the middle of the gap between neighbouring frames, where their corners are farthest apart."""
+    """Layers that reach the middle of the gap between neighbouring frames, where their corners are farthest apart."""
     corners = sweep.corners_mm()
-    distances = np.linalg.norm(corners[:, None] - corners[None], axis=-1)  # [F, F, P]
-    nearest = distances.mean(axis=-1) + np.diag(np.full(len(corners), np.inf))
-    gaps_mm = distances[np.arange(len(corners)), nearest.argmin(axis=1)].max(axis=-1)
-    return min(MAX_LAYERS, 1 + math.ceil(float(np.quantile(gaps_mm, TYPICAL_GAP)) / 2.0 / voxel_mm))
+    gaps_mm = []
+    for place, own in enumerate(corners):
+        distances = np.linalg.norm(np.delete(corners, place, axis=0) - own, axis=-1)  # [F-1, P]
+        gaps_mm.append(distances[distances.mean(axis=-1).argmin()].max())
+    reach_mm = max(LEAST_REACH_MM, float(np.quantile(gaps_mm, TYPICAL_GAP)) / 2.0)
+    return min(MAX_LAYERS, math.ceil(reach_mm / voxel_mm))
 
 
 def _fill_gaps(values: Tensor, known: Tensor, layers: int) -> tuple[Tensor, Tensor]:  # [X, Y, Z] each

@@ -50,7 +50,9 @@ def render_outputs(
         )
     view = _view_arguments(probe, poses_cm, height, width, instruction_set)
     if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in scene.splats.values()):
-        frames = _Render.apply(scene.info.intensity, view, tuple(outputs), *scene.splats.values())
+        frames = _Render.apply(  # type: ignore[no-untyped-call]
+            scene.info.intensity, view, tuple(outputs), *scene.splats.values()
+        )
         return dict(zip(outputs, frames, strict=True))
     planes = _empty_planes(view, outputs)
     _cpu.render(_prepared(scene), **view, **_arrays(planes))
@@ -104,7 +106,7 @@ class _Render(torch.autograd.Function):
         return tuple(planes.values())
 
     @staticmethod
-    @once_differentiable  # type: ignore[untyped-decorator]
+    @once_differentiable
     def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
         wanted = {
             name: gradient.contiguous()

@@ -59,14 +59,19 @@ def evaluate(scene: GaussianScene, sweep: Sweep, *, backend: str = "auto") -> Ev
 
 def evaluate_frames(frames: npt.NDArray[np.float32], sweep: Sweep) -> Evaluation:  # [F, H, W] in [0, 1]
     """Measures predicted frames against those of the sweep; raises as `evaluate` does."""
-    if not len(sweep):
-        raise DatasetInvalid(f"{sweep.source}: it holds no frames to measure with; hold some out")
+    require_frames(sweep)
     truth = torch.from_numpy(sweep.images).float() / 255.0
     return Evaluation(
         frames=frame_metrics(torch.from_numpy(frames), truth),
         frame_numbers=sweep.frame_numbers,
         ms_ssim_scales=ms_ssim_scales(sweep.height, sweep.width),
     )
+
+
+def require_frames(sweep: Sweep) -> None:
+    """Raises DatasetInvalid where there is nothing to measure with."""
+    if not len(sweep):
+        raise DatasetInvalid(f"{sweep.source}: it holds no frames to measure with; hold some out")
 
 
 def render_sweep(

@@ -1,11 +1,12 @@
 """How near a rendered frame comes to the real one: PSNR, MS-SSIM, GMS and GMSD, each per frame on [0, 1].
 
 - PSNR = −10 log10(mean squared error), at most MAX_PSNR_DB, which identical frames get.
-- MS-SSIM of Wang, Simoncelli and Bovik (2003): five scales of an 11x11 Gaussian window, σ = 1.5, constants 0.01² and 0.03²,
-  2x2 average pooling between scales. The coarsest scale must still hold the window, so that a side of 160 pixels or less leaves
-  fewer scales, their weights renormalised to sum 1: see `ms_ssim_scales`.
-- GMS, GMSD of Xue et al. (2014): mean and standard deviation over the image of (2ab + c)/(a² + b² + c), a and b the gradient
-  magnitudes of the two frames after 2x2 average pooling, by Prewitt filters divided by 3 with zero padding, c = 170/255².
+- MS-SSIM of Wang, Simoncelli and Bovik (2003): five scales of an 11x11 Gaussian window, σ = 1.5, constants 0.01² and
+  0.03², 2x2 average pooling between scales. The coarsest scale must still hold the window, so that a side of 160 pixels
+  or less leaves fewer scales, their weights renormalised to sum 1: see `ms_ssim_scales`.
+- GMS, GMSD of Xue et al. (2014): mean and standard deviation over the image of (2ab + c)/(a² + b² + c), a and b the
+  gradient magnitudes of the two frames after 2x2 average pooling, by Prewitt filters divided by 3 with zero padding,
+  c = 170/255².
 """
 
 from __future__ import annotations
@@ -57,8 +58,8 @@ def ms_ssim_scales(height: int, width: int) -> int:
 def frame_metrics(rendered: Tensor, truth: Tensor) -> list[FrameMetrics]:
     """The metrics of each of C frames; both are floating [C, H, W] in [0, 1].
 
-    Raises InvalidArgument where the shapes differ or `rendered` is not finite, and InvalidImageSize for images smaller than the window
-    of MS-SSIM.
+    Raises InvalidArgument where the shapes differ or `rendered` is not finite, and InvalidImageSize for images smaller
+    than the window of MS-SSIM.
     """
     if rendered.ndim != 3 or rendered.shape != truth.shape:
         raise InvalidArgument(
@@ -113,7 +114,7 @@ def _ssim_maps(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:  # [C, 1, H, W] -
     """The luminance term and the contrast-structure term; SSIM is their product."""
     c1, c2 = SSIM_CONSTANTS
     means = _smooth(torch.cat([x, y, x * x, y * y, x * y], dim=1))
-    mean_x, mean_y, mean_xx, mean_yy, mean_xy = means.split(1, dim=1)
+    mean_x, mean_y, mean_xx, mean_yy, mean_xy = torch.chunk(means, 5, dim=1)
     luminance = (2.0 * mean_x * mean_y + c1) / (mean_x.square() + mean_y.square() + c1)
     covariance = mean_xy - mean_x * mean_y
     variances = mean_xx - mean_x.square() + mean_yy - mean_y.square()

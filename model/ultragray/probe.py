@@ -28,7 +28,10 @@ def _check_number(field: str, value: object, *, low: float, high: float, low_ope
     expected = f"a finite number in {bracket}{low:g}, {high:g}]"
     if isinstance(value, bool) or not isinstance(value, (int, float, np.floating, np.integer)):
         raise InvalidProbe(f"{field} must be {expected}, got {value!r}", field=field)
-    number = float(value) if abs(value) <= high else math.inf  # an int may be too large for a float
+    try:
+        number = float(value)
+    except OverflowError:  # an int of hundreds of digits
+        number = math.inf
     if not math.isfinite(number) or number > high or number < low or (low_open and number == low):
         raise InvalidProbe(f"{field} must be {expected}, got {value!r}", field=field)
     return number

@@ -65,7 +65,7 @@ def side_by_side_panels(
 
 
 def as_picture(frame: npt.NDArray[np.float32], sweep: Sweep, max_side: int = MAX_SIDE_PIXELS) -> ByteImage:
-    """A frame [H, W] in [0, 1] as the eye expects it: square pixels, a convex probe's as a fan, at most `max_side` a side."""
+    """A frame [H, W] in [0, 1] as the eye expects it: square pixels, a fan of a convex probe, `max_side` at most."""
     if isinstance(sweep.probe, ConvexProbe):
         half = math.radians(sweep.probe.opening_angle_deg) / 2
         across_mm = 2.0 * sweep.probe.far_mm * (1.0 if half >= math.pi / 2 else math.sin(half))

@@ -1,4 +1,4 @@
-"""`ultragray bench`: what a frame costs in the kernel and through each front door, here and now.
+"""`ultragray bench`: what a frame costs in the kernel and through each front door, and a training step, here and now.
 
 Machines drift, so every time is also given in yards, a fixed piece of work timed in the same run (docs/physics.md §5).
 """
@@ -23,8 +23,9 @@ import ultragray
 from ultragray import cpu
 from ultragray.files import atomic_path
 
-from .bench_kernel import BenchScene, bench_scenes, measure_kernel, time_yard_ms
+from .bench_kernel import BATCH, BenchScene, bench_scenes, measure_kernel, time_yard_ms
 from .bench_served import measure_served
+from .bench_train import PARTS, measure_training, training_scenes
 
 TABLE_WIDTH = 110  # columns, where no terminal says
 
@@ -47,9 +48,7 @@ class Row:
 
 def run_bench(output: Path | None, quick: bool) -> None:
     """Prints the table; writes it as JSON to `output`. `quick` takes few repetitions and leaves the large scene out."""
-    console = Console()
-    if not console.is_terminal:
-        console = Console(width=TABLE_WIDTH)
+    console = _console()
     repeats = 20 if quick else 200
     threads = torch.get_num_threads()
     yards = [time_yard_ms()]
@@ -86,6 +85,50 @@ def run_bench(output: Path | None, quick: bool) -> None:
         "rows": [asdict(row) for row in rows],
     }
     _print_table(console, rows, document)
+    _write(console, output, document)
+
+
+def run_training_bench(output: Path | None, quick: bool) -> None:
+    """The same for a training step and its parts; `quick` takes few repetitions and leaves the large scene out."""
+    console = _console()
+    threads = torch.get_num_threads()
+    rows: list[dict[str, Any]] = []
+    yards: list[float] = []
+    for scene in training_scenes()[1 if quick else 0 :]:
+        console.print(f"{scene.gaussian_count:,} Gaussians: training ...", style="dim")
+        before = time_yard_ms()
+        timing = measure_training(scene, threads, repeats=5 if quick else 20)
+        yards.append(float(np.median([before, time_yard_ms()])))
+        step_ms = float(np.median(timing.step_ms))
+        rows.append(
+            {
+                "gaussians": scene.gaussian_count,
+                "images": f"{BATCH} of {scene.height}x{scene.width}",
+                "threads": threads,
+                "step_ms": step_ms,
+                "step_yards": step_ms / yards[-1],
+                "shares": {part: timing.share(part) for part in PARTS},
+            }
+        )
+    document = {"machine": _machine(threads), "yard_ms": float(np.median(yards)), "rows": rows}
+    table = Table(title=_title(document))
+    for name in ("Gaussians", "images", "step ms", "yards", *PARTS):
+        table.add_column(name, justify="right")
+    for row in rows:
+        shares = (f"{100.0 * row['shares'][part]:.0f} %" for part in PARTS)
+        table.add_row(
+            f"{row['gaussians']:,}", row["images"], f"{row['step_ms']:.0f}", f"{row['step_yards']:.1f}", *shares
+        )
+    console.print(table)
+    _write(console, output, document)
+
+
+def _console() -> Console:
+    console = Console()
+    return console if console.is_terminal else Console(width=TABLE_WIDTH)
+
+
+def _write(console: Console, output: Path | None, document: dict[str, Any]) -> None:
     if output is not None:
         with atomic_path(output) as temporary:
             temporary.write_text(json.dumps(document, indent=1) + "\n")
@@ -132,12 +175,17 @@ def _processor() -> str:
     return platform.processor() or platform.machine()
 
 
-def _print_table(console: Console, rows: list[Row], document: dict[str, Any]) -> None:
+def _title(document: dict[str, Any]) -> str:
     machine = document["machine"]
-    table = Table(
-        title=f"{machine['processor']}, {machine['threads']} threads, {machine['instruction_set']}; "
+    return (
+        f"{machine['processor']}, {machine['threads']} threads, {machine['instruction_set']}; "
         f"yard {document['yard_ms']:.1f} ms"
     )
+
+
+def _print_table(console: Console, rows: list[Row], document: dict[str, Any]) -> None:
+    machine = document["machine"]
+    table = Table(title=_title(document))
     for name in ("what", "Gaussians", "image", "threads", "poses"):
         table.add_column(name, justify="left" if name == "what" else "right")
     for name in ("p50 ms", "p99 ms", "p50 yards", "frames/s", "above kernel ms"):

@@ -15,7 +15,7 @@ from typer.core import TyperGroup
 import ultragray
 from ultragray.errors import InvalidArgument, UltragrayError
 
-from . import cli_convert, cli_dataset, cli_train
+from . import cli_convert, cli_dataset, cli_eval, cli_report, cli_train
 
 USER_ERROR = 2  # the exit code of a mistake that the caller can mend
 
@@ -243,6 +243,9 @@ def import_checkpoint(
 
 app.add_typer(cli_dataset.dataset_app, name="dataset")
 app.command()(cli_train.train)
+app.command("eval")(cli_eval.evaluate)
+app.command()(cli_eval.compound)
+app.command()(cli_report.report)
 app.command()(cli_convert.export)
 app.command()(cli_convert.import_ply)
 
@@ -269,11 +272,12 @@ def bench(
         typer.Option("--output", "-o", help="Also write the figures as JSON.", show_default=False),
     ] = None,
     quick: Annotated[bool, typer.Option("--quick", help="Fewer repetitions: a minute instead of several.")] = False,
+    train: Annotated[bool, typer.Option("--train", help="Measure a training step and its parts instead.")] = False,
 ) -> None:
     """Measure the kernel and the service on this machine and print a table."""
-    from .bench import run_bench
+    from .bench import run_bench, run_training_bench
     from .cli_output import check_writable
 
     if output is not None:
         check_writable(output)
-    run_bench(output, quick)
+    (run_training_bench if train else run_bench)(output, quick)

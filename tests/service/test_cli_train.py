@@ -167,8 +167,6 @@ def test_tensorboard_that_is_missing_is_said(dataset: Path, tmp_path: Path, monk
 
 
 def test_help_needs_no_torch() -> None:
-    program = (
-        f"import sys; sys.path[:0] = {sys.path!r}; import ultragray_service.cli; assert 'torch' not in sys.modules"
-    )
+    program = f"import sys; sys.path[:0] = {sys.path!r}; import ultragray_service.cli; print('torch' in sys.modules)"
     found = subprocess.run([sys.executable, "-c", program], check=True, capture_output=True, text=True)
     assert found.stdout == "False\n"

@@ -29,13 +29,14 @@ def read_payload(
             f"{header}: {' x '.join(map(str, shape))} bytes of pixels, the limit is {MAX_PIXEL_BYTES >> 30} GiB"
         )
     if not deflated:
-        found = path.stat().st_size - offset
+        found = max(0, path.stat().st_size - offset)
         if found != expected:
             raise DatasetInvalid(_wrong_size(path, header, found, expected))
         return np.fromfile(path, np.uint8, expected, offset=offset).reshape(shape)
     with path.open("rb") as file:
         file.seek(offset)
-        pixels = _inflate(file.read(expected + expected // 256 + (1 << 16)), path, expected)  # incompressible pixels grow by far less
+        deflated_limit = expected + expected // 256 + (1 << 16)  # incompressible pixels grow by far less
+        pixels = _inflate(file.read(deflated_limit), path, expected)
     if len(pixels) != expected:
         raise DatasetInvalid(_wrong_size(path, header, len(pixels), expected))
     return np.frombuffer(pixels, np.uint8).reshape(shape)

@@ -160,7 +160,7 @@ def _notes(
     notes = []
     if left_out:
         listed = ", ".join(map(str, left_out[:10])) + (", …" if len(left_out) > 10 else "")
-        notes.append(f"{len(left_out)} frames without a valid pose or image were left out: {listed}")
+        notes.append(f"frames without a valid pose or image were left out: {listed} ({len(left_out)} in all)")
     if orientation in UNKNOWN:
         notes.append("the file does not say how its images are oriented: taken as MF, columns lateral, rows depth")
     if crop is None:

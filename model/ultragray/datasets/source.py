@@ -42,7 +42,7 @@ def load_dataset(source: str | Path, options: SourceOptions | None = None) -> Da
         return _from_parts(load_phantom(), options)
     if path.is_dir() or path.suffix.lower() == ".json":
         return _from_parts(read_released(path), options)
-    if not path.exists():
+    if not path.is_file():  # a pipe would never end
         raise DatasetInvalid(f"{path}: no such file or folder")
     if path.suffix.lower() not in SEQUENCE_SUFFIXES:
         raise DatasetInvalid(

@@ -17,7 +17,7 @@ def image_loss(rendered: Tensor, truth: Tensor, *, instruction_set: str = "auto"
     SSIM is taken with a Gaussian window of 11x11 pixels, σ = 1.5, where the window lies inside the image.
     Differentiable with respect to `rendered`. Raises ValueError for smaller images.
     """
-    loss: Tensor = _ImageLoss.apply(rendered, truth, instruction_set)
+    loss: Tensor = _ImageLoss.apply(rendered, truth, instruction_set)  # type: ignore[no-untyped-call]
     return loss
 
 
@@ -33,6 +33,6 @@ class _ImageLoss(torch.autograd.Function):
         return x.new_tensor(value)
 
     @staticmethod
-    @once_differentiable  # type: ignore[untyped-decorator]
+    @once_differentiable
     def backward(ctx: Any, by_loss: Tensor) -> tuple[Tensor, None, None]:
         return ctx.gradient * by_loss, None, None

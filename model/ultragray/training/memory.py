@@ -11,9 +11,7 @@ from .config import TrainingConfig
 
 BASE_BYTES = 400 << 20  # the process with torch loaded, and the scratch memory of its kernels
 RAW_FLOATS = 3 + 3 + 4 + 1 + 1  # of a Gaussian, without the harmonics above degree 0
-COPIES = (
-    16  # parameters, gradients, moments; the copies of refinements and checkpoints; the kernel's own (measured: 14)
-)
+COPIES = 16  # parameters, gradients, moments; what refinements, checkpoints and the kernel copy (measured: 14)
 STATISTICS = 2
 PIXEL_FLOATS = 32  # of a pixel of a batch: the outputs and what the backward pass keeps of them (measured: 17)
 GIB = 1 << 30

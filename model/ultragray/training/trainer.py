@@ -15,10 +15,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..datasets.sweep import Dataset, Sweep
+from ..datasets.sweep import Dataset
 from ..errors import BackendUnavailable, DatasetInvalid, TrainingDiverged, TrainingStateInvalid
+from ..evaluation import evaluate
 from ..files import atomic_path
-from ..metrics import frame_metrics, mean_metrics
 from ..rendering import render
 from ..scene import PARAMETERS, GaussianScene
 from ..scene_info import SceneInfo
@@ -349,19 +349,8 @@ class Trainer:
         info = replace(self._info, training={**self.config.to_dict(), "step": self.step})
         scene = GaussianScene.from_splats(splats, info=info, training_poses=self.dataset.train.poses)
         if len(self.dataset.val) and self.step == self.config.steps:
-            scene.info.metrics.update(_held_out_metrics(scene, self.dataset.val, self._backend))
+            scene.info.metrics.update(evaluate(scene, self.dataset.val, backend=self._backend).mean.to_dict())
         return scene
-
-
-def _held_out_metrics(scene: GaussianScene, val: Sweep, backend: str) -> dict[str, float]:
-    found = []
-    for start in range(0, len(val), VALIDATION_FRAMES):
-        part = val.select(np.arange(start, min(start + VALIDATION_FRAMES, len(val))))
-        size = {"height": val.height, "width": val.width}
-        frames = render(scene, val.probe, part.poses, **size, outputs=("bmode",), backend=backend)
-        assert frames.bmode is not None
-        found += frame_metrics(frames.bmode, torch.tensor(part.images) / 255.0)
-    return mean_metrics(found).to_dict()
 
 
 def _torch_device(name: str) -> torch.device:

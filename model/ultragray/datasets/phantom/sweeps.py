@@ -51,14 +51,14 @@ def _rotations(axis: int, angle_rad: FloatArray) -> FloatArray:  # [C] -> [C, 3,
 def load_phantom() -> Dataset:
     """The dataset `phantom`, the same on every call, in about half a minute.
 
-    A straight sweep and two tilted by ±9° to train from; held out, a sweep tilted by 5° and 2 mm to the side.
+    A straight sweep and two tilted by ±9° and 3 mm to the sides to train from; held out, a sweep tilted by 5°.
     """
     train = [
         freehand_poses(91),
-        freehand_poses(60, tilt_deg=9.0, unrest=1.0),
-        freehand_poses(60, tilt_deg=-9.0, unrest=2.0),
+        freehand_poses(60, tilt_deg=9.0, offset_mm=3.0, unrest=1.0),
+        freehand_poses(60, tilt_deg=-9.0, offset_mm=-3.0, unrest=2.0),
     ]
-    poses = np.concatenate([*train, freehand_poses(24, tilt_deg=5.0, offset_mm=2.0, unrest=3.0)])
+    poses = np.concatenate([*train, freehand_poses(24, tilt_deg=5.0, offset_mm=1.0, unrest=3.0)])
     images = simulate(poses, probe=PHANTOM_PROBE, height=PHANTOM_IMAGE_SIDE, width=PHANTOM_IMAGE_SIDE)
     sweep = Sweep(images, poses, PHANTOM_PROBE, np.arange(len(poses)), "phantom")
     first_held_out = sum(len(part) for part in train)

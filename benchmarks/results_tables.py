@@ -1,0 +1,202 @@
+"""Trains and measures on the tracked sweeps and writes docs/results.md: what `make results` runs.
+
+    python benchmarks/results_tables.py DATA_FOLDER [--only NAME ...]
+
+Each run's figures go into the JSON as soon as it is done, so that a killed run keeps them; the tables are written from
+the JSON, which also holds the runs that were not asked for this time.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from ultragray.baselines import BASELINES, evaluate_baselines
+from ultragray.compounding import affordable_voxel_mm
+from ultragray.datasets.source import PHANTOM, SourceOptions, load_dataset
+from ultragray.files import atomic_path
+from ultragray.machine import processor_name
+from ultragray.report.study import train_and_evaluate
+from ultragray.training import Progress, TrainingConfig
+
+FOLDER = Path(__file__).resolve().parent
+TABLES = FOLDER.parent / "docs" / "results.md"
+FIGURES = FOLDER / "results_tables.json"
+SECONDS_PER_LINE = 15.0
+METRICS = ("psnr_db", "ms_ssim", "gms", "gmsd")
+ROW_NAMES = {
+    "scene": "**scene**",
+    "median": "median compounding",
+    "mean": "mean compounding",
+    "maximum": "maximum compounding",
+    "linear": "linear between frames",
+    "nearest": "nearest training frame",
+}
+
+log = logging.getLogger("results")
+
+
+@dataclass(frozen=True)
+class Run:
+    """One training. `source` is a folder of the data folder, or the word phantom."""
+
+    name: str
+    source: str
+    preset: str = "fast"
+    options: SourceOptions = field(default_factory=SourceOptions)
+    settings: Mapping[str, Any] = field(default_factory=dict)
+
+
+RUNS = (
+    Run("ultranerf_liver", "ultranerf_liver"),
+    Run("ultranerf_liver_other_side", "ultranerf_liver", options=SourceOptions("0:90", "90:180")),
+    Run("liver_convex", "liver_convex"),
+    Run("spine_phantom", "spine_phantom"),
+    Run("nwire_phantom", "nwire_phantom"),
+    Run("phantom", PHANTOM),
+    Run(
+        "ultranerf_liver_paper",
+        "ultranerf_liver",
+        preset="paper",
+        settings={"steps": 1_000, "initial_gaussians": 30_000, "max_gaussians": 60_000},
+    ),
+)
+
+
+def main() -> None:
+    arguments = _parser().parse_args()
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
+    if arguments.threads:
+        torch.set_num_threads(arguments.threads)
+    figures = json.loads(arguments.figures.read_text()) if arguments.figures.exists() else {}
+    for run in RUNS:
+        if not arguments.only or run.name in arguments.only:
+            figures[run.name] = measure(run, arguments.data_folder)
+            _write(arguments.figures, json.dumps(figures, indent=1, allow_nan=False) + "\n")
+            _write(arguments.tables, tables(figures))
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("data_folder", type=Path, help="folder of the data sets")
+    parser.add_argument("--only", nargs="+", choices=[run.name for run in RUNS], help="leave out the others")
+    parser.add_argument("--threads", type=int, default=0, help="0: all cores")
+    parser.add_argument("--figures", type=Path, default=FIGURES, help="JSON of the figures")
+    parser.add_argument("--tables", type=Path, default=TABLES, help="Markdown that is written from it")
+    return parser
+
+
+def measure(run: Run, data_folder: Path) -> dict[str, Any]:
+    """Trains and measures one run, and the baselines on the same frames."""
+    dataset = load_dataset(run.source if run.source == PHANTOM else data_folder / run.source, run.options)
+    voxel_mm = affordable_voxel_mm(dataset.train)
+    log.info("%s: baselines", run.name)
+    baselines = evaluate_baselines(dataset, BASELINES, voxel_mm)
+    config = TrainingConfig.preset(run.preset, **run.settings)
+    trained = train_and_evaluate(dataset, config, report=_teller(run.name))
+    log.info("%s: %.2f dB in %.0f s", run.name, trained.evaluation.mean.psnr_db, trained.seconds)
+    evaluations = {"scene": trained.evaluation, **baselines}
+    return {
+        "train_frames": len(dataset.train),
+        "val_frames": len(dataset.val),
+        "image": f"{dataset.train.height}x{dataset.train.width}",
+        "split": {"train": run.options.train_frames, "val": run.options.val_frames},
+        "ms_ssim_scales": trained.evaluation.ms_ssim_scales,
+        "voxel_mm": voxel_mm,
+        "metrics": {
+            name: {"mean": evaluation.mean.to_dict(), "std": evaluation.std.to_dict()}
+            for name, evaluation in evaluations.items()
+        },
+        "preset": run.preset,
+        "settings": dict(run.settings),
+        "steps": config.steps,
+        "gaussians": trained.scene.gaussian_count,
+        "step_ms": 1000.0 * trained.step_s,
+        "total_s": trained.seconds,
+        "machine": f"{processor_name()}, {torch.get_num_threads()} threads",
+        "measured_at": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+    }
+
+
+def _teller(name: str) -> Callable[[Progress], None]:
+    told_at = time.monotonic()
+
+    def tell(progress: Progress) -> None:
+        nonlocal told_at
+        if time.monotonic() - told_at >= SECONDS_PER_LINE:
+            told_at = time.monotonic()
+            log.info("%s: step %d of %d, loss %.4f", name, progress.step, progress.steps, progress.loss)
+
+    return tell
+
+
+def tables(figures: Mapping[str, Any]) -> str:
+    """The page: one table of the trainings, then one of the metrics for each run."""
+    known = {run.name: figures[run.name] for run in RUNS if run.name in figures}
+    lines = [
+        "# Results",
+        "",
+        "Written by `make results`; edit `benchmarks/results_tables.py` instead. Every figure is measured on frames",
+        "that were held out of the training, per frame, then averaged; compounding and the nearest frame are measured",
+        "alike. No setting is tuned to a set. The time of a step is the mean over the run, validation included.",
+        "",
+        "| run | training / held-out frames | image | preset | steps | Gaussians | ms a step | total |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for name, run in known.items():
+        lines.append(
+            f"| {name} | {run['train_frames']} / {run['val_frames']} | {run['image']} | {run['preset']} "
+            f"| {run['steps']:,} | {run['gaussians']:,} | {run['step_ms']:.0f} | {run['total_s']:.0f} s |"
+        )
+    machines = sorted({run["machine"] for run in known.values()})
+    lines += ["", f"Machine: {'; '.join(machines)}.", ""]
+    for name, run in known.items():
+        lines += _metrics_table(name, run)
+    return "\n".join(lines)
+
+
+def _metrics_table(name: str, run: Mapping[str, Any]) -> list[str]:
+    means = {method: run["metrics"][method]["mean"] for method in ROW_NAMES}
+    best = {key: (min if key == "gmsd" else max)(mean[key] for mean in means.values()) for key in METRICS}
+    notes = [f"Compounding with voxels of {run['voxel_mm']:g} mm."]
+    if run["split"]["train"]:
+        notes.append(f"Training frames {run['split']['train']}, held out {run['split']['val']} of the training file.")
+    if run["ms_ssim_scales"] < 5:
+        notes.append(f"MS-SSIM over {run['ms_ssim_scales']} scales, which is what the images hold.")
+    if run["settings"]:
+        settings = ", ".join(f"{key} {value:,}" for key, value in run["settings"].items())
+        notes.append(f"Preset {run['preset']} with {settings}.")
+    lines = [
+        f"## {name}",
+        "",
+        "| held-out frames | PSNR, dB | MS-SSIM | GMS | GMSD |",
+        "|---|---|---|---|---|",
+    ]
+    for method, row_name in ROW_NAMES.items():
+        std = run["metrics"][method]["std"]
+        cells = []
+        for key in METRICS:
+            digits = 2 if key == "psnr_db" else 3
+            mean = f"{means[method][key]:.{digits}f}"
+            shown = f"**{mean}**" if mean == f"{best[key]:.{digits}f}" else mean
+            cells.append(f"{shown} ± {std[key]:.{digits}f}")
+        lines.append(f"| {row_name} | {' | '.join(cells)} |")
+    return [*lines, "", " ".join(notes), ""]
+
+
+def _write(path: Path, text: str) -> None:
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""Reports: a scene against its baselines and ablations, as numbers and as one HTML page."""

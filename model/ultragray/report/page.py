@@ -1,0 +1,177 @@
+"""The page of a report: one HTML file that needs nothing else."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from .. import __version__
+from ..baselines import predict
+from ..datasets.sweep import Dataset
+from ..evaluation import Evaluation
+from ..metrics import FrameMetrics
+from ..scene import GaussianScene
+from ..side_by_side import as_picture, side_by_side_panels
+from .plots import LABELS, plot_counts, plot_frames, plot_tilt, plot_training
+from .study import TiltStudy, Trained
+
+PANEL_PIXELS = 300
+PLOTTED_BASELINES = ("median", "linear", "nearest")
+BASELINE_NAMES = {
+    "median": "median compounding",
+    "mean": "mean compounding",
+    "maximum": "maximum compounding",
+    "linear": "linear interpolation between frames",
+    "nearest": "nearest training frame",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class ReportContent:
+    """What a report shows. `trained` is None for a scene that was read from a file."""
+
+    dataset: Dataset
+    scene: GaussianScene
+    evaluation: Evaluation
+    baselines: Mapping[str, Evaluation]
+    voxel_mm: float
+    machine: str
+    trained: Trained | None = None
+    ablations: Mapping[str, Trained] = field(default_factory=dict)
+    tilt: TiltStudy | None = None
+
+
+@dataclass(frozen=True)
+class Row:
+    """A line of a table of metrics. `cells` pairs each text with whether it is the best of its column."""
+
+    name: str
+    cells: list[tuple[str, bool]]
+    notes: list[str]
+
+
+def render_page(content: ReportContent) -> str:
+    """The HTML text."""
+    environment = Environment(
+        loader=PackageLoader(__package__), autoescape=True, undefined=StrictUndefined, trim_blocks=True
+    )
+    evaluations = {"scene": content.evaluation, **content.baselines}
+    shown = {name: evaluations[name] for name in ("scene", *PLOTTED_BASELINES) if name in evaluations}
+    return environment.get_template("page.html").render(
+        version=__version__,
+        content=content,
+        facts=_facts(content),
+        metric_names=list(LABELS.values()),
+        comparison=metric_rows(
+            {"this scene": content.evaluation}
+            | {BASELINE_NAMES[name]: evaluation for name, evaluation in content.baselines.items()}
+        ),
+        frames_plot=plot_frames(shown),
+        training_plot=None if content.trained is None else plot_training(content.trained),
+        pictures=_pictures(content),
+        ablations=_ablation_rows(content),
+        counts_plot=_counts_plot(content),
+        tilt_plot=None if content.tilt is None else plot_tilt(content.tilt),
+        tilt_rows=[] if content.tilt is None else metric_rows(content.tilt.evaluations),
+        configuration={} if content.trained is None else content.trained.config.to_dict(),
+    )
+
+
+def metric_rows(evaluations: Mapping[str, Evaluation], notes: Mapping[str, list[str]] | None = None) -> list[Row]:
+    """One row a method with mean ± standard deviation, the best mean of each column marked."""
+    means = {name: evaluation.mean.to_dict() for name, evaluation in evaluations.items()}
+    stds = {name: evaluation.std.to_dict() for name, evaluation in evaluations.items()}
+    best = {
+        metric: _text(metric, (min if metric == "gmsd" else max)(mean[metric] for mean in means.values()))
+        for metric in LABELS
+    }
+    return [
+        Row(
+            name=name,
+            cells=[
+                (
+                    f"{_text(metric, means[name][metric])} ± {_text(metric, stds[name][metric])}",
+                    len(means) > 1 and _text(metric, means[name][metric]) == best[metric],
+                )
+                for metric in LABELS
+            ],
+            notes=(notes or {}).get(name, []),
+        )
+        for name in evaluations
+    ]
+
+
+def _text(metric: str, value: float) -> str:
+    return f"{value:.2f}" if metric == "psnr_db" else f"{value:.3f}"
+
+
+def _facts(content: ReportContent) -> dict[str, str]:
+    dataset, scene = content.dataset, content.scene
+    axial_mm, lateral_mm = dataset.train.pixel_mm
+    facts = {
+        "Training frames": f"{len(dataset.train)}",
+        "Held-out frames": f"{len(dataset.val)}",
+        "Image": f"{dataset.train.height} rows x {dataset.train.width} scan lines",
+        "Pixel": f"{axial_mm:.2f} mm axial, {lateral_mm:.2f} mm lateral in the middle",
+        "Probe": str(dataset.probe),
+        "Gaussians": f"{scene.gaussian_count:,}, spherical harmonics of degree {scene.sh_degree}",
+        "Intensity": scene.info.intensity,
+    }
+    if content.trained is not None:
+        facts["Training"] = (
+            f"{content.trained.config.steps:,} steps in {content.trained.seconds:.0f} s, "
+            f"{1000.0 * content.trained.step_s:.0f} ms a step"
+        )
+    return {**facts, "Machine": content.machine}
+
+
+def _ablation_rows(content: ReportContent) -> list[Row]:
+    if not content.ablations:
+        return []
+    runs = {**({} if content.trained is None else {"full model": content.trained}), **content.ablations}
+    return metric_rows(
+        {name: run.evaluation for name, run in runs.items()},
+        {name: [f"{run.scene.gaussian_count:,}", f"{1000.0 * run.step_s:.0f}"] for name, run in runs.items()},
+    )
+
+
+def _counts_plot(content: ReportContent) -> str | None:
+    """Over the runs that differ in their number of Gaussians only."""
+    runs = [run for name, run in content.ablations.items() if "Gaussians" in name]
+    if content.trained is not None:
+        runs.append(content.trained)
+    points: dict[int, FrameMetrics] = {run.scene.gaussian_count: run.evaluation.mean for run in runs}
+    return plot_counts(points) if len(points) > 1 else None
+
+
+def _pictures(content: ReportContent) -> list[dict[str, Any]]:
+    """The held-out frames where the scene does best, as usual, and worst, panel by panel."""
+    order = np.argsort([-frame.psnr_db for frame in content.evaluation.frames], kind="stable")
+    places = {order[-1]: "worst", order[len(order) // 2]: "typical", order[0]: "best"}  # may be fewer than three
+    chosen = content.dataset.val.select(list(places))
+    panels = side_by_side_panels(content.scene, chosen)
+    compounded = predict(content.dataset.train, chosen.poses, "median", voxel_mm=content.voxel_mm)
+    panels = {**panels, BASELINE_NAMES["median"]: compounded}
+    return [
+        {
+            "kind": kind,
+            "frame": int(chosen.frame_numbers[row]),
+            "psnr": f"{content.evaluation.frames[place].psnr_db:.2f}",
+            "panels": {
+                title: _data_uri(as_picture(frames[row], chosen, PANEL_PIXELS)) for title, frames in panels.items()
+            },
+        }
+        for row, (place, kind) in enumerate(places.items())
+    ]
+
+
+def _data_uri(picture: npt.NDArray[np.uint8]) -> str:
+    encoded = cv2.imencode(".png", picture)[1].tobytes()
+    return "data:image/png;base64," + base64.b64encode(encoded).decode()

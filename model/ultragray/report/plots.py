@@ -1,0 +1,106 @@
+"""The plots of a report, as SVG that stands in the page itself."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from ..evaluation import Evaluation
+from ..metrics import FrameMetrics
+from .study import TiltStudy, Trained
+
+COLOURS = {"scene": "#0b6e99", "median": "#d97706", "nearest": "#7c8a97", "linear": "#6d8f3c"}
+LABELS = {"psnr_db": "PSNR, dB", "ms_ssim": "MS-SSIM", "gms": "GMS", "gmsd": "GMSD"}
+TILT_BINS = 6
+LOSS_POINTS = 300  # of the curve, however long the run
+
+
+def plot_frames(evaluations: Mapping[str, Evaluation]) -> str:
+    """Each metric over the frame numbers, one line a method."""
+    figure, axes = _figure(len(LABELS), (11.0, 4.6), columns=2)
+    for axis, (name, label) in zip(axes, LABELS.items(), strict=True):
+        for method, evaluation in evaluations.items():
+            order = evaluation.frame_numbers.argsort()
+            values = np.array([getattr(frame, name) for frame in evaluation.frames])
+            axis.xaxis.set_major_locator(MaxNLocator(integer=True))
+            axis.plot(
+                evaluation.frame_numbers[order],
+                values[order],
+                marker=".",
+                markersize=4,
+                linewidth=1.2,
+                color=COLOURS.get(method),
+                label=method,
+            )
+        axis.set(xlabel="frame", ylabel=label)
+    axes[0].legend(frameon=False, ncols=len(evaluations), loc="lower left", bbox_to_anchor=(0.0, 1.0))
+    return _svg(figure)
+
+
+def plot_training(trained: Trained) -> str:
+    """The loss of each step (means of neighbouring steps in a long run) and the held-out PSNR on the way."""
+    figure, axes = _figure(2, (11.0, 2.6), columns=2)
+    width = max(1, len(trained.losses) // LOSS_POINTS)
+    count = len(trained.losses) // width
+    means = np.array(trained.losses[: count * width]).reshape(count, width).mean(axis=1)
+    axes[0].plot((np.arange(count) + 1) * width, means, linewidth=1.2, color=COLOURS["scene"])
+    axes[0].set(xlabel="step", ylabel="loss")
+    axes[1].plot(
+        list(trained.val_psnr_db), list(trained.val_psnr_db.values()), marker=".", color=COLOURS["scene"], linewidth=1.2
+    )
+    axes[1].set(xlabel="step", ylabel="held-out PSNR, dB")
+    return _svg(figure)
+
+
+def plot_tilt(study: TiltStudy) -> str:
+    """PSNR and GMSD over the angle to the nearest training frame: every frame, and means of equally many."""
+    figure, axes = _figure(2, (11.0, 3.0), columns=2)
+    order = study.angles_deg.argsort()
+    bins = np.array_split(order, min(TILT_BINS, len(order)))
+    for axis, name in zip(axes, ("psnr_db", "gmsd"), strict=True):
+        for method, evaluation in study.evaluations.items():
+            values = np.array([getattr(frame, name) for frame in evaluation.frames])
+            colour = COLOURS[method]
+            axis.plot(study.angles_deg, values, ".", color=colour, alpha=0.25, markersize=4)
+            middles = [study.angles_deg[part].mean() for part in bins]
+            axis.plot(middles, [values[part].mean() for part in bins], color=colour, linewidth=1.6, label=method)
+        axis.set(xlabel="angle to the nearest training frame, degrees", ylabel=LABELS[name])
+    axes[0].legend(frameon=False, ncols=len(study.evaluations), loc="lower left", bbox_to_anchor=(0.0, 1.0))
+    return _svg(figure)
+
+
+def plot_counts(points: Mapping[int, FrameMetrics]) -> str:
+    """PSNR and MS-SSIM over the number of Gaussians."""
+    figure, axes = _figure(2, (11.0, 2.6), columns=2)
+    counts = sorted(points)
+    for axis, name in zip(axes, ("psnr_db", "ms_ssim"), strict=True):
+        axis.plot(counts, [getattr(points[count], name) for count in counts], marker="o", color=COLOURS["scene"])
+        axis.set(xlabel="Gaussians", ylabel=LABELS[name], xscale="log")
+        axis.set_xticks(counts, [f"{count:,}" for count in counts])
+        axis.minorticks_off()
+    return _svg(figure)
+
+
+def _figure(count: int, size: tuple[float, float], *, columns: int) -> tuple[Figure, list[Axes]]:
+    figure = Figure(figsize=size, layout="constrained")
+    grid = figure.subplots(count // columns, columns, squeeze=False)
+    axes: list[Axes] = list(grid.ravel())
+    for axis in axes:
+        axis.spines[["top", "right"]].set_visible(False)
+        axis.grid(axis="y", color="#e5e9ed", linewidth=0.8)
+        axis.tick_params(labelsize=9)
+    return figure, axes
+
+
+def _svg(figure: Figure) -> str:
+    text = io.StringIO()
+    FigureCanvasSVG(figure)
+    figure.savefig(text, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")), transparent=True)
+    written = text.getvalue()
+    return written[written.index("<svg") :]

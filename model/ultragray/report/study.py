@@ -1,0 +1,134 @@
+"""What a report measures: a trained scene, the baselines, the ablations of the paper, and growing tilt."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..baselines import evaluate_baselines, nearest_frames
+from ..compounding import VOXEL_MM, mean_axes
+from ..datasets.sweep import Dataset, IntArray, Sweep
+from ..evaluation import Evaluation, evaluate, require_frames
+from ..pose import rotation_angles_deg
+from ..probe import FloatArray
+from ..scene import GaussianScene
+from ..training import Progress, TrainingConfig, train
+
+LEAST_TILT_DEG = 3.0  # a sweep that turns less cannot show what tilting costs
+TILT_BASELINES = ("median", "nearest")
+Report = Callable[[Progress], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Trained:
+    """A scene, what it reaches on the held-out frames, and how its training went."""
+
+    scene: GaussianScene
+    config: TrainingConfig
+    evaluation: Evaluation
+    seconds: float  # of the whole training
+    step_s: float  # of a step, the mean over the run
+    losses: list[float]  # of each step
+    val_psnr_db: dict[int, float]  # by step, over some held-out frames
+
+
+@dataclass(frozen=True, eq=False)
+class TiltStudy:
+    """A scene trained on one half of the tilts of a sweep and measured on the other half."""
+
+    train_tilts_deg: tuple[float, float]  # least and greatest
+    val_tilts_deg: tuple[float, float]
+    angles_deg: FloatArray  # [F] of each held-out frame to the nearest training frame
+    evaluations: dict[str, Evaluation]  # "scene" and TILT_BASELINES
+
+
+def train_and_evaluate(dataset: Dataset, config: TrainingConfig, *, report: Report | None = None) -> Trained:
+    """Trains on `dataset.train` and measures on `dataset.val`. Raises DatasetInvalid where that has no frames."""
+    require_frames(dataset.val)
+    losses: list[float] = []
+    val_psnr_db: dict[int, float] = {}
+
+    def follow(progress: Progress) -> None:
+        losses.append(progress.loss)
+        if progress.val_psnr_db is not None and progress.val_psnr_db not in val_psnr_db.values():
+            val_psnr_db[progress.step] = progress.val_psnr_db
+        if report is not None:
+            report(progress)
+
+    started = time.perf_counter()
+    scene = train(dataset, config, report=follow)
+    seconds = time.perf_counter() - started
+    return Trained(
+        scene=scene,
+        config=config,
+        evaluation=evaluate(scene, dataset.val),
+        seconds=seconds,
+        step_s=seconds / len(losses),
+        losses=losses,
+        val_psnr_db=val_psnr_db,
+    )
+
+
+def ablations(config: TrainingConfig) -> dict[str, TrainingConfig]:
+    """The runs of the paper's ablation table, each a configuration that differs from `config` in one thing."""
+
+    def with_share_of_gaussians(share: float) -> TrainingConfig:
+        return replace(
+            config,
+            max_gaussians=max(1, round(config.max_gaussians * share)),
+            initial_gaussians=max(1, round(config.initial_gaussians * share)),
+        )
+
+    return {
+        "no transmittance": replace(config, transmittance=False),
+        "spherical harmonics of degree 0": replace(config, sh_degree=0),
+        "no out-of-plane sampling": replace(config, out_of_plane_mm=0.0),
+        "a quarter of the Gaussians": with_share_of_gaussians(0.25),
+        "half of the Gaussians": with_share_of_gaussians(0.5),
+        "twice the Gaussians": with_share_of_gaussians(2.0),
+    }
+
+
+def frame_tilts_deg(sweep: Sweep) -> FloatArray:  # [F]
+    """Signed rotation of each frame against the mean, about the axis that the sweep turns about most, in degrees."""
+    turned = mean_axes(sweep.poses).T @ sweep.poses[:, :3, :3]
+    vectors = np.stack([turned[:, i, j] - turned[:, j, i] for i, j in ((2, 1), (0, 2), (1, 0))], axis=1) / 2.0
+    lengths = np.linalg.norm(vectors, axis=1)
+    angles = np.arctan2(lengths, (np.trace(turned, axis1=1, axis2=2) - 1.0) / 2.0)
+    vectors *= (np.degrees(angles) / np.maximum(lengths, 1e-12))[:, None]
+    axis = np.linalg.svd(vectors)[2][0]
+    tilts: FloatArray = vectors @ axis
+    return tilts
+
+
+def split_by_tilt(tilts_deg: FloatArray) -> tuple[IntArray, IntArray] | None:  # [F]
+    """Places of the lower and of the upper half, each in the order of the sweep; None where the sweep hardly turns."""
+    half = len(tilts_deg) // 2
+    if half < 2 or np.ptp(tilts_deg) < LEAST_TILT_DEG:
+        return None
+    order = tilts_deg.argsort(kind="stable")
+    return np.sort(order[:half]), np.sort(order[half:])
+
+
+def study_tilt(
+    sweep: Sweep, config: TrainingConfig, *, voxel_mm: float = VOXEL_MM, report: Report | None = None
+) -> TiltStudy | None:
+    """Trains on one half of a sweep's tilts and measures on the other; None where the sweep hardly turns."""
+    tilts = frame_tilts_deg(sweep)
+    halves = split_by_tilt(tilts)
+    if halves is None:
+        return None
+    low, high = halves
+    dataset = Dataset(name=f"{sweep.source} by tilt", train=sweep.select(low), val=sweep.select(high))
+    nearest = nearest_frames(dataset.train, dataset.val.poses)
+    angles = rotation_angles_deg(dataset.val.poses, dataset.train.poses)
+    trained = train_and_evaluate(dataset, config, report=report)
+    return TiltStudy(
+        train_tilts_deg=(float(tilts[low].min()), float(tilts[low].max())),
+        val_tilts_deg=(float(tilts[high].min()), float(tilts[high].max())),
+        angles_deg=angles[np.arange(len(high)), nearest],
+        evaluations={"scene": trained.evaluation, **evaluate_baselines(dataset, TILT_BASELINES, voxel_mm)},
+    )
