@@ -45,7 +45,7 @@ from ultragray import (
     scene_info,
     side_by_side,
 )
-from ultragray.datasets import Dataset, Sweep, checks, pictures, plus, released, source
+from ultragray.datasets import Dataset, Sweep, checks, phantom, pictures, plus, released, source
 from ultragray.training import TrainingConfig
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2, scenes_pb2
 from ultragray_service import catalog
@@ -147,6 +147,11 @@ def test_other_modules() -> None:
         for name, value in vars(module).items()
         if inspect.isfunction(value) and value.__module__ == module.__name__
         if not name.startswith("_") and name not in ultragray.__all__
+    }
+    found |= {
+        f"{phantom.__name__}.{call_of(value)}"
+        for value in (getattr(phantom, name) for name in phantom.__all__)
+        if inspect.isfunction(value)
     }
     assert set(table("Other modules")) == found
 

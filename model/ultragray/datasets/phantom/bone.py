@@ -32,11 +32,6 @@ def distance_mm(points: Floats) -> Floats:  # [N, 3] -> [N]
     return np.minimum(_posterior(local), body)
 
 
-def posterior_distance_mm(points: Floats) -> Floats:  # [N, 3] -> [N]
-    """Signed distance to what lies behind the canal: spinous process, laminae, articular and transverse processes."""
-    return _posterior(_local(points))
-
-
 def _local(points: Floats) -> Place:
     """x without its side, y from the nearest level in [−17.5, 17.5) mm, z."""
     x, y, z = points.T
@@ -44,6 +39,7 @@ def _local(points: Floats) -> Place:
 
 
 def _posterior(local: Place) -> Floats:
+    """What lies behind the canal: spinous process, laminae, articular and transverse processes."""
     x, y, z = local
     crest = _capsule(local, (0.0, -3.0, 17.6), (0.0, 10.0, 17.0), 3.5)
     blade = _box(local, (0.0, 3.5, 24.0), (0.6, 8.0, 9.0), 1.6)

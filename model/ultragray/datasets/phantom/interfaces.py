@@ -43,7 +43,7 @@ _ROOTS = LatticeNoise(14, (1.7, 24.0, 1.5))
 
 
 def fascicles(points: Floats) -> Floats:  # [N, 3] -> [N] in [-1, 1]
-    """Bundles of muscle fibres along the spine, leaning out and down to the flanks; patches of fat lobules alike."""
+    """Bundles of muscle fibres along the spine, leaning out and down to the flanks."""
     return _BUNDLES(_along_fibres(points))
 
 

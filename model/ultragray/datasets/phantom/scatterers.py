@@ -22,6 +22,7 @@ Float32Array = npt.NDArray[np.float32]
 BLOCK_MM = 8.0
 PER_MM3 = 8.0  # about five in a cell of the beam's resolution: speckle is fully developed
 BAND_MM = 0.4  # scatterers this near to an interface are repeated on it
+FASCICLES_DB = 9.0  # by which bundles of muscle fibres are brighter or darker
 _SEED = 20261121
 _OFFSET = 1 << 20  # seeds are not negative
 _GRADIENT_STEP_MM = 1e-2
@@ -105,7 +106,7 @@ def _made(index: tuple[int, int, int]) -> Scatterers:
     labels = anatomy.tissue_drawn(drawn)
     amplitudes = backscatter_amplitudes()[labels] * rng.normal(0.0, 1.0, count)
     muscle = labels == anatomy.Tissue.MUSCLE
-    amplitudes[muscle] *= 10.0 ** (9.0 / 20.0 * fascicles(drawn[muscle]))
+    amplitudes[muscle] *= 10.0 ** (FASCICLES_DB / 20.0 * fascicles(drawn[muscle]))
     parts = [_on(interface, rng, points, drawn) for interface in INTERFACES]
     surface, normals, specular, diffuse, lobe = (np.concatenate(column) for column in zip(*parts, strict=True))
     heard = amplitudes != 0.0
