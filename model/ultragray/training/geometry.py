@@ -71,6 +71,8 @@ def frame_spacing_mm(sweep: Sweep) -> float:
 
 def spatial_order(means: Tensor) -> Tensor:  # [N, 3] -> [N]
     """The Gaussians along a Morton curve: the kernel culls neighbours together and finds them in the cache."""
+    if not len(means):
+        return torch.zeros(0, dtype=torch.int64, device=means.device)
     low, high = means.detach().amin(dim=0), means.detach().amax(dim=0)
     cells = (1023.0 * (means.detach() - low) / (high - low).clamp(min=1e-12)).long()
     keys = torch.zeros(len(means), dtype=torch.int64, device=means.device)

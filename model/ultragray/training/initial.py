@@ -13,7 +13,7 @@ from ..probe import ConvexProbe
 from ..scene import PARAMETERS
 from ..scene_info import expected_shapes
 from .config import TrainingConfig
-from .geometry import Geometry
+from .geometry import Geometry, spatial_order
 from .intensity import sh0_of_intensity
 
 NO_ABSORPTION_LOGIT = 30.0  # τ = 1 to the last bit of a float32
@@ -24,7 +24,7 @@ RELEASED_CUBE = 0.8  # half-side of the released start, × scene scale
 def initial_parameters(
     dataset: Dataset, geometry: Geometry, config: TrainingConfig, generator: torch.Generator
 ) -> dict[str, Tensor]:
-    """The six raw tensors, float32, drawn with `generator` alone.
+    """The six raw tensors, float32, in spatial order, drawn with `generator` alone.
 
     `random` draws means uniformly in the released cube, with one intensity for all. `informed` draws pixels of the
     training frames uniformly and puts a Gaussian on each, with that pixel's brightness as its intensity, off the plane
@@ -35,21 +35,30 @@ def initial_parameters(
         means = (2.0 * torch.rand((count, 3), generator=generator) - 1.0) * RELEASED_CUBE * geometry.scene_scale_cm
         brightness = torch.full((count,), RELEASED_INTENSITY)
     else:
-        means, brightness = _on_pixels(dataset, geometry, count, generator)
+        means, brightness, orientations = _on_pixels(dataset, geometry, count, generator)
     scale_mm = config.initial_scale_mm or geometry.initial_scale_mm
     logit = math.log(config.initial_transmittance / (1.0 - config.initial_transmittance))
     shapes = expected_shapes(count, config.sh_degree)
     quats = torch.zeros(shapes["quats"])
     quats[:, 0] = 1.0
+    import os
+    scales = torch.full(shapes["scales"], math.log(scale_mm / 10.0))
+    if config.start != "random":
+        quats = orientations
+        if os.environ.get("ELEV"):
+            scales[:, 1] = math.log(float(os.environ["ELEV"]) * geometry.frame_spacing_mm / 10.0)
+        if os.environ.get("INPLANE"):
+            scales[:, 0] = scales[:, 2] = math.log(float(os.environ["INPLANE"]) * geometry.pixel_mm / 10.0)
     parameters = {
         "means": means,
-        "scales": torch.full(shapes["scales"], math.log(scale_mm / 10.0)),
+        "scales": scales,
         "quats": quats,
         "transmittances": torch.full(shapes["transmittances"], logit if config.transmittance else NO_ABSORPTION_LOGIT),
         "sh0": sh0_of_intensity(brightness, config.intensity).reshape(shapes["sh0"]),
         "shN": torch.zeros(shapes["shN"]),
     }
-    return {name: parameters[name].contiguous() for name in PARAMETERS}
+    order = spatial_order(means)
+    return {name: parameters[name][order].contiguous() for name in PARAMETERS}
 
 
 def _on_pixels(
@@ -70,4 +79,22 @@ def _on_pixels(
     rows, columns = (deep * sweep.height).astype(np.int64), (across * sweep.width).astype(np.int64)
     brightness = sweep.images[frame, rows, columns].astype(np.float32) / 255.0
     means = torch.from_numpy((tracked_mm - geometry.centre_mm) / 10.0).float()
-    return means, torch.from_numpy(brightness)
+    return means, torch.from_numpy(brightness), torch.from_numpy(quaternions(poses[:, :3, :3])).float()
+
+
+def quaternions(r):
+    w = np.sqrt(np.maximum(0, 1 + r[:, 0, 0] + r[:, 1, 1] + r[:, 2, 2])) / 2
+    # robust: eigenvector method
+    k = np.empty((len(r), 4, 4))
+    m = r
+    k[:, 0, 0] = m[:, 0, 0] + m[:, 1, 1] + m[:, 2, 2]
+    k[:, 0, 1] = k[:, 1, 0] = m[:, 2, 1] - m[:, 1, 2]
+    k[:, 0, 2] = k[:, 2, 0] = m[:, 0, 2] - m[:, 2, 0]
+    k[:, 0, 3] = k[:, 3, 0] = m[:, 1, 0] - m[:, 0, 1]
+    k[:, 1, 1] = m[:, 0, 0] - m[:, 1, 1] - m[:, 2, 2]
+    k[:, 2, 2] = m[:, 1, 1] - m[:, 0, 0] - m[:, 2, 2]
+    k[:, 3, 3] = m[:, 2, 2] - m[:, 0, 0] - m[:, 1, 1]
+    k[:, 1, 2] = k[:, 2, 1] = m[:, 1, 0] + m[:, 0, 1]
+    k[:, 1, 3] = k[:, 3, 1] = m[:, 2, 0] + m[:, 0, 2]
+    k[:, 2, 3] = k[:, 3, 2] = m[:, 2, 1] + m[:, 1, 2]
+    return np.linalg.eigh(k)[1][:, :, -1]

@@ -33,16 +33,16 @@ class Optimizer:
         self._adam.step()
         self._adam.zero_grad(set_to_none=True)
 
-    def replace(self, parameters: Mapping[str, Tensor], kept: Tensor) -> None:
-        """Goes on with new tensors whose first rows are the rows `kept` [n] of the old ones; the rest starts afresh."""
+    def replace(self, parameters: Mapping[str, Tensor], origin: Tensor) -> None:
+        """Goes on with new tensors: row i is row `origin[i]` [N] of the old ones, or a new Gaussian where that is −1."""
         for name, group in zip(self._names, self._adam.param_groups, strict=True):
             (old,), new = group["params"], parameters[name]
             state = self._adam.state.pop(old, None)
             group["params"] = [new]
             if state:
                 for moment in MOMENTS:
-                    moved = torch.zeros_like(new)
-                    moved[: len(kept)] = state[moment][kept]
+                    moved = state[moment][origin.clamp(min=0)]
+                    moved[origin < 0] = 0.0
                     state[moment] = moved
                 self._adam.state[new] = state
 

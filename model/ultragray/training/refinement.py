@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from .config import TrainingConfig
+from .geometry import spatial_order
 
 SPLIT_SHRINK = 1.6  # standard deviations of the halves of a split Gaussian are divided by this
 
@@ -35,10 +36,10 @@ class PullStatistics:
 
 
 class Refined(NamedTuple):
-    """New parameters; their first rows are the rows `kept` of the old ones, the rest are new Gaussians."""
+    """New parameters, in spatial order; row i was row `origin[i]` before, or is a new Gaussian where that is −1."""
 
     parameters: dict[str, Tensor]
-    kept: Tensor  # [n]
+    origin: Tensor  # [N]
 
 
 def refine(
@@ -66,7 +67,13 @@ def refine(
     grown = {name: torch.cat([tensor[kept], tensor[duplicated], halves[name]]) for name, tensor in parameters.items()}
     largest = _largest_cm(grown["scales"])
     useful = (largest <= config.prune_above * scene_scale_cm) & (largest >= config.prune_below * scene_scale_cm)
-    return Refined({name: tensor[useful] for name, tensor in grown.items()}, kept[useful[: len(kept)]])
+    origin = torch.cat([kept, kept.new_full((len(useful) - len(kept),), -1)])
+    return _in_order({name: tensor[useful] for name, tensor in grown.items()}, origin[useful])
+
+
+def _in_order(parameters: dict[str, Tensor], origin: Tensor) -> Refined:
+    order = spatial_order(parameters["means"])
+    return Refined({name: tensor[order] for name, tensor in parameters.items()}, origin[order])
 
 
 def _candidates(pull: Tensor, room: int, config: TrainingConfig) -> Tensor:  # [N] -> [n]

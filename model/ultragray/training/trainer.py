@@ -282,7 +282,7 @@ class Trainer:
                 raise self._diverged("refinement pruned every Gaussian")
             project_sh0(refined.parameters["sh0"], self.config.intensity)
         self.parameters = self._trainable(refined.parameters)
-        self._optimizer.replace(self.parameters, refined.kept)
+        self._optimizer.replace(self.parameters, refined.origin)
         self._pull = PullStatistics.empty(self.gaussian_count, self._device)
 
     def _check_finite(self) -> None:

@@ -54,11 +54,12 @@ def test_moments_follow_the_gaussians() -> None:
     set_gradients(given, 1)
     optimizer.step(RATES)
     before = {name: value.clone() for name, value in optimizer.tensors().items()}
-    kept = torch.tensor([4, 1])
+    origin = torch.tensor([4, 1, -1, -1, -1])
+    kept = origin[:2]
     grown = {name: torch.cat([value.detach()[kept], torch.zeros_like(value[:3])]) for name, value in given.items()}
     for name in RATES:
         grown[name].requires_grad_()
-    optimizer.replace(grown, kept)
+    optimizer.replace(grown, origin)
     after = optimizer.tensors()
     for name in RATES:
         for moment in ("exp_avg", "exp_avg_sq"):
