@@ -97,10 +97,12 @@ def compound(sweep: Sweep, method: str = "median", voxel_mm: float = VOXEL_MM) -
 def affordable_voxel_mm(sweep: Sweep, wanted_mm: float = VOXEL_MM) -> float:
     """The voxel that was wanted, or the smallest (to 0.01 mm) with which a grid around the sweep fits into memory."""
     low, high = _extent_mm(sweep, mean_axes(sweep.poses))
-    voxel_mm = wanted_mm
-    while math.prod(_counts(high - low, voxel_mm)) > MAX_VOXELS:
-        voxel_mm = math.floor(voxel_mm * 100.0 + 1.0) / 100.0
-    return voxel_mm
+    if math.prod(_counts(high - low, wanted_mm)) <= MAX_VOXELS:
+        return wanted_mm
+    hundredths = math.ceil(100.0 * wanted_mm)
+    while math.prod(_counts(high - low, hundredths / 100.0)) > MAX_VOXELS:
+        hundredths += 1
+    return hundredths / 100.0
 
 
 def mean_axes(poses: FloatArray) -> FloatArray:  # [F, 4, 4] -> [3, 3]

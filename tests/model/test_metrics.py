@@ -43,7 +43,7 @@ def test_ms_ssim_agrees_with_another_implementation(size: tuple[int, int]) -> No
     rendered = (truth + 0.2 * speckle(3, *size, seed=1) - 0.1).clamp(0, 1)
     expected = pytorch_msssim.ms_ssim(rendered[:, None], truth[:, None], data_range=1.0, size_average=False)
     found = [frame.ms_ssim for frame in frame_metrics(rendered, truth)]
-    assert found == pytest.approx(expected.tolist(), abs=1e-6)
+    assert found == pytest.approx(expected.tolist(), abs=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -53,13 +53,13 @@ def test_scales_of_ms_ssim_follow_from_the_smaller_side(side: int, scales: int) 
     assert ms_ssim_scales(side, side + 100) == ms_ssim_scales(side + 100, side) == scales
 
 
-@pytest.mark.parametrize(("side", "weights"), [(164, (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)), (100, None)])
+@pytest.mark.parametrize(("side", "weights"), [(176, (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)), (104, None)])
 def test_weights_are_renormalised_where_scales_are_missing(side: int, weights: tuple[float, ...] | None) -> None:
     """Flat frames have contrast terms of 1, so that only the coarsest luminance term and its weight remain."""
     x, y, c1 = 0.3, 0.5, 1e-4
     luminance = (2 * x * y + c1) / (x * x + y * y + c1)
     (reached,) = frame_metrics(torch.full((1, side, side), x), torch.full((1, side, side), y))
-    weight = weights[-1] if weights else 0.2363 / (0.0448 + 0.2856 + 0.3001 + 0.2363)
+    weight = weights[-1] / sum(weights) if weights else 0.2363 / (0.0448 + 0.2856 + 0.3001 + 0.2363)
     assert reached.ms_ssim == pytest.approx(luminance**weight, abs=1e-6)
 
 

@@ -93,7 +93,10 @@ def ablations(config: TrainingConfig) -> dict[str, TrainingConfig]:
 
 
 def frame_tilts_deg(sweep: Sweep) -> FloatArray:  # [F]
-    """Signed rotation of each frame against the mean, about the axis that the sweep turns about most, in degrees."""
+    """Rotation of each frame against the mean, in degrees, about the axis that the sweep turns about most.
+
+    Signed so that tilts grow along the sweep.
+    """
     turned = mean_axes(sweep.poses).T @ sweep.poses[:, :3, :3]
     vectors = np.stack([turned[:, i, j] - turned[:, j, i] for i, j in ((2, 1), (0, 2), (1, 0))], axis=1) / 2.0
     lengths = np.linalg.norm(vectors, axis=1)
@@ -101,7 +104,8 @@ def frame_tilts_deg(sweep: Sweep) -> FloatArray:  # [F]
     vectors *= (np.degrees(angles) / np.maximum(lengths, 1e-12))[:, None]
     axis = np.linalg.svd(vectors)[2][0]
     tilts: FloatArray = vectors @ axis
-    return tilts
+    later = np.arange(len(tilts)) - (len(tilts) - 1) / 2.0
+    return tilts if tilts @ later >= 0.0 else -tilts
 
 
 def split_by_tilt(tilts_deg: FloatArray) -> tuple[IntArray, IntArray] | None:  # [F]

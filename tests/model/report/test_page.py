@@ -1,0 +1,118 @@
+"""The page: complete, self-contained, and safe with any name."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from ultragray.baselines import evaluate_baselines
+from ultragray.datasets import Dataset
+from ultragray.evaluation import Evaluation
+from ultragray.metrics import FrameMetrics
+from ultragray.report.page import ReportContent, metric_rows, render_page
+from ultragray.report.study import ablations, study_tilt, train_and_evaluate
+from ultragray.training import TrainingConfig
+
+VOID = {"meta", "img", "link", "br"}
+
+
+class Checked(HTMLParser):
+    """Tags that are closed in order, and every address that the page refers to."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open_tags: list[str] = []
+        self.addresses: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.addresses += [value or "" for name, value in attrs if name in ("src", "href", "xlink:href")]
+        if tag not in VOID:
+            self.open_tags.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.handle_starttag(tag, attrs)
+        if tag not in VOID:
+            self.open_tags.pop()
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open_tags.pop() == tag
+
+
+@pytest.fixture
+def content(turning_dataset: Dataset, small_config: TrainingConfig) -> ReportContent:
+    trained = train_and_evaluate(turning_dataset, small_config)
+    return ReportContent(
+        dataset=turning_dataset,
+        scene=trained.scene,
+        evaluation=trained.evaluation,
+        baselines=evaluate_baselines(turning_dataset),
+        voxel_mm=0.5,
+        machine="a machine",
+        trained=trained,
+        ablations={
+            name: train_and_evaluate(turning_dataset, config) for name, config in ablations(small_config).items()
+        },
+        tilt=study_tilt(turning_dataset.train, small_config),
+    )
+
+
+def test_the_page_is_whole_and_needs_nothing_else(content: ReportContent) -> None:
+    text = render_page(content)
+    page = Checked(text)
+    assert page.open_tags == []
+    assert all(address.startswith(("data:image/png;base64,", "#")) for address in page.addresses)
+    assert "url(http" not in text
+    assert "<script" not in text
+    assert text.count("<img ") == 3 * 6
+    assert text.count("<svg ") == 4
+    assert "turning &lt;sweep&gt;" in text
+    assert "turning <sweep>" not in text
+    for heading in ("Against the baselines", "Pictures", "Ablations", "Growing tilt", "Training"):
+        assert f"<h2>{heading}</h2>" in text
+    rows = re.findall(r'<th scope="row">(.*?)</th>', text)
+    assert rows == [
+        "this scene",
+        "median compounding",
+        "mean compounding",
+        "maximum compounding",
+        "linear interpolation between frames",
+        "nearest training frame",
+        "full model",
+        *content.ablations,
+        "scene",
+        "median",
+        "nearest",
+    ]
+    mean = content.evaluation.mean
+    assert f"{mean.psnr_db:.2f} ±" in text
+    assert f"{mean.gmsd:.3f} ±" in text
+
+
+def test_a_scene_from_a_file_without_ablations(content: ReportContent) -> None:
+    text = render_page(replace(content, trained=None, ablations={}, tilt=None))
+    assert Checked(text).open_tags == []
+    assert re.findall(r"<h2>(.*?)</h2>", text) == ["Against the baselines", "Pictures"]
+
+
+def test_one_held_out_frame_is_shown_once(content: ReportContent) -> None:
+    val = content.dataset.val.select([0])
+    alone = Evaluation(content.evaluation.frames[:1], val.frame_numbers, 1)
+    dataset = replace(content.dataset, val=val)
+    text = render_page(
+        replace(content, dataset=dataset, evaluation=alone, baselines=evaluate_baselines(dataset), ablations={})
+    )
+    assert text.count("<figcaption>") == 1
+
+
+def test_the_best_of_each_column_is_marked_as_numbers_not_as_words() -> None:
+    def of(psnr_db: float, gmsd: float) -> Evaluation:
+        return Evaluation([FrameMetrics(psnr_db, 0.5, 0.5, gmsd)], np.arange(1), 5)
+
+    rows = metric_rows({"a": of(9.5, 0.2), "b": of(10.5, 0.1)})
+    assert [[best for _, best in row.cells] for row in rows] == [[False, True, True, False], [True, True, True, True]]
+    assert [best for _, best in metric_rows({"a": of(9.5, 0.2)})[0].cells] == [False] * 4

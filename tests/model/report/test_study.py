@@ -1,0 +1,83 @@
+"""What a report measures: trainings, ablations that differ in one thing, and tilts that grow."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ultragray.datasets import Dataset
+from ultragray.errors import DatasetInvalid
+from ultragray.evaluation import evaluate
+from ultragray.report.study import ablations, frame_tilts_deg, split_by_tilt, study_tilt, train_and_evaluate
+from ultragray.training import Progress, TrainingConfig
+
+
+def test_a_training_is_followed_and_measured(turning_dataset: Dataset, small_config: TrainingConfig) -> None:
+    seen: list[Progress] = []
+    trained = train_and_evaluate(turning_dataset, small_config, report=seen.append)
+    assert trained.losses == [progress.loss for progress in seen]
+    assert len(trained.losses) == 6
+    assert trained.val_psnr_db
+    assert max(trained.val_psnr_db) <= 6
+    assert trained.evaluation.frames == evaluate(trained.scene, turning_dataset.val).frames
+    assert trained.seconds >= 6 * trained.step_s > 0
+
+
+def test_a_training_without_held_out_frames_is_refused_before_it_begins(
+    turning_dataset: Dataset, small_config: TrainingConfig
+) -> None:
+    with pytest.raises(DatasetInvalid, match="no frames to measure with"):
+        train_and_evaluate(
+            replace(turning_dataset, val=turning_dataset.val.select([])),
+            small_config,
+            report=lambda progress: pytest.fail("it began"),
+        )
+
+
+def test_ablations_differ_in_what_they_are_named_after(small_config: TrainingConfig) -> None:
+    full = small_config.to_dict()
+    changed = {
+        name: {key: value for key, value in config.to_dict().items() if value != full[key]}
+        for name, config in ablations(small_config).items()
+    }
+    assert changed == {
+        "no transmittance": {"transmittance": False},
+        "spherical harmonics of degree 0": {"sh_degree": 0},
+        "no out-of-plane sampling": {"out_of_plane_mm": 0.0},
+        "a quarter of the Gaussians": {"max_gaussians": 15, "initial_gaussians": 8},
+        "half of the Gaussians": {"max_gaussians": 30, "initial_gaussians": 15},
+        "twice the Gaussians": {"max_gaussians": 120, "initial_gaussians": 60},
+    }
+
+
+def test_tilts_are_signed_angles_about_the_axis_of_turning(turning_dataset: Dataset) -> None:
+    tilts = frame_tilts_deg(turning_dataset.train)
+    expected = np.linspace(-10, 10, 12)[turning_dataset.train.frame_numbers]
+    expected -= expected.mean()
+    np.testing.assert_allclose(tilts, expected, atol=0.05)
+    backwards = turning_dataset.train.select(range(len(tilts))[::-1])
+    np.testing.assert_allclose(frame_tilts_deg(backwards), -expected[::-1], atol=0.05)
+
+
+def test_halves_of_the_tilts() -> None:
+    low, high = split_by_tilt(np.array([5.0, -5.0, 4.0, -4.0, 0.0])) or ([], [])
+    assert list(low) == [1, 3]
+    assert list(high) == [0, 2, 4]
+    assert split_by_tilt(np.array([0.0, 1.0, 2.0, 2.9])) is None
+    assert split_by_tilt(np.array([0.0, 10.0, 20.0])) is None
+
+
+def test_a_study_of_tilt_measures_what_was_not_trained_on(
+    turning_dataset: Dataset, small_config: TrainingConfig
+) -> None:
+    study = study_tilt(turning_dataset.train, small_config)
+    assert study is not None
+    assert study.train_tilts_deg[1] < study.val_tilts_deg[0]
+    assert set(study.evaluations) == {"scene", "median", "nearest"}
+    between_frames = 20.0 / 11.0
+    np.testing.assert_allclose(study.angles_deg, between_frames * np.array([2, 3, 4, 6, 7]), atol=1e-9)
+    turned_back = turning_dataset.train.poses.copy()
+    turned_back[:, :3, :3] = np.eye(3)
+    assert study_tilt(replace(turning_dataset.train, poses=turned_back), small_config) is None

@@ -1,0 +1,23 @@
+"""The name of the processor."""
+
+from __future__ import annotations
+
+import platform
+from pathlib import Path
+
+import pytest
+
+from ultragray import machine
+
+
+def test_what_the_system_tells(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    told = tmp_path / "cpuinfo"
+    told.write_text("processor : 0\nmodel name\t: Abacus 3000: fast\nmodel name\t: another\n")
+    monkeypatch.setattr(machine, "Path", lambda _: told)
+    assert machine.processor_name() == "Abacus 3000: fast"
+
+
+def test_else_the_architecture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(machine, "Path", lambda _: tmp_path / "none")
+    monkeypatch.setattr(platform, "processor", lambda: "")
+    assert machine.processor_name() == platform.machine()

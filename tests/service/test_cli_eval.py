@@ -1,0 +1,151 @@
+"""`ultragray eval`, `compound` and `report`: from a folder of frames to figures, pictures and a page."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner, Result
+
+from ultragray import GaussianScene, LinearProbe
+from ultragray.baselines import evaluate_baselines
+from ultragray.datasets import Dataset, Sweep
+from ultragray.datasets.released import read_released, write_released
+from ultragray.evaluation import evaluate
+from ultragray.training import TrainingConfig, train
+from ultragray_service.cli import app
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder in the released layout: a ball in noise, 7 training and 2 held-out frames."""
+    poses = np.tile(np.eye(4), (9, 1, 1))
+    poses[:, 1, 3] = np.linspace(-4.0, 4.0, 9)
+    x, z = np.meshgrid(np.linspace(-1, 1, 16), np.linspace(0, 1, 20))
+    ball = 140.0 * np.exp(-(x**2 + (z - 0.4) ** 2) / 0.1) + 50.0
+    images = np.clip(ball + np.random.default_rng(0).normal(0.0, 4.0, (9, 20, 16)), 0, 255).astype(np.uint8)
+    sweep = Sweep(images, poses, LinearProbe(20.0, 0.0, 25.0), np.arange(9), "ball")
+    folder = tmp_path_factory.mktemp("sweeps") / "ball"
+    write_released(Dataset("ball", sweep.select([0, 1, 3, 4, 5, 7, 8]), sweep.select([2, 6])), folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def scene(dataset: Path) -> Path:
+    config = TrainingConfig.preset("fast", steps=5, max_gaussians=60)
+    train(read_released(dataset), config).save(dataset.parent / "ball.ugr")
+    return dataset.parent / "ball.ugr"
+
+
+def run(*arguments: object) -> Result:
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+def refused(*arguments: object) -> str:
+    """The one line that a mistake gives."""
+    result = run(*arguments)
+    assert result.exit_code == 2, result.output
+    assert result.stderr.startswith("error: ")
+    assert result.stderr.count("\n") == 1
+    return result.stderr
+
+
+def printed_json(*arguments: object) -> Any:
+    result = run(*arguments)
+    assert result.exit_code == 0, result.output
+    return json.loads(result.stdout)
+
+
+def test_eval_prints_what_the_library_measures(dataset: Path, scene: Path) -> None:
+    expected = evaluate(GaussianScene.load(scene), read_released(dataset).val)
+    document = printed_json("eval", scene, dataset, "--json")
+    assert document == {"scene": str(scene), "dataset": "ball", "split": "val", **expected.to_dict()}
+    result = run("eval", scene, dataset)
+    assert result.exit_code == 0
+    mean, std = expected.mean, expected.std
+    assert f"{mean.psnr_db:.2f} ± {std.psnr_db:.2f}" in result.stdout
+    assert f"{mean.gmsd:.3f} ± {std.gmsd:.3f}" in result.stdout
+    assert "1 of its 5 scales" in result.stdout
+
+
+def test_eval_of_the_training_frames_and_of_others(dataset: Path, scene: Path) -> None:
+    train_part = printed_json("eval", scene, dataset, "--json", "--split", "train")
+    assert train_part["split"] == "train"
+    assert len(train_part["frames"]) == 7
+    assert len(printed_json("eval", scene, dataset, "--json", "--val-frames", "0:3")["frames"]) == 3
+
+
+def test_eval_writes_pictures(dataset: Path, scene: Path, tmp_path: Path) -> None:
+    result = run("eval", scene, dataset, "-o", tmp_path / "pictures", "--json")
+    assert result.exit_code == 0
+    assert len(json.loads(result.stdout)["frames"]) == 2
+    assert len(list((tmp_path / "pictures").glob("frame_*.png"))) == 2
+
+
+def test_compound_prints_what_the_library_measures(dataset: Path) -> None:
+    expected = evaluate_baselines(read_released(dataset), voxel_mm=0.7)
+    document = printed_json("compound", dataset, "--json", "--voxel-mm", 0.7)
+    assert document["voxel_mm"] == 0.7
+    assert document["methods"] == {name: evaluation.to_dict() for name, evaluation in expected.items()}
+    table = run("compound", dataset, "--voxel-mm", 0.7).stdout
+    for name, evaluation in expected.items():
+        assert re.search(rf"{name} +{evaluation.mean.psnr_db:.2f} ± ", table)
+
+
+def test_compound_by_one_method(dataset: Path) -> None:
+    document = printed_json("compound", dataset, "--json", "--method", "maximum")
+    assert list(document["methods"]) == ["maximum"]
+    assert document["voxel_mm"] == 0.5
+
+
+def test_report_of_a_scene(dataset: Path, scene: Path, tmp_path: Path) -> None:
+    page = tmp_path / "page.html"
+    result = run("report", dataset, "-o", page, "--scene", scene, "--no-ablations", "--threads", 1)
+    assert result.exit_code == 0, result.output
+    assert result.stdout == f"wrote {page}\n"
+    mean = evaluate(GaussianScene.load(scene), read_released(dataset).val).mean
+    assert f"{mean.psnr_db:.2f} ±" in page.read_text()
+    assert "Ablations" not in page.read_text()
+
+
+def test_report_trains_and_studies(dataset: Path, tmp_path: Path) -> None:
+    page = tmp_path / "page.html"
+    result = run("report", dataset, "-o", page, "--steps", 3, "--max-gaussians", 40, "--threads", 1)
+    assert result.exit_code == 0, result.output
+    assert result.stderr.splitlines() == [
+        "training: scene",
+        "training: no transmittance",
+        "training: spherical harmonics of degree 0",
+        "training: no out-of-plane sampling",
+        "training: a quarter of the Gaussians",
+        "training: half of the Gaussians",
+        "training: twice the Gaussians",
+    ]
+    assert "max_gaussians = 40" in page.read_text()
+    assert "hardly turns" in page.read_text()
+
+
+def test_mistakes(dataset: Path, scene: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    assert "file is a file" in refused("eval", scene, dataset, "-o", tmp_path / "file")
+    assert "no such file" in refused("eval", tmp_path / "none.ugr", dataset)
+    assert "no such file or folder" in refused("compound", tmp_path / "none")
+    assert "voxel_mm must be" in refused("compound", dataset, "--voxel-mm", 0.001)
+    assert "is a folder" in refused("report", dataset, "-o", tmp_path)
+    assert "preset must be" in refused("report", dataset, "-o", tmp_path / "page.html", "--preset", "slow")
+    assert not (tmp_path / "page.html").exists()
+
+
+def test_a_dataset_without_held_out_frames_is_refused(dataset: Path, scene: Path, tmp_path: Path) -> None:
+    sweep = read_released(dataset).train
+    write_released(Dataset("alone", sweep, sweep.select([])), tmp_path / "alone")
+    for arguments in (
+        ("eval", scene, tmp_path / "alone"),
+        ("compound", tmp_path / "alone"),
+        ("report", tmp_path / "alone", "-o", tmp_path / "page.html"),
+    ):
+        assert "no frames to measure with" in refused(*arguments)

@@ -1,0 +1,88 @@
+"""What `make results` runs: figures kept run by run, tables written from them."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from ultragray import LinearProbe
+from ultragray.datasets import Dataset, Sweep
+from ultragray.datasets.released import write_released
+from ultragray.datasets.source import SourceOptions
+from ultragray.errors import DatasetInvalid
+
+SCRIPT = Path(__file__).resolve().parents[1] / "benchmarks" / "results_tables.py"
+SETTINGS = {"steps": 3, "max_gaussians": 40}
+
+
+@pytest.fixture
+def script(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    spec = importlib.util.spec_from_file_location("results_tables", SCRIPT)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, spec.name, module)
+    spec.loader.exec_module(module)
+    monkeypatch.setattr(
+        module,
+        "RUNS",
+        (
+            module.Run("one", "ball", settings=SETTINGS),
+            module.Run("two", "ball", options=SourceOptions("0:3", "3:6"), settings=SETTINGS),
+            module.Run("missing", "none", settings=SETTINGS),
+        ),
+    )
+    return module
+
+
+@pytest.fixture
+def data(tmp_path: Path) -> Path:
+    rng = np.random.default_rng(0)
+    poses = np.tile(np.eye(4), (8, 1, 1))
+    poses[:, 1, 3] = range(8)
+    images = rng.integers(0, 200, (8, 16, 14), dtype=np.uint8)
+    sweep = Sweep(images, poses, LinearProbe(20.0, 0.0, 25.0), np.arange(8), "ball")
+    write_released(Dataset("ball", sweep.select(range(6)), sweep.select([6, 7])), tmp_path / "ball")
+    return tmp_path
+
+
+def run(script: ModuleType, monkeypatch: pytest.MonkeyPatch, data: Path, *arguments: str) -> None:
+    files = ("--figures", str(data / "figures.json"), "--tables", str(data / "results.md"))
+    monkeypatch.setattr(sys, "argv", ["results_tables.py", str(data), *files, *arguments])
+    script.main()
+
+
+def test_runs_are_kept_one_by_one_and_tabled_together(
+    script: ModuleType, monkeypatch: pytest.MonkeyPatch, data: Path
+) -> None:
+    run(script, monkeypatch, data, "--only", "two")
+    first = json.loads((data / "figures.json").read_text())
+    assert list(first) == ["two"]
+    assert first["two"]["split"] == {"train": "0:3", "val": "3:6"}
+    run(script, monkeypatch, data, "--only", "one")
+    figures = json.loads((data / "figures.json").read_text())
+    assert figures["two"] == first["two"]
+    assert figures["one"]["train_frames"] == 6
+    assert figures["one"]["gaussians"] > 0
+    assert figures["one"]["steps"] == 3
+    assert figures["one"]["total_s"] == pytest.approx(0.003 * figures["one"]["step_ms"])
+    tables = (data / "results.md").read_text()
+    assert tables == script.tables(figures)
+    assert tables.index("## one") < tables.index("## two")
+    mean = figures["one"]["metrics"]["scene"]["mean"]
+    assert f"{mean['psnr_db']:.2f}" in tables
+    assert "Training frames 0:3, held out 3:6" in tables
+    assert tables.count("| nearest training frame |") == 2
+
+
+def test_a_run_that_fails_loses_nothing(script: ModuleType, monkeypatch: pytest.MonkeyPatch, data: Path) -> None:
+    with pytest.raises(DatasetInvalid, match="none"):
+        run(script, monkeypatch, data)
+    assert set(json.loads((data / "figures.json").read_text())) == {"one", "two"}
+    assert "## two" in (data / "results.md").read_text()
