@@ -46,6 +46,8 @@ class TrainingConfig:
     initial_scale_mm: float | None = None  # standard deviation; None: from the spacing of frames and pixels
     initial_transmittance: float = 0.99
     intensity: str = "sigmoid"  # activation, docs/physics.md §2
+    intensity_floor: float = 0.5  # no Gaussian's intensity (of degree 0) goes below, up to floor_end: shadows first
+    floor_end: float = 0.5
     sh_degree: int = 1
     sh_start: float = 1_000 / RELEASED_STEPS  # where degree 1 joins; degree d at d times that
     transmittance: bool = True  # False: nothing absorbs
@@ -123,6 +125,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "start": "random",
         "initial_scale_mm": 0.5,
         "intensity": "released",
+        "intensity_floor": 0.0,
         "out_of_plane_mm": 2.0,
         "means_rate": 1e-4,
         "scales_rate": 5e-3,
@@ -144,6 +147,8 @@ _RANGES: dict[str, tuple[float, float]] = {
     "max_gaussians": (1, 100_000_000),
     "initial_scale_mm": (1e-3, 1e3),
     "initial_transmittance": (0.5, 0.9999),
+    "intensity_floor": (0.0, 0.9),
+    "floor_end": (0.0, 1.0),
     "sh_degree": (0, MAX_SH_DEGREE),
     "sh_start": (0.0, 1.0),
     "out_of_plane_mm": (0.0, 100.0),

@@ -5,6 +5,9 @@ stay there. So after each step sh0 is put back between them (a projected gradien
 is the true one and leads back inside as soon as the images ask for it, which is what passing it straight through the
 clamp aims at, with no gradient that `render()` does not give. Harmonics above degree 0 may still cross an end in some
 views; in the others the Gaussian keeps its gradient.
+
+`sigmoid` has no floor, so that a shadow can be learned as tissue without echo, which is wrong from any other angle. A
+training that keeps a floor for its first part learns what absorbs, and dark tissue afterwards.
 """
 
 from __future__ import annotations
@@ -28,8 +31,10 @@ def sh0_of_intensity(brightness: Tensor, intensity: str) -> Tensor:  # [N] in [0
     return value / SH_C0
 
 
-def project_sh0(sh0: Tensor, intensity: str) -> None:  # [N, 1, 1]
-    """Puts sh0 back, in place, to where the activation has a gradient; a sigmoid has one everywhere."""
+def project_sh0(sh0: Tensor, intensity: str, floor: float) -> None:  # [N, 1, 1]
+    """Puts sh0 back, in place, to where the activation has a gradient and its intensity is at least `floor`."""
     if intensity == "released":
         low, high = RELEASED_RANGE
-        sh0.clamp_((low - 1.0) / SH_C0, (high - 1.0) / SH_C0)
+        sh0.clamp_((max(floor, low) - 1.0) / SH_C0, (high - 1.0) / SH_C0)
+    elif floor > 0.0:
+        sh0.clamp_(min=math.log(floor / (1.0 - floor)) / (4.0 * SH_C0))

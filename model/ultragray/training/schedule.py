@@ -36,6 +36,10 @@ class Schedule:
         reached = self._config.sh_degree if first == 0 else int(step / first)
         return min(reached, self._config.sh_degree)
 
+    def intensity_floor(self, step: int) -> float:
+        """The least intensity of degree 0 that a Gaussian may have."""
+        return self._config.intensity_floor if step < self._config.floor_end * self._config.steps else 0.0
+
     def refinement(self, done: int) -> int | None:
         """Which refinement, from 0, is due after `done` steps; None: none, as after the last step."""
         if done in self._refinements and 0 < done < self._config.steps:

@@ -229,7 +229,7 @@ class Trainer:
             assert means_gradient is not None
             self._pull.add(means_gradient)
             self._optimizer.step(self._schedule.rates(self.step))
-            project_sh0(self.parameters["sh0"], self.config.intensity)
+            self._project(self.parameters["sh0"])
         self.step += 1
         if self.step % STEPS_PER_CHECK == 0:
             self._check_finite()
@@ -260,6 +260,9 @@ class Trainer:
         info = replace(self._info, sh_degree=sh_degree, gaussian_count=self.gaussian_count)
         return GaussianScene(**tensors, info=info)
 
+    def _project(self, sh0: Tensor) -> None:
+        project_sh0(sh0, self.config.intensity, self._schedule.intensity_floor(self.step))
+
     def _add_scale_penalty(self) -> float:
         """λ·mean(exp(scales)); its gradient is added to that of the scales."""
         scales = self.parameters["scales"]
@@ -280,7 +283,7 @@ class Trainer:
             )
             if not len(refined.parameters["means"]):
                 raise self._diverged("refinement pruned every Gaussian")
-            project_sh0(refined.parameters["sh0"], self.config.intensity)
+            self._project(refined.parameters["sh0"])
         self.parameters = self._trainable(refined.parameters)
         self._optimizer.replace(self.parameters, refined.origin)
         self._pull = PullStatistics.empty(self.gaussian_count, self._device)

@@ -24,7 +24,7 @@ def test_gives_the_intensity(name: str, low: float, high: float) -> None:
 
 def test_released_gaussian_beyond_an_end_has_a_gradient_again() -> None:
     sh0 = torch.tensor([-5.0, 5.0]).reshape(2, 1, 1)
-    project_sh0(sh0, "released")
+    project_sh0(sh0, "released", 0.0)
     sh0.requires_grad_()
     intensity_of(sh0, "released").sum().backward()
     assert sh0.grad is not None
@@ -33,5 +33,14 @@ def test_released_gaussian_beyond_an_end_has_a_gradient_again() -> None:
 
 def test_sigmoid_is_left_alone() -> None:
     sh0 = torch.tensor([-50.0, 50.0]).reshape(2, 1, 1)
-    project_sh0(sh0, "sigmoid")
+    project_sh0(sh0, "sigmoid", 0.0)
     assert sh0.flatten().tolist() == [-50.0, 50.0]
+
+
+@pytest.mark.parametrize("name", ["released", "sigmoid"])
+def test_a_floor_is_the_least_intensity(name: str) -> None:
+    sh0 = torch.tensor([-5.0, 0.2]).reshape(2, 1, 1)
+    above = intensity_of(sh0, name)[1]
+    project_sh0(sh0, name, 0.6)
+    assert intensity_of(sh0, name)[0].item() == pytest.approx(0.6)
+    assert intensity_of(sh0, name)[1] >= min(above.item(), 0.998) - 1e-6

@@ -54,3 +54,8 @@ def test_each_degree_joins_a_while_after_the_last() -> None:
 def test_even_growth_ends_at_the_limit() -> None:
     schedule = schedule_of(growth="even", initial_gaussians=100, max_gaussians=170)
     assert [schedule.gaussian_limit(k) for k in range(7)] == [110, 120, 130, 140, 150, 160, 170]
+
+
+def test_the_intensity_floor_holds_for_the_first_part() -> None:
+    schedule = schedule_of(steps=10, intensity_floor=0.4, floor_end=0.3)
+    assert [schedule.intensity_floor(step) for step in (0, 2, 3, 9)] == [0.4, 0.4, 0.0, 0.0]

@@ -160,7 +160,7 @@ def test_divergence_keeps_the_last_good_checkpoint(
 def test_parameters_that_are_not_finite_never_reach_a_checkpoint(
     tiny_dataset: Datasets, tiny_config: Configs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def spoil(sh0: torch.Tensor, intensity: str) -> None:
+    def spoil(sh0: torch.Tensor, intensity: str, floor: float) -> None:
         sh0[3] = float("inf")
 
     monkeypatch.setattr(trainer, "project_sh0", spoil)
