@@ -4,11 +4,12 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 KERNEL_SOURCES := $(wildcard model/kernels/*) CMakeLists.txt pyproject.toml
-PYTHON_SOURCES := model service workers proto tests
+PYTHON_SOURCES := model service workers proto tests benchmarks
+DATA ?= ../shared/data
 ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help serve test test-faults check format bench proto clean
+.PHONY: help serve test test-faults check format bench results demo-scene proto clean
 
 help:  ## say what there is
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
@@ -36,6 +37,13 @@ format: $(VENV)/installed-dev  ## rewrite the sources in the project's format
 
 bench: $(VENV)/installed  ## measure the kernel and the service; the table is printed, the JSON written
 	$(BIN)/ultragray bench --output benchmarks/results.json $(ARGS)
+	$(BIN)/ultragray bench --train --output benchmarks/training.json $(ARGS)
+
+results: $(VENV)/installed  ## train on every data set of DATA and write docs/results.md (ARGS="--only liver_convex" for one)
+	$(BIN)/python benchmarks/results_tables.py $(DATA) $(ARGS)
+
+demo-scene: $(VENV)/installed  ## simulate the phantom, train the demo scene from it and put it in its place
+	$(BIN)/python -m ultragray.demo.make
 
 proto: $(VENV)/installed-dev  ## regenerate the gRPC stubs
 	$(BIN)/python proto/generate.py

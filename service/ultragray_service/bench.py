@@ -22,6 +22,7 @@ from rich.table import Table
 import ultragray
 from ultragray import cpu
 from ultragray.files import atomic_path
+from ultragray.machine import processor_name
 
 from .bench_kernel import BATCH, BenchScene, bench_scenes, measure_kernel, time_yard_ms
 from .bench_served import measure_served
@@ -152,7 +153,7 @@ def _row(scene: BenchScene, yard_ms: float, what: str, threads: int, poses: int,
 
 def _machine(threads: int) -> dict[str, Any]:
     return {
-        "processor": _processor(),
+        "processor": processor_name(),
         "threads": threads,
         "instruction_set": cpu.INSTRUCTION_SETS[0],
         "system": platform.platform(),
@@ -164,15 +165,6 @@ def _machine(threads: int) -> dict[str, Any]:
         "uvicorn": version("uvicorn"),
         "measured_at": datetime.now(timezone.utc).isoformat(timespec="seconds"),
     }
-
-
-def _processor() -> str:
-    cpuinfo = Path("/proc/cpuinfo")
-    if cpuinfo.exists():
-        for line in cpuinfo.read_text().splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    return platform.processor() or platform.machine()
 
 
 def _title(document: dict[str, Any]) -> str:

@@ -32,6 +32,22 @@ LINEAR = LinearProbe(width_mm=30.0, near_mm=0.0, far_mm=40.0)
 CONVEX = ConvexProbe(opening_angle_deg=60.0, near_mm=10.0, far_mm=50.0)
 CONVEX_JSON = '{"kind": "convex", "opening_angle_deg": 60, "near_mm": 10, "far_mm": 50}'
 
+COMMANDS = (
+    "serve",
+    "render",
+    "info",
+    "dataset",
+    "train",
+    "eval",
+    "compound",
+    "report",
+    "export",
+    "import-ply",
+    "import-checkpoint",
+    "demo",
+    "bench",
+)
+
 
 def run(*arguments: object) -> Result:
     return CliRunner().invoke(app, [str(argument) for argument in arguments])
@@ -74,12 +90,12 @@ def test_help_is_instant_it_imports_nothing_heavy() -> None:
         "print(sorted({'torch', 'fastapi', 'grpc', 'cv2', 'uvicorn'} & set(sys.modules)))"
     )
     answer = subprocess.run(python(program, "--help"), capture_output=True, text=True, check=True)
-    for command in ("serve", "render", "info", "import-checkpoint", "demo", "bench"):
+    for command in COMMANDS:
         assert re.search(rf"\b{command}\b", answer.stdout)
     assert answer.stdout.splitlines()[-1] == "[]"
 
 
-@pytest.mark.parametrize("command", ["serve", "render", "info", "import-checkpoint", "demo", "bench"])
+@pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_explains_itself(command: str) -> None:
     result = run(command, "--help")
     assert result.exit_code == 0

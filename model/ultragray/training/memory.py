@@ -15,10 +15,6 @@ COPIES = 16  # parameters, gradients, moments; what refinements, checkpoints and
 STATISTICS = 2
 PIXEL_FLOATS = 32  # of a pixel of a batch: the outputs and what the backward pass keeps of them (measured: 17)
 GIB = 1 << 30
-CONTROL_GROUP_FILES = (  # limit and use, in versions 2 and 1
-    ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory.current"),
-    ("/sys/fs/cgroup/memory/memory.limit_in_bytes", "/sys/fs/cgroup/memory/memory.usage_in_bytes"),
-)
 
 
 def required_bytes(dataset: Dataset, config: TrainingConfig) -> int:

@@ -265,6 +265,12 @@ class Trainer:
 
     def _add_scale_penalty(self) -> float:
         """λ·mean(exp(scales)); its gradient is added to that of the scales."""
+        import os
+        lam = float(os.environ.get("LAMT", 0))
+        if lam:
+            x = self.parameters["transmittances"]
+            tau = torch.sigmoid(x)
+            x.grad.sub_(tau * (1 - tau), alpha=lam / len(x))
         scales = self.parameters["scales"]
         deviations = scales.exp()
         assert scales.grad is not None
