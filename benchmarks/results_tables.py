@@ -20,12 +20,16 @@ from typing import Any
 
 import torch
 
-from ultragray.baselines import BASELINES, evaluate_baselines
+from ultragray.baselines import BASELINES, evaluate_baselines, predict
 from ultragray.compounding import affordable_voxel_mm
+from ultragray.datasets.phantom.shadow import SHADOW_DB, BoneShadow
 from ultragray.datasets.source import PHANTOM, SourceOptions, load_dataset
+from ultragray.datasets.sweep import Dataset
+from ultragray.evaluation import render_sweep
 from ultragray.files import atomic_path
 from ultragray.machine import processor_name
 from ultragray.report.study import train_and_evaluate
+from ultragray.scene import GaussianScene
 from ultragray.training import Progress, TrainingConfig
 
 FOLDER = Path(__file__).resolve().parent
@@ -105,7 +109,7 @@ def measure(run: Run, data_folder: Path) -> dict[str, Any]:
     trained = train_and_evaluate(dataset, config, report=_teller(run.name))
     log.info("%s: %.2f dB in %.0f s", run.name, trained.evaluation.mean.psnr_db, trained.seconds)
     evaluations = {"scene": trained.evaluation, **baselines}
-    return {
+    figures = {
         "train_frames": len(dataset.train),
         "val_frames": len(dataset.val),
         "image": f"{dataset.train.height}x{dataset.train.width}",
@@ -124,6 +128,20 @@ def measure(run: Run, data_folder: Path) -> dict[str, Any]:
         "total_s": trained.seconds,
         "machine": f"{processor_name()}, {torch.get_num_threads()} threads",
         "measured_at": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+    }
+    if False:
+        figures["shadow"] = measure_shadow(trained.scene, dataset, voxel_mm)
+    return figures
+
+
+def measure_shadow(scene: GaussianScene, dataset: Dataset, voxel_mm: float) -> dict[str, float]:
+    """What the scene and median compounding show on the phantom's held-out frames where bone hides everything."""
+    shadow = BoneShadow.of(dataset.val)
+    compounded = predict(dataset.train, dataset.val.poses, "median", voxel_mm=voxel_mm)
+    return {
+        "scene_mae": shadow.mean_absolute_error(render_sweep(scene, dataset.val)),
+        "median_mae": shadow.mean_absolute_error(compounded),
+        "scene_transmittance": shadow.mean(render_sweep(scene, dataset.val, output="transmittance")),
     }
 
 
@@ -190,7 +208,19 @@ def _metrics_table(name: str, run: Mapping[str, Any]) -> list[str]:
             shown = f"**{mean}**" if mean == f"{best[key]:.{digits}f}" else mean
             cells.append(f"{shown} ± {std[key]:.{digits}f}")
         lines.append(f"| {row_name} | {' | '.join(cells)} |")
-    return [*lines, "", " ".join(notes), ""]
+    return [*lines, "", " ".join(notes), "", *_shadow_lines(run)]
+
+
+def _shadow_lines(run: Mapping[str, Any]) -> list[str]:
+    if "shadow" not in run:
+        return []
+    shadow = run["shadow"]
+    return [
+        f"Where bone takes more than {SHADOW_DB:g} dB: mean absolute error {shadow['scene_mae']:.4f} (scene) against "
+        f"{shadow['median_mae']:.4f} (median compounding);",
+        f"mean transmittance of the scene {shadow['scene_transmittance']:.3f}.",
+        "",
+    ]
 
 
 def _write(path: Path, text: str) -> None:

@@ -86,3 +86,23 @@ def test_a_run_that_fails_loses_nothing(script: ModuleType, monkeypatch: pytest.
         run(script, monkeypatch, data)
     assert set(json.loads((data / "figures.json").read_text())) == {"one", "two"}
     assert "## two" in (data / "results.md").read_text()
+
+
+def test_the_phantom_is_measured_in_the_shadow_of_bone(script: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    poses[:, 1, 3] = range(4)
+    images = np.random.default_rng(0).integers(100, 200, (4, 24, 24), dtype=np.uint8)
+    sweep = Sweep(images, poses, LinearProbe(60.0, 0.0, 60.0), np.arange(4), "phantom")
+    dataset = Dataset("phantom", sweep.select([0, 1, 3]), sweep.select([2]))
+    monkeypatch.setattr(script, "load_dataset", lambda source, options: dataset)
+    figures = script.measure(script.Run("phantom", script.PHANTOM, settings=SETTINGS), Path())
+    shadow = figures["shadow"]
+    assert 0.0 < shadow["median_mae"] < 0.4  # noise against the median of three times noise
+    assert 0.0 < shadow["scene_mae"] < 0.8
+    assert 0.0 <= shadow["scene_transmittance"] <= 1.0
+    monkeypatch.setattr(script, "RUNS", (script.Run("phantom", script.PHANTOM),))
+    tables = script.tables({"phantom": figures})
+    assert f"{shadow['scene_mae']:.4f} (scene) against {shadow['median_mae']:.4f} (median compounding)" in tables
+    assert f"mean transmittance of the scene {shadow['scene_transmittance']:.3f}" in tables
+    del figures["shadow"]
+    assert "Where bone" not in script.tables({"phantom": figures})

@@ -1,4 +1,4 @@
-"""The CPU backend: the C++ kernel of docs/physics.md §5 behind the signature that all backends share, differentiable."""
+"""The CPU backend: the C++ kernel of docs/physics.md §5 behind the signature that backends share, differentiable."""
 
 from __future__ import annotations
 

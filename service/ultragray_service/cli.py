@@ -72,7 +72,7 @@ def serve(
     data_folder: Annotated[
         Path | None,
         typer.Option(
-            help="Existing folder of scene files (*.ugr); where it holds none, the demo scene is made in it. "
+            help="Existing folder of scene files (*.ugr); where it holds none, the demo scene is put there. "
             "[ULTRAGRAY_DATA_FOLDER]",
             show_default="data",
         ),
@@ -255,14 +255,15 @@ def demo(
     output: Annotated[Path, typer.Option("--output", "-o", help="Scene file to write (.ugr).")] = Path("demo.ugr"),
 ) -> None:
     """Write the built-in demo scene."""
-    from ultragray.demo import build_demo_scene
+    from ultragray.demo import copy_demo_scene
+    from ultragray.scene_info import read_header
 
     from .cli_output import check_writable
 
     check_writable(output)
-    scene = build_demo_scene()
-    scene.save(output)
-    typer.echo(f"wrote {output}: {scene.info.dataset_name}, {scene.gaussian_count:,} Gaussians")
+    copy_demo_scene(output)
+    info = read_header(output).info
+    typer.echo(f"wrote {output}: {info.dataset_name}, {info.gaussian_count:,} Gaussians")
 
 
 @app.command()

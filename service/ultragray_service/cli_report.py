@@ -90,7 +90,7 @@ def _write_report(dataset: Dataset, config: TrainingConfig, output: Path, option
         if options.ablations:
             content["ablations"] = {
                 name: train_and_evaluate(dataset, changed, report=follow(name))
-                for name, changed in ablations(config).items()
+                for name, changed in ablations(config, content["scene"].gaussian_count).items()
             }
             content["tilt"] = study_tilt(
                 dataset.train, config, voxel_mm=options.voxel_mm, report=follow("growing tilt")

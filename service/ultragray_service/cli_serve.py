@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import tempfile
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import Any
 
 import typer
 
+from ultragray.demo import copy_demo_scene
 from ultragray.errors import InvalidArgument
 from ultragray.scene_info import read_header
 from ultragray_workers.scenes import SUFFIX, SceneStore
@@ -51,20 +51,12 @@ def ensure_scenes(folder: Path) -> None:
         raise InvalidArgument(f"data_folder must be an existing folder, got {str(folder)!r}", field="data_folder")
     if SceneStore(folder).names():
         return
-    typer.echo(f"{folder} holds no scenes: building the demo scene…", err=True)
     path = folder / f"{DEMO_NAME}{SUFFIX}"
-    # In a process of its own: it needs torch, which the service never loads.
-    building = multiprocessing.get_context("spawn").Process(target=_write_demo, args=(path,))
-    building.start()
-    building.join()
+    copy_demo_scene(path)
     info = read_header(path).info
-    typer.echo(f"wrote {path}: {info.dataset_name}, {info.gaussian_count:,} Gaussians", err=True)
-
-
-def _write_demo(path: Path) -> None:
-    from ultragray.demo import build_demo_scene
-
-    build_demo_scene().save(path)
+    typer.echo(
+        f"{folder} holds no scenes: wrote {path}: {info.dataset_name}, {info.gaussian_count:,} Gaussians", err=True
+    )
 
 
 def link_scenes(files: Iterable[Path], folder: Path) -> None:

@@ -72,15 +72,15 @@ def train_and_evaluate(dataset: Dataset, config: TrainingConfig, *, report: Repo
     )
 
 
-def ablations(config: TrainingConfig) -> dict[str, TrainingConfig]:
-    """The runs of the paper's ablation table, each a configuration that differs from `config` in one thing."""
+def ablations(config: TrainingConfig, gaussian_count: int) -> dict[str, TrainingConfig]:
+    """The runs of the paper's ablation table, each a configuration that differs from `config` in one thing.
+
+    `gaussian_count` is what the run with `config` has, of which some have a share.
+    """
 
     def with_share_of_gaussians(share: float) -> TrainingConfig:
-        return replace(
-            config,
-            max_gaussians=max(1, round(config.max_gaussians * share)),
-            initial_gaussians=max(1, round(config.initial_gaussians * share)),
-        )
+        limit = max(1, round(gaussian_count * share))
+        return replace(config, max_gaussians=limit, initial_gaussians=None)
 
     return {
         "no transmittance": replace(config, transmittance=False),

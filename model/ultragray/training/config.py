@@ -11,12 +11,13 @@ import math
 import sys
 import typing
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 from ..errors import InvalidArgument
 from ..scene_info import INTENSITIES, MAX_SH_DEGREE
+from .geometry import Geometry
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -24,7 +25,7 @@ else:
     import tomli as tomllib
 
 RELEASED_STEPS = 30_000  # the length of run that the released rates are tuned for
-MAX_TRANSMITTANCE_RATE = 2e-2  # beyond, short runs get worse again
+MAX_FLOOR = 0.9
 STARTS = ("informed", "random")
 GROWTHS = ("even", "threshold")
 
@@ -40,27 +41,29 @@ class TrainingConfig:
     steps: int = 1500
     batch_size: int = 8  # frames of one step; fewer where the dataset has fewer
     seed: int = 0
-    initial_gaussians: int = 30_000
-    max_gaussians: int = 60_000
+    initial_gaussians: int | None = None  # None: max_gaussians, or half of them where refinements add to them
+    max_gaussians: int | None = None  # None: from the number of pixels
     start: str = "informed"  # Gaussians begin on pixels of the frames; `random`: anywhere in a cube
     initial_scale_mm: float | None = None  # standard deviation; None: from the spacing of frames and pixels
+    initial_elevation_mm: float | None = None  # the same along elevation, for an informed start
     initial_transmittance: float = 0.99
     intensity: str = "sigmoid"  # activation, docs/physics.md §2
-    intensity_floor: float = 0.5  # no Gaussian's intensity (of degree 0) goes below, up to floor_end: shadows first
-    floor_end: float = 0.5
+    shadow_start: float = 0.1  # up to this share of the run only the transmittances are trained
+    intensity_floor: float | None = None  # up to floor_end no intensity is less; None: the mean brightness
+    floor_end: float = 0.3
     sh_degree: int = 1
     sh_start: float = 1_000 / RELEASED_STEPS  # where degree 1 joins; degree d at d times that
     transmittance: bool = True  # False: nothing absorbs
-    out_of_plane_mm: float | None = None  # full range of the shift along elevation; None: from the spacing; 0: off
+    out_of_plane_mm: float | None = None  # full range of the shift along elevation; None: from the frames; 0: off
     means_rate: float = 2e-4  # times the scene's scale, cm
     scales_rate: float = 1e-2
     quats_rate: float = 1e-2
-    transmittance_rate: float | None = None  # None: 5e-4 · 30,000 / steps, at most 2e-2
+    transmittance_rate: float = 5e-2
     sh0_rate: float = 1e-2
     shn_rate: float = 2e-5
     final_rate: float = 0.1  # every rate decays exponentially to this share
     scale_penalty: float = 1e-3  # λ of λ·mean(exp(scales)), cm
-    refinements: int = 7  # how often Gaussians are added and pruned
+    refinements: int = 0  # how often Gaussians are added and pruned
     refinement_end: float = 17_500 / RELEASED_STEPS  # the last refinement
     growth: str = "even"  # `threshold`: all above growth_gradient; `even`: the best, evenly up to max_gaussians
     growth_gradient: float = 5e-6  # mean ‖∂L/∂mean‖ of a Gaussian that is refined
@@ -83,7 +86,7 @@ class TrainingConfig:
                 raise InvalidArgument(
                     f"{name} must be one of {', '.join(choices)}, got {getattr(self, name)!r}", field=name
                 )
-        if self.initial_gaussians > self.max_gaussians:
+        if (self.initial_gaussians or 0) > (self.max_gaussians or math.inf):
             raise InvalidArgument(
                 f"initial_gaussians must be at most max_gaussians ({self.max_gaussians}), got {self.initial_gaussians}",
                 field="initial_gaussians",
@@ -93,16 +96,27 @@ class TrainingConfig:
     def preset(cls, name: str, **overrides: Any) -> TrainingConfig:
         """The preset `fast` or `paper` with some fields set otherwise.
 
-        Where only max_gaussians is set, the run starts with half of it. Raises InvalidArgument for an unknown preset
-        or field.
+        Raises InvalidArgument for an unknown preset or field.
         """
         if name not in PRESETS:
             raise InvalidArgument(f"preset must be one of {', '.join(PRESETS)}, got {name!r}", field="preset")
         values = {**PRESETS[name], **overrides}
         if "max_gaussians" in overrides and "initial_gaussians" not in overrides:
-            limit = overrides["max_gaussians"]
-            values["initial_gaussians"] = (limit + 1) // 2 if isinstance(limit, int) else limit
+            values["initial_gaussians"] = None
         return cls.from_dict(values)
+
+    def resolved(self, geometry: Geometry) -> TrainingConfig:
+        """The same with everything that was left to the data filled in."""
+        limit = self.max_gaussians or max(geometry.gaussian_count, self.initial_gaussians or 0)
+        return replace(
+            self,
+            max_gaussians=limit,
+            initial_gaussians=self.initial_gaussians or (limit if not self.refinements else (limit + 1) // 2),
+            initial_scale_mm=self.initial_scale_mm or geometry.initial_scale_mm,
+            initial_elevation_mm=self.initial_elevation_mm or geometry.initial_elevation_mm,
+            intensity_floor=_given_or(self.intensity_floor, min(geometry.brightness, MAX_FLOOR)),
+            out_of_plane_mm=_given_or(self.out_of_plane_mm, geometry.out_of_plane_mm),
+        )
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> TrainingConfig:
@@ -125,6 +139,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "start": "random",
         "initial_scale_mm": 0.5,
         "intensity": "released",
+        "shadow_start": 0.0,
         "intensity_floor": 0.0,
         "out_of_plane_mm": 2.0,
         "means_rate": 1e-4,
@@ -133,6 +148,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "transmittance_rate": 5e-4,
         "sh0_rate": 5e-3,
         "shn_rate": 1e-5,
+        "refinements": 7,
         "growth": "threshold",
         "split_intensity": 3.0,
     },
@@ -147,7 +163,9 @@ _RANGES: dict[str, tuple[float, float]] = {
     "max_gaussians": (1, 100_000_000),
     "initial_scale_mm": (1e-3, 1e3),
     "initial_transmittance": (0.5, 0.9999),
-    "intensity_floor": (0.0, 0.9),
+    "initial_elevation_mm": (1e-3, 1e3),
+    "shadow_start": (0.0, 1.0),
+    "intensity_floor": (0.0, MAX_FLOOR),
     "floor_end": (0.0, 1.0),
     "sh_degree": (0, MAX_SH_DEGREE),
     "sh_start": (0.0, 1.0),
@@ -164,6 +182,10 @@ _RANGES: dict[str, tuple[float, float]] = {
     "prune_below": (0.0, 1.0),
     "memory_gb": (1e-3, 1e6),
 }
+
+
+def _given_or(value: float | None, otherwise: float) -> float:
+    return otherwise if value is None else value
 
 
 def _check_type(name: str, value: Any, hint: Any) -> None:

@@ -10,15 +10,17 @@ from torch import Tensor
 
 from ..datasets.sweep import Dataset, Sweep
 from ..probe import FloatArray
+from .sampling import out_of_plane_range_mm
 
 SCALE_MARGIN = 1.1  # of the released recipe
-MIN_OUT_OF_PLANE_MM = 2.0  # likewise: the thickness of a slice
 FRAMES_AT_ONCE = 64
+PIXELS_PER_GAUSSIAN = 25  # of the training frames
+MIN_GAUSSIANS, MAX_GAUSSIANS = 2_000, 150_000  # fewer hold no anatomy, more take longer than they are worth
 
 
 @dataclass(frozen=True)
 class Geometry:
-    """Lengths of a dataset.
+    """What a training takes from the data where its configuration leaves it open.
 
     The scene scale is 1.1 × the largest distance of a corner of a training image from the centre.
     """
@@ -27,28 +29,35 @@ class Geometry:
     scene_scale_cm: float
     frame_spacing_mm: float
     pixel_mm: float  # geometric mean of the axial and the lateral size
+    out_of_plane_mm: float  # full range of the shift of a batch along elevation
+    gaussian_count: int
+    brightness: float  # mean of the training frames, in [0, 1]
 
     @classmethod
     def of(cls, dataset: Dataset) -> Geometry:
-        centre = dataset.centre_mm
-        reach_mm = float(np.linalg.norm(dataset.train.corners_mm() - centre, axis=-1).max())
-        axial, lateral = dataset.train.pixel_mm
+        sweep, centre = dataset.train, dataset.centre_mm
+        reach_mm = float(np.linalg.norm(sweep.corners_mm() - centre, axis=-1).max())
+        axial, lateral = sweep.pixel_mm
+        spacing = frame_spacing_mm(sweep)
         return cls(
             centre_mm=centre,
             scene_scale_cm=SCALE_MARGIN * reach_mm / 10.0,
-            frame_spacing_mm=frame_spacing_mm(dataset.train),
+            frame_spacing_mm=spacing,
             pixel_mm=(axial * lateral) ** 0.5,
+            out_of_plane_mm=out_of_plane_range_mm(sweep, spacing),
+            gaussian_count=min(max(sweep.images.size // PIXELS_PER_GAUSSIAN, MIN_GAUSSIANS), MAX_GAUSSIANS),
+            brightness=float(sweep.images.mean(dtype=np.float64)) / 255.0,
         )
 
     @property
     def initial_scale_mm(self) -> float:
-        """Standard deviation at the start: three quarters of a frame spacing, and no less than a pixel."""
-        return max(0.75 * self.frame_spacing_mm, self.pixel_mm)
+        """Standard deviation in the image plane at the start: half a frame spacing, and no less than a pixel."""
+        return max(0.5 * self.frame_spacing_mm, self.pixel_mm)
 
     @property
-    def out_of_plane_mm(self) -> float:
-        """Full range of the out-of-plane shift: 2 mm, or 2.5 spacings where frames lie further apart."""
-        return max(MIN_OUT_OF_PLANE_MM, 2.5 * self.frame_spacing_mm)
+    def initial_elevation_mm(self) -> float:
+        """Standard deviation across the image plane at the start: as thick as the slice that is learned."""
+        return max(self.frame_spacing_mm, self.out_of_plane_mm / 3.0, self.pixel_mm)
 
 
 def frame_spacing_mm(sweep: Sweep) -> float:

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from ..datasets.sweep import Dataset
+from ..pose import quaternion_from_pose
 from ..probe import ConvexProbe
 from ..scene import PARAMETERS
 from ..scene_info import expected_shapes
@@ -24,34 +25,31 @@ RELEASED_CUBE = 0.8  # half-side of the released start, × scene scale
 def initial_parameters(
     dataset: Dataset, geometry: Geometry, config: TrainingConfig, generator: torch.Generator
 ) -> dict[str, Tensor]:
-    """The six raw tensors, float32, in spatial order, drawn with `generator` alone.
+    """The six raw tensors, float32, in spatial order, drawn with `generator` alone; `config` leaves nothing open.
 
-    `random` draws means uniformly in the released cube, with one intensity for all. `informed` draws pixels of the
-    training frames uniformly and puts a Gaussian on each, with that pixel's brightness as its intensity, off the plane
-    by a normal deviate of half a frame spacing.
+    `random` draws means uniformly in the released cube, round Gaussians of one intensity. `informed` draws pixels of
+    the training frames uniformly and puts a Gaussian on each, turned like its frame and as thick as a slice, with
+    that pixel's brightness as its intensity, off the plane by a normal deviate of half a frame spacing.
     """
     count = config.initial_gaussians
+    assert count is not None
+    assert config.initial_scale_mm is not None
+    shapes = expected_shapes(count, config.sh_degree)
+    quats = torch.zeros(shapes["quats"])
+    quats[:, 0] = 1.0
+    scales_mm = torch.full(shapes["scales"], config.initial_scale_mm)
     if config.start == "random":
         means = (2.0 * torch.rand((count, 3), generator=generator) - 1.0) * RELEASED_CUBE * geometry.scene_scale_cm
         brightness = torch.full((count,), RELEASED_INTENSITY)
     else:
-        means, brightness, orientations = _on_pixels(dataset, geometry, count, generator)
-    scale_mm = config.initial_scale_mm or geometry.initial_scale_mm
+        frame, means, brightness = _on_pixels(dataset, geometry, count, generator)
+        turns = torch.tensor([quaternion_from_pose(pose) for pose in dataset.train.poses])
+        quats = turns[frame]
+        scales_mm[:, 1] = config.initial_elevation_mm or config.initial_scale_mm
     logit = math.log(config.initial_transmittance / (1.0 - config.initial_transmittance))
-    shapes = expected_shapes(count, config.sh_degree)
-    quats = torch.zeros(shapes["quats"])
-    quats[:, 0] = 1.0
-    import os
-    scales = torch.full(shapes["scales"], math.log(scale_mm / 10.0))
-    if config.start != "random":
-        quats = orientations
-        if os.environ.get("ELEV"):
-            scales[:, 1] = math.log(float(os.environ["ELEV"]) * geometry.frame_spacing_mm / 10.0)
-        if os.environ.get("INPLANE"):
-            scales[:, 0] = scales[:, 2] = math.log(float(os.environ["INPLANE"]) * geometry.pixel_mm / 10.0)
     parameters = {
         "means": means,
-        "scales": scales,
+        "scales": torch.log(scales_mm / 10.0),
         "quats": quats,
         "transmittances": torch.full(shapes["transmittances"], logit if config.transmittance else NO_ABSORPTION_LOGIT),
         "sh0": sh0_of_intensity(brightness, config.intensity).reshape(shapes["sh0"]),
@@ -63,9 +61,9 @@ def initial_parameters(
 
 def _on_pixels(
     dataset: Dataset, geometry: Geometry, count: int, generator: torch.Generator
-) -> tuple[Tensor, Tensor]:  # [N, 3] cm, [N] in [0, 1]
+) -> tuple[Tensor, Tensor, Tensor]:  # frames [N], means [N, 3] cm, brightness [N] in [0, 1]
     sweep, probe = dataset.train, dataset.probe
-    frame = torch.randint(len(sweep), (count,), generator=generator).numpy()
+    frame = torch.randint(len(sweep), (count,), generator=generator)
     across, deep = torch.rand((2, count), generator=generator, dtype=torch.float64).numpy()  # share of the image
     elevation_mm = torch.randn(count, generator=generator, dtype=torch.float64).numpy() * geometry.frame_spacing_mm / 2
     depth_mm = probe.near_mm + deep * probe.scan_line_length_mm
@@ -74,27 +72,9 @@ def _on_pixels(
         points_mm = np.stack([depth_mm * np.sin(angle), elevation_mm, depth_mm * np.cos(angle)], axis=1)
     else:
         points_mm = np.stack([probe.width_mm * (across - 0.5), elevation_mm, depth_mm], axis=1)
-    poses = sweep.poses[frame]
+    poses = sweep.poses[frame.numpy()]
     tracked_mm = np.einsum("nij,nj->ni", poses[:, :3, :3], points_mm) + poses[:, :3, 3]
     rows, columns = (deep * sweep.height).astype(np.int64), (across * sweep.width).astype(np.int64)
-    brightness = sweep.images[frame, rows, columns].astype(np.float32) / 255.0
+    brightness = sweep.images[frame.numpy(), rows, columns].astype(np.float32) / 255.0
     means = torch.from_numpy((tracked_mm - geometry.centre_mm) / 10.0).float()
-    return means, torch.from_numpy(brightness), torch.from_numpy(quaternions(poses[:, :3, :3])).float()
-
-
-def quaternions(r):
-    w = np.sqrt(np.maximum(0, 1 + r[:, 0, 0] + r[:, 1, 1] + r[:, 2, 2])) / 2
-    # robust: eigenvector method
-    k = np.empty((len(r), 4, 4))
-    m = r
-    k[:, 0, 0] = m[:, 0, 0] + m[:, 1, 1] + m[:, 2, 2]
-    k[:, 0, 1] = k[:, 1, 0] = m[:, 2, 1] - m[:, 1, 2]
-    k[:, 0, 2] = k[:, 2, 0] = m[:, 0, 2] - m[:, 2, 0]
-    k[:, 0, 3] = k[:, 3, 0] = m[:, 1, 0] - m[:, 0, 1]
-    k[:, 1, 1] = m[:, 0, 0] - m[:, 1, 1] - m[:, 2, 2]
-    k[:, 2, 2] = m[:, 1, 1] - m[:, 0, 0] - m[:, 2, 2]
-    k[:, 3, 3] = m[:, 2, 2] - m[:, 0, 0] - m[:, 1, 1]
-    k[:, 1, 2] = k[:, 2, 1] = m[:, 1, 0] + m[:, 0, 1]
-    k[:, 1, 3] = k[:, 3, 1] = m[:, 2, 0] + m[:, 0, 2]
-    k[:, 2, 3] = k[:, 3, 2] = m[:, 2, 1] + m[:, 1, 2]
-    return np.linalg.eigh(k)[1][:, :, -1]
+    return frame, means, torch.from_numpy(brightness)

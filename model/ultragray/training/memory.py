@@ -19,6 +19,7 @@ GIB = 1 << 30
 
 def required_bytes(dataset: Dataset, config: TrainingConfig) -> int:
     """An upper bound of the process's memory, dataset included."""
+    assert config.max_gaussians is not None
     harmonics = (config.sh_degree + 1) ** 2 - 1
     gaussians = 4 * config.max_gaussians * ((RAW_FLOATS + harmonics) * COPIES + STATISTICS)
     frames = min(config.batch_size, len(dataset.train))
@@ -66,8 +67,8 @@ def check_memory(dataset: Dataset, config: TrainingConfig) -> None:
     if limit is not None and needed > limit:
         source = "this machine has free" if config.memory_gb is None else "memory_gb allows"
         raise MemoryExceeded(
-            f"the training needs up to {needed / GIB:.1f} GiB with {config.max_gaussians:,} Gaussians and batches of "
-            f"{config.batch_size} frames of {dataset.train.height}x{dataset.train.width}, {source} {limit / GIB:.1f} "
+            f"the training needs up to {needed / GIB:.1f} GiB with {config.max_gaussians or 0:,} Gaussians and batches "
+            f"of {config.batch_size} frames of {dataset.train.height}x{dataset.train.width}, {source} {limit / GIB:.1f} "
             "GiB: lower max_gaussians or batch_size",
             field="max_gaussians",
         )

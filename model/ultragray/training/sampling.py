@@ -4,10 +4,15 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from ..datasets.sweep import IntArray, Sweep
 from ..probe import FloatArray
+
+RANGES = (1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 11.0, 16.0, 23.0, 32.0)  # × the distance of neighbouring frames
+PREDICTED_FRAMES, PREDICTED_PIXELS = 256, 4096  # enough to tell one range from another
 
 
 class BatchSampler:
@@ -26,6 +31,42 @@ class BatchSampler:
             self.waiting = torch.cat([self.waiting, order])
         batch, self.waiting = self.waiting[: self.batch_size], self.waiting[self.batch_size :]
         return batch
+
+
+def out_of_plane_range_mm(sweep: Sweep, spacing_mm: float) -> float:
+    """How far the frames themselves say that a slice is blurred along elevation: the full range of the shift.
+
+    Each frame is predicted by its neighbours within ± half a range, with the weights that the shift is drawn with, and
+    the range with the best mean PSNR is taken. That sees only neighbours at least one frame away, on two sides, so two
+    frame distances are taken off. At least 2.5 spacings: between the frames there must be no gap.
+    """
+    least = 2.5 * spacing_mm
+    corners = sweep.corners_mm().reshape(len(sweep), -1)  # [F, 3·K]
+    corner_count = corners.shape[1] // 3
+    distances = np.empty((len(sweep), len(sweep)))
+    for place in range(len(sweep)):
+        offsets = (corners - corners[place]).reshape(len(sweep), corner_count, 3)
+        distances[place] = np.linalg.norm(offsets, axis=-1).mean(axis=-1)
+        distances[place, place] = np.inf
+    step_mm = float(np.median(distances.min(axis=1)))
+    if step_mm == 0.0:
+        return least
+    pixels = sweep.images.reshape(len(sweep), -1)
+    stride = max(1, pixels.shape[1] // PREDICTED_PIXELS) | 1  # odd: it must not fall into step with the columns
+    images = torch.from_numpy(pixels[:, ::stride].astype(np.float32)) / 255.0  # [F, P]
+    targets = np.unique(np.linspace(0, len(sweep) - 1, PREDICTED_FRAMES).round().astype(np.int64))
+    scores = [_psnr_from_neighbours(images, distances[targets], targets, factor * step_mm) for factor in RANGES]
+    return max(least, RANGES[int(np.argmax(scores))] * step_mm - 2.0 * step_mm)
+
+
+def _psnr_from_neighbours(images: Tensor, distances: FloatArray, targets: IntArray, range_mm: float) -> float:
+    """Mean PSNR, dB, of frames `targets` [T] predicted by those within half a range; by the nearest where none is."""
+    weights = np.where(distances < range_mm / 2, np.cos(np.pi * np.minimum(distances, range_mm) / range_mm) ** 2, 0.0)
+    alone = weights.sum(axis=1) < 1e-6
+    weights[alone, distances[alone].argmin(axis=1)] = 1.0
+    shares = torch.from_numpy(weights / weights.sum(axis=1, keepdims=True)).float()
+    errors = (shares @ images - images[torch.from_numpy(targets)]).square().mean(dim=1)
+    return float((-10.0 * (errors + 1e-9).log10()).mean())
 
 
 def out_of_plane_shift_mm(range_mm: float, generator: torch.Generator) -> float:

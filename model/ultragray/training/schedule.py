@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from .config import MAX_TRANSMITTANCE_RATE, RELEASED_STEPS, TrainingConfig
+from .config import TrainingConfig
 
 
 class Schedule:
@@ -11,14 +11,11 @@ class Schedule:
     def __init__(self, config: TrainingConfig, *, scene_scale_cm: float, batch_size: int) -> None:
         self._config = config
         root = batch_size**0.5
-        transmittance = config.transmittance_rate
-        if transmittance is None:
-            transmittance = min(5e-4 * RELEASED_STEPS / config.steps, MAX_TRANSMITTANCE_RATE)
         self._first_rates = {
             "means": config.means_rate * scene_scale_cm * root,
             "scales": config.scales_rate * root,
             "quats": config.quats_rate * root,
-            "transmittances": transmittance * root,
+            "transmittances": config.transmittance_rate * root,
             "sh0": config.sh0_rate * root,
             "shN": config.shn_rate * root,
         }
@@ -26,9 +23,14 @@ class Schedule:
         self._refinements = [round(last * (k + 1) / config.refinements) for k in range(config.refinements)]
 
     def rates(self, step: int) -> dict[str, float]:
-        """Adam's rate for each parameter: exponential decay from the first to the last step."""
-        decay = self._config.final_rate ** (step / self._config.steps)
-        return {name: rate * decay for name, rate in self._first_rates.items()}
+        """Adam's rate for each parameter: exponential decay from the first to the last step, 0 before it is trained."""
+        config = self._config
+        decay = config.final_rate ** (step / config.steps)
+        shadows_only = config.transmittance and step < config.shadow_start * config.steps
+        return {
+            name: 0.0 if shadows_only and name != "transmittances" else rate * decay
+            for name, rate in self._first_rates.items()
+        }
 
     def sh_degree(self, step: int) -> int:
         """The degree of the harmonics in use: one more at each multiple of sh_start."""
@@ -38,6 +40,7 @@ class Schedule:
 
     def intensity_floor(self, step: int) -> float:
         """The least intensity of degree 0 that a Gaussian may have."""
+        assert self._config.intensity_floor is not None
         return self._config.intensity_floor if step < self._config.floor_end * self._config.steps else 0.0
 
     def refinement(self, done: int) -> int | None:
@@ -49,6 +52,8 @@ class Schedule:
     def gaussian_limit(self, refinement: int) -> int:
         """How many Gaussians there may be after a refinement."""
         config = self._config
+        assert config.initial_gaussians is not None
+        assert config.max_gaussians is not None
         if config.growth == "threshold":
             return config.max_gaussians
         share = (refinement + 1) / config.refinements

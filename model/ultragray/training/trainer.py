@@ -102,14 +102,12 @@ class Trainer:
                 f"{dataset.train.source}: images must have at least {SSIM_WINDOW} rows and columns, got "
                 f"{dataset.train.height}x{dataset.train.width}"
             )
+        self._geometry = Geometry.of(dataset)
+        config = config.resolved(self._geometry)
         check_memory(dataset, config)
         self.dataset, self.config, self.folder = dataset, config, folder
         self._device, self._backend = _torch_device(device), backend
-        self._geometry = Geometry.of(dataset)
         self._images = torch.tensor(dataset.train.images, device=self._device)  # [F, H, W] uint8
-        self._out_of_plane_mm = (
-            self._geometry.out_of_plane_mm if config.out_of_plane_mm is None else config.out_of_plane_mm
-        )
         x, y, z = self._geometry.centre_mm.tolist()
         self._info = SceneInfo(
             centre_mm=(x, y, z),
@@ -216,8 +214,8 @@ class Trainer:
         """One batch, one update, and the refinement that is due after it; returns the loss."""
         batch = self._sampler.next_batch()
         poses = self.dataset.train.poses[batch.numpy()]
-        if self._out_of_plane_mm:
-            poses = shift_out_of_plane(poses, out_of_plane_shift_mm(self._out_of_plane_mm, self._generator))
+        if self.config.out_of_plane_mm:
+            poses = shift_out_of_plane(poses, out_of_plane_shift_mm(self.config.out_of_plane_mm, self._generator))
         truth = self._images[batch.to(self._device)].float().div_(255.0)
         image = image_loss(self._rendered(poses, self._schedule.sh_degree(self.step)), truth)
         image.backward()  # type: ignore[no-untyped-call]
@@ -265,12 +263,6 @@ class Trainer:
 
     def _add_scale_penalty(self) -> float:
         """λ·mean(exp(scales)); its gradient is added to that of the scales."""
-        import os
-        lam = float(os.environ.get("LAMT", 0))
-        if lam:
-            x = self.parameters["transmittances"]
-            tau = torch.sigmoid(x)
-            x.grad.sub_(tau * (1 - tau), alpha=lam / len(x))
         scales = self.parameters["scales"]
         deviations = scales.exp()
         assert scales.grad is not None

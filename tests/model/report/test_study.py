@@ -40,15 +40,15 @@ def test_ablations_differ_in_what_they_are_named_after(small_config: TrainingCon
     full = small_config.to_dict()
     changed = {
         name: {key: value for key, value in config.to_dict().items() if value != full[key]}
-        for name, config in ablations(small_config).items()
+        for name, config in ablations(small_config, small_config.max_gaussians or 0).items()
     }
     assert changed == {
         "no transmittance": {"transmittance": False},
         "spherical harmonics of degree 0": {"sh_degree": 0},
         "no out-of-plane sampling": {"out_of_plane_mm": 0.0},
-        "a quarter of the Gaussians": {"max_gaussians": 15, "initial_gaussians": 8},
-        "half of the Gaussians": {"max_gaussians": 30, "initial_gaussians": 15},
-        "twice the Gaussians": {"max_gaussians": 120, "initial_gaussians": 60},
+        "a quarter of the Gaussians": {"max_gaussians": 15},
+        "half of the Gaussians": {"max_gaussians": 30},
+        "twice the Gaussians": {"max_gaussians": 120},
     }
 
 

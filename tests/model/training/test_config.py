@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from ultragray.datasets.sweep import Dataset
 from ultragray.errors import InvalidArgument
 from ultragray.training.config import TrainingConfig, parse_value, read_config_file
+from ultragray.training.geometry import Geometry
 
 
 def test_presets() -> None:
@@ -21,9 +24,25 @@ def test_presets() -> None:
         TrainingConfig.preset("slow")
 
 
-def test_half_of_the_gaussians_start_where_only_the_end_is_given() -> None:
-    assert TrainingConfig.preset("paper", max_gaussians=60_000).initial_gaussians == 30_000
+def test_half_of_the_gaussians_start_where_only_the_end_is_given(tiny_dataset: Callable[..., Dataset]) -> None:
+    geometry = Geometry.of(tiny_dataset())
+    assert TrainingConfig.preset("paper", max_gaussians=60_000).resolved(geometry).initial_gaussians == 30_000
     assert TrainingConfig.preset("paper", max_gaussians=60_000, initial_gaussians=7).initial_gaussians == 7
+
+
+def test_what_is_left_open_follows_from_the_data(tiny_dataset: Callable[..., Dataset]) -> None:
+    geometry = Geometry.of(tiny_dataset())
+    config = TrainingConfig().resolved(geometry)
+    assert config.max_gaussians == config.initial_gaussians == geometry.gaussian_count
+    assert config.initial_scale_mm == geometry.initial_scale_mm
+    assert config.initial_elevation_mm == geometry.initial_elevation_mm
+    assert config.out_of_plane_mm == geometry.out_of_plane_mm
+    assert config.intensity_floor == geometry.brightness
+    given = TrainingConfig(max_gaussians=9, out_of_plane_mm=0.0, intensity_floor=0.0, initial_scale_mm=2.0)
+    resolved = given.resolved(geometry)
+    assert (resolved.max_gaussians, resolved.initial_gaussians, resolved.initial_scale_mm) == (9, 9, 2.0)
+    assert (resolved.out_of_plane_mm, resolved.intensity_floor) == (0.0, 0.0)
+    assert resolved.resolved(geometry) == resolved
 
 
 def test_survives_json() -> None:
@@ -45,7 +64,7 @@ def test_survives_json() -> None:
         ({"intensity": "linear"}, "intensity must be one of released, sigmoid, got 'linear'"),
         ({"start": "warm"}, "start must be one of informed, random, got 'warm'"),
         ({"max_gaussians": 5, "initial_gaussians": 6}, "initial_gaussians must be at most max_gaussians (5), got 6"),
-        ({"max_gaussians": "many"}, "initial_gaussians must be an integer, got 'many'"),
+        ({"max_gaussians": "many"}, "max_gaussians must be an integer or none, got 'many'"),
         ({"sh_degree": 4}, "sh_degree must be between 0 and 3, got 4"),
     ],
 )

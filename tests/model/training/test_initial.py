@@ -15,10 +15,12 @@ from ultragray.datasets.sweep import Dataset
 from ultragray.training import TrainingConfig
 from ultragray.training.geometry import Geometry
 from ultragray.training.initial import initial_parameters
+from ultragray.training.refinement import rotate
 
 
 def start_of(dataset: Dataset, config: TrainingConfig) -> dict[str, torch.Tensor]:
-    return initial_parameters(dataset, Geometry.of(dataset), config, torch.Generator().manual_seed(3))
+    geometry = Geometry.of(dataset)
+    return initial_parameters(dataset, geometry, config.resolved(geometry), torch.Generator().manual_seed(3))
 
 
 def test_informed_start_lies_on_pixels_of_that_brightness(
@@ -74,3 +76,17 @@ def test_depends_on_the_generator_alone(
 ) -> None:
     first, second = (start_of(tiny_dataset(), tiny_config()) for _ in range(2))
     assert all(torch.equal(first[name], second[name]) for name in first)
+
+
+def test_informed_gaussians_are_turned_like_their_frame_and_as_thick_as_a_slice(
+    tiny_dataset: Callable[..., Dataset], tiny_config: Callable[..., TrainingConfig]
+) -> None:
+    dataset = tiny_dataset()
+    turn = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    poses = dataset.train.poses.copy()
+    poses[:, :3, :3] = turn
+    dataset = replace(dataset, train=replace(dataset.train, poses=poses))
+    parameters = start_of(dataset, tiny_config(initial_scale_mm=1.0, initial_elevation_mm=3.0))
+    elevation = rotate(parameters["quats"], torch.tensor([[0.0, 1.0, 0.0]]).expand(len(parameters["quats"]), 3))
+    assert torch.allclose(elevation, torch.tensor(turn[:, 1]).float(), atol=1e-6)
+    assert torch.allclose(parameters["scales"].exp(), torch.tensor([0.1, 0.3, 0.1]))

@@ -22,7 +22,7 @@ def test_names_what_to_lower(tiny_dataset: Callable[..., Dataset]) -> None:
 
 
 def test_uses_what_is_free(tiny_dataset: Callable[..., Dataset], monkeypatch: pytest.MonkeyPatch) -> None:
-    dataset, config = tiny_dataset(), TrainingConfig()
+    dataset, config = tiny_dataset(), TrainingConfig(max_gaussians=1000)
     needed = memory.required_bytes(dataset, config)
     monkeypatch.setattr(memory, "available_bytes", lambda: needed)
     memory.check_memory(dataset, config)
@@ -33,7 +33,7 @@ def test_uses_what_is_free(tiny_dataset: Callable[..., Dataset], monkeypatch: py
 
 def test_grows_with_gaussians_and_pixels(tiny_dataset: Callable[..., Dataset]) -> None:
     def needed(dataset: Dataset, **settings: int) -> int:
-        return memory.required_bytes(dataset, TrainingConfig.preset("fast", **settings))
+        return memory.required_bytes(dataset, TrainingConfig.preset("fast", **{"max_gaussians": 1000, **settings}))
 
     small = tiny_dataset()
     per_gaussian = (needed(small, max_gaussians=200_000) - needed(small, max_gaussians=100_000)) / 100_000

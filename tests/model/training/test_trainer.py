@@ -60,7 +60,7 @@ def test_scene_says_what_it_is(tiny_dataset: Datasets, tiny_config: Configs, tmp
     assert info.centre_mm == pytest.approx(Geometry.of(dataset).centre_mm.tolist())
     assert (info.dataset_name, info.dataset_sha256) == ("tiny", dataset.sha256)
     assert (info.intensity, info.sh_degree) == ("sigmoid", 1)
-    assert info.training == {**config.to_dict(), "step": 24}
+    assert info.training == {**config.resolved(Geometry.of(dataset)).to_dict(), "step": 24}
     assert set(info.metrics) == {"psnr_db", "ms_ssim", "gms", "gmsd"}
     assert np.array_equal(scene.training_poses, dataset.train.poses)
 
@@ -89,7 +89,7 @@ def test_resumed_run_ends_in_the_same_scene(tiny_dataset: Datasets, tiny_config:
     assert scene.to_bytes() == expected.to_bytes()
     lines = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
     assert [line["step"] for line in lines] == list(range(1, 13))
-    assert json.loads((tmp_path / "config.json").read_text()) == config.to_dict()
+    assert json.loads((tmp_path / "config.json").read_text()) == config.resolved(Geometry.of(dataset)).to_dict()
 
 
 PROGRAM = """

@@ -1,0 +1,46 @@
+"""Where bone hides the phantom from the probe, and what a rendering shows there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from ...errors import DatasetInvalid
+from ...probe import LinearProbe
+from ..sweep import Sweep
+from .imaging import bone_attenuation_db
+from .scatterers import Float32Array
+
+SHADOW_DB = 30.0  # taken by bone, there and back
+
+
+@dataclass(frozen=True, eq=False)
+class BoneShadow:
+    """The pixels of a sweep of the phantom from which bone takes more than SHADOW_DB."""
+
+    sweep: Sweep
+    hidden: npt.NDArray[np.bool_]  # [F, H, W]
+
+    @classmethod
+    def of(cls, sweep: Sweep) -> BoneShadow:
+        """Simulates the attenuation along each scan line.
+
+        Raises DatasetInvalid for a sweep of another probe than a linear one, or without a pixel behind bone.
+        """
+        if not isinstance(sweep.probe, LinearProbe):
+            raise DatasetInvalid(f"{sweep.source}: the phantom is scanned with a linear probe, got {sweep.probe}")
+        attenuation_db = bone_attenuation_db(sweep.poses, probe=sweep.probe, height=sweep.height, width=sweep.width)
+        hidden = attenuation_db > SHADOW_DB
+        if not hidden.any():
+            raise DatasetInvalid(f"{sweep.source}: no pixel lies in the shadow of bone")
+        return cls(sweep, hidden)
+
+    def mean(self, values: Float32Array) -> float:  # [F, H, W]
+        """Mean of something over the shadow."""
+        return float(values[self.hidden].mean(dtype=np.float64))
+
+    def mean_absolute_error(self, frames: Float32Array) -> float:  # [F, H, W] in [0, 1]
+        """Mean absolute difference between predicted frames and those of the sweep over the shadow."""
+        return self.mean(np.abs(frames - self.sweep.images / np.float32(255.0)))
