@@ -129,7 +129,7 @@ def measure(run: Run, data_folder: Path) -> dict[str, Any]:
         "machine": f"{processor_name()}, {torch.get_num_threads()} threads",
         "measured_at": datetime.now(timezone.utc).isoformat(timespec="seconds"),
     }
-    if False:
+    if run.source == PHANTOM:
         figures["shadow"] = measure_shadow(trained.scene, dataset, voxel_mm)
     return figures
 

@@ -11,6 +11,7 @@ from torch import Tensor
 from ..datasets.sweep import IntArray, Sweep
 from ..probe import FloatArray
 
+TELLING_RANGE = 8.0  # × that distance: four frames on either side
 RANGES = (1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 11.0, 16.0, 23.0, 32.0)  # × the distance of neighbouring frames
 PREDICTED_FRAMES, PREDICTED_PIXELS = 256, 4096  # enough to tell one range from another
 
@@ -37,8 +38,8 @@ def out_of_plane_range_mm(sweep: Sweep, spacing_mm: float) -> float:
     """How far the frames themselves say that a slice is blurred along elevation: the full range of the shift.
 
     Each frame is predicted by its neighbours within ± half a range, with the weights that the shift is drawn with, and
-    the range with the best mean PSNR is taken. That sees only neighbours at least one frame away, on two sides, so two
-    frame distances are taken off. At least 2.5 spacings: between the frames there must be no gap.
+    the range with the best mean PSNR is taken, if it takes in several frames on either side: their own distance decides
+    otherwise. At least 2.5 spacings: between the frames there must be no gap.
     """
     least = 2.5 * spacing_mm
     corners = sweep.corners_mm().reshape(len(sweep), -1)  # [F, 3·K]
@@ -56,7 +57,8 @@ def out_of_plane_range_mm(sweep: Sweep, spacing_mm: float) -> float:
     images = torch.from_numpy(pixels[:, ::stride].astype(np.float32)) / 255.0  # [F, P]
     targets = np.unique(np.linspace(0, len(sweep) - 1, PREDICTED_FRAMES).round().astype(np.int64))
     scores = [_psnr_from_neighbours(images, distances[targets], targets, factor * step_mm) for factor in RANGES]
-    return max(least, RANGES[int(np.argmax(scores))] * step_mm - 2.0 * step_mm)
+    best = RANGES[int(np.argmax(scores))]
+    return max(least, best * step_mm) if best >= TELLING_RANGE else least
 
 
 def _psnr_from_neighbours(images: Tensor, distances: FloatArray, targets: IntArray, range_mm: float) -> float:
