@@ -1,5 +1,5 @@
 // Half L1, half structural dissimilarity of one image, and the gradient: SSIM with a Gaussian window of 11x11 pixels,
-// sigma 1.5, only where the window lies inside (docs/physics.md §6). Both passes are separable: down the columns, then along
+// sigma 1.5, only where the window lies inside (docs/physics.md §7). Both passes are separable: down the columns, then along
 // the rows.
 
 namespace {

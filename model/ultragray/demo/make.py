@@ -55,7 +55,7 @@ def make_scene(dataset: Dataset, config: TrainingConfig) -> GaussianScene:
         "shadow_mae": shadow.mean_absolute_error(render_sweep(scene, dataset.val)),
         "shadow_transmittance": shadow.mean(render_sweep(scene, dataset.val, output="transmittance")),
     }
-    return replace(scene, info=replace(scene.info, metrics=metrics))
+    return replace(scene, info=replace(scene.info, dataset_name=DATASET_NAME, metrics=metrics))
 
 
 def _teller() -> Callable[[Progress], None]:

@@ -1,4 +1,4 @@
-"""The image part of the training loss by the C++ kernel (docs/physics.md §6): forward and gradient in one pass."""
+"""The image part of the training loss by the C++ kernel (docs/physics.md §7): forward and gradient in one pass."""
 
 from __future__ import annotations
 

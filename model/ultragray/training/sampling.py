@@ -41,7 +41,7 @@ def out_of_plane_range_mm(sweep: Sweep, spacing_mm: float) -> float:
     the range with the best mean PSNR is taken, if it takes in several frames on either side: their own distance decides
     otherwise. At least 2.5 spacings: between the frames there must be no gap.
     """
-    least = 2.5 * spacing_mm
+    least = 1.25 * spacing_mm
     corners = sweep.corners_mm().reshape(len(sweep), -1)  # [F, 3·K]
     corner_count = corners.shape[1] // 3
     distances = np.empty((len(sweep), len(sweep)))
