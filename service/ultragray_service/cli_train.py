@@ -210,10 +210,10 @@ def _train(dataset: Any, config: TrainingConfig, run: RunOptions) -> None:
         raise TrainingDiverged(f"{error.detail}; {run.output} is the scene after step {step}") from error
     scene.save(run.output)
     elapsed_s = time.monotonic() - started
-    done = scene.info.training["step"]
-    if done < config.steps:
+    done, steps = scene.info.training["step"], scene.info.training["steps"]
+    if done < steps:
         typer.echo(
-            f"stopped after step {done:,} of {config.steps:,}; wrote {run.output} as it is; go on with the same "
+            f"stopped after step {done:,} of {steps:,}; wrote {run.output} as it is; go on with the same "
             "command and --resume",
             err=True,
         )

@@ -17,7 +17,9 @@ import torch
 from typer.testing import CliRunner, Result
 
 from ultragray import GaussianScene, LinearProbe
+from ultragray.datasets.source import load_dataset
 from ultragray.training import TrainingConfig, trainer
+from ultragray.training.geometry import Geometry
 from ultragray_service.cli import app
 
 SMALL = ("--steps", 24, "--max-gaussians", 60, "--threads", 1)
@@ -95,7 +97,7 @@ def test_settings_come_from_file_set_and_options(dataset: Path, tmp_path: Path) 
         out_of_plane_mm=0,
         intensity="sigmoid",
     )
-    assert TrainingConfig.from_dict(training) == expected
+    assert TrainingConfig.from_dict(training) == expected.resolved(Geometry.of(load_dataset(dataset)))
     assert run(dataset, "-o", tmp_path / "b.ugr", "--config", file, "--preset", "fast").exit_code == 0
     assert GaussianScene.load(tmp_path / "b.ugr").info.training["intensity"] == TrainingConfig().intensity
 

@@ -38,7 +38,7 @@ class TrainingConfig:
     naming the field, for a value outside its range.
     """
 
-    steps: int = 1500
+    steps: int | None = None  # None: 1,500, fewer for a few frames
     batch_size: int = 8  # frames of one step; fewer where the dataset has fewer
     seed: int = 0
     initial_gaussians: int | None = None  # None: max_gaussians, or half of them where refinements add to them
@@ -110,6 +110,7 @@ class TrainingConfig:
         limit = self.max_gaussians or max(geometry.gaussian_count, self.initial_gaussians or 0)
         return replace(
             self,
+            steps=self.steps or geometry.steps,
             max_gaussians=limit,
             initial_gaussians=self.initial_gaussians or (limit if not self.refinements else (limit + 1) // 2),
             initial_scale_mm=self.initial_scale_mm or geometry.initial_scale_mm,

@@ -15,6 +15,7 @@ from .sampling import out_of_plane_range_mm
 SCALE_MARGIN = 1.1  # of the released recipe
 FRAMES_AT_ONCE = 64
 PIXELS_PER_GAUSSIAN = 25  # of the training frames
+MAX_STEPS, STEPS_PER_FRAME = 1_500, 40  # a frame that is seen more often is learned with its noise
 MIN_GAUSSIANS, MAX_GAUSSIANS = 2_000, 150_000  # fewer hold no anatomy, more take longer than they are worth
 
 
@@ -31,6 +32,7 @@ class Geometry:
     pixel_mm: float  # geometric mean of the axial and the lateral size
     out_of_plane_mm: float  # full range of the shift of a batch along elevation
     gaussian_count: int
+    steps: int
     brightness: float  # mean of the training frames, in [0, 1]
 
     @classmethod
@@ -46,6 +48,7 @@ class Geometry:
             pixel_mm=(axial * lateral) ** 0.5,
             out_of_plane_mm=out_of_plane_range_mm(sweep, spacing),
             gaussian_count=min(max(sweep.images.size // PIXELS_PER_GAUSSIAN, MIN_GAUSSIANS), MAX_GAUSSIANS),
+            steps=min(MAX_STEPS, STEPS_PER_FRAME * len(sweep)),
             brightness=float(sweep.images.mean(dtype=np.float64)) / 255.0,
         )
 
@@ -57,7 +60,7 @@ class Geometry:
     @property
     def initial_elevation_mm(self) -> float:
         """Standard deviation across the image plane at the start: as thick as the slice that is learned."""
-        return max(self.frame_spacing_mm, self.out_of_plane_mm / 3.0, self.pixel_mm)
+        return max(self.frame_spacing_mm, self.out_of_plane_mm / 2.0, self.pixel_mm)
 
 
 def frame_spacing_mm(sweep: Sweep) -> float:

@@ -68,7 +68,7 @@ def check_memory(dataset: Dataset, config: TrainingConfig) -> None:
         source = "this machine has free" if config.memory_gb is None else "memory_gb allows"
         raise MemoryExceeded(
             f"the training needs up to {needed / GIB:.1f} GiB with {config.max_gaussians or 0:,} Gaussians and batches "
-            f"of {config.batch_size} frames of {dataset.train.height}x{dataset.train.width}, {source} {limit / GIB:.1f} "
-            "GiB: lower max_gaussians or batch_size",
+            f"of {config.batch_size} frames of {dataset.train.height}x{dataset.train.width}, {source} "
+            f"{limit / GIB:.1f} GiB: lower max_gaussians or batch_size",
             field="max_gaussians",
         )

@@ -34,7 +34,7 @@ class Optimizer:
         self._adam.zero_grad(set_to_none=True)
 
     def replace(self, parameters: Mapping[str, Tensor], origin: Tensor) -> None:
-        """Goes on with new tensors: row i was row `origin[i]` of the old ones, or is a new Gaussian where that is −1."""
+        """Goes on with new tensors: row i was row `origin[i]` of the old, or is a new Gaussian where that is −1."""
         for name, group in zip(self._names, self._adam.param_groups, strict=True):
             (old,), new = group["params"], parameters[name]
             state = self._adam.state.pop(old, None)

@@ -11,6 +11,7 @@ from torch import Tensor
 from ..datasets.sweep import IntArray, Sweep
 from ..probe import FloatArray
 
+LEAST_RANGE = 1.5  # × the spacing of the frames
 TELLING_RANGE = 8.0  # × that distance: four frames on either side
 RANGES = (1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 11.0, 16.0, 23.0, 32.0)  # × the distance of neighbouring frames
 PREDICTED_FRAMES, PREDICTED_PIXELS = 256, 4096  # enough to tell one range from another
@@ -38,10 +39,11 @@ def out_of_plane_range_mm(sweep: Sweep, spacing_mm: float) -> float:
     """How far the frames themselves say that a slice is blurred along elevation: the full range of the shift.
 
     Each frame is predicted by its neighbours within ± half a range, with the weights that the shift is drawn with, and
-    the range with the best mean PSNR is taken, if it takes in several frames on either side: their own distance decides
-    otherwise. At least 2.5 spacings: between the frames there must be no gap.
+    half the range with the best mean PSNR is taken (PSNR likes blur; the half has most of the gain and keeps detail), if
+    that range takes in several frames on either side: their own distance decides otherwise. At least 1.5 spacings:
+    between the frames there must be no gap.
     """
-    least = 1.25 * spacing_mm
+    least = LEAST_RANGE * spacing_mm
     corners = sweep.corners_mm().reshape(len(sweep), -1)  # [F, 3·K]
     corner_count = corners.shape[1] // 3
     distances = np.empty((len(sweep), len(sweep)))
@@ -58,7 +60,7 @@ def out_of_plane_range_mm(sweep: Sweep, spacing_mm: float) -> float:
     targets = np.unique(np.linspace(0, len(sweep) - 1, PREDICTED_FRAMES).round().astype(np.int64))
     scores = [_psnr_from_neighbours(images, distances[targets], targets, factor * step_mm) for factor in RANGES]
     best = RANGES[int(np.argmax(scores))]
-    return max(least, best * step_mm) if best >= TELLING_RANGE else least
+    return max(least, 0.5 * best * step_mm) if best >= TELLING_RANGE else least
 
 
 def _psnr_from_neighbours(images: Tensor, distances: FloatArray, targets: IntArray, range_mm: float) -> float:

@@ -9,7 +9,8 @@ class Schedule:
     """The schedules of one run. Steps count from 0; `step` of n completed steps is the next one."""
 
     def __init__(self, config: TrainingConfig, *, scene_scale_cm: float, batch_size: int) -> None:
-        self._config = config
+        assert config.steps is not None
+        self._config, self.steps = config, config.steps
         root = batch_size**0.5
         self._first_rates = {
             "means": config.means_rate * scene_scale_cm * root,
@@ -19,14 +20,14 @@ class Schedule:
             "sh0": config.sh0_rate * root,
             "shN": config.shn_rate * root,
         }
-        last = config.refinement_end * config.steps
+        last = config.refinement_end * self.steps
         self._refinements = [round(last * (k + 1) / config.refinements) for k in range(config.refinements)]
 
     def rates(self, step: int) -> dict[str, float]:
         """Adam's rate for each parameter: exponential decay from the first to the last step, 0 before it is trained."""
         config = self._config
-        decay = config.final_rate ** (step / config.steps)
-        shadows_only = config.transmittance and step < config.shadow_start * config.steps
+        decay = config.final_rate ** (step / self.steps)
+        shadows_only = config.transmittance and step < config.shadow_start * self.steps
         return {
             name: 0.0 if shadows_only and name != "transmittances" else rate * decay
             for name, rate in self._first_rates.items()
@@ -34,18 +35,18 @@ class Schedule:
 
     def sh_degree(self, step: int) -> int:
         """The degree of the harmonics in use: one more at each multiple of sh_start."""
-        first = self._config.sh_start * self._config.steps
+        first = self._config.sh_start * self.steps
         reached = self._config.sh_degree if first == 0 else int(step / first)
         return min(reached, self._config.sh_degree)
 
     def intensity_floor(self, step: int) -> float:
         """The least intensity of degree 0 that a Gaussian may have."""
         assert self._config.intensity_floor is not None
-        return self._config.intensity_floor if step < self._config.floor_end * self._config.steps else 0.0
+        return self._config.intensity_floor if step < self._config.floor_end * self.steps else 0.0
 
     def refinement(self, done: int) -> int | None:
         """Which refinement, from 0, is due after `done` steps; None: none, as after the last step."""
-        if done in self._refinements and 0 < done < self._config.steps:
+        if done in self._refinements and 0 < done < self.steps:
             return self._refinements.index(done)
         return None
 

@@ -176,13 +176,13 @@ class Trainer:
     ) -> None:
         """Steps to the end, or until `should_stop`; see `train`."""
         saved_at = time.monotonic()
-        while self.step < self.config.steps:
+        while self.step < self._schedule.steps:
             progress = self._timed_step(log)
             if report is not None:
                 report(progress)
             if should_stop is not None and should_stop():
                 break
-            if self.step < self.config.steps and time.monotonic() - saved_at >= checkpoint_interval_s:
+            if self.step < self._schedule.steps and time.monotonic() - saved_at >= checkpoint_interval_s:
                 self.save_checkpoint()
                 saved_at = time.monotonic()
         self.save_checkpoint()
@@ -191,18 +191,18 @@ class Trainer:
         started = time.perf_counter()
         loss = self.take_step()
         line: dict[str, float] = {"step": self.step, "loss": loss, "gaussians": self.gaussian_count}
-        if len(self.dataset.val) and self.step % math.ceil(self.config.steps / VALIDATIONS) == 0:
+        if len(self.dataset.val) and self.step % math.ceil(self._schedule.steps / VALIDATIONS) == 0:
             self._val_psnr_db = line["val_psnr_db"] = self._validate()
         self._timer.add(time.perf_counter() - started)
         log({**line, "elapsed_s": round(self._timer.elapsed_s, 3)})
         rate = self._timer.rate()
         return Progress(
             step=self.step,
-            steps=self.config.steps,
+            steps=self._schedule.steps,
             loss=loss,
             gaussian_count=self.gaussian_count,
             steps_per_s=rate,
-            seconds_left=(self.config.steps - self.step) / rate if rate else math.inf,
+            seconds_left=(self._schedule.steps - self.step) / rate if rate else math.inf,
             val_psnr_db=self._val_psnr_db,
         )
 
@@ -349,7 +349,7 @@ class Trainer:
         splats = {name: tensor.detach().cpu() for name, tensor in self.parameters.items()}
         info = replace(self._info, training={**self.config.to_dict(), "step": self.step})
         scene = GaussianScene.from_splats(splats, info=info, training_poses=self.dataset.train.poses)
-        if len(self.dataset.val) and self.step == self.config.steps:
+        if len(self.dataset.val) and self.step == self._schedule.steps:
             scene.info.metrics.update(evaluate(scene, self.dataset.val, backend=self._backend).mean.to_dict())
         return scene
 

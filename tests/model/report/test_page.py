@@ -55,7 +55,8 @@ def content(turning_dataset: Dataset, small_config: TrainingConfig) -> ReportCon
         machine="a machine",
         trained=trained,
         ablations={
-            name: train_and_evaluate(turning_dataset, config) for name, config in ablations(small_config, small_config.max_gaussians or 0).items()
+            name: train_and_evaluate(turning_dataset, config)
+            for name, config in ablations(small_config, small_config.max_gaussians or 0).items()
         },
         tilt=study_tilt(turning_dataset.train, small_config),
     )

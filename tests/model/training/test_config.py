@@ -33,6 +33,7 @@ def test_half_of_the_gaussians_start_where_only_the_end_is_given(tiny_dataset: C
 def test_what_is_left_open_follows_from_the_data(tiny_dataset: Callable[..., Dataset]) -> None:
     geometry = Geometry.of(tiny_dataset())
     config = TrainingConfig().resolved(geometry)
+    assert config.steps == geometry.steps
     assert config.max_gaussians == config.initial_gaussians == geometry.gaussian_count
     assert config.initial_scale_mm == geometry.initial_scale_mm
     assert config.initial_elevation_mm == geometry.initial_elevation_mm
@@ -55,9 +56,9 @@ def test_survives_json() -> None:
     [
         ({"stepz": 3}, "a training has no setting stepz"),
         ({"steps": 0}, "steps must be between 1 and 1e+07, got 0"),
-        ({"steps": 2.5}, "steps must be an integer, got 2.5"),
-        ({"steps": True}, "steps must be an integer, got True"),
-        ({"steps": None}, "steps must be an integer, got None"),
+        ({"steps": 2.5}, "steps must be an integer or none, got 2.5"),
+        ({"steps": True}, "steps must be an integer or none, got True"),
+        ({"batch_size": None}, "batch_size must be an integer, got None"),
         ({"means_rate": float("nan")}, "means_rate must be a finite number, got nan"),
         ({"out_of_plane_mm": "wide"}, "out_of_plane_mm must be a finite number or none, got 'wide'"),
         ({"transmittance": 0}, "transmittance must be true or false, got 0"),

@@ -49,7 +49,14 @@ def test_pulled_gaussians_are_duplicated_or_split_by_their_size() -> None:
     found, origin = refined([0.05, 0.05, 0.5, 0.5], [0.0, 1e-4, 0.0, 1e-4], limit=100)
     assert sorted(origin.tolist()) == [-1, -1, -1, 0, 1, 2]
     found = by_parent(found)
-    assert found["transmittances"].tolist() == [0.0, 1.0, 1.0, 2.0, 3.0, 3.0]  # the duplicate beside its like, two halves
+    assert found["transmittances"].tolist() == [
+        0.0,
+        1.0,
+        1.0,
+        2.0,
+        3.0,
+        3.0,
+    ]  # the duplicate beside its like, two halves
     assert torch.equal(found["means"][1], found["means"][2])
     halves = slice(4, 6)
     assert torch.allclose(found["scales"][halves, 0], torch.tensor(math.log(0.5 / 1.6)))

@@ -49,9 +49,9 @@ def test_shift_is_along_elevation(random_poses: Callable[..., FloatArray]) -> No
     assert np.array_equal(shifted[:, :3, :3], poses[:, :3, :3])
 
 
-@pytest.mark.parametrize("blur_mm", [2.0, 6.0])
+@pytest.mark.parametrize("blur_mm", [4.0, 8.0])
 def test_out_of_plane_range_follows_the_blur_of_the_frames(blur_mm: float) -> None:
-    """Noisy slices through a field that is smooth over `blur_mm`: noise asks for a wide range, detail for a narrow one."""
+    """Noisy slices through a field that is smooth over `blur_mm`: noise widens the range, detail narrows it."""
     rng = np.random.default_rng(5)
     y = 0.5 * np.arange(80)
     phases, rates = rng.uniform(0, 2 * np.pi, 400), 2 * np.pi / (blur_mm * rng.uniform(2.0, 4.0, 400))
@@ -60,10 +60,10 @@ def test_out_of_plane_range_follows_the_blur_of_the_frames(blur_mm: float) -> No
     poses[:, 1, 3] = y
     frames = np.clip(images, 0, 255).astype(np.uint8).reshape(80, 20, 20)
     sweep = Sweep(frames, poses, LinearProbe(20.0, 0.0, 20.0), np.arange(80), "waves")
-    assert blur_mm / 2 <= out_of_plane_range_mm(sweep, 0.5) <= 1.5 * blur_mm
+    assert blur_mm / 4 <= out_of_plane_range_mm(sweep, 0.5) <= 0.75 * blur_mm
 
 
 def test_out_of_plane_range_leaves_no_gap_between_frames(tiny_dataset: Callable[..., Dataset]) -> None:
-    assert out_of_plane_range_mm(tiny_dataset(spacing_mm=30.0).train, 30.0) >= 75.0
+    assert out_of_plane_range_mm(tiny_dataset(spacing_mm=30.0).train, 30.0) >= 45.0
     still = tiny_dataset(spacing_mm=0.0).train
     assert out_of_plane_range_mm(still, 0.0) == 0.0
