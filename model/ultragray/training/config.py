@@ -25,6 +25,7 @@ else:
     import tomli as tomllib
 
 RELEASED_STEPS = 30_000  # the length of run that the released rates are tuned for
+RELEASED_TRANSMITTANCE_RATE, MAX_SCALED_RATE = 5e-4, 2e-2
 MAX_FLOOR = 0.9
 STARTS = ("informed", "random")
 GROWTHS = ("even", "threshold")
@@ -58,7 +59,7 @@ class TrainingConfig:
     means_rate: float = 2e-4  # times the scene's scale, cm
     scales_rate: float = 1e-2
     quats_rate: float = 1e-2
-    transmittance_rate: float = 5e-2
+    transmittance_rate: float | None = 5e-2  # None: 5e-4, and more in runs of less than 30,000 steps
     sh0_rate: float = 1e-2
     shn_rate: float = 2e-5
     final_rate: float = 0.1  # every rate decays exponentially to this share
@@ -107,16 +108,18 @@ class TrainingConfig:
 
     def resolved(self, geometry: Geometry) -> TrainingConfig:
         """The same with everything that was left to the data filled in."""
+        steps = self.steps or geometry.steps
         limit = self.max_gaussians or max(geometry.gaussian_count, self.initial_gaussians or 0)
         return replace(
             self,
-            steps=self.steps or geometry.steps,
+            steps=steps,
             max_gaussians=limit,
             initial_gaussians=self.initial_gaussians or (limit if not self.refinements else (limit + 1) // 2),
             initial_scale_mm=self.initial_scale_mm or geometry.initial_scale_mm,
             initial_elevation_mm=self.initial_elevation_mm or geometry.initial_elevation_mm,
             intensity_floor=_given_or(self.intensity_floor, min(geometry.brightness, MAX_FLOOR)),
             out_of_plane_mm=_given_or(self.out_of_plane_mm, geometry.out_of_plane_mm),
+            transmittance_rate=_given_or(self.transmittance_rate, scaled_transmittance_rate(steps)),
         )
 
     @classmethod
@@ -146,7 +149,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "means_rate": 1e-4,
         "scales_rate": 5e-3,
         "quats_rate": 5e-3,
-        "transmittance_rate": 5e-4,
+        "transmittance_rate": None,
         "sh0_rate": 5e-3,
         "shn_rate": 1e-5,
         "refinements": 7,
@@ -183,6 +186,11 @@ _RANGES: dict[str, tuple[float, float]] = {
     "prune_below": (0.0, 1.0),
     "memory_gb": (1e-3, 1e6),
 }
+
+
+def scaled_transmittance_rate(steps: int) -> float:
+    """The released rate for as many steps as it is meant for, in proportion more for fewer, so that shadows form."""
+    return min(RELEASED_TRANSMITTANCE_RATE * max(1.0, RELEASED_STEPS / steps), MAX_SCALED_RATE)
 
 
 def _given_or(value: float | None, otherwise: float) -> float:

@@ -38,8 +38,8 @@ class BatchSampler:
 def out_of_plane_range_mm(sweep: Sweep, spacing_mm: float) -> float:
     """How far the frames themselves say that a slice is blurred along elevation: the full range of the shift.
 
-    Each frame is predicted by its neighbours within ± half a range, with the weights that the shift is drawn with, and
-    half the range with the best mean PSNR is taken (PSNR likes blur; the half has most of the gain and keeps detail), if
+    Each frame is predicted by its neighbours within ± half a range, with the weights that the shift is drawn with.
+    Half the range with the best mean PSNR is taken (PSNR likes blur; the half has most of the gain and keeps detail) if
     that range takes in several frames on either side: their own distance decides otherwise. At least 1.5 spacings:
     between the frames there must be no gap.
     """

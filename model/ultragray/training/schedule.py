@@ -10,6 +10,7 @@ class Schedule:
 
     def __init__(self, config: TrainingConfig, *, scene_scale_cm: float, batch_size: int) -> None:
         assert config.steps is not None
+        assert config.transmittance_rate is not None
         self._config, self.steps = config, config.steps
         root = batch_size**0.5
         self._first_rates = {

@@ -11,14 +11,14 @@ import pytest
 
 from ultragray.datasets.sweep import Dataset
 from ultragray.errors import InvalidArgument
-from ultragray.training.config import TrainingConfig, parse_value, read_config_file
+from ultragray.training.config import TrainingConfig, parse_value, read_config_file, scaled_transmittance_rate
 from ultragray.training.geometry import Geometry
 
 
 def test_presets() -> None:
     paper = TrainingConfig.preset("paper")
     assert (paper.steps, paper.max_gaussians, paper.initial_gaussians) == (30_000, 500_000, 500_000)
-    assert (paper.intensity, paper.start, paper.transmittance_rate) == ("released", "random", 5e-4)
+    assert (paper.intensity, paper.start, paper.out_of_plane_mm) == ("released", "random", 2.0)
     assert TrainingConfig.preset("fast") == TrainingConfig()
     with pytest.raises(InvalidArgument, match="preset must be one of fast, paper, got 'slow'"):
         TrainingConfig.preset("slow")
@@ -91,3 +91,8 @@ def test_file(tmp_path: Path) -> None:
 def test_values() -> None:
     values = [parse_value(text) for text in ("3", "1e-4", "true", "random", '"random"', "")]
     assert values == [3, 1e-4, True, "random", "random", ""]
+
+
+@pytest.mark.parametrize(("steps", "rate"), [(60_000, 5e-4), (30_000, 5e-4), (3_000, 5e-3), (500, 2e-2)])
+def test_short_runs_of_the_released_recipe_let_shadows_form(steps: int, rate: float) -> None:
+    assert scaled_transmittance_rate(steps) == pytest.approx(rate)

@@ -9,7 +9,8 @@ from ultragray.training.schedule import Schedule
 
 
 def schedule_of(**settings: object) -> Schedule:
-    return Schedule(TrainingConfig.preset("paper", **settings), scene_scale_cm=5.0, batch_size=8)
+    config = TrainingConfig.preset("paper", **{"transmittance_rate": 5e-4, **settings})
+    return Schedule(config, scene_scale_cm=5.0, batch_size=8)
 
 
 def test_released_rates() -> None:
