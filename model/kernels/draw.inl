@@ -5,6 +5,8 @@
 // an exponential; it is restarted every few rows so that rounding stays under 1e-4 of w. The absorption is exp(-m2/2) sigma
 // G(u) with one polynomial for G, or its quadrature itself where depth 0 clips the window.
 
+#pragma once
+
 namespace {
 
 constexpr float kMinPsi = 0.0039292930f;  // -log(1 - 1/255): alpha reaches 1/255

@@ -2,6 +2,11 @@
 // its own footprint, so nothing is added to from two sides. Thresholds and culls are held fixed; all else is the true
 // gradient.
 
+#pragma once
+
+#include "draw.inl"
+#include "slice.inl"
+
 namespace {
 
 // (1 - exp(-S)) S / (S (S + 1e-8)) is the factor of sum(I w) in E; its value and its derivative by S.

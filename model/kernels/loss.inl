@@ -2,6 +2,8 @@
 // sigma 1.5, only where the window lies inside (docs/physics.md §7). Both passes are separable: down the columns, then along
 // the rows.
 
+#pragma once
+
 namespace {
 
 constexpr int kWindow = 11;
