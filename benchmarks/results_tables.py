@@ -122,7 +122,7 @@ def measure(run: Run, data_folder: Path) -> dict[str, Any]:
         },
         "preset": run.preset,
         "settings": dict(run.settings),
-        "steps": config.steps,
+        "steps": trained.scene.info.training["steps"],
         "gaussians": trained.scene.gaussian_count,
         "step_ms": 1000.0 * trained.step_s,
         "total_s": trained.seconds,

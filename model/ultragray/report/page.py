@@ -80,7 +80,7 @@ def render_page(content: ReportContent) -> str:
         counts_plot=_counts_plot(content),
         tilt_plot=None if content.tilt is None else plot_tilt(content.tilt),
         tilt_rows=[] if content.tilt is None else metric_rows(content.tilt.evaluations),
-        configuration={} if content.trained is None else content.trained.config.to_dict(),
+        configuration={} if content.trained is None else content.trained.scene.info.training,
     )
 
 
@@ -126,7 +126,7 @@ def _facts(content: ReportContent) -> dict[str, str]:
     }
     if content.trained is not None:
         facts["Training"] = (
-            f"{content.trained.config.steps:,} steps in {content.trained.seconds:.0f} s, "
+            f"{content.trained.scene.info.training['steps']:,} steps in {content.trained.seconds:.0f} s, "
             f"{1000.0 * content.trained.step_s:.0f} ms a step"
         )
     return {**facts, "Machine": content.machine}

@@ -27,7 +27,6 @@ class Trained:
     """A scene, what it reaches on the held-out frames, and how its training went."""
 
     scene: GaussianScene
-    config: TrainingConfig
     evaluation: Evaluation
     seconds: float  # of the whole training
     step_s: float  # of a step, the mean over the run
@@ -63,7 +62,6 @@ def train_and_evaluate(dataset: Dataset, config: TrainingConfig, *, report: Repo
     seconds = time.perf_counter() - started
     return Trained(
         scene=scene,
-        config=config,
         evaluation=evaluate(scene, dataset.val),
         seconds=seconds,
         step_s=seconds / len(losses),
