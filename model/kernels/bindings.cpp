@@ -106,20 +106,24 @@ NB_MODULE(_cpu, m) {
             nb::keep_alive<1, 2>(), RENDER_ARGUMENTS)
         .def(
             "differentiate",
-            [](const Recording& self, int threads, size_t count, int height, int width, OptionalPlanes bmode,
-               OptionalPlanes echo, OptionalPlanes transmittance, OptionalPlanes coverage, FreeMatrix means,
-               FreeMatrix scales, FreeMatrix quats, FreeVector transmittances, FreeVector sh0, FreeMatrix shn) {
-                const Outputs gradients = planes_of({bmode, echo, transmittance, coverage}, count, height, width);
+            [](const Recording& self, int threads, OptionalPlanes bmode, OptionalPlanes echo, OptionalPlanes transmittance,
+               OptionalPlanes coverage, FreeMatrix means, FreeMatrix scales, FreeMatrix quats, FreeVector transmittances,
+               FreeVector sh0, FreeMatrix shn) {
+                const Outputs gradients =
+                    planes_of({bmode, echo, transmittance, coverage}, self.count(), self.height(), self.width());
+                const size_t n = self.gaussian_count(), rest = self.harmonics() - 1;
+                if (means.size() != 3 * n || scales.size() != 3 * n || quats.size() != 4 * n || transmittances.size() != n ||
+                    sh0.size() != n || shn.size() != rest * n)
+                    throw std::invalid_argument("the gradients' shapes are not those of the parameters");
                 const RawGradients out{means.data(),          scales.data(), quats.data(),
                                        transmittances.data(), sh0.data(),    shn.data()};
                 nb::gil_scoped_release release;
                 self.differentiate(gradients, out, threads);
             },
-            nb::arg("threads"), nb::arg("count"), nb::arg("height"), nb::arg("width"), nb::arg("bmode").noconvert().none(),
-            nb::arg("echo").noconvert().none(), nb::arg("transmittance").noconvert().none(),
-            nb::arg("coverage").noconvert().none(), nb::arg("means").noconvert(), nb::arg("scales").noconvert(),
-            nb::arg("quats").noconvert(), nb::arg("transmittances").noconvert(), nb::arg("sh0").noconvert(),
-            nb::arg("shn").noconvert());
+            nb::arg("threads"), nb::arg("bmode").noconvert().none(), nb::arg("echo").noconvert().none(),
+            nb::arg("transmittance").noconvert().none(), nb::arg("coverage").noconvert().none(),
+            nb::arg("means").noconvert(), nb::arg("scales").noconvert(), nb::arg("quats").noconvert(),
+            nb::arg("transmittances").noconvert(), nb::arg("sh0").noconvert(), nb::arg("shn").noconvert());
 
     m.def(
         "image_loss",

@@ -15,7 +15,7 @@ inline constexpr int kMaxLanes = 16;  // of the widest instruction set; buffers 
 
 enum class Intensity : int32_t { Released = 0, Sigmoid = 1 };
 
-// One Gaussian, activated. Records are sorted along a space-filling curve.
+// One Gaussian, activated.
 struct Gaussian {
     float mean[3];   // cm
     float scale[3];  // cm
@@ -76,7 +76,6 @@ class SliceList {
     ~SliceList();
     Slice* append(int n);  // room for n more; call shrink_by for those not written
     void shrink_by(int n);
-    void clear() { size_ = 0; }
     const Slice* data() const { return data_; }
     int64_t size() const { return size_; }
 

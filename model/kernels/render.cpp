@@ -217,19 +217,18 @@ struct Recording::State {
     Batch batch;
     Planes planes;
     std::vector<SavedPlanes> saved;
-    int count, height, stride;
+    int stride;
 };
 
 Recording::Recording(const PreparedScene& scene, const ProbeGeometry& probe, const double* poses, int count, int height,
                      int width, int threads, const std::string& instruction_set, const Outputs& outputs)
-    : scene_(scene) {
+    : scene_(scene), count_(count), height_(height), width_(width) {
+    if (scene.order() == Order::Sorted) throw std::invalid_argument("a recording needs a scene in its given order");
     if (count == 0) return;
     const int stride = (width + kMaxLanes - 1) / kMaxLanes * kMaxLanes + kMaxLanes;
     state_.reset(new State{{scene, probe, poses, count, height, width, choose_kernels(instruction_set)},
                            {count, 3, height, stride},
                            {},
-                           count,
-                           height,
                            stride});
     const Planes& planes = state_->planes;
     for (int c = 0; c < count; ++c) state_->saved.push_back({planes.at(c, 0), planes.at(c, 1), planes.at(c, 2), stride});
@@ -238,15 +237,19 @@ Recording::Recording(const PreparedScene& scene, const ProbeGeometry& probe, con
 
 Recording::~Recording() = default;
 
+int Recording::harmonics() const {
+    const int degree = scene_.view().sh_degree;
+    return (degree + 1) * (degree + 1);
+}
+
 void Recording::differentiate(const Outputs& gradients, const RawGradients& out, int threads) const {
     const SceneView scene = scene_.view();
-    const int terms = (scene.sh_degree + 1) * (scene.sh_degree + 1);
     std::vector<GaussianGradient> gaussians(scene.count);
-    std::vector<float> sh(scene.count * terms);
+    std::vector<float> sh(scene.count * harmonics());
     if (state_) {
-        const Planes planes(state_->count, 4, state_->height, state_->stride);
+        const Planes planes(count_, 4, height_, state_->stride);
         std::vector<PixelGradients> pixels;
-        for (int c = 0; c < state_->count; ++c)
+        for (int c = 0; c < count_; ++c)
             pixels.push_back({planes.at(c, 0), planes.at(c, 1), planes.at(c, 2), planes.at(c, 3), state_->stride});
         state_->batch.differentiate(state_->saved, gradients, pixels, gaussians.data(), sh.data(), threads);
     }

@@ -27,10 +27,10 @@ struct Outputs {
 void render(const PreparedScene& scene, const ProbeGeometry& probe, const double* poses, int count, int height, int width,
             int threads, const std::string& instruction_set, const Outputs& outputs);
 
-// Frames that remember what their gradients need. The scene must be unsorted and outlive the recording.
+// Frames that remember what their gradients need. The scene must outlive the recording.
 class Recording {
  public:
-    // As `render`.
+    // As `render`. Throws std::invalid_argument for a sorted scene: its gradients would come in another order.
     Recording(const PreparedScene& scene, const ProbeGeometry& probe, const double* poses, int count, int height, int width,
               int threads, const std::string& instruction_set, const Outputs& outputs);
     ~Recording();
@@ -39,9 +39,16 @@ class Recording {
     // which are overwritten. The result does not depend on the number of threads.
     void differentiate(const Outputs& gradients, const RawGradients& out, int threads) const;
 
+    int count() const { return count_; }
+    int height() const { return height_; }
+    int width() const { return width_; }
+    int64_t gaussian_count() const { return scene_.view().count; }
+    int harmonics() const;  // K
+
  private:
     struct State;
     const PreparedScene& scene_;
+    int count_, height_, width_;
     std::unique_ptr<State> state_;  // null for no poses
 };
 

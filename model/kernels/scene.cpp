@@ -88,16 +88,16 @@ Cluster enclose(const Gaussian* gaussians, int64_t count) {
 }  // namespace
 
 PreparedScene::PreparedScene(const RawSplats& raw, Order order, int threads)
-    : sh_degree_(raw.sh_degree), intensity_(raw.intensity) {
+    : order_(order), sh_degree_(raw.sh_degree), intensity_(raw.intensity) {
     if (raw.count == 0) return;
     std::vector<Gaussian> activated(raw.count);
-    quat_norms_.resize(raw.count);
+    if (order == Order::AsGiven) quat_norms_.resize(raw.count);
     run_ranges(
         raw.count,
         [&](int64_t begin, int64_t end) {
             for (int64_t i = begin; i < end; ++i) {
                 activated[i] = activate(raw, i);
-                quat_norms_[i] = static_cast<float>(quat_norm(raw, i));
+                if (order == Order::AsGiven) quat_norms_[i] = static_cast<float>(quat_norm(raw, i));
             }
         },
         threads);

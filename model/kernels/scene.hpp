@@ -1,4 +1,4 @@
-// A scene made ready for rendering: activated, sorted along a space-filling curve, clustered (docs/physics.md §2, §5.4).
+// A scene made ready for rendering: activated, sorted along a space-filling curve, clustered (docs/physics.md §2, §5.2).
 #pragma once
 
 #include <vector>
@@ -27,6 +27,7 @@ class PreparedScene {
  public:
     PreparedScene(const RawSplats& raw, Order order, int threads);
     SceneView view() const;
+    Order order() const { return order_; }
     // From gradients with respect to activated Gaussians, [N] and sh [N, K], to raw ones. Only for a scene in its given
     // order.
     void to_raw(const GaussianGradient* gaussians, const float* sh, const RawGradients& out, int threads) const;
@@ -35,7 +36,8 @@ class PreparedScene {
  private:
     std::vector<Gaussian> gaussians_;
     std::vector<float> sh_;
-    std::vector<float> quat_norms_;  // in the given order
+    std::vector<float> quat_norms_;  // for gradients only: none in a sorted scene
+    Order order_;
     std::vector<Cluster> clusters_;
     int sh_degree_;
     Intensity intensity_;

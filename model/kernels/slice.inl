@@ -1,5 +1,5 @@
-// From Gaussians to slices: which of them the image plane cuts, and the 2D Gaussian each leaves there (docs/physics.md §5.2,
-// §5.4). Computed in double: m2 and s* lose digits to cancellation otherwise, and a threshold that flips is a visible pixel.
+// From Gaussians to slices: which of them the image plane cuts, and the 2D Gaussian each leaves there (docs/physics.md
+// §5.2). Computed in double: m2 and s* lose digits to cancellation otherwise, and a threshold that flips is a visible pixel.
 
 #pragma once
 

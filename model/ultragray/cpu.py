@@ -100,7 +100,7 @@ class _Render(torch.autograd.Function):
         planes = _empty_planes(view, names)
         scene = _prepare(dict(zip(PARAMETERS, splats, strict=True)), intensity, as_given=True)
         ctx.recording = _cpu.Recording(scene, **view, **_arrays(planes))
-        ctx.names, ctx.shape = names, (len(view["poses"]), view["height"], view["width"])
+        ctx.names = names
         ctx.shapes = [tensor.shape for tensor in splats]
         ctx.set_materialize_grads(False)
         return tuple(planes.values())
@@ -116,12 +116,8 @@ class _Render(torch.autograd.Function):
         means, scales, quats, transmittances, sh0, shn = (
             torch.empty(shape, dtype=torch.float32, device="cpu") for shape in ctx.shapes
         )
-        count, height, width = ctx.shape
         ctx.recording.differentiate(
             threads=torch.get_num_threads(),
-            count=count,
-            height=height,
-            width=width,
             **_arrays(wanted),
             means=means.numpy(),
             scales=scales.numpy(),

@@ -1,4 +1,4 @@
-"""The command line: `ultragray serve | render | info | import-checkpoint | train | export | import-ply | demo | bench`.
+"""The command line `ultragray`: serving, rendering, datasets, training, evaluation, export, benchmarks.
 
 Only names and help live here; what a command needs (torch, FastAPI) is imported when it runs, so that
 `--help` is instant.

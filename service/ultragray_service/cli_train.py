@@ -51,13 +51,14 @@ def train(
         typer.Option("--set", metavar="NAME=VALUE", help="Any field of TrainingConfig; repeat.", show_default=False),
     ] = None,
     steps: Annotated[
-        int | None, typer.Option(help="Steps of one batch; every schedule follows.", show_default="preset")
+        int | None,
+        typer.Option(help="Steps of one batch; every schedule follows.", show_default="from the number of frames"),
     ] = None,
     max_gaussians: Annotated[
-        int | None, typer.Option(help="Gaussians at the end; it starts with half of them.", show_default="preset")
+        int | None, typer.Option(help="Gaussians at most.", show_default="from the number of pixels")
     ] = None,
     initial_gaussians: Annotated[
-        int | None, typer.Option(help="Gaussians at the start.", show_default="preset")
+        int | None, typer.Option(help="Gaussians at the start.", show_default="all; half where they are refined")
     ] = None,
     batch_size: Annotated[int | None, typer.Option(help="Frames of one step.", show_default="8")] = None,
     seed: Annotated[int | None, typer.Option(help="Of every random choice.", show_default="0")] = None,

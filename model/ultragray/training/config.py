@@ -18,6 +18,7 @@ from typing import Any
 from ..errors import InvalidArgument
 from ..scene_info import INTENSITIES, MAX_SH_DEGREE
 from .geometry import Geometry
+from .sampling import MAX_RANGE_MM
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -110,15 +111,16 @@ class TrainingConfig:
         """The same with everything that was left to the data filled in."""
         steps = self.steps or geometry.steps
         limit = self.max_gaussians or max(geometry.gaussian_count, self.initial_gaussians or 0)
+        out_of_plane_mm = _given_or(self.out_of_plane_mm, geometry.out_of_plane_mm)
         return replace(
             self,
             steps=steps,
             max_gaussians=limit,
             initial_gaussians=self.initial_gaussians or (limit if not self.refinements else (limit + 1) // 2),
             initial_scale_mm=self.initial_scale_mm or geometry.initial_scale_mm,
-            initial_elevation_mm=self.initial_elevation_mm or geometry.initial_elevation_mm,
+            initial_elevation_mm=self.initial_elevation_mm or geometry.initial_elevation_mm(out_of_plane_mm),
             intensity_floor=_given_or(self.intensity_floor, min(geometry.brightness, MAX_FLOOR)),
-            out_of_plane_mm=_given_or(self.out_of_plane_mm, geometry.out_of_plane_mm),
+            out_of_plane_mm=out_of_plane_mm,
             transmittance_rate=_given_or(self.transmittance_rate, scaled_transmittance_rate(steps)),
         )
 
@@ -173,7 +175,7 @@ _RANGES: dict[str, tuple[float, float]] = {
     "floor_end": (0.0, 1.0),
     "sh_degree": (0, MAX_SH_DEGREE),
     "sh_start": (0.0, 1.0),
-    "out_of_plane_mm": (0.0, 100.0),
+    "out_of_plane_mm": (0.0, MAX_RANGE_MM),
     **dict.fromkeys(_RATES, (0.0, 1.0)),
     "final_rate": (1e-6, 1.0),
     "scale_penalty": (0.0, 100.0),

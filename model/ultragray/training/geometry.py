@@ -57,10 +57,9 @@ class Geometry:
         """Standard deviation in the image plane at the start: half a frame spacing, and no less than a pixel."""
         return max(0.5 * self.frame_spacing_mm, self.pixel_mm)
 
-    @property
-    def initial_elevation_mm(self) -> float:
+    def initial_elevation_mm(self, out_of_plane_mm: float) -> float:
         """Standard deviation across the image plane at the start: as thick as the slice that is learned."""
-        return max(self.frame_spacing_mm, self.out_of_plane_mm / 2.0, self.pixel_mm)
+        return max(self.frame_spacing_mm, out_of_plane_mm / 2.0, self.pixel_mm)
 
 
 def frame_spacing_mm(sweep: Sweep) -> float:

@@ -12,7 +12,9 @@ from ..datasets.sweep import IntArray, Sweep
 from ..probe import FloatArray
 
 LEAST_RANGE = 1.5  # × the spacing of the frames
-TELLING_RANGE = 8.0  # × that distance: four frames on either side
+TELLING_NEIGHBOURS = 8
+MAX_SLICE_MM = 8.0  # no probe's slice is thicker
+MAX_RANGE_MM = 100.0  # frames further apart have nothing to say about what lies between
 RANGES = (1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 11.0, 16.0, 23.0, 32.0)  # × the distance of neighbouring frames
 PREDICTED_FRAMES, PREDICTED_PIXELS = 256, 4096  # enough to tell one range from another
 
@@ -40,10 +42,10 @@ def out_of_plane_range_mm(sweep: Sweep, spacing_mm: float) -> float:
 
     Each frame is predicted by its neighbours within ± half a range, with the weights that the shift is drawn with.
     Half the range with the best mean PSNR is taken (PSNR likes blur; the half has most of the gain and keeps detail) if
-    that range takes in several frames on either side: their own distance decides otherwise. At least 1.5 spacings:
-    between the frames there must be no gap.
+    there are eight frames or more within that range of the median frame: their own distance decides otherwise. At least
+    1.5 spacings, so that there is no gap between frames; no more than that above MAX_SLICE_MM.
     """
-    least = LEAST_RANGE * spacing_mm
+    least = min(LEAST_RANGE * spacing_mm, MAX_RANGE_MM)
     corners = sweep.corners_mm().reshape(len(sweep), -1)  # [F, 3·K]
     corner_count = corners.shape[1] // 3
     distances = np.empty((len(sweep), len(sweep)))
@@ -58,9 +60,11 @@ def out_of_plane_range_mm(sweep: Sweep, spacing_mm: float) -> float:
     stride = max(1, pixels.shape[1] // PREDICTED_PIXELS) | 1  # odd: it must not fall into step with the columns
     images = torch.from_numpy(pixels[:, ::stride].astype(np.float32)) / 255.0  # [F, P]
     targets = np.unique(np.linspace(0, len(sweep) - 1, PREDICTED_FRAMES).round().astype(np.int64))
-    scores = [_psnr_from_neighbours(images, distances[targets], targets, factor * step_mm) for factor in RANGES]
-    best = RANGES[int(np.argmax(scores))]
-    return max(least, 0.5 * best * step_mm) if best >= TELLING_RANGE else least
+    ranges_mm = [factor * step_mm for factor in RANGES]
+    scores = [_psnr_from_neighbours(images, distances[targets], targets, range_mm) for range_mm in ranges_mm]
+    best_mm = ranges_mm[int(np.argmax(scores))]
+    neighbours = float(np.median((distances[targets] < best_mm / 2).sum(axis=1)))
+    return max(least, min(0.5 * best_mm, MAX_SLICE_MM)) if neighbours >= TELLING_NEIGHBOURS else least
 
 
 def _psnr_from_neighbours(images: Tensor, distances: FloatArray, targets: IntArray, range_mm: float) -> float:

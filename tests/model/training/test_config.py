@@ -36,7 +36,7 @@ def test_what_is_left_open_follows_from_the_data(tiny_dataset: Callable[..., Dat
     assert config.steps == geometry.steps
     assert config.max_gaussians == config.initial_gaussians == geometry.gaussian_count
     assert config.initial_scale_mm == geometry.initial_scale_mm
-    assert config.initial_elevation_mm == geometry.initial_elevation_mm
+    assert config.initial_elevation_mm == geometry.initial_elevation_mm(geometry.out_of_plane_mm)
     assert config.out_of_plane_mm == geometry.out_of_plane_mm
     assert config.intensity_floor == geometry.brightness
     given = TrainingConfig(max_gaussians=9, out_of_plane_mm=0.0, intensity_floor=0.0, initial_scale_mm=2.0)

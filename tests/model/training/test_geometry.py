@@ -24,12 +24,13 @@ def test_lengths_of_a_straight_sweep(tiny_dataset: Callable[..., Dataset]) -> No
     assert geometry.initial_scale_mm == pytest.approx(1.25)  # a pixel is more than half a spacing
     assert geometry.out_of_plane_mm == pytest.approx(3.0)  # six frames cannot tell
     assert geometry.steps == 40 * 7
-    assert geometry.initial_elevation_mm == pytest.approx(2.0)
+    assert geometry.initial_elevation_mm(0.0) == pytest.approx(2.0)
+    assert geometry.initial_elevation_mm(9.0) == pytest.approx(4.5)
 
 
 def test_dense_sweep_keeps_the_pixel(tiny_dataset: Callable[..., Dataset]) -> None:
     geometry = Geometry.of(tiny_dataset(spacing_mm=0.01))
-    assert geometry.initial_scale_mm == geometry.initial_elevation_mm == pytest.approx(geometry.pixel_mm)
+    assert geometry.initial_scale_mm == geometry.initial_elevation_mm(0.0) == pytest.approx(geometry.pixel_mm)
 
 
 def test_spacing_of_a_raster_is_that_across_the_frames(tiny_dataset: Callable[..., Dataset]) -> None:

@@ -67,3 +67,13 @@ def test_out_of_plane_range_leaves_no_gap_between_frames(tiny_dataset: Callable[
     assert out_of_plane_range_mm(tiny_dataset(spacing_mm=30.0).train, 30.0) >= 45.0
     still = tiny_dataset(spacing_mm=0.0).train
     assert out_of_plane_range_mm(still, 0.0) == 0.0
+
+
+@pytest.mark.parametrize(("frames", "spacing_mm"), [(3, 10.0), (6, 5.0), (12, 3.0), (20, 1.5), (3, 80.0)])
+def test_out_of_plane_range_does_not_run_away_where_speckle_tells_nothing(frames: int, spacing_mm: float) -> None:
+    """Frames of pure speckle are best predicted by the mean of them all, however far they lie apart."""
+    speckle = np.random.default_rng(2).rayleigh(40.0, (frames, 20, 20)).clip(0, 255).astype(np.uint8)
+    poses = np.tile(np.eye(4), (frames, 1, 1))
+    poses[:, 1, 3] = spacing_mm * np.arange(frames)
+    sweep = Sweep(speckle, poses, LinearProbe(20.0, 0.0, 20.0), np.arange(frames), "speckle")
+    assert out_of_plane_range_mm(sweep, spacing_mm) <= max(min(1.5 * spacing_mm, 100.0), 8.0)
