@@ -14,8 +14,9 @@ import pytest
 from ultragray import LinearProbe
 from ultragray.datasets import Dataset, Sweep
 from ultragray.datasets.released import write_released
-from ultragray.datasets.source import SourceOptions
+from ultragray.datasets.source import SourceOptions, load_dataset
 from ultragray.errors import DatasetInvalid
+from ultragray.training.geometry import Geometry
 
 SCRIPT = Path(__file__).resolve().parents[1] / "benchmarks" / "results_tables.py"
 SETTINGS = {"steps": 3, "max_gaussians": 40}
@@ -79,6 +80,17 @@ def test_runs_are_kept_one_by_one_and_tabled_together(
     assert f"{mean['psnr_db']:.2f}" in tables
     assert "Training frames 0:3, held out 3:6" in tables
     assert tables.count("| nearest training frame |") == 2
+
+
+def test_a_run_tells_the_steps_that_the_data_decided(
+    script: ModuleType, monkeypatch: pytest.MonkeyPatch, data: Path
+) -> None:
+    monkeypatch.setattr(script, "RUNS", (script.Run("default", "ball", options=SourceOptions("0:2", "3:4")),))
+    run(script, monkeypatch, data)
+    dataset = load_dataset(data / "ball", SourceOptions("0:2", "3:4"))
+    steps = Geometry.of(dataset).steps
+    assert json.loads((data / "figures.json").read_text())["default"]["steps"] == steps
+    assert f"| default | 2 / 1 | 16x14 | fast | {steps:,} |" in (data / "results.md").read_text()
 
 
 def test_a_run_that_fails_loses_nothing(script: ModuleType, monkeypatch: pytest.MonkeyPatch, data: Path) -> None:

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from .compounding import METHODS as VOLUME_METHODS
 from .compounding import VOXEL_MM, compound, pixel_positions_mm
-from .datasets.sweep import Dataset, IntArray, Sweep
+from .datasets.sweep import Dataset, IntArray, Sweep, corner_distances_mm
 from .errors import InvalidArgument
 from .evaluation import Evaluation, evaluate_frames, require_frames
 from .pose import check_poses
@@ -50,17 +50,9 @@ def evaluate_baselines(
     }
 
 
-def corner_distances_mm(sweep: Sweep, poses: FloatArray) -> FloatArray:  # [C, F]
-    """Mean distance between the corners of the image planes at poses [C, 4, 4] and those of the sweep's frames, mm."""
-    corners = sweep.probe.corners_mm()
-    asked = np.einsum("cij,pj->cpi", poses[:, :3, :3], corners) + poses[:, None, :3, 3]
-    distances: FloatArray = np.linalg.norm(asked[:, None] - sweep.corners_mm()[None], axis=-1).mean(axis=-1)
-    return distances
-
-
 def nearest_frames(sweep: Sweep, poses: FloatArray) -> IntArray:  # [C]
-    """The place of the sweep's nearest frame for each pose, by `corner_distances_mm`."""
-    nearest: IntArray = corner_distances_mm(sweep, poses).argmin(axis=1)
+    """The place of the sweep's frame whose corners lie nearest on average, for each pose [C, 4, 4] (mm)."""
+    nearest: IntArray = _distances_to_frames_mm(sweep, poses).argmin(axis=1)
     return nearest
 
 
@@ -71,11 +63,16 @@ def interpolate_planes(sweep: Sweep, poses: FloatArray) -> FrameArray:  # [C, H,
     one side only it takes that, with none it is 0.
     """
     points = pixel_positions_mm(sweep.probe, sweep.height, sweep.width)
-    order = corner_distances_mm(sweep, poses).argsort(axis=1)
+    order = _distances_to_frames_mm(sweep, poses).argsort(axis=1)
     planes = np.zeros((len(poses), sweep.height, sweep.width), np.float32)
     for plane, pose, frames in zip(planes, check_poses(poses) if len(poses) else poses, order, strict=True):
         plane[:] = _between(sweep, points @ pose[:3, :3].T + pose[:3, 3], frames).reshape(plane.shape)
     return planes
+
+
+def _distances_to_frames_mm(sweep: Sweep, poses: FloatArray) -> FloatArray:  # [C, F]
+    asked = np.einsum("cij,pj->cpi", poses[:, :3, :3], sweep.probe.corners_mm()) + poses[:, None, :3, 3]
+    return corner_distances_mm(asked[:, None], sweep.corners_mm()[None])
 
 
 def _between(sweep: Sweep, points: FloatArray, frames: IntArray) -> FloatArray:  # [P, 3] mm, [F] -> [P]

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from .datasets.sweep import IntArray, Sweep
+from .datasets.sweep import IntArray, Sweep, corner_distances_mm
 from .errors import InvalidArgument
 from .pose import check_poses
 from .probe import FloatArray, Probe
@@ -49,7 +49,7 @@ class Volume:
         """The planes that a probe sees from poses [C, 4, 4] (mm, probe→tracker); 0 where no known voxel is near."""
         points = pixel_positions_mm(probe, height, width)
         volume = torch.stack([self.values, self.known])[None]  # [1, 2, X, Y, Z]
-        last = np.maximum(np.array(self.values.shape) - 1, 1)
+        last = np.array(self.values.shape) - 1
         planes = np.zeros((len(poses), height, width), np.float32)
         for plane, pose in zip(planes, check_poses(poses) if len(poses) else poses, strict=True):
             places = self._places(points, pose) * (2.0 / last) - 1.0
@@ -140,7 +140,8 @@ def _extent_mm(sweep: Sweep, axes: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _counts(span_mm: FloatArray, voxel_mm: float) -> tuple[int, int, int]:
-    x, y, z = (int(count) for count in np.ceil(span_mm / voxel_mm) + 1)
+    """Voxels along each axis: at least two, since along an axis of one `grid_sample` takes any place for that one."""
+    x, y, z = (max(2, int(count)) for count in np.ceil(span_mm / voxel_mm) + 1)
     return x, y, z
 
 
@@ -180,8 +181,9 @@ def _layers(sweep: Sweep, voxel_mm: float) -> int:
     corners = sweep.corners_mm()
     gaps_mm = []
     for place, own in enumerate(corners):
-        distances = np.linalg.norm(np.delete(corners, place, axis=0) - own, axis=-1)  # [F-1, P]
-        gaps_mm.append(distances[distances.mean(axis=-1).argmin()].max())
+        distances = corner_distances_mm(corners, own)  # [F]
+        distances[place] = np.inf
+        gaps_mm.append(np.linalg.norm(corners[distances.argmin()] - own, axis=-1).max())
     reach_mm = max(LEAST_REACH_MM, float(np.quantile(gaps_mm, TYPICAL_GAP)) / 2.0)
     return min(MAX_LAYERS, math.ceil(reach_mm / voxel_mm))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,12 +11,12 @@ import numpy.typing as npt
 import torch
 
 from .datasets.sweep import IntArray, Sweep
-from .errors import DatasetInvalid
+from .errors import DatasetInvalid, InvalidArgument
 from .metrics import FrameMetrics, frame_metrics, mean_metrics, ms_ssim_scales, std_metrics
 from .rendering import render
 from .scene import GaussianScene
 
-CHUNK_PIXELS = 1 << 22  # rendered at once
+CHUNK_PIXELS = 1 << 20  # rendered and measured at once: measuring takes about 200 bytes of each
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,22 +51,40 @@ class Evaluation:
 
 
 def evaluate(scene: GaussianScene, sweep: Sweep, *, backend: str = "auto") -> Evaluation:
-    """Renders the scene at the sweep's poses with the sweep's probe and measures against its frames.
+    """Renders the scene at the sweep's poses with the sweep's probe and measures against its frames, a few at a time.
 
     Raises DatasetInvalid where the sweep has no frames, InvalidImageSize below 11x11 pixels, BackendUnavailable.
     """
-    return evaluate_frames(render_sweep(scene, sweep, backend=backend), sweep)
+    parts = (sweep.select(np.arange(len(sweep))[places]) for places in _chunks(sweep))
+    return _measured((render_sweep(scene, part, backend=backend) for part in parts), sweep)
 
 
 def evaluate_frames(frames: npt.NDArray[np.float32], sweep: Sweep) -> Evaluation:  # [F, H, W] in [0, 1]
     """Measures predicted frames against those of the sweep; raises as `evaluate` does."""
+    if frames.shape != sweep.images.shape:
+        raise InvalidArgument(
+            f"frames must be {list(sweep.images.shape)} like those of {sweep.source}, got {list(frames.shape)}",
+            field="frames",
+        )
+    return _measured((frames[places] for places in _chunks(sweep)), sweep)
+
+
+def _measured(predictions: Iterable[npt.NDArray[np.float32]], sweep: Sweep) -> Evaluation:
+    """Measures the predicted frames of each of `_chunks`."""
     require_frames(sweep)
-    truth = torch.from_numpy(sweep.images).float() / 255.0
-    return Evaluation(
-        frames=frame_metrics(torch.from_numpy(frames), truth),
-        frame_numbers=sweep.frame_numbers,
-        ms_ssim_scales=ms_ssim_scales(sweep.height, sweep.width),
-    )
+    scales = ms_ssim_scales(sweep.height, sweep.width)
+    measured: list[FrameMetrics] = []
+    for predicted, places in zip(predictions, _chunks(sweep), strict=True):
+        truth = torch.from_numpy(sweep.images[places]).float().div_(255.0)
+        measured += frame_metrics(torch.from_numpy(predicted), truth)
+    return Evaluation(frames=measured, frame_numbers=sweep.frame_numbers, ms_ssim_scales=scales)
+
+
+def _chunks(sweep: Sweep) -> Iterator[slice]:
+    """Places of the frames that are taken at once, in order."""
+    count = max(1, CHUNK_PIXELS // (sweep.height * sweep.width))
+    for first in range(0, len(sweep), count):
+        yield slice(first, first + count)
 
 
 def require_frames(sweep: Sweep) -> None:
@@ -79,17 +98,16 @@ def render_sweep(
 ) -> npt.NDArray[np.float32]:  # [F, H, W]
     """One output of the scene at every pose of the sweep, a few frames at a time."""
     frames = np.zeros(sweep.images.shape, np.float32)
-    chunk = max(1, CHUNK_PIXELS // (sweep.height * sweep.width))
     with torch.no_grad():
-        for first in range(0, len(sweep), chunk):
+        for places in _chunks(sweep):
             rendered = render(
                 scene,
                 sweep.probe,
-                sweep.poses[first : first + chunk],
+                sweep.poses[places],
                 height=sweep.height,
                 width=sweep.width,
                 outputs=(output,),
                 backend=backend,
             )
-            frames[first : first + chunk] = getattr(rendered, output).cpu().numpy()
+            frames[places] = getattr(rendered, output).cpu().numpy()
     return frames

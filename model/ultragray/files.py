@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import contextlib
+import glob
 import hashlib
 import os
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
+TEMPORARY_SUFFIX = ".tmp"
+
 
 @contextlib.contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
     """A temporary path beside `path`; on success it is synced and renamed to `path`, on failure removed."""
     path = Path(path)
-    descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".tmp")
+    descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=TEMPORARY_SUFFIX)
     os.close(descriptor)
     temporary = Path(name)
     try:
@@ -25,6 +28,15 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         _sync(path.parent)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def remove_stale_temporaries(path: str | Path) -> None:
+    """Removes what processes killed inside `atomic_path(path)` left; nobody may be writing `path` meanwhile."""
+    path = Path(path)
+    prefix = f".{path.name}."
+    for found in path.parent.glob(f"{glob.escape(prefix)}*{TEMPORARY_SUFFIX}"):
+        if "." not in found.name.removeprefix(prefix).removesuffix(TEMPORARY_SUFFIX):  # else another file's
+            found.unlink(missing_ok=True)
 
 
 def _sync(path: Path) -> None:

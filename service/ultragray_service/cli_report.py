@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from ultragray.datasets import Dataset
     from ultragray.training import Progress, TrainingConfig
 
+TILT = "growing tilt"
 Follow = Callable[["Progress"], None]
 
 
@@ -66,16 +68,19 @@ def report(
         torch.set_num_threads(threads)
     read = read_dataset(dataset, train_frames, val_frames, frames, device_set, crop, image_size)
     voxel_mm = affordable_voxel_mm(read.train) if voxel_mm is None else voxel_mm
-    _write_report(read, config, output, ReportOptions(scene, not no_ablations, voxel_mm))
+    failures = _write_report(read, config, output, ReportOptions(scene, not no_ablations, voxel_mm))
+    for name, reason in failures.items():
+        typer.echo(f"failed: {name}: {reason}", err=True)
     typer.echo(f"wrote {output}")
 
 
-def _write_report(dataset: Dataset, config: TrainingConfig, output: Path, options: ReportOptions) -> None:
+def _write_report(dataset: Dataset, config: TrainingConfig, output: Path, options: ReportOptions) -> dict[str, str]:
+    """The studies that could not be finished, and why; the page has the others."""
     from ultragray.baselines import evaluate_baselines
     from ultragray.evaluation import evaluate
     from ultragray.files import atomic_path
     from ultragray.report.page import ReportContent, render_page
-    from ultragray.report.study import ablations, study_tilt, train_and_evaluate
+    from ultragray.report.study import Failed, ablations, attempt, study_tilt, train_and_evaluate
     from ultragray.scene import GaussianScene
 
     with _following() as follow:
@@ -89,17 +94,19 @@ def _write_report(dataset: Dataset, config: TrainingConfig, output: Path, option
             content |= {"scene": scene, "evaluation": evaluate(scene, dataset.val)}
         if options.ablations:
             content["ablations"] = {
-                name: train_and_evaluate(dataset, changed, report=follow(name))
+                name: attempt(partial(train_and_evaluate, dataset, changed, report=follow(name)))
                 for name, changed in ablations(config, content["scene"].gaussian_count).items()
             }
-            content["tilt"] = study_tilt(
-                dataset.train, config, voxel_mm=options.voxel_mm, report=follow("growing tilt")
+            content["tilt"] = attempt(
+                partial(study_tilt, dataset.train, config, voxel_mm=options.voxel_mm, report=follow(TILT))
             )
     page = render_page(
         ReportContent(dataset=dataset, baselines=baselines, voxel_mm=options.voxel_mm, machine=_machine(), **content)
     )
     with atomic_path(output) as temporary:
         temporary.write_text(page, encoding="utf-8")
+    studies = {**content.get("ablations", {}), TILT: content.get("tilt")}
+    return {name: study.reason for name, study in studies.items() if isinstance(study, Failed)}
 
 
 def _machine() -> str:

@@ -11,7 +11,6 @@ import pytest
 from ultragray import ConvexProbe, LinearProbe, Probe
 from ultragray.baselines import (
     BASELINES,
-    corner_distances_mm,
     evaluate_baselines,
     interpolate_planes,
     nearest_frames,
@@ -70,7 +69,6 @@ def test_nearest_looks_at_the_whole_plane_not_only_its_origin() -> None:
     sweep = sweep_of(np.concatenate([upright, tilted]))
     asked = at(0.3)  # nearer to the origin of the tilted one
     assert nearest_frames(sweep, asked).tolist() == [0]
-    np.testing.assert_allclose(corner_distances_mm(sweep, at(0.3))[0, 0], 0.3)
     np.testing.assert_array_equal(predict(sweep, asked, "nearest")[0], (sweep.images[0] / 255.0).astype(np.float32))
 
 

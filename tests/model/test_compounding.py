@@ -94,6 +94,14 @@ def test_what_no_frame_comes_near_is_black(images: np.ndarray) -> None:
     assert volume.reslice(PROBE, at(), HEIGHT, WIDTH).shape == (0, HEIGHT, WIDTH)
 
 
+@pytest.mark.parametrize("count", [1, 3])
+def test_a_probe_that_was_held_still_is_not_seen_from_afar(images: np.ndarray, count: int) -> None:
+    volume = compound(sweep_of(images[:1].repeat(count, axis=0), at(*[0.0] * count)), "median", 0.5)
+    planes = volume.reslice(PROBE, at(-500.0, -1.0, 0.0, 1.0, 500.0), HEIGHT, WIDTH)
+    np.testing.assert_allclose(planes[2], images[0] / 255.0, atol=2e-5)
+    assert not planes[[0, 1, 3, 4]].any()
+
+
 def test_a_convex_sweep_keeps_its_geometry(random_poses: Callable[..., FloatArray]) -> None:
     """A smooth field in space, seen by a fan that moves along elevation, comes back on a plane in between."""
     probe = ConvexProbe(opening_angle_deg=70.0, near_mm=10.0, far_mm=30.0)

@@ -12,9 +12,9 @@ import torch
 
 from ultragray import ConvexProbe, GaussianScene, LinearProbe, Probe, evaluation, render
 from ultragray.datasets import Sweep
-from ultragray.errors import DatasetInvalid
+from ultragray.errors import DatasetInvalid, InvalidArgument
 from ultragray.evaluation import evaluate, evaluate_frames, render_sweep
-from ultragray.metrics import frame_metrics
+from ultragray.metrics import FrameMetrics, frame_metrics
 from ultragray.probe import FloatArray
 
 
@@ -73,6 +73,29 @@ def test_frames_rendered_in_chunks_are_the_same(
     for output, frames in whole.items():
         np.testing.assert_array_equal(render_sweep(scene, sweep, output=output), frames)
     assert np.abs(whole["bmode"] - whole["transmittance"]).max() > 0.1
+
+
+def test_frames_are_rendered_and_measured_a_few_at_a_time(
+    scene: GaussianScene, sweep: Sweep, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = evaluate(scene, sweep)
+    predicted = render_sweep(scene, sweep)
+    at_once: list[int] = []
+
+    def counted(rendered: torch.Tensor, truth: torch.Tensor) -> list[FrameMetrics]:
+        at_once.append(len(rendered))
+        return frame_metrics(rendered, truth)
+
+    monkeypatch.setattr(evaluation, "CHUNK_PIXELS", 2 * 24 * 20)
+    monkeypatch.setattr(evaluation, "frame_metrics", counted)
+    assert evaluate(scene, sweep).frames == whole.frames
+    assert evaluate_frames(predicted, sweep).frames == whole.frames
+    assert at_once == [2, 2, 1] * 2
+
+
+def test_a_prediction_of_another_size_is_refused(sweep: Sweep) -> None:
+    with pytest.raises(InvalidArgument, match=r"frames must be \[5, 24, 20\] like those of rendered, got \[6, 24, 20\]"):
+        evaluate_frames(np.zeros((6, 24, 20), np.float32), sweep)
 
 
 def test_any_prediction_is_measured_alike(sweep: Sweep) -> None:

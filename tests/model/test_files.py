@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from ultragray.files import atomic_path
+from ultragray.files import atomic_path, remove_stale_temporaries
 
 
 @pytest.fixture
@@ -48,3 +48,17 @@ def test_a_failure_keeps_the_old_file_and_leaves_nothing(tmp_path: Path) -> None
 def test_a_missing_folder_is_an_os_error(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError), atomic_path(tmp_path / "nowhere" / "scene.ugr"):
         pass
+
+
+def test_what_a_killed_process_left_is_removed_and_nothing_else(tmp_path: Path) -> None:
+    path = tmp_path / "scene[1].ugr"
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(b"half")
+        (tmp_path / "left").write_bytes(b"half")
+        stale = temporary
+    (tmp_path / "left").rename(stale)
+    others = [".other.ugr.abcdefgh.tmp", ".scene[1].ugr.zip.abcdefgh.tmp", "scene[1].ugr", "scene[1].ugr.tmp"]
+    for name in others:
+        (tmp_path / name).touch()
+    remove_stale_temporaries(path)
+    assert sorted(os.listdir(tmp_path)) == sorted(others)

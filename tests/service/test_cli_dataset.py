@@ -77,7 +77,7 @@ def test_convert_writes_what_is_read_back(folder: Path) -> None:
     assert load_dataset(folder.parent / "half").train.images.shape == (8, 10, 8)
     again = run("convert", folder, "-o", folder.parent / "half")
     assert again.exit_code == 2
-    assert "already holds a dataset" in again.stderr
+    assert "conf.json already exists: choose another folder" in again.stderr
 
 
 def test_a_plus_sequence_by_the_documented_command(tmp_path: Path) -> None:

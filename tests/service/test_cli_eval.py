@@ -15,7 +15,9 @@ from ultragray import GaussianScene, LinearProbe
 from ultragray.baselines import evaluate_baselines
 from ultragray.datasets import Dataset, Sweep
 from ultragray.datasets.released import read_released, write_released
+from ultragray.errors import MemoryExceeded, TrainingDiverged
 from ultragray.evaluation import evaluate
+from ultragray.report import study
 from ultragray.training import TrainingConfig, train
 from ultragray_service.cli import app
 
@@ -127,6 +129,40 @@ def test_report_trains_and_studies(dataset: Path, tmp_path: Path) -> None:
     ]
     assert "max_gaussians = 40" in page.read_text()
     assert "hardly turns" in page.read_text()
+
+
+def test_a_study_that_fails_does_not_take_the_report_with_it(
+    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def train_or_fail(read: Dataset, config: TrainingConfig, **options: Any) -> GaussianScene:
+        if not config.transmittance:
+            raise MemoryExceeded("it needs 9 GB")
+        return train(read, config, **options)
+
+    def study_tilt(*arguments: Any, **options: Any) -> None:
+        raise TrainingDiverged("the loss is nan")
+
+    monkeypatch.setattr(study, "train", train_or_fail)
+    monkeypatch.setattr(study, "study_tilt", study_tilt)
+    page = tmp_path / "page.html"
+    result = run("report", dataset, "-o", page, "--steps", 2, "--max-gaussians", 40, "--threads", 1)
+    assert result.exit_code == 0, result.output
+    assert result.stderr.splitlines()[-2:] == [
+        "failed: no transmittance: it needs 9 GB",
+        "failed: growing tilt: the loss is nan",
+    ]
+    text = page.read_text()
+    assert re.search(r">no transmittance</th><td [^>]*>it needs 9 GB<", text)
+    assert "could not be finished: the loss is nan" in text
+    assert text.index("no transmittance") < text.index("twice the Gaussians")
+
+
+def test_a_folder_that_cannot_be_written_to_is_told_before_the_work(
+    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("os.access", lambda path, mode: Path(path) != tmp_path)  # a superuser may write anywhere
+    message = refused("report", tmp_path / "no dataset", "-o", tmp_path / "page.html")
+    assert f"output must lie in a folder that can be written to, {tmp_path} cannot" in message
 
 
 def test_mistakes(dataset: Path, scene: Path, tmp_path: Path) -> None:

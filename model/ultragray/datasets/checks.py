@@ -6,6 +6,7 @@ warnings leave the choice to a person.
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from itertools import pairwise
@@ -15,7 +16,7 @@ import numpy as np
 
 from ..pose import rotation_angles_deg
 from ..probe import FloatArray, Probe, probe_to_dict
-from .sweep import Dataset, Sweep
+from .sweep import Dataset, Sweep, corner_distances_mm
 from .swept_volume import swept_volume
 
 JUMP_FACTOR = 5.0  # times the usual step
@@ -89,7 +90,7 @@ def check_dataset(dataset: Dataset) -> DatasetReport:
 def check_sweep(sweep: Sweep) -> SweepReport:
     """Describes the frames of a sweep (at least one) and lists what looks wrong, with frame numbers."""
     corners = sweep.corners_mm()
-    steps_mm = _corner_travel(corners[:-1], corners[1:])
+    steps_mm = corner_distances_mm(corners[:-1], corners[1:])
     steps_deg = np.array([rotation_angles_deg(a[None], b[None])[0, 0] for a, b in pairwise(sweep.poses)])
     thinned = sweep.poses[:: -(-len(sweep) // MAX_TILT_FRAMES)]
     swept = swept_volume(sweep)
@@ -115,11 +116,6 @@ def check_sweep(sweep: Sweep) -> SweepReport:
         voxel_mm=swept.voxel_mm,
         warnings=(*_jumps(sweep, steps_mm), *_repeats(sweep), *_odd_images(sweep)),
     )
-
-
-def _corner_travel(corners: FloatArray, others: FloatArray) -> FloatArray:  # [..., P, 3] twice -> [...]
-    travel: FloatArray = np.linalg.norm(corners - others, axis=-1).mean(axis=-1)
-    return travel
 
 
 def _vector(values: FloatArray) -> tuple[float, float, float]:
@@ -148,7 +144,7 @@ def _nearest_training_frames(dataset: Dataset) -> tuple[FloatArray, FloatArray]:
     train_corners = dataset.train.corners_mm()
     distances, angles = np.zeros(len(dataset.val)), np.zeros(len(dataset.val))
     for place, corners in enumerate(dataset.val.corners_mm()):
-        travel = _corner_travel(train_corners, corners)
+        travel = corner_distances_mm(train_corners, corners)
         nearest = int(np.argmin(travel))
         distances[place] = travel[nearest]
         angles[place] = rotation_angles_deg(dataset.val.poses[[place]], dataset.train.poses[[nearest]])[0, 0]
@@ -187,12 +183,12 @@ def _repeats(sweep: Sweep) -> list[str]:
     poses = np.round(sweep.poses / SAME_POSE_MM).astype(np.int64)
     told = []
     for places in _groups(poses):
-        if len({sweep.images[place].tobytes() for place in places}) == 1:
+        if len({_digest(sweep.images[place]) for place in places}) == 1:
             told.append(f"frames {_list(sweep, places)} are the same frame: one pose, one image")
         else:
             told.append(f"frames {_list(sweep, places)} share one pose, but show different images: tracking stalled?")
     for places in _groups(sweep.images):
-        if len({poses[place].tobytes() for place in places}) > 1:
+        if len({_digest(poses[place]) for place in places}) > 1:
             told.append(f"frames {_list(sweep, places)} show one image at different poses: a frozen picture?")
     return told
 
@@ -201,8 +197,12 @@ def _groups(arrays: np.ndarray) -> list[list[int]]:
     """Places whose arrays are equal, in groups of two and more."""
     places: dict[bytes, list[int]] = {}
     for place, array in enumerate(arrays):
-        places.setdefault(array.tobytes(), []).append(place)
+        places.setdefault(_digest(array), []).append(place)
     return [group for group in places.values() if len(group) > 1]
+
+
+def _digest(array: np.ndarray) -> bytes:
+    return hashlib.blake2b(np.ascontiguousarray(array).reshape(-1).data, digest_size=16).digest()
 
 
 def _odd_images(sweep: Sweep) -> list[str]:
@@ -227,7 +227,7 @@ def _dataset_warnings(dataset: Dataset) -> list[str]:
 
 
 def _contents(sweep: Sweep) -> list[tuple[bytes, bytes]]:
-    return [(image.tobytes(), pose.tobytes()) for image, pose in zip(sweep.images, sweep.poses, strict=True)]
+    return [(_digest(image), _digest(pose)) for image, pose in zip(sweep.images, sweep.poses, strict=True)]
 
 
 def _list(sweep: Sweep, places: Sequence[int]) -> str:

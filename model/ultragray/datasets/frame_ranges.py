@@ -6,7 +6,7 @@ import re
 
 from ..errors import InvalidArgument
 
-_PART = re.compile(r"(?P<start>\d*)(?P<range>:(?P<stop>\d*)(:(?P<step>\d+))?)?")
+_PART = re.compile(r"(?P<start>\d{0,9})(?P<range>:(?P<stop>\d{0,9})(:(?P<step>\d{1,9}))?)?")
 
 
 def parse_frame_ranges(text: str, count: int, *, option: str) -> list[int]:
@@ -21,7 +21,7 @@ def parse_frame_ranges(text: str, count: int, *, option: str) -> list[int]:
         match = _PART.fullmatch(part.strip())
         if match is None or not part.strip():
             raise InvalidArgument(
-                f"{option} must be frames such as 7, 0:90 or 0:90,100:120:2 (the stop is left out), got {text!r}",
+                f"{option} must be frames such as 7, 0:90 or 0:90,100:120:2 (the stop is left out), got {text[:80]!r}",
                 field=option,
             )
         frames = _frames(match, count)

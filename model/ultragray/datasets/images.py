@@ -37,10 +37,10 @@ def parse_crop(text: str | None, height: int, width: int) -> CropBox:
     """`"188:632,12:600"`: columns, rows, half open. None: the whole image. Raises InvalidArgument."""
     if text is None:
         return CropBox(0, width, 0, height)
-    match = re.fullmatch(r"\s*(\d*):(\d*)\s*,\s*(\d*):(\d*)\s*", text)
+    match = re.fullmatch(r"\s*(\d{0,9}):(\d{0,9})\s*,\s*(\d{0,9}):(\d{0,9})\s*", text)
     if match is None:
         raise InvalidArgument(
-            f"--crop must be columns and rows such as 188:632,12:600 (the ends are left out), got {text!r}",
+            f"--crop must be columns and rows such as 188:632,12:600 (the ends are left out), got {text[:80]!r}",
             field="--crop",
         )
     left, right, top, bottom = (
@@ -56,11 +56,11 @@ def parse_crop(text: str | None, height: int, width: int) -> CropBox:
 
 def parse_image_size(text: str) -> tuple[int, int]:  # width, height
     """`"192x256"`: width, height. Raises InvalidArgument."""
-    match = re.fullmatch(r"\s*(\d+)\s*[xX×]\s*(\d+)\s*", text)
+    match = re.fullmatch(r"\s*(\d{1,9})\s*[xX×]\s*(\d{1,9})\s*", text)
     size = (int(match[1]), int(match[2])) if match else (0, 0)
     if not all(1 <= side <= MAX_IMAGE_SIDE for side in size):
         raise InvalidArgument(
-            f"--image-size must be width x height such as 192x256, each 1 to {MAX_IMAGE_SIDE}, got {text!r}",
+            f"--image-size must be width x height such as 192x256, each 1 to {MAX_IMAGE_SIDE}, got {text[:80]!r}",
             field="--image-size",
         )
     return size

@@ -30,6 +30,7 @@ def read_meta_image(path: Path) -> StoredSequence:
     sizes = whole_numbers(path, "DimSize", entries.get("DimSize", ""))
     channels = whole_numbers(path, "ElementNumberOfChannels", entries.get("ElementNumberOfChannels", "1"))[0]
     shape = pixel_shape(path, sizes, channels)
+    fields, frame_fields = split_fields(path, entries, shape[0])
     local = entries["ElementDataFile"].upper() == "LOCAL"
     header_size = whole_numbers(path, "HeaderSize", entries.get("HeaderSize", "0"))[0]
     pixels = read_payload(
@@ -39,7 +40,6 @@ def read_meta_image(path: Path) -> StoredSequence:
         shape,
         deflated=_is_true(entries, "CompressedData", default=False),
     )
-    fields, frame_fields = split_fields(entries, shape[0])
     return StoredSequence(path, pixels, fields, frame_fields)
 
 

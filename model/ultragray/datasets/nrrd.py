@@ -27,9 +27,9 @@ def read_nrrd(path: Path) -> StoredSequence:
     if any(fields.get(key, "0") != "0" for key in ("line skip", "lineskip", "byte skip", "byteskip")):
         raise DatasetInvalid(f"{path}: files with a line skip or byte skip cannot be read")
     shape = _shape(path, fields)
+    file_fields, frame_fields = split_fields(path, own, shape[0])
     data_file = fields.get("data file", fields.get("datafile"))
     pixels = read_payload(path, data_file, 0 if data_file else offset, shape, deflated=encoding != "raw")
-    file_fields, frame_fields = split_fields(own, shape[0])
     return StoredSequence(path, pixels, file_fields, frame_fields)
 
 

@@ -59,7 +59,7 @@ def read_plus_sweep(
         probe=probe,
         frame_numbers=numbers,
         source=str(path),
-        notes=_notes(orientation, crop, images.shape[1:], sorted(set(chosen) - set(numbers.tolist())), stored, way),
+        notes=_notes(orientation, crop, images.shape[1:], sorted(set(chosen) - set(numbers.tolist()))),
     )
     return sweep, frame_count
 
@@ -149,14 +149,7 @@ def _tracked(way: list[tuple[TransformName, bool]], fixed: Mapping[TransformName
     return " and ".join("To".join(name) for name, _ in way if name not in fixed) or "image"
 
 
-def _notes(
-    orientation: str,
-    crop: str | None,
-    size: tuple[int, ...],
-    left_out: list[int],
-    stored: StoredSequence,
-    way: list[tuple[TransformName, bool]],
-) -> tuple[str, ...]:
+def _notes(orientation: str, crop: str | None, size: tuple[int, ...], left_out: list[int]) -> tuple[str, ...]:
     notes = []
     if left_out:
         listed = ", ".join(map(str, left_out[:10])) + (", …" if len(left_out) > 10 else "")

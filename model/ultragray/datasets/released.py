@@ -88,24 +88,29 @@ def write_released(dataset: Dataset, folder: str | Path) -> None:
 
     Our reader gives the same dataset back (`Dataset.sha256`) where the planes are whole multiples of 1e-9 mm. Paths in
     conf.json are written as the released trainer expects them, from the folder that holds `data/`. Raises
-    InvalidArgument where the folder already holds a dataset.
+    InvalidArgument where one of the files already exists: nothing is replaced.
     """
     folder = Path(folder)
-    if (folder / CONFIG_NAME).exists():
-        raise InvalidArgument(f"{folder} already holds a dataset: choose another folder", field="output")
+    parts = [(part, sweep) for part, sweep in (("train", dataset.train), ("val", dataset.val)) if len(sweep)]
+    arrays = {(kind, part): getattr(sweep, kind) for part, sweep in parts for kind in ("images", "poses")}
+    for file_name in (CONFIG_NAME, *(_array_name(*key) for key in arrays)):
+        if (folder / file_name).exists():
+            raise InvalidArgument(f"{folder / file_name} already exists: choose another folder", field="output")
     folder.mkdir(parents=True, exist_ok=True)
     name = folder.resolve().name
     document: dict[str, Any] = {}
-    for part, sweep in (("train", dataset.train), ("val", dataset.val)):
-        if len(sweep):
-            for kind, array in (("images", sweep.images), ("poses", sweep.poses)):
-                file_name = f"{kind}_{part}.npy"
-                with atomic_path(folder / file_name) as temporary, temporary.open("wb") as file:
-                    np.save(file, array, allow_pickle=False)
-                document[f"{kind}_file_{part}"] = f"data/{name}/{file_name}"
+    for (kind, part), array in arrays.items():
+        file_name = _array_name(kind, part)
+        with atomic_path(folder / file_name) as temporary, temporary.open("wb") as file:
+            np.save(file, array, allow_pickle=False)
+        document[f"{kind}_file_{part}"] = f"data/{name}/{file_name}"
     document |= {"result_dir": f"results/{name}", **_planes(dataset.probe), "_source": dataset.name}
     with atomic_path(folder / CONFIG_NAME) as temporary:
         temporary.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+
+
+def _array_name(kind: str, part: str) -> str:
+    return f"{kind}_{part}.npy"
 
 
 def _planes(probe: Probe) -> dict[str, float]:

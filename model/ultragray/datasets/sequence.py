@@ -16,6 +16,7 @@ from .sweep import ByteArray
 
 MAX_HEADER_BYTES = 256 << 20
 MAX_LINE_BYTES = 1 << 20
+MAX_BARE_FRAMES = 1_000  # without a field of their own: a few may lack a pose, but a frame costs memory
 _FRAME_FIELD = re.compile(r"Seq_Frame(\d{1,9})_(\w+)")
 
 
@@ -39,17 +40,24 @@ def header_lines(file: BinaryIO, path: Path) -> Iterator[str]:
         yield line.decode("utf-8", errors="replace").rstrip("\r\n")
 
 
-def split_fields(entries: Mapping[str, str], frame_count: int) -> tuple[dict[str, str], tuple[Mapping[str, str], ...]]:
-    """The fields of the file, and those of each of its frames; fields of frames beyond them are left out."""
+def split_fields(
+    path: Path, entries: Mapping[str, str], frame_count: int
+) -> tuple[dict[str, str], tuple[Mapping[str, str], ...]]:
+    """The fields of the file, and those of each of its frames; fields of frames beyond them are left out.
+
+    Raises DatasetInvalid for a number of frames far beyond those that have fields.
+    """
     fields: dict[str, str] = {}
-    frames: tuple[dict[str, str], ...] = tuple({} for _ in range(frame_count))
+    frames: dict[int, dict[str, str]] = {}
     for key, value in entries.items():
         match = _FRAME_FIELD.fullmatch(key)
         if match is None:
             fields[key] = value
         elif int(match[1]) < frame_count:
-            frames[int(match[1])][match[2]] = value
-    return fields, frames
+            frames.setdefault(int(match[1]), {})[match[2]] = value
+    if frame_count > len(frames) + MAX_BARE_FRAMES:
+        raise DatasetInvalid(f"{path}: its header says {frame_count} frames, but has fields of {len(frames)} only")
+    return fields, tuple(frames.get(number, {}) for number in range(frame_count))
 
 
 def pixel_shape(path: Path, sizes: list[int], channels: int) -> tuple[int, ...]:  # [F, rows, columns(, channels)]

@@ -99,6 +99,12 @@ class Sweep:
         return corners + self.poses[:, None, :3, 3]
 
 
+def corner_distances_mm(corners: FloatArray, others: FloatArray) -> FloatArray:  # [..., K, 3] both -> [...]
+    """How far image planes lie from each other: the mean distance of corresponding corners, mm; shapes broadcast."""
+    distances: FloatArray = np.linalg.norm(corners - others, axis=-1).mean(axis=-1)
+    return distances
+
+
 @dataclass(frozen=True, eq=False)
 class Dataset:
     """Frames to train from and frames held out to measure with (there may be none), of one probe and image size.
@@ -138,6 +144,6 @@ class Dataset:
         digest = hashlib.sha256(json.dumps(probe_to_dict(self.probe), sort_keys=True).encode())
         for part in (self.train, self.val):
             digest.update(repr(part.images.shape).encode())
-            digest.update(np.ascontiguousarray(part.images).tobytes())
-            digest.update(np.ascontiguousarray(part.poses).tobytes())
+            digest.update(np.ascontiguousarray(part.images).reshape(-1).data)
+            digest.update(np.ascontiguousarray(part.poses).reshape(-1).data)
         return digest.hexdigest()

@@ -12,6 +12,7 @@ from .sweep import Sweep
 
 VOXEL_MM = 1.0
 MAX_VOXELS = 8_000_000
+GROWTH = 1.01  # of voxels that are still too many
 MAX_POINTS = 200_000  # of one image plane
 
 
@@ -30,7 +31,9 @@ def swept_volume(sweep: Sweep) -> SweptVolume:
     corners = sweep.corners_mm() @ axes
     low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
     voxel_mm = max(VOXEL_MM, float(np.prod(np.maximum(high - low, VOXEL_MM)) / MAX_VOXELS) ** (1 / 3))
-    counts = np.maximum(np.ceil((high - low) / voxel_mm - 1e-9), 1).astype(np.int64)
+    while _counts(high - low, voxel_mm).prod() > MAX_VOXELS:  # a side thinner than a voxel still takes one
+        voxel_mm *= GROWTH
+    counts = _counts(high - low, voxel_mm).astype(np.int64)
     crossed = np.zeros(counts.prod(), bool)
     points = _plane_points(sweep.probe, voxel_mm / 2)
     for pose in sweep.poses:
@@ -39,6 +42,11 @@ def swept_volume(sweep: Sweep) -> SweptVolume:
         crossed[(x * counts[1] + y) * counts[2] + z] = True
     share = float(crossed.mean())
     return SweptVolume(swept_ml=float(crossed.sum()) * voxel_mm**3 / 1000.0, coverage=share, voxel_mm=voxel_mm)
+
+
+def _counts(span_mm: FloatArray, voxel_mm: float) -> FloatArray:  # [3]
+    counts: FloatArray = np.maximum(np.ceil(span_mm / voxel_mm - 1e-9), 1.0)
+    return counts
 
 
 def _plane_points(probe: Probe, spacing_mm: float) -> FloatArray:  # [P, 3]

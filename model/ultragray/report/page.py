@@ -20,7 +20,7 @@ from ..metrics import FrameMetrics
 from ..scene import GaussianScene
 from ..side_by_side import as_picture, side_by_side_panels
 from .plots import LABELS, plot_counts, plot_frames, plot_tilt, plot_training
-from .study import TiltStudy, Trained
+from .study import GAUSSIAN_SHARES, Failed, TiltStudy, Trained
 
 PANEL_PIXELS = 300
 PLOTTED_BASELINES = ("median", "linear", "nearest")
@@ -35,7 +35,7 @@ BASELINE_NAMES = {
 
 @dataclass(frozen=True, eq=False)
 class ReportContent:
-    """What a report shows. `trained` is None for a scene that was read from a file."""
+    """What a report shows. `trained` is None for a scene that was read from a file; what failed says why."""
 
     dataset: Dataset
     scene: GaussianScene
@@ -44,17 +44,21 @@ class ReportContent:
     voxel_mm: float
     machine: str
     trained: Trained | None = None
-    ablations: Mapping[str, Trained] = field(default_factory=dict)
-    tilt: TiltStudy | None = None
+    ablations: Mapping[str, Trained | Failed] = field(default_factory=dict)
+    tilt: TiltStudy | Failed | None = None
 
 
 @dataclass(frozen=True)
 class Row:
-    """A line of a table of metrics. `cells` pairs each text with whether it is the best of its column."""
+    """A line of a table of metrics. `cells` pairs each text with whether it is the best of its column.
+
+    A line with a `failure` has that in their place.
+    """
 
     name: str
     cells: list[tuple[str, bool]]
     notes: list[str]
+    failure: str | None = None
 
 
 def render_page(content: ReportContent) -> str:
@@ -64,6 +68,7 @@ def render_page(content: ReportContent) -> str:
     )
     evaluations = {"scene": content.evaluation, **content.baselines}
     shown = {name: evaluations[name] for name in ("scene", *PLOTTED_BASELINES) if name in evaluations}
+    tilt = content.tilt if isinstance(content.tilt, TiltStudy) else None
     return environment.get_template("page.html").render(
         version=__version__,
         content=content,
@@ -78,14 +83,18 @@ def render_page(content: ReportContent) -> str:
         pictures=_pictures(content),
         ablations=_ablation_rows(content),
         counts_plot=_counts_plot(content),
-        tilt_plot=None if content.tilt is None else plot_tilt(content.tilt),
-        tilt_rows=[] if content.tilt is None else metric_rows(content.tilt.evaluations),
+        tilt=tilt,
+        tilt_failure=content.tilt.reason if isinstance(content.tilt, Failed) else None,
+        tilt_plot=None if tilt is None else plot_tilt(tilt),
+        tilt_rows=[] if tilt is None else metric_rows(tilt.evaluations),
         configuration={} if content.trained is None else content.trained.scene.info.training,
     )
 
 
 def metric_rows(evaluations: Mapping[str, Evaluation], notes: Mapping[str, list[str]] | None = None) -> list[Row]:
     """One row a method with mean ± standard deviation, the best mean of each column marked."""
+    if not evaluations:
+        return []
     means = {name: evaluation.mean.to_dict() for name, evaluation in evaluations.items()}
     stds = {name: evaluation.std.to_dict() for name, evaluation in evaluations.items()}
     best = {
@@ -136,18 +145,21 @@ def _ablation_rows(content: ReportContent) -> list[Row]:
     if not content.ablations:
         return []
     runs = {**({} if content.trained is None else {"full model": content.trained}), **content.ablations}
-    return metric_rows(
-        {name: run.evaluation for name, run in runs.items()},
-        {name: [f"{run.scene.gaussian_count:,}", f"{1000.0 * run.step_s:.0f}"] for name, run in runs.items()},
+    trained = {name: run for name, run in runs.items() if isinstance(run, Trained)}
+    measured = metric_rows(
+        {name: run.evaluation for name, run in trained.items()},
+        {name: [f"{run.scene.gaussian_count:,}", f"{1000.0 * run.step_s:.0f}"] for name, run in trained.items()},
     )
+    failed = [Row(name, [], [], run.reason) for name, run in runs.items() if isinstance(run, Failed)]
+    return sorted([*measured, *failed], key=lambda row: list(runs).index(row.name))
 
 
 def _counts_plot(content: ReportContent) -> str | None:
     """Over the runs that differ in their number of Gaussians only."""
-    runs = [run for name, run in content.ablations.items() if "Gaussians" in name]
-    if content.trained is not None:
-        runs.append(content.trained)
-    points: dict[int, FrameMetrics] = {run.scene.gaussian_count: run.evaluation.mean for run in runs}
+    runs = [*(content.ablations.get(name) for name in GAUSSIAN_SHARES), content.trained]
+    points: dict[int, FrameMetrics] = {
+        run.scene.gaussian_count: run.evaluation.mean for run in runs if isinstance(run, Trained)
+    }
     return plot_counts(points) if len(points) > 1 else None
 
 

@@ -5,12 +5,14 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 
 from ..baselines import evaluate_baselines, nearest_frames
 from ..compounding import VOXEL_MM, mean_axes
 from ..datasets.sweep import Dataset, IntArray, Sweep
+from ..errors import UltragrayError
 from ..evaluation import Evaluation, evaluate, require_frames
 from ..pose import rotation_angles_deg
 from ..probe import FloatArray
@@ -19,7 +21,9 @@ from ..training import Progress, TrainingConfig, train
 
 LEAST_TILT_DEG = 3.0  # a sweep that turns less cannot show what tilting costs
 TILT_BASELINES = ("median", "nearest")
+GAUSSIAN_SHARES = {"a quarter of the Gaussians": 0.25, "half of the Gaussians": 0.5, "twice the Gaussians": 2.0}
 Report = Callable[[Progress], None]
+Result = TypeVar("Result")
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +48,21 @@ class TiltStudy:
     evaluations: dict[str, Evaluation]  # "scene" and TILT_BASELINES
 
 
+@dataclass(frozen=True)
+class Failed:
+    """A study that could not be finished."""
+
+    reason: str
+
+
+def attempt(study: Callable[[], Result]) -> Result | Failed:
+    """What `study` gives, or why it could not: one of several studies must not take the others with it."""
+    try:
+        return study()
+    except UltragrayError as error:
+        return Failed(str(error))
+
+
 def train_and_evaluate(dataset: Dataset, config: TrainingConfig, *, report: Report | None = None) -> Trained:
     """Trains on `dataset.train` and measures on `dataset.val`. Raises DatasetInvalid where that has no frames."""
     require_frames(dataset.val)
@@ -52,8 +71,8 @@ def train_and_evaluate(dataset: Dataset, config: TrainingConfig, *, report: Repo
 
     def follow(progress: Progress) -> None:
         losses.append(progress.loss)
-        if progress.val_psnr_db is not None and progress.val_psnr_db not in val_psnr_db.values():
-            val_psnr_db[progress.step] = progress.val_psnr_db
+        if progress.val_psnr_db is not None and progress.val_step is not None:
+            val_psnr_db[progress.val_step] = progress.val_psnr_db
         if report is not None:
             report(progress)
 
@@ -78,15 +97,16 @@ def ablations(config: TrainingConfig, gaussian_count: int) -> dict[str, Training
 
     def with_share_of_gaussians(share: float) -> TrainingConfig:
         limit = max(1, round(gaussian_count * share))
-        return replace(config, max_gaussians=limit, initial_gaussians=None)
+        start = config.initial_gaussians
+        if start is not None:
+            start = min(max(1, round(start * share)), limit)
+        return replace(config, max_gaussians=limit, initial_gaussians=start)
 
     return {
         "no transmittance": replace(config, transmittance=False),
         "spherical harmonics of degree 0": replace(config, sh_degree=0),
         "no out-of-plane sampling": replace(config, out_of_plane_mm=0.0),
-        "a quarter of the Gaussians": with_share_of_gaussians(0.25),
-        "half of the Gaussians": with_share_of_gaussians(0.5),
-        "twice the Gaussians": with_share_of_gaussians(2.0),
+        **{name: with_share_of_gaussians(share) for name, share in GAUSSIAN_SHARES.items()},
     }
 
 

@@ -8,18 +8,22 @@ of the run's random numbers). Metadata: one JSON object with the fields of `Chec
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
 from ..errors import InvalidArgument, TrainingStateInvalid
 from ..files import atomic_path
+from ..scene_info import expected_shapes
 from .config import TrainingConfig
+from .optimizer import MOMENTS, is_trained
 
 FORMAT_VERSION = 1
 METADATA_KEY = "ultragray-training"
@@ -69,14 +73,64 @@ def _read(path: Path, *, with_tensors: bool) -> tuple[CheckpointHeader, dict[str
 
 
 def _header(text: str) -> CheckpointHeader:
-    document: dict[str, Any] = json.loads(text)
+    document: Any = json.loads(text)
+    if not isinstance(document, dict):
+        raise ValueError("its metadata is not a JSON object")
     version = document.pop("format_version", None)
     if version != FORMAT_VERSION:
         raise ValueError(f"its format_version is {version!r}, this release reads {FORMAT_VERSION}")
     try:
-        return CheckpointHeader(**{**document, "config": TrainingConfig.from_dict(document["config"])})
+        header = CheckpointHeader(**{**document, "config": TrainingConfig.from_dict(document["config"])})
     except InvalidArgument as error:
         raise ValueError(error.detail) from error
+    if type(header.step) is not int or not 1 <= header.step <= (header.config.steps or 0):
+        raise ValueError(f"its step is {header.step!r}, expected 1 to {header.config.steps}")
+    if not isinstance(header.elapsed_s, (int, float)) or not 0.0 <= header.elapsed_s < math.inf:
+        raise ValueError(f"its elapsed_s is {header.elapsed_s!r}, expected seconds")
+    if not isinstance(header.dataset_sha256, str):
+        raise ValueError(f"its dataset_sha256 is {header.dataset_sha256!r}, expected text")
+    return header
+
+
+def check_tensors(path: Path, header: CheckpointHeader, tensors: Mapping[str, Tensor], frame_count: int) -> None:
+    """Raises TrainingStateInvalid unless these are the tensors of such a run on so many training frames."""
+    config, means, waiting = header.config, tensors.get("parameter.means"), tensors.get("waiting")
+    assert config.max_gaussians is not None
+    count, waiting_count = (len(t) if t is not None and t.ndim else 0 for t in (means, waiting))
+    if not 1 <= count <= config.max_gaussians:
+        raise TrainingStateInvalid(f"{path}: it holds {count} Gaussians, expected 1 to {config.max_gaussians}")
+    expected = _expected_tensors(config, count, waiting_count)
+    if different := set(tensors) ^ set(expected):
+        raise TrainingStateInvalid(f"{path}: missing or unexpected tensors: {', '.join(sorted(different))}")
+    for name, (dtype, shape) in expected.items():
+        tensor = tensors[name]
+        if tensor.dtype != dtype or tuple(tensor.shape) != shape:
+            raise TrainingStateInvalid(
+                f"{path}: its tensor {name} is {tensor.dtype} {list(tensor.shape)}, expected {dtype} {list(shape)}"
+            )
+        if not bool(torch.isfinite(tensor).all()):
+            raise TrainingStateInvalid(f"{path}: its tensor {name} is not finite")
+        if name.startswith("adam.") and name.endswith(".step") and int(tensor) != header.step:
+            raise TrainingStateInvalid(f"{path}: its tensor {name} is {int(tensor)}, expected {header.step}")
+    places = tensors["waiting"]
+    if waiting_count >= frame_count or not bool(((places >= 0) & (places < frame_count)).all()):
+        raise TrainingStateInvalid(f"{path}: its tensor waiting names frames that the {frame_count} do not have")
+
+
+def _expected_tensors(
+    config: TrainingConfig, gaussian_count: int, waiting_count: int
+) -> dict[str, tuple[torch.dtype, tuple[int, ...]]]:
+    shapes: dict[str, tuple[int, ...]] = {"pull.total": (gaussian_count,), "pull.seen": (gaussian_count,)}
+    for name, shape in expected_shapes(gaussian_count, config.sh_degree).items():
+        shapes[f"parameter.{name}"] = shape
+        if is_trained(name, shape, config):
+            shapes |= {f"adam.{name}.{moment}": shape for moment in MOMENTS} | {f"adam.{name}.step": ()}
+    generator = torch.Generator().get_state()
+    return {
+        **{name: (torch.float32, shape) for name, shape in shapes.items()},
+        "waiting": (torch.int64, (waiting_count,)),
+        "generator": (generator.dtype, tuple(generator.shape)),
+    }
 
 
 def check_same_run(path: Path, header: CheckpointHeader, config: TrainingConfig, dataset_sha256: str) -> None:

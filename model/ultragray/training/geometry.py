@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..datasets.sweep import Dataset, Sweep
+from ..datasets.sweep import Dataset, Sweep, corner_distances_mm
 from ..probe import FloatArray
 from .sampling import out_of_plane_range_mm
 
@@ -73,7 +73,7 @@ def frame_spacing_mm(sweep: Sweep) -> float:
     gaps: list[float] = []
     for start in range(0, count, FRAMES_AT_ONCE):
         some = np.arange(start, min(start + FRAMES_AT_ONCE, count))
-        travel = np.linalg.norm(corners[some, None] - corners[None], axis=-1).mean(axis=-1)  # [f, F]
+        travel = corner_distances_mm(corners[some, None], corners)  # [f, F]
         travel[some - start, some] = np.inf
         offsets = corners[travel.argmin(axis=1)] - corners[some]  # [f, K, 3]
         gaps.extend(np.abs(np.einsum("fkc,fc->fk", offsets, elevations[some])).mean(axis=1).tolist())

@@ -1,6 +1,6 @@
 """What a rendered frame costs: half L1, half structural dissimilarity.
 
-Written in torch for any device and dtype; float32 images on the CPU take the C++ kernel, which gives the same.
+Written in torch for any device and dtype; where both images are float32 on the CPU, the C++ kernel gives the same.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ SSIM_C2 = 0.03**2
 
 def image_loss(rendered: Tensor, truth: Tensor) -> Tensor:  # [C, H, W], [C, H, W] in [0, 1] -> scalar
     """0.5·mean|rendered − truth| + 0.5·(1 − SSIM), both sides at least 11 pixels."""
-    if rendered.device.type == "cpu" and rendered.dtype == torch.float32:
+    if all(image.device.type == "cpu" and image.dtype == torch.float32 for image in (rendered, truth)):
         return kernel_image_loss(rendered, truth)
     return plain_image_loss(rendered, truth)
 
@@ -31,10 +31,10 @@ def plain_image_loss(rendered: Tensor, truth: Tensor) -> Tensor:  # [C, H, W], [
 
 def ssim(x: Tensor, y: Tensor) -> Tensor:  # [C, H, W], [C, H, W] -> scalar
     """Mean structural similarity: Gaussian window 11x11, σ = 1.5, only where the window lies inside (valid padding)."""
-    offsets = torch.arange(SSIM_WINDOW, dtype=x.dtype, device=x.device) - SSIM_WINDOW // 2
+    fields = torch.stack([x, y, x * x, y * y, x * y]).flatten(0, 1)[:, None]  # [5·C, 1, H, W]
+    offsets = torch.arange(SSIM_WINDOW, dtype=fields.dtype, device=fields.device) - SSIM_WINDOW // 2
     window = torch.exp(-0.5 * (offsets / SSIM_SIGMA).square())
     window = window / window.sum()
-    fields = torch.stack([x, y, x * x, y * y, x * y]).flatten(0, 1)[:, None]  # [5·C, 1, H, W]
     blurred = F.conv2d(F.conv2d(fields, window[None, None, :, None]), window[None, None, None, :])
     mean_x, mean_y, square_x, square_y, product = blurred[:, 0].chunk(5)
     variances = square_x + square_y - mean_x.square() - mean_y.square()

@@ -1,4 +1,8 @@
-"""The memory that a training will need at its largest, known before it starts."""
+"""The memory that a training will need at its largest, known before it starts.
+
+For the backend `cpu`; `reference` keeps a graph of [H, W] for every Gaussian that a frame touches, which nobody can
+foresee. On another device than the CPU what is said here is taken there for the most part.
+"""
 
 from __future__ import annotations
 
@@ -7,14 +11,22 @@ from pathlib import Path
 
 from ..datasets.sweep import Dataset
 from ..errors import MemoryExceeded
+from ..evaluation import CHUNK_PIXELS
 from .config import TrainingConfig
+from .sampling import PREDICTED_PIXELS
 
 BASE_BYTES = 400 << 20  # the process with torch loaded, and the scratch memory of its kernels
 RAW_FLOATS = 3 + 3 + 4 + 1 + 1  # of a Gaussian, without the harmonics above degree 0
 COPIES = 16  # parameters, gradients, moments; what refinements, checkpoints and the kernel copy (measured: 14)
 STATISTICS = 2
-PIXEL_FLOATS = 32  # of a pixel of a batch: the outputs and what the backward pass keeps of them (measured: 17)
+PIXEL_FLOATS = 25  # of a pixel of a batch: the outputs and what the backward pass keeps of them (measured: 17)
+PADDING = 32  # pixels that the kernel adds to a row
+LIST_GAUSSIANS = 4096  # a step lists those that an image plane touches, so many in a list
+LIST_BYTES = 72 * 4160  # of a full list: it begins with room for 1040 slices of 72 bytes and doubles twice
+MEASURED_BYTES = 256  # of a pixel of the held-out frames that are measured at once (measured: 234)
+COMPARED_BYTES = 8 * 2 * PREDICTED_PIXELS + 32_768  # of a frame beside its distances, when frames are compared
 GIB = 1 << 30
+CONTROL_GROUPS = Path("/sys/fs/cgroup")
 
 
 def required_bytes(dataset: Dataset, config: TrainingConfig) -> int:
@@ -23,9 +35,21 @@ def required_bytes(dataset: Dataset, config: TrainingConfig) -> int:
     harmonics = (config.sh_degree + 1) ** 2 - 1
     gaussians = 4 * config.max_gaussians * ((RAW_FLOATS + harmonics) * COPIES + STATISTICS)
     frames = min(config.batch_size, len(dataset.train))
-    pixels = dataset.train.height * dataset.train.width
-    images = 2 * (dataset.train.images.nbytes + dataset.val.images.nbytes)  # the dataset's and the trainer's copy
-    return BASE_BYTES + gaussians + 4 * PIXEL_FLOATS * frames * pixels + images
+    height, width = dataset.train.height, dataset.train.width
+    stepping = 4 * PIXEL_FLOATS * frames * height * (width + PADDING)
+    measuring = MEASURED_BYTES * min(len(dataset.val) * height * width, max(CHUNK_PIXELS, height * width))
+    slices = frames * -(-config.max_gaussians // LIST_GAUSSIANS) * LIST_BYTES  # as if all touched all planes
+    return BASE_BYTES + gaussians + slices + max(stepping, measuring) + _images_bytes(dataset)
+
+
+def comparison_bytes(dataset: Dataset) -> int:
+    """An upper bound of the process's memory while Geometry.of compares the training frames with each other."""
+    count = len(dataset.train)
+    return BASE_BYTES + 8 * count**2 + COMPARED_BYTES * count + _images_bytes(dataset)
+
+
+def _images_bytes(dataset: Dataset) -> int:
+    return 2 * dataset.train.images.nbytes + dataset.val.images.nbytes  # the dataset's and the trainer's copy
 
 
 def available_bytes() -> int | None:
@@ -48,27 +72,50 @@ def _free_memory() -> int | None:
 
 
 def _left_in_group() -> int | None:
-    folder = Path("/sys/fs/cgroup")
-    for limit, used in (
-        ("memory.max", "memory.current"),
-        ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes"),
+    for folder, limit, used, reclaimable in (
+        (CONTROL_GROUPS, "memory.max", "memory.current", "inactive_file"),
+        (CONTROL_GROUPS / "memory", "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
     ):
         try:
-            return int((folder / limit).read_text()) - int((folder / used).read_text())
+            taken = int((folder / used).read_text()) - _entry(folder / "memory.stat", reclaimable)
+            return int((folder / limit).read_text()) - taken
         except (OSError, ValueError):  # another layout, or "max": no limit
             continue
     return None
 
 
+def _entry(path: Path, name: str) -> int:
+    """A number of memory.stat; 0 where it has none. What files take in a cache counts as used but can be had."""
+    values = dict(line.split() for line in path.read_text(encoding="ascii").splitlines())
+    return int(values.get(name, 0))
+
+
 def check_memory(dataset: Dataset, config: TrainingConfig) -> None:
     """Raises MemoryExceeded, saying what to lower, where the training may need more than it can have."""
     needed = required_bytes(dataset, config)
-    limit = available_bytes() if config.memory_gb is None else int(config.memory_gb * GIB)
-    if limit is not None and needed > limit:
-        source = "this machine has free" if config.memory_gb is None else "memory_gb allows"
+    if missing := _missing(needed, config):
         raise MemoryExceeded(
             f"the training needs up to {needed / GIB:.1f} GiB with {config.max_gaussians or 0:,} Gaussians and batches "
-            f"of {config.batch_size} frames of {dataset.train.height}x{dataset.train.width}, {source} "
-            f"{limit / GIB:.1f} GiB: lower max_gaussians or batch_size",
+            f"of {config.batch_size} frames of {dataset.train.height}x{dataset.train.width}, {missing}: lower "
+            "max_gaussians or batch_size",
             field="max_gaussians",
         )
+
+
+def check_comparison_memory(dataset: Dataset, config: TrainingConfig) -> None:
+    """Raises MemoryExceeded where even comparing the frames, before a training, may need more than it can have."""
+    needed = comparison_bytes(dataset)
+    if missing := _missing(needed, config):
+        raise MemoryExceeded(
+            f"{dataset.train.source}: comparing its {len(dataset.train):,} frames needs up to {needed / GIB:.1f} GiB, "
+            f"{missing}: train from fewer frames",
+            field="train_frames",
+        )
+
+
+def _missing(needed: int, config: TrainingConfig) -> str | None:
+    """Who allows how much, where that is less than needed."""
+    limit = available_bytes() if config.memory_gb is None else int(config.memory_gb * GIB)
+    if limit is None or needed <= limit:
+        return None
+    return f"{'this machine has free' if config.memory_gb is None else 'memory_gb allows'} {limit / GIB:.1f} GiB"

@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
 
+from .config import TrainingConfig
+
 MOMENTS = ("exp_avg", "exp_avg_sq")
+
+
+def is_trained(name: str, shape: Sequence[int], config: TrainingConfig) -> bool:
+    """Whether a parameter of this shape changes in a run."""
+    return math.prod(shape) > 0 and (config.transmittance or name != "transmittances")
 
 
 class Optimizer:

@@ -23,6 +23,7 @@ class Progress:
     steps_per_s: float
     seconds_left: float
     val_psnr_db: float | None
+    val_step: int | None  # after which it was measured
 
 
 class StepTimer:
@@ -45,9 +46,9 @@ class Journal:
     """Appends to a JSONL file; a line is in the file when `write` returns."""
 
     def __init__(self, path: Path, *, steps_done: int) -> None:
-        """Begins the file anew, or goes on after the lines of the first `steps_done` steps."""
+        """Begins the file anew, or goes on after the lines of the first `steps_done` steps; damage cuts it short."""
         with atomic_path(path) as temporary:
-            temporary.write_text("".join(_lines_until(path, steps_done)), encoding="utf-8")
+            temporary.write_bytes(b"".join(_lines_until(path, steps_done)))
         self._file = path.open("a", encoding="utf-8")
 
     def write(self, line: Mapping[str, float]) -> None:
@@ -58,13 +59,23 @@ class Journal:
         self._file.close()
 
 
-def _lines_until(path: Path, steps_done: int) -> list[str]:
-    """The complete lines of steps up to `steps_done`: a killed run may have written more, and half a line."""
+def _lines_until(path: Path, steps_done: int) -> list[bytes]:
+    """The lines of steps up to `steps_done`, before the first bad one: a killed run may have written half a line."""
     if not steps_done or not path.exists():
         return []
     kept = []
-    for line in path.read_text(encoding="utf-8").splitlines(keepends=True):
-        if not line.endswith("\n") or json.loads(line)["step"] > steps_done:
+    for line in path.read_bytes().splitlines(keepends=True):
+        if not line.endswith(b"\n") or not 1 <= _step_of(line) <= steps_done:
             break
         kept.append(line)
     return kept
+
+
+def _step_of(line: bytes) -> int:
+    """The step that a line is about; 0 where it is damaged."""
+    try:
+        document = json.loads(line)
+    except (ValueError, RecursionError):
+        return 0
+    step = document.get("step") if isinstance(document, dict) else None
+    return step if type(step) is int else 0

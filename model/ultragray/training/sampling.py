@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..datasets.sweep import IntArray, Sweep
+from ..datasets.sweep import IntArray, Sweep, corner_distances_mm
 from ..probe import FloatArray
 
 LEAST_RANGE = 1.5  # × the spacing of the frames
@@ -46,13 +46,9 @@ def out_of_plane_range_mm(sweep: Sweep, spacing_mm: float) -> float:
     1.5 spacings, so that there is no gap between frames; no more than that above MAX_SLICE_MM.
     """
     least = min(LEAST_RANGE * spacing_mm, MAX_RANGE_MM)
-    corners = sweep.corners_mm().reshape(len(sweep), -1)  # [F, 3·K]
-    corner_count = corners.shape[1] // 3
-    distances = np.empty((len(sweep), len(sweep)))
-    for place in range(len(sweep)):
-        offsets = (corners - corners[place]).reshape(len(sweep), corner_count, 3)
-        distances[place] = np.linalg.norm(offsets, axis=-1).mean(axis=-1)
-        distances[place, place] = np.inf
+    corners = sweep.corners_mm()  # [F, K, 3]
+    distances = np.stack([corner_distances_mm(own, corners) for own in corners])  # [F, F]
+    np.fill_diagonal(distances, np.inf)
     step_mm = float(np.median(distances.min(axis=1)))
     if step_mm == 0.0:
         return least

@@ -22,7 +22,9 @@ class Schedule:
             "shN": config.shn_rate * root,
         }
         last = config.refinement_end * self.steps
-        self._refinements = [round(last * (k + 1) / config.refinements) for k in range(config.refinements)]
+        after = [round(last * (k + 1) / config.refinements) for k in range(config.refinements)]
+        # What is added by a refinement must still be trained. Several after one step become the last of them.
+        self._refinements = {min(done, self.steps - 1): place for place, done in enumerate(after)}
 
     def rates(self, step: int) -> dict[str, float]:
         """Adam's rate for each parameter: exponential decay from the first to the last step, 0 before it is trained."""
@@ -46,10 +48,8 @@ class Schedule:
         return self._config.intensity_floor if step < self._config.floor_end * self.steps else 0.0
 
     def refinement(self, done: int) -> int | None:
-        """Which refinement, from 0, is due after `done` steps; None: none, as after the last step."""
-        if done in self._refinements and 0 < done < self.steps:
-            return self._refinements.index(done)
-        return None
+        """Which refinement, from 0, is due after `done` steps; None: none, as before the first and after the last."""
+        return self._refinements.get(done) if done > 0 else None
 
     def gaussian_limit(self, refinement: int) -> int:
         """How many Gaussians there may be after a refinement."""

@@ -18,7 +18,7 @@ from torch import Tensor
 from ..datasets.sweep import Dataset
 from ..errors import BackendUnavailable, DatasetInvalid, TrainingDiverged, TrainingStateInvalid
 from ..evaluation import evaluate
-from ..files import atomic_path
+from ..files import atomic_path, remove_stale_temporaries
 from ..rendering import render
 from ..scene import PARAMETERS, GaussianScene
 from ..scene_info import SceneInfo
@@ -26,6 +26,7 @@ from .board import Board
 from .checkpointing import (
     CheckpointHeader,
     check_same_run,
+    check_tensors,
     read_checkpoint,
     read_checkpoint_header,
     write_checkpoint,
@@ -35,8 +36,8 @@ from .geometry import Geometry
 from .initial import initial_parameters
 from .intensity import project_sh0
 from .losses import SSIM_WINDOW, image_loss
-from .memory import check_memory
-from .optimizer import Optimizer
+from .memory import check_comparison_memory, check_memory
+from .optimizer import Optimizer, is_trained
 from .progress import Journal, Progress, StepTimer
 from .refinement import PullStatistics, refine
 from .sampling import BatchSampler, out_of_plane_shift_mm, shift_out_of_plane
@@ -102,6 +103,7 @@ class Trainer:
                 f"{dataset.train.source}: images must have at least {SSIM_WINDOW} rows and columns, got "
                 f"{dataset.train.height}x{dataset.train.width}"
             )
+        check_comparison_memory(dataset, config)
         self._geometry = Geometry.of(dataset)
         config = config.resolved(self._geometry)
         check_memory(dataset, config)
@@ -126,6 +128,7 @@ class Trainer:
         self.step = 0  # steps done
         self._timer = StepTimer()
         self._val_psnr_db: float | None = None
+        self._val_step: int | None = None
         self._begin_with(initial_parameters(dataset, self._geometry, config, self._generator))
 
     def _begin_with(self, parameters: dict[str, Tensor]) -> None:
@@ -134,9 +137,8 @@ class Trainer:
         self._pull = PullStatistics.empty(len(parameters["means"]), self._device)
 
     def _trainable(self, parameters: dict[str, Tensor]) -> dict[str, Tensor]:
-        fixed = set() if self.config.transmittance else {"transmittances"}
         return {
-            name: tensor.detach().to(self._device).requires_grad_(name not in fixed and tensor.numel() > 0)
+            name: tensor.detach().to(self._device).requires_grad_(is_trained(name, tensor.shape, self.config))
             for name, tensor in parameters.items()
         }
 
@@ -152,6 +154,8 @@ class Trainer:
                 f"{checkpoint}: there is an unfinished run: resume it, or remove {self.folder} to begin anew"
             )
         self.folder.mkdir(parents=True, exist_ok=True)
+        for name in (CHECKPOINT_FILE, JOURNAL_FILE, CONFIG_FILE):
+            remove_stale_temporaries(self.folder / name)
         with atomic_path(self.folder / CONFIG_FILE) as temporary:
             temporary.write_text(json.dumps(self.config.to_dict(), indent=2) + "\n", encoding="utf-8")
         with contextlib.ExitStack() as stack:
@@ -193,6 +197,7 @@ class Trainer:
         line: dict[str, float] = {"step": self.step, "loss": loss, "gaussians": self.gaussian_count}
         if len(self.dataset.val) and self.step % math.ceil(self._schedule.steps / VALIDATIONS) == 0:
             self._val_psnr_db = line["val_psnr_db"] = self._validate()
+            self._val_step = self.step
         self._timer.add(time.perf_counter() - started)
         log({**line, "elapsed_s": round(self._timer.elapsed_s, 3)})
         rate = self._timer.rate()
@@ -204,6 +209,7 @@ class Trainer:
             steps_per_s=rate,
             seconds_left=(self._schedule.steps - self.step) / rate if rate else math.inf,
             val_psnr_db=self._val_psnr_db,
+            val_step=self._val_step,
         )
 
     @property
@@ -222,7 +228,7 @@ class Trainer:
         with torch.no_grad():
             loss = float(image) + self._add_scale_penalty()
             if not math.isfinite(loss):
-                raise self._diverged(f"the loss is {loss}")
+                raise self._diverged(self.step + 1, f"the loss is {loss}")
             means_gradient = self.parameters["means"].grad
             assert means_gradient is not None
             self._pull.add(means_gradient)
@@ -280,7 +286,7 @@ class Trainer:
                 generator=self._generator,
             )
             if not len(refined.parameters["means"]):
-                raise self._diverged("refinement pruned every Gaussian")
+                raise self._diverged(self.step, "refinement pruned every Gaussian")
             self._project(refined.parameters["sh0"])
         self.parameters = self._trainable(refined.parameters)
         self._optimizer.replace(self.parameters, refined.origin)
@@ -289,12 +295,12 @@ class Trainer:
     def _check_finite(self) -> None:
         for name, tensor in self.parameters.items():
             if not bool(torch.isfinite(tensor.detach()).all()):
-                raise self._diverged(f"{name} are no longer finite")
+                raise self._diverged(self.step, f"{name} are no longer finite")
 
-    def _diverged(self, what: str) -> TrainingDiverged:
+    def _diverged(self, step: int, what: str) -> TrainingDiverged:  # step: from 1
         path = None if self.folder is None else self.folder / CHECKPOINT_FILE
         kept = f"; the last good checkpoint is kept in {path}" if path is not None and path.exists() else ""
-        return TrainingDiverged(f"training diverged in step {self.step + 1}: {what}{kept}")
+        return TrainingDiverged(f"training diverged in step {step}: {what}{kept}")
 
     def _validate(self) -> float:
         """Mean PSNR over some of the held-out frames, dB."""
@@ -332,15 +338,16 @@ class Trainer:
         header, tensors = read_checkpoint(path)
         assert self._info.dataset_sha256 is not None
         check_same_run(path, header, self.config, self._info.dataset_sha256)
+        check_tensors(path, header, tensors, len(self.dataset.train))
         try:
-            self._begin_with({name: tensors[f"parameter.{name}"] for name in PARAMETERS})
-            prefix = "adam."
-            self._optimizer.load({k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)})
-            self._pull = PullStatistics(tensors["pull.total"].to(self._device), tensors["pull.seen"].to(self._device))
-            self._sampler.waiting = tensors["waiting"]
             self._generator.set_state(tensors["generator"])
-        except (KeyError, RuntimeError, TypeError) as error:
-            raise TrainingStateInvalid(f"{path}: its tensors are not those of a training: {error}") from error
+        except RuntimeError as error:
+            raise TrainingStateInvalid(f"{path}: its tensor generator is no generator's state: {error}") from error
+        self._begin_with({name: tensors[f"parameter.{name}"] for name in PARAMETERS})
+        prefix = "adam."
+        self._optimizer.load({k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)})
+        self._pull = PullStatistics(tensors["pull.total"].to(self._device), tensors["pull.seen"].to(self._device))
+        self._sampler.waiting = tensors["waiting"]
         self.step = header.step
         self._timer = StepTimer(header.elapsed_s)
 

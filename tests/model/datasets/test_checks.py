@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 
@@ -98,6 +99,19 @@ def test_held_out_frames_are_measured_from_the_nearest_training_frame(make_sweep
     document = json.loads(json.dumps(report.to_dict()))
     assert document["probe"] == {"kind": "linear", "width_mm": 40.0, "near_mm": 0.0, "far_mm": 50.0}
     assert document["train"]["frames"] == 5
+
+
+def test_images_are_compared_without_a_copy_of_them(make_sweep: Callable[..., Sweep]) -> None:
+    images = np.random.default_rng(0).integers(0, 250, (64, 256, 256), dtype=np.uint8)
+    small = LinearProbe(width_mm=4.0, near_mm=0.0, far_mm=5.0)
+    sweep = make_sweep(64, images=images, probe=small, step_mm=0.1)
+    dataset = Dataset("one", sweep, Sweep(images[:4], sweep.poses[:4] * 1.0, small, np.arange(4), "val"))
+    tracemalloc.start()
+    report = check_dataset(dataset)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert "0, 1, 2, 3" in report.warnings[-1]
+    assert peak < images.nbytes / 4
 
 
 def test_nothing_held_out(make_sweep: Callable[..., Sweep]) -> None:

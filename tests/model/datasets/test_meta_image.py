@@ -44,7 +44,8 @@ def test_colour_and_four_sizes(tmp_path: Path, plus_files: SimpleNamespace) -> N
         ({"DimSize": "seven"}, "DimSize must be whole numbers"),
         ({"DimSize": "-7 5 3"}, "DimSize must be whole numbers"),
         ({"DimSize": "0 5 3"}, "0 bytes of pixels|limit"),
-        ({"DimSize": "99999 99999 99999"}, "the limit is 4 GiB"),
+        ({"DimSize": "99999 99999 99"}, "the limit is 4 GiB"),
+        ({"DimSize": "1 1 4000000000"}, "says 4000000000 frames, but has fields of 2 only"),
         ({"DimSize": "7 5 4"}, "truncated: .* 105 of 140|truncated: 105 bytes .*140"),
         ({"DimSize": "7 5 2"}, "more pixels than the 70 bytes"),
         ({"ElementNumberOfChannels": "2"}, "1, 3 or 4 channels, got 2"),
@@ -54,7 +55,8 @@ def test_colour_and_four_sizes(tmp_path: Path, plus_files: SimpleNamespace) -> N
 def test_headers_that_cannot_be_are_refused(
     tmp_path: Path, plus_files: SimpleNamespace, changes: dict[str, str], message: str, deflate: bool
 ) -> None:
-    path = plus_files.write_mha(tmp_path / "s.mha", plus_files.speckle(3, 5, 7), changes, deflate=deflate)
+    fields = plus_files.tracked_fields(2) | changes
+    path = plus_files.write_mha(tmp_path / "s.mha", plus_files.speckle(3, 5, 7), fields, deflate=deflate)
     with pytest.raises(DatasetInvalid, match=rf"s\.mha: .*({message})"):
         read_meta_image(path)
 

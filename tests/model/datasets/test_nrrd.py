@@ -43,6 +43,7 @@ def test_colour_and_four_sizes(tmp_path: Path, plus_files: SimpleNamespace) -> N
         ({"sizes": "7 5"}, "columns x rows x frames"),
         ({"sizes": "7 5 x"}, "sizes must be whole numbers"),
         ({"sizes": "7 5 4"}, "truncated"),
+        ({"sizes": "1 1 4000000000"}, "says 4000000000 frames, but has fields of 0 only"),
         ({"sizes": "7 5 2"}, "more pixels"),
         ({"byte skip": "-1"}, "byte skip"),
         ({"kinds": "list domain domain"}, "frames must be the last axis"),

@@ -174,9 +174,24 @@ def test_what_is_written_is_read_back(
     assert len(read.val) == val_count
 
 
-def test_a_dataset_is_not_overwritten(layout: Layout) -> None:
+@pytest.mark.parametrize(
+    ("configuration", "named"), [("conf.json", "conf"), ("liver.json", "images_train"), (None, "images_train")]
+)
+def test_a_dataset_is_not_overwritten(layout: Layout, configuration: str | None, named: str) -> None:
     dataset = read_released(layout.folder)
+    if configuration is None:
+        (layout.folder / "conf.json").unlink()
+    else:
+        (layout.folder / "conf.json").rename(layout.folder / configuration)
     before = {path.name: path.read_bytes() for path in layout.folder.iterdir()}
-    with pytest.raises(InvalidArgument, match="already holds a dataset"):
+    with pytest.raises(InvalidArgument, match=rf"{named}\.(json|npy) already exists: choose another folder"):
         write_released(dataset, layout.folder)
     assert {path.name: path.read_bytes() for path in layout.folder.iterdir()} == before
+
+
+def test_single_poses_are_not_overwritten_either(layout: Layout, tmp_path: Path) -> None:
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "poses_val.npy").write_bytes(b"mine")
+    with pytest.raises(InvalidArgument, match=r"poses_val\.npy already exists"):
+        write_released(read_released(layout.folder), tmp_path / "other")
+    assert [path.name for path in (tmp_path / "other").iterdir()] == ["poses_val.npy"]

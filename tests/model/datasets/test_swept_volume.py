@@ -37,4 +37,14 @@ def test_it_does_not_depend_on_the_frame_of_the_tracker(
 
 def test_huge_volumes_get_larger_voxels(make_sweep: Callable[..., Sweep]) -> None:
     swept = swept_volume(make_sweep(3, step_mm=100_000.0))
-    assert 40 * 50 * 200_000 / swept.voxel_mm**3 == pytest.approx(MAX_VOXELS)
+    voxels = math.prod(math.ceil(side_mm / swept.voxel_mm) for side_mm in (40, 50, 200_000))
+    assert 0.9 * MAX_VOXELS < voxels <= MAX_VOXELS
+
+
+def test_flat_boxes_keep_the_limit_too(make_sweep: Callable[..., Sweep]) -> None:
+    """Two poses far off, in the plane of the others: one layer of voxels."""
+    poses = make_sweep(4, step_mm=0.0).poses.copy()
+    poses[2, 0, 3], poses[3, 2, 3] = 100_000.0, 100_000.0
+    swept = swept_volume(make_sweep(4, poses=poses))
+    voxels = math.prod(math.ceil(side_mm / swept.voxel_mm) for side_mm in (100_000, 100_000))
+    assert 0.9 * MAX_VOXELS < voxels <= MAX_VOXELS

@@ -13,9 +13,11 @@ from ultragray.baselines import evaluate_baselines
 from ultragray.datasets import Dataset
 from ultragray.evaluation import Evaluation
 from ultragray.metrics import FrameMetrics
+from ultragray.report import page as page_module
 from ultragray.report.page import ReportContent, metric_rows, render_page
-from ultragray.report.study import ablations, study_tilt, train_and_evaluate
+from ultragray.report.study import Failed, ablations, study_tilt, train_and_evaluate
 from ultragray.training import TrainingConfig
+from ultragray.training.geometry import Geometry
 
 VOID = {"meta", "img", "link", "br"}
 
@@ -98,6 +100,50 @@ def test_a_scene_from_a_file_without_ablations(content: ReportContent) -> None:
     text = render_page(replace(content, trained=None, ablations={}, tilt=None))
     assert Checked(text).open_tags == []
     assert re.findall(r"<h2>(.*?)</h2>", text) == ["Against the baselines", "Pictures"]
+
+
+def test_a_study_that_failed_says_why_in_place_of_its_figures(content: ReportContent) -> None:
+    name = "half of the Gaussians"
+    failed = Failed("it needs 9 GB & more")
+    text = render_page(replace(content, ablations={**content.ablations, name: failed}, tilt=Failed("<diverged>")))
+    assert Checked(text).open_tags == []
+    assert f'<th scope="row">{name}</th><td class="failure" colspan="6">it needs 9 GB &amp; more</td></tr>' in text
+    rows = re.findall(r'<th scope="row">(.*?)</th>', text)
+    assert rows[6:] == ["full model", *content.ablations]
+    assert "This study could not be finished: &lt;diverged&gt;" in text
+    assert "hardly turns" not in text
+    everything = render_page(replace(content, trained=None, ablations=dict.fromkeys(content.ablations, failed)))
+    assert everything.count('class="failure"') == len(content.ablations)
+
+
+def test_the_plot_of_counts_holds_the_runs_that_differ_in_nothing_else(
+    content: ReportContent, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plotted: list[int] = []
+    monkeypatch.setattr(page_module, "plot_counts", lambda points: plotted.extend(points) or "<svg></svg>")
+    other = train_and_evaluate(content.dataset, TrainingConfig(steps=1, max_gaussians=77, transmittance=False))
+    render_page(replace(content, ablations={**content.ablations, "opaque Gaussians": other}))
+    assert sorted(plotted) == [15, 30, 60, 120]
+
+
+def test_what_the_data_decides_is_told_as_it_was_decided(turning_dataset: Dataset) -> None:
+    dataset = replace(turning_dataset, train=turning_dataset.train.select([3, 4]))
+    trained = train_and_evaluate(dataset, TrainingConfig())
+    text = render_page(
+        ReportContent(
+            dataset=dataset,
+            scene=trained.scene,
+            evaluation=trained.evaluation,
+            baselines=evaluate_baselines(dataset, ("median",)),
+            voxel_mm=0.5,
+            machine="a machine",
+            trained=trained,
+        )
+    )
+    steps = Geometry.of(dataset).steps
+    assert f"{steps:,} steps in " in text
+    assert f"<code>steps = {steps}</code>" in text
+    assert "= None" not in text.replace("memory_gb = None", "")
 
 
 def test_one_held_out_frame_is_shown_once(content: ReportContent) -> None:

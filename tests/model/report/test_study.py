@@ -2,15 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from ultragray.datasets import Dataset
-from ultragray.errors import DatasetInvalid
+from ultragray.errors import DatasetInvalid, TrainingDiverged
 from ultragray.evaluation import evaluate
-from ultragray.report.study import ablations, frame_tilts_deg, split_by_tilt, study_tilt, train_and_evaluate
+from ultragray.report import study
+from ultragray.report.study import (
+    Failed,
+    ablations,
+    attempt,
+    frame_tilts_deg,
+    split_by_tilt,
+    study_tilt,
+    train_and_evaluate,
+)
+from ultragray.scene import GaussianScene
 from ultragray.training import Progress, TrainingConfig
 
 
@@ -19,10 +30,34 @@ def test_a_training_is_followed_and_measured(turning_dataset: Dataset, small_con
     trained = train_and_evaluate(turning_dataset, small_config, report=seen.append)
     assert trained.losses == [progress.loss for progress in seen]
     assert len(trained.losses) == 6
-    assert trained.val_psnr_db
-    assert max(trained.val_psnr_db) <= 6
+    assert list(trained.val_psnr_db) == [1, 2, 3, 4, 5, 6]
     assert trained.evaluation.frames == evaluate(trained.scene, turning_dataset.val).frames
     assert trained.seconds >= 6 * trained.step_s > 0
+
+
+def test_each_validation_is_a_point_even_where_nothing_changed(
+    turning_dataset: Dataset,
+    small_config: TrainingConfig,
+    random_scene: Callable[..., GaussianScene],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def train(dataset: Dataset, config: TrainingConfig, *, report: Callable[[Progress], None]) -> GaussianScene:
+        for step, val_step in ((1, None), (2, 2), (3, 2), (4, 4), (5, 4)):
+            report(Progress(step, 5, 0.1, 7, 1.0, 1.0, None if val_step is None else 20.0, val_step))
+        return random_scene(7)
+
+    monkeypatch.setattr(study, "train", train)
+    assert train_and_evaluate(turning_dataset, small_config).val_psnr_db == {2: 20.0, 4: 20.0}
+
+
+def test_a_study_that_fails_gives_its_reason() -> None:
+    def fail() -> int:
+        raise TrainingDiverged("the loss is nan")
+
+    assert attempt(fail) == Failed("the loss is nan")
+    assert attempt(lambda: 3) == 3
+    with pytest.raises(ZeroDivisionError):
+        attempt(lambda: 1 // 0)
 
 
 def test_a_training_without_held_out_frames_is_refused_before_it_begins(
@@ -52,6 +87,22 @@ def test_ablations_differ_in_what_they_are_named_after(small_config: TrainingCon
     }
 
 
+def test_a_share_of_the_gaussians_is_a_share_from_the_start() -> None:
+    paper = TrainingConfig.preset("paper", initial_gaussians=300_000, max_gaussians=500_000)
+    counts = {
+        name: (config.initial_gaussians, config.max_gaussians)
+        for name, config in ablations(paper, 440_000).items()
+        if "of the Gaussians" in name or name.startswith("twice")
+    }
+    assert counts == {
+        "a quarter of the Gaussians": (75_000, 110_000),
+        "half of the Gaussians": (150_000, 220_000),
+        "twice the Gaussians": (600_000, 880_000),
+    }
+    pruned = ablations(TrainingConfig.preset("paper"), 400_000)["half of the Gaussians"]
+    assert (pruned.initial_gaussians, pruned.max_gaussians) == (200_000, 200_000)
+
+
 def test_tilts_are_signed_angles_about_the_axis_of_turning(turning_dataset: Dataset) -> None:
     tilts = frame_tilts_deg(turning_dataset.train)
     expected = np.linspace(-10, 10, 12)[turning_dataset.train.frame_numbers]
@@ -72,12 +123,12 @@ def test_halves_of_the_tilts() -> None:
 def test_a_study_of_tilt_measures_what_was_not_trained_on(
     turning_dataset: Dataset, small_config: TrainingConfig
 ) -> None:
-    study = study_tilt(turning_dataset.train, small_config)
-    assert study is not None
-    assert study.train_tilts_deg[1] < study.val_tilts_deg[0]
-    assert set(study.evaluations) == {"scene", "median", "nearest"}
+    tilt = study_tilt(turning_dataset.train, small_config)
+    assert tilt is not None
+    assert tilt.train_tilts_deg[1] < tilt.val_tilts_deg[0]
+    assert set(tilt.evaluations) == {"scene", "median", "nearest"}
     between_frames = 20.0 / 11.0
-    np.testing.assert_allclose(study.angles_deg, between_frames * np.array([2, 3, 4, 6, 7]), atol=1e-9)
+    np.testing.assert_allclose(tilt.angles_deg, between_frames * np.array([2, 3, 4, 6, 7]), atol=1e-9)
     turned_back = turning_dataset.train.poses.copy()
     turned_back[:, :3, :3] = np.eye(3)
     assert study_tilt(replace(turning_dataset.train, poses=turned_back), small_config) is None

@@ -43,3 +43,11 @@ def test_kernel_gives_the_same_as_torch() -> None:
         assert rendered.grad is not None
         gradients.append(rendered.grad)
     assert torch.allclose(*gradients, rtol=1e-3, atol=1e-7)
+
+
+def test_truth_of_another_dtype_does_not_reach_the_kernel() -> None:
+    generator = torch.Generator().manual_seed(3)
+    x, y = torch.rand((2, 1, 12, 13), generator=generator)
+    expected = float(plain_image_loss(x.double(), y.double()))
+    assert float(image_loss(x, y.double())) == pytest.approx(expected, abs=1e-7)
+    assert float(image_loss(x.double(), y)) == pytest.approx(expected, abs=1e-7)

@@ -42,6 +42,64 @@ def test_grows_with_gaussians_and_pixels(tiny_dataset: Callable[..., Dataset]) -
     assert needed(small, sh_degree=3) > needed(small)
 
 
+def test_batches_take_room_for_the_slices_of_all_gaussians(tiny_dataset: Callable[..., Dataset]) -> None:
+    dataset = tiny_dataset(frames=90)
+
+    def needed(batch_size: int) -> int:
+        return memory.required_bytes(dataset, TrainingConfig(max_gaussians=150_000, batch_size=batch_size))
+
+    per_frame = (needed(64) - needed(32)) / 32
+    assert 72 * 150_000 < per_frame < 72 * 150_000 * 1.2
+
+
+def test_held_out_frames_take_bounded_room(tiny_dataset: Callable[..., Dataset]) -> None:
+    few, many = (tiny_dataset(frames=frames) for frames in (40, 400))
+    config = TrainingConfig(max_gaussians=1000)
+    measured = 20 * 16 * len(few.val) * memory.MEASURED_BYTES
+    assert memory.required_bytes(few, config) > measured
+    long = Dataset("long", few.train, replace_frames(many.val, 100))
+    longer = Dataset("longer", few.train, replace_frames(many.val, 200))
+    grown = memory.required_bytes(longer, config) - memory.required_bytes(long, config)
+    assert grown == longer.val.images.nbytes - long.val.images.nbytes
+
+
+def test_frames_that_cannot_be_compared_are_refused_before_they_are(
+    tiny_dataset: Callable[..., Dataset], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    dataset, config = tiny_dataset(), TrainingConfig(max_gaussians=1000)
+    monkeypatch.setattr(memory, "available_bytes", lambda: memory.comparison_bytes(dataset) - 1)
+    monkeypatch.setattr(Geometry, "of", lambda dataset: pytest.fail("the frames were compared"))
+    with pytest.raises(MemoryExceeded, match=r"tiny: comparing its 8 frames needs up to 0\.4 GiB, this machine has free"):
+        train(dataset, config)
+
+
+def test_comparing_frames_grows_with_their_square(tiny_dataset: Callable[..., Dataset]) -> None:
+    first, second, third = (memory.comparison_bytes(tiny_dataset(frames=frames)) for frames in (40, 80, 120))
+    assert (third - second) - (second - first) == pytest.approx(8 * 30**2 * 2, rel=0.2)
+
+
+@pytest.mark.parametrize(
+    ("folder", "limit", "used", "entry"),
+    [
+        (".", "memory.max", "memory.current", "inactive_file"),
+        ("memory", "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
+    ],
+)
+def test_file_caches_of_a_control_group_are_free(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, folder: str, limit: str, used: str, entry: str
+) -> None:
+    group = tmp_path / folder
+    group.mkdir(exist_ok=True)
+    (group / limit).write_text("1000000\n")
+    (group / used).write_text("900000\n")
+    (group / "memory.stat").write_text(f"anon 12\n{entry} 600000\nother 7\n")
+    monkeypatch.setattr(memory, "CONTROL_GROUPS", tmp_path)
+    assert memory.available_bytes() == 700_000
+    (group / limit).write_text("max\n")
+    available = memory.available_bytes()
+    assert available is None or available > 1_000_000
+
+
 def test_finds_out_what_is_available() -> None:
     available = memory.available_bytes()
     assert available is None or available > 0

@@ -59,6 +59,23 @@ def test_even_growth_ends_at_the_limit() -> None:
     assert [schedule.gaussian_limit(k) for k in range(7)] == [110, 120, 130, 140, 150, 160, 170]
 
 
+@pytest.mark.parametrize(
+    ("settings", "due"),
+    [
+        ({"steps": 10, "refinements": 5, "refinement_end": 1.0}, [2, 4, 6, 8, 9]),
+        ({"steps": 10, "refinements": 1, "refinement_end": 0.99}, [9]),
+        ({"steps": 4, "refinements": 20, "refinement_end": 0.5}, [1, 2]),
+    ],
+)
+def test_even_growth_ends_at_the_limit_however_refinements_fall(settings: dict[str, float], due: list[int]) -> None:
+    schedule = schedule_of(growth="even", initial_gaussians=100, max_gaussians=170, **settings)
+    found = {done: schedule.refinement(done) for done in range(int(settings["steps"]) + 1)}
+    places = [place for place in found.values() if place is not None]
+    assert [done for done, place in found.items() if place is not None] == due
+    assert places == sorted(places)
+    assert schedule.gaussian_limit(places[-1]) == 170
+
+
 def test_the_intensity_floor_holds_for_the_first_part() -> None:
     schedule = schedule_of(steps=10, intensity_floor=0.4, floor_end=0.3)
     assert [schedule.intensity_floor(step) for step in (0, 2, 3, 9)] == [0.4, 0.4, 0.0, 0.0]
