@@ -88,13 +88,14 @@ def test_frames_are_rendered_and_measured_a_few_at_a_time(
 
     monkeypatch.setattr(evaluation, "CHUNK_PIXELS", 2 * 24 * 20)
     monkeypatch.setattr(evaluation, "frame_metrics", counted)
-    assert evaluate(scene, sweep).frames == whole.frames
-    assert evaluate_frames(predicted, sweep).frames == whole.frames
+    for measured in (evaluate(scene, sweep), evaluate_frames(predicted, sweep)):
+        for frame, expected in zip(measured.frames, whole.frames, strict=True):
+            assert frame.to_dict() == pytest.approx(expected.to_dict(), rel=1e-9)
     assert at_once == [2, 2, 1] * 2
 
 
 def test_a_prediction_of_another_size_is_refused(sweep: Sweep) -> None:
-    with pytest.raises(InvalidArgument, match=r"frames must be \[5, 24, 20\] like those of rendered, got \[6, 24, 20\]"):
+    with pytest.raises(InvalidArgument, match=r"be \[5, 24, 20\] like those of rendered, got \[6, 24, 20\]"):
         evaluate_frames(np.zeros((6, 24, 20), np.float32), sweep)
 
 

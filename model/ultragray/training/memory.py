@@ -39,17 +39,14 @@ def required_bytes(dataset: Dataset, config: TrainingConfig) -> int:
     stepping = 4 * PIXEL_FLOATS * frames * height * (width + PADDING)
     measuring = MEASURED_BYTES * min(len(dataset.val) * height * width, max(CHUNK_PIXELS, height * width))
     slices = frames * -(-config.max_gaussians // LIST_GAUSSIANS) * LIST_BYTES  # as if all touched all planes
-    return BASE_BYTES + gaussians + slices + max(stepping, measuring) + _images_bytes(dataset)
+    images = 2 * dataset.train.images.nbytes + dataset.val.images.nbytes  # the dataset's and the trainer's copy
+    return BASE_BYTES + gaussians + slices + max(stepping, measuring, comparison_bytes(dataset)) + images
 
 
 def comparison_bytes(dataset: Dataset) -> int:
-    """An upper bound of the process's memory while Geometry.of compares the training frames with each other."""
+    """An upper bound of what Geometry.of takes to compare the training frames with each other."""
     count = len(dataset.train)
-    return BASE_BYTES + 8 * count**2 + COMPARED_BYTES * count + _images_bytes(dataset)
-
-
-def _images_bytes(dataset: Dataset) -> int:
-    return 2 * dataset.train.images.nbytes + dataset.val.images.nbytes  # the dataset's and the trainer's copy
+    return 8 * count**2 + COMPARED_BYTES * count
 
 
 def available_bytes() -> int | None:
@@ -103,7 +100,7 @@ def check_memory(dataset: Dataset, config: TrainingConfig) -> None:
 
 
 def check_comparison_memory(dataset: Dataset, config: TrainingConfig) -> None:
-    """Raises MemoryExceeded where even comparing the frames, before a training, may need more than it can have."""
+    """Raises MemoryExceeded where comparing the frames, before anything else, may need more than it can have."""
     needed = comparison_bytes(dataset)
     if missing := _missing(needed, config):
         raise MemoryExceeded(

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import json
+import math
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
@@ -46,6 +48,34 @@ def test_refuses_what_is_no_checkpoint(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-7])
     with pytest.raises(TrainingStateInvalid, match="not a checkpoint that can be read"):
         read_checkpoint(path)
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"step": 10}, "its step is 10, expected 1 to 9"),
+        ({"step": 0}, "its step is 0, expected 1 to 9"),
+        ({"step": 7.0}, r"its step is 7\.0, expected 1 to 9"),
+        ({"step": True}, "its step is True, expected 1 to 9"),
+        ({"elapsed_s": math.nan}, "its elapsed_s is nan, expected seconds"),
+        ({"elapsed_s": "1"}, "its elapsed_s is '1', expected seconds"),
+        ({"dataset_sha256": 5}, "its dataset_sha256 is 5, expected text"),
+        ({"config": {"steps": 9, "colour": 1}}, "a training has no setting colour"),
+        ({"config": 3}, "int"),
+    ],
+)
+def test_refuses_a_header_that_no_run_wrote(tmp_path: Path, changes: dict[str, object], reason: str) -> None:
+    document = {"format_version": 1, **asdict(HEADER), **changes}
+    save_file({"a": torch.ones(1)}, tmp_path / "c", metadata={METADATA_KEY: json.dumps(document)})
+    with pytest.raises(TrainingStateInvalid, match=f"c: not a checkpoint that can be read: .*{reason}"):
+        read_checkpoint_header(tmp_path / "c")
+
+
+@pytest.mark.parametrize("text", ["3", "null", '["format_version"]', "{"])
+def test_refuses_metadata_that_is_no_object(tmp_path: Path, text: str) -> None:
+    save_file({"a": torch.ones(1)}, tmp_path / "c", metadata={METADATA_KEY: text})
+    with pytest.raises(TrainingStateInvalid, match="c: not a checkpoint that can be read"):
+        read_checkpoint_header(tmp_path / "c")
 
 
 def test_refuses_another_run() -> None:

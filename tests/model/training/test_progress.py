@@ -39,7 +39,9 @@ def test_half_a_line_is_dropped(tmp_path: Path) -> None:
     assert steps_in(path) == [1]
 
 
-@pytest.mark.parametrize("damage", [b"{nonsense\n", b"\xff\xfe\n", b"3\n", b'{"loss": 0.5}\n', b'{"step": null}\n', b"\0" * 9])
+@pytest.mark.parametrize(
+    "damage", [b"{nonsense\n", b"\xff\xfe\n", b"3\n", b'{"loss": 0.5}\n', b'{"step": null}\n', b"\0" * 9]
+)
 def test_a_damaged_line_ends_what_is_kept(tmp_path: Path, damage: bytes) -> None:
     path = tmp_path / "metrics.jsonl"
     path.write_bytes(b'{"step": 1}\n' + damage + b'{"step": 3}\n')

@@ -17,6 +17,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from safetensors import safe_open
+from safetensors.torch import save_file
 
 from ultragray import GaussianScene
 from ultragray.datasets.sweep import Dataset
@@ -140,6 +142,64 @@ def test_folder_of_another_run_is_refused(tiny_dataset: Datasets, tiny_config: C
         train(tiny_dataset(spacing_mm=0.9), config, folder=tmp_path, resume=True)
 
 
+def spoilt(path: Path, **changed: torch.Tensor | None) -> None:
+    """The checkpoint with some tensors changed, or left out where they are None; `__` stands for a dot."""
+    with safe_open(path, framework="pt") as bundle:
+        metadata = bundle.metadata()
+        tensors = {name: bundle.get_tensor(name) for name in bundle.keys()}  # noqa: SIM118
+    tensors |= {name.replace("__", "."): tensor for name, tensor in changed.items()}
+    save_file({name: tensor for name, tensor in tensors.items() if tensor is not None}, path, metadata)
+
+
+@pytest.mark.parametrize(
+    ("changed", "reason"),
+    [
+        ({"adam__means__exp_avg": torch.zeros(5, 3)}, r"adam\.means\.exp_avg is torch\.float32 \[5, 3\], expected"),
+        (
+            {"adam__sh0__exp_avg_sq": torch.zeros(30, 1)},
+            r"adam\.sh0\.exp_avg_sq is .*\[30, 1\], expected .*\[30, 1, 1\]",
+        ),
+        ({"adam__quats__step": torch.tensor(7.0)}, r"adam\.quats\.step is 7, expected 2"),
+        ({"adam__quats__step": None}, r"missing or unexpected tensors: adam\.quats\.step"),
+        ({"adam__colours__step": torch.tensor(2.0)}, r"missing or unexpected tensors: adam\.colours\.step"),
+        ({"parameter__means": torch.zeros(30, 3).double()}, r"parameter\.means is torch\.float64"),
+        ({"parameter__means": torch.zeros(())}, r"it holds 0 Gaussians, expected 1 to 60"),
+        ({"parameter__means": torch.zeros(61, 3)}, r"it holds 61 Gaussians, expected 1 to 60"),
+        ({"parameter__quats": torch.ones(29, 4)}, r"parameter\.quats is torch\.float32 \[29, 4\]"),
+        ({"parameter__scales": torch.full((30, 3), float("nan"))}, r"parameter\.scales is not finite"),
+        ({"pull__total": torch.zeros(29)}, r"pull\.total is torch\.float32 \[29\]"),
+        ({"waiting": torch.tensor([999])}, r"waiting names frames that the 8 do not have"),
+        ({"waiting": torch.tensor([-1])}, r"waiting names frames"),
+        ({"waiting": torch.zeros(8, dtype=torch.int64)}, r"waiting names frames"),
+        ({"waiting": torch.tensor([1.0])}, r"waiting is torch\.float32"),
+        ({"generator": torch.zeros(7, dtype=torch.uint8)}, r"generator is torch\.uint8 \[7\]"),
+        ({"generator": torch.full((5056,), 255, dtype=torch.uint8)}, r"generator is no generator's state"),
+    ],
+)
+def test_a_checkpoint_with_other_tensors_is_refused(
+    tiny_dataset: Datasets,
+    tiny_config: Configs,
+    tmp_path: Path,
+    changed: dict[str, torch.Tensor | None],
+    reason: str,
+) -> None:
+    stop = iter([False, True])
+    train(tiny_dataset(), tiny_config(), folder=tmp_path, should_stop=lambda: next(stop))
+    spoilt(tmp_path / "checkpoint.safetensors", **changed)
+    with pytest.raises(TrainingStateInvalid, match=rf"checkpoint\.safetensors: .*{reason}"):
+        train(tiny_dataset(), tiny_config(), folder=tmp_path, resume=True)
+
+
+def test_opening_a_folder_removes_what_a_killed_run_left(
+    tiny_dataset: Datasets, tiny_config: Configs, tmp_path: Path
+) -> None:
+    train(tiny_dataset(), tiny_config(), folder=tmp_path, should_stop=lambda: True)
+    for name in ("checkpoint.safetensors", "metrics.jsonl", "config.json", "scene.ugr"):
+        (tmp_path / f".{name}.abcdefgh.tmp").touch()
+    train(tiny_dataset(), tiny_config(), folder=tmp_path, resume=True, should_stop=lambda: True)
+    assert [path.name for path in tmp_path.glob(".*")] == [".scene.ugr.abcdefgh.tmp"]
+
+
 def test_divergence_keeps_the_last_good_checkpoint(
     tiny_dataset: Datasets, tiny_config: Configs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -164,7 +224,7 @@ def test_parameters_that_are_not_finite_never_reach_a_checkpoint(
         sh0[3] = float("inf")
 
     monkeypatch.setattr(trainer, "project_sh0", spoil)
-    with pytest.raises(TrainingDiverged, match="sh0 are no longer finite"):
+    with pytest.raises(TrainingDiverged, match="in step 1: sh0 are no longer finite"):
         train(tiny_dataset(), tiny_config(), folder=tmp_path, checkpoint_interval_s=0.0)
     assert not (tmp_path / "checkpoint.safetensors").exists()
 
