@@ -10,11 +10,12 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from .datasets.sweep import IntArray, Sweep
+from .datasets.sweep import Dataset, IntArray, Sweep
 from .errors import DatasetInvalid, InvalidArgument
 from .metrics import FrameMetrics, frame_metrics, mean_metrics, ms_ssim_scales, std_metrics
 from .rendering import render
 from .scene import GaussianScene
+from .scene_info import SceneInfo
 
 CHUNK_PIXELS = 1 << 20  # rendered and measured at once: measuring takes about 200 bytes of each
 
@@ -91,6 +92,26 @@ def require_frames(sweep: Sweep) -> None:
     """Raises DatasetInvalid where there is nothing to measure with."""
     if not len(sweep):
         raise DatasetInvalid(f"{sweep.source}: it holds no frames to measure with; hold some out")
+
+
+def check_same_origin(info: SceneInfo, dataset: Dataset) -> list[str]:
+    """Warnings where a scene was trained with another probe or from other data, as far as its `info` says.
+
+    Raises DatasetInvalid where the probes are of different kinds: their frames cannot be compared.
+    """
+    warnings = []
+    if info.probe is not None and info.probe.kind != dataset.probe.kind:
+        raise DatasetInvalid(
+            f"{dataset.name}: its probe is {dataset.probe.kind}, the scene was trained with a {info.probe.kind} one"
+        )
+    if info.probe not in (None, dataset.probe):
+        warnings.append(f"the scene was trained with {info.probe}, {dataset.name} has {dataset.probe}")
+    if info.dataset_sha256 not in (None, dataset.sha256):
+        warnings.append(
+            f"the scene was trained from other data than {dataset.name}, or from another split of it: it may have "
+            "been trained on the frames it is measured on"
+        )
+    return warnings
 
 
 def render_sweep(

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from .errors import InvalidPose
+from .npy_file import map_npy
 from .pose import check_poses
 from .probe import FloatArray
 
@@ -49,7 +50,7 @@ def _read(path: Path) -> Any:
     if path.suffix == ".json":
         return json.loads(path.read_text(encoding="utf-8"))
     if path.suffix == ".npy":
-        return np.load(path, mmap_mode="r", allow_pickle=False)  # a mapping cannot be larger than its file
+        return map_npy(path)
     raise ValueError("poses are read from .npy and .json files")
 
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from .datasets.images import frame_size
 from .errors import CheckpointInvalid, InvalidProbe
+from .npy_file import map_npy
 from .probe import ConvexProbe, FloatArray, LinearProbe, Probe, stretch_released_far
 
 MAX_CONFIG_BYTES = 1 << 20
@@ -139,13 +140,13 @@ def _number(path: Path, document: Mapping[str, Any], key: str) -> float:
             raise ValueError
         return float(value)
     except (ValueError, OverflowError):
-        raise CheckpointInvalid(f"{path}: {key} must be a finite number, got {str(value)[:40]}") from None
+        raise CheckpointInvalid(f"{path}: {key} must be a finite number, got {repr(value)[:40]}") from None
 
 
 def _optional_count(path: Path, document: Mapping[str, Any], key: str, *, at_least: int) -> int | None:
     value = document.get(key)
     if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < at_least):
-        raise CheckpointInvalid(f"{path}: {key} must be an integer of at least {at_least}, got {str(value)[:40]}")
+        raise CheckpointInvalid(f"{path}: {key} must be an integer of at least {at_least}, got {repr(value)[:40]}")
     return value
 
 
@@ -153,7 +154,7 @@ def _named_files(path: Path, document: Mapping[str, Any]) -> dict[str, str]:
     named = {key: document[key] for key in FILE_KEYS if document.get(key) is not None}
     for key, value in named.items():
         if not isinstance(value, str):
-            raise CheckpointInvalid(f"{path}: {key} must be a path, got {str(value)[:40]}")
+            raise CheckpointInvalid(f"{path}: {key} must be a path, got {repr(value)[:40]}")
     return named
 
 
@@ -192,14 +193,15 @@ def _is_file(path: Path) -> bool:
 
 def _shape(path: Path) -> TrainingImages:
     try:
-        array = np.load(path, mmap_mode="r", allow_pickle=False)  # reads the header only
-    except (OSError, ValueError, EOFError) as error:
+        array = map_npy(path)
+    except (OSError, ValueError) as error:
         raise CheckpointInvalid(f"{path}: not an array of images that can be read: {error}") from error
-    size = frame_size(array.shape) if isinstance(array, np.ndarray) else None
+    if array.shape[:1] == (0,):
+        raise CheckpointInvalid(f"{path}: it holds no frames")
+    size = frame_size(array.shape)
     if size is None:
-        shape = list(array.shape) if isinstance(array, np.ndarray) else "an archive"
         raise CheckpointInvalid(
-            f"{path}: images must have shape [N, H, W], [N, H, W, 1, 3 or 4] or [N, 1, H, W], got {shape}"
+            f"{path}: images must have shape [N, H, W], [N, H, W, 1, 3 or 4] or [N, 1, H, W], got {list(array.shape)}"
         )
     return TrainingImages(path=path, count=len(array), height=size[0], width=size[1])
 

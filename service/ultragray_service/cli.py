@@ -213,7 +213,7 @@ def import_checkpoint(
     """Turn a released UltraG-Ray checkpoint into a scene file, with its place in the tracker's frame."""
     from ultragray.checkpoint import import_checkpoint as read_checkpoint
 
-    from .cli_output import check_writable
+    from .cli_output import SCENE_SUFFIX, check_writable
 
     if [poses is not None, center is not None, centered].count(True) != 1:
         raise InvalidArgument(
@@ -221,7 +221,7 @@ def import_checkpoint(
             "--centered (poses relative to the centre)",
             field="poses",
         )
-    check_writable(output)
+    check_writable(output, SCENE_SUFFIX)
     try:
         scene = read_checkpoint(
             checkpoint,
@@ -258,9 +258,9 @@ def demo(
     from ultragray.demo import copy_demo_scene
     from ultragray.scene_info import read_header
 
-    from .cli_output import check_writable
+    from .cli_output import SCENE_SUFFIX, check_writable
 
-    check_writable(output)
+    check_writable(output, SCENE_SUFFIX)
     copy_demo_scene(output)
     info = read_header(output).info
     typer.echo(f"wrote {output}: {info.dataset_name}, {info.gaussian_count:,} Gaussians")

@@ -9,7 +9,7 @@ import typer
 
 from ultragray.errors import InvalidArgument
 
-from .cli_output import check_writable
+from .cli_output import SCENE_SUFFIX, check_writable
 
 if TYPE_CHECKING:
     from ultragray import GaussianScene
@@ -63,7 +63,7 @@ def import_ply(
     output: Annotated[Path, typer.Option("--output", "-o", help="Scene file to write (.ugr).", show_default=False)],
 ) -> None:
     """Turn a PLY file of a scene back into a scene file."""
-    check_writable(output)
+    check_writable(output, SCENE_SUFFIX)
 
     from ultragray.ply import read_ply
 

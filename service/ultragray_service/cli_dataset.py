@@ -7,7 +7,17 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from .cli_source import Crop, DatasetArgument, DeviceSet, Frames, ImageSize, TrainFrames, ValFrames, read_dataset
+from .cli_source import (
+    Crop,
+    DatasetArgument,
+    DeviceSet,
+    Frames,
+    ImageSize,
+    TrainFrames,
+    ValFrames,
+    read_dataset,
+    warnings_of,
+)
 
 if TYPE_CHECKING:
     from ultragray.datasets.checks import DatasetReport, SweepReport
@@ -108,11 +118,7 @@ def _print_report(report: DatasetReport) -> None:
             f"mm and up to {report.val_angle_max_deg:.2f}° from the nearest training frame",
             soft_wrap=True,
         )
-    warnings = [
-        *(f"train: {text}" for text in report.train.warnings),
-        *(f"val: {text}" for text in (report.val.warnings if report.val else ())),
-        *report.warnings,
-    ]
+    warnings = warnings_of(report)
     for warning in warnings:
         console.print(f"[yellow]warning:[/] {escape(warning)}", soft_wrap=True)
     if not warnings:

@@ -9,7 +9,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from .cli_source import Crop, DatasetArgument, DeviceSet, Frames, ImageSize, TrainFrames, ValFrames, read_dataset
+from .cli_output import check_picture_folder
+from .cli_source import (
+    Crop,
+    DatasetArgument,
+    DeviceSet,
+    Frames,
+    ImageSize,
+    TrainFrames,
+    ValFrames,
+    check_scene_fits,
+    read_dataset,
+)
 
 if TYPE_CHECKING:
     from ultragray.evaluation import Evaluation
@@ -47,7 +58,7 @@ def evaluate(
         typer.Option(
             "--output",
             "-o",
-            help="Folder for one picture a frame: truth, rendering, difference, echo, transmittance.",
+            help="New folder for one picture a frame: truth, rendering, difference, echo, transmittance.",
             show_default="no pictures",
         ),
     ] = None,
@@ -62,15 +73,17 @@ def evaluate(
     image_size: ImageSize = None,
 ) -> None:
     """Measure a scene on the held-out frames of a dataset: PSNR, MS-SSIM, GMS, GMSD."""
-    from ultragray.errors import InvalidArgument
     from ultragray.evaluation import evaluate as evaluate_scene
+    from ultragray.evaluation import require_frames
     from ultragray.scene import GaussianScene
 
-    if output is not None and output.exists() and not output.is_dir():
-        raise InvalidArgument(f"output must be a folder for pictures, {output} is a file", field="output")
+    if output is not None:
+        check_picture_folder(output)
     loaded = GaussianScene.load(scene)
     read = read_dataset(dataset, train_frames, val_frames, frames, device_set, crop, image_size)
     sweep = read.val if split is Split.VAL else read.train
+    require_frames(sweep)
+    check_scene_fits(loaded.info, read)
     evaluation = evaluate_scene(loaded, sweep, backend=backend)
     if json:
         _print_json({"scene": str(scene), "dataset": read.name, "split": split.value, **evaluation.to_dict()})

@@ -7,13 +7,25 @@ from pathlib import Path
 
 from ultragray.errors import InvalidArgument
 
+SCENE_SUFFIX = ".ugr"  # the service lists no other files
 
-def check_writable(path: Path) -> None:
-    """Raises InvalidArgument where `path` is a folder, or the folder it would lie in is missing or read-only."""
+
+def check_writable(path: Path, suffix: str | None = None) -> None:
+    """Raises InvalidArgument where `path` is a folder or does not end in `suffix`, or where it could not be made."""
     if path.is_dir():
         raise InvalidArgument(f"output must be a file, {path} is a folder", field="output")
+    if suffix is not None and path.suffix != suffix:
+        raise InvalidArgument(f"output must end in {suffix}, got {path.name!r}", field="output")
     folder = path.absolute().parent
     if not folder.is_dir():
         raise InvalidArgument(f"output must lie in a folder that exists, {path.parent} does not", field="output")
     if not os.access(folder, os.W_OK):
         raise InvalidArgument(f"output must lie in a folder that can be written to, {folder} cannot", field="output")
+
+
+def check_picture_folder(path: Path) -> None:
+    """Raises InvalidArgument where `path` is a file, or a folder with files: pictures of two runs would mix."""
+    if path.exists() and not path.is_dir():
+        raise InvalidArgument(f"output must be a folder for pictures, {path} is a file", field="output")
+    if path.is_dir() and next(path.iterdir(), None) is not None:
+        raise InvalidArgument(f"output must be a new or empty folder, {path} holds files", field="output")

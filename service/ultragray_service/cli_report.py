@@ -13,7 +13,18 @@ import typer
 
 from .cli_eval import VoxelMm
 from .cli_output import check_writable
-from .cli_source import Crop, DatasetArgument, DeviceSet, Frames, ImageSize, TrainFrames, ValFrames, read_dataset
+from .cli_source import (
+    Crop,
+    DatasetArgument,
+    DeviceSet,
+    Frames,
+    ImageSize,
+    TrainFrames,
+    ValFrames,
+    check_scene_fits,
+    read_dataset,
+    warn_about_dataset,
+)
 
 if TYPE_CHECKING:
     from ultragray.datasets import Dataset
@@ -57,9 +68,10 @@ def report(
 ) -> None:
     """Train and measure a scene, the baselines and the paper's ablations; write one self-contained HTML page."""
     from ultragray.compounding import affordable_voxel_mm
+    from ultragray.evaluation import require_frames
     from ultragray.training import TrainingConfig
 
-    check_writable(output)
+    check_writable(output, ".html")
     given = {"steps": steps, "max_gaussians": max_gaussians, "seed": seed}
     config = TrainingConfig.preset(preset, **{name: value for name, value in given.items() if value is not None})
     if threads:
@@ -67,6 +79,8 @@ def report(
 
         torch.set_num_threads(threads)
     read = read_dataset(dataset, train_frames, val_frames, frames, device_set, crop, image_size)
+    require_frames(read.val)
+    warn_about_dataset(read)
     voxel_mm = affordable_voxel_mm(read.train) if voxel_mm is None else voxel_mm
     failures = _write_report(read, config, output, ReportOptions(scene, not no_ablations, voxel_mm))
     for name, reason in failures.items():
@@ -83,14 +97,16 @@ def _write_report(dataset: Dataset, config: TrainingConfig, output: Path, option
     from ultragray.report.study import Failed, ablations, attempt, study_tilt, train_and_evaluate
     from ultragray.scene import GaussianScene
 
+    scene = None if options.scene is None else GaussianScene.load(options.scene)
+    if scene is not None:
+        check_scene_fits(scene.info, dataset)
     with _following() as follow:
         baselines = evaluate_baselines(dataset, voxel_mm=options.voxel_mm)
         content: dict[str, Any] = {}
-        if options.scene is None:
+        if scene is None:
             trained = train_and_evaluate(dataset, config, report=follow("scene"))
             content |= {"trained": trained, "scene": trained.scene, "evaluation": trained.evaluation}
         else:
-            scene = GaussianScene.load(options.scene)
             content |= {"scene": scene, "evaluation": evaluate(scene, dataset.val)}
         if options.ablations:
             content["ablations"] = {

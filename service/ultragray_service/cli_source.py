@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -9,6 +10,8 @@ import typer
 
 if TYPE_CHECKING:
     from ultragray.datasets import Dataset
+    from ultragray.datasets.checks import DatasetReport
+    from ultragray.scene_info import SceneInfo
 
 DatasetArgument = Annotated[
     str,
@@ -67,8 +70,10 @@ def read_dataset(
     image_size: str | None,
 ) -> Dataset:
     """The dataset that a command's argument and options name. Raises DatasetInvalid and InvalidArgument."""
-    from ultragray.datasets.source import SourceOptions, load_dataset
+    from ultragray.datasets.source import PHANTOM, SourceOptions, load_dataset
 
+    if source == PHANTOM:
+        typer.echo("simulating the phantom …", err=True)
     return load_dataset(
         source,
         SourceOptions(
@@ -80,3 +85,31 @@ def read_dataset(
             image_size=image_size,
         ),
     )
+
+
+def warnings_of(report: DatasetReport) -> list[str]:
+    """What looks wrong about a dataset, the part that it is about first."""
+    return [
+        *(f"train: {text}" for text in report.train.warnings),
+        *(f"val: {text}" for text in (report.val.warnings if report.val else ())),
+        *report.warnings,
+    ]
+
+
+def warn_about_dataset(dataset: Dataset) -> None:
+    """Tells on stderr what `dataset check` warns of."""
+    from ultragray.datasets.checks import check_dataset
+
+    _warn(warnings_of(check_dataset(dataset)))
+
+
+def check_scene_fits(info: SceneInfo, dataset: Dataset) -> None:
+    """Tells on stderr what makes figures of a scene on a dataset doubtful; raises as `check_same_origin`."""
+    from ultragray.evaluation import check_same_origin
+
+    _warn(check_same_origin(info, dataset))
+
+
+def _warn(warnings: Iterable[str]) -> None:
+    for text in warnings:
+        typer.secho(f"warning: {text}", fg=typer.colors.YELLOW, err=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import signal
 import sys
 import time
@@ -13,9 +14,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ultragray.errors import InvalidArgument, TrainingDiverged
+from ultragray.errors import InvalidArgument, TrainingDiverged, TrainingStateInvalid
 
-from .cli_output import check_writable
+from .cli_output import SCENE_SUFFIX, check_writable
 from .cli_source import (
     Crop,
     DatasetArgument,
@@ -25,6 +26,7 @@ from .cli_source import (
     TrainFrames,
     ValFrames,
     read_dataset,
+    warn_about_dataset,
 )
 
 if TYPE_CHECKING:
@@ -117,7 +119,7 @@ def train(
         **{name: value for name, value in flags.items() if value is not None},
         **({} if preset is None else {"preset": preset}),
     }
-    check_writable(output)
+    check_writable(output, SCENE_SUFFIX)
     run = RunOptions(
         output=output,
         folder=folder or output.with_name(f"{output.name}.run"),
@@ -127,12 +129,16 @@ def train(
         device=device,
         backend=backend,
     )
+    if resume:
+        _check_resumable(run)
     chosen = _config_of(run, given)
     if threads:
         import torch
 
         torch.set_num_threads(threads)
-    _train(read_dataset(dataset, train_frames, val_frames, frames, device_set, crop, image_size), chosen, run)
+    read = read_dataset(dataset, train_frames, val_frames, frames, device_set, crop, image_size)
+    warn_about_dataset(read)
+    _train(read, chosen, run)
 
 
 @dataclass(frozen=True)
@@ -169,6 +175,22 @@ def _from_settings(settings: list[str]) -> dict[str, Any]:
     return found
 
 
+def _check_resumable(run: RunOptions) -> None:
+    """Raises TrainingStateInvalid where the folder of the run holds no checkpoint, with the reason."""
+    from ultragray.training.trainer import CHECKPOINT_FILE, CONFIG_FILE, JOURNAL_FILE
+
+    if (run.folder / CHECKPOINT_FILE).exists():
+        return
+    steps = last_step = None
+    with contextlib.suppress(OSError, ValueError, LookupError, TypeError):  # whatever is there is no finished run
+        steps = json.loads((run.folder / CONFIG_FILE).read_text(encoding="utf-8"))["steps"]
+        last_line = (run.folder / JOURNAL_FILE).read_text(encoding="utf-8").splitlines()[-1]
+        last_step = json.loads(last_line)["step"]
+    if steps is not None and last_step == steps:
+        raise TrainingStateInvalid(f"{run.folder}: the run is finished, all {steps} steps are done; nothing to resume")
+    raise TrainingStateInvalid(f"{run.folder}: no checkpoint to resume from; leave out --resume to begin a run")
+
+
 def _config_of(run: RunOptions, given: Mapping[str, Any]) -> TrainingConfig:
     """The preset with what was given; of a resumed run the one it was begun with, and what was given again."""
     from ultragray.training import TrainingConfig
@@ -188,28 +210,29 @@ def _train(dataset: Any, config: TrainingConfig, run: RunOptions) -> None:
     from ultragray.training.trainer import CHECKPOINT_FILE, scene_of_checkpoint
 
     started = time.monotonic()
-    try:
-        with _stop_on_signal() as should_stop, _progress_bar() as report:
-            scene = train_scene(
-                dataset,
-                config,
-                folder=run.folder,
-                resume=run.resume,
-                report=report,
-                should_stop=should_stop,
-                device=run.device,
-                backend=run.backend,
-                checkpoint_interval_s=run.checkpoint_interval_s,
-                tensorboard=run.tensorboard,
-            )
-    except TrainingDiverged as error:
-        if not (run.folder / CHECKPOINT_FILE).exists():
-            raise
-        scene = scene_of_checkpoint(dataset, run.folder)
+    with _stop_on_signal() as should_stop:
+        try:
+            with _progress_bar() as report:
+                scene = train_scene(
+                    dataset,
+                    config,
+                    folder=run.folder,
+                    resume=run.resume,
+                    report=report,
+                    should_stop=should_stop,
+                    device=run.device,
+                    backend=run.backend,
+                    checkpoint_interval_s=run.checkpoint_interval_s,
+                    tensorboard=run.tensorboard,
+                )
+        except TrainingDiverged as error:
+            if not (run.folder / CHECKPOINT_FILE).exists():
+                raise
+            scene = scene_of_checkpoint(dataset, run.folder)
+            scene.save(run.output)
+            step = scene.info.training["step"]
+            raise TrainingDiverged(f"{error.detail}; {run.output} is the scene after step {step}") from error
         scene.save(run.output)
-        step = scene.info.training["step"]
-        raise TrainingDiverged(f"{error.detail}; {run.output} is the scene after step {step}") from error
-    scene.save(run.output)
     elapsed_s = time.monotonic() - started
     done, steps = scene.info.training["step"], scene.info.training["steps"]
     if done < steps:
@@ -226,22 +249,15 @@ def _train(dataset: Any, config: TrainingConfig, run: RunOptions) -> None:
 
 @contextlib.contextmanager
 def _stop_on_signal() -> Iterator[Callable[[], bool]]:
-    """Whether SIGINT or SIGTERM came. A second one ends the process at once, as it would without this."""
+    """Whether SIGINT or SIGTERM came. More of them change nothing: a stopping process writes its scene and ends."""
     received: list[int] = []
-    before: dict[signal.Signals, Any] = {}
-
-    def remember(number: int, frame: object) -> None:
-        received.append(number)
-        for name, handler in before.items():
-            signal.signal(name, handler)
-
-    for number in (signal.SIGINT, signal.SIGTERM):
-        before[number] = signal.signal(number, remember)
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.signal(number, lambda came, frame: received.append(came)) for number in numbers]
     try:
         yield lambda: bool(received)
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, signal.SIG_IGN if received else handler)
 
 
 @contextlib.contextmanager

@@ -301,6 +301,7 @@ def test_demo_writes_the_demo_scene(tmp_path: Path) -> None:
     assert run("demo", "-o", output).exit_code == 0
     assert output.read_bytes() == DEMO_FILE.read_bytes()
     assert "folder that exists" in refused("demo", "-o", tmp_path / "absent" / "d.ugr")
+    assert "output must end in .ugr, got 'd.txt'" in refused("demo", "-o", tmp_path / "d.txt")
 
 
 def test_a_data_folder_without_scenes_gets_the_demo(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

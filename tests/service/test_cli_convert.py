@@ -74,6 +74,7 @@ def test_mistakes_are_told_in_one_line(make_file: Callable[..., Path], tmp_path:
     assert "does not" in refused("export", scene, "-o", tmp_path / "none" / "none" / "ckpt.pt")
     assert "no such file" in refused("export", tmp_path / "none.ugr", "-o", tmp_path / "a.ply")
     assert "no such file" in refused("import-ply", tmp_path / "none.ply", "-o", tmp_path / "b.ugr")
+    assert "must end in .ugr, got 'b.txt'" in refused("import-ply", scene, "-o", tmp_path / "b.txt")
     assert "does not begin like a PLY" in refused("import-ply", scene, "-o", tmp_path / "b.ugr")
     (tmp_path / "conf.json").write_text("{}")
     assert "folder of its own" in refused("export", scene, "-o", tmp_path / "ckpt.pt")

@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from ultragray import LinearProbe
-from ultragray.datasets import Dataset, Sweep
+from ultragray.datasets import Dataset, Sweep, phantom
 from ultragray.datasets.released import write_released
 from ultragray.datasets.source import load_dataset
 from ultragray_service.cli import app
@@ -68,6 +68,14 @@ def test_bad_data_is_one_line_and_exit_code_two(folder: Path) -> None:
         assert "images_train.npy: frame 3 is constant" in result.stderr
         assert result.stderr.count("\n") == 1
     assert sorted(path.name for path in folder.parent.iterdir()) == ["tiny"]
+
+
+def test_says_that_the_phantom_takes_time(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(phantom, "load_phantom", lambda: load_dataset(folder))
+    result = run("check", "phantom", "--json")
+    assert result.stderr == "simulating the phantom …\n"
+    assert json.loads(result.stdout)["name"] == "tiny"
+    assert run("check", folder).stderr == ""
 
 
 def test_convert_writes_what_is_read_back(folder: Path) -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +13,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
-from ultragray import GaussianScene, LinearProbe
+from ultragray import ConvexProbe, GaussianScene, LinearProbe, Probe
 from ultragray.baselines import evaluate_baselines
 from ultragray.datasets import Dataset, Sweep
 from ultragray.datasets.released import read_released, write_released
@@ -168,12 +170,47 @@ def test_a_folder_that_cannot_be_written_to_is_told_before_the_work(
 def test_mistakes(dataset: Path, scene: Path, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     assert "file is a file" in refused("eval", scene, dataset, "-o", tmp_path / "file")
+    assert f"new or empty folder, {tmp_path} holds files" in refused("eval", scene, dataset, "-o", tmp_path)
     assert "no such file" in refused("eval", tmp_path / "none.ugr", dataset)
     assert "no such file or folder" in refused("compound", tmp_path / "none")
     assert "voxel_mm must be" in refused("compound", dataset, "--voxel-mm", 0.001)
     assert "is a folder" in refused("report", dataset, "-o", tmp_path)
+    assert "must end in .html, got 'page.pdf'" in refused("report", dataset, "-o", tmp_path / "page.pdf")
     assert "preset must be" in refused("report", dataset, "-o", tmp_path / "page.html", "--preset", "slow")
     assert not (tmp_path / "page.html").exists()
+
+
+def test_a_scene_of_another_probe_or_of_other_data(dataset: Path, scene: Path, tmp_path: Path) -> None:
+    result = run("eval", scene, dataset, "--json", "--val-frames", "0:3")
+    assert "warning: the scene was trained from other data than ball, or from another split of it" in result.stderr
+    assert run("eval", scene, dataset, "--json").stderr == ""
+    read = read_released(dataset)
+
+    def written(name: str, probe: Probe) -> Path:
+        parts = (replace(part, probe=probe) for part in (read.train, read.val))
+        write_released(Dataset(name, *parts), tmp_path / name)
+        return tmp_path / name
+
+    wide = run("eval", scene, written("wide", LinearProbe(30.0, 0.0, 25.0)), "--json")
+    assert "warning: the scene was trained with LinearProbe(width_mm=20.0" in wide.stderr
+    convex = written("convex", ConvexProbe(60.0, 10.0, 35.0))
+    reported = ("report", convex, "-o", tmp_path / "page.html", "--scene", scene, "--no-ablations")
+    for arguments in (("eval", scene, convex), reported):
+        result = run(*arguments)
+        assert result.exit_code == 2
+        assert "error: convex: its probe is convex, the scene was trained with a linear one" in result.stderr
+
+
+def test_report_warns_of_what_looks_wrong(dataset: Path, scene: Path, tmp_path: Path) -> None:
+    page = tmp_path / "page.html"
+    arguments = ("-o", page, "--scene", scene, "--no-ablations", "--threads", 1, "--train-frames", "0:4")
+    copied = tmp_path / "ball"
+    shutil.copytree(dataset, copied)
+    np.save(copied / "images_val.npy", np.load(copied / "images_train.npy")[:2])
+    np.save(copied / "poses_val.npy", np.load(copied / "poses_train.npy")[:2])
+    result = run("report", copied, *arguments)
+    assert result.exit_code == 0, result.output
+    assert "warning: held-out frames 0, 1 are also training frames" in result.stderr
 
 
 def test_a_dataset_without_held_out_frames_is_refused(dataset: Path, scene: Path, tmp_path: Path) -> None:

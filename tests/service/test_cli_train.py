@@ -73,6 +73,7 @@ def test_trains_a_scene(dataset: Path, tmp_path: Path) -> None:
     folder = tmp_path / "scene.ugr.run"
     assert sorted(path.name for path in folder.iterdir()) == ["config.json", "metrics.jsonl"]
     assert len((folder / "metrics.jsonl").read_text().splitlines()) == 24
+    assert "the run is finished, all 24 steps are done" in refused(dataset, "-o", output, "--resume")
 
 
 def test_settings_come_from_file_set_and_options(dataset: Path, tmp_path: Path) -> None:
@@ -107,7 +108,9 @@ def test_mistakes_give_one_line(dataset: Path, tmp_path: Path) -> None:
     assert "a training has no setting stepz" in refused(dataset, "-o", output, "--set", "stepz=3")
     assert "--set takes NAME=VALUE, got 'steps'" in refused(dataset, "-o", output, "--set", "steps")
     assert "steps must be between 1 and" in refused(dataset, "-o", output, "--steps", 0)
-    assert "no such file: there is nothing to resume" in refused(dataset, "-o", output, "--resume")
+    assert "no checkpoint to resume from" in refused(dataset, "-o", output, "--resume")
+    assert "output must end in .ugr, got 'scene.txt'" in refused(dataset, "-o", tmp_path / "scene.txt")
+    assert "backend must be one of" in refused(dataset, "-o", output, *SMALL, "--backend", "cuda")
     assert "GiB: lower max_gaussians" in refused(dataset, "-o", output, *SMALL, "--set", "memory_gb=0.01")
     assert not output.exists()
     assert not (tmp_path / "scene.ugr.run").exists()
@@ -146,6 +149,33 @@ def test_stopped_run_leaves_a_scene_and_goes_on(dataset: Path, tmp_path: Path, n
     assert output.read_bytes() == (tmp_path / "undisturbed.ugr").read_bytes()
 
 
+def test_further_signals_do_not_stop_the_scene_from_being_written(dataset: Path, tmp_path: Path) -> None:
+    output = tmp_path / "scene.ugr"
+    process = start(dataset, "-o", output, "--steps", 3000, "--max-gaussians", 60, "--threads", 1)
+    wait_for_lines(tmp_path / "scene.ugr.run" / "metrics.jsonl", 5, process)
+    while process.poll() is None:  # until the interpreter itself has ended
+        for number in (signal.SIGINT, signal.SIGTERM):
+            process.send_signal(number)
+        time.sleep(0.003)
+    assert process.stderr is not None
+    told = process.stderr.read()
+    process.stderr.close()
+    assert process.returncode == 130, told
+    assert "Traceback" not in told
+    assert GaussianScene.load(output).info.training["step"] < 3000
+
+
+def test_warns_of_what_looks_wrong_before_it_trains(dataset: Path, tmp_path: Path) -> None:
+    poses = np.load(dataset / "poses_train.npy")
+    poses[4, 0, 3] = 30.0
+    np.save(dataset / "poses_train.npy", poses)
+    result = run(dataset, "-o", tmp_path / "scene.ugr", *SMALL)
+    assert result.exit_code == 0, result.output
+    lines = result.stderr.splitlines()
+    assert lines[0].startswith("warning: train: frame 4 lies 30.0 mm off")
+    assert lines[-1].startswith("step 24 of 24")
+
+
 def test_divergence_leaves_the_last_good_scene(dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     true_loss, calls = trainer.image_loss, 0
 
@@ -166,6 +196,7 @@ def test_tensorboard_that_is_missing_is_said(dataset: Path, tmp_path: Path, monk
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
     told = refused(dataset, "-o", tmp_path / "scene.ugr", *SMALL, "--tensorboard")
     assert "TensorBoard is not installed: pip install 'ultragray[tensorboard]'" in told
+    assert not (tmp_path / "scene.ugr.run").exists()
 
 
 def test_help_needs_no_torch() -> None:

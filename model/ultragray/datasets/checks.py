@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from ..pose import rotation_angles_deg
-from ..probe import FloatArray, Probe, probe_to_dict
+from ..probe import ConvexProbe, FloatArray, LinearProbe, Probe, probe_to_dict
 from .sweep import Dataset, Sweep, corner_distances_mm
 from .swept_volume import swept_volume
 
@@ -25,6 +25,11 @@ SMALLEST_JUMP_MM = 1.0
 SATURATED_SHARE = 0.05
 DARKEST_PEAK = 16  # of 255
 SAME_POSE_MM = 1e-6
+USUAL_WIDTHS_MM = (5.0, 200.0)
+USUAL_SCAN_LINES_MM = (10.0, 400.0)
+SMALLEST_OPENING_DEG = 5.0
+SHORTEST_TRAVEL = 0.1  # of the length of the scan lines
+TURN_IN_PLACE_DEG = 5.0
 MAX_TILT_FRAMES = 300
 
 
@@ -218,12 +223,49 @@ def _odd_images(sweep: Sweep) -> list[str]:
 
 
 def _dataset_warnings(dataset: Dataset) -> list[str]:
-    told = list(dict.fromkeys((*dataset.train.notes, *dataset.val.notes)))
+    told = [
+        *dict.fromkeys((*dataset.train.notes, *dataset.val.notes)),
+        *(_unusual_probe(dataset.probe) or _hardly_moved(dataset.train)),
+    ]
     known = set(_contents(dataset.train))
     leaked = [place for place, frame in enumerate(_contents(dataset.val)) if frame in known]
     if leaked:
         told.append(f"held-out frames {_list(dataset.val, leaked)} are also training frames: metrics will flatter")
     return told
+
+
+def _unusual_probe(probe: Probe) -> list[str]:
+    """Sizes that no probe has, as lengths and angles in other units give them."""
+    lengths = [("scan lines are", "long", probe.scan_line_length_mm, USUAL_SCAN_LINES_MM)]
+    if isinstance(probe, LinearProbe):
+        lengths.insert(0, ("image is", "wide", probe.width_mm, USUAL_WIDTHS_MM))
+    told = [
+        f"the {subject} {length_mm:.3g} mm {measure}, where {low:g} to {high:g} mm are usual: a length in another "
+        "unit? (conf.json is in centimetres, a calibration in millimetres)"
+        for subject, measure, length_mm, (low, high) in lengths
+        if not low <= length_mm <= high
+    ]
+    if isinstance(probe, ConvexProbe) and probe.opening_angle_deg < SMALLEST_OPENING_DEG:
+        told.append(
+            f"the fan opens by {probe.opening_angle_deg:.3g}°, where {SMALLEST_OPENING_DEG:g}° and more are usual: "
+            "an angle in radians? (conf.json is in degrees)"
+        )
+    return told
+
+
+def _hardly_moved(sweep: Sweep) -> list[str]:
+    """A probe that stays where it is, as poses in metres or centimetres have it."""
+    travel_mm = float(np.linalg.norm(np.ptp(sweep.poses[:, :3, 3], axis=0)))
+    pixel_mm, usual_mm = min(sweep.pixel_mm), SHORTEST_TRAVEL * sweep.probe.scan_line_length_mm
+    if travel_mm >= max(pixel_mm, usual_mm):
+        return []
+    turn_deg = float(rotation_angles_deg(sweep.poses[[0]], sweep.poses).max())
+    found = f"the poses of all {len(sweep)} training frames lie within {travel_mm:.2g} mm"
+    if turn_deg >= TURN_IN_PLACE_DEG:
+        return [f"{found} and turn by {turn_deg:.0f}°: a probe tilted in place, or positions not in millimetres?"]
+    if travel_mm < pixel_mm:
+        return [f"{found}, less than a pixel ({pixel_mm:.2g} mm): tracking stalled, or positions in metres?"]
+    return [f"{found}, where scan lines are {sweep.probe.scan_line_length_mm:.0f} mm long: positions in centimetres?"]
 
 
 def _contents(sweep: Sweep) -> list[tuple[bytes, bytes]]:

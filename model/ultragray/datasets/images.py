@@ -84,6 +84,8 @@ def grey_frames(frames: npt.NDArray[Any], source: str) -> ByteArray:  # [F, H, W
     """
     if frames.dtype != np.uint8 and frames.dtype.kind != "f":
         raise DatasetInvalid(f"{source}: images must be uint8, or floats in [0, 1], got {frames.dtype}")
+    if frames.shape[:1] == (0,):
+        raise DatasetInvalid(f"{source}: it holds no frames")
     size = frame_size(frames.shape)
     if size is None:
         raise DatasetInvalid(

@@ -15,7 +15,7 @@ from ..probe import ConvexProbe, FloatArray
 from .sweep import Dataset, Sweep
 
 TRAIN_COLOUR, VAL_COLOUR = "#1f77b4", "#d62728"
-MAX_PLANES = 60  # outlines of one part; the path of the probe shows every frame
+MAX_PLANES = 16  # outlines of one part: more are a thicket; the path of the probe shows every frame
 SHEET_COLUMNS, MAX_SHEET_FRAMES = 8, 24
 MAX_TILE_PIXELS = 256
 VIEWS_DEG = ((20.0, -60.0), (20.0, 30.0))  # elevation and azimuth of the eye
@@ -24,7 +24,8 @@ VIEWS_DEG = ((20.0, -60.0), (20.0, 30.0))  # elevation and azimuth of the eye
 def draw_dataset(dataset: Dataset, path: str | Path) -> None:
     """Writes a PNG: the planes seen from two sides, below them frames at even distances, held-out ones in red.
 
-    Axes are those of the tracker, in mm. Frames of a convex probe are drawn as fans.
+    Of many planes a few are drawn, at even distances, as the legend says. Axes are those of the tracker,
+    in mm. Frames of a convex probe are drawn as fans.
     """
     shown = _sheet_frames(dataset)
     rows = math.ceil(len(shown) / SHEET_COLUMNS)
@@ -78,21 +79,25 @@ def _tile(sweep: Sweep, frame: int) -> np.ndarray:  # [rows, columns]
 
 def _draw_planes(axes: Any, dataset: Dataset, elevation_deg: float, azimuth_deg: float) -> None:
     corners = [part.corners_mm() for part in (dataset.train, dataset.val)]
-    for part, part_corners, colour in zip(
-        (dataset.train, dataset.val), corners, (TRAIN_COLOUR, VAL_COLOUR), strict=True
-    ):
+    # dashes and smaller dots: held-out frames close to training frames do not hide them
+    parts = (("training", dataset.train, TRAIN_COLOUR, "-", 3.0), ("held out", dataset.val, VAL_COLOUR, "--", 1.5))
+    for (name, part, colour, style, dot_size), part_corners in zip(parts, corners, strict=True):
         if not len(part):
             continue
         faces = part_corners[:, : part_corners.shape[1] // 2].mean(axis=1)  # middle of the near edge
-        axes.plot(*faces.T, ".", color=colour, markersize=3)
-        thinned = part_corners[:: -(-len(part) // MAX_PLANES)]
-        axes.plot(*_outlines(thinned).T, color=colour, linewidth=0.5, alpha=0.5)
+        axes.plot(*faces.T, ".", color=colour, markersize=dot_size)
+        count = min(len(part), MAX_PLANES)
+        thinned = part_corners[np.linspace(0, len(part) - 1, count).round().astype(np.intp)]
+        label = f"{name}: {count} of {len(part)} planes" if count < len(part) else f"{name}: every plane"
+        axes.plot(*_outlines(thinned).T, style, color=colour, linewidth=0.7, alpha=0.6, label=label)
+    for line in axes.legend(loc="upper left", fontsize=9).get_lines():
+        line.set(alpha=1.0, linewidth=1.5)
     every = np.concatenate([part.reshape(-1, 3) for part in corners])
     low, high = every.min(axis=0), every.max(axis=0)
     middle, half = (low + high) / 2, max(float((high - low).max()) / 2, 1.0)
-    for name, centre in zip("xyz", middle, strict=True):
-        getattr(axes, f"set_{name}lim")(centre - half, centre + half)
-        getattr(axes, f"set_{name}label")(f"{name}, mm")
+    for axis, centre in zip("xyz", middle, strict=True):
+        getattr(axes, f"set_{axis}lim")(centre - half, centre + half)
+        getattr(axes, f"set_{axis}label")(f"{axis}, mm")
     axes.set_box_aspect((1, 1, 1))
     axes.view_init(elev=elevation_deg, azim=azimuth_deg)
 

@@ -14,11 +14,12 @@ import numpy as np
 
 from ..errors import CheckpointInvalid, DatasetInvalid, InvalidArgument, InvalidPose
 from ..files import atomic_path
+from ..npy_file import map_npy
 from ..pose_file import read_pose_array
 from ..probe import FloatArray, LinearProbe, Probe
 from ..released_config import ReleasedConfig, read_released_config
 from .images import grey_frames
-from .sweep import ByteArray, Dataset, Sweep
+from .sweep import ByteArray, Dataset, Sweep, check_frame_poses
 
 CONFIG_NAME = "conf.json"
 
@@ -63,11 +64,9 @@ def _file(config: ReleasedConfig, key: str) -> Path:
 
 def _read_images(path: Path) -> ByteArray:  # [F, H, W]
     try:
-        frames = np.load(path, mmap_mode="r", allow_pickle=False)  # a truncated file is noticed before it is read
-    except (OSError, ValueError, EOFError) as error:
+        frames = map_npy(path)
+    except (OSError, ValueError) as error:
         raise DatasetInvalid(f"{path}: not an array of images that can be read: {error}") from error
-    if not isinstance(frames, np.ndarray):
-        raise DatasetInvalid(f"{path}: not an array of images, but an archive of several")
     return grey_frames(frames, str(path))
 
 
@@ -80,7 +79,7 @@ def _read_poses(path: Path) -> FloatArray:  # [F, 4, 4]
         raise DatasetInvalid(
             f"{path}: poses must be numbers [N, 4, 4] or [N, 3, 4], got {poses.dtype} {list(poses.shape)}"
         )
-    return np.array(poses, np.float64)
+    return check_frame_poses(np.array(poses, np.float64), np.arange(len(poses)), str(path))
 
 
 def write_released(dataset: Dataset, folder: str | Path) -> None:

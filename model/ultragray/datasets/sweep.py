@@ -22,6 +22,24 @@ ByteArray: TypeAlias = npt.NDArray[np.uint8]
 IntArray: TypeAlias = npt.NDArray[np.int64]
 
 
+def check_frame_poses(poses: FloatArray, frame_numbers: IntArray, source: str) -> FloatArray:  # [F, 4, 4]
+    """The poses, mm, with exact rotations (`check_poses`).
+
+    Raises DatasetInvalid, naming the source and the frame, for a pose that is not rigid.
+    """
+    if poses.shape[1:] != (4, 4):
+        raise DatasetInvalid(f"{source}: poses must be [F, 4, 4], got {list(poses.shape)}")
+    try:
+        return check_poses(poses) if len(poses) else poses
+    except InvalidPose:
+        for number, pose in zip(frame_numbers, poses, strict=True):
+            try:
+                check_poses(pose, field="its pose")
+            except InvalidPose as error:
+                raise DatasetInvalid(f"{source}: frame {number}: {error}") from error
+        raise
+
+
 @dataclass(frozen=True, eq=False)
 class Sweep:
     """F frames of one probe. `source` says where they come from, as messages name it.
@@ -45,25 +63,12 @@ class Sweep:
             )
         if len(self.poses) != count or len(self.frame_numbers) != count:
             raise DatasetInvalid(f"{self.source}: it holds {count} images but {len(self.poses)} poses")
-        object.__setattr__(self, "poses", self._checked_poses())
+        object.__setattr__(self, "poses", check_frame_poses(self.poses, self.frame_numbers, self.source))
         for number, image in zip(self.frame_numbers, images, strict=True):
             if image.min() == image.max():
                 raise DatasetInvalid(
                     f"{self.source}: frame {number} is constant: every pixel is {image.min()}; leave it out"
                 )
-
-    def _checked_poses(self) -> FloatArray:  # [F, 4, 4]
-        if self.poses.shape[1:] != (4, 4):
-            raise DatasetInvalid(f"{self.source}: poses must be [F, 4, 4], got {list(self.poses.shape)}")
-        try:
-            return check_poses(self.poses) if len(self.poses) else self.poses
-        except InvalidPose:
-            for number, pose in zip(self.frame_numbers, self.poses, strict=True):
-                try:
-                    check_poses(pose, field="its pose")
-                except InvalidPose as error:
-                    raise DatasetInvalid(f"{self.source}: frame {number}: {error}") from error
-            raise
 
     def __len__(self) -> int:
         return len(self.images)

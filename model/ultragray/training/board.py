@@ -8,17 +8,24 @@ from pathlib import Path
 from ..errors import InvalidArgument
 
 
+def require_tensorboard() -> None:
+    """Raises InvalidArgument where TensorBoard is not installed."""
+    try:
+        import torch.utils.tensorboard  # noqa: F401
+    except ImportError as error:
+        raise InvalidArgument(
+            "TensorBoard is not installed: pip install 'ultragray[tensorboard]'", field="tensorboard"
+        ) from error
+
+
 class Board:
     """Writes the numbers of each step beside the journal."""
 
     def __init__(self, folder: Path, *, steps_done: int) -> None:
         """Raises InvalidArgument where TensorBoard is not installed. Later steps of an earlier run are hidden."""
-        try:
-            from torch.utils.tensorboard import SummaryWriter
-        except ImportError as error:
-            raise InvalidArgument(
-                "TensorBoard is not installed: pip install 'ultragray[tensorboard]'", field="tensorboard"
-            ) from error
+        require_tensorboard()
+        from torch.utils.tensorboard import SummaryWriter
+
         self._writer = SummaryWriter(str(folder), purge_step=steps_done + 1 if steps_done else None)
 
     def write(self, line: Mapping[str, float]) -> None:

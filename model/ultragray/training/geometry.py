@@ -15,7 +15,7 @@ from .sampling import out_of_plane_range_mm
 SCALE_MARGIN = 1.1  # of the released recipe
 FRAMES_AT_ONCE = 64
 PIXELS_PER_GAUSSIAN = 25  # of the training frames
-MAX_STEPS, STEPS_PER_FRAME = 1_500, 40  # a frame that is seen more often is learned with its noise
+MAX_STEPS, STEPS_PER_FRAME = 1_500, 15  # a frame that is seen more often is learned with its noise
 MIN_GAUSSIANS, MAX_GAUSSIANS = 2_000, 150_000  # fewer hold no anatomy, more take longer than they are worth
 
 

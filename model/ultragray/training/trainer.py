@@ -19,10 +19,10 @@ from ..datasets.sweep import Dataset
 from ..errors import BackendUnavailable, DatasetInvalid, TrainingDiverged, TrainingStateInvalid
 from ..evaluation import evaluate
 from ..files import atomic_path, remove_stale_temporaries
-from ..rendering import render
+from ..rendering import choose_backend, render
 from ..scene import PARAMETERS, GaussianScene
 from ..scene_info import SceneInfo
-from .board import Board
+from .board import Board, require_tensorboard
 from .checkpointing import (
     CheckpointHeader,
     check_same_run,
@@ -74,8 +74,11 @@ def train(
     ends after the step at hand with a checkpoint and the scene as it is; `scene.info.training["step"]` says how far
     it came.
     Raises TrainingDiverged (the last good checkpoint stays), TrainingStateInvalid, MemoryExceeded, DatasetInvalid,
-    BackendUnavailable.
+    BackendUnavailable, and InvalidArgument for a TensorBoard that is not installed; what can be known before the first
+    step is, before `folder` is made.
     """
+    if tensorboard:
+        require_tensorboard()
     trainer = Trainer(dataset, config or TrainingConfig(), folder=folder, device=device, backend=backend)
     if resume:
         trainer.restore()
@@ -108,7 +111,7 @@ class Trainer:
         config = config.resolved(self._geometry)
         check_memory(dataset, config)
         self.dataset, self.config, self.folder = dataset, config, folder
-        self._device, self._backend = _torch_device(device), backend
+        self._device = _torch_device(device)
         self._images = torch.tensor(dataset.train.images, device=self._device)  # [F, H, W] uint8
         x, y, z = self._geometry.centre_mm.tolist()
         self._info = SceneInfo(
@@ -130,6 +133,7 @@ class Trainer:
         self._val_psnr_db: float | None = None
         self._val_step: int | None = None
         self._begin_with(initial_parameters(dataset, self._geometry, config, self._generator))
+        self._backend = choose_backend(backend, self._view(sh_degree=0))
 
     def _begin_with(self, parameters: dict[str, Tensor]) -> None:
         self.parameters = self._trainable(parameters)

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ultragray import LinearProbe
+from ultragray import ConvexProbe, LinearProbe, Probe
 from ultragray.datasets import Dataset, Sweep
 from ultragray.datasets.checks import check_dataset, check_sweep
 from ultragray.datasets.source import load_dataset
@@ -99,6 +99,54 @@ def test_held_out_frames_are_measured_from_the_nearest_training_frame(make_sweep
     document = json.loads(json.dumps(report.to_dict()))
     assert document["probe"] == {"kind": "linear", "width_mm": 40.0, "near_mm": 0.0, "far_mm": 50.0}
     assert document["train"]["frames"] == 5
+
+
+@pytest.mark.parametrize(
+    ("probe", "told"),
+    [
+        (
+            LinearProbe(379.269, 0, 50),
+            "the image is 379 mm wide, where 5 to 200 mm are usual: a length in another unit?",
+        ),
+        (LinearProbe(0.379, 0, 50), "the image is 0.379 mm wide"),
+        (LinearProbe(40, 0, 464.542), "the scan lines are 465 mm long, where 10 to 400 mm are usual"),
+        (ConvexProbe(60, 0.5, 2.3), "the scan lines are 1.8 mm long"),
+        (ConvexProbe(1.05, 50, 200), "the fan opens by 1.05°, where 5° and more are usual: an angle in radians?"),
+    ],
+)
+def test_a_probe_in_other_units_is_named(make_sweep: Callable[..., Sweep], probe: Probe, told: str) -> None:
+    sweep = make_sweep(10, probe=probe)
+    warnings = check_dataset(Dataset("one", sweep, sweep.select([]))).warnings
+    assert [text[: len(told)] for text in warnings] == [told]
+
+
+@pytest.mark.parametrize(
+    ("scale", "turn_deg", "told"),
+    [
+        (1.0, 0.0, None),
+        (1.0, 30.0, None),
+        (0.1, 0.0, "lie within 3.9 mm, where scan lines are 50 mm long: positions in centimetres?"),
+        (0.001, 0.0, "lie within 0.039 mm, less than a pixel (2.5 mm): tracking stalled, or positions in metres?"),
+        (0.001, 30.0, "lie within 0.039 mm and turn by 30°: a probe tilted in place, or positions not in millimetres?"),
+    ],
+)
+def test_poses_in_other_units_are_named(
+    make_sweep: Callable[..., Sweep], scale: float, turn_deg: float, told: str | None
+) -> None:
+    poses = make_sweep(40).poses.copy()
+    poses[:, :3, 3] *= scale
+    for pose, angle in zip(poses, np.radians(np.linspace(0, turn_deg, 40)), strict=True):
+        pose[1:3, 1:3] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    sweep = make_sweep(40, poses=poses)
+    warnings = check_dataset(Dataset("one", sweep, sweep.select([]))).warnings
+    assert warnings == (() if told is None else (f"the poses of all 40 training frames {told}",))
+
+
+@pytest.mark.parametrize("name", ["liver_convex", "nwire_phantom", "spine_phantom", "ultranerf_liver"])
+def test_real_units_are_usual(data_folder: Path, name: str) -> None:
+    dataset = load_dataset(data_folder / name)
+    warnings = check_dataset(dataset).warnings
+    assert not [text for text in warnings if "usual" in text or "positions" in text]
 
 
 def test_images_are_compared_without_a_copy_of_them(make_sweep: Callable[..., Sweep]) -> None:

@@ -8,10 +8,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from ultragray import ConvexProbe, LinearProbe, Probe
 from ultragray.datasets import Dataset, Sweep
-from ultragray.datasets.pictures import draw_dataset
+from ultragray.datasets.pictures import _draw_planes, draw_dataset
 
 
 def pixels_of(picture: np.ndarray, colour: tuple[int, int, int]) -> int:  # RGB
@@ -37,6 +38,23 @@ def test_both_parts_are_drawn(make_sweep: Callable[..., Sweep], tmp_path: Path, 
     assert pixels_of(one, red) < pixels_of(both, red) / 10
     assert np.ptp(both[-150:], axis=-1).max() < 200  # the contact sheet lies below, grey but for the titles
     assert both[-150:].std() > 20
+
+
+def test_at_most_sixteen_planes_of_a_part_are_drawn(make_sweep: Callable[..., Sweep]) -> None:
+    sweep = make_sweep(200)
+    axes = Figure().add_subplot(projection="3d")
+    _draw_planes(axes, Dataset("many", sweep, sweep.select(range(20))), 20.0, 30.0)
+    legend = axes.get_legend()
+    assert legend is not None
+    assert [text.get_text() for text in legend.get_texts()] == [
+        "training: 16 of 200 planes",
+        "held out: 16 of 20 planes",
+    ]
+    outlines = np.array(axes.get_lines()[1].get_data_3d())  # [3, 16 * 6]
+    assert outlines.shape[1] == 16 * 6
+    y_mm = outlines[1, ::6]
+    assert (y_mm[0], y_mm[-1]) == (0.0, 199.0)
+    assert set(np.diff(y_mm)) == {13.0, 14.0}
 
 
 def test_a_picture_that_fails_leaves_nothing(make_sweep: Callable[..., Sweep], tmp_path: Path) -> None:

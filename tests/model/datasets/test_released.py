@@ -118,6 +118,14 @@ def truncated_images(layout: Layout) -> None:
     path.write_bytes(path.read_bytes()[:-100])
 
 
+def garbage_images(layout: Layout) -> None:
+    (layout.folder / "images_train.npy").write_bytes(b"garbage" * 99)
+
+
+def object_images(layout: Layout) -> None:
+    np.save(layout.folder / "images_train.npy", np.array([None, {}]), allow_pickle=True)
+
+
 def truncated_poses(layout: Layout) -> None:
     path = layout.folder / "poses_val.npy"
     path.write_bytes(path.read_bytes()[:-1])
@@ -126,12 +134,17 @@ def truncated_poses(layout: Layout) -> None:
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
-        (nan_pose, r"images_train\.npy: frame 2: its pose must be finite"),
-        (mirrored_pose, r"images_train\.npy: frame 3: its pose must .*mirrored"),
+        (nan_pose, r"poses_train\.npy: frame 2: its pose must be finite"),
+        (mirrored_pose, r"poses_train\.npy: frame 3: its pose must .*mirrored"),
         (constant_image, r"images_train\.npy: frame 1 is constant: every pixel is 7"),
         (nan_image, r"images_train\.npy: frame 3 holds NaN"),
-        (truncated_images, r"images_train\.npy: not an array of images that can be read"),
-        (truncated_poses, r"poses_val\.npy: not a file of poses that can be read"),
+        (truncated_images, r"images_train\.npy: not an array of images .*truncated: 100 bytes"),
+        (garbage_images, r"images_train\.npy: not an array of images .*: it does not start as a \.npy file does$"),
+        (object_images, r"images_train\.npy: not an array of images .*: it holds Python objects"),
+        (lambda it: it.save("images_train.npy", it.images[:0]), r"images_train\.npy: it holds no frames$"),
+        (lambda it: it.save("images_val.npy", it.images[:0]), r"images_val\.npy: it holds no frames$"),
+        (lambda it: it.configure(ultrasound_opening_width="3.8"), r"opening_width must be a finite number, got '3\.8'"),
+        (truncated_poses, r"poses_val\.npy: not a file of poses .*truncated: 1 bytes"),
         (lambda it: it.save("images_train.npy", it.images[0]), r"images_train\.npy: images must have shape"),
         (lambda it: it.save("images_val.npy", it.images[0]), r"images_val\.npy: images must be \[N, H, W\]"),
         (
