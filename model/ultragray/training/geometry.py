@@ -15,7 +15,8 @@ from .sampling import out_of_plane_range_mm
 SCALE_MARGIN = 1.1  # of the released recipe
 FRAMES_AT_ONCE = 64
 PIXELS_PER_GAUSSIAN = 25  # of the training frames
-MAX_STEPS, STEPS_PER_FRAME = 1_500, 15  # a frame that is seen more often is learned with its noise
+STEPS_PER_FRAME = 15  # a frame that is seen more often is learned with its noise
+MIN_STEPS, MAX_STEPS = 250, 1_500  # fewer leave shadows unlearned
 MIN_GAUSSIANS, MAX_GAUSSIANS = 2_000, 150_000  # fewer hold no anatomy, more take longer than they are worth
 
 
@@ -48,7 +49,7 @@ class Geometry:
             pixel_mm=(axial * lateral) ** 0.5,
             out_of_plane_mm=out_of_plane_range_mm(sweep, spacing),
             gaussian_count=min(max(sweep.images.size // PIXELS_PER_GAUSSIAN, MIN_GAUSSIANS), MAX_GAUSSIANS),
-            steps=min(MAX_STEPS, STEPS_PER_FRAME * len(sweep)),
+            steps=min(max(STEPS_PER_FRAME * len(sweep), MIN_STEPS), MAX_STEPS),
             brightness=float(sweep.images.mean(dtype=np.float64)) / 255.0,
         )
 
