@@ -40,7 +40,7 @@ class TrainingConfig:
     naming the field, for a value outside its range.
     """
 
-    steps: int | None = None  # None: 1,500, fewer for a few frames
+    steps: int | None = None  # None: from the number of frames
     batch_size: int = 8  # frames of one step; fewer where the dataset has fewer
     seed: int = 0
     initial_gaussians: int | None = None  # None: max_gaussians, or half of them where refinements add to them
@@ -51,8 +51,8 @@ class TrainingConfig:
     initial_transmittance: float = 0.99
     intensity: str = "sigmoid"  # activation, docs/physics.md §2
     shadow_start: float = 0.1  # up to this share of the run only the transmittances are trained
-    intensity_floor: float | None = None  # up to floor_end no intensity is less; None: the mean brightness
-    floor_end: float = 0.3
+    intensity_floor: float | None = None  # least intensity, up to floor_end; None: the frames' mean brightness
+    floor_end: float = 0.3  # share of the run
     sh_degree: int = 1
     sh_start: float = 1_000 / RELEASED_STEPS  # where degree 1 joins; degree d at d times that
     transmittance: bool = True  # False: nothing absorbs

@@ -1,4 +1,4 @@
-"""The lengths of a dataset that training follows: how large the scene is, how far apart frames and pixels are."""
+"""What training takes from a dataset: how large it is, how far apart its frames and pixels are, how bright."""
 
 from __future__ import annotations
 

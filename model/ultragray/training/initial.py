@@ -34,6 +34,7 @@ def initial_parameters(
     count = config.initial_gaussians
     assert count is not None
     assert config.initial_scale_mm is not None
+    assert config.initial_elevation_mm is not None
     shapes = expected_shapes(count, config.sh_degree)
     quats = torch.zeros(shapes["quats"])
     quats[:, 0] = 1.0
@@ -45,7 +46,7 @@ def initial_parameters(
         frame, means, brightness = _on_pixels(dataset, geometry, count, generator)
         turns = torch.tensor([quaternion_from_pose(pose) for pose in dataset.train.poses])
         quats = turns[frame]
-        scales_mm[:, 1] = config.initial_elevation_mm or config.initial_scale_mm
+        scales_mm[:, 1] = config.initial_elevation_mm
     logit = math.log(config.initial_transmittance / (1.0 - config.initial_transmittance))
     parameters = {
         "means": means,

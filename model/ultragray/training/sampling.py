@@ -12,7 +12,7 @@ from ..datasets.sweep import IntArray, Sweep, corner_distances_mm
 from ..probe import FloatArray
 
 LEAST_RANGE = 1.5  # × the spacing of the frames
-TELLING_NEIGHBOURS = 8
+TELLING_NEIGHBOURS = 8  # with fewer, PSNR only says that speckle averages out
 MAX_SLICE_MM = 8.0  # no probe's slice is thicker
 MAX_RANGE_MM = 100.0  # frames further apart have nothing to say about what lies between
 RANGES = (1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 11.0, 16.0, 23.0, 32.0)  # × the distance of neighbouring frames
@@ -41,9 +41,9 @@ def out_of_plane_range_mm(sweep: Sweep, spacing_mm: float) -> float:
     """How far the frames themselves say that a slice is blurred along elevation: the full range of the shift.
 
     Each frame is predicted by its neighbours within ± half a range, with the weights that the shift is drawn with.
-    Half the range with the best mean PSNR is taken (PSNR likes blur; the half has most of the gain and keeps detail) if
-    there are eight frames or more within that range of the median frame: their own distance decides otherwise. At least
-    1.5 spacings, so that there is no gap between frames; no more than that above MAX_SLICE_MM.
+    Half the range with the best mean PSNR is taken (PSNR likes blur; the half has most of the gain and keeps detail),
+    at most MAX_SLICE_MM, if the median frame has eight others or more within ± half that range: among fewer the mean of
+    all wins, however far apart they are. Else, and at least, 1.5 spacings: no gap may stay between frames.
     """
     least = min(LEAST_RANGE * spacing_mm, MAX_RANGE_MM)
     corners = sweep.corners_mm()  # [F, K, 3]
