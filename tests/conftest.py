@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,10 +13,13 @@ import numpy as np
 import pytest
 import torch
 
-from ultragray import ConvexProbe, Frames, GaussianScene, LinearProbe, Probe, SceneInfo
+from ultragray import ConvexProbe, Frames, GaussianScene, LinearProbe, Probe, SceneInfo, cuda
 from ultragray.probe import FloatArray, stretch_released_far
 from ultragray.request import OUTPUTS
 from ultragray.scene import PARAMETERS
+
+if not torch.cuda.is_available():
+    os.environ.setdefault("TRITON_INTERPRET", "1")  # before any kernel is imported: they run on the CPU then
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 LARGEST_FLIP = 5e-3  # a threshold that flips moves a pixel by about 1/255
@@ -139,6 +143,26 @@ def random_poses() -> Callable[..., FloatArray]:
         return poses
 
     return make
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Tests marked `gpu` are skipped where there is none."""
+    if torch.cuda.is_available():
+        return
+    for item in items:
+        if "gpu" in item.keywords:
+            item.add_marker(pytest.mark.skip(reason="there is no CUDA device"))
+
+
+@pytest.fixture(scope="session")
+def on_device() -> Callable[[GaussianScene], GaussianScene]:
+    """A scene where the CUDA backend wants it: on the GPU, or as it is where the kernels are interpreted."""
+
+    def move(scene: GaussianScene) -> GaussianScene:
+        device = cuda.device()
+        return scene if scene.means.device == device else scene.to(device)
+
+    return move
 
 
 @pytest.fixture

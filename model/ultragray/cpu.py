@@ -36,13 +36,8 @@ def render_outputs(
 ) -> dict[str, Tensor]:
     """The outputs by name, each [C, H, W] float32; differentiable once with respect to every parameter.
 
-    Raises BackendUnavailable for a scene it does not support.
+    The scene is one that it supports. Raises BackendUnavailable for an unknown instruction set.
     """
-    if not supports(scene):
-        raise BackendUnavailable(
-            f"backend cpu renders float32 scenes on the CPU, got {scene.means.dtype} on {scene.means.device}",
-            field="backend",
-        )
     if instruction_set != "auto" and instruction_set not in INSTRUCTION_SETS:
         raise BackendUnavailable(
             f"instruction_set must be auto or one of {', '.join(INSTRUCTION_SETS)}, got {instruction_set!r}",

@@ -19,7 +19,7 @@ UltragrayError
 ├── DatasetInvalid                  a tracked sweep that cannot be used; names the file, the frame and the reason
 ├── TrainingDiverged                a training whose loss or parameters are no longer finite
 ├── TrainingStateInvalid            a training folder that cannot be resumed from
-├── MemoryExceeded                  a training that would not fit into memory
+├── MemoryExceeded                  a training, or a frame on a GPU, that does not fit into memory
 ├── SceneTooLarge                   a scene that does not fit the memory budget at all
 ├── BackendUnavailable              a render backend that cannot run here
 ├── QueueFull                       too many frames wait already
@@ -182,7 +182,7 @@ class MemoryExceeded(UltragrayError):
     reason = "MEMORY_EXCEEDED"
     http_status = 507
     grpc_status = "RESOURCE_EXHAUSTED"
-    title = "Training exceeds the memory budget"
+    title = "Memory exceeded"
 
 
 class SceneTooLarge(UltragrayError):

@@ -8,7 +8,7 @@ from typing import Any
 
 from torch import Tensor
 
-from . import __version__, cpu, reference
+from . import __version__, cpu, cuda, reference
 from .errors import BackendUnavailable
 from .pose import check_poses
 from .probe import FloatArray, Probe
@@ -44,10 +44,12 @@ def render(
     """Frames [C, height, width] of a scene seen by `probe` (None: the probe the scene was trained with) from `poses`.
 
     Poses are rigid probe→scene transforms in mm, in the frame of the sweep that the scene was trained from.
-    Backends: `reference` computes in the dtype of the scene's tensors; `cpu` computes in float32 on as many threads as
-    torch.get_num_threads(); `auto` takes `cpu` for float32 scenes on the CPU. Both are differentiable with respect to
-    the scene's tensors (`cpu` once); the gradients are the true ones (docs/physics.md §4).
-    Raises InvalidPose, InvalidProbe, InvalidImageSize, UnknownOutput, BackendUnavailable.
+    Backends: `reference` computes in the dtype of the scene's tensors, where they are; `cpu` in float32 on as many
+    threads as torch.get_num_threads(); `cuda` in float32 on the GPU that holds the scene (`scene.to("cuda")`). `auto`
+    takes the fast one for where the scene is. All are differentiable with respect to the scene's tensors (`cpu` and
+    `cuda` once); the gradients are the true ones (docs/physics.md §4).
+    Raises InvalidPose, InvalidProbe, InvalidImageSize, UnknownOutput, BackendUnavailable, and MemoryExceeded where the
+    GPU's memory does not suffice.
     """
     chosen = check_outputs(outputs)
     check_image_size(height, width)
@@ -57,19 +59,37 @@ def render(
     return Frames(**_BACKENDS[backend](scene, probe, poses_cm, height, width, chosen))
 
 
-_BACKENDS: dict[str, Backend] = {"reference": reference.render_outputs, "cpu": cpu.render_outputs}
+_BACKENDS: dict[str, Backend] = {
+    "reference": reference.render_outputs,
+    "cpu": cpu.render_outputs,
+    "cuda": cuda.render_outputs,
+}
 
 
 def choose_backend(name: str, scene: GaussianScene) -> str:
-    """The backend that `name` (auto: the best) means for a scene. Raises BackendUnavailable for an unknown name."""
+    """The backend that `name` (auto: the best) means for a scene.
+
+    Raises BackendUnavailable for an unknown name and for one that cannot render the scene here.
+    """
     if name == "auto":
+        if scene.means.is_cuda and cuda.supports(scene):
+            return "cuda"
         return "cpu" if cpu.supports(scene) else "reference"
     if name not in _BACKENDS:
         raise BackendUnavailable(f"backend must be one of auto, {', '.join(_BACKENDS)}, got {name!r}", field="backend")
+    if name == "cuda":
+        cuda.require()
+    if name != "reference" and not (cpu if name == "cpu" else cuda).supports(scene):
+        place = "on the CPU" if name == "cpu" else f"on the device {cuda.device()}"
+        raise BackendUnavailable(
+            f"backend {name} renders float32 scenes {place}, got {scene.means.dtype} on {scene.means.device}",
+            field="backend",
+        )
     return name
 
 
 def renderer_name(backend: str, scene: GaussianScene) -> str:
-    """What renders a scene, as every frame says it: `ultragray/0.1.0 cpu-avx512`."""
+    """What renders a scene, as every frame says it: `ultragray/0.1.0 cpu-avx512`, `ultragray/0.1.0 cuda-sm90`."""
     chosen = choose_backend(backend, scene)
-    return f"ultragray/{__version__} {f'cpu-{cpu.INSTRUCTION_SETS[0]}' if chosen == 'cpu' else chosen}"
+    by = {"cpu": f"cpu-{cpu.INSTRUCTION_SETS[0]}", "cuda": cuda.renderer() if chosen == "cuda" else ""}
+    return f"ultragray/{__version__} {by.get(chosen, chosen)}"

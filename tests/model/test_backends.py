@@ -15,7 +15,7 @@ from ultragray import ConvexProbe, Frames, GaussianScene, LinearProbe, Probe, cp
 from ultragray.errors import BackendUnavailable
 from ultragray.request import OUTPUTS
 
-RENDERERS = ("reference", "cpu", *(f"cpu-{name}" for name in cpu.INSTRUCTION_SETS))
+RENDERERS = ("reference", "cuda", "cpu", *(f"cpu-{name}" for name in cpu.INSTRUCTION_SETS))
 LINEAR = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)
 CONVEX = ConvexProbe(opening_angle_deg=60.0, near_mm=10.0, far_mm=60.0)
 
@@ -23,9 +23,16 @@ Renderer = Callable[..., Frames]
 
 
 @pytest.fixture(params=RENDERERS)
-def renderer(request: pytest.FixtureRequest) -> Renderer:
+def renderer(request: pytest.FixtureRequest, on_device: Callable[[GaussianScene], GaussianScene]) -> Renderer:
     """render() on one backend, or on the CPU backend with one instruction set forced."""
     backend, _, instruction_set = request.param.partition("-")
+    if backend == "cuda":
+
+        def moved(scene: GaussianScene, probe: Probe, poses: Any, **size: Any) -> Frames:
+            frames = render(on_device(scene), probe, poses, backend="cuda", **size)
+            return Frames(**{name: frame.cpu() for name, frame in vars(frames).items() if frame is not None})
+
+        return moved
     if not instruction_set:
         return lambda scene, probe, poses, **size: render(scene, probe, poses, backend=backend, **size)
 
@@ -289,7 +296,7 @@ def test_cpu_refuses_what_it_would_get_wrong(random_scene: Callable[..., Gaussia
 
 
 def test_an_unknown_backend_is_named(random_scene: Callable[..., GaussianScene]) -> None:
-    with pytest.raises(BackendUnavailable, match="auto, reference, cpu, got 'gpu'"):
+    with pytest.raises(BackendUnavailable, match="auto, reference, cpu, cuda, got 'gpu'"):
         render(random_scene(1), LINEAR, np.eye(4), height=4, width=4, backend="gpu")
 
 
@@ -325,12 +332,10 @@ EXTREMES = {
 }
 
 
-@pytest.mark.parametrize("instruction_set", cpu.INSTRUCTION_SETS)
 @pytest.mark.parametrize("name", EXTREMES)
-def test_extreme_gaussians(name: str, instruction_set: str, assert_agrees: Callable[..., None]) -> None:
+def test_extreme_gaussians(name: str, renderer: Renderer, assert_agrees: Callable[..., None]) -> None:
     scene = EXTREMES[name]
     probe = LinearProbe(width_mm=20.0, near_mm=0.0, far_mm=80.0)
-    planes = cpu.render_outputs(scene, probe, np.eye(4)[None], 40, 40, OUTPUTS, instruction_set=instruction_set)
+    frames = renderer(scene, probe, np.eye(4), height=40, width=40)
     exact = render(scene.to(torch.float64), probe, np.eye(4), height=40, width=40, backend="reference")
-    expected = {output: getattr(exact, output).numpy() for output in OUTPUTS}
-    assert_agrees(Frames(**planes), expected, tolerance=5e-4)
+    assert_agrees(frames, {output: getattr(exact, output).numpy() for output in OUTPUTS}, tolerance=5e-4)

@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from ..datasets.sweep import Dataset, Sweep, corner_distances_mm
 from ..probe import FloatArray
@@ -79,16 +77,3 @@ def frame_spacing_mm(sweep: Sweep) -> float:
         offsets = corners[travel.argmin(axis=1)] - corners[some]  # [f, K, 3]
         gaps.extend(np.abs(np.einsum("fkc,fc->fk", offsets, elevations[some])).mean(axis=1).tolist())
     return float(np.median(gaps))
-
-
-def spatial_order(means: Tensor) -> Tensor:  # [N, 3] -> [N]
-    """The Gaussians along a Morton curve: the kernel culls neighbours together and finds them in the cache."""
-    if not len(means):
-        return torch.zeros(0, dtype=torch.int64, device=means.device)
-    low, high = means.detach().amin(dim=0), means.detach().amax(dim=0)
-    cells = (1023.0 * (means.detach() - low) / (high - low).clamp(min=1e-12)).long()
-    keys = torch.zeros(len(means), dtype=torch.int64, device=means.device)
-    for bit in range(10):
-        for axis in range(3):
-            keys |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
-    return torch.argsort(keys, stable=True)

@@ -13,8 +13,9 @@ from ..pose import quaternion_from_pose
 from ..probe import ConvexProbe
 from ..scene import PARAMETERS
 from ..scene_info import expected_shapes
+from ..spatial_order import spatial_order
 from .config import TrainingConfig
-from .geometry import Geometry, spatial_order
+from .geometry import Geometry
 from .intensity import sh0_of_intensity
 
 NO_ABSORPTION_LOGIT = 30.0  # τ = 1 to the last bit of a float32

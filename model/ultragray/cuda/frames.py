@@ -1,0 +1,128 @@
+"""Frames of a scene on the device: what is kept between calls, how many poses go together, and the gradient."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, TypeVar
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from ..errors import MemoryExceeded
+from ..probe import FloatArray, Probe
+from ..scene import PARAMETERS, GaussianScene
+from ..spatial_order import spatial_order
+from .launch import Gaussians, Geometry, bytes_per_pose, cut, differentiate, draw, view_table
+
+WORKSPACE_BYTES = 1 << 30  # of slices and planes; poses beyond it are rendered in a further round
+
+Result = TypeVar("Result")
+
+
+def render_frames(
+    scene: GaussianScene,
+    probe: Probe,
+    poses_cm: FloatArray,  # [C, 4, 4]
+    height: int,
+    width: int,
+    outputs: Sequence[str],
+) -> dict[str, Tensor]:  # [C, H, W] each
+    """See `ultragray.cuda.render_outputs`."""
+    geometry = Geometry.of(probe, height, width)
+    device = scene.means.device
+    views = torch.from_numpy(view_table(probe, poses_cm, height)).to(device, non_blocking=True)
+    if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in scene.splats.values()):
+        frames = within_memory(
+            lambda: _Render.apply(  # type: ignore[no-untyped-call]
+                scene.info.intensity, geometry, views, tuple(outputs), *scene.splats.values()
+            ),
+            scene,
+            geometry,
+            len(views),
+        )
+        return dict(zip(outputs, frames, strict=True))
+    return within_memory(lambda: _render(_sorted(scene), geometry, views, outputs), scene, geometry, len(views))
+
+
+def _render(gaussians: Gaussians, geometry: Geometry, views: Tensor, outputs: Sequence[str]) -> dict[str, Tensor]:
+    at_once = max(1, WORKSPACE_BYTES // bytes_per_pose(len(gaussians.means), geometry))
+    rounds = [
+        draw(cut(gaussians, some, geometry, record=False), geometry, outputs, keep=False)[0]
+        for some in (torch.split(views, at_once) if len(views) else (views,))
+    ]
+    if len(rounds) == 1:
+        return rounds[0]
+    return {name: torch.cat([frames[name] for frames in rounds]) for name in outputs}
+
+
+def within_memory(render: Callable[[], Result], scene: GaussianScene, geometry: Geometry, poses: int) -> Result:
+    """What `render` gives. Raises MemoryExceeded for torch's own error, and gives back what torch keeps in reserve."""
+    try:
+        return render()
+    except torch.OutOfMemoryError as error:
+        torch.cuda.empty_cache()
+        raise MemoryExceeded(
+            f"the memory of {scene.means.device} does not suffice for {poses} frames of {geometry.height}x"
+            f"{geometry.width} pixels from {len(scene.means):,} Gaussians: ask for fewer or smaller frames at once",
+        ) from error
+
+
+class _Render(torch.autograd.Function):
+    """The kernels' backward pass (docs/physics.md §4) as torch sees it."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, intensity: str, geometry: Geometry, views: Tensor, names: tuple[str, ...], *splats: Tensor
+    ) -> tuple[Tensor, ...]:
+        gaussians = Gaussians.of(dict(zip(PARAMETERS, splats, strict=True)), intensity)
+        slices = cut(gaussians, views, geometry, record=True)
+        frames, planes = draw(slices, geometry, names, keep=True)
+        ctx.recorded = (gaussians, views, geometry, slices, planes)
+        ctx.names = names
+        ctx.set_materialize_grads(False)
+        return tuple(frames.values())
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
+        given = {
+            name: gradient.contiguous()
+            for name, gradient in zip(ctx.names, gradients, strict=True)
+            if gradient is not None
+        }
+        gaussians, views, geometry, slices, planes = ctx.recorded
+        found = differentiate(gaussians, views, geometry, slices, planes, given)
+        return (None, None, None, None, *found.values())
+
+
+class _Kept(NamedTuple):
+    """Gaussians in spatial order, and what they were made of: holding the tensors keeps their identity from reuse."""
+
+    tensors: tuple[Tensor, ...]
+    versions: tuple[int, ...]
+    intensity: str
+    gaussians: Gaussians
+
+
+def _sorted(scene: GaussianScene) -> Gaussians:
+    """The scene's Gaussians along a space-filling curve, kept with the scene until one of its tensors changes.
+
+    A change that torch does not count (through `.data`) is not noticed.
+    """
+    tensors = tuple(scene.splats.values())
+    if any(tensor.is_inference() for tensor in tensors):  # their changes are not counted
+        return Gaussians.of(scene.splats, scene.info.intensity)
+    versions = tuple(tensor._version for tensor in tensors)
+    kept: _Kept | None = scene.cache.get("cuda")
+    if (
+        kept is None
+        or kept.versions != versions
+        or kept.intensity != scene.info.intensity
+        or any(a is not b for a, b in zip(kept.tensors, tensors, strict=True))
+    ):
+        order = spatial_order(scene.means)
+        gaussians = Gaussians.of({name: t.detach()[order] for name, t in scene.splats.items()}, scene.info.intensity)
+        kept = _Kept(tensors, versions, scene.info.intensity, gaussians)
+        scene.cache["cuda"] = kept  # one assignment: threads may render the scene at the same time
+    return kept.gaussians
