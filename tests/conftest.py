@@ -150,7 +150,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     if torch.cuda.is_available():
         return
     for item in items:
-        if "gpu" in item.keywords:
+        if item.get_closest_marker("gpu"):
             item.add_marker(pytest.mark.skip(reason="there is no CUDA device"))
 
 
@@ -176,7 +176,7 @@ def assert_agrees() -> Callable[..., None]:
             got = getattr(frames, name)
             want = np.asarray(expected[name], dtype=np.float64)
             assert tuple(got.shape) == want.shape
-            difference = np.abs(got.double().numpy() - want)
+            difference = np.abs(got.cpu().double().numpy() - want)
             if stable is not None:
                 difference = difference[stable]
             assert np.isfinite(difference).all(), f"{name} is not finite"

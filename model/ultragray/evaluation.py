@@ -18,6 +18,7 @@ from .scene import GaussianScene
 from .scene_info import SceneInfo
 
 CHUNK_PIXELS = 1 << 20  # rendered and measured at once: measuring takes about 200 bytes of each
+CHUNK_FRAMES = 32  # of a frame, rendering takes room for each Gaussian too
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,9 +82,14 @@ def _measured(predictions: Iterable[npt.NDArray[np.float32]], sweep: Sweep) -> E
     return Evaluation(frames=measured, frame_numbers=sweep.frame_numbers, ms_ssim_scales=scales)
 
 
+def frames_at_once(height: int, width: int) -> int:
+    """How many frames of this size are rendered and measured together."""
+    return min(CHUNK_FRAMES, max(1, CHUNK_PIXELS // (height * width)))
+
+
 def _chunks(sweep: Sweep) -> Iterator[slice]:
     """Places of the frames that are taken at once, in order."""
-    count = max(1, CHUNK_PIXELS // (sweep.height * sweep.width))
+    count = frames_at_once(sweep.height, sweep.width)
     for first in range(0, len(sweep), count):
         yield slice(first, first + count)
 

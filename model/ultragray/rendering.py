@@ -91,5 +91,8 @@ def choose_backend(name: str, scene: GaussianScene) -> str:
 def renderer_name(backend: str, scene: GaussianScene) -> str:
     """What renders a scene, as every frame says it: `ultragray/0.1.0 cpu-avx512`, `ultragray/0.1.0 cuda-sm90`."""
     chosen = choose_backend(backend, scene)
-    by = {"cpu": f"cpu-{cpu.INSTRUCTION_SETS[0]}", "cuda": cuda.renderer() if chosen == "cuda" else ""}
-    return f"ultragray/{__version__} {by.get(chosen, chosen)}"
+    if chosen == "cpu":
+        by = f"cpu-{cpu.INSTRUCTION_SETS[0]}"
+    else:
+        by = cuda.renderer(scene.means.device) if chosen == "cuda" else chosen
+    return f"ultragray/{__version__} {by}"

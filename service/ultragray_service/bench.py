@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import platform
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from datetime import datetime, timezone
 from importlib.metadata import version
@@ -20,7 +21,8 @@ from rich.console import Console
 from rich.table import Table
 
 import ultragray
-from ultragray import cpu
+from ultragray import cpu, cuda
+from ultragray.errors import BackendUnavailable
 from ultragray.files import atomic_path
 from ultragray.machine import processor_name
 
@@ -47,9 +49,24 @@ class Row:
     above_kernel_ms: float | None = None  # p50 over that of the kernel's single pose at the same thread count
 
 
+def chosen_bench(backend: str, train: bool) -> Callable[[Path | None, bool], None]:
+    """What measures the kernel and the service, or a training step, on a backend.
+
+    Raises BackendUnavailable for one that is not cpu or cuda, and for cuda where there is no GPU.
+    """
+    if backend == "cpu":
+        return run_training_bench if train else run_bench
+    if backend != "cuda":
+        raise BackendUnavailable(f"backend must be cpu or cuda, got {backend!r}", field="backend")
+    cuda.require()
+    from .bench_cuda import run_cuda_bench, run_cuda_training_bench
+
+    return run_cuda_training_bench if train else run_cuda_bench
+
+
 def run_bench(output: Path | None, quick: bool) -> None:
     """Prints the table; writes it as JSON to `output`. `quick` takes few repetitions and leaves the large scene out."""
-    console = _console()
+    console = bench_console()
     repeats = 20 if quick else 200
     threads = torch.get_num_threads()
     yards = [time_yard_ms()]
@@ -64,7 +81,7 @@ def run_bench(output: Path | None, quick: bool) -> None:
             rows.append(_row(scene, yard, timing.what, timing.threads, timing.poses, timing.frame_ms))
         kernel_p50 = next(row.p50_ms for row in rows[-len(timings) :] if row.threads == threads and row.poses == 1)
         console.print(f"{scene.gaussian_count:,} Gaussians: served ...", style="dim")
-        served = measure_served(scene, repeats)
+        served = measure_served(scene, repeats, "cpu")
         memory_mb[str(scene.gaussian_count)] = served.worker_memory_mb
         yards.append(time_yard_ms())
         yard = float(np.median(yards[-2:]))
@@ -86,12 +103,12 @@ def run_bench(output: Path | None, quick: bool) -> None:
         "rows": [asdict(row) for row in rows],
     }
     _print_table(console, rows, document)
-    _write(console, output, document)
+    write_document(console, output, document)
 
 
 def run_training_bench(output: Path | None, quick: bool) -> None:
     """The same for a training step and its parts; `quick` takes few repetitions and leaves the large scene out."""
-    console = _console()
+    console = bench_console()
     threads = torch.get_num_threads()
     rows: list[dict[str, Any]] = []
     yards: list[float] = []
@@ -121,15 +138,17 @@ def run_training_bench(output: Path | None, quick: bool) -> None:
             f"{row['gaussians']:,}", row["images"], f"{row['step_ms']:.0f}", f"{row['step_yards']:.1f}", *shares
         )
     console.print(table)
-    _write(console, output, document)
+    write_document(console, output, document)
 
 
-def _console() -> Console:
+def bench_console() -> Console:
+    """As wide as the terminal; elsewhere as wide as a table."""
     console = Console()
     return console if console.is_terminal else Console(width=TABLE_WIDTH)
 
 
-def _write(console: Console, output: Path | None, document: dict[str, Any]) -> None:
+def write_document(console: Console, output: Path | None, document: dict[str, Any]) -> None:
+    """The figures as JSON, where a file was asked for."""
     if output is not None:
         with atomic_path(output) as temporary:
             temporary.write_text(json.dumps(document, indent=1) + "\n")
@@ -156,6 +175,13 @@ def _machine(threads: int) -> dict[str, Any]:
         "processor": processor_name(),
         "threads": threads,
         "instruction_set": cpu.INSTRUCTION_SETS[0],
+        **versions(),
+    }
+
+
+def versions() -> dict[str, str]:
+    """Of the system and of what is measured and measures, and when."""
+    return {
         "system": platform.platform(),
         "python": platform.python_version(),
         "ultragray": ultragray.__version__,
@@ -198,7 +224,5 @@ def _print_table(console: Console, rows: list[Row], document: dict[str, Any]) ->
     console.print(table)
     for count, memory in document["worker_memory_mb"].items():
         console.print(f"worker memory with {int(count):,} Gaussians: {memory:.0f} MB")
-    versions = ", ".join(
-        f"{name} {machine[name]}" for name in ("ultragray", "torch", "numpy", "grpc", "uvicorn", "python")
-    )
-    console.print(versions, style="dim")
+    told = ", ".join(f"{name} {machine[name]}" for name in ("ultragray", "torch", "numpy", "grpc", "uvicorn", "python"))
+    console.print(told, style="dim")

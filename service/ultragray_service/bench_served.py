@@ -48,12 +48,12 @@ class Served:
     worker_memory_mb: float
 
 
-def measure_served(bench: BenchScene, repeats: int) -> Served:
+def measure_served(bench: BenchScene, repeats: int, backend: str) -> Served:
     """Raises NotReady where the server does not come up."""
     poses = bench_poses(repeats + WARM_UP)
     with tempfile.TemporaryDirectory(prefix="ultragray-bench-") as folder:
         bench.scene.save(Path(folder) / f"{SCENE}.ugr")
-        with _server(Path(folder)) as (http_port, grpc_port, pid):
+        with _server(Path(folder), backend) as (http_port, grpc_port, pid):
             doors = [
                 _grpc_stream(grpc_port, poses),
                 _grpc_unary(grpc_port, poses),
@@ -64,12 +64,13 @@ def measure_served(bench: BenchScene, repeats: int) -> Served:
 
 
 @contextmanager
-def _server(folder: Path) -> Iterator[tuple[int, int, int]]:
+def _server(folder: Path, backend: str) -> Iterator[tuple[int, int, int]]:
     http_port, grpc_port = _free_port(), _free_port()
     settings = {
         "ULTRAGRAY_DATA_FOLDER": str(folder),
         "ULTRAGRAY_HTTP_PORT": str(http_port),
         "ULTRAGRAY_GRPC_PORT": str(grpc_port),
+        "ULTRAGRAY_BACKEND": backend,
         "ULTRAGRAY_PRELOAD": SCENE,
         "ULTRAGRAY_LOG_LEVEL": "error",
     }

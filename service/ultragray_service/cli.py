@@ -90,7 +90,8 @@ def serve(
         typer.Option(help="Port of gRPC; 0 takes a free one. [ULTRAGRAY_GRPC_PORT]", show_default="50051"),
     ] = None,
     processes: Annotated[
-        int | None, typer.Option(help="Render processes. [ULTRAGRAY_PROCESSES]", show_default="1")
+        int | None,
+        typer.Option(help="Render processes; 0: one per GPU, on the CPU one. [ULTRAGRAY_PROCESSES]", show_default="0"),
     ] = None,
     threads: Annotated[
         int | None,
@@ -101,7 +102,7 @@ def serve(
     ] = None,
     backend: Annotated[
         str | None,
-        typer.Option(help="auto, cpu or reference. [ULTRAGRAY_BACKEND]", show_default="auto"),
+        typer.Option(help="auto, cpu, cuda or reference. [ULTRAGRAY_BACKEND]", show_default="auto"),
     ] = None,
     log_level: Annotated[
         str | None,
@@ -157,7 +158,7 @@ def render(
             show_default=False,
         ),
     ] = None,
-    backend: Annotated[str, typer.Option(help="auto, cpu or reference.")] = "auto",
+    backend: Annotated[str, typer.Option(help="auto, cpu, cuda or reference.")] = "auto",
     threads: Annotated[int, typer.Option(min=0, help="Render threads; 0: all cores.")] = 0,
 ) -> None:
     """Render frames from poses into one .npz file or a folder of PNGs."""
@@ -274,11 +275,12 @@ def bench(
     ] = None,
     quick: Annotated[bool, typer.Option("--quick", help="Fewer repetitions: a minute instead of several.")] = False,
     train: Annotated[bool, typer.Option("--train", help="Measure a training step and its parts instead.")] = False,
+    backend: Annotated[str, typer.Option(help="cpu, or cuda: the first GPU.")] = "cpu",
 ) -> None:
     """Measure the kernel and the service on this machine and print a table."""
-    from .bench import run_bench, run_training_bench
+    from .bench import chosen_bench
     from .cli_output import check_writable
 
     if output is not None:
         check_writable(output)
-    (run_training_bench if train else run_bench)(output, quick)
+    chosen_bench(backend, train)(output, quick)

@@ -27,6 +27,7 @@ from ultragray.rendering import render, renderer_name
 from ultragray.request import check_image_size, check_outputs
 from ultragray.scene import GaussianScene
 from ultragray_workers.encoding import encode_image
+from ultragray_workers.placement import render_device
 from ultragray_workers.types import Encoding
 
 from .cli_output import check_writable
@@ -57,8 +58,8 @@ class RenderOptions:
 def render_to_files(options: RenderOptions) -> str:
     """Renders and writes; returns one sentence about what was done.
 
-    Raises InvalidArgument and its kind, SceneFileInvalid, BackendUnavailable and OSError; an .npz is then not
-    written.
+    Raises InvalidArgument and its kind, SceneFileInvalid, BackendUnavailable, MemoryExceeded and OSError; an
+    .npz is then not written.
     """
     outputs = check_outputs(options.outputs)
     to_npz = _writes_npz(options.output)
@@ -74,6 +75,7 @@ def render_to_files(options: RenderOptions) -> str:
         raise InvalidArgument("--poses must be given: the scene holds no training poses", field="poses")
     height, width = scene.info.image_size_or(options.height, options.width)
     check_image_size(height, width)
+    scene = scene.to(render_device(options.backend))
     draw = _drawing(options.scan_convert_mm, probe, to_npz)
     if options.threads:
         torch.set_num_threads(options.threads)
@@ -95,7 +97,7 @@ def render_to_files(options: RenderOptions) -> str:
         for start in range(0, len(poses), chunk):
             some = poses[start : start + chunk]
             frames = render(scene, probe, some, height=height, width=width, outputs=outputs, backend=options.backend)
-            add({name: getattr(frames, name).numpy() for name in outputs})
+            add({name: getattr(frames, name).cpu().numpy() for name in outputs})
             advance(len(some))
     elapsed_s = time.perf_counter() - started
     what = f"{len(poses)} frames of {height}x{width}, {', '.join(outputs)}"

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ultragray.errors import InvalidArgument, TrainingDiverged, TrainingStateInvalid
+from ultragray.errors import InvalidArgument, MemoryExceeded, TrainingDiverged, TrainingStateInvalid
 
 from .cli_output import SCENE_SUFFIX, check_writable
 from .cli_source import (
@@ -31,7 +31,7 @@ from .cli_source import (
 
 if TYPE_CHECKING:
     from ultragray.scene import GaussianScene
-    from ultragray.training import TrainingConfig
+    from ultragray.training import Progress, TrainingConfig
 
 INTERRUPTED = 130  # the exit code of a run that Ctrl-C or SIGTERM stopped
 METRIC_NAMES = {"psnr_db": "PSNR, dB", "ms_ssim": "MS-SSIM", "gms": "GMS", "gmsd": "GMSD"}
@@ -90,8 +90,8 @@ def train(
         float, typer.Option(metavar="SECONDS", min=0.0, help="How often a checkpoint is written.")
     ] = 30.0,
     tensorboard: Annotated[bool, typer.Option("--tensorboard", help="Also write TensorBoard events.")] = False,
-    device: Annotated[str, typer.Option(help="cpu, or a device of torch such as cuda.")] = "cpu",
-    backend: Annotated[str, typer.Option(help="auto, cpu or reference.")] = "auto",
+    device: Annotated[str, typer.Option(help="cpu, or a GPU: cuda, or cuda:N for one of several.")] = "cpu",
+    backend: Annotated[str, typer.Option(help="auto (the one for the device), cpu, cuda or reference.")] = "auto",
     threads: Annotated[int, typer.Option(min=0, help="Threads; 0: all cores.")] = 0,
     train_frames: TrainFrames = None,
     val_frames: ValFrames = None,
@@ -210,9 +210,16 @@ def _train(dataset: Any, config: TrainingConfig, run: RunOptions) -> None:
     from ultragray.training.trainer import CHECKPOINT_FILE, scene_of_checkpoint
 
     started = time.monotonic()
+    last: Progress | None = None
     with _stop_on_signal() as should_stop:
         try:
-            with _progress_bar() as report:
+            with _progress_bar() as show:
+
+                def report(state: Progress) -> None:
+                    nonlocal last
+                    last = state
+                    show(state)
+
                 scene = train_scene(
                     dataset,
                     config,
@@ -225,13 +232,15 @@ def _train(dataset: Any, config: TrainingConfig, run: RunOptions) -> None:
                     checkpoint_interval_s=run.checkpoint_interval_s,
                     tensorboard=run.tensorboard,
                 )
-        except TrainingDiverged as error:
+        except (TrainingDiverged, MemoryExceeded) as error:
             if not (run.folder / CHECKPOINT_FILE).exists():
                 raise
             scene = scene_of_checkpoint(dataset, run.folder)
             scene.save(run.output)
             step = scene.info.training["step"]
-            raise TrainingDiverged(f"{error.detail}; {run.output} is the scene after step {step}") from error
+            raise type(error)(
+                f"{error.detail}; {run.output} is the scene after step {step}", field=error.field
+            ) from error
         scene.save(run.output)
     elapsed_s = time.monotonic() - started
     done, steps = scene.info.training["step"], scene.info.training["steps"]
@@ -244,7 +253,14 @@ def _train(dataset: Any, config: TrainingConfig, run: RunOptions) -> None:
         raise typer.Exit(INTERRUPTED)
     (run.folder / CHECKPOINT_FILE).unlink()
     _print_metrics(scene)
-    typer.echo(f"wrote {run.output}: {scene.gaussian_count:,} Gaussians, {done:,} steps, {elapsed_s:.0f} s")
+    cost = "" if last is None else f" ({_cost(last)})"
+    typer.echo(f"wrote {run.output}: {scene.gaussian_count:,} Gaussians, {done:,} steps, {elapsed_s:.0f} s{cost}")
+
+
+def _cost(state: Progress) -> str:
+    """What a step took at the end, and of a GPU's memory the most at a time."""
+    step = f"{1000.0 / state.steps_per_s:.1f} ms a step"
+    return step if state.peak_memory_mb is None else f"{step}, at most {state.peak_memory_mb:,.0f} MB of the GPU"
 
 
 @contextlib.contextmanager

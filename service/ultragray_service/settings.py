@@ -29,14 +29,20 @@ class Settings(BaseSettings):
     data_folder: Path = Field(Path("data"), description="Folder of the scene files (*.ugr). Must exist.")
     preload: Words = Field((), description="Scenes loaded before the service is ready.")
 
-    processes: int = Field(1, ge=1, le=256, description="Render processes.")
+    processes: int = Field(
+        0, ge=0, le=256, description="Render processes; 0: one per GPU that renders, on the CPU one."
+    )
     threads_per_process: int = Field(0, ge=0, le=1024, description="Render threads each; 0: cores // processes.")
-    backend: Literal["auto", "cpu", "reference"] = Field("auto", description="Render backend.")
+    backend: Literal["auto", "cpu", "cuda", "reference"] = Field(
+        "auto", description="Render backend; auto: cuda where there is a GPU, else cpu."
+    )
     queue_limit_frames: int = Field(256, ge=1, le=100_000, description="Frames that may wait; beyond: QUEUE_FULL.")
     max_batch_poses: int = Field(
         16, ge=1, le=MAX_BATCH_POSES, description="Poses of one scene that are rendered together."
     )
-    memory_budget_mb: int = Field(4096, ge=16, le=16_777_216, description="MiB of scenes held by each process.")
+    memory_budget_mb: int = Field(
+        4096, ge=16, le=16_777_216, description="MiB of scenes held by each process, on its GPU if it has one."
+    )
 
     max_poses_per_request: int = Field(1024, ge=1, le=100_000, description="Poses in one request or batch.")
     max_image_side: int = Field(2048, ge=1, le=MAX_IMAGE_SIDE, description="Largest height and width, pixels.")

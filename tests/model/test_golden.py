@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from ultragray import GaussianScene
 from ultragray.rendering import render
 
 FILES = ("g01", "g03", "g05", "g06", "g08")
@@ -21,20 +22,23 @@ FILES = ("g01", "g03", "g05", "g06", "g08")
         ("reference", torch.float32, 5e-4),
         ("reference", torch.float64, 5e-5),
         ("cpu", torch.float32, 5e-4),
+        ("cuda", torch.float32, 5e-4),
         ("auto", torch.float32, 5e-4),
     ],
-    ids=["reference-float32", "reference-float64", "cpu", "auto"],
+    ids=["reference-float32", "reference-float64", "cpu", "cuda", "auto"],
 )
 def test_all_outputs_match(
     golden: Callable[[str], Any],
     assert_agrees: Callable[..., None],
+    on_device: Callable[[GaussianScene], GaussianScene],
     name: str,
     backend: str,
     dtype: torch.dtype,
     tolerance: float,
 ) -> None:
     file = golden(name)
-    frames = render(file.scene(dtype), file.probe, file.poses, height=file.height, width=file.width, backend=backend)
+    scene = on_device(file.scene(dtype)) if backend == "cuda" else file.scene(dtype)
+    frames = render(scene, file.probe, file.poses, height=file.height, width=file.width, backend=backend)
     assert frames.bmode is not None
     assert frames.bmode.dtype == dtype
     assert_agrees(frames, file.expected, tolerance=tolerance, stable=file.stable)

@@ -1,4 +1,4 @@
-"""One suite of gradients for every instruction set: the true gradient of every output, by every parameter."""
+"""One suite of gradients for every backend and instruction set: of every output, by every parameter, the true one."""
 
 from __future__ import annotations
 
@@ -10,12 +10,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from ultragray import ConvexProbe, GaussianScene, LinearProbe, Probe, cpu, render
+from ultragray import ConvexProbe, GaussianScene, LinearProbe, Probe, cpu, cuda, render
 from ultragray.request import OUTPUTS
 
 LINEAR = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)
 CONVEX = ConvexProbe(opening_angle_deg=60.0, near_mm=10.0, far_mm=60.0)
 HEIGHT, WIDTH = 37, 53
+KERNELS = ("cuda", *cpu.INSTRUCTION_SETS)
 
 SCENES: dict[str, tuple[Mapping[str, Any], Probe]] = {
     "linear": ({}, LINEAR),
@@ -40,10 +41,10 @@ def gradients(
     """Of the weighted sum of the outputs, by raw parameter."""
     leaves = {name: tensor.clone().requires_grad_() for name, tensor in scene.splats.items()}
     frames = draw(GaussianScene.from_splats(leaves, info=scene.info))
-    loss = torch.stack([(frames[name] * weight.to(frames[name].dtype)).sum() for name, weight in weights.items()]).sum()
+    loss = torch.stack([(frames[name] * weight.to(frames[name])).sum() for name, weight in weights.items()]).sum()
     loss.backward()
     return {
-        name: np.zeros(tuple(leaf.shape)) if leaf.grad is None else leaf.grad.double().numpy()
+        name: np.zeros(tuple(leaf.shape)) if leaf.grad is None else leaf.grad.cpu().double().numpy()
         for name, leaf in leaves.items()
     }
 
@@ -52,9 +53,19 @@ def by_reference(probe: Probe, poses: Any) -> Callable[[GaussianScene], Mapping[
     return lambda scene: vars(render(scene, probe, poses, height=HEIGHT, width=WIDTH, backend="reference"))
 
 
-def by_kernel(probe: Probe, poses: Any, instruction_set: str) -> Callable[[GaussianScene], Mapping[str, Tensor]]:
+def by_kernel(
+    probe: Probe, poses: Any, kernel: str, height: int = HEIGHT, width: int = WIDTH
+) -> Callable[[GaussianScene], Mapping[str, Tensor]]:
+    """The CUDA backend, which takes the scene's tensors to its device, or an instruction set of the CPU's."""
+    if kernel == "cuda":
+
+        def draw(scene: GaussianScene) -> Mapping[str, Tensor]:
+            there = scene.to(cuda.device())
+            return cuda.render_outputs(there, probe, there.poses_to_scene_cm(poses), height, width, OUTPUTS)
+
+        return draw
     return lambda scene: cpu.render_outputs(
-        scene, probe, scene.poses_to_scene_cm(poses), HEIGHT, WIDTH, OUTPUTS, instruction_set=instruction_set
+        scene, probe, scene.poses_to_scene_cm(poses), height, width, OUTPUTS, instruction_set=kernel
     )
 
 
@@ -94,33 +105,26 @@ def assert_same_direction_and_length(got: Mapping[str, np.ndarray], want: Mappin
             assert np.abs(got[name]).max(initial=0.0) < 1e-6
 
 
-@pytest.mark.parametrize("instruction_set", cpu.INSTRUCTION_SETS)
+@pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize("name", SCENES)
-def test_all_outputs_together(name: str, instruction_set: str, expected: Callable[..., Any]) -> None:
+def test_all_outputs_together(name: str, kernel: str, expected: Callable[..., Any]) -> None:
     scene, probe, poses, weights, want = expected(name, OUTPUTS)
-    assert_same_direction_and_length(gradients(scene, weights, by_kernel(probe, poses, instruction_set)), want)
+    assert_same_direction_and_length(gradients(scene, weights, by_kernel(probe, poses, kernel)), want)
 
 
+@pytest.mark.parametrize("kernel", ["cuda", "auto"])
 @pytest.mark.parametrize("output", OUTPUTS)
 @pytest.mark.parametrize("name", ["linear", "convex", "shadows"])
-def test_each_output_alone(name: str, output: str, expected: Callable[..., Any]) -> None:
+def test_each_output_alone(name: str, output: str, kernel: str, expected: Callable[..., Any]) -> None:
     scene, probe, poses, weights, want = expected(name, (output,))
-    assert_same_direction_and_length(gradients(scene, weights, by_kernel(probe, poses, "auto")), want)
+    assert_same_direction_and_length(gradients(scene, weights, by_kernel(probe, poses, kernel)), want)
 
 
-@pytest.mark.parametrize("instruction_set", cpu.INSTRUCTION_SETS)
-def test_golden_gradient(golden: Callable[[str], Any], instruction_set: str) -> None:
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_golden_gradient(golden: Callable[[str], Any], kernel: str) -> None:
     file = golden("g05")
     scene = file.scene(torch.float32)
-    draw = lambda s: cpu.render_outputs(  # noqa: E731
-        s,
-        file.probe,
-        s.poses_to_scene_cm(file.poses),
-        file.height,
-        file.width,
-        ("bmode",),
-        instruction_set=instruction_set,
-    )
+    draw = by_kernel(file.probe, file.poses, kernel, file.height, file.width)
     got = gradients(scene, {"bmode": torch.from_numpy(file.arrays["G"])}, draw)
     for name, gradient in got.items():
         want = file.arrays[f"true_grad_{name}"]

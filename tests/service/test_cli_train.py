@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -68,7 +69,7 @@ def test_trains_a_scene(dataset: Path, tmp_path: Path) -> None:
     assert scene.info.probe == LinearProbe(width_mm=20.0, near_mm=0.0, far_mm=25.0)
     assert scene.info.training["step"] == 24
     assert f"{scene.info.metrics['psnr_db']:.2f}" in result.stdout
-    assert f"wrote {output}: 60 Gaussians, 24 steps" in result.stdout
+    assert re.search(rf"wrote {output}: 60 Gaussians, 24 steps, \d+ s \(\d+\.\d ms a step\)\n", result.stdout)
     assert sum(line.startswith("step ") for line in result.stderr.splitlines()) == 10
     folder = tmp_path / "scene.ugr.run"
     assert sorted(path.name for path in folder.iterdir()) == ["config.json", "metrics.jsonl"]
@@ -110,10 +111,44 @@ def test_mistakes_give_one_line(dataset: Path, tmp_path: Path) -> None:
     assert "steps must be between 1 and" in refused(dataset, "-o", output, "--steps", 0)
     assert "no checkpoint to resume from" in refused(dataset, "-o", output, "--resume")
     assert "output must end in .ugr, got 'scene.txt'" in refused(dataset, "-o", tmp_path / "scene.txt")
-    assert "backend must be one of" in refused(dataset, "-o", output, *SMALL, "--backend", "cuda")
+    assert "backend must be one of" in refused(dataset, "-o", output, *SMALL, "--backend", "gpu")
+    assert "device must be cpu, cuda or cuda:N" in refused(dataset, "-o", output, *SMALL, "--device", "gpu")
     assert "GiB: lower max_gaussians" in refused(dataset, "-o", output, *SMALL, "--set", "memory_gb=0.01")
     assert not output.exists()
     assert not (tmp_path / "scene.ugr.run").exists()
+
+
+@pytest.mark.parametrize("options", [("--device", "cuda"), ("--backend", "cuda"), ("--device", "cuda:7")])
+def test_says_what_is_missing_without_a_gpu(
+    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: tuple[str, str]
+) -> None:
+    monkeypatch.delenv("TRITON_INTERPRET", raising=False)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    told = refused(dataset, "-o", tmp_path / "scene.ugr", *SMALL, *options)
+    assert "backend cuda needs an NVIDIA GPU and torch's CUDA build, but" in told
+    assert not (tmp_path / "scene.ugr.run").exists()
+
+
+def test_running_out_of_memory_leaves_the_last_good_scene(
+    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    true_loss, calls = trainer.image_loss, 0
+
+    def loss_that_runs_out(rendered: torch.Tensor, truth: torch.Tensor) -> Any:
+        nonlocal calls
+        calls += 1
+        if calls == 6:
+            raise torch.OutOfMemoryError("CUDA out of memory.")
+        return true_loss(rendered, truth)
+
+    monkeypatch.setattr(trainer, "image_loss", loss_that_runs_out)
+    output = tmp_path / "scene.ugr"
+    told = refused(dataset, "-o", output, *SMALL, "--checkpoint-every", 0)
+    assert "did not suffice after step 5 with 60 Gaussians" in told
+    assert f"lower max_gaussians or batch_size; the last good checkpoint is kept in {output}.run" in told
+    assert f"{output} is the scene after step 5" in told
+    assert GaussianScene.load(output).info.training["step"] == 5
+    assert run(dataset, "-o", output, "--resume").exit_code == 0
 
 
 def start(*arguments: object) -> subprocess.Popen[str]:

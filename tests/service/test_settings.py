@@ -24,6 +24,7 @@ def test_defaults() -> None:
     assert (settings.host, settings.http_port, settings.grpc_port) == ("127.0.0.1", 8000, 50051)
     assert settings.max_poses_per_request == 1024
     assert settings.max_body_bytes == 8 * 2**20
+    assert (settings.processes, settings.backend) == (0, "auto")
 
 
 @pytest.mark.parametrize(
@@ -31,7 +32,7 @@ def test_defaults() -> None:
     [
         ("http_port", "65536"),
         ("http_port", "eighty"),
-        ("processes", "0"),
+        ("processes", "-1"),
         ("default_timeout_s", "0"),
         ("max_image_side", "99999"),
         ("max_batch_poses", "0"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 
 from ultragray_workers import Encoding
@@ -19,6 +20,13 @@ def test_pixels_are_little_endian_and_contiguous():
     frames = np.arange(12, dtype=np.float32).reshape(2, 2, 3)[:, :, ::2]
     assert encode_pixels(frames, Encoding.FLOAT32).data.cast("B")[4:8].tobytes() == np.float32(2).tobytes()
     assert encode_pixels(frames, Encoding.UINT8).tolist() == [[[0, 255], [255, 255]], [[255, 255], [255, 255]]]
+
+
+def test_bytes_are_taken_as_they_are():
+    """A GPU has rounded them already."""
+    frame = np.array([[0, 1], [254, 255]], np.uint8)
+    assert encode_pixels(frame[None], Encoding.UINT8).tolist() == [frame.tolist()]
+    assert cv2.imdecode(encode_image(frame, Encoding.PNG), cv2.IMREAD_UNCHANGED).tolist() == frame.tolist()
 
 
 def test_one_by_one_images():

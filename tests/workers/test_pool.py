@@ -32,7 +32,7 @@ from ultragray_workers import Encoding, PoolConfig, Priority, RenderPool, Render
 def test_results_equal_a_direct_render(run, open_pool, random_poses, expect_frames, scene_folder):
     convex = ConvexProbe(opening_angle_deg=60.0, near_mm=5.0, far_mm=40.0)
     one_frame = RenderRequest("a", random_poses(1))
-    many = RenderRequest("b", random_poses(5), probe=convex, height=20, width=17, outputs=("coverage", "bmode"))
+    many = RenderRequest("b", random_poses(11), probe=convex, height=20, width=17, outputs=("coverage", "bmode"))
     requests = [replace(one_frame, encoding=encoding) for encoding in Encoding]
     requests += [replace(many, encoding=encoding) for encoding in Encoding if not encoding.is_image_file]
 
@@ -42,7 +42,7 @@ def test_results_equal_a_direct_render(run, open_pool, random_poses, expect_fram
 
     in_one_go, in_parts = run(main(32)), run(main(2))
     for request, whole, result in zip(requests, in_one_go, in_parts, strict=True):
-        assert (whole.batch_size, result.batch_size) == ((1, 1) if len(request.poses) == 1 else (5, 2))
+        assert (whole.batch_size, result.batch_size) == ((1, 1) if len(request.poses) == 1 else (11, 2))
         assert request.encoding is Encoding.NPZ or whole.data == result.data
         expect_frames(request, whole)
         expect_frames(request, result)
@@ -311,7 +311,7 @@ def test_a_start_that_is_cancelled_leaves_no_process(run, scene_folder, processe
     run(main())
 
 
-@pytest.mark.parametrize("settings", [{"processes": 0}, {"max_batch_poses": 1000}, {"queue_limit_frames": 0}])
+@pytest.mark.parametrize("settings", [{"processes": -1}, {"max_batch_poses": 1000}, {"queue_limit_frames": 0}])
 def test_impossible_sizes_are_refused(settings):
     with pytest.raises(InvalidArgument, match=next(iter(settings))):
         PoolConfig(**settings)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 from collections.abc import Awaitable, Iterable
+from dataclasses import replace
 
 from ultragray.errors import RenderFailed, UltragrayError
 
@@ -24,14 +25,27 @@ class SceneChangedError(Exception):
 class Dispatcher:
     """The worker processes and the queue before them, in the event loop's thread."""
 
-    def __init__(self, launcher: Launcher, settings: ForkWorker, processes: int, waiting: WaitingQueue) -> None:
-        self.slots = [Slot(launcher, settings, self) for _ in range(processes)]
+    def __init__(self, launcher: Launcher, settings: ForkWorker, waiting: WaitingQueue) -> None:
+        self.slots: list[Slot] = []
+        self._launcher = launcher
+        self._settings = settings
         self._waiting = waiting
         self._memories = MemoryPool()
 
     async def start(self) -> None:
-        """Returns when every process has rendered a frame. Raises BackendUnavailable, RenderFailed."""
-        await _all([slot.start() for slot in self.slots])
+        """Returns when every process has rendered a frame. Raises BackendUnavailable, RenderFailed.
+
+        The first one tells how many GPUs there are, and leaves compiled kernels where the others find them.
+        """
+        first = self._add_slot()
+        await first.start()
+        processes = self._settings.processes or max(1, first.gpus)
+        await _all([self._add_slot().start() for _ in range(1, processes)])
+
+    def _add_slot(self) -> Slot:
+        slot = Slot(self._launcher, replace(self._settings, number=len(self.slots)), self)
+        self.slots.append(slot)
+        return slot
 
     def submit(self, ticket: Ticket) -> None:
         """Queues a ticket; `ticket.done` tells when its frames lie in its memory. Raises QueueFull."""

@@ -18,22 +18,25 @@ JPEG_QUALITY = 90
 
 FrameArray = npt.NDArray[np.float32]
 ByteArray = npt.NDArray[np.uint8]
+PixelArray = npt.NDArray[Any]  # float32 as rendered, or uint8 as a GPU has rounded it
 
 
-def to_uint8(frames: FrameArray) -> ByteArray:
-    """round(255·min(x, 1)), the same shape; no output of a renderer is negative."""
+def to_uint8(frames: PixelArray) -> ByteArray:
+    """round(255·min(x, 1)), half to even, the same shape; no output of a renderer is negative."""
+    if frames.dtype == np.uint8:
+        return frames
     rows = frames.reshape(-1, frames.shape[-1])
     return cv2.convertScaleAbs(rows, alpha=255.0).astype(np.uint8, copy=False).reshape(frames.shape)
 
 
-def encode_pixels(frames: FrameArray, encoding: Encoding) -> npt.NDArray[np.generic]:  # [C, H, W] -> [C, H, W]
+def encode_pixels(frames: PixelArray, encoding: Encoding) -> npt.NDArray[np.generic]:  # [C, H, W] -> [C, H, W]
     """Frames in the pixel type of an encoding, C order, little endian."""
     pixel_type = encoding.pixel_type
     pixels: npt.NDArray[Any] = to_uint8(frames) if pixel_type == np.uint8 else frames
     return np.ascontiguousarray(pixels, dtype=pixel_type)
 
 
-def encode_image(frame: FrameArray, encoding: Encoding) -> ByteArray:  # [H, W] -> [bytes]
+def encode_image(frame: PixelArray, encoding: Encoding) -> ByteArray:  # [H, W] -> [bytes]
     """A frame as the bytes of a grey PNG (at OpenCV's default settings) or JPEG file."""
     suffix, options = (".png", []) if encoding is Encoding.PNG else (".jpg", [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     written, data = cv2.imencode(suffix, to_uint8(frame), options)
@@ -44,7 +47,7 @@ def encode_image(frame: FrameArray, encoding: Encoding) -> ByteArray:  # [H, W] 
 
 def write_npz(
     file: BinaryIO,
-    frames: Mapping[str, FrameArray],  # each [C, H, W]
+    frames: Mapping[str, PixelArray],  # each [C, H, W] float32
     poses: FloatArray,  # [C, 4, 4] mm
     *,
     scene: str,

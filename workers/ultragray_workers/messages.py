@@ -15,7 +15,9 @@ class ForkWorker:
     """To a template process: fork a worker that serves the channel sent along."""
 
     backend: str
-    threads: int
+    number: int  # of its place in the pool, from 0: tells which GPU it takes
+    processes: int  # in the pool; 0: one per GPU, or one
+    threads: int  # 0: the cores this process may use, divided by the number of processes
     memory_budget_bytes: int
 
 
@@ -29,6 +31,7 @@ class Hello:
     """A child's first message: it is ready, or it cannot work because of `error`."""
 
     pid: int
+    gpus: int = 0  # that the pool's scenes could lie on; 0 where they are rendered on the CPU
     error: UltragrayError | None = None
 
 

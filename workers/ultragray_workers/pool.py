@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import os
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -38,16 +37,16 @@ _READ_IN_THREAD_BYTES = 2**20
 class PoolConfig:
     """Sizes of a pool. Raises InvalidArgument for values that no pool can have."""
 
-    processes: int = 1
-    threads_per_process: int = 0  # 0: the cores this process may use, divided by `processes`
+    processes: int = 0  # 0: one per GPU that renders; on the CPU one
+    threads_per_process: int = 0  # 0: the cores this process may use, divided by the number of processes
     queue_limit_frames: int = 256  # poses that may wait, for each priority
     max_batch_poses: int = 16  # rendered together; fewer for images of more than 512x512 pixels
-    memory_budget_bytes: int = 4 * 2**30  # of loaded scenes, per process
+    memory_budget_bytes: int = 4 * 2**30  # of loaded scenes, per process, where they are rendered
     backend: str = "auto"
 
     def __post_init__(self) -> None:
         limits = {
-            "processes": (1, 1024),
+            "processes": (0, 1024),
             "threads_per_process": (0, 1024),
             "queue_limit_frames": (1, 2**31),
             "max_batch_poses": (1, MAX_BATCH_POSES),
@@ -56,10 +55,6 @@ class PoolConfig:
         for name, (low, high) in limits.items():
             if not low <= getattr(self, name) <= high:
                 raise InvalidArgument(f"{name} must be from {low} to {high}, got {getattr(self, name)}", field=name)
-
-    @property
-    def threads(self) -> int:
-        return self.threads_per_process or max(1, len(os.sched_getaffinity(0)) // self.processes)
 
 
 @dataclass(frozen=True)
@@ -81,8 +76,13 @@ class RenderPool:
         self._launcher = Launcher()
         self._dispatcher = Dispatcher(
             self._launcher,
-            ForkWorker(backend=config.backend, threads=config.threads, memory_budget_bytes=config.memory_budget_bytes),
-            config.processes,
+            ForkWorker(
+                backend=config.backend,
+                number=0,
+                processes=config.processes,
+                threads=config.threads_per_process,
+                memory_budget_bytes=config.memory_budget_bytes,
+            ),
             self._waiting,
         )
         self._open: set[Ticket] = set()
@@ -112,7 +112,7 @@ class RenderPool:
         """Renders the request as soon as its turn comes; cancelling the caller drops what has not begun.
 
         Raises NotReady, Draining, QueueFull, DeadlineExceeded, InvalidArgument, SceneNotFound,
-        SceneFileInvalid, SceneTooLarge, RenderFailed.
+        SceneFileInvalid, SceneTooLarge, MemoryExceeded, RenderFailed.
         """
         self._check_accepting()
         self._active += 1
@@ -136,7 +136,7 @@ class RenderPool:
                 self._all_answered.set()
 
     async def load(self, scene: str) -> None:
-        """Loads a scene in every process. Raises SceneNotFound, SceneFileInvalid, SceneTooLarge."""
+        """Loads a scene in every process. Raises SceneNotFound, SceneFileInvalid, SceneTooLarge, MemoryExceeded."""
         self._check_accepting()
         path = self._store.path(scene)
         await self._dispatcher.command_all(LoadJob(scene, str(path)))

@@ -1,11 +1,14 @@
-"""The scenes a worker process holds: loaded on demand, the least recently used evicted within a memory budget."""
+"""The scenes a worker process holds where it renders them: loaded on demand, the least recently used evicted within a
+memory budget."""
 
 from __future__ import annotations
 
 from collections import OrderedDict
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from ultragray.errors import SceneFileInvalid, SceneTooLarge, UltragrayError
+import torch
+
+from ultragray.errors import MemoryExceeded, SceneFileInvalid, SceneTooLarge, UltragrayError
 from ultragray.files import file_sha256
 from ultragray.scene import GaussianScene
 from ultragray.scene_info import read_header, scene_file_invalid
@@ -25,17 +28,18 @@ class LoadedScene:
 
 
 class SceneCache:
-    """At most `budget_bytes` of scenes, as `resident_bytes` counts them."""
+    """At most `budget_bytes` of scenes on a device, as `resident_bytes` counts them."""
 
-    def __init__(self, budget_bytes: int) -> None:
+    def __init__(self, budget_bytes: int, device: torch.device) -> None:
         self._budget_bytes = budget_bytes
+        self._device = device
         self._scenes: OrderedDict[str, LoadedScene] = OrderedDict()  # least recently used first
 
     def names(self) -> tuple[str, ...]:
         return tuple(self._scenes)
 
     def get(self, name: str, path: str) -> LoadedScene:
-        """The scene of a file as it is now. Raises SceneFileInvalid, SceneTooLarge."""
+        """The scene of a file as it is now. Raises SceneFileInvalid, SceneTooLarge, MemoryExceeded."""
         try:
             version = FileVersion.of(path)
         except OSError as error:
@@ -47,7 +51,7 @@ class SceneCache:
             return held
         self.drop(name)
         self._make_room(name, path)
-        loaded = _load(path)
+        loaded = self._load(name, path)
         self._scenes[name] = loaded
         return loaded
 
@@ -65,11 +69,22 @@ class SceneCache:
         while self._scenes and (self._held_bytes() + needed > self._budget_bytes or len(self._scenes) >= MAX_SCENES):
             self._scenes.popitem(last=False)
 
+    def _load(self, name: str, path: str) -> LoadedScene:
+        loaded = _read(path)
+        try:
+            return replace(loaded, scene=loaded.scene.to(self._device))
+        except torch.OutOfMemoryError as error:
+            raise MemoryExceeded(
+                f"scene {name!r} of {_megabytes(loaded.bytes)} does not fit into the free memory of {self._device}; "
+                f"the memory budget for scenes is {_megabytes(self._budget_bytes)}, a lower one leaves more room",
+                field="scene",
+            ) from error
+
     def _held_bytes(self) -> int:
         return sum(loaded.bytes for loaded in self._scenes.values())
 
 
-def _load(path: str) -> LoadedScene:
+def _read(path: str) -> LoadedScene:
     """Tensors and hash of the same bytes: read again when the file changed in between."""
     for _ in range(_READ_ATTEMPTS):
         version = _version(path)

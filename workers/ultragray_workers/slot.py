@@ -59,6 +59,7 @@ class Slot:
         self.resident: tuple[str, ...] = ()  # scenes its worker holds
         self.commands: deque[Command] = deque()
         self.replacements = 0
+        self.gpus = 0  # that its worker found
         self._launcher = launcher
         self._settings = settings
         self._listener = listener
@@ -127,6 +128,7 @@ class Slot:
             if message.error is not None:
                 self._start_error = message.error  # the process exits now
                 return
+            self.gpus = message.gpus
             self._greeted = True
             self._failed_starts = 0
             self._settled.set()

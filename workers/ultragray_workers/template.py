@@ -1,13 +1,14 @@
 """The template process: has torch imported and waits, so that a new worker takes a fork and not an import.
 
-It never renders and has one thread, which is what makes forking it safe. Every process it forks, a worker or
-another template, serves the channel sent along with the request.
+It never renders, never touches a GPU (a CUDA context does not survive a fork) and has one thread, which is what makes
+forking it safe. Every process it forks, a worker or another template, serves the channel sent along with the request.
 """
 
 from __future__ import annotations
 
 import contextlib
 import gc
+import importlib
 import os
 import signal
 import traceback
@@ -23,8 +24,13 @@ def main(channel_descriptor: int) -> NoReturn:
     for number in (signal.SIGINT, signal.SIGTERM):  # meant for the service, which drains and then hangs up
         signal.signal(number, signal.SIG_IGN)
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # no zombies
-    from .worker import run_worker  # after the signals: importing torch takes seconds
+    import torch  # after the signals: it takes seconds
 
+    from .worker import run_worker
+
+    if torch.version.cuda is not None:
+        with contextlib.suppress(ImportError):
+            importlib.import_module("triton")  # a third of a second less for each worker with a GPU
     gc.collect()
     gc.freeze()  # keeps the collector of each fork from touching, and so copying, these pages
     channel = Channel.from_descriptor(channel_descriptor)

@@ -11,17 +11,19 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
-from ultragray import GaussianScene, LinearProbe, Probe, render
-from ultragray.errors import RenderFailed, UltragrayError
+from ultragray import ConvexProbe, GaussianScene, LinearProbe, Probe, cuda, render
+from ultragray.errors import MemoryExceeded, RenderFailed, UltragrayError
 from ultragray.probe import FloatArray
 from ultragray.rendering import renderer_name
 
 from .channel import Channel
-from .encoding import FrameArray, encode_image, encode_pixels, write_npz
+from .encoding import ByteArray, encode_image, encode_pixels, to_uint8, write_npz
 from .memory import write_at
 from .messages import (
     Answer,
@@ -35,10 +37,13 @@ from .messages import (
     RenderPart,
     UnloadJob,
 )
+from .placement import render_device
 from .scene_cache import SceneCache
+from .transfer import CHUNK_POSES, Arriving, Wanted, render_to_host
 from .types import Encoding
 
 MAX_DETAIL_LENGTH = 2000
+_SMALL_PROBES = (LinearProbe(width_mm=10.0, near_mm=0.0, far_mm=10.0), ConvexProbe(60.0, near_mm=5.0, far_mm=10.0))
 
 logger = logging.getLogger(__name__)
 
@@ -47,15 +52,14 @@ def run_worker(channel: Channel, settings: ForkWorker) -> None:
     """Serves the channel until the service hangs up or dies."""
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     threading.Thread(target=_exit_with_service, args=(channel.fileno(),), daemon=True).start()
-    torch.set_num_threads(settings.threads)
     torch.set_grad_enabled(False)
-    worker = _Worker(channel, settings)
     try:
+        worker = _Worker(channel, settings)
         worker.warm_up()
     except Exception as error:
         channel.send(Hello(os.getpid(), error=_as_reported(error)))
         return
-    channel.send(Hello(os.getpid()))
+    channel.send(Hello(os.getpid(), gpus=worker.gpus))
     while True:
         try:
             job, descriptors = channel.receive()
@@ -76,14 +80,21 @@ class _Worker:
     def __init__(self, channel: Channel, settings: ForkWorker) -> None:
         self._channel = channel
         self._backend = settings.backend
-        self._scenes = SceneCache(settings.memory_budget_bytes)
+        self._device = render_device(settings.backend, settings.number)
+        self.gpus = cuda.device_count() if self._device.type == "cuda" else 0
+        if self.gpus:
+            torch.cuda.set_device(self._device)  # kernels are launched on the current one
+        processes = settings.processes or max(1, self.gpus)
+        torch.set_num_threads(settings.threads or max(1, len(os.sched_getaffinity(0)) // processes))
+        self._scenes = SceneCache(settings.memory_budget_bytes, self._device)
 
     def warm_up(self) -> None:
-        """Renders and encodes a small frame, so that the first request does not pay for first uses."""
+        """Renders and encodes small frames, so that the first request does not pay for first uses."""
         shapes = {"means": (1, 3), "scales": (1, 3), "transmittances": (1,), "sh0": (1, 1, 1)}
         splats = {name: torch.zeros(shape) for name, shape in shapes.items()} | {"quats": torch.ones(1, 4)}
-        frames = self._render_small(GaussianScene.from_splats(splats))
-        encode_image(frames["bmode"][0], Encoding.PNG)
+        scene = GaussianScene.from_splats(splats).to(self._device)
+        for probe in _SMALL_PROBES:
+            encode_image(self._render_small(scene, probe), Encoding.PNG)
 
     def do(self, job: Job, descriptors: list[int]) -> None:
         """Does one job and answers it, whatever happens."""
@@ -105,7 +116,8 @@ class _Worker:
             if isinstance(job, PackJob):
                 return _pack(job, *descriptors)
             if isinstance(job, LoadJob):
-                self._render_small(self._scenes.get(job.scene, job.path).scene)  # lets the kernel prepare the scene
+                # lets the kernel prepare the scene
+                self._render_small(self._scenes.get(job.scene, job.path).scene, _SMALL_PROBES[0])
             else:
                 self._scenes.drop(job.scene)
         except Exception as error:
@@ -119,15 +131,20 @@ class _Worker:
         except Exception as error:
             yield from [_as_reported(error)] * len(job.parts)
             return
-        outputs = tuple(dict.fromkeys(name for part in job.parts for name in part.outputs))
         poses = np.concatenate([part.poses for part in job.parts])  # [C, 4, 4]
+        wanted: dict[str, set[np.dtype[Any]]] = {}
+        for part in job.parts:
+            for name in part.outputs:
+                wanted.setdefault(name, set()).add(part.encoding.pixel_type)
         started = time.monotonic()
+        frames = None
         try:
-            frames = self._render(loaded.scene, job.probe, poses, job.height, job.width, outputs)
+            frames = self._render(loaded.scene, job.probe, poses, job.height, job.width, wanted)
         except Exception as error:
             if len(job.parts) == 1:
                 yield _as_reported(error)
                 return
+        if frames is None:  # out of the handler: the error holds on to memory of the GPU
             for part, memory in zip(job.parts, memories, strict=True):  # alone: it may be one that fails
                 yield from self._render_parts(replace(job, parts=(part,)), [memory])
             return
@@ -141,11 +158,8 @@ class _Worker:
         )
         begin = 0
         for part, memory in zip(job.parts, memories, strict=True):
-            end = begin + len(part.poses)
-            yield _write_part(
-                job.scene, part, {name: frames[name][begin:end] for name in part.outputs}, memory, rendered
-            )
-            begin = end
+            yield _write_part(job.scene, part, frames, begin, memory, rendered)
+            begin += len(part.poses)
 
     def _render(
         self,
@@ -154,50 +168,71 @@ class _Worker:
         poses: FloatArray,  # [C, 4, 4] mm
         height: int,
         width: int,
-        outputs: tuple[str, ...],
-    ) -> dict[str, FrameArray]:  # each [C, H, W]
-        frames = render(scene, probe, poses, height=height, width=width, outputs=outputs, backend=self._backend)
-        return {name: getattr(frames, name).to("cpu", torch.float32).numpy() for name in outputs}
+        wanted: Wanted,
+    ) -> Arriving:
+        def shoot(some: FloatArray) -> dict[str, Tensor]:  # [C, 4, 4] -> each [C, H, W]
+            frames = render(scene, probe, some, height=height, width=width, outputs=outputs, backend=self._backend)
+            return {name: getattr(frames, name) for name in outputs}
 
-    def _render_small(self, scene: GaussianScene) -> dict[str, FrameArray]:  # each [1, 16, 16]
-        probe = LinearProbe(width_mm=10.0, near_mm=0.0, far_mm=10.0)
-        return self._render(scene, probe, np.eye(4)[None], 16, 16, ("bmode",))
+        outputs = tuple(wanted)
+        try:
+            return render_to_host(shoot, poses, wanted, self._device)
+        except torch.OutOfMemoryError as error:
+            raise MemoryExceeded(
+                f"{len(poses)} frames of {height}x{width} pixels ({', '.join(outputs)}) do not fit into the free "
+                f"memory of {self._device}; ask for fewer or smaller ones"
+            ) from error
+
+    def _render_small(self, scene: GaussianScene, probe: Probe) -> ByteArray:  # [16, 16]
+        pixel_type = Encoding.UINT8.pixel_type
+        frames = self._render(scene, probe, np.eye(4)[None], 16, 16, {"bmode": {pixel_type}})
+        return to_uint8(frames.take("bmode", pixel_type, 0, 1)[0])
 
 
 def _write_part(
     scene: str,
     part: RenderPart,
-    frames: dict[str, FrameArray],  # each [C, H, W]
+    frames: Arriving,  # of a batch that holds the part from its pose `begin` on
+    begin: int,
     memory: int,
     rendered: Rendered,
 ) -> Rendered | UltragrayError:
     """Encodes a part into its request's memory: a whole file, or its share of the pixels."""
-    started = time.monotonic()
+    started, waited_ms = time.monotonic(), frames.waited_ms
+    pixel_type, end = part.encoding.pixel_type, begin + len(part.poses)
     try:
         if part.encoding.is_image_file:
-            image = encode_image(frames[part.outputs[0]][0], part.encoding)
+            image = encode_image(frames.take(part.outputs[0], pixel_type, begin, end)[0], part.encoding)
             write_at(memory, image.data, 0)
             size = image.nbytes
         elif part.encoding is Encoding.NPZ and len(part.poses) == part.total:
             with os.fdopen(os.dup(memory), "wb") as file:
                 size = write_npz(
                     file,
-                    frames,
+                    {name: frames.take(name, pixel_type, begin, end) for name in part.outputs},
                     part.poses,
                     scene=scene,
                     scene_sha256=rendered.scene_sha256,
                     renderer=rendered.renderer,
                 )
         else:
-            size = 0
-            for number, name in enumerate(part.outputs):
-                pixels = encode_pixels(frames[name], part.encoding)
-                frame_bytes = pixels[0].nbytes
-                write_at(memory, pixels.data.cast("B"), (number * part.total + part.first) * frame_bytes)
-                size += part.total * frame_bytes
+            for first in range(begin, end, CHUNK_POSES):  # each is written while the next one arrives
+                for number, name in enumerate(part.outputs):
+                    pixels = encode_pixels(
+                        frames.take(name, pixel_type, first, min(first + CHUNK_POSES, end)), part.encoding
+                    )
+                    place = number * part.total + part.first + first - begin
+                    write_at(memory, pixels.data.cast("B"), place * pixels[0].nbytes)
+            size = len(part.outputs) * part.total * pixels[0].nbytes
     except Exception as error:
         return _as_reported(error)
-    return replace(rendered, size=size, encode_ms=_since_ms(started))
+    waiting_ms = frames.waited_ms - waited_ms
+    return replace(
+        rendered,
+        size=size,
+        render_ms=rendered.render_ms + frames.waited_ms,
+        encode_ms=_since_ms(started) - waiting_ms,
+    )
 
 
 def _pack(job: PackJob, pixels_memory: int, archive_memory: int) -> Rendered:
@@ -229,8 +264,13 @@ def _pack(job: PackJob, pixels_memory: int, archive_memory: int) -> Rendered:
 
 
 def _as_reported(error: Exception) -> UltragrayError:
-    """The error as the service gets it: ours as they are, all others as RenderFailed and in the log."""
+    """The error as the service gets it: ours as they are, all others as RenderFailed and in the log.
+
+    Raises the CUDA error that has cost this process its GPU: a new process gets it back.
+    """
     if not isinstance(error, UltragrayError):
+        if torch.cuda.is_initialized():  # type: ignore[no-untyped-call]
+            torch.cuda.synchronize()
         logger.error("rendering failed", exc_info=error)
         return RenderFailed(f"rendering failed: {type(error).__name__}: {error}"[:MAX_DETAIL_LENGTH])
     if len(error.detail) > MAX_DETAIL_LENGTH:  # such as the tensor names of a hostile file

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ..probe import FloatArray, Probe
 from ..scene import GaussianScene
-from .device import available, device, device_count, interpreted, renderer, require, supports
+from .device import available, device, device_count, interpreted, renderer, require, supports, upload
 
 __all__ = [
     "available",
@@ -22,6 +22,7 @@ __all__ = [
     "renderer",
     "require",
     "supports",
+    "upload",
 ]
 
 

@@ -6,6 +6,7 @@ import importlib.util
 import os
 
 import torch
+from torch import Tensor
 
 from ..errors import BackendUnavailable
 from ..scene import GaussianScene
@@ -65,9 +66,14 @@ def supports(scene: GaussianScene) -> bool:
     return scene.means.device.type == wanted and scene.means.dtype == torch.float32 and available()
 
 
-def renderer() -> str:
-    """What renders, as frames say it: `cuda-sm90`."""
+def upload(tensor: Tensor, device: torch.device) -> Tensor:
+    """A tensor of the CPU on the device, without waiting for what the device still has to do."""
+    return tensor.pin_memory().to(device, non_blocking=True) if device.type == "cuda" else tensor
+
+
+def renderer(device: torch.device) -> str:
+    """What renders on a device, as frames say it: `cuda-sm90`."""
     if interpreted():
         return "cuda-interpreted"
-    major, minor = torch.cuda.get_device_capability()
+    major, minor = torch.cuda.get_device_capability(device)
     return f"cuda-sm{major}{minor}"

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, TypeVar
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -13,11 +13,10 @@ from ..errors import MemoryExceeded
 from ..probe import FloatArray, Probe
 from ..scene import PARAMETERS, GaussianScene
 from ..spatial_order import spatial_order
-from .launch import Gaussians, Geometry, bytes_per_pose, cut, differentiate, draw, view_table
+from .device import upload
+from .launch import Gaussians, Geometry, bytes_per_pose, cut, differentiate, draw, launching, view_table
 
 WORKSPACE_BYTES = 1 << 30  # of slices and planes; poses beyond it are rendered in a further round
-
-Result = TypeVar("Result")
 
 
 def render_frames(
@@ -30,19 +29,21 @@ def render_frames(
 ) -> dict[str, Tensor]:  # [C, H, W] each
     """See `ultragray.cuda.render_outputs`."""
     geometry = Geometry.of(probe, height, width)
-    device = scene.means.device
-    views = torch.from_numpy(view_table(probe, poses_cm, height)).to(device, non_blocking=True)
-    if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in scene.splats.values()):
-        frames = within_memory(
-            lambda: _Render.apply(  # type: ignore[no-untyped-call]
-                scene.info.intensity, geometry, views, tuple(outputs), *scene.splats.values()
-            ),
-            scene,
-            geometry,
-            len(views),
-        )
-        return dict(zip(outputs, frames, strict=True))
-    return within_memory(lambda: _render(_sorted(scene), geometry, views, outputs), scene, geometry, len(views))
+    views = upload(torch.from_numpy(view_table(probe, poses_cm, height)), scene.means.device)
+    try:
+        with launching(scene.means.device):
+            if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in scene.splats.values()):
+                frames = _Render.apply(  # type: ignore[no-untyped-call]
+                    scene.info.intensity, geometry, views, tuple(outputs), *scene.splats.values()
+                )
+                return dict(zip(outputs, frames, strict=True))
+            return _render(sorted_gaussians(scene), geometry, views, outputs)
+    except torch.OutOfMemoryError as error:
+        torch.cuda.empty_cache()
+        raise MemoryExceeded(
+            f"the memory of {scene.means.device} does not suffice for {len(views)} frames of {height}x{width} pixels "
+            f"from {len(scene.means):,} Gaussians: ask for fewer or smaller frames at once",
+        ) from error
 
 
 def _render(gaussians: Gaussians, geometry: Geometry, views: Tensor, outputs: Sequence[str]) -> dict[str, Tensor]:
@@ -54,18 +55,6 @@ def _render(gaussians: Gaussians, geometry: Geometry, views: Tensor, outputs: Se
     if len(rounds) == 1:
         return rounds[0]
     return {name: torch.cat([frames[name] for frames in rounds]) for name in outputs}
-
-
-def within_memory(render: Callable[[], Result], scene: GaussianScene, geometry: Geometry, poses: int) -> Result:
-    """What `render` gives. Raises MemoryExceeded for torch's own error, and gives back what torch keeps in reserve."""
-    try:
-        return render()
-    except torch.OutOfMemoryError as error:
-        torch.cuda.empty_cache()
-        raise MemoryExceeded(
-            f"the memory of {scene.means.device} does not suffice for {poses} frames of {geometry.height}x"
-            f"{geometry.width} pixels from {len(scene.means):,} Gaussians: ask for fewer or smaller frames at once",
-        ) from error
 
 
 class _Render(torch.autograd.Function):
@@ -92,7 +81,8 @@ class _Render(torch.autograd.Function):
             if gradient is not None
         }
         gaussians, views, geometry, slices, planes = ctx.recorded
-        found = differentiate(gaussians, views, geometry, slices, planes, given)
+        with launching(gaussians.means.device):
+            found = differentiate(gaussians, views, geometry, slices, planes, given)
         return (None, None, None, None, *found.values())
 
 
@@ -105,7 +95,7 @@ class _Kept(NamedTuple):
     gaussians: Gaussians
 
 
-def _sorted(scene: GaussianScene) -> Gaussians:
+def sorted_gaussians(scene: GaussianScene) -> Gaussians:
     """The scene's Gaussians along a space-filling curve, kept with the scene until one of its tensors changes.
 
     A change that torch does not count (through `.data`) is not noticed.

@@ -5,8 +5,9 @@ Nothing here waits for the device: sizes are known beforehand, so a CUDA graph c
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -22,8 +23,6 @@ from .kernels.drawing import draw_tiles, finish_frames
 from .kernels.gathering import differentiate_pixels, gather_slices
 from .kernels.placing import place_gradients
 from .kernels.slicing import slice_gaussians
-
-_quiet = np.errstate(all="ignore")  # interpreted kernels warn of infinities, where a GPU just has them
 
 OUTPUTS = ("bmode", "echo", "transmittance", "coverage")
 
@@ -61,6 +60,14 @@ INTERPRETER_SHAPES = Shapes(
     pixel_rows=512,
     pixel_columns=512,
 )
+
+
+@contextlib.contextmanager
+def launching(device: torch.device) -> Iterator[None]:
+    """What every launch needs around it: Triton launches on the current device, and interpreted kernels warn of
+    infinities, where a GPU just has them."""
+    with torch.cuda.device(device) if device.type == "cuda" else np.errstate(all="ignore"):
+        yield
 
 
 class Geometry(NamedTuple):
@@ -154,7 +161,6 @@ def shapes() -> Shapes:
     return INTERPRETER_SHAPES if interpreted() else GPU_SHAPES
 
 
-@_quiet
 def cut(gaussians: Gaussians, views: Tensor, geometry: Geometry, *, record: bool) -> Slices:
     """Slices of every pose of `views` [C, VIEW] float64."""
     how, device = shapes(), gaussians.means.device
@@ -196,7 +202,6 @@ def cut(gaussians: Gaussians, views: Tensor, geometry: Geometry, *, record: bool
     return made
 
 
-@_quiet
 def draw(slices: Slices, geometry: Geometry, outputs: Sequence[str], *, keep: bool) -> tuple[dict[str, Tensor], Planes]:
     """The outputs by name, each [C, H, W], and the planes beneath them, T among these where it is to be kept."""
     how, device = shapes(), slices.slices.device
@@ -248,7 +253,6 @@ def draw(slices: Slices, geometry: Geometry, outputs: Sequence[str], *, keep: bo
     return frames, planes
 
 
-@_quiet
 def differentiate(
     gaussians: Gaussians,
     views: Tensor,

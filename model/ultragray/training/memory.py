@@ -1,7 +1,7 @@
 """The memory that a training will need at its largest, known before it starts.
 
-For the backend `cpu`; `reference` keeps a graph of [H, W] for every Gaussian that a frame touches, which nobody can
-foresee. On another device than the CPU what is said here is taken there for the most part.
+The machine's for the backend `cpu`, the GPU's where that trains; `reference` keeps a graph of [H, W] for every
+Gaussian that a frame touches, which nobody can foresee.
 """
 
 from __future__ import annotations
@@ -9,9 +9,11 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+import torch
+
 from ..datasets.sweep import Dataset
 from ..errors import MemoryExceeded
-from ..evaluation import CHUNK_PIXELS
+from ..evaluation import CHUNK_PIXELS, frames_at_once
 from .config import TrainingConfig
 from .sampling import PREDICTED_PIXELS
 
@@ -23,8 +25,12 @@ PIXEL_FLOATS = 25  # of a pixel of a batch: the outputs and what the backward pa
 PADDING = 32  # pixels that the kernel adds to a row
 LIST_GAUSSIANS = 4096  # a step lists those that an image plane touches, so many in a list
 LIST_BYTES = 72 * 4160  # of a full list: it begins with room for 1040 slices of 72 bytes and doubles twice
-MEASURED_BYTES = 256  # of a pixel of the held-out frames that are measured at once (measured: 234)
+MEASURED_BYTES = 288  # of a pixel of the held-out frames that are measured at once (measured: 234 to 259)
 COMPARED_BYTES = 8 * 2 * PREDICTED_PIXELS + 32_768  # of a frame beside its distances, when frames are compared
+CUDA_BASE_BYTES = 256 << 20  # what torch's allocator rounds up and leaves unused
+CUDA_SLICE_BYTES = 4 * (20 + 1 + 8)  # of a Gaussian in a pose: the slice, its place and its gradient
+CUDA_PLANES = 10  # of a pose, as large as a frame: the frame, what it is made of, and their gradients
+CUDA_LOSS_FLOATS = 72  # of a pixel of a batch: the fields of SSIM, what autograd keeps of them (measured on a CPU: 68)
 GIB = 1 << 30
 CONTROL_GROUPS = Path("/sys/fs/cgroup")
 
@@ -41,6 +47,19 @@ def required_bytes(dataset: Dataset, config: TrainingConfig) -> int:
     slices = frames * -(-config.max_gaussians // LIST_GAUSSIANS) * LIST_BYTES  # as if all touched all planes
     images = 2 * dataset.train.images.nbytes + dataset.val.images.nbytes  # the dataset's and the trainer's copy
     return BASE_BYTES + gaussians + slices + max(stepping, measuring, comparison_bytes(dataset)) + images
+
+
+def required_device_bytes(dataset: Dataset, config: TrainingConfig) -> int:
+    """An upper bound of what a training takes of a GPU."""
+    assert config.max_gaussians is not None
+    harmonics = (config.sh_degree + 1) ** 2 - 1
+    gaussians = 4 * config.max_gaussians * ((RAW_FLOATS + harmonics) * COPIES + STATISTICS)
+    height, width = dataset.train.height, dataset.train.width
+    per_frame = config.max_gaussians * CUDA_SLICE_BYTES + 4 * CUDA_PLANES * height * width
+    frames = min(config.batch_size, len(dataset.train))
+    stepping = frames * (per_frame + 4 * CUDA_LOSS_FLOATS * height * width)
+    measuring = min(len(dataset.val), frames_at_once(height, width)) * per_frame
+    return CUDA_BASE_BYTES + gaussians + max(stepping, measuring) + dataset.train.images.nbytes
 
 
 def comparison_bytes(dataset: Dataset) -> int:
@@ -87,10 +106,15 @@ def _entry(path: Path, name: str) -> int:
     return int(values.get(name, 0))
 
 
-def check_memory(dataset: Dataset, config: TrainingConfig) -> None:
-    """Raises MemoryExceeded, saying what to lower, where the training may need more than it can have."""
-    needed = required_bytes(dataset, config)
-    if missing := _missing(needed, config):
+def check_memory(dataset: Dataset, config: TrainingConfig, device: torch.device) -> None:
+    """Raises MemoryExceeded, saying what to lower, where the training may need more of a device than it can have."""
+    if device.type == "cuda":
+        needed = required_device_bytes(dataset, config)
+        missing = _missing(needed, config, torch.cuda.mem_get_info(device)[0], str(device))
+    else:
+        needed = required_bytes(dataset, config)
+        missing = _missing(needed, config, available_bytes())
+    if missing:
         raise MemoryExceeded(
             f"the training needs up to {needed / GIB:.1f} GiB with {config.max_gaussians or 0:,} Gaussians and batches "
             f"of {config.batch_size} frames of {dataset.train.height}x{dataset.train.width}, {missing}: lower "
@@ -102,7 +126,7 @@ def check_memory(dataset: Dataset, config: TrainingConfig) -> None:
 def check_comparison_memory(dataset: Dataset, config: TrainingConfig) -> None:
     """Raises MemoryExceeded where comparing the frames, before anything else, may need more than it can have."""
     needed = comparison_bytes(dataset)
-    if missing := _missing(needed, config):
+    if missing := _missing(needed, config, available_bytes()):
         raise MemoryExceeded(
             f"{dataset.train.source}: comparing its {len(dataset.train):,} frames needs up to {needed / GIB:.1f} GiB, "
             f"{missing}: train from fewer frames",
@@ -110,9 +134,9 @@ def check_comparison_memory(dataset: Dataset, config: TrainingConfig) -> None:
         )
 
 
-def _missing(needed: int, config: TrainingConfig) -> str | None:
+def _missing(needed: int, config: TrainingConfig, free: int | None, place: str = "this machine") -> str | None:
     """Who allows how much, where that is less than needed."""
-    limit = available_bytes() if config.memory_gb is None else int(config.memory_gb * GIB)
+    limit = free if config.memory_gb is None else int(config.memory_gb * GIB)
     if limit is None or needed <= limit:
         return None
-    return f"{'this machine has free' if config.memory_gb is None else 'memory_gb allows'} {limit / GIB:.1f} GiB"
+    return f"{f'{place} has free' if config.memory_gb is None else 'memory_gb allows'} {limit / GIB:.1f} GiB"

@@ -63,8 +63,10 @@ class Optimizer:
         return found
 
     def load(self, tensors: Mapping[str, Tensor]) -> None:
-        """Inverse of `tensors`."""
+        """Inverse of `tensors`, which may lie on another device than the parameters."""
         for name, group in zip(self._names, self._adam.param_groups, strict=True):
-            state = {key: tensors[f"{name}.{key}"] for key in (*MOMENTS, "step") if f"{name}.{key}" in tensors}
+            (parameter,) = group["params"]
+            stored = {key: tensors.get(f"{name}.{key}") for key in (*MOMENTS, "step")}
+            state = {key: value.to(parameter.device) for key, value in stored.items() if value is not None}
             if state:
-                self._adam.state[group["params"][0]] = state
+                self._adam.state[parameter] = state

@@ -14,7 +14,10 @@ SMOOTHING = 0.05  # weight of the newest step in the mean time of a step
 
 @dataclass(frozen=True)
 class Progress:
-    """After a step. `val_psnr_db` is the latest over some held-out frames; None before the first, or without any."""
+    """After a step. `val_psnr_db` is the latest over some held-out frames; None before the first, or without any.
+
+    `peak_memory_mb` (10^6 bytes) is the most that the run took of a GPU until it was last looked at; None on the CPU.
+    """
 
     step: int  # steps done
     steps: int
@@ -24,6 +27,7 @@ class Progress:
     seconds_left: float
     val_psnr_db: float | None
     val_step: int | None  # after which it was measured
+    peak_memory_mb: float | None = None
 
 
 class StepTimer:

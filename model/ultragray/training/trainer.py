@@ -15,8 +15,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from .. import cuda
 from ..datasets.sweep import Dataset
-from ..errors import BackendUnavailable, DatasetInvalid, TrainingDiverged, TrainingStateInvalid
+from ..errors import DatasetInvalid, MemoryExceeded, TrainingDiverged, TrainingStateInvalid
 from ..evaluation import evaluate
 from ..files import atomic_path, remove_stale_temporaries
 from ..rendering import choose_backend, render
@@ -32,6 +33,7 @@ from .checkpointing import (
     write_checkpoint,
 )
 from .config import TrainingConfig
+from .device import forget_peak_memory, peak_memory_mb, training_device
 from .geometry import Geometry
 from .initial import initial_parameters
 from .intensity import project_sh0
@@ -47,7 +49,7 @@ CHECKPOINT_FILE = "checkpoint.safetensors"
 JOURNAL_FILE = "metrics.jsonl"
 CONFIG_FILE = "config.json"
 STEPS_PER_CHECK = 100  # of the parameters being finite; the loss is looked at after every step
-VALIDATIONS = 20  # in a run
+VALIDATIONS = 20  # in a run; the peak of a GPU's memory is noted as often
 VALIDATION_FRAMES = 8
 
 Log: TypeAlias = Callable[[dict[str, float]], None]
@@ -68,23 +70,31 @@ def train(
 ) -> GaussianScene:
     """The scene trained from `dataset.train`, measured on `dataset.val` where that has frames.
 
-    The same dataset, configuration and machine give the same scene, bit for bit on one thread. `folder` keeps
+    `device` is cpu, cuda or cuda:N; the backend `auto` is the one for it. The same dataset, configuration and machine
+    give the same scene, bit for bit on one thread of a CPU; random choices are the same on every device. `folder` keeps
     checkpoints, the journal and the configuration; with `resume` the run goes on from its checkpoint and ends in the
     scene that an undisturbed run gives. `report` is called after every step. When `should_stop` turns true, the run
     ends after the step at hand with a checkpoint and the scene as it is; `scene.info.training["step"]` says how far
     it came.
-    Raises TrainingDiverged (the last good checkpoint stays), TrainingStateInvalid, MemoryExceeded, DatasetInvalid,
+    Raises TrainingDiverged and MemoryExceeded (the last good checkpoint stays), TrainingStateInvalid, DatasetInvalid,
     BackendUnavailable, and InvalidArgument for a TensorBoard that is not installed; what can be known before the first
     step is, before `folder` is made.
     """
     if tensorboard:
         require_tensorboard()
-    trainer = Trainer(dataset, config or TrainingConfig(), folder=folder, device=device, backend=backend)
-    if resume:
-        trainer.restore()
-    with trainer.logs(tensorboard) as log:
-        trainer.run(log, report, should_stop, checkpoint_interval_s)
-    return trainer.scene()
+    try:
+        trainer = Trainer(dataset, config or TrainingConfig(), folder=folder, device=device, backend=backend)
+        if resume:
+            trainer.restore()
+    except torch.OutOfMemoryError as error:
+        raise MemoryExceeded(
+            f"the memory of {device} did not suffice for the Gaussians and the frames: lower max_gaussians",
+            field="max_gaussians",
+        ) from error
+    with trainer.running_out_of_memory_explained():
+        with trainer.logs(tensorboard) as log:
+            trainer.run(log, report, should_stop, checkpoint_interval_s)
+        return trainer.scene()
 
 
 def scene_of_checkpoint(dataset: Dataset, folder: Path) -> GaussianScene:
@@ -101,6 +111,7 @@ class Trainer:
     def __init__(
         self, dataset: Dataset, config: TrainingConfig, *, folder: Path | None, device: str, backend: str
     ) -> None:
+        self._device = training_device(device, backend)
         if min(dataset.train.height, dataset.train.width) < SSIM_WINDOW:
             raise DatasetInvalid(
                 f"{dataset.train.source}: images must have at least {SSIM_WINDOW} rows and columns, got "
@@ -109,9 +120,9 @@ class Trainer:
         check_comparison_memory(dataset, config)
         self._geometry = Geometry.of(dataset)
         config = config.resolved(self._geometry)
-        check_memory(dataset, config)
+        check_memory(dataset, config, self._device)
         self.dataset, self.config, self.folder = dataset, config, folder
-        self._device = _torch_device(device)
+        forget_peak_memory(self._device)
         self._images = torch.tensor(dataset.train.images, device=self._device)  # [F, H, W] uint8
         x, y, z = self._geometry.centre_mm.tolist()
         self._info = SceneInfo(
@@ -132,6 +143,7 @@ class Trainer:
         self._timer = StepTimer()
         self._val_psnr_db: float | None = None
         self._val_step: int | None = None
+        self._peak_memory_mb: float | None = None
         self._begin_with(initial_parameters(dataset, self._geometry, config, self._generator))
         self._backend = choose_backend(backend, self._view(sh_degree=0))
 
@@ -175,6 +187,19 @@ class Trainer:
 
             yield log
 
+    @contextlib.contextmanager
+    def running_out_of_memory_explained(self) -> Iterator[None]:
+        """Raises MemoryExceeded, saying what to lower and what is kept, where the device's memory does not suffice."""
+        try:
+            yield
+        except (torch.OutOfMemoryError, MemoryExceeded) as error:
+            raise MemoryExceeded(
+                f"the memory of {self._device} did not suffice after step {self.step:,} with {self.gaussian_count:,} "
+                f"Gaussians and batches of {self._sampler.batch_size} frames of {self.dataset.train.height}x"
+                f"{self.dataset.train.width}: lower max_gaussians or batch_size{self._kept()}",
+                field="max_gaussians",
+            ) from error
+
     def run(
         self,
         log: Log,
@@ -199,9 +224,13 @@ class Trainer:
         started = time.perf_counter()
         loss = self.take_step()
         line: dict[str, float] = {"step": self.step, "loss": loss, "gaussians": self.gaussian_count}
-        if len(self.dataset.val) and self.step % math.ceil(self._schedule.steps / VALIDATIONS) == 0:
-            self._val_psnr_db = line["val_psnr_db"] = self._validate()
-            self._val_step = self.step
+        if self.step % math.ceil(self._schedule.steps / VALIDATIONS) == 0:
+            if len(self.dataset.val):
+                self._val_psnr_db = line["val_psnr_db"] = self._validate()
+                self._val_step = self.step
+            self._peak_memory_mb = peak_memory_mb(self._device)
+            if self._peak_memory_mb is not None:
+                line["peak_memory_mb"] = round(self._peak_memory_mb, 1)
         self._timer.add(time.perf_counter() - started)
         log({**line, "elapsed_s": round(self._timer.elapsed_s, 3)})
         rate = self._timer.rate()
@@ -214,6 +243,7 @@ class Trainer:
             seconds_left=(self._schedule.steps - self.step) / rate if rate else math.inf,
             val_psnr_db=self._val_psnr_db,
             val_step=self._val_step,
+            peak_memory_mb=self._peak_memory_mb,
         )
 
     @property
@@ -226,18 +256,20 @@ class Trainer:
         poses = self.dataset.train.poses[batch.numpy()]
         if self.config.out_of_plane_mm:
             poses = shift_out_of_plane(poses, out_of_plane_shift_mm(self.config.out_of_plane_mm, self._generator))
-        truth = self._images[batch.to(self._device)].float().div_(255.0)
+        truth = self._images[cuda.upload(batch, self._device)].float().div_(255.0)
         image = image_loss(self._rendered(poses, self._schedule.sh_degree(self.step)), truth)
         image.backward()  # type: ignore[no-untyped-call]
         with torch.no_grad():
-            loss = float(image) + self._add_scale_penalty()
-            if not math.isfinite(loss):
-                raise self._diverged(self.step + 1, f"the loss is {loss}")
+            parts = torch.stack([image.detach(), self._add_scale_penalty()])
             means_gradient = self.parameters["means"].grad
             assert means_gradient is not None
             self._pull.add(means_gradient)
             self._optimizer.step(self._schedule.rates(self.step))
             self._project(self.parameters["sh0"])
+            image_part, scale_part = parts.tolist()  # the one wait of a step for a GPU: all its work is queued by now
+        loss: float = image_part + scale_part
+        if not math.isfinite(loss):
+            raise self._diverged(self.step + 1, f"the loss is {loss}")
         self.step += 1
         if self.step % STEPS_PER_CHECK == 0:
             self._check_finite()
@@ -271,13 +303,13 @@ class Trainer:
     def _project(self, sh0: Tensor) -> None:
         project_sh0(sh0, self.config.intensity, self._schedule.intensity_floor(self.step))
 
-    def _add_scale_penalty(self) -> float:
-        """λ·mean(exp(scales)); its gradient is added to that of the scales."""
+    def _add_scale_penalty(self) -> Tensor:
+        """λ·mean(exp(scales)), a scalar; its gradient is added to that of the scales."""
         scales = self.parameters["scales"]
         deviations = scales.exp()
         assert scales.grad is not None
         scales.grad.add_(deviations, alpha=self.config.scale_penalty / deviations.numel())
-        return self.config.scale_penalty * float(deviations.mean())
+        return self.config.scale_penalty * deviations.mean()
 
     def _refine(self, limit: int) -> None:
         with torch.no_grad():
@@ -297,14 +329,17 @@ class Trainer:
         self._pull = PullStatistics.empty(self.gaussian_count, self._device)
 
     def _check_finite(self) -> None:
-        for name, tensor in self.parameters.items():
-            if not bool(torch.isfinite(tensor.detach()).all()):
+        finite = torch.stack([torch.isfinite(tensor.detach()).all() for tensor in self.parameters.values()]).tolist()
+        for name, is_finite in zip(self.parameters, finite, strict=True):
+            if not is_finite:
                 raise self._diverged(self.step, f"{name} are no longer finite")
 
     def _diverged(self, step: int, what: str) -> TrainingDiverged:  # step: from 1
+        return TrainingDiverged(f"training diverged in step {step}: {what}{self._kept()}")
+
+    def _kept(self) -> str:
         path = None if self.folder is None else self.folder / CHECKPOINT_FILE
-        kept = f"; the last good checkpoint is kept in {path}" if path is not None and path.exists() else ""
-        return TrainingDiverged(f"training diverged in step {step}: {what}{kept}")
+        return f"; the last good checkpoint is kept in {path}" if path is not None and path.exists() else ""
 
     def _validate(self) -> float:
         """Mean PSNR over some of the held-out frames, dB."""
@@ -361,14 +396,6 @@ class Trainer:
         info = replace(self._info, training={**self.config.to_dict(), "step": self.step})
         scene = GaussianScene.from_splats(splats, info=info, training_poses=self.dataset.train.poses)
         if len(self.dataset.val) and self.step == self._schedule.steps:
-            scene.info.metrics.update(evaluate(scene, self.dataset.val, backend=self._backend).mean.to_dict())
+            measured = evaluate(scene.to(self._device), self.dataset.val, backend=self._backend)
+            scene.info.metrics.update(measured.mean.to_dict())
         return scene
-
-
-def _torch_device(name: str) -> torch.device:
-    try:
-        device = torch.device(name)
-        torch.zeros(1, device=device)
-    except (RuntimeError, AssertionError) as error:
-        raise BackendUnavailable(f"device {name!r} cannot be used here", field="device") from error
-    return device

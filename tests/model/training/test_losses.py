@@ -51,3 +51,16 @@ def test_truth_of_another_dtype_does_not_reach_the_kernel() -> None:
     expected = float(plain_image_loss(x.double(), y.double()))
     assert float(image_loss(x, y.double())) == pytest.approx(expected, abs=1e-7)
     assert float(image_loss(x.double(), y)) == pytest.approx(expected, abs=1e-7)
+
+
+def test_windows_are_not_left_to_cudnn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It would round to ten bits, and a variance is the small difference of two means; see `_blurred`."""
+    true_conv2d, groups = torch.nn.functional.conv2d, []
+
+    def watched(fields: torch.Tensor, window: torch.Tensor, **options: int) -> torch.Tensor:
+        groups.append((options["groups"], fields.shape[1]))
+        return true_conv2d(fields, window, **options)
+
+    monkeypatch.setattr(torch.nn.functional, "conv2d", watched)
+    ssim(torch.rand(2, 12, 13), torch.rand(2, 12, 13))
+    assert groups == [(5, 5), (5, 5)]

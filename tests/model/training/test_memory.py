@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from ultragray.datasets.sweep import Dataset
 from ultragray.errors import MemoryExceeded
@@ -27,10 +28,40 @@ def test_uses_what_is_free(tiny_dataset: Callable[..., Dataset], monkeypatch: py
     dataset, config = tiny_dataset(), TrainingConfig(max_gaussians=1000)
     needed = memory.required_bytes(dataset, config)
     monkeypatch.setattr(memory, "available_bytes", lambda: needed)
-    memory.check_memory(dataset, config)
+    memory.check_memory(dataset, config, torch.device("cpu"))
     monkeypatch.setattr(memory, "available_bytes", lambda: needed - 1)
     with pytest.raises(MemoryExceeded, match="this machine has free"):
-        memory.check_memory(dataset, config)
+        memory.check_memory(dataset, config, torch.device("cpu"))
+
+
+def test_a_gpu_is_asked_for_its_own_memory(
+    tiny_dataset: Callable[..., Dataset], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    dataset, device = tiny_dataset(), torch.device("cuda", 1)
+    config = TrainingConfig(max_gaussians=1000)
+    needed = memory.required_device_bytes(dataset, config)
+    free = {device: needed}
+    monkeypatch.setattr(memory, "available_bytes", lambda: 0)
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda asked: (free[asked], 1 << 40))
+    memory.check_memory(dataset, config, device)
+    free[device] = needed - 1
+    with pytest.raises(
+        MemoryExceeded, match=r"1,000 Gaussians .* cuda:1 has free 0\.3 GiB: lower max_gaussians or batch"
+    ):
+        memory.check_memory(dataset, config, device)
+    with pytest.raises(MemoryExceeded, match=r"memory_gb allows 0\.1 GiB"):
+        memory.check_memory(dataset, TrainingConfig(max_gaussians=1000, memory_gb=0.1), device)
+
+
+def test_a_gpu_keeps_a_slice_of_each_gaussian_for_each_frame(tiny_dataset: Callable[..., Dataset]) -> None:
+    dataset = tiny_dataset(frames=90)
+
+    def needed(batch_size: int, gaussians: int) -> int:
+        return memory.required_device_bytes(dataset, TrainingConfig(max_gaussians=gaussians, batch_size=batch_size))
+
+    per_frame = (needed(64, 500_000) - needed(32, 500_000)) / 32
+    assert 500_000 * 4 * 21 < per_frame < 500_000 * 4 * 32
+    assert needed(8, 500_000) < 2 << 30  # the training of the paper fits every GPU that is in use
 
 
 def test_grows_with_gaussians_and_pixels(tiny_dataset: Callable[..., Dataset]) -> None:

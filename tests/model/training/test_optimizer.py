@@ -82,3 +82,15 @@ def test_goes_on_bit_for_bit_from_its_tensors() -> None:
         set_gradients(tensors, 2)
         one.step(RATES)
     assert all(torch.equal(first[name], second[name]) for name in first)
+
+
+def test_moments_are_taken_to_the_device_of_the_parameters() -> None:
+    first = parameters()
+    optimizer = Optimizer(first, batch_size=4)
+    set_gradients(first, 1)
+    optimizer.step(RATES)
+    elsewhere = {name: value.detach().to("meta").requires_grad_(value.requires_grad) for name, value in first.items()}
+    resumed = Optimizer(elsewhere, batch_size=4)
+    resumed.load(optimizer.tensors())
+    assert {tensor.device.type for tensor in resumed.tensors().values()} == {"meta"}
+    assert resumed.tensors().keys() == optimizer.tensors().keys()

@@ -22,7 +22,13 @@ from safetensors.torch import save_file
 
 from ultragray import GaussianScene
 from ultragray.datasets.sweep import Dataset
-from ultragray.errors import BackendUnavailable, DatasetInvalid, TrainingDiverged, TrainingStateInvalid
+from ultragray.errors import (
+    BackendUnavailable,
+    DatasetInvalid,
+    MemoryExceeded,
+    TrainingDiverged,
+    TrainingStateInvalid,
+)
 from ultragray.training import Progress, TrainingConfig, train, trainer
 from ultragray.training.geometry import Geometry
 
@@ -217,6 +223,47 @@ def test_divergence_keeps_the_last_good_checkpoint(
     assert scene.info.training["step"] == 5
 
 
+@pytest.mark.parametrize("error", [torch.OutOfMemoryError("CUDA out of memory."), MemoryExceeded("no room")])
+def test_running_out_of_memory_keeps_the_last_good_checkpoint(
+    tiny_dataset: Datasets, tiny_config: Configs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    true_render, calls = trainer.render, 0
+
+    def render_that_runs_out(*given: Any, **options: Any) -> Any:
+        nonlocal calls
+        calls += 1
+        if calls == 6:
+            raise error
+        return true_render(*given, **options)
+
+    monkeypatch.setattr(trainer, "render", render_that_runs_out)
+    config = tiny_config(refinements=0)
+    told = (
+        r"the memory of cpu did not suffice after step 4 with 60 Gaussians and batches of 3 frames of 20x16: lower "
+        r"max_gaussians or batch_size; the last good checkpoint is kept in .*checkpoint\.safetensors"
+    )  # the validations after steps 2 and 4 render too
+    with pytest.raises(MemoryExceeded, match=told):
+        train(tiny_dataset(), config, folder=tmp_path, checkpoint_interval_s=0.0)
+    scene = train(tiny_dataset(), config, folder=tmp_path, resume=True)
+    assert scene.to_bytes() == train(tiny_dataset(), config).to_bytes()
+
+
+def test_a_step_reads_back_once(tiny_dataset: Datasets, tiny_config: Configs, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each time that a number is asked for, a GPU is waited for."""
+    asked: list[str] = []
+
+    def watch(name: str) -> None:
+        true = getattr(torch.Tensor, name)
+        monkeypatch.setattr(torch.Tensor, name, lambda *given: (asked.append(name), true(*given))[1])
+
+    config = tiny_config(out_of_plane_mm=0)
+    first = trainer.Trainer(tiny_dataset(), config, folder=None, device="cpu", backend="auto")
+    for name in ("tolist", "item", "cpu", "nonzero", "__float__", "__int__", "__bool__", "__index__"):
+        watch(name)
+    first.take_step()
+    assert asked == ["tolist"]
+
+
 def test_parameters_that_are_not_finite_never_reach_a_checkpoint(
     tiny_dataset: Datasets, tiny_config: Configs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -251,5 +298,17 @@ def test_released_intensities_stay_where_they_have_a_gradient(tiny_dataset: Data
 def test_refuses_what_cannot_be_trained(tiny_dataset: Datasets, tiny_config: Configs) -> None:
     with pytest.raises(DatasetInvalid, match="images must have at least 11 rows and columns, got 10x16"):
         train(tiny_dataset(height=10), tiny_config())
-    with pytest.raises(BackendUnavailable, match="device 'warp' cannot be used here"):
+    with pytest.raises(BackendUnavailable, match="device must be cpu, cuda or cuda:N, got 'warp'"):
         train(tiny_dataset(), tiny_config(), device="warp")
+
+
+def test_no_room_to_begin_is_said(
+    tiny_dataset: Datasets, tiny_config: Configs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def no_room(*given: Any) -> Any:
+        raise torch.OutOfMemoryError("CUDA out of memory.")
+
+    monkeypatch.setattr(trainer, "initial_parameters", no_room)
+    with pytest.raises(MemoryExceeded, match="the memory of cpu did not suffice for the Gaussians and the frames: low"):
+        train(tiny_dataset(), tiny_config(), folder=tmp_path / "run")
+    assert not (tmp_path / "run").exists()

@@ -10,6 +10,8 @@ FULL_PROFILE = tl.constexpr(2.8906850)  # G(u) for u >= 3
 NEGLIGIBLE = tl.constexpr(24.0)  # w < 7e-6 beyond m2 + u2: dozens of such tails on a pixel still do not show
 EARLY_SIGMA_CM = tl.constexpr(1.8)  # an opaque Gaussian wider than this absorbs 1/255 above the rows where w does
 MIN_VARIANCE_CM2 = tl.constexpr(1e-32)  # thinner ones touch no row
+LOG2_E = tl.constexpr(1.4426950408889634)  # the hardware's exponential has base 2
+HALF_LOG2_E = tl.constexpr(0.7213475204444817)  # exp(-x2 / 2) is exp2(-HALF_LOG2_E x2)
 NODE = tl.constexpr(0.7745966692414834)  # Gauss-Legendre: nodes 0, +-sqrt(0.6)
 
 VIEW = tl.constexpr(16)  # of a pose: axes 9, origin 3, span, near, cull_far, row_cm

@@ -8,7 +8,7 @@ row hands the factor to the tiles beneath.
 import triton
 import triton.language as tl
 
-from .constants import FIELDS, MAX_M2, MAX_WEIGHT, MIN_PSI, NOTHING, RECTANGLE
+from .constants import FIELDS, HALF_LOG2_E, LOG2_E, MAX_M2, MAX_WEIGHT, MIN_PSI, NOTHING, RECTANGLE
 from .profile import clipped_profile, cross, peak_of, polynomial_profile
 
 
@@ -67,48 +67,51 @@ def draw_tiles(
         while chosen < NOTHING:
             group = pose * blocks + chosen
             count = tl.load(counts + group)
-            for first in range(0, count, S_LANES):
-                lane = first + tl.arange(0, S_LANES)
-                slot = group * BLOCK + lane
-                present = lane < count
-                rectangle = rectangles + slot * RECTANGLE
-                hits = touches(rectangle, present, x0, x1, y0, y1)
-                if tl.max(hits.to(tl.int32), 0) > 0:
-                    turn = columns_at - tl.load(rectangle + 4, hits, 0).to(tl.float32)[:, None, None]  # [S, 1, columns]
-                    down = rows_at - tl.load(rectangle + 5, hits, 0).to(tl.float32)[:, None, None]  # [S, rows, 1]
-                    _, _, _, _, m2, sigma, past, star, touched = cross(
-                        turn,
-                        field(slices, slot, hits, 0),
-                        field(slices, slot, hits, 1),
-                        field(slices, slot, hits, 2),
-                        field(slices, slot, hits, 3),
-                        field(slices, slot, hits, 4),
-                        field(slices, slot, hits, 5),
-                        field(slices, slot, hits, 6),
-                        field(slices, slot, hits, 7),
+            if S_LANES == 1:  # a warp picks those that touch the tile out of the whole block at once
+                lane = tl.arange(0, BLOCK)
+                hits = touches(rectangles + (group * BLOCK + lane) * RECTANGLE, lane < count, x0, x1, y0, y1)
+                picked = tl.min(tl.where(hits, lane, NOTHING), 0)
+                while picked < NOTHING:
+                    total, echo, passing, ending = add_slices(
+                        total,
+                        echo,
+                        passing,
+                        ending,
+                        slices,
+                        rectangles,
+                        group * BLOCK + picked + tl.arange(0, 1),
+                        tl.full([1], 1, tl.int1),
+                        columns_at,
+                        rows_at,
+                        y1,
                         pitch,
+                        row_cm,
                         CONVEX,
+                        S_LANES,
                     )
-                    touched = touched & hits[:, None, None]
-                    scale = 1.0 / sigma
-                    peak = peak_of(m2, sigma, touched)
-                    window2 = tl.where(touched, MAX_M2 - m2, -1.0)  # u2 up to here has w >= 1/255
-                    u = down * (row_cm * scale) + past * scale  # [S, rows, columns]
-                    if tl.max(tl.load(rectangle + 6, hits, 0), 0) > 0:
-                        shape = clipped_profile(u, -star * scale)
-                    else:
-                        shape = polynomial_profile(u)
-                    psi = peak * shape
-                    u2 = u * u
-                    counted = (u2 <= window2) | (psi >= MIN_PSI)
-                    w = tl.where(counted, tl.minimum(tl.exp(-0.5 * (u2 + m2)), MAX_WEIGHT), 0.0)
-                    alpha = tl.where(counted, tl.minimum(1.0 - tl.exp(-psi), MAX_WEIGHT), 0.0)
-                    absorb = field(slices, slot, hits, 9)
-                    ends = (tl.load(rectangle + 3, hits, 0) <= y1)[:, None, None]
-                    total += tl.sum(w, 0)
-                    echo += tl.sum(field(slices, slot, hits, 8) * w, 0)
-                    passing *= product(1.0 - tl.where(ends, 0.0, absorb) * alpha, S_LANES)
-                    ending *= product(1.0 - tl.where(ends, absorb, 0.0) * alpha, S_LANES)
+                    picked = tl.min(tl.where(hits & (lane > picked), lane, NOTHING), 0)
+            else:
+                for first in range(0, count, S_LANES):
+                    lane = first + tl.arange(0, S_LANES)
+                    slot = group * BLOCK + lane
+                    hits = touches(rectangles + slot * RECTANGLE, lane < count, x0, x1, y0, y1)
+                    total, echo, passing, ending = add_slices(
+                        total,
+                        echo,
+                        passing,
+                        ending,
+                        slices,
+                        rectangles,
+                        slot,
+                        hits,
+                        columns_at,
+                        rows_at,
+                        y1,
+                        pitch,
+                        row_cm,
+                        CONVEX,
+                        S_LANES,
+                    )
             chosen = tl.min(tl.where(hit & (block > chosen), block, NOTHING), 0)
 
     inside = (rows < height)[:, None] & (columns < width)[None, :]
@@ -121,12 +124,79 @@ def draw_tiles(
 
 
 @triton.jit
+def add_slices(
+    total,
+    echo,
+    passing,
+    ending,
+    slices,
+    rectangles,
+    slot,  # [S]
+    hits,  # [S] which of them there are
+    columns_at,  # [1, 1, columns]
+    rows_at,  # [1, rows, 1]
+    y1,
+    pitch,
+    row_cm,
+    CONVEX: tl.constexpr,
+    S_LANES: tl.constexpr,
+):
+    """The accumulators of a tile, with some slices added."""
+    rectangle = rectangles + slot * RECTANGLE
+    turn = columns_at - tl.load(rectangle + 4, hits, 0).to(tl.float32)[:, None, None]  # [S, 1, columns]
+    down = rows_at - tl.load(rectangle + 5, hits, 0).to(tl.float32)[:, None, None]  # [S, rows, 1]
+    _, _, _, _, m2, sigma, past, star, touched = cross(
+        turn,
+        field(slices, slot, hits, 0),
+        field(slices, slot, hits, 1),
+        field(slices, slot, hits, 2),
+        field(slices, slot, hits, 3),
+        field(slices, slot, hits, 4),
+        field(slices, slot, hits, 5),
+        field(slices, slot, hits, 6),
+        field(slices, slot, hits, 7),
+        pitch,
+        CONVEX,
+    )
+    touched = touched & hits[:, None, None]
+    scale = 1.0 / sigma
+    peak = peak_of(m2, sigma, touched) * -LOG2_E
+    echo_peak = m2 * -HALF_LOG2_E
+    window2 = tl.where(touched, MAX_M2 - m2, -1.0)  # u2 up to here has w >= 1/255
+    u = down * (row_cm * scale) + past * scale  # [S, rows, columns]
+    if tl.max(tl.load(rectangle + 6, hits, 0), 0) > 0:
+        shape = clipped_profile(u, -star * scale)
+    else:
+        shape = polynomial_profile(u)
+    fall = peak * shape  # -psi, to base 2
+    u2 = u * u
+    counted = (u2 <= window2) | (fall <= -LOG2_E * MIN_PSI)
+    w = tl.minimum(tl.exp2(u2 * -HALF_LOG2_E + echo_peak), MAX_WEIGHT)
+    w = tl.where(counted, w, 0.0)
+    left = tl.where(counted, tl.maximum(tl.exp2(fall), 1.0 - MAX_WEIGHT), 1.0)  # 1 - alpha
+    absorb = tl.load(slices + slot * FIELDS + 9, hits, 0.0)
+    ends = tl.load(rectangle + 3, hits, 0) <= y1
+    return (
+        total + tl.sum(w, 0),
+        echo + tl.sum(field(slices, slot, hits, 8) * w, 0),
+        passing * product(passed(left, tl.where(ends, 0.0, absorb)), S_LANES),
+        ending * product(passed(left, tl.where(ends, absorb, 0.0)), S_LANES),
+    )
+
+
+@triton.jit
+def passed(left, absorb):
+    """1 - alpha (1 - tau), [S, rows, columns]; exactly 1 where nothing is absorbed."""
+    return (1.0 - absorb)[:, None, None] + absorb[:, None, None] * left
+
+
+@triton.jit
 def product(factors, LANES: tl.constexpr):
     """[S, rows, columns] -> [rows, columns]; all factors are positive."""
     if LANES == 1:
         return tl.sum(factors, 0)
     else:
-        return tl.exp(tl.sum(tl.log(factors), 0))
+        return tl.exp2(tl.sum(tl.log2(factors), 0))
 
 
 @triton.jit(

@@ -7,7 +7,7 @@ Thresholds and culls are held fixed; all else is the true gradient.
 import triton
 import triton.language as tl
 
-from .constants import FIELDS, GRADIENTS, MAX_M2, MAX_WEIGHT, MIN_PSI, RECTANGLE
+from .constants import FIELDS, GRADIENTS, HALF_LOG2_E, LOG2_E, MAX_M2, MAX_WEIGHT, MIN_PSI, RECTANGLE
 from .profile import cross, peak_of, profile_slopes
 
 
@@ -158,9 +158,9 @@ def gather_slices(
                 psi = peak[:, None, :] * shape
                 u2 = u * u
                 counted = inside & ((u2 <= window2[:, None, :]) | (psi >= MIN_PSI))
-                w = tl.exp(-0.5 * (u2 + m2[:, None, :]))
+                w = tl.exp2((u2 + m2[:, None, :]) * -HALF_LOG2_E)
                 weight = tl.where(counted, tl.minimum(w, MAX_WEIGHT), 0.0)
-                alpha = 1.0 - tl.exp(-psi)
+                alpha = 1.0 - tl.exp2(psi * -LOG2_E)
                 capped = tl.minimum(alpha, MAX_WEIGHT)
 
                 on_weighted = tl.load(by_weighted + pixel, inside, 0.0)
@@ -185,7 +185,7 @@ def gather_slices(
             beneath = touched & (last_row + 1 < height)[:, None]
             shape, _, by_zero = profile_slopes(tl.maximum(zero, 0.0) + 4.0, zero)
             psi = peak * shape
-            alpha = 1.0 - tl.exp(-psi)
+            alpha = 1.0 - tl.exp2(psi * -LOG2_E)
             capped = tl.minimum(alpha, MAX_WEIGHT)
             passes = beneath & (psi >= MIN_PSI)
             on_log = tl.load(by_below + (pose * height + last_row[:, None] + 1) * width + columns, passes, 0.0)

@@ -3,7 +3,13 @@
 import triton
 import triton.language as tl
 
-from .constants import FULL_PROFILE, MAX_M2, MAX_M2_ATTENUATION, MIN_VARIANCE_CM2, NODE
+from .constants import FULL_PROFILE, HALF_LOG2_E, MAX_M2, MAX_M2_ATTENUATION, MIN_VARIANCE_CM2, NODE
+
+
+@triton.jit
+def bell(x):
+    """exp(-x2 / 2)"""
+    return tl.exp2((x * x) * -HALF_LOG2_E)
 
 
 @triton.jit
@@ -32,11 +38,10 @@ def clipped_profile(u, zero):
     low, high = tl.maximum(centre - 3.0, zero), tl.minimum(centre + 3.0, u)
     half, middle = 0.5 * (high - low), 0.5 * (high + low)
     before, after = middle - NODE * half, middle + NODE * half
-    total = 0.8888888888888888 * tl.exp(-0.5 * middle * middle)
-    total += 0.5555555555555556 * (tl.exp(-0.5 * before * before) + tl.exp(-0.5 * after * after))
-    depth, point = u - zero, 0.5 * (u + zero)
+    total = 0.8888888888888888 * bell(middle) + 0.5555555555555556 * (bell(before) + bell(after))
+    depth = u - zero
     degenerate = (depth * depth <= 1e-8) | (high <= low)
-    return tl.where(degenerate, depth * tl.exp(-0.5 * point * point), half * total)
+    return tl.where(degenerate, depth * bell(0.5 * (u + zero)), half * total)
 
 
 @triton.jit
@@ -54,16 +59,15 @@ def profile_slopes(u, zero):
 
     half, middle = 0.5 * (high - low), 0.5 * (high + low)
     before, after = middle - NODE * half, middle + NODE * half
-    at_middle = 0.8888888888888888 * tl.exp(-0.5 * middle * middle)
-    at_before = 0.5555555555555556 * tl.exp(-0.5 * before * before)
-    at_after = 0.5555555555555556 * tl.exp(-0.5 * after * after)
+    at_middle = 0.8888888888888888 * bell(middle)
+    at_before, at_after = 0.5555555555555556 * bell(before), 0.5555555555555556 * bell(after)
     total = at_middle + at_before + at_after
     by_middle = -half * (middle * at_middle + before * at_before + after * at_after)
     by_half = total - half * NODE * (after * at_after - before * at_before)
     by_low, by_high = 0.5 * (by_middle - by_half), 0.5 * (by_middle + by_half)
 
     depth, point = u - zero, 0.5 * (u + zero)
-    density = tl.exp(-0.5 * point * point)
+    density = bell(point)
     degenerate = (depth * depth <= 1e-8) | (high <= low)
     bend = 0.5 * depth * point * density
     value = tl.where(degenerate, depth * density, half * total)
@@ -109,4 +113,4 @@ def cross(turn, t, row_offset, r, m2_plane, tt, tr, rr, det, pitch, CONVEX: tl.c
 @triton.jit
 def peak_of(m2, sigma, touched):
     """psi = peak * G(u)."""
-    return tl.where(touched & (m2 <= MAX_M2_ATTENUATION), tl.exp(-0.5 * m2) * sigma, 0.0)
+    return tl.where(touched & (m2 <= MAX_M2_ATTENUATION), tl.exp2(m2 * -HALF_LOG2_E) * sigma, 0.0)
