@@ -9,7 +9,7 @@ DATA ?= ../shared/data
 ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help serve test test-faults check format bench results demo-scene proto clean
+.PHONY: help serve test test-faults check format bench bench-cuda results demo-scene proto clean
 
 help:  ## say what there is
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
@@ -38,6 +38,10 @@ format: $(VENV)/installed-dev  ## rewrite the sources in the project's format
 bench: $(VENV)/installed  ## measure the kernel and the service; the table is printed, the JSON written
 	$(BIN)/ultragray bench --output benchmarks/results.json $(ARGS)
 	$(BIN)/ultragray bench --train --output benchmarks/training.json $(ARGS)
+
+bench-cuda: $(VENV)/installed  ## the same on a GPU, with the distance to what it can do at most
+	$(BIN)/ultragray bench --backend cuda --output benchmarks/cuda.json $(ARGS)
+	$(BIN)/ultragray bench --backend cuda --train --output benchmarks/cuda_training.json $(ARGS)
 
 results: $(VENV)/installed  ## train on every data set of DATA and write docs/results.md (ARGS="--only liver_convex" for one)
 	$(BIN)/python benchmarks/results_tables.py $(DATA) $(ARGS)

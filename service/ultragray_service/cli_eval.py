@@ -64,7 +64,7 @@ def evaluate(
     ] = None,
     split: Annotated[Split, typer.Option(help="Frames to measure on.")] = Split.VAL,
     json: Annotated[bool, typer.Option("--json", help="One JSON object, with every frame.")] = False,
-    backend: Annotated[str, typer.Option(help="auto, cpu or reference.")] = "auto",
+    backend: Annotated[str, typer.Option(help="auto, cpu, cuda or reference.")] = "auto",
     train_frames: TrainFrames = None,
     val_frames: ValFrames = None,
     frames: Frames = None,
@@ -76,10 +76,11 @@ def evaluate(
     from ultragray.evaluation import evaluate as evaluate_scene
     from ultragray.evaluation import require_frames
     from ultragray.scene import GaussianScene
+    from ultragray_workers.placement import render_device
 
     if output is not None:
         check_picture_folder(output)
-    loaded = GaussianScene.load(scene)
+    loaded = GaussianScene.load(scene).to(render_device(backend))
     read = read_dataset(dataset, train_frames, val_frames, frames, device_set, crop, image_size)
     sweep = read.val if split is Split.VAL else read.train
     require_frames(sweep)

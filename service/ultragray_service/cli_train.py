@@ -120,6 +120,7 @@ def train(
         **({} if preset is None else {"preset": preset}),
     }
     check_writable(output, SCENE_SUFFIX)
+    _check_device(device, backend)
     run = RunOptions(
         output=output,
         folder=folder or output.with_name(f"{output.name}.run"),
@@ -173,6 +174,13 @@ def _from_settings(settings: list[str]) -> dict[str, Any]:
             raise InvalidArgument(f"--set takes NAME=VALUE, got {text!r}", field="set")
         found[name.strip()] = parse_value(value.strip())
     return found
+
+
+def _check_device(device: str, backend: str) -> None:
+    """Raises BackendUnavailable before the dataset is read, which may take long."""
+    from ultragray.training.device import training_device
+
+    training_device(device, backend)
 
 
 def _check_resumable(run: RunOptions) -> None:

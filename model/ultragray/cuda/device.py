@@ -25,7 +25,7 @@ def available() -> bool:
 def require() -> None:
     """Raises BackendUnavailable, saying what is missing, where the backend cannot render here."""
     if (missing := _missing()) is not None:
-        raise BackendUnavailable(f"{missing}; use backend cpu", field="backend")
+        raise BackendUnavailable(f"{missing}; the CPU does the same (backend cpu, device cpu)", field="backend")
 
 
 def _missing() -> str | None:

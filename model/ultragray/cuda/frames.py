@@ -14,7 +14,7 @@ from ..probe import FloatArray, Probe
 from ..scene import PARAMETERS, GaussianScene
 from ..spatial_order import spatial_order
 from .device import upload
-from .launch import Gaussians, Geometry, bytes_per_pose, cut, differentiate, draw, launching, view_table
+from .launch import Gaussians, Geometry, bytes_per_pose, cut, differentiate, draw, empty_frames, launching, view_table
 
 WORKSPACE_BYTES = 1 << 30  # of slices and planes; poses beyond it are rendered in a further round
 
@@ -47,14 +47,13 @@ def render_frames(
 
 
 def _render(gaussians: Gaussians, geometry: Geometry, views: Tensor, outputs: Sequence[str]) -> dict[str, Tensor]:
+    frames = empty_frames(outputs, len(views), geometry, views.device)
     at_once = max(1, WORKSPACE_BYTES // bytes_per_pose(len(gaussians.means), geometry))
-    rounds = [
-        draw(cut(gaussians, some, geometry, record=False), geometry, outputs, keep=False)[0]
-        for some in (torch.split(views, at_once) if len(views) else (views,))
-    ]
-    if len(rounds) == 1:
-        return rounds[0]
-    return {name: torch.cat([frames[name] for frames in rounds]) for name in outputs}
+    for first in range(0, len(views), at_once):
+        some = slice(first, first + at_once)
+        slices = cut(gaussians, views[some], geometry, record=False)
+        draw(slices, geometry, {name: frame[some] for name, frame in frames.items()}, keep=False)
+    return frames
 
 
 class _Render(torch.autograd.Function):
@@ -66,7 +65,8 @@ class _Render(torch.autograd.Function):
     ) -> tuple[Tensor, ...]:
         gaussians = Gaussians.of(dict(zip(PARAMETERS, splats, strict=True)), intensity)
         slices = cut(gaussians, views, geometry, record=True)
-        frames, planes = draw(slices, geometry, names, keep=True)
+        frames = empty_frames(names, len(views), geometry, views.device)
+        planes = draw(slices, geometry, frames, keep=True)
         ctx.recorded = (gaussians, views, geometry, slices, planes)
         ctx.names = names
         ctx.set_materialize_grads(False)

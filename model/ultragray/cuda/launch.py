@@ -202,17 +202,21 @@ def cut(gaussians: Gaussians, views: Tensor, geometry: Geometry, *, record: bool
     return made
 
 
-def draw(slices: Slices, geometry: Geometry, outputs: Sequence[str], *, keep: bool) -> tuple[dict[str, Tensor], Planes]:
-    """The outputs by name, each [C, H, W], and the planes beneath them, T among these where it is to be kept."""
+def empty_frames(outputs: Sequence[str], poses: int, geometry: Geometry, device: torch.device) -> dict[str, Tensor]:
+    """Room for each output, [C, H, W]."""
+    return {name: torch.empty((poses, geometry.height, geometry.width), device=device) for name in outputs}
+
+
+def draw(slices: Slices, geometry: Geometry, frames: Mapping[str, Tensor], *, keep: bool) -> Planes:
+    """Fills the outputs, each [C, H, W] contiguous; returns the planes beneath them, with T where it is to be kept."""
     how, device = shapes(), slices.slices.device
     poses, blocks = slices.counts.shape
     height, width = geometry.height, geometry.width
     planes = Planes(*(torch.empty((poses, height, width), device=device) for _ in range(3)))
+    if not poses:
+        return planes
     tile_rows, tile_columns = -(-height // how.tile_rows), -(-width // how.tile_columns)
     steps = torch.empty((poses, tile_rows, width), device=device)
-    frames = {name: torch.empty((poses, height, width), device=device) for name in outputs}
-    if not poses:
-        return frames, planes
     draw_tiles[(tile_columns, tile_rows, poses)](
         slices.slices,
         slices.rectangles,
@@ -250,7 +254,7 @@ def draw(slices: Slices, geometry: Geometry, outputs: Sequence[str], *, keep: bo
         COLUMNS=how.finish_columns,
         num_warps=4,
     )
-    return frames, planes
+    return planes
 
 
 def differentiate(

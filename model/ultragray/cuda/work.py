@@ -19,7 +19,7 @@ from .launch import Geometry, cut, launching, shapes, view_table
 # Floating-point operations, counted in the source; a fused multiply-add is two.
 OPERATIONS_PER_GAUSSIAN = 110  # the cull by the image plane
 OPERATIONS_PER_SLICE = 500  # float64, cutting
-OPERATIONS_PER_EVALUATION = 48  # a pixel of a slice: w, psi, alpha and what they are added to
+OPERATIONS_PER_EVALUATION = 45  # a pixel of a slice: w, psi, alpha and what they are added to
 GAUSSIAN_BYTES = 4 * (3 + 3 + 4)  # read to cull: mean, scales, quaternion
 PLANES = 3  # S, the sum of I·w and T: written by the tiles, read to finish
 
