@@ -53,6 +53,7 @@ def render(
     """
     chosen = check_outputs(outputs)
     check_image_size(height, width)
+    height, width = int(height), int(width)
     probe = scene.info.probe_or(probe)
     poses_cm = scene.poses_to_scene_cm(check_poses(poses))
     backend = choose_backend(backend, scene)

@@ -137,6 +137,11 @@ def test_an_empty_scene_is_black_and_lets_everything_through(renderer: Renderer,
     assert (transmittance == 1).all()
 
 
+def test_sizes_may_be_numpy_integers(renderer: Renderer, random_scene: Callable[..., GaussianScene]) -> None:
+    frames = renderer(random_scene(5), LINEAR, np.eye(4)[None], height=np.int64(9), width=np.int64(7))
+    assert planes(frames).shape == (4, 1, 9, 7)
+
+
 def test_no_poses_give_no_frames(renderer: Renderer, random_scene: Callable[..., GaussianScene]) -> None:
     frames = planes(renderer(random_scene(5), LINEAR, np.zeros((0, 4, 4)), height=9, width=7))
     assert frames.shape == (4, 0, 9, 7)

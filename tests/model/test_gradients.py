@@ -28,6 +28,7 @@ SCENES: dict[str, tuple[Mapping[str, Any], Probe]] = {
     "saturated": ({"count": 40, "sigma_cm": (1.0, 3.0), "transmittance_logit": (2.0, 5.0)}, LINEAR),
     "at the face": ({"centre_cm": (0, 0, 0.02), "extent_cm": (3, 0.2, 0.3), "sigma_cm": (0.02, 0.3)}, LINEAR),
     "needles": ({"sigma_cm": (0.01, 1.0)}, LINEAR),
+    "transparent": ({"transmittance_logit": (10.0, 16.0)}, CONVEX),
     "degree 0": ({"sh_degree": 0}, LINEAR),
     "degree 2": ({"sh_degree": 2}, CONVEX),
     "degree 3": ({"sh_degree": 3}, LINEAR),

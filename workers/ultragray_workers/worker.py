@@ -116,8 +116,8 @@ class _Worker:
             if isinstance(job, PackJob):
                 return _pack(job, *descriptors)
             if isinstance(job, LoadJob):
-                # lets the kernel prepare the scene
-                self._render_small(self._scenes.get(job.scene, job.path).scene, _SMALL_PROBES[0])
+                for probe in _SMALL_PROBES:  # lets the kernels prepare the scene
+                    self._render_small(self._scenes.get(job.scene, job.path).scene, probe)
             else:
                 self._scenes.drop(job.scene)
         except Exception as error:

@@ -24,6 +24,7 @@ from .kernels.gathering import differentiate_pixels, gather_slices
 from .kernels.placing import place_gradients
 from .kernels.slicing import slice_gaussians
 
+MAX_POSES = 65_535  # of one launch, by CUDA's limit for a grid
 OUTPUTS = ("bmode", "echo", "transmittance", "coverage")
 
 
@@ -153,8 +154,9 @@ class Planes:
 
 def bytes_per_pose(count: int, geometry: Geometry) -> int:
     """Of the device's memory that a pose takes beside its outputs: slices of `count` Gaussians, and planes."""
+    places = -(-count // shapes().block) * shapes().block
     per_slice: int = constants.FIELDS.value + constants.RECTANGLE.value
-    return 4 * (count * per_slice + 3 * geometry.height * geometry.width)
+    return 4 * (places * per_slice + 3 * geometry.height * geometry.width)
 
 
 def shapes() -> Shapes:

@@ -15,7 +15,7 @@ HALF_LOG2_E = tl.constexpr(0.7213475204444817)  # exp(-x2 / 2) is exp2(-HALF_LOG
 NODE = tl.constexpr(0.7745966692414834)  # Gauss-Legendre: nodes 0, +-sqrt(0.6)
 
 VIEW = tl.constexpr(16)  # of a pose: axes 9, origin 3, span, near, cull_far, row_cm
-FIELDS = tl.constexpr(12)  # of a slice: t, row offset, r, m2, tt, tr, rr, det, intensity, 1 - tau
-RECTANGLE = tl.constexpr(8)  # of a slice: first and last column, first and last row, column, row, clipped
-GRADIENTS = tl.constexpr(8)  # by a slice's x, z, xx, xz, zz, m2, intensity, 1 - tau
+FIELDS = tl.constexpr(12)  # of a slice: t, row offset, r, m2, tt, tr, rr, det, intensity, 1 - tau; to whole 16 bytes
+RECTANGLE = tl.constexpr(8)  # of a slice: first and last column and row, own column and row, clipped; likewise
+GRADIENTS = tl.constexpr(9)  # by a slice's t, r, tt, tr, rr, m2, intensity, 1 - tau, det
 NOTHING = tl.constexpr(1 << 30)  # larger than every block, row and column

@@ -159,6 +159,9 @@ def add_slices(
         CONVEX,
     )
     touched = touched & hits[:, None, None]
+    if CONVEX:  # a line of the far side of a wide fan meets the slice behind the apex
+        own = tl.load(rectangle, hits, 0)[:, None, None] <= columns_at
+        touched = touched & own & (columns_at <= tl.load(rectangle + 1, hits, -1)[:, None, None])
     scale = 1.0 / sigma
     peak = peak_of(m2, sigma, touched) * -LOG2_E
     echo_peak = m2 * -HALF_LOG2_E

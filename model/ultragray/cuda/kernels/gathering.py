@@ -126,6 +126,7 @@ def gather_slices(
         on_tt = tl.zeros([S_LANES, COLUMNS], tl.float32)
         on_tr = tl.zeros([S_LANES, COLUMNS], tl.float32)
         on_rr = tl.zeros([S_LANES, COLUMNS], tl.float32)
+        on_det = tl.zeros([S_LANES, COLUMNS], tl.float32)  # by det apart: of a thin sheet it is all that matters
         on_m2 = tl.zeros([S_LANES, COLUMNS], tl.float32)
         on_intensity = tl.zeros([S_LANES, COLUMNS], tl.float32)
         on_absorb = tl.zeros([S_LANES, COLUMNS], tl.float32)
@@ -203,15 +204,15 @@ def gather_slices(
             # variance = det / q, where q = a.C a, k = a.C e and det = det C.
             k = dx * dz * (rr - tt) + tr * (dx * dx - dz * dz)
             slant = across * spread
-            by_det = by_variance * spread
             by_k = -by_star * slant
             by_across = 2.0 * by_m2 * slant - by_star * k * spread
             by_q = (by_star * k * slant - by_variance * sigma * sigma) * spread - by_m2 * slant * slant
             on_t += tl.where(touched, dx * by_star - dz * by_across, 0.0)
             on_r += tl.where(touched, dz * by_star + dx * by_across, 0.0)
-            on_tt += tl.where(touched, by_q * dz * dz - by_k * dx * dz + by_det * rr, 0.0)
-            on_tr += tl.where(touched, by_k * (dx * dx - dz * dz) - 2.0 * (by_q * dx * dz + by_det * tr), 0.0)
-            on_rr += tl.where(touched, by_q * dx * dx + by_k * dx * dz + by_det * tt, 0.0)
+            on_tt += tl.where(touched, by_q * dz * dz - by_k * dx * dz, 0.0)
+            on_tr += tl.where(touched, by_k * (dx * dx - dz * dz) - 2.0 * by_q * dx * dz, 0.0)
+            on_rr += tl.where(touched, by_q * dx * dx + by_k * dx * dz, 0.0)
+            on_det += tl.where(touched, by_variance * spread, 0.0)
             on_m2 += tl.where(touched, by_m2, 0.0)
             on_intensity += tl.sum(sum_intensity, 1)
             on_absorb += line_absorb
@@ -224,3 +225,4 @@ def gather_slices(
         tl.store(to + 5, tl.sum(on_m2, 1), present)
         tl.store(to + 6, tl.sum(on_intensity, 1), present)
         tl.store(to + 7, tl.sum(on_absorb, 1), present)
+        tl.store(to + 8, tl.sum(on_det, 1), present)

@@ -28,7 +28,7 @@ def spoke_gradient(spoke, on_xx, on_xy, on_xz, on_yy, on_yz, on_zz):
 
 
 @triton.jit
-def add3(to, index, mask, x, y, z):
+def store3(to, index, mask, x, y, z):
     tl.store(to + index * 3, x.to(tl.float32), mask)
     tl.store(to + index * 3 + 1, y.to(tl.float32), mask)
     tl.store(to + index * 3 + 2, z.to(tl.float32), mask)
@@ -97,17 +97,24 @@ def place_gradients(
                 on_x, on_z, on_xx, on_xz, on_zz = on_t, on_r, on_tt, on_tr, on_rr
 
             offset, mean, a, b, c, q, norm, s = place(view, means, scales, quats, index, cut)
+            xx = a[0] * a[0] + b[0] * b[0] + c[0] * c[0]
             xy = a[0] * a[1] + b[0] * b[1] + c[0] * c[1]
+            xz = a[0] * a[2] + b[0] * b[2] + c[0] * c[2]
             yy = a[1] * a[1] + b[1] * b[1] + c[1] * c[1]
             yz = a[1] * a[2] + b[1] * b[2] + c[1] * c[2]
+            zz = a[2] * a[2] + b[2] * b[2] + c[2] * c[2]
             # The conditioning on the plane, backwards.
             inverse = 1.0 / yy
-            height, tilt_x, tilt_z = mean[1] * inverse, xy * inverse, yz * inverse
-            on_y = 2.0 * height * on_m2 - tilt_x * on_x - tilt_z * on_z
-            on_xy = -2.0 * tilt_x * on_xx - tilt_z * on_xz - height * on_x
-            on_yz = -2.0 * tilt_z * on_zz - tilt_x * on_xz - height * on_z
+            rise, tilt_x, tilt_z = mean[1] * inverse, xy * inverse, yz * inverse
+            on_det = tl.load(g + 8, cut, 0.0).to(tl.float64)
+            on_xx += on_det * (zz - yz * tilt_z)
+            on_xz -= 2.0 * on_det * (xz - xy * tilt_z)
+            on_zz += on_det * (xx - xy * tilt_x)
+            on_y = 2.0 * rise * on_m2 - tilt_x * on_x - tilt_z * on_z
+            on_xy = -2.0 * tilt_x * on_xx - tilt_z * on_xz - rise * on_x
+            on_yz = -2.0 * tilt_z * on_zz - tilt_x * on_xz - rise * on_z
             on_yy = tilt_x * tilt_x * on_xx + tilt_x * tilt_z * on_xz + tilt_z * tilt_z * on_zz
-            on_yy += height * (tilt_x * on_x + tilt_z * on_z) - height * height * on_m2
+            on_yy += rise * (tilt_x * on_x + tilt_z * on_z) - rise * rise * on_m2
 
             ga = spoke_gradient(a, on_xx, on_xy, on_xz, on_yy, on_yz, on_zz)
             gb = spoke_gradient(b, on_xx, on_xy, on_xz, on_yy, on_yz, on_zz)
@@ -148,15 +155,15 @@ def place_gradients(
             sum_mz += tl.where(cut, towards_scene(view, on_x, on_y, on_z, 2), 0.0).to(tl.float32) + hz
             sum_absorb += tl.load(g + 7, cut, 0.0)
 
-    add3(by_means, index, mask, sum_mx, sum_my, sum_mz)
-    add3(by_scales, index, mask, sum_s0, sum_s1, sum_s2)
+    store3(by_means, index, mask, sum_mx, sum_my, sum_mz)
+    store3(by_scales, index, mask, sum_s0, sum_s1, sum_s2)
     to = by_quats + index * 4
     tl.store(to, sum_qw, mask)
     tl.store(to + 1, sum_qx, mask)
     tl.store(to + 2, sum_qy, mask)
     tl.store(to + 3, sum_qz, mask)
-    tau = tl.sigmoid(tl.load(transmittances + index, mask, 0.0))
-    tl.store(by_transmittances + index, -sum_absorb * tau * (1.0 - tau), mask)
+    logit = tl.load(transmittances + index, mask, 0.0)
+    tl.store(by_transmittances + index, -sum_absorb * tl.sigmoid(logit) * tl.sigmoid(-logit), mask)
     term = tl.arange(0, TERMS)[None, :]
     terms: tl.constexpr = (DEGREE + 1) * (DEGREE + 1)
     owned = mask[:, None]

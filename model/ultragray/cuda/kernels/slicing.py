@@ -251,7 +251,7 @@ def slice_gaussians(
         vx, vy, vz = offset[0].to(tl.float32), offset[1].to(tl.float32), offset[2].to(tl.float32)
         value = harmonics(vx, vy, vz, sh0, shn, shn_stride, index, kept, DEGREE)
         intensity = activate(value, SIGMOID)
-        tau = tl.sigmoid(tl.load(transmittances + index, kept, 0.0))
+        absorb = tl.sigmoid(-tl.load(transmittances + index, kept, 0.0))
 
         rank = tl.cumsum(kept.to(tl.int32), 0) - 1
         slot = group * BLOCK + rank
@@ -265,7 +265,7 @@ def slice_gaussians(
         tl.store(to + 6, rr.to(tl.float32), kept)
         tl.store(to + 7, det.to(tl.float32), kept)
         tl.store(to + 8, intensity, kept)
-        tl.store(to + 9, 1.0 - tau, kept)
+        tl.store(to + 9, absorb, kept)
         to = rectangles + slot * RECTANGLE
         tl.store(to, first_column, kept)
         tl.store(to + 1, last_column, kept)
