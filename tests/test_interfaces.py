@@ -47,10 +47,11 @@ from ultragray import (
 )
 from ultragray.datasets import Dataset, Sweep, checks, phantom, pictures, plus, released, source
 from ultragray.training import TrainingConfig
-from ultragray_proto.v1 import geometry_pb2, rendering_pb2, scenes_pb2
-from ultragray_service import catalog
+from ultragray_proto.v1 import datasets_pb2, geometry_pb2, jobs_pb2, rendering_pb2, scenes_pb2
+from ultragray_service import catalog, dataset_uploads
 from ultragray_service.cli import USER_ERROR
 from ultragray_service.cli import app as command_line
+from ultragray_service.cli_jobs_watch import JOB_CANCELLED, JOB_FAILED
 from ultragray_service.cli_train import INTERRUPTED
 from ultragray_service.http import accept, middleware, problems
 from ultragray_service.http.app import create_app
@@ -62,12 +63,12 @@ from ultragray_service.rpc import server as grpc_server
 from ultragray_service.rpc import status, stream
 from ultragray_service.settings import ENVIRONMENT_PREFIX, Settings, load_settings
 from ultragray_service.state import Service
+from ultragray_workers import dataset_store, dataset_unpack, scenes
 from ultragray_workers import encoding as pixels
-from ultragray_workers import scenes
 from ultragray_workers.types import Encoding, RenderResult
 
 DOCUMENT = (Path(__file__).resolve().parents[1] / "docs" / "interfaces.md").read_text(encoding="utf-8")
-PROTO_MODULES = (geometry_pb2, rendering_pb2, scenes_pb2)
+PROTO_MODULES = (geometry_pb2, rendering_pb2, scenes_pb2, datasets_pb2, jobs_pb2)
 LIBRARY_MODULES = (checkpoint, checkpoint_export, demo, files, ply, pose, pose_file, probe, rendering)
 MEASURING_MODULES = (baselines, compounding, evaluation, metrics, side_by_side)
 MEMBERS_OF = (GaussianScene, LinearProbe, ConvexProbe, errors.UltragrayError)
@@ -433,7 +434,8 @@ def test_settings() -> None:
 def test_command_line() -> None:
     commands = typer.main.get_command(command_line).commands  # type: ignore[attr-defined]
     assert list(table("Command line")) == list(commands)
-    for name in [name for name in commands if hasattr(commands[name], "commands")]:
+    while groups := [name for name in commands if hasattr(commands[name], "commands")]:
+        name = groups[0]
         group = commands.pop(name)
         commands |= {f"{name} {command}": value for command, value in group.commands.items()}
     for name, command in commands.items():
@@ -453,7 +455,7 @@ def test_training_settings() -> None:
 
 
 def test_exit_codes() -> None:
-    assert set(table("Exit codes")) == {"0", "1", str(USER_ERROR), str(INTERRUPTED)}
+    assert set(table("Exit codes")) == {"0", "1", *map(str, (USER_ERROR, JOB_FAILED, JOB_CANCELLED, INTERRUPTED))}
 
 
 # Metrics, logs, limits
@@ -485,6 +487,7 @@ def test_logs() -> None:
 def test_fixed_limits() -> None:
     documented = {cells[0]: code(cells[1])[0] for cells in rows("Fixed limits")}
     assert documented.pop("Scene names") == scenes._NAME.pattern
+    assert documented.pop("Dataset names") == dataset_store._NAME.pattern
     assert {name: float(value) for name, value in documented.items()} == {
         "Rotation tolerance": pose.ROTATION_TOLERANCE,
         "Largest coordinate of a pose": pose.MAX_POSITION_MM,
@@ -495,6 +498,11 @@ def test_fixed_limits() -> None:
         "Largest spherical-harmonic degree": scene_info.MAX_SH_DEGREE,
         "Scenes on one page, default": catalog.DEFAULT_PAGE_SIZE,
         "Scenes on one page": catalog.MAX_PAGE_SIZE,
+        "Datasets on one page, default": catalog.DEFAULT_PAGE_SIZE,
+        "Datasets on one page": catalog.MAX_PAGE_SIZE,
+        "Uploads at the same time": dataset_uploads.MAX_UPLOADS,
+        "Files of a dataset": dataset_unpack.MAX_FILES,
+        "Check of a dataset": dataset_uploads.CHECK_TIMEOUT_S,
         "Frames in flight in one `RenderStream`": stream.MAX_FRAMES_IN_FLIGHT,
         "gRPC message received": grpc_server.MAX_RECEIVE_BYTES,
         "JPEG quality": pixels.JPEG_QUALITY,

@@ -17,9 +17,21 @@ UltragrayError
 ├── SceneFileInvalid                a scene file that is truncated, foreign or inconsistent
 ├── CheckpointInvalid               a released checkpoint, or its conf.json or poses, that cannot be imported
 ├── DatasetInvalid                  a tracked sweep that cannot be used; names the file, the frame and the reason
+├── DatasetNotFound                 no dataset of that name
+├── DatasetExists                   a dataset of that name holds something else
+├── DatasetInUse                    a job needs the dataset
+├── UploadTooLarge                  an upload over the limit, packed or unpacked
+├── StorageFull                     a disk that has no room for what was sent
 ├── TrainingDiverged                a training whose loss or parameters are no longer finite
 ├── TrainingStateInvalid            a training folder that cannot be resumed from
-├── MemoryExceeded                  a training, or a frame on a GPU, that does not fit into memory
+├── MemoryExceeded                  a training, a check of a dataset, or a frame on a GPU, that does not fit into memory
+├── SceneExists                     a scene of that name is there, or a job is making it
+├── JobNotFound                     no job of that id
+├── JobConflict                     the request_id was used for something else
+├── JobFinished                     a job that succeeded or failed cannot be cancelled
+├── JobNotFinished                  only a failed or cancelled job can be retried
+├── JobQueueFull                    too many jobs wait already
+├── ArtifactNotFound                the job has no file of that name
 ├── SceneTooLarge                   a scene that does not fit the memory budget at all
 ├── BackendUnavailable              a render backend that cannot run here
 ├── QueueFull                       too many frames wait already
@@ -164,6 +176,41 @@ class DatasetInvalid(UltragrayError):
     title = "Invalid dataset"
 
 
+class DatasetNotFound(UltragrayError):
+    reason = "DATASET_NOT_FOUND"
+    http_status = 404
+    grpc_status = "NOT_FOUND"
+    title = "No such dataset"
+
+
+class DatasetExists(UltragrayError):
+    reason = "DATASET_EXISTS"
+    http_status = 409
+    grpc_status = "ALREADY_EXISTS"
+    title = "Another dataset has that name"
+
+
+class DatasetInUse(UltragrayError):
+    reason = "DATASET_IN_USE"
+    http_status = 409
+    grpc_status = "FAILED_PRECONDITION"
+    title = "Dataset in use"
+
+
+class UploadTooLarge(UltragrayError):
+    reason = "UPLOAD_TOO_LARGE"
+    http_status = 413
+    grpc_status = "INVALID_ARGUMENT"
+    title = "Upload too large"
+
+
+class StorageFull(UltragrayError):
+    reason = "STORAGE_FULL"
+    http_status = 507
+    grpc_status = "RESOURCE_EXHAUSTED"
+    title = "No room on the disk"
+
+
 class TrainingDiverged(UltragrayError):
     reason = "TRAINING_DIVERGED"
     http_status = 422
@@ -183,6 +230,56 @@ class MemoryExceeded(UltragrayError):
     http_status = 507
     grpc_status = "RESOURCE_EXHAUSTED"
     title = "Memory exceeded"
+
+
+class SceneExists(UltragrayError):
+    reason = "SCENE_EXISTS"
+    http_status = 409
+    grpc_status = "ALREADY_EXISTS"
+    title = "Scene already exists"
+
+
+class JobNotFound(UltragrayError):
+    reason = "JOB_NOT_FOUND"
+    http_status = 404
+    grpc_status = "NOT_FOUND"
+    title = "No such job"
+
+
+class JobConflict(UltragrayError):
+    reason = "REQUEST_ID_CONFLICT"
+    http_status = 409
+    grpc_status = "ALREADY_EXISTS"
+    title = "Request id used for another job"
+
+
+class JobFinished(UltragrayError):
+    reason = "JOB_FINISHED"
+    http_status = 409
+    grpc_status = "FAILED_PRECONDITION"
+    title = "Job is finished"
+
+
+class JobNotFinished(UltragrayError):
+    reason = "JOB_NOT_FINISHED"
+    http_status = 409
+    grpc_status = "FAILED_PRECONDITION"
+    title = "Job cannot be retried"
+
+
+class JobQueueFull(UltragrayError):
+    reason = "JOB_QUEUE_FULL"
+    http_status = 429
+    grpc_status = "RESOURCE_EXHAUSTED"
+    title = "Too many jobs are waiting"
+    retry_after_s = 10
+
+
+class ArtifactNotFound(UltragrayError):
+    reason = "ARTIFACT_NOT_FOUND"
+    http_status = 404
+    grpc_status = "NOT_FOUND"
+    title = "No such artifact"
 
 
 class SceneTooLarge(UltragrayError):

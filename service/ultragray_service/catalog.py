@@ -59,16 +59,9 @@ class SceneCatalog:
 
         Raises InvalidArgument for a page_size outside 1 to 1000 and for a token that no page gave.
         """
-        if not 1 <= page_size <= MAX_PAGE_SIZE:
-            raise InvalidArgument(
-                f"page_size must be an integer from 1 to {MAX_PAGE_SIZE}, got {page_size}", field="page_size"
-            )
-        names = await asyncio.to_thread(self._store.names)
-        start = bisect_right(names, _name_of_token(page_token)) if page_token else 0
-        chosen = names[start : start + page_size]
+        chosen, next_page_token = page_of_names(await asyncio.to_thread(self._store.names), page_size, page_token)
         entries = [entry for name in chosen if (entry := await self._entry(name)) is not None]
-        more = start + page_size < len(names)
-        return entries, _token_of_name(chosen[-1]) if more else ""
+        return entries, next_page_token
 
     async def _entry(self, name: str) -> CatalogEntry | None:
         try:
@@ -77,6 +70,20 @@ class SceneCatalog:
             return None
         except UltragrayError as error:
             return CatalogEntry(name, None, error)
+
+
+def page_of_names(names: list[str], page_size: int, page_token: str) -> tuple[list[str], str]:
+    """The names of one page of the sorted `names`, and the token of the next page (empty on the last).
+
+    Raises InvalidArgument for a page_size outside 1 to 1000 and for a token that no page gave.
+    """
+    if not 1 <= page_size <= MAX_PAGE_SIZE:
+        raise InvalidArgument(
+            f"page_size must be an integer from 1 to {MAX_PAGE_SIZE}, got {page_size}", field="page_size"
+        )
+    start = bisect_right(names, _name_of_token(page_token)) if page_token else 0
+    chosen = names[start : start + page_size]
+    return chosen, _token_of_name(chosen[-1]) if start + page_size < len(names) else ""
 
 
 @contextmanager

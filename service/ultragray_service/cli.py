@@ -15,7 +15,7 @@ from typer.core import TyperGroup
 import ultragray
 from ultragray.errors import InvalidArgument, UltragrayError
 
-from . import cli_convert, cli_dataset, cli_eval, cli_report, cli_train
+from . import cli_convert, cli_dataset, cli_eval, cli_jobs, cli_report, cli_train, cli_worker
 
 USER_ERROR = 2  # the exit code of a mistake that the caller can mend
 
@@ -243,12 +243,14 @@ def import_checkpoint(
 
 
 app.add_typer(cli_dataset.dataset_app, name="dataset")
+app.add_typer(cli_jobs.jobs_app, name="jobs")
 app.command()(cli_train.train)
 app.command("eval")(cli_eval.evaluate)
 app.command()(cli_eval.compound)
 app.command()(cli_report.report)
 app.command()(cli_convert.export)
 app.command()(cli_convert.import_ply)
+app.command()(cli_worker.worker)
 
 
 @app.command()

@@ -39,7 +39,8 @@ def serve_scenes(scenes: Iterable[Path], options: Mapping[str, Any]) -> None:
         raise InvalidArgument("scenes and --data-folder cannot be given together", field="data_folder")
     with tempfile.TemporaryDirectory(prefix="ultragray-scenes-") as folder:
         link_scenes(files, Path(folder))
-        run(load_settings(**{**options, "data_folder": Path(folder)}))
+        artifacts = load_settings(**options).artifacts  # not in the folder of links, which does not last
+        run(load_settings(**{**options, "data_folder": Path(folder), "artifact_folder": artifacts}))
 
 
 def ensure_scenes(folder: Path) -> None:

@@ -89,11 +89,7 @@ def read_dataset(
 
 def warnings_of(report: DatasetReport) -> list[str]:
     """What looks wrong about a dataset, the part that it is about first."""
-    return [
-        *(f"train: {text}" for text in report.train.warnings),
-        *(f"val: {text}" for text in (report.val.warnings if report.val else ())),
-        *report.warnings,
-    ]
+    return list(report.labelled_warnings)
 
 
 def warn_about_dataset(dataset: Dataset) -> None:

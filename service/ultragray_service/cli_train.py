@@ -115,7 +115,7 @@ def train(
     }
     given = {
         **_from_file(config),
-        **_from_settings(setting or []),
+        **parse_settings(setting or []),
         **{name: value for name, value in flags.items() if value is not None},
         **({} if preset is None else {"preset": preset}),
     }
@@ -163,7 +163,7 @@ def _from_file(path: Path | None) -> dict[str, Any]:
     return read_config_file(path)
 
 
-def _from_settings(settings: list[str]) -> dict[str, Any]:
+def parse_settings(settings: list[str]) -> dict[str, Any]:
     """NAME=VALUE pairs, the value as in TOML; a bare word is itself."""
     from ultragray.training.config import parse_value
 

@@ -16,6 +16,7 @@ import uvloop
 
 from ultragray.errors import StartupFailed
 
+from .embedded_worker import EmbeddedWorker
 from .http.app import create_app
 from .logs import configure_logging
 from .rpc.server import GrpcServer
@@ -52,8 +53,10 @@ async def serve(settings: Settings) -> None:
         http_task = asyncio.ensure_future(http_server.serve([http_socket]))
         health_task = asyncio.ensure_future(_mirror_health(service, grpc_server))
         _log.info("starting the render processes")
+        worker = EmbeddedWorker(settings)
         try:
             if await signals.unless_stopped(service.start()):
+                worker.start()
                 gc.freeze()  # what lives this long is never garbage: shorter pauses
                 _tell_where(settings, http_socket.getsockname()[1], grpc_port)
                 await signals.stop.wait()
@@ -61,12 +64,15 @@ async def serve(settings: Settings) -> None:
         finally:
             health_task.cancel()
             service.begin_draining()
+            worker_stop = asyncio.ensure_future(worker.stop())
             await grpc_server.tell_health(serving=False)
             await signals.unless_forced(service.pool.drain(settings.drain_timeout_s))
             await service.pool.close()
             http_server.should_exit = True
             http_server.force_exit = signals.force.is_set()
             await signals.unless_forced(asyncio.gather(grpc_server.stop(_FLUSH_S), http_task))
+            await signals.unless_forced(worker_stop)
+            await service.jobs.close()
     _log.info("stopped")
 
 

@@ -54,6 +54,27 @@ class Settings(BaseSettings):
     )
     max_body_bytes: int = Field(8 * 2**20, ge=1024, le=2**30, description="Largest HTTP request body, bytes.")
 
+    artifact_folder: Path | None = Field(
+        None, description="Folder of datasets and jobs, shared with all workers; None: artifacts in data_folder."
+    )
+    max_dataset_bytes: int = Field(8 * 2**30, ge=1024, le=2**50, description="Largest dataset, packed and unpacked.")
+    dataset_memory_mb: int = Field(
+        8192, ge=256, le=16_777_216, description="MiB that the check of an uploaded dataset may take."
+    )
+    upload_idle_timeout_s: float = Field(
+        60.0, gt=0, le=3600, description="How long an upload may send nothing, seconds."
+    )
+
+    database_url: str | None = Field(
+        None, description="PostgreSQL URL of the queue of jobs; None: a SQLite file in the artifact folder."
+    )
+    job_queue_limit: int = Field(1000, ge=1, le=100_000, description="Jobs that may wait; beyond: JOB_QUEUE_FULL.")
+    embedded_worker: bool = Field(True, description="Whether `ultragray serve` starts a worker for jobs as well.")
+    training_threads: int = Field(
+        0, ge=0, le=1024, description="Threads of a job's process; 0: all cores but one, at least one."
+    )
+    job_nice: int = Field(10, ge=0, le=19, description="Nice level of a job's process; frames go first.")
+
     default_timeout_s: float = Field(30.0, gt=0, le=3600, description="Deadline of a request that names none, seconds.")
     drain_timeout_s: float = Field(
         10.0, ge=0, le=3600, description="How long waiting frames may take at a stop, seconds."
@@ -62,6 +83,11 @@ class Settings(BaseSettings):
     api_keys: Secrets = Field((), description="Where set, every request but health needs one of these keys.")
     cors_origins: Words = Field((), description="Origins whose pages may call HTTP; * for all.")
     log_level: Literal["debug", "info", "warning", "error"] = Field("info", description="Least level that is logged.")
+
+    @property
+    def artifacts(self) -> Path:
+        """The artifact folder, resolved."""
+        return self.data_folder / "artifacts" if self.artifact_folder is None else self.artifact_folder
 
     @field_validator("preload", "cors_origins", "api_keys", mode="before")
     @classmethod

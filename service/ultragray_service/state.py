@@ -6,12 +6,16 @@ import asyncio
 from enum import Enum
 
 from ultragray.errors import Draining, NotReady, StartupFailed, UltragrayError
+from ultragray_workers.dataset_store import DatasetStore
+from ultragray_workers.jobs.store import SCENES_FOLDER
 from ultragray_workers.pool import PoolConfig, RenderPool
 from ultragray_workers.scenes import SceneStore
 from ultragray_workers.types import RenderRequest, RenderResult
 
 from .auth import KeyGuard
 from .catalog import SceneCatalog, scene_to_blame
+from .dataset_uploads import DatasetUploads
+from .jobs import Jobs
 from .metrics import Metrics
 from .requests import RequestPlanner
 from .settings import Settings
@@ -34,7 +38,7 @@ class Service:
                 f"data_folder must be an existing folder, got {str(settings.data_folder)!r}",
                 field="data_folder",
             )
-        store = SceneStore(settings.data_folder)
+        store = SceneStore(settings.data_folder, settings.artifacts / SCENES_FOLDER)
         self.settings = settings
         self.catalog = SceneCatalog(store)
         self.planner = RequestPlanner(settings, self.catalog)
@@ -54,6 +58,10 @@ class Service:
         self.pool.on_rendered = self.metrics.observe_result
         self.phase = Phase.STARTING
         self.draining = asyncio.Event()
+        self.datasets = DatasetStore(settings.artifacts)
+        self.uploads = DatasetUploads(self.datasets, settings, self.draining)
+        self.jobs = Jobs(settings, store)
+        self.datasets.in_use = self.jobs.uses_dataset
 
     @property
     def ready(self) -> bool:
@@ -62,19 +70,24 @@ class Service:
 
     def require_ready(self) -> None:
         """Raises NotReady or Draining, saying why no frame would be rendered now."""
-        self._require_serving()
+        self.require_serving()
         if not self.pool.ready:
             raise NotReady("no render process is alive at the moment")
 
-    def _require_serving(self) -> None:
+    def require_serving(self) -> None:
+        """Raises NotReady or Draining."""
         if self.phase is Phase.STARTING:
             raise NotReady("the service is starting")
         if self.phase is Phase.DRAINING:
             raise Draining("the service is stopping")
 
     async def start(self) -> None:
-        """Starts the pool and loads the scenes to preload. Raises StartupFailed."""
-        await self.pool.start()
+        """Starts the pool, loads the scenes to preload, opens the jobs, clears what dead uploads left.
+
+        Raises StartupFailed.
+        """
+        await self.uploads.remove_stale()
+        await asyncio.gather(self.pool.start(), self.jobs.start())
         for name in self.settings.preload:
             try:
                 await self.pool.load(name)
@@ -85,7 +98,7 @@ class Service:
 
     async def render(self, request: RenderRequest) -> RenderResult:
         """Renders. Raises what RenderPool.render raises; cancelling drops a request that still waits."""
-        self._require_serving()
+        self.require_serving()
         with scene_to_blame():
             return await self.pool.render(request)
 
@@ -94,14 +107,14 @@ class Service:
 
         Raises SceneNotFound, SceneFileInvalid, SceneTooLarge.
         """
-        self._require_serving()
+        self.require_serving()
         with scene_to_blame():
             await self.pool.load(scene)
         return self.pool.loaded().get(scene, 0)
 
     async def unload(self, scene: str) -> int:
         """Frees a scene; how many processes still hold it. Raises SceneNotFound."""
-        self._require_serving()
+        self.require_serving()
         with scene_to_blame():
             await self.pool.unload(scene)
         return self.pool.loaded().get(scene, 0)
@@ -110,3 +123,4 @@ class Service:
         """From now on frames are refused with Draining; streams end after the frames they have in flight."""
         self.phase = Phase.DRAINING
         self.draining.set()
+        self.jobs.end_watches()

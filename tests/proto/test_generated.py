@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+from importlib.resources import files
 from pathlib import Path
 from types import ModuleType
 
@@ -11,7 +12,7 @@ from google.protobuf.descriptor_pb2 import DescriptorProto, FileDescriptorProto,
 from google.protobuf.descriptor_pool import DescriptorPool
 from grpc_tools import protoc
 
-from ultragray_proto.v1 import geometry_pb2, rendering_pb2, scenes_pb2
+from ultragray_proto.v1 import datasets_pb2, geometry_pb2, jobs_pb2, rendering_pb2, scenes_pb2
 
 PROTO = Path(__file__).resolve().parents[2] / "proto"
 COMMITTED = PROTO / "ultragray_proto" / "v1"
@@ -52,11 +53,12 @@ def test_stubs_are_current(generator: ModuleType, tmp_path: Path) -> None:
 def test_descriptors_are_current(tmp_path: Path) -> None:
     output = tmp_path / "descriptors"
     sources = sorted(str(path) for path in (PROTO / "ultragray" / "v1").glob("*.proto"))
-    assert protoc.main(["protoc", f"-I{PROTO}", "--include_imports", f"--descriptor_set_out={output}", *sources]) == 0
+    folders = (f"-I{PROTO}", f"-I{files('grpc_tools') / '_proto'}")
+    assert protoc.main(["protoc", *folders, "--include_imports", f"--descriptor_set_out={output}", *sources]) == 0
     pool = DescriptorPool()
     for file in FileDescriptorSet.FromString(output.read_bytes()).file:  # dependencies come first
         pool.AddSerializedFile(file.SerializeToString())
-    modules = (geometry_pb2, scenes_pb2, rendering_pb2)
+    modules = (geometry_pb2, scenes_pb2, rendering_pb2, datasets_pb2, jobs_pb2)
     assert len(modules) == len(sources)
     for module in modules:
         committed, expected = FileDescriptorProto(), FileDescriptorProto()

@@ -40,6 +40,7 @@ class RunningService:
             "ULTRAGRAY_HTTP_PORT": "0",
             "ULTRAGRAY_GRPC_PORT": "0",
             "ULTRAGRAY_THREADS_PER_PROCESS": "1",
+            "ULTRAGRAY_EMBEDDED_WORKER": "false",
             "PYTHONPATH": os.pathsep.join(str(ROOT / folder) for folder in SOURCE_FOLDERS),
         }
         with log_path.open("wb") as log:

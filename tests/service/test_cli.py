@@ -38,6 +38,7 @@ COMMANDS = (
     "render",
     "info",
     "dataset",
+    "jobs",
     "train",
     "eval",
     "compound",

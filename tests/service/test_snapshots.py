@@ -15,7 +15,7 @@ import httpx
 from google.protobuf.descriptor import Descriptor, FileDescriptor
 
 from ultragray import errors
-from ultragray_proto.v1 import geometry_pb2, rendering_pb2, scenes_pb2
+from ultragray_proto.v1 import datasets_pb2, geometry_pb2, jobs_pb2, rendering_pb2, scenes_pb2
 from ultragray_service.settings import Settings
 
 FOLDER = Path(__file__).parent / "snapshots"
@@ -76,7 +76,7 @@ def contract(file: FileDescriptor) -> dict[str, Any]:
 
 
 def test_grpc() -> None:
-    files = (geometry_pb2, scenes_pb2, rendering_pb2)
+    files = (geometry_pb2, scenes_pb2, rendering_pb2, datasets_pb2, jobs_pb2)
     check("proto", {module.DESCRIPTOR.name: contract(module.DESCRIPTOR) for module in files})
 
 

@@ -26,6 +26,21 @@ def test_a_folder_that_does_not_exist_has_no_scenes(tmp_path):
         store.header("a")
 
 
+def test_the_first_folder_wins_over_further_ones(scene_folder, tmp_path):
+    further = tmp_path / "further"
+    further.mkdir()
+    for name in ("b", "c"):
+        (further / f"{name}.ugr").write_bytes((scene_folder / "a.ugr").read_bytes())
+    store = SceneStore(scene_folder, further, tmp_path / "missing")
+    assert store.names() == ["a", "b", "c"]
+    assert store.path("b") == scene_folder / "b.ugr"
+    assert store.path("c") == further / "c.ugr"
+    assert store.file("d") == scene_folder / "d.ugr"
+    assert store.header("c").info == store.header("a").info
+    (scene_folder / "b.ugr").unlink()
+    assert store.path("b") == further / "b.ugr"
+
+
 @pytest.mark.parametrize("name", ["c", "", "../a", "/etc/passwd", "a.ugr", "a/../a", "a\0", "x" * 200])
 def test_unknown_and_impossible_names_are_not_found(scene_folder, name):
     with pytest.raises(SceneNotFound, match="known scenes: a, b"):

@@ -1,4 +1,4 @@
-"""The scene files of a data folder, and what a loaded scene costs. Free of torch."""
+"""The scene files of one or more folders, and what a loaded scene costs. Free of torch."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from ultragray.errors import SceneNotFound
+from ultragray.errors import InvalidArgument, SceneNotFound
 from ultragray.scene_info import SceneHeader, SceneInfo, read_header, scene_file_invalid
 
 SUFFIX = ".ugr"
@@ -39,23 +40,18 @@ class FileVersion:
 
 
 class SceneStore:
-    """The scenes of one folder: `NAME.ugr` is the scene NAME. Files may come, change and go at any time."""
+    """The scenes of some folders: `NAME.ugr` is the scene NAME, in the first folder that has it.
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = Path(folder)
+    Files and folders may come, change and go at any time.
+    """
+
+    def __init__(self, *folders: Path) -> None:
+        self.folders = tuple(Path(folder) for folder in folders)
         self._headers: dict[str, tuple[FileVersion, SceneHeader]] = {}
 
     def names(self) -> list[str]:
         """The names of all scenes, sorted; files whose name could not stand in a URL are left out."""
-        try:
-            entries = list(self.folder.iterdir())
-        except (FileNotFoundError, NotADirectoryError):
-            return []
-        return sorted(
-            entry.stem
-            for entry in entries
-            if entry.suffix == SUFFIX and _NAME.fullmatch(entry.stem) and entry.is_file()
-        )
+        return sorted({name for folder in self.folders for name in _names_in(folder)})
 
     def path(self, name: str) -> Path:
         """The file of a scene. Raises SceneNotFound, also for a name that no scene can have."""
@@ -64,8 +60,9 @@ class SceneStore:
         raise self._not_found(name)
 
     def file(self, name: str) -> Path:
-        """Where the file of a scene lies, whether or not it exists."""
-        return self.folder / f"{name}{SUFFIX}"
+        """Where the file of a scene lies; in the first folder where there is none."""
+        paths = [folder / f"{name}{SUFFIX}" for folder in self.folders]
+        return next((path for path in paths if path.is_file()), paths[0])
 
     def header(self, name: str) -> SceneHeader:
         """A scene's description and training poses. Raises SceneNotFound, SceneFileInvalid."""
@@ -98,3 +95,22 @@ class SceneStore:
         shown = ", ".join(known[:_NAMES_IN_MESSAGE]) + (", …" if len(known) > _NAMES_IN_MESSAGE else "")
         hint = f"known scenes: {shown}" if known else "there are no scenes yet"
         return SceneNotFound(f"there is no scene {name[:128]!r}; {hint}", field="scene")
+
+
+def check_scene_name(name: Any) -> None:
+    """Raises InvalidArgument for a name that no scene can have."""
+    if not isinstance(name, str) or not _NAME.fullmatch(name):
+        raise InvalidArgument(
+            f"scene must be 1 to 128 letters, digits, '.', '_', '-', got {str(name)[:128]!r}",
+            field="scene",
+        )
+
+
+def _names_in(folder: Path) -> list[str]:
+    try:
+        entries = list(folder.iterdir())
+    except (FileNotFoundError, NotADirectoryError):
+        return []
+    return [
+        entry.stem for entry in entries if entry.suffix == SUFFIX and _NAME.fullmatch(entry.stem) and entry.is_file()
+    ]

@@ -71,6 +71,15 @@ class DatasetReport:
     val_angle_max_deg: float | None  # to that nearest frame
     warnings: tuple[str, ...]
 
+    @property
+    def labelled_warnings(self) -> tuple[str, ...]:
+        """Every warning, the part that it is about first."""
+        return (
+            *(f"train: {text}" for text in self.train.warnings),
+            *(f"val: {text}" for text in (self.val.warnings if self.val else ())),
+            *self.warnings,
+        )
+
     def to_dict(self) -> dict[str, Any]:
         """The report as JSON can hold it."""
         return {**asdict(self), "probe": probe_to_dict(self.probe)}

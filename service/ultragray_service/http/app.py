@@ -14,10 +14,10 @@ from ultragray import __version__
 from ultragray.errors import UltragrayError
 
 from ..state import Service
-from . import problems
+from . import job_schemas, problems
 from .docs import add_docs
 from .middleware import LimitBody, RequestContext, RequireKey
-from .routes import health, metrics, render, scenes
+from .routes import datasets, health, jobs, metrics, render, scenes
 from .schemas import RenderBody
 
 _DESCRIPTION = """B-mode frames from trained 3D-Gaussian ultrasound scenes.
@@ -45,7 +45,7 @@ def create_app(service: Service) -> FastAPI:
     )
     app.state.service = service
     # render comes first: its route is the one that must be found fast
-    for module in (render, scenes, health, metrics):
+    for module in (render, scenes, datasets, jobs, health, metrics):
         app.include_router(module.router)
     add_docs(app)
     app.add_exception_handler(UltragrayError, problems.answer_ultragray_error)
@@ -57,7 +57,7 @@ def create_app(service: Service) -> FastAPI:
         app.add_middleware(
             CORSMiddleware,
             allow_origins=list(service.settings.cors_origins),
-            allow_methods=["GET", "POST"],
+            allow_methods=["GET", "POST", "PUT", "DELETE"],
             allow_headers=["*"],
             expose_headers=["Retry-After", *render.RENDER_HEADERS],
         )
@@ -72,7 +72,13 @@ class _Application(FastAPI):
         if self.openapi_schema is None:
             document = super().openapi()
             _, extra = models_json_schema(
-                [(RenderBody, "validation"), (problems.Problem, "serialization")],
+                [
+                    (RenderBody, "validation"),
+                    (job_schemas.JobBody, "validation"),
+                    (job_schemas.TrainSpecification, "validation"),
+                    (job_schemas.RenderSpecification, "validation"),
+                    (problems.Problem, "serialization"),
+                ],
                 ref_template="#/components/schemas/{model}",
             )
             schemas = document.setdefault("components", {}).setdefault("schemas", {})

@@ -31,15 +31,18 @@ def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
 
 _MEANINGS = {
     401: "No API key, or an unknown one (UNAUTHENTICATED), where the service asks for one.",
-    404: "No such scene (SCENE_NOT_FOUND).",
+    404: "No such scene, dataset, job or artifact (SCENE_NOT_FOUND, DATASET_NOT_FOUND, JOB_NOT_FOUND, "
+    "ARTIFACT_NOT_FOUND).",
     406: "The Accept header allows no type that can hold the request (NOT_ACCEPTABLE).",
-    413: "The body is over the limit (BODY_TOO_LARGE).",
-    415: "The body is not JSON (UNSUPPORTED_MEDIA_TYPE).",
+    409: "What is there already, or its state, does not allow it (DATASET_EXISTS, DATASET_IN_USE, SCENE_EXISTS, "
+    "REQUEST_ID_CONFLICT, JOB_FINISHED, JOB_NOT_FINISHED).",
+    413: "The body is over the limit (BODY_TOO_LARGE, UPLOAD_TOO_LARGE).",
+    415: "The body is of another type than the route takes (UNSUPPORTED_MEDIA_TYPE).",
     422: "A value cannot be used: INVALID_ARGUMENT, INVALID_POSE, INVALID_PROBE, INVALID_IMAGE_SIZE, "
-    "UNKNOWN_OUTPUT, TOO_MANY_POSES, SCENE_FILE_INVALID. `field` names it.",
-    429: "Too many frames wait (QUEUE_FULL); retry after the seconds of Retry-After.",
+    "UNKNOWN_OUTPUT, TOO_MANY_POSES, SCENE_FILE_INVALID, DATASET_INVALID. `field` names it.",
+    429: "Too many frames, uploads or jobs wait (QUEUE_FULL, JOB_QUEUE_FULL); retry after the seconds of Retry-After.",
     500: "Rendering failed (RENDER_FAILED, INTERNAL).",
     503: "The service is starting or stopping (NOT_READY, DRAINING); retry after the seconds of Retry-After.",
-    504: "The deadline passed before the frame was rendered (DEADLINE_EXCEEDED).",
-    507: "The scene does not fit the memory budget (SCENE_TOO_LARGE).",
+    504: "The deadline passed before the answer was ready, or an upload came to a halt (DEADLINE_EXCEEDED).",
+    507: "The memory or the disk has no room (SCENE_TOO_LARGE, MEMORY_EXCEEDED, STORAGE_FULL).",
 }

@@ -51,3 +51,25 @@ RENDER_EXAMPLES: dict[str, Any] = {
         },
     },
 }
+
+JOB_EXAMPLES: dict[str, Any] = {
+    "train": {
+        "summary": "Train a scene from an uploaded dataset and serve it",
+        "value": {
+            "kind": "train",
+            "specification": {"dataset": "liver", "scene": "liver-1", "settings": {"steps": 500}},
+            "request_id": "liver-1",
+        },
+    },
+    "render": {
+        "summary": "A hundred frames about the training poses, as a tar of PNGs",
+        "value": {
+            "kind": "render",
+            "specification": {
+                "scene": DEMO_SCENE,
+                "sampler": {"kind": "jitter", "count": 100, "translation_mm": 2.0, "rotation_deg": 5.0, "seed": 0},
+                "format": "tar",
+            },
+        },
+    },
+}

@@ -19,6 +19,7 @@ from .problems import problem_response
 REQUEST_ID_HEADER = "X-Request-Id"
 _OPEN_PATHS = ("/v1/health/", "/docs", "/openapi.json")
 _QUIET_PATHS = ("/v1/health/", "/metrics")
+_UPLOAD_PATH = "/v1/datasets/"
 _CLIENT_GONE = 499
 
 _log = logging.getLogger("ultragray.http")
@@ -91,14 +92,17 @@ class RequireKey:
 
 
 class LimitBody:
-    """Refuses bodies over the limit, whether they announce their length or come in chunks."""
+    """Refuses bodies over the limit, whether they announce their length or come in chunks.
+
+    Uploads go straight to a disk and count for themselves.
+    """
 
     def __init__(self, app: ASGIApp, limit_bytes: int) -> None:
         self._app = app
         self._limit_bytes = limit_bytes
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http":
+        if scope["type"] != "http" or (scope["method"] == "PUT" and scope["path"].startswith(_UPLOAD_PATH)):
             await self._app(scope, receive, send)
             return
         announced = Headers(scope=scope).get("content-length", "")

@@ -1,31 +1,13 @@
-"""Reading a render request: the body as bytes, its checks, its poses."""
+"""The poses and the probe of a render request, checked."""
 
 from __future__ import annotations
 
-from pydantic import ValidationError
-from starlette.requests import Request
-
-from ultragray.errors import InvalidArgument, InvalidPose, UnsupportedMediaType
+from ultragray.errors import InvalidArgument, InvalidPose
 from ultragray.pose import pose_from_position_quaternion
 from ultragray.probe import FloatArray, Probe
 
 from ..requests import check_pose_count, field_under, gather_poses, one_pose
-from .problems import invalid_argument
 from .schemas import PoseBody, RenderBody
-
-
-async def read_render_body(request: Request) -> RenderBody:
-    """The body, each field of the right type. Raises UnsupportedMediaType, BodyTooLarge, InvalidArgument."""
-    content_type = request.headers.get("content-type", "application/json")
-    media_type = content_type.partition(";")[0].strip().lower()
-    if media_type != "application/json" and not media_type.endswith("+json"):
-        raise UnsupportedMediaType(f"Content-Type must be application/json, got {content_type!r}", field="Content-Type")
-    if request.headers.get("content-encoding", "identity").lower() != "identity":
-        raise UnsupportedMediaType("the body must not be compressed", field="Content-Encoding")
-    try:
-        return RenderBody.model_validate_json(await request.body())
-    except ValidationError as error:
-        raise invalid_argument(error.errors(include_url=False)[0]) from None
 
 
 def poses_as_written(body: RenderBody, limit: int) -> list[tuple[str, PoseBody]]:

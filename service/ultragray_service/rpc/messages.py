@@ -18,7 +18,7 @@ OUTPUT_NAMES = {
     rendering_pb2.OUTPUT_TRANSMITTANCE: "transmittance",
     rendering_pb2.OUTPUT_COVERAGE: "coverage",
 }
-_OUTPUT_NUMBERS = {name: number for number, name in OUTPUT_NAMES.items()}
+OUTPUT_NUMBERS = {name: number for number, name in OUTPUT_NAMES.items()}
 
 ENCODINGS = {
     rendering_pb2.ENCODING_UNSPECIFIED: Encoding.UINT8,
@@ -93,11 +93,7 @@ def spec_from_message(message: rendering_pb2.RenderSettings) -> RenderSpec:
     """What the settings ask for. Raises InvalidArgument; its field is a path below the settings."""
     if message.encoding not in ENCODINGS:
         raise InvalidArgument(f"encoding must be one of the enum Encoding, got {message.encoding}", field="encoding")
-    for number in message.outputs:
-        if number not in OUTPUT_NAMES:
-            raise UnknownOutput(
-                f"outputs must be some of {', '.join(_enum_names())}, got number {number}", field="outputs"
-            )
+    outputs = tuple(output_name(number) for number in message.outputs)
     probe = None
     if message.HasField("probe"):
         with field_under("probe"):
@@ -107,13 +103,17 @@ def spec_from_message(message: rendering_pb2.RenderSettings) -> RenderSpec:
         probe=probe,
         height=message.height if message.HasField("height") else None,
         width=message.width if message.HasField("width") else None,
-        outputs=tuple(OUTPUT_NAMES[number] for number in message.outputs) or ("bmode",),
+        outputs=outputs or ("bmode",),
         encoding=ENCODINGS[message.encoding],
     )
 
 
-def _enum_names() -> list[str]:
-    return [rendering_pb2.Output.Name(number) for number in OUTPUT_NAMES]
+def output_name(number: rendering_pb2.Output) -> str:
+    """The name of an output. Raises UnknownOutput."""
+    if number not in OUTPUT_NAMES:
+        names = ", ".join(rendering_pb2.Output.Name(known) for known in OUTPUT_NAMES)
+        raise UnknownOutput(f"outputs must be some of {names}, got number {number}", field="outputs")
+    return OUTPUT_NAMES[number]
 
 
 def frame_message(result: RenderResult, sequence: int) -> rendering_pb2.Frame:
@@ -127,7 +127,7 @@ def frame_message(result: RenderResult, sequence: int) -> rendering_pb2.Frame:
         probe=probe_message(result.probe),
         height=result.height,
         width=result.width,
-        outputs=[_OUTPUT_NUMBERS[name] for name in result.outputs],
+        outputs=[OUTPUT_NUMBERS[name] for name in result.outputs],
         encoding=_ENCODING_NUMBERS[result.encoding],
         data=result.data,
         timings=rendering_pb2.Timings(queue_ms=result.queue_ms, render_ms=result.render_ms, encode_ms=result.encode_ms),

@@ -1,4 +1,4 @@
-"""The gRPC server: our two services, health and reflection."""
+"""The gRPC server: our services, health and reflection."""
 
 from __future__ import annotations
 
@@ -6,10 +6,21 @@ import grpc
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
-from ultragray_proto.v1 import rendering_pb2, rendering_pb2_grpc, scenes_pb2, scenes_pb2_grpc
+from ultragray_proto.v1 import (
+    datasets_pb2,
+    datasets_pb2_grpc,
+    jobs_pb2,
+    jobs_pb2_grpc,
+    rendering_pb2,
+    rendering_pb2_grpc,
+    scenes_pb2,
+    scenes_pb2_grpc,
+)
 
 from ..state import Service
+from .datasets import DatasetService
 from .interceptor import CallContext
+from .jobs import JobService
 from .rendering import RenderService
 from .scenes import SceneService
 
@@ -19,6 +30,8 @@ _UNLIMITED = -1
 SERVICE_NAMES = (
     scenes_pb2.DESCRIPTOR.services_by_name["SceneService"].full_name,
     rendering_pb2.DESCRIPTOR.services_by_name["RenderService"].full_name,
+    datasets_pb2.DESCRIPTOR.services_by_name["DatasetService"].full_name,
+    jobs_pb2.DESCRIPTOR.services_by_name["JobService"].full_name,
 )
 
 
@@ -37,6 +50,8 @@ class GrpcServer:
         self._health = health.aio.HealthServicer()
         rendering_pb2_grpc.add_RenderServiceServicer_to_server(RenderService(service), self._server)
         scenes_pb2_grpc.add_SceneServiceServicer_to_server(SceneService(service), self._server)
+        datasets_pb2_grpc.add_DatasetServiceServicer_to_server(DatasetService(service), self._server)
+        jobs_pb2_grpc.add_JobServiceServicer_to_server(JobService(service), self._server)
         health_pb2_grpc.add_HealthServicer_to_server(self._health, self._server)
         reflection.enable_server_reflection(
             (*SERVICE_NAMES, health.SERVICE_NAME, reflection.SERVICE_NAME), self._server

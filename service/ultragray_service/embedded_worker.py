@@ -1,0 +1,83 @@
+"""The worker that `ultragray serve` brings along: a process of its own, started again when it dies."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import os
+import subprocess
+import sys
+import time
+
+from .settings import ENVIRONMENT_PREFIX, Settings
+
+_FIRST_WAIT_S, _LONGEST_WAIT_S = 0.5, 30.0
+_STEADY_S = 60.0  # after which a death is a new misfortune
+_STOP_WAIT_S = 20.0
+_PASSED_ON = (
+    "data_folder",
+    "artifact_folder",
+    "database_url",
+    "training_threads",
+    "job_nice",
+    "log_level",
+)
+
+_log = logging.getLogger("ultragray.service")
+
+
+class EmbeddedWorker:
+    """Its methods belong to the event loop's thread, which must be the main one: the worker dies with it."""
+
+    def __init__(self, settings: Settings) -> None:
+        self._settings = settings
+        self._stop = asyncio.Event()
+        self._process: subprocess.Popen[bytes] | None = None
+        self._task: asyncio.Task[None] | None = None
+
+    def start(self) -> None:
+        """Starts the worker and returns at once; nothing where the settings want none."""
+        if self._settings.embedded_worker:
+            self._task = asyncio.create_task(self._keep_alive())
+
+    async def stop(self) -> None:
+        """Ends the worker, which puts the job at hand back into the queue."""
+        self._stop.set()
+        self._terminate()
+        if self._task is None:
+            return
+        done, _ = await asyncio.wait({self._task}, timeout=_STOP_WAIT_S)
+        if not done and self._process is not None:
+            self._process.kill()
+            await self._task
+
+    async def _keep_alive(self) -> None:
+        wait_s = _FIRST_WAIT_S
+        while not self._stop.is_set():
+            started = time.monotonic()
+            self._process = self._spawn()
+            code = await asyncio.get_running_loop().run_in_executor(None, self._process.wait)
+            if self._stop.is_set():
+                return
+            if time.monotonic() - started > _STEADY_S:
+                wait_s = _FIRST_WAIT_S
+            _log.warning(f"the worker for jobs ended with {code}; the next one starts in {wait_s:g} s")
+            with contextlib.suppress(asyncio.TimeoutError):
+                await asyncio.wait_for(self._stop.wait(), wait_s)
+            wait_s = min(2.0 * wait_s, _LONGEST_WAIT_S)
+
+    def _terminate(self) -> None:
+        if self._process is not None and self._process.poll() is None:
+            self._process.terminate()
+
+    def _spawn(self) -> subprocess.Popen[bytes]:
+        values = {name: getattr(self._settings, name) for name in _PASSED_ON}
+        given = {ENVIRONMENT_PREFIX + name.upper(): str(value) for name, value in values.items() if value is not None}
+        # Not asyncio's: it forks, which gRPC complains about.
+        return subprocess.Popen(
+            [sys.executable, "-m", "ultragray_service.cli_worker", str(os.getpid())],
+            stdin=subprocess.DEVNULL,
+            env={**os.environ, **given, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)},
+            start_new_session=True,  # Ctrl-C is for the service, which then stops the worker
+        )

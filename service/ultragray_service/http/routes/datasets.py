@@ -1,0 +1,184 @@
+"""Datasets: uploaded, checked, listed, looked at, deleted."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import AsyncIterator
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Path, Query
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import Response
+
+from ultragray.errors import UnsupportedMediaType, UploadTooLarge
+
+from ...catalog import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE
+from ...dataset_catalog import contact_sheet, dataset_page
+from ...dataset_uploads import CHECK_TIMEOUT_S, DatasetUpload
+from ..accept import PNG
+from ..dataset_schemas import DatasetOut, DatasetPage
+from ..deps import ServiceDep, problems
+from ..disconnect import finish_or_abandon
+from ..multipart import FileParts
+
+router = APIRouter(prefix="/v1/datasets", tags=["datasets"])
+
+MULTIPART = "multipart/form-data"
+ARCHIVES = (
+    "application/zip",
+    "application/x-zip-compressed",
+    "application/x-tar",
+    "application/gzip",
+    "application/x-gzip",
+)
+
+DatasetName = Annotated[str, Path(description="Name of the dataset.", examples=["liver"])]
+PageSize = Annotated[int, Query(ge=1, le=MAX_PAGE_SIZE, description="Datasets on one page.")]
+PageToken = Annotated[str, Query(description="next_page_token of the page before.")]
+Crop = Annotated[str, Query(description="Region of a sequence's image: columns,rows, such as 188:632,12:600.")]
+ImageSize = Annotated[str, Query(description="Resize the frames: WIDTHxHEIGHT, such as 192x256.")]
+Frames = Annotated[str, Query(description="Frames of a sequence to read at all, such as 0:90,100:120:2.")]
+TrainFrames = Annotated[str, Query(description="Frames to train from.")]
+ValFrames = Annotated[str, Query(description="Frames to hold out.")]
+
+_BINARY = {"schema": {"type": "string", "format": "binary"}}
+_UPLOAD: dict[str, Any] = {
+    "requestBody": {
+        "required": True,
+        "description": "An archive, or separate files: conf.json and .npy files of the released layout, or a PLUS "
+        "sequence with its device set (.xml).",
+        "content": {
+            **dict.fromkeys(ARCHIVES, _BINARY),
+            MULTIPART: {
+                "schema": {
+                    "type": "object",
+                    "properties": {"files": {"type": "array", "items": {"type": "string", "format": "binary"}}},
+                }
+            },
+        },
+    }
+}
+_Answers = dict[int | str, dict[str, Any]]
+_PRESENT: _Answers = {
+    200: {"model": DatasetOut, "description": "It is there already, with this content and these options."}
+}
+_PICTURE: _Answers = {200: {"description": "The image planes in space and some frames.", "content": {PNG: _BINARY}}}
+
+
+@router.put(
+    "/{dataset}",
+    status_code=201,
+    response_model=DatasetOut,
+    openapi_extra=_UPLOAD,
+    responses=_PRESENT | problems(401, 409, 413, 415, 422, 429, 500, 503, 504, 507),
+)
+async def put_dataset(
+    request: Request,
+    response: Response,
+    service: ServiceDep,
+    dataset: DatasetName,
+    crop: Crop = "",
+    image_size: ImageSize = "",
+    frames: Frames = "",
+    train_frames: TrainFrames = "",
+    val_frames: ValFrames = "",
+) -> DatasetOut:
+    """Uploads a dataset, checks it as `ultragray dataset check` does, and keeps it. Empty options: as it is stored."""
+    service.require_serving()
+    media_type = _media_type(request)
+    given = {
+        "crop": crop,
+        "image_size": image_size,
+        "frames": frames,
+        "train_frames": train_frames,
+        "val_frames": val_frames,
+    }
+    announced = request.headers.get("content-length", "")
+    if announced.isdigit() and int(announced) > service.settings.max_dataset_bytes:
+        raise UploadTooLarge(
+            f"a dataset may have at most {service.settings.max_dataset_bytes} bytes, {announced} were announced",
+            field="body",
+        )
+    options = {name: value for name, value in given.items() if value}
+    async with service.uploads.receive(dataset, options) as upload:
+        if media_type == MULTIPART:
+            await _receive_files(request, upload)
+        else:
+            await _receive_archive(request, upload)
+        deadline = time.monotonic() + CHECK_TIMEOUT_S
+        record, is_new = await finish_or_abandon(upload.finish(), request.receive, deadline)
+    response.status_code = 201 if is_new else 200
+    return DatasetOut.of(record)
+
+
+@router.get("", responses=problems(401, 422))
+async def list_datasets(
+    service: ServiceDep, page_size: PageSize = DEFAULT_PAGE_SIZE, page_token: PageToken = ""
+) -> DatasetPage:
+    """The datasets by name."""
+    records, next_page_token = await dataset_page(service.datasets, page_size, page_token)
+    return DatasetPage(datasets=[DatasetOut.of(record) for record in records], next_page_token=next_page_token)
+
+
+@router.get("/{dataset}", responses=problems(401, 404, 422))
+async def get_dataset(service: ServiceDep, dataset: DatasetName) -> DatasetOut:
+    """Size, probe, split, and what the check warned of."""
+    return DatasetOut.of(await asyncio.to_thread(service.datasets.get, dataset))
+
+
+@router.get(
+    "/{dataset}/contact-sheet",
+    response_class=Response,
+    responses=_PICTURE | problems(401, 404, 422),
+)
+async def get_contact_sheet(service: ServiceDep, dataset: DatasetName) -> Response:
+    """A picture of the dataset, PNG."""
+    return Response(await contact_sheet(service.datasets, dataset), media_type=PNG)
+
+
+@router.delete("/{dataset}", status_code=204, responses=problems(401, 404, 409, 422))
+async def delete_dataset(service: ServiceDep, dataset: DatasetName) -> None:
+    """Deletes a dataset that no job needs."""
+    await asyncio.to_thread(service.datasets.delete, dataset)
+
+
+def _media_type(request: Request) -> str:
+    content_type = request.headers.get("content-type", "")
+    media_type = content_type.partition(";")[0].strip().lower()
+    if media_type != MULTIPART and media_type not in ARCHIVES:
+        raise UnsupportedMediaType(
+            f"Content-Type must be {MULTIPART} or one of {', '.join(ARCHIVES)}, got {content_type[:200]!r}",
+            field="Content-Type",
+        )
+    if request.headers.get("content-encoding", "identity").lower() != "identity":
+        raise UnsupportedMediaType("the body must not be compressed as a whole", field="Content-Encoding")
+    return media_type
+
+
+async def _receive_archive(request: Request, upload: DatasetUpload) -> None:
+    await upload.begin_archive()
+    async for block in _blocks(request, upload):
+        await upload.write(block)
+
+
+async def _receive_files(request: Request, upload: DatasetUpload) -> None:
+    parts = FileParts(request.headers["content-type"])
+    async for block in _blocks(request, upload):
+        for event in parts.feed(block):
+            if isinstance(event, str):
+                await upload.begin_file(event)
+            else:
+                await upload.write(event)
+    parts.finish()
+
+
+async def _blocks(request: Request, upload: DatasetUpload) -> AsyncIterator[bytes]:
+    """The body as it comes. Raises ClientDisconnect, and as `DatasetUpload.next`."""
+    more = True
+    while more:
+        message = await upload.next(request.receive())
+        if message["type"] == "http.disconnect":
+            raise ClientDisconnect
+        more = message.get("more_body", False)
+        yield message.get("body", b"")

@@ -1,0 +1,165 @@
+"""Training and batch rendering in the background."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from fastapi import APIRouter, Path, Query
+from starlette.requests import Request
+from starlette.responses import FileResponse, PlainTextResponse, Response, StreamingResponse
+
+from ultragray.errors import InvalidArgument
+from ultragray_workers.jobs.specification import from_dict
+
+from ...catalog import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE
+from ...requests import field_under
+from ..accept import NPZ, PNG
+from ..deps import ServiceDep, problems
+from ..examples import JOB_EXAMPLES
+from ..job_events import EVENTS_TYPE, JobEvents
+from ..job_schemas import JobBody, JobOut, JobPage
+from ..json_body import read_json_body
+
+router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
+
+DEFAULT_LOG_BYTES = 65536
+MAX_LOG_BYTES = 2**20
+MEDIA_TYPES = {
+    ".html": "text/html; charset=utf-8",
+    ".json": "application/json",
+    ".jsonl": "application/jsonl",
+    ".npz": NPZ,
+    ".png": PNG,
+    ".tar": "application/x-tar",
+}
+_SPECIFICATION = "specification"  # the key of the body
+_ANY_FILE = "application/octet-stream"
+
+JobId = Annotated[str, Path(description="Id of the job.")]
+StateFilter = Annotated[
+    Literal["", "queued", "running", "succeeded", "failed", "cancelled"],
+    Query(description="Only jobs in this state; empty: all."),
+]
+KindFilter = Annotated[Literal["", "train", "render"], Query(description="Only jobs of this kind; empty: all.")]
+PageSize = Annotated[int, Query(ge=1, le=MAX_PAGE_SIZE, description="Jobs on one page.")]
+PageToken = Annotated[str, Query(description="next_page_token of the page before.")]
+LogBytes = Annotated[int, Query(ge=1, le=MAX_LOG_BYTES, description="How much of the log's end is given.")]
+
+_SUBMIT: dict[str, Any] = {
+    "requestBody": {
+        "required": True,
+        "content": {
+            "application/json": {
+                "schema": {"$ref": f"#/components/schemas/{JobBody.__name__}"},
+                "examples": JOB_EXAMPLES,
+            }
+        },
+    }
+}
+_Answers = dict[int | str, dict[str, Any]]
+_SAME_JOB: _Answers = {200: {"model": JobOut, "description": "The job that this request_id made before."}}
+_LOG: _Answers = {200: {"description": "The end of the log.", "content": {"text/plain": {}}}}
+_FILE: _Answers = {
+    200: {
+        "description": "The file.",
+        "content": {
+            media_type: {"schema": {"type": "string", "format": "binary"}}
+            for media_type in (*MEDIA_TYPES.values(), _ANY_FILE)
+        },
+    }
+}
+_EVENTS: _Answers = {
+    200: {
+        "description": "Server-sent events: `progress` with the job (JobOut) at first and whenever it changed, at most "
+        "twice a second; `log` with new lines. The stream ends after the job's final state.",
+        "content": {EVENTS_TYPE: {"schema": {"type": "string"}}},
+    }
+}
+
+
+@router.post(
+    "",
+    status_code=201,
+    response_model=JobOut,
+    openapi_extra=_SUBMIT,
+    responses=_SAME_JOB | problems(401, 404, 409, 413, 415, 422, 429, 503),
+)
+async def submit_job(request: Request, response: Response, service: ServiceDep) -> JobOut:
+    """Puts a job into the queue. The same request_id with the same body gives the same job, whatever its state."""
+    service.require_serving()
+    body = await read_json_body(request, JobBody)
+    with field_under(_SPECIFICATION):
+        if "kind" in body.specification:
+            raise InvalidArgument("kind stands beside the specification, not in it", field="kind")
+        specification = from_dict({"kind": body.kind, **body.specification})
+    job, is_new = await service.jobs.submit(
+        specification, field=_SPECIFICATION, request_id=body.request_id, priority=body.priority
+    )
+    response.status_code = 201 if is_new else 200
+    return JobOut.of(job)
+
+
+@router.get("", responses=problems(401, 422, 503))
+async def list_jobs(
+    service: ServiceDep,
+    state: StateFilter = "",
+    kind: KindFilter = "",
+    page_size: PageSize = DEFAULT_PAGE_SIZE,
+    page_token: PageToken = "",
+) -> JobPage:
+    """The jobs, newest first."""
+    jobs, next_page_token = await service.jobs.page(state=state, kind=kind, page_size=page_size, page_token=page_token)
+    return JobPage(jobs=[JobOut.of(job) for job in jobs], next_page_token=next_page_token)
+
+
+@router.get("/{job}", responses=problems(401, 404, 422, 503))
+async def get_job(service: ServiceDep, job: JobId) -> JobOut:
+    """State, progress, metrics, and the names of the artifacts."""
+    return JobOut.of(await service.jobs.get(job))
+
+
+@router.post("/{job}:cancel", responses=problems(401, 404, 409, 422, 503))
+async def cancel_job(service: ServiceDep, job: JobId) -> JobOut:
+    """Stops a job within a second; no error where it is cancelled already."""
+    return JobOut.of(await service.jobs.cancel(job))
+
+
+@router.post("/{job}:retry", status_code=201, responses=problems(401, 404, 409, 422, 429, 503))
+async def retry_job(service: ServiceDep, job: JobId) -> JobOut:
+    """A new job in place of a failed or cancelled one; a training goes on from its last checkpoint."""
+    service.require_serving()
+    return JobOut.of(await service.jobs.retry(job))
+
+
+@router.get(
+    "/{job}/log",
+    response_class=PlainTextResponse,
+    responses=_LOG | problems(401, 404, 422, 503),
+)
+async def get_job_log(service: ServiceDep, job: JobId, max_bytes: LogBytes = DEFAULT_LOG_BYTES) -> PlainTextResponse:
+    """What the job's process wrote."""
+    return PlainTextResponse(await service.jobs.log_tail(job, max_bytes))
+
+
+@router.get(
+    "/{job}/artifacts/{name}",
+    response_class=FileResponse,
+    responses=_FILE | problems(401, 404, 422, 503),
+)
+async def get_artifact(
+    service: ServiceDep, job: JobId, name: Annotated[str, Path(description="One of the job's artifacts.")]
+) -> FileResponse:
+    """Downloads a file that the job made. Ranges are answered, so that a download can go on."""
+    path = await service.jobs.artifact(job, name)
+    return FileResponse(path, media_type=MEDIA_TYPES.get(path.suffix, _ANY_FILE), filename=name)
+
+
+@router.get(
+    "/{job}/events",
+    response_class=StreamingResponse,
+    responses=_EVENTS | problems(401, 404, 422, 503),
+)
+async def watch_job(service: ServiceDep, job: JobId) -> JobEvents:
+    """Follows a job. A stream that ends before the final state (the service stopped) can be asked for again."""
+    service.require_serving()
+    return JobEvents(await service.jobs.watch(job))

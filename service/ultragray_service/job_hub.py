@@ -1,0 +1,164 @@
+"""Watching jobs: one reader for each job that is watched, however many watch it."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from ultragray_workers.jobs.store import Job, JobState
+
+from .job_log import TAIL_BYTES, GrowingLog
+
+READ_INTERVAL_S = 0.5
+_WAITING_LOG_CHARACTERS = 65536  # of a watcher that reads slowly; the oldest go
+
+FINAL_STATES = (JobState.SUCCEEDED, JobState.FAILED, JobState.CANCELLED)
+
+
+@dataclass(frozen=True)
+class JobChange:
+    """What is new about a job: its state and progress where they changed, and new lines of its log."""
+
+    job: Job | None
+    log: str
+
+
+class JobWatch:
+    """One watcher's part. A watcher that reads slowly gets the newest state and loses old log lines, never both."""
+
+    def __init__(self, leave: Callable[[JobWatch], None]) -> None:
+        self._leave = leave
+        self._job: Job | None = None
+        self._log = ""
+        self.finished = False  # whether the final state was told
+        self._ended = False
+        self._error: Exception | None = None
+        self._news = asyncio.Event()
+
+    async def next(self, timeout_s: float) -> JobChange | None:
+        """What changed since the last time, after at most `timeout_s` seconds (nothing: an empty change).
+
+        None after the job's final state was told, or when the service stops. Raises what reading the job raises.
+        """
+        if not self._news.is_set() and not self._ended:
+            try:
+                await asyncio.wait_for(self._news.wait(), timeout_s)
+            except asyncio.TimeoutError:
+                return JobChange(None, "")
+        self._news.clear()
+        if self._job is not None or self._log:
+            change = JobChange(self._job, self._log)
+            self._job, self._log = None, ""
+            return change
+        if self._error is not None:
+            raise self._error
+        return None
+
+    def tell(self, job: Job | None, log: str) -> None:
+        """Adds to what the watcher has not read yet."""
+        if job is not None:
+            self._job = job
+            self.finished = job.state in FINAL_STATES
+        self._log = (self._log + log)[-_WAITING_LOG_CHARACTERS:]
+        self._news.set()
+
+    def end(self, error: Exception | None = None) -> None:
+        """Nothing more will come."""
+        self._ended = True
+        self._error = error
+        self._news.set()
+
+    def close(self) -> None:
+        """The watcher goes away: what was kept for it is freed."""
+        self._leave(self)
+
+
+class _Reader:
+    """Reads one job for all of its watchers, until its final state or until nobody watches."""
+
+    def __init__(self, read: Callable[[], Job], log_path: Path) -> None:
+        self._read = read
+        self._log = GrowingLog(log_path)
+        self._tail = ""  # for those who come later
+        self._job: Job | None = None
+        self.watches: set[JobWatch] = set()
+        self.task = asyncio.ensure_future(self._run())
+
+    def add(self, watch: JobWatch) -> None:
+        """A watcher begins with the job as it is known and the last lines of its log."""
+        self.watches.add(watch)
+        if self._job is not None:
+            watch.tell(self._job, self._tail)
+
+    async def _run(self) -> None:
+        error: Exception | None = None
+        try:
+            while self._job is None or self._job.state not in FINAL_STATES:
+                if self._job is not None:
+                    await asyncio.sleep(READ_INTERVAL_S)
+                job, log = await asyncio.to_thread(self._look)
+                changed = job if job != self._job else None
+                self._job = job
+                self._tail = (self._tail + log)[-TAIL_BYTES:]
+                if changed is not None or log:
+                    for watch in self.watches:
+                        watch.tell(changed, log)
+        except Exception as raised:
+            error = raised
+        finally:
+            for watch in self.watches:
+                watch.end(error)
+
+    def _look(self) -> tuple[Job, str]:
+        job = self._read()  # first, so that the log of a finished job is whole
+        return job, self._log.read()
+
+
+class JobHub:
+    """The watchers of all jobs. Belongs to one event loop."""
+
+    def __init__(self, get: Callable[[str], Job], log_path: Callable[[str], Path]) -> None:
+        self._get = get
+        self._log_path = log_path
+        self._readers: dict[str, _Reader] = {}
+        self._closed = False
+
+    @property
+    def readers(self) -> int:
+        """How many jobs are being read."""
+        return len(self._readers)
+
+    async def watch(self, job_id: str) -> JobWatch:
+        """A watcher of a job; its first change tells all. It must be closed. Raises JobNotFound."""
+        reader = self._readers.get(job_id)
+        if reader is None or reader.task.done():
+            await asyncio.to_thread(self._get, job_id)
+            reader = self._readers.get(job_id)  # another watcher may have come in the meantime
+        if self._closed:
+            over = JobWatch(lambda leaving: None)
+            over.end()
+            return over
+        if reader is None or reader.task.done():
+            reader = _Reader(lambda: self._get(job_id), self._log_path(job_id))
+            self._readers[job_id] = reader
+        chosen = reader
+        watch = JobWatch(lambda leaving: self._remove(job_id, chosen, leaving))
+        chosen.add(watch)
+        return watch
+
+    def _remove(self, job_id: str, reader: _Reader, watch: JobWatch) -> None:
+        reader.watches.discard(watch)
+        if not reader.watches:
+            reader.task.cancel()
+            if self._readers.get(job_id) is reader:
+                del self._readers[job_id]
+
+    def close(self) -> None:
+        """Ends every watcher: the service stops."""
+        self._closed = True
+        for reader in self._readers.values():
+            reader.task.cancel()
+            for watch in reader.watches:
+                watch.end()

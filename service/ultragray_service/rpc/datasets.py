@@ -1,0 +1,94 @@
+"""DatasetService."""
+
+from __future__ import annotations
+
+import asyncio
+
+import grpc
+
+from ultragray.errors import InvalidArgument
+from ultragray_proto.v1 import datasets_pb2
+from ultragray_workers.dataset_store import DatasetRecord
+
+from ..catalog import DEFAULT_PAGE_SIZE
+from ..dataset_catalog import contact_sheet, dataset_page
+from ..dataset_uploads import OPTION_NAMES, DatasetUpload
+from ..state import Service
+from .messages import probe_message
+
+
+class DatasetService:
+    """The methods of ultragray.v1.DatasetService."""
+
+    def __init__(self, service: Service) -> None:
+        self._service = service
+
+    async def UploadDataset(  # noqa: N802
+        self, requests: object, context: grpc.aio.ServicerContext
+    ) -> datasets_pb2.UploadDatasetResponse:
+        self._service.require_serving()
+        first = await context.read()
+        if first is grpc.aio.EOF or first.WhichOneof("part") != "header":
+            raise InvalidArgument("the first message must hold the header", field="header")
+        header = first.header
+        options = {name: value for name in OPTION_NAMES if (value := getattr(header.options, name))}
+        async with self._service.uploads.receive(header.dataset, options) as upload:
+            if header.archive:
+                await upload.begin_archive()
+            await _receive(context, upload, archive=header.archive)
+            record, is_new = await upload.finish()
+        return datasets_pb2.UploadDatasetResponse(dataset=_dataset(record), created=is_new)
+
+    async def ListDatasets(  # noqa: N802
+        self, request: datasets_pb2.ListDatasetsRequest, context: grpc.aio.ServicerContext
+    ) -> datasets_pb2.ListDatasetsResponse:
+        page_size = request.page_size or DEFAULT_PAGE_SIZE
+        records, next_page_token = await dataset_page(self._service.datasets, page_size, request.page_token)
+        return datasets_pb2.ListDatasetsResponse(
+            datasets=[_dataset(record) for record in records], next_page_token=next_page_token
+        )
+
+    async def GetDataset(  # noqa: N802
+        self, request: datasets_pb2.GetDatasetRequest, context: grpc.aio.ServicerContext
+    ) -> datasets_pb2.Dataset:
+        return _dataset(await asyncio.to_thread(self._service.datasets.get, request.dataset))
+
+    async def GetContactSheet(  # noqa: N802
+        self, request: datasets_pb2.GetContactSheetRequest, context: grpc.aio.ServicerContext
+    ) -> datasets_pb2.GetContactSheetResponse:
+        return datasets_pb2.GetContactSheetResponse(png=await contact_sheet(self._service.datasets, request.dataset))
+
+    async def DeleteDataset(  # noqa: N802
+        self, request: datasets_pb2.DeleteDatasetRequest, context: grpc.aio.ServicerContext
+    ) -> datasets_pb2.DeleteDatasetResponse:
+        await asyncio.to_thread(self._service.datasets.delete, request.dataset)
+        return datasets_pb2.DeleteDatasetResponse(dataset=request.dataset)
+
+
+async def _receive(context: grpc.aio.ServicerContext, upload: DatasetUpload, *, archive: bool) -> None:
+    while (message := await upload.next(context.read())) is not grpc.aio.EOF:
+        part = message.WhichOneof("part")
+        if part == "chunk":
+            await upload.write(message.chunk)
+        elif part == "file" and not archive:
+            await upload.begin_file(message.file)
+        else:
+            expected = "chunk" if archive else "file or chunk"
+            raise InvalidArgument(f"a message after the header must hold {expected}, got {part or 'neither'}")
+
+
+def _dataset(record: DatasetRecord) -> datasets_pb2.Dataset:
+    return datasets_pb2.Dataset(
+        name=record.name,
+        kind=record.kind,
+        sha256=record.sha256,
+        bytes=record.bytes,
+        created_at=record.created_at,
+        train_frames=record.train_frames,
+        val_frames=record.val_frames,
+        height=record.height,
+        width=record.width,
+        probe=None if record.probe is None else probe_message(record.probe),
+        warnings=record.warnings,
+        options=datasets_pb2.DatasetOptions(**record.options),
+    )

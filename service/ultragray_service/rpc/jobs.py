@@ -1,0 +1,74 @@
+"""JobService."""
+
+from __future__ import annotations
+
+import grpc
+
+from ultragray.errors import Draining
+from ultragray_proto.v1 import jobs_pb2
+
+from ..catalog import DEFAULT_PAGE_SIZE
+from ..state import Service
+from .job_messages import KINDS, STATES, filter_from_number, job_message, specification_from_message
+
+_LOOK_AROUND_S = 15.0  # how long a watch waits for news at a time
+
+
+class JobService:
+    """The methods of ultragray.v1.JobService."""
+
+    def __init__(self, service: Service) -> None:
+        self._service = service
+
+    async def SubmitJob(  # noqa: N802
+        self, request: jobs_pb2.SubmitJobRequest, context: grpc.aio.ServicerContext
+    ) -> jobs_pb2.SubmitJobResponse:
+        self._service.require_serving()
+        specification, field = specification_from_message(request)
+        job, is_new = await self._service.jobs.submit(
+            specification, field=field, request_id=request.request_id or None, priority=request.priority
+        )
+        return jobs_pb2.SubmitJobResponse(job=job_message(job), created=is_new)
+
+    async def ListJobs(  # noqa: N802
+        self, request: jobs_pb2.ListJobsRequest, context: grpc.aio.ServicerContext
+    ) -> jobs_pb2.ListJobsResponse:
+        jobs, next_page_token = await self._service.jobs.page(
+            state=filter_from_number(request.state, STATES, "state"),
+            kind=filter_from_number(request.kind, KINDS, "kind"),
+            page_size=request.page_size or DEFAULT_PAGE_SIZE,
+            page_token=request.page_token,
+        )
+        return jobs_pb2.ListJobsResponse(jobs=[job_message(job) for job in jobs], next_page_token=next_page_token)
+
+    async def GetJob(  # noqa: N802
+        self, request: jobs_pb2.GetJobRequest, context: grpc.aio.ServicerContext
+    ) -> jobs_pb2.Job:
+        return job_message(await self._service.jobs.get(request.job))
+
+    async def CancelJob(  # noqa: N802
+        self, request: jobs_pb2.CancelJobRequest, context: grpc.aio.ServicerContext
+    ) -> jobs_pb2.Job:
+        return job_message(await self._service.jobs.cancel(request.job))
+
+    async def RetryJob(  # noqa: N802
+        self, request: jobs_pb2.RetryJobRequest, context: grpc.aio.ServicerContext
+    ) -> jobs_pb2.Job:
+        self._service.require_serving()
+        return job_message(await self._service.jobs.retry(request.job))
+
+    async def WatchJob(  # noqa: N802
+        self, request: jobs_pb2.WatchJobRequest, context: grpc.aio.ServicerContext
+    ) -> None:
+        self._service.require_serving()
+        watch = await self._service.jobs.watch(request.job)
+        try:
+            while (change := await watch.next(_LOOK_AROUND_S)) is not None:
+                if change.job is None and not change.log:
+                    continue
+                job = None if change.job is None else job_message(change.job)
+                await context.write(jobs_pb2.JobEvent(job=job, log=change.log))
+            if not watch.finished:
+                raise Draining("the service is stopping; watch the job again when it is back")
+        finally:
+            watch.close()

@@ -1,0 +1,154 @@
+"""Jobs with real workers, each a process of its own, on datasets that train within a second."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ultragray import LinearProbe
+from ultragray.datasets.released import write_released
+from ultragray.datasets.sweep import Dataset, Sweep
+from ultragray_workers.dataset_store import FILES_NAME, DatasetRecord, write_manifest
+from ultragray_workers.jobs.specification import TrainJob
+from ultragray_workers.jobs.store import Job, JobState, JobStore
+
+FINAL = (JobState.SUCCEEDED, JobState.FAILED, JobState.CANCELLED)
+PROBE = LinearProbe(width_mm=20.0, near_mm=0.0, far_mm=25.0)
+PROGRAM = """
+import os, signal, sys, threading
+from pathlib import Path
+from ultragray_workers.jobs import heartbeat
+from ultragray_workers.jobs.worker import work
+heartbeat.DEAD_AFTER_S = 3.0
+stop = threading.Event()
+signal.signal(signal.SIGTERM, lambda number, frame: stop.set())
+work(Path(sys.argv[1]), None, stop, name=sys.argv[2], device="cpu", threads=1, nice=0)
+os._exit(0)
+"""
+
+
+def tiny_dataset(frames: int = 8, side: int = 16) -> Dataset:
+    """A bright ball in grey noise; every fourth frame is held out."""
+    poses = np.tile(np.eye(4), (frames, 1, 1))
+    poses[:, 1, 3] = 0.8 * np.arange(frames)
+    x, z = np.meshgrid(np.linspace(-1, 1, side), np.linspace(0, 1, side))
+    ball = 140.0 * np.exp(-((x - 0.1) ** 2 + (z - 0.4) ** 2) / 0.1)
+    noise = np.random.default_rng(0).normal(50.0, 4.0, (frames, side, side))
+    images = np.clip(ball + noise, 0, 255).astype(np.uint8)
+    held_out = np.arange(frames) % 4 == 2
+
+    def part(chosen: Any) -> Sweep:
+        return Sweep(images[chosen], poses[chosen], PROBE, np.arange(frames)[chosen], "tiny")
+
+    return Dataset("tiny", part(~held_out), part(held_out))
+
+
+def store_dataset(artifact_folder: Path, name: str) -> Path:
+    """A dataset as an upload leaves it; its folder."""
+    dataset = tiny_dataset()
+    folder = artifact_folder / "datasets" / name
+    folder.mkdir(parents=True)
+    write_released(dataset, folder / FILES_NAME)
+    record = DatasetRecord(
+        name=name,
+        kind="released",
+        sha256=dataset.sha256,
+        bytes=1,
+        created_at="2026-01-01T00:00:00+00:00",
+        train_frames=len(dataset.train),
+        val_frames=len(dataset.val),
+        height=16,
+        width=16,
+        probe=PROBE,
+        warnings=(),
+        source="conf.json",
+        device_set=None,
+    )
+    write_manifest(record, folder)
+    return folder
+
+
+def train_job(scene: str, *, dataset: str = "tiny", steps: int = 20, **settings: Any) -> TrainJob:
+    values = {"steps": steps, "max_gaussians": 40, "batch_size": 2, **settings}
+    return TrainJob(dataset=dataset, scene=scene, settings=values, device="cpu")
+
+
+class RunningWorker:
+    """A worker in a process of its own."""
+
+    def __init__(self, artifact_folder: Path, name: str, log: Path) -> None:
+        with log.open("ab") as file:
+            self.process = subprocess.Popen(
+                [sys.executable, "-c", PROGRAM, str(artifact_folder), name],
+                env={**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)},
+                stdout=file,
+                stderr=file,
+            )
+
+    def kill(self) -> None:
+        """As a loss of power to the worker would."""
+        self.process.kill()
+        self.process.wait()
+
+    def terminate(self) -> int:
+        """As a service manager does."""
+        self.process.send_signal(signal.SIGTERM)
+        return self.process.wait(20)
+
+    def job_process(self) -> int | None:
+        """The process of the job at hand."""
+        for children in Path(f"/proc/{self.process.pid}/task").glob("*/children"):
+            for pid in children.read_text().split():
+                return int(pid)
+        return None
+
+
+@pytest.fixture
+def artifact_folder(tmp_path: Path) -> Path:
+    folder = tmp_path / "artifacts"
+    store_dataset(folder, "tiny")
+    return folder
+
+
+@pytest.fixture
+def store(artifact_folder: Path) -> Iterator[JobStore]:
+    store = JobStore(artifact_folder, None, queue_limit=20)
+    yield store
+    store.close()
+
+
+@pytest.fixture
+def start_worker(artifact_folder: Path, tmp_path: Path) -> Iterator[Callable[..., RunningWorker]]:
+    started: list[RunningWorker] = []
+
+    def start(name: str = "one") -> RunningWorker:
+        started.append(RunningWorker(artifact_folder, name, tmp_path / f"{name}.log"))
+        return started[-1]
+
+    yield start
+    for worker in started:
+        worker.kill()
+
+
+@pytest.fixture
+def until(store: JobStore) -> Callable[..., Job]:
+    """Waits for a job to be final, or whatever is asked for."""
+
+    def wait(job: Job, reached: Callable[[Job], bool] = lambda job: job.state in FINAL, timeout_s: float = 60) -> Job:
+        end = time.monotonic() + timeout_s
+        while not reached(job):
+            assert time.monotonic() < end, (job, store.log_tail(job.id))
+            time.sleep(0.05)
+            job = store.get(job.id)
+        return job
+
+    return wait

@@ -1,0 +1,212 @@
+"""The store without a worker: jobs stay queued."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+
+from ultragray.errors import (
+    ArtifactNotFound,
+    DatasetNotFound,
+    InvalidArgument,
+    JobConflict,
+    JobNotFinished,
+    JobNotFound,
+    JobQueueFull,
+    SceneExists,
+    SceneNotFound,
+    StartupFailed,
+)
+from ultragray_workers.jobs.specification import PoseSampler, RenderJob
+from ultragray_workers.jobs.store import JobState, JobStore
+from ultragray_workers.scenes import SceneStore
+
+from .conftest import train_job
+
+TRAINING_POSES = PoseSampler("training")
+
+
+def test_submitted_job_waits(store: JobStore) -> None:
+    job, is_new = store.submit(train_job("one"), priority=5)
+    assert is_new
+    assert job.state is JobState.QUEUED
+    assert (job.kind, job.priority, job.attempts, job.worker, job.started_at) == ("train", 5, 0, None, None)
+    assert job.specification["dataset"] == "tiny"
+    assert job.specification["settings"]["steps"] == 20
+    assert store.get(job.id) == job
+    assert store.log_tail(job.id) == ""
+
+
+def test_same_request_id_gives_the_same_job(store: JobStore) -> None:
+    job, _ = store.submit(train_job("one"), request_id="mine")
+    assert store.submit(train_job("one"), request_id="mine") == (job, False)
+    store.cancel(job.id)
+    assert store.submit(train_job("one"), request_id="mine") == (store.get(job.id), False)
+    for other in (train_job("two"), RenderJob("one", sampler=TRAINING_POSES)):
+        with pytest.raises(JobConflict, match="'mine'"):
+            store.submit(other, request_id="mine")
+    with pytest.raises(JobConflict):
+        store.submit(train_job("one"), request_id="mine", priority=1)
+    with pytest.raises(InvalidArgument, match="128"):
+        store.submit(train_job("one"), request_id="x" * 129)
+
+
+def test_submitted_by_two_services_at_once(store: JobStore, artifact_folder: Path) -> None:
+    other = JobStore(artifact_folder, None)
+    with ThreadPoolExecutor(8) as threads:
+        answers = list(
+            threads.map(lambda number: (store, other)[number % 2].submit(train_job("one"), request_id="mine"), range(8))
+        )
+    other.close()
+    assert len({job.id for job, _ in answers}) == 1
+    assert sum(is_new for _, is_new in answers) == 1
+
+
+def test_refused_at_once(store: JobStore, artifact_folder: Path) -> None:
+    with pytest.raises(DatasetNotFound):
+        store.submit(train_job("one", dataset="none"))
+    with pytest.raises(SceneNotFound):
+        store.submit(RenderJob("one", sampler=TRAINING_POSES))
+    store.submit(train_job("one"))
+    with pytest.raises(SceneExists, match="another job"):
+        store.submit(train_job("one"))
+    (artifact_folder / "scenes").mkdir()
+    (artifact_folder / "scenes" / "two.ugr").touch()
+    with pytest.raises(SceneExists, match="already a scene"):
+        store.submit(train_job("two"))
+    with pytest.raises(InvalidArgument, match="priority"):
+        store.submit(train_job("three"), priority=1001)
+
+
+def test_scene_name_is_free_again_after_cancelling(store: JobStore) -> None:
+    job, _ = store.submit(train_job("one"))
+    store.cancel(job.id)
+    assert store.submit(train_job("one"))[1]
+
+
+def test_scenes_of_the_service_may_be_rendered_and_not_replaced(artifact_folder: Path, tmp_path: Path) -> None:
+    from ultragray.demo import copy_demo_scene
+
+    (tmp_path / "data").mkdir()
+    copy_demo_scene(tmp_path / "data" / "demo.ugr")
+    store = JobStore(artifact_folder, None, scenes=SceneStore(tmp_path / "data"))
+    job, _ = store.submit(RenderJob("demo", sampler=TRAINING_POSES))
+    kept = artifact_folder / "jobs" / job.id / "demo.ugr"
+    assert kept.read_bytes() == (tmp_path / "data" / "demo.ugr").read_bytes()
+    with pytest.raises(SceneExists):
+        store.submit(train_job("demo"))
+    store.close()
+
+
+def test_queue_limit(artifact_folder: Path) -> None:
+    store = JobStore(artifact_folder, None, queue_limit=2)
+    first, _ = store.submit(train_job("one"), request_id="first")
+    store.submit(train_job("two"))
+    with pytest.raises(JobQueueFull):
+        store.submit(train_job("three"))
+    assert store.submit(train_job("one"), request_id="first")[0] == first
+    store.cancel(first.id)
+    store.submit(train_job("three"))
+    store.close()
+
+
+def test_pages_newest_first(store: JobStore) -> None:
+    made = [store.submit(train_job(f"scene-{number}"))[0].id for number in range(7)]
+    store.cancel(made[3])
+    found: list[str] = []
+    token: str | None = None
+    sizes = []
+    while True:
+        jobs, token = store.list(page_size=3, page_token=token)
+        found += [job.id for job in jobs]
+        sizes.append(len(jobs))
+        store.submit(train_job(f"later-{len(sizes)}"))  # moves nothing
+        if token is None:
+            break
+    assert found == made[::-1]
+    assert sizes == [3, 3, 1]
+    assert [job.id for job in store.list(state=JobState.CANCELLED)[0]] == [made[3]]
+    assert len(store.list(state=JobState.QUEUED)[0]) == 9
+    assert store.list(kind="render") == ([], None)
+    assert store.list(state=JobState.RUNNING) == ([], None)
+    for token in ("x", "bm90aGluZw==", "WzEsIDJd"):
+        with pytest.raises(InvalidArgument, match="page_token"):
+            store.list(page_token=token)
+
+
+def test_cancel_and_retry(store: JobStore) -> None:
+    job, _ = store.submit(train_job("one"), priority=3, request_id="mine")
+    with pytest.raises(JobNotFinished, match="queued"):
+        store.retry(job.id)
+    cancelled = store.cancel(job.id)
+    assert cancelled.state is JobState.CANCELLED
+    assert cancelled.finished_at is not None
+    assert store.cancel(job.id) == cancelled
+    successor = store.retry(job.id)
+    assert (successor.retry_of, successor.state, successor.priority) == (job.id, JobState.QUEUED, 3)
+    assert successor.specification == job.specification
+    assert successor.request_id is None
+    assert store.retry(job.id) == successor
+
+
+def test_unknown_jobs(store: JobStore) -> None:
+    for job_id in ("0" * 24, "../datasets", ""):
+        for call in (store.get, store.cancel, store.retry, store.log_tail):
+            with pytest.raises(JobNotFound):
+                call(job_id)
+        with pytest.raises(JobNotFound):
+            store.artifact(job_id, "a")
+    job, _ = store.submit(train_job("one"))
+    with pytest.raises(ArtifactNotFound):
+        store.artifact(job.id, "../job.json")
+
+
+def test_dataset_in_use(store: JobStore) -> None:
+    assert store.uses_dataset("tiny") is None
+    job, _ = store.submit(train_job("one"))
+    assert store.uses_dataset("tiny") == f"the job {job.id}"
+    assert store.uses_dataset("other") is None
+    store.cancel(job.id)
+    assert store.uses_dataset("tiny") is None
+
+
+def test_jobs_outlive_the_store(store: JobStore, artifact_folder: Path) -> None:
+    job, _ = store.submit(train_job("one"))
+    again = JobStore(artifact_folder, None)
+    assert again.get(job.id) == job
+    again.close()
+
+
+def test_rows_hold_no_pickles(store: JobStore, artifact_folder: Path) -> None:
+    store.submit(train_job("one"))
+    database = (artifact_folder / "jobs.sqlite").read_bytes()
+    assert b"portable_json" in database
+    assert b"py_pickle" not in database
+
+
+def test_database_that_cannot_be_reached_is_told_without_the_password(tmp_path: Path) -> None:
+    with pytest.raises(StartupFailed, match="database") as caught:
+        JobStore(tmp_path, "postgresql://me:secret@127.0.0.1:1/jobs")
+    assert "secret" not in str(caught.value)
+
+
+def test_importing_the_store_and_the_worker_needs_no_torch() -> None:
+    program = (
+        f"import sys; sys.path[:] = {sys.path!r}; import ultragray_workers.jobs.store, ultragray_workers.jobs.worker; "
+        "print('torch' in sys.modules)"
+    )
+    told = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
+    assert told.strip() == "False"
+
+
+def test_ids_are_the_names_of_folders(store: JobStore, artifact_folder: Path) -> None:
+    job, _ = store.submit(train_job("one"))
+    assert re.fullmatch(r"[0-9a-f]{24}", job.id)
+    shutil.rmtree(artifact_folder / "jobs", ignore_errors=True)
+    assert store.get(job.id).progress.step is None

@@ -1,0 +1,172 @@
+"""The folder of one job, which its worker and its training process write and the service reads.
+
+job.json        what is asked for: written by the worker before its process starts
+lock            held by the one process that works in the folder
+NAME.ugr        the scene of a render job, as it was when the job was submitted
+run/            the trainer's folder: checkpoint, journal, configuration
+progress.json   how far it is
+log.txt         what the process said
+artifacts/      what can be downloaded; appears whole
+outcome.json    how it ended: the last thing that the process writes
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shutil
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+from ultragray.files import atomic_path
+
+FOLDER = "jobs"
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a job is; None for what does not apply to its kind, or is not known yet."""
+
+    step: int | None = None  # of a training
+    steps: int | None = None
+    loss: float | None = None
+    val_psnr_db: float | None = None
+    gaussians: int | None = None
+    frames_done: int | None = None  # of a rendering
+    frames: int | None = None
+    rate_per_s: float | None = None  # steps or frames
+    seconds_left: float | None = None
+
+    @classmethod
+    def from_dict(cls, document: Mapping[str, Any]) -> Progress:
+        """Inverse of `asdict`; unknown keys, of a later release, are left out."""
+        return cls(**{item.name: document.get(item.name) for item in fields(cls)})
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How the work of a job ended: with artifacts, or with a reason."""
+
+    error: str | None = None  # stable reason, such as DATASET_INVALID; None: it succeeded
+    reason: str | None = None  # one sentence
+    artifacts: tuple[str, ...] = ()
+    metrics: dict[str, float] = field(default_factory=dict)
+    progress: Progress = Progress()
+    attempts: int = 1  # how often a process was started for it
+
+    def to_dict(self) -> dict[str, Any]:
+        """What JSON holds of it."""
+        return {**asdict(self), "artifacts": list(self.artifacts)}
+
+    @classmethod
+    def from_dict(cls, document: Mapping[str, Any]) -> Outcome:
+        """Inverse of `to_dict`."""
+        values = {item.name: document[item.name] for item in fields(cls) if item.name in document}
+        values["artifacts"] = tuple(values.get("artifacts", ()))
+        values["progress"] = Progress.from_dict(values.get("progress", {}))
+        return cls(**values)
+
+
+@dataclass(frozen=True)
+class Request:
+    """What a worker tells the process of a job."""
+
+    specification: dict[str, Any]
+    retry_of: str | None
+    device: str  # the worker's: auto, cpu, cuda or cuda:N
+    threads: int
+    nice: int
+
+
+class JobFolder:
+    """The paths of one job, and its small files."""
+
+    def __init__(self, artifact_folder: Path, job_id: str) -> None:
+        self.artifact_folder, self.job_id = Path(artifact_folder), job_id
+        self.path = self.artifact_folder / FOLDER / job_id
+        self.lock = self.path / "lock"
+        self.run = self.path / "run"
+        self.log = self.path / "log.txt"
+        self.artifacts = self.path / "artifacts"
+        self._partial = self.path / "artifacts.partial"
+        self._request = self.path / "job.json"
+        self._progress = self.path / "progress.json"
+        self._outcome = self.path / "outcome.json"
+
+    def request(self) -> Request:
+        """What the worker wrote. Raises OSError, ValueError."""
+        return Request(**json.loads(self._request.read_text(encoding="utf-8")))
+
+    def write_request(self, request: Request) -> None:
+        """Replaces the file whole. Raises OSError."""
+        _write(self._request, asdict(request))
+
+    def progress(self) -> Progress:
+        """How far the job is, as far as its folder says."""
+        document = _read(self._progress)
+        return Progress() if document is None else Progress.from_dict(document)
+
+    def write_progress(self, progress: Progress) -> None:
+        """Replaces the file whole. Raises OSError."""
+        _write(self._progress, asdict(progress))
+
+    def outcome(self) -> Outcome | None:
+        """How the work ended; None where it did not."""
+        document = _read(self._outcome)
+        return None if document is None else Outcome.from_dict(document)
+
+    def write_outcome(self, outcome: Outcome) -> None:
+        """Replaces the file whole. Raises OSError."""
+        _write(self._outcome, outcome.to_dict())
+
+    @contextlib.contextmanager
+    def new_artifacts(self) -> Iterator[Path]:
+        """An empty folder for the artifacts, which becomes `artifacts` at the end; nothing where the body raises."""
+        self.remove_partial_artifacts()
+        shutil.rmtree(self.artifacts, ignore_errors=True)  # of a process that died before it wrote its outcome
+        self._partial.mkdir()
+        try:
+            yield self._partial
+            for path in self._partial.iterdir():
+                _sync(path)
+            _sync(self._partial)
+            self._partial.rename(self.artifacts)
+            _sync(self.path)
+        finally:
+            self.remove_partial_artifacts()
+
+    def remove_partial_artifacts(self) -> None:
+        """Removes what is not complete."""
+        shutil.rmtree(self._partial, ignore_errors=True)
+
+    def artifact_names(self) -> tuple[str, ...]:
+        """What can be downloaded, sorted."""
+        return tuple(sorted(path.name for path in self.artifacts.iterdir()))
+
+    def remove_checkpoints(self) -> None:
+        """Removes what only an unfinished training needs."""
+        shutil.rmtree(self.run, ignore_errors=True)
+
+
+def _sync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _read(path: Path) -> dict[str, Any] | None:
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    return document if isinstance(document, dict) else None
+
+
+def _write(path: Path, document: Mapping[str, Any]) -> None:
+    with atomic_path(path) as temporary:
+        temporary.write_text(json.dumps(document) + "\n", encoding="utf-8")

@@ -1,0 +1,116 @@
+"""A job as it is seen from outside, and how it follows from its row in the queue."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+from dbos import WorkflowStatus
+
+from . import database
+from .folder import JobFolder, Outcome, Progress
+
+MAX_PRIORITY = 1000
+PRIORITY_ZERO = MAX_PRIORITY + 1  # DBOS takes the lowest number first, from 1
+
+
+class JobState(str, Enum):
+    """Where a job is in its life."""
+
+    QUEUED = "queued"
+    RUNNING = "running"
+    SUCCEEDED = "succeeded"
+    FAILED = "failed"
+    CANCELLED = "cancelled"
+
+
+STATUSES = {
+    JobState.QUEUED: database.QUEUED,
+    JobState.RUNNING: database.RUNNING,
+    JobState.SUCCEEDED: database.SUCCEEDED,
+    JobState.FAILED: database.FAILED,
+    JobState.CANCELLED: database.CANCELLED,
+}
+_STATE_OF = {status: state for state, statuses in STATUSES.items() for status in statuses}
+
+
+@dataclass(frozen=True)
+class Job:
+    """A job as it is now. Times are ISO 8601, UTC."""
+
+    id: str
+    kind: str  # train or render
+    state: JobState
+    request_id: str | None
+    specification: dict[str, Any]  # of poses only their number, as pose_count
+    priority: int  # higher ones go first
+    created_at: str
+    started_at: str | None  # the last time
+    finished_at: str | None
+    reason: str | None  # why it failed: one sentence
+    error: str | None  # the same, stable, such as DATASET_INVALID
+    progress: Progress
+    artifacts: tuple[str, ...]  # names of files
+    metrics: dict[str, float]  # of a trained scene on the held-out frames
+    worker: str | None
+    retry_of: str | None
+    attempts: int  # how often it was started
+
+
+def job_of_row(row: WorkflowStatus, artifact_folder: Path) -> Job:
+    """The job that a row of the queue is about; of one that is not finished its folder says how far it is."""
+    state = _STATE_OF[row.status]
+    outcome = _outcome(row)
+    started = state is not JobState.QUEUED or bool(row.recovery_attempts)
+    if outcome is None:
+        progress = JobFolder(artifact_folder, row.workflow_id).progress() if started else Progress()
+        outcome = Outcome(progress=progress, attempts=row.recovery_attempts or 0)
+    assert row.created_at is not None
+    return Job(
+        id=row.workflow_id,
+        kind=row.name,
+        state=state,
+        request_id=attribute(row, "request_id"),
+        specification=attribute(row, "specification"),
+        priority=PRIORITY_ZERO - (row.priority or 0),
+        created_at=_iso(row.created_at),
+        started_at=_iso_not_before(row.created_at, row.dequeued_at),
+        finished_at=_iso_not_before(max(row.created_at, row.dequeued_at or 0), row.completed_at),
+        reason=outcome.reason,
+        error=outcome.error,
+        progress=outcome.progress,
+        artifacts=outcome.artifacts,
+        metrics=outcome.metrics,
+        worker=row.executor_id if started else None,
+        retry_of=attribute(row, "retry_of"),
+        attempts=outcome.attempts,
+    )
+
+
+def _outcome(row: WorkflowStatus) -> Outcome | None:
+    """How a finished job ended, as the queue keeps it."""
+    if isinstance(row.output, dict):
+        return Outcome.from_dict(row.output)
+    if row.error is None:
+        return None
+    kept = getattr(row.error, "data", None)
+    if isinstance(kept, dict):
+        return Outcome.from_dict(kept)
+    return Outcome(error="INTERNAL", reason=str(row.error) or type(row.error).__name__)
+
+
+def attribute(row: WorkflowStatus, name: str) -> Any:
+    """What the store kept with a row at its submission."""
+    return (row.attributes or {}).get(name)
+
+
+def _iso(epoch_ms: int) -> str:
+    return datetime.fromtimestamp(epoch_ms / 1000, timezone.utc).isoformat(timespec="milliseconds")
+
+
+def _iso_not_before(earliest_ms: int, epoch_ms: int | None) -> str | None:
+    """DBOS rounds the times of a SQLite file to seconds, before Python 3.12."""
+    return None if epoch_ms is None else _iso(max(earliest_ms, epoch_ms))

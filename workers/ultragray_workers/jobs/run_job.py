@@ -1,0 +1,108 @@
+"""`python -m ultragray_workers.jobs.run_job JOB_FOLDER WORKER_PID`: the process that does the work of one job.
+
+It dies with its worker, works alone in the folder, and as its last act says in outcome.json how the job ended. A job
+that fails is a process that ends well; SIGTERM ends it with exit code STOPPED and a checkpoint to go on from.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import fcntl
+import os
+import signal
+import sys
+import traceback
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+
+from ultragray.errors import InvalidArgument, MemoryExceeded, StorageFull, UltragrayError
+
+from .folder import JobFolder, Outcome
+from .specification import RenderJob, from_dict
+from .work import Stopped, Work
+
+STOPPED, STORAGE_FULL = 75, 73
+_PR_SET_PDEATHSIG = 1
+
+
+def main(folder_path: str, worker_pid: str) -> int:
+    """The exit code: 0 where outcome.json says how the job ended."""
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != int(worker_pid):  # it died before the line above
+        return STOPPED
+    received: list[int] = []
+    signal.signal(signal.SIGTERM, lambda number, frame: received.append(number))
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    path = Path(folder_path)
+    folder = JobFolder(path.parent.parent, path.name)
+    with folder.lock.open("a") as lock:
+        fcntl.lockf(lock, fcntl.LOCK_EX)  # another worker's process may still be at it, or have finished
+        if folder.outcome() is not None:
+            return 0
+        request = folder.request()
+        os.nice(request.nice)
+        work = Work(folder, request, lambda: bool(received))
+        try:
+            outcome = _outcome_of(work)
+        except Stopped:
+            return STOPPED
+        try:
+            folder.write_progress(outcome.progress)
+            folder.write_outcome(outcome)
+        except OSError:
+            return STORAGE_FULL
+        if outcome.error is None:
+            folder.remove_checkpoints()
+    return 0
+
+
+def _outcome_of(work: Work) -> Outcome:
+    try:
+        return replace(_do(work), progress=work.progress)
+    except Stopped:
+        raise
+    except UltragrayError as error:
+        field = error.field if isinstance(error, InvalidArgument) else None
+        given = f"{field}: " if field is not None and field not in error.detail else ""
+        return _failed(work, error.reason, given + error.detail)
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+            return _broken(work, error)
+        work.folder.remove_partial_artifacts()
+        return _failed(work, StorageFull.reason, "the artifact folder has no room for what this job writes")
+    except (MemoryError, RuntimeError) as error:
+        if isinstance(error, RuntimeError) and "allocate memory" not in str(error):
+            return _broken(work, error)
+        return _failed(work, MemoryExceeded.reason, "the memory of the machine did not suffice for this job")
+    except Exception as error:
+        return _broken(work, error)
+
+
+def _do(work: Work) -> Outcome:
+    specification = from_dict(work.request.specification)
+    if isinstance(specification, RenderJob):
+        from .render_job import render
+
+        return render(work, specification)
+    from .train_job import train
+
+    return train(work, specification)
+
+
+def _broken(work: Work, error: Exception) -> Outcome:
+    traceback.print_exc()
+    told = " ".join(str(error).split()) or "no message"
+    return _failed(work, "INTERNAL", f"the process of the job failed, see its log: {type(error).__name__}: {told}")
+
+
+def _failed(work: Work, error: str, reason: str) -> Outcome:
+    told = reason.replace(f"{work.folder.artifact_folder}{os.sep}", "")  # where a service keeps its files is its own
+    with suppress(OSError):
+        sys.stderr.write(f"failed: {told}\n")
+    return Outcome(error=error, reason=told, progress=work.progress)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1], sys.argv[2]))

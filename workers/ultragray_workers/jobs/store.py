@@ -1,0 +1,285 @@
+"""The jobs as the service sees them: submitted, listed, watched, cancelled, retried. Free of torch."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+import threading
+import uuid
+from pathlib import Path
+
+from dbos import EnqueueOptions, WorkflowSerializationFormat, WorkflowStatus
+from dbos import error as dbos_error
+
+from ultragray.errors import (
+    ArtifactNotFound,
+    InvalidArgument,
+    JobConflict,
+    JobFinished,
+    JobNotFinished,
+    JobNotFound,
+    JobQueueFull,
+    SceneExists,
+)
+
+from ..dataset_store import DatasetStore
+from ..scenes import SUFFIX, SceneStore
+from . import database
+from .database import JobDatabase
+from .folder import JobFolder, Progress
+from .job import MAX_PRIORITY, PRIORITY_ZERO, STATUSES, Job, JobState, attribute, job_of_row
+from .link import link_or_copy
+from .paging import iso_after, read_token, write_token
+from .publication import SCENES_FOLDER
+from .specification import RenderJob, Specification, TrainJob, digest, from_dict, in_short, to_dict
+
+__all__ = ["SCENES_FOLDER", "Job", "JobState", "JobStore", "Progress"]
+
+
+MAX_REQUEST_ID_CHARACTERS = 128
+_JOB_ID = re.compile(r"[0-9a-f]{24}")
+_TAIL_BYTES = 8192
+
+
+class JobStore:
+    """The jobs of an artifact folder. Its methods block; they may be called from any thread."""
+
+    def __init__(
+        self,
+        artifact_folder: Path,
+        database_url: str | None,
+        queue_limit: int = 1000,
+        *,
+        scenes: SceneStore | None = None,
+    ) -> None:
+        """`scenes`: those that render jobs may name, and whose names trainings may not take.
+
+        None: those that trainings made. Raises StartupFailed where the database cannot be reached.
+        """
+        self._artifact_folder = Path(artifact_folder)
+        self._database = JobDatabase(self._artifact_folder, database_url)
+        self._queue_limit = queue_limit
+        self._scenes = scenes or SceneStore(self._artifact_folder / SCENES_FOLDER)
+        self._datasets = DatasetStore(self._artifact_folder)
+        self._submitting = threading.Lock()  # so that one service keeps the queue limit to the job
+
+    def submit(
+        self,
+        specification: Specification,
+        *,
+        request_id: str | None = None,
+        priority: int = 0,
+        retry_of: str | None = None,
+    ) -> tuple[Job, bool]:
+        """The job, and whether it is new: the same `request_id` gives the same job, whatever became of it.
+
+        Raises JobConflict where that one asked for something else, JobQueueFull, DatasetNotFound, DatasetInvalid,
+        SceneNotFound, SceneFileInvalid, SceneExists and InvalidArgument.
+        """
+        if abs(priority) > MAX_PRIORITY:
+            raise InvalidArgument(
+                f"priority must be an integer from {-MAX_PRIORITY} to {MAX_PRIORITY}, got {priority}", field="priority"
+            )
+        job_id = uuid.uuid4().hex[:24] if request_id is None else _id_of_request(request_id)
+        return self._submit(job_id, specification, request_id, priority, retry_of)
+
+    def _submit(
+        self, job_id: str, specification: Specification, request_id: str | None, priority: int, retry_of: str | None
+    ) -> tuple[Job, bool]:
+        asked = digest(specification, priority)
+        with self._submitting:
+            if (present := self._database.workflow(job_id, with_output=True)) is not None:
+                return self._same(present, asked), False
+            waiting = self._database.unfinished()
+            if sum(row.status in database.QUEUED for row in waiting) >= self._queue_limit:
+                raise JobQueueFull(f"{self._queue_limit} jobs wait already: try again later, or cancel some")
+            self._check_resources(specification, job_id)
+            attributes = {
+                "request_id": request_id,
+                "digest": asked,
+                "retry_of": retry_of,
+                "specification": in_short(specification),
+            }
+            options: EnqueueOptions = {
+                "workflow_name": specification.kind,
+                "queue_name": database.QUEUE,
+                "workflow_id": job_id,
+                "workflow_id_reuse_policy": "reject",
+                "app_version": database.VERSION,
+                "priority": PRIORITY_ZERO - priority,
+                "attributes": attributes,
+                "serialization_type": WorkflowSerializationFormat.PORTABLE,
+            }
+            if isinstance(specification, TrainJob):
+                options["deduplication_id"] = f"scene {specification.scene}"
+            try:
+                self._database.enqueue(options, {"specification": to_dict(specification), "retry_of": retry_of})
+            except dbos_error.DBOSWorkflowIDInUseError:  # another service was quicker
+                present = self._database.workflow(job_id, with_output=True)
+                assert present is not None
+                return self._same(present, asked), False
+            except dbos_error.DBOSQueueDeduplicatedError:
+                assert isinstance(specification, TrainJob)
+                raise SceneExists(
+                    f"another job that waits or runs makes the scene {specification.scene!r}: choose another name",
+                    field="scene",
+                ) from None
+        return self.get(job_id), True
+
+    def _same(self, present: WorkflowStatus, asked: str) -> Job:
+        job = self._seen(present)
+        if (present.attributes or {}).get("digest") != asked:
+            raise JobConflict(
+                f"the request_id {job.request_id!r} was used for the job {job.id}, which asks for something else",
+                field="request_id",
+            )
+        return job
+
+    def _check_resources(self, specification: Specification, job_id: str) -> None:
+        """Refuses what could not run, and keeps the scene of a rendering as it is now."""
+        if isinstance(specification, TrainJob):
+            self._datasets.get(specification.dataset)
+            if specification.scene in self._scenes.names():
+                raise SceneExists(
+                    f"there is already a scene {specification.scene!r}: choose another name", field="scene"
+                )
+            return
+        assert isinstance(specification, RenderJob)
+        self._scenes.header(specification.scene)
+        folder = JobFolder(self._artifact_folder, job_id).path
+        folder.mkdir(parents=True, exist_ok=True)
+        link_or_copy(self._scenes.path(specification.scene), folder / f"{specification.scene}{SUFFIX}")
+
+    def get(self, job_id: str) -> Job:
+        """Raises JobNotFound."""
+        return self._seen(self._row(job_id))
+
+    def list(
+        self,
+        *,
+        state: JobState | None = None,
+        kind: str | None = None,
+        page_size: int = 50,
+        page_token: str | None = None,
+    ) -> tuple[list[Job], str | None]:
+        """One page of jobs, newest first, and the token of the next; None on the last.
+
+        Raises InvalidArgument for a token that no page gave.
+        """
+        before_ms, seen = (None, []) if page_token is None else read_token(page_token)
+        rows = [
+            row
+            for row in self._database.client.list_workflows(
+                name=kind,
+                status=None if state is None else list(STATUSES[state]),
+                end_time=None if before_ms is None else iso_after(before_ms),
+                sort_desc=True,
+                limit=page_size + len(seen) + 1,  # one more than the page tells whether there is another
+                load_input=False,
+            )
+            if row.workflow_id not in seen
+        ]
+        page, more = rows[:page_size], len(rows) > page_size
+        jobs = [self._seen(row) for row in page]
+        if not more:
+            return jobs, None
+        last_ms = page[-1].created_at
+        assert last_ms is not None
+        at_last = [row.workflow_id for row in page if row.created_at == last_ms]
+        return jobs, write_token(last_ms, at_last + (seen if before_ms == last_ms else []))
+
+    def cancel(self, job_id: str) -> Job:
+        """Ends a job that waits or runs, its process within a second; nothing where it is cancelled already.
+
+        Raises JobNotFound, and JobFinished for one that succeeded or failed.
+        """
+        self._row(job_id)
+        self._database.client.cancel_workflow(job_id)
+        job = self.get(job_id)
+        if job.state is not JobState.CANCELLED:
+            raise JobFinished(f"the job {job_id} has {job.state.value} already", field="job")
+        return job
+
+    def retry(self, job_id: str) -> Job:
+        """The job in place of a failed or cancelled one; a training goes on from the last checkpoint of that one.
+
+        A job has one such successor: asked again, this gives the same. Raises JobNotFound, JobNotFinished, and what
+        `submit` raises.
+        """
+        rows = self._database.client.list_workflows(workflow_ids=[_checked_id(job_id)], load_input=True)
+        if not rows:
+            raise _not_found(job_id)
+        job = self._seen(rows[0])
+        if job.state not in (JobState.FAILED, JobState.CANCELLED):
+            raise JobNotFinished(
+                f"only a failed or cancelled job can be retried, the job {job_id} is {job.state.value}", field="job"
+            )
+        assert rows[0].input is not None
+        specification = from_dict(rows[0].input["args"][0]["specification"])
+        return self._submit(_hashed(f"retry {job_id}"), specification, None, job.priority, job_id)[0]
+
+    def log_tail(self, job_id: str, bytes: int = _TAIL_BYTES) -> str:
+        """The end of what a job's process said; empty before it said anything. Raises JobNotFound."""
+        self._row(job_id)
+        try:
+            with self._folder(job_id).log.open("rb") as file:
+                file.seek(max(0, os.fstat(file.fileno()).st_size - bytes))
+                return file.read(bytes).decode("utf-8", "replace")
+        except FileNotFoundError:
+            return ""
+
+    def artifact(self, job_id: str, name: str) -> Path:
+        """The file of an artifact. Raises JobNotFound, ArtifactNotFound."""
+        job = self.get(job_id)
+        path = self._folder(job_id).artifacts / name
+        if name not in job.artifacts or not path.is_file():
+            known = ", ".join(job.artifacts) or "none"
+            raise ArtifactNotFound(f"the job {job_id} has no artifact {name[:128]!r}; it has {known}", field="name")
+        return path
+
+    def uses_dataset(self, name: str) -> str | None:
+        """The job that needs a dataset, in words; None where no job that waits or runs does."""
+        for row in self._database.unfinished():
+            if attribute(row, "specification").get("dataset") == name:
+                return f"the job {row.workflow_id}"
+        return None
+
+    def close(self) -> None:
+        """Ends the connections to the database."""
+        self._database.close()
+
+    def _row(self, job_id: str) -> WorkflowStatus:
+        row = self._database.workflow(_checked_id(job_id), with_output=True)
+        if row is None:
+            raise _not_found(job_id)
+        return row
+
+    def _seen(self, row: WorkflowStatus) -> Job:
+        return job_of_row(row, self._artifact_folder)
+
+    def _folder(self, job_id: str) -> JobFolder:
+        return JobFolder(self._artifact_folder, job_id)
+
+
+def _id_of_request(request_id: str) -> str:
+    if not 1 <= len(request_id) <= MAX_REQUEST_ID_CHARACTERS:
+        raise InvalidArgument(
+            f"request_id must have 1 to {MAX_REQUEST_ID_CHARACTERS} characters, got {len(request_id)}",
+            field="request_id",
+        )
+    return _hashed(f"request {request_id}")
+
+
+def _hashed(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()[:24]
+
+
+def _checked_id(job_id: str) -> str:
+    if not _JOB_ID.fullmatch(job_id):
+        raise _not_found(job_id)
+    return job_id
+
+
+def _not_found(job_id: str) -> JobNotFound:
+    return JobNotFound(f"there is no job {job_id[:64]!r}", field="job")

@@ -1,0 +1,219 @@
+"""Supervision of one job: starts its process, watches it and the queue, and says how the job ended. Free of torch."""
+
+from __future__ import annotations
+
+import errno
+import logging
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NoReturn
+
+from dbos import WorkflowStatus
+
+from ultragray.errors import MemoryExceeded, SceneExists, StorageFull
+
+from . import database
+from .database import JobDatabase
+from .folder import JobFolder, Outcome, Request
+from .publication import publish_scene
+from .run_job import STORAGE_FULL
+from .specification import TrainJob
+
+WATCH_INTERVAL_S = 0.25
+_POLL_INTERVAL_S = 0.05
+_STOP_WAIT_S = 10.0  # for the checkpoint of a training that is told to stop
+MAX_CRASHES = 3  # of a process that got no further in between: then the job fails
+# Somebody who kills processes at random is not the job's fault; without end it is not tried either.
+MAX_KILLS = 20
+
+_log = logging.getLogger("ultragray.jobs")
+
+
+@dataclass(frozen=True)
+class WorkerConfig:
+    """What a worker gives the processes of its jobs."""
+
+    artifact_folder: Path
+    executor: str  # name of the worker, the same after a restart
+    device: str = "auto"
+    threads: int = 1
+    nice: int = 10
+
+
+class Interrupted(Exception):
+    """The job is cancelled, is another worker's, or waits in the queue again: how it ends is not for us to say."""
+
+
+class Supervisor:
+    """Does the jobs of a worker, one at a time."""
+
+    def __init__(self, config: WorkerConfig, jobs: JobDatabase) -> None:
+        self._config, self._database = config, jobs
+        self._stop = threading.Event()
+        self._idle = threading.Event()
+        self._idle.set()
+
+    def stop(self) -> None:
+        """Ends the process at hand, which writes a checkpoint, and puts its job back into the queue.
+
+        Whatever DBOS starts from now on is put back too, and waits for the end of this worker.
+        """
+        self._stop.set()
+        self._idle.wait(_STOP_WAIT_S + 5.0)
+
+    def supervise(self, job_id: str, request: dict[str, Any]) -> Outcome:
+        """Does a job, from where an earlier process left it. Never raises for a job that fails.
+
+        Raises Interrupted.
+        """
+        self._idle.clear()
+        try:
+            row = self._require_ours(job_id)
+            if self._stop.is_set():
+                self._give_back(job_id)
+            folder = JobFolder(self._config.artifact_folder, job_id)
+            try:
+                folder.path.mkdir(parents=True, exist_ok=True)
+                outcome = folder.outcome() or self._work(folder, request, row.recovery_attempts or 1)
+                if outcome.error is None and request["specification"]["kind"] == TrainJob.kind:
+                    self._require_ours(job_id)
+                    publish_scene(folder, request["specification"]["scene"])
+            except SceneExists as error:
+                outcome = Outcome(error=error.reason, reason=error.detail, progress=folder.progress())
+                shutil.rmtree(folder.artifacts, ignore_errors=True)
+            except OSError as error:
+                outcome = _failure_of_storage(error)
+            _log.info(f"job {job_id} {'succeeded' if outcome.error is None else f'failed: {outcome.reason}'}")
+            return outcome
+        finally:
+            self._idle.set()
+
+    def _work(self, folder: JobFolder, request: dict[str, Any], attempt: int) -> Outcome:
+        config = self._config
+        folder.write_request(
+            Request(
+                specification=request["specification"],
+                retry_of=request["retry_of"],
+                device=config.device,
+                threads=config.threads,
+                nice=config.nice,
+            )
+        )
+        crashes = kills = 0
+        furthest = _furthest(folder)
+        while True:
+            memory_kills = _memory_kills()
+            code = self._run_process(folder)
+            if (outcome := folder.outcome()) is not None:
+                return replace(outcome, attempts=attempt)
+            if code == STORAGE_FULL:
+                return replace(_storage_full(), progress=folder.progress(), attempts=attempt)
+            if _furthest(folder) > furthest:
+                crashes = kills = 0
+            furthest = max(furthest, _furthest(folder))
+            is_kill = code in (-signal.SIGKILL, -signal.SIGTERM) and _memory_kills() == memory_kills
+            kills, crashes = kills + is_kill, crashes + (not is_kill)
+            _log.warning(f"the process of the job {folder.job_id} died ({_told(code)})")
+            if kills >= MAX_KILLS or crashes >= MAX_CRASHES:
+                failed = _failure_of_process(code, crashes + kills, _memory_kills() > memory_kills)
+                return replace(failed, progress=folder.progress(), attempts=attempt)
+            attempt += 1
+
+    def _run_process(self, folder: JobFolder) -> int:
+        """Runs the job's process to its end; its exit code. Raises Interrupted."""
+        threads = str(self._config.threads)
+        with folder.log.open("ab") as log:
+            process = subprocess.Popen(
+                [sys.executable, "-m", "ultragray_workers.jobs.run_job", str(folder.path), str(os.getpid())],
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                env={
+                    **os.environ,
+                    "PYTHONPATH": os.pathsep.join(path for path in sys.path if path),
+                    "OMP_NUM_THREADS": threads,
+                    "OPENBLAS_NUM_THREADS": threads,
+                },
+                start_new_session=True,
+            )
+        try:
+            watched_at = float("-inf")
+            while (code := process.poll()) is None:
+                if self._stop.is_set():
+                    process.terminate()
+                    with suppress(subprocess.TimeoutExpired):
+                        process.wait(_STOP_WAIT_S)
+                    self._give_back(folder.job_id)
+                if time.monotonic() - watched_at >= WATCH_INTERVAL_S:
+                    self._require_ours(folder.job_id)
+                    watched_at = time.monotonic()
+                time.sleep(_POLL_INTERVAL_S)
+            return code
+        finally:
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+
+    def _give_back(self, job_id: str) -> NoReturn:
+        self._database.take_back(job_id, self._config.executor)
+        self._idle.set()
+        while True:  # until the process ends: else DBOS would take the job once more
+            time.sleep(_STOP_WAIT_S)
+
+    def _require_ours(self, job_id: str) -> WorkflowStatus:
+        """The queue's row of the job. Raises Interrupted unless it says that this worker runs it."""
+        row = self._database.workflow(job_id)
+        if row is None or row.status not in database.RUNNING or row.executor_id != self._config.executor:
+            _log.info(f"job {job_id} is {'gone' if row is None else row.status.lower()}: its process is ended")
+            raise Interrupted
+        return row
+
+
+def _furthest(folder: JobFolder) -> int:
+    progress = folder.progress()
+    return (progress.step or 0) + (progress.frames_done or 0)
+
+
+def _memory_kills() -> int:
+    """How many processes of this machine, or of our own control group, the kernel has killed to free memory."""
+    count = 0
+    for path in ("/proc/vmstat", "/sys/fs/cgroup/memory.events"):
+        with suppress(OSError, ValueError):
+            for line in Path(path).read_text(encoding="ascii").splitlines():
+                name, _, value = line.partition(" ")
+                count += int(value) if name == "oom_kill" else 0
+    return count
+
+
+def _failure_of_process(code: int, times: int, of_memory: bool) -> Outcome:
+    if of_memory:
+        return Outcome(
+            error=MemoryExceeded.reason,
+            reason=f"the memory of the machine did not suffice: the job's process was ended {times} times",
+        )
+    return Outcome(
+        error="INTERNAL",
+        reason=f"the process of the job died {times} times without getting further ({_told(code)}); see its log",
+    )
+
+
+def _failure_of_storage(error: OSError) -> Outcome:
+    if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        return _storage_full()
+    return Outcome(error="INTERNAL", reason=f"the folder of the job cannot be used: {error.strerror}")
+
+
+def _storage_full() -> Outcome:
+    return Outcome(error=StorageFull.reason, reason="the artifact folder has no room for what this job writes")
+
+
+def _told(code: int) -> str:
+    return f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"

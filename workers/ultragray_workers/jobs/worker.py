@@ -1,0 +1,119 @@
+"""A worker: takes one job at a time from the queue and supervises its process. Free of torch."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import itertools
+import logging
+import os
+import re
+import socket
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from dbos import DBOS, PortableWorkflowError, WorkflowSerializationFormat
+from dbos import error as dbos_error
+
+from ultragray.errors import StartupFailed
+
+from . import database
+from .database import JobDatabase, dbos_config, quiet_dbos
+from .heartbeat import Heartbeat
+from .specification import RenderJob, TrainJob
+from .supervision import Interrupted, Supervisor, WorkerConfig
+
+POLLING_INTERVAL_S = 0.25
+_NAMES_FOLDER = "workers"
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
+
+_log = logging.getLogger("ultragray.jobs")
+
+
+def work(
+    artifact_folder: Path,
+    database_url: str | None,
+    stop: threading.Event,
+    *,
+    name: str | None = None,
+    device: str = "auto",
+    threads: int = 0,
+    nice: int = 10,
+) -> None:
+    """Does jobs until `stop` is set; then the one at hand is put back into the queue with a checkpoint.
+
+    `name` (None: of the host, numbered) must be the worker's alone; a worker that comes back under its name goes on
+    with its jobs at once. `threads` 0: all cores but one. Threads of DBOS are left behind: end the process by os._exit.
+    Raises StartupFailed.
+    """
+    jobs = JobDatabase(artifact_folder, database_url)
+    with claim_name(artifact_folder, name) as executor:
+        config = WorkerConfig(
+            artifact_folder=artifact_folder.resolve(),
+            executor=executor,
+            device=device,
+            threads=threads or max(1, (os.cpu_count() or 1) - 1),
+            nice=nice,
+        )
+        supervisor = Supervisor(config, jobs)
+        heartbeat = Heartbeat(jobs, executor)
+        _launch(jobs.url, config, supervisor)
+        fields = {"worker": executor, "threads": config.threads, "device": device}
+        _log.info(f"worker {executor} takes jobs", extra={"fields": fields})
+        stop.wait()
+        supervisor.stop()
+        heartbeat.stop()
+        _log.info(f"worker {executor} stopped")
+
+
+def _launch(url: str, config: WorkerConfig, supervisor: Supervisor) -> None:
+    def run(request: dict[str, Any]) -> dict[str, Any]:
+        job_id = DBOS.workflow_id
+        assert job_id is not None
+        try:
+            outcome = supervisor.supervise(job_id, request)
+        except Interrupted:
+            # Any other error, or a step of DBOS's, would be kept as the job's end, even while another worker has it.
+            raise dbos_error.DBOSWorkflowConflictIDError(job_id) from None
+        if outcome.error is not None:
+            raise PortableWorkflowError(outcome.reason or outcome.error, outcome.error, data=outcome.to_dict())
+        return outcome.to_dict()
+
+    DBOS(config=dbos_config(url, config.executor))
+    for kind in (TrainJob.kind, RenderJob.kind):
+        # A worker that dies is not the job's fault, however often.
+        DBOS.workflow(name=kind, max_recovery_attempts=None, serialization_type=WorkflowSerializationFormat.PORTABLE)(
+            run
+        )
+    quiet_dbos()
+    DBOS.listen_queues([database.QUEUE])
+    DBOS.launch()
+    DBOS.register_queue(database.QUEUE, worker_concurrency=1, polling_interval_sec=POLLING_INTERVAL_S)
+
+
+@contextlib.contextmanager
+def claim_name(artifact_folder: Path, name: str | None) -> Iterator[str]:
+    """The worker's name for as long as it lives: the one given, or HOST-N with the first N that is free.
+
+    Raises StartupFailed where another worker has the name.
+    """
+    folder = artifact_folder / _NAMES_FOLDER
+    folder.mkdir(parents=True, exist_ok=True)
+    if name is not None:
+        if not _NAME.fullmatch(name):
+            raise StartupFailed(f"name must be letters, digits, '.', '_', '-', got {name!r}", field="name")
+        candidates: Iterator[str] = iter([name])
+    else:
+        host = re.sub(r"[^A-Za-z0-9.-]", "-", socket.gethostname()).lstrip(".-")[:100] or "host"
+        candidates = (f"{host}-{number}" for number in itertools.count())
+    for candidate in candidates:
+        with (folder / f"{candidate}.lock").open("a") as file:
+            try:
+                fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                continue
+            yield candidate
+            return
+    raise StartupFailed(f"another worker is called {name!r}: give this one another name", field="name")
