@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,6 +14,7 @@ from torch.autograd.function import once_differentiable
 from . import _cpu
 from .errors import BackendUnavailable
 from .probe import ConvexProbe, FloatArray, Probe
+from .request import OUTPUTS
 from .scene import PARAMETERS, GaussianScene
 
 INSTRUCTION_SETS: tuple[str, ...] = tuple(_cpu.instruction_sets())  # what this processor can run, best first
@@ -50,11 +51,9 @@ def render_outputs(
         )
         return dict(zip(outputs, frames, strict=True))
     planes = _empty_planes(view, outputs)
-    _cpu.render(_prepared(scene), **view, **_arrays(planes))
+    prepared = scene.prepared("cpu", lambda: _prepare(scene.splats, scene.info.intensity))
+    _cpu.render(prepared, **view, **_arrays(planes))
     return planes
-
-
-_PLANES = ("bmode", "echo", "transmittance", "coverage")
 
 
 def _view_arguments(
@@ -82,7 +81,7 @@ def _empty_planes(view: dict[str, Any], names: Sequence[str]) -> dict[str, Tenso
 
 
 def _arrays(planes: dict[str, Tensor]) -> dict[str, Any]:
-    return {name: planes[name].numpy() if name in planes else None for name in _PLANES}
+    return {name: planes[name].numpy() if name in planes else None for name in OUTPUTS}
 
 
 class _Render(torch.autograd.Function):
@@ -122,36 +121,6 @@ class _Render(torch.autograd.Function):
             shn=shn.squeeze(-1).numpy(),
         )
         return (None, None, None, means, scales, quats, transmittances, sh0, shn)
-
-
-class _Prepared(NamedTuple):
-    """A prepared scene, and what it was prepared from: holding the tensors keeps their identity from being reused."""
-
-    tensors: tuple[Tensor, ...]
-    versions: tuple[int, ...]
-    intensity: str
-    scene: _cpu.PreparedScene
-
-
-def _prepared(scene: GaussianScene) -> _cpu.PreparedScene:
-    """The scene as the kernel wants it, kept with the scene until one of its tensors changes.
-
-    A change that torch does not count (through `.data`) is not noticed.
-    """
-    tensors = tuple(scene.splats.values())
-    if any(t.is_inference() for t in tensors):  # their changes are not counted
-        return _prepare(scene.splats, scene.info.intensity)
-    versions = tuple(t._version for t in tensors)
-    kept: _Prepared | None = scene.cache.get("cpu")
-    if (
-        kept is None
-        or kept.versions != versions
-        or kept.intensity != scene.info.intensity
-        or any(a is not b for a, b in zip(kept.tensors, tensors, strict=True))
-    ):
-        kept = _Prepared(tensors, versions, scene.info.intensity, _prepare(scene.splats, scene.info.intensity))
-        scene.cache["cpu"] = kept  # one assignment: threads may render the scene at the same time
-    return kept.scene
 
 
 def _prepare(splats: Mapping[str, Tensor], intensity: str, *, as_given: bool = False) -> _cpu.PreparedScene:

@@ -6,10 +6,10 @@ mm in the frame of the training sweep: p_cm = (p_mm − centre_mm) / 10.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -35,6 +35,18 @@ MAX_POSITION_CM = 1e6
 PARAMETERS = ("means", "scales", "quats", "transmittances", "sh0", "shN")
 
 
+Prepared = TypeVar("Prepared")
+
+
+class _Kept(NamedTuple):
+    """What was made of a scene, and of what: holding the tensors keeps their identity from being reused."""
+
+    tensors: tuple[Tensor, ...]
+    versions: tuple[int, ...]
+    intensity: str
+    made: Any
+
+
 @dataclass(eq=False)
 class GaussianScene:
     """Raw parameters (docs/physics.md §2), as a released checkpoint's `splats` holds them, and the scene's description.
@@ -50,9 +62,7 @@ class GaussianScene:
     shN: Tensor  # [N, K-1, 1]  # noqa: N815 (the released name)
     info: SceneInfo = field(default_factory=SceneInfo)
     training_poses: FloatArray = field(default_factory=lambda: np.zeros((0, 4, 4)))  # [P, 4, 4] mm
-    cache: dict[str, Any] = field(
-        default_factory=dict, init=False, repr=False
-    )  # what a backend prepared for this scene
+    _prepared: dict[str, _Kept] = field(default_factory=dict, init=False, repr=False)
 
     @classmethod
     def from_splats(
@@ -128,6 +138,27 @@ class GaussianScene:
         """The same scene with its tensors in another dtype or on another device."""
         moved: dict[str, Any] = {name: tensor.to(target) for name, tensor in self.splats.items()}
         return GaussianScene(**moved, info=self.info, training_poses=self.training_poses)
+
+    def prepared(self, name: str, make: Callable[[], Prepared]) -> Prepared:
+        """What a backend makes of the scene, kept under its name until one of the tensors, or the activation, changes.
+
+        A change that torch does not count (through `.data`) is not noticed.
+        """
+        tensors = tuple(self.splats.values())
+        if any(tensor.is_inference() for tensor in tensors):  # their changes are not counted
+            return make()
+        versions = tuple(tensor._version for tensor in tensors)
+        kept = self._prepared.get(name)
+        if (
+            kept is None
+            or kept.versions != versions
+            or kept.intensity != self.info.intensity
+            or any(a is not b for a, b in zip(kept.tensors, tensors, strict=True))
+        ):
+            kept = _Kept(tensors, versions, self.info.intensity, make())
+            self._prepared[name] = kept  # one assignment: threads may render the scene at the same time
+        made: Prepared = kept.made
+        return made
 
     def poses_to_scene_cm(self, poses: FloatArray) -> FloatArray:  # [C, 4, 4] mm -> [C, 4, 4] cm
         """Poses in the sweep's frame (mm) as poses in the scene's own (cm, about its centre)."""

@@ -24,6 +24,7 @@ from ultragray.cuda.work import Work, count_work
 from ultragray.machine import processor_name
 from ultragray.probe import FloatArray
 from ultragray.training.device import forget_peak_memory, peak_memory_mb
+from ultragray_workers.transfer import to_uint8
 
 from .bench import bench_console, versions, write_document
 from .bench_clock import elapsed_ms, finish, mark
@@ -128,7 +129,7 @@ def _measure(
         views = poses_cm[first : first + poses]
         frames = cuda.render_outputs(scene, PROBE, views, bench.height, bench.width, ("bmode",))["bmode"]
         if what == ON_HOST:
-            host.copy_((frames.clamp(max=1.0) * 255.0).round_().to(torch.uint8), non_blocking=True)
+            host.copy_(to_uint8(frames), non_blocking=True)
 
     places = range(0, len(poses_cm), poses)
     for first in itertools.islice(itertools.cycle(places), 3):  # compiles, allocates

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -114,33 +114,11 @@ class _Render(torch.autograd.Function):
         return (None, None, None, None, *found.values())
 
 
-class _Kept(NamedTuple):
-    """Gaussians in spatial order, and what they were made of: holding the tensors keeps their identity from reuse."""
-
-    tensors: tuple[Tensor, ...]
-    versions: tuple[int, ...]
-    intensity: str
-    gaussians: Gaussians
-
-
 def sorted_gaussians(scene: GaussianScene) -> Gaussians:
-    """The scene's Gaussians along a space-filling curve, kept with the scene until one of its tensors changes.
+    """The scene's Gaussians along a space-filling curve, kept with the scene until one of its tensors changes."""
 
-    A change that torch does not count (through `.data`) is not noticed.
-    """
-    tensors = tuple(scene.splats.values())
-    if any(tensor.is_inference() for tensor in tensors):  # their changes are not counted
-        return Gaussians.of(scene.splats, scene.info.intensity)
-    versions = tuple(tensor._version for tensor in tensors)
-    kept: _Kept | None = scene.cache.get("cuda")
-    if (
-        kept is None
-        or kept.versions != versions
-        or kept.intensity != scene.info.intensity
-        or any(a is not b for a, b in zip(kept.tensors, tensors, strict=True))
-    ):
+    def sort() -> Gaussians:
         order = spatial_order(scene.means)
-        gaussians = Gaussians.of({name: t.detach()[order] for name, t in scene.splats.items()}, scene.info.intensity)
-        kept = _Kept(tensors, versions, scene.info.intensity, gaussians)
-        scene.cache["cuda"] = kept  # one assignment: threads may render the scene at the same time
-    return kept.gaussians
+        return Gaussians.of({name: t.detach()[order] for name, t in scene.splats.items()}, scene.info.intensity)
+
+    return scene.prepared("cuda", sort)

@@ -17,6 +17,7 @@ import triton
 from torch import Tensor
 
 from ..probe import ConvexProbe, FloatArray, Probe
+from ..request import OUTPUTS
 from .device import interpreted
 from .kernels import constants
 from .kernels.drawing import draw_tiles, finish_frames
@@ -25,7 +26,6 @@ from .kernels.placing import place_gradients
 from .kernels.slicing import slice_gaussians
 
 MAX_POSES = 65_535  # of one launch, by CUDA's limit for a grid
-OUTPUTS = ("bmode", "echo", "transmittance", "coverage")
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ class Geometry(NamedTuple):
             height,
             width,
             _span(probe) / width,
-            (probe.far_mm - probe.near_mm) / 10.0 / height,
+            _row_cm(probe, height),
         )
 
 
@@ -95,13 +95,16 @@ def _span(probe: Probe) -> float:
     return math.radians(probe.opening_angle_deg) if isinstance(probe, ConvexProbe) else probe.width_mm / 10.0
 
 
+def _row_cm(probe: Probe, height: int) -> float:
+    return (probe.far_mm - probe.near_mm) / 10.0 / height
+
+
 def view_table(probe: Probe, poses_cm: FloatArray, height: int) -> FloatArray:  # [C, 4, 4] -> [C, VIEW]
     """Each pose as the kernels want it: the probe's axes and origin, and the probe."""
     table = np.empty((len(poses_cm), constants.VIEW.value))
     table[:, :9] = poses_cm[:, :3, :3].transpose(0, 2, 1).reshape(-1, 9)
     table[:, 9:12] = poses_cm[:, :3, 3]
-    row_cm = (probe.far_mm - probe.near_mm) / 10.0 / height
-    table[:, 12:] = _span(probe), probe.near_mm / 10.0, probe.cull_far_mm(height) / 10.0, row_cm
+    table[:, 12:] = _span(probe), probe.near_mm / 10.0, probe.cull_far_mm(height) / 10.0, _row_cm(probe, height)
     return table
 
 
