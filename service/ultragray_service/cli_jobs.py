@@ -66,6 +66,15 @@ def retry(job: JobArgument, server: Server = "http://127.0.0.1:8000", api_key: A
 
 
 @jobs_app.command()
+def delete(job: JobArgument, server: Server = "http://127.0.0.1:8000", api_key: ApiKey = None) -> None:
+    """Remove a finished job and its files; the scene that it trained stays."""
+    from .job_client import JobClient
+
+    JobClient(server, api_key).delete(job)
+    typer.echo(f"{job} deleted")
+
+
+@jobs_app.command()
 def logs(
     job: JobArgument,
     max_bytes: Annotated[int, typer.Option("--bytes", min=1, max=2**20, help="How much of its end.")] = 65536,

@@ -7,9 +7,19 @@ from typing import Annotated, Any
 
 import typer
 
-from ultragray.errors import InvalidArgument
-
 from .cli_jobs_options import ApiKey, Priority, RequestId, Server, Wait
+from .cli_sampler import (
+    Count,
+    Kind,
+    MinConfidence,
+    RotationDeg,
+    Seed,
+    SpacingMm,
+    StepDeg,
+    TiltDeg,
+    TranslationMm,
+    sampler_document,
+)
 
 submit_app = typer.Typer(no_args_is_help=True, help="Put a job into the queue; its id is printed.")
 
@@ -50,17 +60,22 @@ def render(
         Path | None,
         typer.Option(help="Poses in mm: .npy or .json, [P, 4, 4] or [P, 3, 4].", show_default="the training poses"),
     ] = None,
-    jitter: Annotated[
-        int | None,
-        typer.Option(metavar="COUNT", help="So many poses about the training poses instead.", show_default=False),
-    ] = None,
-    translation_mm: Annotated[float, typer.Option(help="Of --jitter, along each axis.")] = 2.0,
-    rotation_deg: Annotated[float, typer.Option(help="Of --jitter, about each axis.")] = 5.0,
-    seed: Annotated[int, typer.Option(help="Of --jitter.")] = 0,
+    sampler: Kind = None,
+    count: Count = None,
+    translation_mm: TranslationMm = None,
+    rotation_deg: RotationDeg = None,
+    seed: Seed = None,
+    spacing_mm: SpacingMm = None,
+    tilt_deg: TiltDeg = None,
+    step_deg: StepDeg = None,
     height: Annotated[int | None, typer.Option(help="Depth samples.", show_default="as trained, else 512")] = None,
     width: Annotated[int | None, typer.Option(help="Scan lines.", show_default="as trained, else 512")] = None,
-    outputs: Annotated[str, typer.Option(help="Some of bmode, echo, transmittance, coverage, with commas.")] = "bmode",
-    format: Annotated[str, typer.Option(help="npz, or tar of PNGs and JSON (WebDataset).")] = "npz",
+    outputs: Annotated[
+        str, typer.Option(help="Some of bmode, echo, transmittance, coverage, labels, with commas.")
+    ] = "bmode",
+    format: Annotated[str, typer.Option(help="npz, tar (WebDataset), zarr, hdf5, dicom, or plus (.igs.mha).")] = "npz",
+    dtype: Annotated[str | None, typer.Option(help="uint8 or float32.", show_default="the format's own")] = None,
+    min_confidence: MinConfidence = None,
     request_id: RequestId = None,
     priority: Priority = 0,
     wait: Wait = False,
@@ -74,22 +89,24 @@ def render(
         "width": width,
         "outputs": [name.strip() for name in outputs.split(",") if name.strip()],
         "format": format,
+        "dtype": dtype,
+        "min_confidence": min_confidence,
+        "sampler": sampler_document(
+            sampler,
+            count=count,
+            translation_mm=translation_mm,
+            rotation_deg=rotation_deg,
+            seed=seed,
+            spacing_mm=spacing_mm,
+            tilt_deg=tilt_deg,
+            step_deg=step_deg,
+        ),
     }
-    if poses is not None and jitter is not None:
-        raise InvalidArgument("--poses and --jitter cannot be given together", field="poses")
     if poses is not None:
         from ultragray.pose_file import load_poses
 
         specification["poses"] = load_poses(poses).tolist()
-    elif jitter is not None:
-        specification["sampler"] = {
-            "kind": "jitter",
-            "count": jitter,
-            "translation_mm": translation_mm,
-            "rotation_deg": rotation_deg,
-            "seed": seed,
-        }
-    else:
+    elif specification["sampler"] is None:
         specification["sampler"] = {"kind": "training"}
     _submit("render", specification, request_id, priority, wait, server, api_key)
 

@@ -103,6 +103,8 @@ def told(job: dict[str, Any]) -> str:
     """The figures of the progress that are known, in short."""
     progress = job["progress"]
     parts = []
+    if progress["waits_for"] is not None:
+        parts.append(f"waits for {progress['waits_for']}, where another job is at work")
     if progress["loss"] is not None:
         parts.append(f"loss {progress['loss']:.4f}")
     if progress["gaussians"] is not None:

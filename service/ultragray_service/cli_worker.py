@@ -73,6 +73,7 @@ def run_worker(overrides: dict[str, Any], *, name: str | None = None, device: st
         device=device,
         threads=settings.training_threads,
         nice=settings.job_nice,
+        retention_days=settings.job_retention_days,
     )
     sys.stderr.flush()
     os._exit(0)  # threads of the queue would be waited for

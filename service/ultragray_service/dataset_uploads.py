@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import logging
-import os
-import sys
 from collections.abc import AsyncIterator, Awaitable
 from contextlib import asynccontextmanager
+from dataclasses import asdict
 from typing import Any, TypeVar
 
-from ultragray import errors
-from ultragray.errors import DatasetInvalid, DeadlineExceeded, Draining, InvalidArgument, QueueFull, UltragrayError
+from ultragray.errors import DatasetInvalid, Draining, InvalidArgument, QueueFull
 from ultragray_workers.dataset_incoming import IncomingDataset, remove_stale
 from ultragray_workers.dataset_intake import IntakeRequest
 from ultragray_workers.dataset_store import DatasetRecord, DatasetStore, check_dataset_name
 
+from .arrival import arrival
+from .helper_process import run_helper
 from .settings import Settings
 
 MAX_UPLOADS = 8
@@ -26,9 +25,6 @@ CHECK_TIMEOUT_S = 1800.0
 _BLOCK_BYTES = 1 << 20
 
 _log = logging.getLogger("ultragray.service")
-_ERRORS = {
-    cls.reason: cls for cls in vars(errors).values() if isinstance(cls, type) and issubclass(cls, UltragrayError)
-}
 
 T = TypeVar("T")
 
@@ -103,18 +99,7 @@ class DatasetUpload:
 
         Raises DeadlineExceeded where it sends nothing for too long, Draining where the service stops.
         """
-        idle_timeout_s = self._settings.upload_idle_timeout_s
-        work = asyncio.ensure_future(arriving)
-        either: set[asyncio.Future[Any]] = {work, self._stopping}
-        try:
-            await asyncio.wait(either, timeout=idle_timeout_s, return_when=asyncio.FIRST_COMPLETED)
-            if self._stopping.done():
-                raise Draining("the service is stopping; send the dataset again")
-            if not work.done():
-                raise DeadlineExceeded(f"the upload sent nothing for {idle_timeout_s:g} s")
-            return work.result()
-        finally:
-            work.cancel()
+        return await arrival(arriving, self._settings.upload_idle_timeout_s, self._stopping)
 
     async def begin_file(self, name: str) -> None:
         """What is written next belongs to the file `name`. Raises DatasetInvalid, UploadTooLarge, StorageFull."""
@@ -161,40 +146,11 @@ class DatasetUpload:
             memory_bytes=self._settings.dataset_memory_mb << 20,
         )
         async with self._checking:
-            await _check(request)
+            await run_helper(
+                "dataset_intake",
+                asdict(request),
+                what="checking the dataset",
+                timeout_s=CHECK_TIMEOUT_S,
+                killed=DatasetInvalid,
+            )
         return await asyncio.to_thread(self._incoming.accept, self._name)
-
-
-async def _check(request: IntakeRequest) -> None:
-    program = f"import sys; sys.path[:] = {sys.path!r}; from ultragray_workers.dataset_intake import main; main()"
-    process = await asyncio.create_subprocess_exec(
-        sys.executable,
-        "-c",
-        program,
-        stdin=asyncio.subprocess.PIPE,
-        stdout=asyncio.subprocess.PIPE,
-        stderr=asyncio.subprocess.PIPE,
-        env={**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
-    )
-    try:
-        output, complaints = await asyncio.wait_for(
-            process.communicate(request.to_json().encode()), timeout=CHECK_TIMEOUT_S
-        )
-    except asyncio.TimeoutError:
-        raise DeadlineExceeded(f"checking the dataset took more than {CHECK_TIMEOUT_S:g} s") from None
-    finally:
-        if process.returncode is None:
-            process.kill()
-            await asyncio.shield(process.wait())
-    status = process.returncode or 0
-    if status < 0:
-        raise DatasetInvalid(
-            f"the process that checked the dataset was killed (signal {-status}): perhaps it is too large for the "
-            "memory of the machine"
-        )
-    if status:
-        fields = {"status": status, "stderr": complaints.decode(errors="replace")[-4000:]}
-        _log.error("the check of a dataset failed unexpectedly", extra={"fields": fields})
-        raise UltragrayError("the check of the dataset failed unexpectedly, see the log")
-    if answer := json.loads(output):
-        raise _ERRORS[answer["reason"]](answer["detail"], field=answer["field"])

@@ -9,6 +9,7 @@ import os
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 from .settings import ENVIRONMENT_PREFIX, Settings
 
@@ -21,6 +22,7 @@ _PASSED_ON = (
     "database_url",
     "training_threads",
     "job_nice",
+    "job_retention_days",
     "log_level",
 )
 
@@ -35,6 +37,7 @@ class EmbeddedWorker:
         self._stop = asyncio.Event()
         self._process: subprocess.Popen[bytes] | None = None
         self._task: asyncio.Task[None] | None = None
+        self._thread = ThreadPoolExecutor(1, "embedded-worker")  # not the loop's, which others need
 
     def start(self) -> None:
         """Starts the worker and returns at once; nothing where the settings want none."""
@@ -47,17 +50,19 @@ class EmbeddedWorker:
         self._terminate()
         if self._task is None:
             return
-        done, _ = await asyncio.wait({self._task}, timeout=_STOP_WAIT_S)
-        if not done and self._process is not None:
-            self._process.kill()
-            await self._task
+        try:
+            await asyncio.wait({self._task}, timeout=_STOP_WAIT_S)
+        finally:  # also where nobody waits any longer
+            if self._process is not None and self._process.poll() is None:
+                self._process.kill()
+        await self._task
 
     async def _keep_alive(self) -> None:
         wait_s = _FIRST_WAIT_S
         while not self._stop.is_set():
             started = time.monotonic()
             self._process = self._spawn()
-            code = await asyncio.get_running_loop().run_in_executor(None, self._process.wait)
+            code = await asyncio.get_running_loop().run_in_executor(self._thread, self._process.wait)
             if self._stop.is_set():
                 return
             if time.monotonic() - started > _STEADY_S:

@@ -39,13 +39,20 @@ class JobClient:
             return json.load(answer), answer.status == 201
 
     def get(self, job_id: str) -> dict[str, Any]:
+        """The job as it is now."""
         return self._json("GET", f"/v1/jobs/{quote(job_id, safe='')}")
 
     def cancel(self, job_id: str) -> dict[str, Any]:
+        """The job, cancelled."""
         return self._json("POST", f"/v1/jobs/{quote(job_id, safe='')}:cancel")
 
     def retry(self, job_id: str) -> dict[str, Any]:
+        """The job in its place."""
         return self._json("POST", f"/v1/jobs/{quote(job_id, safe='')}:retry")
+
+    def delete(self, job_id: str) -> None:
+        """Removes a finished job and its files."""
+        self._open("DELETE", f"/v1/jobs/{quote(job_id, safe='')}").close()
 
     def jobs(self, *, state: str, kind: str, limit: int) -> list[dict[str, Any]]:
         """The newest jobs, at most `limit`."""
@@ -61,6 +68,7 @@ class JobClient:
         return found
 
     def log(self, job_id: str, max_bytes: int) -> str:
+        """The end of its log."""
         with self._open("GET", f"/v1/jobs/{quote(job_id, safe='')}/log?max_bytes={max_bytes}") as answer:
             return answer.read().decode("utf-8", "replace")
 

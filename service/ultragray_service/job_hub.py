@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
 
+from ultragray.errors import DatabaseUnavailable
 from ultragray_workers.jobs.store import Job, JobState
 
 from .job_log import TAIL_BYTES, GrowingLog
@@ -78,8 +80,9 @@ class JobWatch:
 class _Reader:
     """Reads one job for all of its watchers, until its final state or until nobody watches."""
 
-    def __init__(self, read: Callable[[], Job], log_path: Path) -> None:
+    def __init__(self, read: Callable[[], Job], log_path: Path, threads: Executor | None) -> None:
         self._read = read
+        self._threads = threads
         self._log = GrowingLog(log_path)
         self._tail = ""  # for those who come later
         self._job: Job | None = None
@@ -98,7 +101,12 @@ class _Reader:
             while self._job is None or self._job.state not in FINAL_STATES:
                 if self._job is not None:
                     await asyncio.sleep(READ_INTERVAL_S)
-                job, log = await asyncio.to_thread(self._look)
+                try:
+                    job, log = await asyncio.get_running_loop().run_in_executor(self._threads, self._look)
+                except DatabaseUnavailable:
+                    if self._job is None:
+                        raise
+                    continue  # it comes back, and the watchers have nothing else to do
                 changed = job if job != self._job else None
                 self._job = job
                 self._tail = (self._tail + log)[-TAIL_BYTES:]
@@ -119,8 +127,12 @@ class _Reader:
 class JobHub:
     """The watchers of all jobs. Belongs to one event loop."""
 
-    def __init__(self, get: Callable[[str], Job], log_path: Callable[[str], Path]) -> None:
+    def __init__(
+        self, get: Callable[[str], Job], log_path: Callable[[str], Path], threads: Executor | None = None
+    ) -> None:
+        """`threads`: where jobs are read; None: the event loop's own."""
         self._get = get
+        self._threads = threads
         self._log_path = log_path
         self._readers: dict[str, _Reader] = {}
         self._closed = False
@@ -134,14 +146,14 @@ class JobHub:
         """A watcher of a job; its first change tells all. It must be closed. Raises JobNotFound."""
         reader = self._readers.get(job_id)
         if reader is None or reader.task.done():
-            await asyncio.to_thread(self._get, job_id)
+            await asyncio.get_running_loop().run_in_executor(self._threads, self._get, job_id)
             reader = self._readers.get(job_id)  # another watcher may have come in the meantime
         if self._closed:
             over = JobWatch(lambda leaving: None)
             over.end()
             return over
         if reader is None or reader.task.done():
-            reader = _Reader(lambda: self._get(job_id), self._log_path(job_id))
+            reader = _Reader(lambda: self._get(job_id), self._log_path(job_id), self._threads)
             self._readers[job_id] = reader
         chosen = reader
         watch = JobWatch(lambda leaving: self._remove(job_id, chosen, leaving))

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeVar
 
+from sqlalchemy.exc import SQLAlchemyError
+
 from ultragray.errors import (
+    DatabaseUnavailable,
     DatasetInvalid,
     DatasetNotFound,
     InvalidArgument,
@@ -16,6 +20,7 @@ from ultragray.errors import (
     SceneExists,
     SceneFileInvalid,
     SceneNotFound,
+    UltragrayError,
 )
 from ultragray_workers.jobs.folder import JobFolder
 from ultragray_workers.jobs.specification import Specification
@@ -27,6 +32,11 @@ from .job_hub import JobHub, JobWatch
 from .requests import field_under
 from .settings import Settings
 
+COUNT_INTERVAL_S = 10.0
+_BESIDE_SPECIFICATION = ("request_id", "priority")
+_THREADS = 4
+_PATIENCE_S = 10.0  # with a database that is there and says nothing
+
 T = TypeVar("T")
 
 
@@ -37,7 +47,11 @@ class Jobs:
         self._settings = settings
         self._scenes = scenes
         self._opened: JobStore | None = None
-        self.hub = JobHub(lambda job_id: self._store.get(job_id), self._log_path)
+        # Of their own, so that a database that does not answer keeps nobody else waiting.
+        self._threads = ThreadPoolExecutor(_THREADS, "jobs")
+        self.hub = JobHub(lambda job_id: self._store.get(job_id), self._log_path, self._threads)
+        self.counts: dict[JobState, int] = {}  # as it was up to COUNT_INTERVAL_S ago; empty: not known
+        self._counting: asyncio.Task[None] | None = None
 
     @property
     def _store(self) -> JobStore:
@@ -49,8 +63,14 @@ class Jobs:
         """Opens the store. Raises StartupFailed where its database cannot be reached."""
         settings = self._settings
         self._opened = await asyncio.to_thread(
-            JobStore, settings.artifacts, settings.database_url, settings.job_queue_limit, scenes=self._scenes
+            JobStore,
+            settings.artifacts,
+            settings.database_url,
+            settings.job_queue_limit,
+            scenes=self._scenes,
+            max_image_side=settings.max_image_side,
         )
+        self._counting = asyncio.create_task(self._count())
 
     async def submit(
         self, specification: Specification, *, field: str, request_id: str | None, priority: int
@@ -90,9 +110,16 @@ class Jobs:
         """Raises JobNotFound, and JobFinished for one that succeeded or failed."""
         return await self._do(lambda store: store.cancel(job_id))
 
-    async def retry(self, job_id: str) -> Job:
-        """A new job that goes on where a failed or cancelled one stopped. Raises JobNotFound, JobNotFinished."""
+    async def retry(self, job_id: str) -> tuple[Job, bool]:
+        """The job that goes on where a failed or cancelled one stopped, and whether it is new.
+
+        Raises JobNotFound, JobNotFinished, and what `submit` raises.
+        """
         return await self._do(lambda store: store.retry(job_id))
+
+    async def delete(self, job_id: str) -> None:
+        """Removes a finished job. Raises JobNotFound, JobInUse."""
+        await self._do(lambda store: store.delete(job_id))
 
     async def log_tail(self, job_id: str, max_bytes: int) -> str:
         """The end of a job's log. Raises JobNotFound."""
@@ -110,18 +137,38 @@ class Jobs:
         """The waiting or running job that needs a dataset; blocks. Raises NotReady before the start."""
         return self._store.uses_dataset(name)
 
+    def makes_scene(self, name: str) -> str | None:
+        """The waiting or running job that makes a scene; blocks. Raises NotReady before the start."""
+        return self._store.makes_scene(name)
+
     def end_watches(self) -> None:
         """Ends all watchers, now and from now on: the service stops."""
         self.hub.close()
 
     async def close(self) -> None:
         """Closes the store."""
+        if self._counting is not None:
+            self._counting.cancel()
         if self._opened is not None:
             await asyncio.to_thread(self._opened.close)
 
+    async def _count(self) -> None:
+        while True:
+            try:
+                self.counts = await self._do(lambda store: store.counts())
+            except (UltragrayError, SQLAlchemyError):
+                self.counts = {}
+            await asyncio.sleep(COUNT_INTERVAL_S)
+
     async def _do(self, work: Callable[[JobStore], T]) -> T:
         store = self._store
-        return await asyncio.to_thread(work, store)
+        answer = asyncio.get_running_loop().run_in_executor(self._threads, work, store)
+        try:
+            return await asyncio.wait_for(answer, _PATIENCE_S)
+        except asyncio.TimeoutError:
+            raise DatabaseUnavailable(
+                f"the database of the jobs has not answered for {_PATIENCE_S:g} s: try again later"
+            ) from None
 
     def _log_path(self, job_id: str) -> Path:
         return JobFolder(self._settings.artifacts, job_id).log
@@ -133,6 +180,11 @@ def _specification_to_blame(field: str) -> Iterator[None]:
     try:
         with scene_to_blame():
             yield
+    except InvalidArgument as error:
+        if error.field in _BESIDE_SPECIFICATION:
+            raise
+        with field_under(field):
+            raise
     except (DatasetInvalid, DatasetNotFound, SceneExists, SceneFileInvalid, SceneNotFound):
         with field_under(field):
             raise

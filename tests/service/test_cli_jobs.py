@@ -126,9 +126,9 @@ def test_poses_of_a_file_become_an_archive(server: RunningService, client: httpx
 
 
 def test_a_job_that_fails_says_why_by_its_exit_code(server: RunningService, client: httpx.Client) -> None:
-    result = run(server, "submit", "train", "tiny", "--scene", "never", "--set", "no_such_setting=1", "--wait")
+    result = run(server, "submit", "train", "tiny", "--scene", "never", "--set", "memory_gb=0.001", "--wait")
     assert result.exit_code == JOB_FAILED, result.output
-    assert "no_such_setting" in result.stderr.splitlines()[-1]
+    assert "memory_gb allows" in result.stderr.splitlines()[-1]
     assert result.stderr.splitlines()[-1].startswith("error: ")
     assert "Traceback" not in result.output
 
@@ -142,6 +142,8 @@ def test_a_cancelled_job_has_its_own_exit_code_and_can_be_retried(server: Runnin
     again = done(server, "retry", job).strip()
     assert client.get(f"/v1/jobs/{again}").json()["retry_of"] == job
     done(server, "cancel", again)
+    assert done(server, "delete", again) == f"{again} deleted\n"
+    assert "there is no job" in run(server, "delete", again).stderr
 
 
 @pytest.mark.parametrize(
@@ -151,8 +153,12 @@ def test_a_cancelled_job_has_its_own_exit_code_and_can_be_retried(server: Runnin
         (("list", "--server", "localhost:8000"), "--server must be a URL"),
         (("list", "--server", "http://127.0.0.1:9"), "no service answers at http://127.0.0.1:9"),
         (("list", "--api-key", "x" * 16), "API key"),
-        (("submit", "render", "demo", "--jitter", "3", "--poses", "poses.npy"), "cannot be given together"),
+        (("submit", "render", "demo", "--count", "3"), "--count is of a sampler: name it with --sampler"),
+        (("submit", "render", "demo", "--sampler", "fan", "--count", "3"), "it takes tilt_deg, step_deg"),
+        (("submit", "render", "demo", "--format", "dicom", "--outputs", "echo"), "bmode alone in format dicom"),
         (("submit", "render", "gone"), "no scene"),
+        (("submit", "train", "tiny", "--scene", "new", "--set", "stepz=3"), "no setting stepz; it has steps, "),
+        (("submit", "train", "tiny", "--scene", "new", "--set", "steps=0"), "steps must be between 1 and"),
         (("download", "0" * 24, "name", "-o", "nowhere/name"), "output must lie in a folder that exists"),
     ],
 )
@@ -162,6 +168,18 @@ def test_mistakes_give_one_line(server: RunningService, arguments: tuple[str, ..
     assert result.stderr.startswith("error: ")
     assert told in result.stderr
     assert result.stderr.count("\n") == 1
+
+
+def test_submitting_needs_no_torch() -> None:
+    program = (
+        "import sys; from typer.testing import CliRunner; from ultragray_service.cli import app\n"
+        "arguments = 'jobs submit train tiny --scene new --set steps=3 --server http://127.0.0.1:9'\n"
+        "print(CliRunner().invoke(app, arguments.split()).exit_code, 'torch' in sys.modules)"
+    )
+    path = os.pathsep.join(str(ROOT / folder) for folder in SOURCE_FOLDERS)
+    environment = {**os.environ, "PYTHONPATH": path}
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, env=environment)
+    assert done.stdout.split() == ["2", "False"]
 
 
 def test_a_watch_outlives_a_restart_of_the_service(start_service: StartService, tmp_path: Path) -> None:

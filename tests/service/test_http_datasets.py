@@ -275,7 +275,8 @@ def test_limits(http: httpx.Client) -> None:
     ("name", "headers", "content", "expected"),
     [
         ("a", {"Content-Type": "application/json"}, b"{}", (415, "UNSUPPORTED_MEDIA_TYPE", "Content-Type")),
-        ("a", {}, b"PK", (415, "UNSUPPORTED_MEDIA_TYPE", "Content-Type")),
+        ("a", {}, b"PK", (422, "DATASET_INVALID", "neither .zip nor .tar")),
+        ("a", {}, b"PK\x03\x04and no more", (422, "DATASET_INVALID", "cut short")),
         ("a", {"Content-Type": ZIP, "Content-Encoding": "gzip"}, b"PK", (415, "UNSUPPORTED_MEDIA_TYPE", "compressed")),
         (".hidden", {"Content-Type": ZIP}, b"PK", (422, "INVALID_ARGUMENT", "dataset must be")),
         ("a", {"Content-Type": "multipart/form-data"}, b"PK", (422, "INVALID_ARGUMENT", "boundary")),

@@ -5,15 +5,19 @@ from __future__ import annotations
 import json
 import threading
 import time
+import typing
 from collections.abc import Iterator
 from dataclasses import MISSING, fields
+from pathlib import Path
 from typing import Any
 
 import httpx
 import pytest
 
+from ultragray.exports import FORMATS
+from ultragray.samplers import SAMPLERS
 from ultragray_service.http.job_schemas import RenderSpecification, SamplerBody, TrainSpecification
-from ultragray_workers.jobs.specification import PoseSampler, RenderJob, TrainJob
+from ultragray_workers.jobs.specification import RenderJob, TrainJob
 
 from .conftest import RunningService, StartService
 
@@ -84,7 +88,7 @@ def test_the_same_request_id_gives_the_same_job_and_another_body_a_conflict(clie
         ({"kind": "render", "specification": {"scene": "demo"}}, 422, "INVALID_ARGUMENT", "specification.poses"),
         ({"kind": "render", "specification": {"kind": "train"}}, 422, "INVALID_ARGUMENT", "specification.kind"),
         (
-            {"kind": "render", "specification": {"scene": "demo", "sampler": {"kind": "jitter", "count": 0}}},
+            {"kind": "render", "specification": {"scene": "demo", "sampler": {"kind": "around", "count": 0}}},
             422,
             "INVALID_ARGUMENT",
             "specification.sampler.count",
@@ -108,6 +112,12 @@ def test_the_same_request_id_gives_the_same_job_and_another_body_a_conflict(clie
             "specification.dataset",
         ),
         ({"kind": "train", "specification": {"dataset": "gone"}}, 422, "INVALID_ARGUMENT", "specification.scene"),
+        (
+            {"kind": "train", "specification": {"dataset": "gone", "scene": "new", "settings": {"stepz": 3}}},
+            422,
+            "INVALID_ARGUMENT",
+            "specification.settings.stepz",
+        ),
     ],
 )
 def test_what_cannot_be_run_is_refused_by_name(
@@ -127,6 +137,7 @@ def test_a_body_that_is_no_json_is_refused(client: httpx.Client) -> None:
         ("GET", ""),
         ("POST", ":cancel"),
         ("POST", ":retry"),
+        ("DELETE", ""),
         ("GET", "/log"),
         ("GET", "/events"),
         ("GET", "/artifacts/a"),
@@ -165,8 +176,34 @@ def test_cancel_is_idempotent_and_retry_makes_a_successor(client: httpx.Client) 
         assert (cancelled.status_code, cancelled.json()["state"]) == (200, "cancelled")
     retried = client.post(f"/v1/jobs/{job['id']}:retry")
     assert retried.status_code == 201
+    again = client.post(f"/v1/jobs/{job['id']}:retry")
+    assert (again.status_code, again.json()) == (200, retried.json())
     assert (retried.json()["state"], retried.json()["retry_of"]) == ("queued", job["id"])
     assert retried.json()["id"] != job["id"]
+
+
+def test_a_finished_job_is_deleted_and_others_are_not(client: httpx.Client) -> None:
+    route = f"/v1/jobs/{submit(client)['id']}"
+    assert problem(client.delete(route)) == (409, "JOB_IN_USE", "job")
+    client.post(f"{route}:cancel")
+    deleted = client.delete(route)
+    assert (deleted.status_code, deleted.content) == (204, b"")
+    for answer in (client.get(route), client.delete(route)):
+        assert problem(answer) == (404, "JOB_NOT_FOUND", "job")
+
+
+def test_jobs_are_counted_for_prometheus(start_service: StartService, tmp_path: Path) -> None:
+    service = start_service(artifact_folder=tmp_path, embedded_worker=False)
+    end = time.monotonic() + WAIT_S
+    with httpx.Client(base_url=service.http, timeout=WAIT_S) as client:
+        while 'ultragray_jobs{state="queued"} 0.0' not in (told := client.get("/metrics").text):
+            assert time.monotonic() < end, told
+            time.sleep(0.05)
+        submit(client)
+        while 'ultragray_jobs{state="queued"} 1.0' not in (told := client.get("/metrics").text):
+            assert time.monotonic() < end, told
+            time.sleep(0.1)
+    assert 'ultragray_jobs{state="failed"} 0.0' in told
 
 
 def test_a_job_that_waits_has_an_empty_log_and_no_artifacts(client: httpx.Client) -> None:
@@ -232,10 +269,8 @@ def test_a_watcher_that_goes_away_is_let_go(client: httpx.Client, jobs_service: 
 
 
 def test_the_documented_specifications_are_those_that_are_taken() -> None:
-    pairs = ((TrainSpecification, TrainJob), (RenderSpecification, RenderJob), (SamplerBody, PoseSampler))
-    for model, taken in pairs:
+    for model, taken in ((TrainSpecification, TrainJob), (RenderSpecification, RenderJob)):
         assert list(model.model_fields) == [field.name for field in fields(taken)]
-    for model, taken in pairs[:2]:
         defaults = {
             field.name: field.default if field.default is not MISSING else {}
             for field in fields(taken)
@@ -243,6 +278,12 @@ def test_the_documented_specifications_are_those_that_are_taken() -> None:
         }
         documented = {name: field.default for name, field in model.model_fields.items() if not field.is_required()}
         assert documented == defaults | ({"outputs": ["bmode"]} if taken is RenderJob else {})
+    assert set(SamplerBody.model_fields) == {"kind"} | {
+        field.name for cls in SAMPLERS.values() for field in fields(cls)
+    }
+    kinds = typing.get_args(SamplerBody.model_fields["kind"].annotation)
+    formats = typing.get_args(RenderSpecification.model_fields["format"].annotation)
+    assert (kinds, formats) == (tuple(SAMPLERS), tuple(FORMATS))
 
 
 def test_a_full_queue_refuses_and_a_stopping_service_ends_the_events_at_once(

@@ -22,6 +22,7 @@ from .dataset_unpack import FileBudget, create_below
 PREFIX = ".incoming-"
 LOCK_NAME, ARCHIVE_NAME, DATASET_NAME = "lock", "archive", "dataset"
 _LOCKED_WITHIN_S = 60.0  # a folder this young without a lock is being made
+_DELETED_WITHIN_S = 60.0  # a folder renamed this lately may yet be given back
 
 
 class IncomingDataset:
@@ -37,7 +38,7 @@ class IncomingDataset:
         self._budget = FileBudget(max_bytes)
         self._using = threading.Lock()
         self._file: IO[bytes] | None = None
-        with storage_full():
+        with storage_full("the dataset"):
             store.folder.mkdir(parents=True, exist_ok=True)
             self.folder = store.folder / f"{PREFIX}{secrets.token_hex(8)}"
             self.folder.mkdir()
@@ -92,7 +93,7 @@ class IncomingDataset:
         with self._using:
             if self._lock is None:
                 raise ValueError("the upload was discarded")
-            with storage_full():
+            with storage_full("the dataset"):
                 yield
 
     def _finish_file(self) -> None:
@@ -112,8 +113,10 @@ def remove_stale(store: DatasetStore) -> int:
                 shutil.rmtree(folder, ignore_errors=True)
                 removed += 1
     for folder in list(store.folder.glob(f"{DELETED_PREFIX}*")):
-        shutil.rmtree(folder, ignore_errors=True)
-        removed += 1
+        with contextlib.suppress(FileNotFoundError):
+            if time.time() - folder.stat().st_ctime > _DELETED_WITHIN_S:
+                shutil.rmtree(folder, ignore_errors=True)
+                removed += 1
     return removed
 
 
@@ -135,11 +138,11 @@ def _unless_locked(folder: Path) -> Iterator[bool]:
 
 
 @contextlib.contextmanager
-def storage_full() -> Iterator[None]:
+def storage_full(what: str) -> Iterator[None]:
     """Raises StorageFull where a disk has no room."""
     try:
         yield
     except OSError as error:
         if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-            raise StorageFull("the artifact folder has no room for the dataset") from error
+            raise StorageFull(f"the artifact folder has no room for {what}") from error
         raise

@@ -1,20 +1,11 @@
-"""The process that unpacks and checks an upload: apart from the service, slow to others, and of limited memory.
-
-It reads one JSON object (`IntakeRequest`) from stdin and writes one to stdout: `{}`, or the `reason`, `detail` and
-`field` of an error. Where it succeeds the folder holds a complete dataset.
-"""
+"""The helper process that unpacks and checks an upload. Where it succeeds the folder holds a complete dataset."""
 
 from __future__ import annotations
 
 import contextlib
-import ctypes
-import json
 import os
-import resource
-import signal
-import sys
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -24,14 +15,13 @@ from ultragray.errors import DatasetInvalid, MemoryExceeded, UltragrayError
 from .dataset_incoming import ARCHIVE_NAME, DATASET_NAME, storage_full
 from .dataset_store import CONTACT_SHEET_NAME, FILES_NAME, DatasetRecord, sync_folder, write_manifest
 from .dataset_unpack import unpack
+from .helper import answer_request
 
 if TYPE_CHECKING:
     from ultragray.datasets import Dataset
 
 CONFIG_NAME = "conf.json"
 RELEASED, PLUS = "released", "plus"
-NICE_LEVEL = 10
-_PR_SET_PDEATHSIG = 1
 _NAMES_IN_MESSAGE = 5
 _OPTIONS = {f"--{name.replace('_', '-')}": name for name in ("train_frames", "val_frames", "image_size")} | {
     "--crop": "crop",
@@ -49,22 +39,10 @@ class IntakeRequest:
     max_bytes: int
     memory_bytes: int
 
-    def to_json(self) -> str:
-        return json.dumps(asdict(self))
-
 
 def main() -> None:
-    """Answers the request on stdin."""
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    os.nice(NICE_LEVEL)
-    request = IntakeRequest(**json.loads(sys.stdin.buffer.read()))
-    resource.setrlimit(resource.RLIMIT_DATA, (request.memory_bytes, request.memory_bytes))
-    answer: dict[str, str | None] = {}
-    try:
-        take_in(request)
-    except UltragrayError as error:
-        answer = {"reason": error.reason, "detail": error.detail, "field": error.field}
-    sys.stdout.write(json.dumps(answer))
+    """Answers the `IntakeRequest` on stdin."""
+    answer_request(lambda request: take_in(IntakeRequest(**request)))
 
 
 def take_in(request: IntakeRequest) -> None:
@@ -76,7 +54,7 @@ def take_in(request: IntakeRequest) -> None:
     folder = Path(request.folder).resolve()
     dataset_folder = folder / DATASET_NAME
     files = dataset_folder / FILES_NAME
-    with _in_words_of_the_upload(files, request), storage_full():
+    with _in_words_of_the_upload(files, request), storage_full("the dataset"):
         archive = folder / ARCHIVE_NAME
         if archive.exists():
             unpack(archive, files, request.max_bytes)

@@ -120,17 +120,30 @@ class DatasetStore:
         return record, True
 
     def delete(self, name: str) -> None:
-        """Raises DatasetNotFound, and DatasetInUse where `in_use` names who needs it."""
+        """Raises DatasetNotFound, and DatasetInUse where `in_use` names who needs it.
+
+        `in_use` is asked again when nobody finds the dataset any more: who came in between gets it back, unless
+        another one has taken its name.
+        """
         path = self._existing(name)
-        if (user := self.in_use(name)) is not None:
-            raise DatasetInUse(f"the dataset {name!r} is needed by {user}", field="dataset")
+        self._require_unused(name)
         doomed = self.folder / f"{DELETED_PREFIX}{secrets.token_hex(8)}"
         try:
             path.rename(doomed)
         except FileNotFoundError:
             raise self._not_found(name) from None
+        try:
+            self._require_unused(name)
+        except Exception:
+            with contextlib.suppress(OSError):
+                doomed.rename(path)
+            raise
         sync_folder(self.folder)
         shutil.rmtree(doomed, ignore_errors=True)
+
+    def _require_unused(self, name: str) -> None:
+        if (user := self.in_use(name)) is not None:
+            raise DatasetInUse(f"the dataset {name!r} is needed by {user}", field="dataset")
 
     def _existing(self, name: str) -> Path:
         if _NAME.fullmatch(name) and self._exists(name):

@@ -20,6 +20,7 @@ MAX_ENTRIES = 10_000  # of an archive, folders included
 MAX_PATH_LENGTH, MAX_PART_LENGTH = 512, 200
 _BLOCK_BYTES = 1 << 20
 _GZIP_MAGIC = b"\x1f\x8b"
+_ZIP_MAGIC = b"PK\x03\x04"
 
 _Entry = TypeVar("_Entry")
 
@@ -80,11 +81,14 @@ def unpack(archive: Path, folder: Path, max_bytes: int) -> None:
     budget = FileBudget(max_bytes)
     try:
         with archive.open("rb") as file:
-            packed = file.read(len(_GZIP_MAGIC)) == _GZIP_MAGIC
+            beginning = file.read(len(_ZIP_MAGIC))
+        packed = beginning.startswith(_GZIP_MAGIC)
         if packed or tarfile.is_tarfile(archive):
             _unpack_tar(archive, "r:gz" if packed else "r:", folder, budget)
         elif zipfile.is_zipfile(archive):
             _unpack_zip(archive, folder, budget)
+        elif beginning == _ZIP_MAGIC:
+            raise DatasetInvalid("the .zip is cut short: its end is missing")
         else:
             raise DatasetInvalid("the archive is neither .zip nor .tar nor .tar.gz")
     except (

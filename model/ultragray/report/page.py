@@ -14,6 +14,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from .. import __version__
 from ..baselines import predict
+from ..compounding import VOXEL_MM
 from ..datasets.sweep import Dataset
 from ..evaluation import Evaluation
 from ..metrics import FrameMetrics
@@ -22,7 +23,7 @@ from ..side_by_side import as_picture, side_by_side_panels
 from .plots import LABELS, plot_counts, plot_frames, plot_tilt, plot_training
 from .study import GAUSSIAN_SHARES, Failed, TiltStudy, Trained
 
-PANEL_PIXELS = 300
+PANEL_PIXELS, SMALL_PANEL_PIXELS = 300, 220
 PLOTTED_BASELINES = ("median", "linear", "nearest")
 BASELINE_NAMES = {
     "median": "median compounding",
@@ -35,14 +36,20 @@ BASELINE_NAMES = {
 
 @dataclass(frozen=True, eq=False)
 class ReportContent:
-    """What a report shows. `trained` is None for a scene that was read from a file; what failed says why."""
+    """What a report shows. `trained` is None for a scene that was read from a file; what failed says why.
+
+    `spread` is how many held-out frames are shown at most, from the first to the last; None: the worst, a typical one
+    and the best.
+    """
 
     dataset: Dataset
     scene: GaussianScene
     evaluation: Evaluation
-    baselines: Mapping[str, Evaluation]
-    voxel_mm: float
     machine: str
+    scene_name: str | None = None
+    baselines: Mapping[str, Evaluation] = field(default_factory=dict)
+    voxel_mm: float = VOXEL_MM
+    spread: int | None = None
     trained: Trained | None = None
     ablations: Mapping[str, Trained | Failed] = field(default_factory=dict)
     tilt: TiltStudy | Failed | None = None
@@ -125,6 +132,7 @@ def _facts(content: ReportContent) -> dict[str, str]:
     dataset, scene = content.dataset, content.scene
     axial_mm, lateral_mm = dataset.train.pixel_mm
     facts = {
+        **({} if content.scene_name is None else {"Scene": content.scene_name}),
         "Training frames": f"{len(dataset.train)}",
         "Held-out frames": f"{len(dataset.val)}",
         "Image": f"{dataset.train.height} rows x {dataset.train.width} scan lines",
@@ -164,24 +172,35 @@ def _counts_plot(content: ReportContent) -> str | None:
 
 
 def _pictures(content: ReportContent) -> list[dict[str, Any]]:
-    """The held-out frames where the scene does best, as usual, and worst, panel by panel."""
-    order = np.argsort([-frame.psnr_db for frame in content.evaluation.frames], kind="stable")
-    places = {order[-1]: "worst", order[len(order) // 2]: "typical", order[0]: "best"}  # may be fewer than three
+    """The chosen held-out frames, panel by panel."""
+    places = _telling_places(content) if content.spread is None else _spread_places(content, content.spread)
+    pixels = PANEL_PIXELS if content.spread is None else SMALL_PANEL_PIXELS
     chosen = content.dataset.val.select(list(places))
     panels = side_by_side_panels(content.scene, chosen)
-    compounded = predict(content.dataset.train, chosen.poses, "median", voxel_mm=content.voxel_mm)
-    panels = {**panels, BASELINE_NAMES["median"]: compounded}
+    if content.baselines:
+        compounded = predict(content.dataset.train, chosen.poses, "median", voxel_mm=content.voxel_mm)
+        panels = {**panels, BASELINE_NAMES["median"]: compounded}
     return [
         {
             "kind": kind,
             "frame": int(chosen.frame_numbers[row]),
             "psnr": f"{content.evaluation.frames[place].psnr_db:.2f}",
-            "panels": {
-                title: _data_uri(as_picture(frames[row], chosen, PANEL_PIXELS)) for title, frames in panels.items()
-            },
+            "panels": {title: _data_uri(as_picture(frames[row], chosen, pixels)) for title, frames in panels.items()},
         }
         for row, (place, kind) in enumerate(places.items())
     ]
+
+
+def _telling_places(content: ReportContent) -> dict[int, str]:
+    """Where the scene does worst, as usual, and best among the held-out frames; perhaps fewer than three."""
+    order = np.argsort([-frame.psnr_db for frame in content.evaluation.frames], kind="stable")
+    return {int(order[-1]): ", worst", int(order[len(order) // 2]): ", typical", int(order[0]): ", best"}
+
+
+def _spread_places(content: ReportContent, most: int) -> dict[int, str]:
+    count = len(content.dataset.val)
+    places = np.linspace(0, count - 1, min(count, most)).round().astype(np.int64)
+    return dict.fromkeys(places.tolist(), "")
 
 
 def _data_uri(picture: npt.NDArray[np.uint8]) -> str:

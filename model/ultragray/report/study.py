@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
@@ -64,7 +66,10 @@ def attempt(study: Callable[[], Result]) -> Result | Failed:
 
 
 def train_and_evaluate(dataset: Dataset, config: TrainingConfig, *, report: Report | None = None) -> Trained:
-    """Trains on `dataset.train` and measures on `dataset.val`. Raises DatasetInvalid where that has no frames."""
+    """Trains on `dataset.train`, without the fit of a confidence, and measures on `dataset.val`.
+
+    Raises DatasetInvalid where that has no frames.
+    """
     require_frames(dataset.val)
     losses: list[float] = []
     val_psnr_db: dict[int, float] = {}
@@ -77,7 +82,7 @@ def train_and_evaluate(dataset: Dataset, config: TrainingConfig, *, report: Repo
             report(progress)
 
     started = time.perf_counter()
-    scene = train(dataset, config, report=follow)
+    scene = train(dataset, replace(config, confidence=False), report=follow)
     seconds = time.perf_counter() - started
     return Trained(
         scene=scene,
@@ -86,6 +91,20 @@ def train_and_evaluate(dataset: Dataset, config: TrainingConfig, *, report: Repo
         step_s=seconds / len(losses),
         losses=losses,
         val_psnr_db=val_psnr_db,
+    )
+
+
+def trained_of_journal(scene: GaussianScene, evaluation: Evaluation, journal: Path) -> Trained:
+    """The same of a training that has finished: its scene, and the `metrics.jsonl` of its run. Raises OSError."""
+    lines = [json.loads(line) for line in journal.read_text(encoding="utf-8").splitlines()]
+    seconds = float(lines[-1]["elapsed_s"])
+    return Trained(
+        scene=scene,
+        evaluation=evaluation,
+        seconds=seconds,
+        step_s=seconds / len(lines),
+        losses=[line["loss"] for line in lines],
+        val_psnr_db={line["step"]: line["val_psnr_db"] for line in lines if "val_psnr_db" in line},
     )
 
 

@@ -59,6 +59,21 @@ class JobServiceStub:
                 request_serializer=ultragray_dot_v1_dot_jobs__pb2.RetryJobRequest.SerializeToString,
                 response_deserializer=ultragray_dot_v1_dot_jobs__pb2.Job.FromString,
                 _registered_method=True)
+        self.DeleteJob = channel.unary_unary(
+                '/ultragray.v1.JobService/DeleteJob',
+                request_serializer=ultragray_dot_v1_dot_jobs__pb2.DeleteJobRequest.SerializeToString,
+                response_deserializer=ultragray_dot_v1_dot_jobs__pb2.DeleteJobResponse.FromString,
+                _registered_method=True)
+        self.GetJobLog = channel.unary_unary(
+                '/ultragray.v1.JobService/GetJobLog',
+                request_serializer=ultragray_dot_v1_dot_jobs__pb2.GetJobLogRequest.SerializeToString,
+                response_deserializer=ultragray_dot_v1_dot_jobs__pb2.GetJobLogResponse.FromString,
+                _registered_method=True)
+        self.DownloadArtifact = channel.unary_stream(
+                '/ultragray.v1.JobService/DownloadArtifact',
+                request_serializer=ultragray_dot_v1_dot_jobs__pb2.DownloadArtifactRequest.SerializeToString,
+                response_deserializer=ultragray_dot_v1_dot_jobs__pb2.ArtifactChunk.FromString,
+                _registered_method=True)
         self.WatchJob = channel.unary_stream(
                 '/ultragray.v1.JobService/WatchJob',
                 request_serializer=ultragray_dot_v1_dot_jobs__pb2.WatchJobRequest.SerializeToString,
@@ -99,8 +114,30 @@ class JobServiceServicer:
         raise NotImplementedError('Method not implemented!')
 
     def RetryJob(self, request, context):
-        """A new job in place of a failed or cancelled one; a training goes on from its last checkpoint. JOB_NOT_FOUND,
-        JOB_NOT_FINISHED, JOB_QUEUE_FULL.
+        """A new job in place of a failed or cancelled one; a training goes on from its last checkpoint. Asked again, it gives
+        the same job, whatever became of it. JOB_NOT_FOUND, JOB_NOT_FINISHED, JOB_QUEUE_FULL.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def DeleteJob(self, request, context):
+        """Removes a finished job and its files; the scene that it trained stays. JOB_NOT_FOUND; JOB_IN_USE for one that waits
+        or runs, or that another of those goes on from.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def GetJobLog(self, request, context):
+        """The end of what the job's process said. JOB_NOT_FOUND.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def DownloadArtifact(self, request, context):
+        """A file that the job made, in chunks. JOB_NOT_FOUND, ARTIFACT_NOT_FOUND.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -141,6 +178,21 @@ def add_JobServiceServicer_to_server(servicer, server):
                     servicer.RetryJob,
                     request_deserializer=ultragray_dot_v1_dot_jobs__pb2.RetryJobRequest.FromString,
                     response_serializer=ultragray_dot_v1_dot_jobs__pb2.Job.SerializeToString,
+            ),
+            'DeleteJob': grpc.unary_unary_rpc_method_handler(
+                    servicer.DeleteJob,
+                    request_deserializer=ultragray_dot_v1_dot_jobs__pb2.DeleteJobRequest.FromString,
+                    response_serializer=ultragray_dot_v1_dot_jobs__pb2.DeleteJobResponse.SerializeToString,
+            ),
+            'GetJobLog': grpc.unary_unary_rpc_method_handler(
+                    servicer.GetJobLog,
+                    request_deserializer=ultragray_dot_v1_dot_jobs__pb2.GetJobLogRequest.FromString,
+                    response_serializer=ultragray_dot_v1_dot_jobs__pb2.GetJobLogResponse.SerializeToString,
+            ),
+            'DownloadArtifact': grpc.unary_stream_rpc_method_handler(
+                    servicer.DownloadArtifact,
+                    request_deserializer=ultragray_dot_v1_dot_jobs__pb2.DownloadArtifactRequest.FromString,
+                    response_serializer=ultragray_dot_v1_dot_jobs__pb2.ArtifactChunk.SerializeToString,
             ),
             'WatchJob': grpc.unary_stream_rpc_method_handler(
                     servicer.WatchJob,
@@ -283,6 +335,87 @@ class JobService:
             '/ultragray.v1.JobService/RetryJob',
             ultragray_dot_v1_dot_jobs__pb2.RetryJobRequest.SerializeToString,
             ultragray_dot_v1_dot_jobs__pb2.Job.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def DeleteJob(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/ultragray.v1.JobService/DeleteJob',
+            ultragray_dot_v1_dot_jobs__pb2.DeleteJobRequest.SerializeToString,
+            ultragray_dot_v1_dot_jobs__pb2.DeleteJobResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def GetJobLog(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/ultragray.v1.JobService/GetJobLog',
+            ultragray_dot_v1_dot_jobs__pb2.GetJobLogRequest.SerializeToString,
+            ultragray_dot_v1_dot_jobs__pb2.GetJobLogResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def DownloadArtifact(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_stream(
+            request,
+            target,
+            '/ultragray.v1.JobService/DownloadArtifact',
+            ultragray_dot_v1_dot_jobs__pb2.DownloadArtifactRequest.SerializeToString,
+            ultragray_dot_v1_dot_jobs__pb2.ArtifactChunk.FromString,
             options,
             channel_credentials,
             insecure,

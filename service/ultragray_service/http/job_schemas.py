@@ -25,25 +25,40 @@ class TrainSpecification(BaseModel):
 
 
 class SamplerBody(BaseModel):
-    """Poses made from the scene's training poses: those themselves, or `count` of them moved at random."""
+    """Poses made from the given poses, else from the scene's training poses; each kind takes its own keys only.
 
-    kind: Literal["training", "jitter"]
-    count: int | None = Field(None, description="jitter: how many poses.")
-    translation_mm: float | None = Field(None, description="jitter: standard deviation along each axis.")
-    rotation_deg: float | None = Field(None, description="jitter: standard deviation about each axis.")
-    seed: int | None = Field(None, description="jitter: of the random choices.")
+    training: the training poses themselves. around: some of them, moved at random. spline: on a smooth path through
+    them. fan: all of them, tilted about the lateral axis. covered: uniform within the region that they cover.
+    """
+
+    kind: Literal["training", "around", "spline", "fan", "covered"]
+    count: int | None = Field(None, description="around, spline, covered: how many poses.")
+    translation_mm: float | None = Field(None, description="around: standard deviation along each axis; default 2.")
+    rotation_deg: float | None = Field(None, description="around: standard deviation of the angle; default 5.")
+    seed: int | None = Field(None, description="around, covered: of the random choices; default 0.")
+    spacing_mm: float | None = Field(None, description="spline, instead of count: distance along the path.")
+    tilt_deg: float | None = Field(None, description="fan: the largest tilt, to both sides.")
+    step_deg: float | None = Field(None, description="fan: between two tilts.")
 
 
 class RenderSpecification(BaseModel):
-    """Many frames of a scene become one archive. Exactly one of `poses` and `sampler`."""
+    """Many frames of a scene become one archive, at `poses`, or at those that `sampler` makes."""
 
     scene: str
     poses: list[list[list[float]]] | None = Field(None, description="4x4 matrices, mm.")
     sampler: SamplerBody | None = None
     height: int | None = Field(None, description="Depth samples. Default: as trained, else 512.")
     width: int | None = Field(None, description="Scan lines. Default: as trained, else 512.")
-    outputs: list[str] = Field(["bmode"], description="Some of bmode, echo, transmittance, coverage.")
-    format: Literal["npz", "tar"] = Field("npz", description="tar: 000000.bmode.png, 000000.json, … (WebDataset).")
+    outputs: list[str] = Field(["bmode"], description="Some of bmode, echo, transmittance, coverage, labels.")
+    format: Literal["npz", "tar", "zarr", "hdf5", "dicom", "plus"] = Field(
+        "npz", description="tar: WebDataset; dicom and plus (.igs.mha): bmode in uint8."
+    )
+    dtype: Literal["uint8", "float32"] | None = Field(None, description="Default: the format's own.")
+    min_confidence: float | None = Field(
+        None,
+        description="0 to 1. Poses below it are refused. Samplers keep within it: around and covered draw on until "
+        "they have their count, the others leave such poses out.",
+    )
 
 
 class JobBody(RequestModel):
@@ -77,6 +92,7 @@ class ProgressOut(BaseModel):
     frames: int | None
     rate_per_s: float | None = Field(description="Steps or frames.")
     seconds_left: float | None
+    waits_for: str | None = Field(description="The device, while another job of the same host is at work on it.")
 
 
 class JobOut(BaseModel):
@@ -126,6 +142,7 @@ class JobOut(BaseModel):
                 frames=progress.frames,
                 rate_per_s=progress.rate_per_s,
                 seconds_left=progress.seconds_left,
+                waits_for=progress.waits_for,
             ),
             artifacts=list(job.artifacts),
             metrics=dict(job.metrics),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from google.protobuf.json_format import MessageToDict  # type: ignore[import-untyped]
+from google.protobuf.json_format import MessageToDict, SerializeToJsonError  # type: ignore[import-untyped]
 
 from ultragray.errors import InvalidArgument
 from ultragray_proto.v1 import jobs_pb2, scenes_pb2
@@ -12,7 +12,7 @@ from ultragray_workers.jobs.specification import Specification, from_dict
 from ultragray_workers.jobs.store import Job
 
 from ..requests import field_under
-from .messages import OUTPUT_NUMBERS, output_name, pose_from_message
+from .messages import OUTPUT_NUMBERS, output_name, poses_from_messages
 
 STATES: dict[int, str] = {
     jobs_pb2.JOB_STATE_UNSPECIFIED: "",
@@ -27,7 +27,8 @@ KINDS: dict[int, str] = {
     jobs_pb2.JOB_KIND_TRAIN: "train",
     jobs_pb2.JOB_KIND_RENDER: "render",
 }
-_SAMPLER_NUMBERS = ("count", "translation_mm", "rotation_deg", "seed")
+_SAMPLER_NUMBERS = ("count", "translation_mm", "rotation_deg", "seed", "spacing_mm", "tilt_deg", "step_deg")
+_OPTIONAL = ("height", "width", "min_confidence")
 _PROGRESS = (
     "step",
     "steps",
@@ -38,6 +39,7 @@ _PROGRESS = (
     "frames",
     "rate_per_s",
     "seconds_left",
+    "waits_for",
 )
 
 
@@ -68,7 +70,10 @@ def _written_train(message: jobs_pb2.TrainJob) -> dict[str, Any]:
 
 def _settings(message: jobs_pb2.TrainJob) -> dict[str, Any]:
     """A Struct holds every number as a double: those without a fraction are integers again."""
-    settings = MessageToDict(message.settings)
+    try:
+        settings = MessageToDict(message.settings)
+    except (ValueError, SerializeToJsonError) as error:  # of a number that is not finite
+        raise InvalidArgument(f"settings must hold finite numbers: {error}", field="settings") from None
     return {
         name: int(value) if isinstance(value, float) and value.is_integer() else value
         for name, value in settings.items()
@@ -78,19 +83,15 @@ def _settings(message: jobs_pb2.TrainJob) -> dict[str, Any]:
 def _written_render(message: jobs_pb2.RenderJob) -> dict[str, Any]:
     written: dict[str, Any] = {"scene": message.scene}
     if message.poses:
-        written["poses"] = [
-            pose_from_message(pose, f"poses[{index}]").tolist() for index, pose in enumerate(message.poses)
-        ]
+        written["poses"] = poses_from_messages(message.poses, "poses")
     if message.HasField("sampler"):
         sampler = message.sampler
         numbers = {name: getattr(sampler, name) for name in _SAMPLER_NUMBERS if sampler.HasField(name)}
         written["sampler"] = {"kind": sampler.kind, **numbers}
-    written |= {name: getattr(message, name) for name in ("height", "width") if message.HasField(name)}
+    written |= {name: getattr(message, name) for name in _OPTIONAL if message.HasField(name)}
     if message.outputs:
         written["outputs"] = [output_name(number) for number in message.outputs]
-    if message.format:
-        written["format"] = message.format
-    return written
+    return written | {name: value for name in ("format", "dtype") if (value := getattr(message, name))}
 
 
 def job_message(job: Job) -> jobs_pb2.Job:
@@ -128,11 +129,11 @@ def _tell_train(message: jobs_pb2.TrainJob, specification: dict[str, Any]) -> No
 
 def _tell_render(message: jobs_pb2.RenderJob, specification: dict[str, Any]) -> None:
     message.scene, message.format = specification["scene"], specification["format"]
+    message.dtype = specification.get("dtype") or ""
     message.pose_count = specification.get("pose_count", 0)
     message.outputs.extend(OUTPUT_NUMBERS[name] for name in specification["outputs"])
-    for name in ("height", "width"):
+    for name in _OPTIONAL:
         if specification.get(name) is not None:
             setattr(message, name, specification[name])
     if specification.get("sampler") is not None:
-        sampler = {name: value for name, value in specification["sampler"].items() if value is not None}
-        message.sampler.CopyFrom(jobs_pb2.PoseSampler(**sampler))
+        message.sampler.CopyFrom(jobs_pb2.PoseSampler(**specification["sampler"]))

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import asyncio
+import os
+
 import grpc
 
-from ultragray.errors import Draining
+from ultragray.errors import Draining, InvalidArgument
 from ultragray_proto.v1 import jobs_pb2
 
 from ..catalog import DEFAULT_PAGE_SIZE
+from ..job_log import DEFAULT_LOG_BYTES, MAX_LOG_BYTES
 from ..state import Service
 from .job_messages import KINDS, STATES, filter_from_number, job_message, specification_from_message
 
+_CHUNK_BYTES = 2**20
 _LOOK_AROUND_S = 15.0  # how long a watch waits for news at a time
 
 
@@ -24,7 +29,7 @@ class JobService:
         self, request: jobs_pb2.SubmitJobRequest, context: grpc.aio.ServicerContext
     ) -> jobs_pb2.SubmitJobResponse:
         self._service.require_serving()
-        specification, field = specification_from_message(request)
+        specification, field = await asyncio.to_thread(specification_from_message, request)  # of many poses
         job, is_new = await self._service.jobs.submit(
             specification, field=field, request_id=request.request_id or None, priority=request.priority
         )
@@ -55,7 +60,37 @@ class JobService:
         self, request: jobs_pb2.RetryJobRequest, context: grpc.aio.ServicerContext
     ) -> jobs_pb2.Job:
         self._service.require_serving()
-        return job_message(await self._service.jobs.retry(request.job))
+        job, _ = await self._service.jobs.retry(request.job)
+        return job_message(job)
+
+    async def DeleteJob(  # noqa: N802
+        self, request: jobs_pb2.DeleteJobRequest, context: grpc.aio.ServicerContext
+    ) -> jobs_pb2.DeleteJobResponse:
+        await self._service.jobs.delete(request.job)
+        return jobs_pb2.DeleteJobResponse(job=request.job)
+
+    async def GetJobLog(  # noqa: N802
+        self, request: jobs_pb2.GetJobLogRequest, context: grpc.aio.ServicerContext
+    ) -> jobs_pb2.GetJobLogResponse:
+        max_bytes = request.max_bytes or DEFAULT_LOG_BYTES
+        if not 1 <= max_bytes <= MAX_LOG_BYTES:
+            raise InvalidArgument(f"max_bytes must be from 1 to {MAX_LOG_BYTES}, got {max_bytes}", field="max_bytes")
+        return jobs_pb2.GetJobLogResponse(log=await self._service.jobs.log_tail(request.job, max_bytes))
+
+    async def DownloadArtifact(  # noqa: N802
+        self, request: jobs_pb2.DownloadArtifactRequest, context: grpc.aio.ServicerContext
+    ) -> None:
+        path = await self._service.jobs.artifact(request.job, request.name)
+        with await asyncio.to_thread(path.open, "rb") as file:
+            file_bytes = os.fstat(file.fileno()).st_size
+            if not 0 <= request.offset <= file_bytes:
+                raise InvalidArgument(f"offset must be from 0 to {file_bytes}, got {request.offset}", field="offset")
+            file.seek(request.offset)
+            while True:
+                data = await asyncio.to_thread(file.read, _CHUNK_BYTES)
+                await context.write(jobs_pb2.ArtifactChunk(data=data, file_bytes=file_bytes))
+                if not data or file.tell() >= file_bytes:
+                    return
 
     async def WatchJob(  # noqa: N802
         self, request: jobs_pb2.WatchJobRequest, context: grpc.aio.ServicerContext

@@ -31,7 +31,7 @@ from ultragray_workers.jobs.worker import work
 heartbeat.DEAD_AFTER_S = 3.0
 stop = threading.Event()
 signal.signal(signal.SIGTERM, lambda number, frame: stop.set())
-work(Path(sys.argv[1]), None, stop, name=sys.argv[2], device="cpu", threads=1, nice=0)
+work(Path(sys.argv[1]), os.environ.get("DATABASE_URL"), stop, name=sys.argv[2], device="cpu", threads=1, nice=0)
 os._exit(0)
 """
 
@@ -85,11 +85,15 @@ def train_job(scene: str, *, dataset: str = "tiny", steps: int = 20, **settings:
 class RunningWorker:
     """A worker in a process of its own."""
 
-    def __init__(self, artifact_folder: Path, name: str, log: Path) -> None:
+    def __init__(self, artifact_folder: Path, database_url: str | None, name: str, log: Path) -> None:
         with log.open("ab") as file:
             self.process = subprocess.Popen(
                 [sys.executable, "-c", PROGRAM, str(artifact_folder), name],
-                env={**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)},
+                env={
+                    **os.environ,
+                    "PYTHONPATH": os.pathsep.join(path for path in sys.path if path),
+                    **({} if database_url is None else {"DATABASE_URL": database_url}),
+                },
                 stdout=file,
                 stderr=file,
             )
@@ -108,7 +112,8 @@ class RunningWorker:
         """The process of the job at hand."""
         for children in Path(f"/proc/{self.process.pid}/task").glob("*/children"):
             for pid in children.read_text().split():
-                return int(pid)
+                if "jobs.run_job" in Path(f"/proc/{pid}/cmdline").read_text():
+                    return int(pid)
         return None
 
 
@@ -120,18 +125,26 @@ def artifact_folder(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def store(artifact_folder: Path) -> Iterator[JobStore]:
-    store = JobStore(artifact_folder, None, queue_limit=20)
+def database_url() -> str | None:
+    """None: a SQLite file."""
+    return None
+
+
+@pytest.fixture
+def store(artifact_folder: Path, database_url: str | None) -> Iterator[JobStore]:
+    store = JobStore(artifact_folder, database_url, queue_limit=20)
     yield store
     store.close()
 
 
 @pytest.fixture
-def start_worker(artifact_folder: Path, tmp_path: Path) -> Iterator[Callable[..., RunningWorker]]:
+def start_worker(
+    artifact_folder: Path, database_url: str | None, tmp_path: Path
+) -> Iterator[Callable[..., RunningWorker]]:
     started: list[RunningWorker] = []
 
     def start(name: str = "one") -> RunningWorker:
-        started.append(RunningWorker(artifact_folder, name, tmp_path / f"{name}.log"))
+        started.append(RunningWorker(artifact_folder, database_url, name, tmp_path / f"{name}.log"))
         return started[-1]
 
     yield start

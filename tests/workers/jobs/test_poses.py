@@ -1,35 +1,54 @@
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
-from ultragray.errors import InvalidArgument
-from ultragray.pose import check_poses, position_distances_mm, rotation_angles_deg
-from ultragray_workers.jobs.poses import jittered, poses_of
-from ultragray_workers.jobs.specification import PoseSampler, RenderJob
+from ultragray import LinearProbe
+from ultragray.confidence import Extrapolation
+from ultragray.errors import InvalidArgument, LowConfidence
+from ultragray.samplers import AroundSampler, FanSampler, TrainingSampler
+from ultragray_workers.jobs.poses import assessed_poses, poses_of
+from ultragray_workers.jobs.specification import RenderJob
 
+PROBE = LinearProbe(40.0, 0.0, 50.0)
 TRAINING = np.tile(np.eye(4), (2, 1, 1))
 TRAINING[1, 0, 3] = 1000.0
+GIVEN = (np.eye(4) + 7.0 * np.eye(4, k=3))[None]
 
 
-def test_jitter_has_the_spread_asked_for() -> None:
-    poses = jittered(TRAINING[:1], PoseSampler("jitter", 4000, translation_mm=2.0, rotation_deg=5.0, seed=1))
-    np.testing.assert_array_equal(check_poses(poses), poses)
-    assert poses[:, :3, 3].std(axis=0) == pytest.approx([2.0] * 3, rel=0.05)
-    angles = rotation_angles_deg(poses, TRAINING[:1])[:, 0]
-    assert np.sqrt((angles**2).mean()) == pytest.approx(5.0, rel=0.05)
-
-
-def test_jitter_lies_around_every_training_pose_and_repeats() -> None:
-    sampler = PoseSampler("jitter", 50, translation_mm=1.0, seed=3)
-    poses = jittered(TRAINING, sampler)
-    nearest = position_distances_mm(poses, TRAINING).argmin(axis=1)
-    assert set(nearest) == {0, 1}
-    np.testing.assert_array_equal(poses, jittered(TRAINING, sampler))
-
-
-def test_training_poses_themselves() -> None:
-    job = RenderJob("one", sampler=PoseSampler("training"))
-    np.testing.assert_array_equal(poses_of(job, TRAINING), TRAINING)
+def test_given_poses_and_training_poses_themselves() -> None:
+    np.testing.assert_array_equal(poses_of(RenderJob("one", poses=GIVEN.tolist()), TRAINING, PROBE), GIVEN)
+    job = RenderJob("one", sampler=TrainingSampler())
+    np.testing.assert_array_equal(poses_of(job, TRAINING, PROBE), TRAINING)
     with pytest.raises(InvalidArgument, match="has none"):
-        poses_of(job, TRAINING[:0])
+        poses_of(job, TRAINING[:0], PROBE)
+
+
+def test_a_sampler_makes_its_poses_of_given_ones_or_of_training_poses() -> None:
+    sampler = AroundSampler(20, seed=3)
+    around = poses_of(RenderJob("one", sampler=sampler), TRAINING, PROBE)
+    np.testing.assert_array_equal(around, sampler.poses(TRAINING, PROBE))
+    fan = poses_of(RenderJob("one", poses=GIVEN.tolist(), sampler=FanSampler(5.0, 5.0)), TRAINING[:0], PROBE)
+    np.testing.assert_array_equal(fan[:, :3, 3], np.tile(GIVEN[:, :3, 3], (3, 1)))
+
+
+def told(poses: Any) -> list[Extrapolation]:  # [C, 4, 4] -> [C]
+    """Sure of poses up to x = 10 mm."""
+    return [Extrapolation(1.0, 2.0, 0.9 if pose[0, 3] <= 10 else 0.2, None) for pose in poses]
+
+
+def test_given_poses_must_be_confident_and_samplers_keep_to_those_that_are() -> None:
+    poses, extrapolations = assessed_poses(RenderJob("one", poses=TRAINING), TRAINING, PROBE, told)
+    np.testing.assert_array_equal(poses, TRAINING)
+    assert [one.confidence for one in extrapolations] == [0.9, 0.2]
+    with pytest.raises(LowConfidence, match=r"poses\[1\] .* 0\.20, 0\.5 is asked for: .* 1\.0 mm") as caught:
+        assessed_poses(RenderJob("one", poses=TRAINING, min_confidence=0.5), TRAINING, PROBE, told)
+    assert caught.value.field == "poses[1]"
+    sampled = RenderJob("one", poses=TRAINING, sampler=AroundSampler(20), min_confidence=0.5)
+    poses, extrapolations = assessed_poses(sampled, TRAINING[:0], PROBE, told)
+    assert len(poses) == 20
+    assert {one.confidence for one in extrapolations} == {0.9}
+    with pytest.raises(InvalidArgument, match="has none"):
+        assessed_poses(RenderJob("one", sampler=AroundSampler(20), min_confidence=0.5), TRAINING[:0], PROBE, told)

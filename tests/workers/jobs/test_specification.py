@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from ultragray.errors import InvalidArgument
-from ultragray_workers.jobs.specification import PoseSampler, RenderJob, TrainJob, digest, from_dict, in_short, to_dict
+from ultragray.samplers import AroundSampler, FanSampler, SplineSampler, TrainingSampler
+from ultragray_workers.jobs.specification import RenderJob, TrainJob, digest, from_dict, in_short, to_dict
 
 POSES = np.tile(np.eye(4), (3, 1, 1)).tolist()
 
@@ -17,12 +18,35 @@ POSES = np.tile(np.eye(4), (3, 1, 1)).tolist()
     [
         TrainJob("liver", "liver-1", preset="paper", settings={"steps": 10, "start": "random"}, device="cuda:1"),
         RenderJob("liver", poses=POSES, height=20, width=30, outputs=("echo", "bmode"), format="tar"),
-        RenderJob("liver", sampler=PoseSampler("jitter", 4, 2.0, 5.0, 7)),
-        RenderJob("liver", sampler=PoseSampler("training")),
+        RenderJob("liver", sampler=AroundSampler(4, 2.0, 5.0, 7), format="zarr", dtype="uint8"),
+        RenderJob("liver", sampler=AroundSampler(4), min_confidence=1),
+        RenderJob("liver", poses=POSES, sampler=FanSampler(10.0, 2.5), format="dicom"),
+        RenderJob("liver", sampler=SplineSampler(spacing_mm=0.5)),
+        RenderJob("liver", sampler=TrainingSampler()),
     ],
 )
 def test_there_and_back(job: Any) -> None:
     assert from_dict(json.loads(json.dumps(to_dict(job)))) == job
+
+
+def test_poses_as_lists_and_packed_are_the_same_and_exact() -> None:
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    poses[:, :3, 3] = np.random.default_rng(0).normal(size=(2, 3))
+    listed, packed = RenderJob("liver", poses=poses.tolist()), from_dict(to_dict(RenderJob("liver", poses=poses)))
+    assert isinstance(packed, RenderJob)
+    np.testing.assert_array_equal(packed.poses, poses)
+    assert packed == listed
+    assert digest(packed, 0) == digest(listed, 0)
+    poses[1, 0, 3] += 1e-12
+    assert RenderJob("liver", poses=poses) != listed
+    assert digest(RenderJob("liver", poses=poses), 0) != digest(listed, 0)
+
+
+def test_long_names_are_cut() -> None:
+    with pytest.raises(InvalidArgument) as caught:
+        from_dict({"kind": "train", "dataset": "liver", "scene": "one", "x" * 10**6: 1})
+    assert caught.value.field == "x" * 64
+    assert len(caught.value.detail) < 300
 
 
 def test_in_short_holds_no_poses() -> None:
@@ -45,8 +69,8 @@ def render(**values: Any) -> dict[str, Any]:
     return {"kind": "render", "scene": "one", "poses": POSES, **values}
 
 
-def jitter(**values: Any) -> dict[str, Any]:
-    return render(poses=None, sampler={"kind": "jitter", "count": 3, **values})
+def around(**values: Any) -> dict[str, Any]:
+    return render(poses=None, sampler={"kind": "around", "count": 3, **values})
 
 
 @pytest.mark.parametrize(
@@ -62,25 +86,44 @@ def jitter(**values: Any) -> dict[str, Any]:
         (train(settings=[1]), "settings"),
         (train(settings={"steps": [1]}), "settings.steps"),
         (train(settings={"means_rate": float("nan")}), "settings.means_rate"),
+        (train(settings={"stepz": 3}), "settings.stepz"),
+        (train(settings={"steps": 0}), "settings.steps"),
+        (train(settings={"steps": "many"}), "settings.steps"),
+        (train(settings={"start": "x" * 101}), "settings.start"),
+        (train(settings={"x" * 101: 1}), "settings"),
+        (train(settings={f"a{number}": 1 for number in range(101)}), "settings"),
+        (train(settings={"max_gaussians": 5, "initial_gaussians": 6}), "settings.initial_gaussians"),
+        (train(preset=["fast"]), "preset"),
         (train(device="tpu"), "device"),
         (train(poses=POSES), "poses"),
         (render(poses=None), "poses"),
         (render(sampler={"kind": "training"}), "poses"),
         (render(poses=[]), "poses"),
+        (render(poses="AAAA"), "poses"),
+        (render(poses="no base64"), "poses"),
         (render(poses=np.full((1, 4, 4), np.nan).tolist()), "poses[0]"),
         (render(height=0), "height"),
         (render(width=True), "width"),
         (render(outputs=["colour"]), "outputs"),
         (render(outputs=[[1]]), "outputs"),
         (render(format="zip"), "format"),
+        (render(dtype="int8"), "dtype"),
+        (render(min_confidence=1.5), "min_confidence"),
+        (render(min_confidence=float("nan")), "min_confidence"),
+        (render(min_confidence="0.5"), "min_confidence"),
+        (render(min_confidence=True), "min_confidence"),
+        (render(format="dicom", dtype="float32"), "dtype"),
+        (render(format="plus", outputs=["bmode", "echo"]), "outputs"),
         (render(poses=None, sampler=3), "sampler"),
         (render(poses=None, sampler={}), "sampler.kind"),
-        (render(poses=None, sampler={"kind": "training", "count": 3}), "sampler.kind"),
-        (jitter(count=0), "sampler.count"),
-        (jitter(translation_mm=-1), "sampler.translation_mm"),
-        (jitter(rotation_deg="much"), "sampler.rotation_deg"),
-        (jitter(seed=0.5), "sampler.seed"),
-        (jitter(speed=1), "sampler.speed"),
+        (render(poses=None, sampler={"kind": "training", "count": 3}), "sampler.count"),
+        (around(count=0), "sampler.count"),
+        (around(translation_mm=-1), "sampler.translation_mm"),
+        (around(translation_mm=10**400), "sampler.translation_mm"),
+        (around(rotation_deg="much"), "sampler.rotation_deg"),
+        (around(seed=0.5), "sampler.seed"),
+        (around(kind="jitter"), "sampler.kind"),
+        (around(speed=1), "sampler.speed"),
     ],
 )
 def test_refused_with_the_field(document: dict[str, Any], field: str) -> None:

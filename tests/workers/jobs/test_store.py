@@ -10,6 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
+import sqlalchemy as sa
 
 from ultragray.errors import (
     ArtifactNotFound,
@@ -23,13 +24,24 @@ from ultragray.errors import (
     SceneNotFound,
     StartupFailed,
 )
-from ultragray_workers.jobs.specification import PoseSampler, RenderJob
+from ultragray.samplers import TrainingSampler
+from ultragray_workers.jobs.database import checked_url
+from ultragray_workers.jobs.specification import RenderJob
 from ultragray_workers.jobs.store import JobState, JobStore
 from ultragray_workers.scenes import SceneStore
 
+from ...postgres import PostgresServer
 from .conftest import train_job
 
-TRAINING_POSES = PoseSampler("training")
+TRAINING_POSES = TrainingSampler()
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def database_url(request: pytest.FixtureRequest) -> str | None:
+    if request.param == "sqlite":
+        return None
+    server: PostgresServer = request.getfixturevalue("postgres")
+    return server.create_database()
 
 
 def test_submitted_job_waits(store: JobStore) -> None:
@@ -57,8 +69,8 @@ def test_same_request_id_gives_the_same_job(store: JobStore) -> None:
         store.submit(train_job("one"), request_id="x" * 129)
 
 
-def test_submitted_by_two_services_at_once(store: JobStore, artifact_folder: Path) -> None:
-    other = JobStore(artifact_folder, None)
+def test_submitted_by_two_services_at_once(store: JobStore, artifact_folder: Path, database_url: str | None) -> None:
+    other = JobStore(artifact_folder, database_url)
     with ThreadPoolExecutor(8) as threads:
         answers = list(
             threads.map(lambda number: (store, other)[number % 2].submit(train_job("one"), request_id="mine"), range(8))
@@ -90,12 +102,14 @@ def test_scene_name_is_free_again_after_cancelling(store: JobStore) -> None:
     assert store.submit(train_job("one"))[1]
 
 
-def test_scenes_of_the_service_may_be_rendered_and_not_replaced(artifact_folder: Path, tmp_path: Path) -> None:
+def test_scenes_of_the_service_may_be_rendered_and_not_replaced(
+    artifact_folder: Path, tmp_path: Path, database_url: str | None
+) -> None:
     from ultragray.demo import copy_demo_scene
 
     (tmp_path / "data").mkdir()
     copy_demo_scene(tmp_path / "data" / "demo.ugr")
-    store = JobStore(artifact_folder, None, scenes=SceneStore(tmp_path / "data"))
+    store = JobStore(artifact_folder, database_url, scenes=SceneStore(tmp_path / "data"))
     job, _ = store.submit(RenderJob("demo", sampler=TRAINING_POSES))
     kept = artifact_folder / "jobs" / job.id / "demo.ugr"
     assert kept.read_bytes() == (tmp_path / "data" / "demo.ugr").read_bytes()
@@ -104,8 +118,8 @@ def test_scenes_of_the_service_may_be_rendered_and_not_replaced(artifact_folder:
     store.close()
 
 
-def test_queue_limit(artifact_folder: Path) -> None:
-    store = JobStore(artifact_folder, None, queue_limit=2)
+def test_queue_limit(artifact_folder: Path, database_url: str | None) -> None:
+    store = JobStore(artifact_folder, database_url, queue_limit=2)
     first, _ = store.submit(train_job("one"), request_id="first")
     store.submit(train_job("two"))
     with pytest.raises(JobQueueFull):
@@ -148,11 +162,12 @@ def test_cancel_and_retry(store: JobStore) -> None:
     assert cancelled.state is JobState.CANCELLED
     assert cancelled.finished_at is not None
     assert store.cancel(job.id) == cancelled
-    successor = store.retry(job.id)
+    successor, is_new = store.retry(job.id)
     assert (successor.retry_of, successor.state, successor.priority) == (job.id, JobState.QUEUED, 3)
     assert successor.specification == job.specification
     assert successor.request_id is None
-    assert store.retry(job.id) == successor
+    assert is_new
+    assert store.retry(job.id) == (successor, False)
 
 
 def test_unknown_jobs(store: JobStore) -> None:
@@ -176,18 +191,25 @@ def test_dataset_in_use(store: JobStore) -> None:
     assert store.uses_dataset("tiny") is None
 
 
-def test_jobs_outlive_the_store(store: JobStore, artifact_folder: Path) -> None:
+def test_jobs_outlive_the_store(store: JobStore, artifact_folder: Path, database_url: str | None) -> None:
     job, _ = store.submit(train_job("one"))
-    again = JobStore(artifact_folder, None)
+    again = JobStore(artifact_folder, database_url)
     assert again.get(job.id) == job
     again.close()
 
 
-def test_rows_hold_no_pickles(store: JobStore, artifact_folder: Path) -> None:
+def test_rows_hold_no_pickles(store: JobStore, artifact_folder: Path, database_url: str | None) -> None:
     store.submit(train_job("one"))
-    database = (artifact_folder / "jobs.sqlite").read_bytes()
-    assert b"portable_json" in database
-    assert b"py_pickle" not in database
+    kept = []
+    engine = sa.create_engine(checked_url(database_url, artifact_folder), poolclass=sa.NullPool)
+    with engine.connect() as connection:
+        tables = sa.MetaData()
+        tables.reflect(connection, schema=None if database_url is None else "dbos")
+        for table in tables.sorted_tables:
+            kept += [value for row in connection.execute(sa.select(table)) for value in row]
+    assert "portable_json" in kept
+    assert "py_pickle" not in kept
+    assert any('"scene":"one"' in str(value).replace(" ", "") for value in kept)
 
 
 def test_database_that_cannot_be_reached_is_told_without_the_password(tmp_path: Path) -> None:

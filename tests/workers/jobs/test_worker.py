@@ -17,9 +17,10 @@ import torch
 
 from ultragray.datasets.source import load_dataset
 from ultragray.errors import JobFinished, JobNotFinished, StartupFailed
+from ultragray.samplers import AroundSampler
 from ultragray.scene import GaussianScene
 from ultragray.training import TrainingConfig, train
-from ultragray_workers.jobs.specification import PoseSampler, RenderJob
+from ultragray_workers.jobs.specification import RenderJob
 from ultragray_workers.jobs.store import Job, JobState, JobStore
 from ultragray_workers.jobs.worker import claim_name
 
@@ -64,7 +65,11 @@ def test_good_jobs_run_in_order_and_bad_ones_fail_with_a_reason(
     assert last.metrics["psnr_db"] > 5
     served = artifact_folder / "scenes" / "good.ugr"
     assert store.artifact(last.id, "good.ugr").read_bytes() == served.read_bytes()
-    assert {"metrics.json", "metrics.jsonl", "training_curve.png"} < set(last.artifacts)
+    assert {"metrics.json", "metrics.jsonl", "training_curve.png", "report.html"} < set(last.artifacts)
+    report = store.artifact(last.id, "report.html").read_text()
+    assert "<dt>Scene</dt><dd>good</dd>" in report
+    assert f"{last.metrics['psnr_db']:.2f} ±" in report
+    assert report.count("<img ") == 2 * 5  # both held-out frames, with all panels
     for name in last.artifacts:
         if name.endswith(".png"):
             assert store.artifact(last.id, name).read_bytes().startswith(b"\x89PNG")
@@ -74,7 +79,7 @@ def test_good_jobs_run_in_order_and_bad_ones_fail_with_a_reason(
     with pytest.raises(JobNotFinished):
         store.retry(last.id)
 
-    render, _ = store.submit(RenderJob("good", sampler=PoseSampler("jitter", 40, 1.0, 1.0), height=20, width=24))
+    render, _ = store.submit(RenderJob("good", sampler=AroundSampler(40, 1.0, 1.0), height=20, width=24))
     render = until(render)
     assert render.state is JobState.SUCCEEDED, render
     assert (render.progress.frames_done, render.progress.frames, render.artifacts) == (40, 40, ("frames.npz",))
@@ -123,7 +128,7 @@ def test_cancelled_within_a_second_and_retried_from_its_checkpoint(
         time.sleep(0.01)
     assert not (artifact_folder / "scenes" / "one.ugr").exists()
 
-    successor = store.retry(job.id)
+    successor, _ = store.retry(job.id)
     until(successor, is_training)
     assert "going on from a checkpoint" in store.log_tail(successor.id)
     store.cancel(successor.id)
@@ -153,7 +158,7 @@ def test_process_that_dies_again_and_again_is_given_up(
 def test_killed_worker_is_replaced_and_the_scene_is_that_of_an_undisturbed_run(
     store: JobStore, artifact_folder: Path, tmp_path: Path, start_worker: StartWorker, until: Until
 ) -> None:
-    asked = train_job("one", steps=1500)
+    asked = train_job("one", steps=800)
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     config = TrainingConfig.preset("fast", **asked.settings)
@@ -181,5 +186,5 @@ def test_killed_worker_is_replaced_and_the_scene_is_that_of_an_undisturbed_run(
     for name, tensor in undisturbed.splats.items():
         assert torch.equal(made.splats[name], tensor), name
     steps = [line.count('"step"') for line in store.artifact(job.id, "metrics.jsonl").read_text().splitlines()]
-    assert steps == [1] * 1500
+    assert steps == [1] * 800
     assert three.terminate() == 0

@@ -9,14 +9,21 @@ from typing import Any
 
 import sqlalchemy as sa
 from dbos import DBOS, DBOSClient, DBOSPortableJSONSerializer, EnqueueOptions, WorkflowStatus
+from sqlalchemy.engine import ExceptionContext
 from sqlalchemy.exc import SQLAlchemyError
 
-from ultragray.errors import StartupFailed
+from ultragray.errors import DatabaseUnavailable, StartupFailed, StorageFull
 
 APPLICATION = "ultragray"
 VERSION = "1"  # of the workflow's inputs and steps: workers take the jobs of their own version only
 QUEUE = "ultragray-jobs"
 SQLITE_FILE = "jobs.sqlite"
+_POSTGRES_SCHEMES = ("postgresql", "postgres", "postgresql+psycopg")
+# libpq's: a server that cannot be reached, or from which nothing comes back any more, is given up. s, ms, ms
+_PATIENCE = {"connect_timeout": "5", "tcp_user_timeout": "10000", "options": "-c statement_timeout=30000"}
+# SQLSTATE: the connection is gone, the server lacks the means, a statement took too long, the server stops or starts.
+_AWAY = ("08", "53", "57014", "57P")
+_DEADLOCK = "40P01"
 
 QUEUED = ("ENQUEUED", "DELAYED")
 RUNNING = ("PENDING",)
@@ -24,32 +31,93 @@ SUCCEEDED = ("SUCCESS",)
 FAILED = ("ERROR", "MAX_RECOVERY_ATTEMPTS_EXCEEDED")
 CANCELLED = ("CANCELLED",)
 
+_TOLD_BY_US = (
+    "Exception encountered in background workflow",
+    "no longer owned",  # by this worker
+    "to verify existence of",  # the database, to which we have been connected
+    "psycopg.OperationalError",  # the heartbeat tells once what these tell several times a second
+    "psycopg.errors.AdminShutdown",
+    "psycopg.errors.CannotConnectNow",
+    "psycopg.errors.ConnectionTimeout",
+    "Notification listener error",
+    "disk is full",
+)
+
 # Rows hold JSON, never pickles: whoever can write to the database must not run code in the service.
 SERIALIZER = DBOSPortableJSONSerializer()
 
 
-def database_url_or_default(database_url: str | None, artifact_folder: Path) -> str:
-    """The URL given, else that of a SQLite file in the artifact folder."""
-    return database_url or f"sqlite:///{artifact_folder.resolve() / SQLITE_FILE}"
+def checked_url(database_url: str | None, artifact_folder: Path) -> str:
+    """The URL given, which gives up on a silent server in time; None: that of a SQLite file in the artifact folder.
+
+    Raises StartupFailed for one that names no database.
+    """
+    if database_url is None:
+        return f"sqlite:///{artifact_folder.resolve() / SQLITE_FILE}"
+    try:
+        url = sa.make_url(database_url)
+    except (SQLAlchemyError, ValueError):
+        url = sa.URL.create("unreadable")
+    if url.drivername == "sqlite" and url.database:
+        return database_url
+    is_split_rightly = "@" not in f"{url.host}{url.database}"  # else a part of the password
+    if url.drivername not in _POSTGRES_SCHEMES or not url.database or not is_split_rightly:
+        raise StartupFailed(  # without the URL: it may hold a password
+            "database_url must be postgresql://USER:PASSWORD@HOST:PORT/DATABASE (in the password, %40 stands for @, "
+            "%2F for /), or be left out for a SQLite file in the artifact folder",
+            field="database_url",
+        )
+    ours = url.set(drivername="postgresql+psycopg", query={**_PATIENCE, **url.query})
+    return ours.render_as_string(hide_password=False)
+
+
+def _connect_once(url: str) -> None:
+    """DBOS would make a PostgreSQL database that is not there: a misspelt name would be a queue of its own."""
+    engine = sa.create_engine(url, poolclass=sa.NullPool)
+    with engine.connect():
+        pass
+
+
+def _told_as_ours(context: ExceptionContext) -> None:
+    if context.is_pre_ping:  # a connection that was lost while nobody used it is replaced
+        return
+    error = context.original_exception
+    if "disk is full" in str(error):
+        raise StorageFull("the disk of the jobs' database has no room") from error
+    state = getattr(error, "sqlstate", None) or ""
+    if context.connection is None or context.is_disconnect or state.startswith(_AWAY):
+        raise DatabaseUnavailable("the database of the jobs does not answer: try again in a few seconds") from error
 
 
 class JobDatabase:
     """A connection to the queue, its tables made where they are missing. Free for use from several threads."""
 
     def __init__(self, artifact_folder: Path, database_url: str | None) -> None:
-        """Raises StartupFailed where the database cannot be reached."""
-        self.url = database_url_or_default(database_url, artifact_folder)
+        """Raises StartupFailed where the database cannot be used.
+
+        Whatever is asked of a database that goes away later raises DatabaseUnavailable, until it is back; StorageFull
+        where a SQLite file cannot grow.
+        """
         quiet_dbos()
         try:
             artifact_folder.mkdir(parents=True, exist_ok=True)
+            self.url = checked_url(database_url, artifact_folder)
+            _connect_once(self.url)
             DBOS.migrate(self.url)
-            self.client = DBOSClient(system_database_url=self.url, application_name=APPLICATION, serializer=SERIALIZER)
-        except (SQLAlchemyError, OSError, ValueError, ImportError) as error:
+            self.client = DBOSClient(
+                system_database_url=self.url,
+                application_name=APPLICATION,
+                serializer=SERIALIZER,
+                retry_connection_errors=False,
+            )
+        except (SQLAlchemyError, OSError) as error:
+            cause = getattr(error, "orig", None) or error
             raise StartupFailed(
-                f"the database of the jobs cannot be opened ({_without_password(self.url)}): "
-                f"{str(error).splitlines()[0]}; set ULTRAGRAY_DATABASE_URL, or leave it out for a SQLite file",
+                f"the database of the jobs cannot be opened: {' '.join(str(cause).split())} "
+                "(ULTRAGRAY_DATABASE_URL names it: server and database must be there, user and password right)",
                 field="database_url",
             ) from error
+        sa.event.listen(self.engine, "handle_error", _told_as_ours)
 
     @property
     def engine(self) -> sa.Engine:
@@ -63,6 +131,15 @@ class JobDatabase:
         DBOS orders by the time of submission, which on SQLite it may know to the second only: here it is set to the
         millisecond, and after that of every other job.
         """
+        while True:
+            try:
+                return self._enqueue(options, *arguments)
+            except SQLAlchemyError as error:
+                # Two that submit the same job at once: PostgreSQL ends one of them, and for that one it is there now.
+                if getattr(getattr(error, "orig", None), "sqlstate", None) != _DEADLOCK:
+                    raise
+
+    def _enqueue(self, options: EnqueueOptions, *arguments: Any) -> None:
         rows = self.client._sys_db.tables.workflow_status
         with self.engine.begin() as connection:
             self.client.enqueue_in_transaction(connection, options, *arguments)
@@ -107,14 +184,9 @@ def quiet_dbos() -> None:
 
 
 def _is_news(record: logging.LogRecord) -> bool:
-    """Not: that a job failed or is another worker's now. Both are ordinary, and told by us."""
+    """Not what is ordinary, or told by us: ends of jobs, and a database that is away."""
     told = record.getMessage()
-    return "Exception encountered in background workflow" not in told and "no longer owned" not in told
-
-
-def _without_password(url: str) -> str:
-    scheme, separator, rest = url.partition("://")
-    return f"{scheme}{separator}{rest.rpartition('@')[2]}"
+    return not any(known in told for known in _TOLD_BY_US)
 
 
 def dbos_config(url: str, executor: str) -> Any:

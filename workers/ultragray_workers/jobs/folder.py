@@ -6,6 +6,7 @@ NAME.ugr        the scene of a render job, as it was when the job was submitted
 run/            the trainer's folder: checkpoint, journal, configuration
 progress.json   how far it is
 log.txt         what the process said
+reserve         room on the disk, given back when the process has ended
 artifacts/      what can be downloaded; appears whole
 outcome.json    how it ended: the last thing that the process writes
 """
@@ -21,7 +22,7 @@ from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from ultragray.files import atomic_path
+from ultragray.files import atomic_path, remove_stale_temporaries
 
 FOLDER = "jobs"
 
@@ -39,6 +40,7 @@ class Progress:
     frames: int | None = None
     rate_per_s: float | None = None  # steps or frames
     seconds_left: float | None = None
+    waits_for: str | None = None  # the device, while another job of its host is at work on it
 
     @classmethod
     def from_dict(cls, document: Mapping[str, Any]) -> Progress:
@@ -90,6 +92,7 @@ class JobFolder:
         self.lock = self.path / "lock"
         self.run = self.path / "run"
         self.log = self.path / "log.txt"
+        self.reserve = self.path / "reserve"
         self.artifacts = self.path / "artifacts"
         self._partial = self.path / "artifacts.partial"
         self._request = self.path / "job.json"
@@ -99,6 +102,10 @@ class JobFolder:
     def request(self) -> Request:
         """What the worker wrote. Raises OSError, ValueError."""
         return Request(**json.loads(self._request.read_text(encoding="utf-8")))
+
+    def was_begun(self) -> bool:
+        """Whether a worker has started a process in the folder."""
+        return self._request.exists()
 
     def write_request(self, request: Request) -> None:
         """Replaces the file whole. Raises OSError."""
@@ -141,6 +148,14 @@ class JobFolder:
     def remove_partial_artifacts(self) -> None:
         """Removes what is not complete."""
         shutil.rmtree(self._partial, ignore_errors=True)
+
+    def remove_leftovers(self) -> None:
+        """Removes what killed processes left half written; nobody may be at the job meanwhile."""
+        self.remove_partial_artifacts()
+        with contextlib.suppress(OSError):
+            self.reserve.unlink(missing_ok=True)
+            for path in (self._request, self._progress, self._outcome):
+                remove_stale_temporaries(path)
 
     def artifact_names(self) -> tuple[str, ...]:
         """What can be downloaded, sorted."""

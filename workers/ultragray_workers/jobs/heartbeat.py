@@ -1,16 +1,22 @@
 """Which workers are alive: a small table beside the queue, and the take-over of the jobs of those that are not.
 
 DBOS hands a dead worker's jobs to nobody. Here each worker beats every second, by the clock of the database, and puts
-the jobs of workers that have not beaten for a while back into the queue.
+the jobs of workers that have not beaten for a while back into the queue. So it does with jobs of its own that it is
+not at: DBOS forgets a job whose end it cannot write, such as on a full disk.
 """
 
 from __future__ import annotations
 
 import logging
 import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
 
 import sqlalchemy as sa
 from sqlalchemy.exc import SQLAlchemyError
+
+from ultragray.errors import UltragrayError
 
 from . import database
 from .database import JobDatabase
@@ -33,9 +39,11 @@ _workers = sa.Table(
 class Heartbeat:
     """The life sign of one worker, and its eye on the others."""
 
-    def __init__(self, jobs: JobDatabase, executor: str) -> None:
+    def __init__(self, jobs: JobDatabase, executor: str, job_at_hand: Callable[[], str | None]) -> None:
         """The first beat is done when this returns."""
-        self._database, self._executor = jobs, executor
+        self._database, self._executor, self._job_at_hand = jobs, executor, job_at_hand
+        self._forgotten: set[str] = set()  # own jobs that nobody was at when it was looked last
+        self._look_at_s = float("-inf")
         self._stop = threading.Event()
         with jobs.engine.begin() as connection:
             connection.execute(sa.schema.CreateTable(_workers, if_not_exists=True))
@@ -52,25 +60,28 @@ class Heartbeat:
                 connection.execute(sa.insert(_workers).values(executor=self._executor, seen_at_s=now_s))
 
     def take_over(self) -> list[str]:
-        """Puts the jobs of dead workers back into the queue, and returns their ids."""
+        """Puts the jobs that nobody is at back into the queue, and returns their ids."""
         running = [row for row in self._database.unfinished() if row.status in database.RUNNING]
+        mine = {row.workflow_id for row in running if row.executor_id == self._executor} - {self._job_at_hand()}
+        twice, self._forgotten = mine & self._forgotten, mine
         if not running:
             return []
-        alive = self._alive()
+        alive = self._alive() | {self._executor}
         taken = [
             row.workflow_id
             for row in running
-            if row.executor_id not in alive and self._database.take_back(row.workflow_id, row.executor_id or "")
+            if (row.executor_id not in alive or row.workflow_id in twice)
+            and self._database.take_back(row.workflow_id, row.executor_id or "")
         ]
         for job_id in taken:
-            _log.warning(f"the worker of the job {job_id} is dead: the job waits again")
+            _log.warning(f"no worker is at the job {job_id} any more: it waits again")
         return taken
 
     def stop(self) -> None:
         """The worker is gone from now on."""
         self._stop.set()
         self._thread.join()
-        with self._database.engine.begin() as connection:
+        with suppress(UltragrayError, SQLAlchemyError), self._database.engine.begin() as connection:
             connection.execute(sa.delete(_workers).where(_workers.c.executor == self._executor))
 
     def _alive(self) -> set[str]:
@@ -86,11 +97,18 @@ class Heartbeat:
 
     def _run(self) -> None:
         beats = 0
+        is_away = False
         while not self._stop.wait(BEAT_INTERVAL_S):
             try:
                 self.beat()
                 beats += 1
-                if beats % _LOOK_EVERY_BEATS == 0:
+                if is_away:
+                    _log.warning("the heartbeat is back")
+                    is_away = False
+                if beats % _LOOK_EVERY_BEATS == 0 and time.monotonic() > self._look_at_s:
                     self.take_over()
-            except SQLAlchemyError as error:
-                _log.warning(f"no heartbeat: {str(error).splitlines()[0]}")
+            except (UltragrayError, SQLAlchemyError) as error:
+                if not is_away:
+                    _log.warning(f"no heartbeat for now: {str(error).splitlines()[0]}")
+                is_away = True
+                self._look_at_s = time.monotonic() + DEAD_AFTER_S  # others may need longer to come back

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from enum import Enum
 from pathlib import Path
@@ -12,7 +12,9 @@ from dbos import WorkflowStatus
 
 from . import database
 from .folder import JobFolder, Outcome, Progress
+from .specification import RenderJob, TrainJob
 
+KINDS = (TrainJob.kind, RenderJob.kind)
 MAX_PRIORITY = 1000
 PRIORITY_ZERO = MAX_PRIORITY + 1  # DBOS takes the lowest number first, from 1
 
@@ -81,7 +83,7 @@ def job_of_row(row: WorkflowStatus, artifact_folder: Path) -> Job:
         finished_at=_iso_not_before(max(row.created_at, row.dequeued_at or 0), row.completed_at),
         reason=outcome.reason,
         error=outcome.error,
-        progress=outcome.progress,
+        progress=outcome.progress if state is JobState.RUNNING else replace(outcome.progress, waits_for=None),
         artifacts=outcome.artifacts,
         metrics=outcome.metrics,
         worker=row.executor_id if started else None,

@@ -4,21 +4,38 @@ from __future__ import annotations
 
 import os
 import shutil
+from contextlib import suppress
 from pathlib import Path
 
 from ultragray.files import atomic_path
+
+from ..dataset_store import sync_folder
 
 
 def link_or_copy(source: Path, target: Path) -> None:
     """Makes `target` the same file as `source`, or a whole copy where that cannot be; an existing target stays.
 
-    Raises OSError.
+    What is there then survives a loss of power. Raises OSError.
     """
-    source = source.resolve()
-    try:
-        os.link(source, target)
-    except FileExistsError:
-        return
-    except OSError:  # another file system, or one without links
-        with atomic_path(target) as temporary:
-            shutil.copyfile(source, temporary)
+    with suppress(FileExistsError):
+        try:
+            os.link(source.resolve(), target)
+        except FileExistsError:
+            raise
+        except OSError:  # another file system, or one without links
+            _copy(source, target)
+    sync_folder(target.parent)
+
+
+def _copy(source: Path, target: Path) -> None:
+    with atomic_path(target) as temporary:
+        shutil.copyfile(source, temporary)
+        with temporary.open("rb") as file:
+            os.fsync(file.fileno())
+        try:
+            os.link(temporary, target)  # unlike a rename, never over what appeared meanwhile
+        except FileExistsError:
+            raise
+        except OSError:
+            if target.exists():
+                raise FileExistsError from None

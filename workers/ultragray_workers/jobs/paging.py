@@ -24,8 +24,9 @@ def read_token(token: str) -> tuple[int, list[str]]:
     """Inverse of `write_token`. Raises InvalidArgument."""
     try:
         last_ms, seen = json.loads(base64.urlsafe_b64decode(token))
-        if isinstance(last_ms, int) and isinstance(seen, list) and 0 <= last_ms < 2**43:
+        is_seen = isinstance(seen, list) and all(isinstance(job_id, str) for job_id in seen)
+        if isinstance(last_ms, int) and 0 <= last_ms < 2**43 and is_seen:
             return last_ms, seen
-    except (ValueError, TypeError, binascii.Error):
+    except (ValueError, TypeError, RecursionError, binascii.Error):
         pass
     raise InvalidArgument(f"page_token must be one that a page gave, got {token[:64]!r}", field="page_token")

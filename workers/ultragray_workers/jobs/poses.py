@@ -2,47 +2,45 @@
 
 from __future__ import annotations
 
-import numpy as np
+from collections.abc import Sequence
 
+from ultragray.confidence import Extrapolation, require_confidence
 from ultragray.errors import InvalidArgument
 from ultragray.pose import check_poses
-from ultragray.probe import FloatArray
+from ultragray.probe import FloatArray, Probe
+from ultragray.samplers import Assess, confident_poses
 
-from .specification import PoseSampler, RenderJob
+from .specification import RenderJob
 
 
-def poses_of(job: RenderJob, training_poses: FloatArray) -> FloatArray:  # [P, 4, 4] -> [C, 4, 4] mm
-    """The poses that a job asks for; the same job gives the same.
+def poses_of(job: RenderJob, training_poses: FloatArray, probe: Probe) -> FloatArray:  # [P, 4, 4] -> [C, 4, 4] mm
+    """The poses that a job asks for, whatever their confidence; the same job, training poses and probe give the same.
 
-    Raises InvalidArgument where a sampler needs training poses and the scene has none.
+    Raises InvalidArgument where a sampler needs training poses and the scene has none, or cannot use those it has.
     """
     if job.sampler is None:
         return check_poses(job.poses)
+    return job.sampler.poses(_base(job, training_poses), probe)
+
+
+def assessed_poses(
+    job: RenderJob, training_poses: FloatArray, probe: Probe, assess: Assess
+) -> tuple[FloatArray, Sequence[Extrapolation]]:  # [P, 4, 4] -> [C, 4, 4] mm, [C]
+    """The poses that a job is to render, each with its `min_confidence`, and what `assess` tells of them.
+
+    Raises LowConfidence for a given pose below it and for a sampler that keeps too few, and what `poses_of` raises.
+    """
+    if job.sampler is not None and job.min_confidence is not None:
+        return confident_poses(job.sampler, _base(job, training_poses), probe, assess, job.min_confidence)
+    poses = poses_of(job, training_poses, probe)
+    extrapolations = assess(poses)
+    require_confidence(extrapolations, job.min_confidence)
+    return poses, extrapolations
+
+
+def _base(job: RenderJob, training_poses: FloatArray) -> FloatArray:  # [P, 4, 4] -> [P, 4, 4]
+    if job.poses is not None:
+        return check_poses(job.poses)
     if not len(training_poses):
         raise InvalidArgument(f"sampler needs training poses, the scene {job.scene!r} has none", field="sampler")
-    if job.sampler.kind == "training":
-        return training_poses
-    return jittered(training_poses, job.sampler)
-
-
-def jittered(poses: FloatArray, sampler: PoseSampler) -> FloatArray:  # [P, 4, 4] -> [C, 4, 4] mm
-    """Random poses near the given ones: see PoseSampler."""
-    assert sampler.count is not None
-    random = np.random.default_rng(sampler.seed)
-    moved = poses[random.integers(len(poses), size=sampler.count)]
-    axes = random.normal(size=(sampler.count, 3))
-    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
-    angles = np.radians(random.normal(0.0, sampler.rotation_deg, sampler.count))
-    moved[:, :3, :3] = moved[:, :3, :3] @ _rotations(axes, angles)
-    moved[:, :3, 3] += random.normal(0.0, sampler.translation_mm, (sampler.count, 3))
-    return check_poses(moved)
-
-
-def _rotations(axes: FloatArray, angles: FloatArray) -> FloatArray:  # [C, 3] of length 1, [C] rad -> [C, 3, 3]
-    """Rodrigues' formula: 1 + sin a K + (1 − cos a) K²."""
-    x, y, z = axes.T
-    nothing = np.zeros_like(x)
-    cross = np.stack([nothing, -z, y, z, nothing, -x, -y, x, nothing], axis=1).reshape(-1, 3, 3)
-    sine, versine = np.sin(angles)[:, None, None], (1.0 - np.cos(angles))[:, None, None]
-    rotations: FloatArray = np.eye(3) + sine * cross + versine * (cross @ cross)
-    return rotations
+    return training_poses

@@ -7,59 +7,92 @@ import time
 
 import torch
 
+from ultragray.confidence import Assessor, Extrapolation
 from ultragray.evaluation import frames_at_once
+from ultragray.exports import FORMATS, ExportHeader, check_format, export_to
 from ultragray.files import file_sha256
+from ultragray.probe import FloatArray
 from ultragray.rendering import render as render_frames
 from ultragray.rendering import renderer_name
+from ultragray.samplers import Assess
 from ultragray.scene import GaussianScene
-from ultragray.scene_info import read_header
+from ultragray.scene_info import SceneHeader, read_header
 from ultragray.training.device import training_device
 
 from ..scenes import SUFFIX
-from .archive import ARCHIVES, ArchiveHeader
+from ..support import with_support
+from .device import chosen_device, device_alone
 from .folder import Outcome, Progress
-from .poses import poses_of
+from .poses import assessed_poses
 from .specification import RenderJob
 from .work import Stopped, Work
 
+ASSESSED_AT_ONCE = 100_000  # poses times training poses, of about a tenth of a second
+
 
 def render(work: Work, job: RenderJob) -> Outcome:
-    """Renders all poses into `frames.npz` or `frames.tar`. Raises Stopped, InvalidProbe, SceneFileInvalid."""
-    from .train_job import chosen_device
+    """Renders all poses into `frames` with the suffix of the format.
 
+    Raises Stopped, InvalidArgument, LowConfidence, InvalidProbe, SceneFileInvalid, ExtraMissing.
+    """
     torch.set_num_threads(work.request.threads)
+    name = chosen_device("auto", work.request.device)
+    device = training_device(name, "auto")
+    with device_alone(work, name):
+        return _render_on(device, work, job)
+
+
+def _render_on(device: torch.device, work: Work, job: RenderJob) -> Outcome:
     path = work.folder.path / f"{job.scene}{SUFFIX}"
-    poses = poses_of(job, read_header(path).training_poses)
-    device = training_device(chosen_device("auto", work.request.device), "auto")
+    described = read_header(path)
+    probe = described.info.probe_or(None)
+    poses, extrapolations = assessed_poses(job, described.training_poses, probe, _assessing(work, described))
     scene = GaussianScene.load(path).to(device)
     height, width = scene.info.image_size_or(job.height, job.width)
-    header = ArchiveHeader(
+    header = ExportHeader(
         outputs=job.outputs,
+        dtype=check_format(job.format, job.outputs, job.dtype),
         poses=poses,
         height=height,
         width=width,
+        probe=probe,
         scene=job.scene,
         scene_sha256=file_sha256(path),
         renderer=renderer_name("auto", scene),
     )
     sys.stderr.write(f"rendering {len(poses):,} frames of {height}x{width} of {job.scene} on {device}\n")
-    at_once = frames_at_once(height, width)
-    started = time.monotonic()
     with work.folder.new_artifacts() as folder:
-        archive = ARCHIVES[job.format](folder / f"frames.{job.format}", header)
+        started = time.monotonic()
         work.report(Progress(frames_done=0, frames=len(poses)))
+        wanted = tuple(dict.fromkeys((*job.outputs, "coverage")))
+        with export_to(folder / f"frames{FORMATS[job.format].suffix}", job.format, header) as add, torch.no_grad():
+            at_once = frames_at_once(height, width)
+            for first in range(0, len(poses), at_once):
+                if work.should_stop():
+                    raise Stopped
+                some = poses[first : first + at_once]
+                frames = render_frames(scene, probe, some, height=height, width=width, outputs=wanted)
+                assert frames.coverage is not None
+                pixels = {name: getattr(frames, name).cpu().numpy() for name in job.outputs}
+                add(pixels, with_support(extrapolations[first : first + len(some)], frames.coverage))
+                done = first + len(some)
+                rate = done / (time.monotonic() - started)
+                left_s = (len(poses) - done) / rate
+                work.report(Progress(frames_done=done, frames=len(poses), rate_per_s=rate, seconds_left=left_s))
+    return Outcome(artifacts=work.folder.artifact_names())
+
+
+def _assessing(work: Work, described: SceneHeader) -> Assess:
+    """What tells how far poses extrapolate, until the job is to stop."""
+    assessor = Assessor(described.info, described.training_poses)
+    at_once = max(1, ASSESSED_AT_ONCE // max(1, len(described.training_poses)))
+
+    def assess(poses: FloatArray) -> list[Extrapolation]:  # [C, 4, 4] -> [C]
+        told: list[Extrapolation] = []
         for first in range(0, len(poses), at_once):
             if work.should_stop():
                 raise Stopped
-            with torch.no_grad():
-                frames = render_frames(
-                    scene, None, poses[first : first + at_once], height=height, width=width, outputs=job.outputs
-                )
-            archive.add({name: getattr(frames, name).cpu().numpy() for name in job.outputs})
-            done = min(first + at_once, len(poses))
-            rate = done / (time.monotonic() - started)
-            work.report(
-                Progress(frames_done=done, frames=len(poses), rate_per_s=rate, seconds_left=(len(poses) - done) / rate)
-            )
-        archive.close()
-    return Outcome(artifacts=work.folder.artifact_names())
+            told.extend(assessor.assess(poses[first : first + at_once]))
+        return told
+
+    return assess

@@ -25,6 +25,7 @@ from .work import Stopped, Work
 
 STOPPED, STORAGE_FULL = 75, 73
 _PR_SET_PDEATHSIG = 1
+_OOM_SCORE_ADJ = "500"  # of 1000: where memory runs out, jobs go before the service and its workers
 
 
 def main(folder_path: str, worker_pid: str) -> int:
@@ -43,6 +44,7 @@ def main(folder_path: str, worker_pid: str) -> int:
             return 0
         request = folder.request()
         os.nice(request.nice)
+        Path("/proc/self/oom_score_adj").write_text(_OOM_SCORE_ADJ, encoding="ascii")
         work = Work(folder, request, lambda: bool(received))
         try:
             outcome = _outcome_of(work)
@@ -53,8 +55,6 @@ def main(folder_path: str, worker_pid: str) -> int:
             folder.write_outcome(outcome)
         except OSError:
             return STORAGE_FULL
-        if outcome.error is None:
-            folder.remove_checkpoints()
     return 0
 
 

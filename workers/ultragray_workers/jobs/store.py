@@ -1,4 +1,4 @@
-"""The jobs as the service sees them: submitted, listed, watched, cancelled, retried. Free of torch."""
+"""The jobs as the service sees them: submitted, listed, watched, cancelled, retried, deleted. Free of torch."""
 
 from __future__ import annotations
 
@@ -14,24 +14,29 @@ from dbos import error as dbos_error
 
 from ultragray.errors import (
     ArtifactNotFound,
+    DatasetNotFound,
     InvalidArgument,
     JobConflict,
     JobFinished,
+    JobInUse,
     JobNotFinished,
     JobNotFound,
     JobQueueFull,
     SceneExists,
 )
+from ultragray.request import MAX_IMAGE_SIDE
 
 from ..dataset_store import DatasetStore
-from ..scenes import SUFFIX, SceneStore
+from ..scenes import SceneStore
 from . import database
+from .counting import count_by_state
 from .database import JobDatabase
 from .folder import JobFolder, Progress
 from .job import MAX_PRIORITY, PRIORITY_ZERO, STATUSES, Job, JobState, attribute, job_of_row
-from .link import link_or_copy
 from .paging import iso_after, read_token, write_token
 from .publication import SCENES_FOLDER
+from .removal import remove_job, sources_in_use
+from .requirements import keep_scene
 from .specification import RenderJob, Specification, TrainJob, digest, from_dict, in_short, to_dict
 
 __all__ = ["SCENES_FOLDER", "Job", "JobState", "JobStore", "Progress"]
@@ -52,14 +57,17 @@ class JobStore:
         queue_limit: int = 1000,
         *,
         scenes: SceneStore | None = None,
+        max_image_side: int = MAX_IMAGE_SIDE,
     ) -> None:
         """`scenes`: those that render jobs may name, and whose names trainings may not take.
 
-        None: those that trainings made. Raises StartupFailed where the database cannot be reached.
+        None: those that trainings made. `max_image_side`: of frames, pixels. Raises StartupFailed where the database
+        cannot be reached.
         """
         self._artifact_folder = Path(artifact_folder)
         self._database = JobDatabase(self._artifact_folder, database_url)
         self._queue_limit = queue_limit
+        self._max_image_side = max_image_side
         self._scenes = scenes or SceneStore(self._artifact_folder / SCENES_FOLDER)
         self._datasets = DatasetStore(self._artifact_folder)
         self._submitting = threading.Lock()  # so that one service keeps the queue limit to the job
@@ -75,7 +83,7 @@ class JobStore:
         """The job, and whether it is new: the same `request_id` gives the same job, whatever became of it.
 
         Raises JobConflict where that one asked for something else, JobQueueFull, DatasetNotFound, DatasetInvalid,
-        SceneNotFound, SceneFileInvalid, SceneExists and InvalidArgument.
+        SceneNotFound, SceneFileInvalid, SceneExists, StorageFull, InvalidImageSize, InvalidProbe and InvalidArgument.
         """
         if abs(priority) > MAX_PRIORITY:
             raise InvalidArgument(
@@ -94,7 +102,7 @@ class JobStore:
             waiting = self._database.unfinished()
             if sum(row.status in database.QUEUED for row in waiting) >= self._queue_limit:
                 raise JobQueueFull(f"{self._queue_limit} jobs wait already: try again later, or cancel some")
-            self._check_resources(specification, job_id)
+            self._check_resources(specification, job_id, retry_of)
             attributes = {
                 "request_id": request_id,
                 "digest": asked,
@@ -125,7 +133,18 @@ class JobStore:
                     f"another job that waits or runs makes the scene {specification.scene!r}: choose another name",
                     field="scene",
                 ) from None
+            if isinstance(specification, TrainJob):
+                self._withdraw_without_dataset(specification.dataset, job_id)
         return self.get(job_id), True
+
+    def _withdraw_without_dataset(self, dataset: str, job_id: str) -> None:
+        """Looks again, now that a deletion would see the job: one that came in between has won."""
+        try:
+            self._datasets.get(dataset)
+        except DatasetNotFound:
+            self._database.client.cancel_workflow(job_id)
+            self._database.client.delete_workflows([job_id])
+            raise
 
     def _same(self, present: WorkflowStatus, asked: str) -> Job:
         job = self._seen(present)
@@ -136,7 +155,7 @@ class JobStore:
             )
         return job
 
-    def _check_resources(self, specification: Specification, job_id: str) -> None:
+    def _check_resources(self, specification: Specification, job_id: str, retry_of: str | None) -> None:
         """Refuses what could not run, and keeps the scene of a rendering as it is now."""
         if isinstance(specification, TrainJob):
             self._datasets.get(specification.dataset)
@@ -146,10 +165,8 @@ class JobStore:
                 )
             return
         assert isinstance(specification, RenderJob)
-        self._scenes.header(specification.scene)
-        folder = JobFolder(self._artifact_folder, job_id).path
-        folder.mkdir(parents=True, exist_ok=True)
-        link_or_copy(self._scenes.path(specification.scene), folder / f"{specification.scene}{SUFFIX}")
+        before = None if retry_of is None else self._folder(retry_of)
+        keep_scene(specification, self._folder(job_id), self._scenes, before, self._max_image_side)
 
     def get(self, job_id: str) -> Job:
         """Raises JobNotFound."""
@@ -194,17 +211,18 @@ class JobStore:
 
         Raises JobNotFound, and JobFinished for one that succeeded or failed.
         """
-        self._row(job_id)
-        self._database.client.cancel_workflow(job_id)
         job = self.get(job_id)
+        if job.state in (JobState.QUEUED, JobState.RUNNING):
+            self._database.client.cancel_workflow(job_id)
+            job = self.get(job_id)
         if job.state is not JobState.CANCELLED:
             raise JobFinished(f"the job {job_id} has {job.state.value} already", field="job")
         return job
 
-    def retry(self, job_id: str) -> Job:
-        """The job in place of a failed or cancelled one; a training goes on from the last checkpoint of that one.
+    def retry(self, job_id: str) -> tuple[Job, bool]:
+        """The job in place of a failed or cancelled one, and whether it is new: a job has one such successor.
 
-        A job has one such successor: asked again, this gives the same. Raises JobNotFound, JobNotFinished, and what
+        A training goes on from the last checkpoint of its predecessor. Raises JobNotFound, JobNotFinished, and what
         `submit` raises.
         """
         rows = self._database.client.list_workflows(workflow_ids=[_checked_id(job_id)], load_input=True)
@@ -217,7 +235,23 @@ class JobStore:
             )
         assert rows[0].input is not None
         specification = from_dict(rows[0].input["args"][0]["specification"])
-        return self._submit(_hashed(f"retry {job_id}"), specification, None, job.priority, job_id)[0]
+        return self._submit(_hashed(f"retry {job_id}"), specification, None, job.priority, job_id)
+
+    def delete(self, job_id: str) -> None:
+        """Removes a finished job and its files; the scene that it made stays.
+
+        Raises JobNotFound, and JobInUse for a job that waits or runs, or that another of those goes on from.
+        """
+        job = self.get(job_id)
+        if job.state in (JobState.QUEUED, JobState.RUNNING):
+            raise JobInUse(f"the job {job_id} is {job.state.value}: cancel it first", field="job")
+        if (successor := sources_in_use(self._database).get(job_id)) is not None:
+            raise JobInUse(f"the job {successor} goes on from the job {job_id}", field="job")
+        remove_job(self._database, self._folder(job_id))
+
+    def counts(self) -> dict[JobState, int]:
+        """How many jobs there are in each state."""
+        return count_by_state(self._database)
 
     def log_tail(self, job_id: str, bytes: int = _TAIL_BYTES) -> str:
         """The end of what a job's process said; empty before it said anything. Raises JobNotFound."""
@@ -242,6 +276,14 @@ class JobStore:
         """The job that needs a dataset, in words; None where no job that waits or runs does."""
         for row in self._database.unfinished():
             if attribute(row, "specification").get("dataset") == name:
+                return f"the job {row.workflow_id}"
+        return None
+
+    def makes_scene(self, name: str) -> str | None:
+        """The training that will serve a scene of that name, in words; None where no job that waits or runs does."""
+        for row in self._database.unfinished():
+            specification = attribute(row, "specification")
+            if "dataset" in specification and specification.get("scene") == name:
                 return f"the job {row.workflow_id}"
         return None
 

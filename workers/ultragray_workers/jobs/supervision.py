@@ -5,26 +5,26 @@ from __future__ import annotations
 import errno
 import logging
 import os
-import shutil
 import signal
 import subprocess
 import sys
 import threading
 import time
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NoReturn
 
 from dbos import WorkflowStatus
 
-from ultragray.errors import MemoryExceeded, SceneExists, StorageFull
+from ultragray.errors import DatabaseUnavailable, MemoryExceeded, SceneExists, StorageFull
 
 from . import database
 from .database import JobDatabase
 from .folder import JobFolder, Outcome, Request
-from .publication import publish_scene
-from .run_job import STORAGE_FULL
+from .publication import publish_scene, withdraw_scene
+from .run_job import STOPPED, STORAGE_FULL
 from .specification import TrainJob
 
 WATCH_INTERVAL_S = 0.25
@@ -33,6 +33,7 @@ _STOP_WAIT_S = 10.0  # for the checkpoint of a training that is told to stop
 MAX_CRASHES = 3  # of a process that got no further in between: then the job fails
 # Somebody who kills processes at random is not the job's fault; without end it is not tried either.
 MAX_KILLS = 20
+_RESERVE_BYTES = 2**19
 
 _log = logging.getLogger("ultragray.jobs")
 
@@ -60,6 +61,7 @@ class Supervisor:
         self._stop = threading.Event()
         self._idle = threading.Event()
         self._idle.set()
+        self.job_at_hand: str | None = None
 
     def stop(self) -> None:
         """Ends the process at hand, which writes a checkpoint, and puts its job back into the queue.
@@ -75,6 +77,7 @@ class Supervisor:
         Raises Interrupted.
         """
         self._idle.clear()
+        self.job_at_hand = job_id
         try:
             row = self._require_ours(job_id)
             if self._stop.is_set():
@@ -82,18 +85,22 @@ class Supervisor:
             folder = JobFolder(self._config.artifact_folder, job_id)
             try:
                 folder.path.mkdir(parents=True, exist_ok=True)
-                outcome = folder.outcome() or self._work(folder, request, row.recovery_attempts or 1)
+                attempt = row.recovery_attempts or 1
+                kept = folder.outcome()  # of a process whose worker died before it could say so
+                outcome = self._work(folder, request, attempt) if kept is None else replace(kept, attempts=attempt)
                 if outcome.error is None and request["specification"]["kind"] == TrainJob.kind:
                     self._require_ours(job_id)
-                    publish_scene(folder, request["specification"]["scene"])
+                    self._publish(folder, request["specification"]["scene"])
+                    folder.remove_checkpoints()
             except SceneExists as error:
-                outcome = Outcome(error=error.reason, reason=error.detail, progress=folder.progress())
-                shutil.rmtree(folder.artifacts, ignore_errors=True)
+                outcome = replace(outcome, error=error.reason, reason=error.detail)  # the scene can be downloaded
             except OSError as error:
                 outcome = _failure_of_storage(error)
+            folder.remove_leftovers()
             _log.info(f"job {job_id} {'succeeded' if outcome.error is None else f'failed: {outcome.reason}'}")
             return outcome
         finally:
+            self.job_at_hand = None
             self._idle.set()
 
     def _work(self, folder: JobFolder, request: dict[str, Any], attempt: int) -> Outcome:
@@ -111,7 +118,8 @@ class Supervisor:
         furthest = _furthest(folder)
         while True:
             memory_kills = _memory_kills()
-            code = self._run_process(folder)
+            with _room_for_the_end(folder):
+                code = self._run_process(folder)
             if (outcome := folder.outcome()) is not None:
                 return replace(outcome, attempts=attempt)
             if code == STORAGE_FULL:
@@ -119,7 +127,7 @@ class Supervisor:
             if _furthest(folder) > furthest:
                 crashes = kills = 0
             furthest = max(furthest, _furthest(folder))
-            is_kill = code in (-signal.SIGKILL, -signal.SIGTERM) and _memory_kills() == memory_kills
+            is_kill = code in (-signal.SIGKILL, -signal.SIGTERM, STOPPED) and _memory_kills() == memory_kills
             kills, crashes = kills + is_kill, crashes + (not is_kill)
             _log.warning(f"the process of the job {folder.job_id} died ({_told(code)})")
             if kills >= MAX_KILLS or crashes >= MAX_CRASHES:
@@ -153,7 +161,8 @@ class Supervisor:
                         process.wait(_STOP_WAIT_S)
                     self._give_back(folder.job_id)
                 if time.monotonic() - watched_at >= WATCH_INTERVAL_S:
-                    self._require_ours(folder.job_id)
+                    with suppress(DatabaseUnavailable):  # the work goes on meanwhile
+                        self._raise_unless_ours(folder.job_id)
                     watched_at = time.monotonic()
                 time.sleep(_POLL_INTERVAL_S)
             return code
@@ -162,19 +171,53 @@ class Supervisor:
                 os.killpg(process.pid, signal.SIGKILL)
             process.wait()
 
+    def _publish(self, folder: JobFolder, scene: str) -> None:
+        publish_scene(folder, scene)
+        try:
+            self._require_ours(folder.job_id)
+        except Interrupted:
+            row = self._database.workflow(folder.job_id)
+            if row is None or row.status in database.CANCELLED:  # a moment before; else it is another worker's
+                withdraw_scene(folder, scene)
+            raise
+
     def _give_back(self, job_id: str) -> NoReturn:
-        self._database.take_back(job_id, self._config.executor)
+        with suppress(DatabaseUnavailable, StorageFull):  # then this worker, when it is back, or another takes it
+            self._database.take_back(job_id, self._config.executor)
         self._idle.set()
         while True:  # until the process ends: else DBOS would take the job once more
             time.sleep(_STOP_WAIT_S)
 
     def _require_ours(self, job_id: str) -> WorkflowStatus:
+        """As `_raise_unless_ours`, after a wait where the database is away."""
+        while True:
+            try:
+                return self._raise_unless_ours(job_id)
+            except DatabaseUnavailable:
+                if self._stop.wait(WATCH_INTERVAL_S):
+                    self._give_back(job_id)
+
+    def _raise_unless_ours(self, job_id: str) -> WorkflowStatus:
         """The queue's row of the job. Raises Interrupted unless it says that this worker runs it."""
         row = self._database.workflow(job_id)
         if row is None or row.status not in database.RUNNING or row.executor_id != self._config.executor:
             _log.info(f"job {job_id} is {'gone' if row is None else row.status.lower()}: its process is ended")
             raise Interrupted
         return row
+
+
+@contextmanager
+def _room_for_the_end(folder: JobFolder) -> Iterator[None]:
+    """Room that a job leaves on a disk that it fills: for its outcome, and for a queue on the same disk.
+
+    Raises OSError.
+    """
+    try:
+        with folder.reserve.open("wb") as file:
+            os.posix_fallocate(file.fileno(), 0, _RESERVE_BYTES)
+        yield
+    finally:
+        folder.reserve.unlink(missing_ok=True)
 
 
 def _furthest(folder: JobFolder) -> int:

@@ -7,6 +7,7 @@ import json
 import math
 import shutil
 import sys
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +17,10 @@ import torch
 from ultragray.datasets.source import SourceOptions, load_dataset
 from ultragray.datasets.sweep import Dataset
 from ultragray.errors import TrainingStateInvalid
-from ultragray.evaluation import evaluate
+from ultragray.evaluation import Evaluation, evaluate
+from ultragray.machine import processor_name
+from ultragray.report.page import ReportContent, render_page
+from ultragray.report.study import trained_of_journal
 from ultragray.scene import GaussianScene
 from ultragray.side_by_side import write_side_by_side
 from ultragray.training import Progress as TrainingProgress
@@ -27,12 +31,13 @@ from ultragray.training.trainer import CHECKPOINT_FILE, CONFIG_FILE, JOURNAL_FIL
 from ..dataset_store import DatasetStore
 from ..scenes import SUFFIX
 from .curve import draw_training_curve
+from .device import chosen_device, device_alone
 from .folder import JobFolder, Outcome, Progress
 from .specification import TrainJob
 from .work import Stopped, Work
 
 CHECKPOINT_INTERVAL_S = 10.0
-PICTURES = 4  # held-out frames, evenly spread
+PICTURES, REPORT_FRAMES = 4, 24  # held-out frames, evenly spread
 _LINES = 20  # of the log in a run
 
 
@@ -42,9 +47,14 @@ def train(work: Work, job: TrainJob) -> Outcome:
     Raises Stopped, DatasetNotFound, DatasetInvalid, InvalidArgument, and what `ultragray.training.train` raises.
     """
     torch.set_num_threads(work.request.threads)
+    device = chosen_device(job.device, work.request.device)
+    with device_alone(work, device):
+        return _train_on(device, work, job)
+
+
+def _train_on(device: str, work: Work, job: TrainJob) -> Outcome:
     source, options = DatasetStore(work.folder.artifact_folder).source(job.dataset)
     config = TrainingConfig.preset(job.preset, **job.settings)
-    device = chosen_device(job.device, work.request.device)
     dataset = replace(load_dataset(source, SourceOptions(**options)), name=job.dataset)
     _take_over_run(work)
     checkpoint = work.folder.run / CHECKPOINT_FILE
@@ -68,14 +78,6 @@ def train(work: Work, job: TrainJob) -> Outcome:
     return _finish(work, job, dataset, scene, device)
 
 
-def chosen_device(asked: str, workers: str) -> str:
-    """The device of a job: its own wish, else its worker's, else a GPU where there is one."""
-    device = workers if asked == "auto" else asked
-    if device == "auto":
-        return "cuda" if torch.cuda.is_available() else "cpu"
-    return device
-
-
 def _take_over_run(work: Work) -> None:
     """Puts the checkpoint of the job that this one replaces into the run's folder, unless there is a run already."""
     before = work.request.retry_of
@@ -89,13 +91,13 @@ def _take_over_run(work: Work) -> None:
         return  # it cannot be resumed from: this job begins anew
     partial = work.folder.path / "run.partial"
     shutil.rmtree(partial, ignore_errors=True)
-    with old.lock.open("a") as lock:
+    with suppress(FileNotFoundError), old.lock.open("a") as lock:  # it may be deleted meanwhile: then anew
         fcntl.lockf(lock, fcntl.LOCK_EX)  # a process that was cancelled a moment ago may still write
         partial.mkdir()
         for name in (CHECKPOINT_FILE, JOURNAL_FILE, CONFIG_FILE):
             if (old.run / name).exists():
                 shutil.copyfile(old.run / name, partial / name)
-    partial.rename(work.folder.run)
+        partial.rename(work.folder.run)
 
 
 def _report(work: Work, state: TrainingProgress) -> None:
@@ -136,11 +138,25 @@ def _finish(work: Work, job: TrainJob, dataset: Dataset, scene: GaussianScene, d
         }
         (folder / "metrics.json").write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
         if len(dataset.val):
-            _draw(scene.to(device), dataset, folder)
+            scene = scene.to(device)
+            evaluation = evaluate(scene, dataset.val)
+            _draw_frames(scene, dataset, evaluation, folder)
+            processor = f"{processor_name()}, {work.request.threads} threads"
+            content = ReportContent(
+                dataset=dataset,
+                scene=scene,
+                evaluation=evaluation,
+                machine=processor if device == "cpu" else torch.cuda.get_device_name(device),
+                scene_name=job.scene,
+                spread=REPORT_FRAMES,
+                trained=trained_of_journal(scene, evaluation, journal),
+            )
+            (folder / "report.html").write_text(render_page(content), encoding="utf-8")
     return Outcome(artifacts=work.folder.artifact_names(), metrics=metrics)
 
 
-def _draw(scene: GaussianScene, dataset: Dataset, folder: Path) -> None:
+def _draw_frames(scene: GaussianScene, dataset: Dataset, evaluation: Evaluation, folder: Path) -> None:
     count = len(dataset.val)
-    shown = dataset.val.select(np.linspace(0, count - 1, min(count, PICTURES)).round().astype(np.int64))
-    write_side_by_side(scene, shown, evaluate(scene, shown).frames, folder)
+    places = np.linspace(0, count - 1, min(count, PICTURES)).round().astype(np.int64)
+    metrics = [evaluation.frames[place] for place in places]
+    write_side_by_side(scene, dataset.val.select(places), metrics, folder)

@@ -22,7 +22,8 @@ from ultragray.errors import StartupFailed
 from . import database
 from .database import JobDatabase, dbos_config, quiet_dbos
 from .heartbeat import Heartbeat
-from .specification import RenderJob, TrainJob
+from .housekeeping import Housekeeper
+from .job import KINDS
 from .supervision import Interrupted, Supervisor, WorkerConfig
 
 POLLING_INTERVAL_S = 0.25
@@ -41,12 +42,13 @@ def work(
     device: str = "auto",
     threads: int = 0,
     nice: int = 10,
+    retention_days: float = 0.0,
 ) -> None:
     """Does jobs until `stop` is set; then the one at hand is put back into the queue with a checkpoint.
 
     `name` (None: of the host, numbered) must be the worker's alone; a worker that comes back under its name goes on
-    with its jobs at once. `threads` 0: all cores but one. Threads of DBOS are left behind: end the process by os._exit.
-    Raises StartupFailed.
+    with its jobs at once. `threads` 0: all cores but one. Finished jobs are removed after `retention_days`; 0: never.
+    Threads of DBOS are left behind: end the process by os._exit. Raises StartupFailed.
     """
     jobs = JobDatabase(artifact_folder, database_url)
     with claim_name(artifact_folder, name) as executor:
@@ -58,11 +60,15 @@ def work(
             nice=nice,
         )
         supervisor = Supervisor(config, jobs)
-        heartbeat = Heartbeat(jobs, executor)
+        heartbeat = Heartbeat(jobs, executor, lambda: supervisor.job_at_hand)
         _launch(jobs.url, config, supervisor)
+        housekeeper = Housekeeper(jobs, config.artifact_folder, retention_days)
+        if retention_days:
+            housekeeper.start()
         fields = {"worker": executor, "threads": config.threads, "device": device}
         _log.info(f"worker {executor} takes jobs", extra={"fields": fields})
         stop.wait()
+        housekeeper.stop()
         supervisor.stop()
         heartbeat.stop()
         _log.info(f"worker {executor} stopped")
@@ -82,7 +88,7 @@ def _launch(url: str, config: WorkerConfig, supervisor: Supervisor) -> None:
         return outcome.to_dict()
 
     DBOS(config=dbos_config(url, config.executor))
-    for kind in (TrainJob.kind, RenderJob.kind):
+    for kind in KINDS:
         # A worker that dies is not the job's fault, however often.
         DBOS.workflow(name=kind, max_recovery_attempts=None, serialization_type=WorkflowSerializationFormat.PORTABLE)(
             run

@@ -1,0 +1,144 @@
+"""A computer that runs `ultragray serve` and a second worker, starts both again when they die, and can be struck."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from contextlib import suppress
+from pathlib import Path
+
+CHECKPOINT_INTERVAL_S = 0.3
+DEAD_AFTER_S = 3.0
+_START_TIMEOUT_S = 60.0
+_STOP_TIMEOUT_S = 30.0
+
+# Each process of ours imports this first: checkpoints and take-overs come as often as the kills do.
+_PATCHES = f"""
+import sys
+line = " ".join(sys.orig_argv)
+if "ultragray_workers.jobs.run_job" in line:
+    from ultragray_workers.jobs import train_job
+    train_job.CHECKPOINT_INTERVAL_S = {CHECKPOINT_INTERVAL_S}
+elif "worker" in line:
+    from ultragray_workers.jobs import heartbeat
+    heartbeat.DEAD_AFTER_S = {DEAD_AFTER_S}
+"""
+_SERVE = [sys.executable, "-m", "ultragray_service"]
+_WORK = [sys.executable, "-c", "from ultragray_service.cli import app; app()", "worker", "--device", "cpu"]
+
+
+class Machine:
+    """Its processes; `tend` must be called often."""
+
+    def __init__(self, folder: Path) -> None:
+        self.data, self.artifacts = folder / "data", folder / "data" / "artifacts"
+        self.http: str | None = None  # while the server listens
+        self.grpc: str | None = None
+        self._logs = folder / "logs"
+        self._logs.mkdir(parents=True)
+        self.data.mkdir()
+        patches = folder / "patches"
+        patches.mkdir()
+        (patches / "sitecustomize.py").write_text(_PATCHES)
+        self._environment = {
+            **os.environ,
+            "PYTHONPATH": os.pathsep.join([str(patches), *filter(None, sys.path)]),
+            "OMP_NUM_THREADS": "1",
+            "ULTRAGRAY_DATA_FOLDER": str(self.data),
+            "ULTRAGRAY_HTTP_PORT": "0",
+            "ULTRAGRAY_GRPC_PORT": "0",
+            "ULTRAGRAY_THREADS_PER_PROCESS": "1",
+            "ULTRAGRAY_TRAINING_THREADS": "1",
+            "ULTRAGRAY_JOB_NICE": "0",
+        }
+        self._servers: list[subprocess.Popen[bytes]] = []
+        self._workers: list[subprocess.Popen[bytes]] = []
+        self._with_workers = False
+
+    def start_without_workers(self) -> None:
+        """The server alone, listening when this returns."""
+        self.tend()
+        end = time.monotonic() + _START_TIMEOUT_S
+        while self.http is None:
+            assert time.monotonic() < end, self.told()
+            time.sleep(0.05)
+            self.tend()
+
+    def bring_workers(self) -> None:
+        """From now on there is a worker of its own, and one in each server that is started."""
+        self._with_workers = True
+
+    def tend(self) -> None:
+        """Starts again what has died, and learns where the server listens."""
+        if not self._servers or self._servers[-1].poll() is not None:
+            self.http = self.grpc = None
+            embedded = {"ULTRAGRAY_EMBEDDED_WORKER": str(self._with_workers)}
+            self._servers.append(self._spawn(_SERVE, f"server-{len(self._servers)}", embedded))
+        if self._with_workers and (not self._workers or self._workers[-1].poll() is not None):
+            self._workers.append(self._spawn(_WORK, f"worker-{len(self._workers)}", {}))
+        if self.http is None:
+            log = self._logs / f"server-{len(self._servers) - 1}"
+            for line in log.read_text().splitlines():
+                if '"grpc"' in line and line.endswith("}"):
+                    record = json.loads(line)
+                    self.http, self.grpc = record["http"], record["grpc"]
+
+    def _spawn(self, command: list[str], name: str, settings: dict[str, str]) -> subprocess.Popen[bytes]:
+        with (self._logs / name).open("ab") as log:
+            return subprocess.Popen(command, env={**self._environment, **settings}, stdout=log, stderr=log)
+
+    def strike(self, kind: str, chance: random.Random) -> bool:
+        """SIGKILL to one process of a kind, chosen at random, or to `all`; False where there is none."""
+        processes = self._processes()
+        found = [pid for pids in processes.values() for pid in pids] if kind == "all" else processes[kind]
+        if not found or (kind == "all" and not all(processes.values())):
+            return False
+        chance.shuffle(found)
+        _kill(found if kind == "all" else found[:1])
+        return True
+
+    def _processes(self) -> dict[str, list[int]]:
+        """The processes that live, by kind; embedded workers also of servers that died."""
+        found: dict[str, list[int]] = {"job": [], "worker": [], "server": []}
+        for process, kind in [(self._servers[-1:], "server"), (self._workers[-1:], "worker")]:
+            found[kind] += [one.pid for one in process if one.poll() is None]
+        embedded = {f"ultragray_service.cli_worker {server.pid}" for server in self._servers}
+        for path in Path("/proc").glob("[0-9]*/cmdline"):
+            try:
+                line = path.read_text().replace("\0", " ").strip()
+            except OSError:  # it has ended
+                continue
+            if any(line.endswith(end) for end in embedded):
+                found["worker"].append(int(path.parent.name))
+            elif "jobs.run_job" in line and str(self.artifacts) in line:
+                found["job"].append(int(path.parent.name))
+        return found
+
+    def stop(self) -> list[int]:
+        """Ends the server and the worker as a service manager does; their exit codes."""
+        last = [*self._servers[-1:], *self._workers[-1:]]
+        for process in last:
+            process.terminate()
+        return [process.wait(_STOP_TIMEOUT_S) for process in last]
+
+    def kill_all(self) -> None:
+        """Whatever is left of it."""
+        for pids in self._processes().values():
+            _kill(pids)
+        for process in [*self._servers, *self._workers]:
+            process.wait()
+
+    def told(self) -> str:
+        """The ends of all logs, for the message of a test that fails."""
+        return "\n".join(f"--- {log.name}\n{log.read_text()[-1500:]}" for log in sorted(self._logs.iterdir())[-6:])
+
+
+def _kill(pids: list[int]) -> None:
+    for pid in pids:
+        with suppress(ProcessLookupError):  # it ended by itself
+            os.kill(pid, signal.SIGKILL)

@@ -1,0 +1,96 @@
+"""The worker of `ultragray serve`, as a process that takes no jobs: what becomes of it, not what it does."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import sys
+import time
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+
+import pytest
+
+from ultragray_service import embedded_worker
+from ultragray_service.embedded_worker import EmbeddedWorker
+from ultragray_service.settings import Settings
+
+OBEDIENT, DEAF = "", "signal.signal(signal.SIGTERM, signal.SIG_IGN)"
+
+
+def run(folder: Path, work: Callable[[EmbeddedWorker], Awaitable[None]], *, wanted: bool = True) -> None:
+    async def all_of_it() -> None:
+        worker = EmbeddedWorker(Settings(data_folder=folder, embedded_worker=wanted))
+        worker.start()
+        try:
+            await asyncio.wait_for(work(worker), 20)
+        finally:
+            await worker.stop()
+
+    asyncio.run(all_of_it())
+
+
+@pytest.fixture
+def program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Path]:
+    """What runs in place of the worker; returns the file to which each of them adds its process id."""
+
+    def use(source: str) -> Path:
+        started, script = tmp_path / "started", tmp_path / "python"
+        tell = f"import os; open({str(started)!r}, 'a').write(f'{{os.getpid()}}\\n')"
+        script.write_text(f"#!{sys.executable}\nimport signal, time\n{source}\n{tell}\ntime.sleep(60)\n")
+        script.chmod(0o755)
+        monkeypatch.setattr(sys, "executable", str(script))
+        return started
+
+    return use
+
+
+async def pids(started: Path, count: int) -> list[int]:
+    while not started.exists() or len(found := started.read_text().split()) < count:
+        await asyncio.sleep(0.02)
+    return [int(pid) for pid in found]
+
+
+def is_alive(pid: int) -> bool:
+    return Path(f"/proc/{pid}").exists()
+
+
+def test_started_again_when_it_dies_and_ended_with_the_service(
+    program: Callable[[str], Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(embedded_worker, "_FIRST_WAIT_S", 0.05)
+    started = program(OBEDIENT)
+
+    async def kill_one(worker: EmbeddedWorker) -> None:
+        (first,) = await pids(started, 1)
+        os.kill(first, signal.SIGKILL)
+        _, second = await pids(started, 2)
+        assert is_alive(second)
+
+    run(tmp_path, kill_one)
+    assert [is_alive(pid) for pid in map(int, started.read_text().split())] == [False, False]
+    assert [record.message for record in caplog.records] == [
+        "the worker for jobs ended with -9; the next one starts in 0.05 s"
+    ]
+
+
+def test_killed_where_nobody_waits_for_its_end(program: Callable[[str], Path], tmp_path: Path) -> None:
+    started = program(DEAF)
+
+    async def give_up(worker: EmbeddedWorker) -> None:
+        (pid,) = await pids(started, 1)
+        began = time.monotonic()
+        with pytest.raises(asyncio.TimeoutError):
+            await asyncio.wait_for(worker.stop(), 0.3)
+        while is_alive(pid):
+            await asyncio.sleep(0.02)
+        assert time.monotonic() - began < 3.0
+
+    run(tmp_path, give_up)
+
+
+def test_none_where_none_is_wanted(program: Callable[[str], Path], tmp_path: Path) -> None:
+    started = program(OBEDIENT)
+    run(tmp_path, lambda worker: asyncio.sleep(0.3), wanted=False)
+    assert not started.exists()

@@ -1,0 +1,60 @@
+"""Calls whose caller is gone."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from pathlib import Path
+from typing import Any
+
+import grpc
+import pytest
+from google.protobuf.empty_pb2 import Empty  # type: ignore[import-untyped]
+
+from ultragray_service.auth import KeyGuard
+from ultragray_service.metrics import Metrics
+from ultragray_service.rpc.interceptor import CallContext
+from ultragray_workers import PoolConfig, RenderPool, SceneStore
+
+METHOD = "/ultragray.v1.TestService/Stream"
+
+
+class Streaming(grpc.GenericRpcHandler):  # type: ignore[misc]
+    """A call that writes once more when its caller is gone, as if that was not known yet."""
+
+    def __init__(self) -> None:
+        self.ended = asyncio.Event()
+
+    def service(self, details: Any) -> Any:
+        return grpc.unary_stream_rpc_method_handler(self._stream, Empty.FromString, Empty.SerializeToString)
+
+    async def _stream(self, request: Any, context: Any) -> None:
+        await context.write(Empty())
+        try:
+            await asyncio.sleep(60)
+        except asyncio.CancelledError:
+            self.ended.set()
+            await context.write(Empty())
+
+
+async def vanish(folder: Path) -> None:
+    metrics = Metrics(RenderPool(SceneStore(folder), PoolConfig()), dict)
+    server = grpc.aio.server(interceptors=[CallContext(KeyGuard(()), metrics)])
+    streaming = Streaming()
+    server.add_generic_rpc_handlers([streaming])
+    port = server.add_insecure_port("127.0.0.1:0")
+    await server.start()
+    async with grpc.aio.insecure_channel(f"127.0.0.1:{port}") as channel:
+        call = channel.unary_stream(METHOD, Empty.SerializeToString, Empty.FromString)(Empty())
+        await call.read()
+        call.cancel()
+        await asyncio.wait_for(streaming.ended.wait(), 10)
+    await server.stop(5)
+
+
+def test_a_write_to_a_caller_that_is_gone_is_a_cancelled_call(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.INFO):
+        asyncio.run(vanish(tmp_path))
+    (record,) = caplog.records
+    fields = vars(record)["fields"]
+    assert (record.getMessage(), fields["method"], fields["status"]) == ("request", METHOD, "CANCELLED")

@@ -1,0 +1,212 @@
+"""What goes wrong for real: each such job fails with one reason that a person can read, and the next one runs."""
+
+from __future__ import annotations
+
+import os
+import resource
+import shutil
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ultragray.demo import copy_demo_scene
+from ultragray.errors import StorageFull
+from ultragray_workers.jobs.specification import Poses, RenderJob
+from ultragray_workers.jobs.store import Job, JobState, JobStore
+
+from .conftest import RunningWorker, store_dataset, train_job
+
+StartWorker = Callable[..., RunningWorker]
+Until = Callable[..., Job]
+
+DISK_BYTES = 8 * 2**20
+# The loss of trainings with batches of three is NaN from the third step on.
+DIVERGENCE = """
+import sys
+if "ultragray_workers.jobs.run_job" in sys.orig_argv:
+    from ultragray.training import trainer
+    image_loss, calls = trainer.image_loss, []
+    def broken(rendered, truth):
+        calls.append(None)
+        return image_loss(rendered, truth) * (float("nan") if len(truth) == 3 and len(calls) > 2 else 1.0)
+    trainer.image_loss = broken
+"""
+
+
+def poses(count: int) -> Poses:
+    return np.tile(np.eye(4), (count, 1, 1)).tolist()  # type: ignore[no-any-return]
+
+
+def is_training(job: Job) -> bool:
+    return job.state is JobState.RUNNING and (job.progress.step or 0) > 0
+
+
+def process_of(worker: RunningWorker, *, not_: int | None = None, timeout_s: float = 20.0) -> int:
+    """The process of the worker's job, once there is one."""
+    end = time.monotonic() + timeout_s
+    while (process := worker.job_process()) in (None, not_):
+        assert time.monotonic() < end, "no process of a job was started"
+        time.sleep(0.005)
+    assert process is not None
+    return process
+
+
+def assert_failed(job: Job, error: str, *told: str) -> None:
+    assert (job.state, job.error) == (JobState.FAILED, error), job
+    assert job.reason is not None
+    assert "\n" not in job.reason
+    for part in told:
+        assert part in job.reason
+
+
+def test_poisoned_datasets_and_diverging_trainings(
+    store: JobStore,
+    artifact_folder: Path,
+    tmp_path: Path,
+    start_worker: StartWorker,
+    until: Until,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    images = store_dataset(artifact_folder, "images") / "files" / "images_train.npy"
+    frames = np.load(images) / 255.0
+    frames[2, 3, 4] = np.nan
+    np.save(images, frames)
+    jobs = [
+        store.submit(asked)[0]
+        for asked in (
+            train_job("of-images", dataset="images"),
+            train_job("diverging", batch_size=3),
+            train_job("good"),
+        )
+    ]
+    (tmp_path / "sitecustomize.py").write_text(DIVERGENCE)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    start_worker()
+    of_images, diverging, good = (until(job) for job in jobs)
+    assert_failed(of_images, "DATASET_INVALID", "images_train.npy", "frame 2", "NaN")
+    assert_failed(diverging, "TRAINING_DIVERGED", "in step 3", "the loss is nan")
+    assert good.state is JobState.SUCCEEDED, good
+    assert [path.name for path in (artifact_folder / "scenes").iterdir()] == ["good.ugr"]
+
+
+def test_dataset_deleted_while_it_is_trained_from_and_the_next_job_starts_within_a_second_of_a_cancel(
+    store: JobStore, artifact_folder: Path, start_worker: StartWorker, until: Until
+) -> None:
+    worker = start_worker()
+    store_dataset(artifact_folder, "gone")
+    job, _ = store.submit(train_job("one", dataset="gone", steps=1_000_000))
+    until(job, is_training)
+    first = process_of(worker)
+    shutil.rmtree(artifact_folder / "datasets" / "gone")
+    os.kill(first, signal.SIGKILL)
+    assert_failed(until(job), "DATASET_NOT_FOUND", "'gone'")
+
+    job, _ = store.submit(train_job("two", steps=1_000_000))
+    following, _ = store.submit(train_job("three"))
+    process = process_of(worker)
+    until(job, is_training)
+    cancelled_at = time.monotonic()
+    store.cancel(job.id)
+    process_of(worker, not_=process)
+    assert time.monotonic() - cancelled_at < 1.0
+    assert until(following).state is JobState.SUCCEEDED
+
+
+@pytest.fixture
+def small_disk(artifact_folder: Path) -> Iterator[Path]:
+    """The artifact folder is a file system of its own, which anybody can fill."""
+    mounted = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", f"size={DISK_BYTES}", "tmpfs", artifact_folder], capture_output=True, text=True
+    )
+    if mounted.returncode:
+        pytest.skip(f"a small disk cannot be mounted here: {mounted.stderr.strip()}")
+    store_dataset(artifact_folder, "tiny")
+    yield artifact_folder
+    subprocess.run(["umount", "--lazy", artifact_folder], check=True)
+
+
+def test_full_disk(small_disk: Path, tmp_path: Path, start_worker: StartWorker) -> None:
+    from .conftest import FINAL
+
+    store = JobStore(small_disk, None)
+
+    def until(job: Job, reached: Callable[[Job], bool] = lambda job: job.state in FINAL) -> Job:
+        end = time.monotonic() + 60
+        while not reached(job):
+            assert time.monotonic() < end, (job, store.log_tail(job.id), (tmp_path / "one.log").read_text())
+            time.sleep(0.05)
+            job = store.get(job.id)
+        return job
+
+    (small_disk / "scenes").mkdir()
+    copy_demo_scene(small_disk / "scenes" / "demo.ugr")
+    with pytest.raises(StorageFull, match="60 frames of 512x512 take up to 63 MB"):
+        store.submit(RenderJob("demo", poses=poses(60), height=512, width=512))
+    job, _ = store.submit(RenderJob("demo", poses=poses(12), height=256, width=256))
+    with (small_disk / "ballast").open("wb") as ballast:
+        os.posix_fallocate(ballast.fileno(), 0, shutil.disk_usage(small_disk).free - 2**20)
+    start_worker()
+    assert_failed(until(job), "STORAGE_FULL", "no room")
+    (small_disk / "ballast").unlink()
+    assert not (small_disk / "jobs" / job.id / "artifacts").exists()
+    assert shutil.disk_usage(small_disk).free > DISK_BYTES // 2
+
+    job, _ = store.submit(train_job("one", steps=800))
+    until(job, is_training)
+    with (small_disk / "ballast").open("wb") as ballast:
+        os.posix_fallocate(ballast.fileno(), 0, shutil.disk_usage(small_disk).free)
+    assert_failed(until(job), "STORAGE_FULL", "no room")
+    (small_disk / "ballast").unlink()
+    assert [path.name for path in (small_disk / "scenes").iterdir()] == ["demo.ugr"]
+    assert until(store.submit(train_job("two"))[0]).state is JobState.SUCCEEDED
+    store.close()
+
+
+def test_memory_that_does_not_suffice(
+    store: JobStore, artifact_folder: Path, start_worker: StartWorker, until: Until
+) -> None:
+    (artifact_folder / "scenes").mkdir()
+    copy_demo_scene(artifact_folder / "scenes" / "demo.ugr")
+    worker = start_worker()
+    job, _ = store.submit(RenderJob("demo", poses=poses(400), height=1024, width=1024))
+    until(job, lambda job: (job.progress.frames_done or 0) > 0)
+    process = process_of(worker)
+    used = next(line for line in Path(f"/proc/{process}/status").read_text().splitlines() if line.startswith("VmSize"))
+    resource.prlimit(process, resource.RLIMIT_AS, (int(used.split()[1]) * 1024,) * 2)
+    assert_failed(until(job), "MEMORY_EXCEEDED", "memory of the machine")
+
+    with memory_group() as group:
+        job, _ = store.submit(train_job("one", steps=1_000_000))
+        killed: set[int] = set()
+        while store.get(job.id).state in (JobState.QUEUED, JobState.RUNNING):
+            process = worker.job_process() or 0
+            if process and process not in killed:
+                killed.add(process)
+                (group / "cgroup.procs").write_text(str(process))
+            time.sleep(0.01)
+    assert_failed(store.get(job.id), "MEMORY_EXCEEDED", "memory of the machine", "3 times")
+    assert len(killed) == 3
+    assert until(store.submit(train_job("two"))[0]).state is JobState.SUCCEEDED
+
+
+@contextmanager
+def memory_group() -> Iterator[Path]:
+    """A control group in which the kernel kills what takes more than 24 MiB; skips where none can be made."""
+    version_1 = Path("/sys/fs/cgroup/memory")
+    parent, limit = (version_1, "limit_in_bytes") if version_1.is_dir() else (version_1.parent, "max")
+    group = parent / f"ultragray-test-{os.getpid()}"
+    try:
+        group.mkdir()
+        (group / f"memory.{limit}").write_text(str(24 * 2**20))
+    except OSError as error:
+        pytest.skip(f"the kernel's own killing is not tried: no control group can be made here: {error}")
+    try:
+        yield group
+    finally:
+        group.rmdir()

@@ -1,0 +1,197 @@
+"""Jobs that go: deleted by hand, or old. And datasets that go while a job is submitted."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+import sqlalchemy as sa
+
+from ultragray.errors import DatasetInUse, DatasetNotFound, JobInUse, JobNotFound
+from ultragray_workers.dataset_store import DatasetStore
+from ultragray_workers.jobs import housekeeping, removal
+from ultragray_workers.jobs.database import JobDatabase
+from ultragray_workers.jobs.folder import JobFolder
+from ultragray_workers.jobs.housekeeping import DAY_S, Housekeeper
+from ultragray_workers.jobs.store import Job, JobState, JobStore
+
+from ...postgres import PostgresServer
+from .conftest import train_job
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def database_url(request: pytest.FixtureRequest) -> str | None:
+    if request.param == "sqlite":
+        return None
+    server: PostgresServer = request.getfixturevalue("postgres")
+    return server.create_database()
+
+
+@pytest.fixture
+def jobs(artifact_folder: Path, database_url: str | None) -> Iterator[JobDatabase]:
+    jobs = JobDatabase(artifact_folder, database_url)
+    yield jobs
+    jobs.close()
+
+
+@pytest.fixture
+def finished(store: JobStore, jobs: JobDatabase, artifact_folder: Path) -> Callable[..., tuple[Job, Path]]:
+    """Makes a cancelled job that ended so many days ago, with a folder as its process would have left it."""
+    rows = jobs.client._sys_db.tables.workflow_status
+
+    def make(scene: str, days_ago: float = 0.0) -> tuple[Job, Path]:
+        job = store.cancel(store.submit(train_job(scene))[0].id)
+        ended_ms = int((time.time() - days_ago * DAY_S) * 1000)
+        with jobs.engine.begin() as connection:
+            connection.execute(sa.update(rows).where(rows.c.workflow_uuid == job.id).values(completed_at=ended_ms))
+        folder = make_folder(artifact_folder, job.id, days_ago)
+        (folder / "job.json").write_text("{}")
+        return job, folder
+
+    return make
+
+
+def make_folder(artifact_folder: Path, job_id: str, days_ago: float) -> Path:
+    folder = JobFolder(artifact_folder, job_id).path
+    (folder / "artifacts").mkdir(parents=True)
+    (folder / "artifacts" / "metrics.json").write_text("{}")
+    os.utime(folder, (time.time() - days_ago * DAY_S,) * 2)
+    return folder
+
+
+def left(artifact_folder: Path) -> set[str]:
+    return {path.name for path in (artifact_folder / "jobs").iterdir()}
+
+
+Finished = Callable[..., tuple[Job, Path]]
+
+
+def test_a_finished_job_goes_with_its_files_and_its_request_id_is_free(
+    store: JobStore, artifact_folder: Path, finished: Finished
+) -> None:
+    job, _ = store.submit(train_job("named"), request_id="mine")
+    store.cancel(job.id)
+    store.delete(job.id)
+    again, is_new = store.submit(train_job("named"), request_id="mine")
+    assert is_new
+    with pytest.raises(JobInUse, match="queued"):
+        store.delete(again.id)
+    other, _ = finished("other")
+    (artifact_folder / "scenes").mkdir()
+    (artifact_folder / "scenes" / "other.ugr").touch()
+    store.delete(other.id)
+    assert left(artifact_folder) == set()
+    assert (artifact_folder / "scenes" / "other.ugr").exists()
+    for call in (store.get, store.delete):
+        with pytest.raises(JobNotFound):
+            call(other.id)
+
+
+def test_what_another_job_goes_on_from_stays(store: JobStore, finished: Finished) -> None:
+    job, folder = finished("one")
+    successor, _ = store.retry(job.id)
+    with pytest.raises(JobInUse, match=successor.id):
+        store.delete(job.id)
+    store.cancel(successor.id)
+    store.delete(job.id)
+    assert not folder.exists()
+
+
+def test_a_job_whose_process_still_ends_stays_whole(
+    store: JobStore, finished: Finished, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job, folder = finished("one")
+    program = (
+        f"import fcntl, sys; lock = open({str(folder / 'lock')!r}, 'a'); fcntl.lockf(lock, fcntl.LOCK_EX); "
+        "print('locked', flush=True); sys.stdin.read()"
+    )
+    monkeypatch.setattr(removal, "_LOCK_WAIT_S", 0.2)
+    with subprocess.Popen([sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == b"locked\n"
+        with pytest.raises(JobInUse, match="still being stopped"):
+            store.delete(job.id)
+        assert store.get(job.id).state is JobState.CANCELLED
+        assert (folder / "artifacts" / "metrics.json").exists()
+        process.communicate(b"")
+    store.delete(job.id)
+    assert not folder.exists()
+
+
+def test_jobs_are_counted_by_state(store: JobStore, finished: Finished) -> None:
+    finished("one")
+    finished("two")
+    store.submit(train_job("three"))
+    assert store.counts() == {
+        JobState.QUEUED: 1,
+        JobState.RUNNING: 0,
+        JobState.SUCCEEDED: 0,
+        JobState.FAILED: 0,
+        JobState.CANCELLED: 2,
+    }
+
+
+def test_old_jobs_go_and_what_is_needed_stays(
+    store: JobStore, jobs: JobDatabase, artifact_folder: Path, finished: Finished, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(housekeeping, "AT_ONCE", 2)
+    monkeypatch.setattr(housekeeping, "STEP_PAUSE_S", 0.0)
+    old = [finished(f"old-{number}", 31)[0] for number in range(3)]
+    young, _ = finished("young", 29)
+    source, _ = finished("source", 40)
+    successor, _ = store.retry(source.id)
+    make_folder(artifact_folder, "0" * 24, 1.1)  # of a submission that failed
+    make_folder(artifact_folder, "1" * 24, 0.9)
+    worked = make_folder(artifact_folder, "2" * 24, 29)  # of a job that another database may know
+    (worked / "job.json").write_text("{}")
+    os.utime(worked, (time.time() - 29 * DAY_S,) * 2)
+    make_folder(artifact_folder, ".deleted-x", 0)
+    make_folder(artifact_folder, "not-a-job", 99)
+
+    assert Housekeeper(jobs, artifact_folder, 30).keep_house() == len(old) + 1
+    kept = {young.id, source.id}
+    assert left(artifact_folder) == kept | {"1" * 24, "2" * 24, "not-a-job"}
+    assert {job.id for job in store.list()[0]} == kept | {successor.id}
+    store.cancel(successor.id)
+    assert Housekeeper(jobs, artifact_folder, 30).keep_house() == 1
+    assert source.id not in left(artifact_folder)
+
+
+def test_a_deletion_and_a_submission_at_once_never_both_succeed(
+    store: JobStore, artifact_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    datasets = DatasetStore(artifact_folder)
+    datasets.in_use = store.uses_dataset
+
+    def submit_in_between(name: str) -> str | None:
+        """The first look finds nobody; then a job comes, before the dataset is out of sight."""
+        datasets.in_use = store.uses_dataset
+        submitted.append(store.submit(train_job("one"))[0])
+        return None
+
+    submitted: list[Job] = []
+    datasets.in_use = submit_in_between
+    with pytest.raises(DatasetInUse, match="needed by the job"):
+        datasets.delete("tiny")
+    assert datasets.get("tiny").name == "tiny"
+    assert [path.name for path in datasets.folder.iterdir()] == ["tiny"]
+    assert store.get(submitted[0].id).state is JobState.QUEUED
+    store.cancel(submitted[0].id)
+
+    enqueue = JobDatabase.enqueue
+
+    def delete_in_between(self: JobDatabase, *arguments: object) -> None:
+        """The dataset was there when it was looked for, and is gone before a deletion could see the job."""
+        datasets.delete("tiny")
+        enqueue(self, *arguments)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(JobDatabase, "enqueue", delete_in_between)
+    with pytest.raises(DatasetNotFound):
+        store.submit(train_job("two"), request_id="mine")
+    assert store.counts()[JobState.QUEUED] == 0
+    assert {job.id for job in store.list()[0]} == {submitted[0].id}

@@ -1,0 +1,191 @@
+"""Render jobs that could not be done are refused; the scene of the others is kept as it is."""
+
+from __future__ import annotations
+
+import errno
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ultragray import GaussianScene, LinearProbe
+from ultragray.confidence import ConfidenceModel
+from ultragray.errors import (
+    DatabaseUnavailable,
+    InvalidArgument,
+    InvalidImageSize,
+    InvalidProbe,
+    LowConfidence,
+    SceneNotFound,
+    StorageFull,
+    UnknownOutput,
+)
+from ultragray.samplers import AroundSampler, SplineSampler, TrainingSampler
+from ultragray_workers.jobs import requirements
+from ultragray_workers.jobs.database import JobDatabase
+from ultragray_workers.jobs.specification import RenderJob
+from ultragray_workers.jobs.store import JobStore
+from ultragray_workers.scenes import SceneStore
+
+INFO = {"probe": LinearProbe(30.0, 0.0, 40.0), "image_height": 24, "image_width": 20}
+POSES = np.tile(np.eye(4), (3, 1, 1))
+MODEL = ConfidenceModel((3.5, 1.2, 0.8, 0.1, 0.6), 0.06, (0.0,) * 3, 20, 0.04).to_dict()
+
+
+@dataclass
+class Disk:
+    free: int
+
+
+@pytest.fixture
+def save(tmp_path: Path, random_scene: Callable[..., GaussianScene]) -> Callable[..., bytes]:
+    """Serves a scene and returns its file's content."""
+
+    def make(name: str, seed: int = 0, **changes: Any) -> bytes:
+        made = random_scene(20, seed=seed, info=INFO | changes)
+        scene = GaussianScene.from_splats(made.splats, info=made.info, training_poses=POSES)
+        scene.save(tmp_path / f"{name}.ugr")
+        return (tmp_path / f"{name}.ugr").read_bytes()
+
+    return make
+
+
+@pytest.fixture
+def scenes(tmp_path: Path) -> SceneStore:
+    return SceneStore(tmp_path)
+
+
+@pytest.fixture
+def rendering_store(artifact_folder: Path, scenes: SceneStore) -> JobStore:
+    return JobStore(artifact_folder, None, scenes=scenes, max_image_side=64)
+
+
+def kept(artifact_folder: Path, job_id: str) -> bytes:
+    folder = artifact_folder / "jobs" / job_id
+    assert [path.name for path in folder.iterdir()] == ["one.ugr"]
+    return (folder / "one.ugr").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("job", "error"),
+    [
+        (RenderJob("one", sampler=TrainingSampler(), height=65), InvalidImageSize),
+        (RenderJob("one", sampler=TrainingSampler(), outputs=("labels",)), UnknownOutput),
+        (RenderJob("one", poses=POSES, sampler=SplineSampler(count=3)), InvalidArgument),
+        (RenderJob("probeless", sampler=TrainingSampler()), InvalidProbe),
+        (RenderJob("none", sampler=TrainingSampler()), SceneNotFound),
+    ],
+)
+def test_refused(job: RenderJob, error: type[Exception], save: Callable[..., bytes], rendering_store: JobStore) -> None:
+    save("one")
+    save("probeless", probe=None)
+    with pytest.raises(error):
+        rendering_store.submit(job)
+    assert rendering_store.list() == ([], None)
+    rendering_store.close()
+
+
+@pytest.mark.parametrize(
+    ("job", "needed_bytes"),
+    [
+        (RenderJob("one", poses=POSES), 3 * 24 * 20 * 4),
+        (RenderJob("one", poses=POSES, outputs=("bmode", "echo"), dtype="uint8", height=10, width=64), 3 * 10 * 64 * 2),
+        (RenderJob("one", sampler=AroundSampler(50), format="dicom"), 50 * 24 * 20),
+    ],
+)
+def test_room_for_all_pixels(
+    job: RenderJob,
+    needed_bytes: int,
+    save: Callable[..., bytes],
+    scenes: SceneStore,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    save("one")
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: Disk(needed_bytes))
+    requirements.check_rendering(job, scenes.header("one"), 64, tmp_path)
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: Disk(needed_bytes - 1))
+    with pytest.raises(StorageFull, match=r"frames of .* take up to .* left"):
+        requirements.check_rendering(job, scenes.header("one"), 64, tmp_path)
+
+
+def test_given_poses_are_assessed_where_that_is_quick(
+    save: Callable[..., bytes], scenes: SceneStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def check(job: RenderJob) -> None:
+        requirements.check_rendering(job, scenes.header(job.scene), 64, tmp_path)
+
+    save("one", confidence=MODEL)
+    save("plain")
+    far = POSES.copy()
+    far[2, 1, 3] = 30.0
+    check(RenderJob("one", poses=POSES, min_confidence=0.5))
+    with pytest.raises(LowConfidence, match=r"poses\[2\] has a confidence of"):
+        check(RenderJob("one", poses=far, min_confidence=0.5))
+    check(RenderJob("one", poses=far, sampler=AroundSampler(5), min_confidence=0.5))
+    with pytest.raises(InvalidArgument, match="needs a scene that knows"):
+        check(RenderJob("plain", poses=POSES, min_confidence=0.5))
+    monkeypatch.setattr(requirements, "ASSESSED_AT_ONCE", 8)
+    check(RenderJob("one", poses=far, min_confidence=0.5))
+
+
+def test_submission_sent_again_after_a_failure_takes_the_scene_of_now(
+    save: Callable[..., bytes], rendering_store: JobStore, artifact_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def away(*arguments: Any) -> None:
+        raise DatabaseUnavailable("away")
+
+    save("one", seed=1)
+    with monkeypatch.context() as context:
+        context.setattr(JobDatabase, "enqueue", away)
+        with pytest.raises(DatabaseUnavailable):
+            rendering_store.submit(RenderJob("one", poses=POSES), request_id="mine")
+    now = save("one", seed=2)
+    job, _ = rendering_store.submit(RenderJob("one", poses=POSES), request_id="mine")
+    assert kept(artifact_folder, job.id) == now
+    rendering_store.close()
+
+
+def test_retry_takes_the_scene_of_the_job_before(
+    save: Callable[..., bytes], rendering_store: JobStore, artifact_folder: Path, tmp_path: Path
+) -> None:
+    then = save("one", seed=1)
+    job, _ = rendering_store.submit(RenderJob("one", poses=POSES))
+    rendering_store.cancel(job.id)
+    save("one", seed=2)
+    successor, _ = rendering_store.retry(job.id)
+    assert kept(artifact_folder, successor.id) == then
+    (tmp_path / "one.ugr").unlink()
+    rendering_store.cancel(successor.id)
+    last, _ = rendering_store.retry(successor.id)
+    assert kept(artifact_folder, last.id) == then
+    rendering_store.close()
+
+
+def test_scene_that_goes_meanwhile_and_a_disk_that_is_full(
+    save: Callable[..., bytes],
+    rendering_store: JobStore,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    save("one")
+
+    def gone(source: Path, target: Path) -> None:
+        source.unlink()
+        raise FileNotFoundError(errno.ENOENT, "gone")
+
+    def full(source: Path, target: Path) -> None:
+        raise OSError(errno.ENOSPC, "full")
+
+    monkeypatch.setattr(requirements, "link_or_copy", full)
+    with pytest.raises(StorageFull, match="no room for the scene"):
+        rendering_store.submit(RenderJob("one", poses=POSES))
+    monkeypatch.setattr(requirements, "link_or_copy", gone)
+    with pytest.raises(SceneNotFound):
+        rendering_store.submit(RenderJob("one", poses=POSES))
+    assert not (tmp_path / "one.ugr").exists()
+    rendering_store.close()

@@ -1,0 +1,119 @@
+"""Old jobs go, a few at a time: those that finished long ago, and folders of which the queue knows no job.
+
+Any number of workers may do this at once. Scenes that jobs made stay, and so does whatever a job that waits or runs
+still needs.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+import shutil
+import threading
+import time
+from collections.abc import Iterator
+from itertools import islice
+from pathlib import Path
+
+import sqlalchemy as sa
+from sqlalchemy.exc import SQLAlchemyError
+
+from ultragray.errors import JobInUse, UltragrayError
+
+from . import database
+from .database import JobDatabase
+from .folder import FOLDER, JobFolder
+from .job import KINDS
+from .removal import DELETED_PREFIX, remove_folder, remove_job, sources_in_use
+
+INTERVAL_S = 3600.0
+STEP_PAUSE_S = 1.0
+AT_ONCE = 20  # jobs of one step
+DAY_S = 86_400.0
+_FINISHED = (*database.SUCCEEDED, *database.FAILED, *database.CANCELLED)
+_JOB_ID = re.compile(r"[0-9a-f]{24}")
+
+_log = logging.getLogger("ultragray.jobs")
+
+
+class Housekeeper:
+    """Removes what is older than `retention_days`, now and then."""
+
+    def __init__(self, jobs: JobDatabase, artifact_folder: Path, retention_days: float) -> None:
+        self._database, self._artifact_folder = jobs, artifact_folder
+        self._retention_s = retention_days * DAY_S
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="housekeeper", daemon=True)
+
+    def start(self) -> None:
+        """Begins at once, in a thread of its own."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Ends soon: after what is being removed."""
+        self._stop.set()
+
+    def keep_house(self) -> int:
+        """One round: how many jobs and folders went. Raises UltragrayError where the database is away."""
+        removed = 0
+        kept: set[str] = set()
+        while not self._stop.is_set() and (old := self._finished_long_ago(kept | set(sources_in_use(self._database)))):
+            for job_id in old:
+                try:
+                    remove_job(self._database, JobFolder(self._artifact_folder, job_id))
+                    removed += 1
+                except (JobInUse, OSError):
+                    kept.add(job_id)
+            self._stop.wait(STEP_PAUSE_S)
+        strays = self._stray_folders()
+        while not self._stop.is_set() and (some := list(islice(strays, AT_ONCE))):
+            for folder in self._without_job(some):
+                remove_folder(folder)
+                removed += 1
+            self._stop.wait(STEP_PAUSE_S)
+        return removed
+
+    def _finished_long_ago(self, kept: set[str]) -> list[str]:
+        rows = self._database.client._sys_db.tables.workflow_status
+        ended_ms = sa.func.coalesce(rows.c.completed_at, rows.c.updated_at)
+        chosen = sa.select(rows.c.workflow_uuid).where(
+            rows.c.name.in_(KINDS),
+            rows.c.status.in_(_FINISHED),
+            ended_ms < int((time.time() - self._retention_s) * 1000),
+            rows.c.workflow_uuid.not_in(kept),
+        )
+        with self._database.engine.begin() as connection:
+            return list(connection.execute(chosen.order_by(ended_ms).limit(AT_ONCE)).scalars())
+
+    def _stray_folders(self) -> Iterator[Path]:
+        """Those that may be without a job: a day old, or as old as jobs get where work was done in them."""
+        folder = self._artifact_folder / FOLDER
+        for path in folder.iterdir() if folder.is_dir() else ():
+            if path.name.startswith(DELETED_PREFIX):
+                shutil.rmtree(path, ignore_errors=True)
+            elif _JOB_ID.fullmatch(path.name):
+                begun = JobFolder(self._artifact_folder, path.name).was_begun()
+                if _age_s(path) > (max(DAY_S, self._retention_s) if begun else DAY_S):
+                    yield path
+
+    def _without_job(self, folders: list[Path]) -> list[Path]:
+        ids = [path.name for path in folders]
+        rows = self._database.client.list_workflows(workflow_ids=ids, load_input=False, load_output=False)
+        known = {row.workflow_id for row in rows}
+        return [path for path in folders if path.name not in known]
+
+    def _run(self) -> None:
+        while not self._stop.is_set():
+            try:
+                if removed := self.keep_house():
+                    _log.info(f"removed {removed} old jobs")
+            except (UltragrayError, SQLAlchemyError, OSError) as error:
+                _log.warning(f"old jobs are kept for now: {str(error).splitlines()[0]}")
+            self._stop.wait(INTERVAL_S)
+
+
+def _age_s(path: Path) -> float:
+    try:
+        return time.time() - path.stat().st_mtime
+    except FileNotFoundError:
+        return 0.0

@@ -1,0 +1,80 @@
+"""Removing a job: its folder and its row. The row goes last: until then nobody can make another job of that id."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import secrets
+import shutil
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from ultragray.errors import JobInUse
+
+from .database import JobDatabase
+from .folder import JobFolder
+from .job import attribute
+
+DELETED_PREFIX = ".deleted-"
+_LOCK_WAIT_S = 2.0  # for the process of a job that was cancelled a moment ago
+_LOCK_POLL_S = 0.05
+
+
+def sources_in_use(jobs: JobDatabase) -> dict[str, str]:
+    """The jobs that others, which wait or run, go on from: each with one of these."""
+    pairs = ((attribute(row, "retry_of"), row.workflow_id) for row in jobs.unfinished())
+    return {source: job_id for source, job_id in pairs if source is not None}
+
+
+def remove_job(jobs: JobDatabase, folder: JobFolder) -> None:
+    """Removes a finished job; the scene that it made stays.
+
+    Raises JobInUse while its process still ends, OSError, and what the database raises: then all is as before.
+    """
+    with contextlib.ExitStack() as stack:
+        if folder.path.is_dir():
+            stack.enter_context(_locked(folder))
+        doomed = _out_of_sight(folder.path)
+        try:
+            jobs.client.delete_workflows([folder.job_id])
+        except Exception:
+            if doomed is not None:
+                doomed.rename(folder.path)
+            raise
+        if doomed is not None:
+            shutil.rmtree(doomed, ignore_errors=True)
+
+
+def remove_folder(path: Path) -> None:
+    """Removes a folder without a job. Raises OSError."""
+    if (doomed := _out_of_sight(path)) is not None:
+        shutil.rmtree(doomed, ignore_errors=True)
+
+
+def _out_of_sight(path: Path) -> Path | None:
+    """Where the folder is now; None where there is none."""
+    doomed = path.with_name(f"{DELETED_PREFIX}{secrets.token_hex(8)}")
+    try:
+        path.rename(doomed)
+    except FileNotFoundError:
+        return None
+    return doomed
+
+
+@contextlib.contextmanager
+def _locked(folder: JobFolder) -> Iterator[None]:
+    end = time.monotonic() + _LOCK_WAIT_S
+    with folder.lock.open("a") as lock:
+        while True:
+            try:
+                fcntl.lockf(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except OSError:
+                if time.monotonic() > end:
+                    raise JobInUse(
+                        f"the process of the job {folder.job_id} is still being stopped: try again in a moment",
+                        field="job",
+                    ) from None
+                time.sleep(_LOCK_POLL_S)
+        yield

@@ -1,0 +1,89 @@
+"""What a render job asks of its scene and of the disk, checked when it is submitted. Free of torch."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+
+from ultragray.confidence import Assessor, require_confidence
+from ultragray.errors import StorageFull
+from ultragray.exports import check_format
+from ultragray.request import LABELS, check_image_size, check_labelled, check_min_confidence
+from ultragray.scene_info import SceneHeader, read_header
+
+from ..dataset_incoming import storage_full
+from ..dataset_store import sync_folder
+from ..scenes import SUFFIX, SceneStore
+from .folder import JobFolder
+from .link import link_or_copy
+from .poses import poses_of
+from .specification import RenderJob
+
+_MB, _GB = 1e6, 1e9
+ASSESSED_AT_ONCE = 250_000  # poses times training poses that submissions wait for: about a fifth of a second
+
+
+def keep_scene(
+    job: RenderJob, folder: JobFolder, scenes: SceneStore, before: JobFolder | None, max_image_side: int
+) -> None:
+    """Puts the scene as it is now into the folder of the job, once the job can be done.
+
+    `before`: the folder of the job that it replaces, whose scene is taken where it is still there. Raises
+    SceneNotFound, SceneFileInvalid, StorageFull and what `check_rendering` raises.
+    """
+    name = f"{job.scene}{SUFFIX}"
+    old = None if before is None else before.path / name
+    if old is not None and old.is_file():
+        scene, header = old, read_header(old)
+    else:
+        scene, header = scenes.path(job.scene), scenes.header(job.scene)
+    with storage_full("the scene of the job"):
+        check_rendering(job, header, max_image_side, folder.artifact_folder)
+        folder.path.mkdir(parents=True, exist_ok=True)
+        sync_folder(folder.path.parent)
+        new = folder.path / f".{name}"
+        try:
+            new.unlink(missing_ok=True)
+            link_or_copy(scene, new)
+        except FileNotFoundError:
+            scenes.path(job.scene)  # says that it is gone
+            raise
+        new.replace(folder.path / name)  # a submission that failed may have left another scene
+        new.unlink(missing_ok=True)  # or the same
+        sync_folder(folder.path)
+
+
+def check_rendering(job: RenderJob, scene: SceneHeader, max_image_side: int, artifact_folder: Path) -> None:
+    """Raises what a job that cannot be done would end with: UnknownOutput, InvalidProbe, InvalidImageSize,
+    InvalidArgument for a sampler without use for the poses or a `min_confidence` that the scene cannot tell,
+    LowConfidence for a given pose below it, unless there are too many to look at each, StorageFull for more pixels than
+    the disk has room for.
+    """
+    check_labelled(job.outputs, scene.info)
+    height, width = scene.info.image_size_or(job.height, job.width)
+    check_image_size(height, width, limit=max_image_side)
+    check_min_confidence(job.min_confidence, scene.info)
+    poses = poses_of(job, scene.training_poses, scene.info.probe_or(None))
+    frames = len(poses)
+    few = frames * len(scene.training_poses) <= ASSESSED_AT_ONCE
+    if job.min_confidence is not None and job.sampler is None and few:
+        require_confidence(Assessor(scene.info, scene.training_poses).assess(poses), job.min_confidence)
+    needed = frames * height * width * _pixel_bytes(job)
+    free = shutil.disk_usage(artifact_folder).free
+    if needed > free:
+        raise StorageFull(
+            f"{frames:,} frames of {height}x{width} take up to {_size(needed)}, the artifact folder has "
+            f"{_size(free)} left",
+            field="poses" if job.sampler is None else "sampler",
+        )
+
+
+def _pixel_bytes(job: RenderJob) -> int:
+    dtype = np.dtype(check_format(job.format, job.outputs, job.dtype))
+    return sum(1 if name == LABELS else dtype.itemsize for name in job.outputs)
+
+
+def _size(size_bytes: int) -> str:
+    return f"{size_bytes / _MB:,.0f} MB" if size_bytes < _GB else f"{size_bytes / _GB:,.1f} GB"
