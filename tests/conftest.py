@@ -18,6 +18,10 @@ from ultragray.probe import FloatArray, stretch_released_far
 from ultragray.request import OUTPUTS
 from ultragray.scene import PARAMETERS
 
+from .postgres import postgres
+
+__all__ = ["postgres"]
+
 if not torch.cuda.is_available():
     os.environ.setdefault("TRITON_INTERPRET", "1")  # before any kernel is imported: they run on the CPU then
 

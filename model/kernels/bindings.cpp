@@ -25,16 +25,16 @@ using ImageBatch = nb::ndarray<const float, nb::ndim<3>, nb::c_contig, nb::devic
 using FreePlanes = nb::ndarray<float, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
 using OptionalPlanes = std::optional<FreePlanes>;
 
-// B, E, T and coverage, each [C, H, W] or null.
-Outputs planes_of(const std::array<OptionalPlanes, 4>& arrays, size_t count, int height, int width) {
-    std::array<float*, 4> planes{};
+// B, E, T, coverage and S, each [C, H, W] or null.
+Outputs planes_of(const std::array<OptionalPlanes, 5>& arrays, size_t count, int height, int width) {
+    std::array<float*, 5> planes{};
     for (size_t k = 0; k < planes.size(); ++k) {
         if (!arrays[k]) continue;
         if (arrays[k]->shape(0) != count || arrays[k]->shape(1) != size_t(height) || arrays[k]->shape(2) != size_t(width))
             throw std::invalid_argument("an output's shape is not [C, height, width]");
         planes[k] = arrays[k]->data();
     }
-    return {planes[0], planes[1], planes[2], planes[3]};
+    return {planes[0], planes[1], planes[2], planes[3], planes[4]};
 }
 
 // The arguments that rendering and recording share.
@@ -82,13 +82,15 @@ NB_MODULE(_cpu, m) {
         "render",
         [](const PreparedScene& scene, bool convex, double width_cm, double opening_rad, double near_cm, double far_cm,
            double cull_far_cm, Poses poses, int height, int width, int threads, const std::string& instruction_set,
-           OptionalPlanes bmode, OptionalPlanes echo, OptionalPlanes transmittance, OptionalPlanes coverage) {
-            const Outputs outputs = planes_of({bmode, echo, transmittance, coverage}, poses.shape(0), height, width);
+           OptionalPlanes bmode, OptionalPlanes echo, OptionalPlanes transmittance, OptionalPlanes coverage,
+           OptionalPlanes weight_sum) {
+            const Outputs outputs =
+                planes_of({bmode, echo, transmittance, coverage, weight_sum}, poses.shape(0), height, width);
             const ProbeGeometry probe{convex, width_cm, opening_rad, near_cm, far_cm, cull_far_cm};
             nb::gil_scoped_release release;
             render(scene, probe, poses.data(), int(poses.shape(0)), height, width, threads, instruction_set, outputs);
         },
-        RENDER_ARGUMENTS);
+        RENDER_ARGUMENTS, nb::arg("weight_sum").noconvert().none() = nb::none());
 
     nb::class_<Recording>(m, "Recording")
         .def(
@@ -97,7 +99,7 @@ NB_MODULE(_cpu, m) {
                double far_cm, double cull_far_cm, Poses poses, int height, int width, int threads,
                const std::string& instruction_set, OptionalPlanes bmode, OptionalPlanes echo, OptionalPlanes transmittance,
                OptionalPlanes coverage) {
-                const Outputs outputs = planes_of({bmode, echo, transmittance, coverage}, poses.shape(0), height, width);
+                const Outputs outputs = planes_of({bmode, echo, transmittance, coverage, {}}, poses.shape(0), height, width);
                 const ProbeGeometry probe{convex, width_cm, opening_rad, near_cm, far_cm, cull_far_cm};
                 nb::gil_scoped_release release;
                 new (self) Recording(scene, probe, poses.data(), int(poses.shape(0)), height, width, threads,
@@ -110,7 +112,7 @@ NB_MODULE(_cpu, m) {
                OptionalPlanes coverage, FreeMatrix means, FreeMatrix scales, FreeMatrix quats, FreeVector transmittances,
                FreeVector sh0, FreeMatrix shn) {
                 const Outputs gradients =
-                    planes_of({bmode, echo, transmittance, coverage}, self.count(), self.height(), self.width());
+                    planes_of({bmode, echo, transmittance, coverage, {}}, self.count(), self.height(), self.width());
                 const size_t n = self.gaussian_count(), rest = self.harmonics() - 1;
                 if (means.size() != 3 * n || scales.size() != 3 * n || quats.size() != 4 * n || transmittances.size() != n ||
                     sh0.size() != n || shn.size() != rest * n)

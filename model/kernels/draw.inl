@@ -239,6 +239,7 @@ void finish(const View& view, const Strip& strip, const FramePointers& frame, co
             put(frame.echo, row, column, echo);
             put(frame.transmittance, row, column, transmittance);
             put(frame.coverage, row, column, coverage);
+            put(frame.weight_sum, row, column, sum);
             if (saved.weight == nullptr) continue;
             const int64_t kept = int64_t(row) * saved.stride + strip.first + column;
             store(saved.weight + kept, sum);

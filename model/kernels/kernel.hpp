@@ -84,9 +84,9 @@ class SliceList {
     int64_t size_ = 0, capacity_ = 0;
 };
 
-// The outputs of one pose, each [H, W] or null where it was not asked for.
+// The outputs of one pose, and S, each [H, W] or null where it was not asked for.
 struct FramePointers {
-    float *bmode, *echo, *transmittance, *coverage;
+    float *bmode, *echo, *transmittance, *coverage, *weight_sum;
 };
 
 // What the backward pass needs of one pose, rows of `stride` floats; null where no gradient is wanted.

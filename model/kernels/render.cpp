@@ -80,7 +80,7 @@ class StripBuffer {
 
 FramePointers frame_of(const Outputs& outputs, int64_t offset) {
     const auto at = [offset](float* plane) { return plane ? plane + offset : nullptr; };
-    return {at(outputs.bmode), at(outputs.echo), at(outputs.transmittance), at(outputs.coverage)};
+    return {at(outputs.bmode), at(outputs.echo), at(outputs.transmittance), at(outputs.coverage), at(outputs.weight_sum)};
 }
 
 // Some poses on their way from Gaussians to pixels.
@@ -209,7 +209,7 @@ void render(const PreparedScene& scene, const ProbeGeometry& probe, const double
     for (int first = 0; first < count; first += kPosesAtOnce) {
         Batch batch(scene, probe, poses + 16 * first, std::min(kPosesAtOnce, count - first), height, width, kernels);
         const FramePointers from = frame_of(outputs, first * frame_size);
-        batch.render({from.bmode, from.echo, from.transmittance, from.coverage}, {}, threads);
+        batch.render({from.bmode, from.echo, from.transmittance, from.coverage, from.weight_sum}, {}, threads);
     }
 }
 

@@ -17,9 +17,9 @@ struct ProbeGeometry {
     double near, far, cull_far;
 };
 
-// Planes of many poses, each [C, H, W] or null.
+// Planes of many poses, each [C, H, W] or null. S, the sum of w, has no gradient.
 struct Outputs {
-    float *bmode, *echo, *transmittance, *coverage;
+    float *bmode, *echo, *transmittance, *coverage, *weight_sum;
 };
 
 // Renders C poses [4, 4] (row-major, cm, probe to scene). The result does not depend on the number of threads.

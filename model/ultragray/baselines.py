@@ -19,7 +19,7 @@ from .datasets.sweep import Dataset, IntArray, Sweep, corner_distances_mm
 from .errors import InvalidArgument
 from .evaluation import Evaluation, evaluate_frames, require_frames
 from .pose import check_poses
-from .probe import ConvexProbe, FloatArray
+from .probe import FloatArray, LinearProbe
 
 FrameArray = npt.NDArray[np.float32]
 BASELINES = (*VOLUME_METHODS, "linear", "nearest")
@@ -100,11 +100,11 @@ def _between(sweep: Sweep, points: FloatArray, frames: IntArray) -> FloatArray: 
 def _sample(sweep: Sweep, frame: int, local: FloatArray) -> tuple[npt.NDArray[np.bool_], FloatArray]:  # [P, 3] mm
     """Which points (probe frame) fall into the image when projected onto y = 0; their bilinear values in [0, 1]."""
     probe, height, width = sweep.probe, sweep.height, sweep.width
-    if isinstance(probe, ConvexProbe):
+    if isinstance(probe, LinearProbe):
+        depth, lateral = local[:, 2], local[:, 0] / probe.width_mm
+    else:
         depth = np.hypot(local[:, 0], local[:, 2])
         lateral = np.arctan2(local[:, 0], local[:, 2]) / math.radians(probe.opening_angle_deg)
-    else:
-        depth, lateral = local[:, 2], local[:, 0] / probe.width_mm
     row = (depth - probe.near_mm) / probe.scan_line_length_mm * height - 0.5
     column = (lateral + 0.5) * width - 0.5
     inside = (np.abs(lateral) <= 0.5) & (depth >= probe.near_mm) & (depth <= probe.far_mm)

@@ -24,7 +24,7 @@ from torch import Tensor
 from .errors import InvalidArgument, InvalidProbe
 from .files import atomic_path
 from .probe import LinearProbe, Probe
-from .released_config import released_centre_mm
+from .released_config import probe_keys, released_centre_mm
 from .released_intensity import fit_released_intensity
 from .scene import GaussianScene
 from .scene_info import Vector
@@ -70,6 +70,8 @@ def export_checkpoint(scene: GaussianScene, checkpoint: str | Path) -> Checkpoin
             beside[POSES_NAME] = _npy(scene.training_poses)
         else:
             notes.append(f"no {POSES_NAME}: the scene has no training poses; poses are relative to its centre, {at}")
+    if scene.labels is not None:
+        notes.append("its labels are left out: the released format has none")
     splats, largest_error = _splats(scene, centre_mm, notes)
     folder = checkpoint.absolute().parent
     _check_not_replaced(folder, beside)
@@ -96,27 +98,16 @@ def _released_view(scene: GaussianScene) -> tuple[Probe, int, int]:
 
 
 def _config(probe: Probe, height: int, width: int, sh_degree: int) -> bytes:
-    """conf.json as the released trainer reads it, in cm and degrees; the last two keys are for our own import."""
-    aperture: tuple[str, float]
-    if isinstance(probe, LinearProbe):
-        aperture = ("ultrasound_opening_width", _to_cm(probe.width_mm))
-    else:
-        aperture = ("ultrasound_opening_angle", probe.opening_angle_deg)
+    """conf.json as the released trainer reads it, in cm and degrees; image sizes are for our own import."""
     document = {
         **{f"{kind}_file_{part}": f"{kind}_{part}.npy" for kind in ("images", "poses") for part in ("train", "val")},
         "result_dir": "results",
-        "ultrasound_near_plane": _to_cm(probe.near_mm),
-        "ultrasound_far_plane": _to_cm(probe.far_mm),
-        aperture[0]: aperture[1],
+        **probe_keys(probe),
         "sh_degree": sh_degree,
         "image_height": height,
         "image_width": width,
     }
     return (json.dumps(document, indent=1, allow_nan=False) + "\n").encode()
-
-
-def _to_cm(length_mm: float) -> float:
-    return round(length_mm / 10.0, 10)
 
 
 def _npy(array: Any) -> bytes:

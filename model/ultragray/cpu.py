@@ -13,8 +13,8 @@ from torch.autograd.function import once_differentiable
 
 from . import _cpu
 from .errors import BackendUnavailable
-from .probe import ConvexProbe, FloatArray, Probe
-from .request import OUTPUTS
+from .probe import FloatArray, LinearProbe, Probe
+from .request import OUTPUTS, WEIGHT_SUM
 from .scene import PARAMETERS, GaussianScene
 
 INSTRUCTION_SETS: tuple[str, ...] = tuple(_cpu.instruction_sets())  # what this processor can run, best first
@@ -52,18 +52,18 @@ def render_outputs(
         return dict(zip(outputs, frames, strict=True))
     planes = _empty_planes(view, outputs)
     prepared = scene.prepared("cpu", lambda: _prepare(scene.splats, scene.info.intensity))
-    _cpu.render(prepared, **view, **_arrays(planes))
+    weight_sum = planes[WEIGHT_SUM].numpy() if WEIGHT_SUM in planes else None
+    _cpu.render(prepared, **view, **_arrays(planes), weight_sum=weight_sum)
     return planes
 
 
 def _view_arguments(
     probe: Probe, poses_cm: FloatArray, height: int, width: int, instruction_set: str
 ) -> dict[str, Any]:
-    convex = isinstance(probe, ConvexProbe)
     return {
-        "convex": convex,
-        "width_cm": 0.0 if isinstance(probe, ConvexProbe) else probe.width_mm / 10.0,
-        "opening_rad": math.radians(probe.opening_angle_deg) if isinstance(probe, ConvexProbe) else 0.0,
+        "convex": not isinstance(probe, LinearProbe),
+        "width_cm": probe.width_mm / 10.0 if isinstance(probe, LinearProbe) else 0.0,
+        "opening_rad": 0.0 if isinstance(probe, LinearProbe) else math.radians(probe.opening_angle_deg),
         "near_cm": probe.near_mm / 10.0,
         "far_cm": probe.far_mm / 10.0,
         "cull_far_cm": probe.cull_far_mm(height) / 10.0,

@@ -2,17 +2,17 @@
 
 binary_little_endian 1.0. Element `vertex`, one a Gaussian, float32 properties named and ordered as in the PLY files of
 the released code, lengths in cm about the scene's centre as in the scene file: x y z, f_dc_0, f_rest_0 … f_rest_(K−2),
-opacity, scale_0 … scale_2 (logarithms), rot_0 … rot_3 (w, x, y, z), and `transmittance` (logit). `opacity` is 1
-throughout, for viewers that ask for it, and is not read. Element `training_pose`, 16 double properties m00 … m33:
-probe→scene, row by row, mm. Comments `ultragray …`, joined, are the metadata of the scene file, JSON in ASCII without
-spaces.
+opacity, scale_0 … scale_2 (logarithms), rot_0 … rot_3 (w, x, y, z), and `transmittance` (logit); then, where the
+Gaussians carry labels, `label` (uchar). `opacity` is 1 throughout, for viewers that ask for it, and not read. Element
+`training_pose`, 16 double properties m00 … m33: probe→scene, row by row, mm. Comments `ultragray …`, joined, are the
+metadata of the scene file, JSON in ASCII without spaces.
 """
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -33,9 +33,10 @@ UNITS = "lengths of vertex are cm about centre_mm, those of training_pose mm"
 POSE_PROPERTIES = tuple(f"m{row}{column}" for row in range(4) for column in range(4))
 
 Records: TypeAlias = npt.NDArray[np.void]
+LABEL = "label"
 
 
-def _vertex_properties(sh_degree: int) -> tuple[str, ...]:
+def _parameter_properties(sh_degree: int) -> tuple[str, ...]:
     rest = (f"f_rest_{k}" for k in range((sh_degree + 1) ** 2 - 1))
     scales, rotation = (f"scale_{axis}" for axis in range(3)), (f"rot_{k}" for k in range(4))
     return ("x", "y", "z", "f_dc_0", *rest, "opacity", *scales, *rotation, "transmittance")
@@ -45,7 +46,7 @@ def write_ply(scene: GaussianScene, path: str | Path) -> None:
     """Writes the scene whole or not at all. Raises OSError where it cannot be written."""
     columns = {name: tensor.detach().to("cpu", torch.float32).numpy() for name, tensor in scene.splats.items()}
     opacity = np.ones((scene.gaussian_count, 1), np.float32)
-    vertices = np.concatenate(
+    parameters = np.concatenate(
         [
             columns["means"],
             columns["sh0"][..., 0],
@@ -57,14 +58,27 @@ def write_ply(scene: GaussianScene, path: str | Path) -> None:
         ],
         axis=1,
     )  # [N, 12 + K]
+    element = _vertex_element(scene.info)
+    vertices = np.empty(element.count, element.dtype)
+    for name, column in zip(_parameter_properties(scene.sh_degree), parameters.T, strict=True):
+        vertices[name] = column
+    if scene.labels is not None:
+        vertices[LABEL] = scene.labels.cpu().numpy()
     poses = scene.training_poses
     with atomic_path(path) as temporary, temporary.open("wb") as file:
-        file.write(_header_text(scene.info, len(poses)).encode("ascii"))
-        file.write(vertices.astype("<f4").tobytes())
+        file.write(_header_text(scene.info, element, len(poses)).encode("ascii"))
+        file.write(vertices.tobytes())
         file.write(poses.astype("<f8").tobytes())
 
 
-def _header_text(info: SceneInfo, pose_count: int) -> str:
+def _vertex_element(info: SceneInfo) -> _Element:
+    properties = dict.fromkeys(_parameter_properties(info.sh_degree), "float")
+    if info.label_names:
+        properties[LABEL] = "uchar"
+    return _Element("vertex", info.gaussian_count, properties)
+
+
+def _header_text(info: SceneInfo, vertex: _Element, pose_count: int) -> str:
     metadata = json.dumps(json.loads(info_to_json(info)), separators=(",", ":"), sort_keys=True)
     metadata = metadata.replace(" ", r"\u0020")  # those left stand in strings; tools trim and squeeze comments
     pieces = [metadata[k : k + COMMENT_CHARACTERS] for k in range(0, len(metadata), COMMENT_CHARACTERS)]
@@ -73,8 +87,8 @@ def _header_text(info: SceneInfo, pose_count: int) -> str:
         "format binary_little_endian 1.0",
         f"comment UltraG-Ray scene: {UNITS}",
         *(f"comment ultragray {piece}" for piece in pieces),
-        f"element vertex {info.gaussian_count}",
-        *(f"property float {name}" for name in _vertex_properties(info.sh_degree)),
+        f"element vertex {vertex.count}",
+        *(f"property {kind} {name}" for name, kind in vertex.properties.items()),
         f"element training_pose {pose_count}",
         *(f"property double {name}" for name in POSE_PROPERTIES),
         "end_header",
@@ -110,16 +124,15 @@ def read_ply(path: str | Path) -> GaussianScene:
 
 @dataclass(frozen=True)
 class _Element:
-    """A table of the file: `count` records of little-endian floats."""
+    """A table of the file: `count` records of little-endian numbers."""
 
     name: str
     count: int
-    properties: tuple[str, ...]
-    type: str  # "<f4" or "<f8"
+    properties: Mapping[str, str]  # the type of each, in order
 
     @property
     def dtype(self) -> np.dtype[np.void]:
-        return np.dtype([(name, self.type) for name in self.properties])
+        return np.dtype([(name, _DTYPES[kind]) for name, kind in self.properties.items()])
 
     @property
     def bytes(self) -> int:
@@ -172,30 +185,30 @@ def _read_header(start: bytes) -> _Header:
     return _Header(info_from_json("".join(metadata)), elements, end.end())
 
 
-_TYPES = {
-    "vertex": ("<f4", ("float", "float32")),
-    "training_pose": ("<f8", ("double", "float64")),
-}
+_DTYPES = {"float": "<f4", "double": "<f8", "uchar": "u1"}
+_OTHER_NAMES = {"float32": "float", "float64": "double", "uint8": "uchar"}
 
 
 def _element(name: str, count: int, properties: Sequence[tuple[str, str]]) -> _Element:
-    if name not in _TYPES:
+    if name not in ("vertex", "training_pose"):
         raise ValueError(f"it has an element {name[:40]!r}, expected vertex and training_pose")
-    dtype, kinds = _TYPES[name]
-    names = tuple(property_name for _, property_name in properties)
-    degree = 0
+    names = [property_name for _, property_name in properties]
     if name == "vertex":
         rest = sum(property_name.startswith("f_rest_") for property_name in names)
         degree = next((d for d in range(MAX_SH_DEGREE + 1) if (d + 1) ** 2 - 1 == rest), 0)
-    expected = _vertex_properties(degree) if name == "vertex" else POSE_PROPERTIES
+        expected = dict.fromkeys(_parameter_properties(degree), "float")
+        if LABEL in names:
+            expected[LABEL] = "uchar"
+    else:
+        expected = dict.fromkeys(POSE_PROPERTIES, "double")
     if sorted(names) != sorted(expected):
         missing, surplus = sorted(set(expected) - set(names)), sorted(set(names) - set(expected))
         what = f"lacks {', '.join(missing)}" if missing else f"has {', '.join(surplus)[:80] or 'a property twice'}"
         raise ValueError(f"its {name} {what}, expected {' '.join(expected)}")
     for kind, property_name in properties:
-        if kind not in kinds:
-            raise ValueError(f"its {name} property {property_name} is {kind[:40]}, expected {kinds[0]}")
-    return _Element(name, count, names, dtype)
+        if _OTHER_NAMES.get(kind, kind) != expected[property_name]:
+            raise ValueError(f"its {name} property {property_name} is {kind[:40]}, expected {expected[property_name]}")
+    return _Element(name, count, {property_name: expected[property_name] for property_name in names})
 
 
 def _scene(info: SceneInfo, vertices: Records, poses: Records | None) -> GaussianScene:
@@ -217,4 +230,7 @@ def _scene(info: SceneInfo, vertices: Records, poses: Records | None) -> Gaussia
     training_poses: FloatArray | None = None
     if poses is not None:
         training_poses = np.stack([poses[name] for name in POSE_PROPERTIES], axis=-1).reshape(-1, 4, 4)
-    return GaussianScene.from_splats(splats, info=info, training_poses=training_poses)
+    labels = None
+    if LABEL in (vertices.dtype.names or ()):
+        labels = torch.from_numpy(vertices[LABEL].copy())
+    return GaussianScene.from_splats(splats, info=info, training_poses=training_poses, labels=labels)

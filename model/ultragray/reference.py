@@ -14,7 +14,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from .probe import ConvexProbe, FloatArray, Probe
+from .probe import FloatArray, LinearProbe, Probe
+from .request import WEIGHT_SUM
 from .scene import GaussianScene
 
 MIN_WEIGHT = 1.0 / 255.0  # the skip rule: a Gaussian is skipped where both w and α are below this
@@ -48,7 +49,7 @@ def render_outputs(
 
 
 def combine(fields: Fields) -> dict[str, Tensor]:
-    """B = E·T, E = γ·ΣI·w/(S + 1e-8), T, and γ = 1 − exp(−S)."""
+    """B = E·T, E = γ·ΣI·w/(S + 1e-8), T, γ = 1 − exp(−S), and S."""
     coverage = -torch.expm1(-fields.weight_sum)
     echo = coverage * fields.weighted_intensity / (fields.weight_sum + 1e-8)
     return {
@@ -56,6 +57,7 @@ def combine(fields: Fields) -> dict[str, Tensor]:
         "echo": echo,
         "transmittance": fields.transmittance,
         "coverage": coverage,
+        WEIGHT_SUM: fields.weight_sum,
     }
 
 
@@ -94,10 +96,10 @@ def _render_pose(scene: GaussianScene, probe: Probe, pose: Tensor, height: int, 
 def _inside_planes(probe: Probe, means: Tensor, height: int) -> Tensor:  # [N, 3] -> [N] bool
     """The depth cull: the mean lies between the face and the top edge of the last row."""
     near, far = probe.near_mm / 10.0, probe.cull_far_mm(height) / 10.0
-    if isinstance(probe, ConvexProbe):
-        depth = torch.hypot(means[:, 0], means[:, 2])
-        return (means[:, 2] > 0) & (depth >= near) & (depth <= far)
-    return (means[:, 2] >= near) & (means[:, 2] <= far)
+    if isinstance(probe, LinearProbe):
+        return (means[:, 2] >= near) & (means[:, 2] <= far)
+    depth = torch.hypot(means[:, 0], means[:, 2])
+    return (means[:, 2] > 0) & (depth >= near) & (depth <= far)
 
 
 def _inverse_root_covariance(scene: GaussianScene, rotation: Tensor) -> Tensor:  # [N, 3, 3]

@@ -1,7 +1,8 @@
 """conf.json of the released trainer: planes and width in centimetres, angle in degrees.
 
-Keys that start with `_` are comments; keys that an import does not need are ignored. `image_height` and `image_width`
-are keys of ours, which the released code ignores: an exported checkpoint comes without its training images.
+Keys that start with `_` are comments; keys that an import does not need are ignored. Three keys are ours, and the
+released code ignores them: `image_height` and `image_width`, since an exported checkpoint comes without its training
+images, and `probe_kind`, "phased" for a fan that begins at the face.
 """
 
 from __future__ import annotations
@@ -17,9 +18,10 @@ import numpy as np
 from .datasets.images import frame_size
 from .errors import CheckpointInvalid, InvalidProbe
 from .npy_file import map_npy
-from .probe import ConvexProbe, FloatArray, LinearProbe, Probe, stretch_released_far
+from .probe import ConvexProbe, FloatArray, LinearProbe, PhasedProbe, Probe, stretch_released_far
 
 MAX_CONFIG_BYTES = 1 << 20
+KIND_KEY = "probe_kind"
 FILE_KEYS = ("images_file_train", "poses_file_train", "images_file_val", "poses_file_val")
 
 
@@ -42,6 +44,7 @@ class ReleasedConfig:
     far_mm: float  # as released: on the grid (i+½)/(H−1)
     width_mm: float | None
     opening_angle_deg: float | None
+    phased: bool
     dataset_name: str | None
     files: Mapping[str, str]  # those of FILE_KEYS that it has, as written
     images: TrainingImages | None
@@ -69,9 +72,23 @@ class ReleasedConfig:
         try:
             if self.width_mm is not None:
                 return LinearProbe(self.width_mm, self.near_mm, far_mm)
+            if self.phased:
+                return PhasedProbe(opening_angle_deg=self.opening_angle_deg or 0.0, far_mm=far_mm)
             return ConvexProbe(opening_angle_deg=self.opening_angle_deg or 0.0, near_mm=self.near_mm, far_mm=far_mm)
         except InvalidProbe as error:
             raise CheckpointInvalid(f"{self.path}: {error}") from error
+
+
+def probe_keys(released_probe: Probe) -> dict[str, float | str]:
+    """What conf.json says of a probe with its planes as released."""
+    keys: dict[str, float | str] = {
+        "ultrasound_near_plane": _to_cm(released_probe.near_mm),
+        "ultrasound_far_plane": _to_cm(released_probe.far_mm),
+    }
+    if isinstance(released_probe, LinearProbe):
+        return keys | {"ultrasound_opening_width": _to_cm(released_probe.width_mm)}
+    keys["ultrasound_opening_angle"] = released_probe.opening_angle_deg
+    return keys | {KIND_KEY: released_probe.kind} if isinstance(released_probe, PhasedProbe) else keys
 
 
 def released_centre_mm(released_probe: Probe, poses: FloatArray) -> FloatArray:  # [P, 4, 4] mm -> [3]
@@ -92,14 +109,22 @@ def read_released_config(path: str | Path) -> ReleasedConfig:
             f"{path}: it must have exactly one of ultrasound_opening_width (linear, cm) and "
             f"ultrasound_opening_angle (convex, degrees), got {'neither' if width_cm is None else 'both'}"
         )
+    near_mm = _to_mm(_number(path, document, "ultrasound_near_plane"))
+    phased = document.get(KIND_KEY) == PhasedProbe.kind
+    if phased and (angle_deg is None or near_mm != 0.0):
+        raise CheckpointInvalid(
+            f"{path}: a phased probe has ultrasound_opening_angle and ultrasound_near_plane 0, got "
+            f"{'no angle' if angle_deg is None else f'near plane {near_mm / 10.0:g}'}"
+        )
     files = _named_files(path, document)
     images, images_missing = _find_images(path, files)
     config = ReleasedConfig(
         path=path,
-        near_mm=_to_mm(_number(path, document, "ultrasound_near_plane")),
+        near_mm=near_mm,
         far_mm=_to_mm(_number(path, document, "ultrasound_far_plane")),
         width_mm=None if width_cm is None else _to_mm(width_cm),
         opening_angle_deg=angle_deg,
+        phased=phased,
         dataset_name=_dataset_name(path, files),
         files=files,
         images=images,
@@ -208,3 +233,7 @@ def _shape(path: Path) -> TrainingImages:
 
 def _to_mm(length_cm: float) -> float:
     return round(10.0 * length_cm, 9)  # 3.79269 cm is 37.9269 mm, not 37.926899999999996
+
+
+def _to_cm(length_mm: float) -> float:
+    return round(length_mm / 10.0, 10)

@@ -10,9 +10,10 @@ from torch import Tensor
 
 from . import __version__, cpu, cuda, reference
 from .errors import BackendUnavailable
+from .labels import render_labels
 from .pose import check_poses
 from .probe import FloatArray, Probe
-from .request import OUTPUTS, check_image_size, check_outputs
+from .request import LABELS, OUTPUTS, WEIGHT_SUM, check_image_size, check_labelled, check_outputs
 from .scene import GaussianScene
 
 Backend = Callable[[GaussianScene, Probe, FloatArray, int, int, Sequence[str]], dict[str, Tensor]]
@@ -20,15 +21,17 @@ Backend = Callable[[GaussianScene, Probe, FloatArray, int, int, Sequence[str]], 
 
 @dataclass(frozen=True)
 class Frames:
-    """Rendered frames, each [C, H, W] in [0, 1] or None where it was not asked for.
+    """Rendered frames, each [C, H, W] or None where it was not asked for.
 
-    bmode B = E·T, echo E, transmittance T, coverage γ = 1 − exp(−S) (docs/physics.md §3).
+    In [0, 1]: bmode B = E·T, echo E, transmittance T, coverage γ = 1 − exp(−S) (docs/physics.md §3). uint8: labels, of
+    which `scene.info.label_names` tells the meaning; 0 where there is none.
     """
 
     bmode: Tensor | None = None
     echo: Tensor | None = None
     transmittance: Tensor | None = None
     coverage: Tensor | None = None
+    labels: Tensor | None = None
 
 
 def render(
@@ -47,17 +50,26 @@ def render(
     Backends: `reference` computes in the dtype of the scene's tensors, where they are; `cpu` in float32 on as many
     threads as torch.get_num_threads(); `cuda` in float32 on the GPU that holds the scene (`scene.to("cuda")`). `auto`
     takes the fast one for where the scene is. All are differentiable with respect to the scene's tensors (`cpu` and
-    `cuda` once); the gradients are the true ones (docs/physics.md §4).
-    Raises InvalidPose, InvalidProbe, InvalidImageSize, UnknownOutput, BackendUnavailable, and MemoryExceeded where the
-    GPU's memory does not suffice.
+    `cuda` once), labels apart; the gradients are the true ones (docs/physics.md §4).
+    Raises InvalidPose, InvalidProbe, InvalidImageSize, UnknownOutput (also for labels of a scene that carries none),
+    BackendUnavailable, and MemoryExceeded where the GPU's memory does not suffice.
     """
     chosen = check_outputs(outputs)
+    check_labelled(chosen, scene.info)
     check_image_size(height, width)
     height, width = int(height), int(width)
     probe = scene.info.probe_or(probe)
     poses_cm = scene.poses_to_scene_cm(check_poses(poses))
-    backend = choose_backend(backend, scene)
-    return Frames(**_BACKENDS[backend](scene, probe, poses_cm, height, width, chosen))
+    draw = _BACKENDS[choose_backend(backend, scene)]
+    names = [name for name in chosen if name != LABELS]
+    frames = draw(scene, probe, poses_cm, height, width, names) if names else {}
+    if LABELS in chosen:
+        frames[LABELS] = render_labels(
+            scene,
+            (len(poses_cm), height, width),
+            lambda part: draw(part, probe, poses_cm, height, width, (WEIGHT_SUM,))[WEIGHT_SUM],
+        )
+    return Frames(**frames)
 
 
 _BACKENDS: dict[str, Backend] = {

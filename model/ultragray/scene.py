@@ -7,7 +7,7 @@ mm in the frame of the training sweep: p_cm = (p_mm − centre_mm) / 10.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -22,6 +22,7 @@ from .files import atomic_path
 from .pose import check_poses
 from .probe import FloatArray
 from .scene_info import (
+    LABELS_TENSOR,
     METADATA_KEY,
     SceneInfo,
     expected_shapes,
@@ -51,7 +52,8 @@ class _Kept(NamedTuple):
 class GaussianScene:
     """Raw parameters (docs/physics.md §2), as a released checkpoint's `splats` holds them, and the scene's description.
 
-    The tensors share one floating dtype and one device. `GaussianScene.from_splats` checks them; use that.
+    The parameters share one floating dtype and one device. Where the Gaussians carry labels, `info.label_names` says
+    what they mean; 0 is no label. `GaussianScene.from_splats` checks them; use that.
     """
 
     means: Tensor  # [N, 3] cm
@@ -62,6 +64,7 @@ class GaussianScene:
     shN: Tensor  # [N, K-1, 1]  # noqa: N815 (the released name)
     info: SceneInfo = field(default_factory=SceneInfo)
     training_poses: FloatArray = field(default_factory=lambda: np.zeros((0, 4, 4)))  # [P, 4, 4] mm
+    labels: Tensor | None = None  # [N] uint8
     _prepared: dict[str, _Kept] = field(default_factory=dict, init=False, repr=False)
 
     @classmethod
@@ -71,9 +74,11 @@ class GaussianScene:
         *,
         info: SceneInfo | None = None,
         training_poses: Any = None,  # [P, 4, 4] mm
+        labels: Tensor | None = None,  # [N] uint8
     ) -> GaussianScene:
         """A scene of raw released parameters, lengths in cm; the graph of the tensors is kept.
 
+        Labels that `info.label_names` does not name are called after their number.
         Raises InvalidArgument, naming the tensor, for a missing key, a wrong shape, mixed dtypes or devices, or
         values that are not finite.
         """
@@ -119,7 +124,8 @@ class GaussianScene:
             raise InvalidArgument("splats['quats'] must not be zero", field="quats")
         poses = np.zeros((0, 4, 4)) if training_poses is None else check_poses(training_poses, field="training_poses")
         summary = with_summary(info or SceneInfo(), means.detach().cpu().double().numpy(), degree)
-        return cls(**tensors, info=summary, training_poses=poses)
+        names = _names_of_labels(labels, means, summary.label_names)
+        return cls(**tensors, info=replace(summary, label_names=names), training_poses=poses, labels=labels)
 
     @property
     def gaussian_count(self) -> int:
@@ -137,14 +143,15 @@ class GaussianScene:
     def to(self, target: torch.dtype | torch.device | str) -> GaussianScene:
         """The same scene with its tensors in another dtype or on another device."""
         moved: dict[str, Any] = {name: tensor.to(target) for name, tensor in self.splats.items()}
-        return GaussianScene(**moved, info=self.info, training_poses=self.training_poses)
+        labels = None if self.labels is None else self.labels.to(moved["means"].device)
+        return GaussianScene(**moved, info=self.info, training_poses=self.training_poses, labels=labels)
 
     def prepared(self, name: str, make: Callable[[], Prepared]) -> Prepared:
         """What a backend makes of the scene, kept under its name until one of the tensors, or the activation, changes.
 
         A change that torch does not count (through `.data`) is not noticed.
         """
-        tensors = tuple(self.splats.values())
+        tensors = (*self.splats.values(), *(() if self.labels is None else (self.labels,)))
         if any(tensor.is_inference() for tensor in tensors):  # their changes are not counted
             return make()
         versions = tuple(tensor._version for tensor in tensors)
@@ -169,6 +176,8 @@ class GaussianScene:
     def to_bytes(self) -> bytes:
         """The scene file: deterministic, so that its SHA-256 names the scene."""
         tensors = {name: t.detach().to("cpu", torch.float32).contiguous() for name, t in self.splats.items()}
+        if self.labels is not None:
+            tensors[LABELS_TENSOR] = self.labels.cpu().contiguous()
         tensors["training_poses"] = torch.from_numpy(np.ascontiguousarray(self.training_poses))
         return save(tensors, metadata={METADATA_KEY: info_to_json(self.info)})
 
@@ -185,7 +194,27 @@ class GaussianScene:
         try:
             with safe_open(path, framework="pt") as bundle:
                 splats = {name: bundle.get_tensor(name) for name in PARAMETERS}
-            scene = cls.from_splats(splats, info=header.info, training_poses=header.training_poses)
+                labels = bundle.get_tensor(LABELS_TENSOR) if header.info.label_names else None
+            scene = cls.from_splats(splats, info=header.info, training_poses=header.training_poses, labels=labels)
         except (OSError, SafetensorError, ValueError) as error:
             raise scene_file_invalid(path, error) from error
         return scene
+
+
+def _names_of_labels(labels: Any, means: Tensor, known: Mapping[int, str]) -> dict[int, str]:
+    """A name for each label that occurs, and those known besides. Raises InvalidArgument."""
+    if labels is None:
+        if known:
+            raise InvalidArgument(
+                f"labels must be given where info.label_names names some: {', '.join(known.values())}", field="labels"
+            )
+        return {}
+    if not isinstance(labels, Tensor) or labels.dtype != torch.uint8 or labels.shape != means.shape[:1]:
+        got = f"{labels.dtype} {list(labels.shape)}" if isinstance(labels, Tensor) else type(labels).__name__
+        raise InvalidArgument(f"labels must be a uint8 tensor [{len(means)}], got {got}", field="labels")
+    if labels.device != means.device:
+        raise InvalidArgument(f"labels must be on {means.device} like means, got {labels.device}", field="labels")
+    found = {int(label): f"label {label}" for label in torch.unique(labels).tolist() if label > 0} | dict(known)
+    if not found:
+        raise InvalidArgument("labels must hold one above 0, or info.label_names name one", field="labels")
+    return found

@@ -1,8 +1,8 @@
 """What a scene file says about itself, readable without torch: the header of the safetensors bundle.
 
 The file is one safetensors bundle. Tensors: means [N, 3] cm, scales [N, 3] log cm, quats [N, 4] wxyz, transmittances
-[N] logit, sh0 [N, 1, 1], shN [N, K−1, 1], all float32, and training_poses [P, 4, 4] float64 mm. Its metadata holds one
-entry, `ultragray`, a JSON object with the fields of SceneInfo.
+[N] logit, sh0 [N, 1, 1], shN [N, K−1, 1], all float32, training_poses [P, 4, 4] float64 mm, and, where the Gaussians
+carry labels, labels [N] uint8. Its metadata holds one entry, `ultragray`, a JSON object with the fields of SceneInfo.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from safetensors import SafetensorError, safe_open
 
+from .confidence.assess import read_model
 from .errors import InvalidArgument, InvalidProbe, SceneFileInvalid
 from .pose import check_poses
 from .probe import FloatArray, Probe, probe_from_dict, probe_to_dict
@@ -25,6 +26,8 @@ METADATA_KEY = "ultragray"
 INTENSITIES = ("released", "sigmoid")
 MAX_SH_DEGREE = 3
 DEFAULT_IMAGE_SIDE = 512
+MAX_LABEL = 255
+LABELS_TENSOR = "labels"
 
 Vector = tuple[float, float, float]
 
@@ -46,6 +49,8 @@ class SceneInfo:
     dataset_sha256: str | None = None
     metrics: dict[str, float] = field(default_factory=dict)
     training: dict[str, Any] = field(default_factory=dict)  # the configuration the scene was made with
+    confidence: dict[str, Any] = field(default_factory=dict)  # of ultragray.confidence.ConfidenceModel; empty: none
+    label_names: dict[int, str] = field(default_factory=dict)  # by label, 1 to 255; empty: the scene carries none
 
     def __post_init__(self) -> None:
         for name in ("centre_mm", "bounds_min_mm", "bounds_max_mm"):
@@ -59,9 +64,10 @@ class SceneInfo:
             value = getattr(self, name)
             if value is not None and (not isinstance(value, int) or isinstance(value, bool) or value < 1):
                 raise InvalidArgument(f"{name} must be a positive integer, got {value!r}", field=name)
-        for name in ("metrics", "training"):
+        for name in ("metrics", "training", "confidence"):
             if not isinstance(getattr(self, name), dict):
                 raise InvalidArgument(f"{name} must be an object, got {getattr(self, name)!r}", field=name)
+        object.__setattr__(self, "label_names", _label_names(self.label_names))
 
     def probe_or(self, asked: Probe | None) -> Probe:
         """The probe asked for, else the one the scene was trained with. Raises InvalidProbe where neither is known."""
@@ -90,6 +96,19 @@ def _vector(name: str, value: Any) -> Vector:
     return (x, y, z)
 
 
+def _label_names(names: Any) -> dict[int, str]:
+    """With numbers for keys, which JSON writes as text, in their order."""
+    try:
+        found = {int(label): name for label, name in names.items()}
+    except (AttributeError, TypeError, ValueError):
+        found = {0: ""}
+    if not all(1 <= label <= MAX_LABEL and isinstance(name, str) and name for label, name in found.items()):
+        raise InvalidArgument(
+            f"label_names must give labels from 1 to {MAX_LABEL} a name each, got {names!r}", field="label_names"
+        )
+    return dict(sorted(found.items()))
+
+
 def info_to_json(info: SceneInfo) -> str:
     """The metadata entry of a scene file."""
     document = {
@@ -97,6 +116,8 @@ def info_to_json(info: SceneInfo) -> str:
         **asdict(info),
         "probe": None if info.probe is None else probe_to_dict(info.probe),
     }
+    if not info.label_names:
+        del document["label_names"]  # a scene without labels keeps its bytes, and its hash
     return json.dumps(document, allow_nan=False, sort_keys=True)
 
 
@@ -152,6 +173,7 @@ def read_header(path: str | Path) -> SceneHeader:
             info = info_from_json(metadata[METADATA_KEY])
             _check_tensors(bundle, info)
             poses = check_poses(bundle.get_tensor("training_poses"), field="training_poses")
+            read_model(info.confidence, len(poses))
     except (OSError, SafetensorError, ValueError, TypeError, RecursionError) as error:
         raise scene_file_invalid(path, error) from error
     return SceneHeader(info=info, training_poses=poses, file_bytes=size)
@@ -162,13 +184,15 @@ def _check_tensors(bundle: Any, info: SceneInfo) -> None:
     if not isinstance(info.sh_degree, int) or not 0 <= info.sh_degree <= MAX_SH_DEGREE:
         raise ValueError(f"its sh_degree is {info.sh_degree!r}, expected 0 to {MAX_SH_DEGREE}")
     shapes = expected_shapes(info.gaussian_count, info.sh_degree)
+    if info.label_names:
+        shapes[LABELS_TENSOR] = (info.gaussian_count,)
     if names != {*shapes, "training_poses"}:
         raise ValueError(f"its tensors are {sorted(names)}, expected {sorted([*shapes, 'training_poses'])}")
     for name, shape in shapes.items():
-        part = bundle.get_slice(name)
-        if tuple(part.get_shape()) != shape or part.get_dtype() != "F32":
+        part, dtype = bundle.get_slice(name), "U8" if name == LABELS_TENSOR else "F32"
+        if tuple(part.get_shape()) != shape or part.get_dtype() != dtype:
             raise ValueError(
-                f"its tensor {name} is {part.get_dtype()} {list(part.get_shape())}, expected F32 {list(shape)}"
+                f"its tensor {name} is {part.get_dtype()} {list(part.get_shape())}, expected {dtype} {list(shape)}"
             )
     if bundle.get_slice("training_poses").get_dtype() != "F64":
         raise ValueError("its tensor training_poses is not F64")

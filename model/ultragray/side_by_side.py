@@ -14,7 +14,7 @@ from .datasets.sweep import Sweep
 from .evaluation import render_sweep
 from .files import atomic_path
 from .metrics import FrameMetrics
-from .probe import ConvexProbe
+from .probe import LinearProbe
 from .scene import GaussianScene
 
 ByteImage = npt.NDArray[np.uint8]
@@ -30,8 +30,8 @@ def write_side_by_side(
 ) -> list[Path]:
     """Writes one PNG per frame into `folder`, which is made, and returns their paths.
 
-    Panels from left to right: truth, rendering, |difference| x 3, echo, transmittance, with square pixels; frames of a
-    convex probe are drawn as fans. `metrics` (of the same frames) is written below.
+    Panels from left to right: truth, rendering, |difference| x 3, echo, transmittance, with square pixels; frames of
+    convex and phased probes are drawn as fans. `metrics` (of the same frames) is written below.
     """
     panels = side_by_side_panels(scene, sweep, backend=backend)
     folder = Path(folder)
@@ -65,17 +65,16 @@ def side_by_side_panels(
 
 
 def as_picture(frame: npt.NDArray[np.float32], sweep: Sweep, max_side: int = MAX_SIDE_PIXELS) -> ByteImage:
-    """A frame [H, W] in [0, 1] as the eye expects it: square pixels, a fan of a convex probe, `max_side` at most."""
-    if isinstance(sweep.probe, ConvexProbe):
-        half = math.radians(sweep.probe.opening_angle_deg) / 2
-        across_mm = 2.0 * sweep.probe.far_mm * (1.0 if half >= math.pi / 2 else math.sin(half))
-        drawn = sweep.probe.scan_convert(frame, max(across_mm, sweep.probe.scan_line_length_mm) / max_side)
-    else:
+    """A frame [H, W] in [0, 1] as the eye expects it: square pixels, a fan as one, `max_side` at most."""
+    if isinstance(sweep.probe, LinearProbe):
         axial_mm, lateral_mm = sweep.pixel_mm
         height_mm, width_mm = axial_mm * sweep.height, lateral_mm * sweep.width
         scale = max_side / max(height_mm, width_mm)
         size = (max(1, round(width_mm * scale)), max(1, round(height_mm * scale)))
         drawn = cv2.resize(frame, size, interpolation=cv2.INTER_LINEAR).astype(np.float32)
+    else:
+        across_mm = 2.0 * sweep.probe.far_mm * math.sin(math.radians(sweep.probe.opening_angle_deg) / 2)
+        drawn = sweep.probe.scan_convert(frame, max(across_mm, sweep.probe.scan_line_length_mm) / max_side)
     picture: ByteImage = np.rint(np.clip(drawn, 0.0, 1.0) * 255.0).astype(np.uint8)
     return picture
 

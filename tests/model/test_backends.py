@@ -11,13 +11,14 @@ import numpy as np
 import pytest
 import torch
 
-from ultragray import ConvexProbe, Frames, GaussianScene, LinearProbe, Probe, cpu, render
+from ultragray import ConvexProbe, Frames, GaussianScene, LinearProbe, PhasedProbe, Probe, cpu, render
 from ultragray.errors import BackendUnavailable
 from ultragray.request import OUTPUTS
 
 RENDERERS = ("reference", "cuda", "cpu", *(f"cpu-{name}" for name in cpu.INSTRUCTION_SETS))
 LINEAR = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)
 CONVEX = ConvexProbe(opening_angle_deg=60.0, near_mm=10.0, far_mm=60.0)
+PHASED = PhasedProbe(opening_angle_deg=90.0, far_mm=60.0)
 
 Renderer = Callable[..., Frames]
 
@@ -56,6 +57,8 @@ CASES = {
     "convex": Case(probe=CONVEX),
     "wide_fan": Case(probe=ConvexProbe(opening_angle_deg=150.0, near_mm=5.0, far_mm=50.0)),
     "face_beyond_apex_zero": Case(probe=ConvexProbe(opening_angle_deg=45.0, near_mm=0.0, far_mm=50.0)),
+    "phased": Case(probe=PHASED),
+    "phased_at_the_face": Case({"centre_cm": (0, 0, 0.3), "extent_cm": (1, 0.4, 0.8)}, probe=PHASED),
     "near_plane_inside": Case(probe=LinearProbe(width_mm=30.0, near_mm=15.0, far_mm=35.0)),
     "at_the_face": Case({"centre_cm": (0, 0, 0.02), "extent_cm": (3, 0.2, 0.3), "sigma_cm": (0.02, 0.3)}, tilt_deg=3.0),
     "large": Case({"count": 40, "sigma_cm": (1.0, 3.0)}),
@@ -123,7 +126,7 @@ def planes(frames: Frames) -> np.ndarray:  # [4, C, H, W]
     return np.stack([getattr(frames, name).cpu().numpy() for name in OUTPUTS])
 
 
-@pytest.mark.parametrize("probe", [LINEAR, CONVEX], ids=["linear", "convex"])
+@pytest.mark.parametrize("probe", [LINEAR, CONVEX, PHASED], ids=["linear", "convex", "phased"])
 def test_an_empty_scene_is_black_and_lets_everything_through(renderer: Renderer, probe: Probe) -> None:
     splats = {name: torch.zeros(0, n) for name, n in (("means", 3), ("scales", 3), ("quats", 4))}
     scene = GaussianScene.from_splats(
@@ -260,6 +263,10 @@ def test_extreme_parameters_stay_exact(
         (LinearProbe(40, 10, 50), 4.601, False),
         (ConvexProbe(opening_angle_deg=60, near_mm=10, far_mm=50), 4.599, True),
         (ConvexProbe(opening_angle_deg=60, near_mm=10, far_mm=50), 4.601, False),
+        (PhasedProbe(opening_angle_deg=60, far_mm=50), 0.001, True),
+        (PhasedProbe(opening_angle_deg=60, far_mm=50), -0.001, False),
+        (PhasedProbe(opening_angle_deg=60, far_mm=50), 4.499, True),
+        (PhasedProbe(opening_angle_deg=60, far_mm=50), 4.501, False),
     ],
 )
 def test_the_depth_cull_is_by_the_mean(renderer: Renderer, probe: Probe, depth_cm: float, visible: bool) -> None:
@@ -274,6 +281,16 @@ def test_the_depth_cull_is_by_the_mean(renderer: Renderer, probe: Probe, depth_c
     )
     coverage = planes(renderer(scene, probe, np.eye(4)[None], height=10, width=11))[3]
     assert coverage.any() == visible
+
+
+def test_a_phased_probe_sees_what_a_convex_one_without_a_radius_sees(
+    renderer: Renderer, random_scene: Callable[..., GaussianScene], random_poses: Callable[..., Any]
+) -> None:
+    convex = ConvexProbe(opening_angle_deg=90.0, near_mm=0.0, far_mm=60.0)
+    phased_frames, convex_frames = (
+        planes(renderer(random_scene(120), probe, random_poses(3), height=33, width=41)) for probe in (PHASED, convex)
+    )
+    np.testing.assert_array_equal(phased_frames, convex_frames)
 
 
 def test_auto_keeps_the_dtype_and_the_gradient(random_scene: Callable[..., GaussianScene]) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ultragray import ConvexProbe, LinearProbe, Probe
+from ultragray import ConvexProbe, LinearProbe, PhasedProbe, Probe
 from ultragray.baselines import (
     BASELINES,
     evaluate_baselines,
@@ -23,6 +23,7 @@ from ultragray.probe import FloatArray
 
 LINEAR = LinearProbe(width_mm=8.0, near_mm=0.0, far_mm=10.0)
 CONVEX = ConvexProbe(opening_angle_deg=60.0, near_mm=8.0, far_mm=20.0)
+PHASED = PhasedProbe(opening_angle_deg=80.0, far_mm=20.0)
 
 
 def at(*elevations_mm: float, tilt_deg: float = 0.0) -> FloatArray:
@@ -40,7 +41,7 @@ def sweep_of(poses: FloatArray, probe: Probe = LINEAR, *, height: int = 20, widt
     return Sweep(images, poses, probe, np.arange(len(poses)), "made")
 
 
-@pytest.mark.parametrize("probe", [LINEAR, CONVEX], ids=["linear", "convex"])
+@pytest.mark.parametrize("probe", [LINEAR, CONVEX, PHASED], ids=["linear", "convex", "phased"])
 def test_between_two_planes_the_distance_decides(probe: Probe) -> None:
     sweep = sweep_of(at(0.0, 1.0, 4.0), probe)
     images = sweep.images / 255.0

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from ultragray import ConvexProbe, GaussianScene, LinearProbe, Probe, SceneInfo, render
+from ultragray import ConvexProbe, GaussianScene, LinearProbe, PhasedProbe, Probe, SceneInfo, render
 from ultragray.checkpoint import import_checkpoint
 from ultragray.checkpoint_export import export_checkpoint
 from ultragray.errors import InvalidArgument
@@ -21,6 +21,7 @@ from ultragray.scene import PARAMETERS
 
 LINEAR = LinearProbe(width_mm=30.0, near_mm=5.0, far_mm=46.0)
 CONVEX = ConvexProbe(opening_angle_deg=60.0, near_mm=10.0, far_mm=50.0)
+PHASED = PhasedProbe(opening_angle_deg=80.0, far_mm=50.0)
 HEIGHT, WIDTH = 18, 14
 
 SceneMaker = Callable[..., GaussianScene]
@@ -94,7 +95,7 @@ def test_the_golden_checkpoint_goes_through_us_unchanged(
     assert float((before - after).abs().max()) <= 1e-6
 
 
-@pytest.mark.parametrize("probe", [LINEAR, CONVEX], ids=["linear", "convex"])
+@pytest.mark.parametrize("probe", [LINEAR, CONVEX, PHASED], ids=["linear", "convex", "phased"])
 @pytest.mark.parametrize("sh_degree", [0, 1, 3])
 def test_the_same_poses_show_the_same(tmp_path: Path, make_scene: SceneMaker, probe: Probe, sh_degree: int) -> None:
     scene = make_scene(probe, sh_degree=sh_degree)

@@ -13,10 +13,12 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 import pytest
+import torch
 
 from ultragray import GaussianScene, LinearProbe, read_header, render
+from ultragray.compounding import pixel_positions_mm
 from ultragray.datasets import Dataset, Sweep
-from ultragray.datasets.phantom import load_phantom, simulate, sweeps
+from ultragray.datasets.phantom import Tissue, load_phantom, simulate, sweeps, tissue_at
 from ultragray.datasets.phantom.shadow import BoneShadow
 from ultragray.demo import (
     DEMO_FILE,
@@ -42,6 +44,15 @@ Image = npt.NDArray[np.float32]
 @pytest.fixture(scope="module")
 def scene() -> GaussianScene:
     return load_demo_scene()
+
+
+@pytest.fixture(scope="module")
+def truth() -> dict[str, npt.NDArray[np.bool_]]:
+    """Where the phantom's tissues lie in the image at the identity, [SIDE, SIDE] each."""
+    positions = pixel_positions_mm(DEMO_PROBE, SIDE, SIDE)
+    tissue = tissue_at(positions).reshape(SIDE, SIDE)
+    by_name = {"bone": Tissue.BONE, "muscle": Tissue.MUSCLE, "fat": Tissue.FAT, "vessel": Tissue.BLOOD}
+    return {name: tissue == value for name, value in by_name.items()}
 
 
 @pytest.fixture(scope="module")
@@ -225,3 +236,25 @@ def small(sweep: Sweep) -> Sweep:
     """The sweep in images of 32x32 pixels."""
     step = math.ceil(sweep.height / 32)
     return replace(sweep, images=np.ascontiguousarray(sweep.images[:, ::step, ::step]))
+
+
+def test_every_gaussian_carries_the_tissue_at_its_mean(scene: GaussianScene) -> None:
+    assert scene.info.label_names == {1: "bone", 2: "muscle", 3: "fat", 4: "vessel"}
+    assert scene.labels is not None
+    tissue = tissue_at(np.asarray(scene.info.centre_mm) + 10.0 * scene.means.double().numpy())
+    labels = scene.labels.numpy()
+    for label, value in ((1, Tissue.BONE), (2, Tissue.MUSCLE), (3, Tissue.FAT), (4, Tissue.BLOOD)):
+        np.testing.assert_array_equal(labels == label, tissue == value)
+        assert (labels == label).sum() > 200
+    assert torch.equal(make.labelled(replace(scene, labels=None)).labels, scene.labels)
+
+
+def test_labels_show_the_anatomy(scene: GaussianScene, truth: dict[str, npt.NDArray[np.bool_]]) -> None:
+    labels = render(scene, None, np.eye(4), height=SIDE, width=SIDE, outputs=("labels",)).labels
+    assert labels is not None
+    found = labels[0].numpy()
+    lit = np.s_[: int(30 / MM_PER_PIXEL)]  # above the shadow of bone
+    for label, name in scene.info.label_names.items():
+        shown, there = found[lit] == label, truth[name][lit]
+        overlap = (shown & there).sum() / (shown | there).sum()
+        assert overlap > (0.3 if name == "vessel" else 0.65), (name, overlap)

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from ultragray import ConvexProbe, GaussianScene, LinearProbe, Probe, cpu, cuda, render
+from ultragray import ConvexProbe, GaussianScene, LinearProbe, PhasedProbe, Probe, cpu, cuda, render
 from ultragray.request import OUTPUTS
 
 LINEAR = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)
@@ -21,6 +21,7 @@ KERNELS = ("cuda", *cpu.INSTRUCTION_SETS)
 SCENES: dict[str, tuple[Mapping[str, Any], Probe]] = {
     "linear": ({}, LINEAR),
     "convex": ({}, CONVEX),
+    "phased": ({"centre_cm": (0, 0, 1.5)}, PhasedProbe(opening_angle_deg=90.0, far_mm=50.0)),
     "wide fan": ({}, ConvexProbe(opening_angle_deg=150.0, near_mm=5.0, far_mm=50.0)),
     "one Gaussian": ({"count": 1, "extent_cm": (0.1, 0.01, 0.1), "sigma_cm": (0.2, 0.3)}, LINEAR),
     "shadows": ({"count": 400, "transmittance_logit": (-6, 0), "sigma_cm": (0.1, 0.3)}, LINEAR),

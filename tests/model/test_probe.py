@@ -8,12 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ultragray import ConvexProbe, LinearProbe, Probe
+from ultragray import ConvexProbe, LinearProbe, PhasedProbe, Probe
 from ultragray.errors import InvalidProbe
 from ultragray.probe import probe_from_dict, probe_to_dict, stretch_released_far
 
 LINEAR = LinearProbe(width_mm=40.0, near_mm=10.0, far_mm=50.0)
 CONVEX = ConvexProbe(opening_angle_deg=60.0, near_mm=50.0, far_mm=150.0)
+PHASED = PhasedProbe(opening_angle_deg=90.0, far_mm=120.0)
 
 
 def test_rows_are_centres_of_equal_slices() -> None:
@@ -48,6 +49,43 @@ def test_corners() -> None:
     np.testing.assert_allclose(np.degrees(np.arctan2(corners[:, 0], corners[:, 2])), [-30, 0, 30] * 2, atol=1e-12)
 
 
+def test_a_phased_array_fans_out_from_the_centre_of_its_face() -> None:
+    assert (PHASED.kind, PHASED.near_mm, PHASED.scan_line_length_mm) == ("phased", 0.0, 120.0)
+    np.testing.assert_allclose(PHASED.depths_mm(3), [20.0, 60.0, 100.0])
+    assert PHASED.cull_far_mm(3) == pytest.approx(80.0)
+    origins, directions = PHASED.scan_lines(3)
+    assert not origins.any()
+    np.testing.assert_allclose(np.degrees(np.arctan2(directions[:, 0], directions[:, 2])), [-30, 0, 30], atol=1e-12)
+    np.testing.assert_allclose(np.degrees(PHASED.angles_rad(3)), [-30, 0, 30], atol=1e-12)
+    corners = PHASED.corners_mm()
+    assert not corners[:3].any()
+    side = 120.0 * math.sqrt(0.5)
+    np.testing.assert_allclose(corners[3:], [[-side, 0, side], [0, 0, 120], [side, 0, side]], atol=1e-12)
+
+
+def test_a_phased_frame_is_drawn_from_its_apex_on() -> None:
+    picture = PHASED.scan_convert(np.ones((64, 64)), pixel_mm=1.0)
+    assert picture.shape == (120, 170)
+    assert picture[0].sum() <= 2  # the apex, at the top in the middle
+    assert picture[60, 85] == 1.0
+    angle = np.degrees(np.arctan2(np.arange(170) + 0.5 - 85, 30.5))
+    np.testing.assert_array_equal(picture[30] > 0, np.abs(angle) <= 45)
+
+
+def test_labels_are_drawn_without_mixing_them() -> None:
+    labels = np.zeros((40, 40), np.uint8)
+    labels[:, 20:] = 200
+    labels[20:, :20] = 7
+    for probe in (CONVEX, PHASED):
+        picture = probe.scan_convert_labels(labels, pixel_mm=0.7)
+        assert picture.dtype == np.uint8
+        assert set(np.unique(picture)) == {0, 7, 200}
+        drawn = probe.scan_convert(labels == 200, pixel_mm=0.7)
+        assert picture.shape == drawn.shape
+        np.testing.assert_array_equal(picture[drawn == 1.0], 200)
+        np.testing.assert_array_equal(picture[drawn == 0.0] == 200, False)
+
+
 @pytest.mark.parametrize(
     ("make", "field"),
     [
@@ -65,6 +103,9 @@ def test_corners() -> None:
         (lambda: ConvexProbe(near_mm=50.0, far_mm=150.0, opening_angle_deg=0.0), "opening_angle_deg"),
         (lambda: ConvexProbe(near_mm=50.0, far_mm=150.0, opening_angle_deg=175.1), "opening_angle_deg"),
         (lambda: ConvexProbe(near_mm=50.0, far_mm=50.0, opening_angle_deg=60.0), "far_mm"),
+        (lambda: PhasedProbe(opening_angle_deg=0.0, far_mm=120.0), "opening_angle_deg"),
+        (lambda: PhasedProbe(opening_angle_deg=180.0, far_mm=120.0), "opening_angle_deg"),
+        (lambda: PhasedProbe(opening_angle_deg=90.0, far_mm=0.0), "far_mm"),
     ],
 )
 def test_probes_that_no_transducer_could_have_are_refused(make: Any, field: str) -> None:
@@ -78,6 +119,7 @@ def test_integers_become_floats_and_the_repr_is_what_one_writes() -> None:
         "LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)"
     )
     assert eval(repr(CONVEX)) == CONVEX
+    assert repr(PHASED) == "PhasedProbe(opening_angle_deg=90.0, far_mm=120.0)"
 
 
 @pytest.mark.parametrize("probe", [LINEAR, CONVEX])

@@ -7,20 +7,29 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ultragray import SceneInfo
 from ultragray.errors import InvalidImageSize, UnknownOutput
-from ultragray.request import MAX_IMAGE_SIDE, OUTPUTS, check_image_size, check_outputs
+from ultragray.request import ALL_OUTPUTS, MAX_IMAGE_SIDE, check_image_size, check_labelled, check_outputs
 
 
 def test_outputs_keep_their_order_without_repetitions() -> None:
     assert check_outputs(["coverage", "bmode", "coverage"]) == ("coverage", "bmode")
     assert check_outputs("echo") == ("echo",)
-    assert check_outputs(OUTPUTS) == ("bmode", "echo", "transmittance", "coverage")
+    assert check_outputs(ALL_OUTPUTS) == ("bmode", "echo", "transmittance", "coverage", "labels")
 
 
 @pytest.mark.parametrize("outputs", [[], ["bmod"], "b-mode", ["bmode", ""], [None]])
 def test_other_outputs_are_refused(outputs: Any) -> None:
-    with pytest.raises(UnknownOutput, match="bmode, echo, transmittance, coverage") as caught:
+    with pytest.raises(UnknownOutput, match="bmode, echo, transmittance, coverage, labels") as caught:
         check_outputs(outputs)
+    assert caught.value.field == "outputs"
+
+
+def test_labels_need_a_scene_that_has_them() -> None:
+    check_labelled(("bmode", "labels"), SceneInfo(label_names={3: "fat"}))
+    check_labelled(("bmode",), SceneInfo())
+    with pytest.raises(UnknownOutput, match="only for a scene whose Gaussians carry labels") as caught:
+        check_labelled(("bmode", "labels"), SceneInfo())
     assert caught.value.field == "outputs"
 
 

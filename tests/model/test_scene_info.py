@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ultragray import ConvexProbe, GaussianScene, LinearProbe, SceneInfo, read_header
+from ultragray import ConvexProbe, GaussianScene, LinearProbe, PhasedProbe, SceneInfo, read_header
 from ultragray.errors import InvalidArgument
 from ultragray.scene_info import info_from_json, info_to_json, with_summary
 
@@ -33,7 +33,15 @@ FULL = SceneInfo(
 )
 
 
-@pytest.mark.parametrize("info", [FULL, SceneInfo(), SceneInfo(probe=LinearProbe(40.0, 0.0, 50.0))])
+OTHERS = (
+    SceneInfo(),
+    SceneInfo(probe=LinearProbe(40.0, 0.0, 50.0)),
+    SceneInfo(probe=PhasedProbe(90.0, 120.0)),
+    SceneInfo(label_names={1: "bone", 10: "vessel", 2: "muscle"}),
+)
+
+
+@pytest.mark.parametrize("info", [FULL, *OTHERS])
 def test_json_round_trip(info: SceneInfo) -> None:
     assert info_from_json(info_to_json(info)) == info
 
@@ -52,6 +60,8 @@ def test_json_round_trip(info: SceneInfo) -> None:
         ({"image_width": 1.5}, "image_width must be a positive integer"),
         ({"metrics": [1]}, "metrics must be an object"),
         ({"training": None}, "training must be an object"),
+        ({"label_names": {"0": "nothing"}}, "label_names must give labels from 1 to 255 a name each"),
+        ({"label_names": ["bone"]}, "label_names must give"),
         ({"probe": {"kind": "linear"}}, "keys"),
     ],
 )

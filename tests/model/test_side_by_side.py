@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from ultragray import ConvexProbe, GaussianScene, LinearProbe, Probe
+from ultragray import ConvexProbe, GaussianScene, LinearProbe, PhasedProbe, Probe
 from ultragray.datasets import Sweep
 from ultragray.evaluation import evaluate, render_sweep
 from ultragray.probe import FloatArray
@@ -17,6 +17,7 @@ from ultragray.side_by_side import as_picture, side_by_side_panels, write_side_b
 
 LINEAR = LinearProbe(width_mm=30.0, near_mm=0.0, far_mm=60.0)
 CONVEX = ConvexProbe(opening_angle_deg=60.0, near_mm=10.0, far_mm=50.0)
+PHASED = PhasedProbe(opening_angle_deg=60.0, far_mm=50.0)
 
 
 def sweep_of(probe: Probe, poses: FloatArray) -> Sweep:
@@ -24,7 +25,7 @@ def sweep_of(probe: Probe, poses: FloatArray) -> Sweep:
     return Sweep(images, poses, probe, np.arange(len(poses)) + 40, "made")
 
 
-@pytest.mark.parametrize("probe", [LINEAR, CONVEX], ids=["linear", "convex"])
+@pytest.mark.parametrize("probe", [LINEAR, CONVEX, PHASED], ids=["linear", "convex", "phased"])
 def test_one_picture_a_frame(
     tmp_path: Path,
     random_scene: Callable[..., GaussianScene],

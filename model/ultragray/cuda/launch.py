@@ -16,8 +16,8 @@ import torch
 import triton
 from torch import Tensor
 
-from ..probe import ConvexProbe, FloatArray, Probe
-from ..request import OUTPUTS
+from ..probe import FloatArray, LinearProbe, Probe
+from ..request import OUTPUTS, WEIGHT_SUM
 from .device import interpreted
 from .kernels import constants
 from .kernels.drawing import draw_tiles, finish_frames
@@ -83,7 +83,7 @@ class Geometry(NamedTuple):
     @classmethod
     def of(cls, probe: Probe, height: int, width: int) -> Geometry:
         return cls(
-            isinstance(probe, ConvexProbe),
+            not isinstance(probe, LinearProbe),
             height,
             width,
             _span(probe) / width,
@@ -92,7 +92,7 @@ class Geometry(NamedTuple):
 
 
 def _span(probe: Probe) -> float:
-    return math.radians(probe.opening_angle_deg) if isinstance(probe, ConvexProbe) else probe.width_mm / 10.0
+    return probe.width_mm / 10.0 if isinstance(probe, LinearProbe) else math.radians(probe.opening_angle_deg)
 
 
 def _row_cm(probe: Probe, height: int) -> float:
@@ -217,7 +217,8 @@ def draw(slices: Slices, geometry: Geometry, frames: Mapping[str, Tensor], *, ke
     how, device = shapes(), slices.slices.device
     poses, blocks = slices.counts.shape
     height, width = geometry.height, geometry.width
-    planes = Planes(*(torch.empty((poses, height, width), device=device) for _ in range(3)))
+    weight, weighted, transmittance = (torch.empty((poses, height, width), device=device) for _ in range(3))
+    planes = Planes(frames.get(WEIGHT_SUM, weight), weighted, transmittance)
     if not poses:
         return planes
     tile_rows, tile_columns = -(-height // how.tile_rows), -(-width // how.tile_columns)

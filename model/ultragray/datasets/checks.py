@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from ..pose import rotation_angles_deg
-from ..probe import ConvexProbe, FloatArray, LinearProbe, Probe, probe_to_dict
+from ..probe import FloatArray, LinearProbe, Probe, probe_to_dict
 from .sweep import Dataset, Sweep, corner_distances_mm
 from .swept_volume import swept_volume
 
@@ -254,7 +254,7 @@ def _unusual_probe(probe: Probe) -> list[str]:
         for subject, measure, length_mm, (low, high) in lengths
         if not low <= length_mm <= high
     ]
-    if isinstance(probe, ConvexProbe) and probe.opening_angle_deg < SMALLEST_OPENING_DEG:
+    if not isinstance(probe, LinearProbe) and probe.opening_angle_deg < SMALLEST_OPENING_DEG:
         told.append(
             f"the fan opens by {probe.opening_angle_deg:.3g}°, where {SMALLEST_OPENING_DEG:g}° and more are usual: "
             "an angle in radians? (conf.json is in degrees)"

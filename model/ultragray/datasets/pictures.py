@@ -11,7 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from ..files import atomic_path
-from ..probe import ConvexProbe, FloatArray
+from ..probe import FloatArray, LinearProbe
 from .sweep import Dataset, Sweep
 
 TRAIN_COLOUR, VAL_COLOUR = "#1f77b4", "#d62728"
@@ -25,7 +25,7 @@ def draw_dataset(dataset: Dataset, path: str | Path) -> None:
     """Writes a PNG: the planes seen from two sides, below them frames at even distances, held-out ones in red.
 
     Of many planes a few are drawn, at even distances, as the legend says. Axes are those of the tracker,
-    in mm. Frames of a convex probe are drawn as fans.
+    in mm. Frames of convex and phased probes are drawn as fans.
     """
     shown = _sheet_frames(dataset)
     rows = math.ceil(len(shown) / SHEET_COLUMNS)
@@ -66,7 +66,7 @@ def _sheet_frames(dataset: Dataset) -> list[tuple[Sweep, int, str]]:
 def _tile(sweep: Sweep, frame: int) -> np.ndarray:  # [rows, columns]
     """A frame with square pixels, no side longer than MAX_TILE_PIXELS."""
     image = sweep.images[frame]
-    if isinstance(sweep.probe, ConvexProbe):
+    if not isinstance(sweep.probe, LinearProbe):
         return sweep.probe.scan_convert(image, 2.0 * sweep.probe.far_mm / MAX_TILE_PIXELS)
     axial_mm, lateral_mm = sweep.pixel_mm
     pixel_mm = max(axial_mm * sweep.height, lateral_mm * sweep.width) / MAX_TILE_PIXELS

@@ -16,8 +16,8 @@ from ..errors import CheckpointInvalid, DatasetInvalid, InvalidArgument, Invalid
 from ..files import atomic_path
 from ..npy_file import map_npy
 from ..pose_file import read_pose_array
-from ..probe import FloatArray, LinearProbe, Probe
-from ..released_config import ReleasedConfig, read_released_config
+from ..probe import FloatArray, Probe
+from ..released_config import ReleasedConfig, probe_keys, read_released_config
 from .images import grey_frames
 from .sweep import ByteArray, Dataset, Sweep, check_frame_poses
 
@@ -103,24 +103,10 @@ def write_released(dataset: Dataset, folder: str | Path) -> None:
         with atomic_path(folder / file_name) as temporary, temporary.open("wb") as file:
             np.save(file, array, allow_pickle=False)
         document[f"{kind}_file_{part}"] = f"data/{name}/{file_name}"
-    document |= {"result_dir": f"results/{name}", **_planes(dataset.probe), "_source": dataset.name}
+    document |= {"result_dir": f"results/{name}", **probe_keys(dataset.probe), "_source": dataset.name}
     with atomic_path(folder / CONFIG_NAME) as temporary:
         temporary.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
 
 
 def _array_name(kind: str, part: str) -> str:
     return f"{kind}_{part}.npy"
-
-
-def _planes(probe: Probe) -> dict[str, float]:
-    planes = {
-        "ultrasound_near_plane": _to_cm(probe.near_mm),
-        "ultrasound_far_plane": _to_cm(probe.far_mm),
-    }
-    if isinstance(probe, LinearProbe):
-        return planes | {"ultrasound_opening_width": _to_cm(probe.width_mm)}
-    return planes | {"ultrasound_opening_angle": probe.opening_angle_deg}
-
-
-def _to_cm(length_mm: float) -> float:
-    return round(length_mm / 10.0, 10)

@@ -1,7 +1,7 @@
 """Makes the demo scene and its pictures: what `make demo-scene` runs, in the source tree.
 
-Simulates the phantom, trains with the preset `fast`, measures on the held-out sweep, and writes `spine.ugr` beside
-this file and the README's pictures into docs/images.
+Simulates the phantom, trains with the preset `fast`, measures on the held-out sweep, gives each Gaussian the label of
+the tissue that it lies in, and writes `spine.ugr` beside this file and the README's pictures into docs/images.
 """
 
 from __future__ import annotations
@@ -14,8 +14,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import torch
 
-from ..datasets.phantom import load_phantom
+from ..datasets.phantom import Tissue, load_phantom, tissue_at
 from ..datasets.phantom.shadow import BoneShadow
 from ..datasets.sweep import Dataset
 from ..evaluation import render_sweep
@@ -32,6 +33,12 @@ PICTURES_FOLDER = Path(__file__).parents[3] / "docs" / "images"
 PICTURE_SIDE = 512
 PARAMEDIAN_MM = 12.0  # from the midline, across the laminae
 SECONDS_PER_LINE = 10.0
+LABELS: dict[int, tuple[str, tuple[Tissue, ...]]] = {
+    1: ("bone", (Tissue.BONE,)),
+    2: ("muscle", (Tissue.MUSCLE,)),
+    3: ("fat", (Tissue.FAT,)),
+    4: ("vessel", (Tissue.BLOOD,)),
+}
 
 log = logging.getLogger("demo")
 
@@ -39,7 +46,7 @@ log = logging.getLogger("demo")
 def main() -> None:
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
     log.info("simulating the phantom")
-    scene = make_scene(load_phantom(), TrainingConfig.preset("fast", max_gaussians=MAX_GAUSSIANS))
+    scene = labelled(make_scene(load_phantom(), TrainingConfig.preset("fast", max_gaussians=MAX_GAUSSIANS)))
     scene.save(DEMO_FILE)
     write_pictures(scene, PICTURES_FOLDER)
     figures = ", ".join(f"{name} {value:.4g}" for name, value in scene.info.metrics.items())
@@ -56,6 +63,17 @@ def make_scene(dataset: Dataset, config: TrainingConfig) -> GaussianScene:
         "shadow_transmittance": shadow.mean(render_sweep(scene, dataset.val, output="transmittance")),
     }
     return replace(scene, info=replace(scene.info, dataset_name=DATASET_NAME, metrics=metrics))
+
+
+def labelled(scene: GaussianScene) -> GaussianScene:
+    """The scene with the label of the phantom's tissue at each mean; other tissues than those of LABELS have none."""
+    means_mm = np.asarray(scene.info.centre_mm) + 10.0 * scene.means.detach().cpu().double().numpy()
+    by_tissue = np.zeros(max(Tissue) + 1, np.uint8)
+    for label, (_, tissues) in LABELS.items():
+        by_tissue[list(tissues)] = label
+    labels = torch.from_numpy(by_tissue[tissue_at(means_mm)]).to(scene.means.device)
+    names = {label: name for label, (name, _) in LABELS.items()}
+    return replace(scene, info=replace(scene.info, label_names=names), labels=labels)
 
 
 def _teller() -> Callable[[Progress], None]:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from ultragray import ConvexProbe, LinearProbe, Probe
+from ultragray import ConvexProbe, LinearProbe, PhasedProbe, Probe
 from ultragray.datasets import Dataset, Sweep
 from ultragray.datasets.pictures import _draw_planes, draw_dataset
 
@@ -21,8 +21,12 @@ def pixels_of(picture: np.ndarray, colour: tuple[int, int, int]) -> int:  # RGB
 
 @pytest.mark.parametrize(
     "probe",
-    [LinearProbe(40, 0, 50), ConvexProbe(opening_angle_deg=60, near_mm=20, far_mm=70)],
-    ids=["linear", "convex"],
+    [
+        LinearProbe(40, 0, 50),
+        ConvexProbe(opening_angle_deg=60, near_mm=20, far_mm=70),
+        PhasedProbe(opening_angle_deg=90, far_mm=70),
+    ],
+    ids=["linear", "convex", "phased"],
 )
 def test_both_parts_are_drawn(make_sweep: Callable[..., Sweep], tmp_path: Path, probe: Probe) -> None:
     sweep = make_sweep(12, probe=probe)

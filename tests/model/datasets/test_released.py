@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ultragray import ConvexProbe, LinearProbe
+from ultragray import ConvexProbe, LinearProbe, PhasedProbe
 from ultragray.datasets import Dataset, Sweep
 from ultragray.datasets.released import read_released, write_released
 from ultragray.errors import DatasetInvalid, InvalidArgument
@@ -81,6 +81,18 @@ def test_nothing_needs_to_be_held_out(layout: Layout) -> None:
 def test_a_convex_probe(layout: Layout) -> None:
     layout.configure(ultrasound_opening_width=None, ultrasound_opening_angle=60.56)
     assert read_released(layout.folder).probe == ConvexProbe(opening_angle_deg=60.56, near_mm=5.0, far_mm=45.0)
+
+
+def test_a_phased_probe(layout: Layout) -> None:
+    fan: dict[str, Any] = {"ultrasound_opening_width": None, "ultrasound_opening_angle": 90.5}
+    layout.configure(**fan, ultrasound_near_plane=0, probe_kind="phased")
+    assert read_released(layout.folder).probe == PhasedProbe(opening_angle_deg=90.5, far_mm=45.0)
+    layout.configure(**fan, ultrasound_near_plane=0.5, probe_kind="phased")
+    with pytest.raises(DatasetInvalid, match=r"a phased probe has .*near_plane 0, got near plane 0.5"):
+        read_released(layout.folder)
+    layout.configure(ultrasound_near_plane=0, probe_kind="phased")
+    with pytest.raises(DatasetInvalid, match=r"a phased probe has ultrasound_opening_angle .* got no angle"):
+        read_released(layout.folder)
 
 
 def test_a_copied_folder_reads_its_own_files(layout: Layout) -> None:
@@ -174,7 +186,9 @@ def test_bad_data_is_one_clear_error(layout: Layout, spoil: Callable[[Layout], A
 
 
 @pytest.mark.parametrize("val_count", [0, 2])
-@pytest.mark.parametrize("probe", [LinearProbe(37.926892386, 0.1, 46.454218238), ConvexProbe(60.56, 1 / 8, 60)])
+@pytest.mark.parametrize(
+    "probe", [LinearProbe(37.926892386, 0.1, 46.454218238), ConvexProbe(60.56, 1 / 8, 60), PhasedProbe(90.5, 60)]
+)
 def test_what_is_written_is_read_back(
     tmp_path: Path, make_sweep: Callable[..., Sweep], random_poses: Callable[..., Any], probe: Any, val_count: int
 ) -> None:
