@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from ultragray import GaussianScene, LinearProbe, render
+from ultragray.confidence import FIGURES
 from ultragray_workers import Encoding, PoolConfig, RenderPool, RenderRequest, RenderResult, SceneStore
 
 PROBE = LinearProbe(width_mm=30.0, near_mm=0.0, far_mm=40.0)
@@ -74,7 +75,7 @@ def expect_frames(scene_folder: Path) -> Callable[[RenderRequest, RenderResult],
             assert np.abs(decoded.astype(float) - bytes_[0, 0]).mean() < 6
         else:
             with np.load(io.BytesIO(result.data)) as archive:
-                assert set(archive) == {*request.outputs, "poses", "scene", "scene_sha256", "renderer"}
+                assert set(archive) == {*request.outputs, "poses", *FIGURES, "scene", "scene_sha256", "renderer"}
                 for number, name in enumerate(request.outputs):
                     assert archive[name].dtype == np.float32
                     np.testing.assert_array_equal(archive[name], floats[number])

@@ -23,9 +23,11 @@ def test_pixels_are_little_endian_and_contiguous():
 
 
 def test_bytes_are_taken_as_they_are():
-    """A GPU has rounded them already."""
+    """A GPU has rounded them already, or they are labels."""
     frame = np.array([[0, 1], [254, 255]], np.uint8)
     assert encode_pixels(frame[None], Encoding.UINT8).tolist() == [frame.tolist()]
+    floats = encode_pixels(frame[None], Encoding.FLOAT32)
+    assert (floats.dtype.str, floats.tolist()) == ("<f4", [frame.tolist()])
     assert cv2.imdecode(encode_image(frame, Encoding.PNG), cv2.IMREAD_UNCHANGED).tolist() == frame.tolist()
 
 

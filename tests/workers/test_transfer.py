@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from ultragray_workers import encoding
+from ultragray_workers import Encoding, encoding
 from ultragray_workers.transfer import CHUNK_POSES, render_to_host, to_uint8
 
 UINT8, FLOAT32 = np.dtype("u1"), np.dtype("<f4")
 POSES = 2 * CHUNK_POSES + 3
-WANTED = {"bmode": {UINT8, FLOAT32}, "echo": {UINT8}}
+WANTED = {"bmode": {UINT8, FLOAT32}, "echo": {UINT8}, "labels": {UINT8, FLOAT32}}
 
 needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no CUDA device")
 
@@ -35,7 +35,7 @@ def render_on(device, sizes):
         sizes.append(len(poses))
         level = torch.from_numpy(brightness(poses)).to(device, torch.float32)
         bmode = level[:, None, None].expand(-1, 5, 7).contiguous()
-        return {"bmode": bmode, "echo": 1.0 - bmode}
+        return {"bmode": bmode, "echo": 1.0 - bmode, "labels": (bmode * 200.0).to(torch.uint8)}
 
     return render
 
@@ -43,11 +43,15 @@ def render_on(device, sizes):
 def expect_all(frames, poses):
     """Every output in every pixel type, in pieces that do not end where chunks do."""
     level = brightness(poses).astype(np.float32)[:, None, None] * np.ones((1, 5, 7), np.float32)
-    for name, expected in (("bmode", level), ("echo", np.float32(1) - level)):
+    labels = (level * np.float32(200)).astype(np.uint8)
+    for name, expected in (("bmode", level), ("echo", np.float32(1) - level), ("labels", labels)):
         for pixel_type in WANTED[name]:
             for first, stop in ((0, 1), (1, CHUNK_POSES + 1), (CHUNK_POSES + 1, POSES), (0, POSES)):
                 pixels = frames.take(name, pixel_type, first, stop)
-                if pixel_type == UINT8:
+                if name == "labels":
+                    encoded = Encoding(pixel_type.name)
+                    np.testing.assert_array_equal(encoding.encode_pixels(pixels, encoded), expected[first:stop])
+                elif pixel_type == UINT8:
                     np.testing.assert_array_equal(encoding.to_uint8(pixels), encoding.to_uint8(expected[first:stop]))
                 else:
                     np.testing.assert_array_equal(pixels, expected[first:stop])

@@ -12,7 +12,7 @@ import pytest
 from ultragray import LinearProbe
 from ultragray.errors import DeadlineExceeded, QueueFull
 from ultragray_workers import Priority, RenderRequest, waiting
-from ultragray_workers.waiting import Part, Ticket, WaitingQueue
+from ultragray_workers.waiting import Expiry, Part, Ticket, Turn, WaitingQueue
 
 
 @pytest.fixture
@@ -122,3 +122,51 @@ def test_what_is_past_its_deadline_is_dropped(make_ticket):
     assert taken(queue) == [(company, 0, 1)]
     assert isinstance(late.done.exception(), DeadlineExceeded)
     assert queue.frames == 0
+
+
+def test_a_newer_pose_takes_the_place_of_one_that_waits(make_ticket):
+    queue = WaitingQueue(limit_frames=100, max_batch_poses=1)
+    first, second = make_ticket(), make_ticket()
+    turn = Turn()
+    newer = np.tile(2 * np.eye(4), (1, 1, 1))
+    assert not turn.give_to(newer, None)  # it has no place yet
+    turn.ticket = first
+    queue.add(first)
+    queue.add(second)
+    assert turn.give_to(newer, 1e9)
+    assert queue.frames == 2
+    assert taken(queue) == [(first, 0, 1)]
+    assert first.request.poses is newer
+    assert first.request.deadline == 1e9
+    assert not turn.give_to(np.eye(4)[None], None)  # it is being rendered
+    assert first.request.poses is newer
+
+
+def test_a_deadline_that_was_brought_forward_expires_earlier(make_ticket):
+    async def wait():
+        queue = WaitingQueue(limit_frames=100, max_batch_poses=1)
+        ticket = make_ticket(deadline=time.monotonic() + 60.0)
+        queue.add(ticket)
+        turn = Turn(ticket, Expiry(ticket, queue))
+        assert turn.give_to(np.eye(4)[None], time.monotonic() + 0.03)
+        await asyncio.sleep(0.1)
+        assert queue.frames == 0
+        assert isinstance(ticket.done.exception(), DeadlineExceeded)
+
+    asyncio.run(wait())
+
+
+def test_a_deadline_that_was_put_off_expires_later(make_ticket):
+    async def wait():
+        queue = WaitingQueue(limit_frames=100, max_batch_poses=1)
+        ticket = make_ticket(deadline=time.monotonic() + 0.02)
+        queue.add(ticket)
+        turn = Turn(ticket, Expiry(ticket, queue))
+        assert turn.give_to(np.eye(4)[None], time.monotonic() + 0.1)
+        await asyncio.sleep(0.05)
+        assert queue.frames == 1
+        await asyncio.sleep(0.1)
+        assert queue.frames == 0
+        assert isinstance(ticket.done.exception(), DeadlineExceeded)
+
+    asyncio.run(wait())

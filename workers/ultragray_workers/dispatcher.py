@@ -7,6 +7,7 @@ import os
 from collections.abc import Awaitable, Iterable
 from dataclasses import replace
 
+from ultragray.confidence import Extrapolation
 from ultragray.errors import RenderFailed, UltragrayError
 
 from .launcher import Launcher
@@ -188,7 +189,13 @@ def _summary(steps: list[Rendered]) -> Rendered:
         started=min(step.started for step in steps),
         render_ms=sum(step.render_ms for step in steps),
         encode_ms=sum(step.encode_ms for step in steps),
+        extrapolations=_extrapolations(steps),
     )
+
+
+def _extrapolations(steps: Iterable[Rendered]) -> tuple[Extrapolation, ...]:
+    """In the order of the poses."""
+    return tuple(told for step in sorted(steps, key=lambda step: step.first) for told in step.extrapolations)
 
 
 def _render_job(ticket: Ticket, parts: list[Part]) -> RenderJob:
@@ -198,6 +205,8 @@ def _render_job(ticket: Ticket, parts: list[Part]) -> RenderJob:
         probe=ticket.probe,
         height=ticket.height,
         width=ticket.width,
+        display=ticket.request.display,
+        trust=ticket.request.trust,
         parts=tuple(
             RenderPart(
                 poses=part.ticket.request.poses[part.first : part.stop],
@@ -218,8 +227,9 @@ def _pack_job(ticket: Ticket) -> PackJob:
         renderer=ticket.rendered[0].renderer,
         poses=ticket.request.poses,
         outputs=ticket.request.outputs,
-        height=ticket.height,
-        width=ticket.width,
+        extrapolations=_extrapolations(ticket.rendered),
+        height=ticket.picture.height,
+        width=ticket.picture.width,
     )
 
 

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from ultragray.confidence import Extrapolation
+from ultragray.display import Display
 from ultragray.errors import UltragrayError
 from ultragray.probe import FloatArray, Probe
 
-from .types import Encoding
+from .types import Encoding, Trust
 
 
 @dataclass(frozen=True)
@@ -55,6 +57,8 @@ class RenderJob:
     probe: Probe
     height: int
     width: int
+    display: Display
+    trust: Trust
     parts: tuple[RenderPart, ...]
 
 
@@ -67,6 +71,7 @@ class PackJob:
     renderer: str
     poses: FloatArray  # [C, 4, 4] mm
     outputs: tuple[str, ...]
+    extrapolations: tuple[Extrapolation, ...]  # [C]
     height: int
     width: int
 
@@ -95,6 +100,8 @@ class Rendered:
     started: float  # time.monotonic() in seconds, the same clock in all processes
     render_ms: float
     encode_ms: float
+    first: int = 0  # pose of the request that the part begins with
+    extrapolations: tuple[Extrapolation, ...] = ()  # of the part's poses
 
 
 @dataclass(frozen=True)

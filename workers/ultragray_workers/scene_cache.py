@@ -5,9 +5,11 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 
+from ultragray.confidence import Assessor
 from ultragray.errors import MemoryExceeded, SceneFileInvalid, SceneTooLarge, UltragrayError
 from ultragray.files import file_sha256
 from ultragray.scene import GaussianScene
@@ -25,6 +27,11 @@ class LoadedScene:
     sha256: str  # of the very bytes the tensors were read from
     version: FileVersion
     bytes: int
+
+    @cached_property
+    def assessor(self) -> Assessor:
+        """What tells how far its frames extrapolate."""
+        return Assessor(self.scene.info, self.scene.training_poses)
 
 
 class SceneCache:

@@ -15,7 +15,7 @@ from ultragray.probe import FloatArray
 
 CHUNK_POSES = 8  # rendered in one launch; while they are copied and written, the next ones are rendered
 
-Pixels = npt.NDArray[Any]  # float32, or uint8 where the GPU has rounded them
+Pixels = npt.NDArray[Any]  # float32, or uint8: labels, and what the GPU has rounded
 Wanted = Mapping[str, Collection[np.dtype[Any]]]  # the pixel types that an output is asked for in
 
 _TORCH_TYPES = {np.dtype("u1"): torch.uint8, np.dtype("<f4"): torch.float32}
@@ -27,7 +27,8 @@ class Arriving(Protocol):
     waited_ms: float  # in `take`, so far
 
     def take(self, name: str, pixel_type: np.dtype[Any], first: int, stop: int) -> Pixels:  # [stop - first, H, W]
-        """Waits for an output of the poses `first` to `stop`: in that pixel type, or float32 for the encoder to round.
+        """Waits for an output of the poses `first` to `stop`: in that pixel type, or as rendered for the encoder to
+        turn into it.
 
         Raises RuntimeError where the GPU failed.
         """
@@ -47,8 +48,8 @@ def render_to_host(
 
 
 def to_uint8(frames: Tensor) -> Tensor:
-    """encoding.to_uint8 for a tensor, where that is: round(255·min(x, 1)), half to even."""
-    return frames.clamp(max=1.0).mul_(255.0).round_().to(torch.uint8)
+    """encoding.to_uint8 for a tensor, where that is: round(255·min(x, 1)), half to even; labels as they are."""
+    return frames if frames.dtype == torch.uint8 else frames.clamp(max=1.0).mul_(255.0).round_().to(torch.uint8)
 
 
 class _OnHost:
@@ -57,10 +58,14 @@ class _OnHost:
     waited_ms = 0.0
 
     def __init__(self, frames: Mapping[str, Tensor], wanted: Wanted) -> None:
-        self._frames = {name: frames[name].to("cpu", torch.float32).numpy() for name in wanted}
+        self._frames = {name: _on_host(frames[name]) for name in wanted}
 
     def take(self, name: str, pixel_type: np.dtype[Any], first: int, stop: int) -> Pixels:
         return self._frames[name][first:stop]
+
+
+def _on_host(frames: Tensor) -> Pixels:
+    return frames.to("cpu", torch.uint8 if frames.dtype == torch.uint8 else torch.float32).numpy()
 
 
 class _FromGpu:
@@ -79,7 +84,7 @@ class _FromGpu:
         for first in range(0, len(poses), CHUNK_POSES):
             frames = render(poses[first : first + CHUNK_POSES])
             ready = {
-                (name, pixel_type): to_uint8(frames[name]) if pixel_type == np.uint8 else frames[name]
+                (name, pixel_type): to_uint8(frames[name]) if pixel_type == np.uint8 else frames[name].float()
                 for name, pixel_types in wanted.items()
                 for pixel_type in pixel_types
             }

@@ -9,8 +9,9 @@ import select
 import signal
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,9 @@ import torch
 from torch import Tensor
 
 from ultragray import ConvexProbe, GaussianScene, LinearProbe, Probe, cuda, render
+from ultragray.confidence import Extrapolation
+from ultragray.display import AS_RENDERED
+from ultragray.display_frames import show
 from ultragray.errors import MemoryExceeded, RenderFailed, UltragrayError
 from ultragray.probe import FloatArray
 from ultragray.rendering import renderer_name
@@ -39,8 +43,9 @@ from .messages import (
 )
 from .placement import render_device
 from .scene_cache import SceneCache
+from .support import SupportWatch, below_limit, refusal
 from .transfer import CHUNK_POSES, Arriving, Wanted, render_to_host
-from .types import Encoding
+from .types import ANY_CONFIDENCE, Encoding
 
 MAX_DETAIL_LENGTH = 2000
 _SMALL_PROBES = (LinearProbe(width_mm=10.0, near_mm=0.0, far_mm=10.0), ConvexProbe(60.0, near_mm=5.0, far_mm=10.0))
@@ -132,14 +137,25 @@ class _Worker:
             yield from [_as_reported(error)] * len(job.parts)
             return
         poses = np.concatenate([part.poses for part in job.parts])  # [C, 4, 4]
+        try:
+            extrapolations = loaded.assessor.assess(poses, job.probe)
+        except Exception as error:
+            yield from [_as_reported(error)] * len(job.parts)
+            return
+        refused = refusal(job, extrapolations)
+        if refused is not None and len(job.parts) == 1:
+            yield refused
+            return
         wanted: dict[str, set[np.dtype[Any]]] = {}
         for part in job.parts:
             for name in part.outputs:
                 wanted.setdefault(name, set()).add(part.encoding.pixel_type)
         started = time.monotonic()
+        support = SupportWatch(below_limit(job, extrapolations))
         frames = None
         try:
-            frames = self._render(loaded.scene, job.probe, poses, job.height, job.width, wanted)
+            if refused is None:
+                frames = self._render(loaded.scene, job, poses, wanted, support)
         except Exception as error:
             if len(job.parts) == 1:
                 yield _as_reported(error)
@@ -158,34 +174,44 @@ class _Worker:
         )
         begin = 0
         for part, memory in zip(job.parts, memories, strict=True):
-            yield _write_part(job.scene, part, frames, begin, memory, rendered)
-            begin += len(part.poses)
+            end = begin + len(part.poses)
+            told = partial(support.told, extrapolations[begin:end], begin)
+            yield _write_part(job.scene, part, frames, begin, memory, rendered, told)
+            begin = end
 
     def _render(
         self,
         scene: GaussianScene,
-        probe: Probe,
+        job: RenderJob,
         poses: FloatArray,  # [C, 4, 4] mm
-        height: int,
-        width: int,
         wanted: Wanted,
+        support: SupportWatch,
     ) -> Arriving:
-        def shoot(some: FloatArray) -> dict[str, Tensor]:  # [C, 4, 4] -> each [C, H, W]
-            frames = render(scene, probe, some, height=height, width=width, outputs=outputs, backend=self._backend)
-            return {name: getattr(frames, name) for name in outputs}
+        def shoot(some: FloatArray) -> dict[str, Tensor]:  # [C, 4, 4] -> each [C, H, W] of the picture
+            frames = render(
+                scene, job.probe, some, height=job.height, width=job.width, outputs=needed, backend=self._backend
+            )
+            assert frames.coverage is not None
+            blackened = support.look(frames.coverage)
+            rendered = {name: getattr(frames, name) for name in outputs}
+            if job.display == AS_RENDERED and blackened is None:
+                return rendered
+            return show(rendered, job.probe, job.display, blackened)
 
         outputs = tuple(wanted)
+        needed = tuple(dict.fromkeys((*outputs, "coverage")))
         try:
             return render_to_host(shoot, poses, wanted, self._device)
         except torch.OutOfMemoryError as error:
             raise MemoryExceeded(
-                f"{len(poses)} frames of {height}x{width} pixels ({', '.join(outputs)}) do not fit into the free "
-                f"memory of {self._device}; ask for fewer or smaller ones"
+                f"{len(poses)} frames of {job.height}x{job.width} pixels ({', '.join(outputs)}) do not fit into the "
+                f"free memory of {self._device}; ask for fewer or smaller ones"
             ) from error
 
     def _render_small(self, scene: GaussianScene, probe: Probe) -> ByteArray:  # [16, 16]
         pixel_type = Encoding.UINT8.pixel_type
-        frames = self._render(scene, probe, np.eye(4)[None], 16, 16, {"bmode": {pixel_type}})
+        job = RenderJob("", "", probe, 16, 16, AS_RENDERED, ANY_CONFIDENCE, ())
+        frames = self._render(scene, job, np.eye(4)[None], {"bmode": {pixel_type}}, SupportWatch([False]))
         return to_uint8(frames.take("bmode", pixel_type, 0, 1)[0])
 
 
@@ -196,6 +222,7 @@ def _write_part(
     begin: int,
     memory: int,
     rendered: Rendered,
+    told: Callable[[], tuple[Extrapolation, ...]],
 ) -> Rendered | UltragrayError:
     """Encodes a part into its request's memory: a whole file, or its share of the pixels."""
     started, waited_ms = time.monotonic(), frames.waited_ms
@@ -211,6 +238,7 @@ def _write_part(
                     file,
                     {name: frames.take(name, pixel_type, begin, end) for name in part.outputs},
                     part.poses,
+                    told(),
                     scene=scene,
                     scene_sha256=rendered.scene_sha256,
                     renderer=rendered.renderer,
@@ -224,6 +252,7 @@ def _write_part(
                     place = number * part.total + part.first + first - begin
                     write_at(memory, pixels.data.cast("B"), place * pixels[0].nbytes)
             size = len(part.outputs) * part.total * pixels[0].nbytes
+        extrapolations = told()
     except Exception as error:
         return _as_reported(error)
     waiting_ms = frames.waited_ms - waited_ms
@@ -232,6 +261,8 @@ def _write_part(
         size=size,
         render_ms=rendered.render_ms + frames.waited_ms,
         encode_ms=_since_ms(started) - waiting_ms,
+        first=part.first,
+        extrapolations=extrapolations,
     )
 
 
@@ -248,6 +279,7 @@ def _pack(job: PackJob, pixels_memory: int, archive_memory: int) -> Rendered:
             file,
             dict(zip(job.outputs, frames, strict=True)),
             job.poses,
+            job.extrapolations,
             scene=job.scene,
             scene_sha256=job.scene_sha256,
             renderer=job.renderer,

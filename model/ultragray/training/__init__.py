@@ -1,7 +1,25 @@
-"""Training: a tracked sweep becomes a scene."""
+"""Training: a tracked sweep becomes a scene.
+
+`train` is imported on first use, so that a configuration needs no torch.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
 
 from .config import TrainingConfig
 from .progress import Progress
-from .trainer import train
+
+if TYPE_CHECKING:
+    from .trainer import train
 
 __all__ = ["Progress", "TrainingConfig", "train"]
+
+
+def __getattr__(name: str) -> Any:
+    if name == "train":
+        from .trainer import train
+
+        globals()[name] = train
+        return train
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -2,7 +2,7 @@
 
 The same fields come from the command line, from a TOML file and from Python, and are stored in the scene. What follows
 from the data (spacing of the frames, size of a pixel) is None unless it is set; fractions are of the whole run, so that
-a run of any length keeps the shape of its schedules.
+a run of any length keeps the shape of its schedules. Free of torch.
 """
 
 from __future__ import annotations
@@ -17,8 +17,9 @@ from typing import Any
 
 from ..errors import InvalidArgument
 from ..scene_info import INTENSITIES, MAX_SH_DEGREE
-from .geometry import Geometry
-from .sampling import MAX_RANGE_MM
+
+if typing.TYPE_CHECKING:
+    from .geometry import Geometry
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -28,6 +29,7 @@ else:
 RELEASED_STEPS = 30_000  # the length of run that the released rates are tuned for
 RELEASED_TRANSMITTANCE_RATE, MAX_SCALED_RATE = 5e-4, 2e-2
 MAX_FLOOR = 0.9
+MAX_RANGE_MM = 100.0  # frames further apart have nothing to say about what lies between
 STARTS = ("informed", "random")
 GROWTHS = ("even", "threshold")
 
@@ -73,6 +75,7 @@ class TrainingConfig:
     split_intensity: float = 1.0  # factor on sh0 of the halves
     prune_above: float = 0.1  # × scene scale, of the largest standard deviation
     prune_below: float = 1e-5
+    confidence: bool = True  # a second, shorter training on a part of the frames fits the scene's confidence
     memory_gb: float | None = None  # None: what the machine has to give
 
     def __post_init__(self) -> None:
@@ -127,9 +130,12 @@ class TrainingConfig:
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> TrainingConfig:
         """Inverse of `to_dict`; what is left out keeps its default. Raises InvalidArgument, naming unknown keys."""
-        unknown = sorted(set(values) - {item.name for item in fields(cls)})
+        known = [item.name for item in fields(cls)]
+        unknown = sorted(set(values) - set(known))
         if unknown:
-            raise InvalidArgument(f"a training has no setting {', '.join(unknown)}", field=unknown[0])
+            raise InvalidArgument(
+                f"a training has no setting {', '.join(unknown)}; it has {', '.join(known)}", field=unknown[0]
+            )
         return cls(**values)
 
     def to_dict(self) -> dict[str, Any]:

@@ -43,9 +43,11 @@ def required_bytes(dataset: Dataset, config: TrainingConfig) -> int:
     frames = min(config.batch_size, len(dataset.train))
     height, width = dataset.train.height, dataset.train.width
     stepping = 4 * PIXEL_FLOATS * frames * height * (width + PADDING)
-    measuring = MEASURED_BYTES * min(len(dataset.val) * height * width, max(CHUNK_PIXELS, height * width))
+    measured = max(len(dataset.val), len(dataset.train) if config.confidence else 0)
+    measuring = MEASURED_BYTES * min(measured * height * width, max(CHUNK_PIXELS, height * width))
     slices = frames * -(-config.max_gaussians // LIST_GAUSSIANS) * LIST_BYTES  # as if all touched all planes
-    images = 2 * dataset.train.images.nbytes + dataset.val.images.nbytes  # the dataset's and the trainer's copy
+    copies = 3 if config.confidence else 2  # the dataset's, the trainer's and that of the frames it calibrates with
+    images = copies * dataset.train.images.nbytes + dataset.val.images.nbytes
     return BASE_BYTES + gaussians + slices + max(stepping, measuring, comparison_bytes(dataset)) + images
 
 

@@ -10,11 +10,11 @@ from torch import Tensor
 
 from ..datasets.sweep import IntArray, Sweep, corner_distances_mm
 from ..probe import FloatArray
+from .config import MAX_RANGE_MM
 
 LEAST_RANGE = 1.5  # × the spacing of the frames
 TELLING_NEIGHBOURS = 8  # with fewer, PSNR only says that speckle averages out
 MAX_SLICE_MM = 8.0  # no probe's slice is thicker
-MAX_RANGE_MM = 100.0  # frames further apart have nothing to say about what lies between
 RANGES = (1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 11.0, 16.0, 23.0, 32.0)  # × the distance of neighbouring frames
 PREDICTED_FRAMES, PREDICTED_PIXELS = 256, 4096  # enough to tell one range from another
 

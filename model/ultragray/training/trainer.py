@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import logging
 import math
 import time
 from collections.abc import Callable, Iterator
@@ -24,6 +25,7 @@ from ..rendering import choose_backend, render
 from ..scene import PARAMETERS, GaussianScene
 from ..scene_info import SceneInfo
 from .board import Board, require_tensorboard
+from .calibration import fit_confidence, shorter
 from .checkpointing import (
     CheckpointHeader,
     check_same_run,
@@ -75,7 +77,8 @@ def train(
     checkpoints, the journal and the configuration; with `resume` the run goes on from its checkpoint and ends in the
     scene that an undisturbed run gives. `report` is called after every step. When `should_stop` turns true, the run
     ends after the step at hand with a checkpoint and the scene as it is; `scene.info.training["step"]` says how far
-    it came.
+    it came. A finished run then trains once more, shorter, to fit the scene's confidence (`config.confidence`); stopped
+    there, the scene is whole but for that.
     Raises TrainingDiverged and MemoryExceeded (the last good checkpoint stays), TrainingStateInvalid, DatasetInvalid,
     BackendUnavailable, and InvalidArgument for a TensorBoard that is not installed; what can be known before the first
     step is, before `folder` is made.
@@ -94,7 +97,33 @@ def train(
     with trainer.running_out_of_memory_explained():
         with trainer.logs(tensorboard) as log:
             trainer.run(log, report, should_stop, checkpoint_interval_s)
-        return trainer.scene()
+        scene, is_finished, resolved = trainer.scene(), trainer.is_finished, trainer.config
+    if resolved.confidence and is_finished:
+        del trainer  # what it takes of the memory is free for the second training
+        scene.info.confidence.update(_fitted_confidence(dataset, resolved, should_stop, device, backend))
+    return scene
+
+
+def _fitted_confidence(
+    dataset: Dataset, config: TrainingConfig, should_stop: Callable[[], bool] | None, device: str, backend: str
+) -> dict[str, Any]:
+    """The scene's `confidence`; empty where the frames are too few or the second training came to nothing."""
+
+    def train_part(part: Dataset) -> GaussianScene | None:
+        fewer = shorter(config, len(part.train) / len(dataset.train))
+        trainer = Trainer(part, fewer, folder=None, device=device, backend=backend)
+        while not trainer.is_finished:
+            if should_stop is not None and should_stop():
+                return None
+            trainer.take_step()
+        return trainer.scene().to(device)
+
+    try:
+        model = fit_confidence(dataset, train_part, backend=backend)
+    except (MemoryExceeded, TrainingDiverged, torch.OutOfMemoryError) as error:
+        logging.getLogger(__name__).warning("the scene gets no confidence: %s", error)
+        return {}
+    return {} if model is None else model.to_dict()
 
 
 def scene_of_checkpoint(dataset: Dataset, folder: Path) -> GaussianScene:
@@ -247,6 +276,10 @@ class Trainer:
         )
 
     @property
+    def is_finished(self) -> bool:
+        return self.step == self._schedule.steps
+
+    @property
     def gaussian_count(self) -> int:
         return len(self.parameters["means"])
 
@@ -395,7 +428,7 @@ class Trainer:
         splats = {name: tensor.detach().cpu() for name, tensor in self.parameters.items()}
         info = replace(self._info, training={**self.config.to_dict(), "step": self.step})
         scene = GaussianScene.from_splats(splats, info=info, training_poses=self.dataset.train.poses)
-        if len(self.dataset.val) and self.step == self._schedule.steps:
+        if len(self.dataset.val) and self.is_finished:
             measured = evaluate(scene.to(self._device), self.dataset.val, backend=self._backend)
             scene.info.metrics.update(measured.mean.to_dict())
         return scene

@@ -94,6 +94,8 @@ def test_resumed_run_ends_in_the_same_scene(tiny_dataset: Datasets, tiny_config:
     assert scene.info.training["step"] == 3
     while scene.info.training["step"] < 12:
         scene = train(dataset, config, folder=tmp_path, resume=True, should_stop=every_third)
+    assert scene.info.confidence == {}  # it was stopped once more, after the last step
+    scene = train(dataset, config, folder=tmp_path, resume=True)
     assert scene.to_bytes() == expected.to_bytes()
     lines = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
     assert [line["step"] for line in lines] == list(range(1, 13))

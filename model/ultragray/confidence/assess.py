@@ -1,0 +1,95 @@
+"""What a frame says of itself: how far it extrapolates, and how much a real one would look like it. Needs no torch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..errors import InvalidArgument
+from ..pose import check_poses
+from ..probe import FloatArray, Probe
+from .model import ConfidenceModel
+from .views import TrainingViews
+
+if TYPE_CHECKING:
+    from ..scene_info import SceneInfo
+
+SUPPORT_COVERAGE = 0.3  # γ below which a pixel's error is more than twice that of the others
+
+
+@dataclass(frozen=True)
+class Extrapolation:
+    """Of one frame. None: the scene does not know its training views, has no model, or no coverage was given.
+
+    distance_mm and angle_deg lead to the nearest training views, as a mean over the image; confidence is the MS-SSIM
+    that a real frame is expected to have with the rendered one; supported_share is the share of pixels with support.
+    """
+
+    distance_mm: float | None
+    angle_deg: float | None
+    confidence: float | None
+    supported_share: float | None
+
+
+class Assessor:
+    """Tells the extrapolation of frames of one scene. Its distances and confidence need the pose alone."""
+
+    def __init__(self, info: SceneInfo, training_poses: FloatArray) -> None:  # [P, 4, 4] mm
+        """Raises InvalidArgument where the scene's `confidence` is damaged or made for other training poses."""
+        known = info.probe is not None and len(training_poses) > 0
+        self._info = info
+        self._views = TrainingViews(training_poses, info.probe_or(None)) if known else None
+        self._model = read_model(info.confidence, len(training_poses)) if known else None
+
+    def assess(
+        self, poses: Any, probe: Probe | None = None, *, coverage: npt.NDArray[Any] | None = None
+    ) -> list[Extrapolation]:
+        """One for each pose [C, 4, 4] or [4, 4] (mm, probe→scene) of a probe (None: the scene's own).
+
+        `coverage` [C, H, W] is the renderer's γ at these poses; a small image does. Raises InvalidPose, and
+        InvalidProbe where no probe is known.
+        """
+        checked = check_poses(poses)
+        shares = [None] * len(checked) if coverage is None else supported(coverage).mean(axis=(1, 2)).tolist()
+        if len(shares) != len(checked):
+            raise InvalidArgument(
+                f"coverage must have one image for each of {len(checked)} poses, got {len(shares)}", field="coverage"
+            )
+        if self._views is None:
+            return [Extrapolation(None, None, None, share) for share in shares]
+        measures = self._views.measure(checked, self._info.probe_or(probe))
+        confidences: list[Any] = [None] * len(checked)
+        if self._model is not None:
+            confidences = self._model.predict(measures).tolist()
+        return [
+            Extrapolation(*values)
+            for values in zip(
+                measures.nearest_mm.tolist(), measures.angle_deg.tolist(), confidences, shares, strict=True
+            )
+        ]
+
+
+def supported(coverage: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:  # [C, H, W] -> [C, H, W]
+    """Which pixels Gaussians support: γ of at least SUPPORT_COVERAGE."""
+    mask: npt.NDArray[np.bool_] = np.asarray(coverage) >= SUPPORT_COVERAGE
+    return mask
+
+
+def read_model(document: dict[str, Any], view_count: int) -> ConfidenceModel | None:
+    """The model in a scene's `confidence`, None where that is empty.
+
+    Raises InvalidArgument where it is damaged or does not have the hardness of `view_count` views.
+    """
+    if not document:
+        return None
+    model = ConfidenceModel.from_dict(document)
+    if len(model.hardness) != view_count:
+        raise InvalidArgument(
+            f"confidence.hardness must have one number for each of {view_count} training poses, got "
+            f"{len(model.hardness)}",
+            field="confidence",
+        )
+    return model

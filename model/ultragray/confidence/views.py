@@ -1,0 +1,130 @@
+"""How a pose lies to the views that a scene was trained on. Needs no torch."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from ..pose import check_poses
+from ..probe import FloatArray, LinearProbe, Probe
+
+POINTS_PER_SIDE = 6  # of the grid of image points at which distances are taken
+ANGLE_MM_PER_DEG = 0.02  # of views about as near, the one that is turned least counts as the nearest
+FAR_MM = 20.0  # farther from a view, nothing is left to lose
+MAX_VIEWS = 256  # that a pose is measured against, of those around it: a frame must not cost more than its rendering
+NEIGHBOURHOOD_MM = 3.0  # views this near tell how hard a place is, and where all are farther, the nearest
+
+
+@dataclass(frozen=True, eq=False)
+class ViewMeasures:
+    """Of C poses, each a mean over the points of its image, and the weights of the P training views around it.
+
+    distance: to the nearest training image. interpolation: a·b/(a + b) of the distances a, b to the nearest images on
+    either side: half of either midway between two, all of it where there is one side only. Both count as at most FAR_MM
+    at a point; `nearest_mm` is the distance without that limit. angle: the rotation to the view of the nearest image.
+    """
+
+    nearest_mm: FloatArray  # [C]
+    distance_mm: FloatArray  # [C]
+    interpolation_mm: FloatArray  # [C]
+    angle_deg: FloatArray  # [C]
+    weights: FloatArray  # [C, P], each row sums to 1
+
+
+class TrainingViews:
+    """The images of P training poses [P, 4, 4] (mm, probe→scene) of one probe, in space. P is at least 1."""
+
+    def __init__(self, poses: FloatArray, probe: Probe) -> None:
+        self._probe = probe
+        self._axes = np.ascontiguousarray(poses[:, :3, :3].transpose(2, 1, 0))  # [axis, xyz, P]
+        self._offsets = np.einsum("axp,px->ap", self._axes, poses[:, :3, 3])  # [axis, P]
+        self._rotations = poses[:, :3, :3].reshape(len(poses), 9)
+        middle = np.array([0.0, 0.0, 0.5 * (probe.near_mm + probe.far_mm)])
+        self._middles = poses[:, :3, :3] @ middle + poses[:, :3, 3]  # [P, 3] mm
+
+    def __len__(self) -> int:
+        return len(self._rotations)
+
+    def measure(self, poses: FloatArray, probe: Probe) -> ViewMeasures:
+        """Measures poses [C, 4, 4] (mm) of a probe, which need not be the views' own. Raises InvalidPose."""
+        points = _image_points(probe)
+        count = len(poses)
+        measures = np.zeros((4, count))
+        weights = np.zeros((count, len(self)))
+        for place, pose in enumerate(check_poses(poses) if count else poses):
+            seen = points @ pose[:3, :3].T + pose[:3, 3]
+            views = self._nearby(seen.mean(axis=0))
+            measures[:, place], weights[place, views] = self._measure(seen, pose, views)
+        nearest, distance, interpolation, angle = measures
+        return ViewMeasures(nearest, distance, interpolation, angle, weights)
+
+    def mean_distances_mm(self, poses: FloatArray, probe: Probe) -> FloatArray:  # [C, P]
+        """Root of the mean square distance of the points of each image to each view."""
+        points = _image_points(probe)
+        distances = np.zeros((len(poses), len(self)))
+        for place, pose in enumerate(poses):
+            elevation, beside = self._offsets_mm(points @ pose[:3, :3].T + pose[:3, 3], slice(None))
+            distances[place] = _root_mean_square(np.hypot(elevation, beside))
+        return distances
+
+    def _nearby(self, point: FloatArray) -> slice | npt.NDArray[np.intp]:
+        """The views that can matter: all, or of very many those whose images have their middles nearest to a point."""
+        if len(self) <= MAX_VIEWS:
+            return slice(None)
+        return np.argpartition(((self._middles - point) ** 2).sum(axis=1), MAX_VIEWS)[:MAX_VIEWS]
+
+    def _offsets_mm(
+        self, points: FloatArray, views: slice | npt.NDArray[np.intp]
+    ) -> tuple[FloatArray, FloatArray]:  # [K, 3] mm -> [K, P] both
+        """How far points lie off the planes of views along elevation, and beside the images within the planes."""
+        x, elevation, z = (points @ self._axes[axis][:, views] - self._offsets[axis][views] for axis in range(3))
+        probe = self._probe
+        if isinstance(probe, LinearProbe):
+            lateral, depth = np.abs(x) - 0.5 * probe.width_mm, z
+        else:
+            half = math.radians(probe.opening_angle_deg) / 2.0
+            lateral, depth = np.abs(x) * math.cos(half) - z * math.sin(half), np.sqrt(x * x + z * z)
+        middle, reach = 0.5 * (probe.near_mm + probe.far_mm), 0.5 * probe.scan_line_length_mm
+        axial = np.abs(depth - middle) - reach
+        return elevation, np.hypot(np.maximum(lateral, 0.0), np.maximum(axial, 0.0))
+
+    def _measure(
+        self, points: FloatArray, pose: FloatArray, views: slice | npt.NDArray[np.intp]
+    ) -> tuple[FloatArray, FloatArray]:  # [4], [V]
+        elevation, beside = self._offsets_mm(points, views)
+        angles = self._angles_deg(pose)[views]
+        distances = np.hypot(elevation, beside)  # [K, P]
+        nearest = (distances + ANGLE_MM_PER_DEG * angles).argmin(axis=1)
+        nearest_mm = distances[np.arange(len(points)), nearest]
+        along = elevation * np.sign(
+            self._axes[1][:, views].T @ pose[:3, 1]
+        )  # a probe turned round has its front at its back
+        sides = [np.where(side, distances, np.inf).min(axis=1) for side in (along >= 0.0, along <= 0.0)]
+        front, back = (np.minimum(side, 1e3 * FAR_MM) for side in sides)
+        between = front * back / np.maximum(front + back, 1e-9)
+        capped = [np.minimum(value, FAR_MM).mean() for value in (nearest_mm, between)]
+        around = _root_mean_square(np.minimum(distances, 1e3 * FAR_MM))
+        least = around.min()
+        reach = max(NEIGHBOURHOOD_MM, 1.3 * least)
+        weights = np.exp((least / reach) ** 2 - (around / reach) ** 2)
+        return np.array([nearest_mm.mean(), *capped, angles[nearest].mean()]), weights / weights.sum()
+
+    def _angles_deg(self, pose: FloatArray) -> FloatArray:  # [P]
+        """Angle of the rotation from the pose to each view."""
+        cosine = 0.5 * (self._rotations @ pose[:3, :3].ravel() - 1.0)
+        angles: FloatArray = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+        return angles
+
+
+def _image_points(probe: Probe) -> FloatArray:  # [K, 3] mm, probe frame
+    origins, directions = probe.scan_lines(POINTS_PER_SIDE)
+    points = origins + probe.depths_mm(POINTS_PER_SIDE)[:, None, None] * directions
+    return points.reshape(-1, 3)
+
+
+def _root_mean_square(values: FloatArray) -> FloatArray:  # [K, P] -> [P]
+    root: FloatArray = np.sqrt((values * values).mean(axis=0))
+    return root

@@ -1,0 +1,89 @@
+"""The model of `confidence`, fitted on frames that a shorter training of its own did not see."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import TypeAlias
+
+import numpy as np
+
+from ..confidence.model import ConfidenceModel, fit_weights, predicted, terms_of
+from ..confidence.views import TrainingViews
+from ..datasets.sweep import Dataset, IntArray, Sweep
+from ..evaluation import evaluate, evaluate_frames
+from ..scene import GaussianScene
+from .config import TrainingConfig
+from .hardness import hardness_of_views
+from .held_out import held_out_frames
+
+SHORTER, ENOUGH_STEPS = 0.5, 250  # of the steps, but not fewer where the run has them: they leave shadows unlearned
+LEAST_HELD_OUT = 3
+MEASURED_FRAMES = 96  # of those held out; of those trained from a third as many
+BLACK_FRAMES = 32
+
+TrainShorter: TypeAlias = Callable[[Dataset], GaussianScene | None]
+
+
+def shorter(config: TrainingConfig, share: float) -> TrainingConfig:
+    """The configuration, with nothing left open, of a training on `share` of the frames: half of the steps, or 250."""
+    assert config.steps is not None
+    assert config.max_gaussians is not None
+    assert config.initial_gaussians is not None
+    return replace(
+        config,
+        steps=min(config.steps, max(math.ceil(SHORTER * config.steps), ENOUGH_STEPS)),
+        max_gaussians=math.ceil(share * config.max_gaussians),
+        initial_gaussians=math.ceil(share * config.initial_gaussians),
+    )
+
+
+def fit_confidence(dataset: Dataset, train_shorter: TrainShorter, *, backend: str) -> ConfidenceModel | None:
+    """Leaves frames of `dataset.train` out, trains from the others and fits the model to what the left out ones reach.
+
+    None where there are too few frames, or where `train_shorter` gave up.
+    """
+    sweep = dataset.train
+    held_out = held_out_frames(sweep)
+    if len(held_out) < LEAST_HELD_OUT:
+        return None
+    kept = np.setdiff1d(np.arange(len(sweep)), held_out)
+    part = Dataset(dataset.name, train=sweep.select(kept), val=sweep.select([]))
+    scene = train_shorter(part)
+    if scene is None:
+        return None
+    seen = sweep.select(_some(kept, MEASURED_FRAMES // 3))
+    unseen = sweep.select(_some(held_out, MEASURED_FRAMES))
+    ms_ssim = np.array(
+        [
+            frame.ms_ssim
+            for part_of_it in (unseen, seen)
+            for frame in evaluate(scene, part_of_it, backend=backend).frames
+        ]
+    )
+    poses = np.concatenate([unseen.poses, seen.poses])
+    views = TrainingViews(part.train.poses, sweep.probe)
+    terms = terms_of(views.measure(poses, sweep.probe), hardness_of_views(part.train))
+    black = _black_ms_ssim(sweep)
+    weights = fit_weights(terms, ms_ssim, black)
+    misses = np.abs(predicted(weights, terms, black) - ms_ssim)[: len(unseen)]
+    return ConfidenceModel(
+        weights=tuple(weights.tolist()),
+        black_ms_ssim=black,
+        hardness=tuple(hardness_of_views(sweep).tolist()),
+        fitted_on=len(unseen),
+        error=float(misses.mean()),
+    )
+
+
+def _some(places: IntArray, count: int) -> IntArray:
+    """At most `count` of them, evenly."""
+    chosen: IntArray = places[np.unique(np.linspace(0, len(places) - 1, count).round().astype(np.int64))]
+    return chosen
+
+
+def _black_ms_ssim(sweep: Sweep) -> float:
+    """What a black frame reaches against the training frames on average."""
+    some = sweep.select(_some(np.arange(len(sweep)), BLACK_FRAMES))
+    return evaluate_frames(np.zeros(some.images.shape, np.float32), some).mean.ms_ssim

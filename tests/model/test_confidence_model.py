@@ -1,0 +1,102 @@
+"""The model: what it says falls with distance, it is fitted from views, and damaged numbers never become one."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ultragray.confidence import ConfidenceModel
+from ultragray.confidence.model import PRIOR_WEIGHTS, fit_weights, predicted
+from ultragray.confidence.views import ViewMeasures
+from ultragray.errors import InvalidArgument
+
+MODEL = ConfidenceModel(
+    weights=(3.5, 1.2, 0.8, 0.1, 0.6), black_ms_ssim=0.06, hardness=(0.0, 1.0), fitted_on=20, error=0.04
+)
+
+
+def measures(
+    distance_mm: float = 0.0, interpolation_mm: float = 0.0, angle_deg: float = 0.0, weight: float = 0.0
+) -> ViewMeasures:
+    """`weight`: of the harder of two views."""
+    values = (np.array([value]) for value in (distance_mm, distance_mm, interpolation_mm, angle_deg))
+    return ViewMeasures(*values, weights=np.array([[1.0 - weight, weight]]))
+
+
+def test_the_formula() -> None:
+    at_a_view = 0.06 + 0.94 / (1.0 + np.exp(-3.5))
+    assert MODEL.predict(measures()) == pytest.approx([at_a_view])
+    away = 3.5 - 1.2 * np.log(1.0 + 0.9 / 0.3) - 0.8 * 2.0 / 5.0 - 0.1 * 5.0 / 10.0 - 0.6 * 0.25
+    expected = 0.06 + 0.94 / (1.0 + np.exp(-away))
+    assert MODEL.predict(measures(2.0, 0.9, 5.0, 0.25)) == pytest.approx([expected])
+
+
+@pytest.mark.parametrize("name", ["distance_mm", "interpolation_mm", "angle_deg", "weight"])
+def test_farther_is_never_surer(name: str) -> None:
+    figures = [MODEL.predict(measures(**{name: value}))[0] for value in (0.0, 0.1, 0.5, 1.0)]
+    assert figures == sorted(figures, reverse=True)
+    assert figures[0] > figures[-1]
+
+
+def test_far_away_it_is_what_a_black_frame_reaches() -> None:
+    far = ConfidenceModel((3.5, 1.2, 8.0, 0.1, 0.6), 0.06, (0.0, 1.0), 20, 0.04)
+    assert far.predict(measures(20.0, 20.0)) == pytest.approx([0.06], abs=1e-4)
+
+
+def test_views_decide_the_weights() -> None:
+    rng = np.random.default_rng(0)
+    terms = np.column_stack([np.ones(4000), -rng.uniform(0.0, 2.0, (4000, 4))])
+    truth = np.array([2.5, 0.4, 2.0, 0.8, 0.0])
+    fitted = fit_weights(terms, predicted(truth, terms, 0.1), 0.1)
+    assert np.abs(predicted(fitted, terms, 0.1) - predicted(truth, terms, 0.1)).mean() < 0.02
+    assert fitted[2] > 1.5 > 0.8 > fitted[1]
+
+
+def test_no_weight_turns_negative_though_the_views_say_so() -> None:
+    distances = np.linspace(0.0, 2.0, 500)
+    terms = np.column_stack([np.ones(500), -distances, *np.zeros((3, 500))])
+    fitted = fit_weights(terms, 0.3 + 0.3 * distances, 0.05)
+    assert fitted[1] == 0.0
+    assert predicted(fitted, terms, 0.05).std() < 1e-12
+
+
+def test_what_the_views_cannot_tell_stays_as_it_was() -> None:
+    terms = np.column_stack([np.ones(30), -np.linspace(0, 2, 30), *np.zeros((3, 30))])
+    fitted = fit_weights(terms, predicted(np.array([3.0, 2.0, 0, 0, 0]), terms, 0.05), 0.05)
+    assert fitted[2:] == pytest.approx(PRIOR_WEIGHTS[2:])
+    assert fitted[1] > PRIOR_WEIGHTS[1]
+
+
+def test_json_and_back() -> None:
+    document = json.loads(json.dumps(MODEL.to_dict(), allow_nan=False))
+    assert document["version"] == 1
+    assert ConfidenceModel.from_dict(document) == MODEL
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"version": 2}, "version 1, got 2"),
+        ({"weights": [1.0, 2.0]}, "weights must be 5 numbers"),
+        ({"weights": [1.0, -2.0, 0, 0, 0]}, "at least 0"),
+        ({"weights": ["a"] * 5}, "weights must be numbers"),
+        ({"weights": [float("nan")] * 5}, "weights must be finite"),
+        ({"hardness": [float("inf")]}, "hardness must be finite"),
+        ({"hardness": None}, "hardness must be numbers"),
+        ({"black_ms_ssim": 1.5}, r"in \[0, 1\], got 1.5"),
+        ({"error": "much"}, "must be numbers"),
+        ({"fitted_on": 0}, "fitted_on must be a positive integer"),
+        ({"more": 1}, "with the keys"),
+    ],
+)
+def test_damage_is_refused(change: dict[str, Any], said: str) -> None:
+    with pytest.raises(InvalidArgument, match=said):
+        ConfidenceModel.from_dict({**MODEL.to_dict(), **change})
+
+
+def test_what_is_no_object_is_refused() -> None:
+    with pytest.raises(InvalidArgument, match="must be an object"):
+        ConfidenceModel.from_dict([1, 2])  # type: ignore[arg-type]
