@@ -2,12 +2,32 @@
 
 from __future__ import annotations
 
+import base64
+import binascii
 import hmac
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from pydantic import SecretStr
 
 from ultragray.errors import Unauthenticated
+
+STREAM_PROTOCOL = "ultragray.v1"  # WebSocket subprotocol
+_KEY_PROTOCOL = "ultragray.key."
+
+
+def key_of_subprotocols(offered: Iterable[str]) -> str | None:
+    """The key that a page offers as the subprotocol `ultragray.key.` + base64url of the key.
+
+    Browsers let a page set no header of a WebSocket but this one.
+    """
+    for name in offered:
+        if name.startswith(_KEY_PROTOCOL):
+            coded = name[len(_KEY_PROTOCOL) :]
+            try:
+                return base64.urlsafe_b64decode(coded + "=" * (-len(coded) % 4)).decode()
+            except (binascii.Error, UnicodeDecodeError):
+                return None
+    return None
 
 
 class KeyGuard:

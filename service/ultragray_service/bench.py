@@ -22,10 +22,12 @@ from rich.table import Table
 
 import ultragray
 from ultragray import cpu, cuda
-from ultragray.errors import BackendUnavailable
+from ultragray.errors import BackendUnavailable, InvalidArgument
 from ultragray.files import atomic_path
 from ultragray.machine import processor_name
 
+from .bench_clients import ClientsExtent, measure_clients
+from .bench_jobs import JobsExtent, measure_jobs
 from .bench_kernel import BATCH, BenchScene, bench_scenes, measure_kernel, time_yard_ms
 from .bench_served import measure_served
 from .bench_train import PARTS, measure_training, training_scenes
@@ -49,11 +51,18 @@ class Row:
     above_kernel_ms: float | None = None  # p50 over that of the kernel's single pose at the same thread count
 
 
-def chosen_bench(backend: str, train: bool) -> Callable[[Path | None, bool], None]:
-    """What measures the kernel and the service, or a training step, on a backend.
+def chosen_bench(backend: str, *, train: bool, jobs: bool, clients: bool) -> Callable[[Path | None, bool], None]:
+    """What measures the kernel and the service, or a training step, jobs, clients, on a backend.
 
-    Raises BackendUnavailable for one that is not cpu or cuda, and for cuda where there is no GPU.
+    Raises BackendUnavailable for one that is not cpu or cuda, and for cuda where there is no GPU; InvalidArgument for
+    choices that do not go together.
     """
+    if train + jobs + clients > 1 or ((jobs or clients) and backend != "cpu"):
+        raise InvalidArgument("give one of --train, --jobs and --clients; the last two go without --backend")
+    if jobs:
+        return run_jobs_bench
+    if clients:
+        return run_clients_bench
     if backend == "cpu":
         return run_training_bench if train else run_bench
     if backend != "cuda":
@@ -137,6 +146,50 @@ def run_training_bench(output: Path | None, quick: bool) -> None:
         table.add_row(
             f"{row['gaussians']:,}", row["images"], f"{row['step_ms']:.0f}", f"{row['step_yards']:.1f}", *shares
         )
+    console.print(table)
+    write_document(console, output, document)
+
+
+def run_jobs_bench(output: Path | None, quick: bool) -> None:
+    """A full list of jobs, the start of a service that has one, and frames while a training runs."""
+    console = bench_console()
+    extent = JobsExtent(rounds=2, seconds=4.0) if quick else JobsExtent()
+    yards = [time_yard_ms()]
+    measured = measure_jobs(extent, lambda told: console.print(told, style="dim"))
+    yards.append(time_yard_ms())
+    document = {
+        "machine": _machine(torch.get_num_threads()),
+        "yard_ms": float(np.median(yards)),
+        "extent": asdict(extent),
+        **measured,
+    }
+    table = Table("", "p50 ms", "p99 ms", title=_title(document))
+    for what, times in measured["latency_ms"].items():
+        table.add_row(what, f"{times['p50']:.2f}", f"{times['p99']:.2f}")
+    console.print(table)
+    console.print(f"ready with {extent.jobs:,} jobs after {measured['start_s']:.2f} s")
+    console.print(f"p99 of frames with a training over that without: {measured['p99_ratio']:.2f}")
+    write_document(console, output, document)
+
+
+def run_clients_bench(output: Path | None, quick: bool) -> None:
+    """What each kind of client gets of a served demo scene."""
+    console = bench_console()
+    short = ClientsExtent(loop_s=5.0, stream_s=2.0, ping_pongs=100, frames=500, kernel_repeats=50)
+    extent = short if quick else ClientsExtent()
+    yards = [time_yard_ms()]
+    measured = measure_clients(extent, lambda told: console.print(told, style="dim"))
+    yards.append(time_yard_ms())
+    document = {
+        "machine": _machine(torch.get_num_threads()),
+        "yard_ms": float(np.median(yards)),
+        "extent": asdict(extent),
+        "clients": measured,
+    }
+    table = Table("client", "figure", "", title=_title(document))
+    for client, figures in measured.items():
+        for name, value in figures.items():
+            table.add_row(client, name, f"{value:,.2f}")
     console.print(table)
     write_document(console, output, document)
 

@@ -13,7 +13,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -53,31 +53,45 @@ def measure_served(bench: BenchScene, repeats: int, backend: str) -> Served:
     poses = bench_poses(repeats + WARM_UP)
     with tempfile.TemporaryDirectory(prefix="ultragray-bench-") as folder:
         bench.scene.save(Path(folder) / f"{SCENE}.ugr")
-        with _server(Path(folder), backend) as (http_port, grpc_port, pid):
+        with running_server(Path(folder), backend, SCENE) as server:
             doors = [
-                _grpc_stream(grpc_port, poses),
-                _grpc_unary(grpc_port, poses),
-                _http("HTTP raw", http_port, poses, "application/octet-stream"),
-                _http("HTTP PNG", http_port, poses, "image/png"),
+                _grpc_stream(server.grpc_port, poses),
+                _grpc_unary(server.grpc_port, poses),
+                _http("HTTP raw", server.http_port, poses, "application/octet-stream"),
+                _http("HTTP PNG", server.http_port, poses, "image/png"),
             ]
-            return Served(doors, max(map(_memory_mb, _descendants(pid)), default=0.0))
+            return Served(doors, max(map(_memory_mb, _descendants(server.pid)), default=0.0))
+
+
+@dataclass(frozen=True)
+class RunningServer:
+    """A server of the benchmark."""
+
+    http_port: int
+    grpc_port: int
+    igtl_port: int
+    pid: int
 
 
 @contextmanager
-def _server(folder: Path, backend: str) -> Iterator[tuple[int, int, int]]:
-    http_port, grpc_port = _free_port(), _free_port()
+def running_server(folder: Path, backend: str, scene: str, job_threads: int = 0) -> Iterator[RunningServer]:
+    """A service of the scenes in `folder`, with `scene` for OpenIGTLink. Raises NotReady."""
+    http_port, grpc_port, igtl_port = _free_port(), _free_port(), _free_port()
     settings = {
         "ULTRAGRAY_DATA_FOLDER": str(folder),
         "ULTRAGRAY_HTTP_PORT": str(http_port),
         "ULTRAGRAY_GRPC_PORT": str(grpc_port),
+        "ULTRAGRAY_IGTL_PORT": str(igtl_port),
+        "ULTRAGRAY_IGTL_SCENE": scene,
+        "ULTRAGRAY_TRAINING_THREADS": str(job_threads),
         "ULTRAGRAY_BACKEND": backend,
-        "ULTRAGRAY_PRELOAD": SCENE,
+        "ULTRAGRAY_PRELOAD": scene,
         "ULTRAGRAY_LOG_LEVEL": "error",
     }
     process = subprocess.Popen([sys.executable, "-m", "ultragray_service"], env={**os.environ, **settings})
     try:
         _wait_ready(process, http_port)
-        yield http_port, grpc_port, process.pid
+        yield RunningServer(http_port, grpc_port, igtl_port, process.pid)
     finally:
         process.terminate()
         process.wait(timeout=30)
@@ -92,13 +106,10 @@ def _free_port() -> int:
 def _wait_ready(process: subprocess.Popen[bytes], port: int) -> None:
     end = time.monotonic() + START_TIMEOUT_S
     while time.monotonic() < end and process.poll() is None:
-        try:
-            connection = http.client.HTTPConnection("127.0.0.1", port, timeout=5)
+        with suppress(OSError), closing(http.client.HTTPConnection("127.0.0.1", port, timeout=5)) as connection:
             connection.request("GET", "/v1/health/ready")
             if connection.getresponse().status == 200:
                 return
-        except OSError:
-            pass
         time.sleep(0.1)
     raise NotReady(f"the server of the benchmark was not ready within {START_TIMEOUT_S:g} s")
 

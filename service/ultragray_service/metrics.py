@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 
-from prometheus_client import CollectorRegistry, Counter, Histogram, ProcessCollector, generate_latest
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, ProcessCollector, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
+from ultragray_workers.jobs.job import JobState
 from ultragray_workers.pool import RenderPool
 from ultragray_workers.types import RenderResult
+
+from .statistics import Statistics
 
 _SECONDS = (
     0.0005,
@@ -32,6 +35,8 @@ _SECONDS = (
     10,
     30,
 )
+_OVERLOADED = ("429", "RESOURCE_EXHAUSTED", "UNAVAILABLE", "DEADLINE_EXCEEDED", "INTERNAL")
+_HEALTH_ROUTES = "/v1/health/"  # not ready is what they are asked for
 _POSES = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1024)
 
 
@@ -58,11 +63,25 @@ class _PoolCollector(Collector):
         )
 
 
-class Metrics:
-    """One registry per service."""
+class _JobsCollector(Collector):
+    """Tells what was counted last: a scrape asks no database."""
 
-    def __init__(self, pool: RenderPool) -> None:
+    def __init__(self, counts: Callable[[], Mapping[JobState, int]]) -> None:
+        self._counts = counts
+
+    def collect(self) -> Iterator[Metric]:
+        family = GaugeMetricFamily("ultragray_jobs", "Jobs, counted every 10 s.", labels=["state"])
+        for state, count in self._counts().items():
+            family.add_metric([state.value], count)
+        yield family
+
+
+class Metrics:
+    """One registry per service. `jobs`: how many there are in each state; empty where that is not known."""
+
+    def __init__(self, pool: RenderPool, jobs: Callable[[], Mapping[JobState, int]]) -> None:
         self.registry = CollectorRegistry()
+        self.statistics = Statistics()
         self._requests = Counter(
             "ultragray_requests",
             "Requests answered; a stream counts once, at its end.",
@@ -82,6 +101,12 @@ class Metrics:
             ["reason"],
             registry=self.registry,
         )
+        self._streams = Gauge("ultragray_open_streams", "Streams of poses that are open.", registry=self.registry)
+        self._dropped = Counter(
+            "ultragray_stream_dropped_poses",
+            "Poses of streams that newer ones replaced before they were rendered.",
+            registry=self.registry,
+        )
         self._frames = Counter("ultragray_frames", "Frames rendered.", registry=self.registry)
         self._queue = self._histogram("queue", "Waiting time of a request before it was rendered.")
         self._render = self._histogram("render", "Render time of the batch that a request was in.")
@@ -90,19 +115,31 @@ class Metrics:
             "ultragray_batch_poses", "Poses rendered together.", buckets=_POSES, registry=self.registry
         )
         self.registry.register(_PoolCollector(pool))
+        self.registry.register(_JobsCollector(jobs))
         ProcessCollector(registry=self.registry)
 
     def _histogram(self, stage: str, documentation: str) -> Histogram:
         return Histogram(f"ultragray_{stage}_seconds", documentation, buckets=_SECONDS, registry=self.registry)
 
     def count_request(self, door: str, route: str, status: str, seconds: float) -> None:
-        """One answered request of `door` http or grpc."""
+        """One answered request of `door` http, websocket or grpc."""
         self._requests.labels(door, route, status).inc()
         self._request_seconds.labels(door, route).observe(seconds)
+        if (status.startswith("5") or status in _OVERLOADED) and not route.startswith(_HEALTH_ROUTES):
+            self.statistics.count_error()
 
     def count_frame_error(self, reason: str) -> None:
         """One message of a stream that was answered with an error."""
         self._frame_errors.labels(reason).inc()
+        self.statistics.count_error()
+
+    def count_stream(self, change: int) -> None:
+        """One stream opened (+1) or closed (-1)."""
+        self._streams.inc(change)
+
+    def count_dropped(self) -> None:
+        """One pose of a stream that a newer one replaced."""
+        self._dropped.inc()
 
     def observe_result(self, result: RenderResult) -> None:
         """One rendered request of the pool."""
@@ -111,6 +148,7 @@ class Metrics:
         self._render.observe(result.render_ms / 1000)
         self._encode.observe(result.encode_ms / 1000)
         self._batch.observe(result.batch_size)
+        self.statistics.observe(len(result.poses), result.queue_ms, result.render_ms, result.encode_ms)
 
     def exposition(self) -> bytes:
         """The text that Prometheus scrapes."""

@@ -11,11 +11,12 @@ from typing import Any
 
 import numpy as np
 
+from ultragray.display import AS_RENDERED, Display
 from ultragray.errors import InvalidArgument, InvalidImageSize, TooManyPoses, UltragrayError
 from ultragray.pose import check_poses
 from ultragray.probe import FloatArray, Probe
-from ultragray.request import check_image_size, check_outputs
-from ultragray_workers.types import Encoding, Priority, RenderRequest
+from ultragray.request import LABELS, check_image_size, check_labelled, check_min_confidence, check_outputs
+from ultragray_workers.types import ANY_CONFIDENCE, Encoding, Priority, RenderRequest, Trust
 
 from .catalog import SceneCatalog
 from .settings import Settings
@@ -33,6 +34,8 @@ class RenderSpec:
     width: int | None
     outputs: tuple[str, ...]
     encoding: Encoding
+    display: Display = AS_RENDERED
+    trust: Trust = ANY_CONFIDENCE
 
 
 class RequestPlanner:
@@ -60,6 +63,7 @@ class RequestPlanner:
         """
         outputs = check_outputs(spec.outputs)
         header = await self._catalog.header(spec.scene)
+        check_labelled(outputs, header.info)
         probe = header.info.probe_or(spec.probe)
         height, width = header.info.image_size_or(spec.height, spec.width)
         check_image_size(height, width, limit=self._settings.max_image_side)
@@ -68,13 +72,9 @@ class RequestPlanner:
                 f"encoding {spec.encoding.value} holds exactly one output, got {len(outputs)}",
                 field="encoding",
             )
-        pixels = height * width * len(outputs)
-        if pixels > self._settings.max_request_pixels:
-            raise InvalidImageSize(
-                f"height x width x outputs must be at most {self._settings.max_request_pixels} pixels, got {pixels}",
-                field="height",
-            )
-        return RenderRequest(
+        if spec.encoding is Encoding.JPEG and LABELS in outputs:
+            raise InvalidArgument("encoding jpeg would change labels: ask for png, or raw pixels", field="encoding")
+        planned = RenderRequest(
             scene=spec.scene,
             poses=np.empty((0, 4, 4)),
             probe=probe,
@@ -83,11 +83,22 @@ class RequestPlanner:
             outputs=outputs,
             encoding=spec.encoding,
             priority=priority,
+            display=spec.display,
+            trust=spec.trust,
         )
+        check_min_confidence(spec.trust.min_confidence, header.info)
+        with field_under("display"):
+            pixels = _pixels_of_pose(planned)
+        if pixels > self._settings.max_request_pixels:
+            raise InvalidImageSize(
+                f"height x width x outputs must be at most {self._settings.max_request_pixels} pixels, got {pixels}",
+                field="height",
+            )
+        return planned
 
     def with_poses(self, planned: RenderRequest, poses: FloatArray, deadline: float) -> RenderRequest:
         """`planned` with checked poses [C, 4, 4]. Raises TooManyPoses for an answer of too many pixels."""
-        pixels = len(poses) * (planned.height or 0) * (planned.width or 0) * len(planned.outputs)
+        pixels = len(poses) * _pixels_of_pose(planned)
         if pixels > self._settings.max_request_pixels:
             raise TooManyPoses(
                 f"poses x height x width x outputs must be at most {self._settings.max_request_pixels} "
@@ -99,6 +110,20 @@ class RequestPlanner:
     def deadline(self, timeout_s: float | None) -> float:
         """The time.monotonic() seconds by which a request must begin; None: the default timeout."""
         return time.monotonic() + (self._settings.default_timeout_s if timeout_s is None else timeout_s)
+
+
+def frame_bytes(planned: RenderRequest) -> int:
+    """What the frame of one pose takes at most."""
+    return _pixels_of_pose(planned) * planned.encoding.pixel_type.itemsize
+
+
+def _pixels_of_pose(planned: RenderRequest) -> int:
+    """What is rendered or shown for a pose, whichever is more. Raises InvalidImageSize for a picture beyond limits."""
+    assert planned.probe is not None
+    assert planned.height is not None
+    assert planned.width is not None
+    picture = planned.display.picture(planned.probe, planned.height, planned.width)
+    return max(planned.height * planned.width, picture.height * picture.width) * len(planned.outputs)
 
 
 def check_pose_count(count: int, limit: int) -> None:

@@ -164,6 +164,38 @@ def test_a_stream_is_a_dialogue_whose_settings_may_change(conversation: Conversa
         assert (frame.scene, frame.height, frame.width) == ("second", 10, 12)
 
 
+def test_a_latest_stream_answers_for_the_newest_pose(conversation: Conversation) -> None:
+    settings = rendering_pb2.RenderSettings(scene="demo", height=600, width=600, outputs=[1, 2, 3, 4])
+    conversation.send(settings=settings, mode=rendering_pb2.STREAM_MODE_LATEST)
+    shifts = np.linspace(-4, 4, 300)
+    for sequence, shift in enumerate(shifts):
+        conversation.send(sequence, pose=moved(shift), client_time_ns=10**18 + sequence)
+    frames = conversation.finish()
+    sequences = [frame.sequence for frame in frames]
+    assert sequences == sorted(set(sequences))
+    assert sequences[-1] == 299
+    assert len(frames) < 200
+    assert len(frames) + sum(frame.dropped for frame in frames) == 300
+    for frame in frames:
+        assert frame.pose.values[3] == shifts[frame.sequence]
+        assert frame.client_time_ns == 10**18 + frame.sequence
+
+
+def test_each_pose_of_a_stream_may_have_a_deadline(conversation: Conversation, settings_message: Any) -> None:
+    conversation.send(settings=settings_message)
+    assert conversation.ask(1, pose=moved(0), timeout_ms=1e-6).error.reason == "DEADLINE_EXCEEDED"
+    assert conversation.ask(2, pose=moved(0), timeout_ms=10_000).data
+    error = conversation.ask(3, pose=moved(0), timeout_ms=0, client_time_ns=7)
+    assert (error.error.field, error.client_time_ns) == ("timeout_ms", 7)
+
+
+def test_an_unknown_mode_ends_the_stream(renders: Stub, settings_message: Any) -> None:
+    conversation = Conversation(renders)
+    conversation.send(settings=settings_message, mode=9)
+    with pytest.raises(grpc.RpcError, match="StreamMode"):
+        next(conversation.call)
+
+
 def test_bad_messages_do_not_end_a_stream(conversation: Conversation, settings_message: Any) -> None:
     def ask(sequence: int, **fields: Any) -> tuple[str, str]:
         frame = conversation.ask(sequence, **fields)

@@ -23,7 +23,7 @@ from .memory import read_start
 from .messages import ForkWorker, LoadJob, UnloadJob
 from .scenes import SceneStore
 from .types import RenderRequest, RenderResult
-from .waiting import Ticket, WaitingQueue
+from .waiting import Expiry, Ticket, Turn, WaitingQueue
 
 logger = logging.getLogger(__name__)
 
@@ -108,23 +108,26 @@ class RenderPool:
             raise
         self._started = True
 
-    async def render(self, request: RenderRequest) -> RenderResult:
+    async def render(self, request: RenderRequest, turn: Turn | None = None) -> RenderResult:
         """Renders the request as soon as its turn comes; cancelling the caller drops what has not begun.
 
-        Raises NotReady, Draining, QueueFull, DeadlineExceeded, InvalidArgument, SceneNotFound,
-        SceneFileInvalid, SceneTooLarge, MemoryExceeded, RenderFailed.
+        With `turn` its poses can be replaced by newer ones as long as they wait. Raises NotReady, Draining, QueueFull,
+        DeadlineExceeded, InvalidArgument, SceneNotFound, SceneFileInvalid, SceneTooLarge, MemoryExceeded, RenderFailed.
         """
         self._check_accepting()
         self._active += 1
         self._all_answered.clear()
+        turn = turn or Turn()
         try:
             for _ in range(_MAX_SCENE_CHANGES):
                 header = self._store.cached_header(request.scene)
                 if header is None:
                     header = await asyncio.to_thread(self._store.header, request.scene)
                 try:
-                    result = await self._render(request, header)
+                    result = await self._render(request, header, turn)
                 except SceneChangedError:
+                    assert turn.ticket is not None
+                    request = turn.ticket.request  # perhaps with newer poses
                     continue
                 if self.on_rendered is not None:
                     self.on_rendered(result)
@@ -189,15 +192,12 @@ class RenderPool:
         if not self._started:
             raise NotReady("the service is starting; try again in a few seconds")
 
-    async def _render(self, request: RenderRequest, header: SceneHeader) -> RenderResult:
+    async def _render(self, request: RenderRequest, header: SceneHeader, turn: Turn) -> RenderResult:
         if self._closed:  # while the header was read
             raise Draining("the service is stopping")
-        ticket = self._ticket(request, header)
-        timer = None
+        turn.ticket = ticket = self._ticket(request, header)
+        turn.expiry = Expiry(ticket, self._waiting)
         try:
-            if request.deadline is not None:
-                delay_s = max(0.0, request.deadline - time.monotonic())
-                timer = asyncio.get_running_loop().call_later(delay_s, self._waiting.expire, ticket)
             self._open.add(ticket)
             self._dispatcher.submit(ticket)
             rendered = await ticket.done
@@ -206,24 +206,26 @@ class RenderPool:
             else:
                 data = read_start(ticket.reply_memory, rendered.size)
         finally:
-            if timer is not None:
-                timer.cancel()
+            turn.expiry.cancel()
             self._open.discard(ticket)
             self._dispatcher.discard(ticket)
         return RenderResult(
             scene=request.scene,
             scene_sha256=rendered.scene_sha256,
             renderer=rendered.renderer,
-            poses=request.poses,
+            poses=ticket.request.poses,
             probe=ticket.probe,
-            height=ticket.height,
-            width=ticket.width,
+            rendered_height=ticket.height,
+            rendered_width=ticket.width,
+            display=request.display,
+            picture=ticket.picture,
             outputs=request.outputs,
             encoding=request.encoding,
             data=data,
             queue_ms=max(0.0, rendered.started - ticket.submitted) * 1000.0,
             render_ms=rendered.render_ms,
             encode_ms=rendered.encode_ms,
+            extrapolations=rendered.extrapolations,
             batch_size=ticket.batch_size,
         )
 
@@ -231,6 +233,7 @@ class RenderPool:
         """The request with its open choices made from the scene's own description."""
         probe = header.info.probe_or(request.probe)
         height, width = header.info.image_size_or(request.height, request.width)
+        picture = request.display.picture(probe, height, width)
         poses, outputs = len(request.poses), len(request.outputs)
         if poses == 0:
             raise InvalidArgument("poses must hold at least one pose, got none", field="poses")
@@ -240,7 +243,7 @@ class RenderPool:
                 f"{outputs} outputs",
                 field="encoding",
             )
-        reply_bytes = poses * outputs * height * width * request.encoding.pixel_type.itemsize
+        reply_bytes = poses * outputs * picture.height * picture.width * request.encoding.pixel_type.itemsize
         if reply_bytes > MAX_REPLY_BYTES:
             raise InvalidArgument(
                 f"poses times pixels must fit a reply of {MAX_REPLY_BYTES} bytes, got {reply_bytes}",

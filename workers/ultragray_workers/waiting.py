@@ -5,13 +5,14 @@ from __future__ import annotations
 import asyncio
 import time
 from collections import OrderedDict, deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
+from ultragray.display import Display
 from ultragray.errors import DeadlineExceeded, QueueFull
-from ultragray.probe import Probe
+from ultragray.probe import FloatArray, Picture, Probe
 
 from .messages import Rendered
-from .types import Encoding, Priority, RenderRequest
+from .types import Encoding, Priority, RenderRequest, Trust
 
 _FULL_BATCH_PIXELS_PER_POSE = 512 * 512
 _ATTEMPTS_IN_COMPANY = 2
@@ -39,13 +40,23 @@ class Ticket:
     archive: int | None = None  # and of the .npz, where that is made of several parts
 
     @property
-    def batch_key(self) -> tuple[str, Probe, int, int]:
+    def picture(self) -> Picture:
+        """What its frames are shown as. Raises InvalidImageSize."""
+        return self.request.display.picture(self.probe, self.height, self.width)
+
+    @property
+    def batch_key(self) -> tuple[str, Probe, int, int, Display, Trust]:
         """Requests that agree in this can be rendered together."""
-        return (self.request.scene, self.probe, self.height, self.width)
+        return (self.request.scene, self.probe, self.height, self.width, self.request.display, self.request.trust)
 
     @property
     def expired(self) -> bool:
         return self.request.deadline is not None and time.monotonic() >= self.request.deadline
+
+    @property
+    def untouched(self) -> bool:
+        """Whether all of it still waits to be rendered."""
+        return bool(self.waiting) and self.memory is None and not self.done.done()
 
     @property
     def needs_packing(self) -> bool:
@@ -62,6 +73,26 @@ class Ticket:
     def fail(self, error: Exception) -> None:
         if not self.done.done():
             self.done.set_exception(error)
+
+
+@dataclass(eq=False)
+class Turn:
+    """One caller's place in the queue, which a newer pose of his may take while it waits."""
+
+    ticket: Ticket | None = None  # None until the request is queued
+    expiry: Expiry | None = None
+
+    def give_to(self, poses: FloatArray, deadline: float | None) -> bool:
+        """Has other poses rendered in place of those that wait, as many of them; False where that is too late."""
+        ticket = self.ticket
+        if ticket is None or not ticket.untouched:
+            return False
+        assert len(poses) == len(ticket.request.poses)
+        ticket.request = replace(ticket.request, poses=poses, deadline=deadline)
+        ticket.submitted = time.monotonic()
+        if self.expiry is not None:
+            self.expiry.watch()
+        return True
 
 
 @dataclass(eq=False)
@@ -167,7 +198,7 @@ class WaitingQueue:
 
     def expire(self, ticket: Ticket) -> None:
         """Drops a ticket that is past its deadline, if any of it still waits."""
-        if ticket.waiting:
+        if ticket.waiting and ticket.expired:
             self.remove(ticket)
             waited_ms = (time.monotonic() - ticket.submitted) * 1000.0
             ticket.fail(DeadlineExceeded(f"the deadline passed before the frames were rendered ({waited_ms:.0f} ms)"))
@@ -215,3 +246,30 @@ class WaitingQueue:
         pixels = ticket.height * ticket.width * len(ticket.request.outputs)
         fitting = self._max_batch_poses * _FULL_BATCH_PIXELS_PER_POSE // pixels
         return max(1, min(self._max_batch_poses, fitting) // share)
+
+
+class Expiry:
+    """Drops a ticket in time, should it still wait at its deadline."""
+
+    def __init__(self, ticket: Ticket, queue: WaitingQueue) -> None:
+        self._ticket, self._queue = ticket, queue
+        self._timer: asyncio.TimerHandle | None = None
+        self.watch()
+
+    def watch(self) -> None:
+        """Looks at the deadline, which may have changed."""
+        self.cancel()
+        deadline = self._ticket.request.deadline
+        if deadline is not None:
+            delay_s = max(0.0, deadline - time.monotonic())
+            self._timer = asyncio.get_running_loop().call_later(delay_s, self._look)
+
+    def _look(self) -> None:
+        if self._ticket.expired:
+            self._queue.expire(self._ticket)
+        else:  # the timer was a little early
+            self.watch()
+
+    def cancel(self) -> None:
+        if self._timer is not None:
+            self._timer.cancel()

@@ -70,10 +70,20 @@ class ConvexProbe(_message.Message):
     far_mm: float
     def __init__(self, opening_angle_deg: _Optional[float] = ..., near_mm: _Optional[float] = ..., far_mm: _Optional[float] = ...) -> None: ...
 
+class PhasedProbe(_message.Message):
+    __slots__ = ("opening_angle_deg", "far_mm")
+    OPENING_ANGLE_DEG_FIELD_NUMBER: _ClassVar[int]
+    FAR_MM_FIELD_NUMBER: _ClassVar[int]
+    opening_angle_deg: float
+    far_mm: float
+    def __init__(self, opening_angle_deg: _Optional[float] = ..., far_mm: _Optional[float] = ...) -> None: ...
+
 class Probe(_message.Message):
-    __slots__ = ("linear", "convex")
+    __slots__ = ("linear", "convex", "phased")
     LINEAR_FIELD_NUMBER: _ClassVar[int]
     CONVEX_FIELD_NUMBER: _ClassVar[int]
+    PHASED_FIELD_NUMBER: _ClassVar[int]
     linear: LinearProbe
     convex: ConvexProbe
-    def __init__(self, linear: _Optional[_Union[LinearProbe, _Mapping]] = ..., convex: _Optional[_Union[ConvexProbe, _Mapping]] = ...) -> None: ...
+    phased: PhasedProbe
+    def __init__(self, linear: _Optional[_Union[LinearProbe, _Mapping]] = ..., convex: _Optional[_Union[ConvexProbe, _Mapping]] = ..., phased: _Optional[_Union[PhasedProbe, _Mapping]] = ...) -> None: ...

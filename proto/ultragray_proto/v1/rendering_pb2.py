@@ -26,29 +26,39 @@ from ultragray_proto.v1 import geometry_pb2 as ultragray_dot_v1_dot_geometry__pb
 from ultragray_proto.v1 import scenes_pb2 as ultragray_dot_v1_dot_scenes__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1cultragray/v1/rendering.proto\x12\x0cultragray.v1\x1a\x1bultragray/v1/geometry.proto\x1a\x19ultragray/v1/scenes.proto\"\xd2\x01\n\x0eRenderSettings\x12\r\n\x05scene\x18\x01 \x01(\t\x12\x13\n\x06height\x18\x02 \x01(\x05H\x00\x88\x01\x01\x12\x12\n\x05width\x18\x03 \x01(\x05H\x01\x88\x01\x01\x12%\n\x07outputs\x18\x04 \x03(\x0e\x32\x14.ultragray.v1.Output\x12(\n\x08\x65ncoding\x18\x05 \x01(\x0e\x32\x16.ultragray.v1.Encoding\x12\"\n\x05probe\x18\x06 \x01(\x0b\x32\x13.ultragray.v1.ProbeB\t\n\x07_heightB\x08\n\x06_width\"a\n\rRenderRequest\x12.\n\x08settings\x18\x01 \x01(\x0b\x32\x1c.ultragray.v1.RenderSettings\x12 \n\x04pose\x18\x02 \x01(\x0b\x32\x12.ultragray.v1.Pose\"g\n\x12RenderBatchRequest\x12.\n\x08settings\x18\x01 \x01(\x0b\x32\x1c.ultragray.v1.RenderSettings\x12!\n\x05poses\x18\x02 \x03(\x0b\x32\x12.ultragray.v1.Pose\"y\n\x13RenderStreamRequest\x12\x10\n\x08sequence\x18\x01 \x01(\x04\x12.\n\x08settings\x18\x02 \x01(\x0b\x32\x1c.ultragray.v1.RenderSettings\x12 \n\x04pose\x18\x03 \x01(\x0b\x32\x12.ultragray.v1.Pose\"\xe2\x02\n\x05\x46rame\x12\x10\n\x08sequence\x18\x01 \x01(\x04\x12\r\n\x05scene\x18\x02 \x01(\t\x12\x14\n\x0cscene_sha256\x18\x03 \x01(\t\x12\x10\n\x08renderer\x18\x04 \x01(\t\x12\"\n\x04pose\x18\x05 \x01(\x0b\x32\x14.ultragray.v1.Matrix\x12\"\n\x05probe\x18\x06 \x01(\x0b\x32\x13.ultragray.v1.Probe\x12\x0e\n\x06height\x18\x07 \x01(\x05\x12\r\n\x05width\x18\x08 \x01(\x05\x12%\n\x07outputs\x18\t \x03(\x0e\x32\x14.ultragray.v1.Output\x12(\n\x08\x65ncoding\x18\n \x01(\x0e\x32\x16.ultragray.v1.Encoding\x12\x0c\n\x04\x64\x61ta\x18\x0b \x01(\x0c\x12&\n\x07timings\x18\x0c \x01(\x0b\x32\x15.ultragray.v1.Timings\x12\"\n\x05\x65rror\x18\r \x01(\x0b\x32\x13.ultragray.v1.Error\"A\n\x07Timings\x12\x10\n\x08queue_ms\x18\x01 \x01(\x01\x12\x11\n\trender_ms\x18\x02 \x01(\x01\x12\x11\n\tencode_ms\x18\x03 \x01(\x01*r\n\x06Output\x12\x16\n\x12OUTPUT_UNSPECIFIED\x10\x00\x12\x10\n\x0cOUTPUT_BMODE\x10\x01\x12\x0f\n\x0bOUTPUT_ECHO\x10\x02\x12\x18\n\x14OUTPUT_TRANSMITTANCE\x10\x03\x12\x13\n\x0fOUTPUT_COVERAGE\x10\x04*s\n\x08\x45ncoding\x12\x18\n\x14\x45NCODING_UNSPECIFIED\x10\x00\x12\x12\n\x0e\x45NCODING_UINT8\x10\x01\x12\x14\n\x10\x45NCODING_FLOAT32\x10\x02\x12\x10\n\x0c\x45NCODING_PNG\x10\x03\x12\x11\n\rENCODING_JPEG\x10\x04\x32\xdf\x01\n\rRenderService\x12:\n\x06Render\x12\x1b.ultragray.v1.RenderRequest\x1a\x13.ultragray.v1.Frame\x12\x46\n\x0bRenderBatch\x12 .ultragray.v1.RenderBatchRequest\x1a\x13.ultragray.v1.Frame0\x01\x12J\n\x0cRenderStream\x12!.ultragray.v1.RenderStreamRequest\x1a\x13.ultragray.v1.Frame(\x01\x30\x01\x62\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1cultragray/v1/rendering.proto\x12\x0cultragray.v1\x1a\x1bultragray/v1/geometry.proto\x1a\x19ultragray/v1/scenes.proto\"\xe7\x02\n\x0eRenderSettings\x12\r\n\x05scene\x18\x01 \x01(\t\x12\x13\n\x06height\x18\x02 \x01(\x05H\x00\x88\x01\x01\x12\x12\n\x05width\x18\x03 \x01(\x05H\x01\x88\x01\x01\x12%\n\x07outputs\x18\x04 \x03(\x0e\x32\x14.ultragray.v1.Output\x12(\n\x08\x65ncoding\x18\x05 \x01(\x0e\x32\x16.ultragray.v1.Encoding\x12\"\n\x05probe\x18\x06 \x01(\x0b\x32\x13.ultragray.v1.Probe\x12&\n\x07\x64isplay\x18\x07 \x01(\x0b\x32\x15.ultragray.v1.Display\x12\x1b\n\x0emin_confidence\x18\x08 \x01(\x01H\x02\x88\x01\x01\x12;\n\x14\x62\x65low_min_confidence\x18\t \x01(\x0e\x32\x1d.ultragray.v1.BelowConfidenceB\t\n\x07_heightB\x08\n\x06_widthB\x11\n\x0f_min_confidence\"\xb9\x01\n\rExtrapolation\x12\x18\n\x0b\x64istance_mm\x18\x01 \x01(\x01H\x00\x88\x01\x01\x12\x16\n\tangle_deg\x18\x02 \x01(\x01H\x01\x88\x01\x01\x12\x17\n\nconfidence\x18\x03 \x01(\x01H\x02\x88\x01\x01\x12\x1c\n\x0fsupported_share\x18\x04 \x01(\x01H\x03\x88\x01\x01\x42\x0e\n\x0c_distance_mmB\x0c\n\n_angle_degB\r\n\x0b_confidenceB\x12\n\x10_supported_share\"\xb4\x01\n\x07\x44isplay\x12\x0f\n\x07gain_db\x18\x01 \x01(\x01\x12\x1d\n\x10\x64ynamic_range_db\x18\x02 \x01(\x01H\x00\x88\x01\x01\x12\x0e\n\x06tgc_db\x18\x03 \x03(\x01\x12\x15\n\x08\x64\x65pth_mm\x18\x04 \x01(\x01H\x01\x88\x01\x01\x12\x0c\n\x04\x66lip\x18\x05 \x01(\x08\x12\x15\n\x08pixel_mm\x18\x06 \x01(\x01H\x02\x88\x01\x01\x42\x13\n\x11_dynamic_range_dbB\x0b\n\t_depth_mmB\x0b\n\t_pixel_mm\"t\n\x07Picture\x12\x13\n\x0b\x63olumn_unit\x18\x01 \x01(\t\x12\x14\n\x0c\x66irst_column\x18\x02 \x01(\x01\x12\x14\n\x0c\x66irst_row_mm\x18\x03 \x01(\x01\x12\x13\n\x0b\x63olumn_step\x18\x04 \x01(\x01\x12\x13\n\x0brow_step_mm\x18\x05 \x01(\x01\"a\n\rRenderRequest\x12.\n\x08settings\x18\x01 \x01(\x0b\x32\x1c.ultragray.v1.RenderSettings\x12 \n\x04pose\x18\x02 \x01(\x0b\x32\x12.ultragray.v1.Pose\"g\n\x12RenderBatchRequest\x12.\n\x08settings\x18\x01 \x01(\x0b\x32\x1c.ultragray.v1.RenderSettings\x12!\n\x05poses\x18\x02 \x03(\x0b\x32\x12.ultragray.v1.Pose\"\xf9\x01\n\x13RenderStreamRequest\x12\x10\n\x08sequence\x18\x01 \x01(\x04\x12.\n\x08settings\x18\x02 \x01(\x0b\x32\x1c.ultragray.v1.RenderSettings\x12 \n\x04pose\x18\x03 \x01(\x0b\x32\x12.ultragray.v1.Pose\x12&\n\x04mode\x18\x04 \x01(\x0e\x32\x18.ultragray.v1.StreamMode\x12\x17\n\ntimeout_ms\x18\x05 \x01(\x01H\x00\x88\x01\x01\x12\x1b\n\x0e\x63lient_time_ns\x18\x06 \x01(\x03H\x01\x88\x01\x01\x42\r\n\x0b_timeout_msB\x11\n\x0f_client_time_ns\"\xd8\x04\n\x05\x46rame\x12\x10\n\x08sequence\x18\x01 \x01(\x04\x12\r\n\x05scene\x18\x02 \x01(\t\x12\x14\n\x0cscene_sha256\x18\x03 \x01(\t\x12\x10\n\x08renderer\x18\x04 \x01(\t\x12\"\n\x04pose\x18\x05 \x01(\x0b\x32\x14.ultragray.v1.Matrix\x12\"\n\x05probe\x18\x06 \x01(\x0b\x32\x13.ultragray.v1.Probe\x12\x0e\n\x06height\x18\x07 \x01(\x05\x12\r\n\x05width\x18\x08 \x01(\x05\x12%\n\x07outputs\x18\t \x03(\x0e\x32\x14.ultragray.v1.Output\x12(\n\x08\x65ncoding\x18\n \x01(\x0e\x32\x16.ultragray.v1.Encoding\x12\x0c\n\x04\x64\x61ta\x18\x0b \x01(\x0c\x12&\n\x07timings\x18\x0c \x01(\x0b\x32\x15.ultragray.v1.Timings\x12\"\n\x05\x65rror\x18\r \x01(\x0b\x32\x13.ultragray.v1.Error\x12\x0f\n\x07\x64ropped\x18\x0e \x01(\x04\x12\x32\n\rextrapolation\x18\x14 \x01(\x0b\x32\x1b.ultragray.v1.Extrapolation\x12&\n\x07\x64isplay\x18\x10 \x01(\x0b\x32\x15.ultragray.v1.Display\x12&\n\x07picture\x18\x11 \x01(\x0b\x32\x15.ultragray.v1.Picture\x12\x17\n\x0frendered_height\x18\x12 \x01(\x05\x12\x16\n\x0erendered_width\x18\x13 \x01(\x05\x12\x1b\n\x0e\x63lient_time_ns\x18\x0f \x01(\x03H\x00\x88\x01\x01\x42\x11\n\x0f_client_time_ns\"A\n\x07Timings\x12\x10\n\x08queue_ms\x18\x01 \x01(\x01\x12\x11\n\trender_ms\x18\x02 \x01(\x01\x12\x11\n\tencode_ms\x18\x03 \x01(\x01*\x85\x01\n\x06Output\x12\x16\n\x12OUTPUT_UNSPECIFIED\x10\x00\x12\x10\n\x0cOUTPUT_BMODE\x10\x01\x12\x0f\n\x0bOUTPUT_ECHO\x10\x02\x12\x18\n\x14OUTPUT_TRANSMITTANCE\x10\x03\x12\x13\n\x0fOUTPUT_COVERAGE\x10\x04\x12\x11\n\rOUTPUT_LABELS\x10\x05*s\n\x08\x45ncoding\x12\x18\n\x14\x45NCODING_UNSPECIFIED\x10\x00\x12\x12\n\x0e\x45NCODING_UINT8\x10\x01\x12\x14\n\x10\x45NCODING_FLOAT32\x10\x02\x12\x10\n\x0c\x45NCODING_PNG\x10\x03\x12\x11\n\rENCODING_JPEG\x10\x04*k\n\x0f\x42\x65lowConfidence\x12 \n\x1c\x42\x45LOW_CONFIDENCE_UNSPECIFIED\x10\x00\x12\x1b\n\x17\x42\x45LOW_CONFIDENCE_REFUSE\x10\x01\x12\x19\n\x15\x42\x45LOW_CONFIDENCE_MASK\x10\x02*Z\n\nStreamMode\x12\x1b\n\x17STREAM_MODE_UNSPECIFIED\x10\x00\x12\x17\n\x13STREAM_MODE_ORDERED\x10\x01\x12\x16\n\x12STREAM_MODE_LATEST\x10\x02\x32\xdf\x01\n\rRenderService\x12:\n\x06Render\x12\x1b.ultragray.v1.RenderRequest\x1a\x13.ultragray.v1.Frame\x12\x46\n\x0bRenderBatch\x12 .ultragray.v1.RenderBatchRequest\x1a\x13.ultragray.v1.Frame0\x01\x12J\n\x0cRenderStream\x12!.ultragray.v1.RenderStreamRequest\x1a\x13.ultragray.v1.Frame(\x01\x30\x01\x62\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
 _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'ultragray.v1.rendering_pb2', _globals)
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
-  _globals['_OUTPUT']._serialized_start=1066
-  _globals['_OUTPUT']._serialized_end=1180
-  _globals['_ENCODING']._serialized_start=1182
-  _globals['_ENCODING']._serialized_end=1297
+  _globals['_OUTPUT']._serialized_start=2080
+  _globals['_OUTPUT']._serialized_end=2213
+  _globals['_ENCODING']._serialized_start=2215
+  _globals['_ENCODING']._serialized_end=2330
+  _globals['_BELOWCONFIDENCE']._serialized_start=2332
+  _globals['_BELOWCONFIDENCE']._serialized_end=2439
+  _globals['_STREAMMODE']._serialized_start=2441
+  _globals['_STREAMMODE']._serialized_end=2531
   _globals['_RENDERSETTINGS']._serialized_start=103
-  _globals['_RENDERSETTINGS']._serialized_end=313
-  _globals['_RENDERREQUEST']._serialized_start=315
-  _globals['_RENDERREQUEST']._serialized_end=412
-  _globals['_RENDERBATCHREQUEST']._serialized_start=414
-  _globals['_RENDERBATCHREQUEST']._serialized_end=517
-  _globals['_RENDERSTREAMREQUEST']._serialized_start=519
-  _globals['_RENDERSTREAMREQUEST']._serialized_end=640
-  _globals['_FRAME']._serialized_start=643
-  _globals['_FRAME']._serialized_end=997
-  _globals['_TIMINGS']._serialized_start=999
-  _globals['_TIMINGS']._serialized_end=1064
-  _globals['_RENDERSERVICE']._serialized_start=1300
-  _globals['_RENDERSERVICE']._serialized_end=1523
+  _globals['_RENDERSETTINGS']._serialized_end=462
+  _globals['_EXTRAPOLATION']._serialized_start=465
+  _globals['_EXTRAPOLATION']._serialized_end=650
+  _globals['_DISPLAY']._serialized_start=653
+  _globals['_DISPLAY']._serialized_end=833
+  _globals['_PICTURE']._serialized_start=835
+  _globals['_PICTURE']._serialized_end=951
+  _globals['_RENDERREQUEST']._serialized_start=953
+  _globals['_RENDERREQUEST']._serialized_end=1050
+  _globals['_RENDERBATCHREQUEST']._serialized_start=1052
+  _globals['_RENDERBATCHREQUEST']._serialized_end=1155
+  _globals['_RENDERSTREAMREQUEST']._serialized_start=1158
+  _globals['_RENDERSTREAMREQUEST']._serialized_end=1407
+  _globals['_FRAME']._serialized_start=1410
+  _globals['_FRAME']._serialized_end=2010
+  _globals['_TIMINGS']._serialized_start=2012
+  _globals['_TIMINGS']._serialized_end=2077
+  _globals['_RENDERSERVICE']._serialized_start=2534
+  _globals['_RENDERSERVICE']._serialized_end=2757
 # @@protoc_insertion_point(module_scope)

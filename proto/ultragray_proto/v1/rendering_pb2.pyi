@@ -16,6 +16,7 @@ class Output(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     OUTPUT_ECHO: _ClassVar[Output]
     OUTPUT_TRANSMITTANCE: _ClassVar[Output]
     OUTPUT_COVERAGE: _ClassVar[Output]
+    OUTPUT_LABELS: _ClassVar[Output]
 
 class Encoding(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
@@ -24,32 +25,99 @@ class Encoding(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     ENCODING_FLOAT32: _ClassVar[Encoding]
     ENCODING_PNG: _ClassVar[Encoding]
     ENCODING_JPEG: _ClassVar[Encoding]
+
+class BelowConfidence(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    BELOW_CONFIDENCE_UNSPECIFIED: _ClassVar[BelowConfidence]
+    BELOW_CONFIDENCE_REFUSE: _ClassVar[BelowConfidence]
+    BELOW_CONFIDENCE_MASK: _ClassVar[BelowConfidence]
+
+class StreamMode(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    STREAM_MODE_UNSPECIFIED: _ClassVar[StreamMode]
+    STREAM_MODE_ORDERED: _ClassVar[StreamMode]
+    STREAM_MODE_LATEST: _ClassVar[StreamMode]
 OUTPUT_UNSPECIFIED: Output
 OUTPUT_BMODE: Output
 OUTPUT_ECHO: Output
 OUTPUT_TRANSMITTANCE: Output
 OUTPUT_COVERAGE: Output
+OUTPUT_LABELS: Output
 ENCODING_UNSPECIFIED: Encoding
 ENCODING_UINT8: Encoding
 ENCODING_FLOAT32: Encoding
 ENCODING_PNG: Encoding
 ENCODING_JPEG: Encoding
+BELOW_CONFIDENCE_UNSPECIFIED: BelowConfidence
+BELOW_CONFIDENCE_REFUSE: BelowConfidence
+BELOW_CONFIDENCE_MASK: BelowConfidence
+STREAM_MODE_UNSPECIFIED: StreamMode
+STREAM_MODE_ORDERED: StreamMode
+STREAM_MODE_LATEST: StreamMode
 
 class RenderSettings(_message.Message):
-    __slots__ = ("scene", "height", "width", "outputs", "encoding", "probe")
+    __slots__ = ("scene", "height", "width", "outputs", "encoding", "probe", "display", "min_confidence", "below_min_confidence")
     SCENE_FIELD_NUMBER: _ClassVar[int]
     HEIGHT_FIELD_NUMBER: _ClassVar[int]
     WIDTH_FIELD_NUMBER: _ClassVar[int]
     OUTPUTS_FIELD_NUMBER: _ClassVar[int]
     ENCODING_FIELD_NUMBER: _ClassVar[int]
     PROBE_FIELD_NUMBER: _ClassVar[int]
+    DISPLAY_FIELD_NUMBER: _ClassVar[int]
+    MIN_CONFIDENCE_FIELD_NUMBER: _ClassVar[int]
+    BELOW_MIN_CONFIDENCE_FIELD_NUMBER: _ClassVar[int]
     scene: str
     height: int
     width: int
     outputs: _containers.RepeatedScalarFieldContainer[Output]
     encoding: Encoding
     probe: _geometry_pb2.Probe
-    def __init__(self, scene: _Optional[str] = ..., height: _Optional[int] = ..., width: _Optional[int] = ..., outputs: _Optional[_Iterable[_Union[Output, str]]] = ..., encoding: _Optional[_Union[Encoding, str]] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ...) -> None: ...
+    display: Display
+    min_confidence: float
+    below_min_confidence: BelowConfidence
+    def __init__(self, scene: _Optional[str] = ..., height: _Optional[int] = ..., width: _Optional[int] = ..., outputs: _Optional[_Iterable[_Union[Output, str]]] = ..., encoding: _Optional[_Union[Encoding, str]] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., display: _Optional[_Union[Display, _Mapping]] = ..., min_confidence: _Optional[float] = ..., below_min_confidence: _Optional[_Union[BelowConfidence, str]] = ...) -> None: ...
+
+class Extrapolation(_message.Message):
+    __slots__ = ("distance_mm", "angle_deg", "confidence", "supported_share")
+    DISTANCE_MM_FIELD_NUMBER: _ClassVar[int]
+    ANGLE_DEG_FIELD_NUMBER: _ClassVar[int]
+    CONFIDENCE_FIELD_NUMBER: _ClassVar[int]
+    SUPPORTED_SHARE_FIELD_NUMBER: _ClassVar[int]
+    distance_mm: float
+    angle_deg: float
+    confidence: float
+    supported_share: float
+    def __init__(self, distance_mm: _Optional[float] = ..., angle_deg: _Optional[float] = ..., confidence: _Optional[float] = ..., supported_share: _Optional[float] = ...) -> None: ...
+
+class Display(_message.Message):
+    __slots__ = ("gain_db", "dynamic_range_db", "tgc_db", "depth_mm", "flip", "pixel_mm")
+    GAIN_DB_FIELD_NUMBER: _ClassVar[int]
+    DYNAMIC_RANGE_DB_FIELD_NUMBER: _ClassVar[int]
+    TGC_DB_FIELD_NUMBER: _ClassVar[int]
+    DEPTH_MM_FIELD_NUMBER: _ClassVar[int]
+    FLIP_FIELD_NUMBER: _ClassVar[int]
+    PIXEL_MM_FIELD_NUMBER: _ClassVar[int]
+    gain_db: float
+    dynamic_range_db: float
+    tgc_db: _containers.RepeatedScalarFieldContainer[float]
+    depth_mm: float
+    flip: bool
+    pixel_mm: float
+    def __init__(self, gain_db: _Optional[float] = ..., dynamic_range_db: _Optional[float] = ..., tgc_db: _Optional[_Iterable[float]] = ..., depth_mm: _Optional[float] = ..., flip: _Optional[bool] = ..., pixel_mm: _Optional[float] = ...) -> None: ...
+
+class Picture(_message.Message):
+    __slots__ = ("column_unit", "first_column", "first_row_mm", "column_step", "row_step_mm")
+    COLUMN_UNIT_FIELD_NUMBER: _ClassVar[int]
+    FIRST_COLUMN_FIELD_NUMBER: _ClassVar[int]
+    FIRST_ROW_MM_FIELD_NUMBER: _ClassVar[int]
+    COLUMN_STEP_FIELD_NUMBER: _ClassVar[int]
+    ROW_STEP_MM_FIELD_NUMBER: _ClassVar[int]
+    column_unit: str
+    first_column: float
+    first_row_mm: float
+    column_step: float
+    row_step_mm: float
+    def __init__(self, column_unit: _Optional[str] = ..., first_column: _Optional[float] = ..., first_row_mm: _Optional[float] = ..., column_step: _Optional[float] = ..., row_step_mm: _Optional[float] = ...) -> None: ...
 
 class RenderRequest(_message.Message):
     __slots__ = ("settings", "pose")
@@ -68,17 +136,23 @@ class RenderBatchRequest(_message.Message):
     def __init__(self, settings: _Optional[_Union[RenderSettings, _Mapping]] = ..., poses: _Optional[_Iterable[_Union[_geometry_pb2.Pose, _Mapping]]] = ...) -> None: ...
 
 class RenderStreamRequest(_message.Message):
-    __slots__ = ("sequence", "settings", "pose")
+    __slots__ = ("sequence", "settings", "pose", "mode", "timeout_ms", "client_time_ns")
     SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     SETTINGS_FIELD_NUMBER: _ClassVar[int]
     POSE_FIELD_NUMBER: _ClassVar[int]
+    MODE_FIELD_NUMBER: _ClassVar[int]
+    TIMEOUT_MS_FIELD_NUMBER: _ClassVar[int]
+    CLIENT_TIME_NS_FIELD_NUMBER: _ClassVar[int]
     sequence: int
     settings: RenderSettings
     pose: _geometry_pb2.Pose
-    def __init__(self, sequence: _Optional[int] = ..., settings: _Optional[_Union[RenderSettings, _Mapping]] = ..., pose: _Optional[_Union[_geometry_pb2.Pose, _Mapping]] = ...) -> None: ...
+    mode: StreamMode
+    timeout_ms: float
+    client_time_ns: int
+    def __init__(self, sequence: _Optional[int] = ..., settings: _Optional[_Union[RenderSettings, _Mapping]] = ..., pose: _Optional[_Union[_geometry_pb2.Pose, _Mapping]] = ..., mode: _Optional[_Union[StreamMode, str]] = ..., timeout_ms: _Optional[float] = ..., client_time_ns: _Optional[int] = ...) -> None: ...
 
 class Frame(_message.Message):
-    __slots__ = ("sequence", "scene", "scene_sha256", "renderer", "pose", "probe", "height", "width", "outputs", "encoding", "data", "timings", "error")
+    __slots__ = ("sequence", "scene", "scene_sha256", "renderer", "pose", "probe", "height", "width", "outputs", "encoding", "data", "timings", "error", "dropped", "extrapolation", "display", "picture", "rendered_height", "rendered_width", "client_time_ns")
     SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     SCENE_FIELD_NUMBER: _ClassVar[int]
     SCENE_SHA256_FIELD_NUMBER: _ClassVar[int]
@@ -92,6 +166,13 @@ class Frame(_message.Message):
     DATA_FIELD_NUMBER: _ClassVar[int]
     TIMINGS_FIELD_NUMBER: _ClassVar[int]
     ERROR_FIELD_NUMBER: _ClassVar[int]
+    DROPPED_FIELD_NUMBER: _ClassVar[int]
+    EXTRAPOLATION_FIELD_NUMBER: _ClassVar[int]
+    DISPLAY_FIELD_NUMBER: _ClassVar[int]
+    PICTURE_FIELD_NUMBER: _ClassVar[int]
+    RENDERED_HEIGHT_FIELD_NUMBER: _ClassVar[int]
+    RENDERED_WIDTH_FIELD_NUMBER: _ClassVar[int]
+    CLIENT_TIME_NS_FIELD_NUMBER: _ClassVar[int]
     sequence: int
     scene: str
     scene_sha256: str
@@ -105,7 +186,14 @@ class Frame(_message.Message):
     data: bytes
     timings: Timings
     error: _scenes_pb2.Error
-    def __init__(self, sequence: _Optional[int] = ..., scene: _Optional[str] = ..., scene_sha256: _Optional[str] = ..., renderer: _Optional[str] = ..., pose: _Optional[_Union[_geometry_pb2.Matrix, _Mapping]] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., height: _Optional[int] = ..., width: _Optional[int] = ..., outputs: _Optional[_Iterable[_Union[Output, str]]] = ..., encoding: _Optional[_Union[Encoding, str]] = ..., data: _Optional[bytes] = ..., timings: _Optional[_Union[Timings, _Mapping]] = ..., error: _Optional[_Union[_scenes_pb2.Error, _Mapping]] = ...) -> None: ...
+    dropped: int
+    extrapolation: Extrapolation
+    display: Display
+    picture: Picture
+    rendered_height: int
+    rendered_width: int
+    client_time_ns: int
+    def __init__(self, sequence: _Optional[int] = ..., scene: _Optional[str] = ..., scene_sha256: _Optional[str] = ..., renderer: _Optional[str] = ..., pose: _Optional[_Union[_geometry_pb2.Matrix, _Mapping]] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., height: _Optional[int] = ..., width: _Optional[int] = ..., outputs: _Optional[_Iterable[_Union[Output, str]]] = ..., encoding: _Optional[_Union[Encoding, str]] = ..., data: _Optional[bytes] = ..., timings: _Optional[_Union[Timings, _Mapping]] = ..., error: _Optional[_Union[_scenes_pb2.Error, _Mapping]] = ..., dropped: _Optional[int] = ..., extrapolation: _Optional[_Union[Extrapolation, _Mapping]] = ..., display: _Optional[_Union[Display, _Mapping]] = ..., picture: _Optional[_Union[Picture, _Mapping]] = ..., rendered_height: _Optional[int] = ..., rendered_width: _Optional[int] = ..., client_time_ns: _Optional[int] = ...) -> None: ...
 
 class Timings(_message.Message):
     __slots__ = ("queue_ms", "render_ms", "encode_ms")

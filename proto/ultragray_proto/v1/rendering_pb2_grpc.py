@@ -63,7 +63,7 @@ class RenderServiceServicer:
 
     def RenderBatch(self, request, context):
         """Many poses, one frame each, in order, as they become ready; sequence counts from 0. The frames give way to those of
-        interactive callers. All poses are checked before the first frame is rendered. A full queue refuses the call at its
+        interactive callers. All poses are checked before the first frame is rendered, but for their confidence. A full queue refuses the call at its
         start (QUEUE_FULL); once frames flow, the call waits for room instead. A service that stops ends the call with DRAINING
         after the frames in flight; ask another one for the poses from the first sequence that is missing.
         """
@@ -72,11 +72,13 @@ class RenderServiceServicer:
         raise NotImplementedError('Method not implemented!')
 
     def RenderStream(self, request_iterator, context):
-        """Poses in, frames out, in the order of the poses, several in flight (8; then the stream stops reading). The first
-        message must carry settings, later ones may. A message that cannot be answered (a bad pose, an unknown scene, a full
+        """Poses in, frames out, in the order of the poses. The first message must carry settings, later ones may; its mode is
+        that of the stream. ORDERED answers every pose, several in flight (8; then the stream stops reading). LATEST is for
+        control loops: a newer pose takes the place in the queue of one that still waits, which gets no frame and is counted
+        in `dropped`; the stream is read without pause, and a slow reader gets fewer frames, not older ones. A message that cannot be answered (a bad pose, an unknown scene, a full
         queue, a deadline) gets a Frame with its sequence and `error` set, and the stream goes on; refused settings
         change nothing. The call itself fails only where it cannot go on: UNAVAILABLE with reason DRAINING when the service
-        stops (after the frames in flight), or UNAUTHENTICATED.
+        stops (after the frames in flight), UNAUTHENTICATED, or INVALID_ARGUMENT for an unknown mode.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')

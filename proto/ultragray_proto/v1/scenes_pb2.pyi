@@ -48,7 +48,7 @@ class GetSceneRequest(_message.Message):
     def __init__(self, scene: _Optional[str] = ...) -> None: ...
 
 class Scene(_message.Message):
-    __slots__ = ("name", "loaded", "loaded_processes", "file_bytes", "gaussian_count", "sh_degree", "intensity", "centre_mm", "bounds_min_mm", "bounds_max_mm", "probe", "image_height", "image_width", "training_poses", "metrics", "dataset_name", "dataset_sha256")
+    __slots__ = ("name", "loaded", "loaded_processes", "file_bytes", "gaussian_count", "sh_degree", "intensity", "centre_mm", "bounds_min_mm", "bounds_max_mm", "probe", "image_height", "image_width", "training_poses", "metrics", "dataset_name", "dataset_sha256", "label_names", "confidence")
     class MetricsEntry(_message.Message):
         __slots__ = ("key", "value")
         KEY_FIELD_NUMBER: _ClassVar[int]
@@ -56,6 +56,13 @@ class Scene(_message.Message):
         key: str
         value: float
         def __init__(self, key: _Optional[str] = ..., value: _Optional[float] = ...) -> None: ...
+    class LabelNamesEntry(_message.Message):
+        __slots__ = ("key", "value")
+        KEY_FIELD_NUMBER: _ClassVar[int]
+        VALUE_FIELD_NUMBER: _ClassVar[int]
+        key: int
+        value: str
+        def __init__(self, key: _Optional[int] = ..., value: _Optional[str] = ...) -> None: ...
     NAME_FIELD_NUMBER: _ClassVar[int]
     LOADED_FIELD_NUMBER: _ClassVar[int]
     LOADED_PROCESSES_FIELD_NUMBER: _ClassVar[int]
@@ -73,6 +80,8 @@ class Scene(_message.Message):
     METRICS_FIELD_NUMBER: _ClassVar[int]
     DATASET_NAME_FIELD_NUMBER: _ClassVar[int]
     DATASET_SHA256_FIELD_NUMBER: _ClassVar[int]
+    LABEL_NAMES_FIELD_NUMBER: _ClassVar[int]
+    CONFIDENCE_FIELD_NUMBER: _ClassVar[int]
     name: str
     loaded: bool
     loaded_processes: int
@@ -90,7 +99,17 @@ class Scene(_message.Message):
     metrics: _containers.ScalarMap[str, float]
     dataset_name: str
     dataset_sha256: str
-    def __init__(self, name: _Optional[str] = ..., loaded: _Optional[bool] = ..., loaded_processes: _Optional[int] = ..., file_bytes: _Optional[int] = ..., gaussian_count: _Optional[int] = ..., sh_degree: _Optional[int] = ..., intensity: _Optional[str] = ..., centre_mm: _Optional[_Union[_geometry_pb2.Position, _Mapping]] = ..., bounds_min_mm: _Optional[_Union[_geometry_pb2.Position, _Mapping]] = ..., bounds_max_mm: _Optional[_Union[_geometry_pb2.Position, _Mapping]] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., image_height: _Optional[int] = ..., image_width: _Optional[int] = ..., training_poses: _Optional[_Union[TrainingPoses, _Mapping]] = ..., metrics: _Optional[_Mapping[str, float]] = ..., dataset_name: _Optional[str] = ..., dataset_sha256: _Optional[str] = ...) -> None: ...
+    label_names: _containers.ScalarMap[int, str]
+    confidence: ConfidenceFit
+    def __init__(self, name: _Optional[str] = ..., loaded: _Optional[bool] = ..., loaded_processes: _Optional[int] = ..., file_bytes: _Optional[int] = ..., gaussian_count: _Optional[int] = ..., sh_degree: _Optional[int] = ..., intensity: _Optional[str] = ..., centre_mm: _Optional[_Union[_geometry_pb2.Position, _Mapping]] = ..., bounds_min_mm: _Optional[_Union[_geometry_pb2.Position, _Mapping]] = ..., bounds_max_mm: _Optional[_Union[_geometry_pb2.Position, _Mapping]] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., image_height: _Optional[int] = ..., image_width: _Optional[int] = ..., training_poses: _Optional[_Union[TrainingPoses, _Mapping]] = ..., metrics: _Optional[_Mapping[str, float]] = ..., dataset_name: _Optional[str] = ..., dataset_sha256: _Optional[str] = ..., label_names: _Optional[_Mapping[int, str]] = ..., confidence: _Optional[_Union[ConfidenceFit, _Mapping]] = ...) -> None: ...
+
+class ConfidenceFit(_message.Message):
+    __slots__ = ("error", "fitted_on")
+    ERROR_FIELD_NUMBER: _ClassVar[int]
+    FITTED_ON_FIELD_NUMBER: _ClassVar[int]
+    error: float
+    fitted_on: int
+    def __init__(self, error: _Optional[float] = ..., fitted_on: _Optional[int] = ...) -> None: ...
 
 class TrainingPoses(_message.Message):
     __slots__ = ("count", "position_min_mm", "position_max_mm", "first", "middle", "last")

@@ -58,6 +58,8 @@ class CallContext(grpc.aio.ServerInterceptor):  # type: ignore[misc]
                 status = grpc.StatusCode.OK.name
             except asyncio.CancelledError:
                 raise
+            except grpc.aio.InternalError:  # a write: the caller is gone, which grpc tells a moment later
+                raise asyncio.CancelledError from None
             except UltragrayError as error:
                 status = error.grpc_status
                 await abort(context, error)

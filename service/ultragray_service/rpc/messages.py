@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import asdict
+
 import numpy as np
 
+from ultragray.display import AS_RENDERED, FRAME_RANGE_DB, Display
 from ultragray.errors import InvalidArgument, InvalidPose, InvalidProbe, UltragrayError, UnknownOutput
-from ultragray.pose import pose_from_position_quaternion
-from ultragray.probe import ConvexProbe, FloatArray, LinearProbe, Probe
+from ultragray.pose import check_poses, pose_from_position_quaternion
+from ultragray.probe import ConvexProbe, FloatArray, LinearProbe, PhasedProbe, Picture, Probe
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2, scenes_pb2
-from ultragray_workers.types import Encoding, RenderResult
+from ultragray_workers.types import Below, Encoding, RenderResult, Trust
 
 from ..requests import RenderSpec, field_under, one_pose
 
@@ -17,6 +22,7 @@ OUTPUT_NAMES = {
     rendering_pb2.OUTPUT_ECHO: "echo",
     rendering_pb2.OUTPUT_TRANSMITTANCE: "transmittance",
     rendering_pb2.OUTPUT_COVERAGE: "coverage",
+    rendering_pb2.OUTPUT_LABELS: "labels",
 }
 OUTPUT_NUMBERS = {name: number for number, name in OUTPUT_NAMES.items()}
 
@@ -29,6 +35,13 @@ ENCODINGS = {
 }
 _ENCODING_NUMBERS = {
     encoding: number for number, encoding in ENCODINGS.items() if number != rendering_pb2.ENCODING_UNSPECIFIED
+}
+
+
+_BELOW = {
+    rendering_pb2.BELOW_CONFIDENCE_UNSPECIFIED: Below.REFUSE,
+    rendering_pb2.BELOW_CONFIDENCE_REFUSE: Below.REFUSE,
+    rendering_pb2.BELOW_CONFIDENCE_MASK: Below.MASK,
 }
 
 
@@ -53,6 +66,17 @@ def pose_from_message(message: geometry_pb2.Pose, field: str) -> FloatArray:  # 
     return pose_from_position_quaternion((p.x, p.y, p.z), (q.w, q.x, q.y, q.z), field=f"{field}.placement")
 
 
+def poses_from_messages(messages: Sequence[geometry_pb2.Pose], field: str) -> FloatArray:  # [C, 4, 4] mm
+    """The exact poses; many of them, as matrices, at once. Raises InvalidPose, naming the part of `field` to blame."""
+    if all(pose.WhichOneof("form") == "matrix" and len(pose.matrix.values) == 16 for pose in messages):
+        matrices = np.empty((len(messages), 16))
+        for index, pose in enumerate(messages):
+            matrices[index] = pose.matrix.values
+        with suppress(InvalidPose):  # told below
+            return check_poses(matrices.reshape(-1, 4, 4))
+    return np.stack([pose_from_message(pose, f"{field}[{index}]") for index, pose in enumerate(messages)])
+
+
 def probe_from_message(message: geometry_pb2.Probe) -> Probe:
     """Raises InvalidProbe; its field is a path below the probe."""
     kind = message.WhichOneof("kind")
@@ -64,7 +88,10 @@ def probe_from_message(message: geometry_pb2.Probe) -> Probe:
         convex = message.convex
         with field_under("convex"):
             return ConvexProbe(opening_angle_deg=convex.opening_angle_deg, near_mm=convex.near_mm, far_mm=convex.far_mm)
-    raise InvalidProbe("kind must be linear or convex, got none", field="kind")
+    if kind == "phased":
+        with field_under("phased"):
+            return PhasedProbe(opening_angle_deg=message.phased.opening_angle_deg, far_mm=message.phased.far_mm)
+    raise InvalidProbe("kind must be linear, convex or phased, got none", field="kind")
 
 
 def probe_message(probe: Probe) -> geometry_pb2.Probe:
@@ -72,6 +99,9 @@ def probe_message(probe: Probe) -> geometry_pb2.Probe:
     if isinstance(probe, LinearProbe):
         linear = geometry_pb2.LinearProbe(width_mm=probe.width_mm, near_mm=probe.near_mm, far_mm=probe.far_mm)
         return geometry_pb2.Probe(linear=linear)
+    if isinstance(probe, PhasedProbe):
+        phased = geometry_pb2.PhasedProbe(opening_angle_deg=probe.opening_angle_deg, far_mm=probe.far_mm)
+        return geometry_pb2.Probe(phased=phased)
     convex = geometry_pb2.ConvexProbe(
         opening_angle_deg=probe.opening_angle_deg, near_mm=probe.near_mm, far_mm=probe.far_mm
     )
@@ -98,6 +128,10 @@ def spec_from_message(message: rendering_pb2.RenderSettings) -> RenderSpec:
     if message.HasField("probe"):
         with field_under("probe"):
             probe = probe_from_message(message.probe)
+    display = AS_RENDERED
+    if message.HasField("display"):
+        with field_under("display"):
+            display = display_from_message(message.display)
     return RenderSpec(
         scene=message.scene,
         probe=probe,
@@ -105,6 +139,47 @@ def spec_from_message(message: rendering_pb2.RenderSettings) -> RenderSpec:
         width=message.width if message.HasField("width") else None,
         outputs=outputs or ("bmode",),
         encoding=ENCODINGS[message.encoding],
+        display=display,
+        trust=Trust(
+            min_confidence=message.min_confidence if message.HasField("min_confidence") else None,
+            below=_below(message.below_min_confidence),
+        ),
+    )
+
+
+def _below(number: rendering_pb2.BelowConfidence) -> Below:
+    if number not in _BELOW:
+        raise InvalidArgument(
+            f"below_min_confidence must be one of the enum BelowConfidence, got {number}", field="below_min_confidence"
+        )
+    return _BELOW[number]
+
+
+def display_from_message(message: rendering_pb2.Display) -> Display:
+    """Raises InvalidArgument; its field is a path below the display."""
+    return Display(
+        gain_db=message.gain_db,
+        dynamic_range_db=message.dynamic_range_db if message.HasField("dynamic_range_db") else FRAME_RANGE_DB,
+        tgc_db=tuple(message.tgc_db),
+        depth_mm=message.depth_mm if message.HasField("depth_mm") else None,
+        flip=message.flip,
+        pixel_mm=message.pixel_mm if message.HasField("pixel_mm") else None,
+    )
+
+
+def display_message(display: Display) -> rendering_pb2.Display | None:
+    """The message of display settings; None where they change nothing."""
+    return None if display == AS_RENDERED else rendering_pb2.Display(**asdict(display))
+
+
+def picture_message(picture: Picture) -> rendering_pb2.Picture:
+    """Where the pixels of a frame lie."""
+    return rendering_pb2.Picture(
+        column_unit=picture.column_unit,
+        first_column=picture.first[0],
+        first_row_mm=picture.first[1],
+        column_step=picture.step[0],
+        row_step_mm=picture.step[1],
     )
 
 
@@ -130,6 +205,11 @@ def frame_message(result: RenderResult, sequence: int) -> rendering_pb2.Frame:
         outputs=[OUTPUT_NUMBERS[name] for name in result.outputs],
         encoding=_ENCODING_NUMBERS[result.encoding],
         data=result.data,
+        extrapolation=rendering_pb2.Extrapolation(**asdict(result.extrapolations[0])),
+        display=display_message(result.display),
+        picture=picture_message(result.picture),
+        rendered_height=result.rendered_height,
+        rendered_width=result.rendered_width,
         timings=rendering_pb2.Timings(queue_ms=result.queue_ms, render_ms=result.render_ms, encode_ms=result.encode_ms),
     )
 

@@ -8,7 +8,7 @@ from collections import deque
 
 import grpc
 
-from ultragray.errors import InvalidArgument, QueueFull
+from ultragray.errors import InvalidArgument, LowConfidence, QueueFull
 from ultragray_proto.v1 import rendering_pb2
 from ultragray_workers.types import Priority, RenderRequest, RenderResult
 
@@ -58,7 +58,11 @@ class RenderService:
                     render = self._service.render(prepared) if started == 0 else self._render_when_room(prepared)
                     in_flight.append(asyncio.ensure_future(render))
                     started += 1
-                result = await in_flight[0]
+                try:
+                    result = await in_flight[0]
+                except LowConfidence as error:
+                    field = f"poses[{sequence}]"
+                    raise LowConfidence(error.detail.replace("pose", field, 1), field=field) from None
                 in_flight.popleft()
                 await context.write(frame_message(result, sequence))
         finally:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import grpc
 
+from ultragray.confidence.assess import read_model
 from ultragray.scene_info import SceneHeader
 from ultragray_proto.v1 import scenes_pb2
 
@@ -65,7 +66,7 @@ def _entry(entry: CatalogEntry, *, loaded: bool) -> scenes_pb2.SceneEntry:
 
 
 def _scene(name: str, header: SceneHeader, loaded_processes: int) -> scenes_pb2.Scene:
-    info = header.info
+    info, told = header.info, read_model(header.info.confidence, len(header.training_poses))
     return scenes_pb2.Scene(
         name=name,
         loaded=loaded_processes > 0,
@@ -84,6 +85,8 @@ def _scene(name: str, header: SceneHeader, loaded_processes: int) -> scenes_pb2.
         metrics=finite_metrics(header),
         dataset_name=str(info.dataset_name or ""),
         dataset_sha256=str(info.dataset_sha256 or ""),
+        label_names=info.label_names,
+        confidence=None if told is None else scenes_pb2.ConfidenceFit(error=told.error, fitted_on=told.fitted_on),
     )
 
 

@@ -25,6 +25,7 @@ from .rendering import RenderService
 from .scenes import SceneService
 
 MAX_RECEIVE_BYTES = 16 * 2**20
+LEAST_PING_INTERVAL_MS = 10_000
 _UNLIMITED = -1
 
 SERVICE_NAMES = (
@@ -44,6 +45,9 @@ class GrpcServer:
             options=[
                 ("grpc.max_receive_message_length", MAX_RECEIVE_BYTES),
                 ("grpc.max_send_message_length", _UNLIMITED),
+                # A client may ask this often whether the service is still there, as in a quiet WatchJob; without it, a
+                # client that asks more than twice within five minutes is cut off.
+                ("grpc.http2.min_ping_interval_without_data_ms", LEAST_PING_INTERVAL_MS),
                 ("grpc.so_reuseport", 0),  # else a second service would share the port unnoticed
             ],
         )

@@ -1,105 +1,100 @@
-"""RenderStream: poses in, frames out, in order, several in flight."""
+"""RenderStream: poses in, frames out."""
 
 from __future__ import annotations
 
-import asyncio
-import logging
-from collections.abc import Coroutine
-from typing import Any
-
 import grpc
 
-from ultragray.errors import Draining, InvalidArgument, UltragrayError
+from ultragray.errors import InvalidArgument, UltragrayError
 from ultragray_proto.v1 import rendering_pb2
 from ultragray_workers.types import Priority, RenderRequest
 
+from ..pose_stream import Answered, Asked, PoseStream, StreamMode
 from ..state import Service
 from .messages import error_message, frame_message, pose_from_message
 from .planning import plan_settings
 
-MAX_FRAMES_IN_FLIGHT = 8
+_MODES = {
+    rendering_pb2.STREAM_MODE_UNSPECIFIED: StreamMode.ORDERED,
+    rendering_pb2.STREAM_MODE_ORDERED: StreamMode.ORDERED,
+    rendering_pb2.STREAM_MODE_LATEST: StreamMode.LATEST,
+}
 
-_log = logging.getLogger("ultragray.grpc")
 
-Answer = asyncio.Task[rendering_pb2.Frame]
+MAX_TIMEOUT_MS = 3_600_000.0
 
 
 class FrameStream:
-    """One call of RenderStream: a reader that starts frames and a writer that answers them in order."""
+    """One call of RenderStream."""
 
     def __init__(self, service: Service, context: grpc.aio.ServicerContext) -> None:
         self._service = service
         self._context = context
-        self._slots = asyncio.Semaphore(MAX_FRAMES_IN_FLIGHT)
-        self._answers: asyncio.Queue[Answer | None] = asyncio.Queue()
-        self._started: set[Answer] = set()
-        self._planned: RenderRequest | None = None
+        self._settings: RenderRequest | None = None
 
     async def run(self) -> None:
         """Until the client has sent its last message and got its last frame.
 
-        Raises Draining when the service stops.
+        Raises Draining when the service stops, InvalidArgument for a mode that does not exist.
         """
-        reader = asyncio.ensure_future(self._read())
-        stopping = asyncio.ensure_future(self._service.draining.wait())
-        stopping.add_done_callback(lambda _: reader.cancel())
-        try:
-            while (answer := await self._answers.get()) is not None:
-                await self._context.write(await answer)
-                self._slots.release()
-            if self._service.draining.is_set():
-                raise Draining("the service is stopping; the frames in flight have been answered")
-            await reader
-        finally:
-            stopping.cancel()
-            for task in (reader, *self._started):
-                task.cancel()
+        stream = PoseStream(self._service)
 
-    async def _read(self) -> None:
-        try:
-            while True:
-                await self._slots.acquire()
+        async def read() -> None:
+            message = await self._context.read()
+            if message is not grpc.aio.EOF:
+                stream.mode = _mode(message)
+            while message is not grpc.aio.EOF:
+                await self._take(message, stream)
                 message = await self._context.read()
-                if message is grpc.aio.EOF:
-                    return
-                await self._take(message)
-        finally:
-            self._answers.put_nowait(None)
 
-    async def _take(self, message: rendering_pb2.RenderStreamRequest) -> None:
+        await stream.run(read, self._write)
+
+    async def _take(self, message: rendering_pb2.RenderStreamRequest, stream: PoseStream) -> None:
+        client_time = message.client_time_ns if message.HasField("client_time_ns") else None
         try:
             if message.HasField("settings"):
-                self._planned = await plan_settings(self._service, message, Priority.INTERACTIVE)
+                self._settings = await plan_settings(self._service, message, Priority.INTERACTIVE)
                 if not message.HasField("pose"):
-                    self._slots.release()
                     return
-            if self._planned is None:
+            if self._settings is None:
                 raise InvalidArgument("settings is required before the first pose", field="settings")
             if not message.HasField("pose"):
                 raise InvalidArgument("pose or settings is required", field="pose")
-            pose = pose_from_message(message.pose, "pose")
-            deadline = self._service.planner.deadline(self._context.time_remaining())
-            prepared = self._service.planner.with_poses(self._planned, pose[None], deadline)
+            asked = Asked(
+                sequence=message.sequence,
+                client_time=client_time,
+                settings=self._settings,
+                pose=pose_from_message(message.pose, "pose"),
+                deadline=self._service.planner.deadline(self._timeout_s(message)),
+            )
         except UltragrayError as error:
-            self._start(self._refuse(message.sequence, error))
+            await stream.refuse(message.sequence, client_time, error)
         else:
-            self._start(self._answer(message.sequence, prepared))
+            await stream.ask(asked)
 
-    def _start(self, work: Coroutine[Any, Any, rendering_pb2.Frame]) -> None:
-        answer: Answer = asyncio.create_task(work)
-        self._started.add(answer)
-        answer.add_done_callback(self._started.discard)
-        self._answers.put_nowait(answer)
+    def _timeout_s(self, message: rendering_pb2.RenderStreamRequest) -> float | None:
+        of_call_s: float | None = self._context.time_remaining()
+        if not message.HasField("timeout_ms"):
+            return of_call_s
+        if not 0.0 < message.timeout_ms <= MAX_TIMEOUT_MS:
+            raise InvalidArgument(
+                f"timeout_ms must be above 0 and at most {MAX_TIMEOUT_MS:g}, got {message.timeout_ms:g}",
+                field="timeout_ms",
+            )
+        timeout_s: float = message.timeout_ms / 1000.0
+        return timeout_s if of_call_s is None else min(of_call_s, timeout_s)
 
-    async def _answer(self, sequence: int, prepared: RenderRequest) -> rendering_pb2.Frame:
-        try:
-            return frame_message(await self._service.render(prepared), sequence)
-        except UltragrayError as error:
-            return await self._refuse(sequence, error)
-        except Exception:
-            _log.exception("unexpected error in a stream")
-            return await self._refuse(sequence, UltragrayError("an unexpected error, see the log"))
+    async def _write(self, answered: Answered) -> None:
+        if isinstance(answered.outcome, UltragrayError):
+            message = rendering_pb2.Frame(sequence=answered.sequence, error=error_message(answered.outcome))
+        else:
+            message = frame_message(answered.outcome, answered.sequence)
+        message.dropped = answered.dropped
+        if answered.client_time is not None:
+            message.client_time_ns = int(answered.client_time)
+        await self._context.write(message)
 
-    async def _refuse(self, sequence: int, error: UltragrayError) -> rendering_pb2.Frame:
-        self._service.metrics.count_frame_error(error.reason)
-        return rendering_pb2.Frame(sequence=sequence, error=error_message(error))
+
+def _mode(message: rendering_pb2.RenderStreamRequest) -> StreamMode:
+    if message.mode not in _MODES:
+        raise InvalidArgument(f"mode must be one of the enum StreamMode, got {message.mode}", field="mode")
+    return _MODES[message.mode]

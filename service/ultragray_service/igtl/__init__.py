@@ -1,0 +1,1 @@
+"""OpenIGTLink: poses come in, images go out."""

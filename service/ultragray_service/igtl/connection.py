@@ -1,0 +1,234 @@
+"""One OpenIGTLink client: what it sends, what it gets, and how long it may take."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from dataclasses import replace
+from typing import Protocol
+
+from ultragray.errors import IgtlMessageInvalid, UltragrayError
+
+from ..state import Service
+from .contents import (
+    Status,
+    pack_capability,
+    pack_status,
+    unpack_interval_s,
+    unpack_position,
+    unpack_tools,
+    unpack_transform,
+)
+from .feed import Feed
+from .frames import Frame, FrameMaker
+from .kinds import CAPABILITY, HEARD, KINDS, POSE_TYPES, UNDERSTOOD
+from .messages import HEADER_BYTES, Header, Message, pack_message, unpack_header, unpack_message
+from .routes import SceneChooser
+from .states import OK, state_of
+from .waiting import PoseMessage, WaitingPoses
+
+MAX_BODY_BYTES = 64 * 1024  # of a message that is read
+MAX_SKIPPED_BYTES = 64 * 2**20  # of a message that is not
+MESSAGE_TIMEOUT_S = 10.0  # from the first byte of a message to its last
+SEND_TIMEOUT_S = 30.0
+_SKIP_BYTES = 64 * 1024
+_SENT_AHEAD_BYTES = 64 * 1024
+
+_ACCEPTED, _REFUSED = b"\0", b"\1"
+
+_log = logging.getLogger("ultragray.igtl")
+
+
+class Frames(Protocol):
+    """What connections share: the newest frame, and a call that tells all of them about one."""
+
+    newest: Frame | None
+
+    def publish(self, frame: Frame, source: Connection) -> None: ...
+
+
+class Connection:
+    """Reads messages, renders the newest pose of each device, one after another, and sends."""
+
+    def __init__(
+        self,
+        service: Service,
+        scenes: SceneChooser,
+        frames: Frames,
+        reader: asyncio.StreamReader,
+        writer: asyncio.StreamWriter,
+    ) -> None:
+        self.feed = Feed(self._send)
+        self._service = service
+        self._scenes = scenes
+        self._frames = frames
+        self._maker = FrameMaker(service, scenes)
+        self._reader = reader
+        self._writer = writer
+        self._sending = asyncio.Lock()
+        self._poses = WaitingPoses()
+        writer.transport.set_write_buffer_limits(high=_SENT_AHEAD_BYTES)
+
+    async def run(self) -> None:
+        """Until the client goes, sends what is no message, or takes too long."""
+        work = [asyncio.ensure_future(self._render()), asyncio.ensure_future(self.feed.run())]
+        try:
+            while True:
+                await self._take_message()
+                await asyncio.sleep(0)  # reading does not wait while the buffer is full: others get their turn
+        except IgtlMessageInvalid as error:
+            self.dismiss(error)
+        except (asyncio.IncompleteReadError, ConnectionError):
+            pass
+        finally:
+            for task in work:
+                task.cancel()
+            await asyncio.gather(*work, return_exceptions=True)
+            self._writer.close()
+
+    async def settled(self) -> None:
+        """Waits until every pose so far was answered or replaced."""
+        await self._poses.settled()
+
+    def dismiss(self, error: UltragrayError) -> None:
+        """Tells the client why it cannot stay, and closes when it has taken what was sent."""
+        if not self._writer.transport.is_closing():
+            self._writer.write(pack_message(_refusal(Message("", ""), error)))
+            self._writer.close()
+
+    def abort(self) -> None:
+        """Closes at once."""
+        self._writer.transport.abort()
+
+    async def _take_message(self) -> None:
+        """Raises IgtlMessageInvalid where what follows cannot be found any more."""
+        begun = await self._reader.readexactly(1)
+        slow = asyncio.get_running_loop().call_later(MESSAGE_TIMEOUT_S, self.abort)
+        try:
+            header = unpack_header(begun + await self._reader.readexactly(HEADER_BYTES - 1))
+            if header.body_bytes > MAX_SKIPPED_BYTES:
+                raise _too_large(header, MAX_SKIPPED_BYTES)
+            is_read = header.type_name in UNDERSTOOD and header.body_bytes <= MAX_BODY_BYTES
+            if is_read:
+                body = await self._reader.readexactly(header.body_bytes)
+            else:
+                body = None
+                await self._skip(header)
+        finally:
+            slow.cancel()
+        await self._answer(header, body, time.perf_counter())
+
+    async def _skip(self, header: Header) -> None:
+        left = header.body_bytes
+        while left:
+            chunk = await self._reader.read(min(left, _SKIP_BYTES))
+            if not chunk:
+                raise asyncio.IncompleteReadError(b"", left)
+            left -= len(chunk)
+
+    async def _answer(self, header: Header, body: bytes | None, arrived: float) -> None:
+        about = Message(header.type_name, header.device_name, timestamp=header.timestamp, version=header.version)
+        try:
+            if body is not None:
+                about = unpack_message(header, body)
+                await self._obey(about, arrived)
+            elif header.type_name in UNDERSTOOD:
+                raise _too_large(header, MAX_BODY_BYTES)
+            elif header.type_name.startswith(("STT_", "STP_")):
+                await self._send(_reply(f"RTS_{header.type_name[4:]}", about, _REFUSED))
+            elif not header.type_name.startswith(HEARD):
+                raise IgtlMessageInvalid(
+                    f"the type must be one of {', '.join(CAPABILITY)}, got {header.type_name!r}", field="header"
+                )
+        except UltragrayError as error:
+            await self._refuse(about, error, arrived)
+
+    async def _obey(self, message: Message, arrived: float) -> None:
+        prefix, suffix = message.type_name[:4], message.type_name[4:]
+        if message.type_name in POSE_TYPES:
+            await self._take_poses(message, arrived)
+        elif message.type_name == "GET_CAPABIL":
+            await self._send(_reply("CAPABILITY", message, pack_capability(CAPABILITY)))
+        elif message.type_name == "GET_STATUS":
+            self._service.require_ready()
+            await self._send(_reply("STATUS", message, pack_status(Status(OK, 0, "OK", "ready"))))
+        elif prefix == "GET_":
+            await self._send(self._newest(KINDS[suffix], message))
+        else:
+            if prefix == "STT_":
+                self.feed.start(KINDS[suffix], message.device_name, unpack_interval_s(message.content), message.version)
+            else:
+                self.feed.stop(KINDS[suffix])
+            await self._send(_reply(f"RTS_{suffix}", message, _ACCEPTED))
+
+    def _newest(self, kind: str, query: Message) -> Message:
+        """The newest frame as the query wants it; without content where there is none of that name."""
+        frame = self._frames.newest
+        if frame is None or not frame.goes_by(query.device_name):
+            return _reply(kind, query, b"")
+        return frame.message(kind, query.version, query.message_id, query.device_name)
+
+    async def _take_poses(self, message: Message, arrived: float) -> None:
+        if message.type_name == "TRANSFORM":
+            poses = [(message.device_name, unpack_transform(message.content))]
+        elif message.type_name == "POSITION":
+            poses = [(message.device_name, unpack_position(message.content))]
+        else:
+            tools = unpack_tools(message.type_name, message.content)
+            named = [tool for tool in tools if await self._scenes.named(tool.name) is not None]
+            poses = [(tool.name, tool.pose) for tool in named or tools[:1]]
+        for device_name, pose in poses:
+            posed = PoseMessage(replace(message, device_name=device_name), pose, arrived)
+            if self._poses.put(posed, self._service.planner.deadline(None)):
+                self._service.metrics.count_dropped()
+
+    async def _render(self) -> None:
+        while True:
+            underway = await self._poses.next()
+            try:
+                frame = await self._maker.render(underway)
+            except UltragrayError as error:
+                await self._refuse(underway.posed.message, error, underway.posed.arrived)
+            except Exception:
+                _log.exception("unexpected error at a pose")
+                unexpected = UltragrayError("an unexpected error, see the log")
+                await self._refuse(underway.posed.message, unexpected, underway.posed.arrived)
+            else:
+                self._frames.publish(frame, self)
+                asked = frame.posed.message
+                await self._send(frame.message("IMAGE", asked.version, asked.message_id))
+                self._count(asked.type_name, "OK", frame.posed.arrived)
+
+    async def _refuse(self, about: Message, error: UltragrayError, arrived: float) -> None:
+        self._service.metrics.count_frame_error(error.reason)
+        await self._send(_refusal(about, error))
+        self._count(about.type_name, error.reason, arrived)
+
+    def _count(self, type_name: str, status: str, arrived: float) -> None:
+        route = type_name if type_name in UNDERSTOOD else "other"
+        self._service.metrics.count_request("igtl", route, status, time.perf_counter() - arrived)
+
+    async def _send(self, message: Message) -> None:
+        """Raises ConnectionError where the client has gone, or takes nothing for too long."""
+        async with self._sending:
+            self._writer.write(pack_message(message))
+            stalled = asyncio.get_running_loop().call_later(SEND_TIMEOUT_S, self.abort)
+            try:
+                await self._writer.drain()
+            finally:
+                stalled.cancel()
+
+
+def _reply(type_name: str, to: Message, content: bytes) -> Message:
+    return Message(type_name, to.device_name, content, to.timestamp, to.version, to.message_id)
+
+
+def _refusal(about: Message, error: UltragrayError) -> Message:
+    return _reply("STATUS", about, pack_status(state_of(error)))
+
+
+def _too_large(header: Header, limit_bytes: int) -> IgtlMessageInvalid:
+    return IgtlMessageInvalid(
+        f"{header.type_name}: a body may hold at most {limit_bytes} bytes, got {header.body_bytes}", field="header"
+    )

@@ -1,0 +1,203 @@
+"""The contents of OpenIGTLink messages: poses, tracked tools, images, states, requests. All numbers are big-endian."""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from ultragray.errors import IgtlMessageInvalid
+from ultragray.pose import check_poses, pose_from_position_quaternion, quaternion_from_pose
+from ultragray.probe import FloatArray
+
+from .messages import DEVICE_NAME_BYTES, pack_text, unpack_text
+
+TYPE_NAME_BYTES = 12
+
+_MATRIX = np.dtype((">f4", 12))  # the columns of a [3, 4] matrix, one after another
+_POSITION = struct.Struct(">3f")
+_TOOL = struct.Struct(">20sBB")
+_TOOL_6D = 2  # both position and orientation are known
+MAX_TOOLS = 32  # of one message: checking more would keep others waiting
+_POSES_OF_TOOLS = {"TDATA": 48, "QTDATA": 28}  # bytes of a tool's pose: a matrix, or position and quaternion
+_IMAGE = struct.Struct(">HBBBB3H48s6H")
+_IMAGE_VERSION, _SCALAR, _UINT8, _LITTLE_ENDIAN, _RAS = 1, 1, 3, 2, 1
+_STATUS = struct.Struct(">Hq20s")
+_INTERVAL = struct.Struct(">I")
+
+
+@dataclass(frozen=True, eq=False)
+class Tool:
+    """A tracked instrument; `pose` [4, 4] is tool→tracker in mm, exact."""
+
+    name: str
+    pose: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Image:
+    """A slice: `pixels` uint8 [J, I]; `matrix` [4, 4] takes the centre of pixel (i, j, k = 0, 1) to mm."""
+
+    pixels: npt.NDArray[np.uint8]
+    matrix: FloatArray
+
+
+@dataclass(frozen=True)
+class Status:
+    """A state. `code` is of the protocol's list (1: OK), `sub_code` is ours (the HTTP status of the same error)."""
+
+    code: int
+    sub_code: int
+    name: str
+    text: str
+
+
+def unpack_transform(content: bytes) -> FloatArray:  # [4, 4] mm
+    """The rigid transform of a TRANSFORM. Raises IgtlMessageInvalid and InvalidPose."""
+    _check_size("TRANSFORM", content, _MATRIX.itemsize)
+    return _rigid(content, "TRANSFORM")
+
+
+def pack_transform(pose: FloatArray) -> bytes:  # [4, 4]
+    """The content of a TRANSFORM."""
+    return pose[:3].T.astype(">f4").tobytes()
+
+
+def unpack_position(content: bytes) -> FloatArray:  # [4, 4] mm
+    """The pose of a POSITION, in any of its three forms: position only, with the vector part of the quaternion, with
+    all of it (x, y, z, w). Raises IgtlMessageInvalid and InvalidPose.
+    """
+    _check_size("POSITION", content, 12, 24, 28)
+    return _placed(content, "POSITION")
+
+
+def pack_position(pose: FloatArray) -> bytes:  # [4, 4]
+    """The content of a POSITION, with the whole quaternion."""
+    w, x, y, z = quaternion_from_pose(pose)
+    return struct.pack(">7f", *pose[:3, 3], x, y, z, w)
+
+
+def unpack_tools(type_name: str, content: bytes) -> list[Tool]:
+    """The instruments of a TDATA or QTDATA, at most MAX_TOOLS, that have both position and orientation.
+
+    Raises IgtlMessageInvalid and InvalidPose, naming the instrument.
+    """
+    size = _TOOL.size + _POSES_OF_TOOLS[type_name]
+    if len(content) % size:
+        raise IgtlMessageInvalid(
+            f"{type_name} must hold {size} bytes for each instrument, got {len(content)} bytes", field="body"
+        )
+    if len(content) > MAX_TOOLS * size:
+        raise IgtlMessageInvalid(
+            f"{type_name} may hold at most {MAX_TOOLS} instruments, got {len(content) // size}", field="body"
+        )
+    unpack = _rigid if type_name == "TDATA" else _placed
+    tools = []
+    for start in range(0, len(content), size):
+        name, kind, _ = _TOOL.unpack_from(content, start)
+        if kind == _TOOL_6D:
+            text = unpack_text(name)
+            tools.append(Tool(text, unpack(content[start + _TOOL.size : start + size], f"{type_name} of {text!r}")))
+    return tools
+
+
+def pack_tools(type_name: str, tools: Iterable[Tool]) -> bytes:
+    """The content of a TDATA or QTDATA."""
+    pack = pack_transform if type_name == "TDATA" else pack_position
+    return b"".join(
+        _TOOL.pack(pack_text(tool.name, DEVICE_NAME_BYTES), _TOOL_6D, 0) + pack(tool.pose) for tool in tools
+    )
+
+
+def unpack_image(content: bytes) -> Image:
+    """The slice of an IMAGE of 8-bit pixels. Raises IgtlMessageInvalid for anything else."""
+    if len(content) < _IMAGE.size:
+        raise IgtlMessageInvalid(f"IMAGE must hold {_IMAGE.size} bytes or more, got {len(content)}", field="body")
+    version, components, scalar, _, _, columns, rows, slices, vectors, *part = _IMAGE.unpack_from(content)
+    whole = [0, 0, 0, columns, rows, slices]
+    if (version, components, scalar, slices, part) != (_IMAGE_VERSION, _SCALAR, _UINT8, 1, whole):
+        raise IgtlMessageInvalid("IMAGE must be one whole slice of one 8-bit component", field="body")
+    _check_size("IMAGE", content, _IMAGE.size + rows * columns)
+    matrix = np.eye(4)
+    matrix[:3] = np.frombuffer(vectors, ">f4").reshape(4, 3).T
+    matrix[:3, 3] -= matrix[:3, :2] @ ((columns - 1) / 2, (rows - 1) / 2)
+    return Image(np.frombuffer(content, np.uint8, offset=_IMAGE.size).reshape(rows, columns), matrix)
+
+
+def pack_image(image: Image) -> bytes:
+    """The content of an IMAGE. The protocol gives the position of the image's centre, not of its first pixel."""
+    rows, columns = image.pixels.shape
+    vectors = image.matrix[:3].copy()
+    vectors[:, 3] += vectors[:, :2] @ ((columns - 1) / 2, (rows - 1) / 2)
+    size = (columns, rows, 1)
+    header = _IMAGE.pack(
+        _IMAGE_VERSION,
+        _SCALAR,
+        _UINT8,
+        _LITTLE_ENDIAN,
+        _RAS,
+        *size,
+        vectors.T.astype(">f4").tobytes(),
+        0,
+        0,
+        0,
+        *size,
+    )
+    return header + image.pixels.tobytes()
+
+
+def unpack_status(content: bytes) -> Status:
+    """Raises IgtlMessageInvalid."""
+    if len(content) < _STATUS.size:
+        raise IgtlMessageInvalid(f"STATUS must hold {_STATUS.size} bytes or more, got {len(content)}", field="body")
+    code, sub_code, name = _STATUS.unpack_from(content)
+    return Status(code, sub_code, unpack_text(name), unpack_text(content[_STATUS.size :]))
+
+
+def pack_status(status: Status) -> bytes:
+    """The content of a STATUS."""
+    return _STATUS.pack(status.code, status.sub_code, pack_text(status.name, 19)) + status.text.encode() + b"\0"
+
+
+def pack_capability(type_names: Iterable[str]) -> bytes:
+    """The content of a CAPABILITY: the types that the sender understands."""
+    return b"".join(name.encode().ljust(TYPE_NAME_BYTES, b"\0") for name in type_names)
+
+
+def unpack_interval_s(content: bytes) -> float:
+    """The least time between two messages that an STT_TDATA or STT_QTDATA asks for; none: 0.
+
+    Raises IgtlMessageInvalid.
+    """
+    if not content:
+        return 0.0
+    if len(content) < _INTERVAL.size:
+        raise IgtlMessageInvalid(f"an interval must hold {_INTERVAL.size} bytes, got {len(content)}", field="body")
+    return float(_INTERVAL.unpack_from(content)[0]) / 1000.0
+
+
+def _check_size(type_name: str, content: bytes, *sizes: int) -> None:
+    if len(content) not in sizes:
+        expected = " or ".join(str(size) for size in sizes)
+        raise IgtlMessageInvalid(f"{type_name} must hold {expected} bytes, got {len(content)}", field="body")
+
+
+def _rigid(values: bytes, what: str) -> FloatArray:
+    pose = np.eye(4)
+    pose[:3] = np.frombuffer(values, ">f4").reshape(4, 3).T
+    exact: FloatArray = check_poses(pose, field=what)[0]
+    return exact
+
+
+def _placed(values: bytes, what: str) -> FloatArray:
+    position = _POSITION.unpack_from(values)
+    x, y, z = _POSITION.unpack_from(values, _POSITION.size) if len(values) > _POSITION.size else (0.0, 0.0, 0.0)
+    if len(values) > 2 * _POSITION.size:
+        (w,) = struct.unpack_from(">f", values, 2 * _POSITION.size)
+    else:
+        w = math.sqrt(max(0.0, 1.0 - x * x - y * y - z * z))
+    return pose_from_position_quaternion(position, (w, x, y, z), field=what)

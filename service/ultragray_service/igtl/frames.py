@@ -1,0 +1,81 @@
+"""A rendered frame, and the messages that tell it."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, replace
+
+from ultragray.display import true_to_scale
+from ultragray_workers.types import Encoding, Priority, RenderResult
+
+from ..requests import RenderSpec
+from ..state import Service
+from .contents import Image, Tool, pack_image, pack_position, pack_tools, pack_transform
+from .messages import Message
+from .pictures import image_of
+from .routes import SceneChooser, image_name
+from .waiting import PoseMessage, Underway
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """What was rendered for a pose."""
+
+    posed: PoseMessage
+    result: RenderResult
+    image: Image
+
+    def goes_by(self, name: str) -> bool:
+        """Whether a query for `name` means this frame; a query without a name means any."""
+        return name in ("", self.posed.message.device_name, image_name(self.posed.message.device_name))
+
+    def message(self, kind: str, version: int, message_id: int = 0, name: str = "") -> Message:
+        """The frame as an IMAGE, or its pose as a TRANSFORM, POSITION, TDATA or QTDATA; `name` in place of its own."""
+        device_name, pose = self.posed.message.device_name, self.result.poses[0]
+        if kind == "IMAGE":
+            content, own_name = pack_image(self.image), image_name(device_name)
+        elif kind in ("TDATA", "QTDATA"):
+            content, own_name = pack_tools(kind, [Tool(device_name, pose)]), device_name
+        else:
+            content, own_name = (pack_transform if kind == "TRANSFORM" else pack_position)(pose), device_name
+        return Message(
+            kind, name or own_name, content, self.posed.message.timestamp, version, message_id, self._metadata()
+        )
+
+    def _metadata(self) -> dict[str, str]:
+        result = self.result
+        return {
+            "device": self.posed.message.device_name,
+            "scene": result.scene,
+            "scene_sha256": result.scene_sha256,
+            "renderer": result.renderer,
+            "replaced_poses": str(self.posed.replaced),
+            **{name: f"{value:.3f}" for name, value in asdict(result.extrapolations[0]).items() if value is not None},
+            "queue_ms": f"{result.queue_ms:.3f}",
+            "render_ms": f"{result.render_ms:.3f}",
+        }
+
+
+class FrameMaker:
+    """Renders poses of devices."""
+
+    def __init__(self, service: Service, scenes: SceneChooser) -> None:
+        self._service = service
+        self._scenes = scenes
+
+    async def render(self, underway: Underway) -> Frame:
+        """The frame of a pose, or of one that took its turn; probe and size are those the scene was trained with.
+
+        Raises SceneNotFound, and what RequestPlanner.plan and Service.render raise.
+        """
+        self._service.require_serving()
+        scene = await self._scenes.choose(underway.posed.message.device_name)
+        spec = RenderSpec(scene, None, None, None, ("bmode",), Encoding.UINT8)
+        planner = self._service.planner
+        planned = await planner.plan(spec, Priority.INTERACTIVE)
+        assert planned.probe is not None
+        assert planned.height is not None
+        display = true_to_scale(planned.probe, planned.height, self._service.settings.max_image_side)
+        planned = replace(planned, display=display)
+        prepared = planner.with_poses(planned, underway.posed.pose[None], planner.deadline(None))
+        result = await self._service.render(prepared, underway.turn)
+        return Frame(underway.posed, result, image_of(result))

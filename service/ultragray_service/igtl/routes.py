@@ -1,0 +1,59 @@
+"""Which scene a device's poses are for, and what the image of a device is called."""
+
+from __future__ import annotations
+
+import re
+import time
+
+from ultragray.errors import SceneNotFound
+
+from ..catalog import SceneCatalog
+from .messages import DEVICE_NAME_BYTES, pack_text
+
+_FRAME = re.compile(r".+To(?=[A-Z0-9])(?P<frame>.+)|.+?To(?P<other>.+)")  # of PLUS: ProbeToReference
+_NAMES_LIVE_S = 1.0
+
+
+def frame_of(device_name: str) -> str:
+    """The frame that a device's poses lead to: Reference of ProbeToReference; else the device's own name."""
+    match = _FRAME.fullmatch(device_name)
+    return (match["frame"] or match["other"]) if match else device_name
+
+
+def image_name(device_name: str) -> str:
+    """The name of the images of a device: Image_Reference for ProbeToReference, as PLUS calls them."""
+    return pack_text(f"Image_{frame_of(device_name)}", DEVICE_NAME_BYTES).decode()
+
+
+class SceneChooser:
+    """Chooses scenes by the names of devices; knows the scenes as they were at most a second ago."""
+
+    def __init__(self, catalog: SceneCatalog, default: str | None) -> None:
+        self._catalog = catalog
+        self._default = default
+        self._names: list[str] = []
+        self._read_at = -_NAMES_LIVE_S
+
+    async def named(self, device_name: str) -> str | None:
+        """The scene of that name, or of the name of the frame that the device's poses lead to."""
+        names = await self._known()
+        return next((name for name in (device_name, frame_of(device_name)) if name in names), None)
+
+    async def choose(self, device_name: str) -> str:
+        """The scene that the device names, else the default, else the only one. Raises SceneNotFound."""
+        if scene := await self.named(device_name) or self._default:
+            return scene
+        names = await self._known()
+        if len(names) != 1:
+            raise SceneNotFound(
+                f"device {device_name!r} names none of the {len(names)} scenes; name the device like a scene or "
+                f"SomethingToSCENE, or set ULTRAGRAY_IGTL_SCENE",
+                field="scene",
+            )
+        return names[0]
+
+    async def _known(self) -> list[str]:
+        if time.monotonic() - self._read_at >= _NAMES_LIVE_S:
+            self._read_at = time.monotonic()
+            self._names = await self._catalog.names()
+        return self._names

@@ -1,0 +1,46 @@
+"""Errors as OpenIGTLink states: the protocol's own list of codes, and one table from ours to it."""
+
+from __future__ import annotations
+
+from ultragray.errors import (
+    BackendUnavailable,
+    DeadlineExceeded,
+    Draining,
+    IgtlMessageInvalid,
+    InvalidArgument,
+    MemoryExceeded,
+    NotReady,
+    QueueFull,
+    SceneFileInvalid,
+    SceneNotFound,
+    SceneTooLarge,
+    UltragrayError,
+)
+
+from .contents import Status
+
+OK, UNKNOWN_ERROR, NOT_FOUND, BUSY, TIMED_OUT = 1, 2, 4, 6, 7
+CHECKSUM_ERROR, CONFIGURATION_ERROR, NO_RESOURCES, UNKNOWN_INSTRUCTION, NOT_READY, SHUTTING_DOWN = 9, 10, 11, 12, 13, 19
+
+_CODES: dict[type[UltragrayError], int] = {
+    SceneNotFound: NOT_FOUND,
+    QueueFull: BUSY,
+    DeadlineExceeded: TIMED_OUT,
+    InvalidArgument: CONFIGURATION_ERROR,
+    SceneFileInvalid: CONFIGURATION_ERROR,
+    MemoryExceeded: NO_RESOURCES,
+    SceneTooLarge: NO_RESOURCES,
+    IgtlMessageInvalid: UNKNOWN_INSTRUCTION,
+    BackendUnavailable: UNKNOWN_INSTRUCTION,
+    NotReady: NOT_READY,
+    Draining: SHUTTING_DOWN,
+}
+
+
+def state_of(error: UltragrayError) -> Status:
+    """The state that tells an error: code of the list, HTTP status as sub-code, reason as name, detail as text."""
+    if isinstance(error, IgtlMessageInvalid) and error.field == "crc":
+        code = CHECKSUM_ERROR
+    else:
+        code = next((code for kind, code in _CODES.items() if isinstance(error, kind)), UNKNOWN_ERROR)
+    return Status(code, error.http_status, error.reason, error.detail)

@@ -1,0 +1,75 @@
+"""The newest pose of each device of a client."""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import dataclass, replace
+
+from ultragray.errors import QueueFull
+from ultragray.probe import FloatArray
+from ultragray_workers.waiting import Turn
+
+from .messages import Message
+
+MAX_WAITING_DEVICES = 16
+
+
+@dataclass(frozen=True, eq=False)
+class PoseMessage:
+    """A pose [4, 4] mm of a client's message, under the name of its device."""
+
+    message: Message
+    pose: FloatArray
+    arrived: float  # time.perf_counter(), s
+    replaced: int = 0  # poses of the device that were dropped for this one
+
+
+@dataclass(eq=False)
+class Underway:
+    """What is asked of the render pool; while it waits there, a newer pose takes its turn."""
+
+    posed: PoseMessage
+    turn: Turn
+
+
+class WaitingPoses:
+    """Takes poses as they come and gives them out one after another, each device in its turn."""
+
+    def __init__(self) -> None:
+        self._poses: dict[str, PoseMessage] = {}
+        self._underway: Underway | None = None
+        self._come = asyncio.Event()
+        self._settled = asyncio.Event()
+        self._settled.set()
+
+    def put(self, posed: PoseMessage, deadline: float) -> bool:
+        """Takes a pose, to begin by `deadline` (time.monotonic(), s); whether it replaced an older one.
+
+        Raises QueueFull where too many devices wait.
+        """
+        name, underway = posed.message.device_name, self._underway
+        older = self._poses.get(name)
+        if older is None and underway is not None and underway.posed.message.device_name == name:
+            if underway.turn.give_to(posed.pose[None], deadline):
+                underway.posed = replace(posed, replaced=underway.posed.replaced + 1)
+                return True
+        elif older is None and len(self._poses) >= MAX_WAITING_DEVICES:
+            raise QueueFull(f"at most {MAX_WAITING_DEVICES} devices of a client may wait for their frames")
+        self._poses[name] = posed if older is None else replace(posed, replaced=older.replaced + 1)
+        self._come.set()
+        self._settled.clear()
+        return older is not None
+
+    async def next(self) -> Underway:
+        """Waits for a pose and takes it out. What was given out before has its answer by now."""
+        self._underway = None
+        if not self._poses:
+            self._settled.set()
+            self._come.clear()
+            await self._come.wait()
+        self._underway = Underway(self._poses.pop(next(iter(self._poses))), Turn())
+        return self._underway
+
+    async def settled(self) -> None:
+        """Waits until every pose so far was answered or replaced."""
+        await self._settled.wait()

@@ -1,0 +1,142 @@
+"""A real service with OpenIGTLink, and a client that speaks through a socket."""
+
+from __future__ import annotations
+
+import socket
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyigtl
+import pytest
+
+from ultragray import ConvexProbe, GaussianScene
+from ultragray_service.igtl.contents import Image, Status, pack_transform, unpack_image, unpack_status
+from ultragray_service.igtl.messages import HEADER_BYTES, Message, pack_message, unpack_header, unpack_message
+
+from ..conftest import DEMO_PROBE, RunningService, StartService, make_scene
+
+TIMEOUT_S = 20.0
+FAN = ConvexProbe(opening_angle_deg=60.0, near_mm=20.0, far_mm=60.0)
+
+
+class Peer:
+    """One connection, blocking."""
+
+    def __init__(self, address: str, **options: Any) -> None:
+        host, port = address.rsplit(":", 1)
+        self.socket = socket.socket()
+        for option, value in options.items():
+            self.socket.setsockopt(socket.SOL_SOCKET, getattr(socket, option), value)
+        self.socket.settimeout(TIMEOUT_S)
+        self.socket.connect((host, int(port)))
+
+    def send(self, type_name: str, device_name: str = "demo", content: bytes = b"", **more: Any) -> None:
+        self.socket.sendall(pack_message(Message(type_name, device_name, content, **more)))
+
+    def send_pose(self, pose: Any, device_name: str = "demo", **more: Any) -> None:
+        self.send("TRANSFORM", device_name, pack_transform(pose), **more)
+
+    def receive(self) -> Message:
+        header = unpack_header(self._exactly(HEADER_BYTES))
+        return unpack_message(header, self._exactly(header.body_bytes))
+
+    def image(self) -> Image:
+        message = self.receive()
+        assert message.type_name == "IMAGE", unpack_status(message.content)
+        return unpack_image(message.content)
+
+    def status(self) -> Status:
+        message = self.receive()
+        assert message.type_name == "STATUS"
+        return unpack_status(message.content)
+
+    def ask(self, type_name: str, device_name: str = "demo", content: bytes = b"", **more: Any) -> Message:
+        self.send(type_name, device_name, content, **more)
+        return self.receive()
+
+    def is_closed(self) -> bool:
+        try:
+            return self.socket.recv(1) == b""
+        except ConnectionError:
+            return True
+
+    def _exactly(self, count: int) -> bytes:
+        data = b""
+        while len(data) < count:
+            chunk = self.socket.recv(count - len(data))
+            if not chunk:
+                raise ConnectionResetError(f"closed after {len(data)} of {count} bytes")
+            data += chunk
+        return data
+
+
+Connect = Callable[..., Peer]
+
+
+@pytest.fixture(scope="session")
+def igtl_folder(data_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The linear scenes `demo`, `second` and `large` (its images 512x512), and `fan` of a convex probe."""
+    folder = tmp_path_factory.mktemp("igtl")
+    for name in ("demo", "second"):
+        (folder / f"{name}.ugr").write_bytes((data_folder / f"{name}.ugr").read_bytes())
+    demo = make_scene(probe=DEMO_PROBE)
+    large = replace(demo.info, image_height=512, image_width=512)
+    GaussianScene.from_splats(demo.splats, info=large).save(folder / "large.ugr")
+    make_scene(seed=2, probe=FAN).save(folder / "fan.ugr")  # type: ignore[arg-type]
+    return folder
+
+
+@pytest.fixture(scope="session")
+def igtl_service(start_service: StartService, igtl_folder: Path) -> RunningService:
+    return start_service(data_folder=igtl_folder, igtl_port=0, igtl_scene="demo")
+
+
+def address_of(service: RunningService) -> str:
+    return str(next(record["igtl"] for record in service.log() if "igtl" in record))
+
+
+@pytest.fixture
+def connect(igtl_service: RunningService) -> Iterator[Connect]:
+    """Opens connections to the shared service; all are closed after the test."""
+    peers: list[Peer] = []
+
+    def open_one(address: str | None = None, **options: Any) -> Peer:
+        peers.append(Peer(address or address_of(igtl_service), **options))
+        return peers[-1]
+
+    yield open_one
+    for peer in peers:
+        peer.socket.close()
+
+
+@pytest.fixture
+def peer(connect: Connect) -> Peer:
+    return connect()
+
+
+@contextmanager
+def pyigtl_client(address: str) -> Iterator[pyigtl.OpenIGTLinkClient]:
+    host, port = address.rsplit(":", 1)
+    client = pyigtl.OpenIGTLinkClient(host, int(port))
+    end = time.monotonic() + TIMEOUT_S
+    while not client.is_connected() and time.monotonic() < end:
+        time.sleep(0.005)
+    try:
+        yield client
+    finally:
+        client.stop()
+
+
+def random_pose(seed: int) -> Any:
+    """A pose [4, 4] mm near the scenes of the tests, as exact as float32 numbers are."""
+    from ultragray.pose import pose_from_position_quaternion
+
+    rng = np.random.default_rng(seed)
+    quaternion = np.array([1.0, 0.0, 0.0, 0.0]) + rng.normal(0, 0.1, 4)
+    pose = pose_from_position_quaternion(tuple(rng.normal(0, 2, 3)), tuple(quaternion / np.linalg.norm(quaternion)))
+    return pose.astype(np.float32).astype(np.float64)

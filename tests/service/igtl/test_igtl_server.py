@@ -1,0 +1,461 @@
+"""Through real sockets: pyigtl and a client of our own against a real service."""
+
+from __future__ import annotations
+
+import os
+import socket
+import struct
+import time
+from pathlib import Path
+
+import httpx
+import numpy as np
+import pyigtl
+import pytest
+
+from ultragray.pose import check_poses
+from ultragray_proto.v1 import rendering_pb2, rendering_pb2_grpc
+from ultragray_service.igtl.connection import MAX_SKIPPED_BYTES, MESSAGE_TIMEOUT_S, SEND_TIMEOUT_S
+from ultragray_service.igtl.contents import (
+    Tool,
+    pack_position,
+    pack_tools,
+    unpack_image,
+    unpack_position,
+    unpack_status,
+    unpack_tools,
+    unpack_transform,
+)
+from ultragray_service.igtl.messages import HEADER_BYTES, Message, pack_message
+from ultragray_service.igtl.server import MAX_CONNECTIONS
+
+from ..conftest import DEMO_PROBE, HEIGHT, WIDTH, RunningService, StartService
+from ..test_grpc_render import matrix_pose
+from .conftest import FAN, Connect, Peer, address_of, pyigtl_client, random_pose
+
+SLOW = {"backend": "reference", "max_batch_poses": 1}
+
+
+def over_grpc(service: RunningService, scene: str, pose: np.ndarray) -> np.ndarray:
+    with service.channel() as channel:
+        stub = rendering_pb2_grpc.RenderServiceStub(channel)
+        settings = rendering_pb2.RenderSettings(scene=scene)
+        frame = stub.Render(rendering_pb2.RenderRequest(settings=settings, pose=matrix_pose(pose)), timeout=20)
+        return np.frombuffer(frame.data, np.uint8).reshape(frame.height, frame.width)
+
+
+def metric(service: RunningService, name: str) -> float:
+    lines = httpx.get(f"{service.http}/metrics").text.splitlines()
+    return sum(float(line.rpartition(" ")[2]) for line in lines if line.startswith(name))
+
+
+def moved(x_mm: float) -> np.ndarray:
+    pose = np.eye(4)
+    pose[0, 3] = x_mm
+    return pose
+
+
+# Frames
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_pyigtl_gets_the_frame_of_its_pose_in_its_place(igtl_service: RunningService, version: int) -> None:
+    pose = random_pose(1)
+    theirs = pyigtl.TransformMessage(pose, device_name="ProbeToReference", timestamp=1234.5)
+    theirs.header_version = version
+    with pyigtl_client(address_of(igtl_service)) as client:
+        client.send_message(theirs)
+        answer = client.wait_for_message("Image_Reference", timeout=20)
+    assert isinstance(answer, pyigtl.ImageMessage)
+    assert (answer.timestamp, answer.header_version) == (1234.5, version)
+    assert np.array_equal(answer.image[0], over_grpc(igtl_service, "demo", pose))
+    assert answer.world_coordinate_system == "ras"
+    edges = np.array([(i, j, 0, 1) for j in (-0.5, HEIGHT - 0.5) for i in (-0.5, WIDTH - 0.5)])
+    corners = np.c_[DEMO_PROBE.corners_mm(), np.ones(4)] @ check_poses(pose)[0].T
+    assert edges @ answer.ijk_to_world_matrix.T == pytest.approx(corners, abs=1e-4)
+    assert answer.metadata.get("scene") == (None if version == 1 else "demo")
+
+
+def test_every_type_of_pose_gets_the_same_frame(peer: Peer, igtl_service: RunningService) -> None:
+    pose = moved(3.0)
+    expected = over_grpc(igtl_service, "demo", pose)
+    peer.send_pose(pose)
+    assert np.array_equal(peer.image().pixels, expected)
+    peer.send("POSITION", "demo", pack_position(pose))
+    assert np.array_equal(peer.image().pixels, expected)
+    peer.send("POSITION", "demo", struct.pack(">3f", 3, 0, 0))
+    assert np.array_equal(peer.image().pixels, expected)
+    for type_name in ("TDATA", "QTDATA"):
+        tools = [Tool("Probe", pose), Tool("Needle", np.eye(4))]  # no scene is named: the first
+        peer.send(type_name, "Tracker", pack_tools(type_name, tools))
+        answer = peer.receive()
+        assert answer.device_name == "Image_Probe"
+        assert np.array_equal(unpack_image(answer.content).pixels, expected)
+
+
+def test_tools_named_like_scenes_get_a_frame_each(peer: Peer, igtl_service: RunningService) -> None:
+    tools = [Tool("Needle", moved(1)), Tool("second", moved(2)), Tool("ProbeTodemo", moved(3))]
+    peer.send("TDATA", "Tracker", pack_tools("TDATA", tools))
+    for name, pose in (("second", moved(2)), ("demo", moved(3))):
+        answer = peer.receive()
+        assert answer.device_name == f"Image_{name}"
+        assert np.array_equal(unpack_image(answer.content).pixels, over_grpc(igtl_service, name, pose))
+
+
+def test_a_fan_is_sent_as_a_picture(peer: Peer, igtl_service: RunningService) -> None:
+    peer.send_pose(np.eye(4), "ProbeTofan")
+    image = peer.image()
+    expected = FAN.scan_convert(over_grpc(igtl_service, "fan", np.eye(4)), FAN.scan_line_length_mm / HEIGHT)
+    assert np.abs(image.pixels - expected).max() <= 8
+    assert expected.max() > 50
+
+
+def test_an_answer_repeats_what_identifies_its_question(peer: Peer) -> None:
+    peer.send_pose(np.eye(4), "demo", timestamp=77, version=2, message_id=5)
+    answer = peer.receive()
+    assert (answer.timestamp, answer.version, answer.message_id) == (77, 2, 5)
+    assert answer.metadata["scene"] == "demo"
+    assert answer.metadata["device"] == "demo"
+    assert len(answer.metadata["scene_sha256"]) == 64
+    assert answer.metadata["renderer"].startswith("ultragray/")
+    assert answer.metadata["replaced_poses"] == "0"
+    assert float(answer.metadata["render_ms"]) > 0
+
+
+def test_a_newer_pose_replaces_one_that_waits(start_service: StartService, igtl_folder: Path, connect: Connect) -> None:
+    service = start_service(data_folder=igtl_folder, igtl_port=0, **SLOW)
+    peer = connect(address_of(service))
+    for x_mm in range(50):
+        peer.send_pose(moved(x_mm / 10), "demo", version=2, message_id=x_mm)
+    peer.send("GET_STATUS", "end")
+    replaced, frames, last = 0, 0, 0
+    while last < 49:
+        answer = peer.receive()
+        if answer.type_name == "IMAGE":
+            assert answer.message_id >= last
+            last, frames, replaced = answer.message_id, frames + 1, replaced + int(answer.metadata["replaced_poses"])
+    assert np.array_equal(unpack_image(answer.content).pixels, over_grpc(service, "demo", moved(4.9)))
+    assert frames + replaced == 50
+    assert replaced > 20
+    assert metric(service, "ultragray_stream_dropped_poses_total") == replaced
+    assert metric(service, 'ultragray_requests_total{door="igtl",route="TRANSFORM",status="OK"}') == frames
+
+
+def test_clients_do_not_disturb_each_other(connect: Connect, igtl_service: RunningService) -> None:
+    peers = [connect() for _ in range(8)]
+    for step in range(5):
+        for number, peer in enumerate(peers):
+            peer.send_pose(moved(number), "second" if number % 2 else "demo", timestamp=step)
+    for number, peer in enumerate(peers):
+        expected = over_grpc(igtl_service, "second" if number % 2 else "demo", moved(number))
+        while True:
+            answer = peer.receive()
+            assert np.array_equal(unpack_image(answer.content).pixels, expected)
+            if answer.timestamp == 4:
+                break
+
+
+# Queries and streams
+
+
+def test_capability_and_status(peer: Peer) -> None:
+    answer = peer.ask("GET_CAPABIL")
+    names = [answer.content[at : at + 12].rstrip(b"\0").decode() for at in range(0, len(answer.content), 12)]
+    assert answer.type_name == "CAPABILITY"
+    assert {"TRANSFORM", "QTDATA", "POSITION", "STT_QTDATA", "STP_QTDATA", "GET_IMAGE", "STT_TRANSFOR"} <= {*names}
+    peer.send("GET_STATUS")
+    assert (peer.status().code, peer.socket.getblocking()) == (1, True)
+
+
+def test_queries_tell_the_newest_frame_of_any_client(connect: Connect, igtl_service: RunningService) -> None:
+    robot, viewer = connect(), connect()
+    pose = random_pose(4)
+    robot.send_pose(pose, "ProbeToReference", timestamp=9)
+    frame = robot.image()
+    exact = check_poses(pose)[0]
+    answer = viewer.ask("GET_IMAGE", "Image_Reference")
+    assert np.array_equal(unpack_image(answer.content).pixels, frame.pixels)
+    assert (answer.device_name, answer.timestamp) == ("Image_Reference", 9)
+    assert viewer.ask("GET_IMAGE", "").device_name == "Image_Reference"
+    assert viewer.ask("GET_IMAGE", "another").content == b""
+    for query in ("GET_TRANSFOR", "GET_TRANS"):
+        assert unpack_transform(viewer.ask(query, "ProbeToReference").content) == pytest.approx(exact)
+    assert unpack_position(viewer.ask("GET_POSITION", "").content) == pytest.approx(exact, abs=1e-6)
+    (tool,) = unpack_tools("QTDATA", viewer.ask("GET_QTDATA", "").content)
+    assert tool.name == "ProbeToReference"
+    assert tool.pose == pytest.approx(exact, abs=1e-6)
+
+
+def test_without_a_frame_yet_queries_get_no_content(
+    start_service: StartService, igtl_folder: Path, connect: Connect
+) -> None:
+    service = start_service(data_folder=igtl_folder, igtl_port=0)
+    peer = connect(address_of(service))
+    for query, answer in (("GET_IMAGE", "IMAGE"), ("GET_QTDATA", "QTDATA"), ("GET_TRANS", "TRANSFORM")):
+        reply = peer.ask(query, "Probe")
+        assert (reply.type_name, reply.device_name, reply.content) == (answer, "Probe", b"")
+    peer.send_pose(np.eye(4), "Probe")
+    assert "ULTRAGRAY_IGTL_SCENE" in peer.status().text  # several scenes, none named
+
+
+def test_a_viewer_is_sent_what_the_robot_sees(connect: Connect) -> None:
+    robot, viewer, other = connect(), connect(), connect()
+    for query in ("STT_IMAGE", "STT_TRANSFOR"):
+        receipt = viewer.ask(query, "")
+        assert (receipt.type_name, receipt.content) == (f"RTS_{query[4:]}", b"\0")
+    assert other.ask("STT_IMAGE", "another device").content == b"\0"
+    assert robot.ask("STT_IMAGE", "").content == b"\0"
+    robot.send_pose(moved(1), "robot")
+    frame = robot.image()
+    answers = {answer.type_name: answer for answer in (viewer.receive(), viewer.receive())}
+    assert np.array_equal(unpack_image(answers["IMAGE"].content).pixels, frame.pixels)
+    assert answers["IMAGE"].device_name == "Image_robot"
+    assert np.array_equal(unpack_transform(answers["TRANSFORM"].content), moved(1))
+    assert viewer.ask("STP_IMAGE", "").type_name == "RTS_IMAGE"
+    robot.send_pose(moved(2), "robot")
+    robot.image()
+    assert viewer.receive().type_name == "TRANSFORM"
+    assert viewer.ask("GET_STATUS").type_name == "STATUS"  # nothing else came
+    for client in (other, robot):  # a sender gets its images once
+        assert client.ask("GET_STATUS").type_name == "STATUS"
+
+
+def test_the_robot_is_told_its_own_poses_as_often_as_it_asks(peer: Peer) -> None:
+    interval_ms = 300
+    assert peer.ask("STT_QTDATA", "", struct.pack(">I32s", interval_ms, b"")).content == b"\0"
+    images, told = 0, []
+    started = time.monotonic()
+    while time.monotonic() - started < 1.0:
+        peer.send_pose(moved(images / 10))
+        while (answer := peer.receive()).type_name == "QTDATA":
+            told.append(time.monotonic())
+        images += 1
+    assert images > 10
+    assert 3 <= len(told) <= 4
+    assert min(np.diff(told)) > 0.9 * interval_ms / 1000
+    peer.send("STP_QTDATA")
+    while (answer := peer.receive()).type_name != "RTS_QTDATA":
+        assert answer.type_name == "QTDATA"
+
+
+def test_streams_that_we_cannot_give_are_refused(peer: Peer) -> None:
+    receipt = peer.ask("STT_POLYDATA", "x")
+    assert (receipt.type_name, receipt.device_name, receipt.content) == ("RTS_POLYDATA", "x", b"\1")
+
+
+# What is wrong is told, and does no harm
+
+
+def still_serves(peer: Peer) -> None:
+    peer.send_pose(np.eye(4), "demo", timestamp=12345)
+    while True:
+        answer = peer.receive()
+        if answer.type_name == "IMAGE" and answer.timestamp == 12345:
+            return
+
+
+@pytest.mark.parametrize(
+    ("type_name", "content", "code", "reason", "text"),
+    [
+        ("TRANSFORM", bytes(48), 10, "INVALID_POSE", "rotation"),
+        ("TRANSFORM", bytes(47), 12, "IGTL_MESSAGE_INVALI", "48 bytes, got 47"),
+        ("POSITION", bytes(152), 12, "IGTL_MESSAGE_INVALI", "12 or 24 or 28 bytes, got 152"),  # as of pyigtl
+        ("QTDATA", bytes(49), 12, "IGTL_MESSAGE_INVALI", "50 bytes for each"),
+        ("TRANSFORM", bytes(70_000), 12, "IGTL_MESSAGE_INVALI", "at most 65536 bytes"),
+        ("STRING", bytes(5), 12, "IGTL_MESSAGE_INVALI", "got 'STRING'"),
+        ("POLYDATA", bytes(3_000_000), 12, "IGTL_MESSAGE_INVALI", "got 'POLYDATA'"),
+        ("STT_QTDATA", bytes(2), 12, "IGTL_MESSAGE_INVALI", "4 bytes, got 2"),
+    ],
+)
+def test_refusals(peer: Peer, type_name: str, content: bytes, code: int, reason: str, text: str) -> None:
+    answer = peer.ask(type_name, "x", content, timestamp=3)
+    status = unpack_status(answer.content)
+    assert (answer.type_name, answer.device_name, answer.timestamp) == ("STATUS", "x", 3)
+    assert (status.code, status.name) == (code, reason)
+    assert text in status.text
+    still_serves(peer)
+
+
+def test_a_wrong_checksum_is_told_and_the_connection_stays(peer: Peer, igtl_service: RunningService) -> None:
+    before = metric(igtl_service, 'ultragray_stream_frame_errors_total{reason="IGTL_MESSAGE_INVALID"}')
+    data = bytearray(pack_message(Message("TRANSFORM", "demo", bytes(48))))
+    data[-1] ^= 1
+    peer.socket.sendall(data)
+    status = peer.status()
+    assert (status.code, status.sub_code) == (9, 400)
+    assert "CRC-64" in status.text
+    still_serves(peer)
+    assert metric(igtl_service, 'ultragray_stream_frame_errors_total{reason="IGTL_MESSAGE_INVALID"}') == before + 1
+
+
+def test_answers_of_the_client_are_heard_in_silence(peer: Peer) -> None:
+    for type_name in ("STATUS", "CAPABILITY", "RTS_IMAGE"):
+        peer.send(type_name, "x", bytes(40))
+    assert peer.ask("GET_STATUS", "end").device_name == "end"
+
+
+def resident_mb(service: RunningService) -> float:
+    status = Path(f"/proc/{service.process.pid}/status").read_text()
+    return next(int(line.split()[1]) / 1024 for line in status.splitlines() if line.startswith("VmRSS"))
+
+
+@pytest.mark.parametrize("type_name", ["TRANSFORM", "IMAGE"])
+@pytest.mark.parametrize("size", [2**60, 2**63, 2**64 - 1, MAX_SKIPPED_BYTES + 1])
+def test_a_size_beyond_all_bounds_is_refused_without_memory(
+    connect: Connect, igtl_service: RunningService, type_name: str, size: int
+) -> None:
+    peer = connect()
+    before = resident_mb(igtl_service)
+    header = bytearray(pack_message(Message(type_name, "x"))[:HEADER_BYTES])
+    header[42:50] = size.to_bytes(8, "big")
+    peer.socket.sendall(header)
+    assert f"got {size}" in peer.status().text
+    assert peer.is_closed()
+    assert resident_mb(igtl_service) - before < 20
+    still_serves(connect())
+
+
+def test_garbage_closes_its_connection_and_no_other(connect: Connect) -> None:
+    bystander = connect()
+    rng = np.random.default_rng(0)
+    for _ in range(60):
+        attacker = connect()
+        garbage = rng.integers(0, 256, int(rng.integers(58, 3000)), np.uint8).tobytes()
+        try:
+            attacker.socket.sendall(garbage)
+            assert attacker.status().code == 12
+            assert attacker.is_closed()
+        except ConnectionError:
+            pass  # what it sent was not read: the kernel resets
+    for _ in range(60):  # messages with flipped bits: some are refused, some close, some are poses still
+        attacker = connect()
+        data = np.frombuffer(pack_message(Message("TRANSFORM", "x", bytes(48), version=2)), np.uint8).copy()
+        data[rng.integers(0, len(data), 3)] ^= rng.integers(1, 256, 3).astype(np.uint8)
+        attacker.socket.sendall(data.tobytes())
+        attacker.socket.close()
+    still_serves(bystander)
+
+
+def test_clients_that_vanish_in_the_middle_of_a_message(connect: Connect, igtl_service: RunningService) -> None:
+    data = pack_message(Message("TRANSFORM", "demo", bytes(48)))
+    for length in (1, 57, 58, 80):
+        peer = connect()
+        peer.socket.sendall(data[:length])
+        peer.socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # a reset, no FIN
+        peer.socket.close()
+    for _ in range(20):
+        peer = connect()
+        for _ in range(20):
+            peer.send_pose(np.eye(4))
+        peer.socket.close()
+    still_serves(connect())
+    assert not [record for record in igtl_service.log() if record["level"] == "error"]
+
+
+@pytest.mark.slow
+def test_a_message_that_does_not_end_is_cut_off(connect: Connect) -> None:
+    idle, slow = connect(), connect()
+    data = pack_message(Message("TRANSFORM", "demo", bytes(48)))
+    started = time.monotonic()
+    for byte in data:
+        try:
+            slow.socket.sendall(bytes([byte]))
+        except ConnectionError:
+            break
+        time.sleep(0.25)
+    assert MESSAGE_TIMEOUT_S - 1 < time.monotonic() - started < MESSAGE_TIMEOUT_S + 5
+    still_serves(idle)  # silence between messages is nothing bad
+
+
+def test_a_reader_that_stops_costs_bounded_memory_and_nobody_a_frame(
+    connect: Connect, igtl_service: RunningService
+) -> None:
+    stopped, healthy = connect(SO_RCVBUF=4096), connect()
+    stopped.ask("STT_IMAGE", "")
+    still_serves(healthy)
+    before = resident_mb(igtl_service)
+    dropped = metric(igtl_service, "ultragray_stream_dropped_poses_total")
+    for count in range(4000):
+        stopped.send_pose(moved(count / 1000))
+        if count % 100 == 0:
+            still_serves(healthy)
+    assert metric(igtl_service, "ultragray_stream_dropped_poses_total") - dropped > 1000
+    assert resident_mb(igtl_service) - before < 20
+
+
+def open_sockets(service: RunningService) -> int:
+    return sum(os.readlink(path).startswith("socket:") for path in Path(f"/proc/{service.process.pid}/fd").iterdir())
+
+
+@pytest.mark.slow
+def test_a_reader_that_stops_for_long_is_cut_off(connect: Connect, igtl_service: RunningService) -> None:
+    before = open_sockets(igtl_service)
+    stopped, dismissed = connect(SO_RCVBUF=4096), connect(SO_RCVBUF=4096)
+    for count in range(60):  # more images than the kernel's buffers hold
+        for peer in (stopped, dismissed):
+            peer.send_pose(moved(count / 1000), "large")
+        time.sleep(0.1)
+    dismissed.socket.sendall(bytes(HEADER_BYTES))
+    assert open_sockets(igtl_service) == before + 2
+    end = time.monotonic() + SEND_TIMEOUT_S + 20
+    while open_sockets(igtl_service) > before and time.monotonic() < end:
+        time.sleep(0.5)
+    assert open_sockets(igtl_service) <= before
+
+
+def test_more_connections_than_allowed_are_told_so(connect: Connect) -> None:
+    still_serves(connect())
+    peers = [connect() for _ in range(MAX_CONNECTIONS - 1)]
+    surplus = connect()
+    assert surplus.status().code == 6
+    assert surplus.is_closed()
+    still_serves(peers[-1])
+    for peer in peers:
+        peer.socket.close()
+    end = time.monotonic() + 10
+    while time.monotonic() < end:
+        late = connect()
+        late.send("GET_STATUS")
+        if late.status().code == 1:
+            return
+    raise AssertionError("connections that were closed still count")
+
+
+# Life of the service
+
+
+def test_a_stop_answers_what_was_asked_and_is_told(
+    start_service: StartService, igtl_folder: Path, connect: Connect
+) -> None:
+    service = start_service(data_folder=igtl_folder, igtl_port=0, **SLOW)
+    busy, idle = connect(address_of(service)), connect(address_of(service))
+    assert idle.ask("GET_STATUS").type_name == "STATUS"
+    for name in ("demo", "second", "fan"):  # which loads them
+        busy.send_pose(np.eye(4), name)
+        busy.image()
+    for name in ("demo", "second", "fan"):
+        busy.send_pose(np.eye(4), name)
+    answers = [busy.receive()]
+    time.sleep(0.05)  # the second is being rendered, or has been
+    assert service.terminate() == 0
+    while answers[-1].device_name:
+        answers.append(busy.receive())
+    assert [answer.type_name for answer in answers[:2]] == ["IMAGE", "IMAGE"]
+    assert len(answers) == 4  # the third was rendered, or refused
+    for status in (unpack_status(answers[-1].content), idle.status()):
+        assert (status.code, status.name) == (19, "DRAINING")
+    assert busy.is_closed()
+    assert idle.is_closed()
+
+
+def test_without_a_port_it_is_off(service: RunningService) -> None:
+    assert not any("igtl" in record for record in service.log())
+
+
+def test_a_port_in_use_and_keys_stop_the_start(start_service: StartService, igtl_service: RunningService) -> None:
+    port = address_of(igtl_service).rpartition(":")[2]
+    taken = start_service(wait=False, igtl_port=port)
+    keys = start_service(wait=False, igtl_port=0, api_keys="0123456789abcdef")
+    for service, words in ((taken, "ULTRAGRAY_IGTL_PORT to another port"), (keys, "cannot ask for an API key")):
+        assert service.process.wait(30) != 0
+        assert words in service.log_path.read_text()

@@ -1,0 +1,93 @@
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ultragray.errors import QueueFull
+from ultragray_service.igtl.messages import Message
+from ultragray_service.igtl.waiting import MAX_WAITING_DEVICES, PoseMessage, WaitingPoses
+
+
+@dataclass
+class FakeTurn:
+    """Of a request that still waits in the pool."""
+
+    poses: Any = None
+
+    def give_to(self, poses: Any, deadline: float) -> bool:
+        self.poses = poses
+        return True
+
+
+def posed(device_name: str, x_mm: float = 0.0) -> PoseMessage:
+    pose = np.eye(4)
+    pose[0, 3] = x_mm
+    return PoseMessage(Message("TRANSFORM", device_name), pose, 0.0)
+
+
+def run(work: Callable[[WaitingPoses], Awaitable[None]]) -> None:
+    async def main() -> None:
+        await work(WaitingPoses())
+
+    asyncio.run(main())
+
+
+def test_each_device_has_its_turn_with_its_newest_pose() -> None:
+    async def work(waiting: WaitingPoses) -> None:
+        replaced = [waiting.put(posed(name, x_mm), 0.0) for name, x_mm in (("a", 1), ("b", 2), ("a", 3), ("a", 4))]
+        assert replaced == [False, False, True, True]
+        first, second = (await waiting.next()).posed, (await waiting.next()).posed
+        assert (first.message.device_name, first.pose[0, 3], first.replaced) == ("a", 4, 2)
+        assert (second.message.device_name, second.pose[0, 3], second.replaced) == ("b", 2, 0)
+
+    run(work)
+
+
+def test_a_newer_pose_takes_the_turn_of_one_that_waits_in_the_pool() -> None:
+    async def work(waiting: WaitingPoses) -> None:
+        waiting.put(posed("a", 1), 0.0)
+        underway = await waiting.next()
+        assert not waiting.put(posed("a", 2), 0.0)  # it is being rendered
+        underway.turn = turn = FakeTurn()  # type: ignore[assignment]
+        assert waiting.put(posed("a", 3), 0.0)  # of the two that wait here, the older one
+        assert turn.poses is None
+        underway = await waiting.next()
+        assert underway.posed.pose[0, 3] == 3
+        underway.turn = turn = FakeTurn()  # type: ignore[assignment]
+        assert not waiting.put(posed("b", 4), 0.0)
+        assert waiting.put(posed("a", 5), 0.0)
+        assert turn.poses[0, 0, 3] == 5
+        assert (underway.posed.pose[0, 3], underway.posed.replaced) == (5, 2)
+
+    run(work)
+
+
+def test_devices_without_end_are_refused() -> None:
+    async def work(waiting: WaitingPoses) -> None:
+        for number in range(MAX_WAITING_DEVICES):
+            waiting.put(posed(str(number)), 0.0)
+        assert waiting.put(posed("0"), 0.0)
+        with pytest.raises(QueueFull, match="16 devices"):
+            waiting.put(posed("one more"), 0.0)
+
+    run(work)
+
+
+def test_settled_is_when_nothing_waits_and_nothing_is_under_way() -> None:
+    async def work(waiting: WaitingPoses) -> None:
+        await waiting.settled()
+        waiting.put(posed("a"), 0.0)
+        await waiting.next()
+        settled = asyncio.ensure_future(waiting.settled())
+        await asyncio.sleep(0)
+        assert not settled.done()
+        more = asyncio.ensure_future(waiting.next())
+        await asyncio.wait_for(settled, 5)
+        more.cancel()
+
+    run(work)

@@ -1,0 +1,172 @@
+"""Slow, idle and vanishing clients of the streams: bounded memory, and nobody else loses a frame."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import grpc
+import httpx
+import numpy as np
+import pytest
+from websockets.sync.client import connect
+
+from ultragray_proto.v1 import geometry_pb2, rendering_pb2, rendering_pb2_grpc
+
+from .conftest import RunningService, StartService
+
+IDENTITY = geometry_pb2.Pose(matrix=geometry_pb2.Matrix(values=np.eye(4).ravel().tolist()))
+LARGE = rendering_pb2.RenderSettings(
+    scene="demo", height=600, width=600, encoding=rendering_pb2.ENCODING_FLOAT32, outputs=[1, 2]
+)  # 2.9 MB a frame
+CALM_BYTES = 64 * 2**20
+IDLE = 200
+TIMEOUT_S = 30.0
+
+
+def resident_bytes(service: RunningService) -> int:
+    pages = int(Path(f"/proc/{service.process.pid}/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE")
+
+
+def cpu_seconds(service: RunningService) -> float:
+    fields = Path(f"/proc/{service.process.pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def rendered(service: RunningService) -> float:
+    text = httpx.get(f"{service.http}/metrics").text
+    return float(next(line for line in text.splitlines() if line.startswith("ultragray_frames_total")).split()[1])
+
+
+def until_calm(service: RunningService) -> float:
+    """Frames rendered in all, once that does not grow for half a second."""
+    end = time.monotonic() + TIMEOUT_S
+    count = rendered(service)
+    while time.monotonic() < end:
+        time.sleep(0.5)
+        if (now := rendered(service)) == count:
+            return count
+        count = now
+    raise AssertionError("frames are rendered without end")
+
+
+def test_a_batch_whose_reader_stops_waits_for_him(service: RunningService, renders: Any) -> None:
+    before, frames_before = resident_bytes(service), rendered(service)
+    call = renders.RenderBatch(rendering_pb2.RenderBatchRequest(settings=LARGE, poses=[IDENTITY] * 40))
+    next(call)
+    frames = until_calm(service) - frames_before
+    assert frames < 40
+    assert resident_bytes(service) - before < CALM_BYTES + 2 * 32 * 2.9e6
+    small = rendering_pb2.RenderSettings(scene="demo", height=32, width=32)
+    assert renders.Render(rendering_pb2.RenderRequest(settings=small, pose=IDENTITY), timeout=TIMEOUT_S).data
+    assert len(list(call)) == 39
+
+
+def test_a_stream_whose_reader_stops_waits_for_him(service: RunningService, renders: Any) -> None:
+    def messages() -> Iterator[rendering_pb2.RenderStreamRequest]:
+        yield rendering_pb2.RenderStreamRequest(settings=LARGE, mode=rendering_pb2.STREAM_MODE_LATEST)
+        for sequence in range(5000):
+            yield rendering_pb2.RenderStreamRequest(sequence=sequence, pose=IDENTITY)
+
+    before, frames_before = resident_bytes(service), rendered(service)
+    call = renders.RenderStream(messages())
+    next(call)
+    assert until_calm(service) - frames_before < 100
+    assert resident_bytes(service) - before < CALM_BYTES
+    call.cancel()
+
+
+def test_readers_that_stop_hold_little_and_give_it_back(start_service: StartService) -> None:
+    service = start_service()
+    large = {"height": 2048, "width": 2048, "encoding": "float32"}  # 16 MB a frame
+    address = f"{service.http.replace('http', 'ws', 1)}/v1/scenes/demo/stream"
+    before = resident_bytes(service)
+    with contextlib.ExitStack() as opened:
+        for _ in range(3):
+            connection = opened.enter_context(
+                connect(address, compression=None, max_size=None, max_queue=1, close_timeout=0.2)
+            )
+            for _ in range(10):
+                connection.send(json.dumps({"settings": large, "pose": {"matrix": np.eye(4).tolist()}}))
+        until_calm(service)
+        assert resident_bytes(service) - before < 3 * 6 * 16 * 2**20  # two frames each, and the copies of one
+    end = time.monotonic() + TIMEOUT_S
+    while resident_bytes(service) - before > 2 * 16 * 2**20:
+        assert time.monotonic() < end, resident_bytes(service) - before
+        time.sleep(0.2)
+
+
+def test_a_batch_whose_client_goes_stops_within_a_second(service: RunningService) -> None:
+    with grpc.insecure_channel(service.grpc) as channel:
+        renders = rendering_pb2_grpc.RenderServiceStub(channel)
+        settings = rendering_pb2.RenderSettings(scene="demo", height=600, width=600)
+        call = renders.RenderBatch(rendering_pb2.RenderBatchRequest(settings=settings, poses=[IDENTITY] * 40))
+        next(call)
+    time.sleep(1.0)
+    frames = rendered(service)
+    time.sleep(0.5)
+    assert rendered(service) == frames
+
+
+def test_many_idle_connections_cost_nothing(service: RunningService) -> None:
+    """Less than a fiftieth of a core, and some kilobytes each."""
+    before = resident_bytes(service)
+    with contextlib.ExitStack() as opened:
+        channel = opened.enter_context(
+            grpc.insecure_channel(service.grpc, options=[("grpc.use_local_subchannel_pool", 1)])
+        )
+        renders = rendering_pb2_grpc.RenderServiceStub(channel)
+        address = f"{service.http.replace('http', 'ws', 1)}/v1/scenes/demo/stream"
+        for _ in range(IDLE):
+            opened.enter_context(connect(address, ping_interval=None, close_timeout=0.2))
+        time.sleep(0.5)
+        started, spent = time.monotonic(), cpu_seconds(service)
+        time.sleep(3.0)
+        share = (cpu_seconds(service) - spent) / (time.monotonic() - started)
+        assert renders.Render(
+            rendering_pb2.RenderRequest(settings=rendering_pb2.RenderSettings(scene="demo"), pose=IDENTITY),
+            timeout=TIMEOUT_S,
+        ).data
+        assert resident_bytes(service) - before < IDLE * 200_000
+    assert share < 0.02 + 0.03  # the second is that of the service with nobody connected
+
+
+def test_a_flood_of_messages_leaves_others_their_turn(service: RunningService) -> None:
+    """Settings and poses of a latest stream are never answered one by one: nothing slows the sender down."""
+    address = f"{service.http.replace('http', 'ws', 1)}/v1/scenes/demo/stream"
+    pose = json.dumps({"mode": "latest", "settings": {}, "pose": {"matrix": np.eye(4).tolist()}})
+    with connect(address, compression=None, max_size=None, close_timeout=0.2) as connection, httpx.Client() as http:
+        stop = time.monotonic() + 3.0
+        flood = threading.Thread(target=lambda: send_until(connection, pose, stop))
+        flood.start()
+        waits = []
+        while time.monotonic() < stop - 0.5:
+            started = time.monotonic()
+            http.get(f"{service.http}/v1/health/live").raise_for_status()
+            waits.append(time.monotonic() - started)
+        flood.join()
+    assert np.median(waits) < 0.1
+
+
+def send_until(connection: Any, message: str, stop: float) -> None:
+    while time.monotonic() < stop:
+        connection.send(message)
+
+
+@pytest.mark.parametrize("text", ["", "null", "[]", '{"pose":{"matrix":[[1]]}}', '{"sequence":-1}', "\x00", "{" * 5000])
+def test_nonsense_is_answered_and_forgotten(service: RunningService, text: str) -> None:
+    address = f"{service.http.replace('http', 'ws', 1)}/v1/scenes/demo/stream"
+    with connect(address, compression=None) as connection:
+        connection.send(text)
+        told = connection.recv(timeout=TIMEOUT_S)
+        assert isinstance(told, str)
+        assert json.loads(told)["error"]["reason"].startswith("INVALID")
+        connection.send(json.dumps({"pose": {"matrix": np.eye(4).tolist()}}))
+        assert isinstance(connection.recv(timeout=TIMEOUT_S), bytes)
