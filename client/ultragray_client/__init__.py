@@ -1,0 +1,56 @@
+"""The client of an UltraG-Ray service: poses go in, B-mode frames come out as numpy arrays.
+
+`Client` is for ordinary programs, `AsyncClient` for asyncio; their methods are the same. Lengths are millimetres,
+angles degrees; a pose is the rigid transform from the probe's frame to the scene's, [4, 4] or a `Placement`. What fails
+is told as one of `ultragray_client.errors`.
+"""
+
+from __future__ import annotations
+
+from . import errors
+from .aio.client import AsyncClient
+from .aio.stream import AsyncFrameStream
+from .confidence import ConfidenceFit, Extrapolation
+from .datasets import Dataset, DatasetOptions
+from .display import Display, Picture
+from .errors import ClientError
+from .frames import Frame, Timings
+from .geometry import ConvexProbe, LinearProbe, PhasedProbe, Placement, PoseLike, Probe, Quaternion
+from .jobs import Job, JobError, JobEvent, JobKind, JobProgress, JobState
+from .pose_exchange import StreamMode
+from .scenes import Scene, SceneEntry
+from .sync.client import Client
+from .sync.stream import FrameStream
+
+__all__ = [
+    "AsyncClient",
+    "AsyncFrameStream",
+    "Client",
+    "ClientError",
+    "ConfidenceFit",
+    "ConvexProbe",
+    "Dataset",
+    "DatasetOptions",
+    "Display",
+    "Extrapolation",
+    "Frame",
+    "FrameStream",
+    "Job",
+    "JobError",
+    "JobEvent",
+    "JobKind",
+    "JobProgress",
+    "JobState",
+    "LinearProbe",
+    "PhasedProbe",
+    "Picture",
+    "Placement",
+    "PoseLike",
+    "Probe",
+    "Quaternion",
+    "Scene",
+    "SceneEntry",
+    "StreamMode",
+    "Timings",
+    "errors",
+]

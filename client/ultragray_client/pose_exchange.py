@@ -1,0 +1,64 @@
+"""The messages of a stream, there and back."""
+
+from __future__ import annotations
+
+import time
+from enum import Enum
+
+from ultragray_proto.v1 import rendering_pb2
+
+from .errors import InvalidArgument
+from .frames import Frame, frame_from_message
+from .geometry import PoseLike, pose_message
+from .statuses import error_of_frame
+
+
+class StreamMode(str, Enum):
+    """What becomes of a pose that still waits when the next one comes."""
+
+    ORDERED = "ordered"  # every pose gets its frame, in order
+    LATEST = "latest"  # for control loops: the newer pose takes its place; it gets no frame and is counted
+
+
+class PoseExchange:
+    """What a stream sends and gets: poses numbered from 1 (0 are its settings), and their frames."""
+
+    def __init__(self, settings: rendering_pb2.RenderSettings, mode: StreamMode | str) -> None:
+        """Raises InvalidArgument for a mode that does not exist."""
+        try:
+            self.mode = StreamMode(mode)
+        except ValueError:
+            names = ", ".join(known.value for known in StreamMode)
+            raise InvalidArgument(f"mode must be one of {names}, got {mode!r}", field="mode") from None
+        self._settings = settings
+        self._sequence = 0
+        self._dropped = 0
+
+    def opening(self) -> rendering_pb2.RenderStreamRequest:
+        """The first message: settings and mode, no pose. If they are refused, the first answer says so."""
+        mode = f"STREAM_MODE_{self.mode.name}"
+        return rendering_pb2.RenderStreamRequest(settings=self._settings, mode=mode)
+
+    def pose(
+        self, pose: PoseLike, timeout_s: float | None, measured_ns: int | None
+    ) -> rendering_pb2.RenderStreamRequest:
+        """The message of the next pose. Raises InvalidPose."""
+        message = rendering_pb2.RenderStreamRequest(
+            sequence=self._sequence + 1,
+            pose=pose_message(pose),
+            timeout_ms=None if timeout_s is None else 1000.0 * timeout_s,
+            client_time_ns=time.monotonic_ns() if measured_ns is None else measured_ns,
+        )
+        self._sequence += 1
+        return message
+
+    def frame(self, message: rendering_pb2.Frame, dropped_here: int = 0) -> Frame:
+        """The frame of an answer, with what was dropped since the one before.
+
+        Raises ClientError, with the sequence of the pose, where the service told an error in its place.
+        """
+        self._dropped += message.dropped + dropped_here
+        if message.HasField("error"):
+            raise error_of_frame(message.error, message.sequence)
+        dropped, self._dropped = self._dropped, 0
+        return frame_from_message(message, sequence=message.sequence, dropped=dropped)

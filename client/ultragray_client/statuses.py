@@ -1,0 +1,61 @@
+"""From a failed gRPC call to an error of the client."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import grpc
+from google.protobuf.any_pb2 import Any as AnyMessage  # type: ignore[import-untyped]
+from google.protobuf.duration_pb2 import Duration  # type: ignore[import-untyped]
+from google.protobuf.empty_pb2 import Empty  # type: ignore[import-untyped]
+from google.protobuf.unknown_fields import UnknownFieldSet  # type: ignore[import-untyped]
+
+from ultragray_proto.v1 import scenes_pb2
+
+from .errors import ERRORS, ClientError, Unreachable
+
+_DETAILS_KEY = "grpc-status-details-bin"
+_BY_REASON = {error.reason: error for error in ERRORS}
+_BY_STATUS = {error.grpc_status: error for error in reversed(ERRORS)}  # of several, the root of the branch
+
+
+def error_of_call(error: grpc.RpcError, address: str) -> ClientError:
+    """What a failed call tells: the facts of ErrorInfo and RetryInfo, else those of its status."""
+    status, sentence = error.code().name, error.details() or ""
+    reason, field, retry_after_s = _told(dict(error.trailing_metadata() or ()).get(_DETAILS_KEY, b""))
+    if reason is None and status == "UNAVAILABLE":
+        return Unreachable(f"no service answers at {address} ({sentence})")
+    cls = _BY_REASON.get(reason or status) or _BY_STATUS.get(status, ClientError)
+    return cls(sentence, reason=reason or status, field=field, retry_after_s=retry_after_s)
+
+
+def error_of_frame(error: scenes_pb2.Error, sequence: int) -> ClientError:
+    """What a stream tells in place of a frame."""
+    cls = _BY_REASON.get(error.reason, ClientError)
+    return cls(error.detail, reason=error.reason, field=error.field or None, sequence=sequence)
+
+
+def _told(status: bytes) -> tuple[str | None, str | None, float | None]:
+    """Reason, field and delay in seconds of a google.rpc.Status, whose messages protobuf does not come with."""
+    reason = field = retry_after_s = None
+    for packed in _values(status, 3):
+        detail = AnyMessage.FromString(packed)
+        if detail.type_url.endswith("/google.rpc.ErrorInfo"):
+            reason = next((value.decode() for value in _values(detail.value, 1)), None)
+            metadata = {_text(entry, 1): _text(entry, 2) for entry in _values(detail.value, 3)}
+            field = metadata.get("field")
+        elif detail.type_url.endswith("/google.rpc.RetryInfo"):
+            for delay in _values(detail.value, 1):
+                retry_after_s = Duration.FromString(delay).ToTimedelta().total_seconds()
+    return reason, field, retry_after_s
+
+
+def _values(message: bytes, number: int) -> Iterator[Any]:
+    """The values of one field of a message whose type is not known."""
+    unknown = UnknownFieldSet(Empty.FromString(message))
+    return (field.data for field in unknown if field.field_number == number)
+
+
+def _text(message: bytes, number: int) -> str:
+    return b"".join(_values(message, number)).decode()

@@ -1,0 +1,13 @@
+"""Rendered frames in files that others read, written while frames come: whole or not at all.
+
+`export_to(path, "dicom", header)` is the one way in; a format is one module behind `Exporter`, found by its name.
+What a format can hold is known without importing what it needs. Free of torch.
+"""
+
+from __future__ import annotations
+
+from .exporter import Exporter, ExportHeader
+from .formats import FORMATS, Format, check_format, exporter_class
+from .writing import export_to
+
+__all__ = ["FORMATS", "ExportHeader", "Exporter", "Format", "check_format", "export_to", "exporter_class"]

@@ -1,0 +1,52 @@
+"""WebDataset: a tar with some files of one name for each frame."""
+
+from __future__ import annotations
+
+import io
+import json
+import tarfile
+from collections.abc import Mapping
+from dataclasses import asdict
+
+import cv2
+import numpy as np
+
+from .exporter import Exporter, PixelArray
+
+
+class TarExporter(Exporter):
+    """Of frame 12: 000012.OUTPUT.png (float32: .npy) of each output, and 000012.json: pose, figures, origin."""
+
+    def _open(self) -> None:
+        self._tar = self._held.enter_context(tarfile.TarFile(self._path, "w"))
+
+    def _write(self, frames: Mapping[str, PixelArray], count: int) -> None:
+        for place in range(count):
+            number = self._done + place
+            for name in self._header.outputs:
+                frame = frames[name][place]
+                suffix, data = ("png", _png(frame)) if frame.dtype == np.uint8 else ("npy", _npy(frame))
+                self._member(f"{number:06d}.{name}.{suffix}", data)
+            told = asdict(self._extrapolations[number])
+            document = {"pose": self._header.poses[number].tolist(), **told, **self._header.origin()}
+            self._member(f"{number:06d}.json", json.dumps(document).encode())
+
+    def _member(self, name: str, data: bytes) -> None:
+        member = tarfile.TarInfo(name)
+        member.size = len(data)
+        self._tar.addfile(member, io.BytesIO(data))
+
+
+def _png(frame: PixelArray) -> bytes:
+    written, data = cv2.imencode(".png", frame)
+    assert written  # it is uint8 [H, W]
+    return data.tobytes()
+
+
+def _npy(frame: PixelArray) -> bytes:
+    file = io.BytesIO()
+    np.lib.format.write_array(file, frame, allow_pickle=False)
+    return file.getvalue()
+
+
+EXPORTER = TarExporter

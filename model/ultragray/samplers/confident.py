@@ -1,0 +1,79 @@
+"""Samplers that keep to poses whose frames can be trusted."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from ..confidence import Extrapolation, is_confident
+from ..errors import LowConfidence
+from ..probe import FloatArray, Probe
+from .around import AroundSampler
+from .covered import CoveredSampler
+from .sampler import Sampler
+
+MOST_DRAWS_PER_POSE, LEAST_DRAWS = 20, 1000  # where so many do not suffice, the search is given up
+SMALLEST_ROUND = 64
+SPARE = 1.2  # of the draws that the share found so far lets expect
+
+Assess: TypeAlias = Callable[[FloatArray], Sequence[Extrapolation]]  # [C, 4, 4] mm -> [C]
+
+
+def confident_poses(
+    sampler: Sampler, base: Any, probe: Probe, assess: Assess, min_confidence: float
+) -> tuple[FloatArray, list[Extrapolation]]:  # base [P, 4, 4] -> [C, 4, 4] mm, [C]
+    """Those poses of a sampler that have at least `min_confidence`, and what `assess` tells of each.
+
+    A random sampler draws on until it has its `count`, at most 20 poses for each of them (at least 1000): the same
+    arguments give the same poses, and where all of its first poses will do, they are these. The others leave out what
+    does not have it. `assess` is an Assessor's, with the probe of the frames. Raises LowConfidence where no pose is
+    left, or too few are found, and what `sampler.poses` raises.
+    """
+    if isinstance(sampler, (AroundSampler, CoveredSampler)):
+        return _drawn_on(sampler, base, probe, assess, min_confidence)
+    poses = sampler.poses(base, probe)
+    extrapolations = list(assess(poses))
+    kept = [place for place, told in enumerate(extrapolations) if is_confident(told, min_confidence)]
+    if not kept:
+        best = max(told.confidence or 0.0 for told in extrapolations)
+        raise LowConfidence(
+            f"sampler {sampler.kind} makes {len(poses):,} poses, none with a confidence of at least "
+            f"{min_confidence:g}: the best has {best:.2f}",
+            field="sampler",
+        )
+    return poses[kept], [extrapolations[place] for place in kept]
+
+
+def _drawn_on(
+    sampler: AroundSampler | CoveredSampler, base: Any, probe: Probe, assess: Assess, min_confidence: float
+) -> tuple[FloatArray, list[Extrapolation]]:
+    count, most = sampler.count, max(LEAST_DRAWS, MOST_DRAWS_PER_POSE * sampler.count)
+    poses: list[FloatArray] = []
+    extrapolations: list[Extrapolation] = []
+    drawn, rounds, draw = 0, 0, sampler
+    while True:
+        made = draw.poses(base, probe)
+        for pose, told in zip(made, assess(made), strict=True):
+            if is_confident(told, min_confidence):
+                poses.append(pose)
+                extrapolations.append(told)
+        drawn, rounds, found = drawn + len(made), rounds + 1, len(poses)
+        if found >= count:
+            return np.stack(poses[:count]), extrapolations[:count]
+        if drawn >= most:
+            raise LowConfidence(
+                f"sampler {sampler.kind} found {found:,} of {count:,} poses with a confidence of at least "
+                f"{min_confidence:g}: {found / drawn:.2%} of {drawn:,} drawn have it",
+                field="sampler",
+            )
+        wanted = math.ceil(SPARE * (count - found) * drawn / max(found, 1))
+        size = min(max(wanted, SMALLEST_ROUND), max(count, SMALLEST_ROUND), most - drawn)
+        draw = replace(sampler, count=size, seed=_seed_of_round(sampler.seed, rounds))
+
+
+def _seed_of_round(seed: int, number: int) -> int:
+    return int(np.random.SeedSequence([seed, number]).generate_state(1, np.uint64)[0] >> np.uint64(1))

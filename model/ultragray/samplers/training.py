@@ -1,0 +1,19 @@
+"""The base poses themselves."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from ..probe import FloatArray, Probe
+from .sampler import Sampler
+
+
+@dataclass(frozen=True)
+class TrainingSampler(Sampler):
+    """The training poses of the scene as they are, in order."""
+
+    kind: ClassVar[str] = "training"
+
+    def _made(self, base: FloatArray, probe: Probe) -> FloatArray:
+        return base

@@ -1,0 +1,109 @@
+"""Both clients against a real service: what a test does with `client` it does with either."""
+
+from __future__ import annotations
+
+import asyncio
+import inspect
+import threading
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from ultragray_client import AsyncClient, Client
+
+from ..service.conftest import RunningService, StartService, data_folder, demo_scene, start_service
+
+__all__ = ["data_folder", "demo_scene", "start_service"]
+
+KEY = "0123456789abcdef-client"
+MAX_POSES = 40
+
+
+class Blocking:
+    """An object for asyncio as if it were an ordinary one: awaits, iterates and enters for the caller."""
+
+    def __init__(self, target: Any, loop: asyncio.AbstractEventLoop) -> None:
+        self._target, self._loop = target, loop
+
+    def __getattr__(self, name: str) -> Any:
+        return self._as_ordinary(getattr(self._target, name))
+
+    def __call__(self, *arguments: Any, **keywords: Any) -> Any:
+        async def call() -> Any:
+            return self._target(*arguments, **keywords)
+
+        return self._as_ordinary(self._run(call()))
+
+    def __iter__(self) -> Iterator[Any]:
+        return self
+
+    def __next__(self) -> Any:
+        try:
+            return self._run(anext(self._target))
+        except StopAsyncIteration:
+            raise StopIteration from None
+
+    def __enter__(self) -> Any:
+        return self._as_ordinary(self._run(self._target.__aenter__()))
+
+    def __exit__(self, *error: Any) -> None:
+        self._run(self._target.__aexit__(*error))
+
+    def _run(self, awaitable: Any) -> Any:
+        async def wait() -> Any:
+            return await awaitable
+
+        return asyncio.run_coroutine_threadsafe(wait(), self._loop).result(60)
+
+    def _as_ordinary(self, value: Any) -> Any:
+        if inspect.iscoroutine(value):
+            return self._as_ordinary(self._run(value))
+        own = type(value).__module__.startswith("ultragray_client.aio") or inspect.isasyncgen(value)
+        return Blocking(value, self._loop) if own or inspect.ismethod(value) else value
+
+
+@pytest.fixture(scope="session")
+def event_loop_thread() -> Iterator[asyncio.AbstractEventLoop]:
+    loop = asyncio.new_event_loop()
+    thread = threading.Thread(target=loop.run_forever)
+    thread.start()
+    yield loop
+    loop.call_soon_threadsafe(loop.stop)
+    thread.join()
+    loop.close()
+
+
+@pytest.fixture(scope="session")
+def client_service(start_service: StartService, tmp_path_factory: pytest.TempPathFactory) -> RunningService:
+    """It takes few poses at a time, and has a worker for jobs."""
+    return start_service(
+        artifact_folder=tmp_path_factory.mktemp("artifacts"),
+        max_poses_per_request=MAX_POSES,
+        max_image_side=600,
+        api_keys=KEY,
+        embedded_worker=True,
+        training_threads=1,
+    )
+
+
+@pytest.fixture(params=["sync", "asyncio"])
+def make_client(request: pytest.FixtureRequest, event_loop_thread: asyncio.AbstractEventLoop) -> Iterator[Any]:
+    """Makes clients of either kind, with the arguments of both."""
+    made: list[Any] = []
+
+    def make(address: str, **keywords: Any) -> Any:
+        if request.param == "sync":
+            made.append(Client(address, **keywords))
+        else:
+            made.append(Blocking(AsyncClient, event_loop_thread)(address, **keywords))
+        return made[-1]
+
+    yield make
+    for client in made:
+        client.close()
+
+
+@pytest.fixture
+def client(make_client: Any, client_service: RunningService) -> Any:
+    return make_client(client_service.grpc, api_key=KEY, timeout_s=60.0)

@@ -1,0 +1,113 @@
+"""Every error of the service arrives as one of the client's."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import grpc
+import pytest
+from google.protobuf.any_pb2 import Any as AnyMessage  # type: ignore[import-untyped]
+from google.rpc.status_pb2 import Status
+
+from ultragray import errors as service_errors
+from ultragray_client import errors
+from ultragray_client.statuses import error_of_call, error_of_frame
+from ultragray_proto.v1 import scenes_pb2
+from ultragray_service.rpc.status import status_of
+
+ALL = [
+    value
+    for value in vars(service_errors).values()
+    if isinstance(value, type) and issubclass(value, service_errors.UltragrayError)
+]
+OWN = {
+    "UNREACHABLE",
+    "STREAM_ENDED",
+    "NOT_FOUND",
+    "ALREADY_EXISTS",
+    "FAILED_PRECONDITION",
+    "RESOURCE_EXHAUSTED",
+    "UNIMPLEMENTED",
+    "UNAVAILABLE",
+}
+NOT_OVER_GRPC = {
+    "ORIGIN_REFUSED",
+    "BODY_TOO_LARGE",
+    "NOT_ACCEPTABLE",
+    "UNSUPPORTED_MEDIA_TYPE",
+    "ROUTE_NOT_FOUND",
+    "METHOD_NOT_ALLOWED",
+    "SCENE_READ_ONLY",
+    "IGTL_MESSAGE_INVALID",
+    "CHECKPOINT_INVALID",
+    "TRAINING_DIVERGED",
+    "TRAINING_STATE_INVALID",
+    "STARTUP_FAILED",
+}
+
+
+class FailedCall(grpc.RpcError):
+    """As grpc raises it."""
+
+    def __init__(self, code: grpc.StatusCode, details: str, status: bytes | None = None) -> None:
+        super().__init__()
+        self._code, self._details, self._status = code, details, status
+
+    def code(self) -> grpc.StatusCode:
+        return self._code
+
+    def details(self) -> str:
+        return self._details
+
+    def trailing_metadata(self) -> Any:
+        return () if self._status is None else (("grpc-status-details-bin", self._status), ("x-request-id", "1"))
+
+
+@pytest.mark.parametrize("cls", ALL, ids=lambda cls: cls.reason)
+def test_every_error_keeps_its_facts(cls: type[service_errors.UltragrayError]) -> None:
+    told = status_of(cls("what is wrong", field="settings.scene"))
+    error = error_of_call(
+        FailedCall(getattr(grpc.StatusCode, cls.grpc_status), told.message, told.SerializeToString()), "x"
+    )
+    assert (error.reason, error.detail, error.field) == (cls.reason, "what is wrong", "settings.scene")
+    assert error.retry_after_s == cls.retry_after_s
+    if cls.grpc_status in {known.grpc_status for known in errors.ERRORS}:
+        assert error.grpc_status == cls.grpc_status
+    if cls.reason not in NOT_OVER_GRPC:
+        assert type(error).reason == cls.reason
+
+
+def test_the_client_knows_the_reasons_of_the_service() -> None:
+    assert {error.reason for error in errors.ERRORS} - OWN == {cls.reason for cls in ALL} - NOT_OVER_GRPC
+
+
+def test_the_tree_is_drawn_as_it_is() -> None:
+    assert errors.__doc__ is not None
+    drawn = [line for line in errors.__doc__.splitlines() if line.startswith(("ClientError", "│", "├", "└"))]
+    names = [line.lstrip("│├└─ ").split()[0] for line in drawn]
+    assert names == [error.__name__ for error in errors.ERRORS]
+    for error, line in zip(errors.ERRORS, drawn, strict=True):
+        assert len(error.__mro__[: error.__mro__.index(Exception)]) - 1 >= line.index(error.__name__) // 4
+        assert "_" not in line or error.reason in line
+
+
+def test_statuses_without_details() -> None:
+    assert isinstance(error_of_call(FailedCall(grpc.StatusCode.UNAVAILABLE, "refused"), "there"), errors.Unreachable)
+    assert isinstance(error_of_call(FailedCall(grpc.StatusCode.DEADLINE_EXCEEDED, "late"), "there"), TimeoutError)
+    too_large = error_of_call(FailedCall(grpc.StatusCode.RESOURCE_EXHAUSTED, "message larger than max"), "there")
+    assert (type(too_large), too_large.retry_after_s) == (errors.ResourceExhausted, None)
+    assert error_of_call(FailedCall(grpc.StatusCode.UNKNOWN, "?"), "there").reason == "UNKNOWN"
+
+
+def test_details_of_others_are_passed_over() -> None:
+    status = Status(code=5, message="no")
+    other = AnyMessage(type_url="type.googleapis.com/google.rpc.DebugInfo", value=b"\x12\x02no")
+    status.details.append(other)
+    error = error_of_call(FailedCall(grpc.StatusCode.NOT_FOUND, "no", status.SerializeToString()), "there")
+    assert (type(error), error.reason) == (errors.NotFound, "NOT_FOUND")
+
+
+def test_errors_in_place_of_frames() -> None:
+    error = error_of_frame(scenes_pb2.Error(reason="INVALID_POSE", field="pose", detail="no"), 7)
+    assert (type(error), error.field, error.sequence) == (errors.InvalidPose, "pose", 7)
+    assert error_of_frame(scenes_pb2.Error(reason="NEW", detail="no"), 1).reason == "NEW"

@@ -1,0 +1,168 @@
+"""Connections that break off half-way."""
+
+from __future__ import annotations
+
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ultragray_client import JobState, errors
+from ultragray_client.connection import Operation, is_done
+from ultragray_client.downloads import downloaded
+from ultragray_client.jobs import LogTail
+from ultragray_proto.v1 import jobs_pb2
+
+from ..service.conftest import RunningService
+from .conftest import KEY
+
+
+class Proxy:
+    """Passes bytes on to a service; `cut_after` breaks a connection once so many came back over it."""
+
+    def __init__(self, target: str) -> None:
+        host, _, port = target.rpartition(":")
+        self._target = (host, int(port))
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self._open: list[socket.socket] = [self._listener]
+        self._left: int | None = None
+        self.cuts = 0
+        self.address = f"127.0.0.1:{self._listener.getsockname()[1]}"
+        threading.Thread(target=self._accept, daemon=True).start()
+
+    def cut_after(self, count: int) -> None:
+        self._left = count
+
+    def close(self) -> None:
+        for one in self._open:
+            one.close()
+
+    def _accept(self) -> None:
+        while True:
+            try:
+                near, _ = self._listener.accept()
+            except OSError:
+                return
+            far = socket.create_connection(self._target)
+            self._open += [near, far]
+            threading.Thread(target=self._pass, args=(near, far, False), daemon=True).start()
+            threading.Thread(target=self._pass, args=(far, near, True), daemon=True).start()
+
+    def _pass(self, source: socket.socket, sink: socket.socket, counted: bool) -> None:
+        try:
+            while data := source.recv(16384):
+                sink.sendall(data)
+                if counted and self._left is not None:
+                    self._left -= len(data)
+                    if self._left < 0:
+                        self._left = None
+                        self.cuts += 1
+                        break
+        except OSError:
+            pass
+        for one in (source, sink):
+            try:
+                one.shutdown(socket.SHUT_RDWR)
+            except OSError:
+                continue
+
+
+@pytest.fixture
+def proxy(client_service: RunningService) -> Iterator[Proxy]:
+    proxy = Proxy(client_service.grpc)
+    yield proxy
+    proxy.close()
+
+
+@pytest.fixture
+def far_client(make_client: Callable[..., Any], proxy: Proxy) -> Any:
+    return make_client(proxy.address, api_key=KEY, timeout_s=60.0)
+
+
+def test_a_batch_goes_on(far_client: Any, proxy: Proxy) -> None:
+    poses = np.tile(np.eye(4), (120, 1, 1))
+    poses[:, 0, 3] = np.linspace(-4, 4, 120)
+    batch = far_client.render_batch("demo", poses, height=64, width=64)
+    frames = [next(batch)]
+    proxy.cut_after(150_000)
+    frames += list(batch)
+    assert proxy.cuts == 1
+    assert [frame.sequence for frame in frames] == list(range(120))
+    assert [frame.pose[0, 3] for frame in frames] == poses[:, 0, 3].tolist()
+
+
+def test_a_download_goes_on_and_is_whole(far_client: Any, client: Any, proxy: Proxy, tmp_path: Path) -> None:
+    poses = np.tile(np.eye(4), (60, 1, 1))
+    job = client.jobs.render("demo", poses=poses, height=200, width=200, dtype="float32", outputs=("bmode", "echo"))
+    assert client.jobs.wait(job.id).state is JobState.SUCCEEDED
+    client.jobs.download(job.id, "frames.npz", tmp_path / "straight.npz")
+    proxy.cut_after(8_000_000)
+    far_client.jobs.download(job.id, "frames.npz", tmp_path / "broken.npz")
+    assert proxy.cuts == 1
+    assert (tmp_path / "broken.npz").read_bytes() == (tmp_path / "straight.npz").read_bytes()
+    assert {path.name for path in tmp_path.iterdir()} == {"straight.npz", "broken.npz"}
+
+
+def test_a_watch_goes_on(far_client: Any, client: Any, proxy: Proxy) -> None:
+    job = client.jobs.render("demo", poses=np.tile(np.eye(4), (20_000, 1, 1)), height=300, width=300)
+    events = far_client.jobs.watch(job.id)
+    assert next(events).job.id == job.id
+    proxy.cut_after(0)
+    threading.Timer(1.5, client.jobs.cancel, (job.id,)).start()
+    assert [event.job.state for event in events if event.job][-1] is JobState.CANCELLED
+    assert proxy.cuts == 1
+
+
+def test_a_file_that_does_not_come_leaves_nothing(tmp_path: Path) -> None:
+    def half() -> None:
+        with downloaded("job", "file", tmp_path / "file") as download:
+            download.take(jobs_pb2.ArtifactChunk(data=b"half", file_bytes=8))
+            assert not download.complete
+            assert download.request().offset == 4
+            raise download.broke_off()
+
+    with pytest.raises(errors.Unreachable, match="after 4 bytes"):
+        half()
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_empty_file_is_a_file(tmp_path: Path) -> None:
+    with downloaded("job", "file", tmp_path / "file") as download:
+        download.take(jobs_pb2.ArtifactChunk(data=b"", file_bytes=0))
+        assert download.complete
+    assert (tmp_path / "file").read_bytes() == b""
+
+
+def test_a_log_is_not_told_twice() -> None:
+    tail = LogTail()
+    assert tail.new("one\ntwo\n") == "one\ntwo\n"
+    assert tail.new("two\n") == "two\n"
+    tail.broke_off()
+    assert tail.new("") == ""
+    assert tail.new("one\ntwo\ntwo\nthree\n") == "three\n"
+    assert tail.new("three\n") == "three\n"
+    tail.broke_off()
+    assert tail.new("elsewhere\n") == "elsewhere\n"
+
+
+def test_a_deletion_that_had_worked_is_no_error() -> None:
+    deletes = Operation("jobs.DeleteJob", None, lambda answer: None, deletes=True)
+    gone = errors.JobNotFound("gone")
+    assert is_done(deletes, gone, broke=True)
+    assert not is_done(deletes, gone, broke=False)
+    assert not is_done(deletes, errors.JobInUse("used"), broke=True)
+    assert not is_done(Operation("jobs.GetJob", None, str), gone, broke=True)
+
+
+def test_a_silent_peer_does_not_hold_a_call(make_client: Callable[..., Any]) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        client = make_client(f"127.0.0.1:{silent.getsockname()[1]}")
+        started = time.monotonic()
+        with pytest.raises((errors.DeadlineExceeded, errors.Unreachable)):
+            client.scenes.list(timeout_s=0.5)
+        assert time.monotonic() - started < 2.0

@@ -1,0 +1,141 @@
+"""Frames one by one and in batches."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ultragray import GaussianScene, render
+from ultragray_client import AsyncClient, Client, LinearProbe, Placement, Quaternion, errors
+from ultragray_client.geometry import FloatArray
+
+from ..service.conftest import DEMO_PROBE, HEIGHT, WIDTH, RunningService
+from .conftest import KEY, MAX_POSES
+
+
+def moved(x_mm: float) -> FloatArray:
+    pose = np.eye(4)
+    pose[0, 3] = x_mm
+    return pose
+
+
+def test_a_frame_is_what_the_library_renders(client: Any, demo_scene: GaussianScene) -> None:
+    frame = client.render("demo", moved(2.0), outputs=("transmittance", "bmode"), dtype="float32")
+    expected = render(demo_scene, None, moved(2.0), height=HEIGHT, width=WIDTH, outputs=("bmode", "transmittance"))
+    assert list(frame.arrays) == ["transmittance", "bmode"]
+    for name in ("transmittance", "bmode"):
+        assert frame[name].dtype == np.float32
+        assert not frame[name].flags.writeable
+        np.testing.assert_allclose(frame[name], getattr(expected, name)[0], atol=1e-5)
+    np.testing.assert_array_equal(frame.pose, moved(2.0))
+    assert frame.probe == LinearProbe(DEMO_PROBE.width_mm, DEMO_PROBE.near_mm, DEMO_PROBE.far_mm)
+    assert (frame.scene, len(frame.scene_sha256), frame.sequence, frame.dropped) == ("demo", 64, 0, 0)
+    assert frame.renderer.startswith("ultragray/")
+    assert frame.timings.render_ms > 0
+    assert frame.latency_ms is None
+
+
+def test_arrays_are_views_of_one_buffer(client: Any) -> None:
+    frame = client.render("demo", moved(0.0), outputs=("bmode", "echo"))
+    assert frame["bmode"].base is not None
+    assert (
+        frame["bmode"].__array_interface__["data"][0] + HEIGHT * WIDTH == frame["echo"].__array_interface__["data"][0]
+    )
+
+
+def test_poses_and_probes_may_be_written_in_words(client: Any) -> None:
+    half = 0.5**0.5
+    placement = Placement((1.0, 2.0, 3.0), Quaternion(w=half, x=0.0, y=0.0, z=half))
+    probe = LinearProbe(width_mm=20.0, near_mm=1.0, far_mm=30.0)
+    frame = client.render("demo", placement, probe=probe, height=16, width=8)
+    expected = [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]
+    np.testing.assert_allclose(frame.pose, expected, atol=1e-12)
+    assert (frame.probe, frame["bmode"].shape) == (probe, (16, 8))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "field"),
+    [
+        ({"scene": "gone"}, errors.SceneNotFound, "settings.scene"),
+        ({"pose": 2 * np.eye(4)}, errors.InvalidPose, "pose.matrix"),
+        ({"pose": np.eye(3)}, errors.InvalidPose, "pose"),
+        ({"pose": "here"}, errors.InvalidPose, "pose"),
+        ({"height": 601}, errors.InvalidImageSize, "settings.height"),
+        ({"probe": LinearProbe(-1, 0, 1)}, errors.InvalidProbe, "settings.probe.linear.width_mm"),
+        ({"outputs": ("shadow",)}, errors.UnknownOutput, "outputs"),
+        ({"outputs": "labels"}, errors.UnknownOutput, "settings.outputs"),
+        ({"dtype": "float64"}, errors.InvalidArgument, "dtype"),
+        ({"timeout_s": 0.0}, errors.InvalidArgument, "timeout_s"),
+        ({"scene": "truncated"}, errors.SceneFileInvalid, "settings.scene"),
+    ],
+)
+def test_refusals_have_a_type_and_a_field(
+    client: Any, arguments: dict[str, Any], error: type[errors.ClientError], field: str
+) -> None:
+    with pytest.raises(error) as caught:
+        client.render(**{"scene": "demo", "pose": np.eye(4), **arguments})
+    assert type(caught.value) is error
+    assert (caught.value.field, caught.value.reason) == (field, error.reason)
+    assert caught.value.detail in str(caught.value)
+
+
+def test_a_key_is_needed(make_client: Any, client_service: RunningService) -> None:
+    with pytest.raises(errors.Unauthenticated):
+        make_client(client_service.grpc).scenes.list()
+    assert make_client(client_service.grpc, api_key=KEY).scenes.list()
+
+
+def test_a_long_batch_is_split_into_calls_that_the_service_takes(client: Any) -> None:
+    shifts = np.linspace(-4, 4, 3 * MAX_POSES + 7)
+    frames = list(client.render_batch("demo", (moved(x) for x in shifts), height=8, width=8))
+    assert [frame.sequence for frame in frames] == list(range(len(shifts)))
+    assert [frame.pose[0, 3] for frame in frames] == shifts.tolist()
+    alone = client.render("demo", moved(shifts[-1]), height=8, width=8)
+    np.testing.assert_array_equal(frames[-1]["bmode"], alone["bmode"])
+
+
+def test_a_batch_takes_poses_as_it_goes(client: Any) -> None:
+    taken = 0
+
+    def endless() -> Iterator[FloatArray]:
+        nonlocal taken
+        while True:
+            taken += 1
+            yield np.eye(4)
+
+    batch = client.render_batch("demo", endless(), height=8, width=8)
+    for _ in range(10):
+        next(batch)
+    assert taken < 1000
+    assert not list(client.render_batch("demo", []))
+
+
+def test_a_bad_pose_is_named_by_its_place_in_the_whole_batch(client: Any) -> None:
+    poses = np.tile(np.eye(4), (MAX_POSES * 2 + 5, 1, 1))
+    poses[-1] *= 2
+    frames = client.render_batch("demo", poses, height=8, width=8)
+    assert next(frames).sequence == 0
+    with pytest.raises(errors.InvalidPose, match=r"poses\[84\]") as caught:
+        list(frames)
+    assert caught.value.field == "poses[84].matrix"
+
+
+def test_both_clients_have_the_same_methods(client_service: RunningService) -> None:
+    def signatures(cls: type) -> dict[str, list[tuple[str, Any]]]:
+        public = inspect.getmembers(cls, lambda value: inspect.isfunction(value))
+        return {
+            name: [(parameter.name, parameter.default) for parameter in inspect.signature(method).parameters.values()]
+            for name, method in public
+            if not name.startswith("_")
+        }
+
+    assert signatures(Client) == signatures(AsyncClient)
+    with Client(client_service.grpc) as ordinary:
+        for group in ("scenes", "datasets", "jobs"):
+            cls = type(getattr(ordinary, group))
+            other = inspect.getmodule(AsyncClient)
+            assert signatures(cls) == signatures(getattr(other, f"Async{cls.__name__}"))

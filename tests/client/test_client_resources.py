@@ -1,0 +1,161 @@
+"""Scenes, datasets and jobs."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ultragray_client import DatasetOptions, JobKind, JobState, LinearProbe, errors
+
+from ..service.test_http_datasets import poisoned_files, released_files
+
+SETTINGS = {"steps": 20, "max_gaussians": 40, "batch_size": 2}
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    released_files(tmp_path / "tiny")
+    return tmp_path / "tiny"
+
+
+@pytest.fixture
+def name(request: pytest.FixtureRequest) -> str:
+    """Of its own for each test."""
+    return str(request.node.name).translate(str.maketrans("[]", "--"))
+
+
+def test_scenes(client: Any) -> None:
+    entries = {entry.name: entry for entry in client.scenes.list()}
+    assert {"demo", "second", "probeless", "truncated", "foreign", "empty"} <= set(entries)
+    assert entries["demo"].error is None
+    assert entries["demo"].gaussian_count == 400
+    assert "truncated" in (entries["truncated"].error or "")
+    scene = client.scenes.get("demo")
+    assert (scene.gaussian_count, scene.centre_mm, scene.probe) == (400, (0.0, 0.0, 20.0), LinearProbe(40.0, 0.0, 40.0))
+    assert (scene.training_pose_count, scene.training_position_max_mm) == (5, (0.0, 4.0, 0.0))
+    assert [pose[1, 3] for pose in scene.training_poses] == [0.0, 2.0, 4.0]
+    assert scene.metrics == {"psnr": 20.5}
+    assert client.scenes.get("probeless").probe is None
+    assert client.scenes.load("demo") == 1
+    assert client.scenes.get("demo").loaded_processes == 1
+    assert client.scenes.unload("demo") == 0
+    with pytest.raises(errors.SceneNotFound):
+        client.scenes.get("gone")
+
+
+def test_the_life_of_a_dataset(client: Any, folder: Path, name: str) -> None:
+    made = client.datasets.upload(name, folder, options=DatasetOptions(train_frames="0:6"))
+    assert (made.name, made.kind, made.train_frames, made.val_frames) == (name, "released", 6, 3)
+    assert (made.probe, made.options.train_frames) == (LinearProbe(40.0, 0.0, 50.0), "0:6")
+    assert client.datasets.get(name) == made
+    assert made in client.datasets.list()
+    assert client.datasets.contact_sheet(name).startswith(b"\x89PNG")
+    assert client.datasets.upload(name, folder, options=DatasetOptions(train_frames="0:6")) == made
+    with pytest.raises(errors.DatasetExists):
+        client.datasets.upload(name, folder)
+    client.datasets.delete(name)
+    with pytest.raises(errors.DatasetNotFound):
+        client.datasets.delete(name)
+
+
+def test_an_archive_is_a_dataset_too(client: Any, folder: Path, name: str, tmp_path: Path) -> None:
+    with zipfile.ZipFile(tmp_path / "tiny.zip", "w") as archive:
+        for path in folder.iterdir():
+            archive.write(path, path.name)
+    assert client.datasets.upload(name, tmp_path / "tiny.zip").train_frames == 8
+    client.datasets.delete(name)
+
+
+def test_uploads_that_are_refused(client: Any, folder: Path, name: str, tmp_path: Path) -> None:
+    for path in (tmp_path / "gone", folder / "conf.json"):
+        with pytest.raises(errors.InvalidArgument, match="folder or an archive"):
+            client.datasets.upload(name, path)
+    for file, content in poisoned_files({path.name: path.read_bytes() for path in folder.iterdir()}).items():
+        (folder / file).write_bytes(content)
+    with pytest.raises(errors.DatasetInvalid, match=r"poses_train\.npy"):
+        client.datasets.upload(name, folder)
+
+
+def test_the_life_of_a_training(client: Any, folder: Path, name: str, tmp_path: Path) -> None:
+    client.datasets.upload(name, folder)
+    job = client.jobs.train(name, f"{name}.scene", settings=SETTINGS, device="cpu", request_id=name)
+    assert (job.kind, job.specification["settings"], job.request_id) == (JobKind.TRAIN, SETTINGS, name)
+    again = client.jobs.train(name, f"{name}.scene", settings=SETTINGS, device="cpu", request_id=name)
+    assert again.id == job.id
+    with pytest.raises(errors.RequestIdConflict):
+        client.jobs.train(name, f"{name}.other", settings=SETTINGS, device="cpu", request_id=name)
+    events = list(client.jobs.watch(job.id))
+    done = [event.job for event in events if event.job][-1]
+    assert (done.state, done.progress.step, done.error) == (JobState.SUCCEEDED, 20, None)
+    assert done.state.final
+    assert done == client.jobs.wait(job.id) == client.jobs.get(job.id)
+    assert done in client.jobs.list(state="succeeded", kind=JobKind.TRAIN)
+    assert len(client.jobs.list(limit=1)) == 1
+    assert isinstance(client.jobs.log(job.id), str)
+
+    client.jobs.download(job.id, "metrics.json", tmp_path / "metrics.json")
+    assert json.loads((tmp_path / "metrics.json").read_text())
+    client.jobs.download(job.id, f"{name}.scene.ugr", tmp_path / "scene.ugr")
+    assert (tmp_path / "scene.ugr").stat().st_size == client.scenes.get(f"{name}.scene").file_bytes
+    with pytest.raises(errors.ArtifactNotFound):
+        client.jobs.download(job.id, "gone", tmp_path / "gone")
+    assert {path.name for path in tmp_path.iterdir()} == {"tiny", "metrics.json", "scene.ugr"}
+
+    with pytest.raises(errors.JobFinished):
+        client.jobs.cancel(job.id)
+    with pytest.raises(errors.JobNotFinished):
+        client.jobs.retry(job.id)
+    client.jobs.delete(job.id)
+    with pytest.raises(errors.JobNotFound):
+        client.jobs.get(job.id)
+
+
+def test_a_batch_of_frames_as_a_job(client: Any, tmp_path: Path) -> None:
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    job = client.jobs.render("demo", poses=poses, height=8, width=6, outputs=("bmode", "echo"), dtype="uint8")
+    assert (job.specification["pose_count"], job.specification["outputs"]) == (3, ("bmode", "echo"))
+    assert client.jobs.wait(job.id).state is JobState.SUCCEEDED
+    client.jobs.download(job.id, "frames.npz", tmp_path / "frames.npz")
+    with np.load(tmp_path / "frames.npz") as frames:
+        assert frames["echo"].shape == (3, 8, 6)
+    again = client.jobs.render("demo", poses=poses, height=8, width=6)
+    assert again.request_id != job.request_id != ""
+    for sampler in ({"kind": "around", "number": 2}, {"kind": "around", "count": "many"}):
+        with pytest.raises(errors.InvalidArgument, match="sampler"):
+            client.jobs.render("demo", sampler=sampler)
+    with pytest.raises(errors.InvalidArgument, match="state and kind"):
+        client.jobs.list(state="lost")
+
+
+@pytest.mark.parametrize(
+    ("sampler", "format", "dtype"),
+    [
+        ({"kind": "training"}, "tar", "float32"),
+        ({"kind": "around", "count": 2, "translation_mm": 1.5, "rotation_deg": 3.0, "seed": 1}, "npz", "uint8"),
+        ({"kind": "spline", "spacing_mm": 2.0}, "zarr", "float32"),
+        ({"kind": "fan", "tilt_deg": 4.0, "step_deg": 2.0}, "hdf5", "uint8"),
+        ({"kind": "covered", "count": 2, "seed": 5}, "plus", "uint8"),
+    ],
+)
+def test_every_sampler_is_taken(client: Any, sampler: dict[str, Any], format: str, dtype: str) -> None:
+    job = client.jobs.render("demo", sampler=sampler, height=8, width=8, format=format, dtype=dtype, priority=-1000)
+    told = job.specification
+    assert (told["sampler"], told["format"], told["dtype"]) == (sampler, format, dtype)
+
+
+def test_cancel_and_retry(client: Any) -> None:
+    job = client.jobs.render("demo", poses=np.tile(np.eye(4), (20_000, 1, 1)), height=300, width=300, priority=-5)
+    cancelled = client.jobs.cancel(job.id)
+    assert client.jobs.wait(job.id).state is JobState.CANCELLED
+    assert client.jobs.cancel(job.id).state is JobState.CANCELLED
+    again = client.jobs.retry(job.id)
+    assert (again.retry_of, again.id != cancelled.id) == (job.id, True)
+    with pytest.raises(errors.JobInUse):
+        client.jobs.delete(again.id)
+    client.jobs.cancel(again.id)
+    client.jobs.wait(again.id)

@@ -1,0 +1,76 @@
+"""The robot finds the vessel and stays on it, judged by the labels of the scene, which it never sees."""
+
+from __future__ import annotations
+
+import asyncio
+import subprocess
+import sys
+from collections.abc import Callable
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from ultragray_client import Client, LinearProbe
+
+from ..service.conftest import RunningService
+from .conftest import EXAMPLES
+
+VESSEL = 4
+MM_PER_PIXEL = 60.0 / 128
+
+
+@pytest.fixture(scope="module")
+def servo(load_example: Callable[[str], ModuleType]) -> ModuleType:
+    return load_example("robot_servo")
+
+
+def vessel_mm(client: Client, pose: np.ndarray) -> tuple[float, float]:
+    """Where the vessel's middle is in truth: lateral from the centre of the image, and depth."""
+    labels = client.render("demo", pose, outputs=("labels",), height=128, width=128)["labels"]
+    row, column = np.argwhere(labels == VESSEL).mean(axis=0)
+    return (column + 0.5) * MM_PER_PIXEL - 30.0, (row + 0.5) * MM_PER_PIXEL
+
+
+def test_the_vessel_is_found_where_it_is_and_nowhere_else(servo: ModuleType, demo_service: RunningService) -> None:
+    finder = servo.VesselFinder(LinearProbe(60.0, 0.0, 60.0))
+    with Client(demo_service.grpc, timeout_s=60.0) as client:
+        for y_mm in (-20.0, 0.0, 12.0):
+            for x_mm, visible in ((-14.0, False), (0.0, True), (12.0, True), (25.0, True)):
+                pose = np.eye(4)
+                pose[:2, 3] = x_mm, y_mm
+                image = client.render("demo", pose, height=128, width=128)["bmode"]
+                found = finder.find(image, None)
+                assert (found is not None) == visible, (x_mm, y_mm)
+                if visible:
+                    np.testing.assert_allclose(found, vessel_mm(client, pose), atol=0.8)
+
+
+@pytest.mark.slow
+def test_the_robot_converges_and_follows(servo: ModuleType, demo_service: RunningService) -> None:
+    record = asyncio.run(servo.servo(demo_service.grpc, seconds=6.0))
+    assert 0.1 < record.found_after_s < 2.0
+    assert len(record.errors_mm) > 60
+    assert np.sqrt(np.mean(np.square(record.errors_mm))) < 1.0
+    assert record.lost <= 0.05 * len(record.errors_mm)
+    assert len(record.latencies_ms) + record.dropped + record.late == record.sent == 600
+    with Client(demo_service.grpc, timeout_s=60.0) as client:
+        checked = record.poses[:: len(record.poses) // 8]
+        assert np.mean([abs(vessel_mm(client, pose)[0]) for pose in checked]) < 1.2
+    assert f"in {len(record.errors_mm)} frames" in record.tell()
+
+
+def test_the_error_is_that_of_the_control(
+    servo: ModuleType, demo_service: RunningService, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without control the patient's sway is what remains."""
+    monkeypatch.setattr(servo, "GAIN_PER_S", 0.0)
+    record = asyncio.run(servo.servo(demo_service.grpc, seconds=4.0))
+    assert not record.errors_mm or np.abs(record.errors_mm).max() > 3.0
+
+
+def test_as_a_program(demo_service: RunningService) -> None:
+    command = [sys.executable, EXAMPLES / "robot_servo.py", "--address", demo_service.grpc, "--seconds", "2.5"]
+    told = subprocess.run(command, check=True, capture_output=True, text=True, timeout=60).stdout
+    assert "latency p50" in told
+    assert "off centre by" in told

@@ -1,0 +1,210 @@
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ultragray import ConvexProbe, LinearProbe
+from ultragray.errors import InvalidArgument
+from ultragray.pose import check_poses, position_distances_mm, rotation_angles_deg
+from ultragray.samplers import (
+    SAMPLERS,
+    AroundSampler,
+    CoveredSampler,
+    FanSampler,
+    SplineSampler,
+    TrainingSampler,
+    sampler_from_dict,
+    sampler_to_dict,
+)
+
+PROBE = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)
+
+
+def turned(axis: int, angles_deg: Any) -> np.ndarray:  # [C] -> [C, 4, 4]
+    angles = np.radians(np.atleast_1d(angles_deg))
+    poses = np.tile(np.eye(4), (len(angles), 1, 1))
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    poses[:, i, i] = poses[:, j, j] = np.cos(angles)
+    poses[:, j, i], poses[:, i, j] = np.sin(angles), -np.sin(angles)
+    return poses
+
+
+def swept(count: int = 9, length_mm: float = 16.0) -> np.ndarray:
+    """A curved sweep that sways, [C, 4, 4]."""
+    u = np.linspace(0.0, 1.0, count)
+    poses = turned(0, 20.0 * u) @ turned(1, 5.0 * np.sin(6.0 * u))
+    poses[:, 0, 3], poses[:, 1, 3] = 3.0 * np.sin(4.0 * u), length_mm * u
+    return poses
+
+
+@pytest.mark.parametrize(
+    "sampler",
+    [
+        TrainingSampler(),
+        AroundSampler(7, 1.0, 2.0, seed=3),
+        SplineSampler(count=7),
+        SplineSampler(spacing_mm=0.5),
+        FanSampler(10.0, 2.5),
+        CoveredSampler(7, seed=3),
+    ],
+)
+def test_there_and_back_and_again(sampler: Any) -> None:
+    document = json.loads(json.dumps(sampler_to_dict(sampler)))
+    assert sampler_from_dict(document) == sampler
+    poses = sampler.poses(swept(), PROBE)
+    np.testing.assert_array_equal(check_poses(poses), poses)
+    np.testing.assert_array_equal(sampler_from_dict(document).poses(swept(), PROBE), poses)
+
+
+def test_around_has_the_spread_asked_for() -> None:
+    poses = AroundSampler(4000, translation_mm=2.0, rotation_deg=5.0, seed=1).poses(np.eye(4), PROBE)
+    assert poses[:, :3, 3].std(axis=0) == pytest.approx([2.0] * 3, rel=0.05)
+    angles = rotation_angles_deg(poses, np.eye(4)[None])[:, 0]
+    assert np.sqrt((angles**2).mean()) == pytest.approx(5.0, rel=0.05)
+
+
+def test_around_lies_about_every_base_pose_and_follows_the_seed() -> None:
+    base = np.tile(np.eye(4), (2, 1, 1))
+    base[1, 0, 3] = 1000.0
+    poses = AroundSampler(50, seed=3).poses(base, PROBE)
+    assert set(position_distances_mm(poses, base).argmin(axis=1)) == {0, 1}
+    assert not np.array_equal(poses, AroundSampler(50, seed=4).poses(base, PROBE))
+
+
+def test_spline_goes_through_its_base_poses_and_does_not_break() -> None:
+    base = swept(7)
+    fine = SplineSampler(count=6001).poses(base, PROBE)
+    at = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(base[:, :3, 3], axis=0), axis=1))])
+    hit = np.rint(at / at[-1] * 6000).astype(int)
+    np.testing.assert_allclose(fine[hit], base, atol=2e-3)
+    np.testing.assert_allclose(fine[[0, -1]], base[[0, -1]], atol=1e-12)
+    step = at[-1] / 6000
+    first = np.diff(fine[:, :3, 3], axis=0) / step
+    second = np.diff(first, axis=0) / step
+    assert np.abs(np.diff(first, axis=0)).max() < 1e-3
+    assert np.abs(np.diff(second, axis=0)).max() < 1e-2 * np.abs(second).max()
+    assert np.abs(second[[0, -1]]).max() < 0.01 * np.abs(second).max()
+
+
+def test_spline_turns_at_even_speed_the_short_way() -> None:
+    base = turned(2, [10.0, 350.0])
+    base[1, 0, 3] = 8.0
+    poses = SplineSampler(spacing_mm=2.0).poses(base, PROBE)
+    np.testing.assert_allclose(poses[:, 0, 3], [0, 2, 4, 6, 8], atol=1e-12)
+    np.testing.assert_allclose(poses[:, :3, :3], turned(2, [10, 5, 0, -5, -10])[:, :3, :3], atol=1e-12)
+    for angle in (-179.9, -150.0, 150.0, 179.9):
+        ends = np.stack([np.eye(4), turned(0, angle)[0] + np.eye(4, k=3) * 5])
+        middle, end = SplineSampler(count=3).poses(ends, PROBE)[1:, :3, :3]
+        np.testing.assert_allclose(middle, turned(0, angle / 2)[0, :3, :3], atol=1e-9)
+        np.testing.assert_allclose(end, ends[1, :3, :3], atol=1e-9)
+
+
+def test_spline_passes_over_repetitions_but_not_over_turns_on_the_spot() -> None:
+    base = swept(4)
+    twice = base[[0, 0, 1, 2, 2, 3]]
+    sampler = SplineSampler(count=5)
+    np.testing.assert_array_equal(sampler.poses(twice, PROBE), sampler.poses(base, PROBE))
+    with pytest.raises(InvalidArgument, match="0 and 1 differ in orientation only"):
+        sampler.poses(turned(0, [0.0, 5.0]), PROBE)
+    with pytest.raises(InvalidArgument, match="two different"):
+        sampler.poses(base[[0, 0]], PROBE)
+    with pytest.raises(InvalidArgument, match="spacing_mm"):
+        SplineSampler(spacing_mm=1e-9).poses(base, PROBE)
+
+
+def test_fan_tilts_whole_sweeps_about_the_face() -> None:
+    base = swept(3)
+    poses = FanSampler(tilt_deg=5.0, step_deg=2.5).poses(base, PROBE)
+    assert len(poses) == 15
+    np.testing.assert_array_equal(poses[6:9], base)
+    np.testing.assert_array_equal(poses[:, :3, 3], np.tile(base[:, :3, 3], (5, 1)))
+    np.testing.assert_allclose(poses[:3, :3, 0], base[:, :3, 0], atol=1e-15)
+    tilted = base @ turned(0, 5.0)[0]
+    np.testing.assert_allclose(poses[12:], tilted, atol=1e-15)
+    assert (base[0, :3, 1] @ tilted[0, :3, 2]) < 0  # towards −y
+
+    fan = ConvexProbe(opening_angle_deg=60.0, near_mm=30.0, far_mm=90.0)
+    poses = FanSampler(tilt_deg=5.0, step_deg=5.0).poses(base, fan)
+    faces = poses @ np.array([0.0, 0.0, 30.0, 1.0])
+    np.testing.assert_allclose(faces, np.tile(faces[3:6], (3, 1)), atol=1e-12)
+    assert np.abs(poses[0, :3, 3] - base[0, :3, 3]).max() > 1.0
+
+
+def test_fan_takes_no_step_beyond_its_tilt() -> None:
+    poses = FanSampler(tilt_deg=5.0, step_deg=2.0).poses(np.eye(4), PROBE)
+    np.testing.assert_allclose(np.degrees(np.arctan2(poses[:, 2, 1], poses[:, 2, 2])), [-4, -2, 0, 2, 4])
+    with pytest.raises(InvalidArgument, match="step_deg") as caught:
+        FanSampler(tilt_deg=10.0, step_deg=1e-9).poses(np.eye(4), PROBE)
+    assert caught.value.field == "step_deg"
+
+
+def test_covered_stays_between_neighbours_and_out_of_gaps() -> None:
+    one = np.tile(np.eye(4), (5, 1, 1))
+    one[:, 1, 3] = np.arange(5)
+    other = one.copy()
+    other[:, 1, 3] += 100.0
+    base = np.concatenate([one, other])[np.random.default_rng(0).permutation(10)]
+    y = CoveredSampler(4000, seed=1).poses(base, PROBE)[:, 1, 3]
+    inside = ((y > -1) & (y < 5)) | ((y > 99) & (y < 105))
+    assert inside.all()
+    assert (y < 50).mean() == pytest.approx(0.5, abs=0.03)
+    share = np.histogram(y[y < 50], bins=4, range=(0, 4))[0] / (y < 50).sum()
+    np.testing.assert_allclose(share, [0.203, 0.25, 0.25, 0.203], atol=0.02)  # the ends lose 3/64 to their outside
+
+
+def test_covered_turns_no_further_than_its_neighbours() -> None:
+    base = turned(0, [0.0, 2.0, 4.0])
+    poses = CoveredSampler(500, seed=1).poses(base, PROBE)
+    np.testing.assert_array_equal(poses[:, :3, 3], 0.0)
+    nearest = rotation_angles_deg(poses, base).min(axis=1)
+    assert 1.0 < nearest.max() <= 3.0
+    np.testing.assert_array_less(rotation_angles_deg(poses, base).max(axis=1), 6.0 + 1e-9)
+
+
+@pytest.mark.parametrize(
+    ("document", "field", "told"),
+    [
+        (3, "kind", "an object"),
+        ({}, "kind", "one of training, around"),
+        ({"kind": ["fan"]}, "kind", "one of"),
+        ({"kind": "training", "count": 3}, "count", "nothing else"),
+        ({"kind": "around"}, "count", "required"),
+        ({"kind": "around", "count": True}, "count", "integer"),
+        ({"kind": "around", "count": 100_001}, "count", "100000"),
+        ({"kind": "around", "count": 1, "translation_mm": -1}, "translation_mm", "between 0 and 1000"),
+        ({"kind": "around", "count": 1, "rotation_deg": float("nan")}, "rotation_deg", "180"),
+        ({"kind": "around", "count": 1, "seed": 0.5}, "seed", "integer"),
+        ({"kind": "around", "count": 1, "tilt_deg": 3}, "tilt_deg", "it takes count, translation_mm"),
+        ({"kind": "spline"}, "count", "exactly one"),
+        ({"kind": "spline", "count": 3, "spacing_mm": 1.0}, "count", "exactly one"),
+        ({"kind": "spline", "spacing_mm": 0}, "spacing_mm", "above 0"),
+        ({"kind": "fan", "tilt_deg": 10}, "step_deg", "required"),
+        ({"kind": "fan", "tilt_deg": 10, "step_deg": 0}, "step_deg", "above 0"),
+        ({"kind": "fan", "tilt_deg": 181, "step_deg": 1}, "tilt_deg", "180"),
+        ({"kind": "covered", "count": 0}, "count", "integer"),
+        ({"kind": "covered", "count": 1, "seed": -1}, "seed", "integer"),
+    ],
+)
+def test_mistakes_name_the_field(document: Any, field: str, told: str) -> None:
+    with pytest.raises(InvalidArgument, match=told) as caught:
+        sampler_from_dict(document)
+    assert caught.value.field == field
+
+
+@pytest.mark.parametrize("kind", SAMPLERS)
+def test_no_base_poses(kind: str) -> None:
+    numbers = {"around": {"count": 1}, "spline": {"count": 1}, "covered": {"count": 1}}
+    numbers["fan"] = {"tilt_deg": 1, "step_deg": 1}
+    with pytest.raises(InvalidArgument, match="needs base poses"):
+        sampler_from_dict({"kind": kind, **numbers.get(kind, {})}).poses(np.zeros((0, 4, 4)), PROBE)
+
+
+def test_needs_no_torch() -> None:
+    program = f"import sys; sys.path[:] = {sys.path!r}; import ultragray.samplers; print('torch' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"
