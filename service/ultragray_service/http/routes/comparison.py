@@ -1,0 +1,84 @@
+"""Pictures to compare: a scene beside the frames held out from it, and the frames and poses of a dataset."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from fastapi import APIRouter, Path
+from starlette.responses import Response
+
+from ...comparisons import Comparison
+from ..accept import PNG
+from ..console_schemas import ComparedFrame, ComparisonOut, DatasetPoses
+from ..deps import SceneName, ServiceDep, problems
+from .datasets import DatasetName
+
+router = APIRouter(prefix="/v1", tags=["console"])
+
+FrameIndex = Annotated[int, Path(ge=0, description="Place of the frame, from 0.")]
+_Answers = dict[int | str, dict[str, Any]]
+_PICTURE: _Answers = {
+    200: {
+        "description": "8-bit grey, square pixels, at most 512 a side.",
+        "content": {PNG: {"schema": {"type": "string", "format": "binary"}}},
+    }
+}
+_POSES: _Answers = {200: {"model": DatasetPoses}}
+
+
+@router.get("/scenes/{scene}/comparison", responses=problems(401, 404, 422, 503))
+async def get_comparison(service: ServiceDep, scene: SceneName) -> ComparisonOut:
+    """Metrics on the held-out frames of the scene's dataset. The first request begins to compute them."""
+    service.require_serving()
+    return _comparison(await service.comparisons.get(scene))
+
+
+@router.get(
+    "/scenes/{scene}/comparison/{index}/{what}.png",
+    response_class=Response,
+    responses=_PICTURE | problems(401, 404, 422),
+)
+async def get_compared_picture(
+    service: ServiceDep,
+    scene: SceneName,
+    index: FrameIndex,
+    what: Literal["truth", "rendering", "median", "difference"],
+) -> Response:
+    """A picture of a held-out frame; difference: three times the absolute one between truth and rendering."""
+    return Response(await service.comparisons.picture_png(scene, index, what), media_type=PNG)
+
+
+@router.get(
+    "/datasets/{dataset}/poses",
+    response_class=Response,
+    responses=_POSES | problems(401, 404, 422, 500, 503, 504, 507),
+)
+async def get_dataset_poses(service: ServiceDep, dataset: DatasetName) -> Response:
+    """Probe to scene, of the training frames and the held-out ones."""
+    service.require_serving()
+    return Response(await service.dataset_views.poses_json(dataset), media_type="application/json")
+
+
+@router.get(
+    "/datasets/{dataset}/frames/{part}/{index}",
+    response_class=Response,
+    responses=_PICTURE | problems(401, 404, 422, 500, 503, 504, 507),
+)
+async def get_dataset_frame(
+    service: ServiceDep, dataset: DatasetName, part: Literal["train", "val"], index: FrameIndex
+) -> Response:
+    """A frame of a dataset; those of convex and phased probes as fans."""
+    service.require_serving()
+    return Response(await service.dataset_views.frame_png(dataset, part, index), media_type=PNG)
+
+
+def _comparison(comparison: Comparison) -> ComparisonOut:
+    error = comparison.preparation.error
+    return ComparisonOut(
+        state=comparison.preparation.state,
+        progress=comparison.preparation.progress,
+        dataset=comparison.dataset,
+        frames=[ComparedFrame.model_validate(frame) for frame in comparison.frames],
+        reason=None if error is None else error.detail,
+        error=None if error is None else error.reason,
+    )

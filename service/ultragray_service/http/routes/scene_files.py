@@ -1,0 +1,104 @@
+"""Scene files: downloaded, imported, deleted, and looked into."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Query
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import FileResponse, Response
+
+from ultragray.errors import UnsupportedMediaType, UploadTooLarge
+from ultragray_workers.scenes import SUFFIX
+
+from ...arrival import arrival
+from ...scene_points import DEFAULT_POINTS, MAX_POINTS, MAX_POSES, even_selection, point_message
+from ..accept import RAW
+from ..console_schemas import ScenePoses
+from ..deps import SceneName, ServiceDep, problems
+from ..schemas import SceneOut
+from .scenes import scene_out
+
+router = APIRouter(prefix="/v1/scenes", tags=["scenes"])
+
+PointLimit = Annotated[int, Query(ge=1, le=MAX_POINTS, description="Gaussians at most.")]
+_BINARY = {"schema": {"type": "string", "format": "binary"}}
+_Answers = dict[int | str, dict[str, Any]]
+_POINTS: _Answers = {
+    200: {
+        "description": "The length of the JSON that follows (uint32, little endian), the JSON with `count`, `fields` "
+        "and `total`, then float32 [count, 6] from a multiple of 8 bytes.",
+        "content": {RAW: _BINARY},
+    }
+}
+_FILE: _Answers = {200: {"description": "The scene file.", "content": {RAW: _BINARY}}}
+_IMPORT: dict[str, Any] = {
+    "requestBody": {"required": True, "description": "A scene file (.ugr).", "content": {RAW: _BINARY}}
+}
+
+
+@router.get("/{scene}/gaussians", response_class=Response, responses=_POINTS | problems(401, 404, 422))
+async def get_gaussians(service: ServiceDep, scene: SceneName, limit: PointLimit = DEFAULT_POINTS) -> Response:
+    """Gaussians as points: position, intensity, transmittance and size; an even selection, always the same."""
+    header = await service.catalog.header(scene)
+    message = await asyncio.to_thread(point_message, service.scenes.path(scene), header.info, limit)
+    return Response(message, media_type=RAW)
+
+
+@router.get("/{scene}/training-poses", responses=problems(401, 404, 422))
+async def get_training_poses(service: ServiceDep, scene: SceneName) -> ScenePoses:
+    """The poses that the scene was trained from, at most 10,000 of them, evenly taken."""
+    poses = (await service.catalog.header(scene)).training_poses
+    return ScenePoses(poses=poses[even_selection(len(poses), MAX_POSES)].reshape(-1, 16).tolist())
+
+
+@router.get("/{scene}/file", response_class=FileResponse, responses=_FILE | problems(401, 404, 422))
+async def download_scene(service: ServiceDep, scene: SceneName) -> FileResponse:
+    """Downloads the scene file. Ranges are answered, so that a download can go on."""
+    await service.catalog.header(scene)
+    return FileResponse(service.scenes.path(scene), media_type=RAW, filename=f"{scene}{SUFFIX}")
+
+
+@router.put(
+    "/{scene}",
+    status_code=201,
+    openapi_extra=_IMPORT,
+    responses=problems(401, 409, 413, 415, 422, 429, 500, 503, 504, 507),
+)
+async def import_scene(request: Request, service: ServiceDep, scene: SceneName) -> SceneOut:
+    """Takes a scene file in and serves it. It is checked first, and appears whole or not at all."""
+    service.require_serving()
+    if request.headers.get("content-encoding", "identity").lower() != "identity":
+        raise UnsupportedMediaType("the body must not be compressed", field="Content-Encoding")
+    limit = service.settings.max_dataset_bytes
+    announced = request.headers.get("content-length", "")
+    if announced.isdigit() and int(announced) > limit:
+        raise UploadTooLarge(f"a scene file may have at most {limit} bytes, {announced} were announced", field="body")
+    header = await service.imports.take_in(scene, _blocks(request, service))
+    return scene_out(scene, header, 0)
+
+
+@router.delete("/{scene}", status_code=204, responses=problems(401, 403, 404, 422, 503))
+async def delete_scene(service: ServiceDep, scene: SceneName) -> None:
+    """Deletes a scene that was imported or that a job made, and frees its memory. Others are not the service's."""
+    service.require_serving()
+    await service.imports.delete(scene)
+    if scene in service.pool.loaded():
+        await service.unload(scene)
+
+
+async def _blocks(request: Request, service: ServiceDep) -> AsyncIterator[bytes]:
+    """The body as it comes. Raises ClientDisconnect, and as `arrival`."""
+    stopping: asyncio.Future[Any] = asyncio.ensure_future(service.draining.wait())
+    more = True
+    try:
+        while more:
+            message = await arrival(request.receive(), service.settings.upload_idle_timeout_s, stopping)
+            if message["type"] == "http.disconnect":
+                raise ClientDisconnect
+            more = message.get("more_body", False)
+            yield message.get("body", b"")
+    finally:
+        stopping.cancel()

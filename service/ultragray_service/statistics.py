@@ -1,0 +1,103 @@
+"""The last minutes of the service in steps of a few seconds, for people who look: Prometheus keeps the rest."""
+
+from __future__ import annotations
+
+import os
+import random
+import time
+from collections import deque
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+STEP_S = 5
+STEPS = 120
+STAGES = ("queue", "render", "encode")
+_SAMPLES = 500  # of a step and stage; more are sampled
+
+
+@dataclass
+class _Step:
+    start: int  # whole steps since the clock's zero
+    frames: int = 0
+    requests: int = 0
+    errors: int = 0
+    samples: dict[str, list[float]] = field(default_factory=lambda: {stage: [] for stage in STAGES})
+
+
+@dataclass(frozen=True)
+class StepSummary:
+    """What happened in one step; times in ms by stage, None where nothing was rendered."""
+
+    seconds_ago: int  # of its end; the first is still going on
+    frames: int
+    requests: int  # rendered ones: a request may have many frames
+    errors: int
+    p50_ms: dict[str, float] | None
+    p99_ms: dict[str, float] | None
+
+
+class Statistics:
+    """A ring of steps. Belongs to one event loop."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._steps: deque[_Step] = deque(maxlen=STEPS)
+        self._random = random.Random(0)
+
+    def observe(self, frames: int, queue_ms: float, render_ms: float, encode_ms: float) -> None:
+        """One rendered request of the pool."""
+        step = self._now()
+        step.frames += frames
+        step.requests += 1
+        for stage, milliseconds in zip(STAGES, (queue_ms, render_ms, encode_ms), strict=True):
+            samples = step.samples[stage]
+            if len(samples) < _SAMPLES:
+                samples.append(milliseconds)
+            elif (place := self._random.randrange(step.requests)) < _SAMPLES:
+                samples[place] = milliseconds
+
+    def count_error(self) -> None:
+        """One request or message that the service could not answer as asked."""
+        self._now().errors += 1
+
+    def summaries(self) -> list[StepSummary]:
+        """The steps of the last minutes, the oldest first; one for each, also where nothing happened."""
+        now = self._step_number()
+        found = {step.start: step for step in self._steps}
+        return [_summary(found.get(now - age) or _Step(now - age), age) for age in range(STEPS - 1, -1, -1)]
+
+    def _now(self) -> _Step:
+        number = self._step_number()
+        if not self._steps or self._steps[-1].start != number:
+            self._steps.append(_Step(number))
+        return self._steps[-1]
+
+    def _step_number(self) -> int:
+        return int(self._clock() // STEP_S)
+
+
+def memory_bytes(pids: Iterable[int]) -> int:
+    """Memory of this process and of others, shared pages counted once in each."""
+    page = os.sysconf("SC_PAGE_SIZE")
+    total = 0
+    for pid in (os.getpid(), *pids):
+        try:
+            total += page * int(Path(f"/proc/{pid}/statm").read_text().split()[1])
+        except (OSError, IndexError, ValueError):  # gone a moment ago
+            continue
+    return total
+
+
+def _summary(step: _Step, age: int) -> StepSummary:
+    def quantile(share: float) -> dict[str, float] | None:
+        if not step.requests:
+            return None
+        return {stage: round(_quantile(step.samples[stage], share), 3) for stage in STAGES}
+
+    return StepSummary(age * STEP_S, step.frames, step.requests, step.errors, quantile(0.5), quantile(0.99))
+
+
+def _quantile(samples: list[float], share: float) -> float:
+    ordered = sorted(samples)
+    return ordered[min(int(share * len(ordered)), len(ordered) - 1)]

@@ -1,0 +1,108 @@
+"""What the console shows of a training while it runs: its curve, and a frame as the last checkpoint renders it."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ultragray.errors import ArtifactNotFound, TrainingStateInvalid
+from ultragray_workers.encoding import encode_image
+from ultragray_workers.jobs.folder import JobFolder
+from ultragray_workers.jobs.store import Job
+from ultragray_workers.picture_stack import read_picture
+from ultragray_workers.training_preview import PREVIEW_NAME
+from ultragray_workers.types import Encoding
+
+from .jobs import Jobs
+from .prepared import PreparedFolders
+from .settings import Settings
+
+FOLDER = "previews"  # of the artifact folder
+MAX_POINTS = 500
+_JOURNAL, _CHECKPOINT = "metrics.jsonl", "checkpoint.safetensors"  # of a run: `ultragray.training` imports torch
+
+
+@dataclass(frozen=True)
+class CurvePoint:
+    """Neighbouring steps of a training as one: their last step, their mean loss, what was measured last in them."""
+
+    step: int
+    loss: float
+    val_psnr_db: float | None
+
+
+class TrainingViews:
+    """Curves and previews of trainings, running or finished."""
+
+    def __init__(self, jobs: Jobs, settings: Settings) -> None:
+        self._jobs = jobs
+        self._artifacts = settings.artifacts
+        self.folders = PreparedFolders(
+            settings.artifacts / FOLDER, "training_preview", "rendering the training as it is", settings
+        )
+
+    async def curve(self, job_id: str) -> list[CurvePoint]:
+        """At most MAX_POINTS points of the training so far; none before its first step. Raises JobNotFound."""
+        job = await self._jobs.get(job_id)
+        folder = JobFolder(self._artifacts, job.id)
+        return await asyncio.to_thread(_curve_of, (folder.artifacts / _JOURNAL, folder.run / _JOURNAL))
+
+    async def preview_png(self, job_id: str) -> bytes:
+        """Truth, and to its right the rendering, PNG. Raises JobNotFound, and ArtifactNotFound without a checkpoint."""
+        job = await self._jobs.get(job_id)
+        checkpoint = JobFolder(self._artifacts, job.id).run / _CHECKPOINT
+        version = await asyncio.to_thread(_version_of, checkpoint)
+        if version is None or "dataset" not in job.specification:
+            raise self._none(job)
+        request = {
+            "artifact_folder": str(self._artifacts),
+            "dataset": job.specification["dataset"],
+            "checkpoint": str(checkpoint),
+        }
+        try:
+            folder = await self.folders.path(f"{job.id}-{version}", request)
+        except TrainingStateInvalid:  # the training ended a moment ago
+            raise self._none(job) from None
+
+        def read() -> bytes:
+            pictures = [read_picture(folder / PREVIEW_NAME, place) for place in range(2)]
+            shown = [picture for picture in pictures if picture is not None]
+            return encode_image(np.concatenate(shown, axis=1), Encoding.PNG).tobytes()
+
+        return await asyncio.to_thread(read)
+
+    def _none(self, job: Job) -> ArtifactNotFound:
+        return ArtifactNotFound(f"the job {job.id} has no checkpoint to render (any more)", field="job")
+
+
+def _curve_of(journals: tuple[Path, ...]) -> list[CurvePoint]:
+    for journal in journals:
+        try:
+            text = journal.read_text(encoding="utf-8")
+        except FileNotFoundError:
+            continue
+        lines = [
+            json.loads(line) for line in text.splitlines(keepends=True) if line.endswith("\n")
+        ]  # else being written
+        width = max(1, -(-len(lines) // MAX_POINTS))
+        groups = [lines[start : start + width] for start in range(0, len(lines), width)]
+        return [
+            CurvePoint(
+                step=int(group[-1]["step"]),
+                loss=float(np.mean([line["loss"] for line in group])),
+                val_psnr_db=next((line["val_psnr_db"] for line in reversed(group) if "val_psnr_db" in line), None),
+            )
+            for group in groups
+        ]
+    return []
+
+
+def _version_of(checkpoint: Path) -> int | None:
+    try:
+        return checkpoint.stat().st_mtime_ns
+    except FileNotFoundError:
+        return None

@@ -1,0 +1,85 @@
+/** Maps: every output of one view side by side, with one cursor and the values that the service gives. */
+
+import assert from "node:assert/strict";
+import { after, before, describe, it } from "node:test";
+
+import { canvasState, launch, openPage, picture, seriousFindings, Service, until } from "./harness.mjs";
+
+const OUTPUTS = ["bmode", "echo", "transmittance", "coverage", "labels"];
+const SIDE = 256; // of the frames of the demo scene
+const LABELS = { 0: "none", 1: "bone", 2: "muscle", 3: "fat", 4: "vessel" };
+
+let service;
+let browser;
+
+before(async () => {
+  [service, browser] = await Promise.all([Service.start(), launch()]);
+});
+after(async () => {
+  await browser?.close();
+  await service?.stop();
+});
+
+async function openMaps(options) {
+  const page = await openPage(browser, service, "#/maps/demo", options);
+  for (const output of OUTPUTS)
+    await until(() => canvasState(page, `[data-testid="map-${output}"]`), ({ width }) => width === SIDE, `no ${output}`);
+  return page;
+}
+
+/** What the service renders at the pose that the page starts with: each output's uint8 pixels. */
+async function rendered() {
+  const { poses } = await (await fetch(`${service.url}/v1/scenes/demo/training-poses`)).json();
+  const pose = poses[Math.floor(poses.length / 2)];
+  const matrix = [0, 4, 8, 12].map((start) => pose.slice(start, start + 4));
+  const answer = await fetch(`${service.url}/v1/scenes/demo/render`, {
+    method: "POST",
+    headers: { "Content-Type": "application/json", Accept: "application/octet-stream;dtype=uint8" },
+    body: JSON.stringify({ pose: { matrix }, outputs: OUTPUTS }),
+  });
+  const pixels = new Uint8Array(await answer.arrayBuffer());
+  return Object.fromEntries(OUTPUTS.map((output, i) => [output, pixels.subarray(i * SIDE * SIDE, (i + 1) * SIDE * SIDE)]));
+}
+
+describe("maps", () => {
+  it("shows the values of all outputs where the cursor is", async () => {
+    const page = await openMaps();
+    const expected = await rendered();
+    const box = await page.locator('[data-testid="map-echo"] canvas').boundingBox();
+    for (const [column, row] of [[128, 40], [200, 128], [60, 180]]) {
+      await page.mouse.move(box.x + ((column + 0.5) / SIDE) * box.width, box.y + ((row + 0.5) / SIDE) * box.height);
+      await page.getByText(`${column}, ${row}`).waitFor();
+      for (const output of OUTPUTS) {
+        const value = expected[output][row * SIDE + column];
+        const written = output === "labels" ? LABELS[value] : (value / 255).toFixed(3);
+        assert.equal(await page.getByTestId(`value-${output}`).textContent(), written, `${output} at ${column}, ${row}`);
+      }
+    }
+    assert.equal(await page.getByTestId("cursor-lateral").textContent(), "-15.82 mm"); // (60.5 / 256 - 1/2) 60 mm
+    assert.equal(await page.locator('[data-testid^="map-"] svg.overlay rect').count(), OUTPUTS.length);
+    await picture(page, "maps");
+    assert.deepEqual([page.faults, page.foreign], [[], []]);
+    await page.context().close();
+  });
+
+  it("is worked by keyboard, and readers of the screen find their way", async () => {
+    const page = await openMaps({ width: 1024, height: 768 });
+    await page.getByLabel("Maps; the arrow keys move the cursor").focus();
+    await page.keyboard.press("ArrowRight");
+    await page.keyboard.press("Shift+ArrowDown");
+    await page.getByText(`${SIDE / 2 + 1}, ${SIDE / 2 + 10}`).waitFor();
+    assert.deepEqual(await seriousFindings(page), []);
+    await picture(page, "maps-1024");
+    await page.context().close();
+  });
+
+  it("follows the sweep, and keeps the view of Scan", async () => {
+    const page = await openMaps();
+    const first = await canvasState(page, '[data-testid="map-bmode"]');
+    await page.getByLabel("Place in the training sweep").fill("10");
+    await until(() => canvasState(page, '[data-testid="map-bmode"]'), ({ print }) => print !== first.print, "it stood still");
+    await page.getByRole("link", { name: "Scan", exact: true }).click();
+    await page.getByText("view 11 of").waitFor();
+    await page.context().close();
+  });
+});

@@ -1,0 +1,82 @@
+/** Measures the console: frames a second, first paint, growth of the heap, size of the bundle.
+ *
+ * node tests/console/measure.mjs [SECONDS]: a sweep is played at 512x512 for so long (default 300). Prints JSON.
+ */
+
+import { readdirSync, readFileSync, statSync } from "node:fs";
+import path from "node:path";
+import { gzipSync } from "node:zlib";
+
+import { canvasState, launch, openPage, ROOT, Service, until } from "./harness.mjs";
+
+const IMAGE = '[aria-label="Live image"]';
+const SAMPLE_S = 10;
+const WARM_UP_S = 20; // the cine loop fills, the compiler of the browser settles
+const MEBIBYTE = 2 ** 20;
+const seconds = Number(process.argv[2] ?? 300);
+
+function bundleBytes(folder = path.join(ROOT, "service/ultragray_service/console")) {
+  return readdirSync(folder, { recursive: true })
+    .map((name) => path.join(folder, name))
+    .filter((file) => statSync(file).isFile())
+    .reduce((sum, file) => sum + gzipSync(readFileSync(file)).length, 0);
+}
+
+async function firstPaint_ms(page) {
+  return page.evaluate(() => performance.getEntriesByName("first-contentful-paint")[0]?.startTime);
+}
+
+/** Bytes of the heap and of array buffers after a collection. */
+async function heapBytes(session) {
+  await session.send("HeapProfiler.collectGarbage");
+  const { usedSize, backingStorageSize = 0 } = await session.send("Runtime.getHeapUsage");
+  return usedSize + backingStorageSize;
+}
+
+const service = await Service.start();
+const browser = await launch();
+try {
+  const cold = await openPage(browser, service, "#/scan/demo");
+  await until(() => canvasState(cold, IMAGE), ({ mean }) => mean > 5, "no frame came");
+  const paint_ms = await firstPaint_ms(cold);
+  const image_ms = await cold.evaluate(() => performance.now());
+  await cold.context().close();
+
+  const page = await openPage(browser, service, "#/scan/demo");
+  await page.getByRole("combobox", { name: "Samples" }).selectOption("512");
+  await until(() => canvasState(page, IMAGE), ({ width }) => width === 512, "no 512 scan lines");
+  await page.evaluate(() => {
+    const put = CanvasRenderingContext2D.prototype.putImageData;
+    globalThis.drawn = 0;
+    CanvasRenderingContext2D.prototype.putImageData = function (...given) {
+      globalThis.drawn += 1;
+      return put.apply(this, given);
+    };
+  });
+  const session = await page.context().newCDPSession(page);
+  await session.send("HeapProfiler.enable");
+  await page.getByRole("button", { name: "Play the sweep" }).click();
+  await page.waitForTimeout(Math.min(WARM_UP_S, seconds / 2) * 1000);
+  const heaps = [await heapBytes(session)];
+  const rates = [];
+  for (let passed = 0; passed < seconds; passed += SAMPLE_S) {
+    const [drawn, start] = await page.evaluate(() => [globalThis.drawn, performance.now()]);
+    await page.waitForTimeout(SAMPLE_S * 1000);
+    const [later, end] = await page.evaluate(() => [globalThis.drawn, performance.now()]);
+    rates.push(((later - drawn) * 1000) / (end - start));
+    heaps.push(await heapBytes(session));
+  }
+  const sorted = [...rates].sort((a, b) => a - b);
+  const figures = {
+    seconds,
+    frames_per_s: { median: sorted[sorted.length >> 1], least: sorted[0], most: sorted.at(-1) },
+    heap_mib: { first: heaps[0] / MEBIBYTE, last: heaps.at(-1) / MEBIBYTE, most: Math.max(...heaps) / MEBIBYTE },
+    first_contentful_paint_ms: paint_ms,
+    first_image_ms: image_ms,
+    bundle_gzip_kb: bundleBytes() / 1000,
+  };
+  process.stdout.write(`${JSON.stringify(figures, null, 2)}\n`);
+} finally {
+  await browser.close();
+  await service.stop();
+}

@@ -1,0 +1,242 @@
+/** Scan: frames come, follow the probe and the controls, and what stands in the way is said. */
+
+import assert from "node:assert/strict";
+import { readFileSync } from "node:fs";
+import { after, before, describe, it } from "node:test";
+
+import { canvasState, launch, openPage, picture, seriousFindings, Service, until } from "./harness.mjs";
+
+const IMAGE = '[aria-label="Live image"]';
+const PROBE_WIDTH_MM = 60; // of the demo scene
+
+let service;
+let browser;
+
+before(async () => {
+  [service, browser] = await Promise.all([Service.start(), launch()]);
+});
+after(async () => {
+  await browser?.close();
+  await service?.stop();
+});
+
+async function openScan(options) {
+  const page = await openPage(browser, service, "#/scan/demo", options);
+  const first = await until(() => canvasState(page, IMAGE), ({ mean }) => mean > 5, "no frame came");
+  return { page, first };
+}
+
+function changed(page, print) {
+  return until(() => canvasState(page, IMAGE), (state) => state.print !== print, "the image did not change");
+}
+
+async function poseOf(page) {
+  const json = await page.getByLabel("Pose as JSON, Enter applies").inputValue();
+  return JSON.parse(json);
+}
+
+describe("scan", () => {
+  it("is the page at the address of the service, with the first scene", async () => {
+    const page = await openPage(browser, service, "");
+    await until(() => page.url(), (url) => url.endsWith("#/scan/demo"), "no scene was chosen");
+    await until(() => canvasState(page, IMAGE), ({ mean }) => mean > 5, "no frame came");
+    await page.context().close();
+  });
+
+  it("shows the frame of where the probe is, and follows keys, sliders and JSON", async () => {
+    const { page, first } = await openScan();
+    assert.deepEqual([first.width, first.height], [256, 256]);
+    const pose = await poseOf(page);
+    await page.locator(`${IMAGE} .steer`).focus();
+    await page.keyboard.down("ArrowDown");
+    const moved = await changed(page, first.print);
+    await page.keyboard.up("ArrowDown");
+    await until(() => poseOf(page), ({ position_mm }) => position_mm.y > pose.position_mm.y, "it did not slide");
+    await page.keyboard.press("Shift+ArrowRight");
+    await until(() => poseOf(page), ({ quaternion }) => quaternion.z !== pose.quaternion.z, "it did not turn");
+    await page.getByLabel("Position X", { exact: true }).fill("8");
+    await until(() => poseOf(page), ({ position_mm }) => position_mm.x === 8, "the slider did not move it");
+    await changed(page, moved.print);
+    await page.getByLabel("Pose as JSON, Enter applies").fill(JSON.stringify(pose));
+    await page.keyboard.press("Enter");
+    const back = ({ mean }) => Math.abs(mean - first.mean) < 0.05; // the pose is rounded to micrometres
+    await until(() => canvasState(page, IMAGE), back, "the first image did not come back");
+    await page.getByLabel("Pose as JSON, Enter applies").fill('{"position_mm": {"x": 1}}');
+    await page.keyboard.press("Enter");
+    await page.getByText("position_mm needs the numbers x, y, z.").waitFor();
+    await page.getByLabel("Pose as JSON, Enter applies").press("Escape");
+    await page.getByLabel("Copy the pose as JSON").click();
+    assert.deepEqual(JSON.parse(await page.evaluate(() => navigator.clipboard.readText())), pose);
+    assert.deepEqual([page.faults, page.foreign], [[], []]);
+    await page.context().close();
+  });
+
+  it("shows what gain, range, TGC, depth, flip, samples and another probe make of it", async () => {
+    const { page, first } = await openScan();
+    await page.getByLabel("Gain", { exact: true }).fill("12");
+    const brighter = await changed(page, first.print);
+    assert.ok(brighter.mean > first.mean + 10, `${brighter.mean} after ${first.mean}`);
+    await page.getByLabel("Time-gain compensation 6 of 6, dB").fill("20");
+    const deep = await changed(page, brighter.print);
+    assert.ok(deep.mean > brighter.mean);
+    await page.getByRole("button", { name: "Reset" }).click();
+    await until(() => canvasState(page, IMAGE), ({ print }) => print === first.print, "Reset did not reset");
+    await page.getByLabel("Depth", { exact: true }).fill("30");
+    await until(() => canvasState(page, IMAGE), ({ height }) => height === 128, "the depth is not half of it");
+    await page.getByRole("button", { name: "Reset" }).click();
+    await page.getByLabel("Flip left/right").check();
+    await page.locator('[data-testid="orientation-marker"][data-side="right"]').waitFor();
+    await page.getByRole("combobox", { name: "Samples" }).selectOption("512");
+    await until(() => canvasState(page, IMAGE), ({ width }) => width === 512, "no 512 scan lines");
+    await page.getByRole("combobox", { name: "Probe" }).selectOption("convex");
+    await until(() => canvasState(page, IMAGE), ({ width }) => width === 640, "no sector came");
+    await until(() => poseOf(page), ({ position_mm }) => position_mm.z < -30, "the face of the convex probe left the skin");
+    await picture(page, "scan-convex");
+    await page.getByRole("button", { name: "Scan lines" }).click();
+    await until(() => canvasState(page, IMAGE), ({ width }) => width === 512, "no scan lines came");
+    await page.context().close();
+  });
+
+  it("freezes, goes through the cine loop, measures and saves", async () => {
+    const { page, first } = await openScan();
+    await page.getByLabel("Position Y", { exact: true }).fill("0");
+    const second = await changed(page, first.print);
+    await page.getByRole("button", { name: "Freeze" }).click();
+    await page.getByLabel("Position Y", { exact: true }).fill("5");
+    await page.waitForTimeout(400);
+    assert.equal((await canvasState(page, IMAGE)).print, second.print, "the image moved while frozen");
+    const place = page.getByTestId("cine-place");
+    await until(() => place.textContent(), (text) => /^(\d+) \/ \1$/.test(text), "the newest frame is not the one shown");
+    await page.getByLabel("Frame of the cine loop").fill("0");
+    await until(() => canvasState(page, IMAGE), ({ print }) => print === first.print, "the first frame is not kept");
+
+    await page.getByRole("button", { name: "Measure" }).click();
+    const box = await page.locator(`${IMAGE} canvas`).boundingBox();
+    await page.mouse.move(box.x + box.width * 0.25, box.y + box.height * 0.5);
+    await page.mouse.down();
+    await page.mouse.move(box.x + box.width * 0.75, box.y + box.height * 0.5, { steps: 4 });
+    await page.mouse.up();
+    const length = parseFloat(await page.getByTestId("calliper-length").textContent());
+    assert.ok(Math.abs(length - PROBE_WIDTH_MM / 2) < 0.4, `${length} mm`);
+    const end = page.getByLabel("Calliper 1, end B");
+    await end.focus();
+    for (let press = 0; press < 10; press++) await page.keyboard.press("ArrowRight");
+    const longer = parseFloat(await page.getByTestId("calliper-length").textContent());
+    assert.ok(Math.abs(longer - length - (10 * PROBE_WIDTH_MM) / box.width) < 0.2, `${longer} after ${length} mm`);
+
+    const [download] = await Promise.all([page.waitForEvent("download"), page.getByRole("button", { name: "Save" }).click()]);
+    assert.equal(download.suggestedFilename(), "demo.png");
+    assert.equal(readFileSync(await download.path()).subarray(1, 4).toString(), "PNG");
+    await picture(page, "scan-frozen");
+    await page.getByRole("button", { name: "Freeze" }).click();
+    await changed(page, first.print);
+    assert.deepEqual(page.faults, []);
+    await page.context().close();
+  });
+
+  it("snaps to training views, plays them, and says how far the view is from them", async () => {
+    const { page, first } = await openScan();
+    const confidence = page.getByTestId("confidence");
+    await until(() => confidence.textContent(), (text) => text === "Well supported", "home is a training view");
+    await page.getByLabel("Tilt, about the lateral axis", { exact: true }).fill("60");
+    await until(() => confidence.textContent(), (text) => text !== "Well supported", "60 degrees are none");
+    await page.getByRole("button", { name: "Snap" }).click();
+    await until(() => confidence.textContent(), (text) => text === "Well supported", "it did not snap");
+    await page.getByRole("button", { name: "Home" }).click();
+    await until(() => canvasState(page, IMAGE), ({ print }) => print === first.print, "home did not come back");
+    await page.getByRole("button", { name: "Play the sweep" }).click();
+    const playing = await changed(page, first.print);
+    await changed(page, playing.print);
+    await page.getByRole("button", { name: "Pause the sweep" }).click();
+    await page.context().close();
+  });
+
+  it("is steered by a gamepad", async () => {
+    const { page, first } = await openScan();
+    await page.evaluate(() => {
+      const pad = { id: "Pad of the test", connected: true, axes: [0, 1, 0, 0], buttons: [] };
+      navigator.getGamepads = () => [pad];
+      dispatchEvent(new Event("gamepadconnected"));
+    });
+    await page.getByText("Gamepad: Pad of the test").waitFor();
+    await changed(page, first.print);
+    const slid = ({ position_mm }) => position_mm.y > -15; // it was at -18.9
+    await until(() => poseOf(page), slid, "the stick does not slide the probe in elevation");
+    await page.context().close();
+  });
+
+  it("shows the scene in space, where the probe can be dragged", async () => {
+    const { page } = await openScan();
+    const room = page.getByTestId("room");
+    await room.locator("canvas").waitFor();
+    await until(() => room.locator("canvas").evaluate((canvas) => canvas.width), (width) => width > 300, "no 3D view");
+    await page.waitForTimeout(1500); // the Gaussians are on their way
+    const changes = async (change, what) => {
+      const before = (await room.screenshot()).toString("base64");
+      await change();
+      await until(async () => (await room.screenshot()).toString("base64") !== before, Boolean, `${what}: nothing changed`);
+      await page.waitForTimeout(500);
+    };
+    await changes(() => page.getByLabel("Cut").uncheck(), "the cut");
+    await changes(() => page.getByLabel("Colour of the Gaussians").selectOption("transmittance"), "the colours");
+    await picture(page, "scan-uncut");
+    await changes(() => page.getByLabel("Sweep", { exact: true }).uncheck(), "the sweep");
+    await page.getByLabel("Cut").check();
+    const pose = await poseOf(page);
+    assert.ok(await dragProbe(page, room, pose), "there is no handle where the probe is");
+    await picture(page, "scan");
+    assert.deepEqual(page.faults, []);
+    await page.context().close();
+  });
+
+  it("is usable by keyboard and by readers of the screen, at 1280 and at 1024 pixels", async () => {
+    for (const [width, height, scheme] of [[1280, 800, "light"], [1024, 768, "dark"]]) {
+      const { page } = await openScan({ width, height, scheme });
+      assert.deepEqual(await seriousFindings(page), []);
+      const wider = await page.evaluate(() => document.documentElement.scrollWidth > innerWidth);
+      assert.equal(wider, false, `wider than ${width} pixels`);
+      await picture(page, `scan-${width}`);
+      await page.context().close();
+    }
+  });
+
+  it("says that the service is down, and goes on when it is back", async () => {
+    const { page, first } = await openScan();
+    await service.down();
+    await page.getByTestId("service-down").waitFor();
+    await page.getByText("No connection").waitFor();
+    await picture(page, "scan-down");
+    await page.getByLabel("Position Y", { exact: true }).fill("3");
+    await service.up();
+    await page.getByTestId("service-down").waitFor({ state: "detached" });
+    await changed(page, first.print);
+    await page.context().close();
+  });
+
+  it("says that a scene is missing and which there are", async () => {
+    const page = await openPage(browser, service, "#/scan/nobody");
+    await page.getByTestId("scene-missing").getByText("There is no scene nobody here.").waitFor();
+    await picture(page, "scan-missing");
+    await page.getByTestId("scene-missing").getByRole("link", { name: "demo" }).click();
+    await until(() => canvasState(page, IMAGE), ({ mean }) => mean > 5, "no frame came");
+    await page.context().close();
+  });
+});
+
+/** Drags the probe by a handle, which the pointer tells by its shape, until the pose follows; false without a handle. */
+async function dragProbe(page, room, pose) {
+  const box = await room.boundingBox();
+  for (let y = 0.25; y < 0.6; y += 0.015) {
+    for (let x = 0.45; x < 0.75; x += 0.015) {
+      await page.mouse.move(box.x + box.width * x, box.y + box.height * y);
+      if ((await room.locator("canvas").evaluate((canvas) => canvas.style.cursor)) !== "grab") continue;
+      await page.mouse.down();
+      await page.mouse.move(box.x + box.width * x + 30, box.y + box.height * y + 40, { steps: 4 });
+      await page.mouse.up();
+      const moved = (now) => JSON.stringify(now) !== JSON.stringify(pose);
+      await until(() => poseOf(page), moved, "the probe did not follow the pointer");
+      return true;
+    }
+  }
+  return false;
+}

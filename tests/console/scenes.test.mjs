@@ -1,0 +1,102 @@
+/** Scenes and service: what there is, what is held in memory, files in and out, and how the service fares. */
+
+import assert from "node:assert/strict";
+import { readFileSync, writeFileSync } from "node:fs";
+import path from "node:path";
+import { after, before, describe, it } from "node:test";
+
+import { launch, openPage, picture, seriousFindings, Service, until } from "./harness.mjs";
+import { makeSweep } from "./sweep.mjs";
+
+let service;
+let browser;
+let files;
+
+before(async () => {
+  files = makeSweep();
+  [service, browser] = await Promise.all([Service.start(), launch()]);
+  writeFileSync(path.join(service.data, "damaged.ugr"), "no scene");
+});
+after(async () => {
+  await browser?.close();
+  await service?.stop();
+  files?.remove();
+});
+
+describe("scenes and service", () => {
+  it("imports, loads, unloads, gives back and deletes a scene", async () => {
+    const page = await openPage(browser, service, "#/scenes");
+    await page.getByLabel("Import a scene").setInputFiles(files.compared);
+    await page.getByLabel("Name", { exact: true }).fill("mine");
+    await page.getByRole("button", { name: "Import", exact: true }).click();
+    await page.getByRole("status").getByText("mine is there.").waitFor();
+    const row = page.getByTestId("scene-mine");
+    await row.getByRole("button", { name: "Load", exact: true }).click();
+    await row.getByText("loaded").waitFor();
+    await picture(page, "scenes");
+    await row.getByRole("button", { name: "Unload" }).click();
+    await row.getByRole("button", { name: "Load", exact: true }).waitFor();
+    const [download] = await Promise.all([page.waitForEvent("download"), row.getByRole("button", { name: "Download" }).click()]);
+    assert.equal(download.suggestedFilename(), "mine.ugr");
+    assert.deepEqual(readFileSync(await download.path()), readFileSync(files.compared));
+    await row.getByRole("button", { name: "Delete" }).click();
+    await row.getByRole("button", { name: "Keep" }).click();
+    await row.getByRole("button", { name: "Delete" }).click();
+    await row.getByRole("group", { name: "Delete mine?" }).getByRole("button", { name: "Delete" }).click();
+    await row.waitFor({ state: "detached" });
+    assert.deepEqual([page.faults, page.foreign], [[], []]);
+    await page.context().close();
+  });
+
+  it("says what cannot be imported, read or deleted", async () => {
+    const page = await openPage(browser, service, "#/scenes");
+    await page.getByTestId("scene-damaged").getByText("not a scene file").waitFor();
+    await page.getByLabel("Import a scene").setInputFiles({ name: "a b.ugr", mimeType: "", buffer: Buffer.from("nothing") });
+    assert.equal(await page.getByLabel("Name", { exact: true }).inputValue(), "a-b");
+    await page.getByRole("button", { name: "Import", exact: true }).click();
+    await page.getByTestId("import-problem").getByText("not a scene file").waitFor();
+    const row = page.getByTestId("scene-demo");
+    await row.getByRole("button", { name: "Delete" }).click();
+    await row.getByRole("group", { name: "Delete demo?" }).getByRole("button", { name: "Delete" }).click();
+    await page.getByRole("alert").getByText("lies in the data folder").waitFor();
+    await page.context().close();
+  });
+
+  it("shows frames, times and errors of the last minutes", async () => {
+    const page = await openPage(browser, service, "#/scenes");
+    const frames = page.getByTestId("frames-rendered");
+    const before = Number(await frames.textContent());
+    const matrix = [[1, 0, 0, 0], [0, 1, 0, 5], [0, 0, 1, 0], [0, 0, 0, 1]];
+    const headers = { "Content-Type": "application/json" };
+    for (let i = 0; i < 12; i++)
+      await fetch(`${service.url}/v1/scenes/demo/render`, { method: "POST", headers, body: JSON.stringify({ pose: { matrix } }) });
+    await fetch(`${service.url}/v1/scenes/demo/render`, {
+      method: "POST",
+      headers,
+      body: JSON.stringify({ pose: { matrix }, height: 512, width: 512, timeout_ms: 0.001 }),
+    });
+    await until(() => frames.textContent(), (text) => Number(text) === before + 12, "not all frames were counted");
+    const latency = page.getByRole("img", { name: /^Latency, median in ms/ });
+    await until(() => latency.locator("path.line").nth(1).getAttribute("d"), (d) => d !== "", "no render times");
+    await page.getByRole("button", { name: "99th percentile" }).click();
+    await page.getByRole("img", { name: /^Latency, 99th percentile/ }).waitFor();
+    await page.getByRole("img", { name: /^Errors over/ }).waitFor();
+    assert.deepEqual(await seriousFindings(page), []);
+    await picture(page, "service");
+    await page.context().close();
+  });
+
+  it("says that the service is down, and goes on when it is back", async () => {
+    const page = await openPage(browser, service, "#/scenes", { width: 820, height: 1180 });
+    await page.getByTestId("frames-rendered").waitFor();
+    assert.deepEqual(await seriousFindings(page), []);
+    await service.down();
+    await page.getByText("The list may be out of date.").waitFor();
+    await page.getByText("The service does not answer. Trying again.").waitFor();
+    await picture(page, "scenes-down");
+    await service.up();
+    await page.getByText("The list may be out of date.").waitFor({ state: "detached" });
+    await page.getByText("The service does not answer. Trying again.").waitFor({ state: "detached" });
+    await page.context().close();
+  });
+});

@@ -1,0 +1,123 @@
+/** Train: from a file on somebody's disk to a scene that is scanned, and what stands in the way. */
+
+import assert from "node:assert/strict";
+import { after, before, describe, it } from "node:test";
+
+import { canvasState, launch, openPage, picture, seriousFindings, Service, until } from "./harness.mjs";
+import { makeSweep } from "./sweep.mjs";
+
+let service;
+let browser;
+let files;
+
+before(async () => {
+  files = makeSweep();
+  const settings = { ULTRAGRAY_EMBEDDED_WORKER: "true", ULTRAGRAY_TRAINING_THREADS: "1" };
+  [service, browser] = await Promise.all([Service.start(settings), launch()]);
+});
+after(async () => {
+  await browser?.close();
+  await service?.stop();
+  files?.remove();
+});
+
+async function upload(page, file, name) {
+  await page.getByLabel("Add a sweep").setInputFiles(file);
+  await page.getByLabel("Name", { exact: true }).fill(name);
+  await page.getByRole("button", { name: "Upload and check" }).click();
+}
+
+async function start(page, scene, settings) {
+  await page.getByLabel("Scene", { exact: true }).last().fill(scene);
+  await page.locator("summary", { hasText: /^Settings$/ }).click();
+  for (const [label, value] of Object.entries(settings)) await page.getByLabel(label).fill(value);
+  await page.getByRole("button", { name: "Start the training" }).click();
+}
+
+function state(page) {
+  return page.getByTestId("job-state").textContent();
+}
+
+describe("train", () => {
+  it("takes a sweep in, shows it, trains, tells how far it is, and opens the scene", async () => {
+    const page = await openPage(browser, service, "#/train");
+    await upload(page, files.sweep, "sweep");
+    await page.getByText("28 to train from, 5 held out").waitFor();
+    await page.getByRole("img", { name: "Contact sheet of sweep" }).waitFor();
+    const frame = page.getByRole("img", { name: "Frame 0 of sweep" });
+    await frame.waitFor();
+    const room = page.getByTestId("space").locator("canvas");
+    await until(() => room.evaluate((canvas) => canvas.width), (width) => width > 200, "no poses in space");
+    await page.getByRole("button", { name: "Held out" }).click();
+    await page.getByLabel("Frame", { exact: true }).fill("4");
+    await page.getByRole("img", { name: "Frame 4 of sweep" }).waitFor();
+    assert.deepEqual(await seriousFindings(page), []);
+    await picture(page, "train-sweep");
+
+    await start(page, "made", { Steps: "60", "Most Gaussians": "800", Others: "confidence = false" });
+    await until(() => state(page), (text) => text !== "queued", "nobody began");
+    await until(() => state(page), (text) => text === "succeeded", "it did not succeed");
+    await page.getByText("Step 60 of 60", { exact: true }).waitFor();
+    for (const [name, least] of [["Loss over step: training", 60], ["Held-out PSNR in dB over step: validation", 2]]) {
+      const line = page.getByRole("img", { name }).locator("path.line");
+      await until(() => line.getAttribute("d"), (d) => (d.match(/[ML]/g) ?? []).length >= least, `no curve: ${name}`);
+    }
+    await page.getByRole("img", { name: /^Held-out frame/ }).first().waitFor();
+    const [download] = await Promise.all([
+      page.waitForEvent("download"),
+      page.getByRole("button", { name: "made.ugr" }).click(),
+    ]);
+    assert.equal(download.suggestedFilename(), "made.ugr");
+    assert.deepEqual(await seriousFindings(page), []);
+    await picture(page, "train-done");
+
+    await page.getByRole("link", { name: "Open the scene" }).click();
+    await until(() => canvasState(page, '[aria-label="Live image"]'), ({ mean }) => mean > 2, "the scene gives no frame");
+    assert.ok(page.url().endsWith("#/scan/made"));
+    assert.deepEqual([page.faults, page.foreign], [[], []]);
+    await page.context().close();
+  });
+
+  it("shows the rendering as it is, keeps on after the service was down, and cancels", async () => {
+    const page = await openPage(browser, service, "#/train", { scheme: "dark" });
+    await page.getByText("28 to train from, 5 held out").waitFor();
+    await start(page, "long", { Steps: "100000", "Most Gaussians": "800" });
+    const preview = page.getByRole("img", { name: "A held-out frame and its rendering" });
+    await preview.waitFor({ timeout: 60_000 });
+    await picture(page, "train-running");
+    const steps = page.getByText(/^Step [\d,]+ of 100,000$/);
+    const stepNow = async () => Number((await steps.textContent()).split(" ")[1].replaceAll(",", ""));
+    await service.down();
+    await page.getByText("The service does not answer. Trying again.").waitFor();
+    const before = await stepNow();
+    await service.up();
+    await until(stepNow, (step) => step > before, "it did not go on");
+    await page.getByRole("button", { name: "Cancel" }).click();
+    await until(() => state(page), (text) => text === "cancelled", "it was not cancelled");
+    await page.getByRole("button", { name: "Go on from the last checkpoint" }).waitFor();
+    await page.context().close();
+  });
+
+  it("says why an upload or a training is refused", async () => {
+    const page = await openPage(browser, service, "#/train");
+    await upload(page, files.broken, "broken");
+    const problem = page.getByTestId("upload-problem");
+    await problem.getByText("frame 5").waitFor();
+    await picture(page, "train-refused");
+    await page.getByLabel("Add a sweep").setInputFiles({ name: "notes.zip", mimeType: "application/zip", buffer: Buffer.from("no archive") });
+    await page.getByRole("button", { name: "Upload and check" }).click();
+    await problem.getByText("neither .zip nor .tar").waitFor();
+    await page.getByLabel("Scene", { exact: true }).last().fill("demo");
+    await page.getByRole("button", { name: "Start the training" }).click();
+    await page.getByRole("alert").getByText("there is already a scene 'demo'").waitFor();
+    const names = (await (await fetch(`${service.url}/v1/datasets`)).json()).datasets.map(({ name }) => name);
+    assert.deepEqual(names, ["sweep"]);
+    await page.context().close();
+  });
+
+  it("says that a job is gone", async () => {
+    const page = await openPage(browser, service, "#/train/0123456789abcdef01234567");
+    await page.getByText("There is no such job").waitFor();
+    await page.context().close();
+  });
+});

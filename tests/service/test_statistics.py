@@ -1,0 +1,75 @@
+from __future__ import annotations
+
+import httpx
+import pytest
+
+from ultragray_service.statistics import STEP_S, STEPS, Statistics
+
+from .conftest import StartService
+
+POSE = {"position_mm": {"x": 0, "y": 1, "z": 0}, "quaternion": {"w": 1, "x": 0, "y": 0, "z": 0}}
+
+
+class Clock:
+    seconds = 1000.0
+
+    def __call__(self) -> float:
+        return self.seconds
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+@pytest.fixture
+def statistics(clock: Clock) -> Statistics:
+    return Statistics(clock)
+
+
+def test_each_step_tells_what_happened_in_it(statistics: Statistics, clock: Clock) -> None:
+    for render_ms in range(1, 101):
+        statistics.observe(2, 1.0, float(render_ms), 2.0)
+    clock.seconds += STEP_S
+    statistics.count_error()
+    summaries = statistics.summaries()
+    assert [one.seconds_ago for one in summaries] == [STEP_S * age for age in range(STEPS - 1, -1, -1)]
+    now, before = summaries[-1], summaries[-2]
+    assert (now.frames, now.requests, now.errors, now.p50_ms) == (0, 0, 1, None)
+    assert (before.frames, before.requests, before.errors) == (200, 100, 0)
+    assert before.p50_ms == {"queue": 1.0, "render": 51.0, "encode": 2.0}
+    assert before.p99_ms == {"queue": 1.0, "render": 100.0, "encode": 2.0}
+
+
+def test_what_is_older_than_ten_minutes_goes(statistics: Statistics, clock: Clock) -> None:
+    statistics.observe(1, 1.0, 1.0, 1.0)
+    clock.seconds += STEP_S * (STEPS - 1)
+    assert statistics.summaries()[0].frames == 1
+    clock.seconds += STEP_S
+    assert sum(one.frames for one in statistics.summaries()) == 0
+
+
+def test_many_requests_are_sampled(statistics: Statistics) -> None:
+    for place in range(5000):
+        statistics.observe(1, 1.0, float(place % 100), 2.0)
+    summary = statistics.summaries()[-1]
+    assert summary.requests == 5000
+    assert summary.p50_ms is not None
+    assert 35 < summary.p50_ms["render"] < 65
+
+
+def test_over_http(start_service: StartService) -> None:
+    service = start_service()
+    with httpx.Client(base_url=service.http, timeout=30) as http:
+        for _ in range(3):
+            assert http.post("/v1/scenes/demo/render", json={"pose": POSE}).status_code == 200
+        late = http.post("/v1/scenes/demo/render", json={"pose": POSE, "timeout_ms": 0.001})
+        assert late.status_code == 504
+        found = http.get("/v1/statistics").json()
+    assert len(found["steps"]) == STEPS
+    assert sum(step["frames"] for step in found["steps"]) == 3
+    last = next(step for step in reversed(found["steps"]) if step["frames"])
+    assert 0 < last["p50_ms"]["render"] <= last["p99_ms"]["render"]
+    assert [step["errors"] for step in found["steps"] if step["errors"]] == [1]
+    assert (found["processes"], found["loaded_scenes"], found["process_restarts"]) == (1, 1, 0)
+    assert 50e6 < found["memory_bytes"] < 50e9

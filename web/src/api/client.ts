@@ -1,0 +1,100 @@
+/** How the console asks the service: one place for the key, for errors and for their words. */
+
+const KEY_STORAGE = "ultragray.key";
+
+/** What the service answers in place of a result: RFC 9457 with a stable `reason`. */
+export interface Problem {
+  title: string;
+  status: number;
+  detail: string;
+  reason: string;
+  field: string | null;
+  request_id: string | null;
+}
+
+/** The service refused. */
+export class ServiceError extends Error {
+  constructor(readonly problem: Problem) {
+    super(problem.detail);
+    this.name = "ServiceError";
+  }
+  get reason(): string {
+    return this.problem.reason;
+  }
+}
+
+/** Nobody answered: the service is down, or the network is. */
+export class Unreachable extends Error {
+  constructor() {
+    super("The service does not answer.");
+    this.name = "Unreachable";
+  }
+}
+
+/** One sentence for a person. */
+export function explain(error: unknown): string {
+  return error instanceof Error ? error.message : String(error);
+}
+
+export function apiKey(): string | null {
+  return sessionStorage.getItem(KEY_STORAGE);
+}
+
+/** Keeps the key until the tab is closed. */
+export function setApiKey(key: string): void {
+  sessionStorage.setItem(KEY_STORAGE, key);
+}
+
+/** The headers that every request needs. */
+export function keyHeaders(): Record<string, string> {
+  const key = apiKey();
+  return key === null ? {} : { "X-API-Key": key };
+}
+
+/** Sends a request. Throws ServiceError for a status of 400 and above, Unreachable where nobody answers. */
+export async function request(path: string, init: RequestInit = {}): Promise<Response> {
+  const headers = new Headers(init.headers);
+  for (const [name, value] of Object.entries(keyHeaders())) headers.set(name, value);
+  let response: Response;
+  try {
+    response = await fetch(path, { ...init, headers });
+  } catch (error) {
+    if (init.signal?.aborted) throw error;
+    throw new Unreachable();
+  }
+  if (!response.ok) throw new ServiceError(await problemOf(response));
+  return response;
+}
+
+/** The JSON that a GET answers. */
+export async function getJson<T>(path: string, signal?: AbortSignal): Promise<T> {
+  return (await (await request(path, { signal: signal ?? null })).json()) as T;
+}
+
+/** The JSON that a request with a JSON body, or without one, answers. */
+export async function sendJson<T>(method: "POST" | "PUT", path: string, body?: unknown): Promise<T> {
+  const init: RequestInit = { method };
+  if (body !== undefined) {
+    init.body = JSON.stringify(body);
+    init.headers = { "Content-Type": "application/json" };
+  }
+  return (await (await request(path, init)).json()) as T;
+}
+
+/** Reads a problem out of an answer; what is no problem document becomes one. */
+export async function problemOf(response: Response): Promise<Problem> {
+  const text = await response.text();
+  try {
+    const document = JSON.parse(text) as Partial<Problem>;
+    if (typeof document.reason === "string" && typeof document.detail === "string") return document as Problem;
+  } catch {
+    // not JSON: a proxy answered, say
+  }
+  const detail = `The service answered ${response.status} ${response.statusText}`.trim() + ".";
+  return { title: "Error", status: response.status, detail, reason: "UNKNOWN", field: null, request_id: null };
+}
+
+/** A piece of a path. */
+export function segment(name: string): string {
+  return encodeURIComponent(name);
+}

@@ -1,0 +1,207 @@
+/** The WebSocket of a scene: poses out, frames in; only the newest pose counts. */
+
+import type { Picture } from "../geometry/picture";
+import type { Pose } from "../geometry/pose";
+import { apiKey, segment } from "./client";
+import type { Probe } from "./scenes";
+
+export const OUTPUTS = ["bmode", "echo", "transmittance", "coverage", "labels"] as const;
+export type Output = (typeof OUTPUTS)[number];
+
+export interface Display {
+  gain_db: number;
+  dynamic_range_db: number;
+  tgc_db: number[];
+  depth_mm: number | null;
+  flip: boolean;
+  pixel_mm: number | null;
+}
+
+export interface StreamSettings {
+  height: number | null;
+  width: number | null;
+  probe: Probe | null;
+  display: Display;
+  outputs: Output[];
+}
+
+/** How far a view is from what the scene was trained from. */
+export interface Extrapolation {
+  distance_mm: number | null;
+  angle_deg: number | null;
+  /** The MS-SSIM to expect, 0 to 1, where the scene was trained to tell. */
+  confidence: number | null;
+  /** Of the pixels; only with coverage. */
+  supported_share: number | null;
+}
+
+export interface FrameHeader {
+  sequence: number;
+  client_time_ms: number | null;
+  dropped: number;
+  scene: string;
+  pose: number[][];
+  probe: Probe;
+  display: Display;
+  height: number;
+  width: number;
+  picture: Picture;
+  outputs: Output[];
+  queue_ms: number;
+  render_ms: number;
+  encode_ms: number;
+  extrapolation: Extrapolation;
+}
+
+export interface Frame {
+  header: FrameHeader;
+  /** uint8, one output after another, each height × width. */
+  pixels: Uint8Array<ArrayBuffer>;
+  /** From asking to having it. */
+  roundTrip_ms: number;
+}
+
+/** Why a pose got no frame. */
+export interface Refusal {
+  reason: string;
+  detail: string;
+  field: string | null;
+}
+
+export interface StreamEvents {
+  frame(frame: Frame): void;
+  refused(refusal: Refusal): void;
+  /** Whether frames can come. Of a stream that is lost, another is opened by itself. */
+  connected(yes: boolean): void;
+}
+
+const MAX_UNANSWERED = 4; // more would only wait: the newest pose is kept here until there is room
+const LEAST_BETWEEN_MS = 24; // 40 frames a second look smooth; more would only warm the room
+const RECONNECT_MS = { first: 300, most: 3000 };
+
+/** A stream that stays open, over restarts of the service, until it is closed. */
+export class FrameStream {
+  #socket: WebSocket | null = null;
+  #timer: ReturnType<typeof setTimeout> | undefined;
+  #delay_ms = RECONNECT_MS.first;
+  #closed = false;
+  #sequence = 0;
+  #answered = 0;
+  #sentSettings = "";
+  #wanted: { pose: Pose; settings: StreamSettings } | null = null;
+  #waiting = false;
+  #later: ReturnType<typeof setTimeout> | undefined;
+  #sent_ms = -Infinity;
+
+  constructor(
+    private readonly scene: string,
+    private readonly events: StreamEvents,
+  ) {
+    this.#open();
+  }
+
+  /** Asks for a frame; takes the place of what was asked for and not sent yet. */
+  ask(pose: Pose, settings: StreamSettings): void {
+    this.#wanted = { pose, settings };
+    this.#waiting = true;
+    this.#send();
+  }
+
+  close(): void {
+    this.#closed = true;
+    clearTimeout(this.#timer);
+    clearTimeout(this.#later);
+    this.#socket?.close();
+  }
+
+  #open(): void {
+    const key = apiKey();
+    const protocols = key === null ? [] : ["ultragray.v1", `ultragray.key.${base64url(key)}`];
+    const address = new URL(`/v1/scenes/${segment(this.scene)}/stream`, location.href);
+    address.protocol = address.protocol === "https:" ? "wss:" : "ws:";
+    const socket = new WebSocket(address, protocols);
+    socket.binaryType = "arraybuffer";
+    socket.onopen = () => {
+      this.#delay_ms = RECONNECT_MS.first;
+      this.#sequence = this.#answered = 0;
+      this.#sentSettings = "";
+      this.#waiting = this.#wanted !== null;
+      this.events.connected(true);
+      this.#send();
+    };
+    socket.onmessage = (event: MessageEvent<ArrayBuffer | string>) => this.#receive(event.data);
+    socket.onclose = () => {
+      if (this.#closed) return;
+      this.#socket = null;
+      this.events.connected(false);
+      this.#timer = setTimeout(() => this.#open(), this.#delay_ms);
+      this.#delay_ms = Math.min(this.#delay_ms * 2, RECONNECT_MS.most);
+    };
+    this.#socket = socket;
+  }
+
+  #send(): void {
+    const open = this.#socket?.readyState === WebSocket.OPEN;
+    if (!open || !this.#waiting || this.#wanted === null) return;
+    if (this.#sequence - this.#answered >= MAX_UNANSWERED || this.#later !== undefined) return;
+    const wait = this.#sent_ms + LEAST_BETWEEN_MS - performance.now();
+    if (wait > 0) {
+      this.#later = setTimeout(() => {
+        this.#later = undefined;
+        this.#send();
+      }, wait);
+      return;
+    }
+    this.#sent_ms = performance.now();
+    const { pose, settings } = this.#wanted;
+    this.#waiting = false;
+    this.#sequence += 1;
+    const written = JSON.stringify(settings);
+    const message: Record<string, unknown> = {
+      sequence: this.#sequence,
+      mode: "latest",
+      client_time_ms: performance.now(),
+      pose: { matrix: [0, 4, 8, 12].map((start) => pose.slice(start, start + 4)) },
+    };
+    if (written !== this.#sentSettings) message.settings = { ...settings, encoding: "uint8" };
+    this.#sentSettings = written;
+    this.#socket?.send(JSON.stringify(message));
+  }
+
+  #receive(data: ArrayBuffer | string): void {
+    if (this.#closed) return;
+    if (typeof data === "string") {
+      const { sequence, error } = JSON.parse(data) as { sequence: number; error: Refusal };
+      this.#answered = Math.max(this.#answered, sequence);
+      this.events.refused(error);
+    } else {
+      const frame = decodeFrame(data);
+      this.#answered = Math.max(this.#answered, frame.header.sequence);
+      this.events.frame(frame);
+    }
+    this.#send();
+  }
+}
+
+const decoder = new TextDecoder();
+
+/** A binary message of the stream: the length of the JSON header (uint32, little endian), the header, the pixels. */
+export function decodeFrame(message: ArrayBuffer): Frame {
+  const length = new DataView(message).getUint32(0, true);
+  const header = JSON.parse(decoder.decode(new Uint8Array(message, 4, length))) as FrameHeader;
+  const asked = header.client_time_ms ?? performance.now();
+  return { header, pixels: new Uint8Array(message, 4 + length), roundTrip_ms: performance.now() - asked };
+}
+
+/** The pixels of one output of a frame; undefined where it was not asked for. */
+export function outputPixels({ header, pixels }: Frame, output: Output): Uint8Array | undefined {
+  const index = header.outputs.indexOf(output);
+  if (index < 0) return undefined;
+  const count = header.height * header.width;
+  return pixels.subarray(index * count, (index + 1) * count);
+}
+
+function base64url(text: string): string {
+  const bytes = new TextEncoder().encode(text);
+  return btoa(String.fromCharCode(...bytes)).replaceAll("+", "-").replaceAll("/", "_").replaceAll("=", "");
+}

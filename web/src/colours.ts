@@ -1,0 +1,70 @@
+/** Colours of maps: one ramp for each kind of value, categories for labels. */
+
+export type Ramp = "echo" | "transmittance" | "coverage";
+export type Colour = readonly [number, number, number];
+
+/** From low to high; each is even in lightness, so that it can be read without colour. */
+const STOPS: Record<Ramp, Colour[]> = {
+  echo: [
+    [20, 16, 38],
+    [85, 30, 105],
+    [168, 48, 98],
+    [233, 107, 62],
+    [250, 193, 98],
+    [255, 250, 225],
+  ],
+  transmittance: [
+    [12, 18, 40],
+    [26, 60, 105],
+    [30, 112, 140],
+    [63, 165, 145],
+    [150, 210, 130],
+    [250, 245, 170],
+  ],
+  coverage: [
+    [128, 28, 40],
+    [196, 88, 60],
+    [222, 160, 100],
+    [205, 205, 180],
+    [120, 178, 190],
+    [40, 120, 160],
+  ],
+};
+
+/** Of labels from 1 on; 0 is nothing. */
+const CATEGORIES: Colour[] = [
+  [240, 228, 200],
+  [204, 92, 84],
+  [238, 190, 80],
+  [86, 140, 214],
+  [92, 178, 120],
+  [176, 120, 200],
+  [230, 140, 180],
+  [120, 190, 200],
+];
+
+/** The colour of a share of a ramp, 0 to 1. */
+export function ramp(name: Ramp, share: number): Colour {
+  const stops = STOPS[name];
+  const at = Math.max(0, Math.min(1, share)) * (stops.length - 1);
+  const index = Math.min(stops.length - 2, Math.floor(at));
+  const [low, high] = [stops[index]!, stops[index + 1]!];
+  const mix = (i: 0 | 1 | 2): number => Math.round(low[i] + (high[i] - low[i]) * (at - index));
+  return [mix(0), mix(1), mix(2)];
+}
+
+export function labelColour(label: number): Colour {
+  return label === 0 ? [0, 0, 0] : CATEGORIES[(label - 1) % CATEGORIES.length]!;
+}
+
+/** RGBA of the 256 values of a pixel, in the byte order of a canvas. */
+export function table(colour: (value: number) => Colour): Uint32Array {
+  return Uint32Array.from({ length: 256 }, (_, value) => {
+    const [r, g, b] = colour(value);
+    return (0xff000000 | (b << 16) | (g << 8) | r) >>> 0;
+  });
+}
+
+export function css([r, g, b]: Colour): string {
+  return `rgb(${r} ${g} ${b})`;
+}

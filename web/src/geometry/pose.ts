@@ -1,0 +1,205 @@
+/** Rigid probe→scene transforms: 16 numbers row by row, translation in mm. */
+
+export type Pose = readonly number[];
+export type Vector = readonly [number, number, number];
+/** w, x, y, z. */
+export type Quaternion = readonly [number, number, number, number];
+
+const DEGREES = 180 / Math.PI;
+
+export const IDENTITY: Pose = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1];
+
+/** The entry in row `row` and column `column`. */
+export function entry(pose: Pose, row: number, column: number): number {
+  return pose[row * 4 + column] ?? 0;
+}
+
+export function position(pose: Pose): Vector {
+  return [entry(pose, 0, 3), entry(pose, 1, 3), entry(pose, 2, 3)];
+}
+
+/** The direction of an axis of the probe (0 lateral, 1 elevation, 2 axial) in the scene. */
+export function axis(pose: Pose, column: 0 | 1 | 2): Vector {
+  return [entry(pose, 0, column), entry(pose, 1, column), entry(pose, 2, column)];
+}
+
+export function withPosition(pose: Pose, [x, y, z]: Vector): Pose {
+  const moved = [...pose];
+  [moved[3], moved[7], moved[11]] = [x, y, z];
+  return moved;
+}
+
+/** The pose moved along the probe's own axes, in mm. */
+export function translated(pose: Pose, along: Vector): Pose {
+  return withPosition(pose, apply(pose, along));
+}
+
+/** Where a point of the probe frame lies in the scene. */
+export function apply(pose: Pose, [x, y, z]: Vector): Vector {
+  const row = (i: number): number =>
+    entry(pose, i, 0) * x + entry(pose, i, 1) * y + entry(pose, i, 2) * z + entry(pose, i, 3);
+  return [row(0), row(1), row(2)];
+}
+
+/** The pose turned about the probe's own axes by small angles in degrees; the point `pivot_mm` deep on its axis stays. */
+export function rotated(pose: Pose, [x_deg, y_deg, z_deg]: Vector, pivot_mm: number): Pose {
+  const turn = multiply(
+    multiply(aboutAxis([0, 0, 1], z_deg), aboutAxis([0, 1, 0], y_deg)),
+    aboutAxis([1, 0, 0], x_deg),
+  );
+  const q = normalised(multiply(quaternion(pose), turn));
+  return pivoted(pose, q, pivot_mm);
+}
+
+/** The pose with another orientation, the point `pivot_mm` deep on its axis where it was. */
+export function pivoted(pose: Pose, orientation: Quaternion, pivot_mm: number): Pose {
+  const stays = apply(pose, [0, 0, pivot_mm]);
+  return translated(fromPositionQuaternion(stays, orientation), [0, 0, -pivot_mm]);
+}
+
+/** Raises nothing: the quaternion is brought to length 1. */
+export function fromPositionQuaternion([x, y, z]: Vector, quaternionGiven: Quaternion): Pose {
+  const [w, i, j, k] = normalised(quaternionGiven);
+  return [
+    1 - 2 * (j * j + k * k), 2 * (i * j - w * k), 2 * (i * k + w * j), x,
+    2 * (i * j + w * k), 1 - 2 * (i * i + k * k), 2 * (j * k - w * i), y,
+    2 * (i * k - w * j), 2 * (j * k + w * i), 1 - 2 * (i * i + j * j), z,
+    0, 0, 0, 1,
+  ]; // prettier-ignore
+}
+
+/** With w ≥ 0. */
+export function quaternion(pose: Pose): Quaternion {
+  const m = (row: number, column: number): number => entry(pose, row, column);
+  const squares = [
+    1 + m(0, 0) + m(1, 1) + m(2, 2),
+    1 + m(0, 0) - m(1, 1) - m(2, 2),
+    1 - m(0, 0) + m(1, 1) - m(2, 2),
+    1 - m(0, 0) - m(1, 1) + m(2, 2),
+  ];
+  const largest = squares.indexOf(Math.max(...squares));
+  const products: Quaternion[] = [
+    [squares[0]!, m(2, 1) - m(1, 2), m(0, 2) - m(2, 0), m(1, 0) - m(0, 1)],
+    [m(2, 1) - m(1, 2), squares[1]!, m(1, 0) + m(0, 1), m(0, 2) + m(2, 0)],
+    [m(0, 2) - m(2, 0), m(1, 0) + m(0, 1), squares[2]!, m(2, 1) + m(1, 2)],
+    [m(1, 0) - m(0, 1), m(0, 2) + m(2, 0), m(2, 1) + m(1, 2), squares[3]!],
+  ];
+  const q = normalised(products[largest]!);
+  return q[0] < 0 ? [-q[0], -q[1], -q[2], -q[3]] : q;
+}
+
+export function multiply([a, b, c, d]: Quaternion, [e, f, g, h]: Quaternion): Quaternion {
+  return [
+    a * e - b * f - c * g - d * h,
+    a * f + b * e + c * h - d * g,
+    a * g - b * h + c * e + d * f,
+    a * h + b * g - c * f + d * e,
+  ];
+}
+
+export function conjugate([w, x, y, z]: Quaternion): Quaternion {
+  return [w, -x, -y, -z];
+}
+
+function normalised([w, x, y, z]: Quaternion): Quaternion {
+  const length = Math.hypot(w, x, y, z);
+  return length === 0 ? [1, 0, 0, 0] : [w / length, x / length, y / length, z / length];
+}
+
+function aboutAxis([x, y, z]: Vector, angle_deg: number): Quaternion {
+  const half = angle_deg / DEGREES / 2;
+  const s = Math.sin(half);
+  return [Math.cos(half), x * s, y * s, z * s];
+}
+
+/** Tilt (about the lateral axis), rock (elevation), rotation (axial) of a pose against `home`, in degrees. */
+export function anglesFrom(home: Pose, pose: Pose): Vector {
+  const r = fromPositionQuaternion([0, 0, 0], multiply(conjugate(quaternion(home)), quaternion(pose)));
+  // r = Rz(rotation) Ry(rock) Rx(tilt)
+  return [
+    Math.atan2(entry(r, 2, 1), entry(r, 2, 2)) * DEGREES,
+    Math.asin(Math.max(-1, Math.min(1, -entry(r, 2, 0)))) * DEGREES,
+    Math.atan2(entry(r, 1, 0), entry(r, 0, 0)) * DEGREES,
+  ];
+}
+
+/** The orientation with those angles against `home`. */
+export function orientationFrom(home: Pose, [tilt_deg, rock_deg, rotation_deg]: Vector): Quaternion {
+  const turn = multiply(
+    multiply(aboutAxis([0, 0, 1], rotation_deg), aboutAxis([0, 1, 0], rock_deg)),
+    aboutAxis([1, 0, 0], tilt_deg),
+  );
+  return multiply(quaternion(home), turn);
+}
+
+export function distance_mm(a: Pose, b: Pose): number {
+  const [p, q] = [position(a), position(b)];
+  return Math.hypot(p[0] - q[0], p[1] - q[1], p[2] - q[2]);
+}
+
+/** The angle between two orientations. */
+export function angle_deg(a: Pose, b: Pose): number {
+  const [p, q] = [quaternion(a), quaternion(b)];
+  const dot = Math.abs(p[0] * q[0] + p[1] * q[1] + p[2] * q[2] + p[3] * q[3]);
+  return 2 * Math.acos(Math.min(1, dot)) * DEGREES;
+}
+
+/** The pose a share of the way from one to another. */
+export function between(a: Pose, b: Pose, share: number): Pose {
+  const [p, q] = [position(a), position(b)];
+  const mix = (i: 0 | 1 | 2): number => p[i] + (q[i] - p[i]) * share;
+  const from = quaternion(a);
+  let to = quaternion(b);
+  const dot = from[0] * to[0] + from[1] * to[1] + from[2] * to[2] + from[3] * to[3];
+  if (dot < 0) to = [-to[0], -to[1], -to[2], -to[3]];
+  // neighbours of a sweep lie close: the chord is as good as the arc
+  const blended = from.map((value, i) => value + (to[i]! - value) * share) as unknown as Quaternion;
+  return fromPositionQuaternion([mix(0), mix(1), mix(2)], blended);
+}
+
+/** The nearest of `poses`, a degree counting as a millimetre; -1 where there are none. */
+export function nearest(poses: readonly Pose[], pose: Pose): number {
+  let best = -1;
+  let least = Infinity;
+  for (const [index, other] of poses.entries()) {
+    const away = distance_mm(other, pose) + angle_deg(other, pose);
+    if (away < least) [best, least] = [index, away];
+  }
+  return best;
+}
+
+/** The pose as the JSON object that the service reads. */
+export function poseJson(pose: Pose): string {
+  const round = (value: number, digits: number): number => Number(value.toFixed(digits));
+  const [x, y, z] = position(pose).map((value) => round(value, 3));
+  const [w, i, j, k] = quaternion(pose).map((value) => round(value, 6));
+  return JSON.stringify({ position_mm: { x, y, z }, quaternion: { w, x: i, y: j, z: k } });
+}
+
+/** The pose of such an object, or of one with a `matrix`. Throws an Error in words. */
+export function poseFromJson(text: string): Pose {
+  let document: unknown;
+  try {
+    document = JSON.parse(text);
+  } catch {
+    throw new Error("This is not JSON.");
+  }
+  const { matrix, position_mm, quaternion: q } = document as Record<string, unknown>;
+  if (Array.isArray(matrix)) {
+    const numbers = matrix.flat() as unknown[];
+    if (numbers.length !== 16 || !numbers.every(Number.isFinite)) throw new Error("matrix needs four rows of four numbers.");
+    return fromPositionQuaternion(position(numbers as number[]), quaternion(numbers as number[]));
+  }
+  const p = numbersOf(position_mm, ["x", "y", "z"], "position_mm");
+  const r = numbersOf(q, ["w", "x", "y", "z"], "quaternion");
+  if (Math.abs(Math.hypot(...r) - 1) > 1e-2) throw new Error("quaternion must have length 1.");
+  return fromPositionQuaternion(p as unknown as Vector, r as unknown as Quaternion);
+}
+
+function numbersOf(value: unknown, names: string[], what: string): number[] {
+  const object = (typeof value === "object" && value !== null ? value : {}) as Record<string, unknown>;
+  const numbers = names.map((name) => object[name]);
+  if (!numbers.every((number) => typeof number === "number" && Number.isFinite(number)))
+    throw new Error(`${what} needs the numbers ${names.join(", ")}.`);
+  return numbers as number[];
+}

@@ -1,0 +1,73 @@
+/** The image as a PNG: square pixels, a centimetre scale, measurements and a line that says what it is. */
+
+import type { Frame } from "./api/stream";
+import { depthTicks, extent_mm, pixelAt, type Placed, type PlanePoint } from "./geometry/picture";
+import { poseJson } from "./geometry/pose";
+import { length_mm, type Calliper } from "./state/callipers.svelte";
+
+const LONGER_SIDE = 1024;
+const MARGINS = { top: 16, right: 56, bottom: 56, left: 16 };
+const FONT = "13px system-ui, sans-serif";
+const TEXT = "#c8d0d8";
+const MEASURED = "#ffd84d";
+
+/** Throws where the browser cannot make a PNG of that size. */
+export async function screenshot(source: HTMLCanvasElement, frame: Frame, callipers: Calliper[]): Promise<Blob> {
+  const { header } = frame;
+  const placed: Placed = { picture: header.picture, height: header.height, width: header.width };
+  const { across, down } = extent_mm(placed);
+  const scale = LONGER_SIDE / Math.max(across, down);
+  const [width, height] = [across * scale, down * scale];
+  const canvas = document.createElement("canvas");
+  canvas.width = Math.round(width + MARGINS.left + MARGINS.right);
+  canvas.height = Math.round(height + MARGINS.top + MARGINS.bottom);
+  const context = canvas.getContext("2d");
+  if (context === null) throw new Error("The browser cannot draw the screenshot.");
+  context.fillRect(0, 0, canvas.width, canvas.height);
+  context.drawImage(source, MARGINS.left, MARGINS.top, width, height);
+  context.font = FONT;
+  context.fillStyle = context.strokeStyle = TEXT;
+  const rowAt = (row: number): number => MARGINS.top + ((row + 0.5) / placed.height) * height;
+  const right = MARGINS.left + width;
+  for (const tick of depthTicks(placed, header.probe)) {
+    context.fillRect(right + 4, rowAt(tick.at), tick.label === null ? 5 : 9, 1);
+    if (tick.label !== null) context.fillText(`${tick.label}`, right + 18, rowAt(tick.at) + 4);
+  }
+  const screenOf = (point: PlanePoint): [number, number] => {
+    const { column, row } = pixelAt(placed, point);
+    return [MARGINS.left + ((column + 0.5) / placed.width) * width, rowAt(row)];
+  };
+  context.fillStyle = context.strokeStyle = MEASURED;
+  for (const calliper of callipers) drawCalliper(context, screenOf(calliper.a), screenOf(calliper.b), length_mm(calliper));
+  context.fillStyle = TEXT;
+  const bottom = MARGINS.top + height;
+  context.fillText(`${header.scene}   ${new Date().toISOString()}   depth in cm   simulated, not for diagnosis`, MARGINS.left, bottom + 22);
+  context.fillText(poseJson(header.pose.flat()), MARGINS.left, bottom + 42);
+  const blob = await new Promise<Blob | null>((resolve) => canvas.toBlob(resolve, "image/png"));
+  if (blob === null) throw new Error("The browser cannot write the screenshot.");
+  return blob;
+}
+
+function drawCalliper(context: CanvasRenderingContext2D, a: [number, number], b: [number, number], mm: number): void {
+  context.beginPath();
+  context.moveTo(...a);
+  context.lineTo(...b);
+  for (const [x, y] of [a, b]) {
+    context.moveTo(x - 6, y);
+    context.lineTo(x + 6, y);
+    context.moveTo(x, y - 6);
+    context.lineTo(x, y + 6);
+  }
+  context.stroke();
+  context.fillText(`${mm.toFixed(1)} mm`, (a[0] + b[0]) / 2 + 8, (a[1] + b[1]) / 2 - 6);
+}
+
+/** Gives a file to the person. */
+export function saveBlob(blob: Blob, name: string): void {
+  const address = URL.createObjectURL(blob);
+  const link = document.createElement("a");
+  link.href = address;
+  link.download = name;
+  link.click();
+  URL.revokeObjectURL(address);
+}

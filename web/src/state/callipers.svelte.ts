@@ -1,0 +1,34 @@
+/** Distances measured in the image, in mm of the image plane. */
+
+import { distanceBetween_mm, type PlanePoint } from "../geometry/picture";
+
+export interface Calliper {
+  a: PlanePoint;
+  b: PlanePoint;
+}
+
+const MOST = 4;
+
+export class Callipers {
+  /** Whether a press on the image sets a point. */
+  measuring = $state(false);
+  all = $state.raw<Calliper[]>([]);
+
+  /** Begins a measurement; the oldest goes where there are too many. */
+  begin(at: PlanePoint): void {
+    this.all = [...this.all, { a: at, b: at }].slice(-MOST);
+  }
+
+  /** Moves an end of a measurement. */
+  move(index: number, end: "a" | "b", to: PlanePoint): void {
+    this.all = this.all.map((one, i) => (i === index ? { ...one, [end]: to } : one));
+  }
+
+  clear(): void {
+    this.all = [];
+  }
+}
+
+export function length_mm({ a, b }: Calliper): number {
+  return distanceBetween_mm(a, b);
+}

@@ -1,0 +1,37 @@
+/** Whether the service answers, and whether it wants a key. */
+
+import { getJson, ServiceError } from "../api/client";
+import { listScenes, type SceneEntry } from "../api/scenes";
+
+const POLL_MS = 4000;
+const POLL_DOWN_MS = 1000;
+
+export type ServiceStatus = "asking" | "ready" | "starting" | "down" | "locked";
+
+class ServiceState {
+  status = $state<ServiceStatus>("asking");
+  scenes = $state.raw<SceneEntry[]>([]);
+  #timer: ReturnType<typeof setTimeout> | undefined;
+
+  /** Asks now, and from now on. */
+  async poll(): Promise<void> {
+    clearTimeout(this.#timer);
+    try {
+      await getJson("/v1/health/ready");
+      this.scenes = await listScenes();
+      this.status = "ready";
+    } catch (error) {
+      this.status = statusOf(error);
+    }
+    clearTimeout(this.#timer);
+    this.#timer = setTimeout(() => void this.poll(), this.status === "ready" ? POLL_MS : POLL_DOWN_MS);
+  }
+}
+
+function statusOf(error: unknown): ServiceStatus {
+  if (!(error instanceof ServiceError)) return "down";
+  if (error.problem.status === 401) return "locked";
+  return error.problem.status === 503 ? "starting" : "down";
+}
+
+export const service = new ServiceState();

@@ -1,0 +1,78 @@
+"""The helper process that compares a scene with the held-out frames of the dataset that it was trained from."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from .dataset_store import DatasetStore
+from .helper import answer_request
+from .picture_stack import SUFFIX, write_stack
+
+FRAMES_NAME, PROGRESS_NAME = "frames.json", "progress"
+PICTURES = ("truth", "rendering", "median", "difference")
+_COMPARED = ("psnr_db", "ms_ssim", "gms", "gmsd")
+
+
+def main() -> None:
+    """Answers the request on stdin."""
+    answer_request(compare)
+
+
+def compare(request: dict[str, Any]) -> None:
+    """Fills `folder` with the metrics and pictures of the scene at `scene_path` on the frames that the dataset
+    `dataset` in `artifact_folder` holds out.
+
+    `progress` in that folder tells meanwhile which share is done. Raises DatasetNotFound, DatasetInvalid where it holds
+    out none, SceneFileInvalid, InvalidImageSize for frames too small to measure.
+    """
+    import numpy as np
+    import torch
+
+    from ultragray.baselines import predict
+    from ultragray.compounding import affordable_voxel_mm
+    from ultragray.datasets.source import SourceOptions, load_dataset
+    from ultragray.evaluation import check_same_origin, evaluate_frames, render_sweep, require_frames
+    from ultragray.scene import GaussianScene
+    from ultragray.side_by_side import DIFFERENCE_GAIN
+
+    torch.set_num_threads(1)
+    folder = Path(request["folder"])
+    source, options = DatasetStore(Path(request["artifact_folder"])).source(request["dataset"])
+    dataset = load_dataset(source, SourceOptions(**options))
+    scene = GaussianScene.load(request["scene_path"])
+    check_same_origin(scene.info, dataset)
+    require_frames(dataset.val)
+    _tell(folder, 0.1)
+    median = predict(
+        dataset.train, dataset.val.poses, "median", voxel_mm=affordable_voxel_mm(dataset.train)
+    )  # [F, H, W]
+    _tell(folder, 0.4)
+    rendering = render_sweep(scene, dataset.val, backend="cpu")
+    _tell(folder, 0.7)
+    measured, of_median = evaluate_frames(rendering, dataset.val), evaluate_frames(median, dataset.val)
+    _tell(folder, 0.9)
+    truth = (dataset.val.images / 255.0).astype(np.float32)
+    difference = np.minimum(np.abs(rendering - truth) * DIFFERENCE_GAIN, 1.0)
+    for name, frames in zip(PICTURES, (truth, rendering, median, difference), strict=True):
+        write_stack(folder / f"{name}{SUFFIX}", frames, dataset.val)
+    told = [
+        {
+            "index": index,
+            "frame_number": int(number),
+            **{name: getattr(own, name) for name in _COMPARED},
+            **{f"median_{name}": getattr(other, name) for name in _COMPARED},
+        }
+        for index, (number, own, other) in enumerate(
+            zip(measured.frame_numbers, measured.frames, of_median.frames, strict=True)
+        )
+    ]
+    (folder / PROGRESS_NAME).unlink()
+    (folder / FRAMES_NAME).write_text(json.dumps(told), encoding="utf-8")
+
+
+def _tell(folder: Path, share: float) -> None:
+    temporary = folder / f"{PROGRESS_NAME}.new"
+    temporary.write_text(str(share), encoding="utf-8")
+    temporary.replace(folder / PROGRESS_NAME)
