@@ -4,24 +4,33 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 KERNEL_SOURCES := $(wildcard model/kernels/*) CMakeLists.txt pyproject.toml
-PYTHON_SOURCES := model service workers proto tests benchmarks
+PYTHON_SOURCES := model service workers proto client tests benchmarks examples
+NPM := $(shell command -v npm)
+CONSOLE := service/ultragray_service/console/index.html
+CONSOLE_SOURCES := $(shell find web -type f -not -path 'web/node_modules/*')
 DATA ?= ../shared/data
 ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help serve test test-faults check format bench bench-cuda results demo-scene proto clean
+.PHONY: help serve console test test-console test-faults check format bench bench-cuda results demo-scene proto clean
 
 help:  ## say what there is
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
 
-serve: $(VENV)/installed  ## set up, then serve the demo scene and every *.ugr in ./data (ARGS="--help" for options)
+serve: $(VENV)/installed $(if $(NPM),$(CONSOLE))  ## set up, then serve the demo scene and every *.ugr in ./data (ARGS="--help" for options)
 	@exec $(BIN)/ultragray serve $(ARGS)
 
-test: $(VENV)/installed-dev  ## set up, then run the tests (ARGS="-k probe" for some)
+console: $(CONSOLE)  ## build the console, which the service serves at / (needs Node 20 or newer; serve does it where that is there)
+
+test: $(VENV)/installed-dev $(if $(NPM),$(CONSOLE))  ## set up, then run the tests (ARGS="-k probe" for some)
 	$(BIN)/pytest $(ARGS)
 
-test-faults: $(VENV)/installed-dev  ## half a minute of load with a worker killed every second
+test-console: $(VENV)/installed-dev $(CONSOLE)  ## the console in Debian's Chromium against a real service; leaves screenshots in build
+	node --test --test-concurrency=1 tests/console/*.test.mjs
+
+test-faults: $(VENV)/installed-dev  ## processes killed at random: render workers under load, then everything while jobs run
 	ULTRAGRAY_FAULT_SECONDS=30 $(BIN)/pytest tests/workers/test_faults.py -s $(ARGS)
+	ULTRAGRAY_FAULT_KILLS=32 $(BIN)/pytest tests/faults -s $(ARGS)
 
 check: $(VENV)/installed-dev  ## lint, types, formatting
 	$(BIN)/ruff check $(PYTHON_SOURCES)
@@ -29,6 +38,7 @@ check: $(VENV)/installed-dev  ## lint, types, formatting
 	$(BIN)/mypy
 	$(BIN)/clang-format --dry-run --Werror model/kernels/*.[ch]pp model/kernels/*.inl
 	$(BIN)/hadolint docker/Dockerfile.cpu docker/Dockerfile.cuda
+	@[ ! -d web/node_modules ] || npm --prefix web run --silent check
 
 format: $(VENV)/installed-dev  ## rewrite the sources in the project's format
 	$(BIN)/ruff check --fix $(PYTHON_SOURCES)
@@ -38,6 +48,8 @@ format: $(VENV)/installed-dev  ## rewrite the sources in the project's format
 bench: $(VENV)/installed  ## measure the kernel and the service; the table is printed, the JSON written
 	$(BIN)/ultragray bench --output benchmarks/results.json $(ARGS)
 	$(BIN)/ultragray bench --train --output benchmarks/training.json $(ARGS)
+	$(BIN)/ultragray bench --jobs --output benchmarks/jobs.json $(ARGS)
+	$(BIN)/ultragray bench --clients --output benchmarks/clients.json $(ARGS)
 
 bench-cuda: $(VENV)/installed  ## the same on a GPU, with the distance to what it can do at most
 	$(BIN)/ultragray bench --backend cuda --output benchmarks/cuda.json $(ARGS)
@@ -53,7 +65,7 @@ proto: $(VENV)/installed-dev  ## regenerate the gRPC stubs
 	$(BIN)/python proto/generate.py
 
 clean:  ## remove what was built
-	rm -rf $(VENV) build
+	rm -rf $(VENV) build web/node_modules $(dir $(CONSOLE))
 
 $(VENV)/python: Makefile
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' || \
@@ -67,7 +79,17 @@ $(VENV)/installed: $(VENV)/python $(KERNEL_SOURCES)
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable .
 	@touch $@
 
-$(VENV)/installed-dev: $(VENV)/installed
-	@echo "Installing the test and lint tools ..."
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+$(VENV)/installed-dev: $(VENV)/installed client/pyproject.toml
+	@echo "Installing the client and the test and lint tools ..."
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]' --editable ./client
+	@touch $@
+
+web/node_modules/.package-lock.json: web/package-lock.json
+	@[ -n "$(NPM)" ] || { echo "The console needs Node 20 or newer, with npm"; exit 1; }
+	@echo "Installing what the console is built with ..."
+	@npm --prefix web ci --silent --no-audit --no-fund
+	@touch $@
+
+$(CONSOLE): web/node_modules/.package-lock.json $(CONSOLE_SOURCES)
+	@npm --prefix web run --silent build
 	@touch $@

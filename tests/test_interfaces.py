@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import inspect
 import io
 import json
@@ -10,6 +11,8 @@ import math
 import re
 import sys
 import typing
+from dataclasses import asdict, fields
+from enum import Enum
 from pathlib import Path
 from typing import Any
 
@@ -18,22 +21,29 @@ import pytest
 import torch
 import typer
 from google.protobuf.descriptor_pb2 import DescriptorProto, FieldDescriptorProto
+from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from safetensors import safe_open
 
 import ultragray
+import ultragray_client
 from ultragray import (
     ConvexProbe,
     GaussianScene,
     LinearProbe,
+    PhasedProbe,
     SceneInfo,
     baselines,
     checkpoint,
     checkpoint_export,
     compounding,
+    confidence,
     demo,
+    display,
+    display_frames,
     errors,
     evaluation,
+    exports,
     files,
     metrics,
     ply,
@@ -42,13 +52,19 @@ from ultragray import (
     probe,
     rendering,
     request,
+    samplers,
     scene_info,
     side_by_side,
 )
+from ultragray.confidence import Extrapolation
 from ultragray.datasets import Dataset, Sweep, checks, phantom, pictures, plus, released, source
+from ultragray.display import AS_RENDERED
 from ultragray.training import TrainingConfig
+from ultragray_client.sync import datasets as client_datasets
+from ultragray_client.sync import jobs as client_jobs
+from ultragray_client.sync import scenes as client_scenes
 from ultragray_proto.v1 import datasets_pb2, geometry_pb2, jobs_pb2, rendering_pb2, scenes_pb2
-from ultragray_service import catalog, dataset_uploads
+from ultragray_service import catalog, dataset_uploads, pose_stream, server
 from ultragray_service.cli import USER_ERROR
 from ultragray_service.cli import app as command_line
 from ultragray_service.cli_jobs_watch import JOB_CANCELLED, JOB_FAILED
@@ -57,21 +73,38 @@ from ultragray_service.http import accept, middleware, problems
 from ultragray_service.http.app import create_app
 from ultragray_service.http.docs import DOCS_PATH
 from ultragray_service.http.routes import render as render_route
-from ultragray_service.http.schemas import RenderBody
+from ultragray_service.http.schemas import DisplayBody, RenderBody
+from ultragray_service.http.stream_schemas import StreamMessage, StreamSettings, frame_bytes
 from ultragray_service.logs import JsonFormatter, request_id
+from ultragray_service.pose_stream import Answered
 from ultragray_service.rpc import server as grpc_server
-from ultragray_service.rpc import status, stream
+from ultragray_service.rpc import status
 from ultragray_service.settings import ENVIRONMENT_PREFIX, Settings, load_settings
 from ultragray_service.state import Service
 from ultragray_workers import dataset_store, dataset_unpack, scenes
 from ultragray_workers import encoding as pixels
+from ultragray_workers.jobs.job import JobState
 from ultragray_workers.types import Encoding, RenderResult
 
 DOCUMENT = (Path(__file__).resolve().parents[1] / "docs" / "interfaces.md").read_text(encoding="utf-8")
 PROTO_MODULES = (geometry_pb2, rendering_pb2, scenes_pb2, datasets_pb2, jobs_pb2)
-LIBRARY_MODULES = (checkpoint, checkpoint_export, demo, files, ply, pose, pose_file, probe, rendering)
+LIBRARY_MODULES = (
+    checkpoint,
+    checkpoint_export,
+    demo,
+    display,
+    display_frames,
+    files,
+    ply,
+    pose,
+    pose_file,
+    probe,
+    rendering,
+)
 MEASURING_MODULES = (baselines, compounding, evaluation, metrics, side_by_side)
-MEMBERS_OF = (GaussianScene, LinearProbe, ConvexProbe, errors.UltragrayError)
+MEMBERS_OF = (GaussianScene, LinearProbe, ConvexProbe, PhasedProbe, errors.UltragrayError)
+
+LABELS = torch.ones(5, dtype=torch.uint8)
 
 
 def rows(heading: str) -> list[list[str]]:
@@ -154,13 +187,46 @@ def test_other_modules() -> None:
         for value in (getattr(phantom, name) for name in phantom.__all__)
         if inspect.isfunction(value)
     }
+    found |= {
+        f"{package.__name__}.{call_of(value)}"
+        for package in (samplers, exports)
+        for value in (getattr(package, name) for name in package.__all__)
+        if inspect.isfunction(value)
+    }
+    found |= {
+        f"{confidence.__name__}.{call_of(value)}"
+        for value in (getattr(confidence, name) for name in confidence.__all__)
+        if callable(value)
+    }
     assert set(table("Other modules")) == found
+
+
+def test_samplers() -> None:
+    documented = {}
+    for kind, (keys, _) in table("Samplers").items():
+        parts = [code(part) for part in keys.split(",")] if keys else []
+        documented[kind] = {name: json.loads(default[0]) if default else "required" for name, *default in parts}
+    assert documented == {
+        kind: {
+            item.name: "required" if item.default is dataclasses.MISSING else item.default
+            for item in dataclasses.fields(cls)
+        }
+        for kind, cls in samplers.SAMPLERS.items()
+    }
+
+
+def test_export_formats() -> None:
+    documented = {
+        name: (code(suffix)[0], tuple(code(pixels)), (code(extra) or [None])[0])
+        for name, (suffix, pixels, extra, _) in table("Export formats").items()
+    }
+    assert documented == {name: (one.suffix, one.dtypes, one.extra) for name, one in exports.FORMATS.items()}
 
 
 def test_dataset_configuration(tmp_path: Path) -> None:
     images = np.arange(2 * 3 * 4, dtype=np.uint8).reshape(2, 3, 4)
     found: set[str] = set()
-    for number, one in enumerate((LinearProbe(40, 0, 50), ConvexProbe(60, 10, 50))):
+    for number, one in enumerate((LinearProbe(40, 0, 50), PhasedProbe(60, 50))):
         sweep = Sweep(images, np.tile(np.eye(4), (2, 1, 1)), one, np.arange(2), "here")
         released.write_released(Dataset("name", sweep, sweep), tmp_path / str(number))
         found |= set(json.loads((tmp_path / str(number) / "conf.json").read_text()))
@@ -181,19 +247,20 @@ def documented_arrays(heading: str, sizes: dict[str, int]) -> dict[str, tuple[st
 def test_scene_file(tmp_path: Path) -> None:
     shapes = scene_info.expected_shapes(5, 1)
     splats = {name: torch.ones(shape) for name, shape in shapes.items()}
-    GaussianScene.from_splats(splats, training_poses=np.tile(np.eye(4), (2, 1, 1))).save(tmp_path / "scene.ugr")
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    GaussianScene.from_splats(splats, training_poses=poses, labels=LABELS).save(tmp_path / "scene.ugr")
     with safe_open(tmp_path / "scene.ugr", framework="numpy") as bundle:
         parts = {name: bundle.get_slice(name) for name in bundle.keys()}  # noqa: SIM118 (no mapping)
         found = {name: (part.get_dtype(), list(part.get_shape())) for name, part in parts.items()}
         assert set(bundle.metadata()) == {"ultragray"}
     assert documented_arrays("Tensors", {"N": 5, "K-1": 3, "P": 2}) == found
-    defaults = json.loads(scene_info.info_to_json(SceneInfo()))
+    defaults = {**json.loads(scene_info.info_to_json(SceneInfo())), "label_names": {}}  # where empty, it is left out
     assert {key: json.loads(code(default)[0]) for key, (default, _) in table("Metadata keys").items()} == defaults
 
 
 def test_ply_file(tmp_path: Path) -> None:
     splats = {name: torch.ones(shape) for name, shape in scene_info.expected_shapes(5, 1).items()}
-    ply.write_ply(GaussianScene.from_splats(splats), tmp_path / "scene.ply")
+    ply.write_ply(GaussianScene.from_splats(splats, labels=LABELS), tmp_path / "scene.ply")
     header = (tmp_path / "scene.ply").read_bytes().split(b"end_header")[0].decode()
     element, found = "", []
     for line in header.splitlines():
@@ -210,18 +277,18 @@ def test_ply_file(tmp_path: Path) -> None:
 
 def test_exported_checkpoint(tmp_path: Path) -> None:
     splats = {name: torch.ones(shape) for name, shape in scene_info.expected_shapes(5, 1).items()}
-    info = SceneInfo(probe=LinearProbe(40, 0, 50))
+    info = SceneInfo(probe=PhasedProbe(60, 50))
     scene = GaussianScene.from_splats(splats, info=info, training_poses=np.eye(4)[None])
     written = checkpoint_export.export_checkpoint(scene, tmp_path / "ckpt_29999.pt").files
     documented = table("Exported checkpoint")
     assert set(documented) == {path.name for path in written}
     assert code(documented["ckpt_29999.pt"][0]) == list(torch.load(tmp_path / "ckpt_29999.pt", weights_only=True))
     keys = set(code(documented["conf.json"][0]))
-    assert keys == {*json.loads((tmp_path / "conf.json").read_text()), "ultrasound_opening_angle"}
+    assert keys == {*json.loads((tmp_path / "conf.json").read_text()), "ultrasound_opening_width"}
 
 
 def test_frames() -> None:
-    assert list(table("Outputs")) == list(request.OUTPUTS)
+    assert list(table("Outputs")) == list(request.ALL_OUTPUTS)
     documented = {name: code(media_type)[0] for name, (media_type, _) in table("Encodings").items()}
     assert set(documented) == {encoding.value for encoding in Encoding}
     for name, media_type in documented.items():
@@ -231,8 +298,9 @@ def test_frames() -> None:
 
 def test_npz() -> None:
     file = io.BytesIO()
-    frames = {name: np.zeros((2, 3, 5), np.float32) for name in request.OUTPUTS}
-    pixels.write_npz(file, frames, np.zeros((2, 4, 4)), scene="demo", scene_sha256="0" * 64, renderer="ultragray")
+    frames = {name: np.zeros((2, 3, 5), np.float32) for name in request.ALL_OUTPUTS}
+    told = [Extrapolation(None, None, None, None)] * 2
+    pixels.write_npz(file, frames, np.zeros((2, 4, 4)), told, scene="demo", scene_sha256="0" * 64, renderer="ultragray")
     file.seek(0)
     with np.load(file) as archive:
         found = {
@@ -268,6 +336,30 @@ def test_query_parameters(openapi: dict[str, Any]) -> None:
     assert documented == {name: f"`{value}`" if value else "empty" for name, value in found.items()}
 
 
+@pytest.mark.parametrize(
+    ("heading", "model"), [("Stream messages", StreamMessage), ("Stream settings", StreamSettings)]
+)
+def test_stream_messages(heading: str, model: type[BaseModel]) -> None:
+    documented = {key: json.loads(code(default)[0]) for key, (default, _) in table(heading).items()}
+    assert documented == {key: field.default for key, field in model.model_fields.items()}
+
+
+def test_display_settings() -> None:
+    documented = {key: json.loads(code(default)[0]) for key, (default, _) in table("Display settings").items()}
+    assert documented == {**asdict(AS_RENDERED), "tgc_db": []}
+    assert documented == DisplayBody().model_dump()
+
+
+def test_confidence() -> None:
+    assert list(table("Confidence")) == [figure.name for figure in fields(Extrapolation)]
+
+
+def test_stream_frames(rendered: RenderResult) -> None:
+    message = frame_bytes(Answered(0, None, rendered), rendered)
+    header = json.loads(message[4 : 4 + int.from_bytes(message[:4], "little")])
+    assert list(header) == list(table("Stream frames"))
+
+
 def test_bodies(openapi: dict[str, Any]) -> None:
     schemas = openapi["components"]["schemas"]
     body = schemas.pop("RenderBody")["properties"]
@@ -287,24 +379,31 @@ def test_request_headers() -> None:
     assert set(table("Request headers")) == sent
 
 
-def test_render_headers() -> None:
-    result = RenderResult(
+@pytest.fixture
+def rendered() -> RenderResult:
+    return RenderResult(
         scene="demo",
         scene_sha256="0" * 64,
         renderer="ultragray",
         poses=np.eye(4)[None],
         probe=LinearProbe(40, 0, 50),
-        height=1,
-        width=1,
+        rendered_height=1,
+        rendered_width=1,
+        display=AS_RENDERED,
+        picture=AS_RENDERED.picture(LinearProbe(40, 0, 50), 1, 1),
         outputs=("bmode",),
         encoding=Encoding.UINT8,
         data=b"\0",
         queue_ms=0.0,
         render_ms=0.0,
         encode_ms=0.0,
+        extrapolations=(Extrapolation(None, None, None, None),),
         batch_size=1,
     )
-    sent = {*render_route._headers(result), middleware.REQUEST_ID_HEADER}
+
+
+def test_render_headers(rendered: RenderResult) -> None:
+    sent = {*render_route._headers(rendered), middleware.REQUEST_ID_HEADER}
     assert set(table("Render headers")) == sent == set(render_route.RENDER_HEADERS)
 
 
@@ -388,6 +487,42 @@ def test_call_metadata() -> None:
     assert set(table("Call metadata")) == {"authorization", "x-api-key", status.REQUEST_ID_KEY}
 
 
+# Python client
+
+
+def test_python_client() -> None:
+    named = [(name, getattr(ultragray_client, name)) for name in ultragray_client.__all__]
+    built = (ultragray_client.FrameStream, ultragray_client.AsyncFrameStream)  # by `stream`
+    found = {
+        call_of(value) if isinstance(value, type) and not issubclass(value, (Enum, *built)) else name
+        for name, value in named
+    }
+    assert set(table("Python client")) == found
+
+
+def test_client_methods() -> None:
+    groups = {
+        "": ultragray_client.Client,
+        "scenes.": client_scenes.Scenes,
+        "datasets.": client_datasets.Datasets,
+        "jobs.": client_jobs.Jobs,
+        "stream.": ultragray_client.FrameStream,
+    }
+    found = [
+        prefix + call_of(method).replace("(self, ", "(").replace("(self)", "()")
+        for prefix, cls in groups.items()
+        for name, method in vars(cls).items()
+        if not name.startswith("_")
+    ]
+    assert list(table("Client methods")) == found
+
+
+def test_client_errors() -> None:
+    documented = [tuple(code(cell)[0] for cell in row) for row in rows("Client errors")]
+    found = [(cls.reason, cls.__name__, cls.__mro__[1].__name__) for cls in ultragray_client.errors.ERRORS]
+    assert documented == found
+
+
 # Errors, settings, command line
 
 
@@ -464,6 +599,7 @@ def test_exit_codes() -> None:
 def test_metrics(service: Service) -> None:
     service.metrics.count_request("http", "/", "200", 0.1)
     service.metrics.count_frame_error("QUEUE_FULL")
+    service.jobs.counts = {JobState.QUEUED: 1}
     found = {}
     for metric in service.metrics.registry.collect():
         if not metric.name.startswith("process_"):
@@ -503,8 +639,11 @@ def test_fixed_limits() -> None:
         "Uploads at the same time": dataset_uploads.MAX_UPLOADS,
         "Files of a dataset": dataset_unpack.MAX_FILES,
         "Check of a dataset": dataset_uploads.CHECK_TIMEOUT_S,
-        "Frames in flight in one `RenderStream`": stream.MAX_FRAMES_IN_FLIGHT,
+        "Frames in flight in one ordered stream": pose_stream.MAX_FRAMES_IN_FLIGHT,
+        "Bytes of these frames, if there are several": pose_stream.MAX_BYTES_IN_FLIGHT,
+        "Message to a WebSocket": server.MAX_STREAM_MESSAGE_BYTES,
         "gRPC message received": grpc_server.MAX_RECEIVE_BYTES,
+        "Keepalive pings of a gRPC client, no more often than every": grpc_server.LEAST_PING_INTERVAL_MS,
         "JPEG quality": pixels.JPEG_QUALITY,
         "Retry after": errors.QueueFull.retry_after_s,
         "Shortest API key": 16,

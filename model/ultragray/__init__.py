@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from .errors import UltragrayError
 from .pose import check_poses, pose_from_position_quaternion, quaternion_from_pose
-from .probe import ConvexProbe, LinearProbe, Probe
+from .probe import ConvexProbe, LinearProbe, PhasedProbe, Probe
 from .scene_info import SceneHeader, SceneInfo, read_header
 
 if TYPE_CHECKING:
@@ -25,6 +25,7 @@ __all__ = [
     "Frames",
     "GaussianScene",
     "LinearProbe",
+    "PhasedProbe",
     "Probe",
     "SceneHeader",
     "SceneInfo",

@@ -5,12 +5,15 @@ UltragrayError
 │   ├── InvalidPose                 not a rigid probe→scene transform
 │   ├── InvalidProbe                a probe that no transducer could have
 │   ├── InvalidImageSize            height or width outside the limits
-│   ├── UnknownOutput               an output other than bmode, echo, transmittance, coverage
+│   ├── UnknownOutput               an output that is none, or that a scene has not
+│   ├── LowConfidence               a pose too far from the training views, where a confidence is asked for
 │   └── TooManyPoses                more poses in one request than the limit
 ├── Unauthenticated                 no API key, or an unknown one, where the service asks for one
+├── OriginRefused                   a web page of another site opens a stream
 ├── BodyTooLarge                    a request body over the limit
 ├── NotAcceptable                   the Accept header cannot hold what was asked for
 ├── UnsupportedMediaType            a request body that is not JSON
+├── IgtlMessageInvalid              an OpenIGTLink message whose header, checksum or body cannot be used
 ├── RouteNotFound                   no such path
 ├── MethodNotAllowed                the path exists, the method does not
 ├── SceneNotFound                   no scene of that name
@@ -26,14 +29,18 @@ UltragrayError
 ├── TrainingStateInvalid            a training folder that cannot be resumed from
 ├── MemoryExceeded                  a training, a check of a dataset, or a frame on a GPU, that does not fit into memory
 ├── SceneExists                     a scene of that name is there, or a job is making it
+├── SceneReadOnly                   a scene of the data folder cannot be deleted
+├── DatabaseUnavailable             the database of the jobs does not answer; nothing else is affected
 ├── JobNotFound                     no job of that id
 ├── JobConflict                     the request_id was used for something else
 ├── JobFinished                     a job that succeeded or failed cannot be cancelled
 ├── JobNotFinished                  only a failed or cancelled job can be retried
+├── JobInUse                        a job that waits or runs, or that another goes on from, cannot be deleted
 ├── JobQueueFull                    too many jobs wait already
 ├── ArtifactNotFound                the job has no file of that name
 ├── SceneTooLarge                   a scene that does not fit the memory budget at all
 ├── BackendUnavailable              a render backend that cannot run here
+├── ExtraMissing                    a format whose package is not installed here
 ├── QueueFull                       too many frames wait already
 ├── DeadlineExceeded                the deadline passed before the frame was rendered
 ├── NotReady                        the service is starting
@@ -101,6 +108,11 @@ class UnknownOutput(InvalidArgument):
     title = "Unknown output"
 
 
+class LowConfidence(InvalidArgument):
+    reason = "LOW_CONFIDENCE"
+    title = "The confidence is too low"
+
+
 class TooManyPoses(InvalidArgument):
     reason = "TOO_MANY_POSES"
     title = "Too many poses"
@@ -111,6 +123,13 @@ class Unauthenticated(UltragrayError):
     http_status = 401
     grpc_status = "UNAUTHENTICATED"
     title = "Authentication required"
+
+
+class OriginRefused(UltragrayError):
+    reason = "ORIGIN_REFUSED"
+    http_status = 403
+    grpc_status = "PERMISSION_DENIED"
+    title = "Pages of this origin are not allowed"
 
 
 class BodyTooLarge(UltragrayError):
@@ -132,6 +151,13 @@ class UnsupportedMediaType(UltragrayError):
     http_status = 415
     grpc_status = "INVALID_ARGUMENT"
     title = "Unsupported media type"
+
+
+class IgtlMessageInvalid(UltragrayError):
+    reason = "IGTL_MESSAGE_INVALID"
+    http_status = 400
+    grpc_status = "INVALID_ARGUMENT"
+    title = "Invalid OpenIGTLink message"
 
 
 class RouteNotFound(UltragrayError):
@@ -239,6 +265,21 @@ class SceneExists(UltragrayError):
     title = "Scene already exists"
 
 
+class SceneReadOnly(UltragrayError):
+    reason = "SCENE_READ_ONLY"
+    http_status = 403
+    grpc_status = "PERMISSION_DENIED"
+    title = "Scene cannot be deleted"
+
+
+class DatabaseUnavailable(UltragrayError):
+    reason = "DATABASE_UNAVAILABLE"
+    http_status = 503
+    grpc_status = "UNAVAILABLE"
+    title = "The database of the jobs does not answer"
+    retry_after_s = 5
+
+
 class JobNotFound(UltragrayError):
     reason = "JOB_NOT_FOUND"
     http_status = 404
@@ -265,6 +306,13 @@ class JobNotFinished(UltragrayError):
     http_status = 409
     grpc_status = "FAILED_PRECONDITION"
     title = "Job cannot be retried"
+
+
+class JobInUse(UltragrayError):
+    reason = "JOB_IN_USE"
+    http_status = 409
+    grpc_status = "FAILED_PRECONDITION"
+    title = "Job in use"
 
 
 class JobQueueFull(UltragrayError):
@@ -296,11 +344,18 @@ class BackendUnavailable(UltragrayError):
     title = "Render backend unavailable"
 
 
+class ExtraMissing(UltragrayError):
+    reason = "EXTRA_MISSING"
+    http_status = 501
+    grpc_status = "UNIMPLEMENTED"
+    title = "Optional package not installed"
+
+
 class QueueFull(UltragrayError):
     reason = "QUEUE_FULL"
     http_status = 429
     grpc_status = "RESOURCE_EXHAUSTED"
-    title = "Too many frames are waiting"
+    title = "Too much is waiting"
     retry_after_s = 1
 
 

@@ -54,12 +54,16 @@ class SceneCatalog:
             cached = self._store.cached_header(name)
             return cached if cached is not None else await asyncio.to_thread(self._store.header, name)
 
+    async def names(self) -> list[str]:
+        """The names of all scenes, sorted."""
+        return await asyncio.to_thread(self._store.names)
+
     async def page(self, page_size: int, page_token: str) -> tuple[list[CatalogEntry], str]:
         """One page of scenes by name and the token of the next (empty on the last).
 
         Raises InvalidArgument for a page_size outside 1 to 1000 and for a token that no page gave.
         """
-        chosen, next_page_token = page_of_names(await asyncio.to_thread(self._store.names), page_size, page_token)
+        chosen, next_page_token = page_of_names(await self.names(), page_size, page_token)
         entries = [entry for name in chosen if (entry := await self._entry(name)) is not None]
         return entries, next_page_token
 

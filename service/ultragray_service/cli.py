@@ -15,7 +15,7 @@ from typer.core import TyperGroup
 import ultragray
 from ultragray.errors import InvalidArgument, UltragrayError
 
-from . import cli_convert, cli_dataset, cli_eval, cli_jobs, cli_report, cli_train, cli_worker
+from . import cli_convert, cli_dataset, cli_eval, cli_jobs, cli_report, cli_sampler, cli_train, cli_worker
 
 USER_ERROR = 2  # the exit code of a mistake that the caller can mend
 
@@ -89,6 +89,12 @@ def serve(
         int | None,
         typer.Option(help="Port of gRPC; 0 takes a free one. [ULTRAGRAY_GRPC_PORT]", show_default="50051"),
     ] = None,
+    igtl_port: Annotated[
+        int | None,
+        typer.Option(
+            help="Port of OpenIGTLink, usually 18944; 0 takes a free one. [ULTRAGRAY_IGTL_PORT]", show_default="off"
+        ),
+    ] = None,
     processes: Annotated[
         int | None,
         typer.Option(help="Render processes; 0: one per GPU, on the CPU one. [ULTRAGRAY_PROCESSES]", show_default="0"),
@@ -117,6 +123,7 @@ def serve(
         "host": host,
         "http_port": http_port,
         "grpc_port": grpc_port,
+        "igtl_port": igtl_port,
         "processes": processes,
         "threads_per_process": threads,
         "backend": backend,
@@ -130,7 +137,11 @@ def render(
     scene: Scene,
     output: Annotated[
         Path,
-        typer.Option("--output", "-o", help="An .npz file, or a folder for PNGs (frame_00000_bmode.png, …)."),
+        typer.Option(
+            "--output",
+            "-o",
+            help="A file (.npz, .tar, .zarr.zip, .h5, .dcm, .igs.mha), or a folder for PNGs (frame_00000_bmode.png).",
+        ),
     ],
     poses: Annotated[
         Path | None,
@@ -139,14 +150,29 @@ def render(
             show_default="the scene's training poses",
         ),
     ] = None,
+    sampler: cli_sampler.Kind = None,
+    count: cli_sampler.Count = None,
+    translation_mm: cli_sampler.TranslationMm = None,
+    rotation_deg: cli_sampler.RotationDeg = None,
+    seed: cli_sampler.Seed = None,
+    spacing_mm: cli_sampler.SpacingMm = None,
+    tilt_deg: cli_sampler.TiltDeg = None,
+    step_deg: cli_sampler.StepDeg = None,
+    min_confidence: cli_sampler.MinConfidence = None,
     height: Annotated[int | None, typer.Option(help="Depth samples.", show_default="as trained, else 512")] = None,
     width: Annotated[int | None, typer.Option(help="Scan lines.", show_default="as trained, else 512")] = None,
-    outputs: Annotated[str, typer.Option(help="Some of bmode, echo, transmittance, coverage, with commas.")] = "bmode",
+    outputs: Annotated[
+        str, typer.Option(help="Some of bmode, echo, transmittance, coverage, labels, with commas.")
+    ] = "bmode",
+    dtype: Annotated[
+        str | None, typer.Option(help="uint8 or float32, of a file.", show_default="the format's own")
+    ] = None,
     probe: Annotated[
         str | None,
         typer.Option(
             help='Another probe, as JSON: {"kind": "linear", "width_mm": 40, "near_mm": 0, "far_mm": 50} or '
-            '{"kind": "convex", "opening_angle_deg": 60, "near_mm": 50, "far_mm": 200}.',
+            '{"kind": "convex", "opening_angle_deg": 60, "near_mm": 50, "far_mm": 200} or '
+            '{"kind": "phased", "opening_angle_deg": 90, "far_mm": 150}.',
             show_default="the scene's own",
         ),
     ] = None,
@@ -154,23 +180,35 @@ def render(
         float | None,
         typer.Option(
             metavar="PIXEL_MM",
-            help="Draw the PNGs of a convex probe as a fan, with square pixels of this size.",
+            help="Draw the PNGs of a convex or phased probe as a fan, with square pixels of this size.",
             show_default=False,
         ),
     ] = None,
     backend: Annotated[str, typer.Option(help="auto, cpu, cuda or reference.")] = "auto",
     threads: Annotated[int, typer.Option(min=0, help="Render threads; 0: all cores.")] = 0,
 ) -> None:
-    """Render frames from poses into one .npz file or a folder of PNGs."""
+    """Render frames from poses into one file or a folder of PNGs."""
     from .cli_render import RenderOptions, render_to_files
 
     options = RenderOptions(
         scene=scene,
         output=output,
         poses=poses,
+        sampler=cli_sampler.sampler_document(
+            sampler,
+            count=count,
+            translation_mm=translation_mm,
+            rotation_deg=rotation_deg,
+            seed=seed,
+            spacing_mm=spacing_mm,
+            tilt_deg=tilt_deg,
+            step_deg=step_deg,
+        ),
+        min_confidence=min_confidence,
         height=height,
         width=width,
         outputs=tuple(name.strip() for name in outputs.split(",") if name.strip()),
+        dtype=dtype,
         probe_json=probe,
         scan_convert_mm=scan_convert,
         backend=backend,
@@ -277,6 +315,12 @@ def bench(
     ] = None,
     quick: Annotated[bool, typer.Option("--quick", help="Fewer repetitions: a minute instead of several.")] = False,
     train: Annotated[bool, typer.Option("--train", help="Measure a training step and its parts instead.")] = False,
+    jobs: Annotated[
+        bool, typer.Option("--jobs", help="Measure a long list of jobs, and frames beside a training, instead.")
+    ] = False,
+    clients: Annotated[
+        bool, typer.Option("--clients", help="Measure what control loops, pages and scripts get instead.")
+    ] = False,
     backend: Annotated[str, typer.Option(help="cpu, or cuda: the first GPU.")] = "cpu",
 ) -> None:
     """Measure the kernel and the service on this machine and print a table."""
@@ -285,4 +329,4 @@ def bench(
 
     if output is not None:
         check_writable(output)
-    chosen_bench(backend, train)(output, quick)
+    chosen_bench(backend, train=train, jobs=jobs, clients=clients)(output, quick)

@@ -18,7 +18,7 @@ from ultragray.scene_info import SceneHeader, read_header
 
 
 def print_json(path: Path) -> None:
-    """One JSON object on stdout: the fields of SceneInfo, the file and a summary of the training poses."""
+    """One JSON object on stdout: the fields of SceneInfo without hardness, the file and a summary of the poses."""
     typer.echo(json.dumps(_describe(path, read_header(path)), indent=2))
 
 
@@ -40,6 +40,7 @@ def _describe(path: Path, header: SceneHeader) -> dict[str, Any]:
         "sha256": file_sha256(path),
         "file_bytes": header.file_bytes,
         **asdict(info),
+        "confidence": {key: value for key, value in info.confidence.items() if key != "hardness"},
         "probe": None if info.probe is None else probe_to_dict(info.probe),
         "training_poses": {
             "count": len(positions),

@@ -48,3 +48,7 @@ def configure_logging(level: str) -> None:
     root.handlers[:] = [handler]
     root.setLevel(level.upper())
     logging.getLogger("uvicorn").setLevel(max(logging.WARNING, root.level))
+    # It says so of each WebSocket that was refused with an answer, which anyone could fill the log with.
+    logging.getLogger("uvicorn.error").addFilter(
+        lambda record: record.getMessage() != "ASGI callable returned without completing handshake."
+    )

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import ctypes
 import gc
 import logging
 import signal
 import socket
 from collections.abc import Awaitable, Iterator
-from typing import Any
+from typing import Any, Literal
 
 import uvicorn
 import uvloop
@@ -18,15 +19,19 @@ from ultragray.errors import StartupFailed
 
 from .embedded_worker import EmbeddedWorker
 from .http.app import create_app
+from .igtl.server import IgtlServer
 from .logs import configure_logging
 from .rpc.server import GrpcServer
-from .settings import Settings
+from .settings import ENVIRONMENT_PREFIX, Settings
 from .state import Service
 
 _HEALTH_POLL_S = 0.2
 _CANCEL_WAIT_S = 1.0
 _FLUSH_S = 2  # for the last bytes of answers, after the last frame
 _KEEP_ALIVE_S = 75
+_M_MMAP_THRESHOLD = -3  # of malloc.h
+_LARGE_BLOCK_BYTES = 2**20
+MAX_STREAM_MESSAGE_BYTES = 2**16  # of a client, on a WebSocket
 _BACKLOG = 2048
 
 _log = logging.getLogger("ultragray.service")
@@ -35,19 +40,24 @@ _log = logging.getLogger("ultragray.service")
 def run(settings: Settings) -> None:
     """Serves until SIGTERM or SIGINT. Raises StartupFailed where it cannot start."""
     configure_logging(settings.log_level)
+    _return_large_blocks()
     uvloop.run(serve(settings))
 
 
 async def serve(settings: Settings) -> None:
-    """Serves HTTP and gRPC until SIGTERM or SIGINT, then drains: ready turns false, what waits is answered.
+    """Serves HTTP, gRPC and, where it has a port, OpenIGTLink, until SIGTERM or SIGINT.
 
-    A second signal stops at once. Raises StartupFailed: a port in use, no data folder, a bad preload.
+    Then drains: ready turns false, what waits is answered. A second signal stops at once.
+    Raises StartupFailed: a port in use, no data folder, a bad preload, API keys with OpenIGTLink.
     """
     signals = _StopSignals()
     service = Service(settings)
     grpc_server = GrpcServer(service)
     grpc_port = _bind_grpc(grpc_server, settings)
-    with _listen(settings) as http_socket:
+    igtl_server = IgtlServer(service)
+    with contextlib.ExitStack() as sockets:
+        http_socket = sockets.enter_context(_listen(settings, "HTTP", "http_port"))
+        igtl_port = await _start_igtl(igtl_server, settings, sockets)
         http_server = _HttpServer(_http_config(service))
         await grpc_server.start()
         http_task = asyncio.ensure_future(http_server.serve([http_socket]))
@@ -58,7 +68,7 @@ async def serve(settings: Settings) -> None:
             if await signals.unless_stopped(service.start()):
                 worker.start()
                 gc.freeze()  # what lives this long is never garbage: shorter pauses
-                _tell_where(settings, http_socket.getsockname()[1], grpc_port)
+                _tell_where(settings, http_socket.getsockname()[1], grpc_port, igtl_port)
                 await signals.stop.wait()
             _log.info("stopping: frames that wait are answered first")
         finally:
@@ -70,17 +80,30 @@ async def serve(settings: Settings) -> None:
             await service.pool.close()
             http_server.should_exit = True
             http_server.force_exit = signals.force.is_set()
-            await signals.unless_forced(asyncio.gather(grpc_server.stop(_FLUSH_S), http_task))
+            await signals.unless_forced(
+                asyncio.gather(grpc_server.stop(_FLUSH_S), igtl_server.stop(_FLUSH_S), http_task)
+            )
             await signals.unless_forced(worker_stop)
             await service.jobs.close()
     _log.info("stopped")
 
 
-def _tell_where(settings: Settings, http_port: int, grpc_port: int) -> None:
+def _tell_where(settings: Settings, http_port: int, grpc_port: int, igtl_port: int | None) -> None:
     http = f"http://{_authority(settings.host, http_port)}"
     grpc = _authority(settings.host, grpc_port)
     fields = {"http": http, "grpc": grpc, "docs": f"{http}/docs", "data_folder": str(settings.data_folder)}
-    _log.info(f"serving HTTP on {http} (docs at {http}/docs) and gRPC on {grpc}", extra={"fields": fields})
+    message = f"serving HTTP on {http} (docs at {http}/docs) and gRPC on {grpc}"
+    if igtl_port is not None:
+        fields["igtl"] = _authority(settings.host, igtl_port)
+        message += f", OpenIGTLink on {fields['igtl']}"
+    _log.info(message, extra={"fields": fields})
+
+
+def _return_large_blocks() -> None:
+    """Has glibc hand freed blocks of a MiB and more back to the system: by itself it stops after the first ones."""
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    if mallopt is not None:
+        mallopt(_M_MMAP_THRESHOLD, _LARGE_BLOCK_BYTES)
 
 
 class _StopSignals:
@@ -133,7 +156,9 @@ def _http_config(service: Service) -> uvicorn.Config:
     return uvicorn.Config(
         create_app(service),
         http="httptools",
-        ws="none",
+        ws="websockets-sansio",
+        ws_max_size=MAX_STREAM_MESSAGE_BYTES,
+        ws_per_message_deflate=False,  # speckle does not shrink
         lifespan="off",
         log_config=None,
         access_log=False,
@@ -143,8 +168,8 @@ def _http_config(service: Service) -> uvicorn.Config:
     )
 
 
-def _listen(settings: Settings) -> socket.socket:
-    host, port = settings.host, settings.http_port
+def _listen(settings: Settings, what: str, field: Literal["http_port", "igtl_port"]) -> socket.socket:
+    host, port = settings.host, getattr(settings, field)
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     listener = socket.socket(family, socket.SOCK_STREAM)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -153,9 +178,9 @@ def _listen(settings: Settings) -> socket.socket:
     except OSError as error:
         listener.close()
         raise StartupFailed(
-            f"HTTP cannot listen on {_authority(host, port)}: {error.strerror}; "
-            "set ULTRAGRAY_HTTP_PORT to another port",
-            field="http_port",
+            f"{what} cannot listen on {_authority(host, port)}: {error.strerror}; "
+            f"set {ENVIRONMENT_PREFIX}{field.upper()} to another port",
+            field=field,
         ) from error
     listener.listen(_BACKLOG)
     listener.setblocking(False)
@@ -171,6 +196,20 @@ def _bind_grpc(server: GrpcServer, settings: Settings) -> int:
             "or the address is not this machine's; set ULTRAGRAY_GRPC_PORT to another port",
             field="grpc_port",
         ) from error
+
+
+async def _start_igtl(server: IgtlServer, settings: Settings, sockets: contextlib.ExitStack) -> int | None:
+    """Begins to answer and returns the port; None where it has none."""
+    if settings.igtl_port is None:
+        return None
+    if settings.api_keys:
+        raise StartupFailed(
+            "OpenIGTLink cannot ask for an API key: unset ULTRAGRAY_IGTL_PORT or ULTRAGRAY_API_KEYS", field="igtl_port"
+        )
+    listener = sockets.enter_context(_listen(settings, "OpenIGTLink", "igtl_port"))
+    port = int(listener.getsockname()[1])
+    await server.start(listener)
+    return port
 
 
 async def _mirror_health(service: Service, server: GrpcServer) -> None:

@@ -26,6 +26,12 @@ class Settings(BaseSettings):
     host: str = Field("127.0.0.1", min_length=1, description="Address that both servers listen on; 0.0.0.0 for all.")
     http_port: int = Field(8000, ge=0, le=65535, description="Port of HTTP; 0 takes a free one.")
     grpc_port: int = Field(50051, ge=0, le=65535, description="Port of gRPC; 0 takes a free one.")
+    igtl_port: int | None = Field(
+        None, ge=0, le=65535, description="Port of OpenIGTLink, usually 18944; 0 takes a free one; None: off."
+    )
+    igtl_scene: str | None = Field(
+        None, description="Scene of OpenIGTLink devices whose names name none; None: the only one."
+    )
     data_folder: Path = Field(Path("data"), description="Folder of the scene files (*.ugr). Must exist.")
     preload: Words = Field((), description="Scenes loaded before the service is ready.")
 
@@ -75,6 +81,10 @@ class Settings(BaseSettings):
     )
     job_nice: int = Field(10, ge=0, le=19, description="Nice level of a job's process; frames go first.")
 
+    job_retention_days: float = Field(
+        30.0, ge=0, le=36_500, description="Days that workers keep a finished job and its files; 0: for ever."
+    )
+
     default_timeout_s: float = Field(30.0, gt=0, le=3600, description="Deadline of a request that names none, seconds.")
     drain_timeout_s: float = Field(
         10.0, ge=0, le=3600, description="How long waiting frames may take at a stop, seconds."
@@ -101,6 +111,8 @@ class Settings(BaseSettings):
     def _refuse_short_keys(cls, keys: tuple[SecretStr, ...]) -> tuple[SecretStr, ...]:
         if any(len(key.get_secret_value()) < 16 for key in keys):
             raise ValueError("each key must have at least 16 characters")
+        if not all(key.get_secret_value().isascii() for key in keys):
+            raise ValueError("each key must be of ASCII characters, as gRPC carries no others")
         return keys
 
 

@@ -11,14 +11,19 @@ from ultragray_workers.jobs.store import SCENES_FOLDER
 from ultragray_workers.pool import PoolConfig, RenderPool
 from ultragray_workers.scenes import SceneStore
 from ultragray_workers.types import RenderRequest, RenderResult
+from ultragray_workers.waiting import Turn
 
 from .auth import KeyGuard
 from .catalog import SceneCatalog, scene_to_blame
+from .comparisons import Comparisons
 from .dataset_uploads import DatasetUploads
+from .dataset_views import DatasetViews
 from .jobs import Jobs
 from .metrics import Metrics
 from .requests import RequestPlanner
+from .scene_imports import SceneImports
 from .settings import Settings
+from .training_views import TrainingViews
 
 
 class Phase(Enum):
@@ -40,6 +45,7 @@ class Service:
             )
         store = SceneStore(settings.data_folder, settings.artifacts / SCENES_FOLDER)
         self.settings = settings
+        self.scenes = store
         self.catalog = SceneCatalog(store)
         self.planner = RequestPlanner(settings, self.catalog)
         self.guard = KeyGuard(settings.api_keys)
@@ -54,14 +60,19 @@ class Service:
                 backend=settings.backend,
             ),
         )
-        self.metrics = Metrics(self.pool)
+        self.jobs = Jobs(settings, store)
+        self.metrics = Metrics(self.pool, lambda: self.jobs.counts)
         self.pool.on_rendered = self.metrics.observe_result
         self.phase = Phase.STARTING
         self.draining = asyncio.Event()
         self.datasets = DatasetStore(settings.artifacts)
         self.uploads = DatasetUploads(self.datasets, settings, self.draining)
-        self.jobs = Jobs(settings, store)
         self.datasets.in_use = self.jobs.uses_dataset
+        self.imports = SceneImports(store, settings, self.jobs.makes_scene)
+        self.dataset_views = DatasetViews(self.datasets, settings)
+        self.comparisons = Comparisons(store, self.catalog, self.datasets, settings)
+        self.training_views = TrainingViews(self.jobs, settings)
+        self._prepared = (self.dataset_views.folders, self.comparisons.folders, self.training_views.folders)
 
     @property
     def ready(self) -> bool:
@@ -87,6 +98,9 @@ class Service:
         Raises StartupFailed.
         """
         await self.uploads.remove_stale()
+        await self.imports.remove_stale()
+        for prepared in self._prepared:
+            await prepared.remove_stale()
         await asyncio.gather(self.pool.start(), self.jobs.start())
         for name in self.settings.preload:
             try:
@@ -96,11 +110,11 @@ class Service:
         if self.phase is Phase.STARTING:
             self.phase = Phase.SERVING
 
-    async def render(self, request: RenderRequest) -> RenderResult:
+    async def render(self, request: RenderRequest, turn: Turn | None = None) -> RenderResult:
         """Renders. Raises what RenderPool.render raises; cancelling drops a request that still waits."""
         self.require_serving()
         with scene_to_blame():
-            return await self.pool.render(request)
+            return await self.pool.render(request, turn)
 
     async def load(self, scene: str) -> int:
         """Loads a scene into every process; how many hold it.
@@ -124,3 +138,5 @@ class Service:
         self.phase = Phase.DRAINING
         self.draining.set()
         self.jobs.end_watches()
+        for prepared in self._prepared:
+            prepared.end()

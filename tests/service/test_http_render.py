@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from ultragray import GaussianScene, LinearProbe, render
+from ultragray.confidence import FIGURES
 
 from .conftest import HEIGHT, WIDTH, RunningService
 
@@ -87,7 +88,7 @@ def test_npz_holds_frames_poses_and_origin(
     assert answer.headers["content-type"] == "application/x-npz"
     with np.load(io.BytesIO(answer.content)) as bundle:
         arrays = dict(bundle)
-    assert set(arrays) == {"bmode", "coverage", "poses", "scene", "scene_sha256", "renderer"}
+    assert set(arrays) == {"bmode", "coverage", "poses", *FIGURES, "scene", "scene_sha256", "renderer"}
     poses = np.stack([pose_matrix, np.eye(4)])
     np.testing.assert_array_equal(arrays["poses"], poses)
     for name, truth in expected(demo_scene, poses, outputs=("bmode", "coverage")).items():

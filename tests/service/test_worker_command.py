@@ -15,14 +15,15 @@ import httpx
 import pytest
 
 from ultragray.demo import copy_demo_scene
-from ultragray_workers.jobs.specification import PoseSampler, RenderJob
+from ultragray.samplers import AroundSampler
+from ultragray_workers.jobs.specification import RenderJob
 from ultragray_workers.jobs.store import Job, JobState, JobStore
 from ultragray_workers.scenes import SceneStore
 
 from .conftest import RunningService
 
 StartService = Callable[..., RunningService]
-JOB = RenderJob("demo", sampler=PoseSampler("jitter", 2), height=16, width=16)
+JOB = RenderJob("demo", sampler=AroundSampler(2), height=16, width=16)
 WORKER = [sys.executable, "-c", "from ultragray_service.cli import app; app()", "worker"]
 
 

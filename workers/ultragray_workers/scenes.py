@@ -22,6 +22,8 @@ _RESIDENT_PER_RAW_BYTE = 2.5
 def resident_bytes(info: SceneInfo) -> int:
     """Memory of a loaded scene in a worker: its raw float32 parameters and what the kernel prepares of them."""
     floats_per_gaussian = 3 + 3 + 4 + 1 + (info.sh_degree + 1) ** 2  # means, scales, quats, transmittances, SH
+    if info.label_names:
+        floats_per_gaussian += 3 + 3 + 4 + 1 + 1  # the parts by label, of degree 0
     return int(_RESIDENT_PER_RAW_BYTE * 4 * floats_per_gaussian * info.gaussian_count)
 
 

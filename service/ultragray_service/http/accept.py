@@ -65,8 +65,9 @@ def parse_accept(header: str) -> list[MediaRange]:
     return ranges
 
 
-def choose(accept: str, *, frames: int, outputs: int, dtype: str | None) -> Choice:
+def choose(accept: str, *, frames: int, outputs: int, dtype: str | None, lossless: bool = False) -> Choice:
     """The media type for `frames` poses of `outputs` outputs; `dtype` is that of the body, for raw pixels.
+    `lossless`: no pixel may change, as those of labels.
 
     Among types of equal quality: raw first where the body names a dtype, else PNG for one image and npz for several.
     A dtype in the Accept header goes before that of the body.
@@ -74,6 +75,8 @@ def choose(accept: str, *, frames: int, outputs: int, dtype: str | None) -> Choi
     """
     single = frames == 1 and outputs == 1
     able: Sequence[str] = (PNG, JPEG, RAW, NPZ) if single else (NPZ, RAW)
+    if lossless:
+        able = tuple(media_type for media_type in able if media_type != JPEG)
     if dtype is not None:  # only raw pixels have one
         able = (RAW, *(media_type for media_type in able if media_type != RAW))
     ranges = parse_accept(accept) if accept.strip() else [MediaRange("*", "*", None, 1.0)]

@@ -15,9 +15,22 @@ from ultragray.errors import UltragrayError
 
 from ..state import Service
 from . import job_schemas, problems
+from .console import add_console
 from .docs import add_docs
 from .middleware import LimitBody, RequestContext, RequireKey
-from .routes import datasets, health, jobs, metrics, render, scenes
+from .routes import (
+    comparison,
+    datasets,
+    health,
+    jobs,
+    metrics,
+    render,
+    scene_files,
+    scenes,
+    statistics,
+    stream,
+    training,
+)
 from .schemas import RenderBody
 
 _DESCRIPTION = """B-mode frames from trained 3D-Gaussian ultrasound scenes.
@@ -45,9 +58,22 @@ def create_app(service: Service) -> FastAPI:
     )
     app.state.service = service
     # render comes first: its route is the one that must be found fast
-    for module in (render, scenes, datasets, jobs, health, metrics):
+    for module in (
+        render,
+        stream,
+        scenes,
+        scene_files,
+        datasets,
+        comparison,
+        jobs,
+        training,
+        statistics,
+        health,
+        metrics,
+    ):
         app.include_router(module.router)
     add_docs(app)
+    add_console(app)
     app.add_exception_handler(UltragrayError, problems.answer_ultragray_error)
     app.add_exception_handler(HTTPException, problems.answer_http_exception)
     app.add_exception_handler(RequestValidationError, problems.answer_validation_error)

@@ -31,11 +31,12 @@ def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
 
 _MEANINGS = {
     401: "No API key, or an unknown one (UNAUTHENTICATED), where the service asks for one.",
+    403: "The scene lies in the data folder, which is not the service's (SCENE_READ_ONLY).",
     404: "No such scene, dataset, job or artifact (SCENE_NOT_FOUND, DATASET_NOT_FOUND, JOB_NOT_FOUND, "
     "ARTIFACT_NOT_FOUND).",
     406: "The Accept header allows no type that can hold the request (NOT_ACCEPTABLE).",
     409: "What is there already, or its state, does not allow it (DATASET_EXISTS, DATASET_IN_USE, SCENE_EXISTS, "
-    "REQUEST_ID_CONFLICT, JOB_FINISHED, JOB_NOT_FINISHED).",
+    "REQUEST_ID_CONFLICT, JOB_FINISHED, JOB_NOT_FINISHED, JOB_IN_USE).",
     413: "The body is over the limit (BODY_TOO_LARGE, UPLOAD_TOO_LARGE).",
     415: "The body is of another type than the route takes (UNSUPPORTED_MEDIA_TYPE).",
     422: "A value cannot be used: INVALID_ARGUMENT, INVALID_POSE, INVALID_PROBE, INVALID_IMAGE_SIZE, "

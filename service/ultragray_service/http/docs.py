@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from fastapi import FastAPI
 from fastapi.openapi.docs import get_swagger_ui_html
-from starlette.responses import HTMLResponse, RedirectResponse
+from starlette.responses import HTMLResponse
 from starlette.staticfiles import StaticFiles
 
 DOCS_PATH = "/docs"
@@ -12,7 +12,7 @@ _STATIC_PATH = f"{DOCS_PATH}/static"
 
 
 def add_docs(app: FastAPI) -> None:
-    """Serves the pages under /docs; / leads there."""
+    """Serves the pages under /docs."""
     app.mount(_STATIC_PATH, StaticFiles(packages=[("fastapi_offline", "static")]))
     page = get_swagger_ui_html(
         openapi_url=str(app.openapi_url),
@@ -25,7 +25,3 @@ def add_docs(app: FastAPI) -> None:
     @app.get(DOCS_PATH, include_in_schema=False)
     async def docs() -> HTMLResponse:
         return page
-
-    @app.get("/", include_in_schema=False)
-    async def root() -> RedirectResponse:
-        return RedirectResponse(DOCS_PATH)

@@ -67,7 +67,7 @@ JOB_EXAMPLES: dict[str, Any] = {
             "kind": "render",
             "specification": {
                 "scene": DEMO_SCENE,
-                "sampler": {"kind": "jitter", "count": 100, "translation_mm": 2.0, "rotation_deg": 5.0, "seed": 0},
+                "sampler": {"kind": "around", "count": 100, "translation_mm": 2.0, "rotation_deg": 5.0, "seed": 0},
                 "format": "tar",
             },
         },

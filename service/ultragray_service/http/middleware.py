@@ -11,15 +11,16 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from ultragray.errors import BodyTooLarge, UltragrayError, Unauthenticated
 
-from ..auth import KeyGuard
+from ..auth import KeyGuard, key_of_subprotocols
 from ..logs import choose_request_id, request_id
 from ..metrics import Metrics
+from .console import ASSETS_PATH, CONSOLE_PATHS
 from .problems import problem_response
 
 REQUEST_ID_HEADER = "X-Request-Id"
-_OPEN_PATHS = ("/v1/health/", "/docs", "/openapi.json")
+_OPEN_PATHS = ("/v1/health/", "/docs", "/openapi.json", f"{ASSETS_PATH}/")
 _QUIET_PATHS = ("/v1/health/", "/metrics")
-_UPLOAD_PATH = "/v1/datasets/"
+_UPLOAD_PATHS = ("/v1/datasets/", "/v1/scenes/")
 _CLIENT_GONE = 499
 
 _log = logging.getLogger("ultragray.http")
@@ -33,8 +34,12 @@ class RequestContext:
         self._metrics = metrics
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http":
-            await self._app(scope, receive, send)
+        if scope["type"] == "websocket":
+            token = request_id.set(choose_request_id(Headers(scope=scope).get(REQUEST_ID_HEADER)))
+            try:
+                await self._app(scope, receive, send)
+            finally:
+                request_id.reset(token)
             return
         started = time.perf_counter()
         current = choose_request_id(Headers(scope=scope).get(REQUEST_ID_HEADER))
@@ -74,17 +79,18 @@ class RequestContext:
 
 
 class RequireKey:
-    """Lets through who has an API key, and everyone to health and the documentation."""
+    """Lets through who has an API key, and everyone to health, the documentation and the files of the console."""
 
     def __init__(self, app: ASGIApp, guard: KeyGuard) -> None:
         self._app = app
         self._guard = guard
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] == "http" and not scope["path"].startswith(_OPEN_PATHS):
+        if scope["path"] not in CONSOLE_PATHS and not scope["path"].startswith(_OPEN_PATHS):
             headers = Headers(scope=scope)
+            key = headers.get("x-api-key") or key_of_subprotocols(scope.get("subprotocols", ()))
             try:
-                self._guard.check(headers.get("authorization"), headers.get("x-api-key"))
+                self._guard.check(headers.get("authorization"), key)
             except Unauthenticated as error:
                 await problem_response(error)(scope, receive, send)
                 return
@@ -102,7 +108,7 @@ class LimitBody:
         self._limit_bytes = limit_bytes
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http" or (scope["method"] == "PUT" and scope["path"].startswith(_UPLOAD_PATH)):
+        if scope["type"] != "http" or (scope["method"] == "PUT" and scope["path"].startswith(_UPLOAD_PATHS)):
             await self._app(scope, receive, send)
             return
         announced = Headers(scope=scope).get("content-length", "")

@@ -35,7 +35,7 @@ _CLASS_OF_FIELD: dict[str, type[InvalidArgument]] = {
     "width": InvalidImageSize,
     "outputs": UnknownOutput,
 }
-_PROBE_KINDS = ("linear", "convex")  # pydantic puts the tag of a union into the path
+_PROBE_KINDS = ("linear", "convex", "phased")  # pydantic puts the tag of a union into the path
 _SHOWN_INPUT = 60
 
 
@@ -101,7 +101,7 @@ def invalid_argument(first: Mapping[str, Any]) -> InvalidArgument:
     kind = str(first["type"])
     root = str(first["loc"][0]) if first["loc"] else ""
     if kind == "json_invalid":
-        return InvalidArgument(f"the body must be JSON: {first.get('ctx', {}).get('error', 'it cannot be read')}")
+        return InvalidArgument(f"this must be JSON: {first.get('ctx', {}).get('error', 'it cannot be read')}")
     if kind == "missing":
         detail = f"{path} is required"
     elif kind == "extra_forbidden":

@@ -6,8 +6,9 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from ultragray.display import FRAME_RANGE_DB, Display
 from ultragray.pose import quaternion_from_pose
-from ultragray.probe import ConvexProbe, FloatArray, LinearProbe, Probe
+from ultragray.probe import ConvexProbe, FloatArray, LinearProbe, PhasedProbe, Probe
 
 
 class RequestModel(BaseModel):
@@ -71,16 +72,45 @@ class ConvexProbeBody(RequestModel):
         return ConvexProbe(opening_angle_deg=self.opening_angle_deg, near_mm=self.near_mm, far_mm=self.far_mm)
 
 
-ProbeBody = Annotated[LinearProbeBody | ConvexProbeBody, Field(discriminator="kind")]
+class PhasedProbeBody(RequestModel):
+    """A fan of scan lines from the centre of the face."""
+
+    kind: Literal["phased"]
+    opening_angle_deg: float
+    far_mm: float
+
+    def probe(self) -> Probe:
+        """Raises InvalidProbe."""
+        return PhasedProbe(opening_angle_deg=self.opening_angle_deg, far_mm=self.far_mm)
 
 
-def probe_body(probe: Probe) -> LinearProbeBody | ConvexProbeBody:
+ProbeBody = Annotated[LinearProbeBody | ConvexProbeBody | PhasedProbeBody, Field(discriminator="kind")]
+
+
+def probe_body(probe: Probe) -> LinearProbeBody | ConvexProbeBody | PhasedProbeBody:
     """The JSON of a probe."""
     if isinstance(probe, LinearProbe):
         return LinearProbeBody(kind="linear", width_mm=probe.width_mm, near_mm=probe.near_mm, far_mm=probe.far_mm)
+    if isinstance(probe, PhasedProbe):
+        return PhasedProbeBody(kind="phased", opening_angle_deg=probe.opening_angle_deg, far_mm=probe.far_mm)
     return ConvexProbeBody(
         kind="convex", opening_angle_deg=probe.opening_angle_deg, near_mm=probe.near_mm, far_mm=probe.far_mm
     )
+
+
+class DisplayBody(RequestModel):
+    """What a sonographer sets. The first three change B-mode only."""
+
+    gain_db: float = Field(0.0, description="Added to every echo.")
+    dynamic_range_db: float = Field(FRAME_RANGE_DB, description="From white down to black.")
+    tgc_db: list[float] = Field(default=[], description="Gains at evenly spaced depths, linear in between.")
+    depth_mm: float | None = Field(None, description="Deeper rows, counted from the face, are cut off.")
+    flip: bool = Field(False, description="Left and right change places.")
+    pixel_mm: float | None = Field(None, description="Scan conversion to square pixels of this size.")
+
+    def display(self) -> Display:
+        """Raises InvalidArgument."""
+        return Display(**{**self.model_dump(), "tgc_db": tuple(self.tgc_db)})
 
 
 class RenderBody(RequestModel):
@@ -91,7 +121,12 @@ class RenderBody(RequestModel):
     height: int | None = Field(None, description="Depth samples. Default: that of the training images, else 512.")
     width: int | None = Field(None, description="Scan lines. Default: that of the training images, else 512.")
     probe: ProbeBody | None = Field(None, description="Instead of the scene's own.")
-    outputs: list[str] = Field(["bmode"], description="Some of bmode, echo, transmittance, coverage.")
+    min_confidence: float | None = Field(None, description="0 to 1; what is below is refused, or masked.")
+    below_min_confidence: Literal["refuse", "mask"] = Field(
+        "refuse", description="mask: pixels of such frames that Gaussians do not support are 0."
+    )
+    display: DisplayBody | None = Field(None, description="Gain, depth, scan conversion ...; default: as rendered.")
+    outputs: list[str] = Field(["bmode"], description="Some of bmode, echo, transmittance, coverage, labels.")
     dtype: Literal["uint8", "float32"] | None = Field(
         None,
         description="Of application/octet-stream; a dtype in the Accept header goes first. Default: uint8.",
@@ -169,6 +204,13 @@ class TrainingPosesOut(BaseModel):
     last: PoseOut | None = None
 
 
+class ConfidenceOut(BaseModel):
+    """How well a scene knows the confidence of its frames."""
+
+    error: float = Field(description="Mean absolute error of the confidence on the views it was fitted on.")
+    fitted_on: int = Field(description="How many those are.")
+
+
 class SceneOut(BaseModel):
     """All that a scene says about itself."""
 
@@ -188,6 +230,8 @@ class SceneOut(BaseModel):
     metrics: dict[str, float]
     dataset_name: str | None
     dataset_sha256: str | None
+    label_names: dict[int, str] = Field(description="What the values of the output labels mean; empty: it has none.")
+    confidence: ConfidenceOut | None = Field(description="null: the scene cannot tell the confidence of its frames.")
 
 
 class SceneLoaded(BaseModel):

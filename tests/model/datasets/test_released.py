@@ -90,7 +90,8 @@ def test_a_phased_probe(layout: Layout) -> None:
     layout.configure(**fan, ultrasound_near_plane=0.5, probe_kind="phased")
     with pytest.raises(DatasetInvalid, match=r"a phased probe has .*near_plane 0, got near plane 0.5"):
         read_released(layout.folder)
-    layout.configure(ultrasound_near_plane=0, probe_kind="phased")
+    linear = {"ultrasound_opening_width": 3.8, "ultrasound_opening_angle": None}
+    layout.configure(**linear, ultrasound_near_plane=0, probe_kind="phased")
     with pytest.raises(DatasetInvalid, match=r"a phased probe has ultrasound_opening_angle .* got no angle"):
         read_released(layout.folder)
 

@@ -102,6 +102,21 @@ def test_a_scene_from_a_file_without_ablations(content: ReportContent) -> None:
     assert re.findall(r"<h2>(.*?)</h2>", text) == ["Against the baselines", "Pictures"]
 
 
+def test_a_scene_alone_with_frames_from_end_to_end(content: ReportContent) -> None:
+    alone = replace(content, baselines={}, ablations={}, tilt=None, spread=2, scene_name="ball & <noise>")
+    text = render_page(alone)
+    assert Checked(text).open_tags == []
+    assert re.findall(r"<h2>(.*?)</h2>", text) == ["Held-out frames", "Pictures", "Training"]
+    assert "<dt>Scene</dt><dd>ball &amp; &lt;noise&gt;</dd>" in text
+    assert re.findall(r'<th scope="row">(.*?)</th>', text) == ["this scene"]
+    first, last = content.dataset.val.frame_numbers[[0, -1]]
+    captions = re.findall(r"<figcaption>Frame (\d+): [\d.]+ dB</figcaption>", text)
+    assert captions == [str(first), str(last)]
+    assert text.count("<img ") == 2 * 5
+    everything = render_page(replace(alone, spread=24))
+    assert everything.count("<img ") == len(content.dataset.val) * 5
+
+
 def test_a_study_that_failed_says_why_in_place_of_its_figures(content: ReportContent) -> None:
     name = "half of the Gaussians"
     failed = Failed("it needs 9 GB & more")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,9 +21,11 @@ from ultragray.report.study import (
     split_by_tilt,
     study_tilt,
     train_and_evaluate,
+    trained_of_journal,
 )
 from ultragray.scene import GaussianScene
-from ultragray.training import Progress, TrainingConfig
+from ultragray.training import Progress, TrainingConfig, train
+from ultragray.training.trainer import JOURNAL_FILE
 
 
 def test_a_training_is_followed_and_measured(turning_dataset: Dataset, small_config: TrainingConfig) -> None:
@@ -33,6 +36,20 @@ def test_a_training_is_followed_and_measured(turning_dataset: Dataset, small_con
     assert list(trained.val_psnr_db) == [1, 2, 3, 4, 5, 6]
     assert trained.evaluation.frames == evaluate(trained.scene, turning_dataset.val).frames
     assert trained.seconds >= 6 * trained.step_s > 0
+
+
+def test_a_finished_run_is_read_from_its_journal(
+    turning_dataset: Dataset, small_config: TrainingConfig, tmp_path: Path
+) -> None:
+    seen: list[Progress] = []
+    scene = train(turning_dataset, small_config, folder=tmp_path, report=seen.append)
+    evaluation = evaluate(scene, turning_dataset.val)
+    trained = trained_of_journal(scene, evaluation, tmp_path / JOURNAL_FILE)
+    assert trained.losses == [progress.loss for progress in seen]
+    assert trained.val_psnr_db == {step + 1: progress.val_psnr_db for step, progress in enumerate(seen)}
+    assert trained.seconds == pytest.approx(6 * trained.step_s)
+    assert trained.seconds > 0
+    assert trained.evaluation is evaluation
 
 
 def test_each_validation_is_a_point_even_where_nothing_changed(

@@ -31,6 +31,7 @@ ARCHIVES = (
     "application/x-tar",
     "application/gzip",
     "application/x-gzip",
+    "application/octet-stream",  # the archive's first bytes tell which it is
 )
 
 DatasetName = Annotated[str, Path(description="Name of the dataset.", examples=["liver"])]
@@ -144,9 +145,9 @@ async def delete_dataset(service: ServiceDep, dataset: DatasetName) -> None:
 
 
 def _media_type(request: Request) -> str:
-    content_type = request.headers.get("content-type", "")
+    content_type = request.headers.get("content-type", "application/octet-stream")  # curl -T sends none
     media_type = content_type.partition(";")[0].strip().lower()
-    if media_type != MULTIPART and media_type not in ARCHIVES:
+    if media_type not in (MULTIPART, *ARCHIVES):
         raise UnsupportedMediaType(
             f"Content-Type must be {MULTIPART} or one of {', '.join(ARCHIVES)}, got {content_type[:200]!r}",
             field="Content-Type",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Path, Query
@@ -12,6 +13,7 @@ from ultragray.errors import InvalidArgument
 from ultragray_workers.jobs.specification import from_dict
 
 from ...catalog import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE
+from ...job_log import DEFAULT_LOG_BYTES, MAX_LOG_BYTES
 from ...requests import field_under
 from ..accept import NPZ, PNG
 from ..deps import ServiceDep, problems
@@ -22,15 +24,16 @@ from ..json_body import read_json_body
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 
-DEFAULT_LOG_BYTES = 65536
-MAX_LOG_BYTES = 2**20
 MEDIA_TYPES = {
+    ".dcm": "application/dicom",
+    ".h5": "application/x-hdf5",
     ".html": "text/html; charset=utf-8",
     ".json": "application/json",
     ".jsonl": "application/jsonl",
     ".npz": NPZ,
     ".png": PNG,
     ".tar": "application/x-tar",
+    ".zip": "application/zip",
 }
 _SPECIFICATION = "specification"  # the key of the body
 _ANY_FILE = "application/octet-stream"
@@ -58,6 +61,7 @@ _SUBMIT: dict[str, Any] = {
 }
 _Answers = dict[int | str, dict[str, Any]]
 _SAME_JOB: _Answers = {200: {"model": JobOut, "description": "The job that this request_id made before."}}
+_SAME_RETRY: _Answers = {200: {"model": JobOut, "description": "The job that an earlier call made."}}
 _LOG: _Answers = {200: {"description": "The end of the log.", "content": {"text/plain": {}}}}
 _FILE: _Answers = {
     200: {
@@ -82,7 +86,7 @@ _EVENTS: _Answers = {
     status_code=201,
     response_model=JobOut,
     openapi_extra=_SUBMIT,
-    responses=_SAME_JOB | problems(401, 404, 409, 413, 415, 422, 429, 503),
+    responses=_SAME_JOB | problems(401, 404, 409, 413, 415, 422, 429, 503, 507),
 )
 async def submit_job(request: Request, response: Response, service: ServiceDep) -> JobOut:
     """Puts a job into the queue. The same request_id with the same body gives the same job, whatever its state."""
@@ -91,7 +95,8 @@ async def submit_job(request: Request, response: Response, service: ServiceDep) 
     with field_under(_SPECIFICATION):
         if "kind" in body.specification:
             raise InvalidArgument("kind stands beside the specification, not in it", field="kind")
-        specification = from_dict({"kind": body.kind, **body.specification})
+        # in a thread: there may be many poses
+        specification = await asyncio.to_thread(from_dict, {"kind": body.kind, **body.specification})
     job, is_new = await service.jobs.submit(
         specification, field=_SPECIFICATION, request_id=body.request_id, priority=body.priority
     )
@@ -124,11 +129,24 @@ async def cancel_job(service: ServiceDep, job: JobId) -> JobOut:
     return JobOut.of(await service.jobs.cancel(job))
 
 
-@router.post("/{job}:retry", status_code=201, responses=problems(401, 404, 409, 422, 429, 503))
-async def retry_job(service: ServiceDep, job: JobId) -> JobOut:
+@router.post(
+    "/{job}:retry",
+    status_code=201,
+    response_model=JobOut,
+    responses=_SAME_RETRY | problems(401, 404, 409, 422, 429, 503, 507),
+)
+async def retry_job(response: Response, service: ServiceDep, job: JobId) -> JobOut:
     """A new job in place of a failed or cancelled one; a training goes on from its last checkpoint."""
     service.require_serving()
-    return JobOut.of(await service.jobs.retry(job))
+    successor, is_new = await service.jobs.retry(job)
+    response.status_code = 201 if is_new else 200
+    return JobOut.of(successor)
+
+
+@router.delete("/{job}", status_code=204, responses=problems(401, 404, 409, 422, 503))
+async def delete_job(service: ServiceDep, job: JobId) -> None:
+    """Removes a finished job and its files. The scene that it trained stays."""
+    await service.jobs.delete(job)
 
 
 @router.get(

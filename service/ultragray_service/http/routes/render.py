@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from typing import Any
 
 from fastapi import APIRouter
@@ -10,7 +11,7 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from ultragray.probe import probe_to_dict
-from ultragray.request import check_outputs
+from ultragray.request import LABELS, check_outputs
 from ultragray_workers.types import Encoding, Priority, RenderResult
 
 from ...requests import RenderSpec
@@ -20,8 +21,9 @@ from ..deps import SCENE_NAME, problems
 from ..disconnect import finish_or_abandon
 from ..examples import RENDER_EXAMPLES
 from ..json_body import read_json_body
-from ..render_body import asked_probe, checked_poses, poses_as_written
+from ..render_body import asked_display, asked_probe, asked_trust, checked_poses, poses_as_written
 from ..schemas import RenderBody
+from ..stream_schemas import picture_json
 
 router = APIRouter(prefix="/v1/scenes", tags=["render"])
 
@@ -36,6 +38,10 @@ RENDER_HEADERS = {
     "X-Ultragray-Outputs": "Outputs in the order of the data, with commas.",
     "X-Ultragray-Pose": "One pose only: the 4x4 matrix that was used, JSON. Of many, npz holds `poses`.",
     "X-Ultragray-Probe": "The probe that was used, JSON.",
+    "X-Ultragray-Confidence": "Of each pose, with commas; empty where the scene cannot tell.",
+    "X-Ultragray-Extrapolation": "One pose only: distance_mm, angle_deg, confidence, supported_share, JSON. "
+    "Of many, npz holds them.",
+    "X-Ultragray-Picture": "Where the pixels lie in the image plane, JSON: column_unit, first, step.",
     "X-Ultragray-Queue-Ms": "Waiting time.",
     "X-Ultragray-Render-Ms": "Render time of the batch that the poses were in.",
     "X-Ultragray-Encode-Ms": "Encoding time.",
@@ -84,8 +90,23 @@ async def render(request: Request) -> Response:
     deadline = planner.deadline(None if body.timeout_ms is None else body.timeout_ms / 1000)
     written = poses_as_written(body, planner.max_poses_at_once)
     outputs = check_outputs(body.outputs)
-    choice = choose(request.headers.get("accept", ""), frames=len(written), outputs=len(outputs), dtype=body.dtype)
-    spec = RenderSpec(scene, asked_probe(body), body.height, body.width, outputs, choice.encoding)
+    choice = choose(
+        request.headers.get("accept", ""),
+        frames=len(written),
+        outputs=len(outputs),
+        dtype=body.dtype,
+        lossless=LABELS in outputs,
+    )
+    spec = RenderSpec(
+        scene=scene,
+        probe=asked_probe(body),
+        height=body.height,
+        width=body.width,
+        outputs=outputs,
+        encoding=choice.encoding,
+        display=asked_display(body),
+        trust=asked_trust(body),
+    )
     planned = await planner.plan(spec, Priority.INTERACTIVE if body.poses is None else Priority.BATCH)
     prepared = planner.with_poses(planned, await checked_poses(written), deadline)
     result = await finish_or_abandon(service.render(prepared), request.receive, deadline)
@@ -102,11 +123,16 @@ def _headers(result: RenderResult) -> dict[str, str]:
         "X-Ultragray-Dtype": _DTYPES.get(result.encoding, "uint8"),
         "X-Ultragray-Outputs": ",".join(result.outputs),
         "X-Ultragray-Probe": json.dumps(probe_to_dict(result.probe)),
+        "X-Ultragray-Confidence": ",".join(
+            "" if told.confidence is None else f"{told.confidence:.3f}" for told in result.extrapolations
+        ),
+        "X-Ultragray-Picture": json.dumps(picture_json(result.picture)),
         "X-Ultragray-Queue-Ms": queue,
         "X-Ultragray-Render-Ms": render_time,
         "X-Ultragray-Encode-Ms": encode,
         "Server-Timing": f"queue;dur={queue}, render;dur={render_time}, encode;dur={encode}",
     }
     if len(result.poses) == 1:
+        headers["X-Ultragray-Extrapolation"] = json.dumps(asdict(result.extrapolations[0]))
         headers["X-Ultragray-Pose"] = json.dumps(result.poses[0].tolist())
     return headers

@@ -6,12 +6,14 @@ from typing import Annotated
 
 from fastapi import APIRouter, Query
 
+from ultragray.confidence.assess import read_model
 from ultragray.scene_info import SceneHeader
 
 from ...catalog import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE, CatalogEntry, finite_metrics, summarise_training
 from ..deps import SceneName, ServiceDep, problems
 from ..schemas import (
     Bounds,
+    ConfidenceOut,
     PoseOut,
     SceneEntry,
     SceneError,
@@ -46,7 +48,7 @@ async def list_scenes(
 async def get_scene(service: ServiceDep, scene: SceneName) -> SceneOut:
     """Probe, bounds, centre, training poses and metrics; mm, in the frame of the training sweep."""
     header = await service.catalog.header(scene)
-    return _scene(scene, header, service.pool.loaded().get(scene, 0))
+    return scene_out(scene, header, service.pool.loaded().get(scene, 0))
 
 
 @router.post("/{scene}:load", responses=problems(401, 404, 422, 503, 507))
@@ -79,8 +81,9 @@ def _entry(entry: CatalogEntry, *, loaded: bool) -> SceneEntry:
     )
 
 
-def _scene(name: str, header: SceneHeader, loaded_processes: int) -> SceneOut:
-    info = header.info
+def scene_out(name: str, header: SceneHeader, loaded_processes: int) -> SceneOut:
+    """The JSON of a scene."""
+    info, told = header.info, read_model(header.info.confidence, len(header.training_poses))
     return SceneOut(
         name=name,
         loaded=loaded_processes > 0,
@@ -98,6 +101,8 @@ def _scene(name: str, header: SceneHeader, loaded_processes: int) -> SceneOut:
         metrics=finite_metrics(header),
         dataset_name=None if info.dataset_name is None else str(info.dataset_name),
         dataset_sha256=None if info.dataset_sha256 is None else str(info.dataset_sha256),
+        label_names=info.label_names,
+        confidence=None if told is None else ConfidenceOut(error=told.error, fitted_on=told.fitted_on),
     )
 
 
