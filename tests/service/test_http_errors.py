@@ -105,7 +105,7 @@ BAD_BODIES: dict[str, tuple[dict[str, Any], str, str | None]] = {
         "probe.width_mm",
     ),
     "width 0": ({"pose": GOOD_POSE, "probe": {**LINEAR, "width_mm": 0}}, "INVALID_PROBE", "probe.width_mm"),
-    "unknown probe": ({"pose": GOOD_POSE, "probe": {**LINEAR, "kind": "phased"}}, "INVALID_PROBE", "probe.kind"),
+    "unknown probe": ({"pose": GOOD_POSE, "probe": {**LINEAR, "kind": "matrix"}}, "INVALID_PROBE", "probe.kind"),
     "probe without kind": ({"pose": GOOD_POSE, "probe": {}}, "INVALID_PROBE", "probe.kind"),
     "timeout": ({"pose": GOOD_POSE, "timeout_ms": 0}, "INVALID_ARGUMENT", "timeout_ms"),
     "dtype": ({"pose": GOOD_POSE, "dtype": "int4"}, "INVALID_ARGUMENT", "dtype"),
@@ -197,7 +197,7 @@ def test_chunked_body_too_large(http: httpx.Client) -> None:
 
 def test_unknown_route_and_method(http: httpx.Client) -> None:
     assert_problem(http.get("/v1/nothing"), 404, "ROUTE_NOT_FOUND", None)
-    answer = http.delete("/v1/scenes/demo")
+    answer = http.patch("/v1/scenes/demo")
     assert_problem(answer, 405, "METHOD_NOT_ALLOWED", None)
     assert answer.headers["allow"] == "GET"
     assert_problem(http.get("/v1/scenes/demo/render"), 405, "METHOD_NOT_ALLOWED", None)
