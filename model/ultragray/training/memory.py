@@ -17,7 +17,7 @@ from ..evaluation import CHUNK_PIXELS, frames_at_once
 from .config import TrainingConfig
 from .sampling import PREDICTED_PIXELS
 
-BASE_BYTES = 400 << 20  # the process with torch loaded, and the scratch memory of its kernels
+BASE_BYTES = 440 << 20  # the process with torch loaded, and the scratch memory of its kernels
 RAW_FLOATS = 3 + 3 + 4 + 1 + 1  # of a Gaussian, without the harmonics above degree 0
 COPIES = 16  # parameters, gradients, moments; what refinements, checkpoints and the kernel copy (measured: 14)
 STATISTICS = 2
