@@ -12,7 +12,7 @@ DATA ?= ../shared/data
 ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help serve console test test-console test-faults check format bench bench-cuda results demo-scene proto clean
+.PHONY: help serve console test test-long test-console test-faults check format bench bench-cuda results demo-scene proto clean
 
 help:  ## say what there is
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
@@ -23,7 +23,10 @@ serve: $(VENV)/installed $(if $(NPM),$(CONSOLE))  ## set up, then serve the demo
 console: $(CONSOLE)  ## build the console, which the service serves at / (needs Node 20 or newer; serve does it where that is there)
 
 test: $(VENV)/installed-dev $(if $(NPM),$(CONSOLE))  ## set up, then run the tests (ARGS="-k probe" for some)
-	$(BIN)/pytest $(ARGS)
+	$(BIN)/pytest -m "not long" $(ARGS)
+
+test-long: $(VENV)/installed-dev  ## the tests that take long
+	$(BIN)/pytest -m long $(ARGS)
 
 test-console: $(VENV)/installed-dev $(CONSOLE)  ## the console in Debian's Chromium against a real service; leaves screenshots in build
 	node --test --test-concurrency=1 tests/console/*.test.mjs

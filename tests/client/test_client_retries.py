@@ -83,7 +83,7 @@ def test_nobody_there_is_told_in_time(make_client: Any) -> None:
     assert 0.2 < time.monotonic() - started < 1.5
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_service_that_comes_late_is_found(make_client: Any, start_service: StartService) -> None:
     port = free_port()
     client = make_client(f"127.0.0.1:{port}", timeout_s=60.0)
@@ -95,7 +95,7 @@ def test_a_service_that_comes_late_is_found(make_client: Any, start_service: Sta
     service[0].terminate()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_batch_goes_on_where_a_service_is_restarted(make_client: Any, start_service: StartService) -> None:
     first = start_service()
     port = int(first.grpc.rpartition(":")[2])
@@ -121,7 +121,7 @@ def test_a_batch_goes_on_where_a_service_is_restarted(make_client: Any, start_se
     assert records, "the first service must not have rendered them all"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_full_queue_is_asked_again(make_client: Any, start_service: StartService) -> None:
     service = start_service(queue_limit_frames=1)
     client = make_client(service.grpc, timeout_s=60.0)

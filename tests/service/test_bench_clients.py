@@ -12,7 +12,7 @@ from ultragray_service import bench
 from ultragray_service.bench_clients import ClientsExtent
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_bench_of_clients(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     tiny = ClientsExtent(loop_s=1.0, stream_s=0.3, ping_pongs=5, frames=12, gaussians=500, kernel_repeats=3, side=32)
     monkeypatch.setattr(bench, "time_yard_ms", lambda: 4.0)

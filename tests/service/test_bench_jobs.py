@@ -22,6 +22,7 @@ def small_phantom() -> Dataset:
     return Dataset("phantom", sweep.select([0, 1, 2, 4, 5, 6]), sweep.select([3, 7]))
 
 
+@pytest.mark.long
 def test_bench_of_jobs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr(bench_jobs, "load_phantom", small_phantom)
     monkeypatch.setattr(bench_jobs, "STEPS", 100_000)

@@ -74,7 +74,7 @@ def test_the_curve_of_a_finished_training_and_of_other_jobs(http: httpx.Client) 
     assert http.get("/v1/jobs/0123/curve").json()["reason"] == "JOB_NOT_FOUND"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_training_is_seen_while_it_runs(http: httpx.Client, tmp_path: Path) -> None:
     job = train(http, "long", steps=STEPS, max_gaussians=50, confidence=False)
     missing = http.get(f"/v1/jobs/{job}/preview").json()

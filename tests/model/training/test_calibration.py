@@ -51,7 +51,7 @@ def ranks(values: FloatArray) -> FloatArray:
     return values.argsort().argsort().astype(np.float64)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_it_tells_what_frames_will_reach() -> None:
     scene, (_, val) = trained(), phantom()
     actual = np.array([frame.ms_ssim for frame in evaluate(scene, val).frames])
@@ -61,7 +61,7 @@ def test_it_tells_what_frames_will_reach() -> None:
     assert np.corrcoef(ranks(told), ranks(actual))[0, 1] > 0.8
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_same_training_ends_in_the_same_scene() -> None:
     dataset, _ = phantom()
     again = train(dataset, TrainingConfig.preset("fast", steps=120, max_gaussians=4_000))

@@ -352,7 +352,7 @@ def test_clients_that_vanish_in_the_middle_of_a_message(connect: Connect, igtl_s
     assert not [record for record in igtl_service.log() if record["level"] == "error"]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_message_that_does_not_end_is_cut_off(connect: Connect) -> None:
     idle, slow = connect(), connect()
     data = pack_message(Message("TRANSFORM", "demo", bytes(48)))
@@ -391,7 +391,7 @@ def held(service: RunningService, peers: list[Peer]) -> int:
     return sum(os.readlink(path) in inodes for path in Path(f"/proc/{service.process.pid}/fd").iterdir())
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_reader_that_stops_for_long_is_cut_off(connect: Connect, igtl_service: RunningService) -> None:
     peers = [connect(SO_RCVBUF=4096), connect(SO_RCVBUF=4096)]
     for count in range(60):  # more images than the kernel's buffers hold
