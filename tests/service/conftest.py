@@ -52,7 +52,8 @@ class RunningService:
             )
 
     def log(self) -> list[dict[str, Any]]:
-        return [json.loads(line) for line in self.log_path.read_text().splitlines() if line.startswith("{")]
+        whole = self.log_path.read_text().rpartition("\n")[0]  # the last line may be half written
+        return [json.loads(line) for line in whole.splitlines() if line.startswith("{")]
 
     def wait_until_serving(self) -> None:
         end = time.monotonic() + START_TIMEOUT_S
