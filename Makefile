@@ -8,6 +8,7 @@ PYTHON_SOURCES := model service workers proto client tests benchmarks examples
 NPM := $(shell command -v npm)
 CONSOLE := service/ultragray_service/console/index.html
 CONSOLE_SOURCES := $(shell find web -type f -not -path 'web/node_modules/*')
+CONSOLE_IF_POSSIBLE = [ -z "$(NPM)" ] || $(MAKE) --no-print-directory console || echo "The console could not be built; all else works without it."
 DATA ?= ../shared/data
 ARGS ?=
 
@@ -17,12 +18,14 @@ ARGS ?=
 help:  ## say what there is
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
 
-serve: $(VENV)/installed $(if $(NPM),$(CONSOLE))  ## set up, then serve the demo scene and every *.ugr in ./data (ARGS="--help" for options)
+serve: $(VENV)/installed  ## set up, then serve the demo scene and every *.ugr in ./data (ARGS="--help" for options)
+	@$(CONSOLE_IF_POSSIBLE)
 	@exec $(BIN)/ultragray serve $(ARGS)
 
 console: $(CONSOLE)  ## build the console, which the service serves at / (needs Node 20 or newer; serve does it where that is there)
 
-test: $(VENV)/installed-dev $(if $(NPM),$(CONSOLE))  ## set up, then run the tests (ARGS="-k probe" for some)
+test: $(VENV)/installed-dev  ## set up, then run the tests (ARGS="-k probe" for some)
+	@$(CONSOLE_IF_POSSIBLE)
 	$(BIN)/pytest -m "not long" $(ARGS)
 
 test-long: $(VENV)/installed-dev  ## the tests that take long
