@@ -108,11 +108,11 @@ def main() -> None:
         if not count:
             first_at = time.perf_counter()
             shapes = ", ".join(f"{name} {list(value.shape)}" for name, value in batch.items())
-            print(f"first batch after {first_at - started:.1f} s: {shapes}")  # noqa: T201
+            print(f"first batch after {first_at - started:.1f} s: {shapes}")
         count += len(batch["bmode"])
         brightness += float(batch["bmode"].sum(0).mean())
     rate = (count - given.batch_size) / max(time.perf_counter() - first_at, 1e-9)
-    print(f"{count} frames, {rate:.0f} a second after the first batch, mean brightness {brightness / count:.4f}")  # noqa: T201
+    print(f"{count} frames, {rate:.0f} a second after the first batch, mean brightness {brightness / count:.4f}")
 
 
 if __name__ == "__main__":

@@ -232,7 +232,7 @@ def main() -> None:
     parser.add_argument("--rate-hz", type=float, default=100.0, help="of the control loop")
     given = parser.parse_args()
     record = asyncio.run(servo(given.address, scene=given.scene, seconds=given.seconds, rate_hz=given.rate_hz))
-    print(record.tell())  # noqa: T201
+    print(record.tell())
 
 
 if __name__ == "__main__":

@@ -76,6 +76,15 @@ class RunningService:
             self.process.wait()
             raise
 
+    def metric(self, name: str) -> float:
+        """The sum of all lines of /metrics that begin with `name`."""
+        lines = httpx.get(f"{self.http}/metrics").text.splitlines()
+        return sum(float(line.rpartition(" ")[2]) for line in lines if line.startswith(name))
+
+    def resident_bytes(self) -> int:
+        pages = int(Path(f"/proc/{self.process.pid}/statm").read_text().split()[1])
+        return pages * os.sysconf("SC_PAGE_SIZE")
+
     def channel(self) -> grpc.Channel:
         return grpc.insecure_channel(self.grpc, options=[("grpc.max_receive_message_length", -1)])
 

@@ -19,6 +19,7 @@ from websockets.sync.client import connect
 
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2, rendering_pb2_grpc
 
+from ..waiting import wait_until
 from .conftest import RunningService, StartService
 
 IDENTITY = geometry_pb2.Pose(matrix=geometry_pb2.Matrix(values=np.eye(4).ravel().tolist()))
@@ -30,19 +31,13 @@ IDLE = 200
 TIMEOUT_S = 30.0
 
 
-def resident_bytes(service: RunningService) -> int:
-    pages = int(Path(f"/proc/{service.process.pid}/statm").read_text().split()[1])
-    return pages * os.sysconf("SC_PAGE_SIZE")
-
-
 def cpu_seconds(service: RunningService) -> float:
     fields = Path(f"/proc/{service.process.pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def rendered(service: RunningService) -> float:
-    text = httpx.get(f"{service.http}/metrics").text
-    return float(next(line for line in text.splitlines() if line.startswith("ultragray_frames_total")).split()[1])
+    return service.metric("ultragray_frames_total")
 
 
 def until_calm(service: RunningService) -> float:
@@ -58,12 +53,12 @@ def until_calm(service: RunningService) -> float:
 
 
 def test_a_batch_whose_reader_stops_waits_for_him(service: RunningService, renders: Any) -> None:
-    before, frames_before = resident_bytes(service), rendered(service)
+    before, frames_before = service.resident_bytes(), rendered(service)
     call = renders.RenderBatch(rendering_pb2.RenderBatchRequest(settings=LARGE, poses=[IDENTITY] * 40))
     next(call)
     frames = until_calm(service) - frames_before
     assert frames < 40
-    assert resident_bytes(service) - before < CALM_BYTES + 2 * 32 * 2.9e6
+    assert service.resident_bytes() - before < CALM_BYTES + 2 * 32 * 2.9e6
     small = rendering_pb2.RenderSettings(scene="demo", height=32, width=32)
     assert renders.Render(rendering_pb2.RenderRequest(settings=small, pose=IDENTITY), timeout=TIMEOUT_S).data
     assert len(list(call)) == 39
@@ -75,11 +70,11 @@ def test_a_stream_whose_reader_stops_waits_for_him(service: RunningService, rend
         for sequence in range(5000):
             yield rendering_pb2.RenderStreamRequest(sequence=sequence, pose=IDENTITY)
 
-    before, frames_before = resident_bytes(service), rendered(service)
+    before, frames_before = service.resident_bytes(), rendered(service)
     call = renders.RenderStream(messages())
     next(call)
     assert until_calm(service) - frames_before < 100
-    assert resident_bytes(service) - before < CALM_BYTES
+    assert service.resident_bytes() - before < CALM_BYTES
     call.cancel()
 
 
@@ -87,7 +82,7 @@ def test_readers_that_stop_hold_little_and_give_it_back(start_service: StartServ
     service = start_service()
     large = {"height": 2048, "width": 2048, "encoding": "float32"}  # 16 MB a frame
     address = f"{service.http.replace('http', 'ws', 1)}/v1/scenes/demo/stream"
-    before = resident_bytes(service)
+    before = service.resident_bytes()
     with contextlib.ExitStack() as opened:
         for _ in range(3):
             connection = opened.enter_context(
@@ -96,11 +91,8 @@ def test_readers_that_stop_hold_little_and_give_it_back(start_service: StartServ
             for _ in range(10):
                 connection.send(json.dumps({"settings": large, "pose": {"matrix": np.eye(4).tolist()}}))
         until_calm(service)
-        assert resident_bytes(service) - before < 3 * 6 * 16 * 2**20  # two frames each, and the copies of one
-    end = time.monotonic() + TIMEOUT_S
-    while resident_bytes(service) - before > 2 * 16 * 2**20:
-        assert time.monotonic() < end, resident_bytes(service) - before
-        time.sleep(0.2)
+        assert service.resident_bytes() - before < 3 * 6 * 16 * 2**20  # two frames each, and the copies of one
+    wait_until(lambda: service.resident_bytes() - before <= 2 * 16 * 2**20, every_s=0.2)
 
 
 def test_a_batch_whose_client_goes_stops_within_a_second(service: RunningService) -> None:
@@ -117,7 +109,7 @@ def test_a_batch_whose_client_goes_stops_within_a_second(service: RunningService
 
 def test_many_idle_connections_cost_nothing(service: RunningService) -> None:
     """Less than a fiftieth of a core, and some kilobytes each."""
-    before = resident_bytes(service)
+    before = service.resident_bytes()
     with contextlib.ExitStack() as opened:
         channel = opened.enter_context(
             grpc.insecure_channel(service.grpc, options=[("grpc.use_local_subchannel_pool", 1)])
@@ -134,7 +126,7 @@ def test_many_idle_connections_cost_nothing(service: RunningService) -> None:
             rendering_pb2.RenderRequest(settings=rendering_pb2.RenderSettings(scene="demo"), pose=IDENTITY),
             timeout=TIMEOUT_S,
         ).data
-        assert resident_bytes(service) - before < IDLE * 200_000
+        assert service.resident_bytes() - before < IDLE * 200_000
     assert share < 0.02 + 0.03  # the second is that of the service with nobody connected
 
 

@@ -10,9 +10,10 @@ import pytest
 
 from ultragray_proto.v1 import datasets_pb2, datasets_pb2_grpc
 
+from ..waiting import wait_until
 from .conftest import RunningService, StartService
 from .test_grpc_render import error_info
-from .test_http_datasets import KEY, LIMIT_BYTES, poisoned_files, released_files, uploads_under_way, wait_until, zipped
+from .test_http_datasets import KEY, LIMIT_BYTES, poisoned_files, released_files, uploads_under_way, zipped
 
 METADATA = (("x-api-key", KEY),)
 Message = datasets_pb2.UploadDatasetRequest

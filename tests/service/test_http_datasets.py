@@ -9,7 +9,7 @@ import tarfile
 import time
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ from ultragray.datasets import Dataset, Sweep
 from ultragray.datasets.released import write_released
 from ultragray_service.dataset_uploads import MAX_UPLOADS
 
+from ..waiting import wait_until
 from .conftest import RunningService, StartService
 
 KEY = "0123456789abcdef-datasets"
@@ -104,15 +105,6 @@ def plus_files() -> dict[str, bytes]:
     )
     text = "".join(f"{key} = {value}\n" for key, value in header.items())
     return {"sweep.igs.mha": text.encode() + payload, "device_set.xml": device_set.encode()}
-
-
-def wait_until(condition: Callable[[], Any]) -> Any:
-    end = time.monotonic() + WAIT_S
-    while time.monotonic() < end:
-        if found := condition():
-            return found
-        time.sleep(0.01)
-    raise AssertionError(f"not within {WAIT_S} s")
 
 
 def uploads_under_way(folder: Path) -> list[str]:

@@ -19,6 +19,7 @@ from ultragray.samplers import SAMPLERS
 from ultragray_service.http.job_schemas import RenderSpecification, SamplerBody, TrainSpecification
 from ultragray_workers.jobs.specification import RenderJob, TrainJob
 
+from ..waiting import wait_until
 from .conftest import RunningService, StartService
 
 RENDER = {"kind": "render", "specification": {"scene": "demo", "sampler": {"kind": "training"}}}
@@ -194,16 +195,12 @@ def test_a_finished_job_is_deleted_and_others_are_not(client: httpx.Client) -> N
 
 def test_jobs_are_counted_for_prometheus(start_service: StartService, tmp_path: Path) -> None:
     service = start_service(artifact_folder=tmp_path, embedded_worker=False)
-    end = time.monotonic() + WAIT_S
+    queued, failed = (f'ultragray_jobs{{state="{state}"}} ' for state in ("queued", "failed"))
     with httpx.Client(base_url=service.http, timeout=WAIT_S) as client:
-        while 'ultragray_jobs{state="queued"} 0.0' not in (told := client.get("/metrics").text):
-            assert time.monotonic() < end, told
-            time.sleep(0.05)
+        wait_until(lambda: f"{queued}0.0" in client.get("/metrics").text)
         submit(client)
-        while 'ultragray_jobs{state="queued"} 1.0' not in (told := client.get("/metrics").text):
-            assert time.monotonic() < end, told
-            time.sleep(0.1)
-    assert 'ultragray_jobs{state="failed"} 0.0' in told
+        wait_until(lambda: f"{queued}1.0" in client.get("/metrics").text)
+        assert f"{failed}0.0" in client.get("/metrics").text
 
 
 def test_a_job_that_waits_has_an_empty_log_and_no_artifacts(client: httpx.Client) -> None:
@@ -246,9 +243,7 @@ def test_events_tell_every_state_and_end_with_the_last(client: httpx.Client, job
     watchers = [threading.Thread(target=watch, args=(number,)) for number in states]
     for watcher in watchers:
         watcher.start()
-    end = time.monotonic() + WAIT_S
-    while not all(states.values()) and time.monotonic() < end:
-        time.sleep(0.02)
+    wait_until(lambda: all(states.values()))
     client.post(f"/v1/jobs/{job['id']}:cancel")
     for watcher in watchers:
         watcher.join(WAIT_S)
@@ -262,10 +257,7 @@ def test_a_watcher_that_goes_away_is_let_go(client: httpx.Client, jobs_service: 
         lines = answer.iter_lines()
         assert next(lines) == "event: progress"
         assert not [line for line in jobs_service.log() if line.get("path") == route]
-    end = time.monotonic() + WAIT_S
-    while not [line for line in jobs_service.log() if line.get("path") == route]:  # logged when it has ended
-        assert time.monotonic() < end
-        time.sleep(0.05)
+    wait_until(lambda: [line for line in jobs_service.log() if line.get("path") == route])  # logged when it has ended
 
 
 def test_the_documented_specifications_are_those_that_are_taken() -> None:

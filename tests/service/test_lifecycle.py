@@ -17,31 +17,18 @@ import pytest
 
 from ultragray_proto.v1 import rendering_pb2, rendering_pb2_grpc
 
+from ..waiting import wait_until
 from .conftest import ROOT, SOURCE_FOLDERS, RunningService, StartService
 from .test_grpc_render import Conversation, error_info, moved
 
 IDENTITY = {"position_mm": {"x": 0, "y": 0, "z": 0}, "quaternion": {"w": 1, "x": 0, "y": 0, "z": 0}}
 SMALL = {"height": 80, "width": 80}
+WAITING = "ultragray_waiting_frames "
 SLOW = {"backend": "reference", "max_batch_poses": 1}  # so that frames still wait when a test looks
 
 
 def render(service: RunningService, client: httpx.Client, **body: Any) -> httpx.Response:
     return client.post(f"{service.http}/v1/scenes/demo/render", json={"pose": IDENTITY, **body}, timeout=30)
-
-
-def wait_for_frames(service: RunningService) -> None:
-    end = time.monotonic() + 10
-    while time.monotonic() < end:
-        lines = httpx.get(f"{service.http}/metrics").text.splitlines()
-        if any(line.startswith("ultragray_waiting_frames ") and float(line.split()[1]) for line in lines):
-            return
-        time.sleep(0.01)
-    raise AssertionError("no frame ever waited")
-
-
-def waiting_frames(service: RunningService) -> float:
-    lines = httpx.get(f"{service.http}/metrics").text.splitlines()
-    return next(float(line.split()[1]) for line in lines if line.startswith("ultragray_waiting_frames "))
 
 
 def test_sigterm_answers_what_is_in_flight_and_exits_cleanly(start_service: StartService) -> None:
@@ -56,7 +43,7 @@ def test_sigterm_answers_what_is_in_flight_and_exits_cleanly(start_service: Star
         pending = [threads.submit(render, service, client, **SMALL) for _ in range(4)]
         request = rendering_pb2.RenderRequest(settings=frames, pose=moved(0))
         unary = stub.Render.future(request, timeout=30)
-        wait_for_frames(service)
+        wait_until(lambda: service.metric(WAITING))
         service.process.send_signal(signal.SIGTERM)
         assert [answer.result().status_code for answer in pending] == [200] * 4
         assert unary.result().data
@@ -86,7 +73,7 @@ def test_a_second_signal_stops_at_once(start_service: StartService) -> None:
     service = start_service(**SLOW)
     with httpx.Client() as client, ThreadPoolExecutor(4) as threads:
         pending = [threads.submit(render, service, client, height=256, width=256) for _ in range(4)]
-        wait_for_frames(service)
+        wait_until(lambda: service.metric(WAITING))
         service.process.send_signal(signal.SIGTERM)
         while not any("stopping" in record["message"] for record in service.log()):
             time.sleep(0.02)
@@ -101,9 +88,7 @@ def test_a_second_signal_stops_at_once(start_service: StartService) -> None:
 
 def test_sigterm_while_starting(start_service: StartService) -> None:
     service = start_service(wait=False)
-    end = time.monotonic() + 20
-    while not service.log() and time.monotonic() < end:
-        time.sleep(0.02)
+    wait_until(service.log)
     assert service.terminate() == 0
     assert not any("grpc" in record for record in service.log()), "it was ready before it was stopped"
 
@@ -149,11 +134,8 @@ def test_frames_of_a_client_that_has_gone_are_dropped(start_service: StartServic
         )
         with socket.create_connection((host, int(port))) as connection:
             connection.sendall(head.encode() + body)
-            wait_for_frames(service)
-        end = time.monotonic() + 3
-        while waiting_frames(service) and time.monotonic() < end:
-            time.sleep(0.02)
-        assert waiting_frames(service) == 0
+            wait_until(lambda: service.metric(WAITING))
+        wait_until(lambda: service.metric(WAITING) == 0, within_s=3)
         assert render(service, client).status_code == 200
 
 
@@ -166,7 +148,7 @@ def test_interactive_frames_go_before_a_batch(start_service: StartService) -> No
         received: list[int] = []
         reader = threading.Thread(target=lambda: received.extend(f.sequence for f in stub.RenderBatch(batch)))
         reader.start()
-        wait_for_frames(service)
+        wait_until(lambda: service.metric(WAITING))
         assert render(service, client, **SMALL).status_code == 200
         done_before = len(received)
         reader.join()

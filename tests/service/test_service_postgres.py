@@ -13,6 +13,7 @@ from typing import Any
 import httpx
 
 from ..postgres import PASSWORD, PostgresServer
+from ..waiting import wait_until
 from ..workers.jobs.conftest import store_dataset
 from .conftest import RunningService
 
@@ -58,10 +59,7 @@ def test_scene_is_trained_and_served_and_an_outage_passes(
         told = []
         watching = threading.Thread(target=watch, args=(client, long, told))
         watching.start()
-        end = time.monotonic() + WAIT_S
-        while not client.get(f"/v1/jobs/{long}").json()["progress"]["step"]:
-            assert time.monotonic() < end
-            time.sleep(0.1)
+        wait_until(lambda: client.get(f"/v1/jobs/{long}").json()["progress"]["step"], within_s=WAIT_S, every_s=0.1)
         postgres.stop()
         try:
             for route in ("/v1/jobs", f"/v1/jobs/{long}"):

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,7 @@ from ultragray.training.trainer import CHECKPOINT_FILE, JOURNAL_FILE
 from ultragray_service import training_views
 from ultragray_service.training_views import MAX_POINTS
 
+from ..waiting import wait_until
 from .conftest import StartService
 from .test_http_comparison import DATASET
 from .test_http_datasets import zipped
@@ -45,15 +45,6 @@ def train(http: httpx.Client, scene: str, **settings: Any) -> str:
     assert answer.status_code == 201, answer.text
     job: str = answer.json()["id"]
     return job
-
-
-def wait_until(condition: Callable[[], Any]) -> Any:
-    end = time.monotonic() + WAIT_S
-    while time.monotonic() < end:
-        if found := condition():
-            return found
-        time.sleep(0.1)
-    raise AssertionError(f"not within {WAIT_S} s")
 
 
 def test_the_names_of_the_files_of_a_run() -> None:

@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import cv2
-import httpx
 import numpy as np
 import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
@@ -20,6 +19,7 @@ from websockets.sync.client import ClientConnection, connect
 
 from ultragray import GaussianScene, render
 
+from ..waiting import wait_until
 from .conftest import HEIGHT, WIDTH, RunningService
 
 TIMEOUT_S = 20.0
@@ -201,34 +201,25 @@ def test_a_message_beyond_the_limit_ends_the_stream_only(open_stream: Callable[.
 def test_a_reader_that_stops_costs_others_nothing(service: RunningService, open_stream: Callable[..., Stream]) -> None:
     stuck = open_stream(max_queue=1)
     stuck.send(mode="latest", settings={"height": 600, "width": 600})
-    before = resident_bytes(service)
+    before = service.resident_bytes()
     for k in range(2000):
         stuck.send(sequence=k, pose=at(k / 1000))
     other = open_stream()
     for k in range(20):
         assert other.ask(sequence=k, pose=at(0.0))[0]["sequence"] == k
-    assert resident_bytes(service) - before < 64 * 2**20
-
-
-def resident_bytes(service: RunningService) -> int:
-    with open(f"/proc/{service.process.pid}/statm") as file:
-        return int(file.read().split()[1]) * 4096
+    assert service.resident_bytes() - before < 64 * 2**20
 
 
 def test_streams_are_counted(service: RunningService, open_stream: Callable[..., Stream]) -> None:
     def open_streams() -> float:
-        text = httpx.get(f"{service.http}/metrics").text
-        return float(next(line for line in text.splitlines() if line.startswith("ultragray_open_streams")).split()[1])
+        return service.metric("ultragray_open_streams")
 
     before = open_streams()
     stream = open_stream()
     stream.ask(pose=at(0.0))
     assert open_streams() == before + 1
     stream.connection.close()
-    end = time.monotonic() + TIMEOUT_S
-    while open_streams() != before:
-        assert time.monotonic() < end
-        time.sleep(0.05)
+    wait_until(lambda: open_streams() == before)
 
 
 def test_keys_are_asked_for(start_service: Callable[..., RunningService]) -> None:

@@ -20,6 +20,7 @@ from ultragray_workers.jobs.specification import RenderJob
 from ultragray_workers.jobs.store import Job, JobState, JobStore
 from ultragray_workers.scenes import SceneStore
 
+from ..waiting import wait_until
 from .conftest import RunningService
 
 StartService = Callable[..., RunningService]
@@ -43,13 +44,6 @@ def children(pid: int) -> dict[int, str]:
         for child in path.read_text().split():
             found[int(child)] = Path(f"/proc/{child}/cmdline").read_text().replace("\0", " ")
     return found
-
-
-def until(reached: Callable[[], bool]) -> None:
-    end = time.monotonic() + 20
-    while not reached():
-        assert time.monotonic() < end
-        time.sleep(0.05)
 
 
 @pytest.fixture
@@ -91,11 +85,11 @@ def test_embedded_worker_comes_back_and_goes_with_the_service(
     def worker() -> int | None:
         return next((pid for pid, line in children(service.process.pid).items() if "cli_worker" in line), None)
 
-    until(lambda: worker() is not None)
+    wait_until(lambda: worker() is not None)
     first = worker()
     assert first is not None
     os.kill(first, signal.SIGKILL)
-    until(lambda: worker() not in (None, first))
+    wait_until(lambda: worker() not in (None, first))
     second = worker()
     job = until_final(demo_store, demo_store.submit(JOB)[0])
     assert job.state is JobState.SUCCEEDED, job

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import socket
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -18,6 +17,7 @@ from ultragray import ConvexProbe, GaussianScene
 from ultragray_service.igtl.contents import Image, Status, pack_transform, unpack_image, unpack_status
 from ultragray_service.igtl.messages import HEADER_BYTES, Message, pack_message, unpack_header, unpack_message
 
+from ...waiting import wait_until
 from ..conftest import DEMO_PROBE, RunningService, StartService, make_scene
 
 TIMEOUT_S = 20.0
@@ -123,13 +123,17 @@ def peer(connect: Connect) -> Peer:
 def pyigtl_client(address: str) -> Iterator[pyigtl.OpenIGTLinkClient]:
     host, port = address.rsplit(":", 1)
     client = pyigtl.OpenIGTLinkClient(host, int(port))
-    end = time.monotonic() + TIMEOUT_S
-    while not client.is_connected() and time.monotonic() < end:
-        time.sleep(0.005)
     try:
+        wait_until(client.is_connected)
         yield client
     finally:
         client.stop()
+
+
+def moved(x_mm: float) -> np.ndarray:
+    pose = np.eye(4)
+    pose[0, 3] = x_mm
+    return pose
 
 
 def random_pose(seed: int) -> Any:

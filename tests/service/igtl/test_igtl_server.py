@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import os
-import socket
 import struct
 import time
 from pathlib import Path
 
-import httpx
 import numpy as np
 import pyigtl
 import pytest
 
 from ultragray.pose import check_poses
 from ultragray_proto.v1 import rendering_pb2, rendering_pb2_grpc
-from ultragray_service.igtl.connection import MAX_SKIPPED_BYTES, MESSAGE_TIMEOUT_S, SEND_TIMEOUT_S
 from ultragray_service.igtl.contents import (
     Tool,
     pack_position,
@@ -26,12 +22,10 @@ from ultragray_service.igtl.contents import (
     unpack_tools,
     unpack_transform,
 )
-from ultragray_service.igtl.messages import HEADER_BYTES, Message, pack_message
-from ultragray_service.igtl.server import MAX_CONNECTIONS
 
 from ..conftest import DEMO_PROBE, HEIGHT, WIDTH, RunningService, StartService
 from ..test_grpc_render import matrix_pose
-from .conftest import FAN, Connect, Peer, address_of, pyigtl_client, random_pose
+from .conftest import FAN, Connect, Peer, address_of, moved, pyigtl_client, random_pose
 
 SLOW = {"backend": "reference", "max_batch_poses": 1}
 
@@ -42,17 +36,6 @@ def over_grpc(service: RunningService, scene: str, pose: np.ndarray) -> np.ndarr
         settings = rendering_pb2.RenderSettings(scene=scene)
         frame = stub.Render(rendering_pb2.RenderRequest(settings=settings, pose=matrix_pose(pose)), timeout=20)
         return np.frombuffer(frame.data, np.uint8).reshape(frame.height, frame.width)
-
-
-def metric(service: RunningService, name: str) -> float:
-    lines = httpx.get(f"{service.http}/metrics").text.splitlines()
-    return sum(float(line.rpartition(" ")[2]) for line in lines if line.startswith(name))
-
-
-def moved(x_mm: float) -> np.ndarray:
-    pose = np.eye(4)
-    pose[0, 3] = x_mm
-    return pose
 
 
 # Frames
@@ -137,8 +120,8 @@ def test_a_newer_pose_replaces_one_that_waits(start_service: StartService, igtl_
     assert np.array_equal(unpack_image(answer.content).pixels, over_grpc(service, "demo", moved(4.9)))
     assert frames + replaced == 50
     assert replaced > 20
-    assert metric(service, "ultragray_stream_dropped_poses_total") == replaced
-    assert metric(service, 'ultragray_requests_total{door="igtl",route="TRANSFORM",status="OK"}') == frames
+    assert service.metric("ultragray_stream_dropped_poses_total") == replaced
+    assert service.metric('ultragray_requests_total{door="igtl",route="TRANSFORM",status="OK"}') == frames
 
 
 def test_clients_do_not_disturb_each_other(connect: Connect, igtl_service: RunningService) -> None:
@@ -241,187 +224,6 @@ def test_the_robot_is_told_its_own_poses_as_often_as_it_asks(peer: Peer) -> None
 def test_streams_that_we_cannot_give_are_refused(peer: Peer) -> None:
     receipt = peer.ask("STT_POLYDATA", "x")
     assert (receipt.type_name, receipt.device_name, receipt.content) == ("RTS_POLYDATA", "x", b"\1")
-
-
-# What is wrong is told, and does no harm
-
-
-def still_serves(peer: Peer) -> None:
-    peer.send_pose(np.eye(4), "demo", timestamp=12345)
-    while True:
-        answer = peer.receive()
-        if answer.type_name == "IMAGE" and answer.timestamp == 12345:
-            return
-
-
-@pytest.mark.parametrize(
-    ("type_name", "content", "code", "reason", "text"),
-    [
-        ("TRANSFORM", bytes(48), 10, "INVALID_POSE", "rotation"),
-        ("TRANSFORM", bytes(47), 12, "IGTL_MESSAGE_INVALI", "48 bytes, got 47"),
-        ("POSITION", bytes(152), 12, "IGTL_MESSAGE_INVALI", "12 or 24 or 28 bytes, got 152"),  # as of pyigtl
-        ("QTDATA", bytes(49), 12, "IGTL_MESSAGE_INVALI", "50 bytes for each"),
-        ("TRANSFORM", bytes(70_000), 12, "IGTL_MESSAGE_INVALI", "at most 65536 bytes"),
-        ("STRING", bytes(5), 12, "IGTL_MESSAGE_INVALI", "got 'STRING'"),
-        ("POLYDATA", bytes(3_000_000), 12, "IGTL_MESSAGE_INVALI", "got 'POLYDATA'"),
-        ("STT_QTDATA", bytes(2), 12, "IGTL_MESSAGE_INVALI", "4 bytes, got 2"),
-    ],
-)
-def test_refusals(peer: Peer, type_name: str, content: bytes, code: int, reason: str, text: str) -> None:
-    answer = peer.ask(type_name, "x", content, timestamp=3)
-    status = unpack_status(answer.content)
-    assert (answer.type_name, answer.device_name, answer.timestamp) == ("STATUS", "x", 3)
-    assert (status.code, status.name) == (code, reason)
-    assert text in status.text
-    still_serves(peer)
-
-
-def test_a_wrong_checksum_is_told_and_the_connection_stays(peer: Peer, igtl_service: RunningService) -> None:
-    before = metric(igtl_service, 'ultragray_stream_frame_errors_total{reason="IGTL_MESSAGE_INVALID"}')
-    data = bytearray(pack_message(Message("TRANSFORM", "demo", bytes(48))))
-    data[-1] ^= 1
-    peer.socket.sendall(data)
-    status = peer.status()
-    assert (status.code, status.sub_code) == (9, 400)
-    assert "CRC-64" in status.text
-    still_serves(peer)
-    assert metric(igtl_service, 'ultragray_stream_frame_errors_total{reason="IGTL_MESSAGE_INVALID"}') == before + 1
-
-
-def test_answers_of_the_client_are_heard_in_silence(peer: Peer) -> None:
-    for type_name in ("STATUS", "CAPABILITY", "RTS_IMAGE"):
-        peer.send(type_name, "x", bytes(40))
-    assert peer.ask("GET_STATUS", "end").device_name == "end"
-
-
-def resident_mb(service: RunningService) -> float:
-    status = Path(f"/proc/{service.process.pid}/status").read_text()
-    return next(int(line.split()[1]) / 1024 for line in status.splitlines() if line.startswith("VmRSS"))
-
-
-@pytest.mark.parametrize("type_name", ["TRANSFORM", "IMAGE"])
-@pytest.mark.parametrize("size", [2**60, 2**63, 2**64 - 1, MAX_SKIPPED_BYTES + 1])
-def test_a_size_beyond_all_bounds_is_refused_without_memory(
-    connect: Connect, igtl_service: RunningService, type_name: str, size: int
-) -> None:
-    peer = connect()
-    before = resident_mb(igtl_service)
-    header = bytearray(pack_message(Message(type_name, "x"))[:HEADER_BYTES])
-    header[42:50] = size.to_bytes(8, "big")
-    peer.socket.sendall(header)
-    assert f"got {size}" in peer.status().text
-    assert peer.is_closed()
-    assert resident_mb(igtl_service) - before < 20
-    still_serves(connect())
-
-
-def test_garbage_closes_its_connection_and_no_other(connect: Connect) -> None:
-    bystander = connect()
-    rng = np.random.default_rng(0)
-    for _ in range(60):
-        attacker = connect()
-        garbage = rng.integers(0, 256, int(rng.integers(58, 3000)), np.uint8).tobytes()
-        try:
-            attacker.socket.sendall(garbage)
-            assert attacker.status().code == 12
-            assert attacker.is_closed()
-        except ConnectionError:
-            pass  # what it sent was not read: the kernel resets
-    for _ in range(60):  # messages with flipped bits: some are refused, some close, some are poses still
-        attacker = connect()
-        data = np.frombuffer(pack_message(Message("TRANSFORM", "x", bytes(48), version=2)), np.uint8).copy()
-        data[rng.integers(0, len(data), 3)] ^= rng.integers(1, 256, 3).astype(np.uint8)
-        attacker.socket.sendall(data.tobytes())
-        attacker.socket.close()
-    still_serves(bystander)
-
-
-def test_clients_that_vanish_in_the_middle_of_a_message(connect: Connect, igtl_service: RunningService) -> None:
-    data = pack_message(Message("TRANSFORM", "demo", bytes(48)))
-    for length in (1, 57, 58, 80):
-        peer = connect()
-        peer.socket.sendall(data[:length])
-        peer.socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # a reset, no FIN
-        peer.socket.close()
-    for _ in range(20):
-        peer = connect()
-        for _ in range(20):
-            peer.send_pose(np.eye(4))
-        peer.socket.close()
-    still_serves(connect())
-    assert not [record for record in igtl_service.log() if record["level"] == "error"]
-
-
-@pytest.mark.long
-def test_a_message_that_does_not_end_is_cut_off(connect: Connect) -> None:
-    idle, slow = connect(), connect()
-    data = pack_message(Message("TRANSFORM", "demo", bytes(48)))
-    started = time.monotonic()
-    for byte in data:
-        try:
-            slow.socket.sendall(bytes([byte]))
-        except ConnectionError:
-            break
-        time.sleep(0.25)
-    assert MESSAGE_TIMEOUT_S - 1 < time.monotonic() - started < MESSAGE_TIMEOUT_S + 5
-    still_serves(idle)  # silence between messages is nothing bad
-
-
-def test_a_reader_that_stops_costs_bounded_memory_and_nobody_a_frame(
-    connect: Connect, igtl_service: RunningService
-) -> None:
-    stopped, healthy = connect(SO_RCVBUF=4096), connect()
-    stopped.ask("STT_IMAGE", "")
-    still_serves(healthy)
-    before = resident_mb(igtl_service)
-    dropped = metric(igtl_service, "ultragray_stream_dropped_poses_total")
-    for count in range(4000):
-        stopped.send_pose(moved(count / 1000))
-        if count % 100 == 0:
-            still_serves(healthy)
-    assert metric(igtl_service, "ultragray_stream_dropped_poses_total") - dropped > 1000
-    assert resident_mb(igtl_service) - before < 20
-
-
-def held(service: RunningService, peers: list[Peer]) -> int:
-    """How many of the service's descriptors are its ends of these connections."""
-    ports = {peer.socket.getsockname()[1] for peer in peers}
-    entries = [line.split() for line in Path("/proc/net/tcp").read_text().splitlines()[1:]]
-    inodes = {f"socket:[{entry[9]}]" for entry in entries if int(entry[2].rpartition(":")[2], 16) in ports}
-    return sum(os.readlink(path) in inodes for path in Path(f"/proc/{service.process.pid}/fd").iterdir())
-
-
-@pytest.mark.long
-def test_a_reader_that_stops_for_long_is_cut_off(connect: Connect, igtl_service: RunningService) -> None:
-    peers = [connect(SO_RCVBUF=4096), connect(SO_RCVBUF=4096)]
-    for count in range(60):  # more images than the kernel's buffers hold
-        for peer in peers:
-            peer.send_pose(moved(count / 1000), "large")
-        time.sleep(0.1)
-    assert held(igtl_service, peers) == 2
-    peers[1].socket.sendall(bytes(HEADER_BYTES))  # dismissed, but it does not take the reason
-    end = time.monotonic() + SEND_TIMEOUT_S + 20
-    while held(igtl_service, peers) and time.monotonic() < end:
-        time.sleep(0.5)
-    assert held(igtl_service, peers) == 0
-
-
-def test_more_connections_than_allowed_are_told_so(connect: Connect) -> None:
-    still_serves(connect())
-    peers = [connect() for _ in range(MAX_CONNECTIONS - 1)]
-    surplus = connect()
-    assert surplus.status().code == 6
-    assert surplus.is_closed()
-    still_serves(peers[-1])
-    for peer in peers:
-        peer.socket.close()
-    end = time.monotonic() + 10
-    while time.monotonic() < end:
-        late = connect()
-        late.send("GET_STATUS")
-        if late.status().code == 1:
-            return
-    raise AssertionError("connections that were closed still count")
 
 
 # Life of the service
