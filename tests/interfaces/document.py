@@ -1,0 +1,55 @@
+"""docs/interfaces.md, read; how it writes a call, and the errors of which several parts tell."""
+
+from __future__ import annotations
+
+import inspect
+import re
+from pathlib import Path
+from typing import Any
+
+from ultragray import errors
+
+DOCUMENT = (Path(__file__).resolve().parents[2] / "docs" / "interfaces.md").read_text(encoding="utf-8")
+
+
+def rows(heading: str) -> list[list[str]]:
+    """The cells of the table below a heading of the document, without the table's own head."""
+    _, *below = re.split(rf"^#+ {re.escape(heading)}$", DOCUMENT, maxsplit=1, flags=re.MULTILINE)
+    section = re.split(r"^#+ ", "".join(below), maxsplit=1, flags=re.MULTILINE)[0]
+    lines = [line.strip("|") for line in section.splitlines() if line.startswith("|")]
+    assert lines, f"the document has no table under {heading!r}"
+    return [[cell.strip() for cell in line.split("|")] for line in lines[2:]]
+
+
+def code(cell: str) -> list[str]:
+    """What a cell writes in backticks."""
+    return re.findall(r"`([^`]+)`", cell)
+
+
+def table(heading: str) -> dict[str, list[str]]:
+    """The rows under a heading, by the name in backticks that each begins with."""
+    named = [(code(first)[0], rest) for first, *rest in rows(heading)]
+    found = dict(named)
+    assert len(found) == len(named), f"a name comes twice under {heading!r}"
+    return found
+
+
+def numbers(cell: str) -> list[float]:
+    return [float(number) for number in re.findall(r"\d+(?:\.\d+)?(?:e-?\d+)?", cell)]
+
+
+def call_of(value: Any) -> str:
+    """`name(parameters, with=defaults)` of a function or class."""
+    parts: list[str] = []
+    for parameter in inspect.signature(value).parameters.values():
+        if parameter.kind is parameter.KEYWORD_ONLY and "*" not in parts:
+            parts.append("*")
+        default = "" if parameter.default is parameter.empty else f"={parameter.default!r}"
+        parts.append(parameter.name + default.replace("<factory>", "…"))
+    return f"{value.__name__}({', '.join(parts)})"
+
+
+def all_errors() -> list[type[errors.UltragrayError]]:
+    return [
+        value for value in vars(errors).values() if isinstance(value, type) and issubclass(value, errors.UltragrayError)
+    ]

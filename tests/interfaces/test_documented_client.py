@@ -1,0 +1,45 @@
+"""The Python client, as docs/interfaces.md lists it."""
+
+from __future__ import annotations
+
+from enum import Enum
+
+import ultragray_client
+from ultragray_client.sync import datasets as client_datasets
+from ultragray_client.sync import jobs as client_jobs
+from ultragray_client.sync import scenes as client_scenes
+
+from .document import call_of, code, rows, table
+
+
+def test_python_client() -> None:
+    named = [(name, getattr(ultragray_client, name)) for name in ultragray_client.__all__]
+    built = (ultragray_client.FrameStream, ultragray_client.AsyncFrameStream)  # by `stream`
+    found = {
+        call_of(value) if isinstance(value, type) and not issubclass(value, (Enum, *built)) else name
+        for name, value in named
+    }
+    assert set(table("Python client")) == found
+
+
+def test_client_methods() -> None:
+    groups = {
+        "": ultragray_client.Client,
+        "scenes.": client_scenes.Scenes,
+        "datasets.": client_datasets.Datasets,
+        "jobs.": client_jobs.Jobs,
+        "stream.": ultragray_client.FrameStream,
+    }
+    found = [
+        prefix + call_of(method).replace("(self, ", "(").replace("(self)", "()")
+        for prefix, cls in groups.items()
+        for name, method in vars(cls).items()
+        if not name.startswith("_")
+    ]
+    assert list(table("Client methods")) == found
+
+
+def test_client_errors() -> None:
+    documented = [tuple(code(cell)[0] for cell in row) for row in rows("Client errors")]
+    found = [(cls.reason, cls.__name__, cls.__mro__[1].__name__) for cls in ultragray_client.errors.ERRORS]
+    assert documented == found

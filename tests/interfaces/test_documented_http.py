@@ -1,0 +1,141 @@
+"""The HTTP interface, as docs/interfaces.md lists it."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import asdict, fields
+from typing import Any
+
+import numpy as np
+import pytest
+from pydantic import BaseModel
+
+from ultragray import (
+    LinearProbe,
+)
+from ultragray.confidence import Extrapolation
+from ultragray.display import AS_RENDERED
+from ultragray_service.http import accept, middleware, problems
+from ultragray_service.http.app import create_app
+from ultragray_service.http.docs import DOCS_PATH
+from ultragray_service.http.routes import render as render_route
+from ultragray_service.http.schemas import DisplayBody, RenderBody
+from ultragray_service.http.stream_schemas import StreamMessage, StreamSettings, frame_bytes
+from ultragray_service.pose_stream import Answered
+from ultragray_service.state import Service
+from ultragray_workers.types import Encoding, RenderResult
+
+from .document import DOCUMENT, all_errors, code, numbers, table
+
+
+@pytest.fixture
+def openapi(service: Service) -> dict[str, Any]:
+    return create_app(service).openapi()
+
+
+def test_routes(service: Service, openapi: dict[str, Any]) -> None:
+    found = {
+        f"{method.upper()} {path}": sorted(map(int, operation["responses"]))
+        for path, operations in openapi["paths"].items()
+        for method, operation in operations.items()
+    }
+    app = create_app(service)
+    found |= {f"GET {path}": [200] for path in (DOCS_PATH, app.openapi_url)}
+    assert {name: [int(n) for n in numbers(statuses)] for name, (statuses, _) in table("Routes").items()} == found
+
+
+def test_query_parameters(openapi: dict[str, Any]) -> None:
+    found = {
+        parameter["name"]: parameter["schema"]["default"]
+        for operations in openapi["paths"].values()
+        for operation in operations.values()
+        for parameter in operation.get("parameters", ())
+        if parameter["in"] == "query"
+    }
+    documented = {name: cell for name, (cell, _) in table("Query parameters").items()}
+    assert documented == {name: f"`{value}`" if value else "empty" for name, value in found.items()}
+
+
+@pytest.mark.parametrize(
+    ("heading", "model"), [("Stream messages", StreamMessage), ("Stream settings", StreamSettings)]
+)
+def test_stream_messages(heading: str, model: type[BaseModel]) -> None:
+    documented = {key: json.loads(code(default)[0]) for key, (default, _) in table(heading).items()}
+    assert documented == {key: field.default for key, field in model.model_fields.items()}
+
+
+def test_display_settings() -> None:
+    documented = {key: json.loads(code(default)[0]) for key, (default, _) in table("Display settings").items()}
+    assert documented == {**asdict(AS_RENDERED), "tgc_db": []}
+    assert documented == DisplayBody().model_dump()
+
+
+def test_confidence() -> None:
+    assert list(table("Confidence")) == [figure.name for figure in fields(Extrapolation)]
+
+
+def test_stream_frames(rendered: RenderResult) -> None:
+    message = frame_bytes(Answered(0, None, rendered), rendered)
+    header = json.loads(message[4 : 4 + int.from_bytes(message[:4], "little")])
+    assert list(header) == list(table("Stream frames"))
+
+
+def test_bodies(openapi: dict[str, Any]) -> None:
+    schemas = openapi["components"]["schemas"]
+    body = schemas.pop("RenderBody")["properties"]
+    documented = {key: json.loads(code(default)[0]) for key, (default, _) in table("Render body").items()}
+    assert documented == {key: value.get("default") for key, value in body.items()}
+    objects = {name: list(schema["properties"]) for name, schema in schemas.items()}
+    assert {name: code(keys) for name, (keys, _) in table("Objects").items()} == objects
+
+
+def test_accept_types() -> None:
+    assert list(table("Accept")) == list(accept.MEDIA_TYPES)
+
+
+def test_request_headers() -> None:
+    # Read one by one where they are needed, so that no list of them exists; the rest of the suite sends each.
+    sent = {"Accept", "Content-Type", "Authorization", "X-API-Key", middleware.REQUEST_ID_HEADER}
+    assert set(table("Request headers")) == sent
+
+
+@pytest.fixture
+def rendered() -> RenderResult:
+    return RenderResult(
+        scene="demo",
+        scene_sha256="0" * 64,
+        renderer="ultragray",
+        poses=np.eye(4)[None],
+        probe=LinearProbe(40, 0, 50),
+        rendered_height=1,
+        rendered_width=1,
+        display=AS_RENDERED,
+        picture=AS_RENDERED.picture(LinearProbe(40, 0, 50), 1, 1),
+        outputs=("bmode",),
+        encoding=Encoding.UINT8,
+        data=b"\0",
+        queue_ms=0.0,
+        render_ms=0.0,
+        encode_ms=0.0,
+        extrapolations=(Extrapolation(None, None, None, None),),
+        batch_size=1,
+    )
+
+
+def test_render_headers(rendered: RenderResult) -> None:
+    sent = {*render_route._headers(rendered), middleware.REQUEST_ID_HEADER}
+    assert set(table("Render headers")) == sent == set(render_route.RENDER_HEADERS)
+
+
+def test_error_headers() -> None:
+    answers = [problems.problem_response(cls("no")) for cls in all_errors()]
+    own = {name for answer in answers for name in answer.headers} - {"content-type", "content-length"}
+    assert {name.lower() for name in table("Error headers")} == own | {"allow"}  # Allow is the framework's
+
+
+def test_example_bodies() -> None:
+    examples = re.findall(r"-d '(\{.*?\})'", DOCUMENT, flags=re.DOTALL)
+    assert examples
+    for example in examples:
+        RenderBody.model_validate_json(example)

@@ -1,0 +1,133 @@
+"""The Python library, as docs/interfaces.md lists it."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import json
+from pathlib import Path
+
+import numpy as np
+
+import ultragray
+from ultragray import (
+    ConvexProbe,
+    GaussianScene,
+    LinearProbe,
+    PhasedProbe,
+    baselines,
+    checkpoint,
+    checkpoint_export,
+    compounding,
+    confidence,
+    demo,
+    display,
+    display_frames,
+    errors,
+    evaluation,
+    exports,
+    files,
+    metrics,
+    ply,
+    pose,
+    pose_file,
+    probe,
+    rendering,
+    samplers,
+    side_by_side,
+)
+from ultragray.datasets import Dataset, Sweep, checks, phantom, pictures, plus, released, source
+
+from .document import call_of, code, table
+
+LIBRARY_MODULES = (
+    checkpoint,
+    checkpoint_export,
+    demo,
+    display,
+    display_frames,
+    files,
+    ply,
+    pose,
+    pose_file,
+    probe,
+    rendering,
+)
+MEASURING_MODULES = (baselines, compounding, evaluation, metrics, side_by_side)
+MEMBERS_OF = (GaussianScene, LinearProbe, ConvexProbe, PhasedProbe, errors.UltragrayError)
+
+
+def test_library() -> None:
+    calls = {name: getattr(ultragray, name) for name in ultragray.__all__}
+    assert set(table("Python library")) == {
+        call_of(value) if hasattr(value, "__name__") and callable(value) else name for name, value in calls.items()
+    }
+
+
+def test_members() -> None:
+    public = {
+        f"{cls.__name__}.{name}"
+        for cls in MEMBERS_OF
+        for name in set(dir(cls)) - set(dir(Exception)) - set(inspect.signature(cls).parameters)
+        if not name.startswith("_")
+    }
+    assert set(table("Members")) == public
+
+
+def test_other_modules() -> None:
+    found = {
+        f"{module.__name__}.{call_of(value)}"
+        for module in (*LIBRARY_MODULES, *MEASURING_MODULES, checks, pictures, plus, released, source)
+        for name, value in vars(module).items()
+        if inspect.isfunction(value) and value.__module__ == module.__name__
+        if not name.startswith("_") and name not in ultragray.__all__
+    }
+    found |= {
+        f"{phantom.__name__}.{call_of(value)}"
+        for value in (getattr(phantom, name) for name in phantom.__all__)
+        if inspect.isfunction(value)
+    }
+    found |= {
+        f"{package.__name__}.{call_of(value)}"
+        for package in (samplers, exports)
+        for value in (getattr(package, name) for name in package.__all__)
+        if inspect.isfunction(value)
+    }
+    found |= {
+        f"{confidence.__name__}.{call_of(value)}"
+        for value in (getattr(confidence, name) for name in confidence.__all__)
+        if callable(value)
+    }
+    assert set(table("Other modules")) == found
+
+
+def test_samplers() -> None:
+    documented = {}
+    for kind, (keys, _) in table("Samplers").items():
+        parts = [code(part) for part in keys.split(",")] if keys else []
+        documented[kind] = {name: json.loads(default[0]) if default else "required" for name, *default in parts}
+    assert documented == {
+        kind: {
+            item.name: "required" if item.default is dataclasses.MISSING else item.default
+            for item in dataclasses.fields(cls)
+        }
+        for kind, cls in samplers.SAMPLERS.items()
+    }
+
+
+def test_export_formats() -> None:
+    documented = {
+        name: (code(suffix)[0], tuple(code(pixels)), (code(extra) or [None])[0])
+        for name, (suffix, pixels, extra, _) in table("Export formats").items()
+    }
+    assert documented == {name: (one.suffix, one.dtypes, one.extra) for name, one in exports.FORMATS.items()}
+
+
+def test_dataset_configuration(tmp_path: Path) -> None:
+    images = np.arange(2 * 3 * 4, dtype=np.uint8).reshape(2, 3, 4)
+    found: set[str] = set()
+    for number, one in enumerate((LinearProbe(40, 0, 50), PhasedProbe(60, 50))):
+        sweep = Sweep(images, np.tile(np.eye(4), (2, 1, 1)), one, np.arange(2), "here")
+        released.write_released(Dataset("name", sweep, sweep), tmp_path / str(number))
+        found |= set(json.loads((tmp_path / str(number) / "conf.json").read_text()))
+    assert set(table("Dataset configuration")) == {key for key in found if not key.startswith("_")}

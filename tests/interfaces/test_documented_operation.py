@@ -1,0 +1,160 @@
+"""Errors, settings, commands, metrics, logs and limits, as docs/interfaces.md lists them."""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import sys
+import typing
+from typing import Any
+
+import pytest
+import typer
+from pydantic.fields import FieldInfo
+
+from ultragray import (
+    ConvexProbe,
+    errors,
+    pose,
+    probe,
+    request,
+    scene_info,
+)
+from ultragray.training import TrainingConfig
+from ultragray_service import catalog, dataset_uploads, pose_stream, server
+from ultragray_service.cli import USER_ERROR
+from ultragray_service.cli import app as command_line
+from ultragray_service.cli_jobs_watch import JOB_CANCELLED, JOB_FAILED
+from ultragray_service.cli_train import INTERRUPTED
+from ultragray_service.logs import JsonFormatter, request_id
+from ultragray_service.rpc import server as grpc_server
+from ultragray_service.settings import ENVIRONMENT_PREFIX, Settings, load_settings
+from ultragray_service.state import Service
+from ultragray_workers import dataset_store, dataset_unpack, scenes
+from ultragray_workers import encoding as pixels
+from ultragray_workers.jobs.job import JobState
+
+from .document import all_errors, code, numbers, rows, table
+
+
+def test_errors() -> None:
+    documented = [
+        (code(reason)[0], code(cls)[0], cls.startswith("↳"), int(http), grpc)
+        for reason, cls, http, grpc, _ in rows("Errors")
+    ]
+    assert documented == [
+        (
+            cls.reason,
+            cls.__name__,
+            issubclass(cls, errors.InvalidArgument) and cls is not errors.InvalidArgument,
+            cls.http_status,
+            cls.grpc_status,
+        )
+        for cls in all_errors()
+    ]
+
+
+def limits_of(field: FieldInfo) -> list[Any]:
+    """The words that may be chosen, or the least and the greatest number."""
+    bounds = [getattr(bound, name) for bound in field.metadata for name in ("ge", "gt", "le") if hasattr(bound, name)]
+    return bounds or list(typing.get_args(field.annotation) if isinstance(field.default, str) else ())
+
+
+def test_settings() -> None:
+    documented = {
+        name: (code(default), code(limits) or numbers(limits))
+        for name, (default, limits, _) in table("Settings").items()
+    }
+    assert documented == {
+        ENVIRONMENT_PREFIX + name.upper(): ([str(field.default)] if field.default != () else [], limits_of(field))
+        for name, field in Settings.model_fields.items()
+    }
+
+
+def test_command_line() -> None:
+    commands = typer.main.get_command(command_line).commands  # type: ignore[attr-defined]
+    assert list(table("Command line")) == list(commands)
+    while groups := [name for name in commands if hasattr(commands[name], "commands")]:
+        name = groups[0]
+        group = commands.pop(name)
+        commands |= {f"{name} {command}": value for command, value in group.commands.items()}
+    for name, command in commands.items():
+        documented = [code(first) for first, _ in rows(f"ultragray {name}")]
+        assert documented == [
+            [parameter.name.upper()] if parameter.param_type_name == "argument" else list(parameter.opts)
+            for parameter in command.params
+        ], name
+
+
+def test_training_settings() -> None:
+    presets = [TrainingConfig.preset(name).to_dict() for name in ("fast", "paper")]
+    documented = {
+        name: [json.loads(code(cell)[0]) for cell in cells[:2]] for name, cells in table("Training settings").items()
+    }
+    assert documented == {name: [preset[name] for preset in presets] for name in presets[0]}
+
+
+def test_exit_codes() -> None:
+    assert set(table("Exit codes")) == {"0", "1", *map(str, (USER_ERROR, JOB_FAILED, JOB_CANCELLED, INTERRUPTED))}
+
+
+def test_metrics(service: Service) -> None:
+    service.metrics.count_request("http", "/", "200", 0.1)
+    service.metrics.count_frame_error("QUEUE_FULL")
+    service.jobs.counts = {JobState.QUEUED: 1}
+    found = {}
+    for metric in service.metrics.registry.collect():
+        if not metric.name.startswith("process_"):
+            suffix = "_total" if metric.type == "counter" else ""
+            labels = {label for sample in metric.samples for label in sample.labels} - {"le"}
+            found[metric.name + suffix] = (metric.type, labels)
+    assert {name: (kind, set(code(labels))) for name, (kind, labels, _) in table("Metrics").items()} == found
+
+
+def test_logs() -> None:
+    token = request_id.set("one")
+    try:
+        raise ValueError("no")
+    except ValueError:
+        record = logging.LogRecord("ultragray", logging.INFO, "", 0, "text", (), sys.exc_info())
+        assert list(table("Logs")) == list(json.loads(JsonFormatter().format(record)))
+    finally:
+        request_id.reset(token)
+
+
+def test_fixed_limits() -> None:
+    documented = {cells[0]: code(cells[1])[0] for cells in rows("Fixed limits")}
+    assert documented.pop("Scene names") == scenes._NAME.pattern
+    assert documented.pop("Dataset names") == dataset_store._NAME.pattern
+    assert {name: float(value) for name, value in documented.items()} == {
+        "Rotation tolerance": pose.ROTATION_TOLERANCE,
+        "Largest coordinate of a pose": pose.MAX_POSITION_MM,
+        "Largest length of a probe": probe.MAX_LENGTH_MM,
+        "Largest opening angle": 175,
+        "Largest height and width of the library": request.MAX_IMAGE_SIDE,
+        "Height and width where the scene knows none": scene_info.DEFAULT_IMAGE_SIDE,
+        "Largest spherical-harmonic degree": scene_info.MAX_SH_DEGREE,
+        "Scenes on one page, default": catalog.DEFAULT_PAGE_SIZE,
+        "Scenes on one page": catalog.MAX_PAGE_SIZE,
+        "Datasets on one page, default": catalog.DEFAULT_PAGE_SIZE,
+        "Datasets on one page": catalog.MAX_PAGE_SIZE,
+        "Uploads at the same time": dataset_uploads.MAX_UPLOADS,
+        "Files of a dataset": dataset_unpack.MAX_FILES,
+        "Check of a dataset": dataset_uploads.CHECK_TIMEOUT_S,
+        "Frames in flight in one ordered stream": pose_stream.MAX_FRAMES_IN_FLIGHT,
+        "Bytes of these frames, if there are several": pose_stream.MAX_BYTES_IN_FLIGHT,
+        "Message to a WebSocket": server.MAX_STREAM_MESSAGE_BYTES,
+        "gRPC message received": grpc_server.MAX_RECEIVE_BYTES,
+        "Keepalive pings of a gRPC client, no more often than every": grpc_server.LEAST_PING_INTERVAL_MS,
+        "JPEG quality": pixels.JPEG_QUALITY,
+        "Retry after": errors.QueueFull.retry_after_s,
+        "Shortest API key": 16,
+    }
+    assert errors.NotReady.retry_after_s == errors.Draining.retry_after_s == errors.QueueFull.retry_after_s
+    ConvexProbe(175, 1, 2)
+    with pytest.raises(errors.InvalidProbe):
+        ConvexProbe(math.nextafter(175, 180), 1, 2)
+    load_settings(api_keys="k" * 16)
+    with pytest.raises(errors.InvalidArgument):
+        load_settings(api_keys="k" * 15)
