@@ -64,6 +64,10 @@ class SceneImports:
         """Removes the file of a scene. Raises SceneNotFound, and SceneReadOnly for one of the data folder."""
         await asyncio.to_thread(self._delete, name)
 
+    async def removable(self) -> set[str]:
+        """The names of the scenes that `delete` removes."""
+        return await asyncio.to_thread(self._store.names_of, self._folder)
+
     async def remove_stale(self) -> None:
         """Removes what services that died during an import left."""
 

@@ -94,6 +94,10 @@ def test_the_life_of_an_imported_scene(http: httpx.Client, artifacts: Path) -> N
     assert (again.status_code, again.json()["reason"]) == (409, "SCENE_EXISTS")
     assert http.post("/v1/scenes/sent/render", json={"pose": POSE}).status_code == 200
     assert http.get("/v1/scenes/sent").json()["loaded"]
+    assert {entry["name"]: entry["removable"] for entry in http.get("/v1/scenes").json()["scenes"]} == {
+        "demo": False,
+        "sent": True,
+    }
 
     assert http.delete("/v1/scenes/sent").status_code == 204
     assert http.get("/v1/scenes/sent").json()["reason"] == "SCENE_NOT_FOUND"

@@ -55,6 +55,11 @@ class SceneStore:
         """The names of all scenes, sorted; files whose name could not stand in a URL are left out."""
         return sorted({name for folder in self.folders for name in _names_in(folder)})
 
+    def names_of(self, folder: Path) -> set[str]:
+        """The names of the scenes that are those of one of the folders: none before it has the name."""
+        before = self.folders[: self.folders.index(folder)]
+        return set(_names_in(folder)).difference(*map(_names_in, before))
+
     def path(self, name: str) -> Path:
         """The file of a scene. Raises SceneNotFound, also for a name that no scene can have."""
         if _NAME.fullmatch(name) and (path := self.file(name)).is_file():

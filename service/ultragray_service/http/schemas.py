@@ -172,6 +172,7 @@ class SceneEntry(BaseModel):
 
     name: str
     loaded: bool
+    removable: bool = Field(description="Whether it may be deleted: scenes of the data folder may not.")
     gaussian_count: int | None = None
     image_height: int | None = None
     image_width: int | None = None

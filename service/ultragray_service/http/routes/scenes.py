@@ -37,9 +37,11 @@ async def list_scenes(
 ) -> ScenePage:
     """The scenes by name. New files appear without a restart; one that cannot be read has an `error`."""
     entries, next_page_token = await service.catalog.page(page_size, page_token)
-    loaded = service.pool.loaded()
+    loaded, removable = service.pool.loaded(), await service.imports.removable()
     return ScenePage(
-        scenes=[_entry(entry, loaded=loaded.get(entry.name, 0) > 0) for entry in entries],
+        scenes=[
+            _entry(entry, loaded=loaded.get(entry.name, 0) > 0, removable=entry.name in removable) for entry in entries
+        ],
         next_page_token=next_page_token,
     )
 
@@ -65,15 +67,16 @@ async def unload_scene(service: ServiceDep, scene: SceneName) -> SceneLoaded:
     return SceneLoaded(scene=scene, loaded=processes > 0, loaded_processes=processes)
 
 
-def _entry(entry: CatalogEntry, *, loaded: bool) -> SceneEntry:
+def _entry(entry: CatalogEntry, *, loaded: bool, removable: bool) -> SceneEntry:
     if entry.error is not None:
         error = SceneError(reason=entry.error.reason, detail=entry.error.detail)
-        return SceneEntry(name=entry.name, loaded=loaded, error=error)
+        return SceneEntry(name=entry.name, loaded=loaded, removable=removable, error=error)
     assert entry.header is not None
     info = entry.header.info
     return SceneEntry(
         name=entry.name,
         loaded=loaded,
+        removable=removable,
         gaussian_count=info.gaussian_count,
         image_height=info.image_height,
         image_width=info.image_width,
