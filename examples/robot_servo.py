@@ -177,6 +177,8 @@ class Servo:
         watching = asyncio.create_task(self._watch(stream))
         next_step = time.monotonic()
         for _ in range(round(seconds / self._step_s)):
+            if watching.done():  # nobody sees any more: it must not drive on
+                break
             self._robot.move(self._wanted_mm_per_s, self._step_s)
             await stream.send(self._robot.pose(), timeout_s=POSE_TIMEOUT_S)
             self.record.sent += 1

@@ -11,7 +11,8 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from ultragray_client import Client, LinearProbe
+from ultragray_client import Client, Frame, LinearProbe
+from ultragray_client.errors import Unavailable
 
 from ..service.conftest import RunningService
 from .conftest import EXAMPLES
@@ -44,6 +45,24 @@ def test_the_vessel_is_found_where_it_is_and_nowhere_else(servo: ModuleType, dem
                 assert (found is not None) == visible, (x_mm, y_mm)
                 if visible:
                     np.testing.assert_allclose(found, vessel_mm(client, pose), atol=0.8)
+
+
+class BlindStream:
+    """Takes poses, and fails where a frame is asked for."""
+
+    async def send(self, pose: np.ndarray, *, timeout_s: float) -> None: ...
+
+    async def done_sending(self) -> None: ...
+
+    async def receive(self) -> Frame:
+        raise Unavailable("gone")
+
+
+def test_a_robot_that_sees_nothing_any_more_stops(servo: ModuleType) -> None:
+    blind = servo.Servo(LinearProbe(60.0, 0.0, 60.0), rate_hz=100.0)
+    with pytest.raises(Unavailable, match="gone"):
+        asyncio.run(blind.run(BlindStream(), seconds=10.0))
+    assert blind.record.sent < 10
 
 
 @pytest.mark.slow

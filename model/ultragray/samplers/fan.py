@@ -10,7 +10,9 @@ import numpy as np
 
 from ..probe import FloatArray, LinearProbe, Probe
 from .rotations import about_axes
-from .sampler import MAX_ROTATION_DEG, Sampler, is_number
+from .sampler import Sampler, is_number
+
+MAX_TILT_DEG = 90.0  # the beam lies along the skin then
 
 
 @dataclass(frozen=True)
@@ -28,11 +30,11 @@ class FanSampler(Sampler):
     kind: ClassVar[str] = "fan"
 
     def __post_init__(self) -> None:
-        self._require(is_number(self.tilt_deg, 0.0, MAX_ROTATION_DEG), "tilt_deg", f"from 0 to {MAX_ROTATION_DEG:g}")
+        self._require(is_number(self.tilt_deg, 0.0, MAX_TILT_DEG), "tilt_deg", f"from 0 to {MAX_TILT_DEG:g}")
         self._require(
-            is_number(self.step_deg, 0.0, MAX_ROTATION_DEG) and self.step_deg > 0.0,
+            is_number(self.step_deg, 0.0, MAX_TILT_DEG) and self.step_deg > 0.0,
             "step_deg",
-            f"above 0, at most {MAX_ROTATION_DEG:g}",
+            f"above 0, at most {MAX_TILT_DEG:g}",
         )
 
     def _made(self, base: FloatArray, probe: Probe) -> FloatArray:

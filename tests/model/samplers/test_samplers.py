@@ -185,7 +185,7 @@ def test_covered_turns_no_further_than_its_neighbours() -> None:
         ({"kind": "spline", "spacing_mm": 0}, "spacing_mm", "above 0"),
         ({"kind": "fan", "tilt_deg": 10}, "step_deg", "required"),
         ({"kind": "fan", "tilt_deg": 10, "step_deg": 0}, "step_deg", "above 0"),
-        ({"kind": "fan", "tilt_deg": 181, "step_deg": 1}, "tilt_deg", "180"),
+        ({"kind": "fan", "tilt_deg": 91, "step_deg": 1}, "tilt_deg", "90"),
         ({"kind": "covered", "count": 0}, "count", "integer"),
         ({"kind": "covered", "count": 1, "seed": -1}, "seed", "integer"),
     ],
