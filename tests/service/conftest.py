@@ -218,3 +218,25 @@ def pose_message() -> geometry_pb2.Pose:
 @pytest.fixture
 def settings_message() -> rendering_pb2.RenderSettings:
     return rendering_pb2.RenderSettings(scene="demo")
+
+
+@pytest.fixture
+def scene_file(tmp_path: Path, random_scene: Callable[..., GaussianScene], random_poses: Callable[..., Any]) -> Path:
+    """Sixty Gaussians and five training poses."""
+    info = {
+        "centre_mm": (1.0, 2.0, 3.0),
+        "probe": LinearProbe(width_mm=30.0, near_mm=0.0, far_mm=40.0),
+        "image_height": 24,
+        "image_width": 20,
+    }
+    made = random_scene(60, info=info)
+    path = tmp_path / "scene.ugr"
+    GaussianScene.from_splats(made.splats, info=made.info, training_poses=random_poses(5)).save(path)
+    return path
+
+
+@pytest.fixture
+def pose_file(tmp_path: Path, random_poses: Callable[..., Any]) -> Path:
+    path = tmp_path / "poses.npy"
+    np.save(path, random_poses(7, seed=3))
+    return path

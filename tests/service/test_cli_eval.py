@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner, Result
 
 from ultragray import ConvexProbe, GaussianScene, LinearProbe, Probe
 from ultragray.baselines import evaluate_baselines
@@ -21,7 +20,8 @@ from ultragray.errors import MemoryExceeded, TrainingDiverged
 from ultragray.evaluation import evaluate
 from ultragray.report import study
 from ultragray.training import TrainingConfig, train
-from ultragray_service.cli import app
+
+from .command_line import refused, run
 
 
 @pytest.fixture(scope="module")
@@ -43,19 +43,6 @@ def scene(dataset: Path) -> Path:
     config = TrainingConfig.preset("fast", steps=5, max_gaussians=60)
     train(read_released(dataset), config).save(dataset.parent / "ball.ugr")
     return dataset.parent / "ball.ugr"
-
-
-def run(*arguments: object) -> Result:
-    return CliRunner().invoke(app, [str(argument) for argument in arguments])
-
-
-def refused(*arguments: object) -> str:
-    """The one line that a mistake gives."""
-    result = run(*arguments)
-    assert result.exit_code == 2, result.output
-    assert result.stderr.startswith("error: ")
-    assert result.stderr.count("\n") == 1
-    return result.stderr
 
 
 def printed_json(*arguments: object) -> Any:
