@@ -23,8 +23,8 @@ from .views import ViewMeasures
 VERSION = 1
 NEAR_MM, DISTANCE_MM, ANGLE_DEG = 0.3, 5.0, 10.0  # units of the terms
 TERMS = 4  # beside the constant
-PRIOR_WEIGHTS = (3.45, 1.27, 0.8, 0.1, 0.6)  # of eight in-silico scenes; what the views cannot tell stays near it
-PRIOR_STRENGTH = 0.6  # squared error that a weight costs which is 1 away from its prior
+PRIOR_WEIGHTS = (3.4, 1.1, 1.4, 0.05, 0.6)  # of fourteen in-silico scenes; what the views cannot tell stays near it
+PRIOR_STRENGTH = 1.0  # squared error that a weight costs which is 1 away from its prior
 FIT_STEPS = 100
 HARDNESS_DIGITS = 3
 
