@@ -25,6 +25,8 @@ from .scene_info import (
     LABELS_TENSOR,
     METADATA_KEY,
     SceneInfo,
+    check_header_size,
+    check_training_pose_count,
     expected_shapes,
     info_to_json,
     read_header,
@@ -123,6 +125,7 @@ class GaussianScene:
         if count and bool((tensors["quats"].detach().norm(dim=-1) == 0).any()):
             raise InvalidArgument("splats['quats'] must not be zero", field="quats")
         poses = np.zeros((0, 4, 4)) if training_poses is None else check_poses(training_poses, field="training_poses")
+        check_training_pose_count(len(poses))
         summary = with_summary(info or SceneInfo(), means.detach().cpu().double().numpy(), degree)
         names = _names_of_labels(labels, means, summary.label_names)
         return cls(**tensors, info=replace(summary, label_names=names), training_poses=poses, labels=labels)
@@ -174,12 +177,17 @@ class GaussianScene:
         return inside
 
     def to_bytes(self) -> bytes:
-        """The scene file: deterministic, so that its SHA-256 names the scene."""
+        """The scene file: deterministic, so that its SHA-256 names the scene.
+
+        Raises InvalidArgument where `info` is larger than the header of a scene file may be.
+        """
         tensors = {name: t.detach().to("cpu", torch.float32).contiguous() for name, t in self.splats.items()}
         if self.labels is not None:
             tensors[LABELS_TENSOR] = self.labels.cpu().contiguous()
         tensors["training_poses"] = torch.from_numpy(np.ascontiguousarray(self.training_poses))
-        return save(tensors, metadata={METADATA_KEY: info_to_json(self.info)})
+        data: bytes = save(tensors, metadata={METADATA_KEY: info_to_json(self.info)})
+        check_header_size(data)
+        return data
 
     def save(self, path: str | Path) -> None:
         """Writes the scene file whole or not at all. Raises OSError where it cannot be written."""

@@ -3,6 +3,7 @@
 The file is one safetensors bundle. Tensors: means [N, 3] cm, scales [N, 3] log cm, quats [N, 4] wxyz, transmittances
 [N] logit, sh0 [N, 1, 1], shN [N, K−1, 1], all float32, training_poses [P, 4, 4] float64 mm, and, where the Gaussians
 carry labels, labels [N] uint8. Its metadata holds one entry, `ultragray`, a JSON object with the fields of SceneInfo.
+All but the Gaussians is bounded, so that the description of any file is read in little memory and time.
 """
 
 from __future__ import annotations
@@ -27,7 +28,11 @@ INTENSITIES = ("released", "sigmoid")
 MAX_SH_DEGREE = 3
 DEFAULT_IMAGE_SIDE = 512
 MAX_LABEL = 255
+MAX_HEADER_BYTES = 4 * 2**20  # of the bundle: names and shapes of tensors, and the metadata
+MAX_TRAINING_POSES = 100_000
+MAX_METRICS = 1000
 LABELS_TENSOR = "labels"
+_LENGTH_BYTES = 8  # a safetensors bundle starts with the length of its header, little endian
 
 Vector = tuple[float, float, float]
 
@@ -67,6 +72,10 @@ class SceneInfo:
         for name in ("metrics", "training", "confidence"):
             if not isinstance(getattr(self, name), dict):
                 raise InvalidArgument(f"{name} must be an object, got {getattr(self, name)!r}", field=name)
+        if len(self.metrics) > MAX_METRICS:
+            raise InvalidArgument(
+                f"metrics must have at most {MAX_METRICS} entries, got {len(self.metrics)}", field="metrics"
+            )
         object.__setattr__(self, "label_names", _label_names(self.label_names))
 
     def probe_or(self, asked: Probe | None) -> Probe:
@@ -166,6 +175,8 @@ def read_header(path: str | Path) -> SceneHeader:
     path = Path(path)
     try:
         size = path.stat().st_size
+        with path.open("rb") as file:
+            check_header_size(file.read(_LENGTH_BYTES))
         with safe_open(path, framework="numpy") as bundle:
             metadata = bundle.metadata() or {}
             if METADATA_KEY not in metadata:
@@ -177,6 +188,21 @@ def read_header(path: str | Path) -> SceneHeader:
     except (OSError, SafetensorError, ValueError, TypeError, RecursionError) as error:
         raise scene_file_invalid(path, error) from error
     return SceneHeader(info=info, training_poses=poses, file_bytes=size)
+
+
+def check_header_size(start: bytes) -> None:
+    """Raises InvalidArgument where a bundle that starts so has a larger header than that of a scene may be."""
+    size = int.from_bytes(start[:_LENGTH_BYTES], "little")
+    if size > MAX_HEADER_BYTES:
+        raise InvalidArgument(f"the header of a scene file may have {MAX_HEADER_BYTES} bytes, it says {size}")
+
+
+def check_training_pose_count(count: int) -> None:
+    """Raises InvalidArgument for more than a scene may have."""
+    if count > MAX_TRAINING_POSES:
+        raise InvalidArgument(
+            f"training_poses must be at most {MAX_TRAINING_POSES}, got {count}", field="training_poses"
+        )
 
 
 def _check_tensors(bundle: Any, info: SceneInfo) -> None:
@@ -194,8 +220,12 @@ def _check_tensors(bundle: Any, info: SceneInfo) -> None:
             raise ValueError(
                 f"its tensor {name} is {part.get_dtype()} {list(part.get_shape())}, expected {dtype} {list(shape)}"
             )
-    if bundle.get_slice("training_poses").get_dtype() != "F64":
-        raise ValueError("its tensor training_poses is not F64")
+    poses = bundle.get_slice("training_poses")
+    if poses.get_dtype() != "F64" or len(poses.get_shape()) != 3:
+        raise ValueError(
+            f"its tensor training_poses is {poses.get_dtype()} {list(poses.get_shape())}, expected F64 [P, 4, 4]"
+        )
+    check_training_pose_count(poses.get_shape()[0])
 
 
 def scene_file_invalid(path: str | Path, error: Exception) -> SceneFileInvalid:

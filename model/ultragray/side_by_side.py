@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -14,8 +13,8 @@ from .datasets.sweep import Sweep
 from .evaluation import render_sweep
 from .files import atomic_path
 from .metrics import FrameMetrics
-from .probe import LinearProbe
 from .scene import GaussianScene
+from .square_pixels import with_square_pixels
 
 ByteImage = npt.NDArray[np.uint8]
 MAX_SIDE_PIXELS = 512  # of one panel
@@ -65,16 +64,8 @@ def side_by_side_panels(
 
 
 def as_picture(frame: npt.NDArray[np.float32], sweep: Sweep, max_side: int = MAX_SIDE_PIXELS) -> ByteImage:
-    """A frame [H, W] in [0, 1] as the eye expects it: square pixels, a fan as one, `max_side` at most."""
-    if isinstance(sweep.probe, LinearProbe):
-        axial_mm, lateral_mm = sweep.pixel_mm
-        height_mm, width_mm = axial_mm * sweep.height, lateral_mm * sweep.width
-        scale = max_side / max(height_mm, width_mm)
-        size = (max(1, round(width_mm * scale)), max(1, round(height_mm * scale)))
-        drawn = cv2.resize(frame, size, interpolation=cv2.INTER_LINEAR).astype(np.float32)
-    else:
-        across_mm = 2.0 * sweep.probe.far_mm * math.sin(math.radians(sweep.probe.opening_angle_deg) / 2)
-        drawn = sweep.probe.scan_convert(frame, max(across_mm, sweep.probe.scan_line_length_mm) / max_side)
+    """A frame [H, W] in [0, 1] as the eye expects it: square pixels, a fan as one, the longer side `max_side`."""
+    drawn = with_square_pixels(frame, sweep.probe, max_side)
     picture: ByteImage = np.rint(np.clip(drawn, 0.0, 1.0) * 255.0).astype(np.uint8)
     return picture
 

@@ -5,17 +5,20 @@ from __future__ import annotations
 import asyncio
 import base64
 import binascii
+import math
 from bisect import bisect_right
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-
-import numpy as np
+from typing import Any
 
 from ultragray.errors import InvalidArgument, SceneFileInvalid, SceneNotFound, SceneTooLarge, UltragrayError
 from ultragray.probe import FloatArray
 from ultragray.scene_info import SceneHeader
-from ultragray_workers.scenes import SceneStore
+from ultragray_workers.scenes import FileVersion, SceneStore
+
+from .own_thread import in_own_thread
+from .scene_points import point_message
 
 DEFAULT_PAGE_SIZE = 100
 MAX_PAGE_SIZE = 1000
@@ -43,16 +46,30 @@ class TrainingSummary:
 
 
 class SceneCatalog:
-    """Headers and pages of scene names."""
+    """Headers, pages of scene names, and Gaussians as points."""
 
     def __init__(self, store: SceneStore) -> None:
         self._store = store
+        self._reading_points = asyncio.Lock()
 
     async def header(self, name: str) -> SceneHeader:
         """The header of a scene. Raises SceneNotFound, SceneFileInvalid; both name the field `scene`."""
         with scene_to_blame():
             cached = self._store.cached_header(name)
             return cached if cached is not None else await asyncio.to_thread(self._store.header, name)
+
+    async def version(self, name: str) -> FileVersion:
+        """Which content the file of a scene has now. Raises SceneNotFound, SceneFileInvalid."""
+        with scene_to_blame():
+            return await asyncio.to_thread(self._store.version, name)
+
+    async def points(self, name: str, limit: int) -> bytes:
+        """At most `limit` Gaussians of a scene, as `point_message`. Raises SceneNotFound, SceneFileInvalid."""
+        header = await self.header(name)
+        with scene_to_blame():
+            path = self._store.path(name)
+            async with self._reading_points:  # all the Gaussians of one scene in memory are enough
+                return await in_own_thread(lambda: point_message(path, header.info, limit))
 
     async def names(self) -> list[str]:
         """The names of all scenes, sorted."""
@@ -117,11 +134,14 @@ def summarise_training(header: SceneHeader) -> TrainingSummary | None:
 
 def finite_metrics(header: SceneHeader) -> dict[str, float]:
     """The scene's metrics that are numbers (a file may claim anything)."""
-    return {
-        name: float(value)
-        for name, value in header.info.metrics.items()
-        if isinstance(value, (int, float)) and np.isfinite(value)
-    }
+    return {name: float(value) for name, value in header.info.metrics.items() if _is_number(value)}
+
+
+def _is_number(value: Any) -> bool:
+    try:
+        return isinstance(value, (int, float)) and math.isfinite(value)
+    except OverflowError:  # an integer beyond all floats
+        return False
 
 
 def _token_of_name(name: str) -> str:

@@ -8,16 +8,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ultragray.errors import ArtifactNotFound, DatasetNotFound, UltragrayError
+from ultragray.errors import ArtifactNotFound, DatasetNotFound
 from ultragray.files import file_sha256
 from ultragray_workers.comparison import FRAMES_NAME
 from ultragray_workers.dataset_store import DatasetStore
 from ultragray_workers.encoding import encode_image
-from ultragray_workers.picture_stack import SUFFIX, read_picture
+from ultragray_workers.picture_stack import read_picture
 from ultragray_workers.scenes import FileVersion, SceneStore
 from ultragray_workers.types import Encoding
 
 from .catalog import SceneCatalog
+from .dataset_views import datasets_by_content
+from .own_thread import in_own_thread
 from .prepared import Preparation, PreparedFolders
 from .settings import Settings
 
@@ -53,22 +55,26 @@ class Comparisons:
         preparation = await self.folders.prepare(key, request)
         frames: list[dict[str, Any]] = []
         if preparation.state == "ready":
-            frames = json.loads(await asyncio.to_thread((self.folders.folder / key / FRAMES_NAME).read_bytes))
+            try:
+                frames = json.loads(await asyncio.to_thread((self.folders.folder / key / FRAMES_NAME).read_bytes))
+            except FileNotFoundError:  # it went this very moment
+                preparation = Preparation("running", 0.0)
         return Comparison(dataset, preparation, frames)
 
-    async def picture_png(self, scene: str, index: int, what: str) -> bytes:
+    async def key(self, scene: str) -> str:
+        """Names the content of a comparison, ready or not. Raises as `get`."""
+        return (await self._wanted(scene))[0]
+
+    async def picture_png(self, key: str, index: int, what: str) -> bytes:
         """A picture of a held-out frame, PNG; `what` is one of `ultragray_workers.comparison.PICTURES`.
 
-        Raises as `get`, and ArtifactNotFound where there is none (yet).
+        Raises ArtifactNotFound where there is none (yet).
         """
-        key, _, _ = await self._wanted(scene)
 
         def read() -> bytes:
-            picture = read_picture(self.folders.folder / key / f"{what}{SUFFIX}", index)
+            picture = read_picture(self.folders.folder / key, what, index)
             if picture is None:
-                raise ArtifactNotFound(
-                    f"the comparison of the scene {scene!r} is not ready, or has no frame {index}", field="index"
-                )
+                raise ArtifactNotFound(f"the comparison is not ready, or has no frame {index}", field="index")
             return encode_image(picture, Encoding.PNG).tobytes()
 
         return await asyncio.to_thread(read)
@@ -77,8 +83,8 @@ class Comparisons:
         """Key, dataset, and what the helper process is told."""
         header = await self._catalog.header(scene)
         wanted = header.info.dataset_sha256
-        dataset = None if wanted is None else await asyncio.to_thread(self._dataset_of, wanted)
-        if dataset is None:
+        present = await asyncio.to_thread(datasets_by_content, self._datasets)
+        if wanted not in present:
             trained_from = header.info.dataset_name
             named = "" if trained_from is None else f" ({str(trained_from)[:128]!r})"
             raise DatasetNotFound(
@@ -86,18 +92,9 @@ class Comparisons:
                 field="scene",
             )
         path = self._scenes.path(scene)
-        scene_sha256 = await asyncio.to_thread(self._sha256, scene, path)
-        request = {"artifact_folder": str(self._artifacts), "dataset": dataset, "scene_path": str(path)}
-        return f"{scene_sha256}-{wanted}", dataset, request
-
-    def _dataset_of(self, sha256: str) -> str | None:
-        for name in self._datasets.names():
-            try:
-                if self._datasets.get(name).sha256 == sha256:
-                    return name
-            except UltragrayError:  # deleted a moment ago, or a damaged manifest
-                continue
-        return None
+        scene_sha256 = await in_own_thread(lambda: self._sha256(scene, path))
+        request = {"artifact_folder": str(self._artifacts), "dataset": present[wanted], "scene_path": str(path)}
+        return f"{scene_sha256}-{wanted}", present[wanted], request
 
     def _sha256(self, scene: str, path: Path) -> str:
         version = FileVersion.of(path)

@@ -30,14 +30,13 @@ T = TypeVar("T")
 
 
 class DatasetUploads:
-    """The uploads under way. A few at a time are received, and one at a time is checked."""
+    """The uploads under way. A few at a time are received and checked."""
 
     def __init__(self, store: DatasetStore, settings: Settings, draining: asyncio.Event) -> None:
         self._store = store
         self._settings = settings
         self._draining = draining
         self._count = 0
-        self._checking = asyncio.Lock()
 
     @asynccontextmanager
     async def receive(self, name: str, options: dict[str, str]) -> AsyncIterator[DatasetUpload]:
@@ -57,7 +56,7 @@ class DatasetUploads:
         stopping: asyncio.Future[Any] = asyncio.ensure_future(self._draining.wait())
         try:
             incoming = await asyncio.to_thread(IncomingDataset, self._store, self._settings.max_dataset_bytes)
-            upload = DatasetUpload(incoming, name, options, self._settings, self._checking, stopping)
+            upload = DatasetUpload(incoming, name, options, self._settings, stopping)
             try:
                 yield upload
             finally:
@@ -82,14 +81,12 @@ class DatasetUpload:
         name: str,
         options: dict[str, str],
         settings: Settings,
-        checking: asyncio.Lock,
         stopping: asyncio.Future[Any],
     ) -> None:
         self._incoming = incoming
         self._name = name
         self._options = options
         self._settings = settings
-        self._checking = checking
         self._stopping = stopping
         self._block = bytearray()
         self._finishing = asyncio.Lock()
@@ -145,12 +142,11 @@ class DatasetUpload:
             max_bytes=self._settings.max_dataset_bytes,
             memory_bytes=self._settings.dataset_memory_mb << 20,
         )
-        async with self._checking:
-            await run_helper(
-                "dataset_intake",
-                asdict(request),
-                what="checking the dataset",
-                timeout_s=CHECK_TIMEOUT_S,
-                killed=DatasetInvalid,
-            )
+        await run_helper(
+            "dataset_intake",
+            asdict(request),
+            what="checking the dataset",
+            timeout_s=CHECK_TIMEOUT_S,
+            killed=DatasetInvalid,
+        )
         return await asyncio.to_thread(self._incoming.accept, self._name)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+from contextlib import suppress
 from pathlib import Path
 
-from ultragray.errors import DatasetNotFound
+from ultragray.errors import DatasetNotFound, UltragrayError
 from ultragray_workers.dataset_store import DatasetStore
 from ultragray_workers.dataset_view import POSES_NAME
 from ultragray_workers.encoding import encode_image
-from ultragray_workers.picture_stack import SUFFIX, read_picture
+from ultragray_workers.picture_stack import read_picture
 from ultragray_workers.types import Encoding
 
 from .prepared import PreparedFolders
@@ -28,25 +29,39 @@ class DatasetViews:
             settings.artifacts / FOLDER, "dataset_view", "laying out the frames of the dataset", settings
         )
 
+    async def key(self, name: str) -> str:
+        """Names the content of a dataset. Raises DatasetNotFound, DatasetInvalid."""
+        return (await asyncio.to_thread(self._store.get, name)).sha256
+
     async def poses_json(self, name: str) -> bytes:
         """`train` and `val`, each a list of poses, 16 numbers row by row, mm. Raises DatasetNotFound, DatasetInvalid,
-        MemoryExceeded."""
+        MemoryExceeded, StorageFull, DeadlineExceeded, Draining."""
         folder = await self._folder(name)
-        return await asyncio.to_thread((folder / POSES_NAME).read_bytes)
+        try:
+            return await asyncio.to_thread((folder / POSES_NAME).read_bytes)
+        except FileNotFoundError:
+            raise DatasetNotFound(f"the dataset {name!r} has been deleted", field="dataset") from None
 
     async def frame_png(self, name: str, part: str, index: int) -> bytes:
         """One frame of `part` (train or val), PNG. Raises as `poses_json`; DatasetNotFound also for no such frame."""
         folder = await self._folder(name)
-        return await asyncio.to_thread(_frame_png, folder / f"{part}{SUFFIX}", name, part, index)
+        return await asyncio.to_thread(_frame_png, folder, name, part, index)
 
     async def _folder(self, name: str) -> Path:
-        record = await asyncio.to_thread(self._store.get, name)
-        request = {"artifact_folder": str(self._artifacts), "dataset": name}
-        return await self.folders.path(record.sha256, request)
+        return await self.folders.path(await self.key(name), {"artifact_folder": str(self._artifacts), "dataset": name})
 
 
-def _frame_png(stack: Path, name: str, part: str, index: int) -> bytes:
-    picture = read_picture(stack, index)
+def datasets_by_content(store: DatasetStore) -> dict[str, str]:
+    """The name of a dataset by its SHA-256; blocks. Those whose manifest is damaged are left out."""
+    found: dict[str, str] = {}
+    for name in store.names():
+        with suppress(UltragrayError):
+            found.setdefault(store.get(name).sha256, name)
+    return found
+
+
+def _frame_png(folder: Path, name: str, part: str, index: int) -> bytes:
+    picture = read_picture(folder, part, index)
     if picture is None:
         raise DatasetNotFound(f"the dataset {name!r} has no frame {index} in its part {part}", field="index")
     return encode_image(picture, Encoding.PNG).tobytes()

@@ -6,12 +6,14 @@ import asyncio
 import json
 import logging
 import os
+import signal
 import subprocess
 import sys
 from typing import Any
+from weakref import WeakKeyDictionary
 
 from ultragray import errors
-from ultragray.errors import DeadlineExceeded, UltragrayError
+from ultragray.errors import DeadlineExceeded, MemoryExceeded, UltragrayError
 
 from .own_thread import in_own_thread
 
@@ -19,15 +21,35 @@ _log = logging.getLogger("ultragray.service")
 _ERRORS = {
     cls.reason: cls for cls in vars(errors).values() if isinstance(cls, type) and issubclass(cls, UltragrayError)
 }
+# Each may take all the memory that settings allow to one.
+_one_at_a_time: WeakKeyDictionary[asyncio.AbstractEventLoop, asyncio.Lock] = WeakKeyDictionary()
 
 
 async def run_helper(
     module: str, request: dict[str, Any], *, what: str, timeout_s: float, killed: type[UltragrayError]
 ) -> None:
-    """Has `ultragray_workers.<module>.main` answer a request; `what` says in errors what it does.
+    """Has `ultragray_workers.<module>.main` answer a request, after those that came before; `what` says in errors what
+    it does.
 
-    Raises what the work raises, DeadlineExceeded, and `killed` where something killed the process.
+    Raises what the work raises, DeadlineExceeded (the wait for its turn does not count), MemoryExceeded where the
+    process was killed as that of a machine without memory is, and `killed` where something else ended it.
     """
+    async with _one_at_a_time.setdefault(asyncio.get_running_loop(), asyncio.Lock()):
+        status, output, complaints = await _run(module, request, what, timeout_s)
+    if status == -signal.SIGKILL:
+        raise MemoryExceeded(f"the process of {what} was killed: the machine has probably no memory left for it")
+    if status < 0:
+        raise killed(f"the process of {what} was ended by signal {-status}")
+    if status:
+        fields = {"status": status, "stderr": complaints.decode(errors="replace")[-4000:]}
+        _log.error(f"{what} failed unexpectedly", extra={"fields": fields})
+        raise UltragrayError(f"{what} failed unexpectedly, see the log")
+    if answer := json.loads(output):
+        raise _ERRORS[answer["reason"]](answer["detail"], field=answer["field"])
+
+
+async def _run(module: str, request: dict[str, Any], what: str, timeout_s: float) -> tuple[int, bytes, bytes]:
+    """Status, stdout and stderr of the process, which does not outlive the wait."""
     program = f"import sys; sys.path[:] = {sys.path!r}; from ultragray_workers.{module} import main; main()"
     # Not asyncio's: it forks, which gRPC complains about.
     process = subprocess.Popen(
@@ -45,14 +67,4 @@ async def run_helper(
     finally:
         process.kill()
         await asyncio.shield(talk)
-    status = process.returncode or 0
-    if status < 0:
-        raise killed(
-            f"the process of {what} was killed (signal {-status}): perhaps it takes more than the memory of the machine"
-        )
-    if status:
-        fields = {"status": status, "stderr": complaints.decode(errors="replace")[-4000:]}
-        _log.error(f"{what} failed unexpectedly", extra={"fields": fields})
-        raise UltragrayError(f"{what} failed unexpectedly, see the log")
-    if answer := json.loads(output):
-        raise _ERRORS[answer["reason"]](answer["detail"], field=answer["field"])
+    return process.returncode, output, complaints

@@ -137,9 +137,9 @@ class Jobs:
         """The waiting or running job that needs a dataset; blocks. Raises NotReady before the start."""
         return self._store.uses_dataset(name)
 
-    def makes_scene(self, name: str) -> str | None:
-        """The waiting or running job that makes a scene; blocks. Raises NotReady before the start."""
-        return self._store.makes_scene(name)
+    async def makes_scene(self, name: str) -> str | None:
+        """The waiting or running job that makes a scene, in words; None where none does."""
+        return await self._do(lambda store: store.makes_scene(name))
 
     def end_watches(self) -> None:
         """Ends all watchers, now and from now on: the service stops."""

@@ -8,6 +8,7 @@ from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, Proc
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
+from ultragray.errors import UltragrayError
 from ultragray_workers.jobs.job import JobState
 from ultragray_workers.pool import RenderPool
 from ultragray_workers.types import RenderResult
@@ -38,6 +39,11 @@ _SECONDS = (
 _OVERLOADED = ("429", "RESOURCE_EXHAUSTED", "UNAVAILABLE", "DEADLINE_EXCEEDED", "INTERNAL")
 _HEALTH_ROUTES = "/v1/health/"  # not ready is what they are asked for
 _POSES = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1024)
+
+
+def _is_of_service(status: str) -> bool:
+    """Whether a status of HTTP or gRPC says that the service could not answer, not that it was asked badly."""
+    return status.startswith("5") or status in _OVERLOADED
 
 
 class _PoolCollector(Collector):
@@ -122,16 +128,17 @@ class Metrics:
         return Histogram(f"ultragray_{stage}_seconds", documentation, buckets=_SECONDS, registry=self.registry)
 
     def count_request(self, door: str, route: str, status: str, seconds: float) -> None:
-        """One answered request of `door` http, websocket or grpc."""
+        """One answered request of `door` http, websocket, grpc or igtl, whose errors are also frame errors."""
         self._requests.labels(door, route, status).inc()
         self._request_seconds.labels(door, route).observe(seconds)
-        if (status.startswith("5") or status in _OVERLOADED) and not route.startswith(_HEALTH_ROUTES):
+        if door != "igtl" and _is_of_service(status) and not route.startswith(_HEALTH_ROUTES):
             self.statistics.count_error()
 
-    def count_frame_error(self, reason: str) -> None:
+    def count_frame_error(self, error: UltragrayError) -> None:
         """One message of a stream that was answered with an error."""
-        self._frame_errors.labels(reason).inc()
-        self.statistics.count_error()
+        self._frame_errors.labels(error.reason).inc()
+        if _is_of_service(str(error.http_status)):
+            self.statistics.count_error()
 
     def count_stream(self, change: int) -> None:
         """One stream opened (+1) or closed (-1)."""

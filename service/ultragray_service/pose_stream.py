@@ -148,7 +148,7 @@ class PoseStream:
         async def refusal() -> Answered:
             return Answered(sequence, client_time, error)
 
-        self._service.metrics.count_frame_error(error.reason)
+        self._service.metrics.count_frame_error(error)
         await self._room.enter(0)
         self._start(refusal(), sent=partial(self._room.leave, 0))
 
@@ -184,7 +184,7 @@ class PoseStream:
         except Exception:
             _log.exception("unexpected error in a stream")
             outcome = UltragrayError("an unexpected error, see the log")
-        self._service.metrics.count_frame_error(outcome.reason)
+        self._service.metrics.count_frame_error(outcome)
         return outcome
 
     def _take_over(self, asked: Asked) -> bool:

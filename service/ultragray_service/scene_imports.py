@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import fcntl
 import os
 import secrets
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
 from typing import IO
 
@@ -21,18 +22,20 @@ from ultragray_workers.jobs.publication import SCENES_FOLDER
 from ultragray_workers.scenes import SUFFIX, SceneStore, check_scene_name
 
 from .helper_process import run_helper
+from .own_thread import in_own_thread
 from .settings import Settings
 
 CHECK_TIMEOUT_S = 600.0
+PATIENCE_S = 3600.0  # with a check that may have to wait for others
 MAX_IMPORTS = 4
 _PREFIX = ".importing-"
-_STALE_S = 3600.0
+_LOCKED_WITHIN_S = 60.0  # an empty file this young may be about to be locked
 
 
 class SceneImports:
     """Takes scene files in, whole or not at all, and removes them."""
 
-    def __init__(self, store: SceneStore, settings: Settings, maker_of: Callable[[str], str | None]) -> None:
+    def __init__(self, store: SceneStore, settings: Settings, maker_of: Callable[[str], Awaitable[str | None]]) -> None:
         """`maker_of`: the job that makes a scene, in words; None where none does."""
         self._store = store
         self._settings = settings
@@ -40,25 +43,47 @@ class SceneImports:
         self._folder = settings.artifacts / SCENES_FOLDER
         self._count = 0
 
-    async def take_in(self, name: str, blocks: AsyncIterator[bytes]) -> SceneHeader:
-        """Writes what arrives, checks it and serves it as the scene `name`.
+    @contextlib.asynccontextmanager
+    async def receive(self, name: str, blocks: AsyncIterator[bytes]) -> AsyncIterator[Path]:
+        """Writes what arrives into a file, to be given to `accept` within this context; it is removed at the end.
 
-        Raises InvalidArgument for a name that no scene can have, SceneExists, SceneFileInvalid, UploadTooLarge,
-        QueueFull, StorageFull, MemoryExceeded, DeadlineExceeded.
+        Raises InvalidArgument for a name that no scene can have, SceneExists, UploadTooLarge, QueueFull, StorageFull.
         """
         check_scene_name(name)
-        await asyncio.to_thread(self._require_free, name)
+        await self._require_free(name)
         if self._count >= MAX_IMPORTS:
             raise QueueFull(f"{MAX_IMPORTS} scenes are being imported already")
         self._count += 1
         temporary = self._folder / f"{_PREFIX}{secrets.token_hex(8)}"
         try:
             with storage_full("the scene"):
-                await self._write(temporary, blocks)
-            return await self._accept(temporary, name)
+                file = await asyncio.to_thread(self._create, temporary)
+                try:
+                    await self._write(file, blocks)
+                    yield temporary
+                finally:
+                    await asyncio.to_thread(file.close)
         finally:
             self._count -= 1
             await asyncio.shield(asyncio.to_thread(temporary.unlink, missing_ok=True))
+
+    async def accept(self, received: Path, name: str) -> SceneHeader:
+        """Checks a file that was received and serves it as the scene `name`.
+
+        Cancelling it ends the check. Raises SceneFileInvalid, SceneExists, StorageFull, MemoryExceeded,
+        DeadlineExceeded.
+        """
+        await run_helper(
+            "scene_check",
+            {"path": str(received), "memory_bytes": self._settings.dataset_memory_mb << 20},
+            what="checking the scene",
+            timeout_s=CHECK_TIMEOUT_S,
+            killed=SceneFileInvalid,
+        )
+        header = await asyncio.to_thread(read_header, received)
+        await self._require_free(name)
+        await in_own_thread(lambda: self._publish(received, name))
+        return header
 
     async def delete(self, name: str) -> None:
         """Removes the file of a scene. Raises SceneNotFound, and SceneReadOnly for one of the data folder."""
@@ -74,57 +99,45 @@ class SceneImports:
         def remove() -> None:
             for path in self._folder.glob(f"{_PREFIX}*"):
                 with contextlib.suppress(FileNotFoundError):
-                    if time.time() - path.stat().st_mtime > _STALE_S:
+                    if _is_left(path):
                         path.unlink()
 
         await asyncio.to_thread(remove)
 
-    async def _write(self, temporary: Path, blocks: AsyncIterator[bytes]) -> None:
-        file = await asyncio.to_thread(self._create, temporary)
+    async def _write(self, file: IO[bytes], blocks: AsyncIterator[bytes]) -> None:
         received = 0
-        try:
-            async for block in blocks:
-                received += len(block)
-                if received > self._settings.max_dataset_bytes:
-                    raise UploadTooLarge(
-                        f"a scene file may have at most {self._settings.max_dataset_bytes} bytes", field="body"
-                    )
-                await asyncio.to_thread(file.write, block)
-            await asyncio.to_thread(_finish, file)
-        finally:
-            await asyncio.to_thread(file.close)
+        async for block in blocks:
+            received += len(block)
+            if received > self._settings.max_dataset_bytes:
+                raise UploadTooLarge(
+                    f"a scene file may have at most {self._settings.max_dataset_bytes} bytes", field="body"
+                )
+            await asyncio.to_thread(file.write, block)
+        await in_own_thread(lambda: _finish(file))
 
     def _create(self, temporary: Path) -> IO[bytes]:
+        """The file, locked as long as it is open."""
         self._folder.mkdir(parents=True, exist_ok=True)
-        return temporary.open("xb")
+        file = temporary.open("xb")
+        fcntl.flock(file, fcntl.LOCK_EX)
+        return file
 
-    async def _accept(self, temporary: Path, name: str) -> SceneHeader:
-        header = await asyncio.to_thread(_header, temporary)
-        await run_helper(
-            "scene_check",
-            {"path": str(temporary), "memory_bytes": self._settings.dataset_memory_mb << 20},
-            what="checking the scene",
-            timeout_s=CHECK_TIMEOUT_S,
-            killed=SceneFileInvalid,
-        )
-        await asyncio.to_thread(self._publish, temporary, name)
-        return header
-
-    def _publish(self, temporary: Path, name: str) -> None:
-        self._require_free(name)
+    def _publish(self, received: Path, name: str) -> None:
         target = self._folder / f"{name}{SUFFIX}"
-        link_or_copy(temporary, target)
-        if file_sha256(target) != file_sha256(temporary):  # another one was quicker
+        link_or_copy(received, target)
+        if not target.samefile(received) and file_sha256(target) != file_sha256(received):  # another one was quicker
             raise self._exists(name)
 
-    def _require_free(self, name: str) -> None:
-        if name in self._store.names():
+    async def _require_free(self, name: str) -> None:
+        if name in await asyncio.to_thread(self._store.names):
             raise self._exists(name)
-        if (maker := self._maker_of(name)) is not None:
+        if (maker := await self._maker_of(name)) is not None:
             raise SceneExists(f"{maker} makes a scene {name!r}: choose another name", field="scene")
 
     def _exists(self, name: str) -> SceneExists:
-        return SceneExists(f"there is already a scene {name!r}: delete it first, or choose another name", field="scene")
+        is_removable = self._store.file(name).parent == self._folder
+        advice = "delete it first, or choose another name" if is_removable else "choose another name"
+        return SceneExists(f"there is already a scene {name!r}: {advice}", field="scene")
 
     def _delete(self, name: str) -> None:
         path = self._store.path(name)
@@ -138,6 +151,7 @@ class SceneImports:
             path.unlink()
         except FileNotFoundError:
             raise SceneNotFound(f"there is no scene {name!r} any more", field="scene") from None
+        self._store.forget(name)
         sync_folder(self._folder)
 
 
@@ -146,8 +160,12 @@ def _finish(file: IO[bytes]) -> None:
     os.fsync(file.fileno())
 
 
-def _header(temporary: Path) -> SceneHeader:
-    try:
-        return read_header(temporary)
-    except SceneFileInvalid as error:
-        raise SceneFileInvalid(error.detail.replace(str(temporary), "the body"), field="body") from error
+def _is_left(path: Path) -> bool:
+    """Whether a file that was being received belongs to nobody any more."""
+    with path.open("rb") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except OSError:
+            return False
+    status = path.stat()
+    return status.st_size > 0 or time.time() - status.st_mtime > _LOCKED_WITHIN_S

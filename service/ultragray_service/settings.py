@@ -63,9 +63,17 @@ class Settings(BaseSettings):
     artifact_folder: Path | None = Field(
         None, description="Folder of datasets and jobs, shared with all workers; None: artifacts in data_folder."
     )
-    max_dataset_bytes: int = Field(8 * 2**30, ge=1024, le=2**50, description="Largest dataset, packed and unpacked.")
+    max_dataset_bytes: int = Field(
+        8 * 2**30,
+        ge=1024,
+        le=2**50,
+        description="Largest upload: a scene file, or a dataset, packed and unpacked.",
+    )
     dataset_memory_mb: int = Field(
-        8192, ge=256, le=16_777_216, description="MiB that the check of an uploaded dataset may take."
+        8192,
+        ge=256,
+        le=16_777_216,
+        description="MiB that the check of an upload, or what the console shows of a dataset, may take; one at a time.",
     )
     upload_idle_timeout_s: float = Field(
         60.0, gt=0, le=3600, description="How long an upload may send nothing, seconds."

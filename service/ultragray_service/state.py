@@ -17,7 +17,7 @@ from .auth import KeyGuard
 from .catalog import SceneCatalog, scene_to_blame
 from .comparisons import Comparisons
 from .dataset_uploads import DatasetUploads
-from .dataset_views import DatasetViews
+from .dataset_views import DatasetViews, datasets_by_content
 from .jobs import Jobs
 from .metrics import Metrics
 from .requests import RequestPlanner
@@ -71,7 +71,7 @@ class Service:
         self.imports = SceneImports(store, settings, self.jobs.makes_scene)
         self.dataset_views = DatasetViews(self.datasets, settings)
         self.comparisons = Comparisons(store, self.catalog, self.datasets, settings)
-        self.training_views = TrainingViews(self.jobs, settings)
+        self.training_views = TrainingViews(self.jobs, self.datasets, settings)
         self._prepared = (self.dataset_views.folders, self.comparisons.folders, self.training_views.folders)
 
     @property
@@ -101,6 +101,8 @@ class Service:
         await self.imports.remove_stale()
         for prepared in self._prepared:
             await prepared.remove_stale()
+        await self._forget_deleted_datasets()
+        await self.training_views.forget()
         await asyncio.gather(self.pool.start(), self.jobs.start())
         for name in self.settings.preload:
             try:
@@ -132,6 +134,21 @@ class Service:
         with scene_to_blame():
             await self.pool.unload(scene)
         return self.pool.loaded().get(scene, 0)
+
+    async def delete_dataset(self, name: str) -> None:
+        """Deletes a dataset, and all that was made of it to be looked at. Raises DatasetNotFound, DatasetInUse."""
+        await asyncio.to_thread(self.datasets.delete, name)
+        await self._forget_deleted_datasets()
+
+    async def delete_job(self, job_id: str) -> None:
+        """Deletes a finished job and its files. Raises JobNotFound, JobInUse, DatabaseUnavailable."""
+        await self.jobs.delete(job_id)
+        await self.training_views.forget(job_id)
+
+    async def _forget_deleted_datasets(self) -> None:
+        present = await asyncio.to_thread(datasets_by_content, self.datasets)
+        for prepared in self._prepared:
+            await prepared.remove(lambda key: key.rpartition("-")[2] not in present)
 
     def begin_draining(self) -> None:
         """From now on frames are refused with Draining; streams end after the frames they have in flight."""

@@ -15,6 +15,8 @@ STEPS = 120
 STAGES = ("queue", "render", "encode")
 _SAMPLES = 500  # of a step and stage; more are sampled
 
+Times = dict[str, float]  # ms by stage
+
 
 @dataclass
 class _Step:
@@ -23,18 +25,30 @@ class _Step:
     requests: int = 0
     errors: int = 0
     samples: dict[str, list[float]] = field(default_factory=lambda: {stage: [] for stage in STAGES})
+    final: tuple[Times, Times] | None = None  # p50 and p99, in place of the samples, of a step that has ended
+
+    def quantiles(self, *, ended: bool) -> tuple[Times, Times] | tuple[None, None]:
+        if not self.requests:
+            return None, None
+        if self.final is not None:
+            return self.final
+        ordered = {stage: sorted(samples) for stage, samples in self.samples.items()}
+        found = _quantile(ordered, 0.5), _quantile(ordered, 0.99)
+        if ended:
+            self.final, self.samples = found, {}
+        return found
 
 
 @dataclass(frozen=True)
 class StepSummary:
-    """What happened in one step; times in ms by stage, None where nothing was rendered."""
+    """What happened in one step; times are None where nothing was rendered."""
 
-    seconds_ago: int  # of its end; the first is still going on
+    seconds_ago: int  # 0: it is going on; 5: it ended up to 5 s ago, and so on
     frames: int
     requests: int  # rendered ones: a request may have many frames
     errors: int
-    p50_ms: dict[str, float] | None
-    p99_ms: dict[str, float] | None
+    p50_ms: Times | None
+    p99_ms: Times | None
 
 
 class Statistics:
@@ -90,14 +104,11 @@ def memory_bytes(pids: Iterable[int]) -> int:
 
 
 def _summary(step: _Step, age: int) -> StepSummary:
-    def quantile(share: float) -> dict[str, float] | None:
-        if not step.requests:
-            return None
-        return {stage: round(_quantile(step.samples[stage], share), 3) for stage in STAGES}
-
-    return StepSummary(age * STEP_S, step.frames, step.requests, step.errors, quantile(0.5), quantile(0.99))
+    p50_ms, p99_ms = step.quantiles(ended=age > 0)
+    return StepSummary(age * STEP_S, step.frames, step.requests, step.errors, p50_ms, p99_ms)
 
 
-def _quantile(samples: list[float], share: float) -> float:
-    ordered = sorted(samples)
-    return ordered[min(int(share * len(ordered)), len(ordered) - 1)]
+def _quantile(ordered: dict[str, list[float]], share: float) -> Times:
+    return {
+        stage: round(samples[min(int(share * len(samples)), len(samples) - 1)], 3) for stage, samples in ordered.items()
+    }

@@ -10,11 +10,12 @@ from pathlib import Path
 import numpy as np
 
 from ultragray.errors import ArtifactNotFound, TrainingStateInvalid
+from ultragray_workers.dataset_store import DatasetStore
 from ultragray_workers.encoding import encode_image
 from ultragray_workers.jobs.folder import JobFolder
 from ultragray_workers.jobs.store import Job
 from ultragray_workers.picture_stack import read_picture
-from ultragray_workers.training_preview import PREVIEW_NAME
+from ultragray_workers.training_preview import PICTURES
 from ultragray_workers.types import Encoding
 
 from .jobs import Jobs
@@ -38,8 +39,9 @@ class CurvePoint:
 class TrainingViews:
     """Curves and previews of trainings, running or finished."""
 
-    def __init__(self, jobs: Jobs, settings: Settings) -> None:
+    def __init__(self, jobs: Jobs, datasets: DatasetStore, settings: Settings) -> None:
         self._jobs = jobs
+        self._datasets = datasets
         self._artifacts = settings.artifacts
         self.folders = PreparedFolders(
             settings.artifacts / FOLDER, "training_preview", "rendering the training as it is", settings
@@ -52,28 +54,34 @@ class TrainingViews:
         return await asyncio.to_thread(_curve_of, (folder.artifacts / _JOURNAL, folder.run / _JOURNAL))
 
     async def preview_png(self, job_id: str) -> bytes:
-        """Truth, and to its right the rendering, PNG. Raises JobNotFound, and ArtifactNotFound without a checkpoint."""
+        """Truth, and to its right the rendering, PNG.
+
+        Raises JobNotFound, ArtifactNotFound without a checkpoint, DatasetNotFound, and as `PreparedFolders.path`.
+        """
         job = await self._jobs.get(job_id)
         checkpoint = JobFolder(self._artifacts, job.id).run / _CHECKPOINT
         version = await asyncio.to_thread(_version_of, checkpoint)
         if version is None or "dataset" not in job.specification:
             raise self._none(job)
-        request = {
-            "artifact_folder": str(self._artifacts),
-            "dataset": job.specification["dataset"],
-            "checkpoint": str(checkpoint),
-        }
+        dataset = await asyncio.to_thread(self._datasets.get, job.specification["dataset"])
+        request = {"artifact_folder": str(self._artifacts), "dataset": dataset.name, "checkpoint": str(checkpoint)}
         try:
-            folder = await self.folders.path(f"{job.id}-{version}", request)
+            folder = await self.folders.path(f"{job.id}-{version}-{dataset.sha256}", request)
         except TrainingStateInvalid:  # the training ended a moment ago
             raise self._none(job) from None
 
         def read() -> bytes:
-            pictures = [read_picture(folder / PREVIEW_NAME, place) for place in range(2)]
+            pictures = [read_picture(folder, name, 0) for name in PICTURES]
             shown = [picture for picture in pictures if picture is not None]
+            if len(shown) < len(PICTURES):  # the folder went this very moment
+                raise self._none(job)
             return encode_image(np.concatenate(shown, axis=1), Encoding.PNG).tobytes()
 
         return await asyncio.to_thread(read)
+
+    async def forget(self, job_id: str | None = None) -> None:
+        """Removes the previews of a job, or of all: a training that goes on has new ones."""
+        await self.folders.remove(lambda key: job_id is None or key.startswith(f"{job_id}-"))
 
     def _none(self, job: Job) -> ArtifactNotFound:
         return ArtifactNotFound(f"the job {job.id} has no checkpoint to render (any more)", field="job")

@@ -101,7 +101,7 @@ def test_exit_codes() -> None:
 
 def test_metrics(service: Service) -> None:
     service.metrics.count_request("http", "/", "200", 0.1)
-    service.metrics.count_frame_error("QUEUE_FULL")
+    service.metrics.count_frame_error(errors.QueueFull("all places are taken"))
     service.jobs.counts = {JobState.QUEUED: 1}
     found = {}
     for metric in service.metrics.registry.collect():
@@ -134,6 +134,9 @@ def test_fixed_limits() -> None:
         "Largest opening angle": 175,
         "Largest height and width of the library": request.MAX_IMAGE_SIDE,
         "Height and width where the scene knows none": scene_info.DEFAULT_IMAGE_SIDE,
+        "Training poses of a scene": scene_info.MAX_TRAINING_POSES,
+        "Header of a scene file, with its metadata": scene_info.MAX_HEADER_BYTES,
+        "Metrics of a scene": scene_info.MAX_METRICS,
         "Largest spherical-harmonic degree": scene_info.MAX_SH_DEGREE,
         "Scenes on one page, default": catalog.DEFAULT_PAGE_SIZE,
         "Scenes on one page": catalog.MAX_PAGE_SIZE,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -11,10 +12,18 @@ from typing import Any
 
 import numpy as np
 import pytest
+from safetensors.numpy import save_file
 
 from ultragray import ConvexProbe, GaussianScene, LinearProbe, PhasedProbe, SceneInfo, read_header
-from ultragray.errors import InvalidArgument
-from ultragray.scene_info import info_from_json, info_to_json, with_summary
+from ultragray.errors import InvalidArgument, SceneFileInvalid
+from ultragray.scene_info import (
+    MAX_HEADER_BYTES,
+    MAX_TRAINING_POSES,
+    expected_shapes,
+    info_from_json,
+    info_to_json,
+    with_summary,
+)
 
 FULL = SceneInfo(
     centre_mm=(1.0, 2.0, 3.0),
@@ -114,3 +123,44 @@ def test_a_header_is_read_without_torch(
         [sys.executable, "-c", program], capture_output=True, text=True, check=True, env={"PYTHONPATH": str(model)}
     )
     assert answer.stdout.split() == ["9", "False"]
+
+
+def write_without_gaussians(path: Path, poses: int, **more_metadata: str) -> None:
+    tensors = {name: np.zeros(shape, np.float32) for name, shape in expected_shapes(0, 0).items()}
+    tensors["training_poses"] = np.tile(np.eye(4), (poses, 1, 1))
+    save_file(tensors, path, {"ultragray": info_to_json(SceneInfo()), **more_metadata})
+
+
+def test_a_description_has_limits(tmp_path: Path) -> None:
+    path = tmp_path / "large.ugr"
+    write_without_gaussians(path, MAX_TRAINING_POSES)
+    assert len(read_header(path).training_poses) == MAX_TRAINING_POSES
+    write_without_gaussians(path, MAX_TRAINING_POSES + 1)
+    with pytest.raises(SceneFileInvalid, match="training_poses must be at most 100000, got 100001"):
+        read_header(path)
+    write_without_gaussians(path, 1, more="x" * MAX_HEADER_BYTES)
+    with pytest.raises(SceneFileInvalid, match="may have 4194304 bytes, it says 419"):
+        read_header(path)
+    with pytest.raises(InvalidArgument, match="at most 1000 entries, got 1001"):
+        SceneInfo(metrics={str(number): 1.0 for number in range(1001)})
+
+
+def test_what_is_over_a_limit_is_not_read(tmp_path: Path) -> None:
+    path = tmp_path / "sparse.ugr"
+    write_without_gaussians(path, 0)
+    length = int.from_bytes(path.read_bytes()[:8], "little")
+    header = json.loads(path.read_bytes()[8 : 8 + length])
+    header["training_poses"] = {"dtype": "F64", "shape": [1 << 29, 4, 4], "data_offsets": [0, 1 << 36]}
+    text = json.dumps(header).encode()
+    path.write_bytes(len(text).to_bytes(8, "little") + text)
+    os.truncate(path, 8 + len(text) + (1 << 36))  # 64 GiB of nothing
+    with pytest.raises(SceneFileInvalid, match="training_poses must be at most"):
+        read_header(path)
+
+
+def test_a_scene_that_could_not_be_read_again_is_not_made(random_scene: Callable[..., GaussianScene]) -> None:
+    scene = random_scene(3)
+    with pytest.raises(InvalidArgument, match="training_poses must be at most"):
+        GaussianScene.from_splats(scene.splats, training_poses=np.tile(np.eye(4), (MAX_TRAINING_POSES + 1, 1, 1)))
+    with pytest.raises(InvalidArgument, match="header of a scene file"):
+        random_scene(3, info={"training": {"text": "x" * MAX_HEADER_BYTES}}).to_bytes()

@@ -35,8 +35,8 @@ def build(folder: Path) -> None:
     (folder / "assets" / "index-1a2b.js").write_text("export {};" * 1000)
 
 
-def get(page: httpx.AsyncClient, path: str) -> httpx.Response:
-    return asyncio.run(page.get(path))
+def get(page: httpx.AsyncClient, path: str, **headers: str) -> httpx.Response:
+    return asyncio.run(page.get(path, headers={name.replace("_", "-"): value for name, value in headers.items()}))
 
 
 def test_before_it_is_built_a_page_says_how(page: httpx.AsyncClient) -> None:
@@ -59,7 +59,28 @@ def test_the_page_is_asked_for_again_and_its_files_are_kept(page: httpx.AsyncCli
     assert script.headers["content-encoding"] == "gzip"
     assert script.text == "export {};" * 1000
     assert get(page, "/favicon.svg").headers["content-type"] == "image/svg+xml"
-    assert get(page, "/assets/../index.html").status_code == 404
+
+
+@pytest.mark.parametrize("path", ["/assets/%2e%2e/index.html", "/assets/%2e%2e%2findex.html"])
+def test_only_assets_lie_below_assets(page: httpx.AsyncClient, folder: Path, path: str) -> None:
+    build(folder)
+    assert get(page, path).request.url.raw_path == path.encode()
+    assert get(page, path).status_code == 404
+
+
+@pytest.mark.parametrize("path", ["/", "/favicon.svg"])
+def test_what_did_not_change_is_not_sent_again(page: httpx.AsyncClient, folder: Path, path: str) -> None:
+    build(folder)
+    tag = get(page, path).headers["etag"]
+    for known in (tag, f"W/{tag}", f'"other", {tag}'):
+        again = get(page, path, if_none_match=known)
+        assert (again.status_code, again.content, again.headers["etag"]) == (304, b"", tag)
+        assert again.headers["cache-control"] == "no-cache"
+    (folder / "index.html").write_text("<!doctype html><title>newer</title>")
+    (folder / "favicon.svg").write_text("<svg></svg>")
+    changed = get(page, path, if_none_match=tag)
+    assert changed.status_code == 200
+    assert changed.headers["etag"] != tag
 
 
 def test_the_policy_lets_nothing_foreign_in(page: httpx.AsyncClient) -> None:
@@ -71,9 +92,26 @@ def test_the_policy_lets_nothing_foreign_in(page: httpx.AsyncClient) -> None:
     assert headers["x-content-type-options"] == "nosniff"
 
 
+@pytest.mark.parametrize(
+    ("host", "sockets"),
+    [
+        ("scan.example:8000", " ws://scan.example:8000 wss://scan.example:8000"),
+        ("[::1]:8000", " ws://[::1]:8000 wss://[::1]:8000"),
+        ("evil.example; script-src *", ""),
+        ("a,b", ""),
+    ],
+)
+def test_the_policy_names_the_sockets_of_its_host(page: httpx.AsyncClient, host: str, sockets: str) -> None:
+    policy = get(page, "/", host=host).headers["content-security-policy"]
+    assert policy.endswith(f"; connect-src 'self'{sockets}")
+
+
 def test_a_service_with_keys_serves_the_page_to_everyone(start_service: StartService) -> None:
     with httpx.Client(base_url=start_service(api_keys=KEY).http) as http:
         assert http.get("/").status_code == 200
+        head = http.head("/")
+        assert (head.status_code, head.content) == (200, b"")
+        assert f"wss://{http.base_url.netloc.decode()}" in head.headers["content-security-policy"]
         assert http.get("/assets/none.js").status_code == 404
         assert http.get("/v1/statistics").status_code == 401
         assert http.get("/favicon.svg").status_code == (200 if CONSOLE_FOLDER.is_dir() else 404)

@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import asyncio
+import fcntl
 import json
 import os
+import resource
+import shutil
+import subprocess
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from ultragray.datasets.released import write_released
-from ultragray.errors import DatasetNotFound, MemoryExceeded
+from ultragray.errors import DatasetNotFound, Draining, MemoryExceeded, StorageFull
 from ultragray_service import prepared
-from ultragray_service.prepared import PreparedFolders
+from ultragray_service.prepared import Preparation, PreparedFolders
 from ultragray_service.settings import Settings
 from ultragray_workers.dataset_intake import check_files
 from ultragray_workers.dataset_store import DatasetStore, write_manifest
@@ -52,21 +57,54 @@ def test_who_asks_at_the_same_time_gets_the_same_folder(tmp_path: Path, request_
     assert names(tmp_path) == ["key"]
 
 
+def aged(tmp_path: Path, name: str, age_s: float, size_bytes: int = 0) -> Path:
+    folder = tmp_path / "views" / name
+    folder.mkdir(parents=True)
+    (folder / "train.npy").write_bytes(b"\0" * size_bytes)
+    os.utime(folder, (time.time() - age_s,) * 2)
+    return folder
+
+
+@pytest.mark.parametrize(("kept_folders", "size_bytes"), [(2, 0), (32, 600)], ids=["by number", "by bytes"])
 def test_the_folder_not_asked_for_the_longest_goes(
-    tmp_path: Path, request_body: dict[str, str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
+    request_body: dict[str, str],
+    monkeypatch: pytest.MonkeyPatch,
+    kept_folders: int,
+    size_bytes: int,
 ) -> None:
-    monkeypatch.setattr(prepared, "KEPT_FOLDERS", 2)
-    for age_s, name in ((300, "old"), (200, "older-but-used"), (100, ".making-now")):
-        (tmp_path / "views" / name).mkdir(parents=True)
-        os.utime(tmp_path / "views" / name, (time.time() - age_s,) * 2)
+    monkeypatch.setattr(prepared, "KEPT_FOLDERS", kept_folders)
+    aged(tmp_path, "old", 300, size_bytes)
+    aged(tmp_path, "older-but-used", 200, size_bytes)
 
     async def ask() -> None:
-        made = folders(tmp_path)
+        settings = Settings(data_folder=tmp_path, max_dataset_bytes=1024)
+        made = PreparedFolders(tmp_path / "views", "dataset_view", "laying out", settings)
         assert (await made.prepare("older-but-used", request_body)).state == "ready"
         await made.path("key", request_body)
 
     asyncio.run(ask())
-    assert names(tmp_path) == [".making-now", "key", "older-but-used"]
+    assert names(tmp_path) == ["key", "older-but-used"]
+
+
+def test_a_service_that_dies_while_it_removes_leaves_no_half_folder(
+    tmp_path: Path, request_body: dict[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(prepared, "KEPT_FOLDERS", 1)
+    aged(tmp_path, "old", 300)
+    with monkeypatch.context() as dying:
+        dying.setattr(shutil, "rmtree", lambda path, ignore_errors: None)
+        asyncio.run(folders(tmp_path).path("key", request_body))
+    (half,) = (name for name in names(tmp_path) if name != "key")
+    assert half.startswith(".making-")
+    asyncio.run(folders(tmp_path).remove_stale())
+    assert names(tmp_path) == ["key"]
+
+
+def test_what_is_laid_out_takes_no_more_room_than_the_frames(tmp_path: Path, request_body: dict[str, str]) -> None:
+    folder = asyncio.run(folders(tmp_path).path("key", request_body))
+    pixels = DATASET.train.images.size + DATASET.val.images.size
+    assert sum(path.stat().st_size for path in folder.glob("*.npy")) < pixels + 2 * 1024
 
 
 def test_what_fails_says_why_and_is_tried_again_later(
@@ -79,6 +117,8 @@ def test_what_fails_says_why_and_is_tried_again_later(
         failed = await made.prepare("key", request_body)
         assert failed.state == "failed"
         assert isinstance(failed.error, DatasetNotFound)
+        with pytest.raises(DatasetNotFound):
+            await made.path("key", request_body)
         monkeypatch.setattr(prepared, "_FAILURE_KEPT_S", 0.0)
         assert (await made.prepare("key", request_body)).state == "running"
         await made.path("key", request_body)
@@ -87,26 +127,94 @@ def test_what_fails_says_why_and_is_tried_again_later(
     assert names(tmp_path) == ["key"]
 
 
-def test_what_is_stopped_or_killed_leaves_nothing(tmp_path: Path, request_body: dict[str, str]) -> None:
-    async def stop() -> None:
+async def end_of(made: PreparedFolders, request_body: dict[str, str]) -> Preparation:
+    while (found := await made.prepare("key", request_body)).state == "running":
+        await asyncio.sleep(0.01)
+    return found
+
+
+def test_what_no_one_foresaw_is_a_failure_as_well(
+    tmp_path: Path, request_body: dict[str, str], caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "views").symlink_to(tmp_path / "nowhere")
+    failed = asyncio.run(asyncio.wait_for(end_of(folders(tmp_path), request_body), 10))
+    assert failed.state == "failed"
+    assert failed.error is not None
+    assert failed.error.detail == "laying out failed unexpectedly, see the log"
+    assert "FileExistsError" in caplog.text
+
+
+def test_a_disk_without_room_is_told(tmp_path: Path, request_body: dict[str, str]) -> None:
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (DATASET.train.images.size, before[1]))
+    try:
+        failed = asyncio.run(asyncio.wait_for(end_of(folders(tmp_path), request_body), 30))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert isinstance(failed.error, StorageFull)
+    assert names(tmp_path) == []
+
+
+@pytest.mark.parametrize("stop", ["end", "remove"])
+def test_what_is_stopped_leaves_nothing(tmp_path: Path, request_body: dict[str, str], stop: str) -> None:
+    async def ask() -> None:
         made = folders(tmp_path)
         asking = asyncio.ensure_future(made.path("key", request_body))
         while not (tmp_path / "views").is_dir() or not names(tmp_path):
             await asyncio.sleep(0.01)
-        made.end()
-        with pytest.raises(asyncio.CancelledError):
+        if stop == "end":
+            made.end()
+            with pytest.raises(Draining):
+                await made.path("key", request_body)
+        else:
+            await made.remove(lambda key: True)
+        with pytest.raises(Draining if stop == "end" else DatasetNotFound):
             await asking
 
-    asyncio.run(stop())
+    asyncio.run(ask())
     assert names(tmp_path) == []
 
 
+def test_what_is_doomed_goes(tmp_path: Path) -> None:
+    for name in ("here", "gone", ".making-now"):
+        aged(tmp_path, name, 0)
+    asyncio.run(folders(tmp_path).remove(lambda key: key != "here"))
+    assert names(tmp_path) == [".making-now", "here"]
+
+
 def test_what_dead_services_left_is_removed(tmp_path: Path) -> None:
-    for age_s, name in ((2 * prepared.TIMEOUT_S, ".making-dead"), (1, ".making-alive"), (9999, "kept")):
-        (tmp_path / "views" / name).mkdir(parents=True)
-        os.utime(tmp_path / "views" / name, (time.time() - age_s,) * 2)
-    asyncio.run(folders(tmp_path).remove_stale())
-    assert names(tmp_path) == [".making-alive", "kept"]
+    aged(tmp_path, "kept", 9999)
+    aged(tmp_path, ".making-being-begun", 1)
+    aged(tmp_path, ".making-half-removed", 100)
+    (aged(tmp_path, ".making-dead", 1) / "lock").touch()
+    with (aged(tmp_path, ".making-alive", 9999) / "lock").open("wb") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        asyncio.run(folders(tmp_path).remove_stale())
+    assert names(tmp_path) == [".making-alive", ".making-being-begun", "kept"]
+
+
+def test_one_helper_process_at_a_time(
+    tmp_path: Path, request_body: dict[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    started: list[subprocess.Popen[bytes]] = []
+
+    class Watched(subprocess.Popen[bytes]):
+        def __init__(self, *arguments: Any, **options: Any) -> None:
+            assert all(process.returncode is not None for process in started)
+            super().__init__(*arguments, **options)
+            started.append(self)
+
+    monkeypatch.setattr(subprocess, "Popen", Watched)
+
+    async def ask() -> None:
+        made, others = (
+            folders(tmp_path),
+            PreparedFolders(tmp_path / "others", "dataset_view", "", Settings(data_folder=tmp_path)),
+        )
+        await asyncio.gather(*(each.path(key, request_body) for each in (made, others) for key in ("a", "b")))
+
+    asyncio.run(ask())
+    assert len(started) == 4
 
 
 def test_memory_beyond_the_limit_is_one_clear_error(tmp_path: Path, request_body: dict[str, str]) -> None:

@@ -1,8 +1,15 @@
 from __future__ import annotations
 
+import json
+from pathlib import Path
+
 import httpx
 import pytest
+from websockets.sync.client import connect
 
+from ultragray.errors import DeadlineExceeded
+from ultragray_service.settings import load_settings
+from ultragray_service.state import Service
 from ultragray_service.statistics import STEP_S, STEPS, Statistics
 
 from .conftest import StartService
@@ -41,6 +48,24 @@ def test_each_step_tells_what_happened_in_it(statistics: Statistics, clock: Cloc
     assert before.p99_ms == {"queue": 1.0, "render": 100.0, "encode": 2.0}
 
 
+def test_the_times_of_a_step_that_ended_are_worked_out_once(statistics: Statistics, clock: Clock) -> None:
+    for _ in range(1000):
+        statistics.observe(1, 1.0, 2.0, 3.0)
+    clock.seconds += STEP_S
+    first = statistics.summaries()[-2]
+    again = statistics.summaries()[-2]
+    assert first == again
+    assert first.p50_ms is again.p50_ms
+    assert not statistics._steps[0].samples
+
+
+def test_a_step_that_is_going_on_takes_more(statistics: Statistics) -> None:
+    for render_ms in (1.0, 3.0):
+        statistics.observe(1, 1.0, render_ms, 2.0)
+        summary = statistics.summaries()[-1]
+        assert summary.p99_ms == {"queue": 1.0, "render": render_ms, "encode": 2.0}
+
+
 def test_what_is_older_than_ten_minutes_goes(statistics: Statistics, clock: Clock) -> None:
     statistics.observe(1, 1.0, 1.0, 1.0)
     clock.seconds += STEP_S * (STEPS - 1)
@@ -56,6 +81,31 @@ def test_many_requests_are_sampled(statistics: Statistics) -> None:
     assert summary.requests == 5000
     assert summary.p50_ms is not None
     assert 35 < summary.p50_ms["render"] < 65
+
+
+def test_only_what_the_service_could_not_do_is_an_error(start_service: StartService) -> None:
+    service = start_service()
+    stream = f"{service.http.replace('http', 'ws', 1)}/v1/scenes/demo/stream"
+    with httpx.Client(base_url=service.http, timeout=30) as http, connect(stream) as websocket:
+
+        def errors() -> int:
+            return sum(step["errors"] for step in http.get("/v1/statistics").json()["steps"])
+
+        websocket.send(json.dumps({"pose": {}}))
+        assert json.loads(websocket.recv(timeout=20))["error"]["reason"] == "INVALID_POSE"
+        assert http.post("/v1/scenes/demo/render", json={"pose": {}}).status_code == 422
+        assert service.metric("ultragray_stream_frame_errors_total") == 1
+        assert errors() == 0
+        websocket.send(json.dumps({"pose": POSE, "timeout_ms": 0.001}))
+        assert json.loads(websocket.recv(timeout=20))["error"]["reason"] == "DEADLINE_EXCEEDED"
+        assert errors() == 1
+
+
+def test_a_refused_message_is_one_error(tmp_path: Path) -> None:
+    metrics = Service(load_settings(data_folder=tmp_path)).metrics
+    metrics.count_frame_error(DeadlineExceeded("too late"))  # OpenIGTLink counts a message as an answer as well
+    metrics.count_request("igtl", "TRANSFORM", "DEADLINE_EXCEEDED", 0.1)
+    assert metrics.statistics.summaries()[-1].errors == 1
 
 
 def test_over_http(start_service: StartService) -> None:

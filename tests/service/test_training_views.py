@@ -26,12 +26,17 @@ STEPS = 40_000  # more than are done here
 
 
 @pytest.fixture(scope="module")
-def http(start_service: StartService, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
+def artifacts(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("artifacts")
+
+
+@pytest.fixture(scope="module")
+def http(
+    start_service: StartService, tmp_path_factory: pytest.TempPathFactory, artifacts: Path
+) -> Iterator[httpx.Client]:
     folder = tmp_path_factory.mktemp("dataset")
     write_released(DATASET, folder)
-    service = start_service(
-        artifact_folder=tmp_path_factory.mktemp("artifacts"), embedded_worker=True, training_threads=1, job_nice=0
-    )
+    service = start_service(artifact_folder=artifacts, embedded_worker=True, training_threads=1, job_nice=0)
     with httpx.Client(base_url=service.http, timeout=60) as client:
         packed = zipped({path.name: path.read_bytes() for path in folder.iterdir()})
         answer = client.put("/v1/datasets/tiny", content=packed, headers={"Content-Type": "application/zip"})
@@ -66,7 +71,7 @@ def test_the_curve_of_a_finished_training_and_of_other_jobs(http: httpx.Client) 
 
 
 @pytest.mark.long
-def test_a_training_is_seen_while_it_runs(http: httpx.Client, tmp_path: Path) -> None:
+def test_a_training_is_seen_while_it_runs(http: httpx.Client, artifacts: Path) -> None:
     job = train(http, "long", steps=STEPS, max_gaussians=50, confidence=False)
     missing = http.get(f"/v1/jobs/{job}/preview").json()
     assert (missing["reason"], missing["field"]) == ("ARTIFACT_NOT_FOUND", "job")
@@ -86,3 +91,8 @@ def test_a_training_is_seen_while_it_runs(http: httpx.Client, tmp_path: Path) ->
     assert picture.shape == (512, 1024)
     assert abs(picture[:, :512].mean() - DATASET.val.images[1].mean()) < 1.0
     assert np.corrcoef(picture[:, :512].ravel(), picture[:, 512:].ravel())[0, 1] > 0.2
+
+    assert list((artifacts / "previews").glob(f"{job}-*"))
+    http.post(f"/v1/jobs/{job}:cancel")
+    wait_until(lambda: http.delete(f"/v1/jobs/{job}").status_code == 204)
+    assert not list((artifacts / "previews").iterdir())

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import weakref
+
 import pytest
 
 from ultragray.errors import SceneFileInvalid, SceneNotFound
-from ultragray_workers import SceneStore
+from ultragray_workers import SceneStore, scenes
 from ultragray_workers.scenes import resident_bytes
 
 
@@ -72,3 +74,38 @@ def test_an_invalid_file_is_named_with_the_reason(scene_folder):
 def test_a_loaded_scene_costs_two_and_a_half_times_its_parameters(scene_folder):
     info = SceneStore(scene_folder).header("a").info  # 50 Gaussians of degree 1: 15 floats each
     assert resident_bytes(info) == 2.5 * 50 * 15 * 4
+
+
+def test_only_the_headers_used_last_are_kept(scene_folder, monkeypatch):
+    described = scenes._described_bytes(SceneStore(scene_folder).header("a"))
+    monkeypatch.setattr(scenes, "_KEPT_HEADER_BYTES", 2.5 * described)
+    store = SceneStore(scene_folder)
+    for name in ("c", "d"):
+        (scene_folder / f"{name}.ugr").write_bytes((scene_folder / "a.ugr").read_bytes())
+    store.header("a")
+    store.header("b")
+    assert store.cached_header("a") is not None  # used later than b
+    store.header("c")
+    assert [name for name in ("a", "b", "c") if store.cached_header(name)] == ["a", "c"]
+
+
+def test_headers_of_deleted_scenes_are_forgotten(scene_folder):
+    store = SceneStore(scene_folder)
+    for number in range(20):
+        path = scene_folder / f"s{number}.ugr"
+        path.write_bytes((scene_folder / "a.ugr").read_bytes())
+        kept = weakref.ref(store.header(path.stem))
+        assert kept() is not None
+        path.unlink()
+        if number % 2:
+            assert store.cached_header(path.stem) is None
+        else:
+            store.forget(path.stem)
+        assert kept() is None
+
+
+def test_what_is_described_is_all_but_the_gaussians(scene_folder):
+    header = SceneStore(scene_folder).header("a")
+    path = scene_folder / "a.ugr"
+    length = int.from_bytes(path.read_bytes()[:8], "little")
+    assert scenes._described_bytes(header) == 8 + length + header.training_poses.nbytes

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from .dataset_store import DatasetStore
-from .helper import answer_request
-from .picture_stack import SUFFIX, write_stack
+from .helper import answer_request, tell_progress
+from .picture_stack import write_stacks
 
-FRAMES_NAME, PROGRESS_NAME = "frames.json", "progress"
+FRAMES_NAME = "frames.json"
 PICTURES = ("truth", "rendering", "median", "difference")
 _COMPARED = ("psnr_db", "ms_ssim", "gms", "gmsd")
 
@@ -24,8 +24,8 @@ def compare(request: dict[str, Any]) -> None:
     """Fills `folder` with the metrics and pictures of the scene at `scene_path` on the frames that the dataset
     `dataset` in `artifact_folder` holds out.
 
-    `progress` in that folder tells meanwhile which share is done. Raises DatasetNotFound, DatasetInvalid where it holds
-    out none, SceneFileInvalid, InvalidImageSize for frames too small to measure.
+    It tells meanwhile which share is done. Raises DatasetNotFound, DatasetInvalid where it holds out none,
+    SceneFileInvalid, InvalidImageSize for frames too small to measure.
     """
     import numpy as np
     import torch
@@ -44,19 +44,19 @@ def compare(request: dict[str, Any]) -> None:
     scene = GaussianScene.load(request["scene_path"])
     check_same_origin(scene.info, dataset)
     require_frames(dataset.val)
-    _tell(folder, 0.1)
+    tell_progress(folder, 0.1)
     median = predict(
         dataset.train, dataset.val.poses, "median", voxel_mm=affordable_voxel_mm(dataset.train)
     )  # [F, H, W]
-    _tell(folder, 0.4)
+    tell_progress(folder, 0.4)
     rendering = render_sweep(scene, dataset.val, backend="cpu")
-    _tell(folder, 0.7)
+    tell_progress(folder, 0.7)
     measured, of_median = evaluate_frames(rendering, dataset.val), evaluate_frames(median, dataset.val)
-    _tell(folder, 0.9)
+    tell_progress(folder, 0.9)
     truth = (dataset.val.images / 255.0).astype(np.float32)
     difference = np.minimum(np.abs(rendering - truth) * DIFFERENCE_GAIN, 1.0)
-    for name, frames in zip(PICTURES, (truth, rendering, median, difference), strict=True):
-        write_stack(folder / f"{name}{SUFFIX}", frames, dataset.val)
+    pictures = dict(zip(PICTURES, (truth, rendering, median, difference), strict=True))
+    write_stacks(folder, pictures, dataset.probe)
     told = [
         {
             "index": index,
@@ -68,11 +68,4 @@ def compare(request: dict[str, Any]) -> None:
             zip(measured.frame_numbers, measured.frames, of_median.frames, strict=True)
         )
     ]
-    (folder / PROGRESS_NAME).unlink()
     (folder / FRAMES_NAME).write_text(json.dumps(told), encoding="utf-8")
-
-
-def _tell(folder: Path, share: float) -> None:
-    temporary = folder / f"{PROGRESS_NAME}.new"
-    temporary.write_text(str(share), encoding="utf-8")
-    temporary.replace(folder / PROGRESS_NAME)

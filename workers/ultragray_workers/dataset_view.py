@@ -8,7 +8,7 @@ from typing import Any
 
 from .dataset_store import DatasetStore
 from .helper import answer_request
-from .picture_stack import SUFFIX, write_stack
+from .picture_stack import write_stacks
 
 POSES_NAME = "poses.json"
 PARTS = ("train", "val")
@@ -30,7 +30,6 @@ def lay_out(request: dict[str, Any]) -> None:
     source, options = DatasetStore(Path(request["artifact_folder"])).source(request["dataset"])
     dataset = load_dataset(source, SourceOptions(**options))
     parts = dict(zip(PARTS, (dataset.train, dataset.val), strict=True))
-    for part, sweep in parts.items():
-        write_stack(folder / f"{part}{SUFFIX}", sweep.images, sweep)
+    write_stacks(folder, {part: sweep.images for part, sweep in parts.items()}, dataset.probe)
     poses = {part: sweep.poses.reshape(-1, 16).tolist() for part, sweep in parts.items()}
     (folder / POSES_NAME).write_text(json.dumps(poses), encoding="utf-8")

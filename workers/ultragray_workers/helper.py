@@ -12,10 +12,14 @@ import resource
 import signal
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 from ultragray.errors import MemoryExceeded, UltragrayError
 
+from .dataset_incoming import storage_full
+
+PROGRESS_NAME = "progress"  # in the folder that a process fills
 NICE_LEVEL = 10
 _PR_SET_PDEATHSIG = 1
 
@@ -28,11 +32,19 @@ def answer_request(work: Callable[[dict[str, Any]], None]) -> None:
     resource.setrlimit(resource.RLIMIT_DATA, (request["memory_bytes"], request["memory_bytes"]))
     answer: dict[str, str | None] = {}
     try:
-        work(request)
+        with storage_full("it"):
+            work(request)
     except (MemoryError, RuntimeError, UltragrayError) as caught:
         error = _in_words(caught, request["memory_bytes"])
         answer = {"reason": error.reason, "detail": error.detail, "field": error.field}
     sys.stdout.write(json.dumps(answer))
+
+
+def tell_progress(folder: Path, share: float) -> None:
+    """Tells which share of the work, from 0 to 1, is done."""
+    temporary = folder / f"{PROGRESS_NAME}.new"
+    temporary.write_text(str(share), encoding="utf-8")
+    temporary.replace(folder / PROGRESS_NAME)
 
 
 def _in_words(error: Exception, memory_bytes: int) -> UltragrayError:

@@ -1,39 +1,47 @@
-"""Many pictures of one size in one NumPy file, uint8 [F, H, W], read one at a time. Reading is free of torch."""
+"""Frames in a folder, uint8 [F, H, W] by name, as their probe samples them; read one at a time, as pictures.
+
+Free of torch.
+"""
 
 from __future__ import annotations
 
+import json
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-if TYPE_CHECKING:
-    from ultragray.datasets.sweep import Sweep
+from ultragray.probe import Probe, probe_from_dict, probe_to_dict
+from ultragray.square_pixels import with_square_pixels
 
-SUFFIX = ".npy"
+from .encoding import to_uint8
 
-
-def write_stack(path: Path, frames: npt.NDArray[Any], sweep: Sweep) -> None:
-    """Writes frames [F, H, W] (uint8, or floats in [0, 1]) with square pixels, those of convex and phased probes as
-    fans."""
-    from ultragray.side_by_side import as_picture
-
-    scale = 255.0 if frames.dtype == np.uint8 else 1.0
-    stack: npt.NDArray[np.uint8] | None = None
-    for place, frame in enumerate(frames):
-        picture = as_picture((frame / scale).astype(np.float32), sweep)
-        if stack is None:
-            stack = np.lib.format.open_memmap(path, "w+", np.uint8, (len(frames), *picture.shape))
-        stack[place] = picture
-    if stack is None:
-        np.save(path, np.zeros((0, sweep.height, sweep.width), np.uint8))
+PROBE_NAME, SUFFIX = "probe.json", ".npy"
+PICTURE_SIDE = 512  # pixels, the longer one
 
 
-def read_picture(path: Path, index: int) -> npt.NDArray[np.uint8] | None:  # [H, W]
-    """One picture; None where the file, or the place in it, is not there."""
+def write_stacks(folder: Path, stacks: Mapping[str, npt.NDArray[Any]], probe: Probe) -> None:
+    """Writes frames of one probe, [F, H, W], uint8 or float32 in [0, 1]."""
+    (folder / PROBE_NAME).write_text(json.dumps(probe_to_dict(probe)), encoding="utf-8")
+    for name, frames in stacks.items():
+        with (folder / f"{name}{SUFFIX}").open("wb") as file:
+            header = {"descr": "|u1", "fortran_order": False, "shape": frames.shape}
+            np.lib.format.write_array_header_1_0(file, header)
+            for frame in frames:  # np.save does not tell that a disk is full
+                file.write(np.ascontiguousarray(to_uint8(frame)).data)
+
+
+def read_picture(folder: Path, name: str, index: int) -> npt.NDArray[np.uint8] | None:  # [H', W']
+    """One frame with square pixels, those of convex and phased probes as fans; None where it is not there."""
     try:
-        stack = np.load(path, mmap_mode="r")
+        stack = np.load(folder / f"{name}{SUFFIX}", mmap_mode="r")
+        probe = probe_from_dict(json.loads((folder / PROBE_NAME).read_text(encoding="utf-8")))
     except FileNotFoundError:
         return None
-    return np.array(stack[index]) if 0 <= index < len(stack) else None
+    if not 0 <= index < len(stack):
+        return None
+    drawn = with_square_pixels(stack[index].astype(np.float32), probe, PICTURE_SIDE)
+    picture: npt.NDArray[np.uint8] = np.rint(drawn).astype(np.uint8)
+    return picture

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import re
+import threading
+from collections import OrderedDict
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,14 +19,19 @@ _NAMES_IN_MESSAGE = 5
 
 # What the kernel prepares of a scene once (axes, activations, bounds) takes about 1.5 times the raw parameters.
 _RESIDENT_PER_RAW_BYTE = 2.5
+_KEPT_HEADER_BYTES = 32 * 2**20  # of training poses and metadata in the files
 
 
 def resident_bytes(info: SceneInfo) -> int:
     """Memory of a loaded scene in a worker: its raw float32 parameters and what the kernel prepares of them."""
-    floats_per_gaussian = 3 + 3 + 4 + 1 + (info.sh_degree + 1) ** 2  # means, scales, quats, transmittances, SH
+    floats = _floats_per_gaussian(info)
     if info.label_names:
-        floats_per_gaussian += 3 + 3 + 4 + 1 + 1  # the parts by label, of degree 0
-    return int(_RESIDENT_PER_RAW_BYTE * 4 * floats_per_gaussian * info.gaussian_count)
+        floats += 3 + 3 + 4 + 1 + 1  # the parts by label, of degree 0
+    return int(_RESIDENT_PER_RAW_BYTE * 4 * floats * info.gaussian_count)
+
+
+def _floats_per_gaussian(info: SceneInfo) -> int:
+    return 3 + 3 + 4 + 1 + (info.sh_degree + 1) ** 2  # means, scales, quats, transmittances, SH
 
 
 @dataclass(frozen=True)
@@ -35,10 +42,56 @@ class FileVersion:
     size: int
     inode: int
 
+    @property
+    def tag(self) -> str:
+        """The same as a word."""
+        return f"{self.mtime_ns:x}-{self.size:x}-{self.inode:x}"
+
     @classmethod
     def of(cls, path: str | Path) -> FileVersion:
         status = os.stat(path)
         return cls(mtime_ns=status.st_mtime_ns, size=status.st_size, inode=status.st_ino)
+
+
+class _KeptHeaders:
+    """The headers that were used last, within a budget. Its methods may be called from any thread."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._kept: OrderedDict[str, tuple[FileVersion, SceneHeader]] = OrderedDict()  # least recently used first
+        self._bytes = 0
+
+    def get(self, name: str, version: FileVersion) -> SceneHeader | None:
+        """The header of a scene if it is of this version; another one goes."""
+        with self._lock:
+            kept = self._kept.get(name)
+            if kept is None or kept[0] != version:
+                self._drop(name)
+                return None
+            self._kept.move_to_end(name)
+            return kept[1]
+
+    def keep(self, name: str, version: FileVersion, header: SceneHeader) -> None:
+        with self._lock:
+            self._drop(name)
+            self._kept[name] = version, header
+            self._bytes += _described_bytes(header)
+            while self._bytes > _KEPT_HEADER_BYTES:
+                self._drop(next(iter(self._kept)))
+
+    def drop(self, name: str) -> None:
+        with self._lock:
+            self._drop(name)
+
+    def _drop(self, name: str) -> None:
+        if (kept := self._kept.pop(name, None)) is not None:
+            self._bytes -= _described_bytes(kept[1])
+
+
+def _described_bytes(header: SceneHeader) -> int:
+    """Of a scene file without its Gaussians."""
+    bytes_per_gaussian = 4 * _floats_per_gaussian(header.info) + bool(header.info.label_names)
+    return header.file_bytes - bytes_per_gaussian * header.info.gaussian_count
 
 
 class SceneStore:
@@ -49,7 +102,7 @@ class SceneStore:
 
     def __init__(self, *folders: Path) -> None:
         self.folders = tuple(Path(folder) for folder in folders)
-        self._headers: dict[str, tuple[FileVersion, SceneHeader]] = {}
+        self._headers = _KeptHeaders()
 
     def names(self) -> list[str]:
         """The names of all scenes, sorted; files whose name could not stand in a URL are left out."""
@@ -73,29 +126,35 @@ class SceneStore:
 
     def header(self, name: str) -> SceneHeader:
         """A scene's description and training poses. Raises SceneNotFound, SceneFileInvalid."""
+        version = self.version(name)  # before reading, so that a change meanwhile counts as newer
+        cached = self._headers.get(name, version)
+        if cached is not None:
+            return cached
+        header = read_header(self.file(name))
+        self._headers.keep(name, version, header)
+        return header
+
+    def version(self, name: str) -> FileVersion:
+        """Which content the file of a scene has now. Raises SceneNotFound, SceneFileInvalid."""
         path = self.path(name)
         try:
-            version = FileVersion.of(path)  # before reading, so that a change meanwhile counts as newer
+            return FileVersion.of(path)
         except FileNotFoundError:
             raise self._not_found(name) from None
         except OSError as error:
             raise scene_file_invalid(path, error) from error
-        cached = self._headers.get(name)
-        if cached is not None and cached[0] == version:
-            return cached[1]
-        header = read_header(path)
-        self._headers[name] = (version, header)
-        return header
 
     def cached_header(self, name: str) -> SceneHeader | None:
         """The description if it was read before and the file is unchanged, at the cost of one stat."""
-        cached = self._headers.get(name)
-        if cached is None:
-            return None
         try:
-            return cached[1] if cached[0] == FileVersion.of(self.file(name)) else None
-        except OSError:
+            return self._headers.get(name, FileVersion.of(self.file(name)))
+        except (OSError, ValueError):  # ValueError: no file can have the name
+            self._headers.drop(name)
             return None
+
+    def forget(self, name: str) -> None:
+        """Drops what is kept of a scene that was deleted."""
+        self._headers.drop(name)
 
     def _not_found(self, name: str) -> SceneNotFound:
         known = self.names()

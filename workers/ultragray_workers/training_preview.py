@@ -7,9 +7,9 @@ from typing import Any
 
 from .dataset_store import DatasetStore
 from .helper import answer_request
-from .picture_stack import SUFFIX, write_stack
+from .picture_stack import write_stacks
 
-PREVIEW_NAME = f"preview{SUFFIX}"
+PICTURES = ("truth", "rendering")
 
 
 def main() -> None:
@@ -44,5 +44,5 @@ def draw_preview(request: dict[str, Any]) -> None:
     part = dataset.val if len(dataset.val) else dataset.train
     frame = part.select(np.array([len(part) // 2]))
     truth = (frame.images / 255.0).astype(np.float32)
-    both = np.concatenate([truth, render_sweep(scene, frame, backend="cpu")])  # [2, H, W]
-    write_stack(Path(request["folder"]) / PREVIEW_NAME, both, frame)
+    pictures = dict(zip(PICTURES, (truth, render_sweep(scene, frame, backend="cpu")), strict=True))
+    write_stacks(Path(request["folder"]), pictures, dataset.probe)

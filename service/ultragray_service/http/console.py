@@ -2,32 +2,37 @@
 
 from __future__ import annotations
 
+import asyncio
+import re
+from collections.abc import Mapping
 from pathlib import Path
 
 from fastapi import FastAPI
 from starlette.middleware.gzip import GZipMiddleware
-from starlette.responses import FileResponse, HTMLResponse, Response
+from starlette.requests import Request
+from starlette.responses import HTMLResponse, Response
 from starlette.staticfiles import StaticFiles
 from starlette.types import Scope
 
 from ultragray.errors import RouteNotFound
+from ultragray_workers.scenes import FileVersion
+
+from .revalidation import revalidated
 
 CONSOLE_FOLDER = Path(__file__).resolve().parents[1] / "console"
 ASSETS_PATH = "/assets"
 CONSOLE_PATHS = ("/", "/favicon.svg")  # and what lies below ASSETS_PATH: a page cannot send a key for itself
 _PAGE_NAME, _ICON_NAME = "index.html", "favicon.svg"
-_POLICY = "; ".join(
-    (
-        "default-src 'self'",
-        "img-src 'self' blob:",  # frames, and files that are saved
-        "object-src 'none'",
-        "base-uri 'none'",
-        "form-action 'none'",
-        "frame-ancestors 'none'",
-    )
+_HOST = re.compile(r"[A-Za-z0-9._:\[\]-]+")
+_POLICY = (
+    "default-src 'self'",
+    "img-src 'self' blob:",  # frames, and files that are saved
+    "object-src 'none'",
+    "base-uri 'none'",
+    "form-action 'none'",
+    "frame-ancestors 'none'",
 )
 _PAGE_HEADERS = {
-    "Content-Security-Policy": _POLICY,
     "Cross-Origin-Opener-Policy": "same-origin",
     "Permissions-Policy": "camera=(), geolocation=(), microphone=()",
     "Referrer-Policy": "no-referrer",
@@ -54,19 +59,38 @@ def add_console(app: FastAPI, folder: Path = CONSOLE_FOLDER) -> None:
     """Serves the console in `folder`, which may be built while the service runs; without it, a page that says how."""
     app.mount(ASSETS_PATH, GZipMiddleware(_Assets(directory=folder / "assets", check_dir=False), minimum_size=1024))
 
-    @app.get("/", include_in_schema=False)
-    async def console() -> Response:
-        page = folder / _PAGE_NAME
-        if page.is_file():
-            return FileResponse(page, headers=_PAGE_HEADERS, media_type="text/html")
-        return HTMLResponse(_NOT_BUILT, headers=_PAGE_HEADERS)
+    @app.api_route("/", methods=["GET", "HEAD"], include_in_schema=False)
+    async def console(request: Request) -> Response:
+        try:
+            return await _file(request, folder / _PAGE_NAME, "text/html")
+        except FileNotFoundError:
+            return HTMLResponse(_NOT_BUILT, headers=_headers(request))
 
-    @app.get(f"/{_ICON_NAME}", include_in_schema=False)
-    async def icon() -> FileResponse:
-        path = folder / _ICON_NAME
-        if not path.is_file():
-            raise RouteNotFound(f"there is no route /{_ICON_NAME}: the console was not built")
-        return FileResponse(path, headers=_PAGE_HEADERS, media_type="image/svg+xml")
+    @app.api_route(f"/{_ICON_NAME}", methods=["GET", "HEAD"], include_in_schema=False)
+    async def icon(request: Request) -> Response:
+        try:
+            return await _file(request, folder / _ICON_NAME, "image/svg+xml")
+        except FileNotFoundError:
+            raise RouteNotFound(f"there is no route /{_ICON_NAME}: the console was not built") from None
+
+
+async def _file(request: Request, path: Path, media_type: str) -> Response:
+    """Raises FileNotFoundError."""
+
+    async def whole() -> Response:
+        return Response(await asyncio.to_thread(path.read_bytes), media_type=media_type)
+
+    response = await revalidated(request, FileVersion.of(path).tag, whole)
+    response.headers.update(_headers(request))
+    return response
+
+
+def _headers(request: Request) -> Mapping[str, str]:
+    """'self' is no WebSocket to some browsers, so that those of this host are named."""
+    host = request.headers.get("host", "")
+    sockets = f" ws://{host} wss://{host}" if _HOST.fullmatch(host) else ""
+    policy = "; ".join((*_POLICY, f"connect-src 'self'{sockets}"))
+    return {**_PAGE_HEADERS, "Content-Security-Policy": policy}
 
 
 class _Assets(StaticFiles):

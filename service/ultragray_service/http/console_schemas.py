@@ -59,10 +59,10 @@ class StageTimes(BaseModel):
 class StatisticsStep(BaseModel):
     """What happened in one step."""
 
-    seconds_ago: int = Field(description="Since its end; the step of 0 is still going on.")
+    seconds_ago: int = Field(description="0: it is going on; 5: it ended up to 5 s ago, and so on.")
     frames: int
     requests: int = Field(description="Rendered ones.")
-    errors: int = Field(description="Requests and messages that the service could not answer as asked.")
+    errors: int = Field(description="Requests and messages that the service could not answer as asked: 429 and 5xx.")
     p50_ms: StageTimes | None = Field(description="null where nothing was rendered.")
     p99_ms: StageTimes | None
 

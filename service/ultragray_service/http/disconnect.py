@@ -30,7 +30,7 @@ async def finish_or_abandon(work: Coroutine[Any, Any, T], receive: Receive, dead
             return working.result()
         if leaving.done():
             raise ClientDisconnect
-        raise DeadlineExceeded("the deadline passed before the frames were ready")
+        raise DeadlineExceeded("the deadline passed before the answer was ready")
     finally:
         working.cancel()
         leaving.cancel()

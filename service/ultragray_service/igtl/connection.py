@@ -201,7 +201,7 @@ class Connection:
                 self._count(asked.type_name, "OK", frame.posed.arrived)
 
     async def _refuse(self, about: Message, error: UltragrayError, arrived: float) -> None:
-        self._service.metrics.count_frame_error(error.reason)
+        self._service.metrics.count_frame_error(error)
         await self._send(_refusal(about, error))
         self._count(about.type_name, error.reason, arrived)
 

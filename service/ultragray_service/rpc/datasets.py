@@ -61,7 +61,7 @@ class DatasetService:
     async def DeleteDataset(  # noqa: N802
         self, request: datasets_pb2.DeleteDatasetRequest, context: grpc.aio.ServicerContext
     ) -> datasets_pb2.DeleteDatasetResponse:
-        await asyncio.to_thread(self._service.datasets.delete, request.dataset)
+        await self._service.delete_dataset(request.dataset)
         return datasets_pb2.DeleteDatasetResponse(dataset=request.dataset)
 
 

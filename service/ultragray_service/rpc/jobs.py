@@ -66,7 +66,7 @@ class JobService:
     async def DeleteJob(  # noqa: N802
         self, request: jobs_pb2.DeleteJobRequest, context: grpc.aio.ServicerContext
     ) -> jobs_pb2.DeleteJobResponse:
-        await self._service.jobs.delete(request.job)
+        await self._service.delete_job(request.job)
         return jobs_pb2.DeleteJobResponse(job=request.job)
 
     async def GetJobLog(  # noqa: N802

@@ -5,12 +5,14 @@ from __future__ import annotations
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Path
+from starlette.requests import Request
 from starlette.responses import Response
 
 from ...comparisons import Comparison
 from ..accept import PNG
 from ..console_schemas import ComparedFrame, ComparisonOut, DatasetPoses
 from ..deps import SceneName, ServiceDep, problems
+from ..revalidation import NOT_MODIFIED, revalidated
 from .datasets import DatasetName
 
 router = APIRouter(prefix="/v1", tags=["console"])
@@ -19,11 +21,12 @@ FrameIndex = Annotated[int, Path(ge=0, description="Place of the frame, from 0."
 _Answers = dict[int | str, dict[str, Any]]
 _PICTURE: _Answers = {
     200: {
-        "description": "8-bit grey, square pixels, at most 512 a side.",
+        "description": "8-bit grey, square pixels, 512 on the longer side.",
         "content": {PNG: {"schema": {"type": "string", "format": "binary"}}},
-    }
+    },
+    304: {"description": NOT_MODIFIED},
 }
-_POSES: _Answers = {200: {"model": DatasetPoses}}
+_POSES: _Answers = {200: {"model": DatasetPoses}, 304: {"description": NOT_MODIFIED}}
 
 
 @router.get("/scenes/{scene}/comparison", responses=problems(401, 404, 422, 503))
@@ -39,13 +42,19 @@ async def get_comparison(service: ServiceDep, scene: SceneName) -> ComparisonOut
     responses=_PICTURE | problems(401, 404, 422),
 )
 async def get_compared_picture(
+    request: Request,
     service: ServiceDep,
     scene: SceneName,
     index: FrameIndex,
     what: Literal["truth", "rendering", "median", "difference"],
 ) -> Response:
     """A picture of a held-out frame; difference: three times the absolute one between truth and rendering."""
-    return Response(await service.comparisons.picture_png(scene, index, what), media_type=PNG)
+    key = await service.comparisons.key(scene)
+
+    async def picture() -> Response:
+        return Response(await service.comparisons.picture_png(key, index, what), media_type=PNG)
+
+    return await revalidated(request, f"{key}-{what}-{index}", picture)
 
 
 @router.get(
@@ -53,10 +62,14 @@ async def get_compared_picture(
     response_class=Response,
     responses=_POSES | problems(401, 404, 422, 500, 503, 504, 507),
 )
-async def get_dataset_poses(service: ServiceDep, dataset: DatasetName) -> Response:
+async def get_dataset_poses(request: Request, service: ServiceDep, dataset: DatasetName) -> Response:
     """Probe to scene, of the training frames and the held-out ones."""
     service.require_serving()
-    return Response(await service.dataset_views.poses_json(dataset), media_type="application/json")
+
+    async def poses() -> Response:
+        return Response(await service.dataset_views.poses_json(dataset), media_type="application/json")
+
+    return await revalidated(request, f"{await service.dataset_views.key(dataset)}-poses", poses)
 
 
 @router.get(
@@ -65,11 +78,15 @@ async def get_dataset_poses(service: ServiceDep, dataset: DatasetName) -> Respon
     responses=_PICTURE | problems(401, 404, 422, 500, 503, 504, 507),
 )
 async def get_dataset_frame(
-    service: ServiceDep, dataset: DatasetName, part: Literal["train", "val"], index: FrameIndex
+    request: Request, service: ServiceDep, dataset: DatasetName, part: Literal["train", "val"], index: FrameIndex
 ) -> Response:
     """A frame of a dataset; those of convex and phased probes as fans."""
     service.require_serving()
-    return Response(await service.dataset_views.frame_png(dataset, part, index), media_type=PNG)
+
+    async def frame() -> Response:
+        return Response(await service.dataset_views.frame_png(dataset, part, index), media_type=PNG)
+
+    return await revalidated(request, f"{await service.dataset_views.key(dataset)}-{part}-{index}", frame)
 
 
 def _comparison(comparison: Comparison) -> ComparisonOut:

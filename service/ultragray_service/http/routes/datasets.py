@@ -140,8 +140,8 @@ async def get_contact_sheet(service: ServiceDep, dataset: DatasetName) -> Respon
 
 @router.delete("/{dataset}", status_code=204, responses=problems(401, 404, 409, 422))
 async def delete_dataset(service: ServiceDep, dataset: DatasetName) -> None:
-    """Deletes a dataset that no job needs."""
-    await asyncio.to_thread(service.datasets.delete, dataset)
+    """Deletes a dataset that no job needs, with the pictures and comparisons that were made of it."""
+    await service.delete_dataset(dataset)
 
 
 def _media_type(request: Request) -> str:

@@ -146,7 +146,7 @@ async def retry_job(response: Response, service: ServiceDep, job: JobId) -> JobO
 @router.delete("/{job}", status_code=204, responses=problems(401, 404, 409, 422, 503))
 async def delete_job(service: ServiceDep, job: JobId) -> None:
     """Removes a finished job and its files. The scene that it trained stays."""
-    await service.jobs.delete(job)
+    await service.delete_job(job)
 
 
 @router.get(

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import json
+import time
 from collections.abc import AsyncIterator
 from typing import Annotated, Any
 
@@ -11,13 +13,17 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import FileResponse, Response
 
 from ultragray.errors import UnsupportedMediaType, UploadTooLarge
+from ultragray.probe import FloatArray
 from ultragray_workers.scenes import SUFFIX
 
 from ...arrival import arrival
-from ...scene_points import DEFAULT_POINTS, MAX_POINTS, MAX_POSES, even_selection, point_message
+from ...scene_imports import PATIENCE_S
+from ...scene_points import DEFAULT_POINTS, MAX_POINTS, MAX_POSES, even_selection
 from ..accept import RAW
 from ..console_schemas import ScenePoses
 from ..deps import SceneName, ServiceDep, problems
+from ..disconnect import finish_or_abandon
+from ..revalidation import NOT_MODIFIED, revalidated
 from ..schemas import SceneOut
 from .scenes import scene_out
 
@@ -31,8 +37,10 @@ _POINTS: _Answers = {
         "description": "The length of the JSON that follows (uint32, little endian), the JSON with `count`, `fields` "
         "and `total`, then float32 [count, 6] from a multiple of 8 bytes.",
         "content": {RAW: _BINARY},
-    }
+    },
+    304: {"description": NOT_MODIFIED},
 }
+_POSES: _Answers = {200: {"model": ScenePoses}, 304: {"description": NOT_MODIFIED}}
 _FILE: _Answers = {200: {"description": "The scene file.", "content": {RAW: _BINARY}}}
 _IMPORT: dict[str, Any] = {
     "requestBody": {"required": True, "description": "A scene file (.ugr).", "content": {RAW: _BINARY}}
@@ -40,18 +48,26 @@ _IMPORT: dict[str, Any] = {
 
 
 @router.get("/{scene}/gaussians", response_class=Response, responses=_POINTS | problems(401, 404, 422))
-async def get_gaussians(service: ServiceDep, scene: SceneName, limit: PointLimit = DEFAULT_POINTS) -> Response:
+async def get_gaussians(
+    request: Request, service: ServiceDep, scene: SceneName, limit: PointLimit = DEFAULT_POINTS
+) -> Response:
     """Gaussians as points: position, intensity, transmittance and size; an even selection, always the same."""
-    header = await service.catalog.header(scene)
-    message = await asyncio.to_thread(point_message, service.scenes.path(scene), header.info, limit)
-    return Response(message, media_type=RAW)
+
+    async def points() -> Response:
+        return Response(await service.catalog.points(scene, limit), media_type=RAW)
+
+    return await revalidated(request, (await service.catalog.version(scene)).tag, points)
 
 
-@router.get("/{scene}/training-poses", responses=problems(401, 404, 422))
-async def get_training_poses(service: ServiceDep, scene: SceneName) -> ScenePoses:
+@router.get("/{scene}/training-poses", response_class=Response, responses=_POSES | problems(401, 404, 422))
+async def get_training_poses(request: Request, service: ServiceDep, scene: SceneName) -> Response:
     """The poses that the scene was trained from, at most 10,000 of them, evenly taken."""
-    poses = (await service.catalog.header(scene)).training_poses
-    return ScenePoses(poses=poses[even_selection(len(poses), MAX_POSES)].reshape(-1, 16).tolist())
+
+    async def poses() -> Response:
+        header = await service.catalog.header(scene)
+        return Response(await asyncio.to_thread(_poses_json, header.training_poses), media_type="application/json")
+
+    return await revalidated(request, (await service.catalog.version(scene)).tag, poses)
 
 
 @router.get("/{scene}/file", response_class=FileResponse, responses=_FILE | problems(401, 404, 422))
@@ -76,7 +92,9 @@ async def import_scene(request: Request, service: ServiceDep, scene: SceneName) 
     announced = request.headers.get("content-length", "")
     if announced.isdigit() and int(announced) > limit:
         raise UploadTooLarge(f"a scene file may have at most {limit} bytes, {announced} were announced", field="body")
-    header = await service.imports.take_in(scene, _blocks(request, service))
+    async with service.imports.receive(scene, _blocks(request, service)) as received:
+        deadline = time.monotonic() + PATIENCE_S
+        header = await finish_or_abandon(service.imports.accept(received, scene), request.receive, deadline)
     return scene_out(scene, header, 0)
 
 
@@ -85,8 +103,12 @@ async def delete_scene(service: ServiceDep, scene: SceneName) -> None:
     """Deletes a scene that was imported or that a job made, and frees its memory. Others are not the service's."""
     service.require_serving()
     await service.imports.delete(scene)
-    if scene in service.pool.loaded():
-        await service.unload(scene)
+    await service.pool.forget(scene)
+
+
+def _poses_json(poses: FloatArray) -> bytes:  # [P, 4, 4]
+    chosen = poses[even_selection(len(poses), MAX_POSES)]
+    return json.dumps({"poses": chosen.reshape(-1, 16).tolist()}).encode()
 
 
 async def _blocks(request: Request, service: ServiceDep) -> AsyncIterator[bytes]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-from dataclasses import asdict
 
 from fastapi import APIRouter
 
@@ -20,7 +19,9 @@ async def get_statistics(service: ServiceDep) -> StatisticsOut:
     pool = service.pool.statistics()
     return StatisticsOut(
         step_s=STEP_S,
-        steps=[StatisticsStep.model_validate(asdict(step)) for step in service.metrics.statistics.summaries()],
+        steps=[
+            StatisticsStep.model_validate(step, from_attributes=True) for step in service.metrics.statistics.summaries()
+        ],
         waiting_frames=pool.waiting_frames,
         busy_processes=pool.busy,
         processes=pool.processes_alive,

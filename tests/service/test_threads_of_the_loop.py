@@ -1,0 +1,86 @@
+"""Long work keeps nobody waiting who needs a thread of the event loop for a moment."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ultragray import GaussianScene
+from ultragray_service import catalog, scene_imports
+from ultragray_service.settings import load_settings
+from ultragray_service.state import Service
+from ultragray_workers.jobs.store import JobStore
+
+
+@pytest.fixture
+def blocked() -> Iterator[threading.Event]:
+    """Until it is set, the work lasts."""
+    event = threading.Event()
+    yield event
+    event.set()
+
+
+async def body() -> AsyncIterator[bytes]:
+    yield b"bytes"
+
+
+async def receive(service: Service) -> None:
+    async with service.imports.receive("sent", body()):
+        pass
+
+
+async def publish(service: Service) -> None:
+    async with service.imports.receive("sent", body()) as received:
+        await service.imports.accept(received, "sent")
+
+
+async def points(service: Service) -> None:
+    await service.catalog.points("demo", 10)
+
+
+LONG: dict[str, tuple[Any, str, Callable[[Service], Awaitable[None]]]] = {
+    "the sync of an import": (scene_imports, "_finish", receive),
+    "a name asked of the database": (JobStore, "makes_scene", receive),
+    "the copy of an import": (scene_imports, "link_or_copy", publish),
+    "points of a scene": (catalog, "point_message", points),
+}
+
+
+@pytest.mark.parametrize("name", LONG)
+def test_long_work_leaves_the_threads_of_the_loop(
+    name: str, tmp_path: Path, demo_scene: GaussianScene, blocked: threading.Event, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    owner, function, begin = LONG[name]
+    begun = threading.Event()
+
+    def wait(*_: object) -> None:
+        begun.set()
+        blocked.wait(30)
+
+    async def checked(*_: object, **__: object) -> None: ...
+
+    monkeypatch.setattr(owner, function, wait)
+    monkeypatch.setattr(scene_imports, "run_helper", checked)
+    monkeypatch.setattr(scene_imports, "read_header", lambda _: None)
+    demo_scene.save(tmp_path / "demo.ugr")
+
+    async def main() -> None:
+        service = Service(load_settings(data_folder=tmp_path))
+        await service.jobs.start()
+        asyncio.get_running_loop().set_default_executor(ThreadPoolExecutor(1))
+        task = asyncio.ensure_future(begin(service))
+        while not begun.is_set():
+            await asyncio.sleep(0.01)
+        await asyncio.wait_for(asyncio.to_thread(int), 10)
+        assert not task.done()
+        blocked.set()
+        await asyncio.wait({task})
+        await service.jobs.close()
+
+    asyncio.run(main())
