@@ -27,7 +27,7 @@ UltragrayError
 ├── StorageFull                     a disk that has no room for what was sent
 ├── TrainingDiverged                a training whose loss or parameters are no longer finite
 ├── TrainingStateInvalid            a training folder that cannot be resumed from
-├── MemoryExceeded                  a training, a check of a dataset or scene, a comparison, or a frame on a GPU, that does not fit
+├── MemoryExceeded                  a training, a check, a comparison, or a frame on a GPU, that does not fit in memory
 ├── SceneExists                     a scene of that name is there, or a job is making it
 ├── SceneReadOnly                   a scene of the data folder cannot be deleted
 ├── DatabaseUnavailable             the database of the jobs does not answer; nothing else is affected
