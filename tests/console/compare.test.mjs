@@ -4,7 +4,7 @@ import assert from "node:assert/strict";
 import { readFileSync } from "node:fs";
 import { after, before, describe, it } from "node:test";
 
-import { launch, openPage, picture, seriousFindings, Service, until } from "./harness.mjs";
+import { hold, launch, openPage, picture, seriousFindings, Service, until } from "./harness.mjs";
 import { makeSweep, put } from "./sweep.mjs";
 
 const HELD_OUT = 5;
@@ -15,7 +15,8 @@ let files;
 
 before(async () => {
   files = makeSweep();
-  [service, browser] = await Promise.all([Service.start(), launch()]);
+  service = await Service.start();
+  browser = await launch();
   await put(service, "/v1/datasets/sweep", readFileSync(files.sweep), "application/zip");
   await put(service, "/v1/scenes/compared", readFileSync(files.compared), "application/octet-stream");
 });
@@ -66,6 +67,40 @@ describe("compare", () => {
     await until(() => page.getByTestId("frame-number").textContent(), (text) => text === `Frame ${frames[0].frame_number}`, "no pick");
     assert.deepEqual([page.faults, page.foreign], [[], []]);
     await picture(page, "compare");
+    await page.context().close();
+  });
+
+  it("tells a picture that is late or did not come, and gets it", async () => {
+    const page = await openPage(browser, service, "#/compare/compared");
+    const truth = page.getByRole("region", { name: "Truth", exact: true });
+    await truth.locator('img[aria-busy="false"]').waitFor();
+    const release = await hold(page, /comparison\/1\/truth\.png$/);
+    await page.getByRole("button", { name: "Next frame" }).click();
+    await until(() => truth.locator('img[aria-busy="true"]').evaluate((image) => Number(getComputedStyle(image).opacity)), (opacity) => opacity < 0.5, "the picture before looks like the new one");
+    release();
+    await until(() => truth.locator('img[aria-busy="false"]').evaluate((image) => getComputedStyle(image).opacity), (opacity) => opacity === "1", "it is not shown");
+
+    let down = true;
+    await page.route(/comparison\/2\/truth\.png$/, (route) => (down ? route.abort() : route.continue()));
+    await page.getByRole("button", { name: "Next frame" }).click();
+    await truth.getByText("The service does not answer.").waitFor();
+    down = false;
+    await truth.locator('img[aria-busy="false"]').waitFor();
+    await page.context().close();
+  });
+
+  it("can be asked again after it failed", async () => {
+    const page = await openPage(browser, service, "#/scenes");
+    let failing = true;
+    const failed = { state: "failed", progress: 0, dataset: "sweep", frames: [], reason: "there was not enough memory" };
+    await page.route(/\/comparison$/, (route) => (failing ? route.fulfill({ json: failed }) : route.continue()));
+    await page.goto(`${service.url}/#/compare/compared`);
+    await page.getByRole("alert").getByText("there was not enough memory").waitFor();
+    await page.getByRole("button", { name: "Try again" }).click();
+    await page.getByRole("alert").getByText("there was not enough memory").waitFor();
+    failing = false;
+    await page.getByRole("button", { name: "Try again" }).click();
+    await page.getByTestId("comparison").waitFor();
     await page.context().close();
   });
 

@@ -94,14 +94,18 @@ export function launch() {
   return chromium.launch({ executablePath: CHROMIUM, args: CHROMIUM_FLAGS });
 }
 
-/** A page that remembers what went wrong in it: `page.faults` (errors, refused sources) and `page.foreign` (requests elsewhere). */
-export async function openPage(browser, service, hash, { width = 1280, height = 800, scheme = "light" } = {}) {
+/** A page that remembers what went wrong in it: `page.faults` (errors, refused sources) and `page.foreign` (requests elsewhere).
+ *
+ * `init`: what runs in it before its own scripts.
+ */
+export async function openPage(browser, service, hash, { width = 1280, height = 800, scheme = "light", init } = {}) {
   const context = await browser.newContext({ viewport: { width, height }, colorScheme: scheme, acceptDownloads: true });
   await context.grantPermissions(["clipboard-read", "clipboard-write"], { origin: service.url });
   const page = await context.newPage();
   page.setDefaultTimeout(TIMEOUT_MS);
   page.faults = [];
   page.foreign = [];
+  if (init !== undefined) await page.addInitScript(init);
   page.on("pageerror", (error) => page.faults.push(error.message));
   page.on("console", (message) => {
     if (message.type() === "error") page.faults.push(message.text());
@@ -161,3 +165,18 @@ export async function until(read, accept, what) {
   throw new Error(`${what}; the last was ${JSON.stringify(last)}`);
 }
 
+/** Keeps the page's requests to addresses that match from being sent until the function that is returned is called. */
+export async function hold(page, addresses) {
+  let release;
+  const released = new Promise((resolve) => (release = resolve));
+  await page.route(addresses, async (route) => {
+    await released;
+    await route.continue();
+  });
+  return release;
+}
+
+/** What has the focus: its label, else its text. */
+export function focused(page) {
+  return page.evaluate(() => document.activeElement.ariaLabel ?? document.activeElement.textContent.trim());
+}

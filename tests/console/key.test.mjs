@@ -1,21 +1,28 @@
 /** A service that asks for a key: the page asks the person, once a tab. */
 
 import assert from "node:assert/strict";
+import { readFileSync } from "node:fs";
+import path from "node:path";
 import { after, before, describe, it } from "node:test";
 
 import { canvasState, launch, openPage, picture, seriousFindings, Service, until } from "./harness.mjs";
+import { makeSweep } from "./sweep.mjs";
 
 const KEY = "a-key-of-the-tests";
 
 let service;
 let browser;
+let files;
 
 before(async () => {
-  [service, browser] = await Promise.all([Service.start({ ULTRAGRAY_API_KEYS: KEY }), launch()]);
+  files = makeSweep();
+  service = await Service.start({ ULTRAGRAY_API_KEYS: KEY });
+  browser = await launch();
 });
 after(async () => {
   await browser?.close();
   await service?.stop();
+  files?.remove();
 });
 
 describe("a key", () => {
@@ -24,6 +31,9 @@ describe("a key", () => {
     await page.getByText("This service asks for a key").waitFor();
     assert.deepEqual(await seriousFindings(page), []);
     await picture(page, "key");
+    await page.getByLabel("API key").fill("a–key–with–dashes–of–a–word–processor");
+    await page.getByRole("button", { name: "Open" }).click();
+    await page.getByRole("alert").getByText("plain letters, digits and signs").waitFor();
     await page.getByLabel("API key").fill("not-the-right-key-at-all");
     await page.getByRole("button", { name: "Open" }).click();
     await page.getByText("The service does not take this key.").waitFor();
@@ -33,6 +43,24 @@ describe("a key", () => {
     await until(image, ({ mean }) => mean > 5, "no frame came");
     await page.reload();
     await until(image, ({ mean }) => mean > 5, "the key was not kept");
+    await page.context().close();
+  });
+
+  it("goes with uploads, pictures and downloads", async () => {
+    const page = await openPage(browser, service, "#/train");
+    await page.getByLabel("API key").fill(KEY);
+    await page.getByRole("button", { name: "Open" }).click();
+    await page.getByLabel("Add a sweep").setInputFiles(files.sweep);
+    await page.getByRole("button", { name: "Upload and check" }).click();
+    await page.getByText("28 to train from, 5 held out").waitFor();
+    await page.getByRole("img", { name: "Contact sheet of sweep" }).waitFor();
+    await page.getByRole("link", { name: "Scenes and service" }).click();
+    const [download] = await Promise.all([
+      page.waitForEvent("download"),
+      page.getByTestId("scene-demo").getByRole("button", { name: "Download" }).click(),
+    ]);
+    assert.equal(download.suggestedFilename(), "demo.ugr");
+    assert.deepEqual(readFileSync(await download.path()), readFileSync(path.join(service.data, "demo.ugr")));
     await page.context().close();
   });
 });

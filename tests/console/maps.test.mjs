@@ -13,7 +13,8 @@ let service;
 let browser;
 
 before(async () => {
-  [service, browser] = await Promise.all([Service.start(), launch()]);
+  service = await Service.start();
+  browser = await launch();
 });
 after(async () => {
   await browser?.close();
@@ -70,6 +71,27 @@ describe("maps", () => {
     await page.getByText(`${SIDE / 2 + 1}, ${SIDE / 2 + 10}`).waitFor();
     assert.deepEqual(await seriousFindings(page), []);
     await picture(page, "maps-1024");
+    await page.context().close();
+  });
+
+  it("shows B-mode as the product of its neighbours whatever gain Scan has, and nothing beside a fan", async () => {
+    const page = await openPage(browser, service, "#/scan/demo");
+    await page.getByLabel("Gain", { exact: true }).fill("12");
+    await page.getByRole("combobox", { name: "Probe" }).selectOption("convex");
+    await page.getByRole("link", { name: "Maps", exact: true }).click();
+    const bmode = '[data-testid="map-bmode"]';
+    await until(() => canvasState(page, bmode), ({ width, mean }) => width === 640 && mean > 5, "no fan came");
+    const box = await page.locator(`${bmode} canvas`).boundingBox();
+    const value = async (output) => Number(await page.getByTestId(`value-${output}`).textContent());
+    for (const depth of [0.2, 0.4, 0.6]) {
+      await page.mouse.move(box.x + box.width / 2, box.y + box.height * depth);
+      await until(() => value("bmode"), (shown) => !Number.isNaN(shown), "no value");
+      const product = (await value("echo")) * (await value("transmittance"));
+      assert.ok(Math.abs((await value("bmode")) - product) < 0.01, `${await value("bmode")} is not ${product}`);
+    }
+    await page.mouse.move(box.x + 3, box.y + 3);
+    for (const output of OUTPUTS)
+      await until(() => page.getByTestId(`value-${output}`).textContent(), (text) => text === "–", `${output} beside the fan`);
     await page.context().close();
   });
 

@@ -5,35 +5,21 @@ import { readFileSync } from "node:fs";
 import { after, before, describe, it } from "node:test";
 
 import { canvasState, launch, openPage, picture, seriousFindings, Service, until } from "./harness.mjs";
+import { changed, dragProbe, enterPose, IMAGE, openScan, poseOf } from "./scan_page.mjs";
 
-const IMAGE = '[aria-label="Live image"]';
 const PROBE_WIDTH_MM = 60; // of the demo scene
 
 let service;
 let browser;
 
 before(async () => {
-  [service, browser] = await Promise.all([Service.start(), launch()]);
+  service = await Service.start();
+  browser = await launch();
 });
 after(async () => {
   await browser?.close();
   await service?.stop();
 });
-
-async function openScan(options) {
-  const page = await openPage(browser, service, "#/scan/demo", options);
-  const first = await until(() => canvasState(page, IMAGE), ({ mean }) => mean > 5, "no frame came");
-  return { page, first };
-}
-
-function changed(page, print) {
-  return until(() => canvasState(page, IMAGE), (state) => state.print !== print, "the image did not change");
-}
-
-async function poseOf(page) {
-  const json = await page.getByLabel("Pose as JSON, Enter applies").inputValue();
-  return JSON.parse(json);
-}
 
 describe("scan", () => {
   it("is the page at the address of the service, with the first scene", async () => {
@@ -44,7 +30,7 @@ describe("scan", () => {
   });
 
   it("shows the frame of where the probe is, and follows keys, sliders and JSON", async () => {
-    const { page, first } = await openScan();
+    const { page, first } = await openScan(browser, service);
     assert.deepEqual([first.width, first.height], [256, 256]);
     const pose = await poseOf(page);
     await page.locator(`${IMAGE} .steer`).focus();
@@ -57,12 +43,10 @@ describe("scan", () => {
     await page.getByLabel("Position X", { exact: true }).fill("8");
     await until(() => poseOf(page), ({ position_mm }) => position_mm.x === 8, "the slider did not move it");
     await changed(page, moved.print);
-    await page.getByLabel("Pose as JSON, Enter applies").fill(JSON.stringify(pose));
-    await page.keyboard.press("Enter");
+    await enterPose(page, JSON.stringify(pose));
     const back = ({ mean }) => Math.abs(mean - first.mean) < 0.05; // the pose is rounded to micrometres
     await until(() => canvasState(page, IMAGE), back, "the first image did not come back");
-    await page.getByLabel("Pose as JSON, Enter applies").fill('{"position_mm": {"x": 1}}');
-    await page.keyboard.press("Enter");
+    await enterPose(page, '{"position_mm": {"x": 1}}');
     await page.getByText("position_mm needs the numbers x, y, z.").waitFor();
     await page.getByLabel("Pose as JSON, Enter applies").press("Escape");
     await page.getByLabel("Copy the pose as JSON").click();
@@ -72,7 +56,7 @@ describe("scan", () => {
   });
 
   it("shows what gain, range, TGC, depth, flip, samples and another probe make of it", async () => {
-    const { page, first } = await openScan();
+    const { page, first } = await openScan(browser, service);
     await page.getByLabel("Gain", { exact: true }).fill("12");
     const brighter = await changed(page, first.print);
     assert.ok(brighter.mean > first.mean + 10, `${brighter.mean} after ${first.mean}`);
@@ -98,7 +82,7 @@ describe("scan", () => {
   });
 
   it("freezes, goes through the cine loop, measures and saves", async () => {
-    const { page, first } = await openScan();
+    const { page, first } = await openScan(browser, service);
     await page.getByLabel("Position Y", { exact: true }).fill("0");
     const second = await changed(page, first.print);
     await page.getByRole("button", { name: "Freeze" }).click();
@@ -135,7 +119,7 @@ describe("scan", () => {
   });
 
   it("snaps to training views, plays them, and says how far the view is from them", async () => {
-    const { page, first } = await openScan();
+    const { page, first } = await openScan(browser, service);
     const confidence = page.getByTestId("confidence");
     await until(() => confidence.textContent(), (text) => text === "Well supported", "home is a training view");
     await page.getByLabel("Tilt, about the lateral axis", { exact: true }).fill("60");
@@ -152,7 +136,7 @@ describe("scan", () => {
   });
 
   it("is steered by a gamepad", async () => {
-    const { page, first } = await openScan();
+    const { page, first } = await openScan(browser, service);
     await page.evaluate(() => {
       const pad = { id: "Pad of the test", connected: true, axes: [0, 1, 0, 0], buttons: [] };
       navigator.getGamepads = () => [pad];
@@ -166,7 +150,7 @@ describe("scan", () => {
   });
 
   it("shows the scene in space, where the probe can be dragged", async () => {
-    const { page } = await openScan();
+    const { page } = await openScan(browser, service);
     const room = page.getByTestId("room");
     await room.locator("canvas").waitFor();
     await until(() => room.locator("canvas").evaluate((canvas) => canvas.width), (width) => width > 300, "no 3D view");
@@ -191,7 +175,7 @@ describe("scan", () => {
 
   it("is usable by keyboard and by readers of the screen, at 1280 and at 1024 pixels", async () => {
     for (const [width, height, scheme] of [[1280, 800, "light"], [1024, 768, "dark"]]) {
-      const { page } = await openScan({ width, height, scheme });
+      const { page } = await openScan(browser, service, { width, height, scheme });
       assert.deepEqual(await seriousFindings(page), []);
       const wider = await page.evaluate(() => document.documentElement.scrollWidth > innerWidth);
       assert.equal(wider, false, `wider than ${width} pixels`);
@@ -201,7 +185,7 @@ describe("scan", () => {
   });
 
   it("says that the service is down, and goes on when it is back", async () => {
-    const { page, first } = await openScan();
+    const { page, first } = await openScan(browser, service);
     await service.down();
     await page.getByTestId("service-down").waitFor();
     await page.getByText("No connection").waitFor();
@@ -222,21 +206,3 @@ describe("scan", () => {
     await page.context().close();
   });
 });
-
-/** Drags the probe by a handle, which the pointer tells by its shape, until the pose follows; false without a handle. */
-async function dragProbe(page, room, pose) {
-  const box = await room.boundingBox();
-  for (let y = 0.25; y < 0.6; y += 0.015) {
-    for (let x = 0.45; x < 0.75; x += 0.015) {
-      await page.mouse.move(box.x + box.width * x, box.y + box.height * y);
-      if ((await room.locator("canvas").evaluate((canvas) => canvas.style.cursor)) !== "grab") continue;
-      await page.mouse.down();
-      await page.mouse.move(box.x + box.width * x + 30, box.y + box.height * y + 40, { steps: 4 });
-      await page.mouse.up();
-      const moved = (now) => JSON.stringify(now) !== JSON.stringify(pose);
-      await until(() => poseOf(page), moved, "the probe did not follow the pointer");
-      return true;
-    }
-  }
-  return false;
-}

@@ -5,8 +5,8 @@ import { readFileSync, writeFileSync } from "node:fs";
 import path from "node:path";
 import { after, before, describe, it } from "node:test";
 
-import { launch, openPage, picture, seriousFindings, Service, until } from "./harness.mjs";
-import { makeSweep } from "./sweep.mjs";
+import { focused, hold, launch, openPage, picture, seriousFindings, Service, until } from "./harness.mjs";
+import { makeSweep, put } from "./sweep.mjs";
 
 let service;
 let browser;
@@ -14,7 +14,8 @@ let files;
 
 before(async () => {
   files = makeSweep();
-  [service, browser] = await Promise.all([Service.start(), launch()]);
+  service = await Service.start();
+  browser = await launch();
   writeFileSync(path.join(service.data, "damaged.ugr"), "no scene");
 });
 after(async () => {
@@ -36,29 +37,69 @@ describe("scenes and service", () => {
     await picture(page, "scenes");
     await row.getByRole("button", { name: "Unload" }).click();
     await row.getByRole("button", { name: "Load", exact: true }).waitFor();
-    const [download] = await Promise.all([page.waitForEvent("download"), row.getByRole("button", { name: "Download" }).click()]);
+    const [download] = await Promise.all([page.waitForEvent("download"), row.getByRole("link", { name: "Download" }).click()]);
     assert.equal(download.suggestedFilename(), "mine.ugr");
     assert.deepEqual(readFileSync(await download.path()), readFileSync(files.compared));
-    await row.getByRole("button", { name: "Delete" }).click();
-    await row.getByRole("button", { name: "Keep" }).click();
+    await row.getByRole("link", { name: "mine", exact: true }).click();
+    await page.getByRole("link", { name: "Scenes and service" }).click();
+    for (const answer of ["Enter", "Escape"]) {
+      await row.getByRole("button", { name: "Delete" }).press("Enter");
+      await page.keyboard.press(answer); // Keep has the focus
+      await until(() => focused(page), (text) => text === "Delete", "the focus is lost");
+    }
     await row.getByRole("button", { name: "Delete" }).click();
     await row.getByRole("group", { name: "Delete mine?" }).getByRole("button", { name: "Delete" }).click();
     await row.waitFor({ state: "detached" });
+    await until(() => focused(page), (text) => text === "List of scenes", "the focus is lost");
+    assert.equal(await page.getByRole("banner").getByLabel("Scene").inputValue(), "demo");
+    assert.equal(await page.getByRole("link", { name: "Compare", exact: true }).getAttribute("href"), "#/compare/demo");
     assert.deepEqual([page.faults, page.foreign], [[], []]);
     await page.context().close();
   });
 
-  it("says what cannot be imported, read or deleted", async () => {
+  it("begins anew with a scene that takes the place of a deleted one", async () => {
+    const scene = readFileSync(files.compared);
+    await put(service, "/v1/scenes/again", scene, "application/octet-stream");
+    const page = await openPage(browser, service, "#/scan/again");
+    const gain = page.getByRole("slider", { name: "Gain", exact: true });
+    await gain.fill("6");
+    await page.getByRole("link", { name: "Scenes and service" }).click();
+    const row = page.getByTestId("scene-again");
+    await row.getByRole("button", { name: "Delete" }).click();
+    await row.getByRole("group", { name: "Delete again?" }).getByRole("button", { name: "Delete" }).click();
+    await row.waitFor({ state: "detached" });
+    await put(service, "/v1/scenes/again", scene, "application/octet-stream");
+    await row.getByRole("link", { name: "again", exact: true }).click();
+    assert.equal(await gain.inputValue(), "0");
+    await page.context().close();
+  });
+
+  it("goes on with an import while other views are looked at", async () => {
+    const page = await openPage(browser, service, "#/scenes");
+    const release = await hold(page, /\/v1\/scenes\/late$/);
+    await page.getByLabel("Import a scene").setInputFiles(files.compared);
+    await page.getByLabel("Name", { exact: true }).fill("late");
+    await page.getByRole("button", { name: "Import", exact: true }).click();
+    await page.getByLabel("Import", { exact: true }).waitFor();
+    await page.getByRole("link", { name: "Train", exact: true }).click();
+    await page.getByRole("link", { name: "Scenes and service" }).click();
+    await page.getByLabel("Import", { exact: true }).waitFor();
+    release();
+    await page.getByRole("status").getByText("late is there.").waitFor();
+    await page.context().close();
+  });
+
+  it("says what cannot be imported or read, and offers no deletion of what is not the service's", async () => {
     const page = await openPage(browser, service, "#/scenes");
     await page.getByTestId("scene-damaged").getByText("not a scene file").waitFor();
     await page.getByLabel("Import a scene").setInputFiles({ name: "a b.ugr", mimeType: "", buffer: Buffer.from("nothing") });
     assert.equal(await page.getByLabel("Name", { exact: true }).inputValue(), "a-b");
     await page.getByRole("button", { name: "Import", exact: true }).click();
     await page.getByTestId("import-problem").getByText("not a scene file").waitFor();
-    const row = page.getByTestId("scene-demo");
-    await row.getByRole("button", { name: "Delete" }).click();
-    await row.getByRole("group", { name: "Delete demo?" }).getByRole("button", { name: "Delete" }).click();
-    await page.getByRole("alert").getByText("lies in the data folder").waitFor();
+    await put(service, "/v1/scenes/removable", readFileSync(files.compared), "application/octet-stream");
+    await page.getByTestId("scene-removable").getByRole("button", { name: "Delete" }).waitFor();
+    for (const name of ["demo", "damaged"])
+      assert.equal(await page.getByTestId(`scene-${name}`).getByRole("button", { name: "Delete" }).count(), 0);
     await page.context().close();
   });
 

@@ -13,7 +13,8 @@ let files;
 before(async () => {
   files = makeSweep();
   const settings = { ULTRAGRAY_EMBEDDED_WORKER: "true", ULTRAGRAY_TRAINING_THREADS: "1" };
-  [service, browser] = await Promise.all([Service.start(settings), launch()]);
+  service = await Service.start(settings);
+  browser = await launch();
 });
 after(async () => {
   await browser?.close();
@@ -65,7 +66,7 @@ describe("train", () => {
     await page.getByRole("img", { name: /^Held-out frame/ }).first().waitFor();
     const [download] = await Promise.all([
       page.waitForEvent("download"),
-      page.getByRole("button", { name: "made.ugr" }).click(),
+      page.getByRole("link", { name: "made.ugr" }).click(),
     ]);
     assert.equal(download.suggestedFilename(), "made.ugr");
     assert.deepEqual(await seriousFindings(page), []);

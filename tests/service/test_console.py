@@ -32,6 +32,7 @@ def build(folder: Path) -> None:
     (folder / "assets").mkdir(parents=True)
     (folder / "index.html").write_text("<!doctype html><title>console</title>")
     (folder / "favicon.svg").write_text("<svg/>")
+    (folder / "licences.txt").write_text("MIT")
     (folder / "assets" / "index-1a2b.js").write_text("export {};" * 1000)
 
 
@@ -59,6 +60,7 @@ def test_the_page_is_asked_for_again_and_its_files_are_kept(page: httpx.AsyncCli
     assert script.headers["content-encoding"] == "gzip"
     assert script.text == "export {};" * 1000
     assert get(page, "/favicon.svg").headers["content-type"] == "image/svg+xml"
+    assert get(page, "/licences.txt").text == "MIT"
 
 
 @pytest.mark.parametrize("path", ["/assets/%2e%2e/index.html", "/assets/%2e%2e%2findex.html"])

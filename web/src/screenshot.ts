@@ -2,14 +2,17 @@
 
 import type { Frame } from "./api/stream";
 import { depthTicks, extent_mm, pixelAt, type Placed, type PlanePoint } from "./geometry/picture";
-import { poseJson } from "./geometry/pose";
+import { poseJson } from "./geometry/pose_json";
 import { length_mm, type Calliper } from "./state/callipers.svelte";
 
 const LONGER_SIDE = 1024;
-const MARGINS = { top: 16, right: 56, bottom: 56, left: 16 };
+const MARGINS = { top: 30, right: 56, bottom: 22, left: 16 };
+const LINE = 20;
 const FONT = "13px system-ui, sans-serif";
 const TEXT = "#c8d0d8";
 const MEASURED = "#ffd84d";
+const MARKER = "#5bbde4";
+const KEPT_MS = 60_000;
 
 /** Throws where the browser cannot make a PNG of that size. */
 export async function screenshot(source: HTMLCanvasElement, frame: Frame, callipers: Calliper[]): Promise<Blob> {
@@ -19,10 +22,15 @@ export async function screenshot(source: HTMLCanvasElement, frame: Frame, callip
   const scale = LONGER_SIDE / Math.max(across, down);
   const [width, height] = [across * scale, down * scale];
   const canvas = document.createElement("canvas");
-  canvas.width = Math.round(width + MARGINS.left + MARGINS.right);
-  canvas.height = Math.round(height + MARGINS.top + MARGINS.bottom);
   const context = canvas.getContext("2d");
   if (context === null) throw new Error("The browser cannot draw the screenshot.");
+  context.font = FONT;
+  const words = `Simulated, not for diagnosis.   ${header.scene}   ${new Date().toISOString()}   depth in cm`;
+  const lines = [words.split("   "), poseJson(header.pose.flat()).split(/(?<=,)/)].flatMap((pieces, index) =>
+    wrapped(context, pieces, index === 0 ? "   " : "", width + MARGINS.right),
+  );
+  canvas.width = Math.round(width + MARGINS.left + MARGINS.right);
+  canvas.height = Math.round(height + MARGINS.top + MARGINS.bottom + LINE * lines.length);
   context.fillRect(0, 0, canvas.width, canvas.height);
   context.drawImage(source, MARGINS.left, MARGINS.top, width, height);
   context.font = FONT;
@@ -39,13 +47,34 @@ export async function screenshot(source: HTMLCanvasElement, frame: Frame, callip
   };
   context.fillStyle = context.strokeStyle = MEASURED;
   for (const calliper of callipers) drawCalliper(context, screenOf(calliper.a), screenOf(calliper.b), length_mm(calliper));
+  drawMarker(context, header.display.flip ? right - 8 : MARGINS.left + 8);
   context.fillStyle = TEXT;
-  const bottom = MARGINS.top + height;
-  context.fillText(`${header.scene}   ${new Date().toISOString()}   depth in cm   simulated, not for diagnosis`, MARGINS.left, bottom + 22);
-  context.fillText(poseJson(header.pose.flat()), MARGINS.left, bottom + 42);
+  const bottom = MARGINS.top + height + MARGINS.bottom;
+  for (const [index, line] of lines.entries()) context.fillText(line, MARGINS.left, bottom + LINE * (index + 0.4));
   const blob = await new Promise<Blob | null>((resolve) => canvas.toBlob(resolve, "image/png"));
   if (blob === null) throw new Error("The browser cannot write the screenshot.");
   return blob;
+}
+
+/** Pieces of text as lines that fit into a width in pixels. */
+function wrapped(context: CanvasRenderingContext2D, pieces: string[], gap: string, width: number): string[] {
+  const lines: string[] = [];
+  for (const piece of pieces) {
+    const longer = `${lines.at(-1)}${gap}${piece}`;
+    if (lines.length > 0 && context.measureText(longer).width <= width) lines[lines.length - 1] = longer;
+    else lines.push(piece);
+  }
+  return lines;
+}
+
+/** On the side of the probe's mark, as above the live image. */
+function drawMarker(context: CanvasRenderingContext2D, x: number): void {
+  const y = MARGINS.top / 2;
+  context.fillStyle = context.strokeStyle = MARKER;
+  context.beginPath();
+  context.arc(x, y, 8, 0, 2 * Math.PI);
+  context.stroke();
+  context.fillText("U", x - context.measureText("U").width / 2, y + 4.5);
 }
 
 function drawCalliper(context: CanvasRenderingContext2D, a: [number, number], b: [number, number], mm: number): void {
@@ -69,5 +98,5 @@ export function saveBlob(blob: Blob, name: string): void {
   link.href = address;
   link.download = name;
   link.click();
-  URL.revokeObjectURL(address);
+  setTimeout(() => URL.revokeObjectURL(address), KEPT_MS); // some browsers read it after the click
 }

@@ -13,9 +13,11 @@ export function count(value: number): string {
 }
 
 export function duration(seconds: number): string {
-  if (seconds < 60) return `${Math.round(seconds)} s`;
-  if (seconds < 3600) return `${Math.floor(seconds / 60)} min ${Math.round(seconds % 60)} s`;
-  return `${Math.floor(seconds / 3600)} h ${Math.round((seconds % 3600) / 60)} min`;
+  const whole_s = Math.round(seconds);
+  if (whole_s < 60) return `${whole_s} s`;
+  if (whole_s < 3600) return `${Math.floor(whole_s / 60)} min ${whole_s % 60} s`;
+  const whole_min = Math.round(seconds / 60);
+  return `${Math.floor(whole_min / 60)} h ${whole_min % 60} min`;
 }
 
 export function localTime(iso: string): string {

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import re
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 
 from fastapi import FastAPI
@@ -21,8 +22,9 @@ from .revalidation import revalidated
 
 CONSOLE_FOLDER = Path(__file__).resolve().parents[1] / "console"
 ASSETS_PATH = "/assets"
-CONSOLE_PATHS = ("/", "/favicon.svg")  # and what lies below ASSETS_PATH: a page cannot send a key for itself
-_PAGE_NAME, _ICON_NAME = "index.html", "favicon.svg"
+_PAGE_NAME = "index.html"
+_BESIDE = {"favicon.svg": "image/svg+xml", "licences.txt": "text/plain"}  # the page: file name and media type
+CONSOLE_PATHS = ("/", *(f"/{name}" for name in _BESIDE))  # and below ASSETS_PATH: a page cannot send a key for itself
 _HOST = re.compile(r"[A-Za-z0-9._:\[\]-]+")
 _POLICY = (
     "default-src 'self'",
@@ -66,12 +68,15 @@ def add_console(app: FastAPI, folder: Path = CONSOLE_FOLDER) -> None:
         except FileNotFoundError:
             return HTMLResponse(_NOT_BUILT, headers=_headers(request))
 
-    @app.api_route(f"/{_ICON_NAME}", methods=["GET", "HEAD"], include_in_schema=False)
-    async def icon(request: Request) -> Response:
-        try:
-            return await _file(request, folder / _ICON_NAME, "image/svg+xml")
-        except FileNotFoundError:
-            raise RouteNotFound(f"there is no route /{_ICON_NAME}: the console was not built") from None
+    for name in _BESIDE:
+        app.add_api_route(f"/{name}", partial(_beside, folder / name), methods=["GET", "HEAD"], include_in_schema=False)
+
+
+async def _beside(path: Path, request: Request) -> Response:
+    try:
+        return await _file(request, path, _BESIDE[path.name])
+    except FileNotFoundError:
+        raise RouteNotFound(f"there is no route /{path.name}: the console was not built") from None
 
 
 async def _file(request: Request, path: Path, media_type: str) -> Response:

@@ -1,6 +1,8 @@
 /** How the console asks the service: one place for the key, for errors and for their words. */
 
 const KEY_STORAGE = "ultragray.key";
+const RETRY_MS = 2000;
+const FULL_OR_STARTING = [429, 503];
 
 /** What the service answers in place of a result: RFC 9457 with a stable `reason`. */
 export interface Problem {
@@ -64,6 +66,27 @@ export async function request(path: string, init: RequestInit = {}): Promise<Res
   }
   if (!response.ok) throw new ServiceError(await problemOf(response));
   return response;
+}
+
+/**
+ * Asks until the service answers; `told` hears what keeps it from it, a service that is down or full, each time. Throws
+ * ServiceError for what asking again does not change, and what `ask` throws once the signal is aborted.
+ */
+export async function untilAnswered<T>(
+  ask: () => Promise<T>,
+  told: (error: unknown) => void,
+  signal: AbortSignal,
+): Promise<T> {
+  for (;;) {
+    try {
+      return await ask();
+    } catch (error) {
+      const lasting = error instanceof ServiceError && !FULL_OR_STARTING.includes(error.problem.status);
+      if (signal.aborted || lasting) throw error;
+      told(error);
+    }
+    await new Promise((resolve) => setTimeout(resolve, RETRY_MS));
+  }
 }
 
 /** The JSON that a GET answers. */

@@ -24,6 +24,8 @@ export type Probe = LinearProbe | ConvexProbe | PhasedProbe;
 export interface SceneEntry {
   name: string;
   loaded: boolean;
+  /** Whether it may be deleted. */
+  removable: boolean;
   gaussian_count?: number;
   image_height?: number;
   image_width?: number;
@@ -39,6 +41,13 @@ export interface Point {
 
 export interface PoseOut {
   matrix: number[][];
+}
+
+/** How well a scene knows the confidence of its frames. */
+export interface ConfidenceFit {
+  /** Mean absolute error on the views that it was fitted on. */
+  error: number;
+  fitted_on: number;
 }
 
 export interface SceneDescription {
@@ -59,6 +68,8 @@ export interface SceneDescription {
   dataset_name: string | null;
   dataset_sha256: string | null;
   label_names: Record<string, string> | null;
+  /** null: the scene cannot tell the confidence of its frames. */
+  confidence: ConfidenceFit | null;
 }
 
 /** The Gaussians of a scene as points: float32 [N, 6], x, y, z in mm, intensity, transmittance, mean sigma in mm. */

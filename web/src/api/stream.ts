@@ -21,6 +21,9 @@ export interface StreamSettings {
   height: number | null;
   width: number | null;
   probe: Probe | null;
+  /** Frames below it are treated as the next one says; null: none are. */
+  min_confidence: number | null;
+  below_min_confidence: "refuse" | "mask";
   display: Display;
   outputs: Output[];
 }
@@ -31,7 +34,7 @@ export interface Extrapolation {
   angle_deg: number | null;
   /** The MS-SSIM to expect, 0 to 1, where the scene was trained to tell. */
   confidence: number | null;
-  /** Of the pixels; only with coverage. */
+  /** Of the pixels. */
   supported_share: number | null;
 }
 
@@ -40,6 +43,7 @@ export interface FrameHeader {
   client_time_ms: number | null;
   dropped: number;
   scene: string;
+  scene_sha256: string;
   pose: number[][];
   probe: Probe;
   display: Display;
@@ -78,6 +82,10 @@ export interface StreamEvents {
 const MAX_UNANSWERED = 4; // more would only wait: the newest pose is kept here until there is room
 const LEAST_BETWEEN_MS = 24; // 40 frames a second look smooth; more would only warm the room
 const RECONNECT_MS = { first: 300, most: 3000 };
+const TIMEOUT_MS = 8000; // of a frame: the service refuses it then
+const SILENT_MS = 10_000; // after so long without the answer that is due, the connection is dead
+const PASSING = ["QUEUE_FULL", "DEADLINE_EXCEEDED", "NOT_READY", "RENDER_FAILED", "INTERNAL"];
+const AGAIN_MS = 1000; // after a refusal that may pass
 
 /** A stream that stays open, over restarts of the service, until it is closed. */
 export class FrameStream {
@@ -87,10 +95,16 @@ export class FrameStream {
   #closed = false;
   #sequence = 0;
   #answered = 0;
+  /** The settings of each message that waits for its answer. */
+  #asked = new Map<number, string>();
   #sentSettings = "";
+  /** Those of the newest frame: what was not answered with one must be sent again. */
+  #takenSettings = "";
   #wanted: { pose: Pose; settings: StreamSettings } | null = null;
   #waiting = false;
   #later: ReturnType<typeof setTimeout> | undefined;
+  #again: ReturnType<typeof setTimeout> | undefined;
+  #silence: ReturnType<typeof setTimeout> | undefined;
   #sent_ms = -Infinity;
 
   constructor(
@@ -107,10 +121,16 @@ export class FrameStream {
     this.#send();
   }
 
+  /** Connects now, where a connection that was lost would be tried again later. */
+  reconnect(): void {
+    if (this.#socket !== null || this.#closed) return;
+    clearTimeout(this.#timer);
+    this.#open();
+  }
+
   close(): void {
     this.#closed = true;
-    clearTimeout(this.#timer);
-    clearTimeout(this.#later);
+    for (const timer of [this.#timer, this.#later, this.#again, this.#silence]) clearTimeout(timer);
     this.#socket?.close();
   }
 
@@ -124,20 +144,37 @@ export class FrameStream {
     socket.onopen = () => {
       this.#delay_ms = RECONNECT_MS.first;
       this.#sequence = this.#answered = 0;
-      this.#sentSettings = "";
+      this.#asked.clear();
+      this.#sentSettings = this.#takenSettings = "";
       this.#waiting = this.#wanted !== null;
+      this.#listen();
       this.events.connected(true);
       this.#send();
     };
     socket.onmessage = (event: MessageEvent<ArrayBuffer | string>) => this.#receive(event.data);
-    socket.onclose = () => {
-      if (this.#closed) return;
-      this.#socket = null;
-      this.events.connected(false);
-      this.#timer = setTimeout(() => this.#open(), this.#delay_ms);
-      this.#delay_ms = Math.min(this.#delay_ms * 2, RECONNECT_MS.most);
-    };
+    socket.onclose = () => this.#lose();
     this.#socket = socket;
+    this.#silence = setTimeout(() => this.#lose(), SILENT_MS);
+  }
+
+  /** Gives the socket up, and opens another after a while. */
+  #lose(): void {
+    if (this.#closed || this.#socket === null) return;
+    // A dead connection tells of its end much later, if ever.
+    this.#socket.onopen = this.#socket.onmessage = this.#socket.onclose = null;
+    this.#socket.close();
+    this.#socket = null;
+    clearTimeout(this.#silence);
+    clearTimeout(this.#again);
+    this.events.connected(false);
+    this.#timer = setTimeout(() => this.#open(), this.#delay_ms);
+    this.#delay_ms = Math.min(this.#delay_ms * 2, RECONNECT_MS.most);
+  }
+
+  /** Waits for the next answer, if one is due. */
+  #listen(): void {
+    clearTimeout(this.#silence);
+    if (this.#sequence > this.#answered) this.#silence = setTimeout(() => this.#lose(), SILENT_MS);
   }
 
   #send(): void {
@@ -155,31 +192,54 @@ export class FrameStream {
     this.#sent_ms = performance.now();
     const { pose, settings } = this.#wanted;
     this.#waiting = false;
+    const nothingDue = this.#sequence === this.#answered;
     this.#sequence += 1;
     const written = JSON.stringify(settings);
     const message: Record<string, unknown> = {
       sequence: this.#sequence,
       mode: "latest",
+      timeout_ms: TIMEOUT_MS,
       client_time_ms: performance.now(),
       pose: { matrix: [0, 4, 8, 12].map((start) => pose.slice(start, start + 4)) },
     };
-    if (written !== this.#sentSettings) message.settings = { ...settings, encoding: "uint8" };
+    const known = written === this.#sentSettings && written === this.#takenSettings;
+    if (!known) message.settings = { ...settings, encoding: "uint8" };
     this.#sentSettings = written;
+    this.#asked.set(this.#sequence, written);
     this.#socket?.send(JSON.stringify(message));
+    if (nothingDue) this.#listen();
   }
 
   #receive(data: ArrayBuffer | string): void {
     if (this.#closed) return;
     if (typeof data === "string") {
       const { sequence, error } = JSON.parse(data) as { sequence: number; error: Refusal };
-      this.#answered = Math.max(this.#answered, sequence);
+      this.#takenSettings = "";
+      this.#settle(sequence);
       this.events.refused(error);
+      if (PASSING.includes(error.reason)) this.#askAgain();
     } else {
       const frame = decodeFrame(data);
-      this.#answered = Math.max(this.#answered, frame.header.sequence);
+      this.#takenSettings = this.#asked.get(frame.header.sequence) ?? "";
+      this.#settle(frame.header.sequence);
       this.events.frame(frame);
     }
     this.#send();
+  }
+
+  /** The messages up to this one need no answer any more. */
+  #settle(sequence: number): void {
+    this.#answered = Math.max(this.#answered, sequence);
+    for (const asked of this.#asked.keys()) if (asked <= sequence) this.#asked.delete(asked);
+    this.#listen();
+  }
+
+  #askAgain(): void {
+    clearTimeout(this.#again);
+    this.#again = setTimeout(() => {
+      this.#waiting = true;
+      this.#send();
+    }, AGAIN_MS);
   }
 }
 

@@ -9,7 +9,8 @@ export const TITLES: Record<Tone, string> = {
   warn: "Partly a guess",
   bad: "A guess",
 };
-const EXPECTED = { good: 0.8, warn: 0.6 };
+/** From which similarity on a view is well supported, and from which it is more than a guess. */
+export const EXPECTED = { good: 0.8, warn: 0.6 };
 const CLOSE = { mm: 2, deg: 10 };
 const FAR = { mm: 6, deg: 25 };
 

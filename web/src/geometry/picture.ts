@@ -55,6 +55,22 @@ export function pixelAt({ picture }: Placed, { x_mm, z_mm }: PlanePoint): { colu
   return { column: (across - picture.first[0]) / picture.step[0], row: (down - picture.first[1]) / picture.step[1] };
 }
 
+/** The probe as far as a picture of it goes, which may end above the depth of the probe. */
+export function shownProbe({ picture, height }: Placed, probe: Probe): Probe {
+  const end_mm = picture.first[1] + picture.step[1] * (height - 0.5);
+  return { ...probe, far_mm: Math.min(probe.far_mm, end_mm) };
+}
+
+/** Whether a pixel shows something: a scan-converted fan leaves corners. */
+export function isShown(placed: Placed, probe: Probe, column: number, row: number): boolean {
+  if (probe.kind === "linear" || placed.picture.column_unit === "deg") return true;
+  const { x_mm, z_mm } = pointAt(placed, column, row);
+  const range_mm = Math.hypot(x_mm, z_mm);
+  const half = (probe.opening_angle_deg / 360) * Math.PI;
+  const within = range_mm >= nearDepth_mm(probe) && range_mm <= shownProbe(placed, probe).far_mm;
+  return within && Math.abs(Math.atan2(x_mm, z_mm)) <= half;
+}
+
 /** Depth below the face, as a scanner counts it: along z, of a fan as it is stored along the scan line. */
 export function depthAtRow({ picture }: Placed, row: number, probe: Probe): number {
   return picture.first[1] + picture.step[1] * row - faceDepth_mm(probe);

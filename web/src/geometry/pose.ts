@@ -167,39 +167,3 @@ export function nearest(poses: readonly Pose[], pose: Pose): number {
   }
   return best;
 }
-
-/** The pose as the JSON object that the service reads. */
-export function poseJson(pose: Pose): string {
-  const round = (value: number, digits: number): number => Number(value.toFixed(digits));
-  const [x, y, z] = position(pose).map((value) => round(value, 3));
-  const [w, i, j, k] = quaternion(pose).map((value) => round(value, 6));
-  return JSON.stringify({ position_mm: { x, y, z }, quaternion: { w, x: i, y: j, z: k } });
-}
-
-/** The pose of such an object, or of one with a `matrix`. Throws an Error in words. */
-export function poseFromJson(text: string): Pose {
-  let document: unknown;
-  try {
-    document = JSON.parse(text);
-  } catch {
-    throw new Error("This is not JSON.");
-  }
-  const { matrix, position_mm, quaternion: q } = document as Record<string, unknown>;
-  if (Array.isArray(matrix)) {
-    const numbers = matrix.flat() as unknown[];
-    if (numbers.length !== 16 || !numbers.every(Number.isFinite)) throw new Error("matrix needs four rows of four numbers.");
-    return fromPositionQuaternion(position(numbers as number[]), quaternion(numbers as number[]));
-  }
-  const p = numbersOf(position_mm, ["x", "y", "z"], "position_mm");
-  const r = numbersOf(q, ["w", "x", "y", "z"], "quaternion");
-  if (Math.abs(Math.hypot(...r) - 1) > 1e-2) throw new Error("quaternion must have length 1.");
-  return fromPositionQuaternion(p as unknown as Vector, r as unknown as Quaternion);
-}
-
-function numbersOf(value: unknown, names: string[], what: string): number[] {
-  const object = (typeof value === "object" && value !== null ? value : {}) as Record<string, unknown>;
-  const numbers = names.map((name) => object[name]);
-  if (!numbers.every((number) => typeof number === "number" && Number.isFinite(number)))
-    throw new Error(`${what} needs the numbers ${names.join(", ")}.`);
-  return numbers as number[];
-}

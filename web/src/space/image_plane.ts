@@ -13,6 +13,7 @@ import {
 } from "three";
 
 import { outputPixels, type Frame } from "../api/stream";
+import { shownProbe } from "../geometry/picture";
 import { placeObject } from "./place";
 import { planeShape, textureCoordinates } from "./shapes";
 
@@ -75,7 +76,7 @@ export class ImagePlane {
     this.#texture.minFilter = this.#texture.magFilter = LinearFilter;
     this.#texture.unpackAlignment = 1;
     this.object.material.uniforms.image!.value = this.#texture;
-    const shape = planeShape(probe);
+    const shape = planeShape(shownProbe({ picture, height, width }, probe));
     const geometry = new BufferGeometry();
     geometry.setAttribute("position", new BufferAttribute(shape.positions, 3));
     geometry.setAttribute("uv", new BufferAttribute(textureCoordinates(shape, { picture, height, width }), 2));

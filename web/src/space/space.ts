@@ -20,7 +20,9 @@ import { TransformControls } from "three/examples/jsm/controls/TransformControls
 
 import type { GaussianPoints, Probe } from "../api/scenes";
 import type { Frame } from "../api/stream";
-import { axis, fromPositionQuaternion, type Pose } from "../geometry/pose";
+import { faceDepth_mm } from "../geometry/picture";
+import { axis, fromPositionQuaternion, IDENTITY, translated, type Pose } from "../geometry/pose";
+import { drop } from "./drop";
 import { ImagePlane } from "./image_plane";
 import { placeObject } from "./place";
 import { PointCloud, type PointColour } from "./points";
@@ -31,7 +33,7 @@ const BUSY_SHARE = 0.3; // of the time, at most, goes into drawing: the live ima
 const HANDLED_SHARE = 0.7; // while the person works in the view
 const SOFTWARE_SHARE = 0.15; // where the processor draws
 const SOFTWARE_PIXELS = 0.7; // of the pixels of the screen, each way
-const BACKGROUND = 0x12161b; // as dark as the image beside it, in both themes
+const BACKGROUND = 0x12161b; // --space of styles.css
 const BOX_LINES = 0x6b7783;
 
 export type Gizmo = "translate" | "rotate" | "none";
@@ -42,7 +44,10 @@ export class SpaceView {
   #camera = new PerspectiveCamera(38, 1, 1, 5000);
   #orbit: OrbitControls;
   #gizmo: TransformControls;
+  /** Lies in the middle of the face, about which the probe is turned. */
   #probe = new Group();
+  #pose: Pose = IDENTITY;
+  #faceDepth_mm = 0;
   #image = new ImagePlane();
   #sweep: Group | null = null;
   #points: PointCloud | null = null;
@@ -56,6 +61,7 @@ export class SpaceView {
   #next_ms = 0;
   #started_ms = 0;
   #fence: WebGLSync | null = null;
+  #looked = false;
   #software = drawnBySoftware();
   /** Whether the person turns the view, or drags the probe. */
   #handled = false;
@@ -69,6 +75,7 @@ export class SpaceView {
     const { domElement } = this.#renderer;
     this.#renderer.localClippingEnabled = true;
     container.append(domElement);
+    domElement.addEventListener("webglcontextrestored", this.#restored);
     this.#camera.up.copy(this.#up);
     this.#orbit = new OrbitControls(this.#camera, domElement);
     this.#orbit.addEventListener("change", this.#touch);
@@ -98,6 +105,8 @@ export class SpaceView {
     this.#orbit.dispose();
     this.#points?.dispose();
     this.#image.dispose();
+    for (const object of [this.#probe, this.#sweep, this.#outline]) if (object) drop(object);
+    this.#renderer.domElement.removeEventListener("webglcontextrestored", this.#restored);
     this.#renderer.dispose();
     this.#renderer.domElement.remove();
   }
@@ -126,10 +135,14 @@ export class SpaceView {
     for (const view of views) down.add(new Vector3(...axis(view, 2)));
     if (down.length() > 1e-6) this.#up.copy(down.normalize().negate());
     this.#camera.up.copy(this.#up);
-    this.#sweep?.removeFromParent();
+    const visible = this.#sweep?.visible ?? true;
+    if (this.#sweep) drop(this.#sweep);
     this.#sweep = sweepPlanes(views, probe, this.#cutPlane);
+    this.#sweep.visible = visible;
     this.#scene.add(this.#sweep, this.#boxLines());
-    this.lookFromOutside();
+    if (this.#looked) this.#touch();
+    else this.lookFromOutside();
+    this.#looked = true;
   }
 
   showSweep(shown: boolean): void {
@@ -157,14 +170,21 @@ export class SpaceView {
   }
 
   setProbe(probe: Probe): void {
-    this.#probe.clear();
-    this.#probe.add(probeBody(probe));
-    this.#touch();
+    for (const body of [...this.#probe.children]) drop(body);
+    this.#faceDepth_mm = faceDepth_mm(probe);
+    const body = probeBody(probe);
+    body.position.z = -this.#faceDepth_mm;
+    this.#probe.add(body);
+    this.#place();
   }
 
   setPose(pose: Pose): void {
-    if (this.#gizmo.dragging) return;
-    placeObject(this.#probe, pose);
+    this.#pose = pose;
+    if (!this.#gizmo.dragging) this.#place();
+  }
+
+  #place(): void {
+    placeObject(this.#probe, translated(this.#pose, [0, 0, this.#faceDepth_mm]));
     this.#touch();
   }
 
@@ -193,7 +213,7 @@ export class SpaceView {
   }
 
   #boxLines(): LineSegments {
-    this.#outline?.removeFromParent();
+    if (this.#outline) drop(this.#outline);
     const [low, high] = this.#box;
     const corner = (bits: number): number[] => [
       bits & 1 ? high.x : low.x,
@@ -225,8 +245,15 @@ export class SpaceView {
 
   #report(): void {
     const { position: p, quaternion: q } = this.#probe;
-    this.moved(fromPositionQuaternion([p.x, p.y, p.z], [q.w, q.x, q.y, q.z]));
+    const face = fromPositionQuaternion([p.x, p.y, p.z], [q.w, q.x, q.y, q.z]);
+    this.moved(translated(face, [0, 0, -this.#faceDepth_mm]));
   }
+
+  /** A fence of the context that was lost would never be signalled. */
+  #restored = (): void => {
+    this.#fence = null;
+    this.#touch();
+  };
 
   #touch = (): void => {
     this.#dirty = true;

@@ -15,6 +15,7 @@ export class FollowedJob {
   problem = $state<string | null>(null);
   missing = $state(false);
   #ending = new AbortController();
+  #thinning = false;
 
   constructor(private readonly id: string) {
     void this.#follow();
@@ -58,6 +59,17 @@ export class FollowedJob {
     if (step === null || loss === null || (last && step <= last.step)) return;
     const known = this.curve.findLast((point) => point.val_psnr_db !== null)?.val_psnr_db;
     this.curve = [...this.curve, { step, loss, val_psnr_db: val_psnr_db === known ? null : val_psnr_db }];
-    if (this.curve.length > POINTS_KEPT) void trainingCurve(this.id, this.#ending.signal).then((curve) => (this.curve = curve));
+    if (this.curve.length > POINTS_KEPT && !this.#thinning) void this.#thin();
+  }
+
+  async #thin(): Promise<void> {
+    this.#thinning = true;
+    try {
+      this.curve = await trainingCurve(this.id, this.#ending.signal);
+    } catch {
+      // the curve stays as long as it is until a later step asks again
+    } finally {
+      this.#thinning = false;
+    }
   }
 }

@@ -1,9 +1,12 @@
 /** The live frames of a session: at most one a screen refresh, the newest, with the rates they come at. */
 
-import { FrameStream, type Frame, type Output, type Refusal } from "../api/stream";
+import { FrameStream, type Frame, type Refusal, type StreamSettings } from "../api/stream";
+import { service } from "./service.svelte";
 import type { Session } from "./session.svelte";
 
 const RATES_EVERY_MS = 500;
+const SCENE_ASKED_AGAIN_MS = 3000;
+const FAILURES_SAID = 5; // in a row; by then the state of the service is known
 
 export interface Rates {
   perSecond: number;
@@ -14,6 +17,9 @@ export interface Rates {
 export class LiveView {
   frame = $state.raw<Frame | null>(null);
   connected = $state(false);
+  #failures = $state(0);
+  /** Whether the stream cannot be opened although the service answers. */
+  readonly barred = $derived(this.#failures >= FAILURES_SAID && service.status === "ready");
   /** Why the newest pose got no frame. */
   refusal = $state.raw<Refusal | null>(null);
   rates = $state.raw<Rates>({ perSecond: 0, roundTrip_ms: 0, render_ms: 0 });
@@ -24,6 +30,7 @@ export class LiveView {
   #since_ms = performance.now();
   #timer: ReturnType<typeof setInterval>;
 
+  /** Must be made while a component is being made; ends with it. */
   constructor(
     private readonly session: Session,
     private readonly onshow: (frame: Frame) => void = () => undefined,
@@ -31,17 +38,33 @@ export class LiveView {
     this.#stream = new FrameStream(session.name, {
       frame: (frame) => this.#take(frame),
       refused: (refusal) => (this.refusal = refusal),
-      connected: (yes) => (this.connected = yes),
+      connected: (yes) => {
+        this.connected = yes;
+        this.#failures = yes ? 0 : this.#failures + 1;
+      },
     });
     this.#timer = setInterval(() => this.#measure(), RATES_EVERY_MS);
+    // Until the scene is known, and while the stream is lost, the service is asked what is the matter.
+    $effect(() => {
+      if (session.known && this.connected) return;
+      void session.load();
+      const timer = setInterval(() => void session.load(), SCENE_ASKED_AGAIN_MS);
+      return () => clearInterval(timer);
+    });
+    $effect(() => {
+      if (service.status !== "ready") return;
+      this.#failures = 0;
+      this.#stream.reconnect();
+    });
+    $effect(() => () => this.#close());
   }
 
   /** Asks for the frame of where the probe is now. */
-  ask(outputs: Output[]): void {
-    this.#stream.ask(this.session.pose, this.session.settings(outputs));
+  ask(settings: StreamSettings): void {
+    this.#stream.ask(this.session.pose, settings);
   }
 
-  close(): void {
+  #close(): void {
     this.#stream.close();
     clearInterval(this.#timer);
     cancelAnimationFrame(this.#request);
@@ -49,6 +72,8 @@ export class LiveView {
 
   #take(frame: Frame): void {
     this.#arrived = frame;
+    this.refusal = null;
+    this.session.rendered(frame.header.scene_sha256);
     if (this.#request === 0) this.#request = requestAnimationFrame(() => this.#show());
   }
 
@@ -56,7 +81,6 @@ export class LiveView {
     this.#request = 0;
     if (this.#arrived === null) return;
     this.frame = this.#arrived;
-    this.refusal = null;
     this.#shown += 1;
     this.onshow(this.#arrived);
     this.#arrived = null;

@@ -2,6 +2,7 @@
 
 import { getJson, ServiceError } from "../api/client";
 import { listScenes, type SceneEntry } from "../api/scenes";
+import { forgetSession } from "./session.svelte";
 
 const POLL_MS = 4000;
 const POLL_DOWN_MS = 1000;
@@ -18,13 +19,19 @@ class ServiceState {
     clearTimeout(this.#timer);
     try {
       await getJson("/v1/health/ready");
-      this.scenes = await listScenes();
+      this.#take(await listScenes());
       this.status = "ready";
     } catch (error) {
       this.status = statusOf(error);
     }
     clearTimeout(this.#timer);
     this.#timer = setTimeout(() => void this.poll(), this.status === "ready" ? POLL_MS : POLL_DOWN_MS);
+  }
+
+  #take(scenes: SceneEntry[]): void {
+    const names = new Set(scenes.map((scene) => scene.name));
+    for (const { name } of this.scenes) if (!names.has(name)) forgetSession(name);
+    this.scenes = scenes;
   }
 }
 

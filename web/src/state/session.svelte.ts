@@ -16,7 +16,14 @@ import {
   type Vector,
 } from "../geometry/pose";
 
+/** Poses to play, of the scene's own probe. */
+export interface Trajectory {
+  name: string;
+  poses: Pose[];
+}
+
 export const TGC_POINTS = 6;
+const AS_RENDERED_DB = 60; // the dynamic range that frames have
 const MOST_PICTURE_PIXELS = 640; // on the longer side of a scan-converted fan
 const WITHOUT_PROBE: Probe = { kind: "linear", width_mm: 40, near_mm: 0, far_mm: 50 };
 
@@ -28,23 +35,33 @@ export class Session {
   /** The views that the scene was trained from. */
   views = $state.raw<Pose[]>([]);
   pose = $state.raw<Pose>(IDENTITY);
-  /** Where the probe was put last in the sweep, in training views; between them too. */
+  /** What is played in place of the training sweep. */
+  trajectory = $state.raw<Trajectory | null>(null);
+  /** Where the probe was put last on the track, in its poses; between them too. */
   place = $state(0);
   /** null: the scene's own. */
   chosenProbe = $state.raw<Probe | null>(null);
   gain_db = $state(0);
-  dynamicRange_db = $state(60);
+  dynamicRange_db = $state(AS_RENDERED_DB);
   tgc_db = $state.raw<number[]>(new Array<number>(TGC_POINTS).fill(0));
   depth_mm = $state<number | null>(null);
   flip = $state(false);
   scanConverted = $state(true);
   /** Depth samples and scan lines; null: as trained. */
   samples = $state<number | null>(null);
+  /** Whether what no Gaussians support is black. */
+  hidesUnsupported = $state(false);
 
+  readonly known = $derived(this.description !== null);
+  readonly track = $derived(this.trajectory?.poses ?? this.views);
   readonly sceneProbe = $derived(this.description?.probe ?? WITHOUT_PROBE);
   readonly probe = $derived(this.chosenProbe ?? this.sceneProbe);
   readonly home = $derived(this.views[Math.floor(this.views.length / 2)] ?? middleOf(this.description));
+  #placed = $state.raw<Pose | null>(null);
+  /** Whether the probe is where the track last put it. */
+  readonly onTrack = $derived(this.pose === this.#placed);
   #asking = false;
+  #sha256: string | null = null;
 
   constructor(readonly name: string) {}
 
@@ -54,12 +71,13 @@ export class Session {
     this.#asking = true;
     try {
       const description = await describeScene(this.name);
-      const first = this.description === null;
-      if (this.views.length === 0 && description.training_poses.count > 0) this.views = await viewsOf(this.name);
-      this.description = description;
+      if (!sameScene(this.description, description)) {
+        this.views = description.training_poses.count > 0 ? await viewsOf(this.name) : [];
+        this.description = description;
+        this.#beginAnew();
+      }
       this.problem = null;
       this.missing = false;
-      if (first) this.goHome();
     } catch (error) {
       this.problem = error instanceof Unreachable ? null : explain(error);
       this.missing = error instanceof ServiceError && error.reason === "SCENE_NOT_FOUND";
@@ -68,21 +86,30 @@ export class Session {
     }
   }
 
-  /** What to ask the stream for. */
-  settings(outputs: Output[]): StreamSettings {
+  /** Takes note of the file that a frame came from: where it is another one, the scene is asked about again. */
+  rendered(sha256: string): void {
+    if (this.#sha256 !== null && this.#sha256 !== sha256) void this.load();
+    this.#sha256 = sha256;
+  }
+
+  /** What to ask the stream for; `plain`: without gain, range and TGC. */
+  settings(outputs: Output[], { plain = false } = {}): StreamSettings {
+    const tgc = !plain && this.tgc_db.some((gain) => gain !== 0);
     return {
       height: this.samples,
       width: this.samples,
       probe: this.description?.probe ? this.chosenProbe : this.probe,
       display: {
-        gain_db: this.gain_db,
-        dynamic_range_db: this.dynamicRange_db,
-        tgc_db: this.tgc_db.some((gain) => gain !== 0) ? this.tgc_db : [],
+        gain_db: plain ? 0 : this.gain_db,
+        dynamic_range_db: plain ? AS_RENDERED_DB : this.dynamicRange_db,
+        tgc_db: tgc ? this.tgc_db : [],
         depth_mm: this.depth_mm,
         flip: this.flip,
         pixel_mm: this.scanConverted ? squarePixel_mm(this.probe) : null,
       },
       outputs,
+      min_confidence: this.hidesUnsupported && this.description?.confidence ? 1 : null,
+      below_min_confidence: "mask",
     };
   }
 
@@ -103,16 +130,28 @@ export class Session {
 
   /** To the middle of the sweep. */
   goHome(): void {
-    this.place = Math.floor(this.views.length / 2);
-    this.pose = this.held(this.home);
+    if (this.trajectory === null && this.views.length > 0) this.goTo(Math.floor(this.views.length / 2));
+    else this.pose = this.held(this.home);
   }
 
-  /** To a place of the sweep, in training views. */
+  /** To a place of the track, in its poses. */
   goTo(place: number): void {
-    this.place = Math.max(0, Math.min(this.views.length - 1, place));
-    const before = this.views[Math.floor(this.place)];
-    const after = this.views[Math.ceil(this.place)];
-    if (before && after) this.pose = this.held(between(before, after, this.place % 1));
+    this.place = Math.max(0, Math.min(this.track.length - 1, place));
+    const before = this.track[Math.floor(this.place)];
+    const after = this.track[Math.ceil(this.place)];
+    if (before && after) this.pose = this.#placed = this.held(between(before, after, this.place % 1));
+  }
+
+  /** To the pose of the track that is nearest. */
+  returnToTrack(): void {
+    if (this.track.length > 0) this.goTo(nearest(this.track, this.trainedPose));
+  }
+
+  /** Takes poses to play, and goes to the first; null: the training sweep again. */
+  follow(trajectory: Trajectory | null): void {
+    this.trajectory = trajectory;
+    if (trajectory === null) this.goHome();
+    else this.goTo(0);
   }
 
   /** The pose that puts the face of the probe in use where that of the scene's own probe was. */
@@ -127,7 +166,10 @@ export class Session {
 
   /** To the nearest training view. */
   snap(): void {
-    if (this.views.length > 0) this.goTo(nearest(this.views, this.trainedPose));
+    const index = nearest(this.views, this.trainedPose);
+    if (index < 0) return;
+    if (this.trajectory === null) this.goTo(index);
+    else this.pose = this.held(this.views[index]!);
   }
 
   /** Takes another probe, its face where that of the one before was. */
@@ -135,16 +177,30 @@ export class Session {
     const before = faceDepth_mm(this.probe);
     this.chosenProbe = probe;
     this.depth_mm = null;
+    const { onTrack } = this;
     this.pose = translated(this.pose, [0, 0, before - faceDepth_mm(this.probe)]);
+    if (onTrack) this.#placed = this.pose;
   }
 
   resetDisplay(): void {
     this.gain_db = 0;
-    this.dynamicRange_db = 60;
+    this.dynamicRange_db = AS_RENDERED_DB;
     this.tgc_db = new Array<number>(TGC_POINTS).fill(0);
     this.depth_mm = null;
     this.flip = false;
   }
+
+  /** What was chosen for another scene of that name does not fit this one. */
+  #beginAnew(): void {
+    this.chosenProbe = this.trajectory = this.depth_mm = this.samples = null;
+    this.goHome();
+  }
+}
+
+/** Whether both tell of one scene file. */
+function sameScene(before: SceneDescription | null, now: SceneDescription): boolean {
+  const lasting = (scene: SceneDescription): string => JSON.stringify({ ...scene, loaded: null, loaded_processes: null });
+  return before !== null && lasting(before) === lasting(now);
 }
 
 async function viewsOf(scene: string): Promise<Pose[]> {
@@ -173,7 +229,15 @@ const sessions = new Map<string, Session>();
 
 /** The session of a scene; the same for every view. */
 export function sessionOf(scene: string): Session {
-  let session = sessions.get(scene);
-  if (session === undefined) sessions.set(scene, (session = new Session(scene)));
+  const known = sessions.get(scene);
+  if (known !== undefined) return known;
+  let session!: Session;
+  $effect.root(() => void (session = new Session(scene))); // what it derives outlives the view that asked first
+  sessions.set(scene, session);
   return session;
+}
+
+/** Lets go of what was kept about a scene that is gone, or that another takes the place of. */
+export function forgetSession(scene: string): void {
+  sessions.delete(scene);
 }

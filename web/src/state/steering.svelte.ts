@@ -1,11 +1,11 @@
-/** What moves the probe by itself while it is held: keys, a gamepad, the playback of the training sweep. */
+/** What moves the probe by itself while it is held: keys, a gamepad, the playback of a track. */
 
 import type { Vector } from "../geometry/pose";
 import type { Session } from "./session.svelte";
 
 const SPEED_MM_S = 25;
 const SPEED_DEG_S = 30;
-const FINE = 0.2; // with Ctrl
+const FINE = 0.2; // with Alt: browsers keep Ctrl with the page keys for themselves
 const TAP_S = 0.02; // a short press moves at least so long
 const DEAD_ZONE = 0.12;
 const PLAYED_VIEWS_PER_SECOND = 12;
@@ -54,9 +54,9 @@ export class Steering {
 
   /** Takes a key that is pressed; true where it steers. */
   press(event: KeyboardEvent): boolean {
-    if (!(event.key in SLIDES) || event.altKey || event.metaKey) return false;
-    if (!this.#held.has(event.key)) this.#step(event.key, event.shiftKey, event.ctrlKey, TAP_S);
-    this.#held.set(event.key, { shift: event.shiftKey, fine: event.ctrlKey });
+    if (!(event.key in SLIDES) || event.ctrlKey || event.metaKey) return false;
+    if (!this.#held.has(event.key)) this.#step(event.key, event.shiftKey, event.altKey, TAP_S);
+    this.#held.set(event.key, { shift: event.shiftKey, fine: event.altKey });
     this.#run();
     return true;
   }
@@ -67,11 +67,12 @@ export class Steering {
 
   togglePlaying(): void {
     this.playing = !this.playing;
+    if (this.playing && !this.session.onTrack) this.session.returnToTrack();
     this.#run();
   }
 
   #connected = (): void => {
-    this.gamepad = navigator.getGamepads().find((pad) => pad?.connected)?.id ?? null;
+    this.gamepad = connectedPad()?.id ?? null;
     this.#run();
   };
 
@@ -94,7 +95,7 @@ export class Steering {
   };
 
   #play(seconds: number): void {
-    const last = this.session.views.length - 1;
+    const last = this.session.track.length - 1;
     let place = this.session.place + this.#direction * PLAYED_VIEWS_PER_SECOND * seconds;
     if (place >= last) [place, this.#direction] = [last, -1];
     if (place <= 0) [place, this.#direction] = [0, 1];
@@ -116,7 +117,7 @@ export class Steering {
 
 /** Left stick: slide; right stick: rotate and tilt; triggers: axial; shoulder buttons: rock. */
 function gamepadMotion(): Motion {
-  const pad = navigator.getGamepads().find((one) => one?.connected);
+  const pad = connectedPad();
   const stick = (index: number): number => {
     const value = pad?.axes[index] ?? 0;
     return Math.abs(value) < DEAD_ZONE ? 0 : value;
@@ -126,4 +127,13 @@ function gamepadMotion(): Motion {
     along: [stick(0), stick(1), button(7) - button(6)],
     turn: [stick(3), button(5) - button(4), stick(2)],
   };
+}
+
+/** The browser tells of gamepads only where the page is trusted: not over plain HTTP from another machine, say. */
+function connectedPad(): Gamepad | undefined {
+  try {
+    return (navigator.getGamepads?.() ?? []).find((pad) => pad?.connected) ?? undefined;
+  } catch {
+    return undefined; // the page may not be allowed to ask
+  }
 }

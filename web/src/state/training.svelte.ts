@@ -14,15 +14,26 @@ class TrainingState {
   chosen = $state("");
   problem = $state<string | null>(null);
   readonly dataset = $derived(this.datasets.find((one) => one.name === this.chosen) ?? null);
+  #asked = 0;
 
   async refresh(): Promise<void> {
+    const asked = ++this.#asked;
     try {
-      [this.datasets, this.jobs] = await Promise.all([listDatasets(), listTrainings(JOBS_LISTED)]);
+      const [datasets, jobs] = await Promise.all([listDatasets(), listTrainings(JOBS_LISTED)]);
+      if (asked !== this.#asked) return;
+      this.datasets = datasets.map((dataset) => this.#known(dataset));
+      this.jobs = jobs;
       if (this.dataset === null) this.chosen = this.datasets[0]?.name ?? "";
       this.problem = null;
     } catch (error) {
-      this.problem = explain(error);
+      if (asked === this.#asked) this.problem = explain(error);
     }
+  }
+
+  /** The object that stands for the dataset already: what is shown of it is not built anew at each answer. */
+  #known(dataset: Dataset): Dataset {
+    const before = this.datasets.find((one) => one.name === dataset.name);
+    return before?.sha256 === dataset.sha256 && before.created_at === dataset.created_at ? before : dataset;
   }
 
   /** Asks now and from now on; the answer ends it. */

@@ -1,0 +1,174 @@
+/** Pages that browsers trust little, and connections that are refused, cut, dead or overloaded. */
+
+import assert from "node:assert/strict";
+import { after, before, describe, it } from "node:test";
+
+import { canvasState, launch, openPage, picture, seriousFindings, Service, until } from "./harness.mjs";
+import { Proxy } from "./proxy.mjs";
+import { changed, IMAGE, openScan, poseOf } from "./scan_page.mjs";
+
+const MAX_SIDE = 512; // of images, in this service
+const CUTS = 4;
+
+let service;
+let browser;
+let proxy;
+
+before(async () => {
+  service = await Service.start({ ULTRAGRAY_MAX_IMAGE_SIDE: String(MAX_SIDE) });
+  browser = await launch();
+  proxy = await Proxy.start(service);
+});
+after(async () => {
+  await browser?.close();
+  await proxy?.stop();
+  await service?.stop();
+});
+
+/** What browsers do to pages over plain HTTP from another machine. */
+function distrust() {
+  delete Navigator.prototype.getGamepads;
+  Object.defineProperty(navigator, "clipboard", { value: undefined });
+}
+
+/** Counts the requests for what the scene says about itself. */
+function countDescriptions(page) {
+  const counted = { count: 0 };
+  page.on("request", (request) => {
+    if (new URL(request.url()).pathname === "/v1/scenes/demo") counted.count += 1;
+  });
+  return counted;
+}
+
+/** Counts what lies on the graphics card: buffers made and not deleted. */
+function countBuffers() {
+  globalThis.buffers = 0;
+  const { createBuffer, deleteBuffer } = WebGL2RenderingContext.prototype;
+  WebGL2RenderingContext.prototype.createBuffer = function () {
+    globalThis.buffers += 1;
+    return createBuffer.call(this);
+  };
+  WebGL2RenderingContext.prototype.deleteBuffer = function (buffer) {
+    globalThis.buffers -= 1;
+    return deleteBuffer.call(this, buffer);
+  };
+}
+
+describe("a page that the browser does not trust", () => {
+  it("shows Scan and Maps without gamepads, and offers the pose for copying by hand", async () => {
+    const { page } = await openScan(browser, service, { init: distrust });
+    await page.getByLabel("Copy the pose as JSON").click();
+    await page.getByText("press Ctrl+C").waitFor();
+    const selected = await page.evaluate(() => {
+      const { value, selectionStart, selectionEnd } = document.activeElement;
+      return value.slice(selectionStart, selectionEnd);
+    });
+    assert.deepEqual(JSON.parse(selected), await poseOf(page));
+    await page.getByRole("link", { name: "Maps", exact: true }).click();
+    await until(() => canvasState(page, '[data-testid="map-echo"]'), ({ mean }) => mean > 1, "no map came");
+    assert.deepEqual(page.faults, []);
+    await page.context().close();
+  });
+});
+
+describe("a proxy", () => {
+  it("that refuses streams is told, without asking for the scene all the time, and left when it takes them", async () => {
+    proxy.refuses = true;
+    const page = await openPage(browser, proxy, "#/scenes");
+    const descriptions = countDescriptions(page);
+    await page.goto(`${proxy.url}/#/scan/demo`);
+    await page.getByTestId("stream-barred").waitFor();
+    assert.ok(descriptions.count >= 1 && descriptions.count <= 5, `asked ${descriptions.count} times`);
+    assert.deepEqual(await seriousFindings(page), []);
+    await picture(page, "scan-barred");
+    proxy.refuses = false;
+    await until(() => canvasState(page, IMAGE), ({ mean }) => mean > 5, "no frame came");
+    await page.getByTestId("stream-barred").waitFor({ state: "detached" });
+    await page.context().close();
+  });
+
+  it("that cuts streams changes nothing in the 3D view, and the image follows again", async () => {
+    const { page, first } = await openScan(browser, proxy, { init: countBuffers });
+    const buffers = () => page.evaluate(() => globalThis.buffers);
+    let steady = -1;
+    const stands = (count) => {
+      const same = count > 8 && count === steady;
+      steady = count;
+      return same;
+    };
+    await page.getByTestId("room").locator("canvas").waitFor();
+    await until(buffers, stands, "no 3D view");
+    const descriptions = countDescriptions(page);
+    for (let cut = 0; cut < CUTS; cut++) {
+      const reconnected = page.waitForEvent("websocket").then((socket) => socket.waitForEvent("framereceived"));
+      proxy.cut();
+      await reconnected;
+    }
+    await page.getByLabel("Position Y", { exact: true }).fill("3");
+    await changed(page, first.print);
+    assert.ok(descriptions.count <= 2 * CUTS, `asked ${descriptions.count} times`);
+    await until(buffers, (count) => count <= steady, "the 3D view was made anew");
+    await page.context().close();
+  });
+
+  it("that lets a stream die silently does not stop the image for long", async () => {
+    const page = await openPage(browser, proxy, "#/scenes");
+    await page.clock.install();
+    await page.goto(`${proxy.url}/#/scan/demo`);
+    const first = await until(() => canvasState(page, IMAGE), ({ mean }) => mean > 5, "no frame came");
+    proxy.silence();
+    const reconnected = page.waitForEvent("websocket");
+    await page.getByLabel("Position Y", { exact: true }).fill("3");
+    await page.clock.fastForward(15_000);
+    await reconnected;
+    await changed(page, first.print);
+    await page.context().close();
+  });
+});
+
+describe("a refused pose", () => {
+  it("is asked for again where the refusal may pass", async () => {
+    const page = await openPage(browser, service, "#/scenes");
+    let full = false;
+    await page.routeWebSocket(/\/stream$/, (socket) => {
+      const there = socket.connectToServer();
+      socket.onMessage((message) => {
+        const { sequence } = JSON.parse(message);
+        const error = { reason: "QUEUE_FULL", detail: "too many frames wait", field: null };
+        if (full) socket.send(JSON.stringify({ sequence, client_time_ms: null, dropped: 0, error }));
+        else there.send(message);
+      });
+    });
+    await page.goto(`${service.url}/#/scan/demo`);
+    const first = await until(() => canvasState(page, IMAGE), ({ mean }) => mean > 5, "no frame came");
+    full = true;
+    await page.getByLabel("Position Y", { exact: true }).fill("3");
+    await page.getByTestId("refusal").getByText("too many frames wait").waitFor();
+    full = false;
+    await changed(page, first.print);
+    await page.getByTestId("refusal").waitFor({ state: "detached" });
+    await page.context().close();
+  });
+
+  it("stays told while its settings are refused: the image before is not taken for theirs", async () => {
+    const page = await openPage(browser, service, "#/scenes");
+    const refusals = [];
+    page.on("websocket", (socket) => {
+      socket.on("framereceived", ({ payload }) => {
+        if (typeof payload === "string") refusals.push(payload);
+      });
+    });
+    await page.goto(`${service.url}/#/scan/demo`);
+    const first = await until(() => canvasState(page, IMAGE), ({ mean }) => mean > 5, "no frame came");
+    await page.getByRole("combobox", { name: "Samples" }).selectOption("768");
+    await page.getByTestId("refusal").waitFor();
+    const before = refusals.length;
+    for (const y of ["0", "1", "2"]) await page.getByLabel("Position Y", { exact: true }).fill(y);
+    await until(() => refusals.length, (count) => count >= before + 2, "the moves were not refused");
+    await page.getByTestId("refusal").waitFor();
+    assert.equal((await canvasState(page, IMAGE)).print, first.print, "an image with the settings before was shown");
+    await page.getByRole("combobox", { name: "Samples" }).selectOption("256");
+    await page.getByTestId("refusal").waitFor({ state: "detached" });
+    await page.context().close();
+  });
+});

@@ -1,0 +1,197 @@
+/** Scan: poses that are entered and loaded, measuring and steering by keyboard, confidence, and what is saved. */
+
+import assert from "node:assert/strict";
+import { readFileSync } from "node:fs";
+import path from "node:path";
+import { after, before, describe, it } from "node:test";
+
+import { canvasState, launch, picture, seriousFindings, Service, until } from "./harness.mjs";
+import { changed, enterPose, IMAGE, openScan, poseOf } from "./scan_page.mjs";
+
+const POSES = [0, 4, 8].map((y) => [[1, 0, 0, 2], [0, 1, 0, y], [0, 0, 1, 0], [0, 0, 0, 1]]);
+
+let service;
+let browser;
+
+before(async () => {
+  service = await Service.start();
+  browser = await launch();
+});
+after(async () => {
+  await browser?.close();
+  await service?.stop();
+});
+
+/** Notes the words that are drawn into pictures, and whether they fit. */
+function watchWords() {
+  globalThis.words = [];
+  const { fillText } = CanvasRenderingContext2D.prototype;
+  CanvasRenderingContext2D.prototype.fillText = function (text, x, y) {
+    const right = x + this.measureText(text).width;
+    globalThis.words.push({ text, fits: right <= this.canvas.width && y <= this.canvas.height, left: x < this.canvas.width / 2 });
+    return fillText.call(this, text, x, y);
+  };
+}
+
+/** A file of poses, as the page is given one. */
+function poseFile(document) {
+  return { name: "poses.json", mimeType: "application/json", buffer: Buffer.from(JSON.stringify(document)) };
+}
+
+describe("poses", () => {
+  it("that are no rigid transforms are refused in words", async () => {
+    const { page } = await openScan(browser, service);
+    const pose = await poseOf(page);
+    const refused = [
+      ["null", "a pose is an object"],
+      ['{"matrix": [[1,0,0,0],[0,1,0,0],[0,0,1,0],[5,6,7,1]]}', "must end in the row 0 0 0 1"],
+      ['{"matrix": [[-1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}', "this one mirrors"],
+      ['{"matrix": [[2,0,0,0],[0,2,0,0],[0,0,2,0],[0,0,0,1]]}', "must hold a rotation"],
+    ];
+    for (const [text, words] of refused) {
+      await enterPose(page, text);
+      await page.getByRole("alert").getByText(words).waitFor();
+    }
+    await page.getByLabel("Pose as JSON, Enter applies").press("Escape");
+    assert.deepEqual(await poseOf(page), pose);
+    await enterPose(page, JSON.stringify({ matrix: POSES[1] }));
+    await until(() => poseOf(page), ({ position_mm: { x, y } }) => x === 2 && y === 4, "the matrix was not taken");
+    await page.context().close();
+  });
+
+  it("of a file are played, and the training sweep comes back", async () => {
+    const { page } = await openScan(browser, service);
+    await page.getByText("view 106 of 211").waitFor();
+    await page.getByLabel("Position X", { exact: true }).fill("9");
+    await page.getByText("beside the views").waitFor();
+    const file = page.getByLabel("File of poses");
+    await file.setInputFiles(poseFile([POSES[0], { matrix: [[1, 2], [3]] }]));
+    await page.getByText("poses.json: Pose 2: matrix needs four rows of four numbers.").waitFor();
+    const quaternion = { position_mm: { x: 2, y: 8, z: 0 }, quaternion: { w: 1, x: 0, y: 0, z: 0 } };
+    await file.setInputFiles(poseFile({ poses: [...POSES.slice(0, 2), quaternion] }));
+    await page.getByText("pose 1 of 3").waitFor();
+    assert.deepEqual((await poseOf(page)).position_mm, { x: 2, y: 0, z: 0 });
+    await page.getByRole("button", { name: "Play the sweep" }).click();
+    await until(() => poseOf(page), ({ position_mm: { y } }) => y > 4, "it is not played");
+    await page.getByRole("button", { name: "Pause the sweep" }).click();
+    await page.getByLabel("Place in poses.json").fill("2");
+    await until(() => poseOf(page), ({ position_mm: { y } }) => y === 8, "the last pose is not there");
+    assert.deepEqual(await seriousFindings(page), []);
+    await picture(page, "scan-trajectory");
+    await page.getByRole("button", { name: "Back to the training sweep" }).click();
+    await page.getByText("view 106 of 211").waitFor();
+    assert.deepEqual(page.faults, []);
+    await page.context().close();
+  });
+
+  it("are steered by keys after a button was pressed, finely with Alt", async () => {
+    const { page } = await openScan(browser, service);
+    await page.getByRole("button", { name: "Snap" }).click();
+    const before = await poseOf(page);
+    await page.keyboard.press("ArrowRight");
+    await until(() => poseOf(page), ({ position_mm }) => position_mm.x > before.position_mm.x, "the key is not heard");
+    const coarse = await poseOf(page);
+    await page.keyboard.press("Alt+PageDown");
+    await until(() => poseOf(page), ({ position_mm }) => position_mm.z > coarse.position_mm.z, "Alt is not heard");
+    await page.context().close();
+  });
+});
+
+describe("the image", () => {
+  it("is measured by keyboard, and by two clicks", async () => {
+    const { page } = await openScan(browser, service);
+    const lengths = () => page.getByTestId("calliper-length").allTextContents();
+    await page.getByRole("button", { name: "Measure" }).focus();
+    await page.keyboard.press("Enter");
+    await until(lengths, (all) => all.join() === "10.0 mm", "no calliper of a centimetre");
+    const focused = () => page.evaluate(() => document.activeElement?.getAttribute("aria-label") ?? "");
+    await until(focused, (label) => label.startsWith("Calliper 1, end B"), "its end has no focus");
+    await page.keyboard.press("Shift+ArrowRight");
+    await until(lengths, ([one]) => parseFloat(one) > 10.5, "its end does not move");
+    await page.getByLabel("Remove the measurements").click();
+    const box = await page.locator(`${IMAGE} canvas`).boundingBox();
+    await page.mouse.click(box.x + box.width * 0.25, box.y + box.height * 0.5);
+    await page.mouse.click(box.x + box.width * 0.75, box.y + box.height * 0.5);
+    await until(lengths, (all) => all.length === 1 && Math.abs(parseFloat(all[0]) - 30) < 0.4, "two clicks are no distance");
+    await page.mouse.click(box.x + box.width * 0.3, box.y + box.height * 0.7);
+    await page.keyboard.press("Escape");
+    await until(lengths, (all) => all.length === 1, "a measurement that was not ended stays");
+    await page.context().close();
+  });
+
+  it("goes back to its full depth by the slider where that is no whole number", async () => {
+    const { page } = await openScan(browser, service);
+    await page.route(/\/v1\/scenes\/demo$/, async (route) => {
+      const scene = await (await route.fetch()).json();
+      await route.fulfill({ json: { ...scene, probe: { ...scene.probe, far_mm: 59.35 } } });
+    });
+    await page.reload();
+    const depth = page.getByLabel("Depth", { exact: true });
+    await until(() => depth.getAttribute("max"), (max) => max === "60", "the slider ends above the full depth");
+    await depth.fill("30");
+    await until(() => canvasState(page, IMAGE), ({ height }) => height === 128, "the depth is not half of it");
+    await depth.fill("60");
+    await until(() => canvasState(page, IMAGE), ({ height }) => height === 256, "the depth is not full again");
+    await page.context().close();
+  });
+
+  it("is black where nothing supports it, if that is asked for, and tells how sure its figure is", async () => {
+    const { page, first } = await openScan(browser, service);
+    await until(() => page.getByTestId("similarity").textContent(), (text) => /\d+ %\s+± 4 %/.test(text), "no error is told");
+    await page.getByLabel("Tilt, about the lateral axis", { exact: true }).fill("60");
+    const tilted = await changed(page, first.print);
+    await page.getByLabel("Black where nothing supports it").check();
+    const black = await changed(page, tilted.print);
+    await page.getByLabel("Black where nothing supports it").uncheck();
+    await until(() => canvasState(page, IMAGE), ({ print }) => print !== black.print, "it stays black");
+    await picture(page, "scan-unsupported");
+    await page.context().close();
+  });
+
+  it("is saved with all words of what it is, and its side", async () => {
+    const { page, first } = await openScan(browser, service, { init: watchWords });
+    await page.getByRole("combobox", { name: "Probe" }).selectOption("linear"); // narrower than the words are long
+    await changed(page, first.print);
+    await page.getByText("view 106 of 211").waitFor(); // the probe is where it was
+    for (const side of ["left", "right"]) {
+      await page.evaluate(() => (globalThis.words = []));
+      const [download] = await Promise.all([page.waitForEvent("download"), page.getByRole("button", { name: "Save" }).click()]);
+      assert.ok(readFileSync(await download.path()).length > 1000);
+      const words = await page.evaluate(() => globalThis.words);
+      assert.deepEqual(words.filter(({ fits }) => !fits), []);
+      assert.match(words.map(({ text }) => text).join("\n"), /Simulated, not for diagnosis\.[^]*demo[^]*"quaternion"/);
+      assert.equal(words.find(({ text }) => text === "U").left, side === "left");
+      await page.getByLabel("Flip left/right").check();
+      await page.locator('[data-testid="orientation-marker"][data-side="right"]').waitFor();
+    }
+    await page.context().close();
+  });
+});
+
+describe("a scene that another takes the place of", () => {
+  it("is not scanned with the probe that was chosen for it", async () => {
+    const file = readFileSync(path.join(service.data, "demo.ugr"));
+    const put = (body) => fetch(`${service.url}/v1/scenes/other`, { method: "PUT", body }).then((answer) => assert.equal(answer.status, 201));
+    await put(file);
+    const { page, first } = await openScan(browser, service, { scene: "other" });
+    await page.getByRole("combobox", { name: "Probe" }).selectOption("convex");
+    await changed(page, first.print);
+    await fetch(`${service.url}/v1/scenes/other`, { method: "DELETE" });
+    await put(renamedDataset(file));
+    const connected = page.waitForEvent("websocket");
+    await page.getByRole("link", { name: "Train", exact: true }).click();
+    await page.getByRole("link", { name: "Scan", exact: true }).click();
+    await connected;
+    await until(() => page.getByRole("combobox", { name: "Probe" }).inputValue(), (value) => value === "own", "the old probe stays");
+    await page.context().close();
+  });
+});
+
+/** The scene file as if it were trained from another dataset. */
+function renamedDataset(file) {
+  const length = Number(file.readBigUInt64LE(0));
+  const header = file.subarray(8, 8 + length).toString();
+  const other = header.replace("demo lumbar spine", "demo LUMBAR spine"); // of the same length
+  assert.notEqual(other, header);
+  return Buffer.concat([file.subarray(0, 8), Buffer.from(other), file.subarray(8 + length)]);
+}

@@ -1,0 +1,136 @@
+/** Train, while nobody trains: uploads that go on, what stays as it is while lists are asked for, long curves. */
+
+import assert from "node:assert/strict";
+import { readFileSync } from "node:fs";
+import { after, before, describe, it } from "node:test";
+
+import { hold, launch, openPage, Service, until } from "./harness.mjs";
+import { makeSweep, put } from "./sweep.mjs";
+
+let service;
+let browser;
+let files;
+
+before(async () => {
+  files = makeSweep();
+  service = await Service.start();
+  browser = await launch();
+  await put(service, "/v1/datasets/sweep", readFileSync(files.sweep), "application/zip");
+});
+after(async () => {
+  await browser?.close();
+  await service?.stop();
+  files?.remove();
+});
+
+/** Closes the page as a person does; whether it asked first. */
+async function asksBeforeClosing(page) {
+  const asked = page.waitForEvent("dialog").then(async (dialog) => {
+    assert.equal(dialog.type(), "beforeunload");
+    await dialog.dismiss();
+    return true;
+  });
+  const closed = page.waitForEvent("close").then(() => false);
+  await page.close({ runBeforeUnload: true });
+  for (const other of [asked, closed]) other.catch(() => undefined); // the one that does not come
+  return Promise.race([asked, closed]);
+}
+
+describe("an upload", () => {
+  it("goes on while other views are looked at, and leaving the page asks first", async () => {
+    const page = await openPage(browser, service, "#/train");
+    await page.locator("summary", { hasText: /^Settings$/ }).click();
+    const scene = page.getByRole("textbox", { name: "Scene" });
+    assert.equal(await scene.inputValue(), "sweep");
+    await page.getByRole("button", { name: "Start the training" }).click();
+    await page.getByText("It waits for its turn.").waitFor();
+    await until(() => scene.inputValue(), (name) => name === "sweep-2", "a name that a training has is proposed");
+    await page.getByRole("link", { name: "Look at sweep" }).click();
+    await page.getByTestId("dataset").waitFor();
+    await page.getByLabel("Steps").fill("77");
+
+    const release = await hold(page, /\/v1\/datasets\/slow\?/);
+    await page.getByLabel("Add a sweep").setInputFiles(files.sweep);
+    await page.getByLabel("Name", { exact: true }).fill("slow");
+    await page.getByRole("button", { name: "Upload and check" }).click();
+    const progress = page.getByLabel("Upload", { exact: true });
+    await progress.waitFor();
+    await page.getByRole("region", { name: "Trainings" }).getByRole("link").click();
+    await page.getByText("It waits for its turn.").waitFor();
+    assert.equal(await progress.count(), 1);
+    assert.equal(await page.getByLabel("Steps").inputValue(), "77");
+    await page.getByRole("link", { name: "Scan", exact: true }).click();
+    await page.getByLabel("Live image").waitFor();
+    assert.equal(await asksBeforeClosing(page), true);
+    await page.getByRole("link", { name: "Train", exact: true }).click();
+    await progress.waitFor();
+    assert.equal(await page.getByLabel("Name", { exact: true }).inputValue(), "slow");
+    release();
+    await page.getByRole("region", { name: "Dataset slow" }).waitFor();
+    assert.equal(await progress.count(), 0);
+    assert.deepEqual([page.faults, page.foreign], [[], []]);
+    assert.equal(await asksBeforeClosing(page), false);
+    await page.context().close();
+  });
+});
+
+describe("a dataset", () => {
+  it("stays as it is looked at while the list is asked for again", async () => {
+    const page = await openPage(browser, service, "#/scenes");
+    await page.addInitScript(() => {
+      globalThis.buffersMade = 0;
+      const { prototype } = WebGL2RenderingContext;
+      const { createBuffer } = prototype;
+      prototype.createBuffer = function () {
+        globalThis.buffersMade += 1;
+        return createBuffer.call(this);
+      };
+    });
+    await page.goto(`${service.url}/#/train`);
+    await page.reload();
+    const room = page.getByTestId("space").locator("canvas");
+    const shown = async () => (await room.screenshot()).toString("base64");
+    let before = "";
+    const still = (now) => now === before || ((before = now), false);
+    await until(() => page.evaluate(() => globalThis.buffersMade), (made) => made > 0, "nothing is drawn");
+    await until(shown, still, "it does not come to rest");
+    const outside = before;
+    const box = await room.boundingBox();
+    await page.mouse.move(box.x + box.width / 2, box.y + box.height / 2);
+    await page.mouse.down();
+    await page.mouse.move(box.x + box.width / 2 + 90, box.y + box.height / 2 + 20, { steps: 4 });
+    await page.mouse.up();
+    await until(shown, (now) => now !== outside && still(now), "it was not turned");
+    const made = await page.evaluate(() => globalThis.buffersMade);
+    for (let polls = 0; polls < 2; polls++) await page.waitForResponse(/\/v1\/datasets\?/);
+    await page.evaluate(() => new Promise((resolve) => requestAnimationFrame(() => requestAnimationFrame(resolve))));
+    assert.equal(await page.evaluate(() => globalThis.buffersMade), made, "it is built anew at each answer");
+    assert.equal(await shown(), before, "it was looked at from elsewhere");
+    await page.context().close();
+  });
+});
+
+describe("a long training", () => {
+  it("asks for a thinner curve once, and goes on where that fails", async () => {
+    const page = await openPage(browser, service, "#/scenes");
+    const steps = 1700;
+    const job = (step, state) => ({
+      id: "long", kind: "train", state, specification: { dataset: "sweep", scene: "long" },
+      created_at: "2026-01-01T00:00:00Z", started_at: null, finished_at: null, reason: null, error: null, retry_of: null,
+      progress: { step, steps, loss: 1 / step, val_psnr_db: null, gaussians: 1, rate_per_s: 1, seconds_left: 119.7 },
+      artifacts: [], metrics: {},
+    });
+    const told = Array.from({ length: steps }, (_, i) => `event: progress\ndata: ${JSON.stringify(job(i + 1, "running"))}\n\n`);
+    let asked = 0;
+    await page.route(/\/jobs\/long\/events$/, (route) => route.fulfill({ contentType: "text/event-stream", body: told.join("") }));
+    await page.route(/\/jobs\/long\/curve$/, (route) => (++asked === 1 ? route.fulfill({ json: { points: [] } }) : route.abort()));
+    const broken = page.waitForEvent("requestfailed");
+    await page.evaluate(() => (location.hash = "#/train/long"));
+    await broken;
+    await page.getByText("Step 1,700 of 1,700", { exact: true }).waitFor();
+    assert.ok(asked <= 3, `${asked} times`); // the first, the thinner one, that of the next connection
+    await page.getByText("The service does not answer. Trying again.").waitFor();
+    assert.deepEqual(page.faults.filter((fault) => !fault.startsWith("Failed to load resource")), []);
+    await page.context().close();
+  });
+});

@@ -1,0 +1,29 @@
+/** The scene file that is chosen and sent in Scenes. */
+
+import { importScene } from "../api/scene_files";
+import { nameOfFile } from "../text";
+import { href, router } from "./router.svelte";
+import { Sending } from "./sending.svelte";
+import { service } from "./service.svelte";
+
+class SceneImport extends Sending {
+  file = $state.raw<File | null>(null);
+  name = $state("");
+
+  choose(file: File | null): void {
+    this.file = file;
+    this.problem = null;
+    if (file) this.name = nameOfFile(file.name) || "scene";
+  }
+
+  /** Sends the file; the scene that it becomes is pointed out. */
+  async send(file: File): Promise<void> {
+    const scene = await this.transfer((told, signal) => importScene(this.name, file, told, signal));
+    if (scene === null) return;
+    this.file = null;
+    await service.poll();
+    if (router.route.view === "scenes") location.hash = href("scenes", scene.name);
+  }
+}
+
+export const sceneImport = new SceneImport();

@@ -1,0 +1,32 @@
+/** The sweep that is chosen and sent in Train. */
+
+import { uploadDataset, type DatasetOptions } from "../api/datasets";
+import { nameOfFile } from "../text";
+import { Sending } from "./sending.svelte";
+import { training } from "./training.svelte";
+
+class SweepUpload extends Sending {
+  files = $state.raw<File[]>([]);
+  name = $state("");
+  options = $state<DatasetOptions>({ crop: "", image_size: "", frames: "", train_frames: "", val_frames: "" });
+
+  choose(files: File[]): void {
+    this.files = files;
+    this.problem = null;
+    const named = files.find((file) => !/\.xml$/i.test(file.name)) ?? files[0];
+    if (named) this.name = nameOfFile(named.name) || "sweep";
+  }
+
+  /** Sends the files; what comes of them is the dataset that is looked at. */
+  async send(): Promise<void> {
+    const dataset = await this.transfer((told, signal) =>
+      uploadDataset(this.name, this.files, { ...this.options }, told, signal),
+    );
+    if (dataset === null) return;
+    this.files = [];
+    await training.refresh();
+    training.chosen = dataset.name;
+  }
+}
+
+export const sweepUpload = new SweepUpload();
