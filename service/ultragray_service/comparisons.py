@@ -38,12 +38,14 @@ class Comparison:
 class Comparisons:
     """Computed at the first look, and kept by the hashes of scene and dataset."""
 
-    def __init__(self, scenes: SceneStore, catalog: SceneCatalog, datasets: DatasetStore, settings: Settings) -> None:
+    def __init__(
+        self, scenes: SceneStore, catalog: SceneCatalog, datasets: DatasetStore, settings: Settings, turn: asyncio.Lock
+    ) -> None:
         self._scenes = scenes
         self._catalog = catalog
         self._datasets = datasets
         self._artifacts = settings.artifacts
-        self.folders = PreparedFolders(settings.artifacts / FOLDER, "comparison", "comparing the scene", settings)
+        self.folders = PreparedFolders(settings.artifacts / FOLDER, "comparison", "comparing the scene", settings, turn)
         self._hashes: dict[str, tuple[FileVersion, str]] = {}
 
     async def get(self, scene: str) -> Comparison:

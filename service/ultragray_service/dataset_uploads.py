@@ -30,12 +30,13 @@ T = TypeVar("T")
 
 
 class DatasetUploads:
-    """The uploads under way. A few at a time are received and checked."""
+    """The uploads under way. A few at a time are received, and wait for `turn` to be checked."""
 
-    def __init__(self, store: DatasetStore, settings: Settings, draining: asyncio.Event) -> None:
+    def __init__(self, store: DatasetStore, settings: Settings, draining: asyncio.Event, turn: asyncio.Lock) -> None:
         self._store = store
         self._settings = settings
         self._draining = draining
+        self._turn = turn
         self._count = 0
 
     @asynccontextmanager
@@ -56,7 +57,7 @@ class DatasetUploads:
         stopping: asyncio.Future[Any] = asyncio.ensure_future(self._draining.wait())
         try:
             incoming = await asyncio.to_thread(IncomingDataset, self._store, self._settings.max_dataset_bytes)
-            upload = DatasetUpload(incoming, name, options, self._settings, stopping)
+            upload = DatasetUpload(incoming, name, options, self._settings, stopping, self._turn)
             try:
                 yield upload
             finally:
@@ -82,12 +83,14 @@ class DatasetUpload:
         options: dict[str, str],
         settings: Settings,
         stopping: asyncio.Future[Any],
+        turn: asyncio.Lock,
     ) -> None:
         self._incoming = incoming
         self._name = name
         self._options = options
         self._settings = settings
         self._stopping = stopping
+        self._turn = turn
         self._block = bytearray()
         self._finishing = asyncio.Lock()
 
@@ -142,11 +145,12 @@ class DatasetUpload:
             max_bytes=self._settings.max_dataset_bytes,
             memory_bytes=self._settings.dataset_memory_mb << 20,
         )
-        await run_helper(
-            "dataset_intake",
-            asdict(request),
-            what="checking the dataset",
-            timeout_s=CHECK_TIMEOUT_S,
-            killed=DatasetInvalid,
-        )
+        async with self._turn:
+            await run_helper(
+                "dataset_intake",
+                asdict(request),
+                what="checking the dataset",
+                timeout_s=CHECK_TIMEOUT_S,
+                killed=DatasetInvalid,
+            )
         return await asyncio.to_thread(self._incoming.accept, self._name)

@@ -6,7 +6,7 @@ import asyncio
 from contextlib import suppress
 from pathlib import Path
 
-from ultragray.errors import DatasetNotFound, UltragrayError
+from ultragray.errors import ArtifactNotFound, DatasetNotFound, UltragrayError
 from ultragray_workers.dataset_store import DatasetStore
 from ultragray_workers.dataset_view import POSES_NAME
 from ultragray_workers.encoding import encode_image
@@ -22,11 +22,11 @@ FOLDER = "dataset-views"  # of the artifact folder
 class DatasetViews:
     """Laid out at the first look, and kept by the content of the dataset."""
 
-    def __init__(self, store: DatasetStore, settings: Settings) -> None:
+    def __init__(self, store: DatasetStore, settings: Settings, turn: asyncio.Lock) -> None:
         self._store = store
         self._artifacts = settings.artifacts
         self.folders = PreparedFolders(
-            settings.artifacts / FOLDER, "dataset_view", "laying out the frames of the dataset", settings
+            settings.artifacts / FOLDER, "dataset_view", "laying out the frames of the dataset", settings, turn
         )
 
     async def key(self, name: str) -> str:
@@ -48,7 +48,11 @@ class DatasetViews:
         return await asyncio.to_thread(_frame_png, folder, name, part, index)
 
     async def _folder(self, name: str) -> Path:
-        return await self.folders.path(await self.key(name), {"artifact_folder": str(self._artifacts), "dataset": name})
+        request = {"artifact_folder": str(self._artifacts), "dataset": name}
+        try:
+            return await self.folders.path(await self.key(name), request)
+        except ArtifactNotFound:
+            raise DatasetNotFound(f"the dataset {name!r} has been deleted", field="dataset") from None
 
 
 def datasets_by_content(store: DatasetStore) -> dict[str, str]:

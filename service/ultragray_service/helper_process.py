@@ -10,7 +10,6 @@ import signal
 import subprocess
 import sys
 from typing import Any
-from weakref import WeakKeyDictionary
 
 from ultragray import errors
 from ultragray.errors import DeadlineExceeded, MemoryExceeded, UltragrayError
@@ -21,21 +20,18 @@ _log = logging.getLogger("ultragray.service")
 _ERRORS = {
     cls.reason: cls for cls in vars(errors).values() if isinstance(cls, type) and issubclass(cls, UltragrayError)
 }
-# Each may take all the memory that settings allow to one.
-_one_at_a_time: WeakKeyDictionary[asyncio.AbstractEventLoop, asyncio.Lock] = WeakKeyDictionary()
+PATIENCE_S = 3600.0  # of who may have to wait for the helpers of others
 
 
 async def run_helper(
     module: str, request: dict[str, Any], *, what: str, timeout_s: float, killed: type[UltragrayError]
 ) -> None:
-    """Has `ultragray_workers.<module>.main` answer a request, after those that came before; `what` says in errors what
-    it does.
+    """Has `ultragray_workers.<module>.main` answer a request; `what` says in errors what it does.
 
-    Raises what the work raises, DeadlineExceeded (the wait for its turn does not count), MemoryExceeded where the
-    process was killed as that of a machine without memory is, and `killed` where something else ended it.
+    Raises what the work raises, DeadlineExceeded, MemoryExceeded where the process was killed as that of a machine
+    without memory is, and `killed` where something else ended it.
     """
-    async with _one_at_a_time.setdefault(asyncio.get_running_loop(), asyncio.Lock()):
-        status, output, complaints = await _run(module, request, what, timeout_s)
+    status, output, complaints = await _run(module, request, what, timeout_s)
     if status == -signal.SIGKILL:
         raise MemoryExceeded(f"the process of {what} was killed: the machine has probably no memory left for it")
     if status < 0:

@@ -16,7 +16,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
-from ultragray.errors import DatasetInvalid, DatasetNotFound, Draining, UltragrayError
+from ultragray.errors import ArtifactNotFound, DatasetInvalid, DatasetNotFound, Draining, UltragrayError
 from ultragray_workers.dataset_incoming import storage_full
 from ultragray_workers.dataset_store import sync_folder
 from ultragray_workers.helper import PROGRESS_NAME
@@ -30,7 +30,7 @@ KEPT_FOLDERS = 32
 _FAILURE_KEPT_S = 60.0  # then it is tried again
 _PREFIX = ".making-"
 _LOCK_NAME = "lock"  # held by the service that makes a folder, as long as it lives
-_LOCKED_WITHIN_S = 60.0  # a folder this young without a lock is being begun or finished
+_FINISHED_WITHIN_S = 60.0  # a folder this young without a lock is about to have its name, or to go
 
 _log = logging.getLogger("ultragray.service")
 
@@ -53,11 +53,12 @@ class PreparedFolders:
     All methods belong to one event loop.
     """
 
-    def __init__(self, folder: Path, module: str, what: str, settings: Settings) -> None:
-        """`module` of ultragray_workers fills a folder; `what` says in errors what it does."""
+    def __init__(self, folder: Path, module: str, what: str, settings: Settings, turn: asyncio.Lock) -> None:
+        """`module` of ultragray_workers fills a folder when it has `turn`; `what` says in errors what it does."""
         self.folder = folder
         self._module = module
         self._what = what
+        self._turn = turn
         self._memory_bytes = settings.dataset_memory_mb << 20
         self._kept_bytes = settings.max_dataset_bytes
         self._tasks: dict[str, asyncio.Task[UltragrayError | None]] = {}
@@ -78,7 +79,7 @@ class PreparedFolders:
         """The folder, made first where it is not there.
 
         Raises what the helper process raises, also where it did so a minute ago, DeadlineExceeded, MemoryExceeded,
-        StorageFull, Draining, and DatasetNotFound where it is removed meanwhile.
+        StorageFull, Draining, and ArtifactNotFound where it is removed meanwhile.
         """
         if await asyncio.to_thread(self._touch, key):
             return self.folder / key
@@ -88,11 +89,16 @@ class PreparedFolders:
             if task.cancelled():
                 if self._ended:
                     raise Draining("the service is stopping")
-                raise DatasetNotFound("the dataset has been deleted", field="dataset")
+                raise ArtifactNotFound("what was to be shown has been deleted meanwhile")
             error = task.result()
         if error is not None:
             raise error.with_traceback(None)
         return self.folder / key
+
+    async def settled(self, is_asked: Callable[[str], bool]) -> None:
+        """Returns when none of the keys that `is_asked` says is being made."""
+        if tasks := {task for key, task in self._tasks.items() if is_asked(key)}:
+            await asyncio.wait(tasks)
 
     def end(self) -> None:
         """Ends what is being made, for good: the service stops."""
@@ -129,14 +135,15 @@ class PreparedFolders:
         error: UltragrayError | None = None
         try:
             with storage_full(self._what):
-                await _to_its_end(partial(_claim, making, claim))
-                await run_helper(
-                    self._module,
-                    {**request, "folder": str(making), "memory_bytes": self._memory_bytes},
-                    what=self._what,
-                    timeout_s=TIMEOUT_S,
-                    killed=DatasetInvalid,
-                )
+                async with self._turn:
+                    await _to_its_end(partial(_claim, making, claim))
+                    await run_helper(
+                        self._module,
+                        {**request, "folder": str(making), "memory_bytes": self._memory_bytes},
+                        what=self._what,
+                        timeout_s=TIMEOUT_S,
+                        killed=DatasetInvalid,
+                    )
                 await _to_its_end(partial(self._keep, making, key))
         except UltragrayError as caught:
             error = caught
@@ -146,7 +153,7 @@ class PreparedFolders:
         finally:
             del self._making[key]
             await _to_its_end(claim.close)
-        if error is not None:
+        if error is not None and not isinstance(error, DatasetNotFound):  # another name may have the same content
             self._failures[key] = (time.monotonic(), error)
         return error
 
@@ -212,11 +219,13 @@ async def _to_its_end(work: Callable[[], T]) -> T:
 
 
 def _claim(making: Path, claim: ExitStack) -> None:
-    """Makes the folder. What is left of it goes when `claim` is closed."""
-    making.mkdir(parents=True)
-    claim.callback(shutil.rmtree, making, ignore_errors=True)
-    lock = claim.enter_context((making / _LOCK_NAME).open("wb"))
+    """Makes the folder, which is locked from the start. What is left of it goes when `claim` is closed."""
+    begun = making.with_name(f".claiming-{secrets.token_hex(8)}")
+    begun.mkdir(parents=True)
+    lock = claim.enter_context((begun / _LOCK_NAME).open("wb"))
     fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    begun.rename(making)
+    claim.callback(shutil.rmtree, making, ignore_errors=True)
 
 
 def _is_abandoned(making: Path) -> bool:
@@ -225,7 +234,7 @@ def _is_abandoned(making: Path) -> bool:
         with (making / _LOCK_NAME).open("rb+") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except FileNotFoundError:
-        return _age_s(making) > _LOCKED_WITHIN_S
+        return _age_s(making) > _FINISHED_WITHIN_S
     except OSError:
         return False
     return True

@@ -26,7 +26,6 @@ from .own_thread import in_own_thread
 from .settings import Settings
 
 CHECK_TIMEOUT_S = 600.0
-PATIENCE_S = 3600.0  # with a check that may have to wait for others
 MAX_IMPORTS = 4
 _PREFIX = ".importing-"
 _LOCKED_WITHIN_S = 60.0  # an empty file this young may be about to be locked
@@ -35,11 +34,18 @@ _LOCKED_WITHIN_S = 60.0  # an empty file this young may be about to be locked
 class SceneImports:
     """Takes scene files in, whole or not at all, and removes them."""
 
-    def __init__(self, store: SceneStore, settings: Settings, maker_of: Callable[[str], Awaitable[str | None]]) -> None:
-        """`maker_of`: the job that makes a scene, in words; None where none does."""
+    def __init__(
+        self,
+        store: SceneStore,
+        settings: Settings,
+        maker_of: Callable[[str], Awaitable[str | None]],
+        turn: asyncio.Lock,
+    ) -> None:
+        """`maker_of`: the job that makes a scene, in words; None where none does. Checks wait for `turn`."""
         self._store = store
         self._settings = settings
         self._maker_of = maker_of
+        self._turn = turn
         self._folder = settings.artifacts / SCENES_FOLDER
         self._count = 0
 
@@ -73,13 +79,14 @@ class SceneImports:
         Cancelling it ends the check. Raises SceneFileInvalid, SceneExists, StorageFull, MemoryExceeded,
         DeadlineExceeded.
         """
-        await run_helper(
-            "scene_check",
-            {"path": str(received), "memory_bytes": self._settings.dataset_memory_mb << 20},
-            what="checking the scene",
-            timeout_s=CHECK_TIMEOUT_S,
-            killed=SceneFileInvalid,
-        )
+        async with self._turn:
+            await run_helper(
+                "scene_check",
+                {"path": str(received), "memory_bytes": self._settings.dataset_memory_mb << 20},
+                what="checking the scene",
+                timeout_s=CHECK_TIMEOUT_S,
+                killed=SceneFileInvalid,
+            )
         header = await asyncio.to_thread(read_header, received)
         await self._require_free(name)
         await in_own_thread(lambda: self._publish(received, name))

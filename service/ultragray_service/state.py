@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable
 from enum import Enum
 
 from ultragray.errors import Draining, NotReady, StartupFailed, UltragrayError
@@ -66,12 +67,14 @@ class Service:
         self.phase = Phase.STARTING
         self.draining = asyncio.Event()
         self.datasets = DatasetStore(settings.artifacts)
-        self.uploads = DatasetUploads(self.datasets, settings, self.draining)
+        # Each helper may take all the memory that settings allow to one: one checks at a time, and one makes pictures.
+        checks, pictures = asyncio.Lock(), asyncio.Lock()
+        self.uploads = DatasetUploads(self.datasets, settings, self.draining, checks)
         self.datasets.in_use = self.jobs.uses_dataset
-        self.imports = SceneImports(store, settings, self.jobs.makes_scene)
-        self.dataset_views = DatasetViews(self.datasets, settings)
-        self.comparisons = Comparisons(store, self.catalog, self.datasets, settings)
-        self.training_views = TrainingViews(self.jobs, self.datasets, settings)
+        self.imports = SceneImports(store, settings, self.jobs.makes_scene, checks)
+        self.dataset_views = DatasetViews(self.datasets, settings, pictures)
+        self.comparisons = Comparisons(store, self.catalog, self.datasets, settings, pictures)
+        self.training_views = TrainingViews(self.jobs, self.datasets, settings, pictures)
         self._prepared = (self.dataset_views.folders, self.comparisons.folders, self.training_views.folders)
 
     @property
@@ -101,7 +104,8 @@ class Service:
         await self.imports.remove_stale()
         for prepared in self._prepared:
             await prepared.remove_stale()
-        await self._forget_deleted_datasets()
+        present = await asyncio.to_thread(datasets_by_content, self.datasets)
+        await self._forget(lambda key: key.rpartition("-")[2] not in present)
         await self.training_views.forget()
         await asyncio.gather(self.pool.start(), self.jobs.start())
         for name in self.settings.preload:
@@ -137,18 +141,19 @@ class Service:
 
     async def delete_dataset(self, name: str) -> None:
         """Deletes a dataset, and all that was made of it to be looked at. Raises DatasetNotFound, DatasetInUse."""
+        deleted = (await asyncio.to_thread(self.datasets.get, name)).sha256
         await asyncio.to_thread(self.datasets.delete, name)
-        await self._forget_deleted_datasets()
+        if deleted not in await asyncio.to_thread(datasets_by_content, self.datasets):
+            await self._forget(lambda key: key.endswith(deleted))
 
     async def delete_job(self, job_id: str) -> None:
         """Deletes a finished job and its files. Raises JobNotFound, JobInUse, DatabaseUnavailable."""
         await self.jobs.delete(job_id)
         await self.training_views.forget(job_id)
 
-    async def _forget_deleted_datasets(self) -> None:
-        present = await asyncio.to_thread(datasets_by_content, self.datasets)
+    async def _forget(self, is_doomed: Callable[[str], bool]) -> None:
         for prepared in self._prepared:
-            await prepared.remove(lambda key: key.rpartition("-")[2] not in present)
+            await prepared.remove(is_doomed)
 
     def begin_draining(self) -> None:
         """From now on frames are refused with Draining; streams end after the frames they have in flight."""

@@ -39,12 +39,12 @@ class CurvePoint:
 class TrainingViews:
     """Curves and previews of trainings, running or finished."""
 
-    def __init__(self, jobs: Jobs, datasets: DatasetStore, settings: Settings) -> None:
+    def __init__(self, jobs: Jobs, datasets: DatasetStore, settings: Settings, turn: asyncio.Lock) -> None:
         self._jobs = jobs
         self._datasets = datasets
         self._artifacts = settings.artifacts
         self.folders = PreparedFolders(
-            settings.artifacts / FOLDER, "training_preview", "rendering the training as it is", settings
+            settings.artifacts / FOLDER, "training_preview", "rendering the training as it is", settings, turn
         )
 
     async def curve(self, job_id: str) -> list[CurvePoint]:
@@ -59,6 +59,7 @@ class TrainingViews:
         Raises JobNotFound, ArtifactNotFound without a checkpoint, DatasetNotFound, and as `PreparedFolders.path`.
         """
         job = await self._jobs.get(job_id)
+        await self.folders.settled(lambda key: key.startswith(f"{job_id}-"))  # one a job at a time: the newest
         checkpoint = JobFolder(self._artifacts, job.id).run / _CHECKPOINT
         version = await asyncio.to_thread(_version_of, checkpoint)
         if version is None or "dataset" not in job.specification:

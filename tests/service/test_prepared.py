@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from ultragray.datasets.released import write_released
-from ultragray.errors import DatasetNotFound, Draining, MemoryExceeded, StorageFull
+from ultragray.errors import ArtifactNotFound, DatasetNotFound, DeadlineExceeded, Draining, MemoryExceeded, StorageFull
 from ultragray_service import prepared
 from ultragray_service.prepared import Preparation, PreparedFolders
 from ultragray_service.settings import Settings
@@ -37,8 +37,14 @@ def request_body(tmp_path: Path) -> dict[str, str]:
     return {"artifact_folder": str(tmp_path), "dataset": "tiny"}
 
 
-def folders(tmp_path: Path) -> PreparedFolders:
-    return PreparedFolders(tmp_path / "views", "dataset_view", "laying out", Settings(data_folder=tmp_path))
+def folders(tmp_path: Path, name: str = "views", turn: asyncio.Lock | None = None, **settings: Any) -> PreparedFolders:
+    return PreparedFolders(
+        tmp_path / name,
+        "dataset_view",
+        "laying out",
+        Settings(data_folder=tmp_path, **settings),
+        turn or asyncio.Lock(),
+    )
 
 
 def names(tmp_path: Path) -> list[str]:
@@ -78,8 +84,7 @@ def test_the_folder_not_asked_for_the_longest_goes(
     aged(tmp_path, "older-but-used", 200, size_bytes)
 
     async def ask() -> None:
-        settings = Settings(data_folder=tmp_path, max_dataset_bytes=1024)
-        made = PreparedFolders(tmp_path / "views", "dataset_view", "laying out", settings)
+        made = folders(tmp_path, max_dataset_bytes=1024)
         assert (await made.prepare("older-but-used", request_body)).state == "ready"
         await made.path("key", request_body)
 
@@ -112,12 +117,14 @@ def test_what_fails_says_why_and_is_tried_again_later(
 ) -> None:
     async def ask() -> None:
         made = folders(tmp_path)
-        with pytest.raises(DatasetNotFound):
-            await made.path("key", request_body | {"dataset": "gone"})
+        with monkeypatch.context() as slow:
+            slow.setattr(prepared, "TIMEOUT_S", 0.0)
+            with pytest.raises(DeadlineExceeded):
+                await made.path("key", request_body)
         failed = await made.prepare("key", request_body)
         assert failed.state == "failed"
-        assert isinstance(failed.error, DatasetNotFound)
-        with pytest.raises(DatasetNotFound):
+        assert isinstance(failed.error, DeadlineExceeded)
+        with pytest.raises(DeadlineExceeded):
             await made.path("key", request_body)
         monkeypatch.setattr(prepared, "_FAILURE_KEPT_S", 0.0)
         assert (await made.prepare("key", request_body)).state == "running"
@@ -125,6 +132,31 @@ def test_what_fails_says_why_and_is_tried_again_later(
 
     asyncio.run(ask())
     assert names(tmp_path) == ["key"]
+
+
+def test_that_a_name_is_gone_says_nothing_of_the_content(tmp_path: Path, request_body: dict[str, str]) -> None:
+    async def ask() -> None:
+        made = folders(tmp_path)
+        with pytest.raises(DatasetNotFound):
+            await made.path("key", request_body | {"dataset": "gone"})
+        await made.path("key", request_body)
+
+    asyncio.run(ask())
+
+
+def test_who_waits_for_what_is_being_made_sees_its_end(tmp_path: Path, request_body: dict[str, str]) -> None:
+    async def ask() -> None:
+        made = folders(tmp_path)
+        asking = asyncio.ensure_future(made.path("job-1", request_body))
+        while not (tmp_path / "views").is_dir():
+            await asyncio.sleep(0.01)
+        await made.settled(lambda key: key.startswith("other-"))
+        assert not (tmp_path / "views" / "job-1").exists()
+        await made.settled(lambda key: key.startswith("job-"))
+        assert (tmp_path / "views" / "job-1").exists()
+        await asking
+
+    asyncio.run(ask())
 
 
 async def end_of(made: PreparedFolders, request_body: dict[str, str]) -> Preparation:
@@ -168,7 +200,7 @@ def test_what_is_stopped_leaves_nothing(tmp_path: Path, request_body: dict[str, 
                 await made.path("key", request_body)
         else:
             await made.remove(lambda key: True)
-        with pytest.raises(Draining if stop == "end" else DatasetNotFound):
+        with pytest.raises(Draining if stop == "end" else ArtifactNotFound):
             await asking
 
     asyncio.run(ask())
@@ -184,13 +216,13 @@ def test_what_is_doomed_goes(tmp_path: Path) -> None:
 
 def test_what_dead_services_left_is_removed(tmp_path: Path) -> None:
     aged(tmp_path, "kept", 9999)
-    aged(tmp_path, ".making-being-begun", 1)
+    aged(tmp_path, ".making-being-finished", 1)
     aged(tmp_path, ".making-half-removed", 100)
     (aged(tmp_path, ".making-dead", 1) / "lock").touch()
     with (aged(tmp_path, ".making-alive", 9999) / "lock").open("wb") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         asyncio.run(folders(tmp_path).remove_stale())
-    assert names(tmp_path) == [".making-alive", ".making-being-begun", "kept"]
+    assert names(tmp_path) == [".making-alive", ".making-being-finished", "kept"]
 
 
 def test_one_helper_process_at_a_time(
@@ -207,10 +239,8 @@ def test_one_helper_process_at_a_time(
     monkeypatch.setattr(subprocess, "Popen", Watched)
 
     async def ask() -> None:
-        made, others = (
-            folders(tmp_path),
-            PreparedFolders(tmp_path / "others", "dataset_view", "", Settings(data_folder=tmp_path)),
-        )
+        turn = asyncio.Lock()
+        made, others = (folders(tmp_path, name, turn) for name in ("views", "others"))
         await asyncio.gather(*(each.path(key, request_body) for each in (made, others) for key in ("a", "b")))
 
     asyncio.run(ask())
@@ -223,8 +253,7 @@ def test_memory_beyond_the_limit_is_one_clear_error(tmp_path: Path, request_body
         shape = (2000, 512, 512)
         np.lib.format.write_array_header_1_0(file, {"descr": "<f4", "fortran_order": False, "shape": shape})
         file.truncate(file.tell() + 4 * 2000 * 512 * 512)  # a hole: nothing is written
-    settings = Settings(data_folder=tmp_path, dataset_memory_mb=512)
-    limited = PreparedFolders(tmp_path / "views", "dataset_view", "laying out", settings)
+    limited = folders(tmp_path, dataset_memory_mb=512)
     with pytest.raises(MemoryExceeded) as caught:
         asyncio.run(limited.path("key", request_body))
     assert "512 MiB" in caught.value.detail

@@ -177,7 +177,7 @@ def test_a_scene_deleted_during_its_first_frame_leaves_no_memory(http: httpx.Cli
         wait_until(lambda: http.get("/v1/statistics").json()["busy_processes"])
         time.sleep(0.05)  # the file is read, the frame is not rendered
         assert http.delete("/v1/scenes/brief").status_code == 204
-        rendering.result()
+        assert rendering.result().status_code == 200
     assert http.get("/v1/statistics").json()["loaded_scenes"] == loaded
 
 

@@ -108,4 +108,4 @@ def test_what_is_described_is_all_but_the_gaussians(scene_folder):
     header = SceneStore(scene_folder).header("a")
     path = scene_folder / "a.ugr"
     length = int.from_bytes(path.read_bytes()[:8], "little")
-    assert scenes._described_bytes(header) == 8 + length + header.training_poses.nbytes
+    assert scenes._described_bytes(header) == 30 * (8 + length) + header.training_poses.nbytes

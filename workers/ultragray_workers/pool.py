@@ -153,7 +153,6 @@ class RenderPool:
 
     async def forget(self, scene: str) -> None:
         """Drops a scene that was deleted from every process, also from one that is loading it just now."""
-        self._check_accepting()
         await self._dispatcher.command_all(UnloadJob(scene))
 
     def loaded(self) -> dict[str, int]:

@@ -19,7 +19,8 @@ _NAMES_IN_MESSAGE = 5
 
 # What the kernel prepares of a scene once (axes, activations, bounds) takes about 1.5 times the raw parameters.
 _RESIDENT_PER_RAW_BYTE = 2.5
-_KEPT_HEADER_BYTES = 32 * 2**20  # of training poses and metadata in the files
+_KEPT_HEADER_BYTES = 128 * 2**20  # of headers: training poses, and what metadata becomes
+_OBJECT_BYTES_PER_TEXT_BYTE = 30  # of the most wasteful metadata: empty lists in a list
 
 
 def resident_bytes(info: SceneInfo) -> int:
@@ -89,9 +90,11 @@ class _KeptHeaders:
 
 
 def _described_bytes(header: SceneHeader) -> int:
-    """Of a scene file without its Gaussians."""
+    """Of a scene file without its Gaussians, as what is read from it: text becomes objects."""
     bytes_per_gaussian = 4 * _floats_per_gaussian(header.info) + bool(header.info.label_names)
-    return header.file_bytes - bytes_per_gaussian * header.info.gaussian_count
+    gaussians_bytes = bytes_per_gaussian * header.info.gaussian_count
+    text_bytes = header.file_bytes - gaussians_bytes - header.training_poses.nbytes
+    return header.training_poses.nbytes + _OBJECT_BYTES_PER_TEXT_BYTE * max(text_bytes, 0)
 
 
 class SceneStore:

@@ -23,7 +23,7 @@ from ..evaluation import evaluate
 from ..files import atomic_path, remove_stale_temporaries
 from ..rendering import choose_backend, render
 from ..scene import PARAMETERS, GaussianScene
-from ..scene_info import SceneInfo
+from ..scene_info import SceneInfo, check_training_pose_count
 from .board import Board, require_tensorboard
 from .calibration import fit_confidence, shorter
 from .checkpointing import (
@@ -146,6 +146,7 @@ class Trainer:
                 f"{dataset.train.source}: images must have at least {SSIM_WINDOW} rows and columns, got "
                 f"{dataset.train.height}x{dataset.train.width}"
             )
+        check_training_pose_count(len(dataset.train))
         check_comparison_memory(dataset, config)
         self._geometry = Geometry.of(dataset)
         config = config.resolved(self._geometry)

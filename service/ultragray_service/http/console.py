@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import re
 from collections.abc import Mapping
-from functools import partial
 from pathlib import Path
 
 from fastapi import FastAPI
@@ -68,15 +67,15 @@ def add_console(app: FastAPI, folder: Path = CONSOLE_FOLDER) -> None:
         except FileNotFoundError:
             return HTMLResponse(_NOT_BUILT, headers=_headers(request))
 
+    async def beside(request: Request) -> Response:
+        name = request.url.path[1:]
+        try:
+            return await _file(request, folder / name, _BESIDE[name])
+        except FileNotFoundError:
+            raise RouteNotFound(f"there is no route /{name}: the console was not built") from None
+
     for name in _BESIDE:
-        app.add_api_route(f"/{name}", partial(_beside, folder / name), methods=["GET", "HEAD"], include_in_schema=False)
-
-
-async def _beside(path: Path, request: Request) -> Response:
-    try:
-        return await _file(request, path, _BESIDE[path.name])
-    except FileNotFoundError:
-        raise RouteNotFound(f"there is no route /{path.name}: the console was not built") from None
+        app.add_api_route(f"/{name}", beside, methods=["GET", "HEAD"], include_in_schema=False)
 
 
 async def _file(request: Request, path: Path, media_type: str) -> Response:

@@ -20,11 +20,12 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
 
-from ultragray import GaussianScene
+from ultragray import GaussianScene, scene_info
 from ultragray.datasets.sweep import Dataset
 from ultragray.errors import (
     BackendUnavailable,
     DatasetInvalid,
+    InvalidArgument,
     MemoryExceeded,
     TrainingDiverged,
     TrainingStateInvalid,
@@ -302,6 +303,16 @@ def test_refuses_what_cannot_be_trained(tiny_dataset: Datasets, tiny_config: Con
         train(tiny_dataset(height=10), tiny_config())
     with pytest.raises(BackendUnavailable, match="device must be cpu, cuda or cuda:N, got 'warp'"):
         train(tiny_dataset(), tiny_config(), device="warp")
+
+
+def test_refuses_more_frames_than_a_scene_can_name(
+    tiny_dataset: Datasets, tiny_config: Configs, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(scene_info, "MAX_TRAINING_POSES", 2)
+    reported: list[Progress] = []
+    with pytest.raises(InvalidArgument, match="training_poses must be at most 2"):
+        train(tiny_dataset(), tiny_config(), report=reported.append)
+    assert not reported
 
 
 def test_no_room_to_begin_is_said(

@@ -15,7 +15,8 @@ from ultragray.errors import UnsupportedMediaType, UploadTooLarge
 
 from ...catalog import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE
 from ...dataset_catalog import contact_sheet, dataset_page
-from ...dataset_uploads import CHECK_TIMEOUT_S, DatasetUpload
+from ...dataset_uploads import DatasetUpload
+from ...helper_process import PATIENCE_S
 from ..accept import PNG
 from ..dataset_schemas import DatasetOut, DatasetPage
 from ..deps import ServiceDep, problems
@@ -107,7 +108,7 @@ async def put_dataset(
             await _receive_files(request, upload)
         else:
             await _receive_archive(request, upload)
-        deadline = time.monotonic() + CHECK_TIMEOUT_S
+        deadline = time.monotonic() + PATIENCE_S
         record, is_new = await finish_or_abandon(upload.finish(), request.receive, deadline)
     response.status_code = 201 if is_new else 200
     return DatasetOut.of(record)

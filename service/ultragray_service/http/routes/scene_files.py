@@ -17,7 +17,7 @@ from ultragray.probe import FloatArray
 from ultragray_workers.scenes import SUFFIX
 
 from ...arrival import arrival
-from ...scene_imports import PATIENCE_S
+from ...helper_process import PATIENCE_S
 from ...scene_points import DEFAULT_POINTS, MAX_POINTS, MAX_POSES, even_selection
 from ..accept import RAW
 from ..console_schemas import ScenePoses
