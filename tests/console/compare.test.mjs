@@ -96,7 +96,9 @@ describe("compare", () => {
     await page.route(/\/comparison$/, (route) => (failing ? route.fulfill({ json: failed }) : route.continue()));
     await page.goto(`${service.url}/#/compare/compared`);
     await page.getByRole("alert").getByText("there was not enough memory").waitFor();
+    const failedAgain = page.waitForResponse(/\/comparison$/);
     await page.getByRole("button", { name: "Try again" }).click();
+    await failedAgain;
     await page.getByRole("alert").getByText("there was not enough memory").waitFor();
     failing = false;
     await page.getByRole("button", { name: "Try again" }).click();

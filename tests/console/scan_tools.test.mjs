@@ -33,6 +33,17 @@ function watchWords() {
   };
 }
 
+/** How far a tap of a key moves the probe, mm: one that is over before the next picture is drawn. */
+async function tap_mm(page, key, altKey) {
+  const before = await poseOf(page);
+  await page.evaluate(({ key, altKey }) => {
+    for (const type of ["keydown", "keyup"])
+      document.activeElement.dispatchEvent(new KeyboardEvent(type, { key, altKey, bubbles: true }));
+  }, { key, altKey });
+  const distance_mm = ({ position_mm: at }) => Math.hypot(...["x", "y", "z"].map((axis) => at[axis] - before.position_mm[axis]));
+  return distance_mm(await until(() => poseOf(page), (pose) => distance_mm(pose) > 0, `${key} is not heard`));
+}
+
 /** A file of poses, as the page is given one. */
 function poseFile(document) {
   return { name: "poses.json", mimeType: "application/json", buffer: Buffer.from(JSON.stringify(document)) };
@@ -90,9 +101,11 @@ describe("poses", () => {
     const before = await poseOf(page);
     await page.keyboard.press("ArrowRight");
     await until(() => poseOf(page), ({ position_mm }) => position_mm.x > before.position_mm.x, "the key is not heard");
-    const coarse = await poseOf(page);
+    const moved = await poseOf(page);
     await page.keyboard.press("Alt+PageDown");
-    await until(() => poseOf(page), ({ position_mm }) => position_mm.z > coarse.position_mm.z, "Alt is not heard");
+    await until(() => poseOf(page), ({ position_mm }) => position_mm.z > moved.position_mm.z, "Alt is not heard");
+    const [coarse_mm, fine_mm] = [await tap_mm(page, "ArrowRight", false), await tap_mm(page, "ArrowRight", true)];
+    assert.ok(Math.abs(fine_mm - coarse_mm / 5) < 0.01, `${fine_mm} mm with Alt, ${coarse_mm} mm without`);
     await page.context().close();
   });
 });
@@ -137,11 +150,14 @@ describe("the image", () => {
 
   it("is black where nothing supports it, if that is asked for, and tells how sure its figure is", async () => {
     const { page, first } = await openScan(browser, service);
-    await until(() => page.getByTestId("similarity").textContent(), (text) => /\d+ %\s+± 4 %/.test(text), "no error is told");
+    const { confidence } = await (await fetch(`${service.url}/v1/scenes/demo`)).json();
+    const told = new RegExp(`\\d+ %\\s+± ${Math.round(confidence.error * 100)} %`);
+    await until(() => page.getByTestId("similarity").textContent(), (text) => told.test(text), "no error is told");
     await page.getByLabel("Tilt, about the lateral axis", { exact: true }).fill("60");
     const tilted = await changed(page, first.print);
     await page.getByLabel("Black where nothing supports it").check();
     const black = await changed(page, tilted.print);
+    assert.ok(black.mean < tilted.mean, `${black.mean} after ${tilted.mean}`);
     await page.getByLabel("Black where nothing supports it").uncheck();
     await until(() => canvasState(page, IMAGE), ({ print }) => print !== black.print, "it stays black");
     await picture(page, "scan-unsupported");
@@ -171,21 +187,49 @@ describe("the image", () => {
 describe("a scene that another takes the place of", () => {
   it("is not scanned with the probe that was chosen for it", async () => {
     const file = readFileSync(path.join(service.data, "demo.ugr"));
-    const put = (body) => fetch(`${service.url}/v1/scenes/other`, { method: "PUT", body }).then((answer) => assert.equal(answer.status, 201));
-    await put(file);
+    await putOther(file);
     const { page, first } = await openScan(browser, service, { scene: "other" });
     await page.getByRole("combobox", { name: "Probe" }).selectOption("convex");
     await changed(page, first.print);
-    await fetch(`${service.url}/v1/scenes/other`, { method: "DELETE" });
-    await put(renamedDataset(file));
+    await deleteOther();
+    await putOther(renamedDataset(file));
     const connected = page.waitForEvent("websocket");
     await page.getByRole("link", { name: "Train", exact: true }).click();
     await page.getByRole("link", { name: "Scan", exact: true }).click();
     await connected;
     await until(() => page.getByRole("combobox", { name: "Probe" }).inputValue(), (value) => value === "own", "the old probe stays");
     await page.context().close();
+    await deleteOther();
+  });
+
+  it("is known while Scan stays open, also where the service was full when it was asked", async () => {
+    const file = readFileSync(path.join(service.data, "demo.ugr"));
+    await putOther(file);
+    const { page, first } = await openScan(browser, service, { scene: "other" });
+    await page.getByRole("combobox", { name: "Probe" }).selectOption("convex");
+    await changed(page, first.print);
+    await deleteOther();
+    await putOther(renamedDataset(file));
+    let full = true;
+    await page.route(/\/v1\/scenes\/other$/, (route) => (full ? route.fulfill({ status: 503 }) : route.continue()));
+    const refused = page.waitForResponse((answer) => answer.status() === 503);
+    await page.getByLabel("Position Y", { exact: true }).fill("3");
+    await refused;
+    full = false;
+    await until(() => page.getByRole("combobox", { name: "Probe" }).inputValue(), (value) => value === "own", "the old probe stays");
+    await page.getByText("view 106 of 211").waitFor();
+    await page.context().close();
+    await deleteOther();
   });
 });
+
+async function putOther(body) {
+  assert.equal((await fetch(`${service.url}/v1/scenes/other`, { method: "PUT", body })).status, 201);
+}
+
+async function deleteOther() {
+  assert.ok((await fetch(`${service.url}/v1/scenes/other`, { method: "DELETE" })).ok);
+}
 
 /** The scene file as if it were trained from another dataset. */
 function renamedDataset(file) {

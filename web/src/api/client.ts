@@ -2,7 +2,7 @@
 
 const KEY_STORAGE = "ultragray.key";
 const RETRY_MS = 2000;
-const FULL_OR_STARTING = [429, 503];
+const PASSING = [429, 502, 503, 504]; // full or starting; proxies answer 502 and 504 while the service starts anew
 
 /** What the service answers in place of a result: RFC 9457 with a stable `reason`. */
 export interface Problem {
@@ -68,6 +68,11 @@ export async function request(path: string, init: RequestInit = {}): Promise<Res
   return response;
 }
 
+/** Whether asking again may help: the service is down, full or starting. */
+export function mayPass(error: unknown): boolean {
+  return !(error instanceof ServiceError) || PASSING.includes(error.problem.status);
+}
+
 /**
  * Asks until the service answers; `told` hears what keeps it from it, a service that is down or full, each time. Throws
  * ServiceError for what asking again does not change, and what `ask` throws once the signal is aborted.
@@ -81,8 +86,7 @@ export async function untilAnswered<T>(
     try {
       return await ask();
     } catch (error) {
-      const lasting = error instanceof ServiceError && !FULL_OR_STARTING.includes(error.problem.status);
-      if (signal.aborted || lasting) throw error;
+      if (signal.aborted || !mayPass(error)) throw error;
       told(error);
     }
     await new Promise((resolve) => setTimeout(resolve, RETRY_MS));

@@ -82,9 +82,12 @@ export interface StreamEvents {
 const MAX_UNANSWERED = 4; // more would only wait: the newest pose is kept here until there is room
 const LEAST_BETWEEN_MS = 24; // 40 frames a second look smooth; more would only warm the room
 const RECONNECT_MS = { first: 300, most: 3000 };
-const TIMEOUT_MS = 8000; // of a frame: the service refuses it then
-const SILENT_MS = 10_000; // after so long without the answer that is due, the connection is dead
-const PASSING = ["QUEUE_FULL", "DEADLINE_EXCEEDED", "NOT_READY", "RENDER_FAILED", "INTERNAL"];
+const TIMEOUT_MS = 8000; // of waiting: then the service refuses a frame that is not being rendered yet
+const CONNECT_MS = 10_000;
+// After so long without the answer that is due, the connection is taken for dead. A scene that is loaded, or a slow
+// processor, may take longer: it is given more time after each loss.
+const SILENT_MS = { first: 10_000, most: 160_000 };
+const PASSING = ["QUEUE_FULL", "DEADLINE_EXCEEDED", "NOT_READY"];
 const AGAIN_MS = 1000; // after a refusal that may pass
 
 /** A stream that stays open, over restarts of the service, until it is closed. */
@@ -105,6 +108,7 @@ export class FrameStream {
   #later: ReturnType<typeof setTimeout> | undefined;
   #again: ReturnType<typeof setTimeout> | undefined;
   #silence: ReturnType<typeof setTimeout> | undefined;
+  #silent_ms = SILENT_MS.first;
   #sent_ms = -Infinity;
 
   constructor(
@@ -154,7 +158,7 @@ export class FrameStream {
     socket.onmessage = (event: MessageEvent<ArrayBuffer | string>) => this.#receive(event.data);
     socket.onclose = () => this.#lose();
     this.#socket = socket;
-    this.#silence = setTimeout(() => this.#lose(), SILENT_MS);
+    this.#silence = setTimeout(() => this.#lose(), CONNECT_MS);
   }
 
   /** Gives the socket up, and opens another after a while. */
@@ -174,7 +178,11 @@ export class FrameStream {
   /** Waits for the next answer, if one is due. */
   #listen(): void {
     clearTimeout(this.#silence);
-    if (this.#sequence > this.#answered) this.#silence = setTimeout(() => this.#lose(), SILENT_MS);
+    if (this.#sequence === this.#answered) return;
+    this.#silence = setTimeout(() => {
+      this.#silent_ms = Math.min(this.#silent_ms * 2, SILENT_MS.most);
+      this.#lose();
+    }, this.#silent_ms);
   }
 
   #send(): void {
@@ -220,6 +228,8 @@ export class FrameStream {
       if (PASSING.includes(error.reason)) this.#askAgain();
     } else {
       const frame = decodeFrame(data);
+      if (frame.header.sequence < this.#answered) return; // a newer pose was refused
+      this.#silent_ms = Math.max(SILENT_MS.first, 2 * frame.roundTrip_ms);
       this.#takenSettings = this.#asked.get(frame.header.sequence) ?? "";
       this.#settle(frame.header.sequence);
       this.events.frame(frame);

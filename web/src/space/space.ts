@@ -130,7 +130,9 @@ export class SpaceView {
 
   /** The box that the scene fills, and its training views: they tell which way is up. */
   setSurroundings(low: readonly number[], high: readonly number[], views: readonly Pose[], probe: Probe): void {
-    this.#box = [new Vector3(...low), new Vector3(...high)];
+    const box: [Vector3, Vector3] = [new Vector3(...low), new Vector3(...high)];
+    const same = this.#looked && box.every((corner, i) => corner.equals(this.#box[i]!));
+    this.#box = box;
     const down = new Vector3();
     for (const view of views) down.add(new Vector3(...axis(view, 2)));
     if (down.length() > 1e-6) this.#up.copy(down.normalize().negate());
@@ -140,7 +142,7 @@ export class SpaceView {
     this.#sweep = sweepPlanes(views, probe, this.#cutPlane);
     this.#sweep.visible = visible;
     this.#scene.add(this.#sweep, this.#boxLines());
-    if (this.#looked) this.#touch();
+    if (same) this.#touch();
     else this.lookFromOutside();
     this.#looked = true;
   }
@@ -150,11 +152,11 @@ export class SpaceView {
     this.#touch();
   }
 
-  setPoints(points: GaussianPoints): void {
+  setPoints(points: GaussianPoints | null): void {
     this.#points?.dispose();
     this.#points?.object.removeFromParent();
-    this.#points = new PointCloud(points, this.#cutPlane);
-    this.#scene.add(this.#points.object);
+    this.#points = points && new PointCloud(points, this.#cutPlane);
+    if (this.#points) this.#scene.add(this.#points.object);
     this.#touch();
   }
 

@@ -44,9 +44,9 @@ export class LiveView {
       },
     });
     this.#timer = setInterval(() => this.#measure(), RATES_EVERY_MS);
-    // Until the scene is known, and while the stream is lost, the service is asked what is the matter.
+    // Until the scene is known as it is now, and while the stream is lost, the service is asked what is the matter.
     $effect(() => {
-      if (session.known && this.connected) return;
+      if (session.known && !session.outdated && this.connected) return;
       void session.load();
       const timer = setInterval(() => void session.load(), SCENE_ASKED_AGAIN_MS);
       return () => clearInterval(timer);

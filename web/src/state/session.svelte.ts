@@ -1,6 +1,6 @@
 /** One scene as it is scanned: its description, the probe, where it is held and how its frames are shown. */
 
-import { explain, ServiceError, Unreachable } from "../api/client";
+import { explain, mayPass, ServiceError, Unreachable } from "../api/client";
 import { describeScene, trainingPoses, type Probe, type SceneDescription } from "../api/scenes";
 import type { Output, StreamSettings } from "../api/stream";
 import { faceDepth_mm, nearDepth_mm } from "../geometry/picture";
@@ -52,6 +52,9 @@ export class Session {
   /** Whether what no Gaussians support is black. */
   hidesUnsupported = $state(false);
 
+  /** Whether frames have come from another file since the description was asked for. */
+  outdated = $state(false);
+
   readonly known = $derived(this.description !== null);
   readonly track = $derived(this.trajectory?.poses ?? this.views);
   readonly sceneProbe = $derived(this.description?.probe ?? WITHOUT_PROBE);
@@ -69,6 +72,7 @@ export class Session {
   async load(): Promise<void> {
     if (this.#asking) return;
     this.#asking = true;
+    const sha256 = this.#sha256;
     try {
       const description = await describeScene(this.name);
       if (!sameScene(this.description, description)) {
@@ -76,6 +80,7 @@ export class Session {
         this.description = description;
         this.#beginAnew();
       }
+      if (sha256 === this.#sha256) this.outdated = false;
       this.problem = null;
       this.missing = false;
     } catch (error) {
@@ -86,9 +91,9 @@ export class Session {
     }
   }
 
-  /** Takes note of the file that a frame came from: where it is another one, the scene is asked about again. */
+  /** Takes note of the file that a frame came from. */
   rendered(sha256: string): void {
-    if (this.#sha256 !== null && this.#sha256 !== sha256) void this.load();
+    if (this.#sha256 !== null && this.#sha256 !== sha256) this.outdated = true;
     this.#sha256 = sha256;
   }
 
@@ -207,8 +212,8 @@ async function viewsOf(scene: string): Promise<Pose[]> {
   try {
     return await trainingPoses(scene);
   } catch (error) {
-    if (error instanceof ServiceError) return [];
-    throw error;
+    if (mayPass(error)) throw error;
+    return [];
   }
 }
 
@@ -237,7 +242,7 @@ export function sessionOf(scene: string): Session {
   return session;
 }
 
-/** Lets go of what was kept about a scene that is gone, or that another takes the place of. */
+/** Lets go of what was kept about a scene that is gone. */
 export function forgetSession(scene: string): void {
   sessions.delete(scene);
 }

@@ -5,10 +5,12 @@ import { nameOfFile } from "../text";
 import { Sending } from "./sending.svelte";
 import { training } from "./training.svelte";
 
+const NO_OPTIONS: DatasetOptions = { crop: "", image_size: "", frames: "", train_frames: "", val_frames: "" };
+
 class SweepUpload extends Sending {
   files = $state.raw<File[]>([]);
   name = $state("");
-  options = $state<DatasetOptions>({ crop: "", image_size: "", frames: "", train_frames: "", val_frames: "" });
+  options = $state<DatasetOptions>({ ...NO_OPTIONS });
 
   choose(files: File[]): void {
     this.files = files;
@@ -17,13 +19,19 @@ class SweepUpload extends Sending {
     if (named) this.name = nameOfFile(named.name) || "sweep";
   }
 
+  /** Lets go of the files and of what was entered for them. */
+  discard(): void {
+    this.files = [];
+    this.options = { ...NO_OPTIONS };
+  }
+
   /** Sends the files; what comes of them is the dataset that is looked at. */
   async send(): Promise<void> {
     const dataset = await this.transfer((told, signal) =>
       uploadDataset(this.name, this.files, { ...this.options }, told, signal),
     );
     if (dataset === null) return;
-    this.files = [];
+    this.discard();
     await training.refresh();
     training.chosen = dataset.name;
   }

@@ -15,18 +15,23 @@ class TrainingState {
   problem = $state<string | null>(null);
   readonly dataset = $derived(this.datasets.find((one) => one.name === this.chosen) ?? null);
   #asked = 0;
+  /** The newest request whose answer was taken: those to older ones come too late. */
+  #taken = 0;
 
   async refresh(): Promise<void> {
     const asked = ++this.#asked;
     try {
       const [datasets, jobs] = await Promise.all([listDatasets(), listTrainings(JOBS_LISTED)]);
-      if (asked !== this.#asked) return;
+      if (asked < this.#taken) return;
+      this.#taken = asked;
       this.datasets = datasets.map((dataset) => this.#known(dataset));
       this.jobs = jobs;
       if (this.dataset === null) this.chosen = this.datasets[0]?.name ?? "";
       this.problem = null;
     } catch (error) {
-      if (asked === this.#asked) this.problem = explain(error);
+      if (asked < this.#taken) return;
+      this.#taken = asked;
+      this.problem = explain(error);
     }
   }
 
