@@ -108,7 +108,8 @@ describe("a proxy", () => {
     await page.getByLabel("Position Y", { exact: true }).fill("3");
     await changed(page, first.print);
     assert.ok(descriptions.count <= 2 * CUTS, `asked ${descriptions.count} times`);
-    assert.equal(await buffersMade(), before, "the 3D view was made anew");
+    const made = (await buffersMade()) - before; // a part may be drawn for the first time; the whole view has dozens
+    assert.ok(made < 10, `the 3D view was made anew: ${made} buffers`);
     await page.context().close();
   });
 
