@@ -13,7 +13,7 @@ DATA ?= ../shared/data
 ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help serve console test test-long test-console test-faults check format bench bench-cuda results demo-scene proto clean
+.PHONY: help serve console test test-long test-console test-faults check format bench bench-console bench-cuda results demo-scene proto clean
 
 help:  ## say what there is
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
@@ -56,6 +56,10 @@ bench: $(VENV)/installed  ## measure the kernel and the service; the table is pr
 	$(BIN)/ultragray bench --train --output benchmarks/training.json $(ARGS)
 	$(BIN)/ultragray bench --jobs --output benchmarks/jobs.json $(ARGS)
 	$(BIN)/ultragray bench --clients --output benchmarks/clients.json $(ARGS)
+
+bench-console: $(VENV)/installed-dev $(CONSOLE)  ## frames a second, memory and first paint of the console in Debian's Chromium; takes six minutes
+	node tests/console/measure.mjs > build/console.json
+	mv build/console.json benchmarks/console.json
 
 bench-cuda: $(VENV)/installed  ## the same on a GPU, with the distance to what it can do at most
 	$(BIN)/ultragray bench --backend cuda --output benchmarks/cuda.json $(ARGS)

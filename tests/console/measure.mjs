@@ -67,13 +67,15 @@ try {
     heaps.push(await heapBytes(session));
   }
   const sorted = [...rates].sort((a, b) => a - b);
+  const rounded = (value) => Math.round(value * 10) / 10;
+  const heaps_mib = heaps.map((bytes) => rounded(bytes / MEBIBYTE));
   const figures = {
     seconds,
-    frames_per_s: { median: sorted[sorted.length >> 1], least: sorted[0], most: sorted.at(-1) },
-    heap_mib: { first: heaps[0] / MEBIBYTE, last: heaps.at(-1) / MEBIBYTE, most: Math.max(...heaps) / MEBIBYTE },
-    first_contentful_paint_ms: paint_ms,
-    first_image_ms: image_ms,
-    bundle_gzip_kb: bundleBytes() / 1000,
+    frames_per_s: { median: rounded(sorted[sorted.length >> 1]), least: rounded(sorted[0]), most: rounded(sorted.at(-1)) },
+    heap_mib: { first: heaps_mib[0], last: heaps_mib.at(-1), most: Math.max(...heaps_mib) },
+    first_contentful_paint_ms: rounded(paint_ms),
+    first_image_ms: rounded(image_ms),
+    bundle_gzip_kb: rounded(bundleBytes() / 1000),
   };
   process.stdout.write(`${JSON.stringify(figures, null, 2)}\n`);
 } finally {
