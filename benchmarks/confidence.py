@@ -1,10 +1,12 @@
 """Whether a scene's confidence is true: in-silico sweeps that mix causes, predicted against actual MS-SSIM.
 
     python benchmarks/confidence.py [--only NAME ...]
+    python benchmarks/confidence.py --recorded FOLDER
 
 Each scene is trained from sweeps with gaps, at some tilts, that stop short of one end; it is then asked for frames of
 new sweeps: tilted by −10° … 10°, within the gaps, and off the end. Writes docs/images/confidence_reliability.png and
-prints the table of docs/confidence.md.
+prints the table of docs/confidence.md. With --recorded it trains from a data set and tells of its
+held-out frames.
 """
 
 from __future__ import annotations
@@ -22,6 +24,7 @@ from matplotlib.figure import Figure
 
 from ultragray.confidence import Assessor
 from ultragray.datasets.phantom import PHANTOM_PROBE, freehand_poses, simulate
+from ultragray.datasets.source import load_dataset
 from ultragray.datasets.sweep import Dataset, Sweep
 from ultragray.evaluation import evaluate
 from ultragray.probe import FloatArray
@@ -101,6 +104,19 @@ def measure(mixture: Mixture) -> tuple[FloatArray, FloatArray, np.ndarray, int]:
     return np.array([frame.confidence for frame in told], dtype=np.float64), actual, causes, len(training)
 
 
+def tell_recorded(dataset: Dataset) -> str:
+    """The confidence of held-out frames against their MS-SSIM, in words."""
+    scene = train(dataset, TrainingConfig.preset("fast"))
+    actual = np.array([frame.ms_ssim for frame in evaluate(scene, dataset.val).frames])
+    told = Assessor(scene.info, scene.training_poses).assess(dataset.val.poses)
+    predicted = np.array([frame.confidence for frame in told], dtype=np.float64)
+    return (
+        f"{dataset.name}: {len(dataset.train)} training frames, {len(actual)} held out: "
+        f"confidence {predicted.mean():.3f}, actual {actual.mean():.3f}, "
+        f"mean absolute error {np.abs(predicted - actual).mean():.3f}"
+    )
+
+
 def rank_correlation(first: FloatArray, second: FloatArray) -> float:
     """Spearman's; no two values are equal."""
     ranks = [values.argsort().argsort() for values in (first, second)]
@@ -110,8 +126,13 @@ def rank_correlation(first: FloatArray, second: FloatArray) -> float:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--only", nargs="*", choices=list(MIXTURES), default=list(MIXTURES))
-    names = parser.parse_args().only
+    parser.add_argument("--recorded", metavar="FOLDER", help="of a data set, instead of the in-silico scenes")
+    given = parser.parse_args()
     torch.set_num_threads(1)
+    if given.recorded is not None:
+        sys.stdout.write(tell_recorded(load_dataset(given.recorded)) + "\n")
+        return
+    names = given.only
     figure = Figure(figsize=(4.2 * min(2, len(names)), 4.0 * -(-len(names) // 2)), layout="constrained")
     axes = figure.subplots(-(-len(names) // 2), min(2, len(names)), squeeze=False).ravel()
     out = sys.stdout
