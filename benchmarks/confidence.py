@@ -26,7 +26,7 @@ from ultragray.confidence import Assessor
 from ultragray.datasets.phantom import PHANTOM_PROBE, freehand_poses, simulate
 from ultragray.datasets.source import load_dataset
 from ultragray.datasets.sweep import Dataset, Sweep
-from ultragray.evaluation import evaluate
+from ultragray.evaluation.scoring import evaluate
 from ultragray.probe import FloatArray
 from ultragray.training import TrainingConfig, train
 

@@ -20,13 +20,13 @@ from typing import Any
 
 import torch
 
-from ultragray.baselines import BASELINES, evaluate_baselines, predict
-from ultragray.compounding import affordable_voxel_mm
 from ultragray.datasets.phantom.shadow import SHADOW_DB, BoneShadow
 from ultragray.datasets.source import PHANTOM, SourceOptions, load_dataset
 from ultragray.datasets.sweep import Dataset
-from ultragray.evaluation import render_sweep
-from ultragray.files import atomic_path
+from ultragray.evaluation.baselines import BASELINES, evaluate_baselines, predict
+from ultragray.evaluation.compounding import affordable_voxel_mm
+from ultragray.evaluation.scoring import render_sweep
+from ultragray.files.atomic import atomic_path
 from ultragray.machine import processor_name
 from ultragray.report.study import train_and_evaluate
 from ultragray.scene import GaussianScene

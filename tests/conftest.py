@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 import torch
 
-from ultragray import ConvexProbe, Frames, GaussianScene, LinearProbe, Probe, SceneInfo, cuda
+from ultragray import ConvexProbe, Frames, GaussianScene, LinearProbe, Probe, SceneInfo
+from ultragray.backends import cuda
 from ultragray.probe import FloatArray, stretch_released_far
 from ultragray.request import OUTPUTS
 from ultragray.scene import PARAMETERS

@@ -8,9 +8,10 @@ from typing import Any
 
 from torch import Tensor
 
-from . import __version__, cpu, cuda, reference
+from . import __version__
+from .backends import cpu, cuda, reference
+from .backends.labels import render_labels
 from .errors import BackendUnavailable
-from .labels import render_labels
 from .pose import check_poses
 from .probe import FloatArray, Probe
 from .request import LABELS, OUTPUTS, WEIGHT_SUM, check_image_size, check_labelled, check_outputs

@@ -18,7 +18,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from .errors import InvalidArgument
-from .files import atomic_path
+from .files.atomic import atomic_path
 from .pose import check_poses
 from .probe import FloatArray
 from .scene_info import (

@@ -10,8 +10,8 @@ from prometheus_client.registry import Collector
 
 from ultragray.errors import UltragrayError
 from ultragray_workers.jobs.job import JobState
-from ultragray_workers.pool import RenderPool
-from ultragray_workers.types import RenderResult
+from ultragray_workers.pool.pool import RenderPool
+from ultragray_workers.pool.types import RenderResult
 
 from .statistics import Statistics
 

@@ -10,7 +10,7 @@ from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
 from ultragray.errors import InvalidArgument
 from ultragray.request import MAX_IMAGE_SIDE
-from ultragray_workers.pool import MAX_BATCH_POSES
+from ultragray_workers.pool.pool import MAX_BATCH_POSES
 
 ENVIRONMENT_PREFIX = "ULTRAGRAY_"
 

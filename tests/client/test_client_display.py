@@ -9,9 +9,9 @@ import pytest
 
 from ultragray import ConvexProbe as LibraryConvexProbe
 from ultragray import GaussianScene, render
-from ultragray.display import AS_RENDERED
-from ultragray.display import Display as LibraryDisplay
-from ultragray.display_frames import show
+from ultragray.display.frames import show
+from ultragray.display.settings import AS_RENDERED
+from ultragray.display.settings import Display as LibraryDisplay
 from ultragray_client import ConvexProbe, Display, Picture, Placement, Quaternion, errors
 
 from ..service.conftest import DEMO_PROBE, HEIGHT, WIDTH

@@ -12,7 +12,7 @@ import pytest
 
 from ultragray_client import DatasetOptions, JobKind, JobState, LinearProbe, errors
 
-from ..service.test_http_datasets import poisoned_files, released_files
+from ..service.http.test_http_datasets import poisoned_files, released_files
 
 SETTINGS = {"steps": 20, "max_gaussians": 40, "batch_size": 2}
 

@@ -29,7 +29,7 @@ elif "worker" in line:
     heartbeat.DEAD_AFTER_S = {DEAD_AFTER_S}
 """
 _SERVE = [sys.executable, "-m", "ultragray_service"]
-_WORK = [sys.executable, "-c", "from ultragray_service.cli import app; app()", "worker", "--device", "cpu"]
+_WORK = [sys.executable, "-c", "from ultragray_service.cli.app import app; app()", "worker", "--device", "cpu"]
 
 
 class Machine:
@@ -107,7 +107,7 @@ class Machine:
         found: dict[str, list[int]] = {"job": [], "worker": [], "server": []}
         for process, kind in [(self._servers[-1:], "server"), (self._workers[-1:], "worker")]:
             found[kind] += [one.pid for one in process if one.poll() is None]
-        embedded = {f"ultragray_service.cli_worker {server.pid}" for server in self._servers}
+        embedded = {f"ultragray_service.cli.worker {server.pid}" for server in self._servers}
         for path in Path("/proc").glob("[0-9]*/cmdline"):
             try:
                 line = path.read_text().replace("\0", " ").strip()

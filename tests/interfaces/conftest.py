@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from ultragray_service.core.state import Service
 from ultragray_service.settings import Settings
-from ultragray_service.state import Service
 
 
 @pytest.fixture

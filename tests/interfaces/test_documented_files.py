@@ -11,19 +11,12 @@ import numpy as np
 import torch
 from safetensors import safe_open
 
-from ultragray import (
-    GaussianScene,
-    PhasedProbe,
-    SceneInfo,
-    checkpoint_export,
-    ply,
-    request,
-    scene_info,
-)
+from ultragray import GaussianScene, PhasedProbe, SceneInfo, request, scene_info
 from ultragray.confidence import Extrapolation
+from ultragray.interchange import checkpoint_export, ply
 from ultragray_service.http import accept
-from ultragray_workers import encoding as pixels
-from ultragray_workers.types import Encoding
+from ultragray_workers.pool.process import encoding as pixels
+from ultragray_workers.pool.types import Encoding
 
 from .document import code, rows, table
 

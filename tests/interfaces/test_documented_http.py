@@ -15,16 +15,16 @@ from ultragray import (
     LinearProbe,
 )
 from ultragray.confidence import Extrapolation
-from ultragray.display import AS_RENDERED
+from ultragray.display.settings import AS_RENDERED
+from ultragray_service.core.pose_stream import Answered
+from ultragray_service.core.state import Service
 from ultragray_service.http import accept, middleware, problems
 from ultragray_service.http.app import create_app
 from ultragray_service.http.docs import DOCS_PATH
 from ultragray_service.http.routes import render as render_route
 from ultragray_service.http.schemas import DisplayBody, RenderBody
 from ultragray_service.http.stream_schemas import StreamMessage, StreamSettings, frame_bytes
-from ultragray_service.pose_stream import Answered
-from ultragray_service.state import Service
-from ultragray_workers.types import Encoding, RenderResult
+from ultragray_workers.pool.types import Encoding, RenderResult
 
 from .document import DOCUMENT, all_errors, code, numbers, table
 

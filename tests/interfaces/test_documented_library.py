@@ -15,28 +15,22 @@ from ultragray import (
     GaussianScene,
     LinearProbe,
     PhasedProbe,
-    baselines,
-    checkpoint,
-    checkpoint_export,
-    compounding,
     confidence,
     demo,
-    display,
-    display_frames,
     errors,
-    evaluation,
-    exports,
-    files,
-    metrics,
-    ply,
     pose,
-    pose_file,
     probe,
     rendering,
     samplers,
-    side_by_side,
 )
 from ultragray.datasets import Dataset, Sweep, checks, phantom, pictures, plus, released, source
+from ultragray.display import frames as display_frames
+from ultragray.display import settings as display
+from ultragray.evaluation import baselines, compounding, metrics, side_by_side
+from ultragray.evaluation import scoring as evaluation
+from ultragray.files import atomic as files
+from ultragray.files import poses as pose_file
+from ultragray.interchange import checkpoint, checkpoint_export, exports, ply
 
 from .document import call_of, code, table
 

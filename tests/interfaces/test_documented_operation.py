@@ -22,18 +22,21 @@ from ultragray import (
     scene_info,
 )
 from ultragray.training import TrainingConfig
-from ultragray_service import catalog, dataset_uploads, pose_stream, server
-from ultragray_service.cli import USER_ERROR
-from ultragray_service.cli import app as command_line
-from ultragray_service.cli_jobs_watch import JOB_CANCELLED, JOB_FAILED
-from ultragray_service.cli_train import INTERRUPTED
+from ultragray_service import server
+from ultragray_service.cli.app import USER_ERROR
+from ultragray_service.cli.app import app as command_line
+from ultragray_service.cli.jobs_watch import JOB_CANCELLED, JOB_FAILED
+from ultragray_service.cli.train import INTERRUPTED
+from ultragray_service.core import catalog, dataset_uploads, pose_stream
+from ultragray_service.core.state import Service
 from ultragray_service.logs import JsonFormatter, request_id
 from ultragray_service.rpc import server as grpc_server
 from ultragray_service.settings import ENVIRONMENT_PREFIX, Settings, load_settings
-from ultragray_service.state import Service
-from ultragray_workers import dataset_store, dataset_unpack, scenes
-from ultragray_workers import encoding as pixels
+from ultragray_workers import scenes
+from ultragray_workers.datasets import store as dataset_store
+from ultragray_workers.datasets import unpack as dataset_unpack
 from ultragray_workers.jobs.job import JobState
+from ultragray_workers.pool.process import encoding as pixels
 
 from .document import all_errors, code, numbers, rows, table
 

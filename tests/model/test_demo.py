@@ -16,7 +16,6 @@ import pytest
 import torch
 
 from ultragray import GaussianScene, LinearProbe, read_header, render
-from ultragray.compounding import pixel_positions_mm
 from ultragray.datasets import Dataset, Sweep
 from ultragray.datasets.phantom import Tissue, load_phantom, simulate, sweeps, tissue_at
 from ultragray.datasets.phantom.shadow import BoneShadow
@@ -30,7 +29,8 @@ from ultragray.demo import (
     make,
 )
 from ultragray.errors import InvalidArgument
-from ultragray.evaluation import evaluate, render_sweep
+from ultragray.evaluation.compounding import pixel_positions_mm
+from ultragray.evaluation.scoring import evaluate, render_sweep
 from ultragray.training import TrainingConfig
 
 SIDE = 256

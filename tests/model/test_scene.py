@@ -18,7 +18,7 @@ from safetensors.torch import save
 
 from ultragray import GaussianScene, LinearProbe, SceneInfo, read_header
 from ultragray.errors import InvalidArgument, SceneFileInvalid
-from ultragray.files import file_sha256
+from ultragray.files.atomic import file_sha256
 from ultragray.scene import PARAMETERS
 from ultragray.scene_info import METADATA_KEY, info_to_json
 

@@ -19,7 +19,7 @@ from ultragray_proto.v1 import rendering_pb2, rendering_pb2_grpc
 
 from ..waiting import wait_until
 from .conftest import ROOT, SOURCE_FOLDERS, RunningService, StartService
-from .test_grpc_render import Conversation, error_info, moved
+from .rpc.test_grpc_render import Conversation, error_info, moved
 
 IDENTITY = {"position_mm": {"x": 0, "y": 0, "z": 0}, "quaternion": {"w": 1, "x": 0, "y": 0, "z": 0}}
 SMALL = {"height": 80, "width": 80}

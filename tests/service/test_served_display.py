@@ -11,8 +11,8 @@ import pytest
 from websockets.sync.client import connect
 
 from ultragray import ConvexProbe, GaussianScene, render
-from ultragray.display import Display
-from ultragray.display_frames import show
+from ultragray.display.frames import show
+from ultragray.display.settings import Display
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2
 
 from .conftest import DEMO_PROBE, HEIGHT, WIDTH, RunningService

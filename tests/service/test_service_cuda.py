@@ -68,7 +68,7 @@ def test_a_service_without_a_gpu_says_so_in_one_line(
 
 
 def run_render(data_folder: Path, output: Path, interpret: str) -> subprocess.CompletedProcess[str]:
-    program = "from ultragray_service.cli import app; app()"
+    program = "from ultragray_service.cli.app import app; app()"
     options = ["-o", str(output), "--backend", "cuda", "--height", "32", "--width", "24"]
     path = os.pathsep.join(str(ROOT / folder) for folder in SOURCE_FOLDERS)
     return subprocess.run(

@@ -8,8 +8,8 @@ import pytest
 from websockets.sync.client import connect
 
 from ultragray.errors import DeadlineExceeded
+from ultragray_service.core.state import Service
 from ultragray_service.settings import load_settings
-from ultragray_service.state import Service
 from ultragray_service.statistics import STEP_S, STEPS, Statistics
 
 from .conftest import StartService

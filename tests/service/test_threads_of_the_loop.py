@@ -12,9 +12,9 @@ from typing import Any
 import pytest
 
 from ultragray import GaussianScene
-from ultragray_service import catalog, scene_imports
+from ultragray_service.core import catalog, scene_imports
+from ultragray_service.core.state import Service
 from ultragray_service.settings import load_settings
-from ultragray_service.state import Service
 from ultragray_workers.jobs.store import JobStore
 
 

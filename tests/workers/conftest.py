@@ -122,7 +122,7 @@ def _pool_processes() -> dict[int, str]:
             continue
         try:
             in_group = os.getpgid(int(folder.name)) == os.getpgid(0)
-            if in_group and b"ultragray_workers.template" in (folder / "cmdline").read_bytes():
+            if in_group and b"ultragray_workers.pool.process.template" in (folder / "cmdline").read_bytes():
                 found[int(folder.name)] = (folder / "comm").read_text().strip()
         except (FileNotFoundError, ProcessLookupError):
             continue

@@ -1,8 +1,8 @@
 """The render pool: worker processes that turn poses into encoded frames. Free of torch."""
 
-from .pool import PoolConfig, PoolStatistics, RenderPool
+from .pool.pool import PoolConfig, PoolStatistics, RenderPool
+from .pool.types import Encoding, Priority, RenderRequest, RenderResult
 from .scenes import SceneStore
-from .types import Encoding, Priority, RenderRequest, RenderResult
 
 __all__ = [
     "Encoding",

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from ..files import atomic_path
+from ..files.atomic import atomic_path
 from ..probe import FloatArray, LinearProbe
 from .sweep import Dataset, Sweep
 

@@ -1,7 +1,8 @@
 """Datasets in the layout of the released trainer: conf.json, images_*.npy, poses_*.npy or .json.
 
-conf.json says where the planes are, in centimetres and degrees (`ultragray.released_config`); poses are in mm. Rows lie
-where Sweep puts them, as measured from the image: the stretch of docs/physics.md §3 is for released checkpoints only.
+conf.json says where the planes are, in centimetres and degrees (`ultragray.interchange.released_config`); poses are in
+mm. Rows lie where Sweep puts them, as measured from the image: the stretch of docs/physics.md §3 is for released
+checkpoints only.
 """
 
 from __future__ import annotations
@@ -13,11 +14,11 @@ from typing import Any
 import numpy as np
 
 from ..errors import CheckpointInvalid, DatasetInvalid, InvalidArgument, InvalidPose
-from ..files import atomic_path
-from ..npy_file import map_npy
-from ..pose_file import read_pose_array
+from ..files.atomic import atomic_path
+from ..files.npy import map_npy
+from ..files.poses import read_pose_array
+from ..interchange.released_config import ReleasedConfig, probe_keys, read_released_config
 from ..probe import FloatArray, Probe
-from ..released_config import ReleasedConfig, probe_keys, read_released_config
 from .images import grey_frames
 from .sweep import ByteArray, Dataset, Sweep, check_frame_poses
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..datasets.phantom import PHANTOM_IMAGE_SIDE, PHANTOM_PROBE, freehand_poses
-from ..files import atomic_path
+from ..files.atomic import atomic_path
 from ..probe import FloatArray
 
 if TYPE_CHECKING:

@@ -19,8 +19,8 @@ import torch
 from ..datasets.phantom import Tissue, load_phantom, tissue_at
 from ..datasets.phantom.shadow import BoneShadow
 from ..datasets.sweep import Dataset
-from ..evaluation import render_sweep
-from ..files import atomic_path
+from ..evaluation.scoring import render_sweep
+from ..files.atomic import atomic_path
 from ..probe import FloatArray
 from ..rendering import render
 from ..scene import GaussianScene

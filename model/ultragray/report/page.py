@@ -13,13 +13,13 @@ import numpy.typing as npt
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from .. import __version__
-from ..baselines import predict
-from ..compounding import VOXEL_MM
 from ..datasets.sweep import Dataset
-from ..evaluation import Evaluation
-from ..metrics import FrameMetrics
+from ..evaluation.baselines import predict
+from ..evaluation.compounding import VOXEL_MM
+from ..evaluation.metrics import FrameMetrics
+from ..evaluation.scoring import Evaluation
+from ..evaluation.side_by_side import as_picture, side_by_side_panels
 from ..scene import GaussianScene
-from ..side_by_side import as_picture, side_by_side_panels
 from .plots import LABELS, plot_counts, plot_frames, plot_tilt, plot_training
 from .study import GAUSSIAN_SHARES, Failed, TiltStudy, Trained
 

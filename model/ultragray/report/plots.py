@@ -11,8 +11,8 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from ..evaluation import Evaluation
-from ..metrics import FrameMetrics
+from ..evaluation.metrics import FrameMetrics
+from ..evaluation.scoring import Evaluation
 from .study import TiltStudy, Trained
 
 COLOURS = {"scene": "#0b6e99", "median": "#d97706", "nearest": "#7c8a97", "linear": "#6d8f3c"}

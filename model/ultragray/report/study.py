@@ -11,11 +11,11 @@ from typing import TypeVar
 
 import numpy as np
 
-from ..baselines import evaluate_baselines, nearest_frames
-from ..compounding import VOXEL_MM, mean_axes
 from ..datasets.sweep import Dataset, IntArray, Sweep
 from ..errors import UltragrayError
-from ..evaluation import Evaluation, evaluate, require_frames
+from ..evaluation.baselines import evaluate_baselines, nearest_frames
+from ..evaluation.compounding import VOXEL_MM, mean_axes
+from ..evaluation.scoring import Evaluation, evaluate, require_frames
 from ..pose import rotation_angles_deg
 from ..probe import FloatArray
 from ..scene import GaussianScene

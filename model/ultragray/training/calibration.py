@@ -12,7 +12,7 @@ import numpy as np
 from ..confidence.model import ConfidenceModel, fit_weights, predicted, terms_of
 from ..confidence.views import TrainingViews
 from ..datasets.sweep import Dataset, IntArray, Sweep
-from ..evaluation import evaluate, evaluate_frames
+from ..evaluation.scoring import evaluate, evaluate_frames
 from ..scene import GaussianScene
 from .config import TrainingConfig
 from .hardness import hardness_of_views

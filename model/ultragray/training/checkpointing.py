@@ -20,7 +20,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from ..errors import InvalidArgument, TrainingStateInvalid
-from ..files import atomic_path
+from ..files.atomic import atomic_path
 from ..scene_info import expected_shapes
 from .config import TrainingConfig
 from .optimizer import MOMENTS, is_trained

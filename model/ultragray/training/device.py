@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from .. import cuda
+from ..backends import cuda
 from ..errors import BackendUnavailable
 
 

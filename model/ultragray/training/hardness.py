@@ -8,11 +8,11 @@ import numpy as np
 import torch
 from torch.nn import functional
 
-from ..baselines import interpolate_planes
 from ..confidence.model import NEAR_MM
 from ..confidence.views import TrainingViews
 from ..datasets.sweep import ByteArray, Sweep
-from ..metrics import frame_metrics
+from ..evaluation.baselines import interpolate_planes
+from ..evaluation.metrics import frame_metrics
 from ..probe import FloatArray
 
 PICTURE_SIDE = 64  # what is smaller than its pixels is speckle

@@ -8,12 +8,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..backends.spatial_order import spatial_order
 from ..datasets.sweep import Dataset
 from ..pose import quaternion_from_pose
 from ..probe import LinearProbe
 from ..scene import PARAMETERS
 from ..scene_info import expected_shapes
-from ..spatial_order import spatial_order
 from .config import TrainingConfig
 from .geometry import Geometry
 from .intensity import sh0_of_intensity

@@ -13,7 +13,7 @@ import torch
 
 from ..datasets.sweep import Dataset
 from ..errors import MemoryExceeded
-from ..evaluation import CHUNK_PIXELS, frames_at_once
+from ..evaluation.scoring import CHUNK_PIXELS, frames_at_once
 from .config import TrainingConfig
 from .sampling import PREDICTED_PIXELS
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ..spatial_order import spatial_order
+from ..backends.spatial_order import spatial_order
 from .config import TrainingConfig
 
 SPLIT_SHRINK = 1.6  # standard deviations of the halves of a split Gaussian are divided by this

@@ -16,11 +16,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .. import cuda
+from ..backends import cuda
 from ..datasets.sweep import Dataset
 from ..errors import DatasetInvalid, MemoryExceeded, TrainingDiverged, TrainingStateInvalid
-from ..evaluation import evaluate
-from ..files import atomic_path, remove_stale_temporaries
+from ..evaluation.scoring import evaluate
+from ..files.atomic import atomic_path, remove_stale_temporaries
 from ..rendering import choose_backend, render
 from ..scene import PARAMETERS, GaussianScene
 from ..scene_info import SceneInfo, check_training_pose_count

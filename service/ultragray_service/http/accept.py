@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from ultragray.errors import NotAcceptable
-from ultragray_workers.types import Encoding
+from ultragray_workers.pool.types import Encoding
 
 PNG = "image/png"
 JPEG = "image/jpeg"

@@ -13,7 +13,7 @@ from starlette.middleware.cors import CORSMiddleware
 from ultragray import __version__
 from ultragray.errors import UltragrayError
 
-from ..state import Service
+from ..core.state import Service
 from . import job_schemas, problems
 from .console import add_console
 from .docs import add_docs

@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import BaseModel, Field
 
-from ultragray_workers.dataset_store import DatasetRecord
+from ultragray_workers.datasets.store import DatasetRecord
 
 from .schemas import ProbeBody, probe_body
 

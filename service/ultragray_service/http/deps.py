@@ -7,7 +7,7 @@ from typing import Annotated, Any
 from fastapi import Depends, Path
 from starlette.requests import HTTPConnection
 
-from ..state import Service
+from ..core.state import Service
 from .problems import PROBLEM_TYPE, Problem
 
 

@@ -7,7 +7,7 @@ from collections.abc import AsyncIterator
 from starlette.responses import StreamingResponse
 from starlette.types import Receive, Scope, Send
 
-from ..job_hub import JobChange, JobWatch
+from ..core.job_hub import JobChange, JobWatch
 from .job_schemas import JobOut
 
 EVENTS_TYPE = "text/event-stream"

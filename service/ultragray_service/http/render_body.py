@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from ultragray.display import AS_RENDERED, Display
+from ultragray.display.settings import AS_RENDERED, Display
 from ultragray.errors import InvalidArgument, InvalidPose
 from ultragray.pose import pose_from_position_quaternion
 from ultragray.probe import FloatArray, Probe
-from ultragray_workers.types import Below, Trust
+from ultragray_workers.pool.types import Below, Trust
 
-from ..requests import check_pose_count, field_under, gather_poses, one_pose
+from ..core.requests import check_pose_count, field_under, gather_poses, one_pose
 from .schemas import PoseBody, RenderBody
 from .stream_schemas import StreamSettings
 

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from ultragray.display import FRAME_RANGE_DB, Display
+from ultragray.display.settings import FRAME_RANGE_DB, Display
 from ultragray.pose import quaternion_from_pose
 from ultragray.probe import ConvexProbe, FloatArray, LinearProbe, PhasedProbe, Probe
 

@@ -10,9 +10,9 @@ from pydantic import BaseModel, Field
 
 from ultragray.errors import UltragrayError
 from ultragray.probe import Picture, probe_to_dict
-from ultragray_workers.types import Encoding, RenderResult
+from ultragray_workers.pool.types import Encoding, RenderResult
 
-from ..pose_stream import Answered, StreamMode
+from ..core.pose_stream import Answered, StreamMode
 from .schemas import DisplayBody, PoseBody, ProbeBody, RequestModel
 
 _ALIGNMENT = 8  # so that a client may look at float32 pixels where they lie

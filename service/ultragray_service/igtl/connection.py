@@ -10,7 +10,7 @@ from typing import Protocol
 
 from ultragray.errors import IgtlMessageInvalid, UltragrayError
 
-from ..state import Service
+from ..core.state import Service
 from .contents import (
     Status,
     pack_capability,

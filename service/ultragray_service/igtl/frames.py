@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
 
-from ultragray.display import true_to_scale
-from ultragray_workers.types import Encoding, Priority, RenderResult
+from ultragray.display.settings import true_to_scale
+from ultragray_workers.pool.types import Encoding, Priority, RenderResult
 
-from ..requests import RenderSpec
-from ..state import Service
+from ..core.requests import RenderSpec
+from ..core.state import Service
 from .contents import Image, Tool, pack_image, pack_position, pack_tools, pack_transform
 from .messages import Message
 from .pictures import image_of

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ultragray_workers.types import RenderResult
+from ultragray_workers.pool.types import RenderResult
 
 from .contents import Image
 

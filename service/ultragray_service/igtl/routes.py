@@ -7,7 +7,7 @@ import time
 
 from ultragray.errors import SceneNotFound
 
-from ..catalog import SceneCatalog
+from ..core.catalog import SceneCatalog
 from .messages import DEVICE_NAME_BYTES, pack_text
 
 _FRAME = re.compile(r".+To(?=[A-Z0-9])(?P<frame>.+)|.+?To(?P<other>.+)")  # of PLUS: ProbeToReference

@@ -10,7 +10,7 @@ import time
 
 from ultragray.errors import Draining, QueueFull
 
-from ..state import Service
+from ..core.state import Service
 from .connection import SEND_TIMEOUT_S, Connection
 from .frames import Frame
 from .routes import SceneChooser

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 from ultragray.errors import QueueFull
 from ultragray.probe import FloatArray
-from ultragray_workers.waiting import Turn
+from ultragray_workers.pool.waiting import Turn
 
 from .messages import Message
 

@@ -8,12 +8,12 @@ import grpc
 
 from ultragray.errors import InvalidArgument
 from ultragray_proto.v1 import datasets_pb2
-from ultragray_workers.dataset_store import DatasetRecord
+from ultragray_workers.datasets.store import DatasetRecord
 
-from ..catalog import DEFAULT_PAGE_SIZE
-from ..dataset_catalog import contact_sheet, dataset_page
-from ..dataset_uploads import OPTION_NAMES, DatasetUpload
-from ..state import Service
+from ..core.catalog import DEFAULT_PAGE_SIZE
+from ..core.dataset_catalog import contact_sheet, dataset_page
+from ..core.dataset_uploads import OPTION_NAMES, DatasetUpload
+from ..core.state import Service
 from .messages import probe_message
 
 

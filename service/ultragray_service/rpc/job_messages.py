@@ -11,7 +11,7 @@ from ultragray_proto.v1 import jobs_pb2, scenes_pb2
 from ultragray_workers.jobs.specification import Specification, from_dict
 from ultragray_workers.jobs.store import Job
 
-from ..requests import field_under
+from ..core.requests import field_under
 from .messages import OUTPUT_NUMBERS, output_name, poses_from_messages
 
 STATES: dict[int, str] = {

@@ -10,9 +10,9 @@ import grpc
 from ultragray.errors import Draining, InvalidArgument
 from ultragray_proto.v1 import jobs_pb2
 
-from ..catalog import DEFAULT_PAGE_SIZE
-from ..job_log import DEFAULT_LOG_BYTES, MAX_LOG_BYTES
-from ..state import Service
+from ..core.catalog import DEFAULT_PAGE_SIZE
+from ..core.job_log import DEFAULT_LOG_BYTES, MAX_LOG_BYTES
+from ..core.state import Service
 from .job_messages import KINDS, STATES, filter_from_number, job_message, specification_from_message
 
 _CHUNK_BYTES = 2**20

@@ -8,14 +8,14 @@ from dataclasses import asdict
 
 import numpy as np
 
-from ultragray.display import AS_RENDERED, FRAME_RANGE_DB, Display
+from ultragray.display.settings import AS_RENDERED, FRAME_RANGE_DB, Display
 from ultragray.errors import InvalidArgument, InvalidPose, InvalidProbe, UltragrayError, UnknownOutput
 from ultragray.pose import check_poses, pose_from_position_quaternion
 from ultragray.probe import ConvexProbe, FloatArray, LinearProbe, PhasedProbe, Picture, Probe
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2, scenes_pb2
-from ultragray_workers.types import Below, Encoding, RenderResult, Trust
+from ultragray_workers.pool.types import Below, Encoding, RenderResult, Trust
 
-from ..requests import RenderSpec, field_under, one_pose
+from ..core.requests import RenderSpec, field_under, one_pose
 
 OUTPUT_NAMES = {
     rendering_pb2.OUTPUT_BMODE: "bmode",

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from ultragray.errors import InvalidArgument
 from ultragray_proto.v1 import rendering_pb2
-from ultragray_workers.types import Priority, RenderRequest
+from ultragray_workers.pool.types import Priority, RenderRequest
 
-from ..requests import field_under
-from ..state import Service
+from ..core.requests import field_under
+from ..core.state import Service
 from .messages import spec_from_message
 
 

@@ -10,10 +10,10 @@ import grpc
 
 from ultragray.errors import InvalidArgument, LowConfidence, QueueFull
 from ultragray_proto.v1 import rendering_pb2
-from ultragray_workers.types import Priority, RenderRequest, RenderResult
+from ultragray_workers.pool.types import Priority, RenderRequest, RenderResult
 
-from ..requests import check_pose_count, gather_poses
-from ..state import Service
+from ..core.requests import check_pose_count, gather_poses
+from ..core.state import Service
 from .messages import frame_message, pose_from_message
 from .planning import plan_settings
 from .stream import FrameStream

@@ -8,8 +8,8 @@ from ultragray.confidence.assess import read_model
 from ultragray.scene_info import SceneHeader
 from ultragray_proto.v1 import scenes_pb2
 
-from ..catalog import DEFAULT_PAGE_SIZE, CatalogEntry, finite_metrics, summarise_training
-from ..state import Service
+from ..core.catalog import DEFAULT_PAGE_SIZE, CatalogEntry, finite_metrics, summarise_training
+from ..core.state import Service
 from .messages import error_message, matrix_message, position_message, probe_message
 
 

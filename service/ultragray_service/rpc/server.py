@@ -17,7 +17,7 @@ from ultragray_proto.v1 import (
     scenes_pb2_grpc,
 )
 
-from ..state import Service
+from ..core.state import Service
 from .datasets import DatasetService
 from .interceptor import CallContext
 from .jobs import JobService

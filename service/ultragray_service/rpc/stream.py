@@ -6,10 +6,10 @@ import grpc
 
 from ultragray.errors import InvalidArgument, UltragrayError
 from ultragray_proto.v1 import rendering_pb2
-from ultragray_workers.types import Priority, RenderRequest
+from ultragray_workers.pool.types import Priority, RenderRequest
 
-from ..pose_stream import Answered, Asked, PoseStream, StreamMode
-from ..state import Service
+from ..core.pose_stream import Answered, Asked, PoseStream, StreamMode
+from ..core.state import Service
 from .messages import error_message, frame_message, pose_from_message
 from .planning import plan_settings
 

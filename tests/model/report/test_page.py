@@ -9,10 +9,10 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from ultragray.baselines import evaluate_baselines
 from ultragray.datasets import Dataset
-from ultragray.evaluation import Evaluation
-from ultragray.metrics import FrameMetrics
+from ultragray.evaluation.baselines import evaluate_baselines
+from ultragray.evaluation.metrics import FrameMetrics
+from ultragray.evaluation.scoring import Evaluation
 from ultragray.report import page as page_module
 from ultragray.report.page import ReportContent, metric_rows, render_page
 from ultragray.report.study import Failed, ablations, study_tilt, train_and_evaluate

@@ -11,7 +11,7 @@ import pytest
 
 from ultragray.datasets import Dataset
 from ultragray.errors import DatasetInvalid, TrainingDiverged
-from ultragray.evaluation import evaluate
+from ultragray.evaluation.scoring import evaluate
 from ultragray.report import study
 from ultragray.report.study import (
     Failed,

@@ -13,7 +13,7 @@ from ultragray.confidence import Assessor, ConfidenceModel
 from ultragray.datasets.phantom import PHANTOM_PROBE, freehand_poses, simulate
 from ultragray.datasets.sweep import Dataset, Sweep
 from ultragray.errors import TrainingDiverged
-from ultragray.evaluation import evaluate
+from ultragray.evaluation.scoring import evaluate
 from ultragray.probe import FloatArray
 from ultragray.training import TrainingConfig, train, trainer
 from ultragray.training.calibration import fit_confidence, shorter

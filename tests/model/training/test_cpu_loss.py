@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from ultragray import cpu
+from ultragray.backends import cpu
 from ultragray.training.cpu_loss import image_loss
 from ultragray.training.losses import plain_image_loss
 

@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ultragray import GaussianScene, cuda
+from ultragray import GaussianScene
+from ultragray.backends import cuda
 from ultragray.datasets.sweep import Dataset
 from ultragray.training import Progress, TrainingConfig, train
 

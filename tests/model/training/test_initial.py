@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from ultragray import GaussianScene, Probe, SceneInfo, reference
+from ultragray import GaussianScene, Probe, SceneInfo
+from ultragray.backends import reference
 from ultragray.datasets.sweep import Dataset
 from ultragray.training import TrainingConfig
 from ultragray.training.geometry import Geometry

@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from ultragray import GaussianScene, SceneInfo, reference
+from ultragray import GaussianScene, SceneInfo
+from ultragray.backends import reference
 from ultragray.scene_info import expected_shapes
 from ultragray.training.intensity import project_sh0, sh0_of_intensity
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ultragray.errors import NotReady
-from ultragray_service.bench_igtl import PingPong
+from ultragray_service.bench.igtl import PingPong
 
 from ..conftest import HEIGHT, WIDTH, RunningService
 from .conftest import address_of

@@ -9,11 +9,11 @@ import torch
 
 from ultragray import ConvexProbe, LinearProbe
 from ultragray.confidence import Extrapolation
-from ultragray.display import true_to_scale
-from ultragray.display_frames import show
+from ultragray.display.frames import show
+from ultragray.display.settings import true_to_scale
 from ultragray.probe import Probe
 from ultragray_service.igtl.pictures import image_of
-from ultragray_workers.types import Encoding, RenderResult
+from ultragray_workers.pool.types import Encoding, RenderResult
 
 from .conftest import FAN, random_pose
 

@@ -24,7 +24,7 @@ from ultragray_service.igtl.contents import (
 )
 
 from ..conftest import DEMO_PROBE, HEIGHT, WIDTH, RunningService, StartService
-from ..test_grpc_render import matrix_pose
+from ..rpc.test_grpc_render import matrix_pose
 from .conftest import FAN, Connect, Peer, address_of, moved, pyigtl_client, random_pose
 
 SLOW = {"backend": "reference", "max_batch_poses": 1}

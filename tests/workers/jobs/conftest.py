@@ -17,7 +17,7 @@ import pytest
 from ultragray import LinearProbe
 from ultragray.datasets.released import write_released
 from ultragray.datasets.sweep import Dataset, Sweep
-from ultragray_workers.dataset_store import FILES_NAME, DatasetRecord, write_manifest
+from ultragray_workers.datasets.store import FILES_NAME, DatasetRecord, write_manifest
 from ultragray_workers.jobs.specification import TrainJob
 from ultragray_workers.jobs.store import Job, JobState, JobStore
 

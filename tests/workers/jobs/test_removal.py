@@ -13,7 +13,7 @@ import pytest
 import sqlalchemy as sa
 
 from ultragray.errors import DatasetInUse, DatasetNotFound, JobInUse, JobNotFound
-from ultragray_workers.dataset_store import DatasetStore
+from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.jobs import housekeeping, removal
 from ultragray_workers.jobs.database import JobDatabase
 from ultragray_workers.jobs.folder import JobFolder

@@ -144,7 +144,7 @@ def test_a_missing_package_is_told_before_anything_is_rendered(
     work: Callable[..., Work], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "h5py", None)
-    monkeypatch.delitem(sys.modules, "ultragray.exports.hdf5", raising=False)
+    monkeypatch.delitem(sys.modules, "ultragray.interchange.exports.hdf5", raising=False)
     job = RenderJob("one", sampler=TrainingSampler(), format="hdf5")
     with pytest.raises(ExtraMissing, match=r"pip install 'ultragray\[hdf5\]'"):
         render_job.render(work(job), job)

@@ -22,7 +22,7 @@ from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from ultragray.files import atomic_path, remove_stale_temporaries
+from ultragray.files.atomic import atomic_path, remove_stale_temporaries
 
 FOLDER = "jobs"
 

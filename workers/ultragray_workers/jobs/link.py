@@ -7,9 +7,9 @@ import shutil
 from contextlib import suppress
 from pathlib import Path
 
-from ultragray.files import atomic_path
+from ultragray.files.atomic import atomic_path
 
-from ..dataset_store import sync_folder
+from ..datasets.store import sync_folder
 
 
 def link_or_copy(source: Path, target: Path) -> None:

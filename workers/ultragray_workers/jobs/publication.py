@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ultragray.errors import SceneExists
-from ultragray.files import file_sha256
+from ultragray.files.atomic import file_sha256
 
 from ..scenes import SUFFIX
 from .folder import JobFolder

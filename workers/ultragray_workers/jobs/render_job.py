@@ -8,9 +8,9 @@ import time
 import torch
 
 from ultragray.confidence import Assessor, Extrapolation
-from ultragray.evaluation import frames_at_once
-from ultragray.exports import FORMATS, ExportHeader, check_format, export_to
-from ultragray.files import file_sha256
+from ultragray.evaluation.scoring import frames_at_once
+from ultragray.files.atomic import file_sha256
+from ultragray.interchange.exports import FORMATS, ExportHeader, check_format, export_to
 from ultragray.probe import FloatArray
 from ultragray.rendering import render as render_frames
 from ultragray.rendering import renderer_name
@@ -19,8 +19,8 @@ from ultragray.scene import GaussianScene
 from ultragray.scene_info import SceneHeader, read_header
 from ultragray.training.device import training_device
 
+from ..pool.process.support import with_support
 from ..scenes import SUFFIX
-from ..support import with_support
 from .device import chosen_device, device_alone
 from .folder import Outcome, Progress
 from .poses import assessed_poses

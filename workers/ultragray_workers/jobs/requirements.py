@@ -9,12 +9,12 @@ import numpy as np
 
 from ultragray.confidence import Assessor, require_confidence
 from ultragray.errors import StorageFull
-from ultragray.exports import check_format
+from ultragray.interchange.exports import check_format
 from ultragray.request import LABELS, check_image_size, check_labelled, check_min_confidence
 from ultragray.scene_info import SceneHeader, read_header
 
-from ..dataset_incoming import storage_full
-from ..dataset_store import sync_folder
+from ..datasets.incoming import storage_full
+from ..datasets.store import sync_folder
 from ..scenes import SUFFIX, SceneStore
 from .folder import JobFolder
 from .link import link_or_copy

@@ -13,7 +13,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from ultragray.errors import InvalidArgument
-from ultragray.exports import check_format
+from ultragray.interchange.exports import check_format
 from ultragray.pose import check_poses
 from ultragray.probe import FloatArray
 from ultragray.request import check_image_size, check_outputs

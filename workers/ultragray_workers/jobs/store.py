@@ -26,7 +26,7 @@ from ultragray.errors import (
 )
 from ultragray.request import MAX_IMAGE_SIDE
 
-from ..dataset_store import DatasetStore
+from ..datasets.store import DatasetStore
 from ..scenes import SceneStore
 from . import database
 from .counting import count_by_state

@@ -17,18 +17,18 @@ import torch
 from ultragray.datasets.source import SourceOptions, load_dataset
 from ultragray.datasets.sweep import Dataset
 from ultragray.errors import TrainingStateInvalid
-from ultragray.evaluation import Evaluation, evaluate
+from ultragray.evaluation.scoring import Evaluation, evaluate
+from ultragray.evaluation.side_by_side import write_side_by_side
 from ultragray.machine import processor_name
 from ultragray.report.page import ReportContent, render_page
 from ultragray.report.study import trained_of_journal
 from ultragray.scene import GaussianScene
-from ultragray.side_by_side import write_side_by_side
 from ultragray.training import Progress as TrainingProgress
 from ultragray.training import TrainingConfig
 from ultragray.training import train as train_scene
 from ultragray.training.trainer import CHECKPOINT_FILE, CONFIG_FILE, JOURNAL_FILE
 
-from ..dataset_store import DatasetStore
+from ..datasets.store import DatasetStore
 from ..scenes import SUFFIX
 from .curve import draw_training_curve
 from .device import chosen_device, device_alone

@@ -8,7 +8,7 @@ from fastapi import APIRouter, Path
 from starlette.requests import Request
 from starlette.responses import Response
 
-from ...comparisons import Comparison
+from ...views.comparisons import Comparison
 from ..accept import PNG
 from ..console_schemas import ComparedFrame, ComparisonOut, DatasetPoses
 from ..deps import SceneName, ServiceDep, problems

@@ -13,10 +13,10 @@ from starlette.responses import Response
 
 from ultragray.errors import UnsupportedMediaType, UploadTooLarge
 
-from ...catalog import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE
-from ...dataset_catalog import contact_sheet, dataset_page
-from ...dataset_uploads import DatasetUpload
-from ...helper_process import PATIENCE_S
+from ...core.catalog import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE
+from ...core.dataset_catalog import contact_sheet, dataset_page
+from ...core.dataset_uploads import DatasetUpload
+from ...views.helper_process import PATIENCE_S
 from ..accept import PNG
 from ..dataset_schemas import DatasetOut, DatasetPage
 from ..deps import ServiceDep, problems

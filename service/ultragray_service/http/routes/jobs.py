@@ -12,9 +12,9 @@ from starlette.responses import FileResponse, PlainTextResponse, Response, Strea
 from ultragray.errors import InvalidArgument
 from ultragray_workers.jobs.specification import from_dict
 
-from ...catalog import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE
-from ...job_log import DEFAULT_LOG_BYTES, MAX_LOG_BYTES
-from ...requests import field_under
+from ...core.catalog import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE
+from ...core.job_log import DEFAULT_LOG_BYTES, MAX_LOG_BYTES
+from ...core.requests import field_under
 from ..accept import NPZ, PNG
 from ..deps import ServiceDep, problems
 from ..examples import JOB_EXAMPLES

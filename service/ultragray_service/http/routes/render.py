@@ -12,10 +12,10 @@ from starlette.responses import Response
 
 from ultragray.probe import probe_to_dict
 from ultragray.request import LABELS, check_outputs
-from ultragray_workers.types import Encoding, Priority, RenderResult
+from ultragray_workers.pool.types import Encoding, Priority, RenderResult
 
-from ...requests import RenderSpec
-from ...state import Service
+from ...core.requests import RenderSpec
+from ...core.state import Service
 from ..accept import JPEG, NPZ, PNG, RAW, choose
 from ..deps import SCENE_NAME, problems
 from ..disconnect import finish_or_abandon

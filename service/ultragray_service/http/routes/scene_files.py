@@ -17,8 +17,8 @@ from ultragray.probe import FloatArray
 from ultragray_workers.scenes import SUFFIX
 
 from ...arrival import arrival
-from ...helper_process import PATIENCE_S
-from ...scene_points import DEFAULT_POINTS, MAX_POINTS, MAX_POSES, even_selection
+from ...views.helper_process import PATIENCE_S
+from ...views.scene_points import DEFAULT_POINTS, MAX_POINTS, MAX_POSES, even_selection
 from ..accept import RAW
 from ..console_schemas import ScenePoses
 from ..deps import SceneName, ServiceDep, problems

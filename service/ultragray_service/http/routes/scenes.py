@@ -9,7 +9,7 @@ from fastapi import APIRouter, Query
 from ultragray.confidence.assess import read_model
 from ultragray.scene_info import SceneHeader
 
-from ...catalog import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE, CatalogEntry, finite_metrics, summarise_training
+from ...core.catalog import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE, CatalogEntry, finite_metrics, summarise_training
 from ..deps import SceneName, ServiceDep, problems
 from ..schemas import (
     Bounds,

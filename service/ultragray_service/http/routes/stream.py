@@ -11,12 +11,12 @@ from pydantic import ValidationError
 
 from ultragray.errors import Draining, InvalidArgument, OriginRefused, UltragrayError
 from ultragray.request import check_outputs
-from ultragray_workers.types import Encoding, Priority, RenderRequest
+from ultragray_workers.pool.types import Encoding, Priority, RenderRequest
 
 from ...auth import STREAM_PROTOCOL
-from ...pose_stream import Answered, Asked, PoseStream
-from ...requests import RenderSpec, field_under
-from ...state import Service
+from ...core.pose_stream import Answered, Asked, PoseStream
+from ...core.requests import RenderSpec, field_under
+from ...core.state import Service
 from ..deps import SceneName
 from ..problems import invalid_argument, problem_response
 from ..render_body import asked_display, asked_probe, asked_trust, checked_pose

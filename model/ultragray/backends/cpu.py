@@ -1,0 +1,139 @@
+"""The CPU backend: the C++ kernel of docs/physics.md §5 behind the signature that backends share, differentiable."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from .. import _cpu
+from ..errors import BackendUnavailable
+from ..probe import FloatArray, LinearProbe, Probe
+from ..request import OUTPUTS, WEIGHT_SUM
+from ..scene import PARAMETERS, GaussianScene
+
+INSTRUCTION_SETS: tuple[str, ...] = tuple(_cpu.instruction_sets())  # what this processor can run, best first
+
+
+def supports(scene: GaussianScene) -> bool:
+    """Whether this backend can render the scene: float32 on the CPU."""
+    return scene.means.device.type == "cpu" and scene.means.dtype == torch.float32
+
+
+def render_outputs(
+    scene: GaussianScene,
+    probe: Probe,
+    poses_cm: FloatArray,  # [C, 4, 4] about the scene's centre
+    height: int,
+    width: int,
+    outputs: Sequence[str],
+    *,
+    instruction_set: str = "auto",
+) -> dict[str, Tensor]:
+    """The outputs by name, each [C, H, W] float32; differentiable once with respect to every parameter.
+
+    The scene is one that it supports. Raises BackendUnavailable for an unknown instruction set.
+    """
+    if instruction_set != "auto" and instruction_set not in INSTRUCTION_SETS:
+        raise BackendUnavailable(
+            f"instruction_set must be auto or one of {', '.join(INSTRUCTION_SETS)}, got {instruction_set!r}",
+            field="instruction_set",
+        )
+    view = _view_arguments(probe, poses_cm, height, width, instruction_set)
+    if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in scene.splats.values()):
+        frames = _Render.apply(  # type: ignore[no-untyped-call]
+            scene.info.intensity, view, tuple(outputs), *scene.splats.values()
+        )
+        return dict(zip(outputs, frames, strict=True))
+    planes = _empty_planes(view, outputs)
+    prepared = scene.prepared("cpu", lambda: _prepare(scene.splats, scene.info.intensity))
+    weight_sum = planes[WEIGHT_SUM].numpy() if WEIGHT_SUM in planes else None
+    _cpu.render(prepared, **view, **_arrays(planes), weight_sum=weight_sum)
+    return planes
+
+
+def _view_arguments(
+    probe: Probe, poses_cm: FloatArray, height: int, width: int, instruction_set: str
+) -> dict[str, Any]:
+    return {
+        "convex": not isinstance(probe, LinearProbe),
+        "width_cm": probe.width_mm / 10.0 if isinstance(probe, LinearProbe) else 0.0,
+        "opening_rad": 0.0 if isinstance(probe, LinearProbe) else math.radians(probe.opening_angle_deg),
+        "near_cm": probe.near_mm / 10.0,
+        "far_cm": probe.far_mm / 10.0,
+        "cull_far_cm": probe.cull_far_mm(height) / 10.0,
+        "poses": np.ascontiguousarray(poses_cm),
+        "height": height,
+        "width": width,
+        "threads": torch.get_num_threads(),
+        "instruction_set": instruction_set,
+    }
+
+
+def _empty_planes(view: dict[str, Any], names: Sequence[str]) -> dict[str, Tensor]:  # [C, H, W] each
+    shape = (len(view["poses"]), view["height"], view["width"])
+    return {name: torch.empty(shape, dtype=torch.float32, device="cpu") for name in names}
+
+
+def _arrays(planes: dict[str, Tensor]) -> dict[str, Any]:
+    return {name: planes[name].numpy() if name in planes else None for name in OUTPUTS}
+
+
+class _Render(torch.autograd.Function):
+    """The kernel's backward pass (docs/physics.md §4) as torch sees it."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, intensity: str, view: dict[str, Any], names: tuple[str, ...], *splats: Tensor
+    ) -> tuple[Tensor, ...]:
+        planes = _empty_planes(view, names)
+        scene = _prepare(dict(zip(PARAMETERS, splats, strict=True)), intensity, as_given=True)
+        ctx.recording = _cpu.Recording(scene, **view, **_arrays(planes))
+        ctx.names = names
+        ctx.shapes = [tensor.shape for tensor in splats]
+        ctx.set_materialize_grads(False)
+        return tuple(planes.values())
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
+        wanted = {
+            name: gradient.contiguous()
+            for name, gradient in zip(ctx.names, gradients, strict=True)
+            if gradient is not None
+        }
+        means, scales, quats, transmittances, sh0, shn = (
+            torch.empty(shape, dtype=torch.float32, device="cpu") for shape in ctx.shapes
+        )
+        ctx.recording.differentiate(
+            threads=torch.get_num_threads(),
+            **_arrays(wanted),
+            means=means.numpy(),
+            scales=scales.numpy(),
+            quats=quats.numpy(),
+            transmittances=transmittances.numpy(),
+            sh0=sh0.view(-1).numpy(),
+            shn=shn.squeeze(-1).numpy(),
+        )
+        return (None, None, None, means, scales, quats, transmittances, sh0, shn)
+
+
+def _prepare(splats: Mapping[str, Tensor], intensity: str, *, as_given: bool = False) -> _cpu.PreparedScene:
+    raw = {name: tensor.detach().contiguous() for name, tensor in splats.items()}
+    return _cpu.PreparedScene(
+        raw["means"].numpy(),
+        raw["scales"].numpy(),
+        raw["quats"].numpy(),
+        raw["transmittances"].numpy(),
+        raw["sh0"].reshape(-1).numpy(),
+        raw["shN"].squeeze(-1).numpy(),
+        sh_degree=math.isqrt(raw["shN"].shape[1] + 1) - 1,
+        sigmoid=intensity == "sigmoid",
+        sorted=not as_given,
+        threads=torch.get_num_threads(),
+    )

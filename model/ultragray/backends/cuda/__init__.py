@@ -1,0 +1,44 @@
+"""The CUDA backend: the forward model and its gradient as Triton kernels (docs/physics.md §8).
+
+Importing this package imports neither Triton nor a CUDA context; the first frame does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from torch import Tensor
+
+from ...probe import FloatArray, Probe
+from ...scene import GaussianScene
+from .device import available, device, device_count, interpreted, renderer, require, supports, upload
+
+__all__ = [
+    "available",
+    "device",
+    "device_count",
+    "interpreted",
+    "render_outputs",
+    "renderer",
+    "require",
+    "supports",
+    "upload",
+]
+
+
+def render_outputs(
+    scene: GaussianScene,
+    probe: Probe,
+    poses_cm: FloatArray,  # [C, 4, 4] about the scene's centre
+    height: int,
+    width: int,
+    outputs: Sequence[str],
+) -> dict[str, Tensor]:
+    """The outputs by name, each [C, H, W] float32 on the scene's device; differentiable once by every parameter.
+
+    The scene is one that the backend supports. Nothing here waits for the device.
+    Raises MemoryExceeded where the device's memory does not suffice.
+    """
+    from .frames import render_frames
+
+    return render_frames(scene, probe, poses_cm, height, width, outputs)

@@ -1,0 +1,124 @@
+"""Frames of a scene on the device: what is kept between calls, how many poses go together, and the gradient."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from ...errors import MemoryExceeded, TooManyPoses
+from ...probe import FloatArray, Probe
+from ...scene import PARAMETERS, GaussianScene
+from ..spatial_order import spatial_order
+from .device import upload
+from .launch import (
+    MAX_POSES,
+    Gaussians,
+    Geometry,
+    Planes,
+    Slices,
+    bytes_per_pose,
+    cut,
+    differentiate,
+    draw,
+    empty_frames,
+    launching,
+    view_table,
+)
+
+WORKSPACE_BYTES = 1 << 30  # of slices and planes; poses beyond it are rendered in a further round
+
+
+def render_frames(
+    scene: GaussianScene,
+    probe: Probe,
+    poses_cm: FloatArray,  # [C, 4, 4]
+    height: int,
+    width: int,
+    outputs: Sequence[str],
+) -> dict[str, Tensor]:  # [C, H, W] each
+    """See `ultragray.backends.cuda.render_outputs`."""
+    geometry, device = Geometry.of(probe, height, width), scene.means.device
+    with _on_device(device, f"{len(poses_cm)} frames of {height}x{width} pixels from {len(scene.means):,} Gaussians"):
+        views = upload(torch.from_numpy(view_table(probe, poses_cm, height)), device)
+        if not torch.is_grad_enabled() or not any(tensor.requires_grad for tensor in scene.splats.values()):
+            return _render(sorted_gaussians(scene), geometry, views, outputs)
+        if len(views) > MAX_POSES:
+            raise TooManyPoses(
+                f"at most {MAX_POSES:,} poses can be differentiated together, got {len(views):,}", field="poses"
+            )
+        frames = _Render.apply(  # type: ignore[no-untyped-call]
+            scene.info.intensity, geometry, views, tuple(outputs), *scene.splats.values()
+        )
+        return dict(zip(outputs, frames, strict=True))
+
+
+@contextlib.contextmanager
+def _on_device(device: torch.device, what: str) -> Iterator[None]:
+    """Raises MemoryExceeded for torch's own error, and gives back what torch keeps in reserve."""
+    try:
+        with launching(device):
+            yield
+    except torch.OutOfMemoryError as error:
+        torch.cuda.empty_cache()
+        raise MemoryExceeded(
+            f"the memory of {device} does not suffice for {what}: ask for fewer or smaller frames at once"
+        ) from error
+
+
+def _render(gaussians: Gaussians, geometry: Geometry, views: Tensor, outputs: Sequence[str]) -> dict[str, Tensor]:
+    frames = empty_frames(outputs, len(views), geometry, views.device)
+    at_once = min(MAX_POSES, max(1, WORKSPACE_BYTES // bytes_per_pose(len(gaussians.means), geometry)))
+    for first in range(0, len(views), at_once):
+        some = slice(first, first + at_once)
+        slices = cut(gaussians, views[some], geometry, record=False)
+        draw(slices, geometry, {name: frame[some] for name, frame in frames.items()}, keep=False)
+    return frames
+
+
+class _Render(torch.autograd.Function):
+    """The kernels' backward pass (docs/physics.md §4) as torch sees it."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, intensity: str, geometry: Geometry, views: Tensor, names: tuple[str, ...], *splats: Tensor
+    ) -> tuple[Tensor, ...]:
+        gaussians = Gaussians.of(dict(zip(PARAMETERS, splats, strict=True)), intensity)
+        slices = cut(gaussians, views, geometry, record=True)
+        frames = empty_frames(names, len(views), geometry, views.device)
+        planes = draw(slices, geometry, frames, keep=True)
+        # Saved by torch: a parameter that changes before the backward pass is noticed, and all is freed after it.
+        ctx.save_for_backward(*splats, views, *vars(slices).values(), *vars(planes).values())
+        ctx.intensity, ctx.geometry, ctx.names = intensity, geometry, names
+        ctx.set_materialize_grads(False)
+        return tuple(frames.values())
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
+        given = {
+            name: gradient.contiguous()
+            for name, gradient in zip(ctx.names, gradients, strict=True)
+            if gradient is not None
+        }
+        saved = list(ctx.saved_tensors)
+        splats, (views, *rest) = saved[: len(PARAMETERS)], saved[len(PARAMETERS) :]
+        slices, planes = Slices(*rest[:5]), Planes(*rest[5:])
+        with _on_device(views.device, f"the gradient of {len(views)} frames"):
+            gaussians = Gaussians.of(dict(zip(PARAMETERS, splats, strict=True)), ctx.intensity)
+            found = differentiate(gaussians, views, ctx.geometry, slices, planes, given)
+        return (None, None, None, None, *found.values())
+
+
+def sorted_gaussians(scene: GaussianScene) -> Gaussians:
+    """The scene's Gaussians along a space-filling curve, kept with the scene until one of its tensors changes."""
+
+    def sort() -> Gaussians:
+        order = spatial_order(scene.means)
+        return Gaussians.of({name: t.detach()[order] for name, t in scene.splats.items()}, scene.info.intensity)
+
+    return scene.prepared("cuda", sort)

@@ -1,0 +1,348 @@
+"""The host's side of the CUDA backend: tables, buffers and launches. Importing it imports Triton.
+
+Nothing here waits for the device: sizes are known beforehand, so a CUDA graph can replay a frame.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+import triton
+from torch import Tensor
+
+from ...probe import FloatArray, LinearProbe, Probe
+from ...request import OUTPUTS, WEIGHT_SUM
+from .device import interpreted
+from .kernels import constants
+from .kernels.drawing import draw_tiles, finish_frames
+from .kernels.gathering import differentiate_pixels, gather_slices
+from .kernels.placing import place_gradients
+from .kernels.slicing import slice_gaussians
+
+MAX_POSES = 65_535  # of one launch, by CUDA's limit for a grid
+
+
+@dataclass(frozen=True)
+class Shapes:
+    """How the work is cut: Gaussians of a block, tiles of an image, and what one warp takes at a time."""
+
+    block: int = 128
+    tile_rows: int = 16
+    tile_columns: int = 16
+    slices_at_once: int = 1
+    chunk: int = 128  # blocks whose bounds are tested together
+    draw_warps: int = 1
+    finish_columns: int = 64
+    gather_rows: int = 16
+    gather_columns: int = 8
+    gatherers: int = 8  # programs that share the slices of a block
+    pixel_rows: int = 32
+    pixel_columns: int = 16
+
+
+GPU_SHAPES = Shapes()
+# The interpreter's cost is by operation, not by element: few and large steps.
+INTERPRETER_SHAPES = Shapes(
+    block=512,
+    tile_rows=32,
+    tile_columns=64,
+    slices_at_once=64,
+    chunk=1024,
+    finish_columns=512,
+    gather_rows=32,
+    gather_columns=32,
+    gatherers=1,
+    pixel_rows=512,
+    pixel_columns=512,
+)
+
+
+@contextlib.contextmanager
+def launching(device: torch.device) -> Iterator[None]:
+    """What every launch needs around it: Triton launches on the current device, and interpreted kernels warn of
+    infinities, where a GPU just has them."""
+    with torch.cuda.device(device) if device.type == "cuda" else np.errstate(all="ignore"):
+        yield
+
+
+class Geometry(NamedTuple):
+    """What a probe and an image size mean to the kernels."""
+
+    convex: bool
+    height: int
+    width: int
+    pitch: float  # between scan lines: cm, or radians for a fan
+    row_cm: float
+
+    @classmethod
+    def of(cls, probe: Probe, height: int, width: int) -> Geometry:
+        return cls(
+            not isinstance(probe, LinearProbe),
+            height,
+            width,
+            _span(probe) / width,
+            _row_cm(probe, height),
+        )
+
+
+def _span(probe: Probe) -> float:
+    return probe.width_mm / 10.0 if isinstance(probe, LinearProbe) else math.radians(probe.opening_angle_deg)
+
+
+def _row_cm(probe: Probe, height: int) -> float:
+    return (probe.far_mm - probe.near_mm) / 10.0 / height
+
+
+def view_table(probe: Probe, poses_cm: FloatArray, height: int) -> FloatArray:  # [C, 4, 4] -> [C, VIEW]
+    """Each pose as the kernels want it: the probe's axes and origin, and the probe."""
+    table = np.empty((len(poses_cm), constants.VIEW.value))
+    table[:, :9] = poses_cm[:, :3, :3].transpose(0, 2, 1).reshape(-1, 9)
+    table[:, 9:12] = poses_cm[:, :3, 3]
+    table[:, 12:] = _span(probe), probe.near_mm / 10.0, probe.cull_far_mm(height) / 10.0, _row_cm(probe, height)
+    return table
+
+
+@dataclass(frozen=True)
+class Gaussians:
+    """Raw parameters, each contiguous but for the rows of `shn`, in the order in which they are cut into blocks."""
+
+    means: Tensor
+    scales: Tensor
+    quats: Tensor
+    transmittances: Tensor
+    sh0: Tensor
+    shn: Tensor
+    sigmoid: bool
+
+    @classmethod
+    def of(cls, splats: Mapping[str, Tensor], intensity: str) -> Gaussians:
+        raw = {name: tensor.detach() for name, tensor in splats.items()}
+        shn = raw.pop("shN").squeeze(-1)
+        return cls(
+            **{name: tensor.contiguous() for name, tensor in raw.items()},
+            shn=shn if shn.stride(-1) == 1 else shn.contiguous(),
+            sigmoid=intensity == "sigmoid",
+        )
+
+    @property
+    def degree(self) -> int:
+        return math.isqrt(self.shn.shape[1] + 1) - 1
+
+
+@dataclass(frozen=True)
+class Slices:
+    """What one pass over the Gaussians leaves on the device, for C poses and B blocks."""
+
+    slices: Tensor  # [C, B, BLOCK, FIELDS]
+    rectangles: Tensor  # [C, B, BLOCK, RECTANGLE] int32
+    bounds: Tensor  # [C, B, 4] int32
+    counts: Tensor  # [C, B] int32
+    places: Tensor  # [C, B, BLOCK] int32, empty where it is not recorded
+
+
+@dataclass(frozen=True)
+class Planes:
+    """S, the sum of I·w and T of each pixel, [C, H, W] each; T is whole only where it was to be kept."""
+
+    weight: Tensor
+    weighted: Tensor
+    transmittance: Tensor
+
+
+def bytes_per_pose(count: int, geometry: Geometry) -> int:
+    """Of the device's memory that a pose takes beside its outputs: slices of `count` Gaussians, and planes."""
+    places = -(-count // shapes().block) * shapes().block
+    per_slice: int = constants.FIELDS.value + constants.RECTANGLE.value
+    return 4 * (places * per_slice + 3 * geometry.height * geometry.width)
+
+
+def shapes() -> Shapes:
+    return INTERPRETER_SHAPES if interpreted() else GPU_SHAPES
+
+
+def cut(gaussians: Gaussians, views: Tensor, geometry: Geometry, *, record: bool) -> Slices:
+    """Slices of every pose of `views` [C, VIEW] float64."""
+    how, device = shapes(), gaussians.means.device
+    count, poses = len(gaussians.means), len(views)
+    blocks = -(-count // how.block)
+    places = poses * blocks * how.block
+    made = Slices(
+        slices=torch.empty((places, constants.FIELDS.value), device=device),
+        rectangles=torch.empty((places, constants.RECTANGLE.value), dtype=torch.int32, device=device),
+        bounds=torch.empty((poses * blocks, 4), dtype=torch.int32, device=device),
+        counts=torch.empty((poses, blocks), dtype=torch.int32, device=device),
+        places=torch.empty(places if record else 0, dtype=torch.int32, device=device),
+    )
+    if places:
+        slice_gaussians[(blocks, poses)](
+            views,
+            gaussians.means,
+            gaussians.scales,
+            gaussians.quats,
+            gaussians.transmittances,
+            gaussians.sh0,
+            gaussians.shn,
+            made.slices,
+            made.rectangles,
+            made.bounds,
+            made.counts,
+            made.places,
+            count,
+            gaussians.shn.stride(0),
+            geometry.height,
+            geometry.width,
+            CONVEX=geometry.convex,
+            SIGMOID=gaussians.sigmoid,
+            DEGREE=gaussians.degree,
+            RECORD=record,
+            BLOCK=how.block,
+            num_warps=4,
+        )
+    return made
+
+
+def empty_frames(outputs: Sequence[str], poses: int, geometry: Geometry, device: torch.device) -> dict[str, Tensor]:
+    """Room for each output, [C, H, W]."""
+    return {name: torch.empty((poses, geometry.height, geometry.width), device=device) for name in outputs}
+
+
+def draw(slices: Slices, geometry: Geometry, frames: Mapping[str, Tensor], *, keep: bool) -> Planes:
+    """Fills the outputs, each [C, H, W] contiguous; returns the planes beneath them, with T where it is to be kept."""
+    how, device = shapes(), slices.slices.device
+    poses, blocks = slices.counts.shape
+    height, width = geometry.height, geometry.width
+    weight, weighted, transmittance = (torch.empty((poses, height, width), device=device) for _ in range(3))
+    planes = Planes(frames.get(WEIGHT_SUM, weight), weighted, transmittance)
+    if not poses:
+        return planes
+    tile_rows, tile_columns = -(-height // how.tile_rows), -(-width // how.tile_columns)
+    steps = torch.empty((poses, tile_rows, width), device=device)
+    draw_tiles[(tile_columns, tile_rows, poses)](
+        slices.slices,
+        slices.rectangles,
+        slices.bounds,
+        slices.counts,
+        planes.weight,
+        planes.weighted,
+        planes.transmittance,
+        steps,
+        blocks,
+        height,
+        width,
+        geometry.pitch,
+        geometry.row_cm,
+        CONVEX=geometry.convex,
+        BLOCK=how.block,
+        S_LANES=how.slices_at_once,
+        TILE_ROWS=how.tile_rows,
+        TILE_COLUMNS=how.tile_columns,
+        CHUNK=how.chunk,
+        num_warps=how.draw_warps,
+    )
+    wanted = [frames.get(name) for name in OUTPUTS]
+    finish_frames[(-(-width // how.finish_columns), tile_rows, poses)](
+        planes.weight,
+        planes.weighted,
+        planes.transmittance,
+        steps,
+        *(planes.weight if frame is None else frame for frame in wanted),
+        height,
+        width,
+        int(keep),
+        *(int(frame is not None) for frame in wanted),
+        TILE_ROWS=how.tile_rows,
+        COLUMNS=how.finish_columns,
+        num_warps=4,
+    )
+    return planes
+
+
+def differentiate(
+    gaussians: Gaussians,
+    views: Tensor,
+    geometry: Geometry,
+    slices: Slices,
+    planes: Planes,
+    gradients: Mapping[str, Tensor],  # of the loss by each output, [C, H, W] contiguous
+) -> dict[str, Tensor]:
+    """The gradient of the loss by every raw parameter, in its shape."""
+    how, device = shapes(), gaussians.means.device
+    height, width = geometry.height, geometry.width
+    poses, blocks = slices.counts.shape
+    count, terms = len(gaussians.means), (gaussians.degree + 1) ** 2
+    found = {
+        "means": torch.empty((count, 3), device=device),
+        "scales": torch.empty((count, 3), device=device),
+        "quats": torch.empty((count, 4), device=device),
+        "transmittances": torch.empty(count, device=device),
+        "sh0": torch.empty((count, 1, 1), device=device),
+        "shN": torch.empty((count, terms - 1, 1), device=device),
+    }
+    if not count:
+        return found
+    by_pixel = [torch.empty_like(planes.weight) for _ in range(4)]
+    by_slice = torch.empty((poses * blocks * how.block, constants.GRADIENTS.value), device=device)
+    given = [gradients.get(name) for name in OUTPUTS]
+    if poses:
+        differentiate_pixels[(-(-width // how.pixel_columns), poses)](
+            planes.weight,
+            planes.weighted,
+            planes.transmittance,
+            *(planes.weight if gradient is None else gradient for gradient in given),
+            *by_pixel,
+            height,
+            width,
+            *(int(gradient is not None) for gradient in given),
+            ROWS=how.pixel_rows,
+            COLUMNS=how.pixel_columns,
+            num_warps=4,
+        )
+        gather_slices[(blocks, how.gatherers, poses)](
+            slices.slices,
+            slices.rectangles,
+            slices.counts,
+            *by_pixel,
+            by_slice,
+            blocks,
+            height,
+            width,
+            geometry.pitch,
+            geometry.row_cm,
+            CONVEX=geometry.convex,
+            BLOCK=how.block,
+            S_LANES=how.slices_at_once,
+            ROWS=how.gather_rows,
+            COLUMNS=how.gather_columns,
+            num_warps=1,
+        )
+    place_gradients[(blocks,)](
+        views,
+        gaussians.means,
+        gaussians.scales,
+        gaussians.quats,
+        gaussians.transmittances,
+        gaussians.sh0,
+        gaussians.shn,
+        slices.rectangles,
+        slices.counts,
+        slices.places,
+        by_slice,
+        *found.values(),
+        poses,
+        count,
+        gaussians.shn.stride(0),
+        width,
+        CONVEX=geometry.convex,
+        SIGMOID=gaussians.sigmoid,
+        DEGREE=gaussians.degree,
+        TERMS=max(2, triton.next_power_of_2(terms)),
+        BLOCK=how.block,
+        num_warps=4,
+    )
+    return found

@@ -1,0 +1,92 @@
+"""Rendered frames as a sonographer has set the display: the pixel work, where the frames are."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import lru_cache
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+from torch.nn.functional import grid_sample
+
+from ..probe import Probe
+from ..request import LABELS
+from .settings import AS_RENDERED, FRAME_RANGE_DB, Display, true_to_scale
+
+_CACHED_PICTURES = 8  # at 9 bytes a pixel
+_LARGEST_CACHED_PICTURE = 2**20  # pixels
+
+
+def show(
+    frames: Mapping[str, Tensor], probe: Probe, display: Display, blackened: Tensor | None = None
+) -> dict[str, Tensor]:
+    """Each output [C, H, W] as `display` shows it, [C, H', W'] of `Display.picture`, in the type that it had.
+
+    Pixels that are `blackened`, [C, H, W] bool, are 0 in every output but coverage, whatever the gain.
+    """
+    shown = {}
+    for name, pixels in frames.items():
+        rows = display.rows_shown(probe, pixels.shape[1])
+        shown[name] = pixels[:, :rows]
+        if name == "bmode" and display.changes_tone:
+            shown[name] = _toned(shown[name], display)
+        if blackened is not None and name != "coverage":
+            shown[name] = shown[name].masked_fill(blackened[:, :rows], 0)
+        if display.pixel_mm is not None:
+            cropped = probe.cropped(rows / pixels.shape[1])
+            shown[name] = _scan_converted(shown[name], cropped, display.pixel_mm, nearest=name == LABELS)
+        if display.flip:
+            shown[name] = shown[name].flip(2)
+        shown[name] = shown[name].contiguous()
+    return shown
+
+
+class TrueToScale:
+    """Makes pictures in which a pixel has one size in mm, such as files hold, of frames of one probe and size."""
+
+    def __init__(self, probe: Probe, height: int, width: int) -> None:
+        self._probe, self._display = probe, true_to_scale(probe, height)
+        self.picture = self._display.picture(probe, height, width)
+
+    def of(self, frames: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:  # [B, H, W] -> those of `picture`
+        """Frames of B-mode as such pictures; 0 outside the fan."""
+        if self._display == AS_RENDERED:
+            return frames
+        pictures: npt.NDArray[np.uint8] = show({"bmode": torch.from_numpy(frames)}, self._probe, self._display)[
+            "bmode"
+        ].numpy()
+        return pictures
+
+
+def _toned(bmode: Tensor, display: Display) -> Tensor:  # [C, H, W] -> [C, H, W]
+    """Grey levels of each echo raised by its gain: 0 dB is white, `dynamic_range_db` below it black."""
+    gains = torch.from_numpy(display.gains(bmode.shape[1])).to(bmode)[:, None]
+    scale = FRAME_RANGE_DB / display.dynamic_range_db
+    return (bmode * scale + (1.0 - scale + gains / display.dynamic_range_db)).clamp_(0.0, 1.0)
+
+
+def _scan_converted(frames: Tensor, probe: Probe, pixel_mm: float, *, nearest: bool) -> Tensor:  # -> [C, H', W']
+    _, height, width = frames.shape
+    picture = probe.picture(pixel_mm)
+    is_small = picture.height * picture.width <= _LARGEST_CACHED_PICTURE
+    samples = _cached_samples if is_small else _samples
+    grid, inside = samples(probe, height, width, pixel_mm, frames.device)
+    floats = frames if frames.is_floating_point() else frames.float()
+    mode = "nearest" if nearest else "bilinear"
+    shown = grid_sample(floats[None], grid.to(floats), mode, padding_mode="border", align_corners=False)[0]
+    shown *= inside
+    return shown if frames.is_floating_point() else shown.round_().to(frames.dtype)
+
+
+def _samples(
+    probe: Probe, height: int, width: int, pixel_mm: float, device: torch.device
+) -> tuple[Tensor, Tensor]:  # [1, H', W', 2], [H', W']
+    """Where each pixel of the picture is sampled, from −1 to 1 across the frame, and whether anything is there."""
+    rows, columns, inside = probe.picture_samples((height, width), pixel_mm)
+    grid = np.stack([(2 * columns + 1) / width - 1, (2 * rows + 1) / height - 1], axis=-1)
+    return torch.from_numpy(grid.astype(np.float32))[None].to(device), torch.from_numpy(inside).to(device)
+
+
+_cached_samples = lru_cache(maxsize=_CACHED_PICTURES)(_samples)

@@ -1,0 +1,70 @@
+"""Poses in files: `.npy` arrays or `.json` lists, probe→scene (camera-to-world), millimetres."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..errors import InvalidPose
+from ..pose import check_poses
+from ..probe import FloatArray
+from .npy import map_npy
+
+
+def load_poses(path: str | Path) -> FloatArray:  # [P, 4, 4]
+    """The poses of a `.npy` or `.json` file as exact float64 [P, 4, 4], mm.
+
+    The file holds [P, 4, 4], [P, 3, 4], or one pose [4, 4] or [3, 4]; a missing last row is 0 0 0 1. Raises
+    InvalidPose, naming the file, the pose and what was expected; never runs code from the file.
+    """
+    path = Path(path)
+    array = read_pose_array(path)
+    try:
+        poses = check_poses(array, field="poses")
+    except InvalidPose as error:
+        raise InvalidPose(f"{path}: {error}", field="poses") from error
+    if not len(poses):
+        raise InvalidPose(f"{path}: it holds no poses", field="poses")
+    return poses
+
+
+def read_pose_array(path: str | Path) -> npt.NDArray[Any]:
+    """What a `.npy` or `.json` file holds, the last row completed, not yet checked for being poses.
+
+    For a caller that checks them itself, frame by frame. Raises InvalidPose, naming a file that cannot be read.
+    """
+    path = Path(path)
+    try:
+        return _with_last_row(_read(path))
+    except (OSError, ValueError, EOFError, RecursionError, MemoryError) as error:
+        raise InvalidPose(f"{path}: {_reason(error)}", field="poses") from error
+
+
+def _read(path: Path) -> Any:
+    if not path.is_file():  # a pipe or a device would never end
+        raise FileNotFoundError
+    if path.suffix == ".json":
+        return json.loads(path.read_text(encoding="utf-8"))
+    if path.suffix == ".npy":
+        return map_npy(path)
+    raise ValueError("poses are read from .npy and .json files")
+
+
+def _with_last_row(poses: Any) -> npt.NDArray[Any]:
+    array = np.asarray(poses)
+    if array.ndim not in (2, 3) or array.shape[-2:] != (3, 4) or array.dtype.kind not in "fiu":
+        return array
+    last = np.broadcast_to(np.array([0.0, 0.0, 0.0, 1.0]), (*array.shape[:-2], 1, 4))
+    return np.concatenate([array, last], axis=-2)
+
+
+def _reason(error: BaseException) -> str:
+    if isinstance(error, FileNotFoundError):
+        return "no such file"
+    if isinstance(error, RecursionError):
+        return "it nests too deeply"
+    return f"not a file of poses that can be read: {error}"

@@ -1,0 +1,1 @@
+"""Foreign formats: the released checkpoints, PLY, and the files that frames are exported to."""

@@ -1,0 +1,239 @@
+"""conf.json of the released trainer: planes and width in centimetres, angle in degrees.
+
+Keys that start with `_` are comments; keys that an import does not need are ignored. Three keys are ours, and the
+released code ignores them: `image_height` and `image_width`, since an exported checkpoint comes without its training
+images, and `probe_kind`, "phased" for a fan that begins at the face.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..datasets.images import frame_size
+from ..errors import CheckpointInvalid, InvalidProbe
+from ..files.npy import map_npy
+from ..probe import ConvexProbe, FloatArray, LinearProbe, PhasedProbe, Probe, stretch_released_far
+
+MAX_CONFIG_BYTES = 1 << 20
+KIND_KEY = "probe_kind"
+FILE_KEYS = ("images_file_train", "poses_file_train", "images_file_val", "poses_file_val")
+
+
+@dataclass(frozen=True)
+class TrainingImages:
+    """The shape of an images file."""
+
+    path: Path
+    count: int
+    height: int
+    width: int
+
+
+@dataclass(frozen=True)
+class ReleasedConfig:
+    """What a reader needs from conf.json, in mm and degrees. Exactly one of width and angle is given."""
+
+    path: Path
+    near_mm: float
+    far_mm: float  # as released: on the grid (i+½)/(H−1)
+    width_mm: float | None
+    opening_angle_deg: float | None
+    phased: bool
+    dataset_name: str | None
+    files: Mapping[str, str]  # those of FILE_KEYS that it has, as written
+    images: TrainingImages | None
+    images_missing: str  # why `images` is None, as a clause
+    image_height: int | None  # H and W of the training images, where conf.json itself says so
+    image_width: int | None
+
+    def find(self, key: str) -> Path | None:
+        """The file that a key names: as written, by its name beside conf.json, or from a folder above."""
+        named = self.files.get(key)
+        return None if named is None else _find(self.path, named)
+
+    def released_probe(self) -> Probe:
+        """The probe with the planes as released."""
+        return self._probe(self.far_mm)
+
+    def probe(self, image_height: int) -> Probe:
+        """The probe of ours for training images of `image_height` rows: the stretch of docs/physics.md §3."""
+        try:
+            return self._probe(stretch_released_far(self.near_mm, self.far_mm, image_height))
+        except InvalidProbe as error:
+            raise CheckpointInvalid(f"{self.path}: {error}") from error
+
+    def _probe(self, far_mm: float) -> Probe:
+        try:
+            if self.width_mm is not None:
+                return LinearProbe(self.width_mm, self.near_mm, far_mm)
+            if self.phased:
+                return PhasedProbe(opening_angle_deg=self.opening_angle_deg or 0.0, far_mm=far_mm)
+            return ConvexProbe(opening_angle_deg=self.opening_angle_deg or 0.0, near_mm=self.near_mm, far_mm=far_mm)
+        except InvalidProbe as error:
+            raise CheckpointInvalid(f"{self.path}: {error}") from error
+
+
+def probe_keys(released_probe: Probe) -> dict[str, float | str]:
+    """What conf.json says of a probe with its planes as released."""
+    keys: dict[str, float | str] = {
+        "ultrasound_near_plane": _to_cm(released_probe.near_mm),
+        "ultrasound_far_plane": _to_cm(released_probe.far_mm),
+    }
+    if isinstance(released_probe, LinearProbe):
+        return keys | {"ultrasound_opening_width": _to_cm(released_probe.width_mm)}
+    keys["ultrasound_opening_angle"] = released_probe.opening_angle_deg
+    return keys | {KIND_KEY: released_probe.kind} if isinstance(released_probe, PhasedProbe) else keys
+
+
+def released_centre_mm(released_probe: Probe, poses: FloatArray) -> FloatArray:  # [P, 4, 4] mm -> [3]
+    """The origin of a scene trained from these poses: the mean corner of its images (docs/physics.md §6)."""
+    corner = released_probe.corners_mm().mean(axis=0)  # [3]
+    centre: FloatArray = (poses[:, :3, :3] @ corner + poses[:, :3, 3]).mean(axis=0)
+    return centre
+
+
+def read_released_config(path: str | Path) -> ReleasedConfig:
+    """Reads conf.json and the shape of its images file. Raises CheckpointInvalid, naming the file."""
+    path = Path(path)
+    document = _read_object(path)
+    width_cm = _optional_number(path, document, "ultrasound_opening_width")
+    angle_deg = _optional_number(path, document, "ultrasound_opening_angle")
+    if (width_cm is None) == (angle_deg is None):
+        raise CheckpointInvalid(
+            f"{path}: it must have exactly one of ultrasound_opening_width (linear, cm) and "
+            f"ultrasound_opening_angle (convex, degrees), got {'neither' if width_cm is None else 'both'}"
+        )
+    near_mm = _to_mm(_number(path, document, "ultrasound_near_plane"))
+    phased = document.get(KIND_KEY) == PhasedProbe.kind
+    if phased and (angle_deg is None or near_mm != 0.0):
+        raise CheckpointInvalid(
+            f"{path}: a phased probe has ultrasound_opening_angle and ultrasound_near_plane 0, got "
+            f"{'no angle' if angle_deg is None else f'near plane {near_mm / 10.0:g}'}"
+        )
+    files = _named_files(path, document)
+    images, images_missing = _find_images(path, files)
+    config = ReleasedConfig(
+        path=path,
+        near_mm=near_mm,
+        far_mm=_to_mm(_number(path, document, "ultrasound_far_plane")),
+        width_mm=None if width_cm is None else _to_mm(width_cm),
+        opening_angle_deg=angle_deg,
+        phased=phased,
+        dataset_name=_dataset_name(path, files),
+        files=files,
+        images=images,
+        images_missing=images_missing,
+        image_height=_optional_count(path, document, "image_height", at_least=2),
+        image_width=_optional_count(path, document, "image_width", at_least=1),
+    )
+    config.released_probe()  # refuses planes, widths and angles that no probe has
+    return config
+
+
+def _read_object(path: Path) -> Mapping[str, Any]:
+    try:
+        if not path.is_file():
+            raise CheckpointInvalid(f"{path}: no such file")
+        if path.stat().st_size > MAX_CONFIG_BYTES:
+            raise CheckpointInvalid(f"{path}: too large for a conf.json: over {MAX_CONFIG_BYTES} bytes")
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise CheckpointInvalid(f"{path}: not JSON that can be read: {error}") from error
+    except RecursionError as error:
+        raise CheckpointInvalid(f"{path}: it nests too deeply") from error
+    if not isinstance(document, dict):
+        raise CheckpointInvalid(f"{path}: it must be a JSON object, got {type(document).__name__}")
+    return document
+
+
+def _optional_number(path: Path, document: Mapping[str, Any], key: str) -> float | None:
+    return None if document.get(key) is None else _number(path, document, key)
+
+
+def _number(path: Path, document: Mapping[str, Any], key: str) -> float:
+    value = document.get(key)
+    if value is None:
+        raise CheckpointInvalid(f"{path}: it lacks {key}")
+    try:
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(float(value)):
+            raise ValueError
+        return float(value)
+    except (ValueError, OverflowError):
+        raise CheckpointInvalid(f"{path}: {key} must be a finite number, got {repr(value)[:40]}") from None
+
+
+def _optional_count(path: Path, document: Mapping[str, Any], key: str, *, at_least: int) -> int | None:
+    value = document.get(key)
+    if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < at_least):
+        raise CheckpointInvalid(f"{path}: {key} must be an integer of at least {at_least}, got {repr(value)[:40]}")
+    return value
+
+
+def _named_files(path: Path, document: Mapping[str, Any]) -> dict[str, str]:
+    named = {key: document[key] for key in FILE_KEYS if document.get(key) is not None}
+    for key, value in named.items():
+        if not isinstance(value, str):
+            raise CheckpointInvalid(f"{path}: {key} must be a path, got {repr(value)[:40]}")
+    return named
+
+
+def _dataset_name(path: Path, files: Mapping[str, str]) -> str | None:
+    """The folder that holds the dataset: `data/liver/images_train.npy` names `liver`."""
+    return Path(files.get("images_file_train", "")).parent.name or path.resolve().parent.name or None
+
+
+def _find_images(path: Path, files: Mapping[str, str]) -> tuple[TrainingImages | None, str]:
+    named = files.get("images_file_train")
+    if named is None:
+        return None, f"{path} names no images_file_train"
+    found = _find(path, named)
+    return (None, f"the file {named[:200]!r} that {path} names was not found") if found is None else (_shape(found), "")
+
+
+def _find(path: Path, named: str) -> Path | None:
+    return next((candidate for candidate in _candidates(path, named) if _is_file(candidate)), None)
+
+
+def _candidates(path: Path, named: str) -> Iterator[Path]:
+    """The path as written from conf.json's folder, then by name beside it, then as written from each folder above."""
+    folder = path.resolve().parent
+    yield folder / named
+    yield folder / Path(named).name  # before the folders above: a copied dataset must not find its original
+    for base in folder.parents:
+        yield base / named
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except (OSError, ValueError):  # a name too long, or with a null byte
+        return False
+
+
+def _shape(path: Path) -> TrainingImages:
+    try:
+        array = map_npy(path)
+    except (OSError, ValueError) as error:
+        raise CheckpointInvalid(f"{path}: not an array of images that can be read: {error}") from error
+    if array.shape[:1] == (0,):
+        raise CheckpointInvalid(f"{path}: it holds no frames")
+    size = frame_size(array.shape)
+    if size is None:
+        raise CheckpointInvalid(
+            f"{path}: images must have shape [N, H, W], [N, H, W, 1, 3 or 4] or [N, 1, H, W], got {list(array.shape)}"
+        )
+    return TrainingImages(path=path, count=len(array), height=size[0], width=size[1])
+
+
+def _to_mm(length_cm: float) -> float:
+    return round(10.0 * length_cm, 9)  # 3.79269 cm is 37.9269 mm, not 37.926899999999996
+
+
+def _to_cm(length_mm: float) -> float:
+    return round(length_mm / 10.0, 10)

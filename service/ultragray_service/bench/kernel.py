@@ -1,0 +1,116 @@
+"""The kernel's own time, and the yard it is measured with."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+
+from ultragray import GaussianScene, LinearProbe, SceneInfo
+from ultragray.backends import cpu
+from ultragray.probe import FloatArray
+
+BLOCK_CM = 5.0
+PROBE = LinearProbe(width_mm=50.0, near_mm=0.0, far_mm=50.0)
+BATCH = 8
+
+
+@dataclass(frozen=True)
+class BenchScene:
+    """A block of random Gaussians, 5x5x5 cm, its scales log-normal around `scale_cm`."""
+
+    gaussian_count: int
+    scale_cm: float
+    height: int = 512
+    width: int = 512
+
+    @cached_property
+    def scene(self) -> GaussianScene:
+        generator = torch.Generator().manual_seed(0)
+
+        def normal(*shape: int) -> torch.Tensor:
+            return torch.randn(*shape, generator=generator)
+
+        n = self.gaussian_count
+        splats = {
+            "means": (torch.rand(n, 3, generator=generator) - 0.5) * BLOCK_CM,
+            "scales": math.log(self.scale_cm) + 0.3 * normal(n, 3),
+            "quats": normal(n, 4),
+            "transmittances": 3.0 + normal(n),
+            "sh0": -1.0 + 0.5 * normal(n, 1, 1),
+            "shN": 0.2 * normal(n, 3, 1),
+        }
+        info = SceneInfo(probe=PROBE, image_height=self.height, image_width=self.width)
+        return GaussianScene.from_splats(splats, info=info)
+
+
+def bench_scenes(quick: bool) -> list[BenchScene]:
+    """The two scenes of the paper's sizes, or only the small one."""
+    small = BenchScene(90_000, 0.05)
+    return [small] if quick else [BenchScene(500_000, 0.03), small]
+
+
+def bench_poses(count: int) -> FloatArray:  # [C, 4, 4] mm
+    """Planes through the middle of the block, moving in elevation and turning a little."""
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    angles = np.radians(np.linspace(-3.0, 3.0, count)) if count > 1 else np.zeros(1)
+    poses[:, 1, 1] = poses[:, 2, 2] = np.cos(angles)
+    poses[:, 2, 1] = np.sin(angles)
+    poses[:, 1, 2] = -np.sin(angles)
+    poses[:, 1, 3] = np.linspace(-2.0, 2.0, count) if count > 1 else 0.0
+    poses[:, 2, 3] = -BLOCK_CM * 5.0
+    return poses
+
+
+@dataclass(frozen=True)
+class KernelTiming:
+    """Times per frame of one way to call the kernel."""
+
+    what: str
+    threads: int
+    poses: int
+    frame_ms: list[float]
+
+
+def measure_kernel(bench: BenchScene, thread_counts: Sequence[int], repeats: int) -> list[KernelTiming]:
+    """One pose and a batch of 8, B-mode only, on each number of threads."""
+    scene = bench.scene
+    before = torch.get_num_threads()
+    timings = []
+    try:
+        for threads in thread_counts:
+            torch.set_num_threads(threads)
+            for poses in (1, BATCH):
+                poses_cm = scene.poses_to_scene_cm(bench_poses(max(repeats, 10 * poses)))
+                frame_ms = []
+                for first in range(0, len(poses_cm) - poses + 1, poses):
+                    started = time.perf_counter()
+                    cpu.render_outputs(
+                        scene, PROBE, poses_cm[first : first + poses], bench.height, bench.width, ("bmode",)
+                    )
+                    frame_ms.append(1000.0 * (time.perf_counter() - started) / poses)
+                timings.append(KernelTiming("kernel", threads, poses, frame_ms[1:]))
+    finally:
+        torch.set_num_threads(before)
+    return timings
+
+
+def time_yard_ms() -> float:
+    """The median time of 36 million float32 exponentials by torch on one thread, ms (docs/physics.md §5)."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    x = -torch.rand(7_200_000)
+    y = torch.empty_like(x)
+    times = []
+    for _ in range(7):
+        started = time.perf_counter()
+        for _ in range(5):
+            torch.exp(x, out=y)
+        times.append(1000.0 * (time.perf_counter() - started))
+    torch.set_num_threads(before)
+    return float(np.median(times))

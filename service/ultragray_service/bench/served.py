@@ -1,0 +1,229 @@
+"""Latency and rate through each front door of a real server in a process of its own."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import os
+import queue
+import re
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import grpc
+
+from ultragray.errors import NotReady
+from ultragray.probe import FloatArray
+from ultragray_proto.v1 import geometry_pb2, rendering_pb2, rendering_pb2_grpc
+
+from .kernel import BenchScene, bench_poses
+
+SCENE = "bench"
+IN_FLIGHT = 8
+WARM_UP = 20  # first requests of a connection, not counted
+START_TIMEOUT_S = 120.0
+
+
+@dataclass(frozen=True)
+class FrontDoor:
+    """Latencies of one request after another, and the rate where the door allows several in flight."""
+
+    what: str
+    latency_ms: list[float]
+    frames_per_s: float
+
+
+@dataclass(frozen=True)
+class Served:
+    """What the service did, and the memory of its worker (resident, shared pages counted by share) in MB."""
+
+    front_doors: list[FrontDoor]
+    worker_memory_mb: float
+
+
+def measure_served(bench: BenchScene, repeats: int, backend: str) -> Served:
+    """Raises NotReady where the server does not come up."""
+    poses = bench_poses(repeats + WARM_UP)
+    with tempfile.TemporaryDirectory(prefix="ultragray-bench-") as folder:
+        bench.scene.save(Path(folder) / f"{SCENE}.ugr")
+        with running_server(Path(folder), backend, SCENE) as server:
+            doors = [
+                _grpc_stream(server.grpc_port, poses),
+                _grpc_unary(server.grpc_port, poses),
+                _http("HTTP raw", server.http_port, poses, "application/octet-stream"),
+                _http("HTTP PNG", server.http_port, poses, "image/png"),
+            ]
+            return Served(doors, max(map(_memory_mb, _descendants(server.pid)), default=0.0))
+
+
+@dataclass(frozen=True)
+class RunningServer:
+    """A server of the benchmark."""
+
+    http_port: int
+    grpc_port: int
+    igtl_port: int
+    pid: int
+
+
+@contextmanager
+def running_server(folder: Path, backend: str, scene: str, job_threads: int = 0) -> Iterator[RunningServer]:
+    """A service of the scenes in `folder`, with `scene` for OpenIGTLink. Raises NotReady."""
+    http_port, grpc_port, igtl_port = _free_port(), _free_port(), _free_port()
+    settings = {
+        "ULTRAGRAY_DATA_FOLDER": str(folder),
+        "ULTRAGRAY_HTTP_PORT": str(http_port),
+        "ULTRAGRAY_GRPC_PORT": str(grpc_port),
+        "ULTRAGRAY_IGTL_PORT": str(igtl_port),
+        "ULTRAGRAY_IGTL_SCENE": scene,
+        "ULTRAGRAY_TRAINING_THREADS": str(job_threads),
+        "ULTRAGRAY_BACKEND": backend,
+        "ULTRAGRAY_PRELOAD": scene,
+        "ULTRAGRAY_LOG_LEVEL": "error",
+    }
+    process = subprocess.Popen([sys.executable, "-m", "ultragray_service"], env={**os.environ, **settings})
+    try:
+        _wait_ready(process, http_port)
+        yield RunningServer(http_port, grpc_port, igtl_port, process.pid)
+    finally:
+        process.terminate()
+        process.wait(timeout=30)
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def _wait_ready(process: subprocess.Popen[bytes], port: int) -> None:
+    end = time.monotonic() + START_TIMEOUT_S
+    while time.monotonic() < end and process.poll() is None:
+        with suppress(OSError), closing(http.client.HTTPConnection("127.0.0.1", port, timeout=5)) as connection:
+            connection.request("GET", "/v1/health/ready")
+            if connection.getresponse().status == 200:
+                return
+        time.sleep(0.1)
+    raise NotReady(f"the server of the benchmark was not ready within {START_TIMEOUT_S:g} s")
+
+
+def _message(pose: FloatArray) -> geometry_pb2.Pose:  # [4, 4] mm
+    return geometry_pb2.Pose(matrix=geometry_pb2.Matrix(values=pose.ravel().tolist()))
+
+
+def _grpc_stream(port: int, poses: FloatArray) -> FrontDoor:  # [C, 4, 4]
+    settings = rendering_pb2.RenderSettings(scene=SCENE)
+    with grpc.insecure_channel(f"127.0.0.1:{port}") as channel:
+        stub = rendering_pb2_grpc.RenderServiceStub(channel)
+        room = _Turns()
+        stream = stub.RenderStream(room.requests(settings, poses))
+        latency_ms = []
+        for _ in poses:
+            started = time.perf_counter()
+            room.release()
+            _check(next(stream))
+            latency_ms.append(1000.0 * (time.perf_counter() - started))
+        room = _Turns()
+        started = time.perf_counter()
+        stream = stub.RenderStream(room.requests(settings, poses))
+        for _ in range(IN_FLIGHT):
+            room.release()
+        for frame in stream:
+            _check(frame)
+            room.release()
+        rate = len(poses) / (time.perf_counter() - started)
+    return FrontDoor("gRPC stream", latency_ms[WARM_UP:], rate)
+
+
+class _Turns:
+    """Lets a request iterator yield only after `release`, so that a known number is in flight."""
+
+    def __init__(self) -> None:
+        self._turns: queue.Queue[None] = queue.Queue()
+
+    def release(self) -> None:
+        self._turns.put(None)
+
+    def requests(
+        self, settings: rendering_pb2.RenderSettings, poses: FloatArray
+    ) -> Iterator[rendering_pb2.RenderStreamRequest]:
+        for sequence, pose in enumerate(poses):
+            self._turns.get()
+            yield rendering_pb2.RenderStreamRequest(
+                sequence=sequence, pose=_message(pose), settings=settings if sequence == 0 else None
+            )
+
+
+def _check(frame: rendering_pb2.Frame) -> None:
+    if frame.HasField("error"):
+        raise NotReady(f"the benchmark's frame {frame.sequence} failed: {frame.error.detail}")
+
+
+def _grpc_unary(port: int, poses: FloatArray) -> FrontDoor:
+    settings = rendering_pb2.RenderSettings(scene=SCENE)
+    with grpc.insecure_channel(f"127.0.0.1:{port}") as channel:
+        stub = rendering_pb2_grpc.RenderServiceStub(channel)
+        return _one_by_one(
+            "gRPC unary",
+            poses,
+            lambda pose: stub.Render(rendering_pb2.RenderRequest(settings=settings, pose=_message(pose))),
+        )
+
+
+def _http(what: str, port: int, poses: FloatArray, media_type: str) -> FrontDoor:
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=60)
+    headers = {"Accept": media_type, "Content-Type": "application/json"}
+
+    def render(pose: FloatArray) -> None:
+        body = json.dumps({"pose": {"matrix": pose.tolist()}})
+        connection.request("POST", f"/v1/scenes/{SCENE}/render", body, headers)
+        response = connection.getresponse()
+        data = response.read()
+        if response.status != 200:
+            raise NotReady(f"the benchmark's frame failed: {data[:500]!r}")
+
+    try:
+        return _one_by_one(what, poses, render)
+    finally:
+        connection.close()
+
+
+def _one_by_one(what: str, poses: FloatArray, render: Callable[[FloatArray], object]) -> FrontDoor:
+    latency_ms = []
+    for pose in poses:
+        started = time.perf_counter()
+        render(pose)
+        latency_ms.append(1000.0 * (time.perf_counter() - started))
+    counted = latency_ms[WARM_UP:]
+    return FrontDoor(what, counted, 1000.0 * len(counted) / sum(counted))
+
+
+def _descendants(pid: int) -> list[int]:
+    parents = {}
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            status = (folder / "status").read_text()
+        except OSError:
+            continue
+        if match := re.search(r"^PPid:\s+(\d+)", status, re.MULTILINE):
+            parents[int(folder.name)] = int(match[1])
+    found = [pid]
+    for parent in found:
+        found += [child for child, of in parents.items() if of == parent]
+    return found[1:]
+
+
+def _memory_mb(pid: int) -> float:
+    try:
+        rollup = Path(f"/proc/{pid}/smaps_rollup").read_text()
+    except OSError:
+        return 0.0
+    match = re.search(r"^Pss:\s+(\d+) kB", rollup, re.MULTILINE)
+    return int(match[1]) / 1024.0 if match else 0.0

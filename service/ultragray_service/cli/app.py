@@ -1,0 +1,339 @@
+"""The command line `ultragray`: serving, rendering, datasets, training, evaluation, export, benchmarks.
+
+Only names and help live here; what a command needs (torch, FastAPI) is imported when it runs, so that
+`--help` is instant.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+import ultragray
+from ultragray.errors import InvalidArgument, UltragrayError
+
+from . import convert as cli_convert
+from . import dataset as cli_dataset
+from . import eval as cli_eval
+from . import jobs as cli_jobs
+from . import report as cli_report
+from . import sampler as cli_sampler
+from . import train as cli_train
+from . import worker as cli_worker
+
+USER_ERROR = 2  # the exit code of a mistake that the caller can mend
+
+
+class _Commands(TyperGroup):
+    """Turns the errors of the project's tree and of the file system into one red line and exit code 2."""
+
+    def invoke(self, context: Any) -> Any:
+        try:
+            return super().invoke(context)
+        except BrokenPipeError:  # `ultragray info scene.ugr | head`: nobody is left to tell
+            raise
+        except UltragrayError as error:
+            message = error.detail
+        except OSError as error:
+            message = f"{error.filename}: {error.strerror}" if error.filename and error.strerror else str(error)
+        typer.secho(f"error: {message}", fg=typer.colors.RED, err=True)
+        raise typer.Exit(USER_ERROR)
+
+
+app = typer.Typer(
+    cls=_Commands,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+    context_settings={"help_option_names": ["-h", "--help"]},
+    help="Ultrasound from trained 3D Gaussian scenes: a probe pose goes in, a B-mode frame comes out.",
+)
+
+Scene = Annotated[Path, typer.Argument(help="Scene file (.ugr).", show_default=False)]
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"ultragray {ultragray.__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def main(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    """Lengths are in mm, angles in degrees; poses are rigid probe→scene transforms."""
+
+
+@app.command(epilog="Every other setting has an environment variable: see docs/interfaces.md.")
+def serve(
+    scenes: Annotated[
+        list[Path] | None,
+        typer.Argument(help="Scene files to serve instead of a data folder.", show_default=False),
+    ] = None,
+    data_folder: Annotated[
+        Path | None,
+        typer.Option(
+            help="Existing folder of scene files (*.ugr); where it holds none, the demo scene is put there. "
+            "[ULTRAGRAY_DATA_FOLDER]",
+            show_default="data",
+        ),
+    ] = None,
+    host: Annotated[
+        str | None,
+        typer.Option(help="Address to listen on; 0.0.0.0 for all. [ULTRAGRAY_HOST]", show_default="127.0.0.1"),
+    ] = None,
+    http_port: Annotated[
+        int | None,
+        typer.Option(help="Port of HTTP; 0 takes a free one. [ULTRAGRAY_HTTP_PORT]", show_default="8000"),
+    ] = None,
+    grpc_port: Annotated[
+        int | None,
+        typer.Option(help="Port of gRPC; 0 takes a free one. [ULTRAGRAY_GRPC_PORT]", show_default="50051"),
+    ] = None,
+    igtl_port: Annotated[
+        int | None,
+        typer.Option(
+            help="Port of OpenIGTLink, usually 18944; 0 takes a free one. [ULTRAGRAY_IGTL_PORT]", show_default="off"
+        ),
+    ] = None,
+    processes: Annotated[
+        int | None,
+        typer.Option(help="Render processes; 0: one per GPU, on the CPU one. [ULTRAGRAY_PROCESSES]", show_default="0"),
+    ] = None,
+    threads: Annotated[
+        int | None,
+        typer.Option(
+            help="Render threads of each process; 0: cores // processes. [ULTRAGRAY_THREADS_PER_PROCESS]",
+            show_default="0",
+        ),
+    ] = None,
+    backend: Annotated[
+        str | None,
+        typer.Option(help="auto, cpu, cuda or reference. [ULTRAGRAY_BACKEND]", show_default="auto"),
+    ] = None,
+    log_level: Annotated[
+        str | None,
+        typer.Option(help="debug, info, warning or error. [ULTRAGRAY_LOG_LEVEL]", show_default="info"),
+    ] = None,
+) -> None:
+    """Serve scenes over HTTP and gRPC, in the foreground, until Ctrl-C or SIGTERM."""
+    from .serve import serve_scenes
+
+    options = {
+        "data_folder": data_folder,
+        "host": host,
+        "http_port": http_port,
+        "grpc_port": grpc_port,
+        "igtl_port": igtl_port,
+        "processes": processes,
+        "threads_per_process": threads,
+        "backend": backend,
+        "log_level": log_level,
+    }
+    serve_scenes(scenes or [], {name: value for name, value in options.items() if value is not None})
+
+
+@app.command()
+def render(
+    scene: Scene,
+    output: Annotated[
+        Path,
+        typer.Option(
+            "--output",
+            "-o",
+            help="A file (.npz, .tar, .zarr.zip, .h5, .dcm, .igs.mha), or a folder for PNGs (frame_00000_bmode.png).",
+        ),
+    ],
+    poses: Annotated[
+        Path | None,
+        typer.Option(
+            help="Poses in mm: .npy or .json, [P, 4, 4] or [P, 3, 4].",
+            show_default="the scene's training poses",
+        ),
+    ] = None,
+    sampler: cli_sampler.Kind = None,
+    count: cli_sampler.Count = None,
+    translation_mm: cli_sampler.TranslationMm = None,
+    rotation_deg: cli_sampler.RotationDeg = None,
+    seed: cli_sampler.Seed = None,
+    spacing_mm: cli_sampler.SpacingMm = None,
+    tilt_deg: cli_sampler.TiltDeg = None,
+    step_deg: cli_sampler.StepDeg = None,
+    min_confidence: cli_sampler.MinConfidence = None,
+    height: Annotated[int | None, typer.Option(help="Depth samples.", show_default="as trained, else 512")] = None,
+    width: Annotated[int | None, typer.Option(help="Scan lines.", show_default="as trained, else 512")] = None,
+    outputs: Annotated[
+        str, typer.Option(help="Some of bmode, echo, transmittance, coverage, labels, with commas.")
+    ] = "bmode",
+    dtype: Annotated[
+        str | None, typer.Option(help="uint8 or float32, of a file.", show_default="the format's own")
+    ] = None,
+    probe: Annotated[
+        str | None,
+        typer.Option(
+            help='Another probe, as JSON: {"kind": "linear", "width_mm": 40, "near_mm": 0, "far_mm": 50} or '
+            '{"kind": "convex", "opening_angle_deg": 60, "near_mm": 50, "far_mm": 200} or '
+            '{"kind": "phased", "opening_angle_deg": 90, "far_mm": 150}.',
+            show_default="the scene's own",
+        ),
+    ] = None,
+    scan_convert: Annotated[
+        float | None,
+        typer.Option(
+            metavar="PIXEL_MM",
+            help="Draw the PNGs of a convex or phased probe as a fan, with square pixels of this size.",
+            show_default=False,
+        ),
+    ] = None,
+    backend: Annotated[str, typer.Option(help="auto, cpu, cuda or reference.")] = "auto",
+    threads: Annotated[int, typer.Option(min=0, help="Render threads; 0: all cores.")] = 0,
+) -> None:
+    """Render frames from poses into one file or a folder of PNGs."""
+    from .render import RenderOptions, render_to_files
+
+    options = RenderOptions(
+        scene=scene,
+        output=output,
+        poses=poses,
+        sampler=cli_sampler.sampler_document(
+            sampler,
+            count=count,
+            translation_mm=translation_mm,
+            rotation_deg=rotation_deg,
+            seed=seed,
+            spacing_mm=spacing_mm,
+            tilt_deg=tilt_deg,
+            step_deg=step_deg,
+        ),
+        min_confidence=min_confidence,
+        height=height,
+        width=width,
+        outputs=tuple(name.strip() for name in outputs.split(",") if name.strip()),
+        dtype=dtype,
+        probe_json=probe,
+        scan_convert_mm=scan_convert,
+        backend=backend,
+        threads=threads,
+    )
+    typer.echo(render_to_files(options))
+
+
+@app.command()
+def info(
+    scene: Scene,
+    json: Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")] = False,
+) -> None:
+    """Print what a scene file says about itself."""
+    from .info import print_json, print_table
+
+    (print_json if json else print_table)(scene)
+
+
+@app.command()
+def import_checkpoint(
+    checkpoint: Annotated[Path, typer.Argument(help="Checkpoint of the released trainer (.pt).", show_default=False)],
+    config: Annotated[Path, typer.Option(help="conf.json of its dataset.", show_default=False)],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Scene file to write (.ugr).", show_default=False)],
+    poses: Annotated[
+        Path | None,
+        typer.Option(help="Its training poses (poses_train.npy); they give the centre.", show_default=False),
+    ] = None,
+    center: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option(metavar="X Y Z", help="Instead of --poses: the scene centre in mm.", show_default=False),
+    ] = None,
+    centered: Annotated[
+        bool, typer.Option("--centered", help="Instead of --poses: poses will be relative to the centre.")
+    ] = False,
+    image_height: Annotated[
+        int | None,
+        typer.Option(help="Height of the training images.", show_default="from the images file that conf.json names"),
+    ] = None,
+) -> None:
+    """Turn a released UltraG-Ray checkpoint into a scene file, with its place in the tracker's frame."""
+    from ultragray.interchange.checkpoint import import_checkpoint as read_checkpoint
+
+    from .output import SCENE_SUFFIX, check_writable
+
+    if [poses is not None, center is not None, centered].count(True) != 1:
+        raise InvalidArgument(
+            "give exactly one of --poses (its training poses), --center X Y Z (the scene centre in mm) and "
+            "--centered (poses relative to the centre)",
+            field="poses",
+        )
+    check_writable(output, SCENE_SUFFIX)
+    try:
+        scene = read_checkpoint(
+            checkpoint,
+            config=config,
+            poses=poses,
+            center_mm=center,
+            centered=centered,
+            image_height=image_height,
+        )
+    except InvalidArgument as error:
+        option = "--image-height: " if error.field == "image_height" else ""
+        raise InvalidArgument(f"{option}{error.detail}", field=error.field) from error
+    scene.save(output)
+    x, y, z = scene.info.centre_mm
+    typer.echo(
+        f"wrote {output}: {scene.gaussian_count:,} Gaussians about ({x:.2f}, {y:.2f}, {z:.2f}) mm, {scene.info.probe}"
+    )
+
+
+app.add_typer(cli_dataset.dataset_app, name="dataset")
+app.add_typer(cli_jobs.jobs_app, name="jobs")
+app.command()(cli_train.train)
+app.command("eval")(cli_eval.evaluate)
+app.command()(cli_eval.compound)
+app.command()(cli_report.report)
+app.command()(cli_convert.export)
+app.command()(cli_convert.import_ply)
+app.command()(cli_worker.worker)
+
+
+@app.command()
+def demo(
+    output: Annotated[Path, typer.Option("--output", "-o", help="Scene file to write (.ugr).")] = Path("demo.ugr"),
+) -> None:
+    """Write the built-in demo scene."""
+    from ultragray.demo import copy_demo_scene
+    from ultragray.scene_info import read_header
+
+    from .output import SCENE_SUFFIX, check_writable
+
+    check_writable(output, SCENE_SUFFIX)
+    copy_demo_scene(output)
+    info = read_header(output).info
+    typer.echo(f"wrote {output}: {info.dataset_name}, {info.gaussian_count:,} Gaussians")
+
+
+@app.command()
+def bench(
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", help="Also write the figures as JSON.", show_default=False),
+    ] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="Fewer repetitions: a minute instead of several.")] = False,
+    train: Annotated[bool, typer.Option("--train", help="Measure a training step and its parts instead.")] = False,
+    jobs: Annotated[
+        bool, typer.Option("--jobs", help="Measure a long list of jobs, and frames beside a training, instead.")
+    ] = False,
+    clients: Annotated[
+        bool, typer.Option("--clients", help="Measure what control loops, pages and scripts get instead.")
+    ] = False,
+    backend: Annotated[str, typer.Option(help="cpu, or cuda: the first GPU.")] = "cpu",
+) -> None:
+    """Measure the kernel and the service on this machine and print a table."""
+    from ..bench.command import chosen_bench
+    from .output import check_writable
+
+    if output is not None:
+        check_writable(output)
+    chosen_bench(backend, train=train, jobs=jobs, clients=clients)(output, quick)

@@ -1,0 +1,156 @@
+"""`ultragray eval | compound`: what a scene, or classical compounding, reaches on frames that were held out."""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from .output import check_picture_folder
+from .source import (
+    Crop,
+    DatasetArgument,
+    DeviceSet,
+    Frames,
+    ImageSize,
+    TrainFrames,
+    ValFrames,
+    check_scene_fits,
+    read_dataset,
+)
+
+if TYPE_CHECKING:
+    from ultragray.evaluation.scoring import Evaluation
+
+
+VoxelMm = Annotated[
+    float | None,
+    typer.Option(metavar="MM", help="Side of a voxel of compounding.", show_default="0.5, or what fits into memory"),
+]
+
+
+class Split(str, enum.Enum):
+    """Which frames of a dataset to measure on."""
+
+    VAL = "val"
+    TRAIN = "train"
+
+
+class Method(str, enum.Enum):
+    """One of ultragray.evaluation.baselines.BASELINES, or all of them."""
+
+    ALL = "all"
+    MEDIAN = "median"
+    MEAN = "mean"
+    MAXIMUM = "maximum"
+    LINEAR = "linear"
+    NEAREST = "nearest"
+
+
+def evaluate(
+    scene: Annotated[Path, typer.Argument(help="Scene file (.ugr).", show_default=False)],
+    dataset: DatasetArgument,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output",
+            "-o",
+            help="New folder for one picture a frame: truth, rendering, difference, echo, transmittance.",
+            show_default="no pictures",
+        ),
+    ] = None,
+    split: Annotated[Split, typer.Option(help="Frames to measure on.")] = Split.VAL,
+    json: Annotated[bool, typer.Option("--json", help="One JSON object, with every frame.")] = False,
+    backend: Annotated[str, typer.Option(help="auto, cpu, cuda or reference.")] = "auto",
+    train_frames: TrainFrames = None,
+    val_frames: ValFrames = None,
+    frames: Frames = None,
+    device_set: DeviceSet = None,
+    crop: Crop = None,
+    image_size: ImageSize = None,
+) -> None:
+    """Measure a scene on the held-out frames of a dataset: PSNR, MS-SSIM, GMS, GMSD."""
+    from ultragray.evaluation.scoring import evaluate as evaluate_scene
+    from ultragray.evaluation.scoring import require_frames
+    from ultragray.scene import GaussianScene
+    from ultragray_workers.pool.process.placement import render_device
+
+    if output is not None:
+        check_picture_folder(output)
+    loaded = GaussianScene.load(scene).to(render_device(backend))
+    read = read_dataset(dataset, train_frames, val_frames, frames, device_set, crop, image_size)
+    sweep = read.val if split is Split.VAL else read.train
+    require_frames(sweep)
+    check_scene_fits(loaded.info, read)
+    evaluation = evaluate_scene(loaded, sweep, backend=backend)
+    if json:
+        _print_json({"scene": str(scene), "dataset": read.name, "split": split.value, **evaluation.to_dict()})
+    else:
+        print_metrics(f"{read.name}, {len(sweep)} {split.value} frames", {scene.stem: evaluation})
+    if output is not None:
+        from ultragray.evaluation.side_by_side import write_side_by_side
+
+        paths = write_side_by_side(loaded, sweep, evaluation.frames, output, backend=backend)
+        typer.echo(f"wrote {len(paths)} pictures into {output}", err=json)
+
+
+def compound(
+    dataset: DatasetArgument,
+    method: Annotated[
+        Method,
+        typer.Option(help="Compounding by voxel, linear between enclosing frames, or the nearest frame as it is."),
+    ] = Method.ALL,
+    voxel_mm: VoxelMm = None,
+    json: Annotated[bool, typer.Option("--json", help="One JSON object, with every frame.")] = False,
+    train_frames: TrainFrames = None,
+    val_frames: ValFrames = None,
+    frames: Frames = None,
+    device_set: DeviceSet = None,
+    crop: Crop = None,
+    image_size: ImageSize = None,
+) -> None:
+    """Measure classical compounding of the training frames on the held-out ones, as eval measures a scene."""
+    from ultragray.evaluation.baselines import BASELINES, evaluate_baselines
+    from ultragray.evaluation.compounding import affordable_voxel_mm
+
+    read = read_dataset(dataset, train_frames, val_frames, frames, device_set, crop, image_size)
+    voxel_mm = affordable_voxel_mm(read.train) if voxel_mm is None else voxel_mm
+    methods = BASELINES if method is Method.ALL else (method.value,)
+    evaluations = evaluate_baselines(read, methods, voxel_mm)
+    if json:
+        found = {name: evaluation.to_dict() for name, evaluation in evaluations.items()}
+        _print_json({"dataset": read.name, "voxel_mm": voxel_mm, "methods": found})
+    else:
+        print_metrics(f"{read.name}, {len(read.val)} val frames, voxels of {voxel_mm:g} mm", evaluations)
+
+
+def print_metrics(title: str, evaluations: Mapping[str, Evaluation]) -> None:
+    """A table of mean ± standard deviation over the frames, one row a name."""
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(box=None, pad_edge=False)
+    for place, head in enumerate(("", "PSNR, dB", "MS-SSIM", "GMS", "GMSD")):
+        table.add_column(head, justify="right" if place else "left", no_wrap=True)
+    for name, evaluation in evaluations.items():
+        mean, std = evaluation.mean, evaluation.std
+        table.add_row(
+            name,
+            f"{mean.psnr_db:.2f} ± {std.psnr_db:.2f}",
+            *(f"{getattr(mean, key):.3f} ± {getattr(std, key):.3f}" for key in ("ms_ssim", "gms", "gmsd")),
+        )
+    console = Console()
+    console.print(title, highlight=False, markup=False, soft_wrap=True)
+    console.print(table)
+    scales = next(iter(evaluations.values())).ms_ssim_scales
+    if scales < 5:
+        console.print(f"MS-SSIM over {scales} of its 5 scales, which is what the image holds", style="dim")
+
+
+def _print_json(document: Mapping[str, Any]) -> None:
+    from json import dumps
+
+    typer.echo(dumps(document, indent=2, allow_nan=False))

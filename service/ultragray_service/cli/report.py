@@ -1,0 +1,159 @@
+"""`ultragray report`: a scene, the baselines and the ablations on one page."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from .eval import VoxelMm
+from .output import check_writable
+from .source import (
+    Crop,
+    DatasetArgument,
+    DeviceSet,
+    Frames,
+    ImageSize,
+    TrainFrames,
+    ValFrames,
+    check_scene_fits,
+    read_dataset,
+    warn_about_dataset,
+)
+
+if TYPE_CHECKING:
+    from ultragray.datasets import Dataset
+    from ultragray.training import Progress, TrainingConfig
+
+TILT = "growing tilt"
+Follow = Callable[["Progress"], None]
+
+
+@dataclass(frozen=True)
+class ReportOptions:
+    """What goes into the page besides the dataset."""
+
+    scene: Path | None
+    ablations: bool
+    voxel_mm: float
+
+
+def report(
+    dataset: DatasetArgument,
+    output: Annotated[Path, typer.Option("--output", "-o", help="Page to write (.html).", show_default=False)],
+    scene: Annotated[
+        Path | None,
+        typer.Option(help="Scene file (.ugr) to report on.", show_default="one is trained"),
+    ] = None,
+    preset: Annotated[str, typer.Option(help="Of every training: fast or paper.")] = "fast",
+    steps: Annotated[int | None, typer.Option(help="Steps of every training.", show_default="preset")] = None,
+    max_gaussians: Annotated[int | None, typer.Option(help="Gaussians at the end.", show_default="preset")] = None,
+    seed: Annotated[int | None, typer.Option(help="Of every random choice.", show_default="0")] = None,
+    no_ablations: Annotated[
+        bool, typer.Option("--no-ablations", help="Leave out the ablations and growing tilt: seven trainings.")
+    ] = False,
+    voxel_mm: VoxelMm = None,
+    threads: Annotated[int, typer.Option(min=0, help="Threads; 0: all cores.")] = 0,
+    train_frames: TrainFrames = None,
+    val_frames: ValFrames = None,
+    frames: Frames = None,
+    device_set: DeviceSet = None,
+    crop: Crop = None,
+    image_size: ImageSize = None,
+) -> None:
+    """Train and measure a scene, the baselines and the paper's ablations; write one self-contained HTML page."""
+    from ultragray.evaluation.compounding import affordable_voxel_mm
+    from ultragray.evaluation.scoring import require_frames
+    from ultragray.training import TrainingConfig
+
+    check_writable(output, ".html")
+    given = {"steps": steps, "max_gaussians": max_gaussians, "seed": seed}
+    config = TrainingConfig.preset(preset, **{name: value for name, value in given.items() if value is not None})
+    if threads:
+        import torch
+
+        torch.set_num_threads(threads)
+    read = read_dataset(dataset, train_frames, val_frames, frames, device_set, crop, image_size)
+    require_frames(read.val)
+    warn_about_dataset(read)
+    voxel_mm = affordable_voxel_mm(read.train) if voxel_mm is None else voxel_mm
+    failures = _write_report(read, config, output, ReportOptions(scene, not no_ablations, voxel_mm))
+    for name, reason in failures.items():
+        typer.echo(f"failed: {name}: {reason}", err=True)
+    typer.echo(f"wrote {output}")
+
+
+def _write_report(dataset: Dataset, config: TrainingConfig, output: Path, options: ReportOptions) -> dict[str, str]:
+    """The studies that could not be finished, and why; the page has the others."""
+    from ultragray.evaluation.baselines import evaluate_baselines
+    from ultragray.evaluation.scoring import evaluate
+    from ultragray.files.atomic import atomic_path
+    from ultragray.report.page import ReportContent, render_page
+    from ultragray.report.study import Failed, ablations, attempt, study_tilt, train_and_evaluate
+    from ultragray.scene import GaussianScene
+
+    scene = None if options.scene is None else GaussianScene.load(options.scene)
+    if scene is not None:
+        check_scene_fits(scene.info, dataset)
+    with _following() as follow:
+        baselines = evaluate_baselines(dataset, voxel_mm=options.voxel_mm)
+        content: dict[str, Any] = {}
+        if scene is None:
+            trained = train_and_evaluate(dataset, config, report=follow("scene"))
+            content |= {"trained": trained, "scene": trained.scene, "evaluation": trained.evaluation}
+        else:
+            content |= {"scene": scene, "evaluation": evaluate(scene, dataset.val)}
+        if options.ablations:
+            content["ablations"] = {
+                name: attempt(partial(train_and_evaluate, dataset, changed, report=follow(name)))
+                for name, changed in ablations(config, content["scene"].gaussian_count).items()
+            }
+            content["tilt"] = attempt(
+                partial(study_tilt, dataset.train, config, voxel_mm=options.voxel_mm, report=follow(TILT))
+            )
+    page = render_page(
+        ReportContent(dataset=dataset, baselines=baselines, voxel_mm=options.voxel_mm, machine=_machine(), **content)
+    )
+    with atomic_path(output) as temporary:
+        temporary.write_text(page, encoding="utf-8")
+    studies = {**content.get("ablations", {}), TILT: content.get("tilt")}
+    return {name: study.reason for name, study in studies.items() if isinstance(study, Failed)}
+
+
+def _machine() -> str:
+    import torch
+
+    from ultragray.machine import processor_name
+
+    return f"{processor_name()}, {torch.get_num_threads()} threads"
+
+
+@contextlib.contextmanager
+def _following() -> Iterator[Callable[[str], Follow]]:
+    """A bar for each training on a terminal's stderr; elsewhere one line when it begins."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn, TimeRemainingColumn
+    from rich.progress import Progress as Bars
+
+    console = Console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Bars(*columns, console=console, disable=not console.is_terminal) as bars:
+
+        def follow(name: str) -> Follow:
+            task: list[TaskID] = []  # made by the first step: a study that is left out shows nothing
+
+            def advance(state: Progress) -> None:
+                if not task:
+                    task.append(bars.add_task(name))
+                    if not console.is_terminal:
+                        console.print(f"training: {name}", highlight=False)
+                bars.update(task[0], completed=state.step, total=state.steps)
+
+            return advance
+
+        yield follow

@@ -1,0 +1,75 @@
+"""`ultragray serve`: the settings of the command line, and a folder that has something to serve."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from ultragray.demo import copy_demo_scene
+from ultragray.errors import InvalidArgument
+from ultragray.scene_info import read_header
+from ultragray_workers.scenes import SUFFIX, SceneStore
+
+from ..server import run
+from ..settings import Settings, load_settings
+
+DEMO_NAME = "demo"
+
+
+def serve_scenes(scenes: Iterable[Path], options: Mapping[str, Any]) -> None:
+    """Serves the given scene files, or the data folder of the settings; returns when the service has stopped.
+
+    Given files are served by their stem from a folder of links that lasts as long as the service. A data
+    folder without a scene gets the demo scene; the default one is made.
+    Raises InvalidArgument, SceneFileInvalid, StartupFailed and OSError.
+    """
+    files = list(scenes)
+    if not files:
+        settings = load_settings(**options)
+        if settings.data_folder == Settings.model_fields["data_folder"].default:
+            settings.data_folder.mkdir(exist_ok=True)  # any other folder must exist: its name may be mistyped
+        ensure_scenes(settings.data_folder)
+        run(settings)
+        return
+    if "data_folder" in options:
+        raise InvalidArgument("scenes and --data-folder cannot be given together", field="data_folder")
+    with tempfile.TemporaryDirectory(prefix="ultragray-scenes-") as folder:
+        link_scenes(files, Path(folder))
+        artifacts = load_settings(**options).artifacts  # not in the folder of links, which does not last
+        run(load_settings(**{**options, "data_folder": Path(folder), "artifact_folder": artifacts}))
+
+
+def ensure_scenes(folder: Path) -> None:
+    """Puts the demo scene into a data folder that holds no scene, and says so on stderr.
+
+    Raises InvalidArgument where there is no such folder.
+    """
+    if not folder.is_dir():
+        raise InvalidArgument(f"data_folder must be an existing folder, got {str(folder)!r}", field="data_folder")
+    if SceneStore(folder).names():
+        return
+    path = folder / f"{DEMO_NAME}{SUFFIX}"
+    copy_demo_scene(path)
+    info = read_header(path).info
+    typer.echo(
+        f"{folder} holds no scenes: wrote {path}: {info.dataset_name}, {info.gaussian_count:,} Gaussians", err=True
+    )
+
+
+def link_scenes(files: Iterable[Path], folder: Path) -> None:
+    """Links scene files into `folder`; refuses what could not be served under its own name."""
+    for file in files:
+        read_header(file)
+        link = folder / f"{file.stem}{SUFFIX}"
+        if link.is_symlink():
+            raise InvalidArgument(f"scenes must have different names, {file.stem!r} comes twice", field="scenes")
+        link.symlink_to(file.resolve())
+        if file.stem not in SceneStore(folder).names():
+            raise InvalidArgument(
+                f"scenes are served by name, at most 128 letters, digits, '.', '_', '-'; got {file.stem!r}",
+                field="scenes",
+            )

@@ -1,0 +1,325 @@
+"""`ultragray train`: a dataset becomes a scene file; the run can be stopped and resumed."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from ultragray.errors import InvalidArgument, MemoryExceeded, TrainingDiverged, TrainingStateInvalid
+
+from .output import SCENE_SUFFIX, check_writable
+from .source import (
+    Crop,
+    DatasetArgument,
+    DeviceSet,
+    Frames,
+    ImageSize,
+    TrainFrames,
+    ValFrames,
+    read_dataset,
+    warn_about_dataset,
+)
+
+if TYPE_CHECKING:
+    from ultragray.scene import GaussianScene
+    from ultragray.training import Progress, TrainingConfig
+
+INTERRUPTED = 130  # the exit code of a run that Ctrl-C or SIGTERM stopped
+METRIC_NAMES = {"psnr_db": "PSNR, dB", "ms_ssim": "MS-SSIM", "gms": "GMS", "gmsd": "GMSD"}
+
+
+def train(
+    dataset: DatasetArgument,
+    output: Annotated[Path, typer.Option("--output", "-o", help="Scene file to write (.ugr).", show_default=False)],
+    preset: Annotated[
+        str | None,
+        typer.Option(help="fast, or paper: the released recipe.", show_default="fast"),
+    ] = None,
+    config: Annotated[
+        Path | None,
+        typer.Option(help="TOML file of settings: any field of TrainingConfig, and preset.", show_default=False),
+    ] = None,
+    setting: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="NAME=VALUE", help="Any field of TrainingConfig; repeat.", show_default=False),
+    ] = None,
+    steps: Annotated[
+        int | None,
+        typer.Option(help="Steps of one batch; every schedule follows.", show_default="from the number of frames"),
+    ] = None,
+    max_gaussians: Annotated[
+        int | None, typer.Option(help="Gaussians at most.", show_default="from the number of pixels")
+    ] = None,
+    initial_gaussians: Annotated[
+        int | None, typer.Option(help="Gaussians at the start.", show_default="all; half where they are refined")
+    ] = None,
+    batch_size: Annotated[int | None, typer.Option(help="Frames of one step.", show_default="8")] = None,
+    seed: Annotated[int | None, typer.Option(help="Of every random choice.", show_default="0")] = None,
+    start: Annotated[
+        str | None, typer.Option(help="informed (on pixels of the frames) or random.", show_default="preset")
+    ] = None,
+    intensity: Annotated[
+        str | None, typer.Option(help="Activation: released, or sigmoid, without its floor.", show_default="preset")
+    ] = None,
+    sh_degree: Annotated[int | None, typer.Option(help="Spherical harmonics, 0 to 3.", show_default="1")] = None,
+    out_of_plane_mm: Annotated[
+        float | None,
+        typer.Option(
+            "--out-of-plane",
+            metavar="MM",
+            help="Full range of the shift of a batch along elevation; 0: none.",
+            show_default="from the spacing of the frames",
+        ),
+    ] = None,
+    no_transmittance: Annotated[bool, typer.Option("--no-transmittance", help="Nothing absorbs: no shadows.")] = False,
+    folder: Annotated[
+        Path | None,
+        typer.Option(help="Folder of the run: checkpoint, metrics.jsonl, config.json.", show_default="OUTPUT.run"),
+    ] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint in the run's folder.")] = False,
+    checkpoint_every: Annotated[
+        float, typer.Option(metavar="SECONDS", min=0.0, help="How often a checkpoint is written.")
+    ] = 30.0,
+    tensorboard: Annotated[bool, typer.Option("--tensorboard", help="Also write TensorBoard events.")] = False,
+    device: Annotated[str, typer.Option(help="cpu, or a GPU: cuda, or cuda:N for one of several.")] = "cpu",
+    backend: Annotated[str, typer.Option(help="auto (the one for the device), cpu, cuda or reference.")] = "auto",
+    threads: Annotated[int, typer.Option(min=0, help="Threads; 0: all cores.")] = 0,
+    train_frames: TrainFrames = None,
+    val_frames: ValFrames = None,
+    frames: Frames = None,
+    device_set: DeviceSet = None,
+    crop: Crop = None,
+    image_size: ImageSize = None,
+) -> None:
+    """Train a scene from a tracked sweep. Ctrl-C leaves a usable scene; --resume goes on."""
+    flags = {
+        "steps": steps,
+        "max_gaussians": max_gaussians,
+        "initial_gaussians": initial_gaussians,
+        "batch_size": batch_size,
+        "seed": seed,
+        "start": start,
+        "intensity": intensity,
+        "sh_degree": sh_degree,
+        "out_of_plane_mm": out_of_plane_mm,
+        "transmittance": False if no_transmittance else None,
+    }
+    given = {
+        **_from_file(config),
+        **parse_settings(setting or []),
+        **{name: value for name, value in flags.items() if value is not None},
+        **({} if preset is None else {"preset": preset}),
+    }
+    check_writable(output, SCENE_SUFFIX)
+    _check_device(device, backend)
+    run = RunOptions(
+        output=output,
+        folder=folder or output.with_name(f"{output.name}.run"),
+        resume=resume,
+        checkpoint_interval_s=checkpoint_every,
+        tensorboard=tensorboard,
+        device=device,
+        backend=backend,
+    )
+    if resume:
+        _check_resumable(run)
+    chosen = _config_of(run, given)
+    if threads:
+        import torch
+
+        torch.set_num_threads(threads)
+    read = read_dataset(dataset, train_frames, val_frames, frames, device_set, crop, image_size)
+    warn_about_dataset(read)
+    _train(read, chosen, run)
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """Where and how a run takes place; none of it changes the scene on one thread."""
+
+    output: Path
+    folder: Path
+    resume: bool
+    checkpoint_interval_s: float
+    tensorboard: bool
+    device: str
+    backend: str
+
+
+def _from_file(path: Path | None) -> dict[str, Any]:
+    if path is None:
+        return {}
+    from ultragray.training.config import read_config_file
+
+    return read_config_file(path)
+
+
+def parse_settings(settings: list[str]) -> dict[str, Any]:
+    """NAME=VALUE pairs, the value as in TOML; a bare word is itself."""
+    from ultragray.training.config import parse_value
+
+    found = {}
+    for text in settings:
+        name, equals, value = text.partition("=")
+        if not equals:
+            raise InvalidArgument(f"--set takes NAME=VALUE, got {text!r}", field="set")
+        found[name.strip()] = parse_value(value.strip())
+    return found
+
+
+def _check_device(device: str, backend: str) -> None:
+    """Raises BackendUnavailable before the dataset is read, which may take long."""
+    from ultragray.training.device import training_device
+
+    training_device(device, backend)
+
+
+def _check_resumable(run: RunOptions) -> None:
+    """Raises TrainingStateInvalid where the folder of the run holds no checkpoint, with the reason."""
+    from ultragray.training.trainer import CHECKPOINT_FILE, CONFIG_FILE, JOURNAL_FILE
+
+    if (run.folder / CHECKPOINT_FILE).exists():
+        return
+    steps = last_step = None
+    with contextlib.suppress(OSError, ValueError, LookupError, TypeError):  # whatever is there is no finished run
+        steps = json.loads((run.folder / CONFIG_FILE).read_text(encoding="utf-8"))["steps"]
+        last_line = (run.folder / JOURNAL_FILE).read_text(encoding="utf-8").splitlines()[-1]
+        last_step = json.loads(last_line)["step"]
+    if steps is not None and last_step == steps:
+        raise TrainingStateInvalid(f"{run.folder}: the run is finished, all {steps} steps are done; nothing to resume")
+    raise TrainingStateInvalid(f"{run.folder}: no checkpoint to resume from; leave out --resume to begin a run")
+
+
+def _config_of(run: RunOptions, given: Mapping[str, Any]) -> TrainingConfig:
+    """The preset with what was given; of a resumed run the one it was begun with, and what was given again."""
+    from ultragray.training import TrainingConfig
+    from ultragray.training.checkpointing import read_checkpoint_header
+    from ultragray.training.trainer import CHECKPOINT_FILE
+
+    values = dict(given)
+    preset = values.pop("preset", None)
+    if run.resume and preset is None:
+        stored = read_checkpoint_header(run.folder / CHECKPOINT_FILE).config
+        return TrainingConfig.from_dict({**stored.to_dict(), **values})
+    return TrainingConfig.preset(preset or "fast", **values)
+
+
+def _train(dataset: Any, config: TrainingConfig, run: RunOptions) -> None:
+    from ultragray.training import train as train_scene
+    from ultragray.training.trainer import CHECKPOINT_FILE, scene_of_checkpoint
+
+    started = time.monotonic()
+    last: Progress | None = None
+    with _stop_on_signal() as should_stop:
+        try:
+            with _progress_bar() as show:
+
+                def report(state: Progress) -> None:
+                    nonlocal last
+                    last = state
+                    show(state)
+
+                scene = train_scene(
+                    dataset,
+                    config,
+                    folder=run.folder,
+                    resume=run.resume,
+                    report=report,
+                    should_stop=should_stop,
+                    device=run.device,
+                    backend=run.backend,
+                    checkpoint_interval_s=run.checkpoint_interval_s,
+                    tensorboard=run.tensorboard,
+                )
+        except (TrainingDiverged, MemoryExceeded) as error:
+            if not (run.folder / CHECKPOINT_FILE).exists():
+                raise
+            scene = scene_of_checkpoint(dataset, run.folder)
+            scene.save(run.output)
+            step = scene.info.training["step"]
+            raise type(error)(
+                f"{error.detail}; {run.output} is the scene after step {step}", field=error.field
+            ) from error
+        scene.save(run.output)
+    elapsed_s = time.monotonic() - started
+    done, steps = scene.info.training["step"], scene.info.training["steps"]
+    if done < steps:
+        typer.echo(
+            f"stopped after step {done:,} of {steps:,}; wrote {run.output} as it is; go on with the same "
+            "command and --resume",
+            err=True,
+        )
+        raise typer.Exit(INTERRUPTED)
+    (run.folder / CHECKPOINT_FILE).unlink()
+    _print_metrics(scene)
+    cost = "" if last is None else f" ({_cost(last)})"
+    typer.echo(f"wrote {run.output}: {scene.gaussian_count:,} Gaussians, {done:,} steps, {elapsed_s:.0f} s{cost}")
+
+
+def _cost(state: Progress) -> str:
+    """What a step took at the end, and of a GPU's memory the most at a time."""
+    step = f"{1000.0 / state.steps_per_s:.1f} ms a step"
+    return step if state.peak_memory_mb is None else f"{step}, at most {state.peak_memory_mb:,.0f} MB of the GPU"
+
+
+@contextlib.contextmanager
+def _stop_on_signal() -> Iterator[Callable[[], bool]]:
+    """Whether SIGINT or SIGTERM came. More of them change nothing: a stopping process writes its scene and ends."""
+    received: list[int] = []
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.signal(number, lambda came, frame: received.append(came)) for number in numbers]
+    try:
+        yield lambda: bool(received)
+    finally:
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, signal.SIG_IGN if received else handler)
+
+
+@contextlib.contextmanager
+def _progress_bar() -> Iterator[Callable[[Any], None]]:
+    """A bar with rate, loss and time left on a terminal's stderr; elsewhere a line for every tenth of the run."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+
+    console = Console(stderr=True)
+    columns = ("training", BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[told]}"))
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
+        task = progress.add_task("", total=None, told="")
+
+        def report(state: Any) -> None:
+            if console.is_terminal:
+                progress.update(task, completed=state.step, total=state.steps, told=_told(state))
+            elif state.step * 10 // state.steps > (state.step - 1) * 10 // state.steps:
+                sys.stderr.write(f"step {state.step:,} of {state.steps:,}: {_told(state)}\n")
+
+        yield report
+
+
+def _told(state: Any) -> str:
+    held_out = "" if state.val_psnr_db is None else f" · held out {state.val_psnr_db:.2f} dB"
+    minutes, seconds = divmod(round(state.seconds_left), 60)
+    return (
+        f"loss {state.loss:.4f} · {state.gaussian_count:,} Gaussians · {state.steps_per_s:.1f} steps/s · "
+        f"{minutes}:{seconds:02d} left{held_out}"
+    )
+
+
+def _print_metrics(scene: GaussianScene) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    metrics = scene.info.metrics
+    if not metrics:
+        return
+    table = Table("held out", *(METRIC_NAMES[name] for name in metrics))
+    table.add_row("mean", *(f"{value:.2f}" if name == "psnr_db" else f"{value:.3f}" for name, value in metrics.items()))
+    Console().print(table)

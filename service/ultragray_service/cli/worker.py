@@ -1,0 +1,95 @@
+"""`ultragray worker`: does the jobs of a queue; `ultragray serve` starts one by `python -m` this module."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import sys
+import threading
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from ultragray.errors import StartupFailed, UltragrayError
+
+_PR_SET_PDEATHSIG = 1
+
+
+def worker(
+    data_folder: Annotated[
+        Path | None, typer.Option(help="Folder whose `artifacts` hold the jobs.", show_default="./data")
+    ] = None,
+    artifact_folder: Annotated[
+        Path | None,
+        typer.Option(help="Folder of datasets and jobs, which all workers share.", show_default="in the data folder"),
+    ] = None,
+    database_url: Annotated[
+        str | None, typer.Option(help="PostgreSQL URL of the queue.", show_default="SQLite in the artifact folder")
+    ] = None,
+    name: Annotated[
+        str | None, typer.Option(help="Name of this worker, its alone.", show_default="of the host, numbered")
+    ] = None,
+    device: Annotated[str, typer.Option(help="auto, cpu, cuda or cuda:N; a GPU where there is one.")] = "auto",
+    threads: Annotated[
+        int | None, typer.Option(min=0, help="Threads of a job's process.", show_default="all cores but one")
+    ] = None,
+) -> None:
+    """Train and render in the background: take jobs from the queue, one at a time, until Ctrl-C.
+
+    What is not given here comes from the settings (ULTRAGRAY_…). A job at hand is put back with a checkpoint.
+    """
+    given = {
+        "data_folder": data_folder,
+        "artifact_folder": artifact_folder,
+        "database_url": database_url,
+        "training_threads": threads,
+    }
+    run_worker({key: value for key, value in given.items() if value is not None}, name=name, device=device)
+
+
+def run_worker(overrides: dict[str, Any], *, name: str | None = None, device: str = "auto") -> None:
+    """Does jobs until SIGTERM or SIGINT, then ends the process. Raises StartupFailed, InvalidArgument."""
+    from ultragray_workers.jobs.worker import work
+
+    from ..logs import configure_logging
+    from ..settings import load_settings
+
+    settings = load_settings(**overrides)
+    configure_logging(settings.log_level)
+    if not settings.artifacts.is_dir() and not settings.data_folder.is_dir():
+        raise StartupFailed(
+            f"artifact_folder must be an existing folder, got {str(settings.artifacts)!r}", field="artifact_folder"
+        )
+    stop = threading.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda received, frame: stop.set())
+    work(
+        settings.artifacts,
+        settings.database_url,
+        stop,
+        name=name,
+        device=device,
+        threads=settings.training_threads,
+        nice=settings.job_nice,
+        retention_days=settings.job_retention_days,
+    )
+    sys.stderr.flush()
+    os._exit(0)  # threads of the queue would be waited for
+
+
+def main(service_pid: str) -> int:
+    """The worker within `ultragray serve`, which it does not outlive."""
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+    if os.getppid() != int(service_pid):
+        return 1
+    try:
+        run_worker({})
+    except UltragrayError as error:
+        sys.stderr.write(f"ultragray worker: {error.detail}\n")
+    return 1
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1]))

@@ -1,0 +1,157 @@
+"""What the service knows about scenes, read from their files without blocking the event loop."""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import binascii
+import math
+from bisect import bisect_right
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+from ultragray.errors import InvalidArgument, SceneFileInvalid, SceneNotFound, SceneTooLarge, UltragrayError
+from ultragray.probe import FloatArray
+from ultragray.scene_info import SceneHeader
+from ultragray_workers.scenes import FileVersion, SceneStore
+
+from ..views.scene_points import point_message
+from .own_thread import in_own_thread
+
+DEFAULT_PAGE_SIZE = 100
+MAX_PAGE_SIZE = 1000
+
+
+@dataclass(frozen=True)
+class CatalogEntry:
+    """A scene of the data folder: its header, or why the file cannot be read."""
+
+    name: str
+    header: SceneHeader | None
+    error: UltragrayError | None
+
+
+@dataclass(frozen=True)
+class TrainingSummary:
+    """The poses that a scene was trained from, in short; positions in mm."""
+
+    count: int
+    position_min_mm: FloatArray  # [3]
+    position_max_mm: FloatArray  # [3]
+    first: FloatArray  # [4, 4]
+    middle: FloatArray  # [4, 4]
+    last: FloatArray  # [4, 4]
+
+
+class SceneCatalog:
+    """Headers, pages of scene names, and Gaussians as points."""
+
+    def __init__(self, store: SceneStore) -> None:
+        self._store = store
+        self._reading_points = asyncio.Lock()
+
+    async def header(self, name: str) -> SceneHeader:
+        """The header of a scene. Raises SceneNotFound, SceneFileInvalid; both name the field `scene`."""
+        with scene_to_blame():
+            cached = self._store.cached_header(name)
+            return cached if cached is not None else await asyncio.to_thread(self._store.header, name)
+
+    async def version(self, name: str) -> FileVersion:
+        """Which content the file of a scene has now. Raises SceneNotFound, SceneFileInvalid."""
+        with scene_to_blame():
+            return await asyncio.to_thread(self._store.version, name)
+
+    async def points(self, name: str, limit: int) -> bytes:
+        """At most `limit` Gaussians of a scene, as `point_message`. Raises SceneNotFound, SceneFileInvalid."""
+        header = await self.header(name)
+        with scene_to_blame():
+            path = self._store.path(name)
+            async with self._reading_points:  # all the Gaussians of one scene in memory are enough
+                return await in_own_thread(lambda: point_message(path, header.info, limit))
+
+    async def names(self) -> list[str]:
+        """The names of all scenes, sorted."""
+        return await asyncio.to_thread(self._store.names)
+
+    async def page(self, page_size: int, page_token: str) -> tuple[list[CatalogEntry], str]:
+        """One page of scenes by name and the token of the next (empty on the last).
+
+        Raises InvalidArgument for a page_size outside 1 to 1000 and for a token that no page gave.
+        """
+        chosen, next_page_token = page_of_names(await self.names(), page_size, page_token)
+        entries = [entry for name in chosen if (entry := await self._entry(name)) is not None]
+        return entries, next_page_token
+
+    async def _entry(self, name: str) -> CatalogEntry | None:
+        try:
+            return CatalogEntry(name, await self.header(name), None)
+        except SceneNotFound:  # deleted since the folder was read
+            return None
+        except UltragrayError as error:
+            return CatalogEntry(name, None, error)
+
+
+def page_of_names(names: list[str], page_size: int, page_token: str) -> tuple[list[str], str]:
+    """The names of one page of the sorted `names`, and the token of the next page (empty on the last).
+
+    Raises InvalidArgument for a page_size outside 1 to 1000 and for a token that no page gave.
+    """
+    if not 1 <= page_size <= MAX_PAGE_SIZE:
+        raise InvalidArgument(
+            f"page_size must be an integer from 1 to {MAX_PAGE_SIZE}, got {page_size}", field="page_size"
+        )
+    start = bisect_right(names, _name_of_token(page_token)) if page_token else 0
+    chosen = names[start : start + page_size]
+    return chosen, _token_of_name(chosen[-1]) if start + page_size < len(names) else ""
+
+
+@contextmanager
+def scene_to_blame() -> Iterator[None]:
+    """Errors about a scene name the field `scene`."""
+    try:
+        yield
+    except (SceneNotFound, SceneFileInvalid, SceneTooLarge) as error:
+        raise type(error)(error.detail, field=error.field or "scene") from error
+
+
+def summarise_training(header: SceneHeader) -> TrainingSummary | None:
+    """The training poses in short; None where the scene knows none."""
+    poses = header.training_poses
+    if not len(poses):
+        return None
+    positions = poses[:, :3, 3]
+    return TrainingSummary(
+        count=len(poses),
+        position_min_mm=positions.min(axis=0),
+        position_max_mm=positions.max(axis=0),
+        first=poses[0],
+        middle=poses[len(poses) // 2],
+        last=poses[-1],
+    )
+
+
+def finite_metrics(header: SceneHeader) -> dict[str, float]:
+    """The scene's metrics that are numbers (a file may claim anything)."""
+    return {name: float(value) for name, value in header.info.metrics.items() if _is_number(value)}
+
+
+def _is_number(value: Any) -> bool:
+    try:
+        return isinstance(value, (int, float)) and math.isfinite(value)
+    except OverflowError:  # an integer beyond all floats
+        return False
+
+
+def _token_of_name(name: str) -> str:
+    return base64.urlsafe_b64encode(name.encode()).decode().rstrip("=")
+
+
+def _name_of_token(token: str) -> str:
+    try:
+        return base64.b64decode(token + "=" * (-len(token) % 4), altchars=b"-_", validate=True).decode()
+    except (binascii.Error, ValueError):
+        raise InvalidArgument(
+            "page_token must be a next_page_token that an earlier page gave", field="page_token"
+        ) from None

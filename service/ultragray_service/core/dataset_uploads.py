@@ -1,0 +1,156 @@
+"""Uploads of datasets, from either front door: to the disk as they come, then checked in a process of their own."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import AsyncIterator, Awaitable
+from contextlib import asynccontextmanager
+from dataclasses import asdict
+from typing import Any, TypeVar
+
+from ultragray.errors import DatasetInvalid, Draining, InvalidArgument, QueueFull
+from ultragray_workers.datasets.incoming import IncomingDataset, remove_stale
+from ultragray_workers.datasets.intake import IntakeRequest
+from ultragray_workers.datasets.store import DatasetRecord, DatasetStore, check_dataset_name
+
+from ..arrival import arrival
+from ..settings import Settings
+from ..views.helper_process import run_helper
+
+MAX_UPLOADS = 8
+OPTION_NAMES = ("crop", "image_size", "frames", "train_frames", "val_frames")
+MAX_OPTION_LENGTH = 1000
+CHECK_TIMEOUT_S = 1800.0
+_BLOCK_BYTES = 1 << 20
+
+_log = logging.getLogger("ultragray.service")
+
+T = TypeVar("T")
+
+
+class DatasetUploads:
+    """The uploads under way. A few at a time are received, and wait for `turn` to be checked."""
+
+    def __init__(self, store: DatasetStore, settings: Settings, draining: asyncio.Event, turn: asyncio.Lock) -> None:
+        self._store = store
+        self._settings = settings
+        self._draining = draining
+        self._turn = turn
+        self._count = 0
+
+    @asynccontextmanager
+    async def receive(self, name: str, options: dict[str, str]) -> AsyncIterator[DatasetUpload]:
+        """An upload; what has not become a dataset at the end is removed.
+
+        Raises InvalidArgument for a bad name or option, QueueFull, Draining, StorageFull.
+        """
+        check_dataset_name(name)
+        for option, value in options.items():
+            if len(value) > MAX_OPTION_LENGTH or not value.isprintable():
+                raise InvalidArgument(f"{option} must be at most {MAX_OPTION_LENGTH} characters of text", field=option)
+        if self._draining.is_set():
+            raise Draining("the service is stopping")
+        if self._count >= MAX_UPLOADS:
+            raise QueueFull(f"{MAX_UPLOADS} uploads are under way already")
+        self._count += 1
+        stopping: asyncio.Future[Any] = asyncio.ensure_future(self._draining.wait())
+        try:
+            incoming = await asyncio.to_thread(IncomingDataset, self._store, self._settings.max_dataset_bytes)
+            upload = DatasetUpload(incoming, name, options, self._settings, stopping, self._turn)
+            try:
+                yield upload
+            finally:
+                await upload.ended()
+                await asyncio.shield(asyncio.to_thread(incoming.discard))
+        finally:
+            stopping.cancel()
+            self._count -= 1
+
+    async def remove_stale(self) -> None:
+        """Removes what uploads of dead services left."""
+        if removed := await asyncio.to_thread(remove_stale, self._store):
+            _log.info(f"removed {removed} uploads and deletions that were not finished")
+
+
+class DatasetUpload:
+    """One upload: files or an archive, a block at a time, then the check."""
+
+    def __init__(
+        self,
+        incoming: IncomingDataset,
+        name: str,
+        options: dict[str, str],
+        settings: Settings,
+        stopping: asyncio.Future[Any],
+        turn: asyncio.Lock,
+    ) -> None:
+        self._incoming = incoming
+        self._name = name
+        self._options = options
+        self._settings = settings
+        self._stopping = stopping
+        self._turn = turn
+        self._block = bytearray()
+        self._finishing = asyncio.Lock()
+
+    async def next(self, arriving: Awaitable[T]) -> T:
+        """What the client sends next.
+
+        Raises DeadlineExceeded where it sends nothing for too long, Draining where the service stops.
+        """
+        return await arrival(arriving, self._settings.upload_idle_timeout_s, self._stopping)
+
+    async def begin_file(self, name: str) -> None:
+        """What is written next belongs to the file `name`. Raises DatasetInvalid, UploadTooLarge, StorageFull."""
+        await self._flush()
+        await asyncio.to_thread(self._incoming.begin_file, name)
+
+    async def begin_archive(self) -> None:
+        """What is written next is one archive. Raises StorageFull."""
+        await asyncio.to_thread(self._incoming.begin_archive)
+
+    async def write(self, data: bytes) -> None:
+        """Raises UploadTooLarge, StorageFull, DatasetInvalid."""
+        self._block += data
+        if len(self._block) >= _BLOCK_BYTES:
+            await self._flush()
+
+    async def _flush(self) -> None:
+        if self._block:
+            block, self._block = bytes(self._block), bytearray()
+            await asyncio.to_thread(self._incoming.write, block)
+
+    async def finish(self) -> tuple[DatasetRecord, bool]:
+        """Checks what was sent and makes it a dataset; its record, and whether it is new.
+
+        Raises DatasetInvalid with the file and the frame, InvalidArgument for an option, DatasetExists, UploadTooLarge,
+        MemoryExceeded, StorageFull, DeadlineExceeded.
+        """
+        async with self._finishing:
+            return await self._finish()
+
+    async def ended(self) -> None:
+        """Returns when a `finish` that was cancelled has ended its process."""
+        async with self._finishing:
+            pass
+
+    async def _finish(self) -> tuple[DatasetRecord, bool]:
+        await self._flush()
+        await asyncio.to_thread(self._incoming.finish)
+        request = IntakeRequest(
+            folder=str(self._incoming.folder),
+            name=self._name,
+            options=self._options,
+            max_bytes=self._settings.max_dataset_bytes,
+            memory_bytes=self._settings.dataset_memory_mb << 20,
+        )
+        async with self._turn:
+            await run_helper(
+                "dataset_intake",
+                asdict(request),
+                what="checking the dataset",
+                timeout_s=CHECK_TIMEOUT_S,
+                killed=DatasetInvalid,
+            )
+        return await asyncio.to_thread(self._incoming.accept, self._name)

@@ -1,0 +1,190 @@
+"""Jobs for both front doors: the store, without blocking the event loop, and who watches."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TypeVar
+
+from sqlalchemy.exc import SQLAlchemyError
+
+from ultragray.errors import (
+    DatabaseUnavailable,
+    DatasetInvalid,
+    DatasetNotFound,
+    InvalidArgument,
+    NotReady,
+    SceneExists,
+    SceneFileInvalid,
+    SceneNotFound,
+    UltragrayError,
+)
+from ultragray_workers.jobs.folder import JobFolder
+from ultragray_workers.jobs.specification import Specification
+from ultragray_workers.jobs.store import Job, JobState, JobStore
+from ultragray_workers.scenes import SceneStore
+
+from ..settings import Settings
+from .catalog import MAX_PAGE_SIZE, scene_to_blame
+from .job_hub import JobHub, JobWatch
+from .requests import field_under
+
+COUNT_INTERVAL_S = 10.0
+_BESIDE_SPECIFICATION = ("request_id", "priority")
+_THREADS = 4
+_PATIENCE_S = 10.0  # with a database that is there and says nothing
+
+T = TypeVar("T")
+
+
+class Jobs:
+    """The jobs of one service. Everything but `watch` goes to the store in a thread."""
+
+    def __init__(self, settings: Settings, scenes: SceneStore) -> None:
+        self._settings = settings
+        self._scenes = scenes
+        self._opened: JobStore | None = None
+        # Of their own, so that a database that does not answer keeps nobody else waiting.
+        self._threads = ThreadPoolExecutor(_THREADS, "jobs")
+        self.hub = JobHub(lambda job_id: self._store.get(job_id), self._log_path, self._threads)
+        self.counts: dict[JobState, int] = {}  # as it was up to COUNT_INTERVAL_S ago; empty: not known
+        self._counting: asyncio.Task[None] | None = None
+
+    @property
+    def _store(self) -> JobStore:
+        if self._opened is None:
+            raise NotReady("the service is starting")
+        return self._opened
+
+    async def start(self) -> None:
+        """Opens the store. Raises StartupFailed where its database cannot be reached."""
+        settings = self._settings
+        self._opened = await asyncio.to_thread(
+            JobStore,
+            settings.artifacts,
+            settings.database_url,
+            settings.job_queue_limit,
+            scenes=self._scenes,
+            max_image_side=settings.max_image_side,
+        )
+        self._counting = asyncio.create_task(self._count())
+
+    async def submit(
+        self, specification: Specification, *, field: str, request_id: str | None, priority: int
+    ) -> tuple[Job, bool]:
+        """The job, and whether it is new. `field` is where the caller wrote the specification.
+
+        Raises InvalidArgument, JobConflict, JobQueueFull, DatasetNotFound, DatasetInvalid, SceneNotFound,
+        SceneFileInvalid, SceneExists.
+        """
+        with _specification_to_blame(field):
+            return await self._do(lambda store: store.submit(specification, request_id=request_id, priority=priority))
+
+    async def get(self, job_id: str) -> Job:
+        """Raises JobNotFound."""
+        return await self._do(lambda store: store.get(job_id))
+
+    async def page(self, *, state: str, kind: str, page_size: int, page_token: str) -> tuple[list[Job], str]:
+        """One page of jobs, newest first, and the token of the next (empty on the last); empty filters pass all.
+
+        Raises InvalidArgument for a page_size outside 1 to 1000 and for a token that no page gave.
+        """
+        if not 1 <= page_size <= MAX_PAGE_SIZE:
+            raise InvalidArgument(
+                f"page_size must be an integer from 1 to {MAX_PAGE_SIZE}, got {page_size}", field="page_size"
+            )
+        jobs, token = await self._do(
+            lambda store: store.list(
+                state=JobState(state) if state else None,
+                kind=kind or None,
+                page_size=page_size,
+                page_token=page_token or None,
+            )
+        )
+        return jobs, token or ""
+
+    async def cancel(self, job_id: str) -> Job:
+        """Raises JobNotFound, and JobFinished for one that succeeded or failed."""
+        return await self._do(lambda store: store.cancel(job_id))
+
+    async def retry(self, job_id: str) -> tuple[Job, bool]:
+        """The job that goes on where a failed or cancelled one stopped, and whether it is new.
+
+        Raises JobNotFound, JobNotFinished, and what `submit` raises.
+        """
+        return await self._do(lambda store: store.retry(job_id))
+
+    async def delete(self, job_id: str) -> None:
+        """Removes a finished job. Raises JobNotFound, JobInUse."""
+        await self._do(lambda store: store.delete(job_id))
+
+    async def log_tail(self, job_id: str, max_bytes: int) -> str:
+        """The end of a job's log. Raises JobNotFound."""
+        return await self._do(lambda store: store.log_tail(job_id, max_bytes))
+
+    async def artifact(self, job_id: str, name: str) -> Path:
+        """The file of an artifact. Raises JobNotFound, ArtifactNotFound."""
+        return await self._do(lambda store: store.artifact(job_id, name))
+
+    async def watch(self, job_id: str) -> JobWatch:
+        """A watcher of a job, to be closed. Raises JobNotFound."""
+        return await self.hub.watch(job_id)
+
+    def uses_dataset(self, name: str) -> str | None:
+        """The waiting or running job that needs a dataset; blocks. Raises NotReady before the start."""
+        return self._store.uses_dataset(name)
+
+    async def makes_scene(self, name: str) -> str | None:
+        """The waiting or running job that makes a scene, in words; None where none does."""
+        return await self._do(lambda store: store.makes_scene(name))
+
+    def end_watches(self) -> None:
+        """Ends all watchers, now and from now on: the service stops."""
+        self.hub.close()
+
+    async def close(self) -> None:
+        """Closes the store."""
+        if self._counting is not None:
+            self._counting.cancel()
+        if self._opened is not None:
+            await asyncio.to_thread(self._opened.close)
+
+    async def _count(self) -> None:
+        while True:
+            try:
+                self.counts = await self._do(lambda store: store.counts())
+            except (UltragrayError, SQLAlchemyError):
+                self.counts = {}
+            await asyncio.sleep(COUNT_INTERVAL_S)
+
+    async def _do(self, work: Callable[[JobStore], T]) -> T:
+        store = self._store
+        answer = asyncio.get_running_loop().run_in_executor(self._threads, work, store)
+        try:
+            return await asyncio.wait_for(answer, _PATIENCE_S)
+        except asyncio.TimeoutError:
+            raise DatabaseUnavailable(
+                f"the database of the jobs has not answered for {_PATIENCE_S:g} s: try again later"
+            ) from None
+
+    def _log_path(self, job_id: str) -> Path:
+        return JobFolder(self._settings.artifacts, job_id).log
+
+
+@contextmanager
+def _specification_to_blame(field: str) -> Iterator[None]:
+    """Errors about what a specification names have their field below `field`."""
+    try:
+        with scene_to_blame():
+            yield
+    except InvalidArgument as error:
+        if error.field in _BESIDE_SPECIFICATION:
+            raise
+        with field_under(field):
+            raise
+    except (DatasetInvalid, DatasetNotFound, SceneExists, SceneFileInvalid, SceneNotFound):
+        with field_under(field):
+            raise

@@ -1,0 +1,226 @@
+"""Poses of one client as they come, frames in their order: what every streaming front door shares."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Awaitable, Callable, Coroutine
+from dataclasses import dataclass, replace
+from enum import Enum
+from functools import partial
+from typing import Any
+
+from ultragray.errors import Draining, UltragrayError
+from ultragray.probe import FloatArray
+from ultragray_workers.pool.types import RenderRequest, RenderResult
+from ultragray_workers.pool.waiting import Turn
+
+from .requests import frame_bytes
+from .state import Service
+
+MAX_FRAMES_IN_FLIGHT = 8  # of an ordered stream; then it stops reading
+MAX_BYTES_IN_FLIGHT = 32 * 2**20  # of their frames, if there is more than one
+_MAX_LATEST_UNSENT = 2  # one on its way to the client, one being rendered
+
+_log = logging.getLogger("ultragray.stream")
+
+
+class StreamMode(str, Enum):
+    """What becomes of a pose that still waits when the next one comes."""
+
+    ORDERED = "ordered"  # every pose gets its frame
+    LATEST = "latest"  # the newer pose takes its place in the queue; it gets no frame, and is counted
+
+
+@dataclass(frozen=True, eq=False)
+class Asked:
+    """One pose of a client, checked."""
+
+    sequence: int
+    client_time: float | None  # any number (an int for gRPC): the client gets it back
+    settings: RenderRequest  # without poses; the same object for as long as nothing changes
+    pose: FloatArray  # [4, 4] mm, exact
+    deadline: float  # time.monotonic() in seconds
+
+
+@dataclass(frozen=True, eq=False)
+class Answered:
+    """A frame, or why there is none."""
+
+    sequence: int
+    client_time: float | None
+    outcome: RenderResult | UltragrayError
+    dropped: int = 0  # poses that were replaced since the answer before
+
+
+@dataclass(frozen=True, eq=False)
+class _Underway:
+    work: asyncio.Task[Answered]
+    sent: Callable[[], None]
+
+
+class _Room:
+    """For answers under way: a few, and of large frames fewer."""
+
+    def __init__(self) -> None:
+        self._count = self._bytes = 0
+        self._left = asyncio.Event()
+
+    async def enter(self, size: int) -> None:
+        """Waits until there is room for an answer of so many bytes; alone it may be of any size."""
+        while self._count and (self._count >= MAX_FRAMES_IN_FLIGHT or self._bytes + size > MAX_BYTES_IN_FLIGHT):
+            self._left.clear()
+            await self._left.wait()
+        self._count += 1
+        self._bytes += size
+
+    def leave(self, size: int) -> None:
+        """The answer is sent."""
+        self._count -= 1
+        self._bytes -= size
+        self._left.set()
+
+
+class PoseStream:
+    """One stream of one client."""
+
+    def __init__(self, service: Service) -> None:
+        self.mode = StreamMode.ORDERED  # to be set before the first pose
+        self._service = service
+        self._room = _Room()
+        self._answers: asyncio.Queue[_Underway | None] = asyncio.Queue()
+        self._started: set[asyncio.Task[Answered]] = set()
+        self._ended = False  # no more poses come
+        self._dropped = 0
+        # Of a latest stream: what is asked of the pool, its place in the queue, and what comes after it.
+        self._current: Asked | None = None
+        self._turn = Turn()
+        self._next: Asked | None = None
+        self._unsent = 0
+
+    async def run(self, read: Callable[[], Awaitable[None]], write: Callable[[Answered], Awaitable[None]]) -> None:
+        """Until the client has sent its last pose and got its last frame.
+
+        `read` takes messages to `ask` and `refuse` until there are no more. Raises Draining when the service stops,
+        after the frames in flight, and what `read` and `write` raise.
+        """
+        reader = asyncio.ensure_future(self._read(read))
+        writer = asyncio.ensure_future(self._write(write))
+        stopping = asyncio.ensure_future(self._service.draining.wait())
+        stopping.add_done_callback(partial(_cancel, reader))
+        self._service.metrics.count_stream(+1)
+        try:
+            await asyncio.wait({reader, writer}, return_when=asyncio.FIRST_EXCEPTION)
+            if reader.done() and not reader.cancelled():
+                reader.result()
+            if writer.done() and not writer.cancelled():
+                writer.result()
+            if self._service.draining.is_set():
+                raise Draining("the service is stopping; the frames in flight have been answered")
+        finally:
+            self._service.metrics.count_stream(-1)
+            left = [task for task in (reader, writer, stopping, *self._started) if not task.done()]
+            for task in left:
+                task.cancel()
+            self._answers = asyncio.Queue()  # with the frames that nobody takes any more
+            await asyncio.gather(*left, return_exceptions=True)
+            left.clear()
+            del reader, writer  # what they raised holds on to this call, and that to frames that nobody takes any more
+
+    async def ask(self, asked: Asked) -> None:
+        """Takes a pose. An ordered stream waits while too many frames are in flight."""
+        if self.mode is StreamMode.ORDERED:
+            size = frame_bytes(asked.settings)
+            await self._room.enter(size)
+            self._start(self._answer(asked), sent=partial(self._room.leave, size))
+            return
+        if self._next is None and self._take_over(asked):
+            self._count_dropped()
+            return
+        if self._next is not None:
+            self._count_dropped()
+        self._next = asked
+        self._advance()
+
+    async def refuse(self, sequence: int, client_time: float | None, error: UltragrayError) -> None:
+        """Takes a message that gets no frame. Waits while too many answers are under way."""
+
+        async def refusal() -> Answered:
+            return Answered(sequence, client_time, error)
+
+        self._service.metrics.count_frame_error(error)
+        await self._room.enter(0)
+        self._start(refusal(), sent=partial(self._room.leave, 0))
+
+    async def _read(self, read: Callable[[], Awaitable[None]]) -> None:
+        try:
+            await read()
+        finally:
+            self._ended = True
+            self._advance()
+
+    async def _write(self, write: Callable[[Answered], Awaitable[None]]) -> None:
+        while (underway := await self._answers.get()) is not None:
+            answered = await underway.work
+            dropped, self._dropped = self._dropped, 0
+            await write(replace(answered, dropped=dropped))
+            underway.sent()
+
+    def _start(self, work: Coroutine[Any, Any, Answered], sent: Callable[[], None]) -> None:
+        task = asyncio.create_task(work)
+        self._started.add(task)
+        task.add_done_callback(self._started.discard)
+        self._answers.put_nowait(_Underway(task, sent))
+
+    async def _answer(self, asked: Asked) -> Answered:
+        return Answered(asked.sequence, asked.client_time, await self._outcome(asked, Turn()))
+
+    async def _outcome(self, asked: Asked, turn: Turn) -> RenderResult | UltragrayError:
+        try:
+            prepared = self._service.planner.with_poses(asked.settings, asked.pose[None], asked.deadline)
+            return await self._service.render(prepared, turn)
+        except UltragrayError as error:
+            outcome = error
+        except Exception:
+            _log.exception("unexpected error in a stream")
+            outcome = UltragrayError("an unexpected error, see the log")
+        self._service.metrics.count_frame_error(outcome)
+        return outcome
+
+    def _take_over(self, asked: Asked) -> bool:
+        """Puts a pose into the place of the one that the pool has not begun."""
+        current = self._current
+        if current is None or current.settings is not asked.settings:
+            return False
+        if not self._turn.give_to(asked.pose[None], asked.deadline):
+            return False
+        self._current = asked
+        return True
+
+    def _advance(self) -> None:
+        """Asks the pool for what comes next, once it may; ends the answers after the last one."""
+        if self._next is not None and self._current is None and self._unsent < _MAX_LATEST_UNSENT:
+            self._current, self._next, self._turn = self._next, None, Turn()
+            self._unsent += 1
+            self._start(self._answer_latest(), sent=self._sent_latest)
+        if self._ended and self._next is None:
+            self._answers.put_nowait(None)
+
+    async def _answer_latest(self) -> Answered:
+        assert self._current is not None
+        outcome = await self._outcome(self._current, self._turn)
+        asked, self._current = self._current, None  # perhaps a later one than at the start
+        self._advance()
+        return Answered(asked.sequence, asked.client_time, outcome)
+
+    def _sent_latest(self) -> None:
+        self._unsent -= 1
+        self._advance()
+
+    def _count_dropped(self) -> None:
+        self._dropped += 1
+        self._service.metrics.count_dropped()
+
+
+def _cancel(task: asyncio.Task[None], _: asyncio.Future[bool]) -> None:
+    task.cancel()

@@ -1,0 +1,1 @@
+"""Pictures and figures that the console looks at, made in the background."""

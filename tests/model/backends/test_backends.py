@@ -1,0 +1,360 @@
+"""One suite for every backend and instruction set: each renders what the reference renders in float64."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from ultragray import ConvexProbe, Frames, GaussianScene, LinearProbe, PhasedProbe, Probe, render
+from ultragray.backends import cpu
+from ultragray.errors import BackendUnavailable
+from ultragray.request import OUTPUTS
+
+RENDERERS = ("reference", "cuda", "cpu", *(f"cpu-{name}" for name in cpu.INSTRUCTION_SETS))
+LINEAR = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)
+CONVEX = ConvexProbe(opening_angle_deg=60.0, near_mm=10.0, far_mm=60.0)
+PHASED = PhasedProbe(opening_angle_deg=90.0, far_mm=60.0)
+
+Renderer = Callable[..., Frames]
+
+
+@pytest.fixture(params=RENDERERS)
+def renderer(request: pytest.FixtureRequest, on_device: Callable[[GaussianScene], GaussianScene]) -> Renderer:
+    """render() on one backend, or on the CPU backend with one instruction set forced."""
+    backend, _, instruction_set = request.param.partition("-")
+    if backend == "cuda":
+        return lambda scene, probe, poses, **size: render(on_device(scene), probe, poses, backend="cuda", **size)
+    if not instruction_set:
+        return lambda scene, probe, poses, **size: render(scene, probe, poses, backend=backend, **size)
+
+    def forced(scene: GaussianScene, probe: Probe, poses: Any, *, height: int, width: int) -> Frames:
+        inside = scene.poses_to_scene_cm(np.atleast_3d(poses).reshape(-1, 4, 4))
+        planes = cpu.render_outputs(scene, probe, inside, height, width, OUTPUTS, instruction_set=instruction_set)
+        return Frames(**planes)
+
+    return forced
+
+
+@dataclass(frozen=True)
+class Case:
+    """A scene, a probe and poses; images are small, poses many, so that strips and batches are crossed."""
+
+    scene: Mapping[str, Any] = field(default_factory=dict)
+    probe: Probe = LINEAR
+    height: int = 37
+    width: int = 53
+    poses: int = 6
+    tilt_deg: float = 20.0
+
+
+CASES = {
+    "linear": Case(),
+    "convex": Case(probe=CONVEX),
+    "wide_fan": Case(probe=ConvexProbe(opening_angle_deg=150.0, near_mm=5.0, far_mm=50.0)),
+    "face_beyond_apex_zero": Case(probe=ConvexProbe(opening_angle_deg=45.0, near_mm=0.0, far_mm=50.0)),
+    "phased": Case(probe=PHASED),
+    "phased_at_the_face": Case({"centre_cm": (0, 0, 0.3), "extent_cm": (1, 0.4, 0.8)}, probe=PHASED),
+    "near_plane_inside": Case(probe=LinearProbe(width_mm=30.0, near_mm=15.0, far_mm=35.0)),
+    "at_the_face": Case({"centre_cm": (0, 0, 0.02), "extent_cm": (3, 0.2, 0.3), "sigma_cm": (0.02, 0.3)}, tilt_deg=3.0),
+    "large": Case({"count": 40, "sigma_cm": (1.0, 3.0)}),
+    "smaller_than_a_pixel": Case({"count": 4000, "sigma_cm": (0.002, 0.01), "extent_cm": (4, 0.6, 5)}, tilt_deg=0.2),
+    "needles": Case({"sigma_cm": (0.005, 1.0)}, tilt_deg=90.0),
+    "needles_convex": Case({"sigma_cm": (0.005, 1.0)}, probe=CONVEX, tilt_deg=60.0),
+    "dense_and_absorbing": Case({"count": 1200, "transmittance_logit": (-6, 0), "sigma_cm": (0.1, 0.3)}, poses=3),
+    "transparent": Case({"transmittance_logit": (18.0, 20.0)}),
+    "degree_0": Case({"sh_degree": 0}),
+    "degree_2": Case({"sh_degree": 2}),
+    "degree_3": Case({"sh_degree": 3}),
+    "sigmoid": Case({"intensity": "sigmoid", "sh_degree": 1}),
+    "sigmoid_degree_3": Case({"intensity": "sigmoid", "sh_degree": 3}, probe=CONVEX),
+    "one_pixel": Case({"sigma_cm": (0.2, 0.5)}, height=1, width=1, poses=60),
+    "one_row": Case(height=1, width=97, poses=20),
+    "one_column": Case(height=97, width=1, poses=20),
+    "one_row_convex": Case(probe=CONVEX, height=1, width=97, poses=20),
+    "tall": Case(height=301, width=7, poses=2),
+    "broad": Case(height=5, width=301, poses=2),
+    "many_poses": Case({"count": 60}, height=16, width=16, poses=50, tilt_deg=180.0),
+}
+
+
+@pytest.fixture(scope="session")
+def prepared(
+    random_scene: Callable[..., GaussianScene], random_poses: Callable[..., Any]
+) -> Callable[[str], tuple[Case, GaussianScene, Any, Mapping[str, np.ndarray], np.ndarray]]:
+    """By case: the scene, its poses, the reference in float64, and where float32 agrees with it."""
+    done: dict[str, Any] = {}
+
+    def prepare(name: str) -> Any:
+        if name not in done:
+            case = CASES[name]
+            scene = random_scene(**{"seed": 7, **case.scene})
+            poses = random_poses(case.poses, seed=11, tilt_deg=case.tilt_deg)
+            size = {"height": case.height, "width": case.width, "backend": "reference"}
+            exact, single = (
+                render(scene.to(dtype), case.probe, poses, **size) for dtype in (torch.float64, torch.float32)
+            )
+            expected = {output: getattr(exact, output).numpy() for output in OUTPUTS}
+            stable = np.all(
+                [np.abs(getattr(single, output).numpy() - expected[output]) < 2e-5 for output in OUTPUTS],
+                axis=0,
+            )
+            done[name] = (case, scene, poses, expected, stable)
+        return done[name]
+
+    return prepare
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_matches_the_reference_in_float64(
+    name: str, renderer: Renderer, prepared: Callable[[str], Any], assert_agrees: Callable[..., None]
+) -> None:
+    case, scene, poses, expected, stable = prepared(name)
+    assert stable.mean() > 0.995
+    assert (expected["coverage"] > 0.01).mean() > 0.002, "the case shows too little to test anything"
+    frames = renderer(scene, case.probe, poses, height=case.height, width=case.width)
+    assert frames.bmode is not None
+    assert frames.bmode.dtype == torch.float32
+    assert_agrees(frames, expected, tolerance=5e-4, stable=stable)
+
+
+def planes(frames: Frames) -> np.ndarray:  # [4, C, H, W]
+    return np.stack([getattr(frames, name).cpu().numpy() for name in OUTPUTS])
+
+
+@pytest.mark.parametrize("probe", [LINEAR, CONVEX, PHASED], ids=["linear", "convex", "phased"])
+def test_an_empty_scene_is_black_and_lets_everything_through(renderer: Renderer, probe: Probe) -> None:
+    splats = {name: torch.zeros(0, n) for name, n in (("means", 3), ("scales", 3), ("quats", 4))}
+    scene = GaussianScene.from_splats(
+        {**splats, "transmittances": torch.zeros(0), "sh0": torch.zeros(0, 1, 1), "shN": torch.zeros(0, 3, 1)}
+    )
+    bmode, echo, transmittance, coverage = planes(renderer(scene, probe, np.eye(4)[None], height=9, width=7))
+    assert bmode.shape == (1, 9, 7)
+    assert not bmode.any()
+    assert not echo.any()
+    assert not coverage.any()
+    assert (transmittance == 1).all()
+
+
+def test_sizes_may_be_numpy_integers(renderer: Renderer, random_scene: Callable[..., GaussianScene]) -> None:
+    frames = renderer(random_scene(5), LINEAR, np.eye(4)[None], height=np.int64(9), width=np.int64(7))
+    assert planes(frames).shape == (4, 1, 9, 7)
+
+
+def test_no_poses_give_no_frames(renderer: Renderer, random_scene: Callable[..., GaussianScene]) -> None:
+    frames = planes(renderer(random_scene(5), LINEAR, np.zeros((0, 4, 4)), height=9, width=7))
+    assert frames.shape == (4, 0, 9, 7)
+
+
+@pytest.mark.parametrize("offset_mm", [(0, 500, 0), (500, 0, 0), (0, 0, 500), (0, 0, -500)])
+def test_a_scene_out_of_view_is_black(
+    renderer: Renderer, random_scene: Callable[..., GaussianScene], offset_mm: tuple[float, ...]
+) -> None:
+    pose = np.eye(4)
+    pose[:3, 3] = offset_mm
+    bmode, _, transmittance, coverage = planes(renderer(random_scene(50), LINEAR, pose[None], height=20, width=20))
+    assert not bmode.any()
+    assert not coverage.any()
+    assert (transmittance == 1).all()
+
+
+def test_a_batch_is_its_frames_one_by_one(
+    renderer: Renderer, random_scene: Callable[..., GaussianScene], random_poses: Callable[..., Any]
+) -> None:
+    scene, poses = random_scene(120), random_poses(7)
+    batch = planes(renderer(scene, LINEAR, poses, height=33, width=41))
+    for c, pose in enumerate(poses):
+        alone = planes(renderer(scene, LINEAR, pose[None], height=33, width=41))
+        np.testing.assert_allclose(batch[:, c], alone[:, 0], atol=1e-6)
+
+
+def test_the_thread_count_does_not_change_a_frame(
+    renderer: Renderer,
+    random_scene: Callable[..., GaussianScene],
+    random_poses: Callable[..., Any],
+) -> None:
+    scene, poses = random_scene(120), random_poses(3)
+    frames = []
+    for count in (1, 2, 5):
+        torch.set_num_threads(count)
+        frames.append(planes(renderer(scene, CONVEX, poses, height=40, width=60)))
+    np.testing.assert_allclose(frames[1], frames[0], atol=1e-6)
+    np.testing.assert_allclose(frames[2], frames[0], atol=1e-6)
+
+
+def test_strided_tensors_are_read_as_they_are(
+    renderer: Renderer, random_scene: Callable[..., GaussianScene], random_poses: Callable[..., Any]
+) -> None:
+    dense, poses = random_scene(60, sh_degree=2), random_poses(2)
+    strided = GaussianScene.from_splats(
+        {name: torch.stack([t, t + 9.0], dim=-1)[..., 0] for name, t in dense.splats.items()}
+    )
+    assert not strided.means.is_contiguous()
+    size = {"height": 20, "width": 30}
+    np.testing.assert_array_equal(
+        planes(renderer(strided, LINEAR, poses, **size)), planes(renderer(dense, LINEAR, poses, **size))
+    )
+
+
+def test_a_changed_scene_renders_anew(renderer: Renderer, random_scene: Callable[..., GaussianScene]) -> None:
+    scene, poses = random_scene(60), np.eye(4)[None]
+    before = planes(renderer(scene, LINEAR, poses, height=20, width=30))
+    scene.means.add_(torch.tensor([0.5, 0.0, 0.0]))
+    after = planes(renderer(scene, LINEAR, poses, height=20, width=30))
+    fresh = GaussianScene.from_splats({name: t.clone() for name, t in scene.splats.items()})
+    assert np.abs(after - before).max() > 0.05
+    np.testing.assert_array_equal(after, planes(renderer(fresh, LINEAR, poses, height=20, width=30)))
+
+
+def test_the_centre_moves_the_frame_of_the_poses(
+    renderer: Renderer, random_scene: Callable[..., GaussianScene], random_poses: Callable[..., Any]
+) -> None:
+    centre = np.array([123.0, -45.0, 67.0])
+    poses = random_poses(2)
+    moved = poses.copy()
+    moved[:, :3, 3] += centre
+    size = {"height": 20, "width": 30}
+    here = planes(renderer(random_scene(60), LINEAR, poses, **size))
+    there = planes(renderer(random_scene(60, info={"centre_mm": tuple(centre)}), LINEAR, moved, **size))
+    np.testing.assert_allclose(there, here, atol=2e-5)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("transmittances", 60.0),
+        ("transmittances", -60.0),
+        ("quats", 1e4),
+        ("quats", 1e-4),
+        ("sh0", 50.0),
+        ("sh0", -50.0),
+    ],
+)
+def test_extreme_parameters_stay_exact(
+    renderer: Renderer,
+    random_scene: Callable[..., GaussianScene],
+    random_poses: Callable[..., Any],
+    assert_agrees: Callable[..., None],
+    name: str,
+    value: float,
+) -> None:
+    scene, poses = random_scene(80, seed=3), random_poses(8, seed=3)
+    tensor = scene.splats[name]
+    tensor.copy_(tensor * value if name == "quats" else torch.full_like(tensor, value))
+    size = {"height": 37, "width": 53}
+    exact = render(scene.to(torch.float64), LINEAR, poses, backend="reference", **size)
+    assert_agrees(
+        renderer(scene, LINEAR, poses, **size),
+        {output: getattr(exact, output).numpy() for output in OUTPUTS},
+        tolerance=5e-4,
+    )
+
+
+@pytest.mark.parametrize(
+    ("probe", "depth_cm", "visible"),
+    [
+        (LinearProbe(40, 10, 50), 0.999, False),
+        (LinearProbe(40, 10, 50), 1.001, True),
+        (LinearProbe(40, 10, 50), 4.599, True),  # the last of 10 rows starts at 46 mm
+        (LinearProbe(40, 10, 50), 4.601, False),
+        (ConvexProbe(opening_angle_deg=60, near_mm=10, far_mm=50), 4.599, True),
+        (ConvexProbe(opening_angle_deg=60, near_mm=10, far_mm=50), 4.601, False),
+        (PhasedProbe(opening_angle_deg=60, far_mm=50), 0.001, True),
+        (PhasedProbe(opening_angle_deg=60, far_mm=50), -0.001, False),
+        (PhasedProbe(opening_angle_deg=60, far_mm=50), 4.499, True),
+        (PhasedProbe(opening_angle_deg=60, far_mm=50), 4.501, False),
+    ],
+)
+def test_the_depth_cull_is_by_the_mean(renderer: Renderer, probe: Probe, depth_cm: float, visible: bool) -> None:
+    scene = GaussianScene.from_splats(
+        {
+            "means": torch.tensor([[0.0, 0.0, depth_cm]]),
+            "scales": torch.full((1, 3), -1.0),
+            "quats": torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
+            "transmittances": torch.zeros(1),
+            "sh0": torch.zeros(1, 1, 1),
+        }
+    )
+    coverage = planes(renderer(scene, probe, np.eye(4)[None], height=10, width=11))[3]
+    assert coverage.any() == visible
+
+
+def test_a_phased_probe_sees_what_a_convex_one_without_a_radius_sees(
+    renderer: Renderer, random_scene: Callable[..., GaussianScene], random_poses: Callable[..., Any]
+) -> None:
+    convex = ConvexProbe(opening_angle_deg=90.0, near_mm=0.0, far_mm=60.0)
+    phased_frames, convex_frames = (
+        planes(renderer(random_scene(120), probe, random_poses(3), height=33, width=41)) for probe in (PHASED, convex)
+    )
+    np.testing.assert_array_equal(phased_frames, convex_frames)
+
+
+def test_auto_keeps_the_dtype_and_the_gradient(random_scene: Callable[..., GaussianScene]) -> None:
+    scene = random_scene(20)
+    size = {"height": 12, "width": 10}
+    double = render(scene.to(torch.float64), LINEAR, np.eye(4), **size)
+    assert double.bmode is not None
+    assert double.bmode.dtype == torch.float64
+    scene.sh0.requires_grad_()
+    frames = render(scene, LINEAR, np.eye(4), **size)
+    assert frames.bmode is not None
+    frames.bmode.sum().backward()
+    assert scene.sh0.grad is not None
+    assert scene.sh0.grad.abs().sum() > 0
+
+
+def test_cpu_refuses_what_it_would_get_wrong(random_scene: Callable[..., GaussianScene]) -> None:
+    with pytest.raises(BackendUnavailable, match="float32"):
+        render(random_scene(5).to(torch.float64), LINEAR, np.eye(4), height=4, width=4, backend="cpu")
+
+
+def test_an_unknown_backend_is_named(random_scene: Callable[..., GaussianScene]) -> None:
+    with pytest.raises(BackendUnavailable, match="auto, reference, cpu, cuda, got 'gpu'"):
+        render(random_scene(1), LINEAR, np.eye(4), height=4, width=4, backend="gpu")
+
+
+def test_an_unknown_instruction_set_is_named(random_scene: Callable[..., GaussianScene]) -> None:
+    with pytest.raises(BackendUnavailable, match="mmx"):
+        cpu.render_outputs(random_scene(1), LINEAR, np.eye(4)[None], 4, 4, OUTPUTS, instruction_set="mmx")
+
+
+def single(mean: Sequence[float], scales: Sequence[float], copies: int = 1, **splats: Any) -> GaussianScene:
+    """Equal Gaussians at `mean` (cm) with raw `scales` (log cm), opaque black unless `splats` says otherwise."""
+    raw = {
+        "means": torch.tensor([mean] * copies, dtype=torch.float32),
+        "scales": torch.tensor([scales] * copies, dtype=torch.float32),
+        "quats": torch.tensor([[1.0, 0.3, -0.2, 0.5]] * copies),
+        "transmittances": torch.full((copies,), -30.0),
+        "sh0": torch.zeros(copies, 1, 1),
+    }
+    return GaussianScene.from_splats({**raw, **splats})
+
+
+EXTREMES = {
+    "a sheet without thickness": single((0, 0, 2), (-1, -1, -60)),
+    "a needle without thickness": single((0, 0, 2), (-1, -20, -20)),
+    "a point": single((0, 0, 2), (-100, -100, -100)),
+    "wider than float32 can square": single((0, 0, 2), (45, 45, 45)),
+    "wider than float32": single((0, 0, 2), (100, 100, 100)),
+    "a quaternion near zero": single((0, 0, 2), (-1, -2, -3), quats=torch.tensor([[1e-14, 2e-15, 0, 3e-15]])),
+    "one at the probe's origin": single((0, 0, 0), (-1, -1, -1)),
+    "many in one place": single((0, 0, 1), (-1.2, -1.2, -1.2), copies=30, transmittances=torch.zeros(30)),
+    "absorbing above the rows where it echoes": single(
+        (0, 0.88, 4), (math.log(0.3), math.log(0.3), math.log(10)), quats=torch.tensor([[1.0, 0, 0, 0]])
+    ),
+}
+
+
+@pytest.mark.parametrize("renderer", RENDERERS[1:], indirect=True)  # beyond the reference's own float32
+@pytest.mark.parametrize("name", EXTREMES)
+def test_extreme_gaussians(name: str, renderer: Renderer, assert_agrees: Callable[..., None]) -> None:
+    scene = EXTREMES[name]
+    probe = LinearProbe(width_mm=20.0, near_mm=0.0, far_mm=80.0)
+    frames = renderer(scene, probe, np.eye(4), height=40, width=40)
+    exact = render(scene.to(torch.float64), probe, np.eye(4), height=40, width=40, backend="reference")
+    assert_agrees(frames, {output: getattr(exact, output).numpy() for output in OUTPUTS}, tolerance=5e-4)

@@ -1,0 +1,137 @@
+"""What the C++ kernel promises beyond right pictures: determinism, its cache, the interpreter lock, its limits."""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from ultragray import GaussianScene, LinearProbe, render
+from ultragray.backends import cpu
+from ultragray.errors import BackendUnavailable
+
+PROBE = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)
+SceneMaker = Callable[..., GaussianScene]
+
+
+@pytest.fixture
+def threads() -> Iterator[None]:
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
+
+
+def poses(count: int) -> np.ndarray:  # [C, 4, 4] mm
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, 1, 3] = np.linspace(-5.0, 5.0, count)
+    poses[:, 2, 3] = -25.0
+    return poses
+
+
+@pytest.mark.usefixtures("threads")
+@pytest.mark.parametrize("instruction_set", cpu.INSTRUCTION_SETS)
+def test_the_number_of_threads_does_not_change_a_bit(random_scene: SceneMaker, instruction_set: str) -> None:
+    scene = random_scene(count=5000)
+    frames = []
+    for count in (1, 2, 5):
+        torch.set_num_threads(count)
+        inside = scene.poses_to_scene_cm(poses(20))
+        frames.append(
+            cpu.render_outputs(scene, PROBE, inside, 65, 193, ("bmode",), instruction_set=instruction_set)["bmode"]
+        )
+    assert frames[0].max() > 0.1
+    assert torch.equal(frames[0], frames[1])
+    assert torch.equal(frames[0], frames[2])
+
+
+def test_a_batch_is_its_poses_one_by_one(random_scene: SceneMaker) -> None:
+    scene = random_scene(count=1000)
+    batch = render(scene, PROBE, poses(19), height=64, width=70, outputs=("bmode",)).bmode
+    for c, pose in enumerate(poses(19)):
+        single = render(scene, PROBE, pose, height=64, width=70, outputs=("bmode",)).bmode
+        assert torch.equal(batch[c], single[0])
+
+
+def test_a_tensor_changed_in_place_is_noticed(random_scene: SceneMaker) -> None:
+    scene = random_scene(count=200)
+    before = render(scene, PROBE, poses(1), height=32, width=32, outputs=("transmittance",)).transmittance
+    scene.transmittances.fill_(-10.0)
+    after = render(scene, PROBE, poses(1), height=32, width=32, outputs=("transmittance",)).transmittance
+    assert after.mean() < before.mean() - 0.01
+
+
+def test_other_python_threads_run_while_it_renders(random_scene: SceneMaker) -> None:
+    scene = random_scene(count=20_000)
+    render(scene, PROBE, poses(1), height=8, width=8)  # prepares the scene
+    done = threading.Event()
+    beats: list[float] = []
+
+    def beat() -> None:
+        while not done.is_set():
+            beats.append(time.perf_counter())
+            time.sleep(0.001)
+
+    interval = sys.getswitchinterval()
+    beating = threading.Thread(target=beat)
+    beating.start()
+    started = time.perf_counter()
+    render(scene, PROBE, np.repeat(poses(1), 64, axis=0), height=512, width=256, outputs=("bmode",))
+    ended = time.perf_counter()
+    done.set()
+    beating.join()
+    inside = [b for b in beats if started + interval < b < ended]
+    assert ended - started > 0.02, "the rendering was too short to tell"
+    assert len(inside) >= 3
+
+
+def test_what_it_cannot_render_is_refused(random_scene: SceneMaker) -> None:
+    scene = random_scene(count=10)
+    with pytest.raises(BackendUnavailable, match="float64"):
+        render(scene.to(torch.float64), PROBE, poses(1), height=8, width=8, backend="cpu")
+    with pytest.raises(BackendUnavailable, match="instruction_set must be auto or one of"):
+        cpu.render_outputs(scene, PROBE, poses(1), 8, 8, ("bmode",), instruction_set="sse9")
+
+
+def test_only_what_was_asked_for_comes_back(random_scene: SceneMaker) -> None:
+    frames = render(random_scene(count=10), PROBE, poses(2), height=8, width=9, outputs=("echo", "coverage"))
+    assert frames.bmode is None
+    assert frames.transmittance is None
+    assert frames.echo is not None
+    assert frames.echo.shape == (2, 8, 9)
+
+
+def test_a_scene_that_shares_tensors_has_its_own_preparation(random_scene: SceneMaker) -> None:
+    scene = random_scene(count=50)
+    render(scene, PROBE, poses(1), height=16, width=16)
+    sigmoid = replace(scene, info=replace(scene.info, intensity="sigmoid"))
+    echo = render(sigmoid, PROBE, poses(1), height=16, width=16, outputs=("echo",)).echo
+    exact = render(sigmoid.to(torch.float64), PROBE, poses(1), height=16, width=16, outputs=("echo",)).echo
+    assert echo is not None
+    assert exact is not None
+    assert (echo - exact).abs().max() < 5e-4
+
+
+def test_a_replaced_tensor_is_noticed(random_scene: SceneMaker) -> None:
+    scene = random_scene(count=50)
+    for _ in range(6):  # the allocator may hand out an address again
+        scene.means = scene.means + 0.05
+        fresh = GaussianScene.from_splats(scene.splats)
+        size = {"height": 16, "width": 16, "outputs": ("bmode",)}
+        assert torch.equal(render(scene, PROBE, poses(1), **size).bmode, render(fresh, PROBE, poses(1), **size).bmode)
+
+
+def test_torch_defaults_and_inference_mode_do_not_matter(random_scene: SceneMaker) -> None:
+    before = render(random_scene(count=50), PROBE, poses(1), height=16, width=16).bmode
+    torch.set_default_dtype(torch.float64)
+    try:
+        assert torch.equal(render(random_scene(count=50), PROBE, poses(1), height=16, width=16).bmode, before)
+    finally:
+        torch.set_default_dtype(torch.float32)
+    with torch.inference_mode():
+        assert torch.equal(render(random_scene(count=50), PROBE, poses(1), height=16, width=16).bmode, before)

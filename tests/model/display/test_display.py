@@ -1,0 +1,126 @@
+"""Display settings: what is shown, and where its pixels lie."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from ultragray import ConvexProbe, LinearProbe, PhasedProbe, Probe
+from ultragray.display.frames import show
+from ultragray.display.settings import Display
+from ultragray.errors import InvalidArgument, InvalidImageSize
+
+LINEAR = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)
+CONVEX = ConvexProbe(opening_angle_deg=60.0, near_mm=40.0, far_mm=100.0)
+PHASED = PhasedProbe(opening_angle_deg=90.0, far_mm=80.0)
+PROBES = (LINEAR, CONVEX, PHASED)
+HEIGHT, WIDTH = 40, 30
+
+
+def frames(seed: int = 0) -> dict[str, torch.Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    names = ("bmode", "echo")
+    return {name: torch.rand((2, HEIGHT, WIDTH), generator=generator) for name in names} | {
+        "labels": torch.randint(0, 5, (2, HEIGHT, WIDTH), generator=generator, dtype=torch.uint8)
+    }
+
+
+@pytest.mark.parametrize("probe", PROBES, ids=lambda probe: probe.kind)
+def test_the_defaults_show_frames_as_they_are(probe: Probe) -> None:
+    given = frames()
+    shown = show(given, probe, Display())
+    assert {name: torch.equal(shown[name], given[name]) for name in given} == dict.fromkeys(given, True)
+    picture = Display().picture(probe, HEIGHT, WIDTH)
+    assert (picture.height, picture.width) == (HEIGHT, WIDTH)
+
+
+def test_grey_levels_follow_their_definition() -> None:
+    display = Display(gain_db=6.0, dynamic_range_db=40.0, tgc_db=(0.0, -10.0, 20.0))
+    bmode = frames()["bmode"]
+    shown = show({"bmode": bmode, "echo": bmode}, LINEAR, display)
+    depth = (np.arange(HEIGHT) + 0.5) / HEIGHT
+    tgc = np.where(depth < 0.5, -20.0 * depth, -10.0 + 60.0 * (depth - 0.5))
+    level_db = 60.0 * (bmode.double().numpy() - 1.0) + 6.0 + tgc[:, None]
+    np.testing.assert_allclose(shown["bmode"].numpy(), np.clip(1.0 + level_db / 40.0, 0.0, 1.0), atol=1e-6)
+    assert torch.equal(shown["echo"], bmode)
+
+
+@pytest.mark.parametrize(("probe", "rows"), [(LINEAR, 16), (CONVEX, 13), (PHASED, 10)], ids=lambda value: str(value))
+def test_depth_counts_from_the_face(probe: Probe, rows: int) -> None:
+    display = Display(depth_mm=20.0)
+    given = frames()
+    shown = show(given, probe, display)
+    assert torch.equal(shown["echo"], given["echo"][:, :rows])
+    assert display.picture(probe, HEIGHT, WIDTH).height == rows
+
+
+def test_depth_beyond_the_frame_cuts_nothing() -> None:
+    assert Display(depth_mm=500.0).rows_shown(LINEAR, HEIGHT) == HEIGHT
+    assert Display(depth_mm=0.001).rows_shown(LINEAR, HEIGHT) == 1
+
+
+@pytest.mark.parametrize("flip", [False, True])
+@pytest.mark.parametrize("probe", PROBES, ids=lambda probe: probe.kind)
+def test_pixels_of_a_picture_lie_where_it_says(probe: Probe, flip: bool) -> None:
+    """A frame whose values are positions shows at each pixel the position that its picture tells."""
+    display = Display(flip=flip, pixel_mm=1.3, depth_mm=45.0)
+    origins, directions = probe.scan_lines(WIDTH)
+    depths = probe.depths_mm(HEIGHT)
+    if probe.kind == "linear":
+        depths = depths - 0.0
+    positions = origins[None] + depths[:, None, None] * directions[None]  # [H, W, 3] mm
+    given = {
+        "x": torch.from_numpy(positions[None, :, :, 0]).float(),
+        "z": torch.from_numpy(positions[None, :, :, 2]).float(),
+        "inside": torch.ones((1, HEIGHT, WIDTH)),
+    }
+    shown = {name: pixels[0].numpy() for name, pixels in show(given, probe, display).items()}
+    picture = display.picture(probe, HEIGHT, WIDTH)
+    assert shown["x"].shape == (picture.height, picture.width)
+    x, z = picture.positions_mm()
+    # Away from the border, where the nearest sample is shown
+    eroded = np.stack([np.roll(shown["inside"], (i, j), (0, 1)) for i in (-3, 0, 3) for j in (-3, 0, 3)]).min(0) > 0
+    eroded[:3] = eroded[-3:] = eroded[:, :3] = eroded[:, -3:] = False
+    assert eroded.sum() > 50
+    np.testing.assert_allclose(shown["x"][eroded], np.broadcast_to(x, eroded.shape)[eroded], atol=0.05)
+    np.testing.assert_allclose(shown["z"][eroded], np.broadcast_to(z, eroded.shape)[eroded], atol=0.05)
+
+
+def test_scan_conversion_is_that_of_the_probe() -> None:
+    given = frames()
+    shown = show(given, CONVEX, Display(pixel_mm=0.8))
+    for k in range(2):
+        expected = CONVEX.scan_convert(given["bmode"][k].numpy(), 0.8)
+        np.testing.assert_allclose(shown["bmode"][k].numpy(), expected, atol=2e-5)
+    labels = CONVEX.scan_convert_labels(given["labels"][0].numpy(), 0.8)
+    assert (shown["labels"][0].numpy() == labels).mean() > 0.999  # samples half-way between two
+
+
+def test_flipping_twice_is_nothing() -> None:
+    picture = CONVEX.picture(0.7)
+    assert picture.flipped() != picture
+    assert picture.flipped().flipped() == picture
+
+
+@pytest.mark.parametrize(
+    ("field", "settings"),
+    [
+        ("gain_db", {"gain_db": 1000.0}),
+        ("gain_db", {"gain_db": float("nan")}),
+        ("dynamic_range_db", {"dynamic_range_db": 0.0}),
+        ("tgc_db", {"tgc_db": (0.0,) * 17}),
+        ("tgc_db[1]", {"tgc_db": (0.0, 1e9)}),
+        ("depth_mm", {"depth_mm": 0.0}),
+        ("pixel_mm", {"pixel_mm": -1.0}),
+    ],
+)
+def test_settings_beyond_their_limits_are_refused(field: str, settings: dict[str, object]) -> None:
+    with pytest.raises(InvalidArgument) as refusal:
+        Display(**settings)  # type: ignore[arg-type]
+    assert refusal.value.field == field
+
+
+def test_a_huge_picture_is_refused() -> None:
+    with pytest.raises(InvalidImageSize, match=r"pixels of 0\.001 mm"):
+        Display(pixel_mm=0.001).picture(CONVEX, HEIGHT, WIDTH)

@@ -1,0 +1,51 @@
+"""A .npy file is mapped, and what is wrong with it is said without numpy's advice."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ultragray.files.npy import map_npy
+
+
+def npy(path: Path, array: np.ndarray) -> bytes:
+    np.save(path, array, allow_pickle=True)
+    return path.read_bytes()
+
+
+@pytest.mark.parametrize("array", [np.arange(6, dtype=np.uint8).reshape(1, 2, 3), np.zeros((0, 4)), np.array(2.5)])
+def test_an_array_is_mapped(tmp_path: Path, array: np.ndarray) -> None:
+    path = tmp_path / "a.npy"
+    npy(path, array)
+    mapped = map_npy(path)
+    np.testing.assert_array_equal(mapped, array)
+    assert mapped.dtype == array.dtype
+    assert not mapped.flags.writeable
+
+
+def test_what_is_wrong_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "a.npy"
+    numbers = npy(path, np.arange(6.0))
+    archive = tmp_path / "a.npz"
+    np.savez(archive, a=np.arange(6.0))
+    for content, reason in [
+        (b"", "does not start as a .npy file"),
+        (b"garbage", "does not start as a .npy file"),
+        (pickle.dumps([1]), "does not start as a .npy file"),
+        (archive.read_bytes(), "it is an archive"),
+        (numbers[:-3], "it is truncated: 3 bytes are missing"),
+        (numbers[:20], "header is damaged or truncated"),
+        (numbers[:6], "header is damaged or truncated"),
+        (numbers.replace(b"(6,)", b"(-6)"), "header is damaged or truncated"),
+        (numbers.replace(b"(6,),", b"(-6,)"), "header is damaged or truncated"),
+        (numbers.replace(b"(6,)", b"[{}:"), "header is damaged or truncated"),
+        (numbers.replace(b"{", b"("), "header is damaged or truncated"),
+        (npy(path, np.array([[1], None], dtype=object)), "holds Python objects"),
+    ]:
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match=reason) as caught:
+            map_npy(path)
+        assert "pickle" not in str(caught.value)

@@ -1,0 +1,114 @@
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ultragray import ConvexProbe, LinearProbe
+from ultragray.confidence import Extrapolation
+from ultragray.datasets.meta_image import read_meta_image
+from ultragray.datasets.plus import read_plus_sweep
+from ultragray.datasets.transforms import parse_matrix
+from ultragray.interchange.exports import ExportHeader, export_to
+from ultragray.pose import pose_from_position_quaternion
+from ultragray.probe import Probe
+
+FRAMES = np.random.default_rng(0).random((12, 20, 16), np.float32)
+TOLD = [Extrapolation(number / 3.0, 1234.5, None, 1e-4 * number) for number in range(12)]
+
+
+def poses(count: int) -> np.ndarray:
+    random = np.random.default_rng(1)
+    made = []
+    for _ in range(count):
+        w, x, y, z = random.normal(size=4)
+        norm = np.sqrt(w * w + x * x + y * y + z * z)
+        place = random.normal(0, 100, 3)
+        made.append(pose_from_position_quaternion((*place,), (w / norm, x / norm, y / norm, z / norm)))
+    return np.stack(made)
+
+
+def export(path: Path, probe: Probe) -> ExportHeader:
+    header = ExportHeader(("bmode",), "uint8", poses(12), 20, 16, probe, "one", "0" * 64, "ultragray/0 cpu")
+    with export_to(path, "plus", header) as add:
+        add({"bmode": FRAMES[:7]}, TOLD[:7])
+        add({"bmode": FRAMES[7:]}, TOLD[7:])
+    return header
+
+
+def test_our_reader_gives_back_the_same_frames_and_poses(tmp_path: Path) -> None:
+    probe = LinearProbe(width_mm=38.1, near_mm=0.0, far_mm=51.7)
+    header = export(tmp_path / "sweep.igs.mha", probe)
+    sweep, count = read_plus_sweep(tmp_path / "sweep.igs.mha")
+    assert count == 12
+    np.testing.assert_array_equal(sweep.images, np.rint(FRAMES * 255))
+    np.testing.assert_allclose(sweep.poses, header.poses, rtol=1e-9, atol=1e-10)
+    assert sweep.probe == probe
+    assert [note for note in sweep.notes if "no crop" not in note] == []
+
+
+def test_a_near_plane_moves_the_poses_to_the_top_of_the_image(tmp_path: Path) -> None:
+    header = export(tmp_path / "sweep.igs.mha", LinearProbe(width_mm=40.0, near_mm=5.0, far_mm=50.0))
+    sweep, _ = read_plus_sweep(tmp_path / "sweep.igs.mha")
+    np.testing.assert_allclose(sweep.poses @ [0, 0, -5.0, 1], header.poses[:, :, 3], atol=1e-9)
+    assert sweep.probe == LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=45.0)
+
+
+def test_every_frame_has_its_fields(tmp_path: Path) -> None:
+    header = export(tmp_path / "sweep.igs.mha", LinearProbe(40.0, 0.0, 50.0))
+    stored = read_meta_image(tmp_path / "sweep.igs.mha")
+    assert stored.fields["UltrasoundImageOrientation"] == "MF"
+    assert stored.fields["UltrasoundImageType"] == "BRIGHTNESS"
+    assert stored.fields["DimSize"] == "16 20 12"
+    for number, fields in enumerate(stored.frame_fields):
+        assert set(fields) == {
+            "ProbeToTrackerTransform",
+            "ProbeToTrackerTransformStatus",
+            "ImageToProbeTransform",
+            "ImageToProbeTransformStatus",
+            "FrameNumber",
+            "Timestamp",
+            "ImageStatus",
+            "UltraGRayDistanceMm",
+            "UltraGRayAngleDeg",
+            "UltraGRayConfidence",
+            "UltraGRaySupportedShare",
+        }
+        assert float(fields["UltraGRayDistanceMm"]) == pytest.approx(number / 3.0)
+        assert (float(fields["UltraGRayAngleDeg"]), fields["UltraGRayConfidence"]) == (1234.5, "nan")
+        assert float(fields["UltraGRaySupportedShare"]) == pytest.approx(1e-4 * number)
+        assert {value for key, value in fields.items() if key.endswith("Status")} == {"OK"}
+        assert float(fields["Timestamp"]) == number * 0.04
+        np.testing.assert_array_equal(parse_matrix(fields["ProbeToTrackerTransform"], "it"), header.poses[number])
+        image = parse_matrix(fields["ImageToProbeTransform"], "it")
+        assert np.linalg.det(image[:3, :3]) > 0
+        np.testing.assert_allclose(image @ [0, 0, 0, 1], [-18.75, 0, 1.25, 1])
+        np.testing.assert_allclose(image @ [15, 19, 0, 1], [18.75, 0, 48.75, 1])
+
+
+def test_a_fan_is_scan_converted(tmp_path: Path) -> None:
+    probe = ConvexProbe(opening_angle_deg=60.0, near_mm=20.0, far_mm=60.0)
+    export(tmp_path / "sweep.igs.mha", probe)
+    stored = read_meta_image(tmp_path / "sweep.igs.mha")
+    fan = np.rint(probe.scan_convert(np.rint(FRAMES[3] * 255), 2.0))
+    np.testing.assert_allclose(stored.pixels[3], fan, atol=1)
+    assert (stored.pixels[3] == fan).mean() > 0.99
+    image = parse_matrix(stored.frame_fields[3]["ImageToProbeTransform"], "it")
+    columns = stored.pixels.shape[2]
+    top = image @ [(columns - 1) / 2, -0.5, 0, 1]
+    np.testing.assert_allclose(top, [0, 0, 20 * np.cos(np.pi / 6), 1], atol=1e-12)
+    np.testing.assert_allclose(image[:3, 0] + image[:3, 1], [2, 0, 2])
+
+
+def test_ten_thousand_frames_keep_their_order(tmp_path: Path) -> None:
+    many = np.tile(np.eye(4), (10_050, 1, 1))
+    many[:, 1, 3] = np.arange(10_050)
+    header = export(tmp_path / "few.igs.mha", LinearProbe(40.0, 0.0, 50.0))
+    header = dataclasses.replace(header, poses=many, height=1, width=2)
+    with export_to(tmp_path / "many.igs.mha", "plus", header) as add:
+        add({"bmode": np.tile(np.array([[[0.0, 1.0]]], np.float32), (10_050, 1, 1))}, TOLD[:1] * 10_050)
+    sweep, count = read_plus_sweep(tmp_path / "many.igs.mha", frames="10000:10050")
+    assert count == 10_050
+    np.testing.assert_allclose(sweep.poses[:, 1, 3], many[10_000:, 1, 3], rtol=1e-9)

@@ -1,0 +1,210 @@
+"""The command line: real files in, real files out; a mistake gives one line and exit code 2."""
+
+from __future__ import annotations
+
+import json
+import re
+import signal
+import subprocess
+import time
+import urllib.request
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import ultragray
+from ultragray import GaussianScene, LinearProbe
+from ultragray.demo import DEMO_FILE
+from ultragray.errors import InvalidArgument, SceneFileInvalid
+from ultragray.files.atomic import file_sha256
+from ultragray_service.cli.app import app
+from ultragray_service.cli.serve import ensure_scenes, link_scenes
+from ultragray_service.settings import Settings
+
+from .command_line import python, refused, run
+
+COMMANDS = (
+    "serve",
+    "render",
+    "info",
+    "dataset",
+    "jobs",
+    "train",
+    "eval",
+    "compound",
+    "report",
+    "export",
+    "import-ply",
+    "import-checkpoint",
+    "demo",
+    "bench",
+)
+
+
+def test_help_is_instant_it_imports_nothing_heavy() -> None:
+    program = (
+        "from ultragray_service.cli.app import app; app(standalone_mode=False); "
+        "print(sorted({'torch', 'fastapi', 'grpc', 'cv2', 'uvicorn'} & set(sys.modules)))"
+    )
+    answer = subprocess.run(python(program, "--help"), capture_output=True, text=True, check=True)
+    for command in COMMANDS:
+        assert re.search(rf"\b{command}\b", answer.stdout)
+    assert answer.stdout.splitlines()[-1] == "[]"
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_explains_itself(command: str) -> None:
+    result = run(command, "--help")
+    assert result.exit_code == 0
+    assert "Usage" in result.output
+
+
+def test_version() -> None:
+    assert run("--version").output.strip() == f"ultragray {ultragray.__version__}"
+
+
+def test_the_defaults_that_serve_names_are_those_of_the_settings() -> None:
+    import typer
+
+    options = {p.name: p for p in typer.main.get_command(app).commands["serve"].params}  # type: ignore[attr-defined]
+    for name, option in options.items():
+        field = "threads_per_process" if name == "threads" else name
+        if field in Settings.model_fields:
+            default = Settings.model_fields[field].default
+            assert option.show_default == ("off" if default is None else str(default))
+            assert f"ULTRAGRAY_{field.upper()}" in option.help
+
+
+def test_a_bad_scene_file_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "bad.ugr"
+    path.write_bytes(b"nonsense that is long enough")
+    for command in (["info", path], ["render", path, "-o", tmp_path / "f.npz"], ["serve", path]):
+        assert "bad.ugr: not a scene file" in refused(*command)
+
+
+def test_info_tells_what_the_file_says(scene_file: Path) -> None:
+    result = run("info", scene_file, "--json")
+    assert result.exit_code == 0
+    document = json.loads(result.output)
+    assert document["sha256"] == file_sha256(scene_file)
+    assert document["gaussian_count"] == 60
+    assert document["probe"] == {"kind": "linear", "width_mm": 30.0, "near_mm": 0.0, "far_mm": 40.0}
+    assert document["centre_mm"] == [1.0, 2.0, 3.0]
+    assert document["training_poses"]["count"] == 5
+    table = run("info", scene_file).output
+    for expected in (file_sha256(scene_file), "gaussian_count", "60", "width_mm=30"):
+        assert expected in table
+
+
+@pytest.fixture
+def released(tmp_path: Path, random_scene: Callable[..., GaussianScene], random_poses: Callable[..., Any]) -> Path:
+    torch.save({"step": 3, "splats": random_scene(8).splats}, tmp_path / "ckpt.pt")
+    conf = {
+        "images_file_train": "images_train.npy",
+        "ultrasound_near_plane": 0.0,
+        "ultrasound_far_plane": 4.0,
+        "ultrasound_opening_width": 3.0,
+    }
+    (tmp_path / "conf.json").write_text(json.dumps(conf))
+    np.save(tmp_path / "images_train.npy", np.zeros((4, 9, 7), np.uint8))
+    np.save(tmp_path / "poses_train.npy", random_poses(4))
+    return tmp_path
+
+
+def test_import_checkpoint_writes_a_scene(released: Path) -> None:
+    output = released / "scene.ugr"
+    common = ("import-checkpoint", released / "ckpt.pt", "--config", released / "conf.json", "-o", output)
+    result = run(*common, "--poses", released / "poses_train.npy")
+    assert result.exit_code == 0, result.output
+    scene = GaussianScene.load(output)
+    assert scene.info.probe == LinearProbe(width_mm=30.0, near_mm=0.0, far_mm=45.0)
+    assert len(scene.training_poses) == 4
+    assert run(*common, "--center", "-1", "2.5", "-3e2").exit_code == 0
+    assert GaussianScene.load(output).info.centre_mm == (-1.0, 2.5, -300.0)
+    assert run(*common, "--centered", "--image-height", 5).exit_code == 0
+    assert GaussianScene.load(output).info.image_height == 5
+
+
+def test_import_checkpoint_says_what_it_needs(released: Path) -> None:
+    output = released / "scene.ugr"
+    common = ("import-checkpoint", released / "ckpt.pt", "--config", released / "conf.json", "-o", output)
+    for extra in ([], ["--centered", "--center", 0, 0, 0]):
+        message = refused(*common, *extra)
+        assert all(option in message for option in ("--poses", "--center X Y Z", "--centered"))
+    (released / "images_train.npy").unlink()
+    assert "--image-height" in refused(*common, "--centered")
+    (released / "ckpt.pt").write_bytes(b"")
+    assert "ckpt.pt: truncated" in refused(*common, "--centered", "--image-height", 9)
+    assert not output.exists()
+
+
+def test_demo_writes_the_demo_scene(tmp_path: Path) -> None:
+    output = tmp_path / "d.ugr"
+    assert run("demo", "-o", output).exit_code == 0
+    assert output.read_bytes() == DEMO_FILE.read_bytes()
+    assert "folder that exists" in refused("demo", "-o", tmp_path / "absent" / "d.ugr")
+    assert "output must end in .ugr, got 'd.txt'" in refused("demo", "-o", tmp_path / "d.txt")
+
+
+def test_a_data_folder_without_scenes_gets_the_demo(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "data"
+    with pytest.raises(InvalidArgument, match="existing folder"):  # its name may be mistyped
+        ensure_scenes(folder)
+    folder.mkdir()
+    ensure_scenes(folder)
+    assert [p.name for p in folder.iterdir()] == ["demo.ugr"]
+    assert "holds no scenes: wrote" in capsys.readouterr().err
+    assert (folder / "demo.ugr").read_bytes() == DEMO_FILE.read_bytes()
+    ensure_scenes(folder)
+    assert capsys.readouterr().err == ""
+
+
+def test_a_data_folder_with_scenes_is_left_alone(scene_file: Path) -> None:
+    before = sorted(scene_file.parent.iterdir())
+    ensure_scenes(scene_file.parent)
+    assert sorted(scene_file.parent.iterdir()) == before
+
+
+def test_given_scenes_are_linked_under_their_own_names(scene_file: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "links"
+    folder.mkdir()
+    link_scenes([scene_file], folder)
+    assert (folder / "scene.ugr").resolve() == scene_file.resolve()
+    with pytest.raises(InvalidArgument, match="'scene' comes twice"):
+        link_scenes([scene_file], folder)
+    odd = scene_file.rename(tmp_path / "no name.ugr")
+    with pytest.raises(InvalidArgument, match="letters, digits"):
+        link_scenes([odd], folder)
+    with pytest.raises(SceneFileInvalid, match="no such file"):
+        link_scenes([tmp_path / "absent.ugr"], folder)
+
+
+def test_mistakes_of_serve_are_named(scene_file: Path, tmp_path: Path) -> None:
+    assert "cannot be given together" in refused("serve", scene_file, "--data-folder", tmp_path)
+    assert "http_port" in refused("serve", scene_file, "--http-port", 70_000)
+    assert "backend" in refused("serve", scene_file, "--backend", "gpu")
+
+
+def test_serve_serves_the_given_file_until_sigterm(scene_file: Path, tmp_path: Path) -> None:
+    arguments = ("serve", scene_file, "--http-port", 0, "--grpc-port", 0, "--threads", 1)
+    program = "from ultragray_service.cli.app import app; app()"
+    with subprocess.Popen(
+        python(program, *arguments), stderr=subprocess.STDOUT, stdout=subprocess.PIPE, text=True
+    ) as service:
+        try:
+            assert service.stdout is not None
+            address = next(m[0] for line in service.stdout if (m := re.search(r"http://127\.0\.0\.1:\d+", line)))
+            with urllib.request.urlopen(f"{address}/v1/scenes", timeout=10) as answer:
+                assert [scene["name"] for scene in json.load(answer)["scenes"]] == ["scene"]
+            service.send_signal(signal.SIGTERM)
+            started = time.monotonic()
+            service.stdout.read()
+            assert service.wait(timeout=20) == 0
+            assert time.monotonic() - started < 15
+        finally:
+            service.kill()
+    assert scene_file.exists()

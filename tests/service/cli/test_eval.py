@@ -1,0 +1,211 @@
+"""`ultragray eval`, `compound` and `report`: from a folder of frames to figures, pictures and a page."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ultragray import ConvexProbe, GaussianScene, LinearProbe, Probe
+from ultragray.datasets import Dataset, Sweep
+from ultragray.datasets.released import read_released, write_released
+from ultragray.errors import MemoryExceeded, TrainingDiverged
+from ultragray.evaluation.baselines import evaluate_baselines
+from ultragray.evaluation.scoring import evaluate
+from ultragray.report import study
+from ultragray.training import TrainingConfig, train
+
+from .command_line import refused, run
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder in the released layout: a ball in noise, 7 training and 2 held-out frames."""
+    poses = np.tile(np.eye(4), (9, 1, 1))
+    poses[:, 1, 3] = np.linspace(-4.0, 4.0, 9)
+    x, z = np.meshgrid(np.linspace(-1, 1, 16), np.linspace(0, 1, 20))
+    ball = 140.0 * np.exp(-(x**2 + (z - 0.4) ** 2) / 0.1) + 50.0
+    images = np.clip(ball + np.random.default_rng(0).normal(0.0, 4.0, (9, 20, 16)), 0, 255).astype(np.uint8)
+    sweep = Sweep(images, poses, LinearProbe(20.0, 0.0, 25.0), np.arange(9), "ball")
+    folder = tmp_path_factory.mktemp("sweeps") / "ball"
+    write_released(Dataset("ball", sweep.select([0, 1, 3, 4, 5, 7, 8]), sweep.select([2, 6])), folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def scene(dataset: Path) -> Path:
+    config = TrainingConfig.preset("fast", steps=5, max_gaussians=60)
+    train(read_released(dataset), config).save(dataset.parent / "ball.ugr")
+    return dataset.parent / "ball.ugr"
+
+
+def printed_json(*arguments: object) -> Any:
+    result = run(*arguments)
+    assert result.exit_code == 0, result.output
+    return json.loads(result.stdout)
+
+
+def test_eval_prints_what_the_library_measures(dataset: Path, scene: Path) -> None:
+    expected = evaluate(GaussianScene.load(scene), read_released(dataset).val)
+    document = printed_json("eval", scene, dataset, "--json")
+    assert document == {"scene": str(scene), "dataset": "ball", "split": "val", **expected.to_dict()}
+    result = run("eval", scene, dataset)
+    assert result.exit_code == 0
+    mean, std = expected.mean, expected.std
+    assert f"{mean.psnr_db:.2f} ± {std.psnr_db:.2f}" in result.stdout
+    assert f"{mean.gmsd:.3f} ± {std.gmsd:.3f}" in result.stdout
+    assert "1 of its 5 scales" in result.stdout
+
+
+def test_eval_of_the_training_frames_and_of_others(dataset: Path, scene: Path) -> None:
+    train_part = printed_json("eval", scene, dataset, "--json", "--split", "train")
+    assert train_part["split"] == "train"
+    assert len(train_part["frames"]) == 7
+    assert len(printed_json("eval", scene, dataset, "--json", "--val-frames", "0:3")["frames"]) == 3
+
+
+def test_eval_writes_pictures(dataset: Path, scene: Path, tmp_path: Path) -> None:
+    result = run("eval", scene, dataset, "-o", tmp_path / "pictures", "--json")
+    assert result.exit_code == 0
+    assert len(json.loads(result.stdout)["frames"]) == 2
+    assert len(list((tmp_path / "pictures").glob("frame_*.png"))) == 2
+
+
+def test_compound_prints_what_the_library_measures(dataset: Path) -> None:
+    expected = evaluate_baselines(read_released(dataset), voxel_mm=0.7)
+    document = printed_json("compound", dataset, "--json", "--voxel-mm", 0.7)
+    assert document["voxel_mm"] == 0.7
+    assert document["methods"] == {name: evaluation.to_dict() for name, evaluation in expected.items()}
+    table = run("compound", dataset, "--voxel-mm", 0.7).stdout
+    for name, evaluation in expected.items():
+        assert re.search(rf"{name} +{evaluation.mean.psnr_db:.2f} ± ", table)
+
+
+def test_compound_by_one_method(dataset: Path) -> None:
+    document = printed_json("compound", dataset, "--json", "--method", "maximum")
+    assert list(document["methods"]) == ["maximum"]
+    assert document["voxel_mm"] == 0.5
+
+
+def test_report_of_a_scene(dataset: Path, scene: Path, tmp_path: Path) -> None:
+    page = tmp_path / "page.html"
+    result = run("report", dataset, "-o", page, "--scene", scene, "--no-ablations", "--threads", 1)
+    assert result.exit_code == 0, result.output
+    assert result.stdout == f"wrote {page}\n"
+    mean = evaluate(GaussianScene.load(scene), read_released(dataset).val).mean
+    assert f"{mean.psnr_db:.2f} ±" in page.read_text()
+    assert "Ablations" not in page.read_text()
+
+
+def test_report_trains_and_studies(dataset: Path, tmp_path: Path) -> None:
+    page = tmp_path / "page.html"
+    result = run("report", dataset, "-o", page, "--steps", 3, "--max-gaussians", 40, "--threads", 1)
+    assert result.exit_code == 0, result.output
+    assert result.stderr.splitlines() == [
+        "training: scene",
+        "training: no transmittance",
+        "training: spherical harmonics of degree 0",
+        "training: no out-of-plane sampling",
+        "training: a quarter of the Gaussians",
+        "training: half of the Gaussians",
+        "training: twice the Gaussians",
+    ]
+    assert "max_gaussians = 40" in page.read_text()
+    assert "hardly turns" in page.read_text()
+
+
+def test_a_study_that_fails_does_not_take_the_report_with_it(
+    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def train_or_fail(read: Dataset, config: TrainingConfig, **options: Any) -> GaussianScene:
+        if not config.transmittance:
+            raise MemoryExceeded("it needs 9 GB")
+        return train(read, config, **options)
+
+    def study_tilt(*arguments: Any, **options: Any) -> None:
+        raise TrainingDiverged("the loss is nan")
+
+    monkeypatch.setattr(study, "train", train_or_fail)
+    monkeypatch.setattr(study, "study_tilt", study_tilt)
+    page = tmp_path / "page.html"
+    result = run("report", dataset, "-o", page, "--steps", 2, "--max-gaussians", 40, "--threads", 1)
+    assert result.exit_code == 0, result.output
+    assert result.stderr.splitlines()[-2:] == [
+        "failed: no transmittance: it needs 9 GB",
+        "failed: growing tilt: the loss is nan",
+    ]
+    text = page.read_text()
+    assert re.search(r">no transmittance</th><td [^>]*>it needs 9 GB<", text)
+    assert "could not be finished: the loss is nan" in text
+    assert text.index("no transmittance") < text.index("twice the Gaussians")
+
+
+def test_a_folder_that_cannot_be_written_to_is_told_before_the_work(
+    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("os.access", lambda path, mode: Path(path) != tmp_path)  # a superuser may write anywhere
+    message = refused("report", tmp_path / "no dataset", "-o", tmp_path / "page.html")
+    assert f"output must lie in a folder that can be written to, {tmp_path} cannot" in message
+
+
+def test_mistakes(dataset: Path, scene: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    assert "file is a file" in refused("eval", scene, dataset, "-o", tmp_path / "file")
+    assert f"new or empty folder, {tmp_path} holds files" in refused("eval", scene, dataset, "-o", tmp_path)
+    assert "no such file" in refused("eval", tmp_path / "none.ugr", dataset)
+    assert "no such file or folder" in refused("compound", tmp_path / "none")
+    assert "voxel_mm must be" in refused("compound", dataset, "--voxel-mm", 0.001)
+    assert "is a folder" in refused("report", dataset, "-o", tmp_path)
+    assert "must end in .html, got 'page.pdf'" in refused("report", dataset, "-o", tmp_path / "page.pdf")
+    assert "preset must be" in refused("report", dataset, "-o", tmp_path / "page.html", "--preset", "slow")
+    assert not (tmp_path / "page.html").exists()
+
+
+def test_a_scene_of_another_probe_or_of_other_data(dataset: Path, scene: Path, tmp_path: Path) -> None:
+    result = run("eval", scene, dataset, "--json", "--val-frames", "0:3")
+    assert "warning: the scene was trained from other data than ball, or from another split of it" in result.stderr
+    assert run("eval", scene, dataset, "--json").stderr == ""
+    read = read_released(dataset)
+
+    def written(name: str, probe: Probe) -> Path:
+        parts = (replace(part, probe=probe) for part in (read.train, read.val))
+        write_released(Dataset(name, *parts), tmp_path / name)
+        return tmp_path / name
+
+    wide = run("eval", scene, written("wide", LinearProbe(30.0, 0.0, 25.0)), "--json")
+    assert "warning: the scene was trained with LinearProbe(width_mm=20.0" in wide.stderr
+    convex = written("convex", ConvexProbe(60.0, 10.0, 35.0))
+    reported = ("report", convex, "-o", tmp_path / "page.html", "--scene", scene, "--no-ablations")
+    for arguments in (("eval", scene, convex), reported):
+        result = run(*arguments)
+        assert result.exit_code == 2
+        assert "error: convex: its probe is convex, the scene was trained with a linear one" in result.stderr
+
+
+def test_report_warns_of_what_looks_wrong(dataset: Path, scene: Path, tmp_path: Path) -> None:
+    page = tmp_path / "page.html"
+    arguments = ("-o", page, "--scene", scene, "--no-ablations", "--threads", 1, "--train-frames", "0:4")
+    copied = tmp_path / "ball"
+    shutil.copytree(dataset, copied)
+    np.save(copied / "images_val.npy", np.load(copied / "images_train.npy")[:2])
+    np.save(copied / "poses_val.npy", np.load(copied / "poses_train.npy")[:2])
+    result = run("report", copied, *arguments)
+    assert result.exit_code == 0, result.output
+    assert "warning: held-out frames 0, 1 are also training frames" in result.stderr
+
+
+def test_a_dataset_without_held_out_frames_is_refused(dataset: Path, scene: Path, tmp_path: Path) -> None:
+    sweep = read_released(dataset).train
+    write_released(Dataset("alone", sweep, sweep.select([])), tmp_path / "alone")
+    for arguments in (
+        ("eval", scene, tmp_path / "alone"),
+        ("compound", tmp_path / "alone"),
+        ("report", tmp_path / "alone", "-o", tmp_path / "page.html"),
+    ):
+        assert "no frames to measure with" in refused(*arguments)

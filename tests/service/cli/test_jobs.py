@@ -1,0 +1,208 @@
+"""`ultragray jobs` against a real service with its worker."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import subprocess
+import sys
+import tarfile
+import time
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx
+import numpy as np
+import pytest
+from typer.testing import CliRunner, Result
+
+from ultragray import LinearProbe
+from ultragray.datasets import Dataset, Sweep
+from ultragray.datasets.released import write_released
+from ultragray_service.cli.app import app
+from ultragray_service.cli.jobs_watch import JOB_CANCELLED, JOB_FAILED
+
+from ..conftest import ROOT, SOURCE_FOLDERS, RunningService, StartService
+
+WAIT_S = 30.0
+KEY = "0123456789abcdef-jobs"
+
+
+def run(server: RunningService, *arguments: object, key: str = KEY) -> Result:
+    environment = {"ULTRAGRAY_SERVER": server.http, "ULTRAGRAY_API_KEY": key}
+    return CliRunner().invoke(app, ["jobs", *map(str, arguments)], env=environment)
+
+
+def done(server: RunningService, *arguments: object) -> str:
+    result = run(server, *arguments)
+    assert result.exit_code == 0, result.output
+    return result.stdout
+
+
+def tiny_dataset(folder: Path) -> bytes:
+    """A zip of a sweep of 20x16 pixels: 8 frames to train from, 2 held out."""
+    images = np.random.default_rng(0).integers(0, 250, (10, 20, 16), dtype=np.uint8)
+    poses = np.tile(np.eye(4), (10, 1, 1))
+    poses[:, 1, 3] = np.arange(10)
+    parts = [
+        Sweep(images[part], poses[part], LinearProbe(40.0, 0.0, 50.0), np.arange(len(images[part])), "sweep")
+        for part in (slice(0, 8), slice(8, 10))
+    ]
+    write_released(Dataset("tiny", *parts), folder)
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w") as archive:
+        for path in folder.iterdir():
+            archive.write(path, path.name)
+    return packed.getvalue()
+
+
+@pytest.fixture(scope="module")
+def server(start_service: StartService, tmp_path_factory: pytest.TempPathFactory) -> RunningService:
+    return start_service(
+        artifact_folder=tmp_path_factory.mktemp("artifacts"), embedded_worker=True, training_threads=1, api_keys=KEY
+    )
+
+
+@pytest.fixture(scope="module")
+def client(server: RunningService, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
+    """Knows the service, which holds the dataset `tiny`."""
+    with httpx.Client(base_url=server.http, headers={"X-API-Key": KEY}, timeout=WAIT_S) as client:
+        content = tiny_dataset(tmp_path_factory.mktemp("tiny"))
+        stored = client.put("/v1/datasets/tiny", content=content, headers={"Content-Type": "application/zip"})
+        assert stored.status_code == 201, stored.text
+        yield client
+
+
+def test_a_scene_is_trained_watched_and_served(server: RunningService, client: httpx.Client, tmp_path: Path) -> None:
+    settings = ("--set", "steps=12", "--set", "max_gaussians=60", "--device", "cpu")
+    options = (*settings, "--request-id", "first", "--wait")
+    result = run(server, "submit", "train", "tiny", "--scene", "trained", *options)
+    assert result.exit_code == 0, result.output
+    job, summary = result.stdout.splitlines()
+    assert summary.startswith(f"{job} succeeded; psnr_db ")
+    assert f"{job} queued" in result.stderr or f"{job} running" in result.stderr
+    assert "12 of 12 steps" in result.stderr
+    assert client.get("/v1/scenes/trained").json()["gaussian_count"] == 60
+    told = client.get(f"/v1/jobs/{job}").json()
+    assert told["specification"]["settings"] == {"steps": 12, "max_gaussians": 60}
+    assert told["metrics"]["psnr_db"] > 0
+
+    assert done(server, "submit", "train", "tiny", "--scene", "trained", *options).splitlines()[0] == job
+    types = {name: client.get(f"/v1/jobs/{job}/artifacts/{name}").headers["content-type"] for name in told["artifacts"]}
+    assert types["training_curve.png"] == "image/png"
+    assert types["metrics.json"] == "application/json"
+    assert types["trained.ugr"] == "application/octet-stream"
+    curve = tmp_path / "curve.png"
+    done(server, "download", job, "training_curve.png", "-o", curve)
+    assert curve.read_bytes().startswith(b"\x89PNG")
+    assert [path.name for path in tmp_path.iterdir()] == ["curve.png"]
+    part = client.get(f"/v1/jobs/{job}/artifacts/training_curve.png", headers={"Range": "bytes=0-7"})
+    assert (part.status_code, part.content) == (206, curve.read_bytes()[:8])
+
+    events = client.get(f"/v1/jobs/{job}/events").text
+    log = done(server, "logs", job)
+    assert log
+    assert events.startswith("event: log\ndata: " + log.splitlines()[0])
+    assert json.loads(events.rpartition("event: progress\ndata: ")[2])["state"] == "succeeded"
+
+
+def test_poses_of_a_file_become_an_archive(server: RunningService, client: httpx.Client, tmp_path: Path) -> None:
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    poses[:, 1, 3] = (0.5, 1.5, 2.5)
+    np.save(tmp_path / "poses.npy", poses)
+    arguments = ("--poses", tmp_path / "poses.npy", "--height", 24, "--width", 16, "--format", "tar", "--wait")
+    job = done(server, "submit", "render", "demo", *arguments).splitlines()[0]
+    [name] = client.get(f"/v1/jobs/{job}").json()["artifacts"]
+    done(server, "download", job, name, "-o", tmp_path / name)
+    with tarfile.open(tmp_path / name) as archive:
+        pictures = [entry for entry in archive.getnames() if entry.endswith(".png")]
+    assert pictures == [f"{number:06d}.bmode.png" for number in range(3)]
+    assert client.get(f"/v1/jobs/{job}/artifacts/{name}").headers["content-type"] == "application/x-tar"
+    listed = json.loads(done(server, "list", "--kind", "render", "--json"))
+    assert [entry["id"] for entry in listed] == [job]
+    assert job in done(server, "list", "--state", "succeeded")
+
+
+def test_a_job_that_fails_says_why_by_its_exit_code(server: RunningService, client: httpx.Client) -> None:
+    result = run(server, "submit", "train", "tiny", "--scene", "never", "--set", "memory_gb=0.001", "--wait")
+    assert result.exit_code == JOB_FAILED, result.output
+    assert "memory_gb allows" in result.stderr.splitlines()[-1]
+    assert result.stderr.splitlines()[-1].startswith("error: ")
+    assert "Traceback" not in result.output
+
+
+def test_a_cancelled_job_has_its_own_exit_code_and_can_be_retried(server: RunningService, client: httpx.Client) -> None:
+    job = done(server, "submit", "train", "tiny", "--scene", "long", "--set", "steps=1000000").strip()
+    used = client.delete("/v1/datasets/tiny")
+    assert (used.status_code, used.json()["reason"]) == (409, "DATASET_IN_USE")
+    assert done(server, "cancel", job) == f"{job} cancelled\n"
+    assert run(server, "watch", job).exit_code == JOB_CANCELLED
+    again = done(server, "retry", job).strip()
+    assert client.get(f"/v1/jobs/{again}").json()["retry_of"] == job
+    done(server, "cancel", again)
+    assert done(server, "delete", again) == f"{again} deleted\n"
+    assert "there is no job" in run(server, "delete", again).stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (("watch", "0" * 24), "there is no job"),
+        (("list", "--server", "localhost:8000"), "--server must be a URL"),
+        (("list", "--server", "http://127.0.0.1:9"), "no service answers at http://127.0.0.1:9"),
+        (("list", "--api-key", "x" * 16), "API key"),
+        (("submit", "render", "demo", "--count", "3"), "--count is of a sampler: name it with --sampler"),
+        (("submit", "render", "demo", "--sampler", "fan", "--count", "3"), "it takes tilt_deg, step_deg"),
+        (("submit", "render", "demo", "--format", "dicom", "--outputs", "echo"), "bmode alone in format dicom"),
+        (("submit", "render", "gone"), "no scene"),
+        (("submit", "train", "tiny", "--scene", "new", "--set", "stepz=3"), "no setting stepz; it has steps, "),
+        (("submit", "train", "tiny", "--scene", "new", "--set", "steps=0"), "steps must be between 1 and"),
+        (("download", "0" * 24, "name", "-o", "nowhere/name"), "output must lie in a folder that exists"),
+    ],
+)
+def test_mistakes_give_one_line(server: RunningService, arguments: tuple[str, ...], told: str) -> None:
+    result = run(server, *arguments)
+    assert result.exit_code == 2, result.output
+    assert result.stderr.startswith("error: ")
+    assert told in result.stderr
+    assert result.stderr.count("\n") == 1
+
+
+def test_submitting_needs_no_torch() -> None:
+    program = (
+        "import sys; from typer.testing import CliRunner; from ultragray_service.cli.app import app\n"
+        "arguments = 'jobs submit train tiny --scene new --set steps=3 --server http://127.0.0.1:9'\n"
+        "print(CliRunner().invoke(app, arguments.split()).exit_code, 'torch' in sys.modules)"
+    )
+    path = os.pathsep.join(str(ROOT / folder) for folder in SOURCE_FOLDERS)
+    environment = {**os.environ, "PYTHONPATH": path}
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, env=environment)
+    assert done.stdout.split() == ["2", "False"]
+
+
+def test_a_watch_outlives_a_restart_of_the_service(start_service: StartService, tmp_path: Path) -> None:
+    settings = {"artifact_folder": tmp_path / "artifacts", "embedded_worker": False, "api_keys": KEY}
+    first = start_service(**settings)
+    job = done(first, "submit", "render", "demo").strip()
+    path = os.pathsep.join(str(ROOT / folder) for folder in SOURCE_FOLDERS)
+    watching = subprocess.Popen(
+        [sys.executable, "-c", "from ultragray_service.cli.app import app; app()", "jobs", "watch", job],
+        env={**os.environ, "PYTHONPATH": path, "ULTRAGRAY_SERVER": first.http, "ULTRAGRAY_API_KEY": KEY},
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        assert watching.stderr is not None
+        assert watching.stderr.readline() == f"{job} queued\n"
+        first.process.kill()
+        first.process.wait(WAIT_S)
+        time.sleep(0.5)
+        assert watching.poll() is None
+        second = start_service(**settings, http_port=first.http.rpartition(":")[2])
+        assert done(second, "cancel", job) == f"{job} cancelled\n"
+        assert watching.wait(WAIT_S) == JOB_CANCELLED
+    finally:
+        watching.kill()
+        watching.communicate()

@@ -1,0 +1,272 @@
+"""`ultragray render`: real files in, real files out; a mistake gives one line and exit code 2."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import h5py
+import numpy as np
+import pytest
+import torch
+
+import ultragray
+from ultragray import ConvexProbe, GaussianScene, LinearProbe, PhasedProbe, SceneInfo, render
+from ultragray.backends import cpu
+from ultragray.confidence import FIGURES, Assessor, ConfidenceModel, figure_arrays
+from ultragray.datasets.plus import read_plus_sweep
+from ultragray.files.atomic import file_sha256
+from ultragray.samplers import FanSampler
+from ultragray_service.cli import render as cli_render
+
+from .command_line import refused, run
+
+LINEAR = LinearProbe(width_mm=30.0, near_mm=0.0, far_mm=40.0)
+CONVEX = ConvexProbe(opening_angle_deg=60.0, near_mm=10.0, far_mm=50.0)
+PHASED = PhasedProbe(opening_angle_deg=90.0, far_mm=50.0)
+CONVEX_JSON = '{"kind": "convex", "opening_angle_deg": 60, "near_mm": 10, "far_mm": 50}'
+
+
+def test_render_writes_an_npz_that_can_be_replayed(scene_file: Path, pose_file: Path, tmp_path: Path) -> None:
+    output = tmp_path / "frames.npz"
+    result = run(
+        *("render", scene_file, "--poses", pose_file, "--height", 16, "--width", 12),
+        *("--outputs", "bmode,transmittance", "-o", output),
+    )
+    assert result.exit_code == 0, result.output
+    assert "7 frames of 16x12" in result.output
+    with np.load(output) as frames:
+        assert set(frames) == {"bmode", "transmittance", "poses", *FIGURES, "scene", "scene_sha256", "renderer"}
+        assert str(frames["scene"]) == "scene"
+        assert str(frames["scene_sha256"]) == file_sha256(scene_file)
+        assert str(frames["renderer"]) == f"ultragray/{ultragray.__version__} cpu-{cpu.INSTRUCTION_SETS[0]}"
+        again = render(GaussianScene.load(scene_file), None, frames["poses"], height=16, width=12)
+        for name in ("bmode", "transmittance"):
+            assert frames[name].dtype == np.float32
+            assert frames[name].max() > 0.05
+            np.testing.assert_allclose(frames[name], getattr(again, name).numpy(), atol=1e-6)
+
+
+def test_chunks_do_not_show(scene_file: Path, pose_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole, chunked = tmp_path / "whole.npz", tmp_path / "chunked.npz"
+    arguments = ("render", scene_file, "--poses", pose_file, "--outputs", "bmode,echo,coverage", "-o")
+    assert run(*arguments, whole).exit_code == 0
+    sizes: list[int] = []
+
+    def counting(scene: Any, probe: Any, poses: Any, **options: Any) -> Any:
+        sizes.append(len(poses))
+        return render(scene, probe, poses, **options)
+
+    monkeypatch.setattr(cli_render, "render", counting)
+    monkeypatch.setattr(cli_render, "CHUNK_BYTES", 3 * 4 * 24 * 20 * 3)
+    assert run(*arguments, chunked).exit_code == 0
+    assert sizes == [3, 3, 1]
+    with np.load(whole) as first, np.load(chunked) as second:
+        for name in first:
+            np.testing.assert_array_equal(first[name], second[name])
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["chunked.npz", "poses.npy", "scene.ugr", "whole.npz"]
+
+
+def test_without_poses_the_training_views_are_rendered_as_trained(scene_file: Path, tmp_path: Path) -> None:
+    assert run("render", scene_file, "-o", tmp_path / "f.npz").exit_code == 0
+    with np.load(tmp_path / "f.npz") as frames:
+        assert frames["bmode"].shape == (5, 24, 20)
+
+
+def test_render_writes_pngs(scene_file: Path, tmp_path: Path) -> None:
+    folder, npz = tmp_path / "pictures", tmp_path / "f.npz"
+    arguments = ("render", scene_file, "--outputs", "bmode,coverage", "-o")
+    assert run(*arguments, folder).exit_code == 0
+    assert run(*arguments, npz).exit_code == 0
+    names = sorted(p.name for p in folder.iterdir())
+    pictures = [f"frame_{i:05d}_{output}.png" for i in range(5) for output in ("bmode", "coverage")]
+    assert names == [*pictures, "frames.json"]
+    with np.load(npz) as frames:
+        for output in ("bmode", "coverage"):
+            picture = cv2.imread(str(folder / f"frame_00003_{output}.png"), cv2.IMREAD_UNCHANGED)
+            np.testing.assert_array_equal(picture, np.rint(frames[output][3] * 255))
+
+
+@pytest.fixture
+def knowing_file(scene_file: Path, tmp_path: Path) -> Path:
+    """The scene with a model of its confidence."""
+    scene = GaussianScene.load(scene_file)
+    model = ConfidenceModel((3.5, 1.2, 0.8, 0.1, 0.6), 0.06, (0.125,) * 5, 20, 0.04)
+    replace(scene, info=replace(scene.info, confidence=model.to_dict())).save(tmp_path / "knowing.ugr")
+    return tmp_path / "knowing.ugr"
+
+
+def test_render_tells_and_stores_how_far_frames_extrapolate(
+    knowing_file: Path, scene_file: Path, tmp_path: Path
+) -> None:
+    scene = GaussianScene.load(knowing_file)
+    coverage = render(scene, None, scene.training_poses, height=24, width=20, outputs=("coverage",)).coverage
+    assert coverage is not None
+    expected = Assessor(scene.info, scene.training_poses).assess(scene.training_poses, coverage=coverage.numpy())
+    figures = figure_arrays(expected)
+    low, high = figures["confidence"].min(), figures["confidence"].max()
+    share = f"Gaussians support {figures['supported_share'].mean():.0%} of the pixels"
+
+    result = run("render", knowing_file, "-o", tmp_path / "pictures")
+    assert result.output.endswith(f"; confidence {low:.2f} to {high:.2f}, {share}\n")
+    told = json.loads((tmp_path / "pictures" / "frames.json").read_text())
+    assert [one["frame"] for one in told] == [0, 1, 2, 3, 4]
+    for one, extrapolation, pose in zip(told, expected, scene.training_poses, strict=True):
+        assert {name: one[name] for name in FIGURES} == pytest.approx(asdict(extrapolation))
+        assert one["pose"] == pose.tolist()
+
+    assert run("render", scene_file, "-o", tmp_path / "f.npz").output.endswith(f" s; {share}\n")
+    with np.load(tmp_path / "f.npz") as frames:
+        np.testing.assert_allclose(frames["supported_share"], figures["supported_share"])
+        np.testing.assert_allclose(frames["angle_deg"], figures["angle_deg"], rtol=1e-6)
+        assert np.isnan(frames["confidence"]).all()
+
+
+def test_render_keeps_to_a_least_confidence(knowing_file: Path, scene_file: Path, tmp_path: Path) -> None:
+    scene = GaussianScene.load(knowing_file)
+    arguments = ("render", knowing_file, "-o", tmp_path / "f.npz", "--min-confidence", 0.5)
+    assert run(*arguments, "--sampler", "around", "--count", 30, "--translation-mm", 8).exit_code == 0
+    with np.load(tmp_path / "f.npz") as frames:
+        assert frames["confidence"].shape == (30,)
+        assert frames["confidence"].min() >= 0.5
+
+    poses = scene.training_poses.copy()
+    poses[3, :3, 3] += 50.0 * poses[3, :3, 1]
+    np.save(tmp_path / "far.npy", poses)
+    assert "poses[3] has a confidence of" in refused(*arguments, "--poses", tmp_path / "far.npy")
+    kept = run(*arguments, "--poses", tmp_path / "far.npy", "--sampler", "training")
+    assert kept.exit_code == 0, kept.output
+    with np.load(tmp_path / "f.npz") as frames:
+        np.testing.assert_array_equal(frames["poses"], poses[[0, 1, 2, 4]])
+    told = figure_arrays(Assessor(scene.info, scene.training_poses).assess(scene.training_poses))["confidence"]
+    some = run("render", knowing_file, "-o", tmp_path / "f.npz", "--min-confidence", np.median(told))
+    assert "wrote" in some.output
+    with np.load(tmp_path / "f.npz") as frames:
+        np.testing.assert_array_equal(frames["poses"], scene.training_poses[told >= np.median(told)])
+    assert "needs a scene that knows" in refused("render", scene_file, *arguments[2:])
+
+
+def test_info_tells_how_well_a_scene_knows_its_confidence(knowing_file: Path, scene_file: Path) -> None:
+    document = json.loads(run("info", knowing_file, "--json").output)
+    assert (document["confidence"]["error"], document["confidence"]["fitted_on"]) == (0.04, 20)
+    assert "hardness" not in document["confidence"]
+    assert "error=0.04" in run("info", knowing_file).output
+    assert json.loads(run("info", scene_file, "--json").output)["confidence"] == {}
+
+
+def test_render_samples_poses_into_the_format_of_the_name(scene_file: Path, pose_file: Path, tmp_path: Path) -> None:
+    sampler = ("--sampler", "fan", "--tilt-deg", 2, "--step-deg", 2, "--poses", pose_file)
+    for name in ("f.npz", "f.igs.mha", "f.h5"):
+        result = run("render", scene_file, *sampler, "--dtype", "uint8", "-o", tmp_path / name)
+        assert result.exit_code == 0, result.output
+        assert "21 frames of 24x20" in result.output
+    with np.load(tmp_path / "f.npz") as frames:
+        np.testing.assert_array_equal(frames["poses"], FanSampler(2, 2).poses(np.load(pose_file), LINEAR))
+        sweep, _ = read_plus_sweep(tmp_path / "f.igs.mha")
+        np.testing.assert_array_equal(sweep.images, frames["bmode"])
+        np.testing.assert_allclose(sweep.poses, frames["poses"], atol=1e-9)
+        with h5py.File(tmp_path / "f.h5") as file:
+            np.testing.assert_array_equal(file["bmode"], frames["bmode"])
+
+
+def test_render_with_another_probe_as_a_fan(scene_file: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "fan"
+    result = run("render", scene_file, "--probe", CONVEX_JSON, "--scan-convert", 0.5, "-o", folder)
+    assert result.exit_code == 0, result.output
+    picture = cv2.imread(str(folder / "frame_00000_bmode.png"), cv2.IMREAD_UNCHANGED)
+    scene = GaussianScene.load(scene_file)
+    frame = render(scene, CONVEX, scene.training_poses[:1], height=24, width=20).bmode
+    assert frame is not None
+    np.testing.assert_array_equal(picture, np.rint(CONVEX.scan_convert(frame[0].numpy(), 0.5) * 255))
+
+
+@pytest.fixture
+def labelled_file(tmp_path: Path, random_scene: Callable[..., GaussianScene]) -> Path:
+    labels = torch.arange(60, dtype=torch.uint8) % 3
+    info = SceneInfo(probe=PHASED, image_height=24, image_width=20, label_names={1: "bone", 2: "fat"})
+    GaussianScene.from_splats(random_scene(60).splats, info=info, labels=labels, training_poses=np.eye(4)[None]).save(
+        tmp_path / "labelled.ugr"
+    )
+    return tmp_path / "labelled.ugr"
+
+
+def test_labels_are_written_as_they_are(labelled_file: Path, tmp_path: Path) -> None:
+    arguments = ("render", labelled_file, "--outputs", "labels,bmode", "-o")
+    for more in ((tmp_path / "f.npz",), (tmp_path / "flat",), (tmp_path / "fan", "--scan-convert", 0.5)):
+        result = run(*arguments, *more)
+        assert result.exit_code == 0, result.output
+    scene = GaussianScene.load(labelled_file)
+    truth = render(scene, None, scene.training_poses, height=24, width=20, outputs=("labels",)).labels
+    assert truth is not None
+    assert {*truth.unique().tolist()} == {0, 1, 2}
+    with np.load(tmp_path / "f.npz") as frames:
+        assert (frames["labels"].dtype, frames["bmode"].dtype) == (np.uint8, np.float32)
+        np.testing.assert_array_equal(frames["labels"], truth)
+    flat, fan = (
+        cv2.imread(str(tmp_path / name / "frame_00000_labels.png"), cv2.IMREAD_UNCHANGED) for name in ("flat", "fan")
+    )
+    np.testing.assert_array_equal(flat, truth[0])
+    np.testing.assert_array_equal(fan, PHASED.scan_convert_labels(truth[0].numpy(), 0.5))
+
+
+def test_info_tells_of_labels_and_a_phased_probe(labelled_file: Path) -> None:
+    document = json.loads(run("info", labelled_file, "--json").output)
+    assert document["label_names"] == {"1": "bone", "2": "fat"}
+    assert document["probe"] == {"kind": "phased", "opening_angle_deg": 90.0, "far_mm": 50.0}
+    assert "1=bone" in run("info", labelled_file).output
+
+
+def test_threads_and_backend_are_used(scene_file: Path, tmp_path: Path) -> None:
+    result = run("render", scene_file, "-o", tmp_path / "f.npz", "--threads", 3, "--backend", "reference")
+    assert result.exit_code == 0
+    assert torch.get_num_threads() == 3
+    with np.load(tmp_path / "f.npz") as frames:
+        assert str(frames["renderer"]).endswith(" reference")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--outputs", "bmode,doppler"], "doppler"),
+        (["--outputs", ","], "at least one of bmode"),
+        (["--outputs", "bmode,labels"], "labels only for a scene whose Gaussians carry labels"),
+        (["--height", 0], "height must be an integer from 1"),
+        (["--width", 100_000], "width must be an integer from 1"),
+        (["--backend", "gpu"], "backend must be one of"),
+        (["--probe", "{"], "--probe must be a JSON object"),
+        (["--probe", '{"kind": "linear", "width_mm": 40, "near_mm": 50, "far_mm": 50}'], "far_mm must be greater"),
+        (["--probe", '{"kind": "sector"}'], 'kind "linear", "convex" or "phased"'),
+        (["--poses", "absent.npy"], "absent.npy: no such file"),
+        (["--scan-convert", 0.5], "--scan-convert draws PNGs of a convex or phased probe only"),
+        (["--scan-convert", 0.0, "--probe", CONVEX_JSON], "--scan-convert must be between"),
+        (["-o", "frames.png"], "ends in .npz, .tar, .zarr.zip, .h5, .dcm, .igs.mha, or a folder"),
+        (["-o", "frames.dcm", "--outputs", "echo"], "bmode alone in format dicom"),
+        (["-o", "frames.tar", "--dtype", "int8"], "dtype must be one of"),
+        (["--dtype", "uint8"], "--dtype must be left out for PNGs"),
+        (["--sampler", "orbit"], "kind must be one of training, around"),
+        (["--sampler", "around"], "count is required by sampler around"),
+        (["--seed", 3], "--seed is of a sampler"),
+        (["-o", "absent/frames.npz"], "absent does not"),
+    ],
+)
+def test_mistakes_of_render_are_named(
+    scene_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[object], message: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    before = sorted(tmp_path.iterdir())
+    output = [] if "-o" in arguments else ["-o", "pictures"]
+    assert message in refused("render", scene_file, *output, *arguments)
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_a_scene_that_knows_no_probe_or_poses_asks_for_them(
+    tmp_path: Path, random_scene: Callable[..., GaussianScene]
+) -> None:
+    path = tmp_path / "bare.ugr"
+    random_scene(3).save(path)
+    assert "--probe must be given" in refused("render", path, "-o", tmp_path / "f.npz")
+    assert "--poses must be given" in refused("render", path, "-o", tmp_path / "f.npz", "--probe", CONVEX_JSON)

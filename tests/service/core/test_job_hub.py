@@ -1,0 +1,211 @@
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Coroutine
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ultragray.errors import JobNotFound
+from ultragray_service.core import job_hub
+from ultragray_service.core.job_hub import JobChange, JobHub, JobWatch
+from ultragray_service.core.job_log import TAIL_BYTES, GrowingLog
+from ultragray_workers.jobs.store import Job, JobState, Progress
+
+INTERVAL_S = 0.02
+WAIT_S = 5.0
+
+
+@pytest.fixture(autouse=True)
+def _short_interval(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(job_hub, "READ_INTERVAL_S", INTERVAL_S)
+
+
+class OneJob:
+    """A job that is changed by hand; counts how often it is read."""
+
+    def __init__(self, folder: Path) -> None:
+        self.log_path = folder / "log.txt"
+        self.reads = 0
+        self.error: Exception | None = None
+        self.job = Job(
+            id="one",
+            kind="train",
+            state=JobState.RUNNING,
+            request_id=None,
+            specification={},
+            priority=0,
+            created_at="2026-01-01T00:00:00+00:00",
+            started_at=None,
+            finished_at=None,
+            reason=None,
+            error=None,
+            progress=Progress(),
+            artifacts=(),
+            metrics={},
+            worker=None,
+            retry_of=None,
+            attempts=1,
+        )
+        self.hub = JobHub(self.get, lambda job_id: self.log_path)
+
+    def get(self, job_id: str) -> Job:
+        self.reads += 1
+        if job_id != "one":
+            raise JobNotFound(f"there is no job {job_id!r}")
+        if self.error is not None:
+            raise self.error
+        return self.job
+
+    def move(self, **changes: Any) -> None:
+        self.job = replace(self.job, **changes)
+
+
+@pytest.fixture
+def one(tmp_path: Path) -> OneJob:
+    return OneJob(tmp_path)
+
+
+def run(work: Coroutine[Any, Any, None]) -> None:
+    asyncio.run(asyncio.wait_for(work, WAIT_S))
+
+
+async def change(watch: JobWatch) -> JobChange:
+    found = await watch.next(WAIT_S)
+    assert found is not None
+    return found
+
+
+def test_many_watchers_cost_one_reader(one: OneJob) -> None:
+    async def work() -> None:
+        watches = [await one.hub.watch("one") for _ in range(50)]
+        assert one.hub.readers == 1
+        for watch in watches:
+            assert (await change(watch)).job == one.job
+        before = one.reads
+        await asyncio.sleep(10 * INTERVAL_S)
+        assert one.reads - before <= 11
+        one.move(progress=Progress(step=3))
+        for watch in watches:
+            assert (await change(watch)).job == one.job
+        for watch in watches:
+            watch.close()
+
+    run(work())
+
+
+def test_the_reader_goes_with_its_last_watcher(one: OneJob) -> None:
+    async def work() -> None:
+        first, second = await one.hub.watch("one"), await one.hub.watch("one")
+        first.close()
+        assert one.hub.readers == 1
+        second.close()
+        assert one.hub.readers == 0
+        await asyncio.sleep(3 * INTERVAL_S)
+        before = one.reads
+        await asyncio.sleep(5 * INTERVAL_S)
+        assert one.reads == before
+        third = await one.hub.watch("one")
+        assert (await change(third)).job == one.job
+        third.close()
+
+    run(work())
+
+
+def test_a_watch_ends_after_the_final_state_and_the_last_line(one: OneJob) -> None:
+    async def work() -> None:
+        one.log_path.write_text("begin\n")
+        watch = await one.hub.watch("one")
+        assert await change(watch) == JobChange(one.job, "begin\n")
+        assert not watch.finished
+        one.log_path.write_text("begin\nend\n")
+        one.move(state=JobState.SUCCEEDED)
+        told = [await change(watch)]
+        if told[0].job is None:  # the line was read before the state
+            told.append(await change(watch))
+        assert "".join(part.log for part in told) == "end\n"
+        assert told[-1].job == one.job
+        assert watch.finished
+        assert await watch.next(WAIT_S) is None
+        late = await one.hub.watch("one")
+        assert await change(late) == JobChange(one.job, "begin\nend\n")
+        assert await late.next(WAIT_S) is None
+        for each in (watch, late):
+            each.close()
+        assert one.hub.readers == 0
+
+    run(work())
+
+
+def test_a_watcher_who_reads_slowly_gets_the_newest_state(one: OneJob) -> None:
+    async def work() -> None:
+        watch = await one.hub.watch("one")
+        for step in range(5):
+            one.move(progress=Progress(step=step))
+            await asyncio.sleep(3 * INTERVAL_S)
+        found = await change(watch)
+        assert found.job is not None
+        assert found.job.progress.step == 4
+        assert await watch.next(2 * INTERVAL_S) == JobChange(None, "")
+        watch.close()
+
+    run(work())
+
+
+def test_an_unknown_job_and_one_that_cannot_be_read_any_more(one: OneJob) -> None:
+    async def work() -> None:
+        with pytest.raises(JobNotFound):
+            await one.hub.watch("two")
+        assert one.hub.readers == 0
+        watch = await one.hub.watch("one")
+        await change(watch)
+        one.error = OSError("the database has gone")
+        with pytest.raises(OSError, match="gone"):
+            await watch.next(WAIT_S)
+        watch.close()
+
+    run(work())
+
+
+def test_a_closed_hub_ends_every_watch(one: OneJob) -> None:
+    async def work() -> None:
+        watch = await one.hub.watch("one")
+        await change(watch)
+        one.hub.close()
+        assert await watch.next(WAIT_S) is None
+        assert not watch.finished
+        late = await one.hub.watch("one")
+        assert await late.next(WAIT_S) is None
+        watch.close()
+        late.close()
+
+    run(work())
+
+
+def test_a_log_is_told_in_whole_lines(tmp_path: Path) -> None:
+    path = tmp_path / "log.txt"
+    log = GrowingLog(path)
+    assert log.read() == ""
+    with path.open("a") as file:
+        for text, expected in (("one\ntw", "one\n"), ("o", ""), ("\nthree\n", "two\nthree\n"), ("", "")):
+            file.write(text)
+            file.flush()
+            assert log.read() == expected
+    path.write_text("anew\n")
+    assert log.read() == "anew\n"
+
+
+def test_a_long_log_is_told_from_its_end(tmp_path: Path) -> None:
+    path = tmp_path / "log.txt"
+    lines = [f"line {number:06d}" for number in range(20_000)]
+    path.write_text("\n".join(lines) + "\n")
+    log = GrowingLog(path)
+    told = log.read()
+    assert len(told) <= TAIL_BYTES
+    assert told.splitlines() == lines[-len(told.splitlines()) :]
+    with path.open("a") as file:
+        file.write("\n".join(lines) + "\n")
+    told = log.read()
+    assert told.splitlines() == lines[-len(told.splitlines()) :]

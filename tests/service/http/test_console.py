@@ -1,0 +1,119 @@
+"""The page at /: its headers, its files, and what is there before it was built."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+
+import httpx
+import pytest
+from fastapi import FastAPI
+
+from ultragray_service.http.console import CONSOLE_FOLDER, add_console
+
+from ..conftest import StartService
+
+KEY = "0123456789abcdef-console"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return tmp_path / "console"
+
+
+@pytest.fixture
+def page(folder: Path) -> httpx.AsyncClient:
+    app = FastAPI()
+    add_console(app, folder)
+    return httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://test")
+
+
+def build(folder: Path) -> None:
+    (folder / "assets").mkdir(parents=True)
+    (folder / "index.html").write_text("<!doctype html><title>console</title>")
+    (folder / "favicon.svg").write_text("<svg/>")
+    (folder / "licences.txt").write_text("MIT")
+    (folder / "assets" / "index-1a2b.js").write_text("export {};" * 1000)
+
+
+def get(page: httpx.AsyncClient, path: str, **headers: str) -> httpx.Response:
+    return asyncio.run(page.get(path, headers={name.replace("_", "-"): value for name, value in headers.items()}))
+
+
+def test_before_it_is_built_a_page_says_how(page: httpx.AsyncClient) -> None:
+    answer = get(page, "/")
+    assert answer.status_code == 200
+    assert "make console" in answer.text
+    assert 'href="/docs"' in answer.text
+    assert get(page, "/assets/index-1a2b.js").status_code == 404
+
+
+def test_the_page_is_asked_for_again_and_its_files_are_kept(page: httpx.AsyncClient, folder: Path) -> None:
+    build(folder)
+    answer = get(page, "/")
+    assert "<title>console</title>" in answer.text
+    assert answer.headers["cache-control"] == "no-cache"
+    script = get(page, "/assets/index-1a2b.js")
+    assert script.headers["content-type"].startswith("text/javascript")
+    assert "immutable" in script.headers["cache-control"]
+    assert script.headers["x-content-type-options"] == "nosniff"
+    assert script.headers["content-encoding"] == "gzip"
+    assert script.text == "export {};" * 1000
+    assert get(page, "/favicon.svg").headers["content-type"] == "image/svg+xml"
+    assert get(page, "/licences.txt").text == "MIT"
+
+
+@pytest.mark.parametrize("path", ["/assets/%2e%2e/index.html", "/assets/%2e%2e%2findex.html"])
+def test_only_assets_lie_below_assets(page: httpx.AsyncClient, folder: Path, path: str) -> None:
+    build(folder)
+    assert get(page, path).request.url.raw_path == path.encode()
+    assert get(page, path).status_code == 404
+
+
+@pytest.mark.parametrize("path", ["/", "/favicon.svg"])
+def test_what_did_not_change_is_not_sent_again(page: httpx.AsyncClient, folder: Path, path: str) -> None:
+    build(folder)
+    tag = get(page, path).headers["etag"]
+    for known in (tag, f"W/{tag}", f'"other", {tag}'):
+        again = get(page, path, if_none_match=known)
+        assert (again.status_code, again.content, again.headers["etag"]) == (304, b"", tag)
+        assert again.headers["cache-control"] == "no-cache"
+    (folder / "index.html").write_text("<!doctype html><title>newer</title>")
+    (folder / "favicon.svg").write_text("<svg></svg>")
+    changed = get(page, path, if_none_match=tag)
+    assert changed.status_code == 200
+    assert changed.headers["etag"] != tag
+
+
+def test_the_policy_lets_nothing_foreign_in(page: httpx.AsyncClient) -> None:
+    headers = get(page, "/").headers
+    policy = dict(part.split(" ", 1) for part in headers["content-security-policy"].split("; "))
+    assert policy["default-src"] == "'self'"
+    assert policy["frame-ancestors"] == "'none'"
+    assert "unsafe" not in headers["content-security-policy"]
+    assert headers["x-content-type-options"] == "nosniff"
+
+
+@pytest.mark.parametrize(
+    ("host", "sockets"),
+    [
+        ("scan.example:8000", " ws://scan.example:8000 wss://scan.example:8000"),
+        ("[::1]:8000", " ws://[::1]:8000 wss://[::1]:8000"),
+        ("evil.example; script-src *", ""),
+        ("a,b", ""),
+    ],
+)
+def test_the_policy_names_the_sockets_of_its_host(page: httpx.AsyncClient, host: str, sockets: str) -> None:
+    policy = get(page, "/", host=host).headers["content-security-policy"]
+    assert policy.endswith(f"; connect-src 'self'{sockets}")
+
+
+def test_a_service_with_keys_serves_the_page_to_everyone(start_service: StartService) -> None:
+    with httpx.Client(base_url=start_service(api_keys=KEY).http) as http:
+        assert http.get("/").status_code == 200
+        head = http.head("/")
+        assert (head.status_code, head.content) == (200, b"")
+        assert f"wss://{http.base_url.netloc.decode()}" in head.headers["content-security-policy"]
+        assert http.get("/assets/none.js").status_code == 404
+        assert http.get("/v1/statistics").status_code == 401
+        assert http.get("/favicon.svg").status_code == (200 if CONSOLE_FOLDER.is_dir() else 404)

@@ -1,0 +1,210 @@
+"""A scene beside the held-out frames of its dataset, and the frames and poses of a dataset."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import httpx
+import numpy as np
+import pytest
+
+from ultragray import GaussianScene, LinearProbe
+from ultragray.datasets import Dataset, Sweep
+from ultragray.datasets.released import write_released
+from ultragray_proto.v1 import datasets_pb2, datasets_pb2_grpc
+from ultragray_workers.helpers.comparison import PICTURES
+from ultragray_workers.helpers.helper import PROGRESS_NAME
+
+from ...waiting import wait_until
+from ..conftest import RunningService, StartService, make_scene
+from .test_http_datasets import helper_process, zipped
+
+RAW = {"Content-Type": "application/octet-stream"}
+PROBE = LinearProbe(40.0, 0.0, 40.0)
+WAIT_S = 60.0
+
+
+def sweep(count: int, offset_mm: float) -> Sweep:
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, 1, 3] = np.arange(count) + offset_mm
+    images = np.broadcast_to(20 + 8 * np.arange(16, dtype=np.uint8), (count, 24, 16)) + np.arange(
+        count, dtype=np.uint8
+    ).reshape(-1, 1, 1)
+    return Sweep(images, poses, PROBE, np.arange(count), "sweep")
+
+
+DATASET = Dataset("tiny", sweep(6, 0.0), sweep(3, 0.5))
+
+
+def scene_of(dataset: Dataset, seed: int = 3) -> GaussianScene:
+    scene = make_scene(probe=PROBE, seed=seed)
+    scene.info = replace(scene.info, dataset_name=dataset.name, dataset_sha256=dataset.sha256)
+    return scene
+
+
+@pytest.fixture(scope="module")
+def artifacts(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("artifacts")
+
+
+@pytest.fixture(scope="module")
+def service(start_service: StartService, artifacts: Path) -> RunningService:
+    return start_service(artifact_folder=artifacts)
+
+
+def upload(client: httpx.Client, name: str, dataset: Dataset, folder: Path) -> None:
+    write_released(dataset, folder)
+    packed = zipped({path.name: path.read_bytes() for path in folder.iterdir()})
+    answer = client.put(f"/v1/datasets/{name}", content=packed, headers={"Content-Type": "application/zip"})
+    assert answer.status_code == 201, answer.text
+
+
+@pytest.fixture(scope="module")
+def http(service: RunningService, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
+    with httpx.Client(base_url=service.http, timeout=60) as client:
+        for dataset in (DATASET, replace(DATASET, name="whole", val=DATASET.val.select(np.arange(0)))):
+            upload(client, dataset.name, dataset, tmp_path_factory.mktemp("dataset"))
+            client.put(f"/v1/scenes/of-{dataset.name}", content=scene_of(dataset).to_bytes(), headers=RAW)
+        yield client
+
+
+def finished(http: httpx.Client, scene: str) -> dict[str, Any]:
+    end = time.monotonic() + WAIT_S
+    while time.monotonic() < end:
+        found: dict[str, Any] = http.get(f"/v1/scenes/{scene}/comparison").json()
+        if found["state"] != "running":
+            return found
+        assert 0.0 <= found["progress"] < 1.0
+        assert found["frames"] == []
+        time.sleep(0.1)
+    raise AssertionError(f"not compared within {WAIT_S} s")
+
+
+def picture(answer: httpx.Response) -> np.ndarray:
+    assert answer.headers["content-type"] == "image/png", answer.text
+    return np.asarray(cv2.imdecode(np.frombuffer(answer.content, np.uint8), cv2.IMREAD_UNCHANGED))
+
+
+def assert_revalidated(http: httpx.Client, path: str) -> None:
+    """Who has it is not sent it again."""
+    whole = http.get(path)
+    assert whole.headers["cache-control"] == "private, no-cache"
+    again = http.get(path, headers={"If-None-Match": whole.headers["etag"]})
+    assert (again.status_code, again.content) == (304, b"")
+
+
+def test_poses_and_frames_of_a_dataset(http: httpx.Client) -> None:
+    poses = http.get("/v1/datasets/tiny/poses").json()
+    for part, own in (("train", DATASET.train), ("val", DATASET.val)):
+        np.testing.assert_allclose(np.reshape(poses[part], (-1, 4, 4)), own.poses, atol=1e-9)
+        frame = picture(http.get(f"/v1/datasets/tiny/frames/{part}/1"))
+        assert frame.shape == (512, 512)  # 40 mm by 40 mm
+        assert abs(frame.mean() - own.images[1].mean()) < 1.0
+        assert_revalidated(http, f"/v1/datasets/tiny/frames/{part}/1")
+    assert_revalidated(http, "/v1/datasets/tiny/poses")
+    for path, status in (("train/6", 404), ("val/3", 404), ("other/0", 422), ("val/-1", 422)):
+        assert http.get(f"/v1/datasets/tiny/frames/{path}").status_code == status
+    assert http.get("/v1/datasets/nobody/poses").json()["reason"] == "DATASET_NOT_FOUND"
+
+
+def test_a_scene_is_compared_with_the_frames_held_out_from_it(http: httpx.Client, artifacts: Path) -> None:
+    assert http.get("/v1/scenes/of-tiny/comparison/0/truth.png").json()["reason"] == "ARTIFACT_NOT_FOUND"
+    found = finished(http, "of-tiny")
+    assert (found["state"], found["dataset"], found["error"]) == ("ready", "tiny", None)
+    assert [frame["index"] for frame in found["frames"]] == [0, 1, 2]
+    pictures = {
+        what: picture(http.get(f"/v1/scenes/of-tiny/comparison/1/{what}.png")).astype(float) for what in PICTURES
+    }
+    assert_revalidated(http, "/v1/scenes/of-tiny/comparison/1/truth.png")
+    expected = np.minimum(3.0 * np.abs(pictures["truth"] - pictures["rendering"]), 255)
+    assert np.abs(pictures["difference"] - expected).mean() < 15.0  # they were enlarged after the difference
+    error = np.mean((pictures["truth"] - pictures["rendering"]) ** 2) / 255.0**2
+    assert abs(-10 * np.log10(error) - found["frames"][1]["psnr_db"]) < 3.0
+    assert found["frames"][1]["median_psnr_db"] != found["frames"][1]["psnr_db"]
+    (kept,) = (artifacts / "comparisons").iterdir()
+    assert kept.name.endswith(DATASET.sha256)
+    assert (kept / PROGRESS_NAME).read_text() == "0.9"  # it never falls back
+    pixels = 4 * DATASET.val.images.size
+    assert sum(path.stat().st_size for path in kept.glob("*.npy")) < pixels + 4 * 1024
+    before = kept.stat().st_ino
+    assert finished(http, "of-tiny") == found
+    assert kept.stat().st_ino == before
+
+
+def test_what_cannot_be_compared_says_why(http: httpx.Client) -> None:
+    missing = http.get("/v1/scenes/demo/comparison").json()
+    assert (missing["reason"], missing["field"]) == ("DATASET_NOT_FOUND", "scene")
+    assert "'synthetic'" in missing["detail"]
+    found = finished(http, "of-whole")
+    assert (found["state"], found["error"]) == ("failed", "DATASET_INVALID")
+    assert "hold some out" in found["reason"]
+    assert http.get("/v1/scenes/nobody/comparison").json()["reason"] == "SCENE_NOT_FOUND"
+
+
+def made_of(dataset: Dataset, artifacts: Path) -> int:
+    return len([*artifacts.glob(f"dataset-views/*{dataset.sha256}"), *artifacts.glob(f"comparisons/*{dataset.sha256}")])
+
+
+def test_nothing_stays_of_a_deleted_dataset(
+    http: httpx.Client, service: RunningService, artifacts: Path, tmp_path: Path
+) -> None:
+    doomed = Dataset("doomed", sweep(5, 0.0), sweep(2, 0.5))
+    upload(http, "doomed", doomed, tmp_path / "doomed")
+    upload(http, "same", doomed, tmp_path / "same")
+    http.put("/v1/scenes/of-doomed", content=scene_of(doomed).to_bytes(), headers=RAW)
+    http.get("/v1/datasets/doomed/poses")
+    finished(http, "of-doomed")
+    assert http.delete("/v1/datasets/doomed").status_code == 204
+    assert made_of(doomed, artifacts) == 2
+    with service.channel() as channel:
+        datasets_pb2_grpc.DatasetServiceStub(channel).DeleteDataset(datasets_pb2.DeleteDatasetRequest(dataset="same"))
+    assert made_of(doomed, artifacts) == 0
+
+
+def test_a_dataset_deleted_while_it_is_laid_out(
+    http: httpx.Client, service: RunningService, artifacts: Path, tmp_path: Path
+) -> None:
+    doomed = Dataset("doomed", sweep(4, 0.0), sweep(2, 0.5))
+    upload(http, "doomed", doomed, tmp_path / "doomed")
+    with ThreadPoolExecutor(1) as executor:
+        answer = executor.submit(http.get, "/v1/datasets/doomed/poses")
+        os.kill(wait_until(lambda: helper_process(service, "dataset_view")), signal.SIGSTOP)
+        assert http.delete("/v1/datasets/doomed").status_code == 204
+        assert answer.result().json()["reason"] == "DATASET_NOT_FOUND"
+    assert made_of(doomed, artifacts) == len(list(artifacts.glob("dataset-views/.*"))) == 0
+
+
+def test_a_service_that_stops_or_dies_while_it_lays_a_dataset_out(start_service: StartService, tmp_path: Path) -> None:
+    with ThreadPoolExecutor(1) as executor:
+
+        def begin() -> tuple[RunningService, Future[httpx.Response]]:
+            service = start_service(artifact_folder=tmp_path / "artifacts")
+            if not (tmp_path / "tiny").is_dir():
+                with httpx.Client(base_url=service.http) as client:
+                    upload(client, "tiny", DATASET, tmp_path / "tiny")
+            asked = executor.submit(httpx.get, f"{service.http}/v1/datasets/tiny/poses", timeout=60)
+            os.kill(wait_until(lambda: helper_process(service, "dataset_view")), signal.SIGSTOP)
+            return service, asked
+
+        def left() -> list[Path]:
+            return list((tmp_path / "artifacts" / "dataset-views").iterdir())
+
+        first, asked = begin()
+        assert first.terminate() == 0
+        answer = asked.result()
+        assert (answer.status_code, answer.json()["reason"]) == (503, "DRAINING")
+        assert not left()
+        second, asked = begin()
+        second.process.kill()
+        assert isinstance(asked.exception(), httpx.HTTPError)
+        assert left()
+        start_service(artifact_folder=tmp_path / "artifacts")
+        assert not left()

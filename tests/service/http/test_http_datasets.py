@@ -1,0 +1,373 @@
+from __future__ import annotations
+
+import io
+import json
+import os
+import signal
+import socket
+import tarfile
+import time
+import zipfile
+import zlib
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+
+from ultragray import LinearProbe
+from ultragray.datasets import Dataset, Sweep
+from ultragray.datasets.released import write_released
+from ultragray_service.core.dataset_uploads import MAX_UPLOADS
+
+from ...waiting import wait_until
+from ..conftest import RunningService, StartService
+
+KEY = "0123456789abcdef-datasets"
+KEY_HEADER = {"X-API-Key": KEY}
+LIMIT_BYTES = 200_000
+ZIP = "application/zip"
+WAIT_S = 10.0
+
+
+def sweep(count: int, offset_mm: float, seed: int = 0) -> Sweep:
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, 1, 3] = np.arange(count) + offset_mm
+    images = np.random.default_rng([count, seed]).integers(0, 250, (count, 20, 16), dtype=np.uint8)
+    return Sweep(images, poses, LinearProbe(40.0, 0.0, 50.0), np.arange(count), "sweep")
+
+
+def released_files(folder: Path, seed: int = 0) -> dict[str, bytes]:
+    """A dataset of the released layout: 8 training and 3 held-out frames of 20x16."""
+    write_released(Dataset("tiny", sweep(8, 0.0, seed), sweep(3, 0.5, seed)), folder)
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def poisoned_files(files: dict[str, bytes]) -> dict[str, bytes]:
+    poses = np.load(io.BytesIO(files["poses_train.npy"]))
+    poses[5, 0, 0] = np.nan
+    changed = io.BytesIO()
+    np.save(changed, poses)
+    return {**files, "poses_train.npy": changed.getvalue()}
+
+
+def zipped(files: dict[str, bytes]) -> bytes:
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in files.items():
+            archive.writestr(f"folder/{name}", content)
+    return packed.getvalue()
+
+
+def tarred(files: dict[str, bytes]) -> bytes:
+    packed = io.BytesIO()
+    with tarfile.open(fileobj=packed, mode="w:gz") as archive:
+        for name, content in files.items():
+            entry = tarfile.TarInfo(name)
+            entry.size = len(content)
+            archive.addfile(entry, io.BytesIO(content))
+    return packed.getvalue()
+
+
+def plus_files() -> dict[str, bytes]:
+    """Ten frames of 40x30 pixels and their device set."""
+
+    def numbers(matrix: Any) -> str:
+        return " ".join(repr(float(value)) for value in np.asarray(matrix).ravel())
+
+    images = np.random.default_rng(3).integers(0, 250, (10, 40, 30), dtype=np.uint8)
+    payload = zlib.compress(images.tobytes())
+    header = {
+        "ObjectType": "Image",
+        "NDims": "3",
+        "BinaryData": "True",
+        "CompressedData": "True",
+        "CompressedDataSize": str(len(payload)),
+        "DimSize": "30 40 10",
+        "ElementSpacing": "1 1 1",
+        "ElementType": "MET_UCHAR",
+        "UltrasoundImageOrientation": "MF",
+    }
+    for frame in range(10):
+        pose = np.eye(4)
+        pose[1, 3] = frame
+        header[f"Seq_Frame{frame:04d}_ProbeToTrackerTransform"] = numbers(pose)
+        header[f"Seq_Frame{frame:04d}_ProbeToTrackerTransformStatus"] = "OK"
+    header["ElementDataFile"] = "LOCAL"
+    calibration = [[0.5, 0, 0, -3.0], [0, 0, 1, 1.0], [0, 0.5, 0, 2.0], [0, 0, 0, 1]]
+    device_set = (
+        '<PlusConfiguration version="2.1"><CoordinateDefinitions>'
+        f'<Transform From="Image" To="Probe" Matrix="{numbers(calibration)}"/>'
+        "</CoordinateDefinitions></PlusConfiguration>"
+    )
+    text = "".join(f"{key} = {value}\n" for key, value in header.items())
+    return {"sweep.igs.mha": text.encode() + payload, "device_set.xml": device_set.encode()}
+
+
+def uploads_under_way(folder: Path) -> list[str]:
+    return [path.name for path in folder.glob("datasets/.*")]
+
+
+def helper_process(service: RunningService, module: str) -> int | None:
+    """The helper process of the service that does the work of a module, once it runs Python."""
+    for path in Path("/proc").glob("[0-9]*"):
+        try:
+            parent = int((path / "stat").read_text().rpartition(")")[2].split()[1])
+            if parent == service.process.pid and module.encode() in (path / "cmdline").read_bytes():
+                return int(path.name)
+        except OSError:
+            continue
+    return None
+
+
+class HalfUpload:
+    """A PUT of which only the beginning has been sent."""
+
+    def __init__(self, service: RunningService, name: str) -> None:
+        address = httpx.URL(service.http)
+        assert address.port is not None
+        self.socket = socket.create_connection((address.host, address.port), timeout=WAIT_S)
+        head = (
+            f"PUT /v1/datasets/{name} HTTP/1.1\r\nHost: test\r\nX-API-Key: {KEY}\r\n"
+            f"Content-Type: {ZIP}\r\nContent-Length: 100000\r\n\r\n"
+        )
+        self.socket.sendall(head.encode() + b"PK" * 100)
+
+    def answer(self) -> str:
+        received = b""
+        while b'"request_id"' not in received:
+            block = self.socket.recv(65536)
+            assert block, received
+            received += block
+        return received.decode()
+
+    def close(self) -> None:
+        self.socket.close()
+
+
+@pytest.fixture(scope="module")
+def artifacts(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("artifacts")
+
+
+@pytest.fixture(scope="module")
+def service(start_service: StartService, artifacts: Path) -> RunningService:
+    return start_service(
+        artifact_folder=artifacts,
+        max_dataset_bytes=LIMIT_BYTES,
+        max_body_bytes=1024,
+        upload_idle_timeout_s=0.5,
+        api_keys=KEY,
+    )
+
+
+@pytest.fixture(scope="module")
+def http(service: RunningService) -> Iterator[httpx.Client]:
+    with httpx.Client(base_url=service.http, headers=KEY_HEADER, timeout=30) as client:
+        yield client
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> dict[str, bytes]:
+    return released_files(tmp_path / "tiny")
+
+
+@pytest.fixture(autouse=True)
+def _nothing_is_left(artifacts: Path) -> Iterator[None]:
+    yield
+    wait_until(lambda: not uploads_under_way(artifacts))
+
+
+def put(http: httpx.Client, name: str, content: Any, media_type: str = ZIP, **options: str) -> httpx.Response:
+    return http.put(f"/v1/datasets/{name}", content=content, headers={"Content-Type": media_type}, params=options)
+
+
+def assert_problem(answer: httpx.Response, status: int, reason: str, detail: str = "") -> None:
+    problem = answer.json()
+    assert (answer.status_code, problem["reason"]) == (status, reason), problem
+    assert detail in problem["detail"]
+
+
+def test_the_life_of_a_dataset(http: httpx.Client, files: dict[str, bytes], tmp_path: Path) -> None:
+    first = put(http, "liver", zipped(files))
+    assert first.status_code == 201, first.text
+    dataset = first.json()
+    assert (dataset["name"], dataset["kind"]) == ("liver", "released")
+    assert (dataset["train_frames"], dataset["val_frames"]) == (8, 3)
+    assert (dataset["height"], dataset["width"]) == (20, 16)
+    assert dataset["probe"] == {"kind": "linear", "width_mm": 40.0, "near_mm": 0.0, "far_mm": 50.0}
+    assert dataset["bytes"] == sum(map(len, files.values()))
+    assert http.get("/v1/datasets/liver").json() == dataset
+
+    again = put(http, "liver", tarred(files), "application/gzip")
+    assert (again.status_code, again.json()) == (200, dataset)
+    other = zipped(released_files(tmp_path / "other", seed=1))
+    assert_problem(put(http, "liver", other), 409, "DATASET_EXISTS")
+    assert http.get("/v1/datasets/liver").json() == dataset
+
+    sheet = http.get("/v1/datasets/liver/contact-sheet")
+    assert sheet.headers["content-type"] == "image/png"
+    assert sheet.content.startswith(b"\x89PNG")
+
+    deleted = http.delete("/v1/datasets/liver")
+    assert (deleted.status_code, deleted.content) == (204, b"")
+    for path in ("/v1/datasets/liver", "/v1/datasets/liver/contact-sheet"):
+        assert_problem(http.get(path), 404, "DATASET_NOT_FOUND", "no dataset 'liver'")
+    assert_problem(http.delete("/v1/datasets/liver"), 404, "DATASET_NOT_FOUND")
+
+
+def test_separate_files_and_options(http: httpx.Client, files: dict[str, bytes]) -> None:
+    parts = [("files", (name, content)) for name, content in files.items()]
+    options = {"train_frames": "0:6", "image_size": "8x10"}
+    dataset = http.put("/v1/datasets/parts", files=parts, params=options).json()
+    assert (dataset["train_frames"], dataset["height"], dataset["width"]) == (6, 10, 8)
+    assert dataset["options"] == options
+    assert dataset["warnings"] == []
+    assert_problem(http.put("/v1/datasets/p", files=parts, params={"train_frames": "0:99"}), 422, "INVALID_ARGUMENT")
+    http.delete("/v1/datasets/parts")
+
+
+def test_a_plus_sequence_with_its_device_set(http: httpx.Client) -> None:
+    parts = [("files", (name, content)) for name, content in plus_files().items()]
+    dataset = http.put("/v1/datasets/sweep", files=parts, params={"crop": "2:28,4:40"}).json()
+    assert (dataset["kind"], dataset["train_frames"], dataset["val_frames"]) == ("plus", 8, 2)
+    assert dataset["probe"] == {"kind": "linear", "width_mm": 13.0, "near_mm": 0.0, "far_mm": 18.0}
+    http.delete("/v1/datasets/sweep")
+
+
+def test_what_cannot_be_used_is_refused_with_the_frame(http: httpx.Client, files: dict[str, bytes]) -> None:
+    answer = put(http, "bad", zipped(poisoned_files(files)))
+    assert_problem(answer, 422, "DATASET_INVALID", "folder/poses_train.npy: frame 5: its pose")
+    assert http.get("/v1/datasets").json() == {"datasets": [], "next_page_token": ""}
+
+
+def test_an_archive_that_leaves_its_folder(http: httpx.Client, artifacts: Path) -> None:
+    assert_problem(put(http, "bad", zipped({"../../../evil": b"1"})), 422, "DATASET_INVALID", "plain paths")
+    assert not list(artifacts.rglob("evil"))
+    part = [("files", ("../../evil", b"1"))]
+    assert_problem(http.put("/v1/datasets/bad", files=part), 422, "DATASET_INVALID", "plain paths")
+
+
+def test_limits(http: httpx.Client) -> None:
+    def chunks() -> Iterator[bytes]:
+        for _ in range(LIMIT_BYTES // 1000 + 1):
+            yield b"\0" * 1000
+
+    assert_problem(put(http, "large", b"\0" * (LIMIT_BYTES + 1)), 413, "UPLOAD_TOO_LARGE", "announced")
+    assert_problem(put(http, "large", chunks()), 413, "UPLOAD_TOO_LARGE", str(LIMIT_BYTES))
+    bomb = zipped({"conf.json": b"\0" * 5_000_000})
+    assert len(bomb) < LIMIT_BYTES
+    assert_problem(put(http, "large", bomb), 413, "UPLOAD_TOO_LARGE", str(LIMIT_BYTES))
+
+
+@pytest.mark.parametrize(
+    ("name", "headers", "content", "expected"),
+    [
+        ("a", {"Content-Type": "application/json"}, b"{}", (415, "UNSUPPORTED_MEDIA_TYPE", "Content-Type")),
+        ("a", {}, b"PK", (422, "DATASET_INVALID", "neither .zip nor .tar")),
+        ("a", {}, b"PK\x03\x04and no more", (422, "DATASET_INVALID", "cut short")),
+        ("a", {"Content-Type": ZIP, "Content-Encoding": "gzip"}, b"PK", (415, "UNSUPPORTED_MEDIA_TYPE", "compressed")),
+        (".hidden", {"Content-Type": ZIP}, b"PK", (422, "INVALID_ARGUMENT", "dataset must be")),
+        ("a", {"Content-Type": "multipart/form-data"}, b"PK", (422, "INVALID_ARGUMENT", "boundary")),
+        ("a", {"Content-Type": "multipart/form-data; boundary=x"}, b"PK", (422, "INVALID_ARGUMENT", "multipart")),
+        ("a", {"Content-Type": "multipart/form-data; boundary=x"}, b"--x\r\n", (422, "INVALID_ARGUMENT", "truncated")),
+        (
+            "a",
+            {"Content-Type": "multipart/form-data; boundary=x"},
+            b'--x\r\nContent-Disposition: form-data; name="crop"\r\n\r\n1\r\n--x--\r\n',
+            (422, "INVALID_ARGUMENT", "'crop' is none"),
+        ),
+    ],
+)
+def test_requests_that_are_no_uploads(
+    http: httpx.Client, name: str, headers: dict[str, str], content: bytes, expected: tuple[int, str, str]
+) -> None:
+    assert_problem(http.put(f"/v1/datasets/{name}", headers=headers, content=content), *expected)
+
+
+def test_an_upload_needs_a_key(service: RunningService, files: dict[str, bytes]) -> None:
+    answer = httpx.put(f"{service.http}/v1/datasets/a", content=zipped(files), headers={"Content-Type": ZIP})
+    assert_problem(answer, 401, "UNAUTHENTICATED")
+
+
+def test_pages_join_to_the_whole_list(http: httpx.Client, artifacts: Path, files: dict[str, bytes]) -> None:
+    names = ["a", "b", "c"]
+    put(http, "a", zipped(files))
+    manifest = json.loads((artifacts / "datasets" / "a" / "dataset.json").read_text())
+    for name in names[1:]:
+        (artifacts / "datasets" / name).mkdir()
+        (artifacts / "datasets" / name / "dataset.json").write_text(json.dumps({**manifest, "name": name}))
+    (artifacts / "datasets" / "no-manifest").mkdir()
+    found, token = [], ""
+    while True:
+        page = http.get("/v1/datasets", params={"page_size": 2, "page_token": token}).json()
+        found += [dataset["name"] for dataset in page["datasets"]]
+        if not (token := page["next_page_token"]):
+            break
+    assert found == names
+    assert_problem(http.get("/v1/datasets", params={"page_token": "*"}), 422, "INVALID_ARGUMENT")
+    for name in names:
+        assert http.delete(f"/v1/datasets/{name}").status_code == 204
+
+
+def test_an_upload_that_comes_to_a_halt(service: RunningService, artifacts: Path) -> None:
+    upload = HalfUpload(service, "halted")
+    wait_until(lambda: uploads_under_way(artifacts))
+    answer = upload.answer()
+    assert "504" in answer.splitlines()[0]
+    assert "DEADLINE_EXCEEDED" in answer
+    upload.close()
+
+
+def test_a_client_that_goes_away(service: RunningService, artifacts: Path) -> None:
+    upload = HalfUpload(service, "gone")
+    wait_until(lambda: uploads_under_way(artifacts))
+    started = time.monotonic()
+    upload.close()
+    wait_until(lambda: not uploads_under_way(artifacts))
+    assert time.monotonic() - started < 0.4  # before the idle timeout
+
+
+def test_too_many_uploads_at_once(service: RunningService) -> None:
+    uploads = [HalfUpload(service, f"upload-{number}") for number in range(MAX_UPLOADS + 1)]
+    answers = [upload.answer() for upload in uploads]
+    assert sum("QUEUE_FULL" in answer for answer in answers) == 1
+    assert sum("DEADLINE_EXCEEDED" in answer for answer in answers) == MAX_UPLOADS
+    for upload in uploads:
+        upload.close()
+
+
+def test_a_check_that_is_killed(http: httpx.Client, service: RunningService, files: dict[str, bytes]) -> None:
+    with ThreadPoolExecutor(1) as executor:
+        answer = executor.submit(put, http, "killed", zipped(files))
+        pid = wait_until(lambda: helper_process(service, "dataset_intake"))
+        os.kill(pid, signal.SIGKILL)
+        assert_problem(answer.result(), 507, "MEMORY_EXCEEDED", "was killed")
+        answer = executor.submit(put, http, "killed", zipped(files))
+        pid = wait_until(lambda: helper_process(service, "dataset_intake"))
+        os.kill(pid, signal.SIGBUS)
+        assert_problem(answer.result(), 422, "DATASET_INVALID", f"signal {signal.SIGBUS:d}")
+    assert put(http, "killed", zipped(files)).status_code == 201
+    http.delete("/v1/datasets/killed")
+
+
+def test_a_service_that_dies_or_stops_leaves_nothing(start_service: StartService, tmp_path: Path) -> None:
+    first = start_service(artifact_folder=tmp_path, api_keys=KEY)
+    upload = HalfUpload(first, "half")
+    wait_until(lambda: uploads_under_way(tmp_path))
+    first.process.kill()
+    first.process.wait()
+    upload.close()
+    assert uploads_under_way(tmp_path)
+    second = start_service(artifact_folder=tmp_path, api_keys=KEY)
+    assert not uploads_under_way(tmp_path)
+    upload = HalfUpload(second, "half")
+    wait_until(lambda: uploads_under_way(tmp_path))
+    second.process.send_signal(signal.SIGTERM)
+    assert "DRAINING" in upload.answer()
+    upload.close()
+    assert second.terminate() == 0
+    assert not list((tmp_path / "datasets").iterdir())

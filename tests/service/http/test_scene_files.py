@@ -1,0 +1,262 @@
+"""Scene files over HTTP: looked into, downloaded, imported, deleted."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import socket
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+from safetensors.numpy import save
+
+from ultragray import GaussianScene, SceneInfo
+from ultragray.scene_info import MAX_TRAINING_POSES, expected_shapes, info_to_json
+from ultragray_service.views.scene_points import even_selection
+
+from ...waiting import wait_until
+from ..conftest import DEMO_PROBE, RunningService, StartService, make_scene
+
+MAX_BYTES = 20_000_000
+RAW = {"Content-Type": "application/octet-stream"}
+POSE = {"position_mm": {"x": 0, "y": 1, "z": 0}, "quaternion": {"w": 1, "x": 0, "y": 0, "z": 0}}
+
+
+@pytest.fixture(scope="module")
+def artifacts(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("artifacts")
+
+
+@pytest.fixture(scope="module")
+def service(start_service: StartService, artifacts: Path) -> RunningService:
+    return start_service(artifact_folder=artifacts, max_dataset_bytes=MAX_BYTES, max_body_bytes=1024)
+
+
+@pytest.fixture(scope="module")
+def http(service: RunningService) -> Iterator[httpx.Client]:
+    with httpx.Client(base_url=service.http, timeout=60) as client:
+        yield client
+
+
+def points_of(answer: httpx.Response) -> tuple[dict[str, object], np.ndarray]:
+    length = int.from_bytes(answer.content[:4], "little")
+    assert (4 + length) % 8 == 0
+    header = json.loads(answer.content[4 : 4 + length])
+    return header, np.frombuffer(answer.content[4 + length :], "<f4").reshape(-1, 6)
+
+
+def test_gaussians_as_points(http: httpx.Client, demo_scene: GaussianScene) -> None:
+    answer = http.get("/v1/scenes/demo/gaussians")
+    header, points = points_of(answer)
+    assert header == {
+        "count": 400,
+        "fields": ["x", "y", "z", "intensity", "transmittance", "deviation_mm"],
+        "total": 400,
+    }
+    means_mm = demo_scene.means.numpy() * 10 + [0, 0, 20]
+    np.testing.assert_allclose(points[:, :3], means_mm, atol=1e-4)
+    intensity = (demo_scene.sh0[:, 0, 0].numpy() * 0.28209479 + 1).clip(0.5, 0.999)
+    np.testing.assert_allclose(points[:, 3], intensity, atol=1e-5)
+    np.testing.assert_allclose(points[:, 4], demo_scene.transmittances.sigmoid().numpy(), atol=1e-5)
+    np.testing.assert_allclose(points[:, 5], 10 * demo_scene.scales.exp().mean(dim=1).numpy(), rtol=1e-5)
+
+    few, chosen = points_of(http.get("/v1/scenes/demo/gaussians", params={"limit": 7}))
+    assert few["count"] == 7
+    np.testing.assert_array_equal(chosen, points[even_selection(400, 7)])
+    assert http.get("/v1/scenes/demo/gaussians", params={"limit": 0}).json()["reason"] == "INVALID_ARGUMENT"
+    assert http.get("/v1/scenes/nobody/gaussians").json()["reason"] == "SCENE_NOT_FOUND"
+
+
+@pytest.mark.parametrize(("count", "limit"), [(0, 5), (3, 5), (5, 5), (1000, 7), (7, 1)])
+def test_an_even_selection(count: int, limit: int) -> None:
+    chosen = even_selection(count, limit)
+    assert len(chosen) == min(count, limit) == len(set(chosen.tolist()))
+    gaps = np.diff([*chosen, count])
+    assert not len(chosen) or gaps.max() - gaps.min() <= 1
+
+
+def test_training_poses(http: httpx.Client, demo_scene: GaussianScene) -> None:
+    poses = np.array(http.get("/v1/scenes/demo/training-poses").json()["poses"])
+    np.testing.assert_array_equal(poses.reshape(-1, 4, 4), demo_scene.training_poses)
+
+
+def test_the_life_of_an_imported_scene(http: httpx.Client, artifacts: Path) -> None:
+    sent = make_scene(probe=DEMO_PROBE, seed=5).to_bytes()
+    answer = http.put("/v1/scenes/sent", content=sent, headers=RAW)
+    assert answer.status_code == 201, answer.text
+    assert (answer.json()["name"], answer.json()["gaussian_count"]) == ("sent", 400)
+    assert "sent" in [scene["name"] for scene in http.get("/v1/scenes").json()["scenes"]]
+
+    whole = http.get("/v1/scenes/sent/file")
+    assert whole.content == sent
+    assert 'filename="sent.ugr"' in whole.headers["content-disposition"]
+    part = http.get("/v1/scenes/sent/file", headers={"Range": "bytes=10-19"})
+    assert (part.status_code, part.content) == (206, sent[10:20])
+
+    again = http.put("/v1/scenes/sent", content=sent, headers=RAW)
+    assert (again.status_code, again.json()["reason"]) == (409, "SCENE_EXISTS")
+    assert "delete it first, or choose another name" in again.json()["detail"]
+    assert http.post("/v1/scenes/sent/render", json={"pose": POSE}).status_code == 200
+    assert http.get("/v1/scenes/sent").json()["loaded"]
+    removable = {entry["name"]: entry["removable"] for entry in http.get("/v1/scenes").json()["scenes"]}
+    assert (removable["demo"], removable["sent"]) == (False, True)
+
+    assert http.delete("/v1/scenes/sent").status_code == 204
+    assert http.get("/v1/scenes/sent").json()["reason"] == "SCENE_NOT_FOUND"
+    assert http.delete("/v1/scenes/sent").json()["reason"] == "SCENE_NOT_FOUND"
+    assert http.get("/v1/statistics").json()["loaded_scenes"] == 0
+    assert not list((artifacts / "scenes").iterdir())
+
+
+def test_what_is_no_scene_is_refused_and_leaves_nothing(http: httpx.Client, artifacts: Path) -> None:
+    whole = make_scene(probe=DEMO_PROBE).to_bytes()
+    damaged = bytearray(whole)
+    damaged[-200:] = b"\xff" * 200  # a header that is well, and numbers that are none
+    for content, detail in (
+        (whole[:-100], "the body"),
+        (b"\x89PNG no scene", "the body"),
+        (bytes(damaged), "the body"),
+    ):
+        answer = http.put("/v1/scenes/bad", content=content, headers=RAW)
+        problem = answer.json()
+        assert (answer.status_code, problem["reason"], problem["field"]) == (422, "SCENE_FILE_INVALID", "body")
+        assert detail in problem["detail"]
+        assert str(artifacts) not in problem["detail"]
+    announced = http.put("/v1/scenes/bad", content=b"\0" * (MAX_BYTES + 1), headers=RAW)
+    assert (announced.status_code, announced.json()["reason"]) == (413, "UPLOAD_TOO_LARGE")
+
+    def blocks() -> Iterator[bytes]:
+        for _ in range(3):
+            yield b"\0" * (MAX_BYTES // 2)
+
+    assert http.put("/v1/scenes/bad", content=blocks(), headers=RAW).status_code == 413
+    assert http.put("/v1/scenes/.bad", content=whole, headers=RAW).json()["reason"] == "INVALID_ARGUMENT"
+    assert not list((artifacts / "scenes").glob("*"))
+    assert not list((artifacts / "scenes").glob(".*"))
+
+
+def test_scenes_of_the_data_folder_stay(http: httpx.Client, data_folder: Path) -> None:
+    answer = http.delete("/v1/scenes/demo")
+    assert (answer.status_code, answer.json()["reason"]) == (403, "SCENE_READ_ONLY")
+    assert (data_folder / "demo.ugr").exists()
+    taken = http.put("/v1/scenes/demo", content=make_scene().to_bytes(), headers=RAW)
+    assert taken.json()["reason"] == "SCENE_EXISTS"
+    assert taken.json()["detail"] == "there is already a scene 'demo': choose another name"
+
+
+def test_what_did_not_change_is_not_sent_again(http: httpx.Client, artifacts: Path) -> None:
+    sent = make_scene(probe=DEMO_PROBE, seed=6).to_bytes()
+    assert http.put("/v1/scenes/kept", content=sent, headers=RAW).status_code == 201
+    for path in ("/v1/scenes/kept/gaussians", "/v1/scenes/kept/training-poses"):
+        first = http.get(path)
+        assert first.headers["cache-control"] == "private, no-cache"
+        again = http.get(path, headers={"If-None-Match": first.headers["etag"]})
+        assert (again.status_code, again.content) == (304, b"")
+    (artifacts / "scenes" / "other").write_bytes(make_scene(300).to_bytes())
+    (artifacts / "scenes" / "other").replace(artifacts / "scenes" / "kept.ugr")
+    for path in ("/v1/scenes/kept/gaussians", "/v1/scenes/kept/training-poses"):
+        assert http.get(path, headers={"If-None-Match": first.headers["etag"]}).status_code == 200
+    assert http.delete("/v1/scenes/kept").status_code == 204
+
+
+def test_a_scene_deleted_during_its_first_frame_leaves_no_memory(http: httpx.Client, service: RunningService) -> None:
+    sent = make_scene(3000, probe=DEMO_PROBE, seed=7).to_bytes()
+    assert http.put("/v1/scenes/brief", content=sent, headers=RAW).status_code == 201
+    loaded = http.get("/v1/statistics").json()["loaded_scenes"]
+    large = {"pose": POSE, "height": 2048, "width": 2048, "outputs": ["bmode", "transmittance"]}
+    with ThreadPoolExecutor() as threads:
+        rendering = threads.submit(http.post, "/v1/scenes/brief/render", json=large)
+        wait_until(lambda: http.get("/v1/statistics").json()["busy_processes"])
+        time.sleep(0.05)  # the file is read, the frame is not rendered
+        assert http.delete("/v1/scenes/brief").status_code == 204
+        assert rendering.result().status_code == 200
+    assert http.get("/v1/statistics").json()["loaded_scenes"] == loaded
+
+
+def test_who_stops_during_the_check_gets_no_scene(service: RunningService, http: httpx.Client, artifacts: Path) -> None:
+    whole = make_scene(probe=DEMO_PROBE, seed=8).to_bytes()
+    url = httpx.URL(service.http)
+    with socket.create_connection((url.host, url.port)) as connection:
+        head = f"PUT /v1/scenes/stopped HTTP/1.1\r\nHost: {url.host}\r\nContent-Length: {len(whole)}\r\n\r\n"
+        connection.sendall(head.encode() + whole)
+        (checking,) = wait_until(lambda: helpers_of(service))
+    wait_until(lambda: not Path(f"/proc/{checking}").exists(), within_s=20)
+    wait_until(lambda: not list((artifacts / "scenes").glob(".*")))
+    assert http.get("/v1/scenes/stopped").status_code == 404
+    assert http.put("/v1/scenes/stopped", content=whole, headers=RAW).status_code == 201
+    assert http.delete("/v1/scenes/stopped").status_code == 204
+
+
+def test_a_check_that_the_machine_ends_blames_no_file(
+    service: RunningService, http: httpx.Client, artifacts: Path
+) -> None:
+    whole = make_scene(probe=DEMO_PROBE, seed=9).to_bytes()
+    with ThreadPoolExecutor() as threads:
+        sending = threads.submit(http.put, "/v1/scenes/unlucky", content=whole, headers=RAW)
+        (checking,) = wait_until(lambda: helpers_of(service))
+        os.kill(checking, signal.SIGKILL)  # as a machine without memory does
+        answer = sending.result()
+    assert (answer.status_code, answer.json()["reason"]) == (507, "MEMORY_EXCEEDED")
+    assert not list((artifacts / "scenes").iterdir())
+
+
+def without_gaussians(poses: np.ndarray, **info: Any) -> bytes:
+    tensors = {name: np.zeros(shape, np.float32) for name, shape in expected_shapes(0, 0).items()}
+    return save({**tensors, "training_poses": poses}, {"ultragray": info_to_json(SceneInfo(**info))})
+
+
+def test_more_poses_than_a_scene_may_have_are_not_read(http: httpx.Client) -> None:
+    sent = without_gaussians(np.zeros((MAX_TRAINING_POSES + 1, 4, 4)))
+    problem = http.put("/v1/scenes/many", content=sent, headers=RAW).json()
+    assert (problem["reason"], problem["field"]) == ("SCENE_FILE_INVALID", "body")
+    assert problem["detail"].startswith("the body: ")
+    assert problem["detail"].endswith("training_poses must be at most 100000, got 100001")
+
+
+def test_metrics_that_are_no_numbers_are_left_out(http: httpx.Client) -> None:
+    sent = without_gaussians(np.eye(4)[None], metrics={"psnr_db": 20.5, "huge": 10**400, "text": "x"})
+    assert http.put("/v1/scenes/odd", content=sent, headers=RAW).status_code == 201
+    assert http.get("/v1/scenes/odd").json()["metrics"] == {"psnr_db": 20.5}
+    assert http.delete("/v1/scenes/odd").status_code == 204
+
+
+def test_what_a_killed_service_left_goes_at_once(start_service: StartService, tmp_path: Path) -> None:
+    whole = make_scene(probe=DEMO_PROBE).to_bytes()
+    killed = start_service(artifact_folder=tmp_path)
+    url = httpx.URL(killed.http)
+
+    def received() -> list[int]:
+        return [path.stat().st_size for path in (tmp_path / "scenes").glob(".importing-*")]
+
+    with socket.create_connection((url.host, url.port)) as connection:
+        head = f"PUT /v1/scenes/late HTTP/1.1\r\nHost: {url.host}\r\nContent-Length: {len(whole)}\r\n\r\n"
+        connection.sendall(head.encode() + whole[:-1])
+        wait_until(lambda: sum(received()))
+        start_service(artifact_folder=tmp_path)
+        assert received()  # another one lives
+        killed.process.kill()
+        killed.process.wait()
+    start_service(artifact_folder=tmp_path)
+    assert not received()
+
+
+def helpers_of(service: RunningService) -> list[int]:
+    """Its processes that check scene files."""
+    found = []
+    for folder in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError):
+            parent = int((folder / "stat").read_text().rpartition(")")[2].split()[1])
+            if (
+                parent == service.process.pid
+                and "ultragray_workers.helpers.scene_check" in (folder / "cmdline").read_text()
+            ):
+                found.append(int(folder.name))
+    return found

@@ -1,0 +1,246 @@
+"""The WebSocket stream against a real service."""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import json
+import socket
+import struct
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import ClientConnection, connect
+
+from ultragray import GaussianScene, render
+
+from ...waiting import wait_until
+from ..conftest import HEIGHT, WIDTH, RunningService
+
+TIMEOUT_S = 20.0
+KEY = "a-key-of-twenty-chars"
+
+
+def at(x: float) -> dict[str, Any]:
+    return {"position_mm": {"x": x, "y": 0.0, "z": 0.0}, "quaternion": {"w": 1.0, "x": 0.0, "y": 0.0, "z": 0.0}}
+
+
+def address(service: RunningService, scene: str = "demo") -> str:
+    return f"{service.http.replace('http', 'ws', 1)}/v1/scenes/{scene}/stream"
+
+
+class Stream:
+    """A client's end of a stream."""
+
+    def __init__(self, connection: ClientConnection) -> None:
+        self.connection = connection
+
+    def send(self, **message: Any) -> None:
+        self.connection.send(json.dumps(message))
+
+    def receive(self) -> tuple[dict[str, Any], bytes]:
+        message = self.connection.recv(timeout=TIMEOUT_S)
+        if isinstance(message, str):
+            return json.loads(message), b""
+        (length,) = struct.unpack_from("<I", message)
+        assert (4 + length) % 8 == 0
+        return json.loads(message[4 : 4 + length]), message[4 + length :]
+
+    def ask(self, **message: Any) -> tuple[dict[str, Any], bytes]:
+        self.send(**message)
+        return self.receive()
+
+
+@pytest.fixture
+def open_stream(service: RunningService) -> Iterator[Callable[..., Stream]]:
+    with contextlib.ExitStack() as opened:
+
+        def open_(scene: str = "demo", **options: Any) -> Stream:
+            connection = connect(address(service, scene), compression=None, max_size=None, close_timeout=0.2, **options)
+            return Stream(opened.enter_context(connection))
+
+        yield open_
+
+
+def test_frames_are_those_of_the_library(open_stream: Callable[..., Stream], demo_scene: GaussianScene) -> None:
+    about, data = open_stream().ask(
+        sequence=2**40,
+        settings={"outputs": ["bmode", "coverage"], "encoding": "float32"},
+        pose=at(1.5),
+        client_time_ms=12.25,
+    )
+    assert (about["sequence"], about["client_time_ms"], about["dropped"]) == (2**40, 12.25, 0)
+    assert (about["scene"], about["height"], about["width"]) == ("demo", HEIGHT, WIDTH)
+    assert about["outputs"] == ["bmode", "coverage"]
+    assert about["pose"][0] == [1.0, 0.0, 0.0, 1.5]
+    assert about["render_ms"] > 0
+    frames = render(demo_scene, None, np.array(about["pose"]), height=HEIGHT, width=WIDTH)
+    pixels = np.frombuffer(data, "<f4").reshape(2, HEIGHT, WIDTH)
+    assert frames.bmode is not None
+    assert frames.coverage is not None
+    np.testing.assert_allclose(pixels[0], frames.bmode[0].numpy(), atol=1e-5)
+    np.testing.assert_allclose(pixels[1], frames.coverage[0].numpy(), atol=1e-5)
+
+
+@pytest.mark.parametrize("encoding", ["png", "jpeg"])
+def test_image_files(open_stream: Callable[..., Stream], encoding: str) -> None:
+    about, data = open_stream().ask(settings={"encoding": encoding, "height": 20, "width": 30}, pose=at(0.0))
+    assert about["encoding"] == encoding
+    assert cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED).shape == (20, 30)
+
+
+def test_ordered_streams_answer_every_pose_and_settings_may_change(open_stream: Callable[..., Stream]) -> None:
+    stream = open_stream()
+    for k in range(30):
+        settings = {"settings": {"height": 10, "width": 12}} if k == 20 else {}
+        stream.send(sequence=k, pose=at(k / 10), **settings)
+    answers = [stream.receive()[0] for _ in range(30)]
+    assert [answer["sequence"] for answer in answers] == list(range(30))
+    assert [answer["height"] for answer in answers] == [HEIGHT] * 20 + [10] * 10
+
+
+def test_latest_streams_answer_for_the_newest_pose(open_stream: Callable[..., Stream]) -> None:
+    stream = open_stream()
+    settings = {"height": 600, "width": 600, "outputs": ["bmode", "echo", "transmittance", "coverage"]}
+    stream.send(mode="latest", settings=settings)
+    for k in range(300):
+        stream.send(sequence=k, pose=at(k / 100))
+    answers = [stream.receive()[0]]
+    while answers[-1]["sequence"] != 299:
+        answers.append(stream.receive()[0])
+    assert len(answers) < 200
+    assert len(answers) + sum(answer["dropped"] for answer in answers) == 300
+
+
+def test_bad_messages_do_not_end_a_stream(open_stream: Callable[..., Stream]) -> None:
+    stream = open_stream()
+
+    def refused(**message: Any) -> tuple[str, str | None]:
+        about, _ = stream.ask(sequence=5, **message)
+        assert about["sequence"] == 5
+        assert about["error"]["detail"]
+        return about["error"]["reason"], about["error"]["field"]
+
+    unanswerable = {"sequence": 7, "client_time_ms": 1.5, "pose": {"matrix": [[1.0]]}}
+    about, _ = stream.ask(**unanswerable)
+    assert (about["sequence"], about["client_time_ms"]) == (7, 1.5)
+    assert refused(pose={"matrix": np.diag([-1.0, 1, 1, 1]).tolist()}) == ("INVALID_POSE", "pose.matrix")
+    assert refused(settings={"outputs": ["colour"]}) == ("UNKNOWN_OUTPUT", "settings.outputs")
+    assert refused(settings={"height": 100_000}) == ("INVALID_IMAGE_SIZE", "settings.height")
+    assert refused(poses=[]) == ("INVALID_ARGUMENT", "poses")
+    assert refused(mode="newest") == ("INVALID_ARGUMENT", "mode")
+    probe = {"kind": "linear", "width_mm": -1.0, "near_mm": 0.0, "far_mm": 10.0}
+    assert refused(settings={"probe": probe}) == ("INVALID_PROBE", "settings.probe.width_mm")
+    stream.connection.send("{")
+    assert stream.receive()[0]["error"]["reason"] == "INVALID_ARGUMENT"
+    stream.connection.send(b"\x00\x01")
+    assert stream.receive()[0]["error"]["reason"] == "INVALID_ARGUMENT"
+    assert refused(pose=at(0.0), timeout_ms=1e-6)[0] == "DEADLINE_EXCEEDED"
+    assert stream.ask(pose=at(0.0))[1]
+
+
+def test_refused_settings_change_nothing(open_stream: Callable[..., Stream]) -> None:
+    stream = open_stream()
+    bad = {"height": 100_000}
+    assert stream.ask(sequence=1, settings=bad)[0]["error"]["field"] == "settings.height"
+    assert stream.ask(sequence=2, pose=at(0.0))[0]["error"]["field"] == "settings"
+    assert stream.ask(sequence=3, settings={"height": 10, "width": 12}, pose=at(0.0))[0]["height"] == 10
+    assert stream.ask(sequence=4, settings=bad, pose=at(0.0))[0]["error"]["field"] == "settings.height"
+    assert stream.ask(sequence=5, pose=at(0.0))[0]["height"] == 10
+
+
+def test_clients_that_break_off_leave_no_trace(service: RunningService, open_stream: Callable[..., Stream]) -> None:
+    before = len(service.log())
+    for _ in range(6):
+        stream = open_stream()
+        for k in range(20):
+            stream.send(settings={"height": 600, "width": 600}, pose=at(k / 10))
+        stream.receive()
+        stream.connection.socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        stream.connection.socket.close()
+    assert open_stream().ask(pose=at(0.0))[1]
+    time.sleep(0.3)
+    assert [record for record in service.log()[before:] if record["level"] == "error"] == []
+
+
+def test_what_cannot_be_streamed_is_refused_before_it_begins(service: RunningService) -> None:
+    with pytest.raises(InvalidStatus) as refusal, connect(address(service, "nowhere")):
+        pass
+    assert refusal.value.response.status_code == 404
+    problem = json.loads(refusal.value.response.body)
+    assert problem["reason"] == "SCENE_NOT_FOUND"
+
+
+@pytest.mark.parametrize("origin", ["http://elsewhere.example", "http://[", "null", ""])
+def test_pages_of_other_sites_are_refused(service: RunningService, origin: str) -> None:
+    before = len(service.log())
+    with pytest.raises(InvalidStatus) as refusal, connect(address(service), origin=origin):
+        pass
+    assert [record for record in service.log()[before:] if record["level"] == "error"] == []
+    assert json.loads(refusal.value.response.body)["reason"] == "ORIGIN_REFUSED"
+
+
+def test_pages_of_the_service_itself_are_welcome(service: RunningService) -> None:
+    with connect(address(service), origin=service.http):
+        pass
+
+
+def test_a_message_beyond_the_limit_ends_the_stream_only(open_stream: Callable[..., Stream]) -> None:
+    stream, other = open_stream(), open_stream()
+    stream.connection.send("x" * 70_000)
+    with pytest.raises(ConnectionClosed, match="1009"):
+        stream.receive()
+    assert other.ask(pose=at(0.0))[1]
+
+
+def test_a_reader_that_stops_costs_others_nothing(service: RunningService, open_stream: Callable[..., Stream]) -> None:
+    stuck = open_stream(max_queue=1)
+    stuck.send(mode="latest", settings={"height": 600, "width": 600})
+    before = service.resident_bytes()
+    for k in range(2000):
+        stuck.send(sequence=k, pose=at(k / 1000))
+    other = open_stream()
+    for k in range(20):
+        assert other.ask(sequence=k, pose=at(0.0))[0]["sequence"] == k
+    assert service.resident_bytes() - before < 64 * 2**20
+
+
+def test_streams_are_counted(service: RunningService, open_stream: Callable[..., Stream]) -> None:
+    def open_streams() -> float:
+        return service.metric("ultragray_open_streams")
+
+    before = open_streams()
+    stream = open_stream()
+    stream.ask(pose=at(0.0))
+    assert open_streams() == before + 1
+    stream.connection.close()
+    wait_until(lambda: open_streams() == before)
+
+
+def test_keys_are_asked_for(start_service: Callable[..., RunningService]) -> None:
+    service = start_service(api_keys=KEY)
+    with pytest.raises(InvalidStatus) as refusal, connect(address(service)):
+        pass
+    assert refusal.value.response.status_code == 401
+    with connect(address(service), additional_headers={"Authorization": f"Bearer {KEY}"}):
+        pass
+    offered = "ultragray.key." + base64.urlsafe_b64encode(KEY.encode()).decode().rstrip("=")
+    with connect(address(service), subprotocols=["ultragray.v1", offered]) as connection:  # type: ignore[list-item]
+        assert connection.subprotocol == "ultragray.v1"
+        assert Stream(connection).ask(pose=at(0.0))[1]
+
+
+def test_a_stop_ends_streams_after_their_frames(start_service: Callable[..., RunningService]) -> None:
+    service = start_service()
+    with connect(address(service), max_size=None) as connection:
+        stream = Stream(connection)
+        stream.ask(pose=at(0.0))
+        service.process.terminate()
+        with pytest.raises(ConnectionClosed, match="1012"):
+            stream.receive()
+    assert service.terminate() == 0

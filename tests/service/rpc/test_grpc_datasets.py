@@ -1,0 +1,142 @@
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import grpc
+import pytest
+
+from ultragray_proto.v1 import datasets_pb2, datasets_pb2_grpc
+
+from ...waiting import wait_until
+from ..conftest import RunningService, StartService
+from ..http.test_http_datasets import KEY, LIMIT_BYTES, poisoned_files, released_files, uploads_under_way, zipped
+from .test_grpc_render import error_info
+
+METADATA = (("x-api-key", KEY),)
+Message = datasets_pb2.UploadDatasetRequest
+
+
+@pytest.fixture(scope="module")
+def artifacts(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("artifacts")
+
+
+@pytest.fixture(scope="module")
+def service(start_service: StartService, artifacts: Path) -> RunningService:
+    return start_service(
+        artifact_folder=artifacts, max_dataset_bytes=LIMIT_BYTES, upload_idle_timeout_s=0.5, api_keys=KEY
+    )
+
+
+@pytest.fixture(scope="module")
+def datasets(service: RunningService) -> Iterator[datasets_pb2_grpc.DatasetServiceStub]:
+    with service.channel() as channel:
+        yield datasets_pb2_grpc.DatasetServiceStub(channel)
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> dict[str, bytes]:
+    return released_files(tmp_path / "tiny")
+
+
+@pytest.fixture(autouse=True)
+def _nothing_is_left(artifacts: Path) -> Iterator[None]:
+    yield
+    wait_until(lambda: not uploads_under_way(artifacts))
+
+
+def header(name: str, *, archive: bool = False, **options: str) -> Message:
+    return Message(
+        header=datasets_pb2.UploadHeader(dataset=name, archive=archive, options=datasets_pb2.DatasetOptions(**options))
+    )
+
+
+def parts(files: dict[str, bytes], chunk_bytes: int = 1000) -> Iterator[Message]:
+    for name, content in files.items():
+        yield Message(file=name)
+        for start in range(0, len(content), chunk_bytes):
+            yield Message(chunk=content[start : start + chunk_bytes])
+
+
+def upload(stub: datasets_pb2_grpc.DatasetServiceStub, *messages: Message) -> datasets_pb2.UploadDatasetResponse:
+    return stub.UploadDataset(iter(messages), metadata=METADATA, timeout=30)
+
+
+def refusal(call: Any, *arguments: Any, **keywords: Any) -> tuple[grpc.StatusCode, str, str]:
+    with pytest.raises(grpc.RpcError) as caught:
+        call(*arguments, **keywords)
+    return caught.value.code(), error_info(caught.value)[0].reason, caught.value.details()
+
+
+def test_the_life_of_a_dataset(datasets: datasets_pb2_grpc.DatasetServiceStub, files: dict[str, bytes]) -> None:
+    first = upload(datasets, header("liver", train_frames="0:6"), *parts(files))
+    assert first.created
+    dataset = first.dataset
+    assert (dataset.name, dataset.kind, dataset.train_frames, dataset.val_frames) == ("liver", "released", 6, 3)
+    assert (dataset.height, dataset.width, dataset.probe.linear.width_mm) == (20, 16, 40.0)
+    assert dataset.options == datasets_pb2.DatasetOptions(train_frames="0:6")
+
+    archive = Message(chunk=zipped(files))
+    again = upload(datasets, header("liver", archive=True, train_frames="0:6"), archive)
+    assert (again.created, again.dataset) == (False, dataset)
+
+    assert datasets.GetDataset(datasets_pb2.GetDatasetRequest(dataset="liver"), metadata=METADATA) == dataset
+    page = datasets.ListDatasets(datasets_pb2.ListDatasetsRequest(), metadata=METADATA)
+    assert (list(page.datasets), page.next_page_token) == ([dataset], "")
+    sheet = datasets.GetContactSheet(datasets_pb2.GetContactSheetRequest(dataset="liver"), metadata=METADATA)
+    assert sheet.png.startswith(b"\x89PNG")
+    datasets.DeleteDataset(datasets_pb2.DeleteDatasetRequest(dataset="liver"), metadata=METADATA)
+    for method, request in (
+        (datasets.GetDataset, datasets_pb2.GetDatasetRequest(dataset="liver")),
+        (datasets.GetContactSheet, datasets_pb2.GetContactSheetRequest(dataset="liver")),
+        (datasets.DeleteDataset, datasets_pb2.DeleteDatasetRequest(dataset="liver")),
+    ):
+        code, reason, _ = refusal(method, request, metadata=METADATA)
+        assert (code, reason) == (grpc.StatusCode.NOT_FOUND, "DATASET_NOT_FOUND")
+
+
+def test_what_is_refused(datasets: datasets_pb2_grpc.DatasetServiceStub, files: dict[str, bytes]) -> None:
+    invalid = grpc.StatusCode.INVALID_ARGUMENT
+    large = [Message(chunk=b"\0" * 100_000)] * 3
+    for messages, reason, detail in (
+        ([header("bad"), *parts(poisoned_files(files))], "DATASET_INVALID", "poses_train.npy: frame 5: its pose"),
+        ([header("bad", archive=True), *large], "UPLOAD_TOO_LARGE", str(LIMIT_BYTES)),
+        ([header("bad"), Message(file="../evil")], "DATASET_INVALID", "plain paths"),
+        ([header("bad"), Message(chunk=b"1")], "DATASET_INVALID", "name a file before its bytes"),
+        ([header("bad", archive=True), Message(file="a")], "INVALID_ARGUMENT", "must hold chunk"),
+        ([header("bad"), header("bad")], "INVALID_ARGUMENT", "got header"),
+        ([header("a/b")], "INVALID_ARGUMENT", "dataset must be"),
+        ([Message(chunk=b"1")], "INVALID_ARGUMENT", "first message"),
+        ([], "INVALID_ARGUMENT", "first message"),
+    ):
+        code, found, details = refusal(upload, datasets, *messages)
+        assert (code, found) == (invalid, reason), details
+        assert detail in details
+
+
+def test_an_upload_needs_a_key(datasets: datasets_pb2_grpc.DatasetServiceStub) -> None:
+    code, reason, _ = refusal(datasets.UploadDataset, iter([header("a")]), timeout=10)
+    assert (code, reason) == (grpc.StatusCode.UNAUTHENTICATED, "UNAUTHENTICATED")
+
+
+def begun(seconds: float) -> Iterator[Message]:
+    yield header("half")
+    yield Message(file="conf.json")
+    time.sleep(seconds)
+
+
+def test_an_upload_that_comes_to_a_halt(datasets: datasets_pb2_grpc.DatasetServiceStub) -> None:
+    code, reason, _ = refusal(datasets.UploadDataset, begun(1.5), metadata=METADATA, timeout=10)
+    assert (code, reason) == (grpc.StatusCode.DEADLINE_EXCEEDED, "DEADLINE_EXCEEDED")
+
+
+def test_a_client_that_goes_away(datasets: datasets_pb2_grpc.DatasetServiceStub, artifacts: Path) -> None:
+    call = datasets.UploadDataset.future(begun(0.5), metadata=METADATA)
+    wait_until(lambda: uploads_under_way(artifacts))
+    started = time.monotonic()
+    call.cancel()
+    wait_until(lambda: not uploads_under_way(artifacts))
+    assert time.monotonic() - started < 0.4

@@ -1,0 +1,254 @@
+"""JobService against a real service without a worker: what is submitted waits."""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import grpc
+import pytest
+from google.protobuf.json_format import MessageToDict
+from google.rpc.error_details_pb2 import ErrorInfo
+from google.rpc.status_pb2 import Status
+
+from ultragray_proto.v1 import geometry_pb2, jobs_pb2, jobs_pb2_grpc, rendering_pb2
+from ultragray_service.rpc.job_messages import specification_from_message
+from ultragray_workers.jobs.specification import TrainJob
+
+from ..conftest import RunningService, StartService
+
+WAIT_S = 20.0
+
+
+@pytest.fixture(scope="module")
+def jobs_service(start_service: StartService, tmp_path_factory: pytest.TempPathFactory) -> RunningService:
+    return start_service(artifact_folder=tmp_path_factory.mktemp("artifacts"), embedded_worker=False)
+
+
+@pytest.fixture(scope="module")
+def jobs(jobs_service: RunningService) -> Iterator[jobs_pb2_grpc.JobServiceStub]:
+    with jobs_service.channel() as channel:
+        yield jobs_pb2_grpc.JobServiceStub(channel)
+
+
+def training_poses(**changes: Any) -> jobs_pb2.SubmitJobRequest:
+    render = jobs_pb2.RenderJob(scene="demo", sampler=jobs_pb2.PoseSampler(kind="training"))
+    return jobs_pb2.SubmitJobRequest(render=render, **changes)
+
+
+def refusal(call: Callable[[], Any]) -> tuple[str, str, str]:
+    """Status, reason and field of a call that fails."""
+    with pytest.raises(grpc.RpcError) as caught:
+        call()
+    error: Any = caught.value
+    details = Status.FromString(dict(error.trailing_metadata())["grpc-status-details-bin"]).details
+    info = ErrorInfo()
+    details[0].Unpack(info)
+    return error.code().name, info.reason, info.metadata["field"]
+
+
+def test_a_render_job_comes_back_as_it_was_asked_for(jobs: jobs_pb2_grpc.JobServiceStub) -> None:
+    pose = geometry_pb2.Pose(matrix=geometry_pb2.Matrix(values=[1, 0, 0, 0, 0, 1, 0, 2.5, 0, 0, 1, 0, 0, 0, 0, 1]))
+    render = jobs_pb2.RenderJob(
+        scene="demo",
+        poses=[pose, pose],
+        height=16,
+        outputs=[rendering_pb2.OUTPUT_ECHO, rendering_pb2.OUTPUT_BMODE],
+        format="tar",
+        dtype="float32",
+        sampler=jobs_pb2.PoseSampler(kind="fan", tilt_deg=5, step_deg=2.5),
+    )
+    answer = jobs.SubmitJob(jobs_pb2.SubmitJobRequest(render=render, priority=2))
+    job = answer.job
+    assert answer.created
+    assert (job.kind, job.state, job.priority) == (jobs_pb2.JOB_KIND_RENDER, jobs_pb2.JOB_STATE_QUEUED, 2)
+    assert (job.render.scene, job.render.pose_count, len(job.render.poses)) == ("demo", 2, 0)
+    assert (job.render.height, job.render.HasField("width")) == (16, False)
+    assert (job.render.format, job.render.dtype, job.render.sampler) == ("tar", "float32", render.sampler)
+    assert list(job.render.outputs) == [rendering_pb2.OUTPUT_ECHO, rendering_pb2.OUTPUT_BMODE]
+    assert not job.HasField("error")
+    assert not any(job.progress.HasField(field.name) for field in job.progress.DESCRIPTOR.fields)
+    assert jobs.GetJob(jobs_pb2.GetJobRequest(job=job.id)) == job
+
+
+def test_the_same_request_id_gives_the_same_job(jobs: jobs_pb2_grpc.JobServiceStub) -> None:
+    sampler = jobs_pb2.PoseSampler(kind="around", count=3, translation_mm=1.5, seed=7)
+    request = jobs_pb2.SubmitJobRequest(render=jobs_pb2.RenderJob(scene="demo", sampler=sampler), request_id="one")
+    first, again = jobs.SubmitJob(request), jobs.SubmitJob(request)
+    assert (first.created, again.created) == (True, False)
+    assert first.job == again.job
+    told = MessageToDict(first.job.render.sampler, preserving_proto_field_name=True)
+    assert told == {"kind": "around", "count": 3, "translation_mm": 1.5, "rotation_deg": 5.0, "seed": "7"}
+    conflict = training_poses(request_id="one")
+    assert refusal(lambda: jobs.SubmitJob(conflict)) == ("ALREADY_EXISTS", "REQUEST_ID_CONFLICT", "request_id")
+
+
+@pytest.mark.parametrize(
+    ("request_message", "expected"),
+    [
+        (jobs_pb2.SubmitJobRequest(), ("INVALID_ARGUMENT", "INVALID_ARGUMENT", "train")),
+        (
+            jobs_pb2.SubmitJobRequest(train=jobs_pb2.TrainJob(scene="new")),
+            ("INVALID_ARGUMENT", "INVALID_ARGUMENT", "train.dataset"),
+        ),
+        (
+            jobs_pb2.SubmitJobRequest(train=jobs_pb2.TrainJob(dataset="gone", scene="new")),
+            ("NOT_FOUND", "DATASET_NOT_FOUND", "train.dataset"),
+        ),
+        (
+            jobs_pb2.SubmitJobRequest(render=jobs_pb2.RenderJob(scene="demo")),
+            ("INVALID_ARGUMENT", "INVALID_ARGUMENT", "render.poses"),
+        ),
+        (
+            jobs_pb2.SubmitJobRequest(render=jobs_pb2.RenderJob(scene="demo", poses=[geometry_pb2.Pose()])),
+            ("INVALID_ARGUMENT", "INVALID_POSE", "render.poses[0]"),
+        ),
+        (
+            jobs_pb2.SubmitJobRequest(render=jobs_pb2.RenderJob(scene="demo", outputs=[9])),
+            ("INVALID_ARGUMENT", "UNKNOWN_OUTPUT", "render.outputs"),
+        ),
+        (
+            jobs_pb2.SubmitJobRequest(
+                render=jobs_pb2.RenderJob(scene="gone", sampler=jobs_pb2.PoseSampler(kind="training"))
+            ),
+            ("NOT_FOUND", "SCENE_NOT_FOUND", "render.scene"),
+        ),
+        (training_poses(priority=-1001), ("INVALID_ARGUMENT", "INVALID_ARGUMENT", "priority")),
+    ],
+)
+def test_what_cannot_be_run_is_refused_by_name(
+    jobs: jobs_pb2_grpc.JobServiceStub,
+    request_message: jobs_pb2.SubmitJobRequest,
+    expected: tuple[str, str, str],
+) -> None:
+    assert refusal(lambda: jobs.SubmitJob(request_message)) == expected
+
+
+def test_pages_and_filters(jobs: jobs_pb2_grpc.JobServiceStub) -> None:
+    made = [jobs.SubmitJob(training_poses()).job.id for _ in range(3)]
+    first = jobs.ListJobs(jobs_pb2.ListJobsRequest(page_size=2, state=jobs_pb2.JOB_STATE_QUEUED))
+    assert [job.id for job in first.jobs] == made[:0:-1]
+    second = jobs.ListJobs(
+        jobs_pb2.ListJobsRequest(page_size=1, state=jobs_pb2.JOB_STATE_QUEUED, page_token=first.next_page_token)
+    )
+    assert [job.id for job in second.jobs] == made[:1]
+    assert not jobs.ListJobs(jobs_pb2.ListJobsRequest(kind=jobs_pb2.JOB_KIND_TRAIN)).jobs
+    refused = refusal(lambda: jobs.ListJobs(jobs_pb2.ListJobsRequest(state=99)))
+    assert refused == ("INVALID_ARGUMENT", "INVALID_ARGUMENT", "state")
+
+
+def test_cancel_and_retry(jobs: jobs_pb2_grpc.JobServiceStub) -> None:
+    job = jobs.SubmitJob(training_poses()).job
+    refused = refusal(lambda: jobs.RetryJob(jobs_pb2.RetryJobRequest(job=job.id)))
+    assert refused == ("FAILED_PRECONDITION", "JOB_NOT_FINISHED", "job")
+    assert jobs.CancelJob(jobs_pb2.CancelJobRequest(job=job.id)).state == jobs_pb2.JOB_STATE_CANCELLED
+    retried = jobs.RetryJob(jobs_pb2.RetryJobRequest(job=job.id))
+    assert (retried.state, retried.retry_of) == (jobs_pb2.JOB_STATE_QUEUED, job.id)
+    assert jobs.RetryJob(jobs_pb2.RetryJobRequest(job=job.id)) == retried
+
+
+def test_a_finished_job_is_deleted(jobs: jobs_pb2_grpc.JobServiceStub) -> None:
+    job = jobs.SubmitJob(training_poses()).job
+    request = jobs_pb2.DeleteJobRequest(job=job.id)
+    assert refusal(lambda: jobs.DeleteJob(request)) == ("FAILED_PRECONDITION", "JOB_IN_USE", "job")
+    jobs.CancelJob(jobs_pb2.CancelJobRequest(job=job.id))
+    assert jobs.DeleteJob(request).job == job.id
+    assert refusal(lambda: jobs.DeleteJob(request)) == ("NOT_FOUND", "JOB_NOT_FOUND", "job")
+
+
+def test_log_and_artifacts_of_a_job(start_service: StartService, tmp_path: Path) -> None:
+    service = start_service(artifact_folder=tmp_path, embedded_worker=True, training_threads=1)
+    with service.channel() as channel:
+        jobs = jobs_pb2_grpc.JobServiceStub(channel)
+        sampler = jobs_pb2.PoseSampler(kind="around", count=60)
+        render = jobs_pb2.RenderJob(scene="demo", sampler=sampler, height=64, width=128)
+        job = jobs.SubmitJob(jobs_pb2.SubmitJobRequest(render=render)).job
+        *_, last = jobs.WatchJob(jobs_pb2.WatchJobRequest(job=job.id), timeout=60)
+        assert last.job.state == jobs_pb2.JOB_STATE_SUCCEEDED, last
+        log = (tmp_path / "jobs" / job.id / "log.txt").read_text()
+        assert jobs.GetJobLog(jobs_pb2.GetJobLogRequest(job=job.id)).log == log
+        assert jobs.GetJobLog(jobs_pb2.GetJobLogRequest(job=job.id, max_bytes=7)).log == log[-7:]
+
+        content = (tmp_path / "jobs" / job.id / "artifacts" / "frames.npz").read_bytes()
+        chunks = list(jobs.DownloadArtifact(jobs_pb2.DownloadArtifactRequest(job=job.id, name="frames.npz")))
+        assert b"".join(chunk.data for chunk in chunks) == content
+        assert len(chunks) == 2
+        assert {chunk.file_bytes for chunk in chunks} == {len(content)}
+        for offset in (len(content) - 5, len(content)):
+            rest = jobs_pb2.DownloadArtifactRequest(job=job.id, name="frames.npz", offset=offset)
+            assert [chunk.data for chunk in jobs.DownloadArtifact(rest)] == [content[offset:]]
+
+        def refused(**changes: Any) -> tuple[str, str, str]:
+            asked = {"job": job.id, "name": "frames.npz"} | changes
+            return refusal(lambda: list(jobs.DownloadArtifact(jobs_pb2.DownloadArtifactRequest(**asked))))
+
+        assert refused(name="../job.json") == ("NOT_FOUND", "ARTIFACT_NOT_FOUND", "name")
+        assert refused(job="0" * 24) == ("NOT_FOUND", "JOB_NOT_FOUND", "job")
+        for offset in (-1, len(content) + 1):
+            assert refused(offset=offset) == ("INVALID_ARGUMENT", "INVALID_ARGUMENT", "offset")
+        log_request = jobs_pb2.GetJobLogRequest(job=job.id, max_bytes=-1)
+        assert refusal(lambda: jobs.GetJobLog(log_request)) == ("INVALID_ARGUMENT", "INVALID_ARGUMENT", "max_bytes")
+
+
+def test_a_watch_tells_every_state_and_ends_with_the_last(jobs: jobs_pb2_grpc.JobServiceStub) -> None:
+    job = jobs.SubmitJob(training_poses()).job
+    watch = jobs.WatchJob(jobs_pb2.WatchJobRequest(job=job.id), timeout=WAIT_S)
+    assert next(watch).job.state == jobs_pb2.JOB_STATE_QUEUED
+    jobs.CancelJob(jobs_pb2.CancelJobRequest(job=job.id))
+    assert [event.job.state for event in watch] == [jobs_pb2.JOB_STATE_CANCELLED]
+    again = jobs.WatchJob(jobs_pb2.WatchJobRequest(job=job.id), timeout=WAIT_S)
+    assert [event.job.state for event in again] == [jobs_pb2.JOB_STATE_CANCELLED]
+    gone = jobs_pb2.WatchJobRequest(job="0" * 24)
+    assert refusal(lambda: next(jobs.WatchJob(gone))) == ("NOT_FOUND", "JOB_NOT_FOUND", "job")
+
+
+def test_a_stopping_service_tells_its_watchers_to_come_again(
+    start_service: StartService, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    service = start_service(artifact_folder=tmp_path_factory.mktemp("artifacts"), embedded_worker=False)
+    with service.channel() as channel:
+        jobs = jobs_pb2_grpc.JobServiceStub(channel)
+        watch = jobs.WatchJob(jobs_pb2.WatchJobRequest(job=jobs.SubmitJob(training_poses()).job.id), timeout=WAIT_S)
+        next(watch)
+        stopper = threading.Thread(target=service.terminate)
+        stopper.start()
+        assert refusal(lambda: next(watch)) == ("UNAVAILABLE", "DRAINING", "")
+        stopper.join(WAIT_S)
+        assert service.process.returncode == 0
+
+
+def test_settings_that_no_training_takes_are_refused(jobs: jobs_pb2_grpc.JobServiceStub) -> None:
+    for settings, field in (({"stepz": 3}, "stepz"), ({"steps": 2.5}, "steps"), ({"start": "warm"}, "start")):
+        train = jobs_pb2.TrainJob(dataset="gone", scene="new")
+        train.settings.update(settings)
+        refused = refusal(lambda: jobs.SubmitJob(jobs_pb2.SubmitJobRequest(train=train)))  # noqa: B023 (called here)
+        assert refused == ("INVALID_ARGUMENT", "INVALID_ARGUMENT", f"train.settings.{field}")
+    for number in (math.nan, math.inf):
+        train = jobs_pb2.TrainJob(dataset="gone", scene="new")
+        train.settings.update({"means_rate": number})
+        refused = refusal(lambda: jobs.SubmitJob(jobs_pb2.SubmitJobRequest(train=train)))  # noqa: B023
+        assert refused == ("INVALID_ARGUMENT", "INVALID_ARGUMENT", "train.settings")
+
+
+def test_whole_numbers_of_settings_are_integers() -> None:
+    train = jobs_pb2.TrainJob(dataset="sweep", scene="new")
+    train.settings.update(
+        {"steps": 250, "prune_above": 0.5, "transmittance": False, "memory_gb": None, "start": "random"}
+    )
+    specification, field = specification_from_message(jobs_pb2.SubmitJobRequest(train=train))
+    assert field == "train"
+    assert isinstance(specification, TrainJob)
+    assert (specification.preset, specification.device) == ("fast", "auto")
+    settings = specification.settings
+    assert settings == {
+        "steps": 250,
+        "prune_above": 0.5,
+        "transmittance": False,
+        "memory_gb": None,
+        "start": "random",
+    }
+    assert type(settings["steps"]) is int
+    assert settings["transmittance"] is False

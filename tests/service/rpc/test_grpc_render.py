@@ -1,0 +1,343 @@
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import cv2
+import grpc
+import numpy as np
+import pytest
+from google.rpc.error_details_pb2 import BadRequest, ErrorInfo
+from google.rpc.status_pb2 import Status
+
+from ultragray import GaussianScene, render
+from ultragray_proto.v1 import geometry_pb2, rendering_pb2, rendering_pb2_grpc
+
+from ..conftest import HEIGHT, WIDTH
+
+Stub = rendering_pb2_grpc.RenderServiceStub
+TIMEOUT_S = 30
+
+
+def error_info(error: grpc.RpcError) -> tuple[ErrorInfo, BadRequest | None]:
+    """What grpc-status-details-bin says, after checking that it agrees with the status itself."""
+    trailers = dict(error.trailing_metadata())
+    status = Status.FromString(trailers["grpc-status-details-bin"])
+    assert status.code == error.code().value[0]
+    assert status.message == error.details()
+    assert trailers["x-request-id"]
+    info, violation = ErrorInfo(), None
+    assert status.details[0].Unpack(info)
+    for detail in status.details[1:]:
+        if detail.Is(BadRequest.DESCRIPTOR):
+            violation = BadRequest()
+            detail.Unpack(violation)
+    assert info.domain == "ultragray"
+    return info, violation
+
+
+def moved(x_mm: float) -> geometry_pb2.Pose:
+    position = geometry_pb2.Position(x=x_mm)
+    return geometry_pb2.Pose(
+        placement=geometry_pb2.Placement(position_mm=position, quaternion=geometry_pb2.Quaternion(w=1.0))
+    )
+
+
+def matrix_pose(matrix: Any) -> geometry_pb2.Pose:
+    return geometry_pb2.Pose(matrix=geometry_pb2.Matrix(values=np.asarray(matrix).ravel().tolist()))
+
+
+def expected(scene: GaussianScene, x_mm: float) -> Any:
+    pose = np.eye(4)
+    pose[0, 3] = x_mm
+    frames = render(scene, None, pose, height=HEIGHT, width=WIDTH, outputs=("bmode",))
+    assert frames.bmode is not None
+    return frames.bmode[0].numpy()
+
+
+def pixels(frame: rendering_pb2.Frame) -> Any:
+    return np.frombuffer(frame.data, np.uint8).reshape(frame.height, frame.width) / 255
+
+
+def test_one_frame_carries_all_that_renders_it_again(
+    renders: Stub, demo_scene: GaussianScene, settings_message: Any, pose_message: Any
+) -> None:
+    request = rendering_pb2.RenderRequest(settings=settings_message, pose=pose_message)
+    frame = renders.Render(request, timeout=TIMEOUT_S)
+    assert np.abs(pixels(frame) - expected(demo_scene, 1.0)).max() <= 1.001 / 255
+    assert (frame.scene, len(frame.scene_sha256), frame.height, frame.width) == ("demo", 64, HEIGHT, WIDTH)
+    assert frame.renderer.startswith("ultragray/")
+    assert list(frame.outputs) == [rendering_pb2.OUTPUT_BMODE]
+    assert frame.encoding == rendering_pb2.ENCODING_UINT8
+    assert frame.probe.linear.far_mm == 40.0
+    assert frame.pose.values[3] == 1.0
+    assert frame.timings.render_ms > 0
+    again = rendering_pb2.RenderSettings(
+        scene=frame.scene,
+        height=frame.height,
+        width=frame.width,
+        outputs=frame.outputs,
+        encoding=frame.encoding,
+        probe=frame.probe,
+    )
+    pose = geometry_pb2.Pose(matrix=frame.pose)
+    repeated = renders.Render(rendering_pb2.RenderRequest(settings=again, pose=pose), timeout=TIMEOUT_S)
+    assert repeated.data == frame.data
+
+
+def test_float32_outputs_follow_each_other(renders: Stub, demo_scene: GaussianScene) -> None:
+    settings = rendering_pb2.RenderSettings(
+        scene="demo",
+        outputs=[rendering_pb2.OUTPUT_TRANSMITTANCE, rendering_pb2.OUTPUT_BMODE],
+        encoding=rendering_pb2.ENCODING_FLOAT32,
+    )
+    frame = renders.Render(rendering_pb2.RenderRequest(settings=settings, pose=moved(2.0)), timeout=TIMEOUT_S)
+    _, bmode = np.frombuffer(frame.data, "<f4").reshape(2, HEIGHT, WIDTH)
+    np.testing.assert_allclose(bmode, expected(demo_scene, 2.0), atol=1e-5)
+
+
+@pytest.mark.parametrize("encoding", [rendering_pb2.ENCODING_PNG, rendering_pb2.ENCODING_JPEG])
+def test_image_files(renders: Stub, encoding: int) -> None:
+    settings = rendering_pb2.RenderSettings(scene="demo", encoding=encoding, height=20, width=30)
+    frame = renders.Render(rendering_pb2.RenderRequest(settings=settings, pose=moved(0.0)), timeout=TIMEOUT_S)
+    assert cv2.imdecode(np.frombuffer(frame.data, np.uint8), cv2.IMREAD_UNCHANGED).shape == (20, 30)
+
+
+def test_a_batch_comes_in_order(renders: Stub, demo_scene: GaussianScene, settings_message: Any) -> None:
+    shifts = np.linspace(-4, 4, 40)
+    request = rendering_pb2.RenderBatchRequest(settings=settings_message, poses=[moved(x) for x in shifts])
+    frames = list(renders.RenderBatch(request, timeout=TIMEOUT_S))
+    assert [frame.sequence for frame in frames] == list(range(40))
+    assert [frame.pose.values[3] for frame in frames] == shifts.tolist()
+    assert np.abs(pixels(frames[7]) - expected(demo_scene, shifts[7])).max() <= 1.001 / 255
+
+
+class Conversation:
+    """A stream whose messages are sent one by one."""
+
+    def __init__(self, stub: Stub) -> None:
+        self._outgoing: queue.Queue[Any] = queue.Queue()
+        self.call = stub.RenderStream(iter(self._outgoing.get, None), timeout=TIMEOUT_S)
+
+    def send(self, sequence: int = 0, **fields: Any) -> None:
+        self._outgoing.put(rendering_pb2.RenderStreamRequest(sequence=sequence, **fields))
+
+    def ask(self, sequence: int, **fields: Any) -> rendering_pb2.Frame:
+        self.send(sequence, **fields)
+        frame = next(self.call)
+        assert frame.sequence == sequence
+        return frame
+
+    def finish(self) -> list[rendering_pb2.Frame]:
+        self._outgoing.put(None)
+        return list(self.call)
+
+
+@pytest.fixture
+def conversation(renders: Stub) -> Iterator[Conversation]:
+    conversation = Conversation(renders)
+    yield conversation
+    conversation.finish()
+
+
+def test_a_stream_answers_in_order_and_echoes_sequences(
+    conversation: Conversation, demo_scene: GaussianScene, settings_message: Any
+) -> None:
+    sequences = [2**63 + k for k in range(50)]
+    conversation.send(settings=settings_message)
+    for k, sequence in enumerate(sequences):
+        conversation.send(sequence, pose=moved(k / 10))
+    frames = conversation.finish()
+    assert [frame.sequence for frame in frames] == sequences
+    assert np.abs(pixels(frames[30]) - expected(demo_scene, 3.0)).max() <= 1.001 / 255
+
+
+def test_a_stream_is_a_dialogue_whose_settings_may_change(conversation: Conversation, settings_message: Any) -> None:
+    first = conversation.ask(1, settings=settings_message, pose=moved(0))
+    small = rendering_pb2.RenderSettings(scene="second", height=10, width=12)
+    second = conversation.ask(2, settings=small, pose=moved(0))
+    third = conversation.ask(3, pose=moved(0))
+    assert (first.scene, first.height) == ("demo", HEIGHT)
+    for frame in (second, third):
+        assert (frame.scene, frame.height, frame.width) == ("second", 10, 12)
+
+
+def test_a_latest_stream_answers_for_the_newest_pose(conversation: Conversation) -> None:
+    settings = rendering_pb2.RenderSettings(scene="demo", height=600, width=600, outputs=[1, 2, 3, 4])
+    conversation.send(settings=settings, mode=rendering_pb2.STREAM_MODE_LATEST)
+    shifts = np.linspace(-4, 4, 300)
+    for sequence, shift in enumerate(shifts):
+        conversation.send(sequence, pose=moved(shift), client_time_ns=10**18 + sequence)
+    frames = conversation.finish()
+    sequences = [frame.sequence for frame in frames]
+    assert sequences == sorted(set(sequences))
+    assert sequences[-1] == 299
+    assert len(frames) < 200
+    assert len(frames) + sum(frame.dropped for frame in frames) == 300
+    for frame in frames:
+        assert frame.pose.values[3] == shifts[frame.sequence]
+        assert frame.client_time_ns == 10**18 + frame.sequence
+
+
+def test_each_pose_of_a_stream_may_have_a_deadline(conversation: Conversation, settings_message: Any) -> None:
+    conversation.send(settings=settings_message)
+    assert conversation.ask(1, pose=moved(0), timeout_ms=1e-6).error.reason == "DEADLINE_EXCEEDED"
+    assert conversation.ask(2, pose=moved(0), timeout_ms=10_000).data
+    error = conversation.ask(3, pose=moved(0), timeout_ms=0, client_time_ns=7)
+    assert (error.error.field, error.client_time_ns) == ("timeout_ms", 7)
+
+
+def test_an_unknown_mode_ends_the_stream(renders: Stub, settings_message: Any) -> None:
+    conversation = Conversation(renders)
+    conversation.send(settings=settings_message, mode=9)
+    with pytest.raises(grpc.RpcError, match="StreamMode"):
+        next(conversation.call)
+
+
+def test_bad_messages_do_not_end_a_stream(conversation: Conversation, settings_message: Any) -> None:
+    def ask(sequence: int, **fields: Any) -> tuple[str, str]:
+        frame = conversation.ask(sequence, **fields)
+        assert not frame.data
+        assert frame.error.detail
+        return frame.error.reason, frame.error.field
+
+    def settings(**fields: Any) -> rendering_pb2.RenderSettings:
+        return rendering_pb2.RenderSettings(**{"scene": "demo", **fields})
+
+    assert ask(1, pose=moved(0)) == ("INVALID_ARGUMENT", "settings")
+    assert conversation.ask(2, settings=settings_message, pose=moved(0)).data
+    assert ask(3, pose=matrix_pose(np.diag([-1, 1, 1, 1]))) == ("INVALID_POSE", "pose.matrix")
+    assert ask(4) == ("INVALID_ARGUMENT", "pose")
+    assert ask(5, settings=settings(scene="nowhere"), pose=moved(0)) == ("SCENE_NOT_FOUND", "settings.scene")
+    assert ask(6, settings=settings(scene="truncated")) == ("SCENE_FILE_INVALID", "settings.scene")
+    assert ask(7, settings=settings(outputs=[9])) == ("UNKNOWN_OUTPUT", "settings.outputs")
+    frame = conversation.ask(8, pose=moved(0))
+    assert frame.data
+    assert frame.scene == "demo"
+
+
+def test_a_client_that_leaves_frees_the_service(renders: Stub, settings_message: Any) -> None:
+    for _ in range(20):
+        conversation = Conversation(renders)
+        conversation.send(settings=settings_message)
+        for k in range(30):
+            conversation.send(k, pose=moved(k))
+        next(conversation.call)
+        conversation.call.cancel()
+    request = rendering_pb2.RenderRequest(settings=settings_message, pose=moved(0))
+    assert renders.Render(request, timeout=TIMEOUT_S).data
+
+
+def test_streams_run_side_by_side(renders: Stub, settings_message: Any) -> None:
+    answers: dict[int, list[int]] = {}
+
+    def run(number: int) -> None:
+        conversation = Conversation(renders)
+        conversation.send(settings=settings_message)
+        for k in range(20):
+            conversation.send(100 * number + k, pose=moved(k))
+        answers[number] = [frame.sequence for frame in conversation.finish()]
+
+    threads = [threading.Thread(target=run, args=(number,)) for number in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert answers == {number: [100 * number + k for k in range(20)] for number in range(4)}
+
+
+def bad(**fields: Any) -> Callable[[], rendering_pb2.RenderRequest]:
+    def make() -> rendering_pb2.RenderRequest:
+        pose = fields.get("pose", moved(0))
+        settings = {"scene": "demo", **{key: value for key, value in fields.items() if key != "pose"}}
+        return rendering_pb2.RenderRequest(settings=rendering_pb2.RenderSettings(**settings), pose=pose)
+
+    return make
+
+
+def linear(**fields: float) -> geometry_pb2.Probe:
+    return geometry_pb2.Probe(linear=geometry_pb2.LinearProbe(**fields))
+
+
+def quaternion(w: float) -> geometry_pb2.Pose:
+    return geometry_pb2.Pose(
+        placement=geometry_pb2.Placement(position_mm=geometry_pb2.Position(), quaternion=geometry_pb2.Quaternion(w=w))
+    )
+
+
+NO_POSITION = geometry_pb2.Pose(placement=geometry_pb2.Placement(quaternion=geometry_pb2.Quaternion(w=1)))
+INVALID = grpc.StatusCode.INVALID_ARGUMENT
+TWO_OUTPUTS = [rendering_pb2.OUTPUT_BMODE, rendering_pb2.OUTPUT_ECHO]
+
+BAD_REQUESTS: dict[str, tuple[Any, grpc.StatusCode, str, str]] = {
+    "mirrored": (bad(pose=matrix_pose(np.diag([-1, 1, 1, 1]))), INVALID, "INVALID_POSE", "pose.matrix"),
+    "scaled": (bad(pose=matrix_pose(np.diag([2, 2, 2, 1]))), INVALID, "INVALID_POSE", "pose.matrix"),
+    "nan": (bad(pose=matrix_pose(np.full((4, 4), np.nan))), INVALID, "INVALID_POSE", "pose.matrix"),
+    "twelve numbers": (bad(pose=matrix_pose(np.eye(4)[:3])), INVALID, "INVALID_POSE", "pose.matrix.values"),
+    "norm": (bad(pose=quaternion(3.0)), INVALID, "INVALID_POSE", "pose.placement.quaternion"),
+    "nan norm": (bad(pose=quaternion(np.nan)), INVALID, "INVALID_POSE", "pose.placement.quaternion"),
+    "no position": (bad(pose=NO_POSITION), INVALID, "INVALID_POSE", "pose.placement.position_mm"),
+    "no form": (bad(pose=geometry_pb2.Pose()), INVALID, "INVALID_POSE", "pose"),
+    "no pose": (bad(pose=None), INVALID, "INVALID_ARGUMENT", "pose"),
+    "no settings": (rendering_pb2.RenderRequest, INVALID, "INVALID_ARGUMENT", "settings"),
+    "scene": (bad(scene="nowhere"), grpc.StatusCode.NOT_FOUND, "SCENE_NOT_FOUND", "settings.scene"),
+    "path": (bad(scene="../demo"), grpc.StatusCode.NOT_FOUND, "SCENE_NOT_FOUND", "settings.scene"),
+    "truncated": (
+        bad(scene="truncated"),
+        grpc.StatusCode.FAILED_PRECONDITION,
+        "SCENE_FILE_INVALID",
+        "settings.scene",
+    ),
+    "output": (bad(outputs=[77]), INVALID, "UNKNOWN_OUTPUT", "settings.outputs"),
+    "unspecified": (bad(outputs=[0]), INVALID, "UNKNOWN_OUTPUT", "settings.outputs"),
+    "encoding": (bad(encoding=77), INVALID, "INVALID_ARGUMENT", "settings.encoding"),
+    "png of two": (
+        bad(outputs=TWO_OUTPUTS, encoding=rendering_pb2.ENCODING_PNG),
+        INVALID,
+        "INVALID_ARGUMENT",
+        "settings.encoding",
+    ),
+    "height 0": (bad(height=0), INVALID, "INVALID_IMAGE_SIZE", "settings.height"),
+    "width beyond": (bad(width=601), INVALID, "INVALID_IMAGE_SIZE", "settings.width"),
+    "far at near": (
+        bad(probe=linear(width_mm=1, near_mm=2, far_mm=2)),
+        INVALID,
+        "INVALID_PROBE",
+        "settings.probe.linear.far_mm",
+    ),
+    "probe of no kind": (bad(probe=geometry_pb2.Probe()), INVALID, "INVALID_PROBE", "settings.probe.kind"),
+    "probeless": (bad(scene="probeless"), INVALID, "INVALID_PROBE", "settings.probe"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_REQUESTS)
+def test_bad_request(renders: Stub, settings_message: Any, case: str) -> None:
+    make, code, reason, field = BAD_REQUESTS[case]
+    with pytest.raises(grpc.RpcError) as caught:
+        renders.Render(make(), timeout=TIMEOUT_S)
+    info, violation = error_info(caught.value)
+    assert (caught.value.code(), info.reason, info.metadata["field"]) == (code, reason, field)
+    if code is INVALID:
+        assert violation is not None
+        assert violation.field_violations[0].field == field
+    request = rendering_pb2.RenderRequest(settings=settings_message, pose=moved(0))
+    assert renders.Render(request, timeout=TIMEOUT_S).data
+
+
+@pytest.mark.parametrize(("count", "reason"), [(0, "INVALID_ARGUMENT"), (41, "TOO_MANY_POSES")])
+def test_batches_of_no_or_too_many_poses(renders: Stub, settings_message: Any, count: int, reason: str) -> None:
+    request = rendering_pb2.RenderBatchRequest(settings=settings_message, poses=[moved(0)] * count)
+    with pytest.raises(grpc.RpcError) as caught:
+        list(renders.RenderBatch(request, timeout=TIMEOUT_S))
+    info, _ = error_info(caught.value)
+    assert (info.reason, info.metadata["field"]) == (reason, "poses")
+
+
+def test_one_bad_pose_refuses_a_batch_before_its_first_frame(renders: Stub, settings_message: Any) -> None:
+    poses = [moved(0), moved(0), quaternion(0.5)]
+    request = rendering_pb2.RenderBatchRequest(settings=settings_message, poses=poses)
+    with pytest.raises(grpc.RpcError) as caught:
+        next(renders.RenderBatch(request, timeout=TIMEOUT_S))
+    assert error_info(caught.value)[0].metadata["field"] == "poses[2].placement.quaternion"

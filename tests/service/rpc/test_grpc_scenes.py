@@ -1,0 +1,92 @@
+from __future__ import annotations
+
+from typing import Any
+
+import grpc
+import pytest
+from grpc_health.v1 import health_pb2, health_pb2_grpc
+from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
+
+from ultragray_proto.v1 import scenes_pb2, scenes_pb2_grpc
+
+from ..conftest import HEIGHT
+from .test_grpc_render import error_info
+
+Stub = scenes_pb2_grpc.SceneServiceStub
+
+
+def test_list_pages_and_tells_bad_files(scenes: Stub) -> None:
+    first = scenes.ListScenes(scenes_pb2.ListScenesRequest(page_size=2))
+    rest = scenes.ListScenes(scenes_pb2.ListScenesRequest(page_token=first.next_page_token))
+    names = [entry.name for entry in (*first.scenes, *rest.scenes)]
+    assert names == ["demo", "empty", "foreign", "probeless", "second", "truncated"]
+    assert first.scenes[0].gaussian_count == 400
+    assert not first.scenes[0].HasField("error")
+    assert first.scenes[1].error.reason == "SCENE_FILE_INVALID"
+    assert rest.next_page_token == ""
+
+
+def test_a_scene_says_all_about_itself(scenes: Stub) -> None:
+    scene = scenes.GetScene(scenes_pb2.GetSceneRequest(scene="demo"))
+    assert scene.probe.linear.width_mm == 40.0
+    assert scene.centre_mm.z == 20.0
+    assert scene.image_height == HEIGHT
+    assert dict(scene.metrics) == {"psnr": 20.5}
+    assert scene.training_poses.count == 5
+    assert scene.training_poses.position_max_mm.y == 4.0
+    assert scene.training_poses.last.values[7] == 4.0
+
+
+def test_load_and_unload(scenes: Stub) -> None:
+    assert scenes.LoadScene(scenes_pb2.LoadSceneRequest(scene="second")).loaded_processes == 1
+    assert scenes.GetScene(scenes_pb2.GetSceneRequest(scene="second")).loaded
+    assert scenes.UnloadScene(scenes_pb2.UnloadSceneRequest(scene="second")).loaded_processes == 0
+
+
+@pytest.mark.parametrize(
+    ("scene", "code", "reason"),
+    [
+        ("nowhere", grpc.StatusCode.NOT_FOUND, "SCENE_NOT_FOUND"),
+        ("", grpc.StatusCode.NOT_FOUND, "SCENE_NOT_FOUND"),
+        ("foreign", grpc.StatusCode.FAILED_PRECONDITION, "SCENE_FILE_INVALID"),
+    ],
+)
+def test_scenes_that_cannot_be_read(scenes: Stub, scene: str, code: Any, reason: str) -> None:
+    calls = (
+        lambda: scenes.GetScene(scenes_pb2.GetSceneRequest(scene=scene)),
+        lambda: scenes.LoadScene(scenes_pb2.LoadSceneRequest(scene=scene)),
+    )
+    for call in calls:
+        with pytest.raises(grpc.RpcError) as caught:
+            call()
+        info, _ = error_info(caught.value)
+        assert (caught.value.code(), info.reason, info.metadata["field"]) == (code, reason, "scene")
+
+
+def test_bad_pages(scenes: Stub) -> None:
+    for request, field in (
+        (scenes_pb2.ListScenesRequest(page_size=-1), "page_size"),
+        (scenes_pb2.ListScenesRequest(page_token="*"), "page_token"),
+    ):
+        with pytest.raises(grpc.RpcError) as caught:
+            scenes.ListScenes(request)
+        assert error_info(caught.value)[0].metadata["field"] == field
+
+
+def test_health_and_reflection(channel: grpc.Channel) -> None:
+    health = health_pb2_grpc.HealthStub(channel)
+    for name in ("", "ultragray.v1.RenderService", "ultragray.v1.SceneService"):
+        answer = health.Check(health_pb2.HealthCheckRequest(service=name), timeout=5)
+        assert answer.status == health_pb2.HealthCheckResponse.SERVING
+    reflection = reflection_pb2_grpc.ServerReflectionStub(channel)
+    request = reflection_pb2.ServerReflectionRequest(list_services="*")
+    (answer,) = reflection.ServerReflectionInfo(iter([request]), timeout=5)
+    names = {service.name for service in answer.list_services_response.service}
+    assert {"ultragray.v1.RenderService", "ultragray.v1.SceneService", "grpc.health.v1.Health"} <= names
+
+
+def test_request_id_is_echoed(scenes: Stub) -> None:
+    call = scenes.GetScene.with_call(scenes_pb2.GetSceneRequest(scene="demo"), metadata=(("x-request-id", "robot-1"),))[
+        1
+    ]
+    assert dict(call.trailing_metadata())["x-request-id"] == "robot-1"

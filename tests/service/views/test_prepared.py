@@ -1,0 +1,267 @@
+"""Folders that helper processes make: once, whole, and the oldest go."""
+
+from __future__ import annotations
+
+import asyncio
+import fcntl
+import json
+import os
+import resource
+import shutil
+import subprocess
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ultragray.datasets.released import write_released
+from ultragray.errors import ArtifactNotFound, DatasetNotFound, DeadlineExceeded, Draining, MemoryExceeded, StorageFull
+from ultragray_service.settings import Settings
+from ultragray_service.views import prepared
+from ultragray_service.views.prepared import Preparation, PreparedFolders
+from ultragray_workers.datasets.intake import check_files
+from ultragray_workers.datasets.store import DatasetStore, write_manifest
+
+from ..http.test_http_comparison import DATASET
+
+
+@pytest.fixture
+def request_body(tmp_path: Path) -> dict[str, str]:
+    """A dataset `tiny` in an artifact folder."""
+    folder = DatasetStore(tmp_path).folder / "tiny"
+    (folder / "files").mkdir(parents=True)
+    write_released(DATASET, folder / "files")
+    write_manifest(check_files(folder / "files", "tiny", {}, folder / "contact_sheet.png"), folder)
+    return {"artifact_folder": str(tmp_path), "dataset": "tiny"}
+
+
+def folders(tmp_path: Path, name: str = "views", turn: asyncio.Lock | None = None, **settings: Any) -> PreparedFolders:
+    return PreparedFolders(
+        tmp_path / name,
+        "dataset_view",
+        "laying out",
+        Settings(data_folder=tmp_path, **settings),
+        turn or asyncio.Lock(),
+    )
+
+
+def names(tmp_path: Path) -> list[str]:
+    return sorted(path.name for path in (tmp_path / "views").iterdir())
+
+
+def test_who_asks_at_the_same_time_gets_the_same_folder(tmp_path: Path, request_body: dict[str, str]) -> None:
+    async def ask() -> list[Path]:
+        made = folders(tmp_path)
+        return await asyncio.gather(*(made.path("key", request_body) for _ in range(3)))
+
+    found = asyncio.run(ask())
+    assert set(found) == {tmp_path / "views" / "key"}
+    poses = json.loads((found[0] / "poses.json").read_text())
+    np.testing.assert_allclose(np.reshape(poses["val"], (-1, 4, 4)), DATASET.val.poses, atol=1e-9)
+    assert names(tmp_path) == ["key"]
+
+
+def aged(tmp_path: Path, name: str, age_s: float, size_bytes: int = 0) -> Path:
+    folder = tmp_path / "views" / name
+    folder.mkdir(parents=True)
+    (folder / "train.npy").write_bytes(b"\0" * size_bytes)
+    os.utime(folder, (time.time() - age_s,) * 2)
+    return folder
+
+
+@pytest.mark.parametrize(("kept_folders", "size_bytes"), [(2, 0), (32, 600)], ids=["by number", "by bytes"])
+def test_the_folder_not_asked_for_the_longest_goes(
+    tmp_path: Path,
+    request_body: dict[str, str],
+    monkeypatch: pytest.MonkeyPatch,
+    kept_folders: int,
+    size_bytes: int,
+) -> None:
+    monkeypatch.setattr(prepared, "KEPT_FOLDERS", kept_folders)
+    aged(tmp_path, "old", 300, size_bytes)
+    aged(tmp_path, "older-but-used", 200, size_bytes)
+
+    async def ask() -> None:
+        made = folders(tmp_path, max_dataset_bytes=1024)
+        assert (await made.prepare("older-but-used", request_body)).state == "ready"
+        await made.path("key", request_body)
+
+    asyncio.run(ask())
+    assert names(tmp_path) == ["key", "older-but-used"]
+
+
+def test_a_service_that_dies_while_it_removes_leaves_no_half_folder(
+    tmp_path: Path, request_body: dict[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(prepared, "KEPT_FOLDERS", 1)
+    aged(tmp_path, "old", 300)
+    with monkeypatch.context() as dying:
+        dying.setattr(shutil, "rmtree", lambda path, ignore_errors: None)
+        asyncio.run(folders(tmp_path).path("key", request_body))
+    (half,) = (name for name in names(tmp_path) if name != "key")
+    assert half.startswith(".making-")
+    asyncio.run(folders(tmp_path).remove_stale())
+    assert names(tmp_path) == ["key"]
+
+
+def test_what_is_laid_out_takes_no_more_room_than_the_frames(tmp_path: Path, request_body: dict[str, str]) -> None:
+    folder = asyncio.run(folders(tmp_path).path("key", request_body))
+    pixels = DATASET.train.images.size + DATASET.val.images.size
+    assert sum(path.stat().st_size for path in folder.glob("*.npy")) < pixels + 2 * 1024
+
+
+def test_what_fails_says_why_and_is_tried_again_later(
+    tmp_path: Path, request_body: dict[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def ask() -> None:
+        made = folders(tmp_path)
+        with monkeypatch.context() as slow:
+            slow.setattr(prepared, "TIMEOUT_S", 0.0)
+            with pytest.raises(DeadlineExceeded):
+                await made.path("key", request_body)
+        failed = await made.prepare("key", request_body)
+        assert failed.state == "failed"
+        assert isinstance(failed.error, DeadlineExceeded)
+        with pytest.raises(DeadlineExceeded):
+            await made.path("key", request_body)
+        monkeypatch.setattr(prepared, "_FAILURE_KEPT_S", 0.0)
+        assert (await made.prepare("key", request_body)).state == "running"
+        await made.path("key", request_body)
+
+    asyncio.run(ask())
+    assert names(tmp_path) == ["key"]
+
+
+def test_that_a_name_is_gone_says_nothing_of_the_content(tmp_path: Path, request_body: dict[str, str]) -> None:
+    async def ask() -> None:
+        made = folders(tmp_path)
+        with pytest.raises(DatasetNotFound):
+            await made.path("key", request_body | {"dataset": "gone"})
+        await made.path("key", request_body)
+
+    asyncio.run(ask())
+
+
+def test_who_waits_for_what_is_being_made_sees_its_end(tmp_path: Path, request_body: dict[str, str]) -> None:
+    async def ask() -> None:
+        made = folders(tmp_path)
+        asking = asyncio.ensure_future(made.path("job-1", request_body))
+        while not (tmp_path / "views").is_dir():
+            await asyncio.sleep(0.01)
+        await made.settled(lambda key: key.startswith("other-"))
+        assert not (tmp_path / "views" / "job-1").exists()
+        await made.settled(lambda key: key.startswith("job-"))
+        assert (tmp_path / "views" / "job-1").exists()
+        await asking
+
+    asyncio.run(ask())
+
+
+async def end_of(made: PreparedFolders, request_body: dict[str, str]) -> Preparation:
+    while (found := await made.prepare("key", request_body)).state == "running":
+        await asyncio.sleep(0.01)
+    return found
+
+
+def test_what_no_one_foresaw_is_a_failure_as_well(
+    tmp_path: Path, request_body: dict[str, str], caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "views").symlink_to(tmp_path / "nowhere")
+    failed = asyncio.run(asyncio.wait_for(end_of(folders(tmp_path), request_body), 10))
+    assert failed.state == "failed"
+    assert failed.error is not None
+    assert failed.error.detail == "laying out failed unexpectedly, see the log"
+    assert "FileExistsError" in caplog.text
+
+
+def test_a_disk_without_room_is_told(tmp_path: Path, request_body: dict[str, str]) -> None:
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (DATASET.train.images.size, before[1]))
+    try:
+        failed = asyncio.run(asyncio.wait_for(end_of(folders(tmp_path), request_body), 30))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert isinstance(failed.error, StorageFull)
+    assert names(tmp_path) == []
+
+
+@pytest.mark.parametrize("stop", ["end", "remove"])
+def test_what_is_stopped_leaves_nothing(tmp_path: Path, request_body: dict[str, str], stop: str) -> None:
+    async def ask() -> None:
+        made = folders(tmp_path)
+        asking = asyncio.ensure_future(made.path("key", request_body))
+        while not (tmp_path / "views").is_dir() or not names(tmp_path):
+            await asyncio.sleep(0.01)
+        if stop == "end":
+            made.end()
+            with pytest.raises(Draining):
+                await made.path("key", request_body)
+        else:
+            await made.remove(lambda key: True)
+        with pytest.raises(Draining if stop == "end" else ArtifactNotFound):
+            await asking
+
+    asyncio.run(ask())
+    assert names(tmp_path) == []
+
+
+def test_what_is_doomed_goes(tmp_path: Path) -> None:
+    for name in ("here", "gone", ".making-now"):
+        aged(tmp_path, name, 0)
+    asyncio.run(folders(tmp_path).remove(lambda key: key != "here"))
+    assert names(tmp_path) == [".making-now", "here"]
+
+
+def test_what_dead_services_left_is_removed(tmp_path: Path) -> None:
+    aged(tmp_path, "kept", 9999)
+    aged(tmp_path, ".making-being-finished", 1)
+    aged(tmp_path, ".making-half-removed", 100)
+    (aged(tmp_path, ".making-dead", 1) / "lock").touch()
+    with (aged(tmp_path, ".making-alive", 9999) / "lock").open("wb") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        asyncio.run(folders(tmp_path).remove_stale())
+    assert names(tmp_path) == [".making-alive", ".making-being-finished", "kept"]
+
+
+def test_one_helper_process_at_a_time(
+    tmp_path: Path, request_body: dict[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    started: list[subprocess.Popen[bytes]] = []
+
+    class Watched(subprocess.Popen[bytes]):
+        def __init__(self, *arguments: Any, **options: Any) -> None:
+            assert all(process.returncode is not None for process in started)
+            super().__init__(*arguments, **options)
+            started.append(self)
+
+    monkeypatch.setattr(subprocess, "Popen", Watched)
+
+    async def ask() -> None:
+        turn = asyncio.Lock()
+        made, others = (folders(tmp_path, name, turn) for name in ("views", "others"))
+        await asyncio.gather(*(each.path(key, request_body) for each in (made, others) for key in ("a", "b")))
+
+    asyncio.run(ask())
+    assert len(started) == 4
+
+
+def test_memory_beyond_the_limit_is_one_clear_error(tmp_path: Path, request_body: dict[str, str]) -> None:
+    images = tmp_path / "datasets" / "tiny" / "files" / "images_train.npy"
+    with images.open("wb") as file:
+        shape = (2000, 512, 512)
+        np.lib.format.write_array_header_1_0(file, {"descr": "<f4", "fortran_order": False, "shape": shape})
+        file.truncate(file.tell() + 4 * 2000 * 512 * 512)  # a hole: nothing is written
+    limited = folders(tmp_path, dataset_memory_mb=512)
+    with pytest.raises(MemoryExceeded) as caught:
+        asyncio.run(limited.path("key", request_body))
+    assert "512 MiB" in caught.value.detail
+
+
+def test_another_service_may_be_quicker(tmp_path: Path, request_body: dict[str, str]) -> None:
+    async def ask() -> list[Path]:
+        return await asyncio.gather(*(folders(tmp_path).path("key", request_body) for _ in range(2)))
+
+    assert asyncio.run(ask()) == [tmp_path / "views" / "key"] * 2
+    assert names(tmp_path) == ["key"]

@@ -1,0 +1,98 @@
+"""A training while it runs: its curve and its preview, over HTTP, with a worker."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import httpx
+import numpy as np
+import pytest
+
+from ultragray.datasets.released import write_released
+from ultragray.training.trainer import CHECKPOINT_FILE, JOURNAL_FILE
+from ultragray_service.views import training as training_views
+from ultragray_service.views.training import MAX_POINTS
+
+from ...waiting import wait_until
+from ..conftest import StartService
+from ..http.test_http_comparison import DATASET
+from ..http.test_http_datasets import zipped
+
+WAIT_S = 90.0
+STEPS = 40_000  # more than are done here
+
+
+@pytest.fixture(scope="module")
+def artifacts(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("artifacts")
+
+
+@pytest.fixture(scope="module")
+def http(
+    start_service: StartService, tmp_path_factory: pytest.TempPathFactory, artifacts: Path
+) -> Iterator[httpx.Client]:
+    folder = tmp_path_factory.mktemp("dataset")
+    write_released(DATASET, folder)
+    service = start_service(artifact_folder=artifacts, embedded_worker=True, training_threads=1, job_nice=0)
+    with httpx.Client(base_url=service.http, timeout=60) as client:
+        packed = zipped({path.name: path.read_bytes() for path in folder.iterdir()})
+        answer = client.put("/v1/datasets/tiny", content=packed, headers={"Content-Type": "application/zip"})
+        assert answer.status_code == 201, answer.text
+        yield client
+
+
+def train(http: httpx.Client, scene: str, **settings: Any) -> str:
+    body = {"kind": "train", "specification": {"dataset": "tiny", "scene": scene, "settings": settings}}
+    answer = http.post("/v1/jobs", json=body)
+    assert answer.status_code == 201, answer.text
+    job: str = answer.json()["id"]
+    return job
+
+
+def test_the_names_of_the_files_of_a_run() -> None:
+    assert (training_views._JOURNAL, training_views._CHECKPOINT) == (JOURNAL_FILE, CHECKPOINT_FILE)
+
+
+def test_the_curve_of_a_finished_training_and_of_other_jobs(http: httpx.Client) -> None:
+    job = train(http, "short", steps=30, max_gaussians=50, confidence=False)
+    wait_until(lambda: http.get(f"/v1/jobs/{job}").json()["state"] == "succeeded")
+    points = http.get(f"/v1/jobs/{job}/curve").json()["points"]
+    assert [point["step"] for point in points] == list(range(1, 31))
+    assert any(point["val_psnr_db"] for point in points)
+    assert http.get(f"/v1/jobs/{job}/preview").json()["reason"] == "ARTIFACT_NOT_FOUND"
+    render = {"kind": "render", "specification": {"scene": "demo", "sampler": {"kind": "training"}}}
+    other = http.post("/v1/jobs", json=render).json()["id"]
+    assert http.get(f"/v1/jobs/{other}/curve").json() == {"points": []}
+    assert http.get(f"/v1/jobs/{other}/preview").json()["reason"] == "ARTIFACT_NOT_FOUND"
+    assert http.get("/v1/jobs/0123/curve").json()["reason"] == "JOB_NOT_FOUND"
+
+
+@pytest.mark.long
+def test_a_training_is_seen_while_it_runs(http: httpx.Client, artifacts: Path) -> None:
+    job = train(http, "long", steps=STEPS, max_gaussians=50, confidence=False)
+    missing = http.get(f"/v1/jobs/{job}/preview").json()
+    assert (missing["reason"], missing["field"]) == ("ARTIFACT_NOT_FOUND", "job")
+
+    def curve() -> list[dict[str, Any]]:
+        points: list[dict[str, Any]] = http.get(f"/v1/jobs/{job}/curve").json()["points"]
+        return points
+
+    before = wait_until(curve)
+    after = wait_until(lambda: (found := curve())[-1]["step"] > before[-1]["step"] + 600 and found)
+    assert len(after) <= MAX_POINTS
+    assert [point["step"] for point in after] == sorted({point["step"] for point in after})
+    assert after[-1]["loss"] < after[0]["loss"]
+
+    preview = wait_until(lambda: (answer := http.get(f"/v1/jobs/{job}/preview")).status_code == 200 and answer)
+    picture = np.asarray(cv2.imdecode(np.frombuffer(preview.content, np.uint8), cv2.IMREAD_UNCHANGED), float)
+    assert picture.shape == (512, 1024)
+    assert abs(picture[:, :512].mean() - DATASET.val.images[1].mean()) < 1.0
+    assert np.corrcoef(picture[:, :512].ravel(), picture[:, 512:].ravel())[0, 1] > 0.2
+
+    assert list((artifacts / "previews").glob(f"{job}-*"))
+    http.post(f"/v1/jobs/{job}:cancel")
+    wait_until(lambda: http.delete(f"/v1/jobs/{job}").status_code == 204)
+    assert not list((artifacts / "previews").iterdir())

@@ -1,0 +1,271 @@
+from __future__ import annotations
+
+import contextlib
+import json
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ultragray import LinearProbe
+from ultragray.datasets import Dataset, Sweep
+from ultragray.datasets.released import write_released
+from ultragray.datasets.source import SourceOptions, load_dataset
+from ultragray.errors import DatasetExists, DatasetInUse, DatasetInvalid, DatasetNotFound, InvalidArgument
+from ultragray_workers.datasets import incoming as dataset_incoming
+from ultragray_workers.datasets.incoming import IncomingDataset, remove_stale
+from ultragray_workers.datasets.intake import IntakeRequest, take_in
+from ultragray_workers.datasets.store import DatasetStore, check_dataset_name
+
+
+def sweep(count: int, offset_mm: float) -> Sweep:
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, 1, 3] = np.arange(count) + offset_mm
+    images = np.random.default_rng(count).integers(0, 250, (count, 20, 16), dtype=np.uint8)
+    return Sweep(images, poses, LinearProbe(40.0, 0.0, 50.0), np.arange(count), "sweep")
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> dict[str, bytes]:
+    """A dataset of the released layout: 8 training and 3 held-out frames of 20x16."""
+    write_released(Dataset("tiny", sweep(8, 0.0), sweep(3, 0.5)), tmp_path / "tiny")
+    return {path.name: path.read_bytes() for path in (tmp_path / "tiny").iterdir()}
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> DatasetStore:
+    return DatasetStore(tmp_path / "artifacts")
+
+
+Receive = Callable[[dict[str, bytes]], IncomingDataset]
+
+
+@pytest.fixture
+def receive(store: DatasetStore) -> Iterator[Receive]:
+    """Uploads files; what is left of them goes at the end."""
+    with contextlib.ExitStack() as stack:
+
+        def receive_files(files: dict[str, bytes]) -> IncomingDataset:
+            incoming = IncomingDataset(store, 10_000_000)
+            stack.callback(incoming.discard)
+            for name, content in files.items():
+                incoming.begin_file(name)
+                incoming.write(content)
+            incoming.finish()
+            return incoming
+
+        yield receive_files
+
+
+def request_for(incoming: IncomingDataset, name: str = "tiny", **options: str) -> IntakeRequest:
+    return IntakeRequest(str(incoming.folder), name, options, 10_000_000, 4 << 30)
+
+
+def leftovers(store: DatasetStore) -> list[str]:
+    return sorted(path.name for path in store.folder.iterdir())
+
+
+def npy(tmp_path: Path, array: np.ndarray) -> bytes:
+    np.save(tmp_path / "array.npy", array)
+    return (tmp_path / "array.npy").read_bytes()
+
+
+def test_an_upload_becomes_a_dataset_that_training_reads(
+    store: DatasetStore, receive: Receive, files: dict[str, bytes]
+) -> None:
+    incoming = receive(files)
+    assert store.names() == []
+    take_in(request_for(incoming, train_frames="0:6"))
+    record, is_new = incoming.accept("tiny")
+    incoming.discard()
+    assert is_new
+    assert leftovers(store) == store.names() == ["tiny"]
+    assert store.get("tiny") == record
+    assert (record.kind, record.train_frames, record.val_frames) == ("released", 6, 3)
+    assert (record.height, record.width, record.bytes) == (20, 16, sum(map(len, files.values())))
+    assert record.probe == LinearProbe(40.0, 0.0, 50.0)
+    source, options = store.source("tiny")
+    assert load_dataset(source, SourceOptions(**options)).sha256 == record.sha256
+    assert store.contact_sheet("tiny").read_bytes().startswith(b"\x89PNG")
+
+
+def test_warnings_of_the_check_are_kept(
+    store: DatasetStore, receive: Receive, files: dict[str, bytes], tmp_path: Path
+) -> None:
+    images = sweep(8, 0.0).images.copy()
+    images[3] = images[3] // 40
+    incoming = receive({**files, "images_train.npy": npy(tmp_path, images)})
+    take_in(request_for(incoming))
+    (warning,) = incoming.accept("tiny")[0].warnings
+    assert warning.startswith("train: frames 3 are nearly black")
+
+
+def poisoned(tmp_path: Path, files: dict[str, bytes]) -> dict[str, bytes]:
+    poses = sweep(8, 0.0).poses.copy()
+    poses[5, 0, 0] = np.nan
+    return {**files, "poses_train.npy": npy(tmp_path, poses)}
+
+
+def changed_config(files: dict[str, bytes], **changes: object) -> dict[str, bytes]:
+    return {**files, "conf.json": json.dumps({**json.loads(files["conf.json"]), **changes}).encode()}
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        (poisoned, r"^poses_train.npy: frame 5: its pose .*finite"),
+        (
+            lambda _, files: {**files, "images_train.npy": files["images_train.npy"][:-7]},
+            r"^images_train.npy: .*truncated: 7 bytes are missing",
+        ),
+        (
+            lambda _, files: {name: files[name] for name in files if name != "conf.json"},
+            r"^the upload holds neither conf.json nor a PLUS sequence .*, it holds images_train.npy, ",
+        ),
+        (
+            lambda _, files: {name: files[name] for name in files if name != "poses_val.npy"},
+            r"^conf.json: poses_file_val names .* which is not in the upload",
+        ),
+        (lambda _, files: {**files, "b/conf.json": b"{}"}, r"must hold one dataset, it holds b/conf.json, conf.json"),
+        (lambda _, files: {**files, "conf.json": b"{"}, r"^conf.json: not JSON"),
+        (lambda _, files: {}, r"it holds no files"),
+    ],
+    ids=["NaN pose", "truncated", "no conf.json", "a file missing", "two datasets", "bad JSON", "nothing"],
+)
+def test_what_is_refused_in_one_sentence(
+    change: Callable[..., dict[str, bytes]],
+    expected: str,
+    store: DatasetStore,
+    receive: Receive,
+    files: dict[str, bytes],
+    tmp_path: Path,
+) -> None:
+    incoming = receive(change(tmp_path, files))
+    with pytest.raises(DatasetInvalid, match=expected) as caught:
+        take_in(request_for(incoming))
+    assert str(store.folder) not in caught.value.detail
+    incoming.discard()
+    assert leftovers(store) == []
+
+
+def test_conf_json_reads_no_file_but_those_of_the_upload(
+    store: DatasetStore, receive: Receive, files: dict[str, bytes], tmp_path: Path
+) -> None:
+    secret = tmp_path / "secret.npy"
+    secret.write_bytes(files["images_train.npy"])
+    for named in (str(secret), "../../../../../secret.npy"):
+        incoming = receive(changed_config(files, images_file_train=named))
+        with pytest.raises(DatasetInvalid, match=r"images_file_train names .* which is not in the upload"):
+            take_in(request_for(incoming))
+
+
+def test_options_are_named_as_requests_write_them(
+    store: DatasetStore, receive: Receive, files: dict[str, bytes]
+) -> None:
+    for options, field in (({"train_frames": "0:99"}, "train_frames"), ({"crop": "0:2,0:2"}, "crop")):
+        with pytest.raises(InvalidArgument, match=rf"^{field}") as caught:
+            take_in(request_for(receive(files), **options))
+        assert caught.value.field == field
+        assert "--" not in caught.value.detail
+
+
+def run_intake(request: IntakeRequest) -> subprocess.CompletedProcess[str]:
+    program = "from ultragray_workers.datasets.intake import main; main()"
+    return subprocess.run(
+        [sys.executable, "-c", program], input=json.dumps(asdict(request)), capture_output=True, text=True
+    )
+
+
+def test_memory_beyond_the_limit_is_one_clear_error(
+    store: DatasetStore, receive: Receive, files: dict[str, bytes], tmp_path: Path
+) -> None:
+    large = changed_config(files, images_file_train="large.npy")
+    incoming = receive(large)
+    with (incoming.folder / "dataset" / "files" / "large.npy").open("wb") as file:
+        header = {"descr": "<f4", "fortran_order": False, "shape": (2000, 512, 512)}
+        np.lib.format.write_array_header_1_0(file, header)
+        file.truncate(file.tell() + 4 * 2000 * 512 * 512)  # a hole: nothing is written
+    request = request_for(incoming)
+    done = run_intake(IntakeRequest(request.folder, "tiny", {}, request.max_bytes, 512 << 20))
+    assert done.returncode == 0, done.stderr
+    answer = json.loads(done.stdout)
+    assert answer["reason"] == "MEMORY_EXCEEDED"
+    assert "512 MiB" in answer["detail"]
+
+
+def add(store: DatasetStore, receive: Receive, files: dict[str, bytes], name: str, **options: str) -> bool:
+    incoming = receive(files)
+    take_in(request_for(incoming, name, **options))
+    is_new = incoming.accept(name)[1]
+    incoming.discard()
+    return is_new
+
+
+def test_the_same_content_twice_is_one_dataset(store: DatasetStore, receive: Receive, files: dict[str, bytes]) -> None:
+    assert add(store, receive, files, "tiny")
+    before = store.get("tiny")
+    assert not add(store, receive, {f"deeper/{name}": content for name, content in files.items()}, "tiny")
+    with pytest.raises(DatasetExists):
+        add(store, receive, files, "tiny", train_frames="0:4")
+    assert store.get("tiny") == before
+    assert store.names() == ["tiny"]
+
+
+def test_deletion(store: DatasetStore, receive: Receive, files: dict[str, bytes]) -> None:
+    add(store, receive, files, "tiny")
+    store.in_use = lambda name: f"job 7 ({name})"
+    with pytest.raises(DatasetInUse, match=r"needed by job 7 \(tiny\)"):
+        store.delete("tiny")
+    assert store.names() == ["tiny"]
+    store.in_use = lambda name: None
+    store.delete("tiny")
+    assert leftovers(store) == []
+    for call in (store.get, store.delete, store.source, store.contact_sheet):
+        with pytest.raises(DatasetNotFound):
+            call("tiny")
+
+
+@pytest.mark.parametrize("name", ["", "..", ".incoming-1", "a/b", "x" * 129, "ü", "a\n"])
+def test_names_that_no_dataset_has(store: DatasetStore, name: str) -> None:
+    with pytest.raises(InvalidArgument):
+        check_dataset_name(name)
+    with pytest.raises(DatasetNotFound):
+        store.delete(name)
+
+
+def test_only_what_nobody_holds_is_stale(
+    store: DatasetStore, receive: Receive, files: dict[str, bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    under_way = receive(files)
+    (store.folder / ".incoming-dead").mkdir()
+    (store.folder / ".incoming-dead" / "lock").write_bytes(b"")
+    (store.folder / ".incoming-young").mkdir()
+    (store.folder / ".deleted-half").mkdir()
+    assert remove_stale(store) == 1  # the deletion may be taken back yet
+    monkeypatch.setattr(dataset_incoming, "_DELETED_WITHIN_S", 0.0)
+    assert remove_stale(store) == 1
+    assert leftovers(store) == sorted([under_way.folder.name, ".incoming-young"])
+    take_in(request_for(under_way))
+    assert under_way.accept("tiny")[1]
+
+
+def test_nothing_is_written_after_a_discard(store: DatasetStore) -> None:
+    incoming = IncomingDataset(store, 1000)
+    incoming.begin_file("a")
+    incoming.discard()
+    incoming.discard()
+    with pytest.raises(ValueError, match="discarded"):
+        incoming.begin_file("b")
+    assert leftovers(store) == []
+
+
+def test_importing_the_store_and_the_intake_needs_no_torch() -> None:
+    code = (
+        "import sys, ultragray_workers.datasets.store, ultragray_workers.datasets.intake, "
+        "ultragray_workers.datasets.incoming; sys.exit('torch' in sys.modules or 'matplotlib' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code]).returncode == 0

@@ -1,0 +1,173 @@
+"""The order of what waits, without processes."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ultragray import LinearProbe
+from ultragray.errors import DeadlineExceeded, QueueFull
+from ultragray_workers import Priority, RenderRequest
+from ultragray_workers.pool import waiting
+from ultragray_workers.pool.waiting import Expiry, Part, Ticket, Turn, WaitingQueue
+
+
+@pytest.fixture
+def make_ticket():
+    loop = asyncio.new_event_loop()
+    template = RenderRequest("a", np.eye(4)[None])
+
+    def make(poses=1, *, height=64, **changes):
+        request = replace(template, poses=np.tile(np.eye(4), (poses, 1, 1)), **changes)
+        probe = LinearProbe(width_mm=1.0, near_mm=0.0, far_mm=1.0)
+        return Ticket(request, "a.ugr", probe, height, 64, done=loop.create_future(), submitted=time.monotonic())
+
+    yield make
+    loop.close()
+
+
+def taken(queue):
+    """The next batch as (ticket, first, stop)."""
+    return [(part.ticket, part.first, part.stop) for part in queue.take_batch()]
+
+
+def test_large_requests_take_turns_with_small_ones(make_ticket):
+    queue = WaitingQueue(limit_frames=100, max_batch_poses=4)
+    large, small = make_ticket(10), make_ticket(4, scene="b")
+    queue.add(large)
+    queue.add(small)
+    assert queue.frames == 14
+    turns = [taken(queue) for _ in range(4)]
+    assert turns == [[(large, 0, 4)], [(small, 0, 4)], [(large, 4, 8)], [(large, 8, 10)]]
+    assert taken(queue) == []
+    assert queue.frames == 0
+
+
+def test_only_what_can_be_rendered_together_is(make_ticket):
+    queue = WaitingQueue(limit_frames=100, max_batch_poses=4)
+    first, other_size, other_scene, alike, batch, too_many = (
+        make_ticket(),
+        make_ticket(height=32),
+        make_ticket(scene="b"),
+        make_ticket(2),
+        make_ticket(priority=Priority.BATCH),
+        make_ticket(2),
+    )
+    for ticket in (first, other_size, other_scene, alike, batch, too_many):
+        queue.add(ticket)
+    assert taken(queue) == [(first, 0, 1), (alike, 0, 2)]
+    assert [batch[0][0] for batch in (taken(queue), taken(queue), taken(queue), taken(queue))] == [
+        other_size,
+        other_scene,
+        too_many,
+        batch,
+    ]
+
+
+def test_batches_get_a_part_rendered_now_and_then(make_ticket, monkeypatch):
+    queue = WaitingQueue(limit_frames=100, max_batch_poses=4)
+    batch = make_ticket(2, priority=Priority.BATCH)
+    interactive = [make_ticket(scene=name) for name in "abc"]
+    for ticket in (batch, *interactive):
+        queue.add(ticket)
+    assert taken(queue) == [(interactive[0], 0, 1)]
+    now = time.monotonic()
+    monkeypatch.setattr(waiting.time, "monotonic", lambda: now + 1.1)
+    assert taken(queue) == [(batch, 0, 1)]
+    assert taken(queue) == [(interactive[1], 0, 1)]
+
+
+def test_large_images_make_smaller_batches(make_ticket):
+    queue = WaitingQueue(limit_frames=100, max_batch_poses=4)
+    ticket = make_ticket(4, height=512 * 8 * 2)  # 64 wide: twice the pixels of 512x512
+    queue.add(ticket)
+    assert taken(queue) == [(ticket, 0, 2)]
+
+
+def test_the_limit_counts_poses_of_each_priority(make_ticket):
+    queue = WaitingQueue(limit_frames=4, max_batch_poses=4)
+    queue.add(make_ticket(10))  # larger than the limit, but nothing else waits
+    with pytest.raises(QueueFull, match="10 frames wait"):
+        queue.add(make_ticket())
+    queue.add(make_ticket(4, priority=Priority.BATCH))
+    with pytest.raises(QueueFull):
+        queue.add(make_ticket(priority=Priority.BATCH))
+
+
+def test_lost_work_comes_first_and_suspects_go_alone(make_ticket):
+    queue = WaitingQueue(limit_frames=100, max_batch_poses=4)
+    lost, others = make_ticket(4), [make_ticket() for _ in range(2)]
+    queue.add(lost)
+    (part,) = queue.take_batch()
+    for ticket in others:
+        queue.add(ticket)
+    for again in reversed(part.for_retry()):
+        queue.put_first(again)
+    assert taken(queue) == [(lost, 0, 2), (others[0], 0, 1), (others[1], 0, 1)]
+    assert taken(queue) == [(lost, 2, 4)]
+    for work in (Part(others[0], 0, 1), Part(lost, 0, 2, attempts=2), Part(others[1], 0, 1)):
+        queue.put_first(work)
+    assert taken(queue) == [(others[1], 0, 1), (others[0], 0, 1)]
+    assert taken(queue) == [(lost, 0, 2)]
+
+
+def test_what_is_past_its_deadline_is_dropped(make_ticket):
+    queue = WaitingQueue(limit_frames=100, max_batch_poses=4)
+    late, company = make_ticket(deadline=time.monotonic() - 1), make_ticket()
+    queue.add(late)
+    queue.add(company)
+    assert taken(queue) == [(company, 0, 1)]
+    assert isinstance(late.done.exception(), DeadlineExceeded)
+    assert queue.frames == 0
+
+
+def test_a_newer_pose_takes_the_place_of_one_that_waits(make_ticket):
+    queue = WaitingQueue(limit_frames=100, max_batch_poses=1)
+    first, second = make_ticket(), make_ticket()
+    turn = Turn()
+    newer = np.tile(2 * np.eye(4), (1, 1, 1))
+    assert not turn.give_to(newer, None)  # it has no place yet
+    turn.ticket = first
+    queue.add(first)
+    queue.add(second)
+    assert turn.give_to(newer, 1e9)
+    assert queue.frames == 2
+    assert taken(queue) == [(first, 0, 1)]
+    assert first.request.poses is newer
+    assert first.request.deadline == 1e9
+    assert not turn.give_to(np.eye(4)[None], None)  # it is being rendered
+    assert first.request.poses is newer
+
+
+def test_a_deadline_that_was_brought_forward_expires_earlier(make_ticket):
+    async def wait():
+        queue = WaitingQueue(limit_frames=100, max_batch_poses=1)
+        ticket = make_ticket(deadline=time.monotonic() + 60.0)
+        queue.add(ticket)
+        turn = Turn(ticket, Expiry(ticket, queue))
+        assert turn.give_to(np.eye(4)[None], time.monotonic() + 0.03)
+        await asyncio.sleep(0.1)
+        assert queue.frames == 0
+        assert isinstance(ticket.done.exception(), DeadlineExceeded)
+
+    asyncio.run(wait())
+
+
+def test_a_deadline_that_was_put_off_expires_later(make_ticket):
+    async def wait():
+        queue = WaitingQueue(limit_frames=100, max_batch_poses=1)
+        ticket = make_ticket(deadline=time.monotonic() + 0.02)
+        queue.add(ticket)
+        turn = Turn(ticket, Expiry(ticket, queue))
+        assert turn.give_to(np.eye(4)[None], time.monotonic() + 0.1)
+        await asyncio.sleep(0.05)
+        assert queue.frames == 1
+        await asyncio.sleep(0.1)
+        assert queue.frames == 0
+        assert isinstance(ticket.done.exception(), DeadlineExceeded)
+
+    asyncio.run(wait())

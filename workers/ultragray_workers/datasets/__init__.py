@@ -1,0 +1,1 @@
+"""Datasets that a service was sent: received, unpacked, checked, kept."""

@@ -1,0 +1,185 @@
+"""The datasets of an artifact folder: each a folder `datasets/NAME`, which appears and goes whole. Free of torch."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import json
+import os
+import re
+import secrets
+import shutil
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+from ultragray.errors import DatasetExists, DatasetInUse, DatasetInvalid, DatasetNotFound, InvalidArgument
+from ultragray.files.atomic import atomic_path
+from ultragray.probe import Probe, probe_from_dict, probe_to_dict
+
+FOLDER = "datasets"
+MANIFEST_NAME, FILES_NAME, CONTACT_SHEET_NAME = "dataset.json", "files", "contact_sheet.png"
+DELETED_PREFIX = ".deleted-"
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
+_NAMES_IN_MESSAGE = 5
+
+
+@dataclass(frozen=True)
+class DatasetRecord:
+    """What is known about an accepted dataset."""
+
+    name: str
+    kind: str  # released or plus
+    sha256: str  # Dataset.sha256: images, poses, probe and split
+    bytes: int  # of the files
+    created_at: str  # ISO 8601, UTC
+    train_frames: int
+    val_frames: int
+    height: int
+    width: int
+    probe: Probe | None
+    warnings: tuple[str, ...]
+    source: str  # the file that load_dataset takes, below files/
+    device_set: str | None  # of a PLUS sequence, likewise
+    options: dict[str, str] = field(default_factory=dict)  # crop, image_size, frames, train_frames, val_frames
+
+    def to_json(self) -> str:
+        """The manifest."""
+        probe = None if self.probe is None else probe_to_dict(self.probe)
+        return json.dumps({**asdict(self), "probe": probe}, indent=1) + "\n"
+
+    @classmethod
+    def from_json(cls, text: str) -> DatasetRecord:
+        """Its inverse. Raises ValueError, KeyError or TypeError for anything else."""
+        document: dict[str, Any] = json.loads(text)
+        values = {one.name: document[one.name] for one in fields(cls)}
+        probe = None if values["probe"] is None else probe_from_dict(values["probe"])
+        return cls(**{**values, "probe": probe, "warnings": tuple(values["warnings"])})
+
+
+class DatasetStore:
+    """The datasets below `artifact_folder`, which several services and workers share."""
+
+    def __init__(self, artifact_folder: Path) -> None:
+        self.folder = Path(artifact_folder) / FOLDER
+        self.in_use: Callable[[str], str | None] = lambda name: None  # who needs a dataset, in words
+
+    def names(self) -> list[str]:
+        """The names of all datasets, sorted."""
+        try:
+            entries = list(self.folder.iterdir())
+        except (FileNotFoundError, NotADirectoryError):
+            return []
+        return sorted(entry.name for entry in entries if _NAME.fullmatch(entry.name) and self._exists(entry.name))
+
+    def get(self, name: str) -> DatasetRecord:
+        """Raises DatasetNotFound, also for a name that no dataset can have; DatasetInvalid for a damaged manifest."""
+        path = self._existing(name) / MANIFEST_NAME
+        try:
+            return DatasetRecord.from_json(path.read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            raise self._not_found(name) from None
+        except (ValueError, KeyError, TypeError) as error:
+            raise DatasetInvalid(f"the manifest of the dataset {name!r} is damaged: {error!r}") from error
+
+    def source(self, name: str) -> tuple[Path, dict[str, Any]]:
+        """What `ultragray.datasets.source.load_dataset` takes: a path, and the fields of its SourceOptions.
+
+        Raises DatasetNotFound, DatasetInvalid.
+        """
+        record, files = self.get(name), self._existing(name) / FILES_NAME
+        device_set = None if record.device_set is None else files / record.device_set
+        return files / record.source, {**record.options, "device_set": device_set}
+
+    def contact_sheet(self, name: str) -> Path:
+        """The PNG. Raises DatasetNotFound."""
+        return self._existing(name) / CONTACT_SHEET_NAME
+
+    def add(self, folder: Path, name: str) -> tuple[DatasetRecord, bool]:
+        """Makes a complete folder the dataset `name`, by one rename; its record, and whether it is new.
+
+        Where there is one already, it stays: with the same content and options it is the answer, else
+        DatasetExists is raised.
+        """
+        record = DatasetRecord.from_json((folder / MANIFEST_NAME).read_text(encoding="utf-8"))
+        try:
+            folder.rename(self.folder / name)
+        except OSError as error:
+            if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
+                raise
+            present = self.get(name)
+            if (present.sha256, present.options) == (record.sha256, record.options):
+                return present, False
+            raise DatasetExists(
+                f"there is already a dataset {name!r} with another content or other options: delete it first, or "
+                "choose another name",
+                field="dataset",
+            ) from None
+        sync_folder(self.folder)
+        return record, True
+
+    def delete(self, name: str) -> None:
+        """Raises DatasetNotFound, and DatasetInUse where `in_use` names who needs it.
+
+        `in_use` is asked again when nobody finds the dataset any more: who came in between gets it back, unless
+        another one has taken its name.
+        """
+        path = self._existing(name)
+        self._require_unused(name)
+        doomed = self.folder / f"{DELETED_PREFIX}{secrets.token_hex(8)}"
+        try:
+            path.rename(doomed)
+        except FileNotFoundError:
+            raise self._not_found(name) from None
+        try:
+            self._require_unused(name)
+        except Exception:
+            with contextlib.suppress(OSError):
+                doomed.rename(path)
+            raise
+        sync_folder(self.folder)
+        shutil.rmtree(doomed, ignore_errors=True)
+
+    def _require_unused(self, name: str) -> None:
+        if (user := self.in_use(name)) is not None:
+            raise DatasetInUse(f"the dataset {name!r} is needed by {user}", field="dataset")
+
+    def _existing(self, name: str) -> Path:
+        if _NAME.fullmatch(name) and self._exists(name):
+            return self.folder / name
+        raise self._not_found(name)
+
+    def _exists(self, name: str) -> bool:
+        return (self.folder / name / MANIFEST_NAME).is_file()
+
+    def _not_found(self, name: str) -> DatasetNotFound:
+        known = self.names()
+        shown = ", ".join(known[:_NAMES_IN_MESSAGE]) + (", …" if len(known) > _NAMES_IN_MESSAGE else "")
+        hint = f"known datasets: {shown}" if known else "there are no datasets yet"
+        return DatasetNotFound(f"there is no dataset {name[:128]!r}; {hint}", field="dataset")
+
+
+def check_dataset_name(name: str) -> None:
+    """Raises InvalidArgument for a name that no dataset may have."""
+    if not _NAME.fullmatch(name):
+        raise InvalidArgument(
+            f"dataset must be 1 to 128 letters, digits, '.', '_', '-', the first a letter or digit, got {name[:128]!r}",
+            field="dataset",
+        )
+
+
+def write_manifest(record: DatasetRecord, folder: Path) -> None:
+    """Writes the manifest of a dataset whose other files are complete."""
+    with atomic_path(folder / MANIFEST_NAME) as temporary:
+        temporary.write_text(record.to_json(), encoding="utf-8")
+
+
+def sync_folder(path: Path) -> None:
+    """Makes renames in a folder survive a loss of power, where its file system can."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        with contextlib.suppress(OSError):
+            os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

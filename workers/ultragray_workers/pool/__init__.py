@@ -1,0 +1,1 @@
+"""The render pool, as the service sees it."""

@@ -1,0 +1,119 @@
+"""Starts worker processes within milliseconds: forks of template processes that have torch imported.
+
+There are two templates, so that a worker can be replaced at once even when a template was killed a moment
+before: the survivor forks both the worker and the next template.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from typing import Any
+
+from .channel import Channel
+from .messages import ForkTemplate, ForkWorker, Hello
+from .peer import Peer
+
+_TEMPLATES = 2
+
+
+class Launcher:
+    """Owns the template processes. Its methods belong to the event loop's thread."""
+
+    def __init__(self) -> None:
+        self._templates: list[_Template] = []  # oldest first
+        self._reaping: set[asyncio.Future[int]] = set()
+        self._closing = False
+
+    def launch(
+        self,
+        request: ForkWorker | ForkTemplate,
+        on_message: Callable[[Any], None],
+        on_gone: Callable[[], None],
+    ) -> Peer:
+        """Has a template fork a process; the first message of the new peer is its Hello.
+
+        Returns at once. Where no template is ready yet the request waits for one; where that dies before it
+        forked, the new peer is gone.
+        """
+        template = next((t for t in self._templates if t.ready), None)
+        if template is None:
+            template = self._templates[0] if self._templates else self._spawn_template()
+        near, far = Channel.pair()
+        template.peer.send(request, [far.fileno()])
+        far.close()
+        return Peer(near, on_message, on_gone)
+
+    def abandon_starting(self) -> None:
+        """Kills templates that are still importing, and with them what waits to be forked."""
+        self._closing = True
+        for template in self._templates:
+            if not template.ready and template.process is not None:
+                template.process.kill()
+
+    async def close(self) -> None:
+        """Returns when all templates are gone. Stop the workers first: they are the templates' children."""
+        self._closing = True
+        for template in reversed(self._templates.copy()):  # children before parents
+            await template.peer.stop()
+        await asyncio.gather(*self._reaping)
+
+    def _spawn_template(self) -> _Template:
+        near, far = Channel.pair()
+        program = f"import sys; sys.path[:] = {sys.path!r}; from ultragray_workers.pool.process.template import main; main({far.fileno()})"
+        process = subprocess.Popen(
+            [sys.executable, "-c", program],
+            stdin=subprocess.DEVNULL,
+            pass_fds=[far.fileno()],
+            # numpy's OpenBLAS starts its threads on import, and a process with threads must not be forked
+            env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
+        )
+        far.close()
+        template = _Template(process)
+        template.peer = Peer(near, self._on_hello(template), self._on_gone(template))
+        self._templates.append(template)
+        return template
+
+    def _fork_template(self) -> None:
+        template = _Template(None)
+        template.peer = self.launch(ForkTemplate(), self._on_hello(template), self._on_gone(template))
+        self._templates.append(template)
+
+    def _on_hello(self, template: _Template) -> Callable[[Hello], None]:
+        def on_hello(hello: Hello) -> None:
+            template.ready = True
+            template.peer.pid = hello.pid
+            self._top_up()
+
+        return on_hello
+
+    def _on_gone(self, template: _Template) -> Callable[[], None]:
+        def on_gone() -> None:
+            self._templates.remove(template)
+            if template.process is not None:
+                reaping = asyncio.get_running_loop().run_in_executor(None, template.process.wait)
+                self._reaping.add(reaping)
+                reaping.add_done_callback(self._reaping.discard)
+            if template.ready:  # one that cannot even start is tried again only when a worker is wanted
+                self._top_up()
+
+        return on_gone
+
+    def _top_up(self) -> None:
+        if self._closing:
+            return
+        if not self._templates:
+            self._spawn_template()
+        elif len(self._templates) < _TEMPLATES and self._templates[0].ready:
+            self._fork_template()
+
+
+class _Template:
+    peer: Peer
+
+    def __init__(self, process: subprocess.Popen[bytes] | None) -> None:
+        self.process = process  # None: forked from another template, which reaps it
+        self.ready = False

@@ -1,0 +1,114 @@
+"""What the service and its child processes say to each other. Free of torch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from ultragray.confidence import Extrapolation
+from ultragray.display.settings import Display
+from ultragray.errors import UltragrayError
+from ultragray.probe import FloatArray, Probe
+
+from .types import Encoding, Trust
+
+
+@dataclass(frozen=True)
+class ForkWorker:
+    """To a template process: fork a worker that serves the channel sent along."""
+
+    backend: str
+    number: int  # of its place in the pool, from 0: tells which GPU it takes
+    processes: int  # in the pool; 0: one per GPU, or one
+    threads: int  # 0: the cores this process may use, divided by the number of processes
+    memory_budget_bytes: int
+
+
+@dataclass(frozen=True)
+class ForkTemplate:
+    """To a template process: fork another template that serves the channel sent along."""
+
+
+@dataclass(frozen=True)
+class Hello:
+    """A child's first message: it is ready, or it cannot work because of `error`."""
+
+    pid: int
+    gpus: int = 0  # that the pool's scenes could lie on; 0 where they are rendered on the CPU
+    error: UltragrayError | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class RenderPart:
+    """Some poses of one request, of `total`, starting with its pose number `first`."""
+
+    poses: FloatArray  # [C, 4, 4] mm
+    outputs: tuple[str, ...]
+    encoding: Encoding
+    first: int
+    total: int
+
+
+@dataclass(frozen=True, eq=False)
+class RenderJob:
+    """Render parts together. One memory descriptor per part goes along; one Answer per part comes back."""
+
+    scene: str
+    path: str
+    probe: Probe
+    height: int
+    width: int
+    display: Display
+    trust: Trust
+    parts: tuple[RenderPart, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class PackJob:
+    """Make an .npz of rendered frames. The memory that holds them and the memory for it go along."""
+
+    scene: str
+    scene_sha256: str
+    renderer: str
+    poses: FloatArray  # [C, 4, 4] mm
+    outputs: tuple[str, ...]
+    extrapolations: tuple[Extrapolation, ...]  # [C]
+    height: int
+    width: int
+
+
+@dataclass(frozen=True)
+class LoadJob:
+    scene: str
+    path: str
+
+
+@dataclass(frozen=True)
+class UnloadJob:
+    scene: str
+
+
+Job = RenderJob | PackJob | LoadJob | UnloadJob
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """What a worker did for one part."""
+
+    size: int  # bytes of the reply so far: all of `data` when this was the request's only part
+    scene_sha256: str
+    renderer: str
+    started: float  # time.monotonic() in seconds, the same clock in all processes
+    render_ms: float
+    encode_ms: float
+    first: int = 0  # pose of the request that the part begins with
+    extrapolations: tuple[Extrapolation, ...] = ()  # of the part's poses
+
+
+@dataclass(frozen=True)
+class Answer:
+    """The outcome of part `part` of a job (0 where it has none); after the `last` one the worker is idle."""
+
+    part: int
+    outcome: Rendered | UltragrayError | None
+    last: bool
+    resident: tuple[str, ...]  # scenes the worker holds now

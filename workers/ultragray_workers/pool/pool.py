@@ -1,0 +1,264 @@
+"""RenderPool: poses in, encoded frames out, rendered by worker processes. Free of torch.
+
+A request becomes a ticket, its poses become parts. Idle workers take parts from the queue, as many as fit one
+batch, and write the pixels into the request's memory. A worker that dies loses nothing: rendering is pure, so
+that the parts it had not answered are rendered again by its replacement.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from ultragray.errors import Draining, InvalidArgument, NotReady, RenderFailed
+from ultragray.scene_info import SceneHeader
+
+from ..scenes import SceneStore
+from .dispatcher import Dispatcher, SceneChangedError
+from .launcher import Launcher
+from .memory import read_start
+from .messages import ForkWorker, LoadJob, UnloadJob
+from .types import RenderRequest, RenderResult
+from .waiting import Expiry, Ticket, Turn, WaitingQueue
+
+logger = logging.getLogger(__name__)
+
+MAX_BATCH_POSES = 128  # file descriptors that go along with one message
+MAX_REPLY_BYTES = 2**31 - 2**20
+_MAX_SCENE_CHANGES = 3
+_READ_IN_THREAD_BYTES = 2**20
+
+
+@dataclass(frozen=True)
+class PoolConfig:
+    """Sizes of a pool. Raises InvalidArgument for values that no pool can have."""
+
+    processes: int = 0  # 0: one per GPU that renders; on the CPU one
+    threads_per_process: int = 0  # 0: the cores this process may use, divided by the number of processes
+    queue_limit_frames: int = 256  # poses that may wait, for each priority
+    max_batch_poses: int = 16  # rendered together; fewer for images of more than 512x512 pixels
+    memory_budget_bytes: int = 4 * 2**30  # of loaded scenes, per process, where they are rendered
+    backend: str = "auto"
+
+    def __post_init__(self) -> None:
+        limits = {
+            "processes": (0, 1024),
+            "threads_per_process": (0, 1024),
+            "queue_limit_frames": (1, 2**31),
+            "max_batch_poses": (1, MAX_BATCH_POSES),
+            "memory_budget_bytes": (1, 2**63),
+        }
+        for name, (low, high) in limits.items():
+            if not low <= getattr(self, name) <= high:
+                raise InvalidArgument(f"{name} must be from {low} to {high}, got {getattr(self, name)}", field=name)
+
+
+@dataclass(frozen=True)
+class PoolStatistics:
+    waiting_frames: int
+    busy: int  # processes at work
+    processes_alive: int
+    restarts_total: int  # workers that died and were replaced
+    pids: tuple[int, ...]  # of the processes that are alive
+
+
+class RenderPool:
+    """Worker processes and the queue before them. All its methods belong to one event loop."""
+
+    def __init__(self, store: SceneStore, config: PoolConfig) -> None:
+        self.on_rendered: Callable[[RenderResult], None] | None = None
+        self._store = store
+        self._waiting = WaitingQueue(config.queue_limit_frames, config.max_batch_poses)
+        self._launcher = Launcher()
+        self._dispatcher = Dispatcher(
+            self._launcher,
+            ForkWorker(
+                backend=config.backend,
+                number=0,
+                processes=config.processes,
+                threads=config.threads_per_process,
+                memory_budget_bytes=config.memory_budget_bytes,
+            ),
+            self._waiting,
+        )
+        self._open: set[Ticket] = set()
+        self._active = 0  # calls of render() under way
+        self._all_answered = asyncio.Event()
+        self._started = False
+        self._draining = False
+        self._closed = False
+
+    @property
+    def ready(self) -> bool:
+        return self._started and not self._draining and any(slot.alive for slot in self._dispatcher.slots)
+
+    async def start(self) -> None:
+        """Returns when every process has rendered its first frame.
+
+        Raises BackendUnavailable, or RenderFailed when the processes do not start; the pool is closed then.
+        """
+        try:
+            await self._dispatcher.start()
+        except BaseException:
+            await self.close()
+            raise
+        self._started = True
+
+    async def render(self, request: RenderRequest, turn: Turn | None = None) -> RenderResult:
+        """Renders the request as soon as its turn comes; cancelling the caller drops what has not begun.
+
+        With `turn` its poses can be replaced by newer ones as long as they wait. Raises NotReady, Draining, QueueFull,
+        DeadlineExceeded, InvalidArgument, SceneNotFound, SceneFileInvalid, SceneTooLarge, MemoryExceeded, RenderFailed.
+        """
+        self._check_accepting()
+        self._active += 1
+        self._all_answered.clear()
+        turn = turn or Turn()
+        try:
+            for _ in range(_MAX_SCENE_CHANGES):
+                header = self._store.cached_header(request.scene)
+                if header is None:
+                    header = await asyncio.to_thread(self._store.header, request.scene)
+                try:
+                    result = await self._render(request, header, turn)
+                except SceneChangedError:
+                    assert turn.ticket is not None
+                    request = turn.ticket.request  # perhaps with newer poses
+                    continue
+                if self.on_rendered is not None:
+                    self.on_rendered(result)
+                return result
+            raise RenderFailed(f"scene {request.scene!r} kept changing while it was being rendered", field="scene")
+        finally:
+            self._active -= 1
+            if self._active == 0:
+                self._all_answered.set()
+
+    async def load(self, scene: str) -> None:
+        """Loads a scene in every process. Raises SceneNotFound, SceneFileInvalid, SceneTooLarge, MemoryExceeded."""
+        self._check_accepting()
+        path = self._store.path(scene)
+        await self._dispatcher.command_all(LoadJob(scene, str(path)))
+
+    async def unload(self, scene: str) -> None:
+        """Drops a scene from every process. Raises SceneNotFound for one that neither is held nor exists."""
+        self._check_accepting()
+        if scene not in self.loaded():
+            self._store.path(scene)
+        await self.forget(scene)
+
+    async def forget(self, scene: str) -> None:
+        """Drops a scene that was deleted from every process, also from one that is loading it just now."""
+        await self._dispatcher.command_all(UnloadJob(scene))
+
+    def loaded(self) -> dict[str, int]:
+        """Each loaded scene, and how many processes hold it."""
+        return dict(Counter(name for slot in self._dispatcher.slots for name in slot.resident))
+
+    def statistics(self) -> PoolStatistics:
+        return PoolStatistics(
+            waiting_frames=self._waiting.frames,
+            busy=sum(slot.busy for slot in self._dispatcher.slots),
+            processes_alive=sum(slot.alive for slot in self._dispatcher.slots),
+            restarts_total=sum(slot.replacements for slot in self._dispatcher.slots),
+            pids=tuple(slot.pid for slot in self._dispatcher.slots if slot.pid is not None),
+        )
+
+    async def drain(self, timeout_s: float) -> None:
+        """Refuses new requests and returns when all earlier ones are answered, or after the timeout."""
+        self._draining = True
+        if self._active:
+            try:
+                await asyncio.wait_for(self._all_answered.wait(), timeout_s)
+            except asyncio.TimeoutError:
+                logger.warning("%d requests were not answered within %g s of draining", self._active, timeout_s)
+
+    async def close(self) -> None:
+        """Ends all processes, and requests that are still open with Draining."""
+        self._draining = True
+        self._closed = True
+        for ticket in list(self._open):
+            self._waiting.remove(ticket)
+            ticket.fail(Draining("the service is stopping"))
+        self._launcher.abandon_starting()
+        await self._dispatcher.close()
+        await self._launcher.close()
+        if self._active:
+            await self._all_answered.wait()
+
+    def _check_accepting(self) -> None:
+        if self._draining:
+            raise Draining("the service is stopping; it takes no new requests")
+        if not self._started:
+            raise NotReady("the service is starting; try again in a few seconds")
+
+    async def _render(self, request: RenderRequest, header: SceneHeader, turn: Turn) -> RenderResult:
+        if self._closed:  # while the header was read
+            raise Draining("the service is stopping")
+        turn.ticket = ticket = self._ticket(request, header)
+        turn.expiry = Expiry(ticket, self._waiting)
+        try:
+            self._open.add(ticket)
+            self._dispatcher.submit(ticket)
+            rendered = await ticket.done
+            if rendered.size > _READ_IN_THREAD_BYTES:
+                data = await asyncio.to_thread(read_start, ticket.reply_memory, rendered.size)
+            else:
+                data = read_start(ticket.reply_memory, rendered.size)
+        finally:
+            turn.expiry.cancel()
+            self._open.discard(ticket)
+            self._dispatcher.discard(ticket)
+        return RenderResult(
+            scene=request.scene,
+            scene_sha256=rendered.scene_sha256,
+            renderer=rendered.renderer,
+            poses=ticket.request.poses,
+            probe=ticket.probe,
+            rendered_height=ticket.height,
+            rendered_width=ticket.width,
+            display=request.display,
+            picture=ticket.picture,
+            outputs=request.outputs,
+            encoding=request.encoding,
+            data=data,
+            queue_ms=max(0.0, rendered.started - ticket.submitted) * 1000.0,
+            render_ms=rendered.render_ms,
+            encode_ms=rendered.encode_ms,
+            extrapolations=rendered.extrapolations,
+            batch_size=ticket.batch_size,
+        )
+
+    def _ticket(self, request: RenderRequest, header: SceneHeader) -> Ticket:
+        """The request with its open choices made from the scene's own description."""
+        probe = header.info.probe_or(request.probe)
+        height, width = header.info.image_size_or(request.height, request.width)
+        picture = request.display.picture(probe, height, width)
+        poses, outputs = len(request.poses), len(request.outputs)
+        if poses == 0:
+            raise InvalidArgument("poses must hold at least one pose, got none", field="poses")
+        if request.encoding.is_image_file and (poses, outputs) != (1, 1):
+            raise InvalidArgument(
+                f"encoding {request.encoding.value} holds one frame of one output, got {poses} poses and "
+                f"{outputs} outputs",
+                field="encoding",
+            )
+        reply_bytes = poses * outputs * picture.height * picture.width * request.encoding.pixel_type.itemsize
+        if reply_bytes > MAX_REPLY_BYTES:
+            raise InvalidArgument(
+                f"poses times pixels must fit a reply of {MAX_REPLY_BYTES} bytes, got {reply_bytes}",
+                field="poses",
+            )
+        return Ticket(
+            request=request,
+            path=str(self._store.file(request.scene)),
+            probe=probe,
+            height=height,
+            width=width,
+            done=asyncio.get_running_loop().create_future(),
+            submitted=time.monotonic(),
+        )

@@ -1,0 +1,304 @@
+"""The worker process: takes jobs from its channel one at a time, renders, encodes, answers. Imports torch."""
+
+from __future__ import annotations
+
+import logging
+import mmap
+import os
+import select
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ultragray import ConvexProbe, GaussianScene, LinearProbe, Probe, render
+from ultragray.backends import cuda
+from ultragray.confidence import Extrapolation
+from ultragray.display.frames import show
+from ultragray.display.settings import AS_RENDERED
+from ultragray.errors import MemoryExceeded, RenderFailed, UltragrayError
+from ultragray.probe import FloatArray
+from ultragray.rendering import renderer_name
+
+from ..channel import Channel
+from ..memory import write_at
+from ..messages import Answer, ForkWorker, Hello, Job, LoadJob, PackJob, Rendered, RenderJob, RenderPart, UnloadJob
+from ..transfer import CHUNK_POSES, Arriving, Wanted, render_to_host
+from ..types import ANY_CONFIDENCE, Encoding
+from .encoding import ByteArray, encode_image, encode_pixels, to_uint8, write_npz
+from .placement import render_device
+from .scene_cache import SceneCache
+from .support import SupportWatch, below_limit, refusal
+
+MAX_DETAIL_LENGTH = 2000
+_SMALL_PROBES = (LinearProbe(width_mm=10.0, near_mm=0.0, far_mm=10.0), ConvexProbe(60.0, near_mm=5.0, far_mm=10.0))
+
+logger = logging.getLogger(__name__)
+
+
+def run_worker(channel: Channel, settings: ForkWorker) -> None:
+    """Serves the channel until the service hangs up or dies."""
+    signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+    threading.Thread(target=_exit_with_service, args=(channel.fileno(),), daemon=True).start()
+    torch.set_grad_enabled(False)
+    try:
+        worker = _Worker(channel, settings)
+        worker.warm_up()
+    except Exception as error:
+        channel.send(Hello(os.getpid(), error=_as_reported(error)))
+        return
+    channel.send(Hello(os.getpid(), gpus=worker.gpus))
+    while True:
+        try:
+            job, descriptors = channel.receive()
+        except (EOFError, ConnectionError):
+            return
+        worker.do(job, descriptors)
+
+
+def _exit_with_service(channel_descriptor: int) -> None:
+    """Ends this process, in the middle of a frame if need be, when the service hangs up or dies."""
+    poll = select.poll()
+    poll.register(channel_descriptor, select.POLLRDHUP)
+    poll.poll()
+    os._exit(0)
+
+
+class _Worker:
+    def __init__(self, channel: Channel, settings: ForkWorker) -> None:
+        self._channel = channel
+        self._backend = settings.backend
+        self._device = render_device(settings.backend, settings.number)
+        self.gpus = cuda.device_count() if self._device.type == "cuda" else 0
+        if self.gpus:
+            torch.cuda.set_device(self._device)  # kernels are launched on the current one
+        processes = settings.processes or max(1, self.gpus)
+        torch.set_num_threads(settings.threads or max(1, len(os.sched_getaffinity(0)) // processes))
+        self._scenes = SceneCache(settings.memory_budget_bytes, self._device)
+
+    def warm_up(self) -> None:
+        """Renders and encodes small frames, so that the first request does not pay for first uses."""
+        shapes = {"means": (1, 3), "scales": (1, 3), "transmittances": (1,), "sh0": (1, 1, 1)}
+        splats = {name: torch.zeros(shape) for name, shape in shapes.items()} | {"quats": torch.ones(1, 4)}
+        scene = GaussianScene.from_splats(splats).to(self._device)
+        for probe in _SMALL_PROBES:
+            encode_image(self._render_small(scene, probe), Encoding.PNG)
+
+    def do(self, job: Job, descriptors: list[int]) -> None:
+        """Does one job and answers it, whatever happens."""
+        try:
+            if isinstance(job, RenderJob):
+                for index, outcome in enumerate(self._render_parts(job, descriptors)):
+                    self._answer(index, outcome, last=index == len(job.parts) - 1)
+            else:
+                self._answer(0, self._do_other(job, descriptors), last=True)
+        finally:
+            for descriptor in descriptors:
+                os.close(descriptor)
+
+    def _answer(self, part: int, outcome: Rendered | UltragrayError | None, *, last: bool) -> None:
+        self._channel.send(Answer(part=part, outcome=outcome, last=last, resident=self._scenes.names()))
+
+    def _do_other(self, job: PackJob | LoadJob | UnloadJob, descriptors: list[int]) -> Rendered | UltragrayError | None:
+        try:
+            if isinstance(job, PackJob):
+                return _pack(job, *descriptors)
+            if isinstance(job, LoadJob):
+                for probe in _SMALL_PROBES:  # lets the kernels prepare the scene
+                    self._render_small(self._scenes.get(job.scene, job.path).scene, probe)
+            else:
+                self._scenes.drop(job.scene)
+        except Exception as error:
+            return _as_reported(error)
+        return None
+
+    def _render_parts(self, job: RenderJob, memories: Sequence[int]) -> Iterator[Rendered | UltragrayError]:
+        """One outcome per part, each as soon as its frames are written."""
+        try:
+            loaded = self._scenes.get(job.scene, job.path)
+        except Exception as error:
+            yield from [_as_reported(error)] * len(job.parts)
+            return
+        poses = np.concatenate([part.poses for part in job.parts])  # [C, 4, 4]
+        try:
+            extrapolations = loaded.assessor.assess(poses, job.probe)
+        except Exception as error:
+            yield from [_as_reported(error)] * len(job.parts)
+            return
+        refused = refusal(job, extrapolations)
+        if refused is not None and len(job.parts) == 1:
+            yield refused
+            return
+        wanted: dict[str, set[np.dtype[Any]]] = {}
+        for part in job.parts:
+            for name in part.outputs:
+                wanted.setdefault(name, set()).add(part.encoding.pixel_type)
+        started = time.monotonic()
+        support = SupportWatch(below_limit(job, extrapolations))
+        frames = None
+        try:
+            if refused is None:
+                frames = self._render(loaded.scene, job, poses, wanted, support)
+        except Exception as error:
+            if len(job.parts) == 1:
+                yield _as_reported(error)
+                return
+        if frames is None:  # out of the handler: the error holds on to memory of the GPU
+            for part, memory in zip(job.parts, memories, strict=True):  # alone: it may be one that fails
+                yield from self._render_parts(replace(job, parts=(part,)), [memory])
+            return
+        rendered = Rendered(
+            size=0,
+            scene_sha256=loaded.sha256,
+            renderer=renderer_name(self._backend, loaded.scene),
+            started=started,
+            render_ms=_since_ms(started),
+            encode_ms=0.0,
+        )
+        begin = 0
+        for part, memory in zip(job.parts, memories, strict=True):
+            end = begin + len(part.poses)
+            told = partial(support.told, extrapolations[begin:end], begin)
+            yield _write_part(job.scene, part, frames, begin, memory, rendered, told)
+            begin = end
+
+    def _render(
+        self,
+        scene: GaussianScene,
+        job: RenderJob,
+        poses: FloatArray,  # [C, 4, 4] mm
+        wanted: Wanted,
+        support: SupportWatch,
+    ) -> Arriving:
+        def shoot(some: FloatArray) -> dict[str, Tensor]:  # [C, 4, 4] -> each [C, H, W] of the picture
+            frames = render(
+                scene, job.probe, some, height=job.height, width=job.width, outputs=needed, backend=self._backend
+            )
+            assert frames.coverage is not None
+            blackened = support.look(frames.coverage)
+            rendered = {name: getattr(frames, name) for name in outputs}
+            if job.display == AS_RENDERED and blackened is None:
+                return rendered
+            return show(rendered, job.probe, job.display, blackened)
+
+        outputs = tuple(wanted)
+        needed = tuple(dict.fromkeys((*outputs, "coverage")))
+        try:
+            return render_to_host(shoot, poses, wanted, self._device)
+        except torch.OutOfMemoryError as error:
+            raise MemoryExceeded(
+                f"{len(poses)} frames of {job.height}x{job.width} pixels ({', '.join(outputs)}) do not fit into the "
+                f"free memory of {self._device}; ask for fewer or smaller ones"
+            ) from error
+
+    def _render_small(self, scene: GaussianScene, probe: Probe) -> ByteArray:  # [16, 16]
+        pixel_type = Encoding.UINT8.pixel_type
+        job = RenderJob("", "", probe, 16, 16, AS_RENDERED, ANY_CONFIDENCE, ())
+        frames = self._render(scene, job, np.eye(4)[None], {"bmode": {pixel_type}}, SupportWatch([False]))
+        return to_uint8(frames.take("bmode", pixel_type, 0, 1)[0])
+
+
+def _write_part(
+    scene: str,
+    part: RenderPart,
+    frames: Arriving,  # of a batch that holds the part from its pose `begin` on
+    begin: int,
+    memory: int,
+    rendered: Rendered,
+    told: Callable[[], tuple[Extrapolation, ...]],
+) -> Rendered | UltragrayError:
+    """Encodes a part into its request's memory: a whole file, or its share of the pixels."""
+    started, waited_ms = time.monotonic(), frames.waited_ms
+    pixel_type, end = part.encoding.pixel_type, begin + len(part.poses)
+    try:
+        if part.encoding.is_image_file:
+            image = encode_image(frames.take(part.outputs[0], pixel_type, begin, end)[0], part.encoding)
+            write_at(memory, image.data, 0)
+            size = image.nbytes
+        elif part.encoding is Encoding.NPZ and len(part.poses) == part.total:
+            with os.fdopen(os.dup(memory), "wb") as file:
+                size = write_npz(
+                    file,
+                    {name: frames.take(name, pixel_type, begin, end) for name in part.outputs},
+                    part.poses,
+                    told(),
+                    scene=scene,
+                    scene_sha256=rendered.scene_sha256,
+                    renderer=rendered.renderer,
+                )
+        else:
+            for first in range(begin, end, CHUNK_POSES):  # each is written while the next one arrives
+                for number, name in enumerate(part.outputs):
+                    pixels = encode_pixels(
+                        frames.take(name, pixel_type, first, min(first + CHUNK_POSES, end)), part.encoding
+                    )
+                    place = number * part.total + part.first + first - begin
+                    write_at(memory, pixels.data.cast("B"), place * pixels[0].nbytes)
+            size = len(part.outputs) * part.total * pixels[0].nbytes
+        extrapolations = told()
+    except Exception as error:
+        return _as_reported(error)
+    waiting_ms = frames.waited_ms - waited_ms
+    return replace(
+        rendered,
+        size=size,
+        render_ms=rendered.render_ms + frames.waited_ms,
+        encode_ms=_since_ms(started) - waiting_ms,
+        first=part.first,
+        extrapolations=extrapolations,
+    )
+
+
+def _pack(job: PackJob, pixels_memory: int, archive_memory: int) -> Rendered:
+    """The .npz of float32 frames that parts left in memory, output after output."""
+    started = time.monotonic()
+    shape = (len(job.outputs), len(job.poses), job.height, job.width)
+    with (
+        mmap.mmap(pixels_memory, 4 * int(np.prod(shape)), prot=mmap.PROT_READ) as pixels,
+        os.fdopen(os.dup(archive_memory), "wb") as file,
+    ):
+        frames = np.frombuffer(pixels, dtype="<f4").reshape(shape)
+        size = write_npz(
+            file,
+            dict(zip(job.outputs, frames, strict=True)),
+            job.poses,
+            job.extrapolations,
+            scene=job.scene,
+            scene_sha256=job.scene_sha256,
+            renderer=job.renderer,
+        )
+        del frames  # the map cannot be closed while an array looks into it
+    return Rendered(
+        size=size,
+        scene_sha256=job.scene_sha256,
+        renderer=job.renderer,
+        started=started,
+        render_ms=0.0,
+        encode_ms=_since_ms(started),
+    )
+
+
+def _as_reported(error: Exception) -> UltragrayError:
+    """The error as the service gets it: ours as they are, all others as RenderFailed and in the log.
+
+    Raises the CUDA error that has cost this process its GPU: a new process gets it back.
+    """
+    if not isinstance(error, UltragrayError):
+        if torch.cuda.is_initialized():  # type: ignore[no-untyped-call]
+            torch.cuda.synchronize()
+        logger.error("rendering failed", exc_info=error)
+        return RenderFailed(f"rendering failed: {type(error).__name__}: {error}"[:MAX_DETAIL_LENGTH])
+    if len(error.detail) > MAX_DETAIL_LENGTH:  # such as the tensor names of a hostile file
+        return type(error)(error.detail[:MAX_DETAIL_LENGTH] + "…", field=error.field)
+    return error
+
+
+def _since_ms(started: float) -> float:
+    return (time.monotonic() - started) * 1000.0
