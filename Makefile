@@ -35,7 +35,7 @@ test-console: $(VENV)/installed-dev $(CONSOLE)  ## the console in Debian's Chrom
 	node --test --test-concurrency=1 tests/console/*.test.mjs
 
 test-faults: $(VENV)/installed-dev  ## processes killed at random: render workers under load, then everything while jobs run
-	ULTRAGRAY_FAULT_SECONDS=30 $(BIN)/pytest tests/workers/test_faults.py -s $(ARGS)
+	ULTRAGRAY_FAULT_SECONDS=30 $(BIN)/pytest tests/workers/pool/test_faults.py -s $(ARGS)
 	ULTRAGRAY_FAULT_KILLS=32 $(BIN)/pytest tests/faults -s $(ARGS)
 
 check: $(VENV)/installed-dev  ## lint, types, formatting

@@ -15,7 +15,7 @@ from ultragray.datasets.released import write_released
 from ultragray.datasets.source import load_dataset
 from ultragray_service.cli.app import app
 
-REAL_SETS = Path(__file__).resolve().parents[3] / "shared" / "data"
+REAL_SETS = Path(__file__).resolve().parents[4] / "shared" / "data"
 
 
 def run(*arguments: object) -> Result:

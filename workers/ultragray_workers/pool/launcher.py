@@ -63,7 +63,10 @@ class Launcher:
 
     def _spawn_template(self) -> _Template:
         near, far = Channel.pair()
-        program = f"import sys; sys.path[:] = {sys.path!r}; from ultragray_workers.pool.process.template import main; main({far.fileno()})"
+        program = (
+            f"import sys; sys.path[:] = {sys.path!r}; "
+            f"from ultragray_workers.pool.process.template import main; main({far.fileno()})"
+        )
         process = subprocess.Popen(
             [sys.executable, "-c", program],
             stdin=subprocess.DEVNULL,
