@@ -1,0 +1,289 @@
+"""The contract's dataclasses: each field says what it means and what it may be, once, for every door.
+
+    @dataclass(frozen=True)
+    class Display(Contract):
+        gain_db: float = described("Added to every echo.", 0.0, low=-100.0, high=100.0)
+
+The checks of the values, help texts, the OpenAPI document, the tables of the documentation and the generated code of
+clients are made of these fields. JSON has the names and values of the fields; a member of a `Family` (a closed set,
+such as the probes) is told apart by its `kind`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import MISSING, Field, field, fields, is_dataclass
+from enum import Enum
+from functools import cache
+from types import NoneType, UnionType
+from typing import Annotated, Any, ClassVar, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+
+from .errors import InvalidArgument, UltragrayError
+
+_T = TypeVar("_T")
+_SHOWN_CHARACTERS = 100
+
+
+def described(
+    meaning: str,
+    default: Any = MISSING,
+    *,
+    factory: Any = MISSING,
+    low: float | None = None,
+    high: float | None = None,
+    above: float | None = None,
+    choices: tuple[str, ...] | None = None,
+    **options: Any,
+) -> Any:
+    """A dataclass field that says what it means.
+
+    A number must lie from `low` (or above `above`) to `high`; a word must be one of `choices`. `options` are those of
+    `dataclasses.field`. The default may be what the limits exclude.
+    """
+    metadata: dict[str, Any] = {"description": meaning}
+    limits = {"low": low, "high": high, "above": above, "choices": choices}
+    metadata |= {name: limit for name, limit in limits.items() if limit is not None}
+    return field(default=default, default_factory=factory, metadata=metadata, **options)
+
+
+class Contract:
+    """Base of the contract's frozen dataclasses: checks each field by its annotation and its limits.
+
+    Raises `error` (InvalidArgument, or a subclass of it that the class names) with the name of the field.
+    """
+
+    error: ClassVar[type[InvalidArgument]] = InvalidArgument
+    # Read by pydantic, which the service checks JSON with: values are taken at their word.
+    __pydantic_config__: ClassVar[dict[str, Any]] = {"extra": "forbid", "strict": True, "allow_inf_nan": False}
+
+    def __post_init__(self) -> None:
+        for item, annotation in annotated_fields(type(self)):
+            value = getattr(self, item.name)
+            try:
+                checked = _checked(value, annotation, item)
+            except UltragrayError as inner:
+                raise _under(item.name, inner, self.error) from None
+            if checked is not value:
+                object.__setattr__(self, item.name, checked)
+
+
+class Family(Contract):
+    """Base of a closed set of contract dataclasses: `class Probe(Family)`, `class LinearProbe(Probe)`.
+
+    A member is told apart by its field `kind: Literal["linear"] = kind_field("linear")`. Members register by being
+    defined.
+    """
+
+    members: ClassVar[dict[str, type[Any]]]
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        if Family in cls.__bases__:
+            cls.members = {}
+        elif isinstance(kind := cls.__dict__.get("kind"), Field):
+            cls.members[str(kind.default)] = cls
+
+    @classmethod
+    def member(cls: type[_T], kind: Any) -> type[_T]:
+        """The class of a kind. Raises the family's error for an unknown one, naming the field `kind`."""
+        members: dict[str, type[_T]] = cls.members  # type: ignore[attr-defined]  # cls is a Family
+        if not isinstance(kind, str) or kind not in members:
+            error: type[InvalidArgument] = cls.error  # type: ignore[attr-defined]
+            raise error(f"kind must be one of {', '.join(members)}, got {shown(kind)}", field="kind")
+        return members[kind]
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, source: Any, handler: Any) -> Any:
+        """How pydantic, where it is used, reads the family: as the member that `kind` names."""
+        if Family not in cls.__bases__:
+            return handler(source)
+        from pydantic import Discriminator  # called by pydantic only
+
+        union: Any = Union.__getitem__(tuple(cls.members.values()))
+        return handler.generate_schema(Annotated[union, Discriminator("kind")])
+
+
+def kind_field(kind: str) -> Any:
+    """The field that tells a member of a family apart."""
+    return field(default=kind, repr=False, kw_only=True, metadata={"description": "Always the same."})
+
+
+def annotated_fields(cls: Any) -> tuple[tuple[Field[Any], Any], ...]:
+    """The fields of a dataclass that are given when it is made, each with its annotation as a type."""
+    return _annotated_fields(cls)
+
+
+@cache
+def _annotated_fields(cls: Any) -> tuple[tuple[Field[Any], Any], ...]:
+    hints = get_type_hints(cls)
+    return tuple((item, hints[item.name]) for item in fields(cls) if item.init)
+
+
+def optional_of(annotation: Any) -> tuple[Any, bool]:
+    """The type that an annotation allows beside None, and whether it allows None."""
+    if get_origin(annotation) in (Union, UnionType):
+        types = [one for one in get_args(annotation) if one is not NoneType]
+        if len(types) == 1:
+            return types[0], len(get_args(annotation)) == 2
+    return annotation, False
+
+
+def to_dict(value: Any, *, with_none: bool = True) -> Any:
+    """What JSON holds of a contract dataclass: `{"kind": "convex", "opening_angle_deg": 60.0, …}`."""
+    if isinstance(value, Enum):
+        return value.value
+    if isinstance(value, (list, tuple)):
+        return [to_dict(item, with_none=with_none) for item in value]
+    if not is_dataclass(value) or isinstance(value, type):
+        return value
+    names = [item.name for item in fields(value) if item.init]
+    if isinstance(value, Family):
+        names = ["kind", *(name for name in names if name != "kind")]
+    found = {name: to_dict(getattr(value, name), with_none=with_none) for name in names}
+    return found if with_none else {name: one for name, one in found.items() if one is not None}
+
+
+def from_dict(cls: type[_T], document: Any) -> _T:
+    """Inverse of `to_dict`; what is left out keeps its default.
+
+    Raises the error of the class, with a path as its field, for unknown and missing keys and for values that cannot be.
+    """
+    error: type[InvalidArgument] = getattr(cls, "error", InvalidArgument)
+    if not isinstance(document, Mapping):
+        raise error(f"must be an object, got {shown(document)}")
+    is_family = issubclass(cls, Family)
+    if is_family and Family in cls.__bases__:
+        cls = cls.member(document.get("kind"))  # type: ignore[attr-defined]
+    known = {item.name: (item, annotation) for item, annotation in annotated_fields(cls)}
+    for name in document:
+        if name not in known:
+            takes = ", ".join(one for one in known if one != "kind") or "nothing"
+            name = str(name)[:_SHOWN_CHARACTERS]
+            raise error(f"{name} is not a known key: {_title(cls)} takes {takes}", field=name)
+    for name, (item, _) in known.items():
+        if name not in document and item.default is MISSING and item.default_factory is MISSING:
+            raise error(f"{name} is required by {_title(cls)}", field=name)
+    values = {}
+    for name, value in document.items():
+        with under(name, error):
+            values[name] = _read(value, known[name][1])
+    return cls(**values)
+
+
+def _title(cls: Any) -> str:
+    kind = getattr(cls, "kind", None)
+    return cls.__name__ if kind is None else f"kind {kind}"
+
+
+def _read(value: Any, annotation: Any) -> Any:
+    """A value of JSON as what the annotation says, where that is a class of ours."""
+    kind, _ = optional_of(annotation)
+    if value is not None and isinstance(kind, type) and (is_dataclass(kind) or issubclass(kind, Family)):
+        return from_dict(kind, value)
+    return value
+
+
+def _checked(value: Any, annotation: Any, item: Field[Any]) -> Any:
+    """The value of a field in its own type. Raises InvalidArgument."""
+    kind, optional = optional_of(annotation)
+    if value is None and (optional or item.default is None):
+        return None
+    if get_origin(kind) is Literal:
+        _require(value in get_args(kind), f"one of {', '.join(map(str, get_args(kind)))}", value)
+        return value
+    if get_origin(kind) is tuple:
+        _require(isinstance(value, (list, tuple)), "a list", value)
+        element = get_args(kind)[0]
+        return tuple(_checked_element(one, element, item, index) for index, one in enumerate(value))
+    if not isinstance(kind, type):
+        return value
+    if issubclass(kind, Enum):
+        try:
+            return kind(value)
+        except ValueError:
+            return _require(False, f"one of {', '.join(one.value for one in kind)}", value)
+    if kind in (int, float):
+        return checked_number(value, kind, **{name: item.metadata.get(name) for name in ("low", "high", "above")})
+    if kind is bool:
+        _require(isinstance(value, (bool, np.bool_)), "true or false", value)
+    elif kind is str:
+        _require(isinstance(value, str), "a text", value)
+        choices = item.metadata.get("choices")
+        _require(choices is None or value in choices, f"one of {', '.join(choices or ())}", value)
+    elif issubclass(kind, Contract):
+        _require(isinstance(value, kind), f"a {kind.__name__}", value)
+    return value
+
+
+def _checked_element(value: Any, annotation: Any, item: Field[Any], index: int) -> Any:
+    with under(f"[{index}]"):
+        return _checked(value, annotation, item)
+
+
+def checked_number(
+    value: Any, kind: type, *, low: float | None = None, high: float | None = None, above: float | None = None
+) -> int | float:
+    """The number as an int or a float. Raises InvalidArgument for one beyond the limits, and for what is none."""
+    expected = f"{'an integer' if kind is int else 'a finite number'}{_range(low, high, above)}"
+    is_number = isinstance(value, (int, np.integer) if kind is int else (int, float, np.integer, np.floating))
+    _require(is_number and not isinstance(value, bool), expected, value)
+    try:
+        number: int | float = int(value) if kind is int else float(value)
+    except OverflowError:  # an int of hundreds of digits
+        number = math.inf
+    fits = math.isfinite(number) and (low is None or number >= low) and (high is None or number <= high)
+    _require(fits and (above is None or number > above), expected, value)
+    return number
+
+
+def _range(low: float | None, high: float | None, above: float | None) -> str:
+    """The limits in words, beginning with a space; empty where there are none."""
+    if low is not None:
+        return f" from {_plain(low)} to {_plain(high)}" if high is not None else f" of at least {_plain(low)}"
+    if above is not None:
+        return f" above {_plain(above)}" + (f" and at most {_plain(high)}" if high is not None else "")
+    return "" if high is None else f" of at most {_plain(high)}"
+
+
+def _plain(limit: float) -> str:
+    return str(limit) if isinstance(limit, int) else f"{limit:g}"
+
+
+def _require(holds: bool, expected: str, given: Any) -> Any:
+    if not holds:
+        raise InvalidArgument(f"must be {expected}, got {shown(given)}")
+
+
+def shown(value: Any) -> str:
+    """A value in a message: as Python writes it, cut where it is long."""
+    text = repr(value)
+    return text if len(text) <= _SHOWN_CHARACTERS else f"{text[:_SHOWN_CHARACTERS]}…"
+
+
+@contextmanager
+def under(prefix: str, error: type[UltragrayError] | None = None) -> Iterator[None]:
+    """Errors from inside name their field as a part of `prefix`; InvalidArgument itself becomes `error`."""
+    try:
+        yield
+    except UltragrayError as inner:
+        raise _under(prefix, inner, error) from inner
+
+
+def _under(prefix: str, inner: UltragrayError, error: type[UltragrayError] | None) -> UltragrayError:
+    path = prefix if inner.field is None else join(prefix, inner.field)
+    cls = error if error is not None and type(inner) is InvalidArgument else type(inner)
+    detail = inner.detail
+    if inner.field is None and detail.startswith("must "):
+        detail = f"{path} {detail}"
+    elif inner.field is not None and detail.startswith(inner.field):
+        detail = join(prefix, detail)
+    return cls(detail, field=path)
+
+
+def join(prefix: str, path: str) -> str:
+    """The path of a part: `probe` and `near_mm` make `probe.near_mm`, `poses` and `[3]` make `poses[3]`."""
+    return f"{prefix}{path}" if path.startswith("[") else f"{prefix}.{path}"
