@@ -147,7 +147,7 @@ class DatasetUpload:
         )
         async with self._turn:
             await run_helper(
-                "dataset_intake",
+                "datasets.intake",
                 asdict(request),
                 what="checking the dataset",
                 timeout_s=CHECK_TIMEOUT_S,

@@ -81,7 +81,7 @@ class SceneImports:
         """
         async with self._turn:
             await run_helper(
-                "scene_check",
+                "helpers.scene_check",
                 {"path": str(received), "memory_bytes": self._settings.dataset_memory_mb << 20},
                 what="checking the scene",
                 timeout_s=CHECK_TIMEOUT_S,

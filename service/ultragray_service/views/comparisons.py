@@ -45,7 +45,9 @@ class Comparisons:
         self._catalog = catalog
         self._datasets = datasets
         self._artifacts = settings.artifacts
-        self.folders = PreparedFolders(settings.artifacts / FOLDER, "comparison", "comparing the scene", settings, turn)
+        self.folders = PreparedFolders(
+            settings.artifacts / FOLDER, "helpers.comparison", "comparing the scene", settings, turn
+        )
         self._hashes: dict[str, tuple[FileVersion, str]] = {}
 
     async def get(self, scene: str) -> Comparison:

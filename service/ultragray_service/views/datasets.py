@@ -26,7 +26,7 @@ class DatasetViews:
         self._store = store
         self._artifacts = settings.artifacts
         self.folders = PreparedFolders(
-            settings.artifacts / FOLDER, "dataset_view", "laying out the frames of the dataset", settings, turn
+            settings.artifacts / FOLDER, "datasets.view", "laying out the frames of the dataset", settings, turn
         )
 
     async def key(self, name: str) -> str:

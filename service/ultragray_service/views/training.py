@@ -44,7 +44,7 @@ class TrainingViews:
         self._datasets = datasets
         self._artifacts = settings.artifacts
         self.folders = PreparedFolders(
-            settings.artifacts / FOLDER, "training_preview", "rendering the training as it is", settings, turn
+            settings.artifacts / FOLDER, "helpers.training_preview", "rendering the training as it is", settings, turn
         )
 
     async def curve(self, job_id: str) -> list[CurvePoint]:

@@ -71,7 +71,7 @@ def test_mistakes_are_told_in_one_line(make_file: Callable[..., Path], tmp_path:
 
 def test_help_imports_nothing_heavy() -> None:
     program = (
-        f"import sys; sys.path[:0] = {sys.path!r}; from ultragray_service import cli_convert; "
+        f"import sys; sys.path[:0] = {sys.path!r}; from ultragray_service.cli import convert; "
         "print(sorted({'torch', 'numpy.testing', 'cv2', 'safetensors.torch'} & set(sys.modules)))"
     )
     answer = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)

@@ -83,7 +83,7 @@ def test_embedded_worker_comes_back_and_goes_with_the_service(
     service = start_service(artifact_folder=tmp_path / "artifacts", embedded_worker=True, training_threads=1)
 
     def worker() -> int | None:
-        return next((pid for pid, line in children(service.process.pid).items() if "cli_worker" in line), None)
+        return next((pid for pid, line in children(service.process.pid).items() if "cli.worker" in line), None)
 
     wait_until(lambda: worker() is not None)
     first = worker()

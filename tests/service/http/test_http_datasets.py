@@ -343,11 +343,11 @@ def test_too_many_uploads_at_once(service: RunningService) -> None:
 def test_a_check_that_is_killed(http: httpx.Client, service: RunningService, files: dict[str, bytes]) -> None:
     with ThreadPoolExecutor(1) as executor:
         answer = executor.submit(put, http, "killed", zipped(files))
-        pid = wait_until(lambda: helper_process(service, "dataset_intake"))
+        pid = wait_until(lambda: helper_process(service, "datasets.intake"))
         os.kill(pid, signal.SIGKILL)
         assert_problem(answer.result(), 507, "MEMORY_EXCEEDED", "was killed")
         answer = executor.submit(put, http, "killed", zipped(files))
-        pid = wait_until(lambda: helper_process(service, "dataset_intake"))
+        pid = wait_until(lambda: helper_process(service, "datasets.intake"))
         os.kill(pid, signal.SIGBUS)
         assert_problem(answer.result(), 422, "DATASET_INVALID", f"signal {signal.SIGBUS:d}")
     assert put(http, "killed", zipped(files)).status_code == 201

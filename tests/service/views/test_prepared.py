@@ -40,7 +40,7 @@ def request_body(tmp_path: Path) -> dict[str, str]:
 def folders(tmp_path: Path, name: str = "views", turn: asyncio.Lock | None = None, **settings: Any) -> PreparedFolders:
     return PreparedFolders(
         tmp_path / name,
-        "dataset_view",
+        "datasets.view",
         "laying out",
         Settings(data_folder=tmp_path, **settings),
         turn or asyncio.Lock(),

@@ -80,7 +80,8 @@ def patch_workers(tmp_path, monkeypatch):
     def patch(code):
         folder = tmp_path / "patches"
         folder.mkdir()
-        (folder / "sitecustomize.py").write_text(f"import torch\nfrom ultragray_workers import worker\n{code}")
+        imports = "import torch\nfrom ultragray_workers.pool.process import worker"
+        (folder / "sitecustomize.py").write_text(f"{imports}\n{code}")
         monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(folder), *filter(None, sys.path)]))
 
     return patch
