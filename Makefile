@@ -13,7 +13,7 @@ DATA ?= ../shared/data
 ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help serve console test test-long test-console test-faults check format bench bench-console bench-cuda results demo-scene proto clean
+.PHONY: help serve console test test-long test-console test-faults check format bench bench-console bench-cuda results demo-scene generate clean
 
 help:  ## say what there is
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
@@ -71,8 +71,9 @@ results: $(VENV)/installed  ## train on every data set of DATA and write docs/re
 demo-scene: $(VENV)/installed  ## simulate the phantom, train the demo scene from it and put it in its place
 	$(BIN)/python -m ultragray.demo.make
 
-proto: $(VENV)/installed-dev  ## regenerate the gRPC stubs
+generate: $(VENV)/installed-dev  ## rewrite what is generated: the gRPC stubs, the client for threads
 	$(BIN)/python proto/generate.py
+	$(BIN)/python client/generate.py
 
 clean:  ## remove what was built
 	rm -rf $(VENV) build web/node_modules $(dir $(CONSOLE))

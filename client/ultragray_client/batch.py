@@ -9,6 +9,7 @@ from itertools import islice
 
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2
 
+from .connection import Conversation
 from .errors import ClientError, TooManyPoses
 from .frames import Frame, frame_from_message
 from .geometry import PoseLike, pose_message
@@ -17,20 +18,21 @@ from .retries import Retries
 _POSES_PER_CALL = 256  # halved where the service takes fewer
 
 
-class Batch:
-    """Which poses wait for their frames."""
+class Batch(Conversation[Frame]):
+    """The poses that wait for their frames."""
 
-    def __init__(self, settings: rendering_pb2.RenderSettings, poses: Iterable[PoseLike], retries: Retries) -> None:
+    method = "rendering.RenderBatch"
+
+    def __init__(self, settings: rendering_pb2.RenderSettings, poses: Iterable[PoseLike]) -> None:
         self._settings = settings
         self._poses = _messages(poses)
-        self._retries = retries
         self._waiting: deque[geometry_pb2.Pose] = deque()
         self._first = 0  # sequence of the first that waits
         self._first_of_call = 0
         self._per_call = _POSES_PER_CALL
 
     def request(self) -> rendering_pb2.RenderBatchRequest | None:
-        """The next call; None when all frames are there. Raises InvalidPose."""
+        """The request for the next poses. Raises InvalidPose."""
         self._waiting.extend(islice(self._poses, max(self._per_call - len(self._waiting), 0)))
         if not self._waiting:
             return None
@@ -43,16 +45,18 @@ class Batch:
         frame = frame_from_message(message, sequence=self._first)
         self._waiting.popleft()
         self._first += 1
-        self._retries.progress()
         return frame
 
-    def pause_s(self, error: ClientError) -> float:
-        """How long to wait before the next call. Raises the error where that cannot succeed."""
+    def end_of_call(self) -> None:
+        """A call brings no more than the frames of its own poses."""
+
+    def pause_s(self, error: ClientError, retries: Retries) -> float:
+        """The seconds to wait; asks for fewer poses at once where they were too many."""
         asked = min(self._per_call, len(self._waiting))
         if isinstance(error, TooManyPoses) and asked > 1:
             self._per_call = asked // 2
             return 0.0
-        return self._retries.pause_s(self._renumbered(error))
+        return retries.pause_s(self._renumbered(error))
 
     def _renumbered(self, error: ClientError) -> ClientError:
         """The error with the index in the whole batch, where it names a pose of one call."""

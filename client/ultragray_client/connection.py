@@ -1,7 +1,8 @@
-"""What both clients share of a connection: its options, the stubs, and calls with one answer as values."""
+"""What both clients share of a connection: its options, the stubs, and calls as values."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from operator import attrgetter
@@ -9,7 +10,8 @@ from typing import Any, Generic, TypeVar
 
 from ultragray_proto.v1 import datasets_pb2_grpc, jobs_pb2_grpc, rendering_pb2_grpc, scenes_pb2_grpc
 
-from .errors import InvalidArgument, NotFound
+from .errors import ClientError, InvalidArgument, NotFound
+from .retries import Retries
 
 T = TypeVar("T")
 
@@ -33,19 +35,41 @@ class Stubs:
         self.datasets = datasets_pb2_grpc.DatasetServiceStub(channel)
         self.jobs = jobs_pb2_grpc.JobServiceStub(channel)
 
+    def method(self, path: str) -> Any:
+        """The method to call, such as "scenes.GetScene"."""
+        return attrgetter(path)(self)
+
 
 @dataclass(frozen=True)
 class Operation(Generic[T]):
-    """A call with one answer: which method of which stub ("scenes.GetScene"), its request, what the answer means."""
+    """A call with one answer: its method ("scenes.GetScene"), its request, and what the answer means."""
 
     method: str
     request: Any
     convert: Callable[[Any], T]
     deletes: bool = False  # then NOT_FOUND after a connection that broke means that it worked
 
-    def of(self, stubs: Stubs) -> Any:
-        """The method to call."""
-        return attrgetter(self.method)(stubs)
+
+class Conversation(ABC, Generic[T]):
+    """A call that streams its answers. Where it breaks off, another one asks for what is missing."""
+
+    method: str  # such as "jobs.WatchJob"
+
+    @abstractmethod
+    def request(self) -> Any:
+        """The request of the next call; None when all is there."""
+
+    @abstractmethod
+    def take(self, message: Any) -> T:
+        """The meaning of a message."""
+
+    @abstractmethod
+    def end_of_call(self) -> None:
+        """Notes that the service ended a call without an error. Raises ClientError where it should have gone on."""
+
+    def pause_s(self, error: ClientError, retries: Retries) -> float:
+        """The seconds to wait before the next call. Raises the error where no other call can succeed."""
+        return retries.pause_s(error)
 
 
 @dataclass

@@ -71,6 +71,11 @@ class Upload:
                     yield request(chunk=chunk)
 
 
+def upload_dataset() -> Operation[Dataset]:
+    """An upload but for its messages."""
+    return Operation("datasets.UploadDataset", None, lambda answer: dataset_from_message(answer.dataset))
+
+
 def list_datasets(page_size: int, page_token: str) -> Operation[tuple[list[Dataset], str]]:
     request = datasets_pb2.ListDatasetsRequest(page_size=page_size, page_token=page_token)
     return Operation(

@@ -10,11 +10,14 @@ from pathlib import Path
 
 from ultragray_proto.v1 import jobs_pb2
 
+from .connection import Conversation
 from .errors import Unreachable
 
 
-class Download:
-    """What of the file is there."""
+class Download(Conversation[jobs_pb2.ArtifactChunk]):
+    """The part of a file that is there; each chunk goes to `write` before the next one is asked for."""
+
+    method = "jobs.DownloadArtifact"
 
     def __init__(self, job_id: str, name: str, descriptor: int) -> None:
         self._job_id, self._name = job_id, name
@@ -22,15 +25,21 @@ class Download:
         self._received = 0
         self._expected: int | None = None
 
-    @property
-    def complete(self) -> bool:
-        return self._received == self._expected
-
-    def request(self) -> jobs_pb2.DownloadArtifactRequest:
-        """For the part that is missing."""
+    def request(self) -> jobs_pb2.DownloadArtifactRequest | None:
+        """The request for the part that is missing."""
+        if self._received == self._expected:
+            return None
         return jobs_pb2.DownloadArtifactRequest(job=self._job_id, name=self._name, offset=self._received)
 
-    def take(self, chunk: jobs_pb2.ArtifactChunk) -> None:
+    def take(self, message: jobs_pb2.ArtifactChunk) -> jobs_pb2.ArtifactChunk:
+        return message
+
+    def end_of_call(self) -> None:
+        """Raises Unreachable where bytes are missing."""
+        if self._received != self._expected:
+            raise Unreachable(f"{self._name} of job {self._job_id} broke off after {self._received} bytes")
+
+    def write(self, chunk: jobs_pb2.ArtifactChunk) -> None:
         """Raises OSError."""
         self._expected = chunk.file_bytes
         rest = memoryview(chunk.data)
@@ -38,10 +47,6 @@ class Download:
             written = os.write(self._descriptor, rest)
             self._received += written
             rest = rest[written:]
-
-    def broke_off(self) -> Unreachable:
-        """What to say of a call that ended too early."""
-        return Unreachable(f"{self._name} of job {self._job_id} broke off after {self._received} bytes")
 
 
 @contextlib.contextmanager

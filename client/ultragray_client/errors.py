@@ -247,5 +247,10 @@ class RenderFailed(ClientError):
 class StreamEnded(ClientError):
     reason = "STREAM_ENDED"
 
+    @classmethod
+    def for_sending(cls) -> StreamEnded:
+        """The error of a pose that comes too late."""
+        return cls("the stream takes no more poses: done_sending was called, or it is over")
+
 
 ERRORS = tuple(value for value in vars().values() if isinstance(value, type) and issubclass(value, ClientError))

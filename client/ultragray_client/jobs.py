@@ -12,10 +12,11 @@ from google.protobuf.json_format import MessageToDict, ParseDict, ParseError  # 
 
 from ultragray_proto.v1 import jobs_pb2
 
-from .connection import Operation
-from .errors import InvalidArgument
+from .connection import Conversation, Operation
+from .errors import ClientError, InvalidArgument
 from .frames import output_names, output_numbers
 from .geometry import PoseLike, pose_message
+from .retries import Retries
 
 
 class JobKind(str, Enum):
@@ -89,18 +90,31 @@ class JobEvent:
     log: str  # new lines
 
 
-class LogTail:
-    """Which lines are new where a watch was broken off: a new one begins with the last lines again."""
+class Watch(Conversation[JobEvent]):
+    """The news of a job until its final state; each call begins with the last lines of the log."""
 
-    def __init__(self) -> None:
-        self._seen = ""
-        self._again = False
+    method = "jobs.WatchJob"
 
-    def broke_off(self) -> None:
+    def __init__(self, job_id: str) -> None:
+        self._job_id = job_id
+        self._over = False
+        self._seen = ""  # the end of the log so far
+        self._again = False  # the next lines may be seen ones
+
+    def request(self) -> jobs_pb2.WatchJobRequest | None:
+        return None if self._over else jobs_pb2.WatchJobRequest(job=self._job_id)
+
+    def take(self, message: jobs_pb2.JobEvent) -> JobEvent:
+        return JobEvent(job_from_message(message.job) if message.HasField("job") else None, self._new(message.log))
+
+    def end_of_call(self) -> None:
+        self._over = True
+
+    def pause_s(self, error: ClientError, retries: Retries) -> float:
         self._again = True
+        return retries.pause_s(error)
 
-    def new(self, log: str) -> str:
-        """The part of `log` that was not told before."""
+    def _new(self, log: str) -> str:
         if self._again and log:
             self._again = False
             place = log.rfind(self._seen) if self._seen else -1
@@ -197,10 +211,6 @@ def delete_job(job_id: str) -> Operation[None]:
 def job_log(job_id: str, max_bytes: int) -> Operation[str]:
     request = jobs_pb2.GetJobLogRequest(job=job_id, max_bytes=max_bytes)
     return Operation("jobs.GetJobLog", request, lambda answer: str(answer.log))
-
-
-def event_from_message(message: jobs_pb2.JobEvent, tail: LogTail) -> JobEvent:
-    return JobEvent(job_from_message(message.job) if message.HasField("job") else None, tail.new(message.log))
 
 
 def job_from_message(message: jobs_pb2.Job) -> Job:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import grpc
@@ -18,6 +19,15 @@ from .errors import ERRORS, ClientError, Unreachable
 _DETAILS_KEY = "grpc-status-details-bin"
 _BY_REASON = {error.reason: error for error in ERRORS}
 _BY_STATUS = {error.grpc_status: error for error in reversed(ERRORS)}  # of several, the root of the branch
+
+
+@contextmanager
+def client_errors(address: str) -> Iterator[None]:
+    """Raises the ClientError of a gRPC call that fails in the context."""
+    try:
+        yield
+    except grpc.RpcError as failure:
+        raise error_of_call(failure, address) from None
 
 
 def error_of_call(error: grpc.RpcError, address: str) -> ClientError:

@@ -15,7 +15,8 @@ import pytest
 from ultragray_client import JobState, errors
 from ultragray_client.connection import Operation, is_done
 from ultragray_client.downloads import downloaded
-from ultragray_client.jobs import LogTail
+from ultragray_client.jobs import Watch
+from ultragray_client.retries import Retries
 from ultragray_proto.v1 import jobs_pb2
 
 from ..service.conftest import RunningService
@@ -121,10 +122,11 @@ def test_a_watch_goes_on(far_client: Any, client: Any, proxy: Proxy) -> None:
 def test_a_file_that_does_not_come_leaves_nothing(tmp_path: Path) -> None:
     def half() -> None:
         with downloaded("job", "file", tmp_path / "file") as download:
-            download.take(jobs_pb2.ArtifactChunk(data=b"half", file_bytes=8))
-            assert not download.complete
-            assert download.request().offset == 4
-            raise download.broke_off()
+            download.write(jobs_pb2.ArtifactChunk(data=b"half", file_bytes=8))
+            request = download.request()
+            assert request is not None
+            assert request.offset == 4
+            download.end_of_call()
 
     with pytest.raises(errors.Unreachable, match="after 4 bytes"):
         half()
@@ -133,21 +135,29 @@ def test_a_file_that_does_not_come_leaves_nothing(tmp_path: Path) -> None:
 
 def test_an_empty_file_is_a_file(tmp_path: Path) -> None:
     with downloaded("job", "file", tmp_path / "file") as download:
-        download.take(jobs_pb2.ArtifactChunk(data=b"", file_bytes=0))
-        assert download.complete
+        download.write(jobs_pb2.ArtifactChunk(data=b"", file_bytes=0))
+        download.end_of_call()
+        assert download.request() is None
     assert (tmp_path / "file").read_bytes() == b""
 
 
 def test_a_log_is_not_told_twice() -> None:
-    tail = LogTail()
-    assert tail.new("one\ntwo\n") == "one\ntwo\n"
-    assert tail.new("two\n") == "two\n"
-    tail.broke_off()
-    assert tail.new("") == ""
-    assert tail.new("one\ntwo\ntwo\nthree\n") == "three\n"
-    assert tail.new("three\n") == "three\n"
-    tail.broke_off()
-    assert tail.new("elsewhere\n") == "elsewhere\n"
+    watch, retries = Watch("job"), Retries(None, patience_s=60.0)
+
+    def new(log: str) -> str:
+        return watch.take(jobs_pb2.JobEvent(log=log)).log
+
+    def break_off() -> None:
+        watch.pause_s(errors.Unreachable("gone"), retries)
+
+    assert new("one\ntwo\n") == "one\ntwo\n"
+    assert new("two\n") == "two\n"
+    break_off()
+    assert new("") == ""
+    assert new("one\ntwo\ntwo\nthree\n") == "three\n"
+    assert new("three\n") == "three\n"
+    break_off()
+    assert new("elsewhere\n") == "elsewhere\n"
 
 
 def test_a_deletion_that_had_worked_is_no_error() -> None:

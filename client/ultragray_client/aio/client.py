@@ -1,18 +1,15 @@
-"""The client for asyncio: rendering, and the way to everything else."""
+"""The client: rendering, and the way to everything else."""
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import AsyncIterator, Iterable, Sequence
-from contextlib import aclosing
 from types import TracebackType
 
 from ultragray_proto.v1 import rendering_pb2
 
 from ..batch import Batch
-from ..connection import DEFAULT_ADDRESS, DEFAULT_TIMEOUT_S, Operation, check_timeout
+from ..connection import DEFAULT_ADDRESS, DEFAULT_TIMEOUT_S, Operation
 from ..display import Display
-from ..errors import ClientError
 from ..frames import Frame, frame_from_message, settings_message
 from ..geometry import PoseLike, Probe, pose_message
 from ..pose_exchange import PoseExchange, StreamMode
@@ -24,7 +21,10 @@ from .stream import AsyncFrameStream
 
 
 class AsyncClient:
-    """A service at `address` (HOST:PORT). Made and used within one event loop.
+    """A service at `address` (HOST:PORT).
+
+    Threads may share a `Client`; each process needs one of its own, made after the fork. An `AsyncClient` is made and
+    used within one event loop.
 
     `timeout_s` is the deadline of each call that names none, all its attempts together, and of the calls that go on
     for as long as they take (`render_batch`, `jobs.watch`, up- and downloads) how long a service
@@ -111,21 +111,7 @@ class AsyncClient:
             min_confidence=min_confidence,
             below_min_confidence=below_min_confidence,
         )
-        return self._batch(settings, poses, timeout_s)
-
-    async def _batch(
-        self, settings: rendering_pb2.RenderSettings, poses: Iterable[PoseLike], timeout_s: float | None
-    ) -> AsyncIterator[Frame]:
-        retries = self._connection.retries(timeout_s)
-        batch = Batch(settings, poses, retries)
-        start = self._connection.stubs.rendering.RenderBatch
-        while (request := batch.request()) is not None:
-            async with aclosing(self._connection.messages(start, request, retries)) as messages:
-                try:
-                    async for message in messages:
-                        yield batch.take(message)
-                except ClientError as error:
-                    await asyncio.sleep(batch.pause_s(error))
+        return self._connection.converse(Batch(settings, poses), timeout_s)
 
     def stream(
         self,
@@ -157,8 +143,7 @@ class AsyncClient:
             min_confidence=min_confidence,
             below_min_confidence=below_min_confidence,
         )
-        exchange = PoseExchange(settings, mode)
-        return AsyncFrameStream(self._connection, exchange, None if timeout_s is None else check_timeout(timeout_s))
+        return AsyncFrameStream(self._connection, PoseExchange(settings, mode), timeout_s)
 
     async def close(self) -> None:
         """Ends all that is under way."""

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import AsyncIterator
+from functools import partial
 from pathlib import Path
-
-import grpc
 
 from ultragray_proto.v1 import datasets_pb2
 
@@ -16,13 +14,13 @@ from ..datasets import (
     DatasetOptions,
     Upload,
     contact_sheet,
-    dataset_from_message,
     delete_dataset,
     get_dataset,
     list_datasets,
+    upload_dataset,
 )
-from ..statuses import error_of_call
 from .connection import AsyncConnection
+from .transport import run_blocking
 
 
 class AsyncDatasets:
@@ -45,16 +43,7 @@ class AsyncDatasets:
         takes. Raises DatasetInvalid with the file and the frame, DatasetExists, UploadTooLarge, StorageFull.
         """
         upload = Upload(name, path, options or DatasetOptions())
-        retries = self._connection.retries(timeout_s)
-        while True:
-            try:
-                answer = await self._connection.stubs.datasets.UploadDataset(
-                    _read(upload), timeout=retries.remaining_s(), metadata=self._connection.metadata
-                )
-            except grpc.RpcError as failure:
-                await asyncio.sleep(retries.pause_s(error_of_call(failure, self._connection.address)))
-            else:
-                return dataset_from_message(answer.dataset)
+        return await self._connection.answer_upload(upload_dataset(), partial(_read, upload), timeout_s)
 
     async def list(self, *, timeout_s: float | None = None) -> tuple[Dataset, ...]:
         """All datasets by name."""
@@ -70,11 +59,11 @@ class AsyncDatasets:
 
     async def delete(self, name: str, *, timeout_s: float | None = None) -> None:
         """Raises DatasetInUse where a job needs it."""
-        await self._connection.run(delete_dataset(name), timeout_s)
+        await self._connection.answer(delete_dataset(name), timeout_s)
 
 
 async def _read(upload: Upload) -> AsyncIterator[datasets_pb2.UploadDatasetRequest]:
-    """Its messages, read from the disk in a thread."""
+    """The messages of an upload."""
     messages = upload.messages()
-    while (message := await asyncio.to_thread(next, messages, None)) is not None:
+    while (message := await run_blocking(next, messages, None)) is not None:
         yield message

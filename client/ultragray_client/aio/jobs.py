@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import AsyncIterator, Iterable, Mapping, Sequence
 from contextlib import aclosing
 from functools import partial
@@ -11,17 +10,15 @@ from typing import Any
 
 from ..connection import Pages
 from ..downloads import downloaded
-from ..errors import ClientError
 from ..geometry import PoseLike
 from ..jobs import (
     Job,
     JobEvent,
     JobKind,
     JobState,
-    LogTail,
+    Watch,
     cancel_job,
     delete_job,
-    event_from_message,
     get_job,
     job_log,
     list_jobs,
@@ -30,6 +27,7 @@ from ..jobs import (
     submit_train,
 )
 from .connection import AsyncConnection
+from .transport import run_blocking
 
 
 class AsyncJobs:
@@ -124,23 +122,12 @@ class AsyncJobs:
         """One job."""
         return await self._connection.answer(get_job(job_id), timeout_s)
 
-    async def watch(self, job_id: str, *, timeout_s: float | None = None) -> AsyncIterator[JobEvent]:
+    def watch(self, job_id: str, *, timeout_s: float | None = None) -> AsyncIterator[JobEvent]:
         """The job at first and whenever it changed, and new lines of its log, until it is in its final state.
 
         Goes on where the service was restarted in the meantime. Without `timeout_s` it takes as long as the job.
         """
-        retries, tail = self._connection.retries(timeout_s), LogTail()
-        start, request = self._connection.stubs.jobs.WatchJob, get_job(job_id).request
-        while True:
-            async with aclosing(self._connection.messages(start, request, retries)) as messages:
-                try:
-                    async for message in messages:
-                        retries.progress()
-                        yield event_from_message(message, tail)
-                    return
-                except ClientError as error:
-                    tail.broke_off()
-                    await asyncio.sleep(retries.pause_s(error))
+        return self._connection.converse(Watch(job_id), timeout_s)
 
     async def wait(self, job_id: str, *, timeout_s: float | None = None) -> Job:
         """The job in its final state, whichever that is."""
@@ -160,7 +147,7 @@ class AsyncJobs:
 
     async def delete(self, job_id: str, *, timeout_s: float | None = None) -> None:
         """Removes a finished job and its files; a scene that it trained stays. Raises JobInUse."""
-        await self._connection.run(delete_job(job_id), timeout_s)
+        await self._connection.answer(delete_job(job_id), timeout_s)
 
     async def log(self, job_id: str, *, max_bytes: int = 65536, timeout_s: float | None = None) -> str:
         """The end of what the job's process said."""
@@ -171,16 +158,8 @@ class AsyncJobs:
 
         Raises ArtifactNotFound, and OSError where the file cannot be written.
         """
-        retries = self._connection.retries(timeout_s)
-        start = self._connection.stubs.jobs.DownloadArtifact
         with downloaded(job_id, artifact, Path(path)) as download:
-            while not download.complete:
-                try:
-                    async with aclosing(self._connection.messages(start, download.request(), retries)) as chunks:
-                        async for chunk in chunks:
-                            await asyncio.to_thread(download.take, chunk)
-                            retries.progress()
-                    if not download.complete:
-                        raise download.broke_off()
-                except ClientError as error:
-                    await asyncio.sleep(retries.pause_s(error))
+            chunks = self._connection.converse(download, timeout_s)
+            async with aclosing(chunks):
+                async for chunk in chunks:
+                    await run_blocking(download.write, chunk)

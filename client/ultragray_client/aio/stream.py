@@ -2,29 +2,24 @@
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import AsyncIterator
 from types import TracebackType
-
-import grpc
 
 from ..errors import StreamEnded
 from ..frames import Frame
 from ..geometry import PoseLike
 from ..pose_exchange import PoseExchange
-from ..statuses import error_of_call
+from ..statuses import client_errors
 from .connection import AsyncConnection
 
 
 class AsyncFrameStream:
-    """Poses in, frames out; sending and receiving may be in tasks of their own. Leaving it as a context ends it."""
+    """Poses in, frames out; sending and receiving may go on side by side. Leaving it as a context ends it."""
 
     def __init__(self, connection: AsyncConnection, exchange: PoseExchange, timeout_s: float | None) -> None:
         self._address = connection.address
         self._exchange = exchange
-        self._call = connection.stubs.rendering.RenderStream(timeout=timeout_s, metadata=connection.metadata)
-        self._opened = False
-        self._sending = asyncio.Lock()
+        self._call = connection.pose_call(exchange, timeout_s)
 
     async def send(self, pose: PoseLike, *, timeout_s: float | None = None, measured_ns: int | None = None) -> int:
         """Sends a pose ([4, 4] mm, or a Placement) and returns the sequence that its frame will carry, from 1.
@@ -33,23 +28,14 @@ class AsyncFrameStream:
         frame. `measured_ns`: when the pose was measured, of `time.monotonic_ns()` (default: now); the frame's
         `latency_ms` counts from it. Raises InvalidPose, StreamEnded, and what ended the stream.
         """
-        async with self._sending:
-            message = self._exchange.pose(pose, timeout_s, measured_ns)
-            try:
-                if not self._opened:
-                    self._opened = True
-                    await self._call.write(self._exchange.opening())
-                await self._call.write(message)
-            except grpc.RpcError as failure:
-                raise error_of_call(failure, self._address) from None
-            except asyncio.InvalidStateError:
-                raise StreamEnded("the stream takes no more poses: done_sending was called, or it is over") from None
+        message = self._exchange.pose(pose, timeout_s, measured_ns)
+        with client_errors(self._address):
+            await self._call.send(message)
         return int(message.sequence)
 
     async def done_sending(self) -> None:
         """No more poses come; the frames of those that were sent still do, then the iteration ends."""
-        async with self._sending:
-            await self._call.done_writing()
+        await self._call.done_sending()
 
     async def receive(self) -> Frame:
         """Waits for the next frame.
@@ -57,13 +43,11 @@ class AsyncFrameStream:
         Raises the ClientError that is told in its place, with the `sequence` of its pose: the stream goes on. Raises
         StreamEnded after the last frame, and what ended the stream, such as Draining: open another one.
         """
-        try:
-            message = await self._call.read()
-        except grpc.RpcError as failure:
-            raise error_of_call(failure, self._address) from None
-        if message is grpc.aio.EOF:
+        with client_errors(self._address):
+            message = await self._call.receive()
+        if message is None:
             raise StreamEnded("the stream is over")
-        return self._exchange.frame(message)
+        return self._exchange.frame(message, self._call.take_replaced())
 
     def __aiter__(self) -> AsyncIterator[Frame]:
         return self
@@ -80,4 +64,4 @@ class AsyncFrameStream:
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        self._call.cancel()
+        await self._call.close()

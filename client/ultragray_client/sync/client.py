@@ -1,18 +1,16 @@
-"""The client for ordinary programs: rendering, and the way to everything else."""
+# Generated from aio/client.py by client/generate.py; change that file.
+"""The client: rendering, and the way to everything else."""
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import closing
 from types import TracebackType
 
 from ultragray_proto.v1 import rendering_pb2
 
 from ..batch import Batch
-from ..connection import DEFAULT_ADDRESS, DEFAULT_TIMEOUT_S, Operation, check_timeout
+from ..connection import DEFAULT_ADDRESS, DEFAULT_TIMEOUT_S, Operation
 from ..display import Display
-from ..errors import ClientError
 from ..frames import Frame, frame_from_message, settings_message
 from ..geometry import PoseLike, Probe, pose_message
 from ..pose_exchange import PoseExchange, StreamMode
@@ -24,7 +22,10 @@ from .stream import FrameStream
 
 
 class Client:
-    """A service at `address` (HOST:PORT). Threads may share it; processes may not: make one in each, after the fork.
+    """A service at `address` (HOST:PORT).
+
+    Threads may share a `Client`; each process needs one of its own, made after the fork. An `AsyncClient` is made and
+    used within one event loop.
 
     `timeout_s` is the deadline of each call that names none, all its attempts together, and of the calls that go on
     for as long as they take (`render_batch`, `jobs.watch`, up- and downloads) how long a service
@@ -111,21 +112,7 @@ class Client:
             min_confidence=min_confidence,
             below_min_confidence=below_min_confidence,
         )
-        return self._batch(settings, poses, timeout_s)
-
-    def _batch(
-        self, settings: rendering_pb2.RenderSettings, poses: Iterable[PoseLike], timeout_s: float | None
-    ) -> Iterator[Frame]:
-        retries = self._connection.retries(timeout_s)
-        batch = Batch(settings, poses, retries)
-        start = self._connection.stubs.rendering.RenderBatch
-        while (request := batch.request()) is not None:
-            with closing(self._connection.messages(start, request, retries)) as messages:
-                try:
-                    for message in messages:
-                        yield batch.take(message)
-                except ClientError as error:
-                    time.sleep(batch.pause_s(error))
+        return self._connection.converse(Batch(settings, poses), timeout_s)
 
     def stream(
         self,
@@ -157,8 +144,7 @@ class Client:
             min_confidence=min_confidence,
             below_min_confidence=below_min_confidence,
         )
-        exchange = PoseExchange(settings, mode)
-        return FrameStream(self._connection, exchange, None if timeout_s is None else check_timeout(timeout_s))
+        return FrameStream(self._connection, PoseExchange(settings, mode), timeout_s)
 
     def close(self) -> None:
         """Ends all that is under way."""

@@ -1,11 +1,13 @@
+# Generated from aio/datasets.py by client/generate.py; change that file.
 """The datasets of a service."""
 
 from __future__ import annotations
 
-import time
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
-import grpc
+from ultragray_proto.v1 import datasets_pb2
 
 from ..connection import Pages
 from ..datasets import (
@@ -13,13 +15,13 @@ from ..datasets import (
     DatasetOptions,
     Upload,
     contact_sheet,
-    dataset_from_message,
     delete_dataset,
     get_dataset,
     list_datasets,
+    upload_dataset,
 )
-from ..statuses import error_of_call
 from .connection import Connection
+from .transport import run_blocking
 
 
 class Datasets:
@@ -42,16 +44,7 @@ class Datasets:
         takes. Raises DatasetInvalid with the file and the frame, DatasetExists, UploadTooLarge, StorageFull.
         """
         upload = Upload(name, path, options or DatasetOptions())
-        retries = self._connection.retries(timeout_s)
-        while True:
-            try:
-                answer = self._connection.stubs.datasets.UploadDataset(
-                    upload.messages(), timeout=retries.remaining_s(), metadata=self._connection.metadata
-                )
-            except grpc.RpcError as failure:
-                time.sleep(retries.pause_s(error_of_call(failure, self._connection.address)))
-            else:
-                return dataset_from_message(answer.dataset)
+        return self._connection.answer_upload(upload_dataset(), partial(_read, upload), timeout_s)
 
     def list(self, *, timeout_s: float | None = None) -> tuple[Dataset, ...]:
         """All datasets by name."""
@@ -67,4 +60,11 @@ class Datasets:
 
     def delete(self, name: str, *, timeout_s: float | None = None) -> None:
         """Raises DatasetInUse where a job needs it."""
-        self._connection.run(delete_dataset(name), timeout_s)
+        self._connection.answer(delete_dataset(name), timeout_s)
+
+
+def _read(upload: Upload) -> Iterator[datasets_pb2.UploadDatasetRequest]:
+    """The messages of an upload."""
+    messages = upload.messages()
+    while (message := run_blocking(next, messages, None)) is not None:
+        yield message

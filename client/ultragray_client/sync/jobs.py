@@ -1,8 +1,8 @@
+# Generated from aio/jobs.py by client/generate.py; change that file.
 """The jobs of a service."""
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from functools import partial
@@ -11,17 +11,15 @@ from typing import Any
 
 from ..connection import Pages
 from ..downloads import downloaded
-from ..errors import ClientError
 from ..geometry import PoseLike
 from ..jobs import (
     Job,
     JobEvent,
     JobKind,
     JobState,
-    LogTail,
+    Watch,
     cancel_job,
     delete_job,
-    event_from_message,
     get_job,
     job_log,
     list_jobs,
@@ -30,6 +28,7 @@ from ..jobs import (
     submit_train,
 )
 from .connection import Connection
+from .transport import run_blocking
 
 
 class Jobs:
@@ -129,18 +128,7 @@ class Jobs:
 
         Goes on where the service was restarted in the meantime. Without `timeout_s` it takes as long as the job.
         """
-        retries, tail = self._connection.retries(timeout_s), LogTail()
-        start, request = self._connection.stubs.jobs.WatchJob, get_job(job_id).request
-        while True:
-            with closing(self._connection.messages(start, request, retries)) as messages:
-                try:
-                    for message in messages:
-                        retries.progress()
-                        yield event_from_message(message, tail)
-                    return
-                except ClientError as error:
-                    tail.broke_off()
-                    time.sleep(retries.pause_s(error))
+        return self._connection.converse(Watch(job_id), timeout_s)
 
     def wait(self, job_id: str, *, timeout_s: float | None = None) -> Job:
         """The job in its final state, whichever that is."""
@@ -160,7 +148,7 @@ class Jobs:
 
     def delete(self, job_id: str, *, timeout_s: float | None = None) -> None:
         """Removes a finished job and its files; a scene that it trained stays. Raises JobInUse."""
-        self._connection.run(delete_job(job_id), timeout_s)
+        self._connection.answer(delete_job(job_id), timeout_s)
 
     def log(self, job_id: str, *, max_bytes: int = 65536, timeout_s: float | None = None) -> str:
         """The end of what the job's process said."""
@@ -171,16 +159,8 @@ class Jobs:
 
         Raises ArtifactNotFound, and OSError where the file cannot be written.
         """
-        retries = self._connection.retries(timeout_s)
-        start = self._connection.stubs.jobs.DownloadArtifact
         with downloaded(job_id, artifact, Path(path)) as download:
-            while not download.complete:
-                try:
-                    with closing(self._connection.messages(start, download.request(), retries)) as chunks:
-                        for chunk in chunks:
-                            download.take(chunk)
-                            retries.progress()
-                    if not download.complete:
-                        raise download.broke_off()
-                except ClientError as error:
-                    time.sleep(retries.pause_s(error))
+            chunks = self._connection.converse(download, timeout_s)
+            with closing(chunks):
+                for chunk in chunks:
+                    run_blocking(download.write, chunk)

@@ -1,3 +1,4 @@
+# Generated from aio/scenes.py by client/generate.py; change that file.
 """The scenes of a service."""
 
 from __future__ import annotations
