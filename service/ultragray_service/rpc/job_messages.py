@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from google.protobuf.json_format import MessageToDict, SerializeToJsonError  # type: ignore[import-untyped]
+from google.protobuf.json_format import MessageToDict, SerializeToJsonError
 
 from ultragray.errors import InvalidArgument
 from ultragray_proto.v1 import jobs_pb2, scenes_pb2

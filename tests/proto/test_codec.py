@@ -1,0 +1,286 @@
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, fields
+from enum import Enum
+from typing import Any, ClassVar, Literal, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from google.protobuf.descriptor import Descriptor
+
+from ultragray.confidence import Extrapolation
+from ultragray.display.settings import Display
+from ultragray.probe import ConvexProbe, LinearProbe, PhasedProbe
+from ultragray_proto.codec import MessageInvalid, from_message, to_message, words
+from ultragray_proto.v1 import datasets_pb2, geometry_pb2, jobs_pb2, rendering_pb2, scenes_pb2
+
+# A dataclass and its message, and the fields that stand on one side only, for a reason.
+PAIRS: list[tuple[type[Any], type[Any], set[str]]] = [
+    (LinearProbe, geometry_pb2.LinearProbe, set()),
+    (ConvexProbe, geometry_pb2.ConvexProbe, set()),
+    (PhasedProbe, geometry_pb2.PhasedProbe, set()),
+    (Display, rendering_pb2.Display, set()),
+    (Extrapolation, rendering_pb2.Extrapolation, set()),
+]
+
+
+def names_of_message(descriptor: Descriptor) -> set[str]:
+    """The fields; those of a oneof by its one name."""
+    return {
+        one.containing_oneof.name
+        if one.containing_oneof and not one.containing_oneof.name.startswith("_")
+        else one.name
+        for one in descriptor.fields
+    }
+
+
+@pytest.mark.parametrize(("cls", "message", "alone"), PAIRS, ids=lambda one: getattr(one, "__name__", ""))
+def test_fields_stand_on_both_sides(cls: type[Any], message: type[Any], alone: set[str]) -> None:
+    given = {one.name for one in fields(cls) if one.init and one.name != "kind"}
+    assert given ^ (names_of_message(message.DESCRIPTOR) - {"kind"}) == alone
+
+
+@dataclass(frozen=True)
+class Linear:
+    width_mm: float
+    near_mm: float
+    far_mm: float
+    kind: Literal["linear"] = field(default="linear", repr=False, kw_only=True)
+
+    def __post_init__(self) -> None:
+        if not self.near_mm < self.far_mm:
+            raise ValueError("far_mm must be beyond near_mm")
+
+
+@dataclass(frozen=True)
+class Phased:
+    opening_angle_deg: float
+    far_mm: float
+    kind: Literal["phased"] = field(default="phased", repr=False, kw_only=True)
+
+
+AnyProbe: TypeAlias = Linear | Phased
+
+
+class Pixels(Enum):
+    UINT8 = "uint8"
+    PNG = "png"
+
+
+@dataclass(frozen=True)
+class Shown:
+    gain_db: float = 0.0
+    dynamic_range_db: float = 60.0
+    tgc_db: tuple[float, ...] = ()
+    depth_mm: float | None = None
+    flip: bool = False
+    pixel_mm: float | None = None
+
+
+@dataclass(frozen=True)
+class Settings:
+    scene: str
+    height: int | None = None
+    outputs: tuple[str, ...] = ("bmode",)
+    encoding: Pixels = Pixels.UINT8
+    probe: AnyProbe | None = None
+    display: Shown = Shown()
+    below_min_confidence: Literal["refuse", "mask"] = "refuse"
+
+
+Point = tuple[float, float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Trained:
+    count: int
+    position_min_mm: Point | None
+    first: npt.NDArray[np.float64] | None
+
+
+@dataclass(frozen=True)
+class Scene:
+    name: str
+    probe: AnyProbe | None
+    image_height: int | None
+    metrics: dict[str, float]
+    label_names: dict[int, str]
+    training_poses: Trained
+    dataset_name: str | None = None
+
+
+@dataclass(frozen=True)
+class Train:
+    dataset: str
+    scene: str
+    preset: str = "fast"
+    settings: dict[str, Any] = field(default_factory=dict)
+    kind: Literal["train"] = field(default="train", kw_only=True)
+
+
+@dataclass(frozen=True)
+class Around:
+    count: int
+    translation_mm: float = 2.0
+    kind: Literal["around"] = field(default="around", kw_only=True)
+
+
+@dataclass(frozen=True)
+class Covered:
+    count: int
+    kind: Literal["covered"] = field(default="covered", kw_only=True)
+
+
+class Sampler:
+    members: ClassVar[dict[str, type[Any]]] = {"around": Around, "covered": Covered}
+
+
+@dataclass(frozen=True)
+class Render:
+    scene: str
+    sampler: Sampler | None = None
+    kind: Literal["render"] = field(default="render", kw_only=True)
+
+
+@dataclass(frozen=True)
+class Submitted:
+    specification: Train | Render
+    priority: int = 0
+
+
+@dataclass(frozen=True)
+class Uploaded:
+    name: str
+    warnings: tuple[str, ...]
+    options: dict[str, str]
+
+
+TOLD: list[tuple[Any, Any]] = [
+    (Settings("liver"), rendering_pb2.RenderSettings),
+    (Settings("liver", 0, ("echo", "labels"), Pixels.PNG, Linear(1.0, 0.0, 2.0)), rendering_pb2.RenderSettings),
+    (Settings("", display=Shown(3.0, tgc_db=(1.0, 2.0), depth_mm=0.0)), rendering_pb2.RenderSettings),
+    (
+        Submitted(Train("a", "b", settings={"steps": 7, "rate": 0.5, "fast": True, "x": None})),
+        jobs_pb2.SubmitJobRequest,
+    ),
+    (Submitted(Render("a", Around(3, 0.0)), priority=-3), jobs_pb2.SubmitJobRequest),
+    (Render("a", Covered(3)), jobs_pb2.RenderJob),
+    (Uploaded("a", ("dark", "short"), {"crop": "1:2,3:4"}), datasets_pb2.Dataset),
+]
+
+
+@pytest.mark.parametrize(("value", "cls"), TOLD)
+def test_there_and_back(value: Any, cls: Any) -> None:
+    message = cls.FromString(to_message(value, cls).SerializeToString())
+    assert from_message(message, type(value)) == value
+
+
+def test_scene() -> None:
+    pose = np.arange(16.0).reshape(4, 4)
+    scene = Scene("liver", None, None, {"psnr_db": 30.5}, {1: "bone"}, Trained(7, (1.0, 2.0, 3.0), pose))
+    message = to_message(scene, scenes_pb2.Scene)
+    assert not message.HasField("probe")
+    assert message.image_height == 0
+    assert message.training_poses.position_min_mm == geometry_pb2.Position(x=1.0, y=2.0, z=3.0)
+    again = from_message(message, Scene)
+    assert (again.image_height, again.dataset_name, again.metrics) == (None, None, {"psnr_db": 30.5})
+    assert (again.label_names, again.training_poses.position_min_mm) == ({1: "bone"}, (1.0, 2.0, 3.0))
+    assert (again.training_poses.first == pose).all()
+
+
+def test_arrays_are_points() -> None:
+    message = to_message(Trained(1, np.array([1.0, 2.0, 3.0], np.float32), None), scenes_pb2.TrainingPoses)  # type: ignore[arg-type]
+    assert message.position_min_mm == geometry_pb2.Position(x=1.0, y=2.0, z=3.0)
+
+
+def test_members_of_a_family_by_themselves() -> None:
+    probe = geometry_pb2.Probe(phased=geometry_pb2.PhasedProbe(opening_angle_deg=60.0, far_mm=50.0))
+    assert from_message(probe, AnyProbe) == Phased(60.0, 50.0)
+    assert from_message(jobs_pb2.PoseSampler(kind="covered", count=3), Sampler) == Covered(3)
+
+
+def test_defaults_are_left_out() -> None:
+    assert to_message(Settings("a"), rendering_pb2.RenderSettings) == rendering_pb2.RenderSettings(
+        scene="a", outputs=["OUTPUT_BMODE"], encoding="ENCODING_UINT8", below_min_confidence="BELOW_CONFIDENCE_REFUSE"
+    )
+    assert from_message(rendering_pb2.RenderSettings(scene="a"), Settings) == Settings("a")
+
+
+def test_fields_beside_the_value() -> None:
+    message = to_message(Shown(3.0), rendering_pb2.Display, flip=True)
+    assert (message.gain_db, message.flip) == (3.0, True)
+    assert from_message(message, Shown, flip=False) == Shown(3.0)
+
+
+REFUSED: list[tuple[Any, Any, str, str]] = [
+    (geometry_pb2.Probe(), AnyProbe, "kind", "kind must be one of linear, phased, got none"),
+    (
+        geometry_pb2.Probe(convex=geometry_pb2.ConvexProbe()),
+        AnyProbe,
+        "kind",
+        "kind must be one of linear, phased, got convex",
+    ),
+    (
+        rendering_pb2.RenderSettings(probe=geometry_pb2.Probe()),
+        Settings,
+        "probe.kind",
+        "probe.kind must be one of linear, phased, got none",
+    ),
+    (
+        rendering_pb2.RenderSettings(outputs=[1, 77]),
+        Settings,
+        "outputs",
+        "outputs must be some of OUTPUT_BMODE, OUTPUT_ECHO, OUTPUT_TRANSMITTANCE, OUTPUT_COVERAGE, OUTPUT_LABELS, "
+        "got number 77",
+    ),
+    (rendering_pb2.RenderSettings(outputs=[0]), Settings, "outputs", "got number 0"),
+    (
+        rendering_pb2.RenderSettings(encoding=2),
+        Settings,
+        "encoding",
+        "must be one of ENCODING_UINT8, ENCODING_PNG, got number 2",
+    ),
+    (scenes_pb2.Scene(), Scene, "training_poses", "training_poses is required"),
+    (jobs_pb2.SubmitJobRequest(), Submitted, "specification", "must be one of train, render, got none"),
+    (
+        jobs_pb2.SubmitJobRequest(render=jobs_pb2.RenderJob(sampler=jobs_pb2.PoseSampler(kind="covered", seed=3))),
+        Submitted,
+        "render.sampler.seed",
+        "render.sampler.seed must be left out: kind covered does not take it",
+    ),
+    (
+        jobs_pb2.RenderJob(sampler=jobs_pb2.PoseSampler(kind="training")),
+        Render,
+        "sampler.kind",
+        "sampler.kind must be one of around, covered, got 'training'",
+    ),
+]
+
+
+@pytest.mark.parametrize(("message", "cls", "path", "detail"), REFUSED)
+def test_refused(message: Any, cls: Any, path: str, detail: str) -> None:
+    with pytest.raises(MessageInvalid) as raised:
+        from_message(message, cls)
+    assert raised.value.field == path
+    assert detail in str(raised.value)
+
+
+def test_infinite_settings_are_refused() -> None:
+    message = jobs_pb2.TrainJob()
+    message.settings.update({"rate": math.inf})
+    with pytest.raises(MessageInvalid, match=r"settings\.rate must be a finite number, got inf"):
+        from_message(message, Train)
+
+
+def test_the_error_of_a_dataclass_is_kept() -> None:
+    probe = geometry_pb2.Probe(linear=geometry_pb2.LinearProbe(width_mm=1.0, near_mm=3.0, far_mm=2.0))
+    with pytest.raises(MessageInvalid) as raised:
+        from_message(rendering_pb2.RenderSettings(probe=probe), Settings)
+    assert raised.value.field == "probe.linear"
+    assert str(raised.value.original) == "far_mm must be beyond near_mm"
+
+
+def test_words() -> None:
+    assert words(rendering_pb2.BelowConfidence.DESCRIPTOR) == {1: "refuse", 2: "mask"}
