@@ -13,6 +13,7 @@ import pytest
 
 from ultragray import GaussianScene
 from ultragray_service.core import catalog, scene_imports
+from ultragray_service.core.helper_processes import HelperProcesses
 from ultragray_service.core.state import Service
 from ultragray_service.settings import load_settings
 from ultragray_workers.jobs.store import JobStore
@@ -45,7 +46,7 @@ async def points(service: Service) -> None:
 
 
 LONG: dict[str, tuple[Any, str, Callable[[Service], Awaitable[None]]]] = {
-    "the sync of an import": (scene_imports, "_finish", receive),
+    "the sync of an import": (scene_imports, "sync", receive),
     "a name asked of the database": (JobStore, "makes_scene", receive),
     "the copy of an import": (scene_imports, "link_or_copy", publish),
     "points of a scene": (catalog, "point_message", points),
@@ -66,7 +67,7 @@ def test_long_work_leaves_the_threads_of_the_loop(
     async def checked(*_: object, **__: object) -> None: ...
 
     monkeypatch.setattr(owner, function, wait)
-    monkeypatch.setattr(scene_imports, "run_helper", checked)
+    monkeypatch.setattr(HelperProcesses, "run", checked)
     monkeypatch.setattr(scene_imports, "read_header", lambda _: None)
     demo_scene.save(tmp_path / "demo.ugr")
 

@@ -22,10 +22,10 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     temporary = Path(name)
     try:
         yield temporary
-        _sync(temporary)
         temporary.chmod(0o666 & ~_umask())
+        sync(temporary)
         temporary.replace(path)
-        _sync(path.parent)
+        sync(path.parent)
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -39,10 +39,20 @@ def remove_stale_temporaries(path: str | Path) -> None:
             found.unlink(missing_ok=True)
 
 
-def _sync(path: Path) -> None:
+def write_whole(path: str | Path, content: str | bytes) -> None:
+    """Write a file of this content (text as UTF-8), or leave what was there."""
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(content.encode() if isinstance(content, str) else content)
+
+
+def sync(path: Path) -> None:
+    """Make a file, or the names in a folder, survive a loss of power; folders where their file system can."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
+    except OSError:
+        if not path.is_dir():
+            raise
     finally:
         os.close(descriptor)
 

@@ -6,17 +6,16 @@ import asyncio
 import logging
 from collections.abc import AsyncIterator, Awaitable
 from contextlib import asynccontextmanager
-from dataclasses import asdict
 from typing import Any, TypeVar
 
 from ultragray.errors import DatasetInvalid, Draining, InvalidArgument, QueueFull
 from ultragray_workers.datasets.incoming import IncomingDataset, remove_stale
-from ultragray_workers.datasets.intake import IntakeRequest
+from ultragray_workers.datasets.intake import take_in
 from ultragray_workers.datasets.store import DatasetRecord, DatasetStore, check_dataset_name
 
 from ..arrival import arrival
 from ..settings import Settings
-from ..views.helper_process import run_helper
+from .helper_processes import HelperProcesses
 
 MAX_UPLOADS = 8
 OPTION_NAMES = ("crop", "image_size", "frames", "train_frames", "val_frames")
@@ -30,13 +29,15 @@ T = TypeVar("T")
 
 
 class DatasetUploads:
-    """The uploads under way. A few at a time are received, and wait for `turn` to be checked."""
+    """The uploads under way. A few at a time are received, and wait for their turn in `checks`."""
 
-    def __init__(self, store: DatasetStore, settings: Settings, draining: asyncio.Event, turn: asyncio.Lock) -> None:
+    def __init__(
+        self, store: DatasetStore, settings: Settings, draining: asyncio.Event, checks: HelperProcesses
+    ) -> None:
         self._store = store
         self._settings = settings
         self._draining = draining
-        self._turn = turn
+        self._checks = checks
         self._count = 0
 
     @asynccontextmanager
@@ -57,7 +58,7 @@ class DatasetUploads:
         stopping: asyncio.Future[Any] = asyncio.ensure_future(self._draining.wait())
         try:
             incoming = await asyncio.to_thread(IncomingDataset, self._store, self._settings.max_dataset_bytes)
-            upload = DatasetUpload(incoming, name, options, self._settings, stopping, self._turn)
+            upload = DatasetUpload(incoming, name, options, self._settings, stopping, self._checks)
             try:
                 yield upload
             finally:
@@ -83,14 +84,14 @@ class DatasetUpload:
         options: dict[str, str],
         settings: Settings,
         stopping: asyncio.Future[Any],
-        turn: asyncio.Lock,
+        checks: HelperProcesses,
     ) -> None:
         self._incoming = incoming
         self._name = name
         self._options = options
         self._settings = settings
         self._stopping = stopping
-        self._turn = turn
+        self._checks = checks
         self._block = bytearray()
         self._finishing = asyncio.Lock()
 
@@ -138,19 +139,13 @@ class DatasetUpload:
     async def _finish(self) -> tuple[DatasetRecord, bool]:
         await self._flush()
         await asyncio.to_thread(self._incoming.finish)
-        request = IntakeRequest(
-            folder=str(self._incoming.folder),
-            name=self._name,
-            options=self._options,
-            max_bytes=self._settings.max_dataset_bytes,
-            memory_bytes=self._settings.dataset_memory_mb << 20,
+        arguments = {
+            "folder": str(self._incoming.folder),
+            "name": self._name,
+            "options": self._options,
+            "max_bytes": self._settings.max_dataset_bytes,
+        }
+        await self._checks.run(
+            take_in, arguments, what="checking the dataset", timeout_s=CHECK_TIMEOUT_S, killed=DatasetInvalid
         )
-        async with self._turn:
-            await run_helper(
-                "datasets.intake",
-                asdict(request),
-                what="checking the dataset",
-                timeout_s=CHECK_TIMEOUT_S,
-                killed=DatasetInvalid,
-            )
         return await asyncio.to_thread(self._incoming.accept, self._name)

@@ -13,7 +13,7 @@ T = TypeVar("T")
 
 
 async def in_own_thread(work: Callable[[], T]) -> T:
-    """What `work` returns or raises. Cancelling the caller leaves the thread to its work; it ends with the process."""
+    """Do `work`. Cancelling the caller leaves the thread to its work; it ends with the process."""
     loop = asyncio.get_running_loop()
     done: asyncio.Future[T] = loop.create_future()
 
@@ -31,3 +31,12 @@ async def in_own_thread(work: Callable[[], T]) -> T:
 
     threading.Thread(target=run, daemon=True).start()
     return await done
+
+
+async def to_its_end(work: Callable[[], T]) -> T:
+    """Do `work` in a thread of its own. A cancelled caller still waits for its end."""
+    working = asyncio.ensure_future(in_own_thread(work))
+    try:
+        return await asyncio.shield(working)
+    finally:
+        await asyncio.wait({working})

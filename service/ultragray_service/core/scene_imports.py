@@ -4,31 +4,25 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import fcntl
-import os
-import secrets
-import time
 from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
-from typing import IO
 
 from ultragray.errors import QueueFull, SceneExists, SceneFileInvalid, SceneNotFound, SceneReadOnly, UploadTooLarge
-from ultragray.files.atomic import file_sha256
+from ultragray.files.atomic import file_sha256, sync
 from ultragray.scene_info import SceneHeader, read_header
-from ultragray_workers.datasets.incoming import storage_full
-from ultragray_workers.datasets.store import sync_folder
+from ultragray_workers.claims import claimed_folder, remove_abandoned, storage_full
+from ultragray_workers.helpers.scene_check import check_scene_file
 from ultragray_workers.jobs.link import link_or_copy
 from ultragray_workers.jobs.publication import SCENES_FOLDER
 from ultragray_workers.scenes import SUFFIX, SceneStore, check_scene_name
 
 from ..settings import Settings
-from ..views.helper_process import run_helper
-from .own_thread import in_own_thread
+from .helper_processes import HelperProcesses
+from .own_thread import in_own_thread, to_its_end
 
 CHECK_TIMEOUT_S = 600.0
 MAX_IMPORTS = 4
 _PREFIX = ".importing-"
-_LOCKED_WITHIN_S = 60.0  # an empty file this young may be about to be locked
 
 
 class SceneImports:
@@ -39,13 +33,13 @@ class SceneImports:
         store: SceneStore,
         settings: Settings,
         maker_of: Callable[[str], Awaitable[str | None]],
-        turn: asyncio.Lock,
+        checks: HelperProcesses,
     ) -> None:
-        """`maker_of`: the job that makes a scene, in words; None where none does. Checks wait for `turn`."""
+        """`maker_of`: the job that makes a scene, in words; None where none does."""
         self._store = store
         self._settings = settings
         self._maker_of = maker_of
-        self._turn = turn
+        self._checks = checks
         self._folder = settings.artifacts / SCENES_FOLDER
         self._count = 0
 
@@ -60,18 +54,16 @@ class SceneImports:
         if self._count >= MAX_IMPORTS:
             raise QueueFull(f"{MAX_IMPORTS} scenes are being imported already")
         self._count += 1
-        temporary = self._folder / f"{_PREFIX}{secrets.token_hex(8)}"
+        claim = contextlib.ExitStack()
         try:
             with storage_full("the scene"):
-                file = await asyncio.to_thread(self._create, temporary)
-                try:
-                    await self._write(file, blocks)
-                    yield temporary
-                finally:
-                    await asyncio.to_thread(file.close)
+                folder = await to_its_end(lambda: claim.enter_context(claimed_folder(self._folder, _PREFIX)))
+                received = folder / f"{name}{SUFFIX}"
+                await self._write(received, blocks)
+                yield received
         finally:
             self._count -= 1
-            await asyncio.shield(asyncio.to_thread(temporary.unlink, missing_ok=True))
+            await to_its_end(claim.close)
 
     async def accept(self, received: Path, name: str) -> SceneHeader:
         """Checks a file that was received and serves it as the scene `name`.
@@ -79,14 +71,13 @@ class SceneImports:
         Cancelling it ends the check. Raises SceneFileInvalid, SceneExists, StorageFull, MemoryExceeded,
         DeadlineExceeded.
         """
-        async with self._turn:
-            await run_helper(
-                "helpers.scene_check",
-                {"path": str(received), "memory_bytes": self._settings.dataset_memory_mb << 20},
-                what="checking the scene",
-                timeout_s=CHECK_TIMEOUT_S,
-                killed=SceneFileInvalid,
-            )
+        await self._checks.run(
+            check_scene_file,
+            {"path": str(received)},
+            what="checking the scene",
+            timeout_s=CHECK_TIMEOUT_S,
+            killed=SceneFileInvalid,
+        )
         header = await asyncio.to_thread(read_header, received)
         await self._require_free(name)
         await in_own_thread(lambda: self._publish(received, name))
@@ -103,31 +94,20 @@ class SceneImports:
     async def remove_stale(self) -> None:
         """Removes what services that died during an import left."""
 
-        def remove() -> None:
-            for path in self._folder.glob(f"{_PREFIX}*"):
-                with contextlib.suppress(FileNotFoundError):
-                    if _is_left(path):
-                        path.unlink()
+        await asyncio.to_thread(remove_abandoned, self._folder, _PREFIX)
 
-        await asyncio.to_thread(remove)
-
-    async def _write(self, file: IO[bytes], blocks: AsyncIterator[bytes]) -> None:
+    async def _write(self, path: Path, blocks: AsyncIterator[bytes]) -> None:
         received = 0
-        async for block in blocks:
-            received += len(block)
-            if received > self._settings.max_dataset_bytes:
-                raise UploadTooLarge(
-                    f"a scene file may have at most {self._settings.max_dataset_bytes} bytes", field="body"
-                )
-            await asyncio.to_thread(file.write, block)
-        await in_own_thread(lambda: _finish(file))
-
-    def _create(self, temporary: Path) -> IO[bytes]:
-        """The file, locked as long as it is open."""
-        self._folder.mkdir(parents=True, exist_ok=True)
-        file = temporary.open("xb")
-        fcntl.flock(file, fcntl.LOCK_EX)
-        return file
+        with path.open("xb") as file:
+            async for block in blocks:
+                received += len(block)
+                if received > self._settings.max_dataset_bytes:
+                    raise UploadTooLarge(
+                        f"a scene file may have at most {self._settings.max_dataset_bytes} bytes", field="body"
+                    )
+                await asyncio.to_thread(file.write, block)
+            await asyncio.to_thread(file.flush)
+        await in_own_thread(lambda: sync(path))
 
     def _publish(self, received: Path, name: str) -> None:
         target = self._folder / f"{name}{SUFFIX}"
@@ -159,20 +139,4 @@ class SceneImports:
         except FileNotFoundError:
             raise SceneNotFound(f"there is no scene {name!r} any more", field="scene") from None
         self._store.forget(name)
-        sync_folder(self._folder)
-
-
-def _finish(file: IO[bytes]) -> None:
-    file.flush()
-    os.fsync(file.fileno())
-
-
-def _is_left(path: Path) -> bool:
-    """Whether a file that was being received belongs to nobody any more."""
-    with path.open("rb") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        except OSError:
-            return False
-    status = path.stat()
-    return status.st_size > 0 or time.time() - status.st_mtime > _LOCKED_WITHIN_S
+        sync(self._folder)

@@ -18,10 +18,11 @@ from ..auth import KeyGuard
 from ..metrics import Metrics
 from ..settings import Settings
 from ..views.comparisons import Comparisons
-from ..views.datasets import DatasetViews, datasets_by_content
+from ..views.datasets import DatasetViews
 from ..views.training import TrainingViews
 from .catalog import SceneCatalog, scene_to_blame
 from .dataset_uploads import DatasetUploads
+from .helper_processes import HelperProcesses
 from .jobs import Jobs
 from .requests import RequestPlanner
 from .scene_imports import SceneImports
@@ -67,15 +68,15 @@ class Service:
         self.phase = Phase.STARTING
         self.draining = asyncio.Event()
         self.datasets = DatasetStore(settings.artifacts)
-        # Each helper may take all the memory that settings allow to one: one checks at a time, and one makes pictures.
-        checks, pictures = asyncio.Lock(), asyncio.Lock()
+        # Each process may take all the memory that settings allow to one: one checks at a time, and one makes pictures.
+        checks, pictures = (HelperProcesses(settings.dataset_memory_mb << 20) for _ in range(2))
         self.uploads = DatasetUploads(self.datasets, settings, self.draining, checks)
         self.datasets.in_use = self.jobs.uses_dataset
         self.imports = SceneImports(store, settings, self.jobs.makes_scene, checks)
         self.dataset_views = DatasetViews(self.datasets, settings, pictures)
         self.comparisons = Comparisons(store, self.catalog, self.datasets, settings, pictures)
         self.training_views = TrainingViews(self.jobs, self.datasets, settings, pictures)
-        self._prepared = (self.dataset_views.folders, self.comparisons.folders, self.training_views.folders)
+        self._prepared = (self.dataset_views, self.comparisons, self.training_views)
 
     @property
     def ready(self) -> bool:
@@ -104,9 +105,9 @@ class Service:
         await self.imports.remove_stale()
         for prepared in self._prepared:
             await prepared.remove_stale()
-        present = await asyncio.to_thread(datasets_by_content, self.datasets)
+        present = await asyncio.to_thread(self.datasets.names_by_content)
         await self._forget(lambda key: key.rpartition("-")[2] not in present)
-        await self.training_views.forget()
+        await self.training_views.forget(lambda key: True)  # a training that goes on has new ones
         await asyncio.gather(self.pool.start(), self.jobs.start())
         for name in self.settings.preload:
             try:
@@ -143,17 +144,17 @@ class Service:
         """Deletes a dataset, and all that was made of it to be looked at. Raises DatasetNotFound, DatasetInUse."""
         deleted = (await asyncio.to_thread(self.datasets.get, name)).sha256
         await asyncio.to_thread(self.datasets.delete, name)
-        if deleted not in await asyncio.to_thread(datasets_by_content, self.datasets):
+        if deleted not in await asyncio.to_thread(self.datasets.names_by_content):
             await self._forget(lambda key: key.endswith(deleted))
 
     async def delete_job(self, job_id: str) -> None:
         """Deletes a finished job and its files. Raises JobNotFound, JobInUse, DatabaseUnavailable."""
         await self.jobs.delete(job_id)
-        await self.training_views.forget(job_id)
+        await self.training_views.forget_job(job_id)
 
     async def _forget(self, is_doomed: Callable[[str], bool]) -> None:
         for prepared in self._prepared:
-            await prepared.remove(is_doomed)
+            await prepared.forget(is_doomed)
 
     def begin_draining(self) -> None:
         """From now on frames are refused with Draining; streams end after the frames they have in flight."""

@@ -1,71 +1,56 @@
-"""What the console shows of a dataset: the poses and the frames, one by one."""
+"""The poses and the frames of a dataset, one by one."""
 
 from __future__ import annotations
 
 import asyncio
-from contextlib import suppress
 from pathlib import Path
 
-from ultragray.errors import ArtifactNotFound, DatasetNotFound, UltragrayError
+from ultragray.errors import ArtifactNotFound, DatasetNotFound
 from ultragray_workers.datasets.store import DatasetStore
-from ultragray_workers.datasets.view import POSES_NAME
-from ultragray_workers.helpers.picture_stack import read_picture
-from ultragray_workers.pool.process.encoding import encode_image
-from ultragray_workers.pool.types import Encoding
+from ultragray_workers.helpers.dataset_view import POSES_NAME, lay_out
 
+from ..core.helper_processes import HelperProcesses
 from ..settings import Settings
-from .prepared import PreparedFolders
-
-FOLDER = "dataset-views"  # of the artifact folder
+from .prepared import Prepared
 
 
-class DatasetViews:
+class DatasetViews(Prepared):
     """Laid out at the first look, and kept by the content of the dataset."""
 
-    def __init__(self, store: DatasetStore, settings: Settings, turn: asyncio.Lock) -> None:
+    name, what, fill = "dataset-views", "laying out the frames of the dataset", staticmethod(lay_out)
+
+    def __init__(self, store: DatasetStore, settings: Settings, processes: HelperProcesses) -> None:
+        super().__init__(settings, processes)
         self._store = store
-        self._artifacts = settings.artifacts
-        self.folders = PreparedFolders(
-            settings.artifacts / FOLDER, "datasets.view", "laying out the frames of the dataset", settings, turn
-        )
 
     async def key(self, name: str) -> str:
-        """Names the content of a dataset. Raises DatasetNotFound, DatasetInvalid."""
+        """The content of a dataset. Raises DatasetNotFound, DatasetInvalid."""
         return (await asyncio.to_thread(self._store.get, name)).sha256
 
     async def poses_json(self, name: str) -> bytes:
-        """`train` and `val`, each a list of poses, 16 numbers row by row, mm. Raises DatasetNotFound, DatasetInvalid,
-        MemoryExceeded, StorageFull, DeadlineExceeded, Draining."""
-        folder = await self._folder(name)
+        """`train` and `val`, each a list of poses, 16 numbers row by row, mm.
+
+        Raises DatasetNotFound, DatasetInvalid, MemoryExceeded, StorageFull, DeadlineExceeded, Draining.
+        """
+        folder = await self._laid_out(name)
         try:
             return await asyncio.to_thread((folder / POSES_NAME).read_bytes)
         except FileNotFoundError:
-            raise DatasetNotFound(f"the dataset {name!r} has been deleted", field="dataset") from None
+            raise _deleted(name) from None
 
     async def frame_png(self, name: str, part: str, index: int) -> bytes:
-        """One frame of `part` (train or val), PNG. Raises as `poses_json`; DatasetNotFound also for no such frame."""
-        folder = await self._folder(name)
-        return await asyncio.to_thread(_frame_png, folder, name, part, index)
+        """One frame of `part` (train or val). Raises as `poses_json`; DatasetNotFound also for no such frame."""
+        key = (await self._laid_out(name)).name
+        if (png := await self.picture_png(key, index, part)) is None:
+            raise DatasetNotFound(f"the dataset {name!r} has no frame {index} in its part {part}", field="index")
+        return png
 
-    async def _folder(self, name: str) -> Path:
-        request = {"artifact_folder": str(self._artifacts), "dataset": name}
+    async def _laid_out(self, name: str) -> Path:
         try:
-            return await self.folders.path(await self.key(name), request)
+            return await self.path(await self.key(name), dataset=name)
         except ArtifactNotFound:
-            raise DatasetNotFound(f"the dataset {name!r} has been deleted", field="dataset") from None
+            raise _deleted(name) from None
 
 
-def datasets_by_content(store: DatasetStore) -> dict[str, str]:
-    """The name of a dataset by its SHA-256; blocks. Those whose manifest is damaged are left out."""
-    found: dict[str, str] = {}
-    for name in store.names():
-        with suppress(UltragrayError):
-            found.setdefault(store.get(name).sha256, name)
-    return found
-
-
-def _frame_png(folder: Path, name: str, part: str, index: int) -> bytes:
-    picture = read_picture(folder, part, index)
-    if picture is None:
-        raise DatasetNotFound(f"the dataset {name!r} has no frame {index} in its part {part}", field="index")
-    return encode_image(picture, Encoding.PNG).tobytes()
+def _deleted(name: str) -> DatasetNotFound:
+    return DatasetNotFound(f"the dataset {name!r} has been deleted", field="dataset")

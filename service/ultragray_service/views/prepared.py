@@ -1,40 +1,37 @@
-"""Folders that take a while to make and are kept: made once each, by a helper process."""
+"""Pictures and figures that helper processes make in the background, once each, and that are kept in folders."""
 
 from __future__ import annotations
 
 import asyncio
-import fcntl
 import logging
 import os
-import secrets
-import shutil
 import time
-from collections.abc import Callable, Iterable
-from contextlib import ExitStack, suppress
+from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import ClassVar, Literal
+
+import numpy as np
 
 from ultragray.errors import ArtifactNotFound, DatasetInvalid, DatasetNotFound, Draining, UltragrayError
-from ultragray_workers.datasets.incoming import storage_full
-from ultragray_workers.datasets.store import sync_folder
+from ultragray.files.atomic import sync
+from ultragray_workers.claims import claimed_folder, remove_abandoned, remove_whole, storage_full
 from ultragray_workers.helpers.helper import PROGRESS_NAME
+from ultragray_workers.helpers.picture_stack import read_picture
+from ultragray_workers.pool.process.encoding import encode_image
+from ultragray_workers.pool.types import Encoding
 
-from ..core.own_thread import in_own_thread
+from ..core.helper_processes import HelperProcesses
+from ..core.own_thread import in_own_thread, to_its_end
 from ..settings import Settings
-from .helper_process import run_helper
 
 TIMEOUT_S = 1800.0
 KEPT_FOLDERS = 32
 _FAILURE_KEPT_S = 60.0  # then it is tried again
-_PREFIX = ".making-"
-_LOCK_NAME = "lock"  # held by the service that makes a folder, as long as it lives
-_FINISHED_WITHIN_S = 60.0  # a folder this young without a lock is about to have its name, or to go
+_PREFIX, _CONTENT = ".making-", "content"
 
 _log = logging.getLogger("ultragray.service")
-
-T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -46,36 +43,39 @@ class Preparation:
     error: UltragrayError | None = None
 
 
-class PreparedFolders:
-    """The folders below `folder`, by a key that names what is in them.
+class Prepared:
+    """Base of a kind of pictures and figures: one folder for each key, which names what is in it.
 
-    Those that were asked for last are kept: KEPT_FOLDERS, and beside the newest no more bytes than a dataset may have.
-    All methods belong to one event loop.
+    A subclass says in which folder of the artifact folder its own lie, what its helper process does, in the words of
+    errors, and which function fills a folder: it takes `folder`, `artifact_folder` and what the kind asks of it. Keys
+    end with the SHA-256 of the dataset that the pictures are of. The folders that were asked for last are kept:
+    KEPT_FOLDERS, and beside the newest no more bytes than a dataset may have. All methods belong to one event loop.
     """
 
-    def __init__(self, folder: Path, module: str, what: str, settings: Settings, turn: asyncio.Lock) -> None:
-        """`module` of ultragray_workers fills a folder when it has `turn`; `what` says in errors what it does."""
-        self.folder = folder
-        self._module = module
-        self._what = what
-        self._turn = turn
-        self._memory_bytes = settings.dataset_memory_mb << 20
+    name: ClassVar[str]
+    what: ClassVar[str]
+    fill: ClassVar[Callable[..., None]]  # a staticmethod
+
+    def __init__(self, settings: Settings, processes: HelperProcesses) -> None:
+        self._artifacts = settings.artifacts
+        self.folder = settings.artifacts / self.name
+        self._processes = processes
         self._kept_bytes = settings.max_dataset_bytes
         self._tasks: dict[str, asyncio.Task[UltragrayError | None]] = {}
         self._making: dict[str, Path] = {}
         self._failures: dict[str, tuple[float, UltragrayError]] = {}
         self._ended = False
 
-    async def prepare(self, key: str, request: dict[str, Any]) -> Preparation:
-        """Begins to make the folder unless it is there, or failed a minute ago; how far it is. Raises Draining."""
+    async def prepare(self, key: str, **arguments: str) -> Preparation:
+        """Begin to make the folder unless it is there, or failed a minute ago; how far it is. Raises Draining."""
         if await asyncio.to_thread(self._touch, key):
             return Preparation("ready", 1.0)
         if (error := self._failure(key)) is not None:
             return Preparation("failed", 0.0, error)
-        self._task(key, request)
+        self._task(key, arguments)
         return Preparation("running", await asyncio.to_thread(self._progress, key))
 
-    async def path(self, key: str, request: dict[str, Any]) -> Path:
+    async def path(self, key: str, **arguments: str) -> Path:
         """The folder, made first where it is not there.
 
         Raises what the helper process raises, also where it did so a minute ago, DeadlineExceeded, MemoryExceeded,
@@ -84,7 +84,7 @@ class PreparedFolders:
         if await asyncio.to_thread(self._touch, key):
             return self.folder / key
         if (error := self._failure(key)) is None:
-            task = self._task(key, request)
+            task = self._task(key, arguments)
             await asyncio.wait({task})
             if task.cancelled():
                 if self._ended:
@@ -95,64 +95,86 @@ class PreparedFolders:
             raise error.with_traceback(None)
         return self.folder / key
 
+    async def picture_png(self, key: str, index: int, *names: str) -> bytes | None:
+        """Frame `index` of the stacks of these names, side by side; None where one is not there (any more)."""
+
+        def read() -> bytes | None:
+            pictures = [read_picture(self.folder / key, name, index) for name in names]
+            found = [picture for picture in pictures if picture is not None]
+            if len(found) < len(names):
+                return None
+            return encode_image(np.concatenate(found, axis=1), Encoding.PNG).tobytes()
+
+        return await asyncio.to_thread(read)
+
     async def settled(self, is_asked: Callable[[str], bool]) -> None:
-        """Returns when none of the keys that `is_asked` says is being made."""
+        """Wait until no folder is being made whose key `is_asked` accepts."""
         if tasks := {task for key, task in self._tasks.items() if is_asked(key)}:
             await asyncio.wait(tasks)
 
     def end(self) -> None:
-        """Ends what is being made, for good: the service stops."""
+        """Stop what is being made; nothing begins any more."""
         self._ended = True
         for task in self._tasks.values():
             task.cancel()
 
-    async def remove(self, is_doomed: Callable[[str], bool]) -> None:
-        """Removes the folders of the keys that `is_doomed` says, also those that are being made."""
+    async def forget(self, is_doomed: Callable[[str], bool]) -> None:
+        """Remove the folders whose key `is_doomed` accepts, also those that are being made."""
         doomed = {task for key, task in self._tasks.items() if is_doomed(key)}
         for task in doomed:
             task.cancel()
         if doomed:
             await asyncio.wait(doomed)
-        await in_own_thread(lambda: _remove(path for path in self._kept() if is_doomed(path.name)))
+
+        def remove() -> None:
+            for folder in self._kept():
+                if is_doomed(folder.name):
+                    remove_whole(folder, _PREFIX)
+
+        await in_own_thread(remove)
 
     async def remove_stale(self) -> None:
-        """Removes what services that died while they made a folder left."""
-        await in_own_thread(self._remove_stale)
+        """Remove what services that died while they made a folder left."""
+        await in_own_thread(lambda: remove_abandoned(self.folder, _PREFIX))
 
-    def _task(self, key: str, request: dict[str, Any]) -> asyncio.Task[UltragrayError | None]:
+    def _task(self, key: str, arguments: dict[str, str]) -> asyncio.Task[UltragrayError | None]:
         if self._ended:
             raise Draining("the service is stopping")
         task = self._tasks.get(key)
         if task is None:
-            task = self._tasks[key] = asyncio.create_task(self._make(key, request))
+            task = self._tasks[key] = asyncio.create_task(self._make(key, arguments))
             task.add_done_callback(lambda _: self._tasks.pop(key, None))
         return task
 
-    async def _make(self, key: str, request: dict[str, Any]) -> UltragrayError | None:
-        """Why the folder could not be made, if so."""
-        making = self._making[key] = self.folder / f"{_PREFIX}{secrets.token_hex(8)}"
+    async def _make(self, key: str, arguments: dict[str, str]) -> UltragrayError | None:
+        """Make the folder; None, or why that failed."""
         claim = ExitStack()
         error: UltragrayError | None = None
+
+        def begin() -> Path:
+            making = claim.enter_context(claimed_folder(self.folder, _PREFIX)) / _CONTENT
+            making.mkdir()
+            return making
+
         try:
-            with storage_full(self._what):
-                async with self._turn:
-                    await _to_its_end(partial(_claim, making, claim))
-                    await run_helper(
-                        self._module,
-                        {**request, "folder": str(making), "memory_bytes": self._memory_bytes},
-                        what=self._what,
-                        timeout_s=TIMEOUT_S,
-                        killed=DatasetInvalid,
-                    )
-                await _to_its_end(partial(self._keep, making, key))
+            with storage_full(self.what):
+                making = self._making[key] = await to_its_end(begin)
+                await self._processes.run(
+                    self.fill,
+                    {**arguments, "artifact_folder": str(self._artifacts), "folder": str(making)},
+                    what=self.what,
+                    timeout_s=TIMEOUT_S,
+                    killed=DatasetInvalid,
+                )
+                await to_its_end(lambda: self._keep(making, key))
         except UltragrayError as caught:
             error = caught
         except Exception:
-            _log.exception(f"{self._what} failed unexpectedly")
-            error = UltragrayError(f"{self._what} failed unexpectedly, see the log")
+            _log.exception(f"{self.what} failed unexpectedly")
+            error = UltragrayError(f"{self.what} failed unexpectedly, see the log")
         finally:
-            del self._making[key]
-            await _to_its_end(claim.close)
+            self._making.pop(key, None)
+            await to_its_end(claim.close)
         if error is not None and not isinstance(error, DatasetNotFound):  # another name may have the same content
             self._failures[key] = (time.monotonic(), error)
         return error
@@ -164,7 +186,7 @@ class PreparedFolders:
         return self._failures[key][1] if key in self._failures else None
 
     def _touch(self, key: str) -> bool:
-        """Whether the folder is there; if so it is the last to go."""
+        """Whether the folder is there; it then counts as the one asked for last."""
         try:
             os.utime(self.folder / key)
         except FileNotFoundError:
@@ -179,18 +201,16 @@ class PreparedFolders:
             return 0.0
 
     def _keep(self, making: Path, key: str) -> None:
-        for path in making.iterdir():
-            sync_folder(path)  # a file likewise
-        (making / _LOCK_NAME).unlink()
-        sync_folder(making)
+        for path in (*making.iterdir(), making):
+            sync(path)
         try:
             making.rename(self.folder / key)
         except OSError:
             if not (self.folder / key).is_dir():  # else another service was quicker
                 raise
-        sync_folder(self.folder)
+        sync(self.folder)
         self._remove_oldest(key)
-        self._remove_stale()
+        remove_abandoned(self.folder, _PREFIX)
 
     def _remove_oldest(self, newest: str) -> None:
         others = sorted((folder for folder in self._kept() if folder.name != newest), key=_age_s)
@@ -198,55 +218,10 @@ class PreparedFolders:
         for count, folder in enumerate(others, 2):
             held_bytes += _size_bytes(folder)
             if count > KEPT_FOLDERS or held_bytes > self._kept_bytes:
-                _remove([folder])
-
-    def _remove_stale(self) -> None:
-        for folder in self.folder.glob(f"{_PREFIX}*"):
-            if _is_abandoned(folder):
-                shutil.rmtree(folder, ignore_errors=True)
+                remove_whole(folder, _PREFIX)
 
     def _kept(self) -> list[Path]:
         return [path for path in self.folder.glob("*") if not path.name.startswith(".")]
-
-
-async def _to_its_end(work: Callable[[], T]) -> T:
-    """What `work` returns or raises, in a thread of its own. Who cancels it waits all the same."""
-    working = asyncio.ensure_future(in_own_thread(work))
-    try:
-        return await asyncio.shield(working)
-    finally:
-        await asyncio.wait({working})
-
-
-def _claim(making: Path, claim: ExitStack) -> None:
-    """Makes the folder, which is locked from the start. What is left of it goes when `claim` is closed."""
-    begun = making.with_name(f".claiming-{secrets.token_hex(8)}")
-    begun.mkdir(parents=True)
-    lock = claim.enter_context((begun / _LOCK_NAME).open("wb"))
-    fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    begun.rename(making)
-    claim.callback(shutil.rmtree, making, ignore_errors=True)
-
-
-def _is_abandoned(making: Path) -> bool:
-    """Whether the service that made it has died."""
-    try:
-        with (making / _LOCK_NAME).open("rb+") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except FileNotFoundError:
-        return _age_s(making) > _FINISHED_WITHIN_S
-    except OSError:
-        return False
-    return True
-
-
-def _remove(folders: Iterable[Path]) -> None:
-    """Each is gone at once, or whole: a service may die while it removes."""
-    for folder in folders:
-        doomed = folder.with_name(f"{_PREFIX}{secrets.token_hex(8)}")
-        with suppress(FileNotFoundError):  # another service was quicker
-            folder.rename(doomed)
-            shutil.rmtree(doomed, ignore_errors=True)
 
 
 def _age_s(path: Path) -> float:

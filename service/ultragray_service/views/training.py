@@ -1,4 +1,4 @@
-"""What the console shows of a training while it runs: its curve, and a frame as the last checkpoint renders it."""
+"""A training while it runs: its curve, and a frame as the last checkpoint renders it."""
 
 from __future__ import annotations
 
@@ -11,18 +11,15 @@ import numpy as np
 
 from ultragray.errors import ArtifactNotFound, TrainingStateInvalid
 from ultragray_workers.datasets.store import DatasetStore
-from ultragray_workers.helpers.picture_stack import read_picture
-from ultragray_workers.helpers.training_preview import PICTURES
+from ultragray_workers.helpers.training_preview import PICTURES, draw_preview
 from ultragray_workers.jobs.folder import JobFolder
 from ultragray_workers.jobs.store import Job
-from ultragray_workers.pool.process.encoding import encode_image
-from ultragray_workers.pool.types import Encoding
 
+from ..core.helper_processes import HelperProcesses
 from ..core.jobs import Jobs
 from ..settings import Settings
-from .prepared import PreparedFolders
+from .prepared import Prepared
 
-FOLDER = "previews"  # of the artifact folder
 MAX_POINTS = 500
 _JOURNAL, _CHECKPOINT = "metrics.jsonl", "checkpoint.safetensors"  # of a run: `ultragray.training` imports torch
 
@@ -36,16 +33,15 @@ class CurvePoint:
     val_psnr_db: float | None
 
 
-class TrainingViews:
-    """Curves and previews of trainings, running or finished."""
+class TrainingViews(Prepared):
+    """Curves and previews of trainings, running or finished. A preview is kept by job, checkpoint and dataset."""
 
-    def __init__(self, jobs: Jobs, datasets: DatasetStore, settings: Settings, turn: asyncio.Lock) -> None:
+    name, what, fill = "previews", "rendering the training as it is", staticmethod(draw_preview)
+
+    def __init__(self, jobs: Jobs, datasets: DatasetStore, settings: Settings, processes: HelperProcesses) -> None:
+        super().__init__(settings, processes)
         self._jobs = jobs
         self._datasets = datasets
-        self._artifacts = settings.artifacts
-        self.folders = PreparedFolders(
-            settings.artifacts / FOLDER, "helpers.training_preview", "rendering the training as it is", settings, turn
-        )
 
     async def curve(self, job_id: str) -> list[CurvePoint]:
         """At most MAX_POINTS points of the training so far; none before its first step. Raises JobNotFound."""
@@ -56,33 +52,27 @@ class TrainingViews:
     async def preview_png(self, job_id: str) -> bytes:
         """Truth, and to its right the rendering, PNG.
 
-        Raises JobNotFound, ArtifactNotFound without a checkpoint, DatasetNotFound, and as `PreparedFolders.path`.
+        Raises JobNotFound, ArtifactNotFound without a checkpoint, DatasetNotFound, and as `Prepared.path`.
         """
         job = await self._jobs.get(job_id)
-        await self.folders.settled(lambda key: key.startswith(f"{job_id}-"))  # one a job at a time: the newest
+        await self.settled(lambda key: key.startswith(f"{job_id}-"))  # one a job at a time: the newest
         checkpoint = JobFolder(self._artifacts, job.id).run / _CHECKPOINT
         version = await asyncio.to_thread(_version_of, checkpoint)
         if version is None or "dataset" not in job.specification:
             raise self._none(job)
         dataset = await asyncio.to_thread(self._datasets.get, job.specification["dataset"])
-        request = {"artifact_folder": str(self._artifacts), "dataset": dataset.name, "checkpoint": str(checkpoint)}
+        key = f"{job.id}-{version}-{dataset.sha256}"
         try:
-            folder = await self.folders.path(f"{job.id}-{version}-{dataset.sha256}", request)
+            await self.path(key, dataset=dataset.name, checkpoint=str(checkpoint))
         except TrainingStateInvalid:  # the training ended a moment ago
             raise self._none(job) from None
+        if (png := await self.picture_png(key, 0, *PICTURES)) is None:  # the folder went this very moment
+            raise self._none(job)
+        return png
 
-        def read() -> bytes:
-            pictures = [read_picture(folder, name, 0) for name in PICTURES]
-            shown = [picture for picture in pictures if picture is not None]
-            if len(shown) < len(PICTURES):  # the folder went this very moment
-                raise self._none(job)
-            return encode_image(np.concatenate(shown, axis=1), Encoding.PNG).tobytes()
-
-        return await asyncio.to_thread(read)
-
-    async def forget(self, job_id: str | None = None) -> None:
-        """Removes the previews of a job, or of all: a training that goes on has new ones."""
-        await self.folders.remove(lambda key: job_id is None or key.startswith(f"{job_id}-"))
+    async def forget_job(self, job_id: str) -> None:
+        """Remove the previews of a job."""
+        await self.forget(lambda key: key.startswith(f"{job_id}-"))
 
     def _none(self, job: Job) -> ArtifactNotFound:
         return ArtifactNotFound(f"the job {job.id} has no checkpoint to render (any more)", field="job")
@@ -94,9 +84,8 @@ def _curve_of(journals: tuple[Path, ...]) -> list[CurvePoint]:
             text = journal.read_text(encoding="utf-8")
         except FileNotFoundError:
             continue
-        lines = [
-            json.loads(line) for line in text.splitlines(keepends=True) if line.endswith("\n")
-        ]  # else being written
+        complete = [line for line in text.splitlines(keepends=True) if line.endswith("\n")]  # the last is being written
+        lines = [json.loads(line) for line in complete]
         width = max(1, -(-len(lines) // MAX_POINTS))
         groups = [lines[start : start + width] for start in range(0, len(lines), width)]
         return [

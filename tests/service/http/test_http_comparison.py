@@ -176,7 +176,7 @@ def test_a_dataset_deleted_while_it_is_laid_out(
     upload(http, "doomed", doomed, tmp_path / "doomed")
     with ThreadPoolExecutor(1) as executor:
         answer = executor.submit(http.get, "/v1/datasets/doomed/poses")
-        os.kill(wait_until(lambda: helper_process(service, "datasets.view")), signal.SIGSTOP)
+        os.kill(wait_until(lambda: helper_process(service, "lay_out")), signal.SIGSTOP)
         assert http.delete("/v1/datasets/doomed").status_code == 204
         assert answer.result().json()["reason"] == "DATASET_NOT_FOUND"
     assert made_of(doomed, artifacts) == len(list(artifacts.glob("dataset-views/.*"))) == 0
@@ -191,7 +191,7 @@ def test_a_service_that_stops_or_dies_while_it_lays_a_dataset_out(start_service:
                 with httpx.Client(base_url=service.http) as client:
                     upload(client, "tiny", DATASET, tmp_path / "tiny")
             asked = executor.submit(httpx.get, f"{service.http}/v1/datasets/tiny/poses", timeout=60)
-            os.kill(wait_until(lambda: helper_process(service, "datasets.view")), signal.SIGSTOP)
+            os.kill(wait_until(lambda: helper_process(service, "lay_out")), signal.SIGSTOP)
             return service, asked
 
         def left() -> list[Path]:

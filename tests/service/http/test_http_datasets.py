@@ -111,12 +111,12 @@ def uploads_under_way(folder: Path) -> list[str]:
     return [path.name for path in folder.glob("datasets/.*")]
 
 
-def helper_process(service: RunningService, module: str) -> int | None:
-    """The helper process of the service that does the work of a module, once it runs Python."""
+def helper_process(service: RunningService, work: str) -> int | None:
+    """The helper process of the service that does this work, once it runs Python."""
     for path in Path("/proc").glob("[0-9]*"):
         try:
             parent = int((path / "stat").read_text().rpartition(")")[2].split()[1])
-            if parent == service.process.pid and module.encode() in (path / "cmdline").read_bytes():
+            if parent == service.process.pid and work.encode() in (path / "cmdline").read_bytes():
                 return int(path.name)
         except OSError:
             continue
@@ -343,11 +343,11 @@ def test_too_many_uploads_at_once(service: RunningService) -> None:
 def test_a_check_that_is_killed(http: httpx.Client, service: RunningService, files: dict[str, bytes]) -> None:
     with ThreadPoolExecutor(1) as executor:
         answer = executor.submit(put, http, "killed", zipped(files))
-        pid = wait_until(lambda: helper_process(service, "datasets.intake"))
+        pid = wait_until(lambda: helper_process(service, "take_in"))
         os.kill(pid, signal.SIGKILL)
         assert_problem(answer.result(), 507, "MEMORY_EXCEEDED", "was killed")
         answer = executor.submit(put, http, "killed", zipped(files))
-        pid = wait_until(lambda: helper_process(service, "datasets.intake"))
+        pid = wait_until(lambda: helper_process(service, "take_in"))
         os.kill(pid, signal.SIGBUS)
         assert_problem(answer.result(), 422, "DATASET_INVALID", f"signal {signal.SIGBUS:d}")
     assert put(http, "killed", zipped(files)).status_code == 201

@@ -18,43 +18,53 @@ import pytest
 
 from ultragray.datasets.released import write_released
 from ultragray.errors import ArtifactNotFound, DatasetNotFound, DeadlineExceeded, Draining, MemoryExceeded, StorageFull
+from ultragray_service.core.helper_processes import HelperProcesses
 from ultragray_service.settings import Settings
 from ultragray_service.views import prepared
-from ultragray_service.views.prepared import Preparation, PreparedFolders
+from ultragray_service.views.prepared import Preparation, Prepared
+from ultragray_workers import claims
 from ultragray_workers.datasets.intake import check_files
 from ultragray_workers.datasets.store import DatasetStore, write_manifest
+from ultragray_workers.helpers.dataset_view import lay_out
 
 from ..http.test_http_comparison import DATASET
 
+Wanted = dict[str, str]
+
 
 @pytest.fixture
-def request_body(tmp_path: Path) -> dict[str, str]:
-    """A dataset `tiny` in an artifact folder."""
+def wanted(tmp_path: Path) -> Wanted:
+    """A dataset `tiny` in the artifact folder, as it is asked for."""
     folder = DatasetStore(tmp_path).folder / "tiny"
     (folder / "files").mkdir(parents=True)
     write_released(DATASET, folder / "files")
     write_manifest(check_files(folder / "files", "tiny", {}, folder / "contact_sheet.png"), folder)
-    return {"artifact_folder": str(tmp_path), "dataset": "tiny"}
+    return {"dataset": "tiny"}
 
 
-def folders(tmp_path: Path, name: str = "views", turn: asyncio.Lock | None = None, **settings: Any) -> PreparedFolders:
-    return PreparedFolders(
-        tmp_path / name,
-        "datasets.view",
-        "laying out",
-        Settings(data_folder=tmp_path, **settings),
-        turn or asyncio.Lock(),
-    )
+class Views(Prepared):
+    name, what, fill = "views", "laying out", staticmethod(lay_out)
+
+
+class Others(Views):
+    name = "others"
+
+
+def views(
+    tmp_path: Path, kind: type[Views] = Views, processes: HelperProcesses | None = None, **settings: Any
+) -> Views:
+    chosen = Settings(data_folder=tmp_path, artifact_folder=tmp_path, **settings)
+    return kind(chosen, processes or HelperProcesses(chosen.dataset_memory_mb << 20))
 
 
 def names(tmp_path: Path) -> list[str]:
     return sorted(path.name for path in (tmp_path / "views").iterdir())
 
 
-def test_who_asks_at_the_same_time_gets_the_same_folder(tmp_path: Path, request_body: dict[str, str]) -> None:
+def test_who_asks_at_the_same_time_gets_the_same_folder(tmp_path: Path, wanted: Wanted) -> None:
     async def ask() -> list[Path]:
-        made = folders(tmp_path)
-        return await asyncio.gather(*(made.path("key", request_body) for _ in range(3)))
+        made = views(tmp_path)
+        return await asyncio.gather(*(made.path("key", **wanted) for _ in range(3)))
 
     found = asyncio.run(ask())
     assert set(found) == {tmp_path / "views" / "key"}
@@ -74,7 +84,7 @@ def aged(tmp_path: Path, name: str, age_s: float, size_bytes: int = 0) -> Path:
 @pytest.mark.parametrize(("kept_folders", "size_bytes"), [(2, 0), (32, 600)], ids=["by number", "by bytes"])
 def test_the_folder_not_asked_for_the_longest_goes(
     tmp_path: Path,
-    request_body: dict[str, str],
+    wanted: Wanted,
     monkeypatch: pytest.MonkeyPatch,
     kept_folders: int,
     size_bytes: int,
@@ -84,70 +94,72 @@ def test_the_folder_not_asked_for_the_longest_goes(
     aged(tmp_path, "older-but-used", 200, size_bytes)
 
     async def ask() -> None:
-        made = folders(tmp_path, max_dataset_bytes=1024)
-        assert (await made.prepare("older-but-used", request_body)).state == "ready"
-        await made.path("key", request_body)
+        made = views(tmp_path, max_dataset_bytes=1024)
+        assert (await made.prepare("older-but-used", **wanted)).state == "ready"
+        await made.path("key", **wanted)
 
     asyncio.run(ask())
     assert names(tmp_path) == ["key", "older-but-used"]
 
 
 def test_a_service_that_dies_while_it_removes_leaves_no_half_folder(
-    tmp_path: Path, request_body: dict[str, str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, wanted: Wanted, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(prepared, "KEPT_FOLDERS", 1)
     aged(tmp_path, "old", 300)
     with monkeypatch.context() as dying:
         dying.setattr(shutil, "rmtree", lambda path, ignore_errors: None)
-        asyncio.run(folders(tmp_path).path("key", request_body))
-    (half,) = (name for name in names(tmp_path) if name != "key")
-    assert half.startswith(".making-")
-    asyncio.run(folders(tmp_path).remove_stale())
+        asyncio.run(views(tmp_path).path("key", **wanted))
+    halves = [name for name in names(tmp_path) if name != "key"]
+    assert halves
+    assert all(name.startswith(".making-") for name in halves)
+    monkeypatch.setattr(claims, "UNLOCKED_S", 0.0)
+    asyncio.run(views(tmp_path).remove_stale())
     assert names(tmp_path) == ["key"]
 
 
-def test_what_is_laid_out_takes_no_more_room_than_the_frames(tmp_path: Path, request_body: dict[str, str]) -> None:
-    folder = asyncio.run(folders(tmp_path).path("key", request_body))
+def test_what_is_laid_out_takes_no_more_room_than_the_frames(tmp_path: Path, wanted: Wanted) -> None:
+    folder = asyncio.run(views(tmp_path).path("key", **wanted))
     pixels = DATASET.train.images.size + DATASET.val.images.size
     assert sum(path.stat().st_size for path in folder.glob("*.npy")) < pixels + 2 * 1024
 
 
 def test_what_fails_says_why_and_is_tried_again_later(
-    tmp_path: Path, request_body: dict[str, str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, wanted: Wanted, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     async def ask() -> None:
-        made = folders(tmp_path)
+        made = views(tmp_path)
         with monkeypatch.context() as slow:
             slow.setattr(prepared, "TIMEOUT_S", 0.0)
             with pytest.raises(DeadlineExceeded):
-                await made.path("key", request_body)
-        failed = await made.prepare("key", request_body)
+                await made.path("key", **wanted)
+        failed = await made.prepare("key", **wanted)
         assert failed.state == "failed"
         assert isinstance(failed.error, DeadlineExceeded)
         with pytest.raises(DeadlineExceeded):
-            await made.path("key", request_body)
+            await made.path("key", **wanted)
         monkeypatch.setattr(prepared, "_FAILURE_KEPT_S", 0.0)
-        assert (await made.prepare("key", request_body)).state == "running"
-        await made.path("key", request_body)
+        assert (await made.prepare("key", **wanted)).state == "running"
+        await made.path("key", **wanted)
 
     asyncio.run(ask())
     assert names(tmp_path) == ["key"]
 
 
-def test_that_a_name_is_gone_says_nothing_of_the_content(tmp_path: Path, request_body: dict[str, str]) -> None:
+def test_that_a_name_is_gone_says_nothing_of_the_content(tmp_path: Path, wanted: Wanted) -> None:
     async def ask() -> None:
-        made = folders(tmp_path)
+        made = views(tmp_path)
         with pytest.raises(DatasetNotFound):
-            await made.path("key", request_body | {"dataset": "gone"})
-        await made.path("key", request_body)
+            await made.path("key", dataset="gone")
+        await made.path("key", **wanted)
 
     asyncio.run(ask())
 
 
-def test_who_waits_for_what_is_being_made_sees_its_end(tmp_path: Path, request_body: dict[str, str]) -> None:
+def test_who_waits_for_what_is_being_made_sees_its_end(tmp_path: Path, wanted: Wanted) -> None:
     async def ask() -> None:
-        made = folders(tmp_path)
-        asking = asyncio.ensure_future(made.path("job-1", request_body))
+        made = views(tmp_path)
+        asking = asyncio.ensure_future(made.path("job-1", **wanted))
         while not (tmp_path / "views").is_dir():
             await asyncio.sleep(0.01)
         await made.settled(lambda key: key.startswith("other-"))
@@ -159,28 +171,28 @@ def test_who_waits_for_what_is_being_made_sees_its_end(tmp_path: Path, request_b
     asyncio.run(ask())
 
 
-async def end_of(made: PreparedFolders, request_body: dict[str, str]) -> Preparation:
-    while (found := await made.prepare("key", request_body)).state == "running":
+async def end_of(made: Prepared, wanted: Wanted) -> Preparation:
+    while (found := await made.prepare("key", **wanted)).state == "running":
         await asyncio.sleep(0.01)
     return found
 
 
 def test_what_no_one_foresaw_is_a_failure_as_well(
-    tmp_path: Path, request_body: dict[str, str], caplog: pytest.LogCaptureFixture
+    tmp_path: Path, wanted: Wanted, caplog: pytest.LogCaptureFixture
 ) -> None:
     (tmp_path / "views").symlink_to(tmp_path / "nowhere")
-    failed = asyncio.run(asyncio.wait_for(end_of(folders(tmp_path), request_body), 10))
+    failed = asyncio.run(asyncio.wait_for(end_of(views(tmp_path), wanted), 10))
     assert failed.state == "failed"
     assert failed.error is not None
     assert failed.error.detail == "laying out failed unexpectedly, see the log"
     assert "FileExistsError" in caplog.text
 
 
-def test_a_disk_without_room_is_told(tmp_path: Path, request_body: dict[str, str]) -> None:
+def test_a_disk_without_room_is_told(tmp_path: Path, wanted: Wanted) -> None:
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (DATASET.train.images.size, before[1]))
     try:
-        failed = asyncio.run(asyncio.wait_for(end_of(folders(tmp_path), request_body), 30))
+        failed = asyncio.run(asyncio.wait_for(end_of(views(tmp_path), wanted), 30))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert isinstance(failed.error, StorageFull)
@@ -188,18 +200,18 @@ def test_a_disk_without_room_is_told(tmp_path: Path, request_body: dict[str, str
 
 
 @pytest.mark.parametrize("stop", ["end", "remove"])
-def test_what_is_stopped_leaves_nothing(tmp_path: Path, request_body: dict[str, str], stop: str) -> None:
+def test_what_is_stopped_leaves_nothing(tmp_path: Path, wanted: Wanted, stop: str) -> None:
     async def ask() -> None:
-        made = folders(tmp_path)
-        asking = asyncio.ensure_future(made.path("key", request_body))
+        made = views(tmp_path)
+        asking = asyncio.ensure_future(made.path("key", **wanted))
         while not (tmp_path / "views").is_dir() or not names(tmp_path):
             await asyncio.sleep(0.01)
         if stop == "end":
             made.end()
             with pytest.raises(Draining):
-                await made.path("key", request_body)
+                await made.path("key", **wanted)
         else:
-            await made.remove(lambda key: True)
+            await made.forget(lambda key: True)
         with pytest.raises(Draining if stop == "end" else ArtifactNotFound):
             await asking
 
@@ -210,24 +222,24 @@ def test_what_is_stopped_leaves_nothing(tmp_path: Path, request_body: dict[str, 
 def test_what_is_doomed_goes(tmp_path: Path) -> None:
     for name in ("here", "gone", ".making-now"):
         aged(tmp_path, name, 0)
-    asyncio.run(folders(tmp_path).remove(lambda key: key != "here"))
+    asyncio.run(views(tmp_path).forget(lambda key: key != "here"))
     assert names(tmp_path) == [".making-now", "here"]
 
 
-def test_what_dead_services_left_is_removed(tmp_path: Path) -> None:
+def test_what_dead_services_left_is_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     aged(tmp_path, "kept", 9999)
-    aged(tmp_path, ".making-being-finished", 1)
-    aged(tmp_path, ".making-half-removed", 100)
+    aged(tmp_path, ".making-being-claimed", 9999)
     (aged(tmp_path, ".making-dead", 1) / "lock").touch()
     with (aged(tmp_path, ".making-alive", 9999) / "lock").open("wb") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        asyncio.run(folders(tmp_path).remove_stale())
-    assert names(tmp_path) == [".making-alive", ".making-being-finished", "kept"]
+        asyncio.run(views(tmp_path).remove_stale())
+        assert names(tmp_path) == [".making-alive", ".making-being-claimed", "kept"]
+        monkeypatch.setattr(claims, "UNLOCKED_S", 0.0)
+        asyncio.run(views(tmp_path).remove_stale())
+    assert names(tmp_path) == [".making-alive", "kept"]
 
 
-def test_one_helper_process_at_a_time(
-    tmp_path: Path, request_body: dict[str, str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_one_helper_process_at_a_time(tmp_path: Path, wanted: Wanted, monkeypatch: pytest.MonkeyPatch) -> None:
     started: list[subprocess.Popen[bytes]] = []
 
     class Watched(subprocess.Popen[bytes]):
@@ -239,29 +251,29 @@ def test_one_helper_process_at_a_time(
     monkeypatch.setattr(subprocess, "Popen", Watched)
 
     async def ask() -> None:
-        turn = asyncio.Lock()
-        made, others = (folders(tmp_path, name, turn) for name in ("views", "others"))
-        await asyncio.gather(*(each.path(key, request_body) for each in (made, others) for key in ("a", "b")))
+        processes = HelperProcesses(4 << 30)
+        made, others = (views(tmp_path, kind, processes) for kind in (Views, Others))
+        await asyncio.gather(*(each.path(key, **wanted) for each in (made, others) for key in ("a", "b")))
 
     asyncio.run(ask())
     assert len(started) == 4
 
 
-def test_memory_beyond_the_limit_is_one_clear_error(tmp_path: Path, request_body: dict[str, str]) -> None:
+def test_memory_beyond_the_limit_is_one_clear_error(tmp_path: Path, wanted: Wanted) -> None:
     images = tmp_path / "datasets" / "tiny" / "files" / "images_train.npy"
     with images.open("wb") as file:
         shape = (2000, 512, 512)
         np.lib.format.write_array_header_1_0(file, {"descr": "<f4", "fortran_order": False, "shape": shape})
         file.truncate(file.tell() + 4 * 2000 * 512 * 512)  # a hole: nothing is written
-    limited = folders(tmp_path, dataset_memory_mb=512)
+    limited = views(tmp_path, dataset_memory_mb=512)
     with pytest.raises(MemoryExceeded) as caught:
-        asyncio.run(limited.path("key", request_body))
+        asyncio.run(limited.path("key", **wanted))
     assert "512 MiB" in caught.value.detail
 
 
-def test_another_service_may_be_quicker(tmp_path: Path, request_body: dict[str, str]) -> None:
+def test_another_service_may_be_quicker(tmp_path: Path, wanted: Wanted) -> None:
     async def ask() -> list[Path]:
-        return await asyncio.gather(*(folders(tmp_path).path("key", request_body) for _ in range(2)))
+        return await asyncio.gather(*(views(tmp_path).path("key", **wanted) for _ in range(2)))
 
     assert asyncio.run(ask()) == [tmp_path / "views" / "key"] * 2
     assert names(tmp_path) == ["key"]

@@ -5,8 +5,8 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,11 +14,10 @@ import pytest
 from ultragray import LinearProbe
 from ultragray.datasets import Dataset, Sweep
 from ultragray.datasets.released import write_released
-from ultragray.datasets.source import SourceOptions, load_dataset
 from ultragray.errors import DatasetExists, DatasetInUse, DatasetInvalid, DatasetNotFound, InvalidArgument
-from ultragray_workers.datasets import incoming as dataset_incoming
+from ultragray_workers import claims
 from ultragray_workers.datasets.incoming import IncomingDataset, remove_stale
-from ultragray_workers.datasets.intake import IntakeRequest, take_in
+from ultragray_workers.datasets.intake import take_in
 from ultragray_workers.datasets.store import DatasetStore, check_dataset_name
 
 
@@ -61,8 +60,8 @@ def receive(store: DatasetStore) -> Iterator[Receive]:
         yield receive_files
 
 
-def request_for(incoming: IncomingDataset, name: str = "tiny", **options: str) -> IntakeRequest:
-    return IntakeRequest(str(incoming.folder), name, options, 10_000_000, 4 << 30)
+def arguments(incoming: IncomingDataset, name: str = "tiny", **options: str) -> dict[str, Any]:
+    return {"folder": str(incoming.folder), "name": name, "options": options, "max_bytes": 10_000_000}
 
 
 def leftovers(store: DatasetStore) -> list[str]:
@@ -79,7 +78,7 @@ def test_an_upload_becomes_a_dataset_that_training_reads(
 ) -> None:
     incoming = receive(files)
     assert store.names() == []
-    take_in(request_for(incoming, train_frames="0:6"))
+    take_in(**arguments(incoming, train_frames="0:6"))
     record, is_new = incoming.accept("tiny")
     incoming.discard()
     assert is_new
@@ -88,8 +87,7 @@ def test_an_upload_becomes_a_dataset_that_training_reads(
     assert (record.kind, record.train_frames, record.val_frames) == ("released", 6, 3)
     assert (record.height, record.width, record.bytes) == (20, 16, sum(map(len, files.values())))
     assert record.probe == LinearProbe(40.0, 0.0, 50.0)
-    source, options = store.source("tiny")
-    assert load_dataset(source, SourceOptions(**options)).sha256 == record.sha256
+    assert store.load("tiny").sha256 == record.sha256
     assert store.contact_sheet("tiny").read_bytes().startswith(b"\x89PNG")
 
 
@@ -99,7 +97,7 @@ def test_warnings_of_the_check_are_kept(
     images = sweep(8, 0.0).images.copy()
     images[3] = images[3] // 40
     incoming = receive({**files, "images_train.npy": npy(tmp_path, images)})
-    take_in(request_for(incoming))
+    take_in(**arguments(incoming))
     (warning,) = incoming.accept("tiny")[0].warnings
     assert warning.startswith("train: frames 3 are nearly black")
 
@@ -146,7 +144,7 @@ def test_what_is_refused_in_one_sentence(
 ) -> None:
     incoming = receive(change(tmp_path, files))
     with pytest.raises(DatasetInvalid, match=expected) as caught:
-        take_in(request_for(incoming))
+        take_in(**arguments(incoming))
     assert str(store.folder) not in caught.value.detail
     incoming.discard()
     assert leftovers(store) == []
@@ -160,7 +158,7 @@ def test_conf_json_reads_no_file_but_those_of_the_upload(
     for named in (str(secret), "../../../../../secret.npy"):
         incoming = receive(changed_config(files, images_file_train=named))
         with pytest.raises(DatasetInvalid, match=r"images_file_train names .* which is not in the upload"):
-            take_in(request_for(incoming))
+            take_in(**arguments(incoming))
 
 
 def test_options_are_named_as_requests_write_them(
@@ -168,16 +166,18 @@ def test_options_are_named_as_requests_write_them(
 ) -> None:
     for options, field in (({"train_frames": "0:99"}, "train_frames"), ({"crop": "0:2,0:2"}, "crop")):
         with pytest.raises(InvalidArgument, match=rf"^{field}") as caught:
-            take_in(request_for(receive(files), **options))
+            take_in(**arguments(receive(files), **options))
         assert caught.value.field == field
         assert "--" not in caught.value.detail
 
 
-def run_intake(request: IntakeRequest) -> subprocess.CompletedProcess[str]:
-    program = "from ultragray_workers.datasets.intake import main; main()"
-    return subprocess.run(
-        [sys.executable, "-c", program], input=json.dumps(asdict(request)), capture_output=True, text=True
+def run_intake(given: dict[str, Any], memory_bytes: int) -> subprocess.CompletedProcess[str]:
+    program = (
+        "from ultragray_workers.datasets.intake import take_in; "
+        "from ultragray_workers.helpers.helper import answer_request; answer_request(take_in)"
     )
+    request = {"arguments": given, "memory_bytes": memory_bytes, "what": "checking the dataset"}
+    return subprocess.run([sys.executable, "-c", program], input=json.dumps(request), capture_output=True, text=True)
 
 
 def test_memory_beyond_the_limit_is_one_clear_error(
@@ -189,17 +189,16 @@ def test_memory_beyond_the_limit_is_one_clear_error(
         header = {"descr": "<f4", "fortran_order": False, "shape": (2000, 512, 512)}
         np.lib.format.write_array_header_1_0(file, header)
         file.truncate(file.tell() + 4 * 2000 * 512 * 512)  # a hole: nothing is written
-    request = request_for(incoming)
-    done = run_intake(IntakeRequest(request.folder, "tiny", {}, request.max_bytes, 512 << 20))
+    done = run_intake(arguments(incoming), 512 << 20)
     assert done.returncode == 0, done.stderr
     answer = json.loads(done.stdout)
     assert answer["reason"] == "MEMORY_EXCEEDED"
-    assert "512 MiB" in answer["detail"]
+    assert answer["detail"].startswith("checking the dataset takes more than 512 MiB")
 
 
 def add(store: DatasetStore, receive: Receive, files: dict[str, bytes], name: str, **options: str) -> bool:
     incoming = receive(files)
-    take_in(request_for(incoming, name, **options))
+    take_in(**arguments(incoming, name, **options))
     is_new = incoming.accept(name)[1]
     incoming.discard()
     return is_new
@@ -224,7 +223,7 @@ def test_deletion(store: DatasetStore, receive: Receive, files: dict[str, bytes]
     store.in_use = lambda name: None
     store.delete("tiny")
     assert leftovers(store) == []
-    for call in (store.get, store.delete, store.source, store.contact_sheet):
+    for call in (store.get, store.delete, store.load, store.contact_sheet):
         with pytest.raises(DatasetNotFound):
             call("tiny")
 
@@ -246,10 +245,10 @@ def test_only_what_nobody_holds_is_stale(
     (store.folder / ".incoming-young").mkdir()
     (store.folder / ".deleted-half").mkdir()
     assert remove_stale(store) == 1  # the deletion may be taken back yet
-    monkeypatch.setattr(dataset_incoming, "_DELETED_WITHIN_S", 0.0)
-    assert remove_stale(store) == 1
-    assert leftovers(store) == sorted([under_way.folder.name, ".incoming-young"])
-    take_in(request_for(under_way))
+    monkeypatch.setattr(claims, "UNLOCKED_S", 0.0)
+    assert remove_stale(store) == 2
+    assert leftovers(store) == [under_way.folder.name]
+    take_in(**arguments(under_way))
     assert under_way.accept("tiny")[1]
 
 

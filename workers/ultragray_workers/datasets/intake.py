@@ -1,20 +1,21 @@
-"""The helper process that unpacks and checks an upload. Where it succeeds the folder holds a complete dataset."""
+"""Work of a helper process: unpacking and checking an upload. Where it succeeds the folder holds a complete dataset."""
 
 from __future__ import annotations
 
 import contextlib
 import os
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ultragray.errors import DatasetInvalid, MemoryExceeded, UltragrayError
+from ultragray.errors import DatasetInvalid, UltragrayError
+from ultragray.files.atomic import sync
 
-from ..helpers.helper import answer_request
-from .incoming import ARCHIVE_NAME, DATASET_NAME, storage_full
-from .store import CONTACT_SHEET_NAME, FILES_NAME, DatasetRecord, sync_folder, write_manifest
+from ..claims import storage_full
+from .incoming import ARCHIVE_NAME, DATASET_NAME
+from .store import CONTACT_SHEET_NAME, FILES_NAME, DatasetRecord, write_manifest
 from .unpack import unpack
 
 if TYPE_CHECKING:
@@ -29,39 +30,22 @@ _OPTIONS = {f"--{name.replace('_', '-')}": name for name in ("train_frames", "va
 }
 
 
-@dataclass(frozen=True)
-class IntakeRequest:
-    """What the process is told."""
+def take_in(folder: str, name: str, options: dict[str, str], max_bytes: int) -> None:
+    """Complete the dataset in the folder of an IncomingDataset: unpacked, checked, with contact sheet and manifest.
 
-    folder: str  # of the IncomingDataset
-    name: str
-    options: dict[str, str]
-    max_bytes: int
-    memory_bytes: int
-
-
-def main() -> None:
-    """Answers the `IntakeRequest` on stdin."""
-    answer_request(lambda request: take_in(IntakeRequest(**request)))
-
-
-def take_in(request: IntakeRequest) -> None:
-    """Completes the dataset in the folder: unpacked, checked, with contact sheet and manifest.
-
-    Raises DatasetInvalid with the file and the frame, InvalidArgument for an option, UploadTooLarge, MemoryExceeded,
-    StorageFull.
+    Raises DatasetInvalid with the file and the frame, InvalidArgument for an option, UploadTooLarge, StorageFull.
     """
-    folder = Path(request.folder).resolve()
-    dataset_folder = folder / DATASET_NAME
+    incoming = Path(folder).resolve()
+    dataset_folder = incoming / DATASET_NAME
     files = dataset_folder / FILES_NAME
-    with _in_words_of_the_upload(files, request), storage_full("the dataset"):
-        archive = folder / ARCHIVE_NAME
+    with _in_words_of_the_upload(files), storage_full("the dataset"):
+        archive = incoming / ARCHIVE_NAME
         if archive.exists():
-            unpack(archive, files, request.max_bytes)
+            unpack(archive, files, max_bytes)
             archive.unlink()
-        record = check_files(files, request.name, request.options, dataset_folder / CONTACT_SHEET_NAME)
+        record = check_files(files, name, options, dataset_folder / CONTACT_SHEET_NAME)
         for path in (*(path for path in files.rglob("*") if path.is_dir()), files):
-            sync_folder(path)
+            sync(path)
         write_manifest(record, dataset_folder)
 
 
@@ -140,15 +124,10 @@ def _listed(paths: list[Path]) -> str:
 
 
 @contextlib.contextmanager
-def _in_words_of_the_upload(files: Path, request: IntakeRequest) -> Iterator[None]:
+def _in_words_of_the_upload(files: Path) -> Iterator[None]:
     """Errors name files as the upload does, and options as requests write them."""
     try:
         yield
-    except MemoryError:
-        raise MemoryExceeded(
-            f"checking the dataset takes more than {request.memory_bytes >> 20} MiB "
-            "(ULTRAGRAY_DATASET_MEMORY_MB of the service)"
-        ) from None
     except UltragrayError as error:
         detail = error.detail.replace(f"{files}{os.sep}", "").replace(str(files), "the upload")
         for option, name in _OPTIONS.items():

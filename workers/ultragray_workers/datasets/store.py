@@ -5,18 +5,27 @@ from __future__ import annotations
 import contextlib
 import errno
 import json
-import os
 import re
 import secrets
 import shutil
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from ultragray.errors import DatasetExists, DatasetInUse, DatasetInvalid, DatasetNotFound, InvalidArgument
-from ultragray.files.atomic import atomic_path
+from ultragray.errors import (
+    DatasetExists,
+    DatasetInUse,
+    DatasetInvalid,
+    DatasetNotFound,
+    InvalidArgument,
+    UltragrayError,
+)
+from ultragray.files.atomic import sync, write_whole
 from ultragray.probe import Probe, probe_from_dict, probe_to_dict
+
+if TYPE_CHECKING:
+    from ultragray.datasets import Dataset
 
 FOLDER = "datasets"
 MANIFEST_NAME, FILES_NAME, CONTACT_SHEET_NAME = "dataset.json", "files", "contact_sheet.png"
@@ -83,14 +92,22 @@ class DatasetStore:
         except (ValueError, KeyError, TypeError) as error:
             raise DatasetInvalid(f"the manifest of the dataset {name!r} is damaged: {error!r}") from error
 
-    def source(self, name: str) -> tuple[Path, dict[str, Any]]:
-        """What `ultragray.datasets.source.load_dataset` takes: a path, and the fields of its SourceOptions.
+    def names_by_content(self) -> dict[str, str]:
+        """The name of a dataset by its SHA-256; those whose manifest is damaged are left out."""
+        found: dict[str, str] = {}
+        for name in self.names():
+            with contextlib.suppress(UltragrayError):
+                found.setdefault(self.get(name).sha256, name)
+        return found
 
-        Raises DatasetNotFound, DatasetInvalid.
-        """
+    def load(self, name: str) -> Dataset:
+        """Read a dataset as it was when it was accepted. Raises DatasetNotFound, DatasetInvalid."""
+        from ultragray.datasets.source import SourceOptions, load_dataset
+
         record, files = self.get(name), self._existing(name) / FILES_NAME
         device_set = None if record.device_set is None else files / record.device_set
-        return files / record.source, {**record.options, "device_set": device_set}
+        read = load_dataset(files / record.source, SourceOptions(**record.options, device_set=device_set))
+        return replace(read, name=name)
 
     def contact_sheet(self, name: str) -> Path:
         """The PNG. Raises DatasetNotFound."""
@@ -116,7 +133,7 @@ class DatasetStore:
                 "choose another name",
                 field="dataset",
             ) from None
-        sync_folder(self.folder)
+        sync(self.folder)
         return record, True
 
     def delete(self, name: str) -> None:
@@ -138,7 +155,7 @@ class DatasetStore:
             with contextlib.suppress(OSError):
                 doomed.rename(path)
             raise
-        sync_folder(self.folder)
+        sync(self.folder)
         shutil.rmtree(doomed, ignore_errors=True)
 
     def _require_unused(self, name: str) -> None:
@@ -171,15 +188,4 @@ def check_dataset_name(name: str) -> None:
 
 def write_manifest(record: DatasetRecord, folder: Path) -> None:
     """Writes the manifest of a dataset whose other files are complete."""
-    with atomic_path(folder / MANIFEST_NAME) as temporary:
-        temporary.write_text(record.to_json(), encoding="utf-8")
-
-
-def sync_folder(path: Path) -> None:
-    """Makes renames in a folder survive a loss of power, where its file system can."""
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        with contextlib.suppress(OSError):
-            os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+    write_whole(folder / MANIFEST_NAME, record.to_json())

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gzip
-import os
 import stat
 import tarfile
 import zipfile
@@ -14,6 +13,7 @@ from pathlib import Path, PurePosixPath
 from typing import IO, TypeVar
 
 from ultragray.errors import DatasetInvalid, UploadTooLarge
+from ultragray.files.atomic import sync
 
 MAX_FILES = 1000
 MAX_ENTRIES = 10_000  # of an archive, folders included
@@ -140,8 +140,7 @@ def _copy(name: str, content: AbstractContextManager[IO[bytes]], folder: Path, b
         while block := source.read(_BLOCK_BYTES):
             budget.take_bytes(len(block))
             target.write(block)
-        target.flush()
-        os.fsync(target.fileno())
+    sync(Path(target.name))
 
 
 def _not_plain(name: str) -> DatasetInvalid:

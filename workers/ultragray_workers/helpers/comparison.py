@@ -1,13 +1,12 @@
-"""The helper process that compares a scene with the held-out frames of the dataset that it was trained from."""
+"""Work of a helper process: comparing a scene with the held-out frames of the dataset that it was trained from."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
 from ..datasets.store import DatasetStore
-from .helper import answer_request, tell_progress
+from .helper import write_progress
 from .picture_stack import write_stacks
 
 FRAMES_NAME = "frames.json"
@@ -15,22 +14,15 @@ PICTURES = ("truth", "rendering", "median", "difference")
 _COMPARED = ("psnr_db", "ms_ssim", "gms", "gmsd")
 
 
-def main() -> None:
-    """Answers the request on stdin."""
-    answer_request(compare)
+def compare(folder: str, artifact_folder: str, dataset: str, scene_path: str) -> None:
+    """Fill `folder` with metrics and pictures of a scene on the frames that the dataset of this name holds out.
 
-
-def compare(request: dict[str, Any]) -> None:
-    """Fills `folder` with the metrics and pictures of the scene at `scene_path` on the frames that the dataset
-    `dataset` in `artifact_folder` holds out.
-
-    It tells meanwhile which share is done. Raises DatasetNotFound, DatasetInvalid where it holds out none,
+    It says meanwhile which share is done. Raises DatasetNotFound, DatasetInvalid where the dataset holds out none,
     SceneFileInvalid, InvalidImageSize for frames too small to measure.
     """
     import numpy as np
     import torch
 
-    from ultragray.datasets.source import SourceOptions, load_dataset
     from ultragray.evaluation.baselines import predict
     from ultragray.evaluation.compounding import affordable_voxel_mm
     from ultragray.evaluation.scoring import check_same_origin, evaluate_frames, render_sweep, require_frames
@@ -38,26 +30,23 @@ def compare(request: dict[str, Any]) -> None:
     from ultragray.scene import GaussianScene
 
     torch.set_num_threads(1)
-    folder = Path(request["folder"])
-    source, options = DatasetStore(Path(request["artifact_folder"])).source(request["dataset"])
-    dataset = load_dataset(source, SourceOptions(**options))
-    scene = GaussianScene.load(request["scene_path"])
-    check_same_origin(scene.info, dataset)
-    require_frames(dataset.val)
-    tell_progress(folder, 0.1)
-    median = predict(
-        dataset.train, dataset.val.poses, "median", voxel_mm=affordable_voxel_mm(dataset.train)
-    )  # [F, H, W]
-    tell_progress(folder, 0.4)
-    rendering = render_sweep(scene, dataset.val, backend="cpu")
-    tell_progress(folder, 0.7)
-    measured, of_median = evaluate_frames(rendering, dataset.val), evaluate_frames(median, dataset.val)
-    tell_progress(folder, 0.9)
-    truth = (dataset.val.images / 255.0).astype(np.float32)
+    filled = Path(folder)
+    sweeps = DatasetStore(Path(artifact_folder)).load(dataset)
+    scene = GaussianScene.load(scene_path)
+    check_same_origin(scene.info, sweeps)
+    require_frames(sweeps.val)
+    write_progress(filled, 0.1)
+    median = predict(sweeps.train, sweeps.val.poses, "median", voxel_mm=affordable_voxel_mm(sweeps.train))  # [F, H, W]
+    write_progress(filled, 0.4)
+    rendering = render_sweep(scene, sweeps.val, backend="cpu")
+    write_progress(filled, 0.7)
+    measured, of_median = evaluate_frames(rendering, sweeps.val), evaluate_frames(median, sweeps.val)
+    write_progress(filled, 0.9)
+    truth = (sweeps.val.images / 255.0).astype(np.float32)
     difference = np.minimum(np.abs(rendering - truth) * DIFFERENCE_GAIN, 1.0)
     pictures = dict(zip(PICTURES, (truth, rendering, median, difference), strict=True))
-    write_stacks(folder, pictures, dataset.probe)
-    told = [
+    write_stacks(filled, pictures, sweeps.probe)
+    frames = [
         {
             "index": index,
             "frame_number": int(number),
@@ -68,4 +57,4 @@ def compare(request: dict[str, Any]) -> None:
             zip(measured.frame_numbers, measured.frames, of_median.frames, strict=True)
         )
     ]
-    (folder / FRAMES_NAME).write_text(json.dumps(told), encoding="utf-8")
+    (filled / FRAMES_NAME).write_text(json.dumps(frames), encoding="utf-8")

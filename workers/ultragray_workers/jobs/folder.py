@@ -15,14 +15,13 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import shutil
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from ultragray.files.atomic import atomic_path, remove_stale_temporaries
+from ultragray.files.atomic import remove_stale_temporaries, sync, write_whole
 
 FOLDER = "jobs"
 
@@ -138,10 +137,10 @@ class JobFolder:
         try:
             yield self._partial
             for path in self._partial.iterdir():
-                _sync(path)
-            _sync(self._partial)
+                sync(path)
+            sync(self._partial)
             self._partial.rename(self.artifacts)
-            _sync(self.path)
+            sync(self.path)
         finally:
             self.remove_partial_artifacts()
 
@@ -166,14 +165,6 @@ class JobFolder:
         shutil.rmtree(self.run, ignore_errors=True)
 
 
-def _sync(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
 def _read(path: Path) -> dict[str, Any] | None:
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
@@ -183,5 +174,4 @@ def _read(path: Path) -> dict[str, Any] | None:
 
 
 def _write(path: Path, document: Mapping[str, Any]) -> None:
-    with atomic_path(path) as temporary:
-        temporary.write_text(json.dumps(document) + "\n", encoding="utf-8")
+    write_whole(path, json.dumps(document) + "\n")

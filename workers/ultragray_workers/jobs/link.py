@@ -7,9 +7,7 @@ import shutil
 from contextlib import suppress
 from pathlib import Path
 
-from ultragray.files.atomic import atomic_path
-
-from ..datasets.store import sync_folder
+from ultragray.files.atomic import atomic_path, sync
 
 
 def link_or_copy(source: Path, target: Path) -> None:
@@ -24,14 +22,13 @@ def link_or_copy(source: Path, target: Path) -> None:
             raise
         except OSError:  # another file system, or one without links
             _copy(source, target)
-    sync_folder(target.parent)
+    sync(target.parent)
 
 
 def _copy(source: Path, target: Path) -> None:
     with atomic_path(target) as temporary:
         shutil.copyfile(source, temporary)
-        with temporary.open("rb") as file:
-            os.fsync(file.fileno())
+        sync(temporary)
         try:
             os.link(temporary, target)  # unlike a rename, never over what appeared meanwhile
         except FileExistsError:

@@ -9,12 +9,12 @@ import numpy as np
 
 from ultragray.confidence import Assessor, require_confidence
 from ultragray.errors import StorageFull
+from ultragray.files.atomic import sync
 from ultragray.interchange.exports import check_format
 from ultragray.request import LABELS, check_image_size, check_labelled, check_min_confidence
 from ultragray.scene_info import SceneHeader, read_header
 
-from ..datasets.incoming import storage_full
-from ..datasets.store import sync_folder
+from ..claims import storage_full
 from ..scenes import SUFFIX, SceneStore
 from .folder import JobFolder
 from .link import link_or_copy
@@ -42,7 +42,7 @@ def keep_scene(
     with storage_full("the scene of the job"):
         check_rendering(job, header, max_image_side, folder.artifact_folder)
         folder.path.mkdir(parents=True, exist_ok=True)
-        sync_folder(folder.path.parent)
+        sync(folder.path.parent)
         new = folder.path / f".{name}"
         try:
             new.unlink(missing_ok=True)
@@ -52,7 +52,7 @@ def keep_scene(
             raise
         new.replace(folder.path / name)  # a submission that failed may have left another scene
         new.unlink(missing_ok=True)  # or the same
-        sync_folder(folder.path)
+        sync(folder.path)
 
 
 def check_rendering(job: RenderJob, scene: SceneHeader, max_image_side: int, artifact_folder: Path) -> None:

@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ultragray.datasets.source import SourceOptions, load_dataset
 from ultragray.datasets.sweep import Dataset
 from ultragray.errors import TrainingStateInvalid
 from ultragray.evaluation.scoring import Evaluation, evaluate
@@ -53,9 +52,8 @@ def train(work: Work, job: TrainJob) -> Outcome:
 
 
 def _train_on(device: str, work: Work, job: TrainJob) -> Outcome:
-    source, options = DatasetStore(work.folder.artifact_folder).source(job.dataset)
     config = TrainingConfig.preset(job.preset, **job.settings)
-    dataset = replace(load_dataset(source, SourceOptions(**options)), name=job.dataset)
+    dataset = DatasetStore(work.folder.artifact_folder).load(job.dataset)
     _take_over_run(work)
     checkpoint = work.folder.run / CHECKPOINT_FILE
     resume = checkpoint.exists()

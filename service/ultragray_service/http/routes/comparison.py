@@ -52,7 +52,7 @@ async def get_compared_picture(
     key = await service.comparisons.key(scene)
 
     async def picture() -> Response:
-        return Response(await service.comparisons.picture_png(key, index, what), media_type=PNG)
+        return Response(await service.comparisons.frame_png(key, index, what), media_type=PNG)
 
     return await revalidated(request, f"{key}-{what}-{index}", picture)
 

@@ -16,7 +16,7 @@ from ultragray.errors import UnsupportedMediaType, UploadTooLarge
 from ...core.catalog import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE
 from ...core.dataset_catalog import contact_sheet, dataset_page
 from ...core.dataset_uploads import DatasetUpload
-from ...views.helper_process import PATIENCE_S
+from ...core.helper_processes import PATIENCE_S
 from ..accept import PNG
 from ..dataset_schemas import DatasetOut, DatasetPage
 from ..deps import ServiceDep, problems

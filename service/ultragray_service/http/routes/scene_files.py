@@ -17,7 +17,7 @@ from ultragray.probe import FloatArray
 from ultragray_workers.scenes import SUFFIX
 
 from ...arrival import arrival
-from ...views.helper_process import PATIENCE_S
+from ...core.helper_processes import PATIENCE_S
 from ...views.scene_points import DEFAULT_POINTS, MAX_POINTS, MAX_POSES, even_selection
 from ..accept import RAW
 from ..console_schemas import ScenePoses
