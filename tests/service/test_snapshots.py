@@ -19,14 +19,13 @@ from ultragray_proto.v1 import datasets_pb2, geometry_pb2, jobs_pb2, rendering_p
 from ultragray_service.settings import Settings
 
 FOLDER = Path(__file__).parent / "snapshots"
+OPENAPI = Path(__file__).parents[2] / "web/openapi.json"  # what the console's types and lists are generated from
 WORDS_ONLY = {"description", "title", "summary", "examples", "example", "operationId"}
 
 
-def check(name: str, current: Any) -> None:
-    path = FOLDER / f"{name}.json"
-    text = json.dumps(current, indent=1, sort_keys=True, ensure_ascii=False) + "\n"
+def check(path: Path, current: Any) -> None:
+    text = json.dumps(current, indent=1, sort_keys=path != OPENAPI, ensure_ascii=False) + "\n"
     if os.environ.get("ULTRAGRAY_UPDATE_SNAPSHOTS") == "1":
-        FOLDER.mkdir(exist_ok=True)
         path.write_text(text)
     assert json.loads(path.read_text()) == json.loads(text), f"the public interface differs from {path}"
 
@@ -45,8 +44,7 @@ def without_words(value: Any, *, named: bool = False) -> Any:
 
 
 def test_http(http: httpx.Client) -> None:
-    document = http.get("/openapi.json").json()
-    check("openapi", without_words({"paths": document["paths"], "schemas": document["components"]["schemas"]}))
+    check(OPENAPI, http.get("/openapi.json").json())
 
 
 def fields(message: Descriptor) -> dict[str, Any]:
@@ -77,7 +75,7 @@ def contract(file: FileDescriptor) -> dict[str, Any]:
 
 def test_grpc() -> None:
     files = (geometry_pb2, scenes_pb2, rendering_pb2, datasets_pb2, jobs_pb2)
-    check("proto", {module.DESCRIPTOR.name: contract(module.DESCRIPTOR) for module in files})
+    check(FOLDER / "proto.json", {module.DESCRIPTOR.name: contract(module.DESCRIPTOR) for module in files})
 
 
 def error_classes(cls: type[errors.UltragrayError]) -> Iterator[type[errors.UltragrayError]]:
@@ -90,9 +88,9 @@ def test_reasons() -> None:
     classes = [cls for cls in error_classes(errors.UltragrayError) if cls.__module__ == errors.__name__]
     table = {cls.reason: {"http": cls.http_status, "grpc": cls.grpc_status} for cls in classes}
     assert len(table) == len(classes), "two errors share a reason"
-    check("reasons", table)
+    check(FOLDER / "reasons.json", table)
 
 
 def test_settings() -> None:
     schema = Settings.model_json_schema()
-    check("settings", without_words(schema["properties"], named=True))
+    check(FOLDER / "settings.json", without_words(schema["properties"], named=True))

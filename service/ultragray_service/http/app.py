@@ -6,7 +6,7 @@ from typing import Any
 
 from fastapi import FastAPI
 from fastapi.exceptions import RequestValidationError
-from pydantic.json_schema import models_json_schema
+from pydantic import TypeAdapter
 from starlette.exceptions import HTTPException
 from starlette.middleware.cors import CORSMiddleware
 
@@ -32,6 +32,7 @@ from .routes import (
     training,
 )
 from .schemas import RenderBody
+from .stream_schemas import FrameHeader, RefusalMessage, StreamMessage
 
 _DESCRIPTION = """B-mode frames from trained 3D-Gaussian ultrasound scenes.
 
@@ -44,6 +45,16 @@ _SECURITY_SCHEMES = {
     "Bearer": {"type": "http", "scheme": "bearer"},
     "ApiKey": {"type": "apiKey", "in": "header", "name": "X-API-Key"},
 }
+
+
+_READ: tuple[Any, ...] = (
+    RenderBody,
+    StreamMessage,
+    job_schemas.JobBody,
+    job_schemas.TrainSpecification,
+    job_schemas.RenderSpecification,
+)
+_WRITTEN: tuple[Any, ...] = (problems.Problem, FrameHeader, RefusalMessage)
 
 
 def create_app(service: Service) -> FastAPI:
@@ -97,14 +108,9 @@ class _Application(FastAPI):
     def openapi(self) -> dict[str, Any]:
         if self.openapi_schema is None:
             document = super().openapi()
-            _, extra = models_json_schema(
-                [
-                    (RenderBody, "validation"),
-                    (job_schemas.JobBody, "validation"),
-                    (job_schemas.TrainSpecification, "validation"),
-                    (job_schemas.RenderSpecification, "validation"),
-                    (problems.Problem, "serialization"),
-                ],
+            _, extra = TypeAdapter.json_schemas(
+                [(cls, "validation", TypeAdapter(cls)) for cls in _READ]
+                + [(cls, "serialization", TypeAdapter(cls)) for cls in _WRITTEN],
                 ref_template="#/components/schemas/{model}",
             )
             schemas = document.setdefault("components", {}).setdefault("schemas", {})

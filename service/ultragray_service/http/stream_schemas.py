@@ -7,13 +7,15 @@ from dataclasses import asdict
 from typing import Any, Literal
 
 from pydantic import BaseModel, Field
+from typing_extensions import TypedDict  # pydantic reads those of `typing` from Python 3.12 on
 
+from ultragray.confidence.assess import Extrapolation
 from ultragray.errors import UltragrayError
 from ultragray.probe import Picture, probe_to_dict
 from ultragray_workers.pool.types import Encoding, RenderResult
 
 from ..core.pose_stream import Answered, StreamMode
-from .schemas import DisplayBody, PoseBody, ProbeBody, RequestModel
+from .schemas import DisplayBody, MatrixRows, PoseBody, ProbeBody, RequestModel
 
 _ALIGNMENT = 8  # so that a client may look at float32 pixels where they lie
 
@@ -44,6 +46,61 @@ class StreamMessage(RequestModel):
     def stream_mode(self) -> StreamMode:
         """The mode asked for."""
         return StreamMode(self.mode or StreamMode.ORDERED)
+
+
+class PictureOut(TypedDict):
+    """Where the pixels of a frame lie: `first` is the centre of pixel (0, 0), `step` the way to the next one.
+
+    Column and row: x and z in mm, or, where the columns are degrees, the angle from the z axis and the range in mm.
+    """
+
+    column_unit: Literal["mm", "deg"]
+    first: tuple[float, float]
+    step: tuple[float, float]
+
+
+class Answer(TypedDict):
+    """What every message of the service begins with."""
+
+    sequence: int
+    client_time_ms: float | None
+    dropped: int
+
+
+class FrameHeader(Answer):
+    """The JSON before the pixels of a frame."""
+
+    scene: str
+    scene_sha256: str
+    renderer: str
+    pose: MatrixRows
+    probe: ProbeBody
+    rendered_height: int
+    rendered_width: int
+    display: DisplayBody
+    height: int
+    width: int
+    picture: PictureOut
+    outputs: list[str]
+    encoding: str
+    extrapolation: Extrapolation
+    queue_ms: float
+    render_ms: float
+    encode_ms: float
+
+
+class Refusal(TypedDict):
+    """Why a pose has no frame."""
+
+    reason: str
+    detail: str
+    field: str | None
+
+
+class RefusalMessage(Answer):
+    """The text message in place of a frame."""
+
+    error: Refusal
 
 
 def message_numbers(text: str) -> tuple[int, float | None]:

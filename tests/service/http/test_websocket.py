@@ -14,10 +14,12 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from pydantic import TypeAdapter
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from ultragray import GaussianScene, render
+from ultragray_service.http.stream_schemas import FrameHeader, RefusalMessage
 
 from ...waiting import wait_until
 from ..conftest import HEIGHT, WIDTH, RunningService
@@ -34,6 +36,14 @@ def address(service: RunningService, scene: str = "demo") -> str:
     return f"{service.http.replace('http', 'ws', 1)}/v1/scenes/{scene}/stream"
 
 
+def checked(kind: Any, text: str | bytes) -> dict[str, Any]:
+    """The JSON of a message, which must be as the OpenAPI document says."""
+    TypeAdapter(kind).validate_json(text)
+    document: dict[str, Any] = json.loads(text)
+    assert document.keys() == kind.__required_keys__
+    return document
+
+
 class Stream:
     """A client's end of a stream."""
 
@@ -46,10 +56,10 @@ class Stream:
     def receive(self) -> tuple[dict[str, Any], bytes]:
         message = self.connection.recv(timeout=TIMEOUT_S)
         if isinstance(message, str):
-            return json.loads(message), b""
+            return checked(RefusalMessage, message), b""
         (length,) = struct.unpack_from("<I", message)
         assert (4 + length) % 8 == 0
-        return json.loads(message[4 : 4 + length]), message[4 + length :]
+        return checked(FrameHeader, message[4 : 4 + length]), message[4 + length :]
 
     def ask(self, **message: Any) -> tuple[dict[str, Any], bytes]:
         self.send(**message)

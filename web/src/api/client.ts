@@ -1,18 +1,26 @@
 /** How the console asks the service: one place for the key, for errors and for their words. */
 
+import type { components, paths } from "./generated/schema";
+
+/** What the service reads and answers, as its OpenAPI document has it. */
+export type Schemas = components["schemas"];
+export type Path = keyof paths;
+type Places<P extends string> = P extends `${string}{${infer Name}}${infer Rest}`
+  ? Record<Name, string | number> & Places<Rest>
+  : unknown;
+
+/** A path of the service with its {places} filled in. */
+export function address<P extends Path>(path: P, places: Places<P>): string {
+  const values = places as Record<string, string | number>;
+  return path.replace(/\{(\w+)\}/g, (_, name: string) => encodeURIComponent(values[name]!));
+}
+
 const KEY_STORAGE = "ultragray.key";
 const RETRY_MS = 2000;
 const PASSING = [429, 502, 503, 504]; // full or starting; proxies answer 502 and 504 while the service starts anew
 
-/** What the service answers in place of a result: RFC 9457 with a stable `reason`. */
-export interface Problem {
-  title: string;
-  status: number;
-  detail: string;
-  reason: string;
-  field: string | null;
-  request_id: string | null;
-}
+/** What the service answers in place of a result. */
+export type Problem = Pick<Schemas["Problem"], "status" | "detail" | "reason">;
 
 /** The service refused. */
 export class ServiceError extends Error {
@@ -93,19 +101,37 @@ export async function untilAnswered<T>(
   }
 }
 
-/** The JSON that a GET answers. */
-export async function getJson<T>(path: string, signal?: AbortSignal): Promise<T> {
-  return (await (await request(path, { signal: signal ?? null })).json()) as T;
+type AnswerTo<P extends Path, Method extends "get" | "post"> = paths[P] extends Record<
+  Method,
+  { responses: { 200: { content: { "application/json": infer Answer } } } }
+>
+  ? Answer
+  : never;
+
+/** The JSON that a GET of an address of `path` answers. */
+export async function getJson<P extends Path>(
+  path: P,
+  places: Places<P>,
+  { query = {}, signal = null }: { query?: Record<string, string>; signal?: AbortSignal | null } = {},
+): Promise<AnswerTo<P, "get">> {
+  const asked = new URLSearchParams(query).toString();
+  const answer = await request(address(path, places) + (asked && `?${asked}`), { signal });
+  return (await answer.json()) as AnswerTo<P, "get">;
 }
 
-/** The JSON that a request with a JSON body, or without one, answers. */
-export async function sendJson<T>(method: "POST" | "PUT", path: string, body?: unknown): Promise<T> {
-  const init: RequestInit = { method };
+/** The JSON that a POST answers, with or without a JSON body. */
+export async function postJson<P extends Path>(path: P, places: Places<P>, body?: unknown): Promise<AnswerTo<P, "post">> {
+  const init: RequestInit = { method: "POST" };
   if (body !== undefined) {
     init.body = JSON.stringify(body);
     init.headers = { "Content-Type": "application/json" };
   }
-  return (await (await request(path, init)).json()) as T;
+  return (await (await request(address(path, places), init)).json()) as AnswerTo<P, "post">;
+}
+
+/** Deletes what stands at an address of `path`. */
+export async function remove<P extends Path>(path: P, places: Places<P>): Promise<void> {
+  await request(address(path, places), { method: "DELETE" });
 }
 
 /** Reads a problem out of an answer; what is no problem document becomes one. */
@@ -118,10 +144,5 @@ export async function problemOf(response: Response): Promise<Problem> {
     // not JSON: a proxy answered, say
   }
   const detail = `The service answered ${response.status} ${response.statusText}`.trim() + ".";
-  return { title: "Error", status: response.status, detail, reason: "UNKNOWN", field: null, request_id: null };
-}
-
-/** A piece of a path. */
-export function segment(name: string): string {
-  return encodeURIComponent(name);
+  return { status: response.status, detail, reason: "UNKNOWN" };
 }

@@ -1,27 +1,19 @@
 /** A scene beside the frames that were held out from its training. */
 
-import { getJson, segment } from "./client";
+import { address, getJson, type Schemas } from "./client";
+import type { paths } from "./generated/schema";
 
-export const METRICS = ["psnr_db", "ms_ssim", "gms", "gmsd"] as const;
-export type Metric = (typeof METRICS)[number];
-export const PICTURES = ["truth", "rendering", "median", "difference"] as const;
-export type ComparedPicture = (typeof PICTURES)[number];
-
-export type ComparedFrame = { index: number; frame_number: number } & Record<Metric | `median_${Metric}`, number>;
-
-export interface Comparison {
-  state: "running" | "ready" | "failed";
-  progress: number;
-  dataset: string;
-  frames: ComparedFrame[];
-  reason: string | null;
-}
+export type Comparison = Schemas["ComparisonOut"];
+type MetricOf<Field> = Field extends `median_${infer Name}` ? Name : never;
+export type Metric = MetricOf<keyof Schemas["ComparedFrame"]>;
+export type ComparedPicture =
+  paths["/v1/scenes/{scene}/comparison/{index}/{what}.png"]["get"]["parameters"]["path"]["what"];
 
 /** Begins the comparison where it is not there. Throws ServiceError DATASET_NOT_FOUND without the scene's dataset. */
 export function comparisonOf(scene: string, signal: AbortSignal): Promise<Comparison> {
-  return getJson(`/v1/scenes/${segment(scene)}/comparison`, signal);
+  return getJson("/v1/scenes/{scene}/comparison", { scene }, { signal });
 }
 
 export function comparedPicturePath(scene: string, index: number, what: ComparedPicture): string {
-  return `/v1/scenes/${segment(scene)}/comparison/${index}/${what}.png`;
+  return address("/v1/scenes/{scene}/comparison/{index}/{what}.png", { scene, index, what });
 }

@@ -1,56 +1,30 @@
 /** Datasets: uploaded, checked, looked at. */
 
-import { getJson, request, segment } from "./client";
-import type { Probe } from "./scenes";
+import { address, getJson, remove, type Schemas } from "./client";
 import { putFile, type Told } from "./upload";
 
-export interface Dataset {
-  name: string;
-  kind: "released" | "plus";
-  sha256: string;
-  bytes: number;
-  created_at: string;
-  train_frames: number;
-  val_frames: number;
-  height: number;
-  width: number;
-  probe: Probe | null;
-  warnings: string[];
-  options: Record<string, string>;
-}
-
-/** How an upload is read; what is empty is left as it is stored. */
-export interface DatasetOptions {
-  crop: string;
-  image_size: string;
-  frames: string;
-  train_frames: string;
-  val_frames: string;
-}
-
-export interface DatasetPoses {
-  train: number[][];
-  val: number[][];
-}
-
+export type Dataset = Schemas["DatasetOut"];
+export type DatasetPoses = Schemas["DatasetPoses"];
 export type Part = keyof DatasetPoses;
+/** How an upload is read; what is empty is left as it is stored. */
+export type DatasetOptions = Record<string, string>;
 
 const ARCHIVES = [".zip", ".tar", ".tgz", ".gz"];
 
 export async function listDatasets(): Promise<Dataset[]> {
-  return (await getJson<{ datasets: Dataset[] }>("/v1/datasets?page_size=1000")).datasets;
+  return (await getJson("/v1/datasets", {}, { query: { page_size: "1000" } })).datasets;
 }
 
 /** One archive is sent as it is, files as a form. Throws what `putFile` throws. */
 export function uploadDataset(
-  name: string,
+  dataset: string,
   files: File[],
   options: DatasetOptions,
   told: Told,
   signal: AbortSignal,
 ): Promise<Dataset> {
   const given = new URLSearchParams(Object.entries(options).filter(([, value]) => value !== ""));
-  const path = `/v1/datasets/${segment(name)}?${given}`;
+  const path = `${address("/v1/datasets/{dataset}", { dataset })}?${given}`;
   const [first] = files;
   if (files.length === 1 && first && ARCHIVES.some((suffix) => first.name.toLowerCase().endsWith(suffix)))
     return putFile(path, new Blob([first], { type: "application/octet-stream" }), told, signal);
@@ -60,17 +34,17 @@ export function uploadDataset(
 }
 
 export function datasetPoses(dataset: string, signal: AbortSignal): Promise<DatasetPoses> {
-  return getJson(`/v1/datasets/${segment(dataset)}/poses`, signal);
+  return getJson("/v1/datasets/{dataset}/poses", { dataset }, { signal });
 }
 
 export function framePath(dataset: string, part: Part, index: number): string {
-  return `/v1/datasets/${segment(dataset)}/frames/${part}/${index}`;
+  return address("/v1/datasets/{dataset}/frames/{part}/{index}", { dataset, part, index });
 }
 
 export function contactSheetPath(dataset: string): string {
-  return `/v1/datasets/${segment(dataset)}/contact-sheet`;
+  return address("/v1/datasets/{dataset}/contact-sheet", { dataset });
 }
 
-export async function deleteDataset(dataset: string): Promise<void> {
-  await request(`/v1/datasets/${segment(dataset)}`, { method: "DELETE" });
+export function deleteDataset(dataset: string): Promise<void> {
+  return remove("/v1/datasets/{dataset}", { dataset });
 }

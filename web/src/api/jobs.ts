@@ -1,45 +1,12 @@
 /** Jobs: trainings above all, followed while they run. */
 
-import { getJson, request, segment, sendJson } from "./client";
+import { address, getJson, postJson, request, type Schemas } from "./client";
 
-export type JobState = "queued" | "running" | "succeeded" | "failed" | "cancelled";
-
-export interface Job {
-  id: string;
-  kind: "train" | "render";
-  state: JobState;
-  specification: { dataset?: string; scene: string; preset?: string; settings?: Record<string, unknown> };
-  created_at: string;
-  started_at: string | null;
-  finished_at: string | null;
-  reason: string | null;
-  error: string | null;
-  progress: {
-    step: number | null;
-    steps: number | null;
-    loss: number | null;
-    val_psnr_db: number | null;
-    gaussians: number | null;
-    rate_per_s: number | null;
-    seconds_left: number | null;
-  };
-  artifacts: string[];
-  metrics: Record<string, number>;
-  retry_of: string | null;
-}
-
-export interface CurvePoint {
-  step: number;
-  loss: number;
-  val_psnr_db: number | null;
-}
-
-export interface Training {
-  dataset: string;
-  scene: string;
-  preset: "fast" | "paper";
-  settings: Record<string, unknown>;
-}
+export type Training = Schemas["TrainSpecification"];
+/** One that trains: the only kind that the console asks for. */
+export type Job = Omit<Schemas["JobOut"], "specification"> & { specification: Training };
+export type JobState = Job["state"];
+export type CurvePoint = Schemas["CurvePointOut"];
 
 const FINAL: readonly JobState[] = ["succeeded", "failed", "cancelled"];
 
@@ -49,41 +16,41 @@ export function isFinal(job: Job): boolean {
 
 /** The newest trainings. */
 export async function listTrainings(count: number): Promise<Job[]> {
-  return (await getJson<{ jobs: Job[] }>(`/v1/jobs?kind=train&page_size=${count}`)).jobs;
+  return (await getJson("/v1/jobs", {}, { query: { kind: "train", page_size: String(count) } })).jobs as unknown as Job[];
 }
 
-export function startTraining(training: Training): Promise<Job> {
-  return sendJson("POST", "/v1/jobs", { kind: "train", specification: training });
+export function startTraining(specification: Partial<Training>): Promise<Job> {
+  return postJson("/v1/jobs", {}, { kind: "train", specification }) as Promise<unknown> as Promise<Job>;
 }
 
-export function cancelJob(id: string): Promise<Job> {
-  return sendJson("POST", `/v1/jobs/${segment(id)}:cancel`);
+export function cancelJob(job: string): Promise<unknown> {
+  return postJson("/v1/jobs/{job}:cancel", { job });
 }
 
-export function retryJob(id: string): Promise<Job> {
-  return sendJson("POST", `/v1/jobs/${segment(id)}:retry`);
+export function retryJob(job: string): Promise<Job> {
+  return postJson("/v1/jobs/{job}:retry", { job }) as Promise<unknown> as Promise<Job>;
 }
 
 /** The training so far, in a few hundred points. */
-export async function trainingCurve(id: string, signal: AbortSignal): Promise<CurvePoint[]> {
-  return (await getJson<{ points: CurvePoint[] }>(`/v1/jobs/${segment(id)}/curve`, signal)).points;
+export async function trainingCurve(job: string, signal: AbortSignal): Promise<CurvePoint[]> {
+  return (await getJson("/v1/jobs/{job}/curve", { job }, { signal })).points;
 }
 
-export function previewPath(id: string): string {
-  return `/v1/jobs/${segment(id)}/preview`;
+export function previewPath(job: string): string {
+  return address("/v1/jobs/{job}/preview", { job });
 }
 
-export function artifactPath(id: string, name: string): string {
-  return `/v1/jobs/${segment(id)}/artifacts/${segment(name)}`;
+export function artifactPath(job: string, name: string): string {
+  return address("/v1/jobs/{job}/artifacts/{name}", { job, name });
 }
 
 /** Tells of the job until its final state. Ends early where the stream breaks; then it can be asked for again. */
 export async function followJob(
-  id: string,
+  job: string,
   told: { job: (job: Job) => void; log: (lines: string) => void },
   signal: AbortSignal,
 ): Promise<void> {
-  const response = await request(`/v1/jobs/${segment(id)}/events`, { signal });
+  const response = await request(address("/v1/jobs/{job}/events", { job }), { signal });
   const reader = response.body!.pipeThrough(new TextDecoderStream()).getReader();
   let text = "";
   for (;;) {

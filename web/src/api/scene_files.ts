@@ -1,27 +1,27 @@
 /** Scene files, and which scenes are held in memory. */
 
-import { request, segment, sendJson } from "./client";
+import { address, postJson, remove } from "./client";
 import type { SceneDescription } from "./scenes";
 import { putFile, type Told } from "./upload";
 
 export const SCENE_SUFFIX = ".ugr";
 
 export async function loadScene(scene: string): Promise<void> {
-  await sendJson("POST", `/v1/scenes/${segment(scene)}:load`);
+  await postJson("/v1/scenes/{scene}:load", { scene });
 }
 
 export async function unloadScene(scene: string): Promise<void> {
-  await sendJson("POST", `/v1/scenes/${segment(scene)}:unload`);
+  await postJson("/v1/scenes/{scene}:unload", { scene });
 }
 
 export function importScene(scene: string, file: File, told: Told, signal: AbortSignal): Promise<SceneDescription> {
-  return putFile(`/v1/scenes/${segment(scene)}`, new Blob([file]), told, signal);
+  return putFile(address("/v1/scenes/{scene}", { scene }), new Blob([file]), told, signal);
 }
 
-export async function deleteScene(scene: string): Promise<void> {
-  await request(`/v1/scenes/${segment(scene)}`, { method: "DELETE" });
+export function deleteScene(scene: string): Promise<void> {
+  return remove("/v1/scenes/{scene}", { scene });
 }
 
 export function sceneFilePath(scene: string): string {
-  return `/v1/scenes/${segment(scene)}/file`;
+  return address("/v1/scenes/{scene}/file", { scene });
 }

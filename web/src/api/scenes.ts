@@ -1,76 +1,10 @@
 /** Scenes: what there is, what they say about themselves, their Gaussians and training views. */
 
-import { getJson, request, segment } from "./client";
+import { address, getJson, request, type Schemas } from "./client";
 
-export interface LinearProbe {
-  kind: "linear";
-  width_mm: number;
-  near_mm: number;
-  far_mm: number;
-}
-export interface ConvexProbe {
-  kind: "convex";
-  opening_angle_deg: number;
-  near_mm: number;
-  far_mm: number;
-}
-export interface PhasedProbe {
-  kind: "phased";
-  opening_angle_deg: number;
-  far_mm: number;
-}
-export type Probe = LinearProbe | ConvexProbe | PhasedProbe;
-
-export interface SceneEntry {
-  name: string;
-  loaded: boolean;
-  /** Whether it may be deleted. */
-  removable: boolean;
-  gaussian_count?: number;
-  image_height?: number;
-  image_width?: number;
-  file_bytes?: number;
-  error?: { reason: string; detail: string };
-}
-
-export interface Point {
-  x: number;
-  y: number;
-  z: number;
-}
-
-export interface PoseOut {
-  matrix: number[][];
-}
-
-/** How well a scene knows the confidence of its frames. */
-export interface ConfidenceFit {
-  /** Mean absolute error on the views that it was fitted on. */
-  error: number;
-  fitted_on: number;
-}
-
-export interface SceneDescription {
-  name: string;
-  loaded: boolean;
-  loaded_processes: number;
-  file_bytes: number;
-  gaussian_count: number;
-  sh_degree: number;
-  intensity: string;
-  centre_mm: Point;
-  bounds: { min_mm: Point; max_mm: Point };
-  probe: Probe | null;
-  image_height: number | null;
-  image_width: number | null;
-  training_poses: { count: number; middle: PoseOut | null };
-  metrics: Record<string, number> | null;
-  dataset_name: string | null;
-  dataset_sha256: string | null;
-  label_names: Record<string, string> | null;
-  /** null: the scene cannot tell the confidence of its frames. */
-  confidence: ConfidenceFit | null;
-}
+export type SceneEntry = Schemas["SceneEntry"];
+export type SceneDescription = Schemas["SceneOut"];
+export type Probe = NonNullable<SceneDescription["probe"]>;
 
 /** The Gaussians of a scene as points: float32 [N, 6], x, y, z in mm, intensity, transmittance, mean sigma in mm. */
 export interface GaussianPoints {
@@ -83,9 +17,7 @@ export async function listScenes(): Promise<SceneEntry[]> {
   const scenes: SceneEntry[] = [];
   let token = "";
   do {
-    const page = await getJson<{ scenes: SceneEntry[]; next_page_token: string }>(
-      `/v1/scenes?page_size=1000&page_token=${segment(token)}`,
-    );
+    const page = await getJson("/v1/scenes", {}, { query: { page_size: "1000", page_token: token } });
     scenes.push(...page.scenes);
     token = page.next_page_token;
   } while (token !== "");
@@ -93,12 +25,12 @@ export async function listScenes(): Promise<SceneEntry[]> {
 }
 
 export function describeScene(scene: string): Promise<SceneDescription> {
-  return getJson(`/v1/scenes/${segment(scene)}`);
+  return getJson("/v1/scenes/{scene}", { scene });
 }
 
 /** An even selection of at most `limit` Gaussians. */
 export async function sceneGaussians(scene: string, limit: number): Promise<GaussianPoints> {
-  const response = await request(`/v1/scenes/${segment(scene)}/gaussians?limit=${limit}`);
+  const response = await request(`${address("/v1/scenes/{scene}/gaussians", { scene })}?limit=${limit}`);
   const buffer = await response.arrayBuffer();
   const length = new DataView(buffer).getUint32(0, true);
   const { count } = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, length))) as { count: number };
@@ -107,5 +39,5 @@ export async function sceneGaussians(scene: string, limit: number): Promise<Gaus
 
 /** The poses that the scene was trained from, each 16 numbers row by row. */
 export async function trainingPoses(scene: string): Promise<number[][]> {
-  return (await getJson<{ poses: number[][] }>(`/v1/scenes/${segment(scene)}/training-poses`)).poses;
+  return (await getJson("/v1/scenes/{scene}/training-poses", { scene })).poses;
 }

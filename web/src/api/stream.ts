@@ -1,61 +1,14 @@
 /** The WebSocket of a scene: poses out, frames in; only the newest pose counts. */
 
-import type { Picture } from "../geometry/picture";
 import type { Pose } from "../geometry/pose";
-import { apiKey, segment } from "./client";
-import type { Probe } from "./scenes";
+import { apiKey, type Schemas } from "./client";
 
-export const OUTPUTS = ["bmode", "echo", "transmittance", "coverage", "labels"] as const;
-export type Output = (typeof OUTPUTS)[number];
-
-export interface Display {
-  gain_db: number;
-  dynamic_range_db: number;
-  tgc_db: number[];
-  depth_mm: number | null;
-  flip: boolean;
-  pixel_mm: number | null;
-}
-
-export interface StreamSettings {
-  height: number | null;
-  width: number | null;
-  probe: Probe | null;
-  /** Frames below it are treated as the next one says; null: none are. */
-  min_confidence: number | null;
-  below_min_confidence: "refuse" | "mask";
-  display: Display;
-  outputs: Output[];
-}
-
-/** How far a view is from what the scene was trained from. */
-export interface Extrapolation {
-  distance_mm: number | null;
-  angle_deg: number | null;
-  /** The MS-SSIM to expect, 0 to 1, where the scene was trained to tell. */
-  confidence: number | null;
-  /** Of the pixels. */
-  supported_share: number | null;
-}
-
-export interface FrameHeader {
-  sequence: number;
-  client_time_ms: number | null;
-  dropped: number;
-  scene: string;
-  scene_sha256: string;
-  pose: number[][];
-  probe: Probe;
-  display: Display;
-  height: number;
-  width: number;
-  picture: Picture;
-  outputs: Output[];
-  queue_ms: number;
-  render_ms: number;
-  encode_ms: number;
-  extrapolation: Extrapolation;
-}
+export type StreamSettings = Omit<Schemas["StreamSettings"], "encoding">;
+export type Display = Schemas["FrameHeader"]["display"];
+export type FrameHeader = Schemas["FrameHeader"];
+export type Extrapolation = FrameHeader["extrapolation"];
+/** Why a pose got no frame. */
+export type Refusal = Schemas["RefusalMessage"]["error"];
 
 export interface Frame {
   header: FrameHeader;
@@ -63,13 +16,6 @@ export interface Frame {
   pixels: Uint8Array<ArrayBuffer>;
   /** From asking to having it. */
   roundTrip_ms: number;
-}
-
-/** Why a pose got no frame. */
-export interface Refusal {
-  reason: string;
-  detail: string;
-  field: string | null;
 }
 
 export interface StreamEvents {
@@ -141,7 +87,7 @@ export class FrameStream {
   #open(): void {
     const key = apiKey();
     const protocols = key === null ? [] : ["ultragray.v1", `ultragray.key.${base64url(key)}`];
-    const address = new URL(`/v1/scenes/${segment(this.scene)}/stream`, location.href);
+    const address = new URL(`/v1/scenes/${encodeURIComponent(this.scene)}/stream`, location.href);
     address.protocol = address.protocol === "https:" ? "wss:" : "ws:";
     const socket = new WebSocket(address, protocols);
     socket.binaryType = "arraybuffer";
@@ -203,12 +149,12 @@ export class FrameStream {
     const nothingDue = this.#sequence === this.#answered;
     this.#sequence += 1;
     const written = JSON.stringify(settings);
-    const message: Record<string, unknown> = {
+    const message: Partial<Schemas["StreamMessage"]> = {
       sequence: this.#sequence,
       mode: "latest",
       timeout_ms: TIMEOUT_MS,
       client_time_ms: performance.now(),
-      pose: { matrix: [0, 4, 8, 12].map((start) => pose.slice(start, start + 4)) },
+      pose: { matrix: [0, 4, 8, 12].map((start) => pose.slice(start, start + 4)), position_mm: null, quaternion: null },
     };
     const known = written === this.#sentSettings && written === this.#takenSettings;
     if (!known) message.settings = { ...settings, encoding: "uint8" };
@@ -221,7 +167,7 @@ export class FrameStream {
   #receive(data: ArrayBuffer | string): void {
     if (this.#closed) return;
     if (typeof data === "string") {
-      const { sequence, error } = JSON.parse(data) as { sequence: number; error: Refusal };
+      const { sequence, error } = JSON.parse(data) as Schemas["RefusalMessage"];
       this.#takenSettings = "";
       this.#settle(sequence);
       this.events.refused(error);
@@ -264,7 +210,7 @@ export function decodeFrame(message: ArrayBuffer): Frame {
 }
 
 /** The pixels of one output of a frame; undefined where it was not asked for. */
-export function outputPixels({ header, pixels }: Frame, output: Output): Uint8Array | undefined {
+export function outputPixels({ header, pixels }: Frame, output: string): Uint8Array | undefined {
   const index = header.outputs.indexOf(output);
   if (index < 0) return undefined;
   const count = header.height * header.width;

@@ -18,7 +18,7 @@ class ServiceState {
   async poll(): Promise<void> {
     clearTimeout(this.#timer);
     try {
-      await getJson("/v1/health/ready");
+      await getJson("/v1/health/ready", {});
       this.#take(await listScenes());
       this.status = "ready";
     } catch (error) {

@@ -2,7 +2,7 @@
 
 import { explain, mayPass, ServiceError, Unreachable } from "../api/client";
 import { describeScene, trainingPoses, type Probe, type SceneDescription } from "../api/scenes";
-import type { Output, StreamSettings } from "../api/stream";
+import type { StreamSettings } from "../api/stream";
 import { faceDepth_mm, nearDepth_mm } from "../geometry/picture";
 import {
   between,
@@ -98,7 +98,7 @@ export class Session {
   }
 
   /** What to ask the stream for; `plain`: without gain, range and TGC. */
-  settings(outputs: Output[], { plain = false } = {}): StreamSettings {
+  settings(outputs: string[], { plain = false } = {}): StreamSettings {
     const tgc = !plain && this.tgc_db.some((gain) => gain !== 0);
     return {
       height: this.samples,

@@ -1,0 +1,46 @@
+/** Writes what the console knows of the service, from its OpenAPI document: types, and descriptions to draw forms from.
+ *
+ * `npm run generate`; `build`, `check` and `dev` do it first. A document that is not that of the service fails
+ * tests/service/test_snapshots.py.
+ */
+
+import { existsSync, mkdirSync, readFileSync, writeFileSync } from "node:fs";
+import openapiTS, { astToString } from "openapi-typescript";
+
+const FOLDER = new URL("src/api/generated/", import.meta.url);
+const KEPT = ["title", "description", "default", "minimum", "exclusiveMinimum", "maximum", "enum", "const", "examples"];
+
+const document = JSON.parse(readFileSync(new URL("openapi.json", import.meta.url), "utf8"));
+const { schemas } = document.components;
+
+/** A JSON schema with its references filled in, as far as a form needs it: see `Described` of web/src/api/described.ts. */
+function described({ $ref, anyOf, oneOf, properties, items, ...schema }) {
+  const kept = Object.fromEntries(Object.entries(schema).filter(([key]) => KEPT.includes(key)));
+  if ($ref) return { ...described(schemas[$ref.split("/").at(-1)]), ...kept };
+  if (anyOf) {
+    const [one, ...others] = anyOf.filter(({ type }) => type !== "null");
+    if (others.length === 0) return { ...described(one), ...kept, nullable: true };
+  }
+  const type = schema.type && { type: schema.type };
+  const fields = properties && {
+    properties: Object.fromEntries(Object.entries(properties).map(([name, value]) => [name, described(value)])),
+  };
+  return { ...type, ...kept, ...fields, ...(items && { items: described(items) }), ...(oneOf && { oneOf: oneOf.map(described) }) };
+}
+
+function parameter(method, path, name) {
+  return document.paths[path][method].parameters.find((one) => one.name === name).schema;
+}
+
+const texts = {
+  "schema.d.ts": astToString(await openapiTS(structuredClone(document))),
+  "contract.ts": `import type { Described } from "../described";
+
+export const settings: Described = ${JSON.stringify(described(schemas.StreamSettings), null, 1)};
+`,
+};
+mkdirSync(FOLDER, { recursive: true });
+for (const [name, text] of Object.entries(texts)) {
+  const file = new URL(name, FOLDER);
+  if (!existsSync(file) || readFileSync(file, "utf8") !== text) writeFileSync(file, text); // what is as it was is not built anew
+}
