@@ -31,6 +31,8 @@ from ultragray.evaluation import scoring as evaluation
 from ultragray.files import atomic as files
 from ultragray.files import poses as pose_file
 from ultragray.interchange import checkpoint, checkpoint_export, exports, ply
+from ultragray.interchange import rendering as file_rendering
+from ultragray.interchange.exports import png_folder
 
 from .document import call_of, code, table
 
@@ -40,6 +42,7 @@ LIBRARY_MODULES = (
     demo,
     display,
     display_frames,
+    file_rendering,
     files,
     ply,
     pose,
@@ -47,7 +50,7 @@ LIBRARY_MODULES = (
     probe,
     rendering,
 )
-MEASURING_MODULES = (baselines, compounding, evaluation, metrics, side_by_side)
+MEASURING_MODULES = (baselines, compounding, evaluation, metrics, side_by_side, png_folder)
 MEMBERS_OF = (GaussianScene, LinearProbe, ConvexProbe, PhasedProbe, errors.UltragrayError)
 
 

@@ -6,14 +6,13 @@ from collections.abc import Mapping
 from functools import lru_cache
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from ..probe import Probe
 from ..request import LABELS
-from .settings import AS_RENDERED, FRAME_RANGE_DB, Display, true_to_scale
+from .settings import FRAME_RANGE_DB, Display
 
 _CACHED_PICTURES = 8  # at 9 bytes a pixel
 _LARGEST_CACHED_PICTURE = 2**20  # pixels
@@ -41,23 +40,6 @@ def show(
             shown[name] = shown[name].flip(2)
         shown[name] = shown[name].contiguous()
     return shown
-
-
-class TrueToScale:
-    """Makes pictures in which a pixel has one size in mm, such as files hold, of frames of one probe and size."""
-
-    def __init__(self, probe: Probe, height: int, width: int) -> None:
-        self._probe, self._display = probe, true_to_scale(probe, height)
-        self.picture = self._display.picture(probe, height, width)
-
-    def of(self, frames: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:  # [B, H, W] -> those of `picture`
-        """Frames of B-mode as such pictures; 0 outside the fan."""
-        if self._display == AS_RENDERED:
-            return frames
-        pictures: npt.NDArray[np.uint8] = show({"bmode": torch.from_numpy(frames)}, self._probe, self._display)[
-            "bmode"
-        ].numpy()
-        return pictures
 
 
 def _toned(bmode: Tensor, display: Display) -> Tensor:  # [C, H, W] -> [C, H, W]

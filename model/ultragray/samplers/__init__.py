@@ -7,7 +7,7 @@ A sampler is made of numbers, travels as a JSON object with a `kind`, and makes 
 from __future__ import annotations
 
 from .around import AroundSampler
-from .confident import Assess, confident_poses
+from .confident import Assess, assessed_poses, confident_poses
 from .covered import CoveredSampler
 from .fan import FanSampler
 from .named import SAMPLERS, sampler_from_dict, sampler_to_dict
@@ -25,6 +25,7 @@ __all__ = [
     "Sampler",
     "SplineSampler",
     "TrainingSampler",
+    "assessed_poses",
     "confident_poses",
     "sampler_from_dict",
     "sampler_to_dict",

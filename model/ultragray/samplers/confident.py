@@ -9,8 +9,9 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from ..confidence import Extrapolation, is_confident
+from ..confidence import Extrapolation, is_confident, require_confidence
 from ..errors import LowConfidence
+from ..pose import check_poses
 from ..probe import FloatArray, Probe
 from .around import AroundSampler
 from .covered import CoveredSampler
@@ -21,6 +22,22 @@ SMALLEST_ROUND = 64
 SPARE = 1.2  # of the draws that the share found so far lets expect
 
 Assess: TypeAlias = Callable[[FloatArray], Sequence[Extrapolation]]  # [C, 4, 4] mm -> [C]
+
+
+def assessed_poses(
+    sampler: Sampler | None, base: Any, probe: Probe, assess: Assess, min_confidence: float | None
+) -> tuple[FloatArray, Sequence[Extrapolation]]:  # base [P, 4, 4] -> [C, 4, 4] mm, [C]
+    """The poses of a sampler, or without one `base` itself, and what `assess` finds about each.
+
+    A sampler keeps to poses with `min_confidence` (None: any). Raises LowConfidence for a pose of `base` below it, and
+    what `confident_poses` raises.
+    """
+    if sampler is not None and min_confidence is not None:
+        return confident_poses(sampler, base, probe, assess, min_confidence)
+    poses = check_poses(base) if sampler is None else sampler.poses(base, probe)
+    extrapolations = assess(poses)
+    require_confidence(extrapolations, min_confidence)
+    return poses, extrapolations
 
 
 def confident_poses(

@@ -20,14 +20,15 @@ from ultragray.backends import cpu
 from ultragray.confidence import FIGURES, Assessor, ConfidenceModel, figure_arrays
 from ultragray.datasets.plus import read_plus_sweep
 from ultragray.files.atomic import file_sha256
+from ultragray.interchange import rendering
 from ultragray.samplers import FanSampler
-from ultragray_service.cli import render as cli_render
 
 from .command_line import refused, run
 
 LINEAR = LinearProbe(width_mm=30.0, near_mm=0.0, far_mm=40.0)
 CONVEX = ConvexProbe(opening_angle_deg=60.0, near_mm=10.0, far_mm=50.0)
 PHASED = PhasedProbe(opening_angle_deg=90.0, far_mm=50.0)
+ORIGIN = ("scene", "scene_sha256", "renderer", "probe", "display", "picture")
 CONVEX_JSON = '{"kind": "convex", "opening_angle_deg": 60, "near_mm": 10, "far_mm": 50}'
 
 
@@ -40,7 +41,7 @@ def test_render_writes_an_npz_that_can_be_replayed(scene_file: Path, pose_file: 
     assert result.exit_code == 0, result.output
     assert "7 frames of 16x12" in result.output
     with np.load(output) as frames:
-        assert set(frames) == {"bmode", "transmittance", "poses", *FIGURES, "scene", "scene_sha256", "renderer"}
+        assert set(frames) == {"bmode", "transmittance", "poses", *FIGURES, *ORIGIN}
         assert str(frames["scene"]) == "scene"
         assert str(frames["scene_sha256"]) == file_sha256(scene_file)
         assert str(frames["renderer"]) == f"ultragray/{ultragray.__version__} cpu-{cpu.INSTRUCTION_SETS[0]}"
@@ -61,8 +62,8 @@ def test_chunks_do_not_show(scene_file: Path, pose_file: Path, tmp_path: Path, m
         sizes.append(len(poses))
         return render(scene, probe, poses, **options)
 
-    monkeypatch.setattr(cli_render, "render", counting)
-    monkeypatch.setattr(cli_render, "CHUNK_BYTES", 3 * 4 * 24 * 20 * 3)
+    monkeypatch.setattr(rendering, "render", counting)
+    monkeypatch.setattr(rendering, "frames_at_once", lambda height, width: 3)
     assert run(*arguments, chunked).exit_code == 0
     assert sizes == [3, 3, 1]
     with np.load(whole) as first, np.load(chunked) as second:
@@ -242,7 +243,7 @@ def test_threads_and_backend_are_used(scene_file: Path, tmp_path: Path) -> None:
         (["--probe", '{"kind": "sector"}'], 'kind "linear", "convex" or "phased"'),
         (["--poses", "absent.npy"], "absent.npy: no such file"),
         (["--scan-convert", 0.5], "--scan-convert draws PNGs of a convex or phased probe only"),
-        (["--scan-convert", 0.0, "--probe", CONVEX_JSON], "--scan-convert must be between"),
+        (["--scan-convert", 0.0, "--probe", CONVEX_JSON], "pixel_mm must be from"),
         (["-o", "frames.png"], "ends in .npz, .tar, .zarr.zip, .h5, .dcm, .igs.mha, or a folder"),
         (["-o", "frames.dcm", "--outputs", "echo"], "bmode alone in format dicom"),
         (["-o", "frames.tar", "--dtype", "int8"], "dtype must be one of"),

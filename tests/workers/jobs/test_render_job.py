@@ -15,6 +15,7 @@ from ultragray import GaussianScene, LinearProbe, render
 from ultragray.confidence import Assessor, ConfidenceModel, figure_arrays
 from ultragray.datasets.plus import read_plus_sweep
 from ultragray.errors import ExtraMissing, InvalidArgument, InvalidProbe, LowConfidence
+from ultragray.interchange import rendering
 from ultragray.samplers import AroundSampler, CoveredSampler, FanSampler, SplineSampler, TrainingSampler
 from ultragray_workers.jobs import render_job
 from ultragray_workers.jobs.folder import JobFolder, Request
@@ -84,7 +85,7 @@ def test_plus_sequence_of_the_spline(work: Callable[..., Work]) -> None:
 def test_figures_of_each_frame_are_in_the_archive(work: Callable[..., Work], monkeypatch: pytest.MonkeyPatch) -> None:
     job = RenderJob("one", sampler=AroundSampler(40, translation_mm=8.0), min_confidence=0.6, outputs=("echo",))
     asked = work(job, confidence=MODEL)
-    monkeypatch.setattr(render_job, "frames_at_once", lambda height, width: 7)
+    monkeypatch.setattr(rendering, "frames_at_once", lambda height, width: 7)
     monkeypatch.setattr(render_job, "ASSESSED_AT_ONCE", 60)
     render_job.render(asked, job)
     scene = GaussianScene.load(asked.folder.path / "one.ugr")

@@ -13,10 +13,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ultragray.display.pixels import to_uint8
 from ultragray.display.square_pixels import with_square_pixels
 from ultragray.probe import Probe, probe_from_dict, probe_to_dict
-
-from ..pool.process.encoding import to_uint8
 
 PROBE_NAME, SUFFIX = "probe.json", ".npy"
 PICTURE_SIDE = 512  # pixels, the longer one

@@ -8,18 +8,17 @@ import time
 import torch
 
 from ultragray.confidence import Assessor, Extrapolation
-from ultragray.evaluation.scoring import frames_at_once
+from ultragray.display import AS_RENDERED
 from ultragray.files.atomic import file_sha256
 from ultragray.interchange.exports import FORMATS, ExportHeader, check_format, export_to
+from ultragray.interchange.rendering import render_into
 from ultragray.probe import FloatArray
-from ultragray.rendering import render as render_frames
 from ultragray.rendering import renderer_name
 from ultragray.samplers import Assess
 from ultragray.scene import GaussianScene
 from ultragray.scene_info import SceneHeader, read_header
 from ultragray.training.device import training_device
 
-from ..pool.process.support import with_support
 from ..scenes import SUFFIX
 from .device import chosen_device, device_alone
 from .folder import Outcome, Progress
@@ -49,6 +48,7 @@ def _render_on(device: torch.device, work: Work, job: RenderJob) -> Outcome:
     poses, extrapolations = assessed_poses(job, described.training_poses, probe, _assessing(work, described))
     scene = GaussianScene.load(path).to(device)
     height, width = scene.info.image_size_or(job.height, job.width)
+    chosen = FORMATS[job.format]
     header = ExportHeader(
         outputs=job.outputs,
         dtype=check_format(job.format, job.outputs, job.dtype),
@@ -59,31 +59,27 @@ def _render_on(device: torch.device, work: Work, job: RenderJob) -> Outcome:
         scene=job.scene,
         scene_sha256=file_sha256(path),
         renderer=renderer_name("auto", scene),
+        display=chosen.shown(AS_RENDERED, probe, height),
     )
     sys.stderr.write(f"rendering {len(poses):,} frames of {height}x{width} of {job.scene} on {device}\n")
     with work.folder.new_artifacts() as folder:
         started = time.monotonic()
-        work.report(Progress(frames_done=0, frames=len(poses)))
-        wanted = tuple(dict.fromkeys((*job.outputs, "coverage")))
-        with export_to(folder / f"frames{FORMATS[job.format].suffix}", job.format, header) as add, torch.no_grad():
-            at_once = frames_at_once(height, width)
-            for first in range(0, len(poses), at_once):
-                if work.should_stop():
-                    raise Stopped
-                some = poses[first : first + at_once]
-                frames = render_frames(scene, probe, some, height=height, width=width, outputs=wanted)
-                assert frames.coverage is not None
-                pixels = {name: getattr(frames, name).cpu().numpy() for name in job.outputs}
-                add(pixels, with_support(extrapolations[first : first + len(some)], frames.coverage))
-                done = first + len(some)
-                rate = done / (time.monotonic() - started)
-                left_s = (len(poses) - done) / rate
-                work.report(Progress(frames_done=done, frames=len(poses), rate_per_s=rate, seconds_left=left_s))
+
+        def before_portion(done: int) -> None:
+            if work.should_stop():
+                raise Stopped
+            rate = done / (time.monotonic() - started)
+            left_s = (len(poses) - done) / rate if done else None
+            progress = Progress(frames_done=done, frames=len(poses), rate_per_s=rate or None, seconds_left=left_s)
+            work.report(progress)
+
+        sink = export_to(folder / f"frames{chosen.suffix}", job.format, header)
+        render_into(sink, header, scene, extrapolations, before_portion=before_portion)
     return Outcome(artifacts=work.folder.artifact_names())
 
 
 def _assessing(work: Work, described: SceneHeader) -> Assess:
-    """What tells how far poses extrapolate, until the job is to stop."""
+    """A function that tells how far poses extrapolate, until the job is to stop."""
     assessor = Assessor(described.info, described.training_poses)
     at_once = max(1, ASSESSED_AT_ONCE // max(1, len(described.training_poses)))
 

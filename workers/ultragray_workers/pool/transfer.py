@@ -48,7 +48,7 @@ def render_to_host(
 
 
 def to_uint8(frames: Tensor) -> Tensor:
-    """encoding.to_uint8 for a tensor, where that is: round(255·min(x, 1)), half to even; labels as they are."""
+    """`ultragray.display.pixels.to_uint8` of a tensor, on the device where that is."""
     return frames if frames.dtype == torch.uint8 else frames.clamp(max=1.0).mul_(255.0).round_().to(torch.uint8)
 
 

@@ -7,7 +7,17 @@ What a format can hold is known without importing what it needs. Free of torch.
 from __future__ import annotations
 
 from .exporter import Exporter, ExportHeader
-from .formats import FORMATS, Format, check_format, exporter_class
-from .writing import export_to
+from .formats import FORMATS, Format, check_format, exporter_class, format_of
+from .writing import Add, export_to
 
-__all__ = ["FORMATS", "ExportHeader", "Exporter", "Format", "check_format", "export_to", "exporter_class"]
+__all__ = [
+    "FORMATS",
+    "Add",
+    "ExportHeader",
+    "Exporter",
+    "Format",
+    "check_format",
+    "export_to",
+    "exporter_class",
+    "format_of",
+]

@@ -1,6 +1,6 @@
 """DICOM: Ultrasound Multi-frame Image Storage (PS3.3 A.7), 8-bit MONOCHROME2, uncompressed. The extra `dicom`.
 
-Pixels of other than linear probes are scan-converted. The one item of SequenceOfUltrasoundRegions (C.8.5.5) covers the
+The one item of SequenceOfUltrasoundRegions (C.8.5.5) covers the
 whole image; its physical values are the probe frame in cm: x lateral, y depth. The patient is the same for every file
 and no person. The UIDs are 2.25 and a UUID (PS3.5 B.2) made of what the frames are made of: that of the study, of the
 scene's hash; those of the series and the image, also of the renderer, the probe, the size and the poses. So the same
@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import struct
 import uuid
 from collections.abc import Mapping
@@ -22,9 +23,9 @@ import numpy as np
 from pydicom.dataset import Dataset, FileDataset, FileMetaDataset
 from pydicom.uid import UID, ExplicitVRLittleEndian, UltrasoundMultiFrameImageStorage
 
-from ...display.frames import TrueToScale
+from ...display.pixels import PixelArray
 from ...errors import InvalidArgument
-from .exporter import FRAME_TIME_MS, Exporter, ExportHeader, PixelArray
+from .exporter import FRAME_TIME_MS, Exporter, ExportHeader
 
 PRIVATE_GROUP, PRIVATE_CREATOR, POSES_ELEMENT, FIGURES_ELEMENT = 0x0019, "ULTRAGRAY", 0x01, 0x02
 MAX_PIXEL_BYTES = 2**32 - 2  # the length of an element (PS3.5 7.1.1)
@@ -38,13 +39,11 @@ class DicomExporter(Exporter):
 
     def _open(self) -> None:
         header = self._header
-        self._scaled = TrueToScale(header.probe, header.height, header.width)
-        self._picture = self._scaled.picture
-        self._bytes = len(header.poses) * self._picture.height * self._picture.width
+        self._bytes = math.prod(header.shape)
         if self._bytes > MAX_PIXEL_BYTES:
             raise InvalidArgument(
                 f"format dicom holds at most {MAX_PIXEL_BYTES:,} pixels in a file, {len(header.poses):,} frames of "
-                f"{self._picture.height}x{self._picture.width} are {self._bytes:,}",
+                f"{header.picture.height}x{header.picture.width} are {self._bytes:,}",
                 field="format",
             )
         self._file = self._held.enter_context(self._path.open("wb"))
@@ -53,7 +52,7 @@ class DicomExporter(Exporter):
         self._file.write(struct.pack("<HH2sHI", 0x7FE0, 0x0010, b"OB", 0, padded))  # PixelData
 
     def _write(self, frames: Mapping[str, PixelArray], count: int) -> None:
-        self._file.write(self._scaled.of(frames["bmode"]).data)
+        self._file.write(frames["bmode"].data)
 
     def _finish(self) -> None:
         self._file.write(b"\0" * (self._bytes % 2))
@@ -98,19 +97,19 @@ class DicomExporter(Exporter):
 
     def _describe_pixels(self, data: Dataset) -> None:
         """The modules Image Pixel, Cine, Multi-frame and US Image."""
-        picture = self._picture
+        picture = self._header.picture
         data.SamplesPerPixel, data.PhotometricInterpretation, data.PixelRepresentation = 1, "MONOCHROME2", 0
         data.BitsAllocated, data.BitsStored, data.HighBit = 8, 8, 7
         data.Rows, data.Columns = picture.height, picture.width
         data.NumberOfFrames = len(self._header.poses)
         data.FrameTime, data.FrameIncrementPointer = f"{FRAME_TIME_MS:g}", 0x00181063
         data.RecommendedDisplayFrameRate = round(1000.0 / FRAME_TIME_MS)
-        aspect = Fraction(picture.step[1] / picture.step[0]).limit_denominator(10_000)
+        aspect = Fraction(picture.step[1] / abs(picture.step[0])).limit_denominator(10_000)
         if aspect != 1 and aspect != 0:
             data.PixelAspectRatio = [aspect.numerator, aspect.denominator]
 
     def _region(self) -> Dataset:
-        picture = self._picture
+        picture = self._header.picture
         region = Dataset()
         region.RegionSpatialFormat, region.RegionDataType = TISSUE_2D, TISSUE
         region.RegionFlags = 0  # high priority, not protected from scaling

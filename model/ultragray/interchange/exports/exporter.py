@@ -1,30 +1,34 @@
-"""What every export is made of: the header that its frames share, and the base of the formats."""
+"""The parts of every export: the header that its frames share, and the base of the formats."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
 from ...confidence import Extrapolation, figure_arrays
+from ...display.pixels import PixelArray, to_uint8
+from ...display.settings import AS_RENDERED, Display
 from ...errors import InvalidArgument
-from ...probe import FloatArray, Probe, probe_to_dict
+from ...probe import FloatArray, Picture, Probe, probe_to_dict
 from ...request import LABELS
 
-PixelArray: TypeAlias = npt.NDArray[Any]  # uint8 or float32
 FRAME_TIME_MS = 40.0  # rendered frames have no time of their own: formats that need one show 25 a second
 
 
 @dataclass(frozen=True)
 class ExportHeader:
-    """What the frames of an export have in common, and all it takes to render them again."""
+    """What the frames of an export have in common, and all it takes to render them again.
+
+    The frames of a file are `picture`s: height x width samples of the probe, shown with `display`.
+    """
 
     outputs: tuple[str, ...]
     dtype: str  # "uint8": round(255·x), or "float32"; labels are uint8 as they are
@@ -35,23 +39,39 @@ class ExportHeader:
     scene: str
     scene_sha256: str
     renderer: str
+    display: Display = AS_RENDERED
+
+    @cached_property
+    def picture(self) -> Picture:
+        """Size and place of the pixels of each frame. Raises InvalidImageSize for a huge one."""
+        return self.display.picture(self.probe, self.height, self.width)
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """[C, H, W] of each output."""
+        return len(self.poses), self.picture.height, self.picture.width
 
     def pixel_type(self, output: str) -> np.dtype[Any]:
-        """What the pixels of an output are stored as."""
+        """The type that the pixels of an output are stored in."""
         return np.dtype("<u1" if output == LABELS or self.dtype == "uint8" else "<f4")
 
     def origin(self) -> dict[str, Any]:
-        """What says where the frames come from, as JSON holds it."""
+        """Where the frames come from and how they are shown, as JSON holds it.
+
+        `picture` has the fields of `ultragray.probe.Picture`.
+        """
         return {
             "scene": self.scene,
             "scene_sha256": self.scene_sha256,
             "renderer": self.renderer,
             "probe": probe_to_dict(self.probe),
+            "display": asdict(self.display),
+            "picture": asdict(self.picture),
         }
 
 
 class Exporter(ABC):
-    """Takes the frames in order, in portions; nothing but `close` makes the file whole.
+    """Writer of one format: takes the frames in order, in portions; only `close` makes the file whole.
 
     Portions are arrays [B, H, W] by output, already of their pixel type (`stored_pixels`). A subclass keeps what must
     be released in `_held`.
@@ -69,14 +89,14 @@ class Exporter(ABC):
             raise
 
     def add(self, frames: Mapping[str, PixelArray], extrapolations: Sequence[Extrapolation]) -> None:
-        """The next frames, each output [B, H, W], and what is told of each, [B]. Raises OSError."""
+        """The next frames, each output [B, H, W], and the extrapolation of each, [B]. Raises OSError."""
         count = len(next(iter(frames.values())))
         self._extrapolations.extend(extrapolations)
         self._write(frames, count)
         self._done += count
 
     def close(self) -> None:
-        """After the last frame. Raises OSError, and InvalidArgument where fewer frames came than poses were told."""
+        """Make the file whole, after the last frame. Raises OSError, InvalidArgument for fewer frames than poses."""
         try:
             if self._done != len(self._header.poses):
                 raise InvalidArgument(
@@ -88,7 +108,7 @@ class Exporter(ABC):
             self._held.close()
 
     def abandon(self) -> None:
-        """Instead of `close`, where the frames end too early: releases the file, which is worth nothing."""
+        """Release the file, which is worth nothing; instead of `close`, where the frames end too early."""
         with suppress(Exception):  # on a full disk, closing fails as writing did
             self._held.close()
 
@@ -99,20 +119,17 @@ class Exporter(ABC):
 
     @abstractmethod
     def _open(self) -> None:
-        """Makes the file."""
+        """Make the file."""
 
     @abstractmethod
     def _write(self, frames: Mapping[str, PixelArray], count: int) -> None:
-        """Frames `_done` to `_done` + count; what is told of them is in `_extrapolations` already."""
+        """Write frames `_done` to `_done` + count; their extrapolations are in `_extrapolations` already."""
 
     def _finish(self) -> None:
-        """What comes after the last frame."""
+        """Write what comes after the last frame."""
         return
 
 
 def stored_pixels(frames: PixelArray, stored: np.dtype[Any]) -> PixelArray:  # [B, H, W] -> [B, H, W]
-    """Rendered frames in [0, 1] (or labels, uint8) as they are stored, C order: round(255·min(x, 1)), half to even."""
-    if stored == np.uint8 and frames.dtype != np.uint8:
-        rows = frames.reshape(-1, frames.shape[-1])
-        return cv2.convertScaleAbs(rows, alpha=255.0).astype(np.uint8, copy=False).reshape(frames.shape)
-    return np.ascontiguousarray(frames, stored)
+    """Rendered frames in [0, 1] (or labels, uint8) as they are stored, C order."""
+    return np.ascontiguousarray(to_uint8(frames) if stored == np.uint8 else frames, stored)

@@ -1,12 +1,17 @@
-"""The formats by name: what they can hold, and where they are written. Needs no package of theirs."""
+"""The registry of formats: what each can hold, and where it is written. Needs no package of theirs.
+
+A new format is a module with an `EXPORTER` beside this one, and its line in `_ALL`.
+"""
 
 from __future__ import annotations
 
 import importlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+from ...display.settings import Display, true_to_scale
 from ...errors import ExtraMissing, InvalidArgument
+from ...probe import Probe
 from .exporter import Exporter
 
 DTYPES = ("float32", "uint8")
@@ -16,22 +21,47 @@ DTYPES = ("float32", "uint8")
 class Format:
     """One format. `dtypes`: the pixel types that it can hold, its default first; labels are uint8 in each."""
 
+    name: str
     suffix: str  # of its files
-    dtypes: tuple[str, ...]
+    meaning: str
     module: str
+    dtypes: tuple[str, ...] = DTYPES
     bmode_only: bool = False
+    in_mm: bool = False  # whether a pixel has one size in mm: fans are scan-converted
     package: str | None = None  # what it needs, as it is imported
     extra: str | None = None  # of ours, that installs it
 
+    def shown(self, display: Display, probe: Probe, height: int) -> Display:
+        """The display that frames have in a file of this format: the given one, scan-converted where it must be."""
+        if not self.in_mm or display.pixel_mm is not None:
+            return display
+        return replace(display, pixel_mm=true_to_scale(probe, height).pixel_mm)
 
-FORMATS: dict[str, Format] = {
-    "npz": Format(".npz", ("float32", "uint8"), "npz"),
-    "tar": Format(".tar", ("uint8", "float32"), "webdataset"),
-    "zarr": Format(".zarr.zip", ("float32", "uint8"), "zarr_zip", package="zarr", extra="zarr"),
-    "hdf5": Format(".h5", ("float32", "uint8"), "hdf5", package="h5py", extra="hdf5"),
-    "dicom": Format(".dcm", ("uint8",), "dicom", bmode_only=True, package="pydicom", extra="dicom"),
-    "plus": Format(".igs.mha", ("uint8",), "plus_sequence", bmode_only=True),
-}
+
+_ALL = (
+    Format("npz", ".npz", "NumPy arrays", "npz"),
+    Format("tar", ".tar", "WebDataset: PNGs (float32: .npy) and JSON", "webdataset", dtypes=("uint8", "float32")),
+    Format("zarr", ".zarr.zip", "Zarr arrays", "zarr_zip", package="zarr", extra="zarr"),
+    Format("hdf5", ".h5", "HDF5 data sets", "hdf5", package="h5py", extra="hdf5"),
+    Format(
+        "dicom",
+        ".dcm",
+        "DICOM ultrasound multi-frame image",
+        "dicom",
+        dtypes=("uint8",),
+        bmode_only=True,
+        in_mm=True,
+        package="pydicom",
+        extra="dicom",
+    ),
+    Format("plus", ".igs.mha", "PLUS sequence", "plus_sequence", dtypes=("uint8",), bmode_only=True, in_mm=True),
+)
+FORMATS: dict[str, Format] = {format.name: format for format in _ALL}
+
+
+def format_of(file_name: str) -> str | None:
+    """The name of the format that the suffix of a file stands for; None where it stands for none."""
+    return next((format.name for format in _ALL if file_name.endswith(format.suffix)), None)
 
 
 def check_format(name: str, outputs: Sequence[str], dtype: str | None) -> str:
@@ -47,8 +77,8 @@ def check_format(name: str, outputs: Sequence[str], dtype: str | None) -> str:
     if dtype is not None and dtype not in chosen.dtypes:
         raise InvalidArgument(f"dtype must be {chosen.dtypes[0]} in format {name}, got {dtype}", field="dtype")
     if chosen.bmode_only and tuple(outputs) != ("bmode",):
-        told = ", ".join(outputs)
-        raise InvalidArgument(f"outputs must be bmode alone in format {name}, got {told}", field="outputs")
+        given = ", ".join(outputs)
+        raise InvalidArgument(f"outputs must be bmode alone in format {name}, got {given}", field="outputs")
     return dtype or chosen.dtypes[0]
 
 

@@ -10,24 +10,25 @@ from typing import Any
 import h5py
 import numpy as np
 
-from .exporter import Exporter, PixelArray
+from ...display.pixels import PixelArray
+from .exporter import Exporter
 
 
 class Hdf5Exporter(Exporter):
-    """Data sets named by their output, `poses` [C, 4, 4], figures [C]; the origin as attributes, the probe as JSON."""
+    """Data sets named by their output, `poses` [C, 4, 4], figures [C]; the origin as attributes, objects as JSON."""
 
     def _open(self) -> None:
         header = self._header
         self._sink = self._held.enter_context(_Sink(str(self._path), "r+"))
         self._hdf5 = file = self._held.enter_context(h5py.File(self._sink, "w"))
         origin = header.origin()
-        file.attrs.update({**origin, "probe": json.dumps(origin["probe"])})
+        file.attrs.update({name: one if isinstance(one, str) else json.dumps(one) for name, one in origin.items()})
         file.create_dataset("poses", data=np.asarray(header.poses, np.float64))
         self._sets = {
             name: file.create_dataset(
                 name,
-                shape=(len(header.poses), header.height, header.width),
-                chunks=(1, header.height, header.width),
+                shape=header.shape,
+                chunks=(1, *header.shape[1:]),
                 dtype=header.pixel_type(name),
             )
             for name in header.outputs

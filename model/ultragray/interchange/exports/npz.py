@@ -1,7 +1,8 @@
-"""NumPy archives: one array [C, H, W] an output, stored without compression."""
+"""NumPy archives: one array [C, H, W] an output, stored without compression; objects of the origin as JSON."""
 
 from __future__ import annotations
 
+import json
 import shutil
 import tempfile
 import zipfile
@@ -10,7 +11,8 @@ from typing import IO
 
 import numpy as np
 
-from .exporter import Exporter, PixelArray
+from ...display.pixels import PixelArray
+from .exporter import Exporter
 
 
 class NpzExporter(Exporter):
@@ -23,9 +25,8 @@ class NpzExporter(Exporter):
         self._waiting = {name: self._held.enter_context(self._nameless()) for name in others}
         self._first = self._held.enter_context(self._member(first))
         self._files: dict[str, IO[bytes]] = {first: self._first, **self._waiting}
-        shape = (len(header.poses), header.height, header.width)
         for name, file in self._files.items():
-            described = {"descr": header.pixel_type(name).str, "fortran_order": False, "shape": shape}
+            described = {"descr": header.pixel_type(name).str, "fortran_order": False, "shape": header.shape}
             np.lib.format.write_array_header_1_0(file, described)
 
     def _nameless(self) -> IO[bytes]:
@@ -45,7 +46,7 @@ class NpzExporter(Exporter):
             with self._member(name) as member:
                 shutil.copyfileobj(file, member, 1 << 20)
         header = self._header
-        origin = {"scene": header.scene, "scene_sha256": header.scene_sha256, "renderer": header.renderer}
+        origin = {name: one if isinstance(one, str) else json.dumps(one) for name, one in header.origin().items()}
         described = {"poses": np.asarray(header.poses, np.float64), **self._figures(), **origin}
         for name, value in described.items():
             with self._member(name) as member:

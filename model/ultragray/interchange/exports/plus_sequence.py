@@ -4,18 +4,18 @@
 pose; the third column of `ImageToProbe` makes it right-handed. Every frame has the status OK, times 25 a second, and
 its figures as `UltraGRayConfidence` and the like, nan where one is not known.
 `read_plus_sweep` gives back the same frames; of a linear probe also the poses, moved by `near_mm` along the axial axis.
-Frames of other probes are scan-converted.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 
 import numpy as np
 
-from ...display.frames import TrueToScale
+from ...display.pixels import PixelArray
 from ...probe import FloatArray
-from .exporter import FRAME_TIME_MS, Exporter, PixelArray
+from .exporter import FRAME_TIME_MS, Exporter
 
 FIELDS = {
     "distance_mm": "UltraGRayDistanceMm",
@@ -30,9 +30,6 @@ class PlusExporter(Exporter):
     """Writes the whole header at once, then the pixels as they come, and the figures over their place in the header."""
 
     def _open(self) -> None:
-        header = self._header
-        self._scaled = TrueToScale(header.probe, header.height, header.width)
-        self._picture = self._scaled.picture
         self._file = self._held.enter_context(self._path.open("wb"))
         self._write_header()
 
@@ -55,7 +52,7 @@ class PlusExporter(Exporter):
         self._line("ElementDataFile", "LOCAL")
 
     def _fields(self) -> dict[str, str]:
-        header, picture = self._header, self._picture
+        header, picture, origin = self._header, self._header.picture, self._header.origin()
         return {
             "ObjectType": "Image",
             "NDims": "3",
@@ -74,22 +71,24 @@ class PlusExporter(Exporter):
             "UltraGRayScene": " ".join(header.scene.split()),
             "UltraGRaySceneSha256": header.scene_sha256,
             "UltraGRayRenderer": header.renderer,
+            "UltraGRayProbe": json.dumps(origin["probe"]),
+            "UltraGRayDisplay": json.dumps(origin["display"]),
         }
 
     def _line(self, key: str, value: str) -> None:
         self._file.write(f"{key} = {value}\n".encode())
 
     def _image_to_probe(self) -> FloatArray:  # [4, 4] pixels -> mm
-        picture = self._picture
+        picture = self._header.picture
         matrix = np.eye(4)
         matrix[:3, 0] = picture.step[0], 0.0, 0.0
         matrix[:3, 1] = 0.0, 0.0, picture.step[1]
-        matrix[:3, 2] = 0.0, -1.0, 0.0
+        matrix[:3, 2] = 0.0, -np.sign(picture.step[0]), 0.0
         matrix[:3, 3] = picture.first[0], 0.0, picture.first[1]
         return matrix
 
     def _write(self, frames: Mapping[str, PixelArray], count: int) -> None:
-        self._file.write(self._scaled.of(frames["bmode"]).data)
+        self._file.write(frames["bmode"].data)
 
     def _finish(self) -> None:
         self._file.seek(0)

@@ -8,10 +8,10 @@ import tarfile
 from collections.abc import Mapping
 from dataclasses import asdict
 
-import cv2
 import numpy as np
 
-from .exporter import Exporter, PixelArray
+from ...display.pixels import PixelArray, image_file
+from .exporter import Exporter
 
 
 class TarExporter(Exporter):
@@ -25,7 +25,9 @@ class TarExporter(Exporter):
             number = self._done + place
             for name in self._header.outputs:
                 frame = frames[name][place]
-                suffix, data = ("png", _png(frame)) if frame.dtype == np.uint8 else ("npy", _npy(frame))
+                suffix, data = (
+                    ("png", image_file(frame, ".png").tobytes()) if frame.dtype == np.uint8 else ("npy", _npy(frame))
+                )
                 self._member(f"{number:06d}.{name}.{suffix}", data)
             told = asdict(self._extrapolations[number])
             document = {"pose": self._header.poses[number].tolist(), **told, **self._header.origin()}
@@ -35,12 +37,6 @@ class TarExporter(Exporter):
         member = tarfile.TarInfo(name)
         member.size = len(data)
         self._tar.addfile(member, io.BytesIO(data))
-
-
-def _png(frame: PixelArray) -> bytes:
-    written, data = cv2.imencode(".png", frame)
-    assert written  # it is uint8 [H, W]
-    return data.tobytes()
 
 
 def _npy(frame: PixelArray) -> bytes:

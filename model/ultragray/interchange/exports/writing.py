@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import TypeAlias
 
 from ...confidence import Extrapolation
+from ...display.pixels import PixelArray
 from ...files.atomic import atomic_path
-from .exporter import Exporter, ExportHeader, PixelArray, stored_pixels
+from .exporter import Exporter, ExportHeader, stored_pixels
 from .formats import exporter_class
 
 WAITING_PORTIONS = 2

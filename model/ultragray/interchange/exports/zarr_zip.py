@@ -10,7 +10,8 @@ import numpy.typing as npt
 import zarr
 from zarr.storage import ZipStore
 
-from .exporter import Exporter, PixelArray
+from ...display.pixels import PixelArray
+from .exporter import Exporter
 
 
 class ZarrExporter(Exporter):
@@ -24,8 +25,8 @@ class ZarrExporter(Exporter):
         self._arrays = {
             name: group.create_array(
                 name,
-                shape=(len(header.poses), header.height, header.width),
-                chunks=(1, header.height, header.width),
+                shape=header.shape,
+                chunks=(1, *header.shape[1:]),
                 dtype=header.pixel_type(name),
                 compressors=None,
                 dimension_names=("frame", "depth", "line"),

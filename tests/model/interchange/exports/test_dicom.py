@@ -9,13 +9,16 @@ from pathlib import Path
 import numpy as np
 import pydicom
 import pytest
+import torch
 from pydicom.dataset import Dataset, FileDataset
 from pydicom.uid import ExplicitVRLittleEndian, UltrasoundMultiFrameImageStorage
 
 from ultragray import ConvexProbe, LinearProbe
 from ultragray.confidence import Extrapolation
+from ultragray.display import AS_RENDERED
+from ultragray.display.frames import show
 from ultragray.errors import InvalidArgument
-from ultragray.interchange.exports import ExportHeader, export_to
+from ultragray.interchange.exports import FORMATS, ExportHeader, export_to
 
 LINEAR = LinearProbe(width_mm=38.0, near_mm=2.0, far_mm=52.0)
 CONVEX = ConvexProbe(opening_angle_deg=60.0, near_mm=20.0, far_mm=60.0)
@@ -77,13 +80,15 @@ def strict_reading(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 def header(**changes: object) -> ExportHeader:
     one = ExportHeader(("bmode",), "uint8", POSES, 21, 19, LINEAR, "one", "0" * 64, "ultragray/0 cpu")
-    return dataclasses.replace(one, **changes)  # type: ignore[arg-type]
+    asked = dataclasses.replace(one, **changes)  # type: ignore[arg-type]
+    return dataclasses.replace(asked, display=FORMATS["dicom"].shown(AS_RENDERED, asked.probe, asked.height))
 
 
 def export(path: Path, header: ExportHeader) -> FileDataset:
     with export_to(path, "dicom", header) as add:
-        add({"bmode": FRAMES[:2]}, TOLD[:2])
-        add({"bmode": FRAMES[2:]}, TOLD[2:])
+        shown = show({"bmode": torch.from_numpy(FRAMES)}, header.probe, header.display)["bmode"].numpy()
+        add({"bmode": shown[:2]}, TOLD[:2])
+        add({"bmode": shown[2:]}, TOLD[2:])
     data = pydicom.dcmread(path)
     for _ in data.iterall():  # reads and checks every value
         pass

@@ -5,13 +5,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from ultragray import ConvexProbe, LinearProbe
 from ultragray.confidence import Extrapolation
 from ultragray.datasets.meta_image import read_meta_image
 from ultragray.datasets.plus import read_plus_sweep
 from ultragray.datasets.transforms import parse_matrix
-from ultragray.interchange.exports import ExportHeader, export_to
+from ultragray.display import AS_RENDERED
+from ultragray.display.frames import show
+from ultragray.interchange.exports import FORMATS, ExportHeader, export_to
 from ultragray.pose import pose_from_position_quaternion
 from ultragray.probe import Probe
 
@@ -32,9 +35,11 @@ def poses(count: int) -> np.ndarray:
 
 def export(path: Path, probe: Probe) -> ExportHeader:
     header = ExportHeader(("bmode",), "uint8", poses(12), 20, 16, probe, "one", "0" * 64, "ultragray/0 cpu")
+    header = dataclasses.replace(header, display=FORMATS["plus"].shown(AS_RENDERED, probe, 20))
+    shown = show({"bmode": torch.from_numpy(FRAMES)}, probe, header.display)["bmode"].numpy()
     with export_to(path, "plus", header) as add:
-        add({"bmode": FRAMES[:7]}, TOLD[:7])
-        add({"bmode": FRAMES[7:]}, TOLD[7:])
+        add({"bmode": shown[:7]}, TOLD[:7])
+        add({"bmode": shown[7:]}, TOLD[7:])
     return header
 
 
@@ -92,7 +97,7 @@ def test_a_fan_is_scan_converted(tmp_path: Path) -> None:
     probe = ConvexProbe(opening_angle_deg=60.0, near_mm=20.0, far_mm=60.0)
     export(tmp_path / "sweep.igs.mha", probe)
     stored = read_meta_image(tmp_path / "sweep.igs.mha")
-    fan = np.rint(probe.scan_convert(np.rint(FRAMES[3] * 255), 2.0))
+    fan = np.rint(255 * probe.scan_convert(FRAMES[3], 2.0))
     np.testing.assert_allclose(stored.pixels[3], fan, atol=1)
     assert (stored.pixels[3] == fan).mean() > 0.99
     image = parse_matrix(stored.frame_fields[3]["ImageToProbeTransform"], "it")

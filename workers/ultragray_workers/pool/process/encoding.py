@@ -10,25 +10,13 @@ import numpy as np
 import numpy.typing as npt
 
 from ultragray.confidence import Extrapolation, figure_arrays
-from ultragray.errors import RenderFailed
+from ultragray.display.pixels import ByteArray, PixelArray, image_file, to_uint8
 from ultragray.probe import FloatArray
 from ultragray.request import LABELS
 
 from ..types import Encoding
 
 JPEG_QUALITY = 90
-
-FrameArray = npt.NDArray[np.float32]
-ByteArray = npt.NDArray[np.uint8]
-PixelArray = npt.NDArray[Any]  # float32 as rendered, or uint8: labels, and what a GPU has rounded
-
-
-def to_uint8(frames: PixelArray) -> ByteArray:
-    """round(255·min(x, 1)), half to even, the same shape; labels as they are. No output of a renderer is negative."""
-    if frames.dtype == np.uint8:
-        return frames
-    rows = frames.reshape(-1, frames.shape[-1])
-    return cv2.convertScaleAbs(rows, alpha=255.0).astype(np.uint8, copy=False).reshape(frames.shape)
 
 
 def encode_pixels(frames: PixelArray, encoding: Encoding) -> npt.NDArray[np.generic]:  # [C, H, W] -> [C, H, W]
@@ -40,11 +28,9 @@ def encode_pixels(frames: PixelArray, encoding: Encoding) -> npt.NDArray[np.gene
 
 def encode_image(frame: PixelArray, encoding: Encoding) -> ByteArray:  # [H, W] -> [bytes]
     """A frame as the bytes of a grey PNG (at OpenCV's default settings) or JPEG file."""
-    suffix, options = (".png", []) if encoding is Encoding.PNG else (".jpg", [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-    written, data = cv2.imencode(suffix, to_uint8(frame), options)
-    if not written:
-        raise RenderFailed(f"a frame of {frame.shape[0]}x{frame.shape[1]} pixels could not be written as {suffix[1:]}")
-    return data.astype(np.uint8, copy=False)
+    if encoding is Encoding.PNG:
+        return image_file(frame, ".png")
+    return image_file(frame, ".jpg", cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY)
 
 
 def npz_type(output: str) -> np.dtype[Any]:

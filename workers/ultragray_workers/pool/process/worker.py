@@ -21,7 +21,9 @@ from torch import Tensor
 from ultragray import ConvexProbe, GaussianScene, LinearProbe, Probe, render
 from ultragray.backends import cuda
 from ultragray.confidence import Extrapolation
+from ultragray.confidence.support import SupportWatch
 from ultragray.display.frames import show
+from ultragray.display.pixels import ByteArray, to_uint8
 from ultragray.display.settings import AS_RENDERED
 from ultragray.errors import MemoryExceeded, RenderFailed, UltragrayError
 from ultragray.probe import FloatArray
@@ -32,10 +34,10 @@ from ..memory import write_at
 from ..messages import Answer, ForkWorker, Hello, Job, LoadJob, PackJob, Rendered, RenderJob, RenderPart, UnloadJob
 from ..transfer import CHUNK_POSES, Arriving, Wanted, render_to_host
 from ..types import ANY_CONFIDENCE, Encoding
-from .encoding import ByteArray, encode_image, encode_pixels, to_uint8, write_npz
+from .encoding import encode_image, encode_pixels, write_npz
 from .placement import render_device
 from .scene_cache import SceneCache
-from .support import SupportWatch, below_limit, refusal
+from .support import below_limit, refusal
 
 MAX_DETAIL_LENGTH = 2000
 _SMALL_PROBES = (LinearProbe(width_mm=10.0, near_mm=0.0, far_mm=10.0), ConvexProbe(60.0, near_mm=5.0, far_mm=10.0))

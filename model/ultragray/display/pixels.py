@@ -1,0 +1,30 @@
+"""Pixels as bytes, and as a PNG file. Free of torch."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from ..errors import RenderFailed
+
+ByteArray = npt.NDArray[np.uint8]
+PixelArray = npt.NDArray[Any]  # float32 as rendered, or uint8: labels, and what is rounded already
+
+
+def to_uint8(frames: PixelArray) -> ByteArray:
+    """round(255·min(x, 1)), half to even, the same shape; labels as they are. No output of a renderer is negative."""
+    if frames.dtype == np.uint8:
+        return frames
+    rows = frames.reshape(-1, frames.shape[-1])
+    return cv2.convertScaleAbs(rows, alpha=255.0).astype(np.uint8, copy=False).reshape(frames.shape)
+
+
+def image_file(frame: PixelArray, suffix: str, *options: int) -> ByteArray:  # [H, W] -> [bytes]
+    """A frame as the bytes of a grey image file: `.png` at OpenCV's default settings, `.jpg`. Raises RenderFailed."""
+    written, data = cv2.imencode(suffix, to_uint8(frame), options)
+    if not written:
+        raise RenderFailed(f"a frame of {frame.shape[0]}x{frame.shape[1]} pixels could not be written as {suffix[1:]}")
+    return data.astype(np.uint8, copy=False)
