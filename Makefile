@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 KERNEL_SOURCES := $(wildcard model/kernels/*) CMakeLists.txt pyproject.toml
-PYTHON_SOURCES := model service workers proto client tests benchmarks examples
+PYTHON_SOURCES := model service workers proto client tests benchmarks docs examples
 NPM := $(shell command -v npm)
 CONSOLE := service/ultragray_service/console/index.html
 CONSOLE_SOURCES := $(shell find web -type f -not -path 'web/node_modules/*' -not -path 'web/src/api/generated/*')
@@ -73,6 +73,7 @@ demo-scene: $(VENV)/installed  ## simulate the phantom, train the demo scene fro
 
 generate: $(VENV)/installed-dev  ## rewrite what is generated: the gRPC stubs, the client for threads
 	$(BIN)/python proto/generate.py
+	$(BIN)/python docs/generate.py
 	$(BIN)/python client/generate.py
 
 clean:  ## remove what was built

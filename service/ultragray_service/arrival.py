@@ -6,7 +6,7 @@ import asyncio
 from collections.abc import Awaitable
 from typing import Any, TypeVar
 
-from ultragray.errors import DeadlineExceeded, Draining
+from ultragray_workers.errors import DeadlineExceeded, Draining
 
 T = TypeVar("T")
 

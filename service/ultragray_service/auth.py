@@ -9,7 +9,7 @@ from collections.abc import Iterable, Sequence
 
 from pydantic import SecretStr
 
-from ultragray.errors import Unauthenticated
+from .errors import Unauthenticated
 
 STREAM_PROTOCOL = "ultragray.v1"  # WebSocket subprotocol
 _KEY_PROTOCOL = "ultragray.key."

@@ -13,6 +13,7 @@ from ultragray_workers.jobs.job import JobState
 from ultragray_workers.pool.pool import RenderPool
 from ultragray_workers.pool.types import RenderResult
 
+from .errors import statuses_of
 from .statistics import Statistics
 
 _SECONDS = (
@@ -137,7 +138,7 @@ class Metrics:
     def count_frame_error(self, error: UltragrayError) -> None:
         """One message of a stream that was answered with an error."""
         self._frame_errors.labels(error.reason).inc()
-        if _is_of_service(str(error.http_status)):
+        if _is_of_service(str(statuses_of(error).http)):
             self.statistics.count_error()
 
     def count_stream(self, change: int) -> None:

@@ -15,7 +15,7 @@ from typing import Any, Literal
 import uvicorn
 import uvloop
 
-from ultragray.errors import StartupFailed
+from ultragray_workers.errors import StartupFailed
 
 from .core.state import Service
 from .embedded_worker import EmbeddedWorker

@@ -9,17 +9,14 @@ import pytest
 from google.protobuf.any_pb2 import Any as AnyMessage
 from google.rpc.status_pb2 import Status
 
-from ultragray import errors as service_errors
+from ultragray.errors import UltragrayError, error_classes
 from ultragray_client import errors
 from ultragray_client.statuses import error_of_call, error_of_frame
 from ultragray_proto.v1 import scenes_pb2
+from ultragray_service.errors import STATUSES
 from ultragray_service.rpc.status import status_of
 
-ALL = [
-    value
-    for value in vars(service_errors).values()
-    if isinstance(value, type) and issubclass(value, service_errors.UltragrayError)
-]
+ALL = [cls for cls in error_classes() if cls.reason in STATUSES]
 OWN = {
     "UNREACHABLE",
     "STREAM_ENDED",
@@ -64,15 +61,16 @@ class FailedCall(grpc.RpcError):
 
 
 @pytest.mark.parametrize("cls", ALL, ids=lambda cls: cls.reason)
-def test_every_error_keeps_its_facts(cls: type[service_errors.UltragrayError]) -> None:
+def test_every_error_keeps_its_facts(cls: type[UltragrayError]) -> None:
+    statuses = STATUSES[cls.reason]
     told = status_of(cls("what is wrong", field="settings.scene"))
     error = error_of_call(
-        FailedCall(getattr(grpc.StatusCode, cls.grpc_status), told.message, told.SerializeToString()), "x"
+        FailedCall(getattr(grpc.StatusCode, statuses.grpc), told.message, told.SerializeToString()), "x"
     )
     assert (error.reason, error.detail, error.field) == (cls.reason, "what is wrong", "settings.scene")
-    assert error.retry_after_s == cls.retry_after_s
-    if cls.grpc_status in {known.grpc_status for known in errors.ERRORS}:
-        assert error.grpc_status == cls.grpc_status
+    assert error.retry_after_s == statuses.retry_after_s
+    if statuses.grpc in {known.grpc_status for known in errors.ERRORS}:
+        assert error.grpc_status == statuses.grpc
     if cls.reason not in NOT_OVER_GRPC:
         assert type(error).reason == cls.reason
 

@@ -1,4 +1,4 @@
-"""docs/interfaces.md, read; how it writes a call, and the errors of which several parts tell."""
+"""docs/interfaces.md, read, and how it writes a call."""
 
 from __future__ import annotations
 
@@ -6,8 +6,6 @@ import inspect
 import re
 from pathlib import Path
 from typing import Any
-
-from ultragray import errors
 
 DOCUMENT = (Path(__file__).resolve().parents[2] / "docs" / "interfaces.md").read_text(encoding="utf-8")
 
@@ -47,9 +45,3 @@ def call_of(value: Any) -> str:
         default = "" if parameter.default is parameter.empty else f"={parameter.default!r}"
         parts.append(parameter.name + default.replace("<factory>", "…"))
     return f"{value.__name__}({', '.join(parts)})"
-
-
-def all_errors() -> list[type[errors.UltragrayError]]:
-    return [
-        value for value in vars(errors).values() if isinstance(value, type) and issubclass(value, errors.UltragrayError)
-    ]

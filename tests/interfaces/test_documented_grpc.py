@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from google.protobuf.descriptor_pb2 import DescriptorProto, FieldDescriptorProto
 
+from ultragray.errors import error_classes
 from ultragray_proto.v1 import datasets_pb2, geometry_pb2, jobs_pb2, rendering_pb2, scenes_pb2
 from ultragray_service.rpc import status
 
-from .document import all_errors, code, table
+from .document import code, table
 
 PROTO_MODULES = (geometry_pb2, rendering_pb2, scenes_pb2, datasets_pb2, jobs_pb2)
 
@@ -67,7 +68,7 @@ def test_methods() -> None:
 
 
 def test_error_details() -> None:
-    told = [status.status_of(cls("no", field="x")) for cls in all_errors()]
+    told = [status.status_of(cls("no", field="x")) for cls in error_classes()]
     found = {detail.type_url.rpartition("/")[2] for one in told for detail in one.details}
     assert set(table("Error details")) == found
 

@@ -16,6 +16,7 @@ from ultragray import (
 )
 from ultragray.confidence import Extrapolation
 from ultragray.display.settings import AS_RENDERED
+from ultragray.errors import error_classes
 from ultragray_service.core.pose_stream import Answered
 from ultragray_service.core.state import Service
 from ultragray_service.http import accept, middleware, problems
@@ -26,7 +27,7 @@ from ultragray_service.http.schemas import DisplayBody, RenderBody
 from ultragray_service.http.stream_schemas import StreamMessage, StreamSettings, frame_bytes
 from ultragray_workers.pool.types import Encoding, RenderResult
 
-from .document import DOCUMENT, all_errors, code, numbers, table
+from .document import DOCUMENT, code, numbers, table
 
 
 @pytest.fixture
@@ -129,7 +130,7 @@ def test_render_headers(rendered: RenderResult) -> None:
 
 
 def test_error_headers() -> None:
-    answers = [problems.problem_response(cls("no")) for cls in all_errors()]
+    answers = [problems.problem_response(cls("no")) for cls in error_classes()]
     own = {name for answer in answers for name in answer.headers} - {"content-type", "content-length"}
     assert {name.lower() for name in table("Error headers")} == own | {"allow"}  # Allow is the framework's
 

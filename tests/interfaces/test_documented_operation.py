@@ -1,4 +1,4 @@
-"""Errors, settings, commands, metrics, logs and limits, as docs/interfaces.md lists them."""
+"""Settings, commands, metrics, logs and limits, as docs/interfaces.md lists them."""
 
 from __future__ import annotations
 
@@ -29,33 +29,18 @@ from ultragray_service.cli.jobs_watch import JOB_CANCELLED, JOB_FAILED
 from ultragray_service.cli.train import INTERRUPTED
 from ultragray_service.core import catalog, dataset_uploads, pose_stream
 from ultragray_service.core.state import Service
+from ultragray_service.errors import STATUSES
 from ultragray_service.logs import JsonFormatter, request_id
 from ultragray_service.rpc import server as grpc_server
 from ultragray_service.settings import ENVIRONMENT_PREFIX, Settings, load_settings
 from ultragray_workers import scenes
 from ultragray_workers.datasets import store as dataset_store
 from ultragray_workers.datasets import unpack as dataset_unpack
+from ultragray_workers.errors import QueueFull
 from ultragray_workers.jobs.job import JobState
 from ultragray_workers.pool.process import encoding as pixels
 
-from .document import all_errors, code, numbers, rows, table
-
-
-def test_errors() -> None:
-    documented = [
-        (code(reason)[0], code(cls)[0], cls.startswith("↳"), int(http), grpc)
-        for reason, cls, http, grpc, _ in rows("Errors")
-    ]
-    assert documented == [
-        (
-            cls.reason,
-            cls.__name__,
-            issubclass(cls, errors.InvalidArgument) and cls is not errors.InvalidArgument,
-            cls.http_status,
-            cls.grpc_status,
-        )
-        for cls in all_errors()
-    ]
+from .document import code, numbers, rows, table
 
 
 def limits_of(field: FieldInfo) -> list[Any]:
@@ -104,7 +89,7 @@ def test_exit_codes() -> None:
 
 def test_metrics(service: Service) -> None:
     service.metrics.count_request("http", "/", "200", 0.1)
-    service.metrics.count_frame_error(errors.QueueFull("all places are taken"))
+    service.metrics.count_frame_error(QueueFull("all places are taken"))
     service.jobs.counts = {JobState.QUEUED: 1}
     found = {}
     for metric in service.metrics.registry.collect():
@@ -154,10 +139,9 @@ def test_fixed_limits() -> None:
         "gRPC message received": grpc_server.MAX_RECEIVE_BYTES,
         "Keepalive pings of a gRPC client, no more often than every": grpc_server.LEAST_PING_INTERVAL_MS,
         "JPEG quality": pixels.JPEG_QUALITY,
-        "Retry after": errors.QueueFull.retry_after_s,
+        "Retry after": STATUSES["QUEUE_FULL"].retry_after_s,
         "Shortest API key": 16,
     }
-    assert errors.NotReady.retry_after_s == errors.Draining.retry_after_s == errors.QueueFull.retry_after_s
     ConvexProbe(175, 1, 2)
     with pytest.raises(errors.InvalidProbe):
         ConvexProbe(math.nextafter(175, 180), 1, 2)

@@ -7,10 +7,10 @@ import httpx
 import pytest
 from websockets.sync.client import connect
 
-from ultragray.errors import DeadlineExceeded
 from ultragray_service.core.state import Service
 from ultragray_service.settings import load_settings
 from ultragray_service.statistics import STEP_S, STEPS, Statistics
+from ultragray_workers.errors import DeadlineExceeded
 
 from .conftest import StartService
 

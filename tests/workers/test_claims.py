@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from ultragray.errors import StorageFull
 from ultragray_workers import claims
 from ultragray_workers.claims import LOCK_NAME, claimed_folder, remove_abandoned, remove_whole, storage_full
+from ultragray_workers.errors import StorageFull
 
 HOLD = """
 import sys

@@ -6,8 +6,9 @@ import weakref
 
 import pytest
 
-from ultragray.errors import SceneFileInvalid, SceneNotFound
+from ultragray.errors import SceneFileInvalid
 from ultragray_workers import SceneStore, scenes
+from ultragray_workers.errors import SceneNotFound
 from ultragray_workers.scenes import resident_bytes
 
 

@@ -14,7 +14,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from ultragray.errors import StorageFull
+from .errors import StorageFull
 
 LOCK_NAME = "lock"
 UNLOCKED_S = 60.0  # a folder without a lock that was made or renamed this lately is about to get one, or to go

@@ -10,8 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ultragray.errors import InvalidArgument, SceneNotFound
+from ultragray.errors import InvalidArgument
 from ultragray.scene_info import SceneHeader, SceneInfo, read_header, scene_file_invalid
+
+from .errors import SceneNotFound
 
 SUFFIX = ".ugr"
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")

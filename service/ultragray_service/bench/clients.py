@@ -18,9 +18,9 @@ import torch
 from websockets.sync.client import connect
 
 from ultragray.demo import copy_demo_scene, demo_poses
-from ultragray.errors import NotReady
 from ultragray.probe import FloatArray
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2, rendering_pb2_grpc
+from ultragray_workers.errors import NotReady
 
 from ..core.job_client import JobClient
 from .igtl import PingPong

@@ -5,8 +5,8 @@ from __future__ import annotations
 import socket
 from types import TracebackType
 
-from ultragray.errors import NotReady
 from ultragray.probe import FloatArray
+from ultragray_workers.errors import NotReady
 
 from ..igtl.contents import Image, pack_transform, unpack_image, unpack_status
 from ..igtl.messages import HEADER_BYTES, Message, pack_message, unpack_header, unpack_message

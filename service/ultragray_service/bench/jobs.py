@@ -22,8 +22,8 @@ from ultragray.datasets import Dataset
 from ultragray.datasets.phantom import load_phantom
 from ultragray.datasets.released import write_released
 from ultragray.demo import copy_demo_scene, demo_poses
-from ultragray.errors import NotReady
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2, rendering_pb2_grpc
+from ultragray_workers.errors import NotReady
 from ultragray_workers.jobs.database import JobDatabase
 
 from ..core.job_client import JobClient

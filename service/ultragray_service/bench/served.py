@@ -19,9 +19,9 @@ from pathlib import Path
 
 import grpc
 
-from ultragray.errors import NotReady
 from ultragray.probe import FloatArray
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2, rendering_pb2_grpc
+from ultragray_workers.errors import NotReady
 
 from .kernel import BenchScene, bench_poses
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import typer
 
-from ultragray.errors import NotReady
+from ultragray_workers.errors import NotReady
 
 from ..core.job_client import JobClient
 from .train import INTERRUPTED

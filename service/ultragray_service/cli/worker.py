@@ -12,7 +12,8 @@ from typing import Annotated, Any
 
 import typer
 
-from ultragray.errors import StartupFailed, UltragrayError
+from ultragray.errors import UltragrayError
+from ultragray_workers.errors import StartupFailed
 
 _PR_SET_PDEATHSIG = 1
 

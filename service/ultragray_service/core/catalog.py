@@ -12,9 +12,10 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
-from ultragray.errors import InvalidArgument, SceneFileInvalid, SceneNotFound, SceneTooLarge, UltragrayError
+from ultragray.errors import InvalidArgument, SceneFileInvalid, UltragrayError
 from ultragray.probe import FloatArray
 from ultragray.scene_info import SceneHeader
+from ultragray_workers.errors import SceneNotFound, SceneTooLarge
 from ultragray_workers.scenes import FileVersion, SceneStore
 
 from ..views.scene_points import point_message

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import asyncio
 
-from ultragray.errors import DatasetInvalid, DatasetNotFound
+from ultragray.errors import DatasetInvalid
 from ultragray_workers.datasets.store import DatasetRecord, DatasetStore
+from ultragray_workers.errors import DatasetNotFound
 
 from .catalog import page_of_names
 

@@ -8,10 +8,11 @@ from collections.abc import AsyncIterator, Awaitable
 from contextlib import asynccontextmanager
 from typing import Any, TypeVar
 
-from ultragray.errors import DatasetInvalid, Draining, InvalidArgument, QueueFull
+from ultragray.errors import DatasetInvalid, InvalidArgument
 from ultragray_workers.datasets.incoming import IncomingDataset, remove_stale
 from ultragray_workers.datasets.intake import take_in
 from ultragray_workers.datasets.store import DatasetRecord, DatasetStore, check_dataset_name
+from ultragray_workers.errors import Draining, QueueFull
 
 from ..arrival import arrival
 from ..settings import Settings

@@ -12,16 +12,13 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
-from ultragray import errors
-from ultragray.errors import DeadlineExceeded, MemoryExceeded, UltragrayError
+from ultragray.errors import MemoryExceeded, UltragrayError, error_classes
+from ultragray_workers.errors import DeadlineExceeded
 from ultragray_workers.helpers import helper
 
 from .own_thread import in_own_thread
 
 _log = logging.getLogger("ultragray.service")
-_ERRORS = {
-    cls.reason: cls for cls in vars(errors).values() if isinstance(cls, type) and issubclass(cls, UltragrayError)
-}
 PATIENCE_S = 3600.0  # of a request that waits for the processes of others
 
 
@@ -58,7 +55,8 @@ class HelperProcesses:
             _log.error(f"{what} failed unexpectedly", extra={"fields": fields})
             raise UltragrayError(f"{what} failed unexpectedly, see the log")
         if answer := json.loads(output):
-            raise _ERRORS[answer["reason"]](answer["detail"], field=answer["field"])
+            error = next(cls for cls in error_classes() if cls.reason == answer["reason"])
+            raise error(answer["detail"], field=answer["field"])
 
 
 async def _communicate(

@@ -12,8 +12,9 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote, urlencode, urlsplit
 
-from ultragray.errors import InvalidArgument, NotReady, UltragrayError
+from ultragray.errors import InvalidArgument, UltragrayError
 from ultragray.files.atomic import atomic_path
+from ultragray_workers.errors import NotReady
 
 _TIMEOUT_S = 60.0  # without a byte; event streams send a comment every 15 s
 

@@ -8,7 +8,7 @@ from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
 
-from ultragray.errors import DatabaseUnavailable
+from ultragray_workers.errors import DatabaseUnavailable
 from ultragray_workers.jobs.store import Job, JobState
 
 from .job_log import TAIL_BYTES, GrowingLog

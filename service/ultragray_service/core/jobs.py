@@ -11,17 +11,8 @@ from typing import TypeVar
 
 from sqlalchemy.exc import SQLAlchemyError
 
-from ultragray.errors import (
-    DatabaseUnavailable,
-    DatasetInvalid,
-    DatasetNotFound,
-    InvalidArgument,
-    NotReady,
-    SceneExists,
-    SceneFileInvalid,
-    SceneNotFound,
-    UltragrayError,
-)
+from ultragray.errors import DatasetInvalid, InvalidArgument, SceneFileInvalid, UltragrayError
+from ultragray_workers.errors import DatabaseUnavailable, DatasetNotFound, NotReady, SceneExists, SceneNotFound
 from ultragray_workers.jobs.folder import JobFolder
 from ultragray_workers.jobs.specification import Specification
 from ultragray_workers.jobs.store import Job, JobState, JobStore

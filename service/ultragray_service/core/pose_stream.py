@@ -10,8 +10,9 @@ from enum import Enum
 from functools import partial
 from typing import Any
 
-from ultragray.errors import Draining, UltragrayError
+from ultragray.errors import UltragrayError
 from ultragray.probe import FloatArray
+from ultragray_workers.errors import Draining
 from ultragray_workers.pool.types import RenderRequest, RenderResult
 from ultragray_workers.pool.waiting import Turn
 

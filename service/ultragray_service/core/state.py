@@ -6,8 +6,9 @@ import asyncio
 from collections.abc import Callable
 from enum import Enum
 
-from ultragray.errors import Draining, NotReady, StartupFailed, UltragrayError
+from ultragray.errors import UltragrayError
 from ultragray_workers.datasets.store import DatasetStore
+from ultragray_workers.errors import Draining, NotReady, StartupFailed
 from ultragray_workers.jobs.store import SCENES_FOLDER
 from ultragray_workers.pool.pool import PoolConfig, RenderPool
 from ultragray_workers.pool.types import RenderRequest, RenderResult

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from ultragray.errors import NotAcceptable
 from ultragray_workers.pool.types import Encoding
+
+from ..errors import NotAcceptable
 
 PNG = "image/png"
 JPEG = "image/jpeg"

@@ -14,9 +14,9 @@ from starlette.responses import HTMLResponse, Response
 from starlette.staticfiles import StaticFiles
 from starlette.types import Scope
 
-from ultragray.errors import RouteNotFound
 from ultragray_workers.scenes import FileVersion
 
+from ..errors import RouteNotFound
 from .revalidation import revalidated
 
 CONSOLE_FOLDER = Path(__file__).resolve().parents[1] / "console"

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 from starlette.requests import ClientDisconnect
 from starlette.types import Receive
 
-from ultragray.errors import DeadlineExceeded
+from ultragray_workers.errors import DeadlineExceeded
 
 T = TypeVar("T")
 

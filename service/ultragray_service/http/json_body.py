@@ -7,8 +7,7 @@ from typing import TypeVar
 from pydantic import BaseModel, ValidationError
 from starlette.requests import Request
 
-from ultragray.errors import UnsupportedMediaType
-
+from ..errors import UnsupportedMediaType
 from .problems import invalid_argument
 
 Model = TypeVar("Model", bound=BaseModel)

@@ -9,9 +9,10 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from ultragray.errors import BodyTooLarge, UltragrayError, Unauthenticated
+from ultragray.errors import UltragrayError
 
 from ..auth import KeyGuard, key_of_subprotocols
+from ..errors import BodyTooLarge, Unauthenticated
 from ..logs import choose_request_id, request_id
 from ..metrics import Metrics
 from .console import ASSETS_PATH, CONSOLE_PATHS

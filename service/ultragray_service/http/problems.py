@@ -12,17 +12,9 @@ from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import Response
 
-from ultragray.errors import (
-    InvalidArgument,
-    InvalidImageSize,
-    InvalidPose,
-    InvalidProbe,
-    MethodNotAllowed,
-    RouteNotFound,
-    UltragrayError,
-    UnknownOutput,
-)
+from ultragray.errors import InvalidArgument, InvalidImageSize, InvalidPose, InvalidProbe, UltragrayError, UnknownOutput
 
+from ..errors import MethodNotAllowed, RouteNotFound, statuses_of
 from ..logs import request_id
 
 PROBLEM_TYPE = "application/problem+json"
@@ -53,22 +45,23 @@ class Problem(BaseModel):
 
 def problem_response(error: UltragrayError, headers: Mapping[str, str] | None = None) -> Response:
     """The answer that tells a client about `error`."""
+    statuses = statuses_of(error)
     document = Problem(
         type=f"urn:ultragray:problem:{error.reason.lower().replace('_', '-')}",
         title=error.title,
-        status=error.http_status,
+        status=statuses.http,
         detail=error.detail,
         reason=error.reason,
         field=error.field,
         request_id=request_id.get(),
     )
     all_headers = dict(headers or {})
-    if error.retry_after_s is not None:
-        all_headers["Retry-After"] = str(error.retry_after_s)
-    if error.http_status == 401:
+    if statuses.retry_after_s is not None:
+        all_headers["Retry-After"] = str(statuses.retry_after_s)
+    if statuses.http == 401:
         all_headers["WWW-Authenticate"] = "Bearer"
     content = json.dumps(document.model_dump(), ensure_ascii=False)
-    return Response(content.encode("utf-8", "replace"), error.http_status, all_headers, PROBLEM_TYPE)
+    return Response(content.encode("utf-8", "replace"), statuses.http, all_headers, PROBLEM_TYPE)
 
 
 async def answer_ultragray_error(request: Request, error: Exception) -> Response:

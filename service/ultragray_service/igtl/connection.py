@@ -8,9 +8,10 @@ import time
 from dataclasses import replace
 from typing import Protocol
 
-from ultragray.errors import IgtlMessageInvalid, UltragrayError
+from ultragray.errors import UltragrayError
 
 from ..core.state import Service
+from ..errors import IgtlMessageInvalid
 from .contents import (
     Status,
     pack_capability,

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from ultragray.errors import IgtlMessageInvalid
 from ultragray.pose import check_poses, pose_from_position_quaternion, quaternion_from_pose
 from ultragray.probe import FloatArray
 
+from ..errors import IgtlMessageInvalid
 from .messages import DEVICE_NAME_BYTES, pack_text, unpack_text
 
 TYPE_NAME_BYTES = 12

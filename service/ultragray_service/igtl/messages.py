@@ -6,8 +6,7 @@ import struct
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from ultragray.errors import IgtlMessageInvalid
-
+from ..errors import IgtlMessageInvalid
 from .crc64 import crc64
 
 HEADER_BYTES = 58

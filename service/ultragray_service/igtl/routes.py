@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import time
 
-from ultragray.errors import SceneNotFound
+from ultragray_workers.errors import SceneNotFound
 
 from ..core.catalog import SceneCatalog
 from .messages import DEVICE_NAME_BYTES, pack_text

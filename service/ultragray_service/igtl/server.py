@@ -8,7 +8,7 @@ import logging
 import socket
 import time
 
-from ultragray.errors import Draining, QueueFull
+from ultragray_workers.errors import Draining, QueueFull
 
 from ..core.state import Service
 from .connection import SEND_TIMEOUT_S, Connection

@@ -2,21 +2,10 @@
 
 from __future__ import annotations
 
-from ultragray.errors import (
-    BackendUnavailable,
-    DeadlineExceeded,
-    Draining,
-    IgtlMessageInvalid,
-    InvalidArgument,
-    MemoryExceeded,
-    NotReady,
-    QueueFull,
-    SceneFileInvalid,
-    SceneNotFound,
-    SceneTooLarge,
-    UltragrayError,
-)
+from ultragray.errors import BackendUnavailable, InvalidArgument, MemoryExceeded, SceneFileInvalid, UltragrayError
+from ultragray_workers.errors import DeadlineExceeded, Draining, NotReady, QueueFull, SceneNotFound, SceneTooLarge
 
+from ..errors import IgtlMessageInvalid, statuses_of
 from .contents import Status
 
 OK, UNKNOWN_ERROR, NOT_FOUND, BUSY, TIMED_OUT = 1, 2, 4, 6, 7
@@ -43,4 +32,4 @@ def state_of(error: UltragrayError) -> Status:
         code = CHECKSUM_ERROR
     else:
         code = next((code for kind, code in _CODES.items() if isinstance(error, kind)), UNKNOWN_ERROR)
-    return Status(code, error.http_status, error.reason, error.detail)
+    return Status(code, statuses_of(error).http, error.reason, error.detail)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import asyncio
 from dataclasses import dataclass, replace
 
-from ultragray.errors import QueueFull
 from ultragray.probe import FloatArray
+from ultragray_workers.errors import QueueFull
 from ultragray_workers.pool.waiting import Turn
 
 from .messages import Message

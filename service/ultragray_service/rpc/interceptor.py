@@ -10,9 +10,10 @@ from typing import Any
 
 import grpc
 
-from ultragray.errors import UltragrayError, Unauthenticated
+from ultragray.errors import UltragrayError
 
 from ..auth import KeyGuard
+from ..errors import Unauthenticated, statuses_of
 from ..logs import choose_request_id, request_id
 from ..metrics import Metrics
 from .status import REQUEST_ID_KEY, abort
@@ -61,7 +62,7 @@ class CallContext(grpc.aio.ServerInterceptor):  # type: ignore[misc]
             except grpc.aio.InternalError:  # a write: the caller is gone, which grpc tells a moment later
                 raise asyncio.CancelledError from None
             except UltragrayError as error:
-                status = error.grpc_status
+                status = statuses_of(error).grpc
                 await abort(context, error)
             except Exception:
                 _log.exception("unexpected error", extra={"fields": {"method": name}})

@@ -7,8 +7,9 @@ import os
 
 import grpc
 
-from ultragray.errors import Draining, InvalidArgument
+from ultragray.errors import InvalidArgument
 from ultragray_proto.v1 import jobs_pb2
+from ultragray_workers.errors import Draining
 
 from ..core.catalog import DEFAULT_PAGE_SIZE
 from ..core.job_log import DEFAULT_LOG_BYTES, MAX_LOG_BYTES

@@ -8,8 +8,9 @@ from collections import deque
 
 import grpc
 
-from ultragray.errors import InvalidArgument, LowConfidence, QueueFull
+from ultragray.errors import InvalidArgument, LowConfidence
 from ultragray_proto.v1 import rendering_pb2
+from ultragray_workers.errors import QueueFull
 from ultragray_workers.pool.types import Priority, RenderRequest, RenderResult
 
 from ..core.requests import check_pose_count, gather_poses

@@ -12,6 +12,7 @@ from google.rpc.status_pb2 import Status
 
 from ultragray.errors import InvalidArgument, UltragrayError
 
+from ..errors import statuses_of
 from ..logs import request_id
 
 ERROR_DOMAIN = "ultragray"
@@ -21,14 +22,15 @@ _DETAILS_KEY = "grpc-status-details-bin"
 
 def status_of(error: UltragrayError) -> Status:
     """The status, with ErrorInfo (domain, reason, metadata `field`), BadRequest and RetryInfo where apt."""
-    code = getattr(grpc.StatusCode, error.grpc_status)
+    statuses = statuses_of(error)
+    code = getattr(grpc.StatusCode, statuses.grpc)
     info = ErrorInfo(reason=error.reason, domain=ERROR_DOMAIN, metadata={"field": error.field} if error.field else {})
     details = [info]
     if error.field and isinstance(error, InvalidArgument):
         violation = BadRequest.FieldViolation(field=error.field, description=error.detail)
         details.append(BadRequest(field_violations=[violation]))
-    if error.retry_after_s is not None:
-        details.append(RetryInfo(retry_delay=Duration(seconds=error.retry_after_s)))
+    if statuses.retry_after_s is not None:
+        details.append(RetryInfo(retry_delay=Duration(seconds=statuses.retry_after_s)))
     status = Status(code=code.value[0], message=error.detail)
     for detail in details:
         packed = AnyMessage()
@@ -40,5 +42,5 @@ def status_of(error: UltragrayError) -> Status:
 async def abort(context: grpc.aio.ServicerContext, error: UltragrayError) -> NoReturn:
     """Ends the call with `error`."""
     details = ((_DETAILS_KEY, status_of(error).SerializeToString()), (REQUEST_ID_KEY, request_id.get()))
-    await context.abort(getattr(grpc.StatusCode, error.grpc_status), error.detail, details)
+    await context.abort(getattr(grpc.StatusCode, statuses_of(error).grpc), error.detail, details)
     raise AssertionError("abort always raises")

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ultragray.errors import ArtifactNotFound, DatasetNotFound
 from ultragray.files.atomic import file_sha256
 from ultragray_workers.datasets.store import DatasetStore
+from ultragray_workers.errors import ArtifactNotFound, DatasetNotFound
 from ultragray_workers.helpers.comparison import FRAMES_NAME, compare
 from ultragray_workers.scenes import FileVersion, SceneStore
 

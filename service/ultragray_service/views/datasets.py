@@ -5,8 +5,8 @@ from __future__ import annotations
 import asyncio
 from pathlib import Path
 
-from ultragray.errors import ArtifactNotFound, DatasetNotFound
 from ultragray_workers.datasets.store import DatasetStore
+from ultragray_workers.errors import ArtifactNotFound, DatasetNotFound
 from ultragray_workers.helpers.dataset_view import POSES_NAME, lay_out
 
 from ..core.helper_processes import HelperProcesses

@@ -14,9 +14,10 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from ultragray.errors import ArtifactNotFound, DatasetInvalid, DatasetNotFound, Draining, UltragrayError
+from ultragray.errors import DatasetInvalid, UltragrayError
 from ultragray.files.atomic import sync
 from ultragray_workers.claims import claimed_folder, remove_abandoned, remove_whole, storage_full
+from ultragray_workers.errors import ArtifactNotFound, DatasetNotFound, Draining
 from ultragray_workers.helpers.helper import PROGRESS_NAME
 from ultragray_workers.helpers.picture_stack import read_picture
 from ultragray_workers.pool.process.encoding import encode_image

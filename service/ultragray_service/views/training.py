@@ -9,8 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ultragray.errors import ArtifactNotFound, TrainingStateInvalid
+from ultragray.errors import TrainingStateInvalid
 from ultragray_workers.datasets.store import DatasetStore
+from ultragray_workers.errors import ArtifactNotFound
 from ultragray_workers.helpers.training_preview import PICTURES, draw_preview
 from ultragray_workers.jobs.folder import JobFolder
 from ultragray_workers.jobs.store import Job

@@ -3,8 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ultragray.errors import NotReady
 from ultragray_service.bench.igtl import PingPong
+from ultragray_workers.errors import NotReady
 
 from ..conftest import HEIGHT, WIDTH, RunningService
 from .conftest import address_of

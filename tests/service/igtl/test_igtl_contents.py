@@ -10,8 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ultragray.errors import IgtlMessageInvalid, InvalidPose, UltragrayError
+from ultragray.errors import InvalidPose, UltragrayError
 from ultragray.pose import check_poses
+from ultragray_service.errors import IgtlMessageInvalid
 from ultragray_service.igtl.contents import (
     Image,
     Status,

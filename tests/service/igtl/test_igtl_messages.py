@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pyigtl.messages import MessageBase
 
-from ultragray.errors import IgtlMessageInvalid
+from ultragray_service.errors import IgtlMessageInvalid
 from ultragray_service.igtl.contents import unpack_image, unpack_transform
 from ultragray_service.igtl.crc64 import crc64
 from ultragray_service.igtl.messages import (

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from ultragray.errors import SceneNotFound
 from ultragray_service.core.catalog import SceneCatalog
 from ultragray_service.igtl import routes
 from ultragray_service.igtl.routes import SceneChooser, frame_of, image_name
+from ultragray_workers.errors import SceneNotFound
 from ultragray_workers.scenes import SceneStore
 
 

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ultragray.errors import QueueFull
 from ultragray_service.igtl.messages import Message
 from ultragray_service.igtl.waiting import MAX_WAITING_DEVICES, PoseMessage, WaitingPoses
+from ultragray_workers.errors import QueueFull
 
 
 @dataclass

@@ -14,11 +14,12 @@ import pytest
 from ultragray import LinearProbe
 from ultragray.datasets import Dataset, Sweep
 from ultragray.datasets.released import write_released
-from ultragray.errors import DatasetExists, DatasetInUse, DatasetInvalid, DatasetNotFound, InvalidArgument
+from ultragray.errors import DatasetInvalid, InvalidArgument
 from ultragray_workers import claims
 from ultragray_workers.datasets.incoming import IncomingDataset, remove_stale
 from ultragray_workers.datasets.intake import take_in
 from ultragray_workers.datasets.store import DatasetStore, check_dataset_name
+from ultragray_workers.errors import DatasetExists, DatasetInUse, DatasetNotFound
 
 
 def sweep(count: int, offset_mm: float) -> Sweep:

@@ -8,9 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from ultragray.errors import DatasetInvalid, UploadTooLarge
+from ultragray.errors import DatasetInvalid
 from ultragray_workers.datasets import unpack as dataset_unpack
 from ultragray_workers.datasets.unpack import unpack
+from ultragray_workers.errors import UploadTooLarge
 
 LIMIT_BYTES = 100_000
 

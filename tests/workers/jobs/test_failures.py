@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from ultragray.demo import copy_demo_scene
-from ultragray.errors import StorageFull
+from ultragray_workers.errors import StorageFull
 from ultragray_workers.jobs.specification import Poses, RenderJob
 from ultragray_workers.jobs.store import Job, JobState, JobStore
 

@@ -16,9 +16,9 @@ import sqlalchemy as sa
 import torch
 
 from ultragray.datasets.source import load_dataset
-from ultragray.errors import DatabaseUnavailable, StartupFailed
 from ultragray.scene import GaussianScene
 from ultragray.training import TrainingConfig, train
+from ultragray_workers.errors import DatabaseUnavailable, StartupFailed
 from ultragray_workers.jobs.database import JobDatabase, checked_url
 from ultragray_workers.jobs.store import Job, JobState, JobStore
 

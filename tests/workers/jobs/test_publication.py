@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from ultragray.errors import SceneExists
+from ultragray_workers.errors import SceneExists
 from ultragray_workers.jobs.folder import JobFolder
 from ultragray_workers.jobs.publication import publish_scene, withdraw_scene
 

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 import sqlalchemy as sa
 
-from ultragray.errors import DatasetInUse, DatasetNotFound, JobInUse, JobNotFound
 from ultragray_workers.datasets.store import DatasetStore
+from ultragray_workers.errors import DatasetInUse, DatasetNotFound, JobInUse, JobNotFound
 from ultragray_workers.jobs import housekeeping, removal
 from ultragray_workers.jobs.database import JobDatabase
 from ultragray_workers.jobs.folder import JobFolder

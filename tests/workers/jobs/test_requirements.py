@@ -14,17 +14,9 @@ import pytest
 
 from ultragray import GaussianScene, LinearProbe
 from ultragray.confidence import ConfidenceModel
-from ultragray.errors import (
-    DatabaseUnavailable,
-    InvalidArgument,
-    InvalidImageSize,
-    InvalidProbe,
-    LowConfidence,
-    SceneNotFound,
-    StorageFull,
-    UnknownOutput,
-)
+from ultragray.errors import InvalidArgument, InvalidImageSize, InvalidProbe, LowConfidence, UnknownOutput
 from ultragray.samplers import AroundSampler, SplineSampler, TrainingSampler
+from ultragray_workers.errors import DatabaseUnavailable, SceneNotFound, StorageFull
 from ultragray_workers.jobs import requirements
 from ultragray_workers.jobs.database import JobDatabase
 from ultragray_workers.jobs.specification import RenderJob

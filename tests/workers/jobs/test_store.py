@@ -12,10 +12,11 @@ from pathlib import Path
 import pytest
 import sqlalchemy as sa
 
-from ultragray.errors import (
+from ultragray.errors import InvalidArgument
+from ultragray.samplers import TrainingSampler
+from ultragray_workers.errors import (
     ArtifactNotFound,
     DatasetNotFound,
-    InvalidArgument,
     JobConflict,
     JobNotFinished,
     JobNotFound,
@@ -24,7 +25,6 @@ from ultragray.errors import (
     SceneNotFound,
     StartupFailed,
 )
-from ultragray.samplers import TrainingSampler
 from ultragray_workers.jobs.database import checked_url
 from ultragray_workers.jobs.specification import RenderJob
 from ultragray_workers.jobs.store import JobState, JobStore

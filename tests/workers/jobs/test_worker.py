@@ -16,10 +16,10 @@ import pytest
 import torch
 
 from ultragray.datasets.source import load_dataset
-from ultragray.errors import JobFinished, JobNotFinished, StartupFailed
 from ultragray.samplers import AroundSampler
 from ultragray.scene import GaussianScene
 from ultragray.training import TrainingConfig, train
+from ultragray_workers.errors import JobFinished, JobNotFinished, StartupFailed
 from ultragray_workers.jobs.specification import RenderJob
 from ultragray_workers.jobs.store import Job, JobState, JobStore
 from ultragray_workers.jobs.worker import claim_name

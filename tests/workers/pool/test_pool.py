@@ -14,19 +14,10 @@ import numpy as np
 import pytest
 
 from ultragray import ConvexProbe
-from ultragray.errors import (
-    BackendUnavailable,
-    DeadlineExceeded,
-    Draining,
-    InvalidArgument,
-    NotReady,
-    QueueFull,
-    SceneFileInvalid,
-    SceneNotFound,
-    SceneTooLarge,
-)
+from ultragray.errors import BackendUnavailable, InvalidArgument, SceneFileInvalid
 from ultragray.files.atomic import file_sha256
 from ultragray_workers import Encoding, PoolConfig, Priority, RenderPool, RenderRequest, SceneStore
+from ultragray_workers.errors import DeadlineExceeded, Draining, NotReady, QueueFull, SceneNotFound, SceneTooLarge
 
 
 def test_results_equal_a_direct_render(run, open_pool, random_poses, expect_frames, scene_folder):

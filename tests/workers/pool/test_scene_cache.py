@@ -8,9 +8,10 @@ import pytest
 import torch
 
 from ultragray import GaussianScene
-from ultragray.errors import MemoryExceeded, SceneFileInvalid, SceneTooLarge
+from ultragray.errors import MemoryExceeded, SceneFileInvalid
 from ultragray.files.atomic import file_sha256
 from ultragray_workers import SceneStore
+from ultragray_workers.errors import SceneTooLarge
 from ultragray_workers.pool.process import scene_cache
 from ultragray_workers.pool.process.scene_cache import SceneCache
 from ultragray_workers.scenes import resident_bytes

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from ultragray import LinearProbe
-from ultragray.errors import DeadlineExceeded, QueueFull
 from ultragray_workers import Priority, RenderRequest
+from ultragray_workers.errors import DeadlineExceeded, QueueFull
 from ultragray_workers.pool import waiting
 from ultragray_workers.pool.waiting import Expiry, Part, Ticket, Turn, WaitingQueue
 

@@ -13,16 +13,11 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ultragray.errors import (
-    DatasetExists,
-    DatasetInUse,
-    DatasetInvalid,
-    DatasetNotFound,
-    InvalidArgument,
-    UltragrayError,
-)
+from ultragray.errors import DatasetInvalid, InvalidArgument, UltragrayError
 from ultragray.files.atomic import sync, write_whole
 from ultragray.probe import Probe, probe_from_dict, probe_to_dict
+
+from ..errors import DatasetExists, DatasetInUse, DatasetNotFound
 
 if TYPE_CHECKING:
     from ultragray.datasets import Dataset

@@ -12,8 +12,10 @@ from contextlib import AbstractContextManager
 from pathlib import Path, PurePosixPath
 from typing import IO, TypeVar
 
-from ultragray.errors import DatasetInvalid, UploadTooLarge
+from ultragray.errors import DatasetInvalid
 from ultragray.files.atomic import sync
+
+from ..errors import UploadTooLarge
 
 MAX_FILES = 1000
 MAX_ENTRIES = 10_000  # of an archive, folders included

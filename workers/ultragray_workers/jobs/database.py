@@ -12,7 +12,7 @@ from dbos import DBOS, DBOSClient, DBOSPortableJSONSerializer, EnqueueOptions, W
 from sqlalchemy.engine import ExceptionContext
 from sqlalchemy.exc import SQLAlchemyError
 
-from ultragray.errors import DatabaseUnavailable, StartupFailed, StorageFull
+from ..errors import DatabaseUnavailable, StartupFailed, StorageFull
 
 APPLICATION = "ultragray"
 VERSION = "1"  # of the workflow's inputs and steps: workers take the jobs of their own version only

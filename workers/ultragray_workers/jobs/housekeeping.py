@@ -18,8 +18,9 @@ from pathlib import Path
 import sqlalchemy as sa
 from sqlalchemy.exc import SQLAlchemyError
 
-from ultragray.errors import JobInUse, UltragrayError
+from ultragray.errors import UltragrayError
 
+from ..errors import JobInUse
 from . import database
 from .database import JobDatabase
 from .folder import FOLDER, JobFolder

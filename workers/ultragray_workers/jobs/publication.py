@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from ultragray.errors import SceneExists
 from ultragray.files.atomic import file_sha256
 
+from ..errors import SceneExists
 from ..scenes import SUFFIX
 from .folder import JobFolder
 from .link import link_or_copy

@@ -10,8 +10,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from ultragray.errors import JobInUse
-
+from ..errors import JobInUse
 from .database import JobDatabase
 from .folder import JobFolder
 from .job import attribute

@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 
 from ultragray.confidence import Assessor, require_confidence
-from ultragray.errors import StorageFull
 from ultragray.files.atomic import sync
 from ultragray.interchange.exports import check_format
 from ultragray.request import LABELS, check_image_size, check_labelled, check_min_confidence
 from ultragray.scene_info import SceneHeader, read_header
 
 from ..claims import storage_full
+from ..errors import StorageFull
 from ..scenes import SUFFIX, SceneStore
 from .folder import JobFolder
 from .link import link_or_copy

@@ -17,8 +17,9 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
-from ultragray.errors import InvalidArgument, MemoryExceeded, StorageFull, UltragrayError
+from ultragray.errors import InvalidArgument, MemoryExceeded, UltragrayError
 
+from ..errors import StorageFull
 from .folder import JobFolder, Outcome
 from .specification import RenderJob, from_dict
 from .work import Stopped, Work

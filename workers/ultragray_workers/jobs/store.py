@@ -12,10 +12,13 @@ from pathlib import Path
 from dbos import EnqueueOptions, WorkflowSerializationFormat, WorkflowStatus
 from dbos import error as dbos_error
 
-from ultragray.errors import (
+from ultragray.errors import InvalidArgument
+from ultragray.request import MAX_IMAGE_SIDE
+
+from ..datasets.store import DatasetStore
+from ..errors import (
     ArtifactNotFound,
     DatasetNotFound,
-    InvalidArgument,
     JobConflict,
     JobFinished,
     JobInUse,
@@ -24,9 +27,6 @@ from ultragray.errors import (
     JobQueueFull,
     SceneExists,
 )
-from ultragray.request import MAX_IMAGE_SIDE
-
-from ..datasets.store import DatasetStore
 from ..scenes import SceneStore
 from . import database
 from .counting import count_by_state

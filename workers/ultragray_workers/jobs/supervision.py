@@ -18,8 +18,9 @@ from typing import Any, NoReturn
 
 from dbos import WorkflowStatus
 
-from ultragray.errors import DatabaseUnavailable, MemoryExceeded, SceneExists, StorageFull
+from ultragray.errors import MemoryExceeded
 
+from ..errors import DatabaseUnavailable, SceneExists, StorageFull
 from . import database
 from .database import JobDatabase
 from .folder import JobFolder, Outcome, Request

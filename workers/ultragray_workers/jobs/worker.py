@@ -17,8 +17,7 @@ from typing import Any
 from dbos import DBOS, PortableWorkflowError, WorkflowSerializationFormat
 from dbos import error as dbos_error
 
-from ultragray.errors import StartupFailed
-
+from ..errors import StartupFailed
 from . import database
 from .database import JobDatabase, dbos_config, quiet_dbos
 from .heartbeat import Heartbeat

@@ -14,9 +14,10 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from ultragray.errors import Draining, InvalidArgument, NotReady, RenderFailed
+from ultragray.errors import InvalidArgument
 from ultragray.scene_info import SceneHeader
 
+from ..errors import Draining, NotReady, RenderFailed
 from ..scenes import SceneStore
 from .dispatcher import Dispatcher, SceneChangedError
 from .launcher import Launcher

@@ -9,8 +9,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
-from ultragray.errors import Draining, RenderFailed, UltragrayError
+from ultragray.errors import UltragrayError
 
+from ..errors import Draining, RenderFailed
 from .launcher import Launcher
 from .messages import Answer, ForkWorker, Hello, Job, LoadJob, UnloadJob
 from .peer import Peer

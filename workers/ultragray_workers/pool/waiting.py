@@ -8,9 +8,9 @@ from collections import OrderedDict, deque
 from dataclasses import dataclass, field, replace
 
 from ultragray.display.settings import Display
-from ultragray.errors import DeadlineExceeded, QueueFull
 from ultragray.probe import FloatArray, Picture, Probe
 
+from ..errors import DeadlineExceeded, QueueFull
 from .messages import Rendered
 from .types import Encoding, Priority, RenderRequest, Trust
 

@@ -11,12 +11,13 @@ from fastapi import APIRouter, Path, Query
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response
 
-from ultragray.errors import UnsupportedMediaType, UploadTooLarge
+from ultragray_workers.errors import UploadTooLarge
 
 from ...core.catalog import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE
 from ...core.dataset_catalog import contact_sheet, dataset_page
 from ...core.dataset_uploads import DatasetUpload
 from ...core.helper_processes import PATIENCE_S
+from ...errors import UnsupportedMediaType
 from ..accept import PNG
 from ..dataset_schemas import DatasetOut, DatasetPage
 from ..deps import ServiceDep, problems

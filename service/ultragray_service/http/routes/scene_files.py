@@ -12,12 +12,13 @@ from fastapi import APIRouter, Query
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import FileResponse, Response
 
-from ultragray.errors import UnsupportedMediaType, UploadTooLarge
 from ultragray.probe import FloatArray
+from ultragray_workers.errors import UploadTooLarge
 from ultragray_workers.scenes import SUFFIX
 
 from ...arrival import arrival
 from ...core.helper_processes import PATIENCE_S
+from ...errors import UnsupportedMediaType
 from ...views.scene_points import DEFAULT_POINTS, MAX_POINTS, MAX_POSES, even_selection
 from ..accept import RAW
 from ..console_schemas import ScenePoses

@@ -9,14 +9,16 @@ from urllib.parse import urlsplit
 from fastapi import APIRouter, WebSocket, WebSocketDisconnect
 from pydantic import ValidationError
 
-from ultragray.errors import Draining, InvalidArgument, OriginRefused, UltragrayError
+from ultragray.errors import InvalidArgument, UltragrayError
 from ultragray.request import check_outputs
+from ultragray_workers.errors import Draining
 from ultragray_workers.pool.types import Encoding, Priority, RenderRequest
 
 from ...auth import STREAM_PROTOCOL
 from ...core.pose_stream import Answered, Asked, PoseStream
 from ...core.requests import RenderSpec, field_under
 from ...core.state import Service
+from ...errors import OriginRefused, statuses_of
 from ..deps import SceneName
 from ..problems import invalid_argument, problem_response
 from ..render_body import asked_display, asked_probe, asked_trust, checked_pose
@@ -40,7 +42,7 @@ async def stream(websocket: WebSocket, scene: SceneName) -> None:
         await service.catalog.header(scene)
     except UltragrayError as error:
         await websocket.send_denial_response(problem_response(error))
-        service.metrics.count_request("websocket", _ROUTE, str(error.http_status), time.perf_counter() - started)
+        service.metrics.count_request("websocket", _ROUTE, str(statuses_of(error).http), time.perf_counter() - started)
         return
     await websocket.accept(STREAM_PROTOCOL if STREAM_PROTOCOL in websocket.scope["subprotocols"] else None)
     status = "closed"

@@ -10,11 +10,12 @@ from functools import cached_property
 import torch
 
 from ultragray.confidence import Assessor
-from ultragray.errors import MemoryExceeded, SceneFileInvalid, SceneTooLarge, UltragrayError
+from ultragray.errors import MemoryExceeded, SceneFileInvalid, UltragrayError
 from ultragray.files.atomic import file_sha256
 from ultragray.scene import GaussianScene
 from ultragray.scene_info import read_header, scene_file_invalid
 
+from ...errors import SceneTooLarge
 from ...scenes import FileVersion, resident_bytes
 
 MAX_SCENES = 256

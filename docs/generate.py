@@ -1,0 +1,64 @@
+"""Writes the tables of docs/interfaces.md that follow from the code: `python docs/generate.py`, or `make generate`.
+
+Such a table stands between `<!-- generated: NAME -->` and `<!-- end -->`, and TABLES says what makes it.
+"""
+
+from __future__ import annotations
+
+import inspect
+import re
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+from ultragray import errors
+from ultragray_service import errors as service_errors
+from ultragray_service.errors import statuses_of
+from ultragray_workers import errors as workers_errors
+
+DOCUMENT = Path(__file__).resolve().parent / "interfaces.md"
+_GENERATED = re.compile(r"(?<=<!-- generated: )(\w+)( -->\n).*?(?=<!-- end -->)", flags=re.DOTALL)
+
+Row = Iterable[str]
+
+
+def generated(document: str) -> str:
+    """The document with its tables as the code has them now."""
+    return _GENERATED.sub(lambda match: f"{match[1]}{match[2]}{_table(*TABLES[match[1]]())}", document)
+
+
+def _table(head: Row, *rows: Row) -> str:
+    first = f"| {' | '.join(head)} |\n{'|---' * len(list(head))}|\n"
+    return first + "".join(f"| {' | '.join(row)} |\n" for row in rows)
+
+
+def error_table() -> list[Row]:
+    """The errors of each module, in their order there."""
+    table: list[Row] = [("Reason", "Class", "In", "HTTP", "gRPC", "Meaning")]
+    for module in (errors, workers_errors, service_errors):
+        for cls in errors.error_classes():
+            if cls.__module__ == module.__name__:
+                arrow = "↳ " if cls.__base__ is errors.InvalidArgument else ""
+                statuses = statuses_of(cls)
+                table.append(
+                    (
+                        f"`{cls.reason}`",
+                        f"{arrow}`{cls.__name__}`",
+                        f"`{module.__name__}`",
+                        str(statuses.http),
+                        statuses.grpc,
+                        _meaning(cls),
+                    )
+                )
+    return table
+
+
+def _meaning(thing: object) -> str:
+    """The first paragraph of a docstring."""
+    return " ".join((inspect.getdoc(thing) or "").partition("\n\n")[0].split()).removesuffix(".")
+
+
+TABLES: dict[str, Callable[[], list[Row]]] = {"errors": error_table}
+
+
+if __name__ == "__main__":
+    DOCUMENT.write_text(generated(DOCUMENT.read_text(encoding="utf-8")), encoding="utf-8")

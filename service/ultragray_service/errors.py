@@ -1,0 +1,135 @@
+"""The errors of the front doors, and the one table of the statuses that the doors answer with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from ultragray.errors import UltragrayError
+
+
+class Unauthenticated(UltragrayError):
+    """No API key, or an unknown one."""
+
+    reason = "UNAUTHENTICATED"
+    title = "Authentication required"
+
+
+class OriginRefused(UltragrayError):
+    """A page of another site opens a stream."""
+
+    reason = "ORIGIN_REFUSED"
+    title = "Pages of this origin are not allowed"
+
+
+class BodyTooLarge(UltragrayError):
+    """A body over `ULTRAGRAY_MAX_BODY_BYTES`."""
+
+    reason = "BODY_TOO_LARGE"
+    title = "Request body too large"
+
+
+class NotAcceptable(UltragrayError):
+    """The Accept header allows no type that can hold the request."""
+
+    reason = "NOT_ACCEPTABLE"
+    title = "Accept header cannot be satisfied"
+
+
+class UnsupportedMediaType(UltragrayError):
+    """A body that is not JSON (of an upload: no archive and no form), or compressed."""
+
+    reason = "UNSUPPORTED_MEDIA_TYPE"
+    title = "Unsupported media type"
+
+
+class IgtlMessageInvalid(UltragrayError):
+    """An OpenIGTLink message whose header, checksum or content cannot be used."""
+
+    reason = "IGTL_MESSAGE_INVALID"
+    title = "Invalid OpenIGTLink message"
+
+
+class RouteNotFound(UltragrayError):
+    """No such path."""
+
+    reason = "ROUTE_NOT_FOUND"
+    title = "No such route"
+
+
+class MethodNotAllowed(UltragrayError):
+    """The path exists, the method does not."""
+
+    reason = "METHOD_NOT_ALLOWED"
+    title = "Method not allowed"
+
+
+class SceneReadOnly(UltragrayError):
+    """A scene of the data folder cannot be deleted over HTTP."""
+
+    reason = "SCENE_READ_ONLY"
+    title = "Scene cannot be deleted"
+
+
+@dataclass(frozen=True)
+class Statuses:
+    """How the doors tell an error. `retry_after_s`: when the same request may succeed; None: not by waiting."""
+
+    http: int
+    grpc: str
+    retry_after_s: int | None = None
+
+
+STATUSES = {  # by the reason of the error
+    "INTERNAL": Statuses(500, "INTERNAL"),
+    "INVALID_ARGUMENT": Statuses(422, "INVALID_ARGUMENT"),
+    "INVALID_POSE": Statuses(422, "INVALID_ARGUMENT"),
+    "INVALID_PROBE": Statuses(422, "INVALID_ARGUMENT"),
+    "INVALID_IMAGE_SIZE": Statuses(422, "INVALID_ARGUMENT"),
+    "UNKNOWN_OUTPUT": Statuses(422, "INVALID_ARGUMENT"),
+    "LOW_CONFIDENCE": Statuses(422, "INVALID_ARGUMENT"),
+    "TOO_MANY_POSES": Statuses(422, "INVALID_ARGUMENT"),
+    "UNAUTHENTICATED": Statuses(401, "UNAUTHENTICATED"),
+    "ORIGIN_REFUSED": Statuses(403, "PERMISSION_DENIED"),
+    "BODY_TOO_LARGE": Statuses(413, "INVALID_ARGUMENT"),
+    "NOT_ACCEPTABLE": Statuses(406, "INVALID_ARGUMENT"),
+    "UNSUPPORTED_MEDIA_TYPE": Statuses(415, "INVALID_ARGUMENT"),
+    "IGTL_MESSAGE_INVALID": Statuses(400, "INVALID_ARGUMENT"),
+    "ROUTE_NOT_FOUND": Statuses(404, "UNIMPLEMENTED"),
+    "METHOD_NOT_ALLOWED": Statuses(405, "UNIMPLEMENTED"),
+    "SCENE_NOT_FOUND": Statuses(404, "NOT_FOUND"),
+    "SCENE_FILE_INVALID": Statuses(422, "FAILED_PRECONDITION"),
+    "CHECKPOINT_INVALID": Statuses(422, "INVALID_ARGUMENT"),
+    "DATASET_INVALID": Statuses(422, "INVALID_ARGUMENT"),
+    "DATASET_NOT_FOUND": Statuses(404, "NOT_FOUND"),
+    "DATASET_EXISTS": Statuses(409, "ALREADY_EXISTS"),
+    "DATASET_IN_USE": Statuses(409, "FAILED_PRECONDITION"),
+    "UPLOAD_TOO_LARGE": Statuses(413, "INVALID_ARGUMENT"),
+    "STORAGE_FULL": Statuses(507, "RESOURCE_EXHAUSTED"),
+    "TRAINING_DIVERGED": Statuses(422, "FAILED_PRECONDITION"),
+    "TRAINING_STATE_INVALID": Statuses(422, "FAILED_PRECONDITION"),
+    "MEMORY_EXCEEDED": Statuses(507, "RESOURCE_EXHAUSTED"),
+    "SCENE_EXISTS": Statuses(409, "ALREADY_EXISTS"),
+    "SCENE_READ_ONLY": Statuses(403, "PERMISSION_DENIED"),
+    "DATABASE_UNAVAILABLE": Statuses(503, "UNAVAILABLE", retry_after_s=5),
+    "JOB_NOT_FOUND": Statuses(404, "NOT_FOUND"),
+    "REQUEST_ID_CONFLICT": Statuses(409, "ALREADY_EXISTS"),
+    "JOB_FINISHED": Statuses(409, "FAILED_PRECONDITION"),
+    "JOB_NOT_FINISHED": Statuses(409, "FAILED_PRECONDITION"),
+    "JOB_IN_USE": Statuses(409, "FAILED_PRECONDITION"),
+    "JOB_QUEUE_FULL": Statuses(429, "RESOURCE_EXHAUSTED", retry_after_s=10),
+    "ARTIFACT_NOT_FOUND": Statuses(404, "NOT_FOUND"),
+    "SCENE_TOO_LARGE": Statuses(507, "RESOURCE_EXHAUSTED"),
+    "BACKEND_UNAVAILABLE": Statuses(501, "UNIMPLEMENTED"),
+    "EXTRA_MISSING": Statuses(501, "UNIMPLEMENTED"),
+    "QUEUE_FULL": Statuses(429, "RESOURCE_EXHAUSTED", retry_after_s=1),
+    "DEADLINE_EXCEEDED": Statuses(504, "DEADLINE_EXCEEDED"),
+    "NOT_READY": Statuses(503, "UNAVAILABLE", retry_after_s=1),
+    "DRAINING": Statuses(503, "UNAVAILABLE", retry_after_s=1),
+    "STARTUP_FAILED": Statuses(500, "INTERNAL"),
+    "RENDER_FAILED": Statuses(500, "INTERNAL"),
+}
+
+
+def statuses_of(error: UltragrayError | type[UltragrayError]) -> Statuses:
+    """How the doors tell an error."""
+    return STATUSES[error.reason]

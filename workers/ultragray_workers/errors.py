@@ -1,0 +1,159 @@
+"""The errors of the render pool, the datasets and the jobs: a part of the tree of `ultragray.errors`."""
+
+from __future__ import annotations
+
+from ultragray.errors import UltragrayError
+
+
+class SceneNotFound(UltragrayError):
+    """No scene of that name."""
+
+    reason = "SCENE_NOT_FOUND"
+    title = "No such scene"
+
+
+class DatasetNotFound(UltragrayError):
+    """No dataset of that name."""
+
+    reason = "DATASET_NOT_FOUND"
+    title = "No such dataset"
+
+
+class DatasetExists(UltragrayError):
+    """A dataset of that name has another content or other options; delete it first."""
+
+    reason = "DATASET_EXISTS"
+    title = "Another dataset has that name"
+
+
+class DatasetInUse(UltragrayError):
+    """A job needs the dataset."""
+
+    reason = "DATASET_IN_USE"
+    title = "Dataset in use"
+
+
+class UploadTooLarge(UltragrayError):
+    """An upload over `ULTRAGRAY_MAX_DATASET_BYTES`, packed or unpacked, or of too many files."""
+
+    reason = "UPLOAD_TOO_LARGE"
+    title = "Upload too large"
+
+
+class StorageFull(UltragrayError):
+    """The artifact folder has no room, or a render job would write more than it has room for."""
+
+    reason = "STORAGE_FULL"
+    title = "No room on the disk"
+
+
+class SceneExists(UltragrayError):
+    """A scene of that name is there, or a job is making it."""
+
+    reason = "SCENE_EXISTS"
+    title = "Scene already exists"
+
+
+class DatabaseUnavailable(UltragrayError):
+    """The database of the jobs does not answer; scenes are rendered all the same; retry."""
+
+    reason = "DATABASE_UNAVAILABLE"
+    title = "The database of the jobs does not answer"
+
+
+class JobNotFound(UltragrayError):
+    """No job of that id."""
+
+    reason = "JOB_NOT_FOUND"
+    title = "No such job"
+
+
+class JobConflict(UltragrayError):
+    """The `request_id` was used for something else."""
+
+    reason = "REQUEST_ID_CONFLICT"
+    title = "Request id used for another job"
+
+
+class JobFinished(UltragrayError):
+    """A job that succeeded or failed cannot be cancelled."""
+
+    reason = "JOB_FINISHED"
+    title = "Job is finished"
+
+
+class JobNotFinished(UltragrayError):
+    """Only a failed or cancelled job can be retried."""
+
+    reason = "JOB_NOT_FINISHED"
+    title = "Job cannot be retried"
+
+
+class JobInUse(UltragrayError):
+    """A job that waits or runs, or that another of those goes on from, cannot be deleted."""
+
+    reason = "JOB_IN_USE"
+    title = "Job in use"
+
+
+class JobQueueFull(UltragrayError):
+    """Too many jobs wait; retry."""
+
+    reason = "JOB_QUEUE_FULL"
+    title = "Too many jobs are waiting"
+
+
+class ArtifactNotFound(UltragrayError):
+    """The job has no file of that name."""
+
+    reason = "ARTIFACT_NOT_FOUND"
+    title = "No such artifact"
+
+
+class SceneTooLarge(UltragrayError):
+    """A scene that does not fit `ULTRAGRAY_MEMORY_BUDGET_MB` at all."""
+
+    reason = "SCENE_TOO_LARGE"
+    title = "Scene exceeds the memory budget"
+
+
+class QueueFull(UltragrayError):
+    """Too many frames wait, or too many uploads are under way; retry."""
+
+    reason = "QUEUE_FULL"
+    title = "Too much is waiting"
+
+
+class DeadlineExceeded(UltragrayError):
+    """The deadline passed first."""
+
+    reason = "DEADLINE_EXCEEDED"
+    title = "Deadline exceeded"
+
+
+class NotReady(UltragrayError):
+    """The service is starting; retry."""
+
+    reason = "NOT_READY"
+    title = "Service is starting"
+
+
+class Draining(UltragrayError):
+    """The service is stopping; retry elsewhere."""
+
+    reason = "DRAINING"
+    title = "Service is stopping"
+
+
+class StartupFailed(UltragrayError):
+    """The service cannot start, such as on a port in use (command line)."""
+
+    reason = "STARTUP_FAILED"
+    title = "Service cannot start"
+
+
+class RenderFailed(UltragrayError):
+    """A worker could not render the frame."""
+
+    reason = "RENDER_FAILED"
+    title = "Rendering failed"
