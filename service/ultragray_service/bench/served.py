@@ -15,6 +15,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import grpc
@@ -54,12 +55,7 @@ def measure_served(bench: BenchScene, repeats: int, backend: str) -> Served:
     with tempfile.TemporaryDirectory(prefix="ultragray-bench-") as folder:
         bench.scene.save(Path(folder) / f"{SCENE}.ugr")
         with running_server(Path(folder), backend, SCENE) as server:
-            doors = [
-                _grpc_stream(server.grpc_port, poses),
-                _grpc_unary(server.grpc_port, poses),
-                _http("HTTP raw", server.http_port, poses, "application/octet-stream"),
-                _http("HTTP PNG", server.http_port, poses, "image/png"),
-            ]
+            doors = [measure(server, poses) for measure in DOORS.values()]
             return Served(doors, max(map(_memory_mb, _descendants(server.pid)), default=0.0))
 
 
@@ -74,8 +70,10 @@ class RunningServer:
 
 
 @contextmanager
-def running_server(folder: Path, backend: str, scene: str, job_threads: int = 0) -> Iterator[RunningServer]:
-    """A service of the scenes in `folder`, with `scene` for OpenIGTLink. Raises NotReady."""
+def running_server(
+    folder: Path, backend: str, scene: str, *, job_threads: int = 0, python: str = sys.executable
+) -> Iterator[RunningServer]:
+    """A service of the scenes in `folder`, `scene` for OpenIGTLink, run by `python`. Raises NotReady."""
     http_port, grpc_port, igtl_port = _free_port(), _free_port(), _free_port()
     settings = {
         "ULTRAGRAY_DATA_FOLDER": str(folder),
@@ -88,7 +86,7 @@ def running_server(folder: Path, backend: str, scene: str, job_threads: int = 0)
         "ULTRAGRAY_PRELOAD": scene,
         "ULTRAGRAY_LOG_LEVEL": "error",
     }
-    process = subprocess.Popen([sys.executable, "-m", "ultragray_service"], env={**os.environ, **settings})
+    process = subprocess.Popen([python, "-m", "ultragray_service"], env={**os.environ, **settings})
     try:
         _wait_ready(process, http_port)
         yield RunningServer(http_port, grpc_port, igtl_port, process.pid)
@@ -118,9 +116,9 @@ def _message(pose: FloatArray) -> geometry_pb2.Pose:  # [4, 4] mm
     return geometry_pb2.Pose(matrix=geometry_pb2.Matrix(values=pose.ravel().tolist()))
 
 
-def _grpc_stream(port: int, poses: FloatArray) -> FrontDoor:  # [C, 4, 4]
+def _grpc_stream(server: RunningServer, poses: FloatArray) -> FrontDoor:  # [C, 4, 4]
     settings = rendering_pb2.RenderSettings(scene=SCENE)
-    with grpc.insecure_channel(f"127.0.0.1:{port}") as channel:
+    with grpc.insecure_channel(f"127.0.0.1:{server.grpc_port}") as channel:
         stub = rendering_pb2_grpc.RenderServiceStub(channel)
         room = _Turns()
         stream = stub.RenderStream(room.requests(settings, poses))
@@ -166,9 +164,9 @@ def _check(frame: rendering_pb2.Frame) -> None:
         raise NotReady(f"the benchmark's frame {frame.sequence} failed: {frame.error.detail}")
 
 
-def _grpc_unary(port: int, poses: FloatArray) -> FrontDoor:
+def _grpc_unary(server: RunningServer, poses: FloatArray) -> FrontDoor:
     settings = rendering_pb2.RenderSettings(scene=SCENE)
-    with grpc.insecure_channel(f"127.0.0.1:{port}") as channel:
+    with grpc.insecure_channel(f"127.0.0.1:{server.grpc_port}") as channel:
         stub = rendering_pb2_grpc.RenderServiceStub(channel)
         return _one_by_one(
             "gRPC unary",
@@ -177,8 +175,8 @@ def _grpc_unary(port: int, poses: FloatArray) -> FrontDoor:
         )
 
 
-def _http(what: str, port: int, poses: FloatArray, media_type: str) -> FrontDoor:
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=60)
+def _http(what: str, media_type: str, server: RunningServer, poses: FloatArray) -> FrontDoor:
+    connection = http.client.HTTPConnection("127.0.0.1", server.http_port, timeout=60)
     headers = {"Accept": media_type, "Content-Type": "application/json"}
 
     def render(pose: FloatArray) -> None:
@@ -203,6 +201,14 @@ def _one_by_one(what: str, poses: FloatArray, render: Callable[[FloatArray], obj
         latency_ms.append(1000.0 * (time.perf_counter() - started))
     counted = latency_ms[WARM_UP:]
     return FrontDoor(what, counted, 1000.0 * len(counted) / sum(counted))
+
+
+DOORS: dict[str, Callable[[RunningServer, FloatArray], FrontDoor]] = {
+    "gRPC stream": _grpc_stream,
+    "gRPC unary": _grpc_unary,
+    "HTTP raw": partial(_http, "HTTP raw", "application/octet-stream"),
+    "HTTP PNG": partial(_http, "HTTP PNG", "image/png"),
+}
 
 
 def _descendants(pid: int) -> list[int]:
