@@ -16,6 +16,7 @@ UltragrayError
 ├── MemoryExceeded
 ├── BackendUnavailable
 ├── ExtraMissing
+├── RenderFailed
 ├── those of pool, datasets and jobs: ultragray_workers.errors
 └── those of the front doors: ultragray_service.errors
 
@@ -165,3 +166,10 @@ class ExtraMissing(UltragrayError):
 
     reason = "EXTRA_MISSING"
     title = "Optional package not installed"
+
+
+class RenderFailed(UltragrayError):
+    """A worker could not render the frame."""
+
+    reason = "RENDER_FAILED"
+    title = "Rendering failed"

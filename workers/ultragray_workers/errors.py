@@ -150,10 +150,3 @@ class StartupFailed(UltragrayError):
 
     reason = "STARTUP_FAILED"
     title = "Service cannot start"
-
-
-class RenderFailed(UltragrayError):
-    """A worker could not render the frame."""
-
-    reason = "RENDER_FAILED"
-    title = "Rendering failed"

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import RenderFailed
+from ultragray.errors import RenderFailed
 
 ByteArray = npt.NDArray[np.uint8]
 PixelArray = npt.NDArray[Any]  # float32 as rendered, or uint8: labels, and what is rounded already

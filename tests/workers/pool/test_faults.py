@@ -11,8 +11,8 @@ import time
 
 import pytest
 
+from ultragray.errors import RenderFailed
 from ultragray_workers import Encoding, Priority, RenderRequest
-from ultragray_workers.errors import RenderFailed
 
 LOAD_SECONDS = float(os.environ.get("ULTRAGRAY_FAULT_SECONDS", "5"))
 

@@ -8,9 +8,8 @@ from collections.abc import Awaitable, Iterable
 from dataclasses import replace
 
 from ultragray.confidence import Extrapolation
-from ultragray.errors import UltragrayError
+from ultragray.errors import RenderFailed, UltragrayError
 
-from ..errors import RenderFailed
 from .launcher import Launcher
 from .memory import MemoryPool
 from .messages import Answer, ForkWorker, LoadJob, PackJob, Rendered, RenderJob, RenderPart, UnloadJob

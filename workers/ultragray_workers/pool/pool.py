@@ -14,10 +14,10 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from ultragray.errors import InvalidArgument
+from ultragray.errors import InvalidArgument, RenderFailed
 from ultragray.scene_info import SceneHeader
 
-from ..errors import Draining, NotReady, RenderFailed
+from ..errors import Draining, NotReady
 from ..scenes import SceneStore
 from .dispatcher import Dispatcher, SceneChangedError
 from .launcher import Launcher

@@ -9,9 +9,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
-from ultragray.errors import UltragrayError
+from ultragray.errors import RenderFailed, UltragrayError
 
-from ..errors import Draining, RenderFailed
+from ..errors import Draining
 from .launcher import Launcher
 from .messages import Answer, ForkWorker, Hello, Job, LoadJob, UnloadJob
 from .peer import Peer

@@ -25,11 +25,10 @@ from ultragray.confidence.support import SupportWatch
 from ultragray.display.frames import show
 from ultragray.display.pixels import ByteArray, to_uint8
 from ultragray.display.settings import AS_RENDERED
-from ultragray.errors import MemoryExceeded, UltragrayError
+from ultragray.errors import MemoryExceeded, RenderFailed, UltragrayError
 from ultragray.probe import FloatArray
 from ultragray.rendering import renderer_name
 
-from ...errors import RenderFailed
 from ..channel import Channel
 from ..memory import write_at
 from ..messages import Answer, ForkWorker, Hello, Job, LoadJob, PackJob, Rendered, RenderJob, RenderPart, UnloadJob
