@@ -8,8 +8,6 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from ultragray.errors import RenderFailed
-
 ByteArray = npt.NDArray[np.uint8]
 PixelArray = npt.NDArray[Any]  # float32 as rendered, or uint8: labels, and what is rounded already
 
@@ -23,8 +21,7 @@ def to_uint8(frames: PixelArray) -> ByteArray:
 
 
 def image_file(frame: PixelArray, suffix: str, *options: int) -> ByteArray:  # [H, W] -> [bytes]
-    """A frame as the bytes of a grey image file: `.png` at OpenCV's default settings, `.jpg`. Raises RenderFailed."""
+    """A frame as the bytes of a grey image file: `.png` at OpenCV's default settings, `.jpg`."""
     written, data = cv2.imencode(suffix, to_uint8(frame), options)
-    if not written:
-        raise RenderFailed(f"a frame of {frame.shape[0]}x{frame.shape[1]} pixels could not be written as {suffix[1:]}")
+    assert written  # the sides of a picture are far below what either format holds
     return data.astype(np.uint8, copy=False)
