@@ -15,8 +15,8 @@ import torch
 
 from ultragray import ConvexProbe, Frames, GaussianScene, LinearProbe, Probe, SceneInfo
 from ultragray.backends import cuda
+from ultragray.outputs import PLANES
 from ultragray.probe import FloatArray, stretch_released_far
-from ultragray.request import OUTPUTS
 from ultragray.scene import PARAMETERS
 
 from .postgres import postgres
@@ -177,7 +177,7 @@ def assert_agrees() -> Callable[..., None]:
     def check(
         frames: Frames, expected: Mapping[str, Any], *, tolerance: float, stable: np.ndarray | None = None
     ) -> None:
-        for name in OUTPUTS:
+        for name in PLANES:
             got = getattr(frames, name)
             want = np.asarray(expected[name], dtype=np.float64)
             assert tuple(got.shape) == want.shape

@@ -37,15 +37,18 @@ def described(
     high: float | None = None,
     above: float | None = None,
     choices: tuple[str, ...] | None = None,
+    most: int | None = None,
+    error: type[InvalidArgument] | None = None,
     **options: Any,
 ) -> Any:
     """A dataclass field that says what it means.
 
-    A number must lie from `low` (or above `above`) to `high`; a word must be one of `choices`. `options` are those of
-    `dataclasses.field`. The default may be what the limits exclude.
+    A number must lie from `low` (or above `above`) to `high`; a word must be one of `choices`, a list may have `most`
+    elements, each within the limits. `error`: what is raised instead of the error of the class. `options` are those of
+    `dataclasses.field`.
     """
     metadata: dict[str, Any] = {"description": meaning}
-    limits = {"low": low, "high": high, "above": above, "choices": choices}
+    limits = {"low": low, "high": high, "above": above, "choices": choices, "most": most, "error": error}
     metadata |= {name: limit for name, limit in limits.items() if limit is not None}
     return field(default=default, default_factory=factory, metadata=metadata, **options)
 
@@ -66,7 +69,7 @@ class Contract:
             try:
                 checked = _checked(value, annotation, item)
             except UltragrayError as inner:
-                raise _under(item.name, inner, self.error) from None
+                raise _under(item.name, inner, item.metadata.get("error", self.error)) from None
             if checked is not value:
                 object.__setattr__(self, item.name, checked)
 
@@ -197,6 +200,8 @@ def _checked(value: Any, annotation: Any, item: Field[Any]) -> Any:
         return value
     if get_origin(kind) is tuple:
         _require(isinstance(value, (list, tuple)), "a list", value)
+        most = item.metadata.get("most")
+        _require(most is None or len(value) <= most, f"at most {most} values", len(value))
         element = get_args(kind)[0]
         return tuple(_checked_element(one, element, item, index) for index, one in enumerate(value))
     if not isinstance(kind, type):

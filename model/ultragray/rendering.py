@@ -2,37 +2,74 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 from torch import Tensor
 
 from . import __version__
 from .backends import cpu, cuda, reference
-from .backends.labels import render_labels
 from .errors import BackendUnavailable
+from .image_size import check_image_size
+from .outputs import OUTPUTS, PLANES, check_available, check_outputs
 from .pose import check_poses
 from .probe import FloatArray, Probe
-from .request import LABELS, OUTPUTS, WEIGHT_SUM, check_image_size, check_labelled, check_outputs
 from .scene import GaussianScene
 
 Backend = Callable[[GaussianScene, Probe, FloatArray, int, int, Sequence[str]], dict[str, Tensor]]
 
 
-@dataclass(frozen=True)
-class Frames:
-    """Rendered frames, each [C, H, W] or None where it was not asked for.
+class Frames(Mapping[str, Tensor]):
+    """Rendered frames by output, each [C, H, W]: `frames["bmode"]`, or `frames.bmode`, None where it was not asked for.
 
-    In [0, 1]: bmode B = E·T, echo E, transmittance T, coverage γ = 1 − exp(−S) (docs/physics.md §3). uint8: labels, of
-    which `scene.info.label_names` tells the meaning; 0 where there is none.
+    `ultragray.outputs` says what each means. Amounts lie in [0, 1]; labels are uint8, of which `scene.info.label_names`
+    tells the meaning, 0 where there is none.
     """
 
-    bmode: Tensor | None = None
-    echo: Tensor | None = None
-    transmittance: Tensor | None = None
-    coverage: Tensor | None = None
-    labels: Tensor | None = None
+    def __init__(self, outputs: Mapping[str, Tensor]) -> None:
+        self._outputs = dict(outputs)
+
+    def __getitem__(self, name: str) -> Tensor:
+        return self._outputs[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._outputs)
+
+    def __len__(self) -> int:
+        return len(self._outputs)
+
+    def __getattr__(self, name: str) -> Tensor | None:
+        if name not in OUTPUTS:
+            raise AttributeError(f"there is no output {name!r}: outputs are {', '.join(OUTPUTS)}")
+        return self._outputs.get(name)
+
+    def __repr__(self) -> str:
+        shapes = ", ".join(f"{name} {list(pixels.shape)}" for name, pixels in self._outputs.items())
+        return f"Frames({shapes})"
+
+
+class Drawing:
+    """Views of a scene by one backend: the planes that outputs are derived from."""
+
+    def __init__(self, draw: Backend, scene: GaussianScene, view: tuple[Probe, FloatArray, int, int]) -> None:
+        """`view`: probe, poses [C, 4, 4] in cm about the scene's centre, height and width."""
+        self.scene = scene
+        self.shape = (len(view[1]), view[2], view[3])
+        self._draw, self._view = draw, view
+        self._planes: dict[str, Tensor] = {}
+
+    def draw(self, planes: Sequence[str]) -> None:
+        """Draws planes of the whole scene at once."""
+        if planes:
+            self._planes = self._draw(self.scene, *self._view, planes)
+
+    def plane(self, name: str) -> Tensor:  # [C, H, W]
+        """One of the planes that were drawn."""
+        return self._planes[name]
+
+    def plane_of(self, part: GaussianScene, name: str) -> Tensor:  # [C, H, W]
+        """A plane of some of the scene's Gaussians alone."""
+        return self._draw(part, *self._view, (name,))[name]
 
 
 def render(
@@ -42,7 +79,7 @@ def render(
     *,
     height: int,
     width: int,
-    outputs: Sequence[str] = OUTPUTS,
+    outputs: Sequence[str] = PLANES,
     backend: str = "auto",
 ) -> Frames:
     """Frames [C, height, width] of a scene seen by `probe` (None: the probe the scene was trained with) from `poses`.
@@ -56,21 +93,17 @@ def render(
     BackendUnavailable, and MemoryExceeded where the GPU's memory does not suffice.
     """
     chosen = check_outputs(outputs)
-    check_labelled(chosen, scene.info)
+    check_available(chosen, scene.info)
     check_image_size(height, width)
-    height, width = int(height), int(width)
-    probe = scene.info.probe_or(probe)
-    poses_cm = scene.poses_to_scene_cm(check_poses(poses))
-    draw = _BACKENDS[choose_backend(backend, scene)]
-    names = [name for name in chosen if name != LABELS]
-    frames = draw(scene, probe, poses_cm, height, width, names) if names else {}
-    if LABELS in chosen:
-        frames[LABELS] = render_labels(
-            scene,
-            (len(poses_cm), height, width),
-            lambda part: draw(part, probe, poses_cm, height, width, (WEIGHT_SUM,))[WEIGHT_SUM],
-        )
-    return Frames(**frames)
+    view = (
+        scene.info.probe_or(probe),
+        scene.poses_to_scene_cm(check_poses(poses)),
+        int(height),
+        int(width),
+    )
+    drawing = Drawing(_BACKENDS[choose_backend(backend, scene)], scene, view)
+    drawing.draw(list(dict.fromkeys(plane for name in chosen for plane in OUTPUTS[name].planes)))
+    return Frames({name: OUTPUTS[name].derive(drawing) for name in chosen})
 
 
 _BACKENDS: dict[str, Backend] = {

@@ -19,6 +19,7 @@ from safetensors import SafetensorError, safe_open
 
 from .confidence.assess import read_model
 from .errors import InvalidArgument, InvalidProbe, SceneFileInvalid
+from .image_size import DEFAULT_IMAGE_SIDE
 from .pose import check_poses
 from .probe import FloatArray, Probe, probe_from_dict, probe_to_dict
 
@@ -26,7 +27,6 @@ FORMAT_VERSION = 1
 METADATA_KEY = "ultragray"
 INTENSITIES = ("released", "sigmoid")
 MAX_SH_DEGREE = 3
-DEFAULT_IMAGE_SIDE = 512
 MAX_LABEL = 255
 MAX_HEADER_BYTES = 4 * 2**20  # of the bundle: names and shapes of tensors, and the metadata
 MAX_TRAINING_POSES = 100_000

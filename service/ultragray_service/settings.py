@@ -9,7 +9,7 @@ from pydantic import Field, SecretStr, ValidationError, field_validator
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
 from ultragray.errors import InvalidArgument
-from ultragray.request import MAX_IMAGE_SIDE
+from ultragray.image_size import MAX_IMAGE_SIDE
 from ultragray_workers.pool.pool import MAX_BATCH_POSES
 
 ENVIRONMENT_PREFIX = "ULTRAGRAY_"

@@ -11,12 +11,13 @@ import numpy as np
 import torch
 from safetensors import safe_open
 
-from ultragray import GaussianScene, PhasedProbe, SceneInfo, request, scene_info
+from ultragray import GaussianScene, PhasedProbe, SceneInfo, scene_info
 from ultragray.confidence import Extrapolation
 from ultragray.interchange import checkpoint_export, ply
+from ultragray.outputs import OUTPUTS
+from ultragray.settings import Encoding
 from ultragray_service.http import accept
 from ultragray_workers.pool.process import encoding as pixels
-from ultragray_workers.pool.types import Encoding
 
 from .document import code, rows, table
 
@@ -75,7 +76,7 @@ def test_exported_checkpoint(tmp_path: Path) -> None:
 
 
 def test_frames() -> None:
-    assert list(table("Outputs")) == list(request.ALL_OUTPUTS)
+    assert list(table("Outputs")) == list(OUTPUTS)
     documented = {name: code(media_type)[0] for name, (media_type, _) in table("Encodings").items()}
     assert set(documented) == {encoding.value for encoding in Encoding}
     for name, media_type in documented.items():
@@ -85,7 +86,7 @@ def test_frames() -> None:
 
 def test_npz() -> None:
     file = io.BytesIO()
-    frames = {name: np.zeros((2, 3, 5), np.float32) for name in request.ALL_OUTPUTS}
+    frames = {name: np.zeros((2, 3, 5), np.float32) for name in OUTPUTS}
     told = [Extrapolation(None, None, None, None)] * 2
     pixels.write_npz(file, frames, np.zeros((2, 4, 4)), told, scene="demo", scene_sha256="0" * 64, renderer="ultragray")
     file.seek(0)

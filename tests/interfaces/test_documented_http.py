@@ -17,6 +17,7 @@ from ultragray import (
 from ultragray.confidence import Extrapolation
 from ultragray.display.settings import AS_RENDERED
 from ultragray.errors import error_classes
+from ultragray.settings import Resolved
 from ultragray_service.core.pose_stream import Answered
 from ultragray_service.core.state import Service
 from ultragray_service.http import accept, middleware, problems
@@ -25,7 +26,7 @@ from ultragray_service.http.docs import DOCS_PATH
 from ultragray_service.http.routes import render as render_route
 from ultragray_service.http.schemas import DisplayBody, RenderBody
 from ultragray_service.http.stream_schemas import StreamMessage, StreamSettings, frame_bytes
-from ultragray_workers.pool.types import Encoding, RenderResult
+from ultragray_workers.pool.types import RenderResult
 
 from .document import DOCUMENT, code, numbers, table
 
@@ -108,13 +109,7 @@ def rendered() -> RenderResult:
         scene_sha256="0" * 64,
         renderer="ultragray",
         poses=np.eye(4)[None],
-        probe=LinearProbe(40, 0, 50),
-        rendered_height=1,
-        rendered_width=1,
-        display=AS_RENDERED,
-        picture=AS_RENDERED.picture(LinearProbe(40, 0, 50), 1, 1),
-        outputs=("bmode",),
-        encoding=Encoding.UINT8,
+        settings=Resolved(LinearProbe(40, 0, 50), 1, 1),
         data=b"\0",
         queue_ms=0.0,
         render_ms=0.0,

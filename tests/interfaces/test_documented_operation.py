@@ -16,9 +16,9 @@ from pydantic.fields import FieldInfo
 from ultragray import (
     ConvexProbe,
     errors,
+    image_size,
     pose,
     probe,
-    request,
     scene_info,
 )
 from ultragray.training import TrainingConfig
@@ -120,8 +120,8 @@ def test_fixed_limits() -> None:
         "Largest coordinate of a pose": pose.MAX_POSITION_MM,
         "Largest length of a probe": probe.MAX_LENGTH_MM,
         "Largest opening angle": 175,
-        "Largest height and width of the library": request.MAX_IMAGE_SIDE,
-        "Height and width where the scene knows none": scene_info.DEFAULT_IMAGE_SIDE,
+        "Largest height and width of the library": image_size.MAX_IMAGE_SIDE,
+        "Height and width where the scene knows none": image_size.DEFAULT_IMAGE_SIDE,
         "Training poses of a scene": scene_info.MAX_TRAINING_POSES,
         "Header of a scene file, with its metadata": scene_info.MAX_HEADER_BYTES,
         "Metrics of a scene": scene_info.MAX_METRICS,

@@ -15,11 +15,13 @@ import cv2
 import numpy as np
 import pytest
 
-from ultragray import GaussianScene, LinearProbe, render
+from ultragray import GaussianScene, render
 from ultragray.confidence import FIGURES
-from ultragray_workers import Encoding, PoolConfig, RenderPool, RenderRequest, RenderResult, SceneStore
+from ultragray.settings import Encoding
+from ultragray_workers import PoolConfig, RenderPool, RenderRequest, RenderResult, SceneStore
 
-PROBE = LinearProbe(width_mm=30.0, near_mm=0.0, far_mm=40.0)
+from .asking import HEIGHT, PROBE, WIDTH
+
 TIME_LIMIT_S = 60.0
 
 T = TypeVar("T")
@@ -29,7 +31,7 @@ OpenPool = Callable[..., contextlib.AbstractAsyncContextManager[RenderPool]]
 @pytest.fixture
 def scene_folder(tmp_path: Path, random_scene: Callable[..., GaussianScene]) -> Path:
     """Scenes `a` and `b`, which look different, trained with frames of 24x32."""
-    info = {"probe": PROBE, "image_height": 24, "image_width": 32}
+    info = {"probe": PROBE, "image_height": HEIGHT, "image_width": WIDTH}
     random_scene(50, seed=1, info=info).save(tmp_path / "a.ugr")
     random_scene(50, seed=2, info=info).save(tmp_path / "b.ugr")
     return tmp_path
@@ -55,28 +57,29 @@ def expect_frames(scene_folder: Path) -> Callable[[RenderRequest, RenderResult],
 
     def check(request: RenderRequest, result: RenderResult) -> None:
         scene = GaussianScene.load(scene_folder / f"{request.scene}.ugr")
+        asked = request.settings
         direct = render(
-            scene, request.probe, request.poses, height=result.height, width=result.width, outputs=request.outputs
+            scene, asked.probe, request.poses, height=result.height, width=result.width, outputs=asked.outputs
         )
-        floats = np.stack([getattr(direct, name).numpy() for name in request.outputs])  # [O, C, H, W]
+        floats = np.stack([direct[name].numpy() for name in asked.outputs])  # [O, C, H, W]
         bytes_ = np.round(np.clip(floats, 0, 1) * np.float32(255)).astype(np.uint8)
-        if request.encoding is Encoding.UINT8:
+        if asked.encoding is Encoding.UINT8:
             assert result.data == bytes_.tobytes()
-        elif request.encoding is Encoding.FLOAT32:
+        elif asked.encoding is Encoding.FLOAT32:
             assert result.data == floats.astype("<f4").tobytes()
-        elif request.encoding is Encoding.PNG:
+        elif asked.encoding is Encoding.PNG:
             assert result.data.startswith(b"\x89PNG")
             decoded = cv2.imdecode(np.frombuffer(result.data, np.uint8), cv2.IMREAD_UNCHANGED)
             np.testing.assert_array_equal(decoded, bytes_[0, 0])
-        elif request.encoding is Encoding.JPEG:
+        elif asked.encoding is Encoding.JPEG:
             assert result.data.startswith(b"\xff\xd8")
             decoded = cv2.imdecode(np.frombuffer(result.data, np.uint8), cv2.IMREAD_UNCHANGED)
             assert decoded.shape == bytes_[0, 0].shape
             assert np.abs(decoded.astype(float) - bytes_[0, 0]).mean() < 6
         else:
             with np.load(io.BytesIO(result.data)) as archive:
-                assert set(archive) == {*request.outputs, "poses", *FIGURES, "scene", "scene_sha256", "renderer"}
-                for number, name in enumerate(request.outputs):
+                assert set(archive) == {*asked.outputs, "poses", *FIGURES, "scene", "scene_sha256", "renderer"}
+                for number, name in enumerate(asked.outputs):
                     assert archive[name].dtype == np.float32
                     np.testing.assert_array_equal(archive[name], floats[number])
                 np.testing.assert_array_equal(archive["poses"], request.poses)

@@ -1,11 +1,10 @@
 """The render pool: worker processes that turn poses into encoded frames. Free of torch."""
 
 from .pool.pool import PoolConfig, PoolStatistics, RenderPool
-from .pool.types import Encoding, Priority, RenderRequest, RenderResult
+from .pool.types import Priority, RenderRequest, RenderResult
 from .scenes import SceneStore
 
 __all__ = [
-    "Encoding",
     "PoolConfig",
     "PoolStatistics",
     "Priority",

@@ -13,8 +13,8 @@ from torch.autograd.function import once_differentiable
 
 from .. import _cpu
 from ..errors import BackendUnavailable
+from ..outputs import PLANES, WEIGHT_SUM
 from ..probe import FloatArray, LinearProbe, Probe
-from ..request import OUTPUTS, WEIGHT_SUM
 from ..scene import PARAMETERS, GaussianScene
 
 INSTRUCTION_SETS: tuple[str, ...] = tuple(_cpu.instruction_sets())  # what this processor can run, best first
@@ -81,7 +81,7 @@ def _empty_planes(view: dict[str, Any], names: Sequence[str]) -> dict[str, Tenso
 
 
 def _arrays(planes: dict[str, Tensor]) -> dict[str, Any]:
-    return {name: planes[name].numpy() if name in planes else None for name in OUTPUTS}
+    return {name: planes[name].numpy() if name in planes else None for name in PLANES}
 
 
 class _Render(torch.autograd.Function):

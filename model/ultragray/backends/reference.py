@@ -14,8 +14,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from ..outputs import WEIGHT_SUM
 from ..probe import FloatArray, LinearProbe, Probe
-from ..request import WEIGHT_SUM
 from ..scene import GaussianScene
 
 MIN_WEIGHT = 1.0 / 255.0  # the skip rule: a Gaussian is skipped where both w and α are below this

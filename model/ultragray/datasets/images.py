@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import DatasetInvalid, InvalidArgument
-from ..request import MAX_IMAGE_SIDE
+from ..image_size import MAX_IMAGE_SIDE
 from .sweep import ByteArray
 
 

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
+from ..outputs import OUTPUTS
 from ..probe import Probe
-from ..request import LABELS
 from .settings import FRAME_RANGE_DB, Display
 
 _CACHED_PICTURES = 8  # at 9 bytes a pixel
@@ -23,19 +23,19 @@ def show(
 ) -> dict[str, Tensor]:
     """Each output [C, H, W] as `display` shows it, [C, H', W'] of `Display.picture`, in the type that it had.
 
-    Pixels that are `blackened`, [C, H, W] bool, are 0 in every output but coverage, whatever the gain.
+    Pixels that are `blackened`, [C, H, W] bool, are 0 in every output but those that tell support, whatever the gain.
     """
     shown = {}
     for name, pixels in frames.items():
         rows = display.rows_shown(probe, pixels.shape[1])
         shown[name] = pixels[:, :rows]
-        if name == "bmode" and display.changes_tone:
+        if OUTPUTS[name].is_toned and display.changes_tone:
             shown[name] = _toned(shown[name], display)
-        if blackened is not None and name != "coverage":
+        if blackened is not None and not OUTPUTS[name].tells_support:
             shown[name] = shown[name].masked_fill(blackened[:, :rows], 0)
         if display.pixel_mm is not None:
             cropped = probe.cropped(rows / pixels.shape[1])
-            shown[name] = _scan_converted(shown[name], cropped, display.pixel_mm, nearest=name == LABELS)
+            shown[name] = _scan_converted(shown[name], cropped, display.pixel_mm, nearest=OUTPUTS[name].is_numbers)
         if display.flip:
             shown[name] = shown[name].flip(2)
         shown[name] = shown[name].contiguous()

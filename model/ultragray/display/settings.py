@@ -5,54 +5,39 @@ Free of torch; `show` in `ultragray.display.frames` applies it.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 
-from ..errors import InvalidArgument, InvalidImageSize
+from ..contract import Contract, described
+from ..errors import InvalidImageSize
+from ..image_size import MAX_IMAGE_SIDE
 from ..probe import FloatArray, LinearProbe, Picture, Probe
-from ..request import MAX_IMAGE_SIDE
 
 FRAME_RANGE_DB = 60.0  # a B-mode frame is taken as compressed logarithmically over this range, 1 being 0 dB
-MAX_GAIN_DB = 100.0
-DYNAMIC_RANGE_DB = (1.0, 200.0)
 MAX_TGC_POINTS = 16
-MAX_PIXEL_MM = 100.0
 
 
 @dataclass(frozen=True)
-class Display:
-    """How frames are shown. The defaults show them as they are.
+class Display(Contract):
+    """Settings of a display. The defaults show frames as they are.
 
-    `gain_db`: added to every echo. `dynamic_range_db`: from white down to black. `tgc_db`: gains at evenly spaced
-    depths from the first row shown to the last, linear in between. Those three change B-mode only; the others change
-    every output: `depth_mm`: deeper rows, counted from the transducer's face, are cut off. `flip`: left and right
-    change places. `pixel_mm`: scan conversion to square pixels of that size.
-
-    Raises InvalidArgument for numbers beyond the limits of this module.
+    Gain, dynamic range and time-gain compensation change B-mode only; the others change every output. Raises
+    InvalidArgument for numbers beyond the limits.
     """
 
-    gain_db: float = 0.0
-    dynamic_range_db: float = FRAME_RANGE_DB
-    tgc_db: tuple[float, ...] = ()
-    depth_mm: float | None = None
-    flip: bool = False
-    pixel_mm: float | None = None
-
-    def __post_init__(self) -> None:
-        _check("gain_db", self.gain_db, -MAX_GAIN_DB, MAX_GAIN_DB)
-        _check("dynamic_range_db", self.dynamic_range_db, *DYNAMIC_RANGE_DB)
-        if len(self.tgc_db) > MAX_TGC_POINTS:
-            raise InvalidArgument(
-                f"tgc_db must hold at most {MAX_TGC_POINTS} gains, got {len(self.tgc_db)}", field="tgc_db"
-            )
-        for index, gain in enumerate(self.tgc_db):
-            _check(f"tgc_db[{index}]", gain, -MAX_GAIN_DB, MAX_GAIN_DB)
-        if self.depth_mm is not None:
-            _check("depth_mm", self.depth_mm, 1e-3, math.inf)
-        if self.pixel_mm is not None:
-            _check("pixel_mm", self.pixel_mm, 1e-3, MAX_PIXEL_MM)
+    gain_db: float = described("Added to every echo.", 0.0, low=-100.0, high=100.0)
+    dynamic_range_db: float = described("From white down to black.", FRAME_RANGE_DB, low=1.0, high=200.0)
+    tgc_db: tuple[float, ...] = described(
+        "Gains at evenly spaced depths from the first row shown to the last, linear in between.",
+        (),
+        low=-100.0,
+        high=100.0,
+        most=MAX_TGC_POINTS,
+    )
+    depth_mm: float | None = described("Deeper rows, counted from the face, are cut off.", None, low=1e-3)
+    flip: bool = described("Left and right change places.", False)
+    pixel_mm: float | None = described("Scan conversion to square pixels of this size.", None, low=1e-3, high=100.0)
 
     @property
     def changes_tone(self) -> bool:
@@ -87,11 +72,6 @@ class Display:
             points = np.linspace(0.0, 1.0, len(self.tgc_db))
             gains += np.interp((np.arange(rows) + 0.5) / rows, points, self.tgc_db)
         return gains
-
-
-def _check(field: str, value: float, low: float, high: float) -> None:
-    if not low <= value <= high:
-        raise InvalidArgument(f"{field} must be from {low:g} to {high:g}, got {value:g}", field=field)
 
 
 AS_RENDERED = Display()

@@ -24,11 +24,12 @@ from ultragray.files.poses import load_poses
 from ultragray.interchange.exports import FORMATS, ExportHeader, check_format, export_to, exporter_class, format_of
 from ultragray.interchange.exports.png_folder import export_pngs
 from ultragray.interchange.rendering import render_into
+from ultragray.outputs import check_outputs
 from ultragray.probe import LinearProbe, Probe, probe_from_dict
 from ultragray.rendering import renderer_name
-from ultragray.request import check_image_size, check_labelled, check_min_confidence, check_outputs
 from ultragray.samplers import TrainingSampler, assessed_poses, sampler_from_dict
 from ultragray.scene import GaussianScene
+from ultragray.settings import Encoding, FrameSettings
 from ultragray_workers.pool.process.placement import render_device
 
 from .output import check_writable
@@ -72,12 +73,18 @@ def render_to_files(options: RenderOptions) -> str:
     given_probe = None if options.probe_json is None else _parse_probe(options.probe_json)
     given_poses = None if options.poses is None else load_poses(options.poses)
     scene = GaussianScene.load(options.scene)
-    check_labelled(outputs, scene.info)
-    check_min_confidence(options.min_confidence, scene.info)
+    asked = FrameSettings(
+        probe=given_probe,
+        height=options.height,
+        width=options.width,
+        outputs=outputs,
+        min_confidence=options.min_confidence,
+    )
     try:
-        probe = scene.info.probe_or(given_probe)
+        settings = asked.resolved(scene.info, Encoding.FLOAT32)
     except InvalidProbe as error:
         raise InvalidProbe(f"--{error.detail}", field="probe") from None  # as the option is called here
+    probe, height, width = settings.probe, settings.height, settings.width
     base = scene.training_poses if given_poses is None else given_poses
     if not len(base):
         raise InvalidArgument("--poses must be given: the scene holds no training poses", field="poses")
@@ -86,8 +93,6 @@ def render_to_files(options: RenderOptions) -> str:
     assessor = Assessor(scene.info, scene.training_poses)
     assess = partial(assessor.assess, probe=probe)
     poses, extrapolations = assessed_poses(sampler, base, probe, assess, options.min_confidence)
-    height, width = scene.info.image_size_or(options.height, options.width)
-    check_image_size(height, width)
     scene = scene.to(render_device(options.backend))
     display = _display(options.scan_convert_mm, probe, format)
     if options.threads:

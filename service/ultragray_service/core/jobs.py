@@ -11,6 +11,7 @@ from typing import TypeVar
 
 from sqlalchemy.exc import SQLAlchemyError
 
+from ultragray.contract import under
 from ultragray.errors import DatasetInvalid, InvalidArgument, SceneFileInvalid, UltragrayError
 from ultragray_workers.errors import DatabaseUnavailable, DatasetNotFound, NotReady, SceneExists, SceneNotFound
 from ultragray_workers.jobs.folder import JobFolder
@@ -21,7 +22,6 @@ from ultragray_workers.scenes import SceneStore
 from ..settings import Settings
 from .catalog import MAX_PAGE_SIZE, scene_to_blame
 from .job_hub import JobHub, JobWatch
-from .requests import field_under
 
 COUNT_INTERVAL_S = 10.0
 _BESIDE_SPECIFICATION = ("request_id", "priority")
@@ -174,8 +174,8 @@ def _specification_to_blame(field: str) -> Iterator[None]:
     except InvalidArgument as error:
         if error.field in _BESIDE_SPECIFICATION:
             raise
-        with field_under(field):
+        with under(field):
             raise
     except (DatasetInvalid, DatasetNotFound, SceneExists, SceneFileInvalid, SceneNotFound):
-        with field_under(field):
+        with under(field):
             raise

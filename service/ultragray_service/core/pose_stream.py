@@ -12,11 +12,11 @@ from typing import Any
 
 from ultragray.errors import UltragrayError
 from ultragray.probe import FloatArray
+from ultragray.settings import Resolved
 from ultragray_workers.errors import Draining
 from ultragray_workers.pool.types import RenderRequest, RenderResult
 from ultragray_workers.pool.waiting import Turn
 
-from .requests import frame_bytes
 from .state import Service
 
 MAX_FRAMES_IN_FLIGHT = 8  # of an ordered stream; then it stops reading
@@ -39,7 +39,8 @@ class Asked:
 
     sequence: int
     client_time: float | None  # any number (an int for gRPC): the client gets it back
-    settings: RenderRequest  # without poses; the same object for as long as nothing changes
+    scene: str
+    settings: Resolved  # the same object for as long as nothing changes
     pose: FloatArray  # [4, 4] mm, exact
     deadline: float  # time.monotonic() in seconds
 
@@ -131,7 +132,7 @@ class PoseStream:
     async def ask(self, asked: Asked) -> None:
         """Takes a pose. An ordered stream waits while too many frames are in flight."""
         if self.mode is StreamMode.ORDERED:
-            size = frame_bytes(asked.settings)
+            size = asked.settings.pixels * asked.settings.encoding.pixel_type.itemsize
             await self._room.enter(size)
             self._start(self._answer(asked), sent=partial(self._room.leave, size))
             return
@@ -178,8 +179,8 @@ class PoseStream:
 
     async def _outcome(self, asked: Asked, turn: Turn) -> RenderResult | UltragrayError:
         try:
-            prepared = self._service.planner.with_poses(asked.settings, asked.pose[None], asked.deadline)
-            return await self._service.render(prepared, turn)
+            request = RenderRequest(asked.scene, asked.settings, asked.pose[None], deadline=asked.deadline)
+            return await self._service.render(request, turn)
         except UltragrayError as error:
             outcome = error
         except Exception:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from ultragray_workers.pool.types import Encoding
+from ultragray.settings import Encoding
 
 from ..errors import NotAcceptable
 

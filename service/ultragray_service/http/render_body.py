@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from ultragray.display.settings import AS_RENDERED, Display
+from ultragray.contract import under
 from ultragray.errors import InvalidArgument, InvalidPose
 from ultragray.pose import pose_from_position_quaternion
-from ultragray.probe import FloatArray, Probe
-from ultragray_workers.pool.types import Below, Trust
+from ultragray.probe import FloatArray
+from ultragray.settings import Below, FrameSettings
 
-from ..core.requests import check_pose_count, field_under, gather_poses, one_pose
+from ..core.requests import check_pose_count, gather_poses, one_pose
 from .schemas import PoseBody, RenderBody
 from .stream_schemas import StreamSettings
 
@@ -45,22 +45,21 @@ def checked_pose(path: str, pose: PoseBody) -> FloatArray:  # [4, 4] mm
     return pose_from_position_quaternion((p.x, p.y, p.z), (q.w, q.x, q.y, q.z), field=path)
 
 
-def asked_display(body: RenderBody | StreamSettings) -> Display:
-    """The display settings of the body. Raises InvalidArgument, naming the number."""
-    if body.display is None:
-        return AS_RENDERED
-    with field_under("display"):
-        return body.display.display()
-
-
-def asked_trust(body: RenderBody | StreamSettings) -> Trust:
-    """The confidence that the body asks for, not yet checked."""
-    return Trust(body.min_confidence, Below(body.below_min_confidence))
-
-
-def asked_probe(body: RenderBody | StreamSettings) -> Probe | None:
-    """The probe of the body. Raises InvalidProbe, naming the number."""
-    if body.probe is None:
-        return None
-    with field_under("probe"):
-        return body.probe.probe()
+def asked_settings(body: RenderBody | StreamSettings) -> FrameSettings:
+    """What the body asks for, apart from the poses. Raises InvalidArgument, naming the number."""
+    probe = display = None
+    if body.probe is not None:
+        with under("probe"):
+            probe = body.probe.probe()
+    if body.display is not None:
+        with under("display"):
+            display = body.display.display()
+    return FrameSettings(
+        height=body.height,
+        width=body.width,
+        probe=probe,
+        min_confidence=body.min_confidence,
+        below_min_confidence=Below(body.below_min_confidence),
+        display=display,
+        outputs=tuple(body.outputs),
+    )

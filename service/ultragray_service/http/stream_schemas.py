@@ -12,7 +12,7 @@ from typing_extensions import TypedDict  # pydantic reads those of `typing` from
 from ultragray.confidence.assess import Extrapolation
 from ultragray.errors import UltragrayError
 from ultragray.probe import Picture, probe_to_dict
-from ultragray_workers.pool.types import Encoding, RenderResult
+from ultragray_workers.pool.types import RenderResult
 
 from ..core.pose_stream import Answered, StreamMode
 from .schemas import DisplayBody, MatrixRows, PoseBody, ProbeBody, RequestModel
@@ -134,15 +134,15 @@ def frame_bytes(answered: Answered, result: RenderResult) -> bytes:
         "scene_sha256": result.scene_sha256,
         "renderer": result.renderer,
         "pose": result.poses[0].tolist(),
-        "probe": probe_to_dict(result.probe),
-        "rendered_height": result.rendered_height,
-        "rendered_width": result.rendered_width,
-        "display": asdict(result.display),
+        "probe": probe_to_dict(result.settings.probe),
+        "rendered_height": result.settings.height,
+        "rendered_width": result.settings.width,
+        "display": asdict(result.settings.display),
         "height": result.height,
         "width": result.width,
-        "picture": picture_json(result.picture),
-        "outputs": result.outputs,
-        "encoding": Encoding(result.encoding).value,
+        "picture": picture_json(result.settings.picture),
+        "outputs": result.settings.outputs,
+        "encoding": result.settings.encoding.value,
         "extrapolation": asdict(result.extrapolations[0]),
         "queue_ms": round(result.queue_ms, 3),
         "render_ms": round(result.render_ms, 3),

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, replace
 
 from ultragray.display.settings import true_to_scale
-from ultragray_workers.pool.types import Encoding, Priority, RenderResult
+from ultragray.settings import Encoding, FrameSettings
+from ultragray_workers.pool.types import RenderRequest, RenderResult
 
-from ..core.requests import RenderSpec
 from ..core.state import Service
 from .contents import Image, Tool, pack_image, pack_position, pack_tools, pack_transform
 from .messages import Message
@@ -65,17 +65,15 @@ class FrameMaker:
     async def render(self, underway: Underway) -> Frame:
         """The frame of a pose, or of one that took its turn; probe and size are those the scene was trained with.
 
-        Raises SceneNotFound, and what RequestPlanner.plan and Service.render raise.
+        Raises SceneNotFound, and what RequestPlanner.resolve and Service.render raise.
         """
         self._service.require_serving()
         scene = await self._scenes.choose(underway.posed.message.device_name)
-        spec = RenderSpec(scene, None, None, None, ("bmode",), Encoding.UINT8)
         planner = self._service.planner
-        planned = await planner.plan(spec, Priority.INTERACTIVE)
-        assert planned.probe is not None
-        assert planned.height is not None
-        display = true_to_scale(planned.probe, planned.height, self._service.settings.max_image_side)
-        planned = replace(planned, display=display)
-        prepared = planner.with_poses(planned, underway.posed.pose[None], planner.deadline(None))
-        result = await self._service.render(prepared, underway.turn)
+        settings = await planner.resolve(scene, FrameSettings(), Encoding.UINT8)
+        display = true_to_scale(settings.probe, settings.height, self._service.settings.max_image_side)
+        asked = RenderRequest(
+            scene, replace(settings, display=display), underway.posed.pose[None], deadline=planner.deadline(None)
+        )
+        result = await self._service.render(asked, underway.turn)
         return Frame(underway.posed, result, image_of(result))

@@ -16,7 +16,7 @@ def image_of(result: RenderResult) -> Image:
 
     i runs along lateral x, j along depth z, k against elevation y, so that i, j, k is right-handed.
     """
-    picture = result.picture
+    picture = result.settings.picture
     in_probe = np.zeros((4, 4))  # pixel→probe
     in_probe[0, 0], in_probe[2, 1] = picture.step
     in_probe[1, 2] = -_SLICE_MM

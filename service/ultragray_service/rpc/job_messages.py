@@ -6,12 +6,12 @@ from typing import Any
 
 from google.protobuf.json_format import MessageToDict, SerializeToJsonError
 
+from ultragray.contract import under
 from ultragray.errors import InvalidArgument
 from ultragray_proto.v1 import jobs_pb2, scenes_pb2
 from ultragray_workers.jobs.specification import Specification, from_dict
 from ultragray_workers.jobs.store import Job
 
-from ..core.requests import field_under
 from .messages import OUTPUT_NUMBERS, output_name, poses_from_messages
 
 STATES: dict[int, str] = {
@@ -58,7 +58,7 @@ def specification_from_message(message: jobs_pb2.SubmitJobRequest) -> tuple[Spec
     kind = message.WhichOneof("specification")
     if kind is None:
         raise InvalidArgument("train or render is required", field="train")
-    with field_under(kind):
+    with under(kind):
         written = _written_train(message.train) if kind == "train" else _written_render(message.render)
         return from_dict({"kind": kind, **written}), kind
 

@@ -8,14 +8,16 @@ from dataclasses import asdict
 
 import numpy as np
 
+from ultragray.contract import under
 from ultragray.display.settings import AS_RENDERED, FRAME_RANGE_DB, Display
 from ultragray.errors import InvalidArgument, InvalidPose, InvalidProbe, UltragrayError, UnknownOutput
 from ultragray.pose import check_poses, pose_from_position_quaternion
 from ultragray.probe import ConvexProbe, FloatArray, LinearProbe, PhasedProbe, Picture, Probe
+from ultragray.settings import Below, Encoding, RenderSettings
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2, scenes_pb2
-from ultragray_workers.pool.types import Below, Encoding, RenderResult, Trust
+from ultragray_workers.pool.types import RenderResult
 
-from ..core.requests import RenderSpec, field_under, one_pose
+from ..core.requests import one_pose
 
 OUTPUT_NAMES = {
     rendering_pb2.OUTPUT_BMODE: "bmode",
@@ -82,14 +84,14 @@ def probe_from_message(message: geometry_pb2.Probe) -> Probe:
     kind = message.WhichOneof("kind")
     if kind == "linear":
         linear = message.linear
-        with field_under("linear"):
+        with under("linear"):
             return LinearProbe(width_mm=linear.width_mm, near_mm=linear.near_mm, far_mm=linear.far_mm)
     if kind == "convex":
         convex = message.convex
-        with field_under("convex"):
+        with under("convex"):
             return ConvexProbe(opening_angle_deg=convex.opening_angle_deg, near_mm=convex.near_mm, far_mm=convex.far_mm)
     if kind == "phased":
-        with field_under("phased"):
+        with under("phased"):
             return PhasedProbe(opening_angle_deg=message.phased.opening_angle_deg, far_mm=message.phased.far_mm)
     raise InvalidProbe("kind must be linear, convex or phased, got none", field="kind")
 
@@ -119,31 +121,28 @@ def position_message(point: FloatArray | tuple[float, float, float]) -> geometry
     return geometry_pb2.Position(x=x, y=y, z=z)
 
 
-def spec_from_message(message: rendering_pb2.RenderSettings) -> RenderSpec:
+def settings_from_message(message: rendering_pb2.RenderSettings) -> RenderSettings:
     """What the settings ask for. Raises InvalidArgument; its field is a path below the settings."""
     if message.encoding not in ENCODINGS:
         raise InvalidArgument(f"encoding must be one of the enum Encoding, got {message.encoding}", field="encoding")
     outputs = tuple(output_name(number) for number in message.outputs)
     probe = None
     if message.HasField("probe"):
-        with field_under("probe"):
+        with under("probe"):
             probe = probe_from_message(message.probe)
-    display = AS_RENDERED
+    display = None
     if message.HasField("display"):
-        with field_under("display"):
+        with under("display"):
             display = display_from_message(message.display)
-    return RenderSpec(
-        scene=message.scene,
+    return RenderSettings(
         probe=probe,
         height=message.height if message.HasField("height") else None,
         width=message.width if message.HasField("width") else None,
         outputs=outputs or ("bmode",),
         encoding=ENCODINGS[message.encoding],
         display=display,
-        trust=Trust(
-            min_confidence=message.min_confidence if message.HasField("min_confidence") else None,
-            below=_below(message.below_min_confidence),
-        ),
+        min_confidence=message.min_confidence if message.HasField("min_confidence") else None,
+        below_min_confidence=_below(message.below_min_confidence),
     )
 
 
@@ -199,17 +198,17 @@ def frame_message(result: RenderResult, sequence: int) -> rendering_pb2.Frame:
         scene_sha256=result.scene_sha256,
         renderer=result.renderer,
         pose=matrix_message(result.poses[0]),
-        probe=probe_message(result.probe),
+        probe=probe_message(result.settings.probe),
         height=result.height,
         width=result.width,
-        outputs=[OUTPUT_NUMBERS[name] for name in result.outputs],
-        encoding=_ENCODING_NUMBERS[result.encoding],
+        outputs=[OUTPUT_NUMBERS[name] for name in result.settings.outputs],
+        encoding=_ENCODING_NUMBERS[result.settings.encoding],
         data=result.data,
         extrapolation=rendering_pb2.Extrapolation(**asdict(result.extrapolations[0])),
-        display=display_message(result.display),
-        picture=picture_message(result.picture),
-        rendered_height=result.rendered_height,
-        rendered_width=result.rendered_width,
+        display=display_message(result.settings.display),
+        picture=picture_message(result.settings.picture),
+        rendered_height=result.settings.height,
+        rendered_width=result.settings.width,
         timings=rendering_pb2.Timings(queue_ms=result.queue_ms, render_ms=result.render_ms, encode_ms=result.encode_ms),
     )
 

@@ -2,25 +2,26 @@
 
 from __future__ import annotations
 
+from ultragray.contract import under
 from ultragray.errors import InvalidArgument
+from ultragray.settings import Resolved
 from ultragray_proto.v1 import rendering_pb2
-from ultragray_workers.pool.types import Priority, RenderRequest
 
-from ..core.requests import field_under
 from ..core.state import Service
-from .messages import spec_from_message
+from .messages import settings_from_message
 
 
-async def plan_settings(
+async def resolved_settings(
     service: Service,
     message: rendering_pb2.RenderRequest | rendering_pb2.RenderBatchRequest | rendering_pb2.RenderStreamRequest,
-    priority: Priority,
-) -> RenderRequest:
-    """The checked settings of a message, still without poses.
+) -> tuple[str, Resolved]:
+    """The scene and the settings of a message, checked, with nothing left open.
 
-    Raises what RequestPlanner.plan raises; the field is a path below `settings`.
+    Raises what RequestPlanner.resolve raises; the field is a path below `settings`.
     """
     if not message.HasField("settings"):
         raise InvalidArgument("settings is required", field="settings")
-    with field_under("settings"):
-        return await service.planner.plan(spec_from_message(message.settings), priority)
+    with under("settings"):
+        settings = settings_from_message(message.settings)
+        scene: str = message.settings.scene
+        return scene, await service.planner.resolve(scene, settings, settings.encoding)

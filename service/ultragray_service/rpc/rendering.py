@@ -16,7 +16,7 @@ from ultragray_workers.pool.types import Priority, RenderRequest, RenderResult
 from ..core.requests import check_pose_count, gather_poses
 from ..core.state import Service
 from .messages import frame_message, pose_from_message
-from .planning import plan_settings
+from .planning import resolved_settings
 from .stream import FrameStream
 
 _RETRY_S = 0.02
@@ -32,19 +32,19 @@ class RenderService:
         self, request: rendering_pb2.RenderRequest, context: grpc.aio.ServicerContext
     ) -> rendering_pb2.Frame:
         deadline = self._service.planner.deadline(context.time_remaining())
-        planned = await plan_settings(self._service, request, Priority.INTERACTIVE)
+        scene, settings = await resolved_settings(self._service, request)
         if not request.HasField("pose"):
             raise InvalidArgument("pose is required", field="pose")
         pose = pose_from_message(request.pose, "pose")
-        prepared = self._service.planner.with_poses(planned, pose[None], deadline)
-        return frame_message(await self._service.render(prepared), 0)
+        asked = RenderRequest(scene, settings, pose[None], deadline=deadline)
+        return frame_message(await self._service.render(asked), 0)
 
     async def RenderBatch(  # noqa: N802
         self, request: rendering_pb2.RenderBatchRequest, context: grpc.aio.ServicerContext
     ) -> None:
         planner = self._service.planner
         check_pose_count(len(request.poses), planner.max_poses)
-        planned = await plan_settings(self._service, request, Priority.BATCH)
+        scene, settings = await resolved_settings(self._service, request)
         poses = await gather_poses(
             len(request.poses), lambda index: pose_from_message(request.poses[index], f"poses[{index}]")
         )
@@ -55,8 +55,9 @@ class RenderService:
             for sequence in range(len(poses)):
                 while started < len(poses) and len(in_flight) < window:
                     deadline = planner.deadline(context.time_remaining())
-                    prepared = planner.with_poses(planned, poses[started : started + 1], deadline)
-                    render = self._service.render(prepared) if started == 0 else self._render_when_room(prepared)
+                    some = poses[started : started + 1]
+                    asked = RenderRequest(scene, settings, some, Priority.BATCH, deadline)
+                    render = self._service.render(asked) if started == 0 else self._render_when_room(asked)
                     in_flight.append(asyncio.ensure_future(render))
                     started += 1
                 try:

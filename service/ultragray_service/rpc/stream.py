@@ -5,13 +5,13 @@ from __future__ import annotations
 import grpc
 
 from ultragray.errors import InvalidArgument, UltragrayError
+from ultragray.settings import Resolved
 from ultragray_proto.v1 import rendering_pb2
-from ultragray_workers.pool.types import Priority, RenderRequest
 
 from ..core.pose_stream import Answered, Asked, PoseStream, StreamMode
 from ..core.state import Service
 from .messages import error_message, frame_message, pose_from_message
-from .planning import plan_settings
+from .planning import resolved_settings
 
 _MODES = {
     rendering_pb2.STREAM_MODE_UNSPECIFIED: StreamMode.ORDERED,
@@ -29,7 +29,7 @@ class FrameStream:
     def __init__(self, service: Service, context: grpc.aio.ServicerContext) -> None:
         self._service = service
         self._context = context
-        self._settings: RenderRequest | None = None
+        self._settings: tuple[str, Resolved] | None = None  # with the scene
 
     async def run(self) -> None:
         """Until the client has sent its last message and got its last frame.
@@ -52,17 +52,19 @@ class FrameStream:
         client_time = message.client_time_ns if message.HasField("client_time_ns") else None
         try:
             if message.HasField("settings"):
-                self._settings = await plan_settings(self._service, message, Priority.INTERACTIVE)
+                self._settings = await resolved_settings(self._service, message)
                 if not message.HasField("pose"):
                     return
             if self._settings is None:
                 raise InvalidArgument("settings is required before the first pose", field="settings")
             if not message.HasField("pose"):
                 raise InvalidArgument("pose or settings is required", field="pose")
+            scene, settings = self._settings
             asked = Asked(
                 sequence=message.sequence,
                 client_time=client_time,
-                settings=self._settings,
+                scene=scene,
+                settings=settings,
                 pose=pose_from_message(message.pose, "pose"),
                 deadline=self._service.planner.deadline(self._timeout_s(message)),
             )

@@ -14,7 +14,7 @@ import torch
 from ultragray import ConvexProbe, Frames, GaussianScene, LinearProbe, PhasedProbe, Probe, render
 from ultragray.backends import cpu
 from ultragray.errors import BackendUnavailable
-from ultragray.request import OUTPUTS
+from ultragray.outputs import PLANES
 
 RENDERERS = ("reference", "cuda", "cpu", *(f"cpu-{name}" for name in cpu.INSTRUCTION_SETS))
 LINEAR = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)
@@ -35,7 +35,7 @@ def renderer(request: pytest.FixtureRequest, on_device: Callable[[GaussianScene]
 
     def forced(scene: GaussianScene, probe: Probe, poses: Any, *, height: int, width: int) -> Frames:
         inside = scene.poses_to_scene_cm(np.atleast_3d(poses).reshape(-1, 4, 4))
-        planes = cpu.render_outputs(scene, probe, inside, height, width, OUTPUTS, instruction_set=instruction_set)
+        planes = cpu.render_outputs(scene, probe, inside, height, width, PLANES, instruction_set=instruction_set)
         return Frames(**planes)
 
     return forced
@@ -99,9 +99,9 @@ def prepared(
             exact, single = (
                 render(scene.to(dtype), case.probe, poses, **size) for dtype in (torch.float64, torch.float32)
             )
-            expected = {output: getattr(exact, output).numpy() for output in OUTPUTS}
+            expected = {output: getattr(exact, output).numpy() for output in PLANES}
             stable = np.all(
-                [np.abs(getattr(single, output).numpy() - expected[output]) < 2e-5 for output in OUTPUTS],
+                [np.abs(getattr(single, output).numpy() - expected[output]) < 2e-5 for output in PLANES],
                 axis=0,
             )
             done[name] = (case, scene, poses, expected, stable)
@@ -124,7 +124,7 @@ def test_matches_the_reference_in_float64(
 
 
 def planes(frames: Frames) -> np.ndarray:  # [4, C, H, W]
-    return np.stack([getattr(frames, name).cpu().numpy() for name in OUTPUTS])
+    return np.stack([getattr(frames, name).cpu().numpy() for name in PLANES])
 
 
 @pytest.mark.parametrize("probe", [LINEAR, CONVEX, PHASED], ids=["linear", "convex", "phased"])
@@ -250,7 +250,7 @@ def test_extreme_parameters_stay_exact(
     exact = render(scene.to(torch.float64), LINEAR, poses, backend="reference", **size)
     assert_agrees(
         renderer(scene, LINEAR, poses, **size),
-        {output: getattr(exact, output).numpy() for output in OUTPUTS},
+        {output: getattr(exact, output).numpy() for output in PLANES},
         tolerance=5e-4,
     )
 
@@ -320,7 +320,7 @@ def test_an_unknown_backend_is_named(random_scene: Callable[..., GaussianScene])
 
 def test_an_unknown_instruction_set_is_named(random_scene: Callable[..., GaussianScene]) -> None:
     with pytest.raises(BackendUnavailable, match="mmx"):
-        cpu.render_outputs(random_scene(1), LINEAR, np.eye(4)[None], 4, 4, OUTPUTS, instruction_set="mmx")
+        cpu.render_outputs(random_scene(1), LINEAR, np.eye(4)[None], 4, 4, PLANES, instruction_set="mmx")
 
 
 def single(mean: Sequence[float], scales: Sequence[float], copies: int = 1, **splats: Any) -> GaussianScene:
@@ -357,4 +357,4 @@ def test_extreme_gaussians(name: str, renderer: Renderer, assert_agrees: Callabl
     probe = LinearProbe(width_mm=20.0, near_mm=0.0, far_mm=80.0)
     frames = renderer(scene, probe, np.eye(4), height=40, width=40)
     exact = render(scene.to(torch.float64), probe, np.eye(4), height=40, width=40, backend="reference")
-    assert_agrees(frames, {output: getattr(exact, output).numpy() for output in OUTPUTS}, tolerance=5e-4)
+    assert_agrees(frames, {output: getattr(exact, output).numpy() for output in PLANES}, tolerance=5e-4)

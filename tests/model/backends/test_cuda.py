@@ -16,8 +16,8 @@ import torch
 from ultragray import ConvexProbe, GaussianScene, LinearProbe, Probe, render
 from ultragray.backends import cuda
 from ultragray.errors import BackendUnavailable, MemoryExceeded
+from ultragray.outputs import PLANES
 from ultragray.rendering import renderer_name
-from ultragray.request import OUTPUTS
 
 pytest.importorskip("triton", reason="the package triton is not installed, which runs these kernels")
 
@@ -43,13 +43,13 @@ def shapes_of_a_gpu(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 def planes(scene: GaussianScene, probe: Probe, poses: Any, backend: str = "cuda") -> np.ndarray:  # [4, C, H, W]
     rendered = render(scene, probe, poses, backend=backend, **SIZE)
-    return np.stack([getattr(rendered, name).detach().cpu().double().numpy() for name in OUTPUTS])
+    return np.stack([getattr(rendered, name).detach().cpu().double().numpy() for name in PLANES])
 
 
 def gradient(scene: GaussianScene, probe: Probe, poses: Any, backend: str) -> dict[str, np.ndarray]:
     leaves = {name: tensor.clone().requires_grad_() for name, tensor in scene.splats.items()}
     rendered = render(GaussianScene.from_splats(leaves, info=scene.info), probe, poses, backend=backend, **SIZE)
-    sum(getattr(rendered, name).square().sum() for name in OUTPUTS).backward()
+    sum(getattr(rendered, name).square().sum() for name in PLANES).backward()
     return {name: leaf.grad.cpu().double().numpy() for name, leaf in leaves.items() if leaf.grad is not None}
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ultragray import ConvexProbe, GaussianScene, LinearProbe, PhasedProbe, Probe, render
 from ultragray.backends import cpu, cuda
-from ultragray.request import OUTPUTS
+from ultragray.outputs import PLANES
 
 LINEAR = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)
 CONVEX = ConvexProbe(opening_angle_deg=60.0, near_mm=10.0, far_mm=60.0)
@@ -64,11 +64,11 @@ def by_kernel(
 
         def draw(scene: GaussianScene) -> Mapping[str, Tensor]:
             there = scene.to(cuda.device())
-            return cuda.render_outputs(there, probe, there.poses_to_scene_cm(poses), height, width, OUTPUTS)
+            return cuda.render_outputs(there, probe, there.poses_to_scene_cm(poses), height, width, PLANES)
 
         return draw
     return lambda scene: cpu.render_outputs(
-        scene, probe, scene.poses_to_scene_cm(poses), height, width, OUTPUTS, instruction_set=kernel
+        scene, probe, scene.poses_to_scene_cm(poses), height, width, PLANES, instruction_set=kernel
     )
 
 
@@ -111,12 +111,12 @@ def assert_same_direction_and_length(got: Mapping[str, np.ndarray], want: Mappin
 @pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize("name", SCENES)
 def test_all_outputs_together(name: str, kernel: str, expected: Callable[..., Any]) -> None:
-    scene, probe, poses, weights, want = expected(name, OUTPUTS)
+    scene, probe, poses, weights, want = expected(name, PLANES)
     assert_same_direction_and_length(gradients(scene, weights, by_kernel(probe, poses, kernel)), want)
 
 
 @pytest.mark.parametrize("kernel", ["cuda", "auto"])
-@pytest.mark.parametrize("output", OUTPUTS)
+@pytest.mark.parametrize("output", PLANES)
 @pytest.mark.parametrize("name", ["linear", "convex", "shadows"])
 def test_each_output_alone(name: str, output: str, kernel: str, expected: Callable[..., Any]) -> None:
     scene, probe, poses, weights, want = expected(name, (output,))
@@ -145,7 +145,7 @@ def test_the_reference_by_finite_differences(
     def outputs(*splats: Tensor) -> tuple[Tensor, ...]:
         moved = GaussianScene.from_splats(dict(zip(scene.splats, splats, strict=True)), info=scene.info)
         frames = render(moved, probe, pose, height=5, width=4, backend="reference")
-        return tuple(vars(frames)[name] for name in OUTPUTS)
+        return tuple(vars(frames)[name] for name in PLANES)
 
     leaves = tuple(tensor.clone().requires_grad_() for tensor in scene.splats.values())
     assert torch.autograd.gradcheck(outputs, leaves, eps=1e-7, atol=1e-6, rtol=1e-4)

@@ -12,7 +12,7 @@ import torch
 
 from ultragray import ConvexProbe, GaussianScene, LinearProbe, Probe, SceneInfo, render
 from ultragray.backends.reference import spherical_harmonics
-from ultragray.request import OUTPUTS
+from ultragray.outputs import PLANES
 
 LINEAR = LinearProbe(width_mm=20.0, near_mm=0.0, far_mm=30.0)
 CONVEX = ConvexProbe(opening_angle_deg=50.0, near_mm=10.0, far_mm=40.0)
@@ -128,7 +128,7 @@ def compare(scene: GaussianScene, probe: Probe, poses: np.ndarray, size: tuple[i
     for c, pose in enumerate(poses):
         for index in np.ndindex(height, width):
             want = pixel(splats, scene.info.intensity, probe, pose, index, size)
-            got = {name: float(getattr(frames, name)[(c, *index)]) for name in OUTPUTS}
+            got = {name: float(getattr(frames, name)[(c, *index)]) for name in PLANES}
             assert got == pytest.approx(want, abs=1e-9), (c, index)
     assert frames.coverage is not None
     return frames.coverage.numpy()
@@ -178,7 +178,7 @@ def test_the_worked_value_in_the_middle_of_a_gaussian() -> None:
     scene = one_gaussian((0.0, 0.0, 1.5), (0.1, 0.1, 0.1), transmittance_logit=0.0, sh=(0.0,))
     probe = LinearProbe(width_mm=20.0, near_mm=0.0, far_mm=30.0)
     frames = render(scene, probe, HERE, height=3, width=1, backend="reference")
-    values = {name: getattr(frames, name)[0, :, 0] for name in OUTPUTS}  # rows at 0.5, 1.5, 2.5 cm
+    values = {name: getattr(frames, name)[0, :, 0] for name in PLANES}  # rows at 0.5, 1.5, 2.5 cm
     assert values["coverage"][1].item() == pytest.approx(1 - math.exp(-0.999), abs=1e-12)
     assert values["echo"][1].item() == pytest.approx((1 - math.exp(-0.999)) * 0.999, abs=1e-7)
     alpha = 1 - math.exp(-1.153 * math.sqrt(2 * math.pi) * 0.1)
@@ -255,7 +255,7 @@ def test_harmonics_are_orthonormal() -> None:
 def test_a_gaussian_at_the_probe_has_no_direction() -> None:
     scene = one_gaussian((0.0, 0.0, 0.0), sh=(0.1, 5.0, 5.0, 5.0))
     frames = render(scene, LINEAR, HERE, height=5, width=3, backend="reference")
-    assert all(torch.isfinite(getattr(frames, name)).all() for name in OUTPUTS)
+    assert all(torch.isfinite(getattr(frames, name)).all() for name in PLANES)
     compare(scene, LINEAR, HERE, (5, 3))
 
 
@@ -279,7 +279,7 @@ def test_a_convex_probe_culls_by_range_in_the_plane(mean_cm: tuple[float, float,
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_the_dtype_of_the_scene_is_kept(random_scene: Callable[..., GaussianScene], dtype: torch.dtype) -> None:
     frames = render(random_scene(3, dtype=dtype), LINEAR, HERE, height=4, width=4, backend="reference")
-    assert {getattr(frames, name).dtype for name in OUTPUTS} == {dtype}
+    assert {getattr(frames, name).dtype for name in PLANES} == {dtype}
 
 
 def test_only_the_outputs_asked_for_come_back(random_scene: Callable[..., GaussianScene]) -> None:
@@ -308,7 +308,7 @@ def test_gradients_are_those_of_finite_differences(
     def outputs(*tensors: torch.Tensor) -> tuple[torch.Tensor, ...]:
         moved = GaussianScene(*tensors, info=scene.info, training_poses=scene.training_poses)
         frames = render(moved, probe, HERE, height=3, width=4, backend="reference")
-        return tuple(getattr(frames, name) for name in OUTPUTS)
+        return tuple(getattr(frames, name) for name in PLANES)
 
     inputs = tuple(tensor.clone().requires_grad_() for tensor in scene.splats.values())
     assert torch.autograd.gradcheck(outputs, inputs, eps=1e-6, atol=1e-7, rtol=1e-5)

@@ -67,24 +67,22 @@ def test_pixels_of_a_picture_lie_where_it_says(probe: Probe, flip: bool) -> None
     display = Display(flip=flip, pixel_mm=1.3, depth_mm=45.0)
     origins, directions = probe.scan_lines(WIDTH)
     depths = probe.depths_mm(HEIGHT)
-    if probe.kind == "linear":
-        depths = depths - 0.0
     positions = origins[None] + depths[:, None, None] * directions[None]  # [H, W, 3] mm
     given = {
-        "x": torch.from_numpy(positions[None, :, :, 0]).float(),
-        "z": torch.from_numpy(positions[None, :, :, 2]).float(),
-        "inside": torch.ones((1, HEIGHT, WIDTH)),
+        "echo": torch.from_numpy(positions[None, :, :, 0]).float(),
+        "transmittance": torch.from_numpy(positions[None, :, :, 2]).float(),
+        "coverage": torch.ones((1, HEIGHT, WIDTH)),
     }
-    shown = {name: pixels[0].numpy() for name, pixels in show(given, probe, display).items()}
+    x_shown, z_shown, inside = (pixels[0].numpy() for pixels in show(given, probe, display).values())
     picture = display.picture(probe, HEIGHT, WIDTH)
-    assert shown["x"].shape == (picture.height, picture.width)
+    assert x_shown.shape == (picture.height, picture.width)
     x, z = picture.positions_mm()
     # Away from the border, where the nearest sample is shown
-    eroded = np.stack([np.roll(shown["inside"], (i, j), (0, 1)) for i in (-3, 0, 3) for j in (-3, 0, 3)]).min(0) > 0
+    eroded = np.stack([np.roll(inside, (i, j), (0, 1)) for i in (-3, 0, 3) for j in (-3, 0, 3)]).min(0) > 0
     eroded[:3] = eroded[-3:] = eroded[:, :3] = eroded[:, -3:] = False
     assert eroded.sum() > 50
-    np.testing.assert_allclose(shown["x"][eroded], np.broadcast_to(x, eroded.shape)[eroded], atol=0.05)
-    np.testing.assert_allclose(shown["z"][eroded], np.broadcast_to(z, eroded.shape)[eroded], atol=0.05)
+    np.testing.assert_allclose(x_shown[eroded], np.broadcast_to(x, eroded.shape)[eroded], atol=0.05)
+    np.testing.assert_allclose(z_shown[eroded], np.broadcast_to(z, eroded.shape)[eroded], atol=0.05)
 
 
 def test_scan_conversion_is_that_of_the_probe() -> None:

@@ -12,8 +12,9 @@ from ultragray.confidence import Extrapolation
 from ultragray.display.frames import show
 from ultragray.display.settings import true_to_scale
 from ultragray.probe import Probe
+from ultragray.settings import Resolved
 from ultragray_service.igtl.pictures import image_of
-from ultragray_workers.pool.types import Encoding, RenderResult
+from ultragray_workers.pool.types import RenderResult
 
 from .conftest import FAN, random_pose
 
@@ -27,13 +28,7 @@ def result_of(frame: Any, probe: Probe, pose: Any, max_side: int = 2048) -> Rend
         scene_sha256="",
         renderer="",
         poses=pose[None],
-        probe=probe,
-        rendered_height=frame.shape[0],
-        rendered_width=frame.shape[1],
-        display=display,
-        picture=display.picture(probe, *frame.shape),
-        outputs=("bmode",),
-        encoding=Encoding.UINT8,
+        settings=Resolved(probe, *frame.shape, display=display),
         data=shown.tobytes(),
         queue_ms=0,
         render_ms=0,

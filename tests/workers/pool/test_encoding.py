@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from ultragray.display.pixels import to_uint8
-from ultragray_workers import Encoding
+from ultragray.settings import Encoding
 from ultragray_workers.pool.process.encoding import encode_image, encode_pixels
 
 

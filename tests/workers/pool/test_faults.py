@@ -12,7 +12,10 @@ import time
 import pytest
 
 from ultragray.errors import RenderFailed
-from ultragray_workers import Encoding, Priority, RenderRequest
+from ultragray.settings import Encoding
+from ultragray_workers import Priority
+
+from ..asking import asking
 
 LOAD_SECONDS = float(os.environ.get("ULTRAGRAY_FAULT_SECONDS", "5"))
 
@@ -22,9 +25,9 @@ def test_a_worker_killed_with_work_is_replaced_and_the_work_done_again(
     run, open_pool, random_poses, expect_frames, until, priority
 ):
     requests = [
-        RenderRequest("a", random_poses(1, seed=1), priority=priority),
-        RenderRequest("a", random_poses(7, seed=2), priority=priority, encoding=Encoding.NPZ),
-        RenderRequest("b", random_poses(1, seed=3), priority=priority, encoding=Encoding.PNG),
+        asking("a", random_poses(1, seed=1), priority=priority),
+        asking("a", random_poses(7, seed=2), priority=priority, encoding=Encoding.NPZ),
+        asking("b", random_poses(1, seed=3), priority=priority, encoding=Encoding.PNG),
     ]
 
     async def main():
@@ -44,7 +47,7 @@ def test_a_worker_killed_with_work_is_replaced_and_the_work_done_again(
 
 
 def test_a_worker_killed_in_the_middle_of_a_frame(run, open_pool, random_poses, expect_frames, until):
-    request = RenderRequest("a", random_poses(2), height=400, width=400)  # a second or so for the reference
+    request = asking("a", random_poses(2), height=400, width=400)  # a second or so for the reference
 
     async def main():
         async with open_pool(backend="reference") as pool:
@@ -64,7 +67,7 @@ def test_a_worker_killed_in_the_middle_of_a_frame(run, open_pool, random_poses, 
 
 
 def test_a_request_that_kills_every_worker_fails_alone(run, open_pool, random_poses, until):
-    slow = RenderRequest("a", random_poses(1), height=600, width=600)
+    slow = asking("a", random_poses(1), height=600, width=600)
 
     async def main():
         async with open_pool(backend="reference") as pool:
@@ -76,7 +79,7 @@ def test_a_request_that_kills_every_worker_fails_alone(run, open_pool, random_po
                 await until(lambda deaths=deaths: pool.statistics().restarts_total == deaths)
             with pytest.raises(RenderFailed, match="died 5 times"):
                 await task
-            await pool.render(RenderRequest("b", random_poses(1)))
+            await pool.render(asking("b", random_poses(1)))
 
     run(main())
 
@@ -92,7 +95,7 @@ def test_killed_templates_are_replaced(run, open_pool, random_poses, processes, 
                 for pid in templates[:wanted]:
                     os.kill(pid, signal.SIGKILL)
                 os.kill(pool.statistics().pids[0], signal.SIGKILL)
-                await pool.render(RenderRequest("a", random_poses(1)))
+                await pool.render(asking("a", random_poses(1)))
             assert pool.statistics().restarts_total == 2
 
     run(main())
@@ -122,9 +125,9 @@ def test_no_process_outlives_the_service(tmp_path):
 
 @pytest.mark.slow
 def test_load_with_a_worker_killed_every_second(run, open_pool, random_poses, expect_frames):
-    singles = [RenderRequest("ab"[seed % 2], random_poses(1, seed=seed), height=96, width=96) for seed in range(6)]
-    sweep = RenderRequest("a", random_poses(40), height=96, width=96, encoding=Encoding.NPZ)
-    batch = RenderRequest("b", random_poses(8), height=96, width=96, priority=Priority.BATCH)
+    singles = [asking("ab"[seed % 2], random_poses(1, seed=seed), height=96, width=96) for seed in range(6)]
+    sweep = asking("a", random_poses(40), height=96, width=96, encoding=Encoding.NPZ)
+    batch = asking("b", random_poses(8), height=96, width=96, priority=Priority.BATCH)
     answers = {request: [] for request in [*singles, sweep, batch]}
 
     async def client(pool, request, end):

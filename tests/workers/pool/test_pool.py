@@ -16,16 +16,23 @@ import pytest
 from ultragray import ConvexProbe
 from ultragray.errors import BackendUnavailable, InvalidArgument, SceneFileInvalid
 from ultragray.files.atomic import file_sha256
-from ultragray_workers import Encoding, PoolConfig, Priority, RenderPool, RenderRequest, SceneStore
+from ultragray.settings import Encoding
+from ultragray_workers import PoolConfig, Priority, RenderPool, SceneStore
 from ultragray_workers.errors import DeadlineExceeded, Draining, NotReady, QueueFull, SceneNotFound, SceneTooLarge
+
+from ..asking import asking
 
 
 def test_results_equal_a_direct_render(run, open_pool, random_poses, expect_frames, scene_folder):
     convex = ConvexProbe(opening_angle_deg=60.0, near_mm=5.0, far_mm=40.0)
-    one_frame = RenderRequest("a", random_poses(1))
-    many = RenderRequest("b", random_poses(11), probe=convex, height=20, width=17, outputs=("coverage", "bmode"))
-    requests = [replace(one_frame, encoding=encoding) for encoding in Encoding]
-    requests += [replace(many, encoding=encoding) for encoding in Encoding if not encoding.is_image_file]
+    one_frame = asking("a", random_poses(1))
+    many = asking("b", random_poses(11), probe=convex, height=20, width=17, outputs=("coverage", "bmode"))
+
+    def encoded(request, encoding):
+        return replace(request, settings=replace(request.settings, encoding=encoding))
+
+    requests = [encoded(one_frame, encoding) for encoding in Encoding]
+    requests += [encoded(many, encoding) for encoding in Encoding if not encoding.is_image_file]
 
     async def main(max_batch_poses):
         async with open_pool(max_batch_poses=max_batch_poses) as pool:
@@ -34,47 +41,36 @@ def test_results_equal_a_direct_render(run, open_pool, random_poses, expect_fram
     in_one_go, in_parts = run(main(32)), run(main(2))
     for request, whole, result in zip(requests, in_one_go, in_parts, strict=True):
         assert (whole.batch_size, result.batch_size) == ((1, 1) if len(request.poses) == 1 else (11, 2))
-        assert request.encoding is Encoding.NPZ or whole.data == result.data
+        assert request.settings.encoding is Encoding.NPZ or whole.data == result.data
         expect_frames(request, whole)
         expect_frames(request, result)
         assert result.scene_sha256 == file_sha256(scene_folder / f"{request.scene}.ugr")
         assert result.renderer.startswith("ultragray/")
-        assert (result.outputs, result.encoding) == (request.outputs, request.encoding)
+        assert result.settings == request.settings
         np.testing.assert_array_equal(result.poses, request.poses)
         assert min(result.queue_ms, result.render_ms, result.encode_ms) > 0
 
 
-def test_the_scene_answers_what_the_request_leaves_open(run, open_pool, random_poses):
+def test_image_files_hold_the_frame_of_one_pose(run, open_pool, random_poses):
     async def main():
         async with open_pool() as pool:
-            return await pool.render(RenderRequest("a", random_poses(1)))
-
-    result = run(main())
-    assert (result.height, result.width, result.probe.far_mm) == (24, 32, 40.0)
-
-
-def test_image_files_hold_one_frame(run, open_pool, random_poses):
-    async def main():
-        async with open_pool() as pool:
-            for poses, outputs in ((2, ("bmode",)), (1, ("bmode", "echo"))):
-                request = RenderRequest("a", random_poses(poses), outputs=outputs, encoding=Encoding.PNG)
-                with pytest.raises(InvalidArgument, match="png holds one frame"):
-                    await pool.render(request)
+            with pytest.raises(InvalidArgument, match="png holds the frame of one pose, got 2"):
+                await pool.render(asking("a", random_poses(2), encoding=Encoding.PNG))
             with pytest.raises(InvalidArgument, match="at least one pose"):
-                await pool.render(RenderRequest("a", np.zeros((0, 4, 4))))
+                await pool.render(asking("a", np.zeros((0, 4, 4))))
 
     run(main())
 
 
 def test_waiting_requests_of_one_kind_are_rendered_together(run, open_pool, random_poses, expect_frames, until):
-    alike = [RenderRequest("a", random_poses(1, seed=seed)) for seed in range(5)]
-    other = RenderRequest("a", random_poses(1), height=10)
+    alike = [asking("a", random_poses(1, seed=seed)) for seed in range(5)]
+    other = asking("a", random_poses(1), height=10)
 
     async def main():
         async with open_pool() as pool:
             (worker,) = pool.statistics().pids
             os.kill(worker, signal.SIGSTOP)
-            first = asyncio.create_task(pool.render(RenderRequest("b", random_poses(1))))
+            first = asyncio.create_task(pool.render(asking("b", random_poses(1))))
             await until(lambda: pool.statistics().busy == 1)
             tasks = [asyncio.create_task(pool.render(request)) for request in [*alike, other]]
             await until(lambda: pool.statistics().waiting_frames == 6)
@@ -96,10 +92,10 @@ def test_interactive_requests_go_before_batches_and_between_their_parts(run, ope
             pool.on_rendered = lambda result: order.append(result.scene)
             (worker,) = pool.statistics().pids
             os.kill(worker, signal.SIGSTOP)
-            batch = RenderRequest("a", random_poses(40), encoding=Encoding.FLOAT32, priority=Priority.BATCH)
+            batch = asking("a", random_poses(40), encoding=Encoding.FLOAT32, priority=Priority.BATCH)
             tasks = [asyncio.create_task(pool.render(batch))]
             await until(lambda: pool.statistics().waiting_frames == 38)  # its first part is under way
-            tasks.append(asyncio.create_task(pool.render(RenderRequest("b", random_poses(1)))))
+            tasks.append(asyncio.create_task(pool.render(asking("b", random_poses(1)))))
             await until(lambda: pool.statistics().waiting_frames == 39)
             os.kill(worker, signal.SIGCONT)
             await asyncio.gather(*tasks)
@@ -113,14 +109,14 @@ def test_a_full_queue_refuses_more_but_keeps_room_for_interactive_requests(run, 
         async with open_pool(queue_limit_frames=4) as pool:
             (worker,) = pool.statistics().pids
             os.kill(worker, signal.SIGSTOP)
-            batch = RenderRequest("a", random_poses(2), priority=Priority.BATCH)
+            batch = asking("a", random_poses(2), priority=Priority.BATCH)
             tasks = [asyncio.create_task(pool.render(batch))]
             await until(lambda: pool.statistics().busy == 1)
             tasks += [asyncio.create_task(pool.render(batch)) for _ in range(2)]
             await until(lambda: pool.statistics().waiting_frames == 4)
             with pytest.raises(QueueFull):
                 await pool.render(batch)
-            tasks.append(asyncio.create_task(pool.render(RenderRequest("a", random_poses(1)))))
+            tasks.append(asyncio.create_task(pool.render(asking("a", random_poses(1)))))
             await until(lambda: pool.statistics().waiting_frames == 5)
             os.kill(worker, signal.SIGCONT)
             await asyncio.gather(*tasks)
@@ -133,16 +129,16 @@ def test_a_request_past_its_deadline_is_dropped_while_the_worker_is_busy(run, op
         async with open_pool() as pool:
             (worker,) = pool.statistics().pids
             os.kill(worker, signal.SIGSTOP)
-            first = asyncio.create_task(pool.render(RenderRequest("a", random_poses(1))))
+            first = asyncio.create_task(pool.render(asking("a", random_poses(1))))
             await until(lambda: pool.statistics().busy == 1)
             with pytest.raises(DeadlineExceeded):
-                await pool.render(RenderRequest("a", random_poses(3), deadline=time.monotonic() + 0.05))
+                await pool.render(asking("a", random_poses(3), deadline=time.monotonic() + 0.05))
             assert pool.statistics().waiting_frames == 0
             os.kill(worker, signal.SIGCONT)
             await first
             with pytest.raises(DeadlineExceeded):
-                await pool.render(RenderRequest("a", random_poses(1), deadline=time.monotonic() - 1.0))
-            await pool.render(RenderRequest("a", random_poses(1), deadline=time.monotonic() + 30.0))
+                await pool.render(asking("a", random_poses(1), deadline=time.monotonic() - 1.0))
+            await pool.render(asking("a", random_poses(1), deadline=time.monotonic() + 30.0))
 
     run(main())
 
@@ -155,9 +151,9 @@ def test_a_cancelled_request_leaves_the_queue(run, open_pool, random_poses, unti
             pool.on_rendered = lambda result: rendered.append(result.scene)
             (worker,) = pool.statistics().pids
             os.kill(worker, signal.SIGSTOP)
-            tasks = [asyncio.create_task(pool.render(RenderRequest("a", random_poses(1))))]
+            tasks = [asyncio.create_task(pool.render(asking("a", random_poses(1))))]
             await until(lambda: pool.statistics().busy == 1)
-            tasks.append(asyncio.create_task(pool.render(RenderRequest("b", random_poses(3)))))
+            tasks.append(asyncio.create_task(pool.render(asking("b", random_poses(3)))))
             await until(lambda: pool.statistics().waiting_frames == 3)
             for task in tasks:  # one under way, one waiting
                 task.cancel()
@@ -165,7 +161,7 @@ def test_a_cancelled_request_leaves_the_queue(run, open_pool, random_poses, unti
             assert all(task.cancelled() for task in tasks)
             assert pool.statistics().waiting_frames == 0
             os.kill(worker, signal.SIGCONT)
-            await pool.render(RenderRequest("a", random_poses(1)))
+            await pool.render(asking("a", random_poses(1)))
             assert "b" not in pool.loaded()
 
     run(main())
@@ -185,7 +181,7 @@ def test_load_and_unload_reach_every_process(run, open_pool):
                 with pytest.raises(SceneNotFound, match="known scenes: a, b"):
                     await call("missing")
             with pytest.raises(SceneNotFound):
-                await pool.render(RenderRequest("../a", np.eye(4)[None]))
+                await pool.render(asking("../a", np.eye(4)[None]))
 
     run(main())
 
@@ -193,7 +189,7 @@ def test_load_and_unload_reach_every_process(run, open_pool):
 def test_a_scene_beyond_the_memory_budget_is_refused_and_the_worker_lives(run, open_pool):
     async def main():
         async with open_pool(memory_budget_bytes=100) as pool:
-            for call in (pool.load("a"), pool.render(RenderRequest("a", np.eye(4)[None]))):
+            for call in (pool.load("a"), pool.render(asking("a", np.eye(4)[None]))):
                 with pytest.raises(SceneTooLarge, match="memory budget"):
                     await call
             assert pool.statistics().restarts_total == 0
@@ -202,7 +198,7 @@ def test_a_scene_beyond_the_memory_budget_is_refused_and_the_worker_lives(run, o
 
 
 def test_a_replaced_file_is_rendered_as_it_is_now(run, open_pool, scene_folder, random_poses, expect_frames):
-    request = RenderRequest("a", random_poses(1))
+    request = asking("a", random_poses(1))
 
     async def main():
         async with open_pool() as pool:
@@ -226,8 +222,8 @@ def test_an_invalid_file_is_an_error_and_no_more(run, open_pool, scene_folder, r
         async with open_pool() as pool:
             for name in ("truncated", "nan"):
                 with pytest.raises(SceneFileInvalid, match=name):
-                    await pool.render(RenderRequest(name, random_poses(1)))
-            await pool.render(RenderRequest("a", random_poses(1)))
+                    await pool.render(asking(name, random_poses(1)))
+            await pool.render(asking("a", random_poses(1)))
             assert pool.statistics().restarts_total == 0
 
     run(main())
@@ -239,13 +235,13 @@ def test_draining_answers_what_was_asked_and_refuses_more(run, open_pool, random
             assert pool.ready
             (worker,) = pool.statistics().pids
             os.kill(worker, signal.SIGSTOP)
-            tasks = [asyncio.create_task(pool.render(RenderRequest("a", random_poses(1)))) for _ in range(3)]
+            tasks = [asyncio.create_task(pool.render(asking("a", random_poses(1)))) for _ in range(3)]
             await until(lambda: pool.statistics().waiting_frames == 2)
             await pool.drain(timeout_s=0.05)  # too short
             assert not any(task.done() for task in tasks)
             assert not pool.ready
             with pytest.raises(Draining):
-                await pool.render(RenderRequest("a", random_poses(1)))
+                await pool.render(asking("a", random_poses(1)))
             os.kill(worker, signal.SIGCONT)
             await pool.drain(timeout_s=30.0)
             assert all(task.done() for task in tasks)
@@ -260,7 +256,7 @@ def test_closing_fails_what_is_open_and_leaves_no_process(run, open_pool, random
             await until(lambda: sorted(processes().values()) == ["ug-template"] * 2 + ["ug-worker"] * 2)
             for worker in pool.statistics().pids:
                 os.kill(worker, signal.SIGSTOP)  # closing must not depend on their help
-            tasks = [asyncio.create_task(pool.render(RenderRequest("a", random_poses(1)))) for _ in range(3)]
+            tasks = [asyncio.create_task(pool.render(asking("a", random_poses(1)))) for _ in range(3)]
             await until(lambda: pool.statistics().busy == 2)
             await pool.close()
             for task in tasks:
@@ -276,7 +272,7 @@ def test_a_pool_that_has_not_started_is_not_ready(run, scene_folder, random_pose
         pool = RenderPool(SceneStore(scene_folder), PoolConfig())
         assert not pool.ready
         with pytest.raises(NotReady):
-            await pool.render(RenderRequest("a", random_poses(1)))
+            await pool.render(asking("a", random_poses(1)))
         await pool.close()
 
     run(main())
@@ -318,7 +314,7 @@ def test_the_service_side_does_not_import_torch():
 
 def test_it_works_on_uvloop(open_pool, random_poses, expect_frames):
     uvloop = pytest.importorskip("uvloop")
-    request = RenderRequest("a", random_poses(3))
+    request = asking("a", random_poses(3))
 
     async def main():
         async with open_pool() as pool:

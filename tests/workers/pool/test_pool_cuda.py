@@ -15,7 +15,10 @@ import torch
 
 from ultragray import ConvexProbe, render
 from ultragray.errors import BackendUnavailable, MemoryExceeded
-from ultragray_workers import Encoding, PoolConfig, RenderPool, RenderRequest, SceneStore
+from ultragray.settings import Encoding
+from ultragray_workers import PoolConfig, RenderPool, SceneStore
+
+from ..asking import asking
 
 TOLERANCE = 5e-4  # of the CUDA backend against the others
 
@@ -38,8 +41,11 @@ def test_frames_are_what_the_cpu_renders(
     convex = ConvexProbe(opening_angle_deg=60.0, near_mm=5.0, far_mm=40.0)
     scene = random_scene(20, sigma_cm=(0.1, 0.4), info={"image_height": 24, "image_width": 32})
     scene.save(scene_folder / "tiny.ugr")
-    request = RenderRequest("tiny", random_poses(3), probe=convex, outputs=("bmode", "transmittance"))
-    requests = [replace(request, encoding=encoding) for encoding in (Encoding.FLOAT32, Encoding.UINT8)]
+    request = asking("tiny", random_poses(3), probe=convex, outputs=("bmode", "transmittance"))
+    requests = [
+        replace(request, settings=replace(request.settings, encoding=encoding))
+        for encoding in (Encoding.FLOAT32, Encoding.UINT8)
+    ]
 
     async def main():
         async with open_pool(backend="cuda", max_batch_poses=2) as pool:
@@ -53,8 +59,8 @@ def test_frames_are_what_the_cpu_renders(
     assert (processes, loaded) == (expected_processes, {"tiny": expected_processes})
     assert f" {renderer}" in floats.renderer
     assert bytes_.renderer == floats.renderer
-    direct = render(scene, convex, request.poses, height=24, width=32, outputs=request.outputs, backend="cpu")
-    expected = np.stack([getattr(direct, name).numpy() for name in request.outputs])
+    direct = render(scene, convex, request.poses, height=24, width=32, outputs=request.settings.outputs, backend="cpu")
+    expected = np.stack([getattr(direct, name).numpy() for name in request.settings.outputs])
     assert expected[0].max() > 0.1  # there is something to see
     np.testing.assert_allclose(np.frombuffer(floats.data, "<f4").reshape(expected.shape), expected, atol=TOLERANCE)
     grey = np.frombuffer(bytes_.data, np.uint8).reshape(expected.shape).astype(float)
@@ -129,8 +135,8 @@ worker.render = render_few
 
 def test_out_of_memory_fails_the_request_and_no_more(run, open_pool, random_poses, expect_frames, until, patch_workers):
     patch_workers(OUT_OF_MEMORY)
-    large = RenderRequest("a", random_poses(1), height=61, outputs=("bmode", "echo"))
-    alike = [RenderRequest("a", random_poses(2, seed=seed)) for seed in range(2)]  # too many together
+    large = asking("a", random_poses(1), height=61, outputs=("bmode", "echo"))
+    alike = [asking("a", random_poses(2, seed=seed)) for seed in range(2)]  # too many together
 
     async def main():
         async with open_pool() as pool:
@@ -138,7 +144,7 @@ def test_out_of_memory_fails_the_request_and_no_more(run, open_pool, random_pose
                 await pool.render(large)
             (worker,) = pool.statistics().pids
             os.kill(worker, signal.SIGSTOP)
-            first = asyncio.create_task(pool.render(RenderRequest("b", random_poses(1))))
+            first = asyncio.create_task(pool.render(asking("b", random_poses(1))))
             await until(lambda: pool.statistics().busy == 1)
             tasks = [asyncio.create_task(pool.render(request)) for request in alike]
             await until(lambda: pool.statistics().waiting_frames == 4)
@@ -173,10 +179,10 @@ def test_a_full_gpu_fails_the_request_and_no_more(run, open_pool, random_poses, 
 
     async def main():
         async with open_pool(backend="cuda", processes=1) as pool:
-            await pool.render(RenderRequest("a", random_poses(1)))
+            await pool.render(asking("a", random_poses(1)))
             with pytest.raises(MemoryExceeded, match="1200"):
-                await pool.render(RenderRequest("a", random_poses(1), height=1200, width=1000))
-            await pool.render(RenderRequest("a", random_poses(1)))
+                await pool.render(asking("a", random_poses(1), height=1200, width=1000))
+            await pool.render(asking("a", random_poses(1)))
             assert pool.statistics().restarts_total == 0
 
     run(main())
@@ -207,7 +213,7 @@ def test_a_worker_that_lost_its_gpu_is_replaced_and_the_work_done_again(
     lost = tmp_path / "lost"
     lost.touch()
     patch_workers(LOST_GPU.format(lost=str(lost)))
-    request = RenderRequest("a", random_poses(2))
+    request = asking("a", random_poses(2))
 
     async def main():
         async with open_pool() as pool:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from ultragray_workers import Encoding
+from ultragray.settings import Encoding
 from ultragray_workers.pool.process import encoding
 from ultragray_workers.pool.transfer import CHUNK_POSES, render_to_host, to_uint8
 

@@ -4,27 +4,25 @@ from __future__ import annotations
 
 import asyncio
 import time
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from ultragray import LinearProbe
-from ultragray_workers import Priority, RenderRequest
+from ultragray_workers import Priority
 from ultragray_workers.errors import DeadlineExceeded, QueueFull
 from ultragray_workers.pool import waiting
 from ultragray_workers.pool.waiting import Expiry, Part, Ticket, Turn, WaitingQueue
+
+from ..asking import asking
 
 
 @pytest.fixture
 def make_ticket():
     loop = asyncio.new_event_loop()
-    template = RenderRequest("a", np.eye(4)[None])
 
-    def make(poses=1, *, height=64, **changes):
-        request = replace(template, poses=np.tile(np.eye(4), (poses, 1, 1)), **changes)
-        probe = LinearProbe(width_mm=1.0, near_mm=0.0, far_mm=1.0)
-        return Ticket(request, "a.ugr", probe, height, 64, done=loop.create_future(), submitted=time.monotonic())
+    def make(poses=1, *, scene="a", height=64, **changes):
+        request = asking(scene, np.tile(np.eye(4), (poses, 1, 1)), height=height, width=64, **changes)
+        return Ticket(request, "a.ugr", done=loop.create_future(), submitted=time.monotonic())
 
     yield make
     loop.close()

@@ -10,8 +10,9 @@ import numpy as np
 from ultragray.confidence import Assessor, require_confidence
 from ultragray.files.atomic import sync
 from ultragray.interchange.exports import check_format
-from ultragray.request import LABELS, check_image_size, check_labelled, check_min_confidence
+from ultragray.outputs import OUTPUTS
 from ultragray.scene_info import SceneHeader, read_header
+from ultragray.settings import Encoding, FrameSettings
 
 from ..claims import storage_full
 from ..errors import StorageFull
@@ -61,28 +62,26 @@ def check_rendering(job: RenderJob, scene: SceneHeader, max_image_side: int, art
     LowConfidence for a given pose below it, unless there are too many to look at each, StorageFull for more pixels than
     the disk has room for.
     """
-    check_labelled(job.outputs, scene.info)
-    height, width = scene.info.image_size_or(job.height, job.width)
-    check_image_size(height, width, limit=max_image_side)
-    check_min_confidence(job.min_confidence, scene.info)
-    poses = poses_of(job, scene.training_poses, scene.info.probe_or(None))
+    asked = FrameSettings(height=job.height, width=job.width, outputs=job.outputs, min_confidence=job.min_confidence)
+    settings = asked.resolved(scene.info, Encoding.FLOAT32, max_image_side=max_image_side)
+    poses = poses_of(job, scene.training_poses, settings.probe)
     frames = len(poses)
     few = frames * len(scene.training_poses) <= ASSESSED_AT_ONCE
     if job.min_confidence is not None and job.sampler is None and few:
         require_confidence(Assessor(scene.info, scene.training_poses).assess(poses), job.min_confidence)
-    needed = frames * height * width * _pixel_bytes(job)
+    needed = frames * settings.height * settings.width * _pixel_bytes(job)
     free = shutil.disk_usage(artifact_folder).free
     if needed > free:
         raise StorageFull(
-            f"{frames:,} frames of {height}x{width} take up to {_size(needed)}, the artifact folder has "
-            f"{_size(free)} left",
+            f"{frames:,} frames of {settings.height}x{settings.width} take up to {_size(needed)}, "
+            f"the artifact folder has {_size(free)} left",
             field="poses" if job.sampler is None else "sampler",
         )
 
 
 def _pixel_bytes(job: RenderJob) -> int:
     dtype = np.dtype(check_format(job.format, job.outputs, job.dtype))
-    return sum(1 if name == LABELS else dtype.itemsize for name in job.outputs)
+    return sum(1 if OUTPUTS[name].is_numbers else dtype.itemsize for name in job.outputs)
 
 
 def _size(size_bytes: int) -> str:

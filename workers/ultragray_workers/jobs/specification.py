@@ -13,10 +13,11 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from ultragray.errors import InvalidArgument
+from ultragray.image_size import check_image_size
 from ultragray.interchange.exports import check_format
+from ultragray.outputs import check_outputs
 from ultragray.pose import check_poses
 from ultragray.probe import FloatArray
-from ultragray.request import check_image_size, check_outputs
 from ultragray.samplers import MAX_POSES, Sampler, TrainingSampler, sampler_from_dict, sampler_to_dict
 from ultragray.samplers.sampler import is_number
 from ultragray.training.config import PRESETS, TrainingConfig

@@ -13,7 +13,7 @@ from dbos import EnqueueOptions, WorkflowSerializationFormat, WorkflowStatus
 from dbos import error as dbos_error
 
 from ultragray.errors import InvalidArgument
-from ultragray.request import MAX_IMAGE_SIDE
+from ultragray.image_size import MAX_IMAGE_SIDE
 
 from ..datasets.store import DatasetStore
 from ..errors import (

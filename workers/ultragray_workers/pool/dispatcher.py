@@ -12,9 +12,9 @@ from ultragray.errors import RenderFailed, UltragrayError
 
 from .launcher import Launcher
 from .memory import MemoryPool
-from .messages import Answer, ForkWorker, LoadJob, PackJob, Rendered, RenderJob, RenderPart, UnloadJob
+from .messages import Answer, ForkWorker, LoadTask, PackTask, Rendered, RenderPart, RenderTask, UnloadTask
 from .slot import Assignment, Command, Slot
-from .waiting import Packing, Part, Ticket, WaitingQueue, Work
+from .waiting import Packing, Part, Step, Ticket, WaitingQueue
 
 _MAX_DEATHS = 5
 
@@ -69,10 +69,10 @@ class Dispatcher:
         await asyncio.gather(*(slot.close() for slot in self.slots))
         self._memories.close()
 
-    async def command_all(self, job: LoadJob | UnloadJob) -> None:
-        """Has every process do a job. Raises what the first of them reports, after all have reported."""
+    async def command_all(self, task: LoadTask | UnloadTask) -> None:
+        """Has every process do a task. Raises what the first of them reports, after all have reported."""
         loop = asyncio.get_running_loop()
-        commands = [Command(job, loop.create_future()) for _ in self.slots]
+        commands = [Command(task, loop.create_future()) for _ in self.slots]
         for slot, command in zip(self.slots, commands, strict=True):
             slot.commands.append(command)
         self._dispatch()
@@ -84,7 +84,7 @@ class Dispatcher:
             while slot.idle and slot.commands:
                 command = slot.commands.popleft()
                 if not command.done.done():
-                    slot.assign(command.job, Assignment(command=command))
+                    slot.assign(command.task, Assignment(command=command))
         idle = [slot for slot in self.slots if slot.idle]
         while idle and (batch := self._waiting.take_batch()):
             scene = batch[0].ticket.request.scene
@@ -92,7 +92,7 @@ class Dispatcher:
             idle.remove(slot)
             self._assign(slot, batch)
 
-    def _assign(self, slot: Slot, batch: list[Work]) -> None:
+    def _assign(self, slot: Slot, batch: list[Step]) -> None:
         parts = [work for work in batch if isinstance(work, Part)]
         for work in batch:
             work.ticket.in_flight += 1
@@ -102,11 +102,11 @@ class Dispatcher:
         assignment = Assignment(parts=dict(enumerate(batch)))
         ticket = batch[0].ticket
         if parts:
-            slot.assign(_render_job(ticket, parts), assignment, _descriptors(part.ticket.memory for part in parts))
+            slot.assign(_render_task(ticket, parts), assignment, _descriptors(part.ticket.memory for part in parts))
         else:
             if ticket.archive is None:
                 ticket.archive = self._memories.acquire()
-            slot.assign(_pack_job(ticket), assignment, _descriptors((ticket.memory, ticket.archive)))
+            slot.assign(_pack_task(ticket), assignment, _descriptors((ticket.memory, ticket.archive)))
 
     def on_idle(self) -> None:
         """A slot has a worker without work."""
@@ -151,7 +151,7 @@ class Dispatcher:
                 self._waiting.put_first(again)
         self._dispatch()
 
-    def _advance(self, ticket: Ticket, work: Work, outcome: Rendered) -> None:
+    def _advance(self, ticket: Ticket, work: Step, outcome: Rendered) -> None:
         """Takes a step of a ticket as done; completes it after its last."""
         if isinstance(work, Packing):
             ticket.done.set_result(_summary([*ticket.rendered, outcome]))
@@ -198,20 +198,14 @@ def _extrapolations(steps: Iterable[Rendered]) -> tuple[Extrapolation, ...]:
     return tuple(told for step in sorted(steps, key=lambda step: step.first) for told in step.extrapolations)
 
 
-def _render_job(ticket: Ticket, parts: list[Part]) -> RenderJob:
-    return RenderJob(
+def _render_task(ticket: Ticket, parts: list[Part]) -> RenderTask:
+    return RenderTask(
         scene=ticket.request.scene,
         path=ticket.path,
-        probe=ticket.probe,
-        height=ticket.height,
-        width=ticket.width,
-        display=ticket.request.display,
-        trust=ticket.request.trust,
         parts=tuple(
             RenderPart(
+                settings=part.ticket.request.settings,
                 poses=part.ticket.request.poses[part.first : part.stop],
-                outputs=part.ticket.request.outputs,
-                encoding=part.ticket.request.encoding,
                 first=part.first,
                 total=len(part.ticket.request.poses),
             )
@@ -220,16 +214,14 @@ def _render_job(ticket: Ticket, parts: list[Part]) -> RenderJob:
     )
 
 
-def _pack_job(ticket: Ticket) -> PackJob:
-    return PackJob(
+def _pack_task(ticket: Ticket) -> PackTask:
+    return PackTask(
         scene=ticket.request.scene,
         scene_sha256=ticket.rendered[0].scene_sha256,
         renderer=ticket.rendered[0].renderer,
+        settings=ticket.request.settings,
         poses=ticket.request.poses,
-        outputs=ticket.request.outputs,
         extrapolations=_extrapolations(ticket.rendered),
-        height=ticket.picture.height,
-        width=ticket.picture.width,
     )
 
 

@@ -5,11 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from ultragray.confidence import Extrapolation
-from ultragray.display.settings import Display
 from ultragray.errors import UltragrayError
-from ultragray.probe import FloatArray, Probe
-
-from .types import Encoding, Trust
+from ultragray.probe import FloatArray
+from ultragray.settings import Resolved
 
 
 @dataclass(frozen=True)
@@ -41,53 +39,52 @@ class Hello:
 class RenderPart:
     """Some poses of one request, of `total`, starting with its pose number `first`."""
 
+    settings: Resolved
     poses: FloatArray  # [C, 4, 4] mm
-    outputs: tuple[str, ...]
-    encoding: Encoding
     first: int
     total: int
 
 
 @dataclass(frozen=True, eq=False)
-class RenderJob:
-    """Render parts together. One memory descriptor per part goes along; one Answer per part comes back."""
+class RenderTask:
+    """Render parts together, which share a view. One memory descriptor per part goes along; one Answer per part comes
+    back.
+    """
 
     scene: str
     path: str
-    probe: Probe
-    height: int
-    width: int
-    display: Display
-    trust: Trust
     parts: tuple[RenderPart, ...]
+
+    @property
+    def view(self) -> Resolved:
+        """Settings whose outputs and encoding are those of the first part only, and all else that of every part."""
+        return self.parts[0].settings
 
 
 @dataclass(frozen=True, eq=False)
-class PackJob:
+class PackTask:
     """Make an .npz of rendered frames. The memory that holds them and the memory for it go along."""
 
     scene: str
     scene_sha256: str
     renderer: str
+    settings: Resolved
     poses: FloatArray  # [C, 4, 4] mm
-    outputs: tuple[str, ...]
     extrapolations: tuple[Extrapolation, ...]  # [C]
-    height: int
-    width: int
 
 
 @dataclass(frozen=True)
-class LoadJob:
+class LoadTask:
     scene: str
     path: str
 
 
 @dataclass(frozen=True)
-class UnloadJob:
+class UnloadTask:
     scene: str
 
 
-Job = RenderJob | PackJob | LoadJob | UnloadJob
+Task = RenderTask | PackTask | LoadTask | UnloadTask
 
 
 @dataclass(frozen=True)
@@ -106,7 +103,7 @@ class Rendered:
 
 @dataclass(frozen=True)
 class Answer:
-    """The outcome of part `part` of a job (0 where it has none); after the `last` one the worker is idle."""
+    """The outcome of part `part` of a task (0 where it has none); after the `last` one the worker is idle."""
 
     part: int
     outcome: Rendered | UltragrayError | None

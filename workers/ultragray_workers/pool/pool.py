@@ -15,14 +15,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from ultragray.errors import InvalidArgument, RenderFailed
-from ultragray.scene_info import SceneHeader
 
 from ..errors import Draining, NotReady
 from ..scenes import SceneStore
 from .dispatcher import Dispatcher, SceneChangedError
 from .launcher import Launcher
 from .memory import read_start
-from .messages import ForkWorker, LoadJob, UnloadJob
+from .messages import ForkWorker, LoadTask, UnloadTask
 from .types import RenderRequest, RenderResult
 from .waiting import Expiry, Ticket, Turn, WaitingQueue
 
@@ -121,11 +120,8 @@ class RenderPool:
         turn = turn or Turn()
         try:
             for _ in range(_MAX_SCENE_CHANGES):
-                header = self._store.cached_header(request.scene)
-                if header is None:
-                    header = await asyncio.to_thread(self._store.header, request.scene)
                 try:
-                    result = await self._render(request, header, turn)
+                    result = await self._render(request, turn)
                 except SceneChangedError:
                     assert turn.ticket is not None
                     request = turn.ticket.request  # perhaps with newer poses
@@ -143,7 +139,7 @@ class RenderPool:
         """Loads a scene in every process. Raises SceneNotFound, SceneFileInvalid, SceneTooLarge, MemoryExceeded."""
         self._check_accepting()
         path = self._store.path(scene)
-        await self._dispatcher.command_all(LoadJob(scene, str(path)))
+        await self._dispatcher.command_all(LoadTask(scene, str(path)))
 
     async def unload(self, scene: str) -> None:
         """Drops a scene from every process. Raises SceneNotFound for one that neither is held nor exists."""
@@ -154,7 +150,7 @@ class RenderPool:
 
     async def forget(self, scene: str) -> None:
         """Drops a scene that was deleted from every process, also from one that is loading it just now."""
-        await self._dispatcher.command_all(UnloadJob(scene))
+        await self._dispatcher.command_all(UnloadTask(scene))
 
     def loaded(self) -> dict[str, int]:
         """Each loaded scene, and how many processes hold it."""
@@ -197,10 +193,8 @@ class RenderPool:
         if not self._started:
             raise NotReady("the service is starting; try again in a few seconds")
 
-    async def _render(self, request: RenderRequest, header: SceneHeader, turn: Turn) -> RenderResult:
-        if self._closed:  # while the header was read
-            raise Draining("the service is stopping")
-        turn.ticket = ticket = self._ticket(request, header)
+    async def _render(self, request: RenderRequest, turn: Turn) -> RenderResult:
+        turn.ticket = ticket = self._ticket(request)
         turn.expiry = Expiry(ticket, self._waiting)
         try:
             self._open.add(ticket)
@@ -218,14 +212,8 @@ class RenderPool:
             scene=request.scene,
             scene_sha256=rendered.scene_sha256,
             renderer=rendered.renderer,
+            settings=request.settings,
             poses=ticket.request.poses,
-            probe=ticket.probe,
-            rendered_height=ticket.height,
-            rendered_width=ticket.width,
-            display=request.display,
-            picture=ticket.picture,
-            outputs=request.outputs,
-            encoding=request.encoding,
             data=data,
             queue_ms=max(0.0, rendered.started - ticket.submitted) * 1000.0,
             render_ms=rendered.render_ms,
@@ -234,21 +222,17 @@ class RenderPool:
             batch_size=ticket.batch_size,
         )
 
-    def _ticket(self, request: RenderRequest, header: SceneHeader) -> Ticket:
-        """The request with its open choices made from the scene's own description."""
-        probe = header.info.probe_or(request.probe)
-        height, width = header.info.image_size_or(request.height, request.width)
-        picture = request.display.picture(probe, height, width)
-        poses, outputs = len(request.poses), len(request.outputs)
+    def _ticket(self, request: RenderRequest) -> Ticket:
+        """Raises InvalidArgument for a request that no reply can hold."""
+        settings, poses = request.settings, len(request.poses)
         if poses == 0:
             raise InvalidArgument("poses must hold at least one pose, got none", field="poses")
-        if request.encoding.is_image_file and (poses, outputs) != (1, 1):
+        if settings.encoding.is_image_file and poses != 1:
             raise InvalidArgument(
-                f"encoding {request.encoding.value} holds one frame of one output, got {poses} poses and "
-                f"{outputs} outputs",
-                field="encoding",
+                f"encoding {settings.encoding.value} holds the frame of one pose, got {poses} poses", field="encoding"
             )
-        reply_bytes = poses * outputs * picture.height * picture.width * request.encoding.pixel_type.itemsize
+        pixels = poses * len(settings.outputs) * settings.picture.height * settings.picture.width
+        reply_bytes = pixels * settings.encoding.pixel_type.itemsize
         if reply_bytes > MAX_REPLY_BYTES:
             raise InvalidArgument(
                 f"poses times pixels must fit a reply of {MAX_REPLY_BYTES} bytes, got {reply_bytes}",
@@ -256,10 +240,7 @@ class RenderPool:
             )
         return Ticket(
             request=request,
-            path=str(self._store.file(request.scene)),
-            probe=probe,
-            height=height,
-            width=width,
+            path=str(self._store.path(request.scene)),
             done=asyncio.get_running_loop().create_future(),
             submitted=time.monotonic(),
         )

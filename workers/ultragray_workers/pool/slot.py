@@ -13,9 +13,9 @@ from ultragray.errors import RenderFailed, UltragrayError
 
 from ..errors import Draining
 from .launcher import Launcher
-from .messages import Answer, ForkWorker, Hello, Job, LoadJob, UnloadJob
+from .messages import Answer, ForkWorker, Hello, LoadTask, Task, UnloadTask
 from .peer import Peer
-from .waiting import Work
+from .waiting import Step
 
 logger = logging.getLogger(__name__)
 
@@ -28,7 +28,7 @@ _LAST_RETRY_DELAY_S = 5.0
 class Command:
     """Something one certain slot is to do, whichever process fills it by then."""
 
-    job: LoadJob | UnloadJob
+    task: LoadTask | UnloadTask
     done: asyncio.Future[None]
     attempts: int = 0  # workers that died with it
 
@@ -41,7 +41,7 @@ class Command:
 class Assignment:
     """What a worker is busy with: the parts of a batch that it has not answered yet, or a command."""
 
-    parts: dict[int, Work] = field(default_factory=dict)
+    parts: dict[int, Step] = field(default_factory=dict)
     command: Command | None = None
 
 
@@ -102,11 +102,11 @@ class Slot:
         self._start_error = None
         self._peer = self._launcher.launch(self._settings, self._on_message, self._on_gone)
 
-    def assign(self, job: Job, assignment: Assignment, descriptors: Sequence[int] = ()) -> None:
-        """Gives the idle worker a job."""
+    def assign(self, task: Task, assignment: Assignment, descriptors: Sequence[int] = ()) -> None:
+        """Gives the idle worker a task."""
         assert self._peer is not None
         self._assignment = assignment
-        self._peer.send(job, descriptors)
+        self._peer.send(task, descriptors)
 
     async def close(self) -> None:
         """Returns when the process is gone; the commands it had not answered fail."""

@@ -6,13 +6,14 @@ import asyncio
 import time
 from collections import OrderedDict, deque
 from dataclasses import dataclass, field, replace
+from typing import Any
 
-from ultragray.display.settings import Display
-from ultragray.probe import FloatArray, Picture, Probe
+from ultragray.probe import FloatArray
+from ultragray.settings import Encoding
 
 from ..errors import DeadlineExceeded, QueueFull
 from .messages import Rendered
-from .types import Encoding, Priority, RenderRequest, Trust
+from .types import Priority, RenderRequest
 
 _FULL_BATCH_PIXELS_PER_POSE = 512 * 512
 _ATTEMPTS_IN_COMPANY = 2
@@ -22,16 +23,13 @@ _BATCH_PATIENCE_S = 1.0
 
 @dataclass(eq=False)
 class Ticket:
-    """A request with its open choices made, and how far it has come."""
+    """A request that waits or is rendered, and how far it has come."""
 
     request: RenderRequest
     path: str  # of the scene's file
-    probe: Probe
-    height: int
-    width: int
     done: asyncio.Future[Rendered]
     submitted: float  # time.monotonic() in seconds
-    waiting: deque[Work] = field(default_factory=deque)
+    waiting: deque[Step] = field(default_factory=deque)
     in_flight: int = 0  # parts that workers have
     rendered: list[Rendered] = field(default_factory=list)
     rendered_poses: int = 0
@@ -40,14 +38,9 @@ class Ticket:
     archive: int | None = None  # and of the .npz, where that is made of several parts
 
     @property
-    def picture(self) -> Picture:
-        """What its frames are shown as. Raises InvalidImageSize."""
-        return self.request.display.picture(self.probe, self.height, self.width)
-
-    @property
-    def batch_key(self) -> tuple[str, Probe, int, int, Display, Trust]:
+    def batch_key(self) -> tuple[Any, ...]:
         """Requests that agree in this can be rendered together."""
-        return (self.request.scene, self.probe, self.height, self.width, self.request.display, self.request.trust)
+        return (self.request.scene, *self.request.settings.view)
 
     @property
     def expired(self) -> bool:
@@ -61,7 +54,7 @@ class Ticket:
     @property
     def needs_packing(self) -> bool:
         """Whether its rendered frames are not yet the file that was asked for."""
-        return self.request.encoding is Encoding.NPZ and len(self.rendered) > 1
+        return self.request.settings.encoding is Encoding.NPZ and len(self.rendered) > 1
 
     @property
     def reply_memory(self) -> int:
@@ -108,7 +101,7 @@ class Part:
     def frames(self) -> int:
         return self.stop - self.first
 
-    def for_retry(self) -> list[Work]:
+    def for_retry(self) -> list[Step]:
         """Itself in halves, so that even slow frames get done between one death and the next."""
         middle = (self.first + self.stop + 1) // 2
         bounds = [(self.first, middle), (middle, self.stop)]
@@ -123,11 +116,11 @@ class Packing:
     attempts: int = 0
     frames: int = 0
 
-    def for_retry(self) -> list[Work]:
+    def for_retry(self) -> list[Step]:
         return [Packing(self.ticket, self.attempts + 1)]
 
 
-Work = Part | Packing
+Step = Part | Packing
 
 
 class WaitingQueue:
@@ -164,8 +157,8 @@ class WaitingQueue:
         for first in range(0, count, size):
             self._append(Part(ticket, first, min(first + size, count)))
 
-    def put_first(self, work: Work) -> None:
-        """Work that was begun and lost comes back ahead of all that waits."""
+    def put_first(self, work: Step) -> None:
+        """Step that was begun and lost comes back ahead of all that waits."""
         ticket = work.ticket
         ticket.waiting.appendleft(work)
         self._frames[ticket.request.priority] += work.frames
@@ -180,7 +173,7 @@ class WaitingQueue:
         ticket.waiting.clear()
         self._tickets[priority].pop(ticket, None)
 
-    def take_batch(self) -> list[Work]:
+    def take_batch(self) -> list[Step]:
         """What is to be rendered next, together; empty when nothing waits. Drops what is past its deadline."""
         priorities = list(Priority)
         if time.monotonic() - self._last_batch_turn >= _BATCH_PATIENCE_S:
@@ -228,7 +221,7 @@ class WaitingQueue:
         self._frames[priority] += part.frames
         self._tickets[priority].setdefault(part.ticket)
 
-    def _take(self, ticket: Ticket) -> Work:
+    def _take(self, ticket: Ticket) -> Step:
         priority = ticket.request.priority
         if priority is Priority.BATCH:
             self._last_batch_turn = time.monotonic()
@@ -243,7 +236,8 @@ class WaitingQueue:
     def _poses_together(self, ticket: Ticket) -> int:
         """How many poses make a full batch: fewer for images of more than 512x512 pixels."""
         share = _BATCH_PRIORITY_SHARE if ticket.request.priority is Priority.BATCH else 1
-        pixels = ticket.height * ticket.width * len(ticket.request.outputs)
+        settings = ticket.request.settings
+        pixels = settings.height * settings.width * len(settings.outputs)
         fitting = self._max_batch_poses * _FULL_BATCH_PIXELS_PER_POSE // pixels
         return max(1, min(self._max_batch_poses, fitting) // share)
 

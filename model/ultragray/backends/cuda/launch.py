@@ -16,8 +16,8 @@ import torch
 import triton
 from torch import Tensor
 
+from ...outputs import PLANES, WEIGHT_SUM
 from ...probe import FloatArray, LinearProbe, Probe
-from ...request import OUTPUTS, WEIGHT_SUM
 from .device import interpreted
 from .kernels import constants
 from .kernels.drawing import draw_tiles, finish_frames
@@ -245,7 +245,7 @@ def draw(slices: Slices, geometry: Geometry, frames: Mapping[str, Tensor], *, ke
         CHUNK=how.chunk,
         num_warps=how.draw_warps,
     )
-    wanted = [frames.get(name) for name in OUTPUTS]
+    wanted = [frames.get(name) for name in PLANES]
     finish_frames[(-(-width // how.finish_columns), tile_rows, poses)](
         planes.weight,
         planes.weighted,
@@ -288,7 +288,7 @@ def differentiate(
         return found
     by_pixel = [torch.empty_like(planes.weight) for _ in range(4)]
     by_slice = torch.empty((poses * blocks * how.block, constants.GRADIENTS.value), device=device)
-    given = [gradients.get(name) for name in OUTPUTS]
+    given = [gradients.get(name) for name in PLANES]
     if poses:
         differentiate_pixels[(-(-width // how.pixel_columns), poses)](
             planes.weight,

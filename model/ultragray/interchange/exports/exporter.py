@@ -17,8 +17,8 @@ from ...confidence import Extrapolation, figure_arrays
 from ...display.pixels import PixelArray, to_uint8
 from ...display.settings import AS_RENDERED, Display
 from ...errors import InvalidArgument
+from ...outputs import OUTPUTS
 from ...probe import FloatArray, Picture, Probe, probe_to_dict
-from ...request import LABELS
 
 FRAME_TIME_MS = 40.0  # rendered frames have no time of their own: formats that need one show 25 a second
 
@@ -53,7 +53,7 @@ class ExportHeader:
 
     def pixel_type(self, output: str) -> np.dtype[Any]:
         """The type that the pixels of an output are stored in."""
-        return np.dtype("<u1" if output == LABELS or self.dtype == "uint8" else "<f4")
+        return np.dtype("<u1" if OUTPUTS[output].is_numbers or self.dtype == "uint8" else "<f4")
 
     def origin(self) -> dict[str, Any]:
         """Where the frames come from and how they are shown, as JSON holds it.

@@ -9,12 +9,12 @@ from fastapi import APIRouter, Path, Query
 from starlette.requests import Request
 from starlette.responses import FileResponse, PlainTextResponse, Response, StreamingResponse
 
+from ultragray.contract import under
 from ultragray.errors import InvalidArgument
 from ultragray_workers.jobs.specification import from_dict
 
 from ...core.catalog import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE
 from ...core.job_log import DEFAULT_LOG_BYTES, MAX_LOG_BYTES
-from ...core.requests import field_under
 from ..accept import NPZ, PNG
 from ..deps import ServiceDep, problems
 from ..examples import JOB_EXAMPLES
@@ -92,7 +92,7 @@ async def submit_job(request: Request, response: Response, service: ServiceDep) 
     """Puts a job into the queue. The same request_id with the same body gives the same job, whatever its state."""
     service.require_serving()
     body = await read_json_body(request, JobBody)
-    with field_under(_SPECIFICATION):
+    with under(_SPECIFICATION):
         if "kind" in body.specification:
             raise InvalidArgument("kind stands beside the specification, not in it", field="kind")
         # in a thread: there may be many poses

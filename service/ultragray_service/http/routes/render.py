@@ -10,18 +10,18 @@ from fastapi import APIRouter
 from starlette.requests import Request
 from starlette.responses import Response
 
+from ultragray.outputs import OUTPUTS, check_outputs
 from ultragray.probe import probe_to_dict
-from ultragray.request import LABELS, check_outputs
-from ultragray_workers.pool.types import Encoding, Priority, RenderResult
+from ultragray.settings import Encoding
+from ultragray_workers.pool.types import Priority, RenderRequest, RenderResult
 
-from ...core.requests import RenderSpec
 from ...core.state import Service
 from ..accept import JPEG, NPZ, PNG, RAW, choose
 from ..deps import SCENE_NAME, problems
 from ..disconnect import finish_or_abandon
 from ..examples import RENDER_EXAMPLES
 from ..json_body import read_json_body
-from ..render_body import asked_display, asked_probe, asked_trust, checked_poses, poses_as_written
+from ..render_body import asked_settings, checked_poses, poses_as_written
 from ..schemas import RenderBody
 from ..stream_schemas import picture_json
 
@@ -95,21 +95,13 @@ async def render(request: Request) -> Response:
         frames=len(written),
         outputs=len(outputs),
         dtype=body.dtype,
-        lossless=LABELS in outputs,
+        lossless=any(OUTPUTS[name].is_numbers for name in outputs),
     )
-    spec = RenderSpec(
-        scene=scene,
-        probe=asked_probe(body),
-        height=body.height,
-        width=body.width,
-        outputs=outputs,
-        encoding=choice.encoding,
-        display=asked_display(body),
-        trust=asked_trust(body),
-    )
-    planned = await planner.plan(spec, Priority.INTERACTIVE if body.poses is None else Priority.BATCH)
-    prepared = planner.with_poses(planned, await checked_poses(written), deadline)
-    result = await finish_or_abandon(service.render(prepared), request.receive, deadline)
+    settings = await planner.resolve(scene, asked_settings(body), choice.encoding)
+    planner.check_pixels(settings, len(written))
+    priority = Priority.INTERACTIVE if body.poses is None else Priority.BATCH
+    asked = RenderRequest(scene, settings, await checked_poses(written), priority, deadline)
+    result = await finish_or_abandon(service.render(asked), request.receive, deadline)
     return Response(result.data, 200, _headers(result), choice.media_type)
 
 
@@ -119,14 +111,14 @@ def _headers(result: RenderResult) -> dict[str, str]:
         "X-Ultragray-Scene": result.scene,
         "X-Ultragray-Scene-Sha256": result.scene_sha256,
         "X-Ultragray-Renderer": result.renderer,
-        "X-Ultragray-Shape": f"{len(result.outputs)},{len(result.poses)},{result.height},{result.width}",
-        "X-Ultragray-Dtype": _DTYPES.get(result.encoding, "uint8"),
-        "X-Ultragray-Outputs": ",".join(result.outputs),
-        "X-Ultragray-Probe": json.dumps(probe_to_dict(result.probe)),
+        "X-Ultragray-Shape": f"{len(result.settings.outputs)},{len(result.poses)},{result.height},{result.width}",
+        "X-Ultragray-Dtype": _DTYPES.get(result.settings.encoding, "uint8"),
+        "X-Ultragray-Outputs": ",".join(result.settings.outputs),
+        "X-Ultragray-Probe": json.dumps(probe_to_dict(result.settings.probe)),
         "X-Ultragray-Confidence": ",".join(
             "" if told.confidence is None else f"{told.confidence:.3f}" for told in result.extrapolations
         ),
-        "X-Ultragray-Picture": json.dumps(picture_json(result.picture)),
+        "X-Ultragray-Picture": json.dumps(picture_json(result.settings.picture)),
         "X-Ultragray-Queue-Ms": queue,
         "X-Ultragray-Render-Ms": render_time,
         "X-Ultragray-Encode-Ms": encode,

@@ -9,19 +9,18 @@ from urllib.parse import urlsplit
 from fastapi import APIRouter, WebSocket, WebSocketDisconnect
 from pydantic import ValidationError
 
+from ultragray.contract import under
 from ultragray.errors import InvalidArgument, UltragrayError
-from ultragray.request import check_outputs
+from ultragray.settings import Encoding, Resolved
 from ultragray_workers.errors import Draining
-from ultragray_workers.pool.types import Encoding, Priority, RenderRequest
 
 from ...auth import STREAM_PROTOCOL
 from ...core.pose_stream import Answered, Asked, PoseStream
-from ...core.requests import RenderSpec, field_under
 from ...core.state import Service
 from ...errors import OriginRefused, statuses_of
 from ..deps import SceneName
 from ..problems import invalid_argument, problem_response
-from ..render_body import asked_display, asked_probe, asked_trust, checked_pose
+from ..render_body import asked_settings, checked_pose
 from ..stream_schemas import StreamMessage, StreamSettings, error_text, frame_bytes, message_numbers
 
 router = APIRouter(prefix="/v1/scenes", tags=["render"])
@@ -87,7 +86,7 @@ class _WebSocketStream:
         self._service = service
         self._websocket = websocket
         self._scene = scene
-        self._settings: RenderRequest | None = None
+        self._settings: Resolved | None = None
         self._has_defaults = True  # until the client sends settings
 
     async def run(self) -> None:
@@ -134,6 +133,7 @@ class _WebSocketStream:
             asked = Asked(
                 sequence=message.sequence,
                 client_time=message.client_time_ms,
+                scene=self._scene,
                 settings=self._settings,
                 pose=checked_pose("pose", message.pose),
                 deadline=self._service.planner.deadline(
@@ -145,19 +145,11 @@ class _WebSocketStream:
         else:
             await stream.ask(asked)
 
-    async def _plan(self, settings: StreamSettings) -> RenderRequest:
-        with field_under("settings"):
-            spec = RenderSpec(
-                scene=self._scene,
-                probe=asked_probe(settings),
-                height=settings.height,
-                width=settings.width,
-                outputs=check_outputs(settings.outputs),
-                encoding=Encoding(settings.encoding),
-                display=asked_display(settings),
-                trust=asked_trust(settings),
+    async def _plan(self, settings: StreamSettings) -> Resolved:
+        with under("settings"):
+            return await self._service.planner.resolve(
+                self._scene, asked_settings(settings), Encoding(settings.encoding)
             )
-            return await self._service.planner.plan(spec, Priority.INTERACTIVE)
 
     async def _write(self, answered: Answered) -> None:
         if isinstance(answered.outcome, UltragrayError):

@@ -11,10 +11,9 @@ import numpy.typing as npt
 
 from ultragray.confidence import Extrapolation, figure_arrays
 from ultragray.display.pixels import ByteArray, PixelArray, image_file, to_uint8
+from ultragray.outputs import OUTPUTS
 from ultragray.probe import FloatArray
-from ultragray.request import LABELS
-
-from ..types import Encoding
+from ultragray.settings import Encoding
 
 JPEG_QUALITY = 90
 
@@ -33,11 +32,6 @@ def encode_image(frame: PixelArray, encoding: Encoding) -> ByteArray:  # [H, W] 
     return image_file(frame, ".jpg", cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY)
 
 
-def npz_type(output: str) -> np.dtype[Any]:
-    """The type of an output's array in an .npz archive."""
-    return np.dtype("u1") if output == LABELS else np.dtype("<f4")
-
-
 def write_npz(
     file: BinaryIO,
     frames: Mapping[str, PixelArray],  # each [C, H, W]
@@ -51,7 +45,7 @@ def write_npz(
     """Writes an .npz archive, labels as uint8, at the start of `file` and returns its size in bytes."""
     file.seek(0)
     arrays: dict[str, Any] = {
-        **{name: np.asarray(pixels, npz_type(name)) for name, pixels in frames.items()},
+        **{name: np.asarray(pixels, OUTPUTS[name].dtype) for name, pixels in frames.items()},
         "poses": np.asarray(poses, dtype=np.float64),
         **figure_arrays(extrapolations),
         "scene": np.array(scene),

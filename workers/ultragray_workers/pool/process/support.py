@@ -6,24 +6,24 @@ from collections.abc import Sequence
 
 from ultragray.confidence import Extrapolation, is_confident, low_confidence
 from ultragray.errors import LowConfidence
+from ultragray.settings import Below
 
-from ..messages import RenderJob
-from ..types import Below
+from ..messages import RenderTask
 
 
-def below_limit(job: RenderJob, extrapolations: Sequence[Extrapolation]) -> list[bool]:
-    """Which poses have less confidence than the job wants; a scene without a model has none."""
-    limit = job.trust.min_confidence
+def below_limit(task: RenderTask, extrapolations: Sequence[Extrapolation]) -> list[bool]:
+    """Which poses have less confidence than the task wants; a scene without a model has none."""
+    limit = task.view.min_confidence
     return [limit is not None and not is_confident(told, limit) for told in extrapolations]
 
 
-def refusal(job: RenderJob, extrapolations: Sequence[Extrapolation]) -> LowConfidence | None:
-    """Why a job of one part is not rendered; None where it is."""
-    limit = job.trust.min_confidence
-    if limit is None or job.trust.below is not Below.REFUSE:
+def refusal(task: RenderTask, extrapolations: Sequence[Extrapolation]) -> LowConfidence | None:
+    """Why a task of one part is not rendered; None where it is."""
+    limit = task.view.min_confidence
+    if limit is None or task.view.below_min_confidence is not Below.REFUSE:
         return None
     for index, told in enumerate(extrapolations):
         if not is_confident(told, limit):
-            part = job.parts[0]
+            part = task.parts[0]
             return low_confidence(told, limit, "pose" if part.total == 1 else f"poses[{part.first + index}]")
     return None

@@ -1,4 +1,4 @@
-"""The worker process: takes jobs from its channel one at a time, renders, encodes, answers. Imports torch."""
+"""The worker process: takes tasks from its channel one at a time, renders, encodes, answers. Imports torch."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ from ultragray.display.settings import AS_RENDERED
 from ultragray.errors import MemoryExceeded, RenderFailed, UltragrayError
 from ultragray.probe import FloatArray
 from ultragray.rendering import renderer_name
+from ultragray.settings import Encoding, Resolved
 
 from ..channel import Channel
 from ..memory import write_at
-from ..messages import Answer, ForkWorker, Hello, Job, LoadJob, PackJob, Rendered, RenderJob, RenderPart, UnloadJob
+from ..messages import Answer, ForkWorker, Hello, LoadTask, PackTask, Rendered, RenderPart, RenderTask, Task, UnloadTask
 from ..transfer import CHUNK_POSES, Arriving, Wanted, render_to_host
-from ..types import ANY_CONFIDENCE, Encoding
 from .encoding import encode_image, encode_pixels, write_npz
 from .placement import render_device
 from .scene_cache import SceneCache
@@ -59,10 +59,10 @@ def run_worker(channel: Channel, settings: ForkWorker) -> None:
     channel.send(Hello(os.getpid(), gpus=worker.gpus))
     while True:
         try:
-            job, descriptors = channel.receive()
+            task, descriptors = channel.receive()
         except (EOFError, ConnectionError):
             return
-        worker.do(job, descriptors)
+        worker.do(task, descriptors)
 
 
 def _exit_with_service(channel_descriptor: int) -> None:
@@ -93,14 +93,14 @@ class _Worker:
         for probe in _SMALL_PROBES:
             encode_image(self._render_small(scene, probe), Encoding.PNG)
 
-    def do(self, job: Job, descriptors: list[int]) -> None:
-        """Does one job and answers it, whatever happens."""
+    def do(self, task: Task, descriptors: list[int]) -> None:
+        """Does one task and answers it, whatever happens."""
         try:
-            if isinstance(job, RenderJob):
-                for index, outcome in enumerate(self._render_parts(job, descriptors)):
-                    self._answer(index, outcome, last=index == len(job.parts) - 1)
+            if isinstance(task, RenderTask):
+                for index, outcome in enumerate(self._render_parts(task, descriptors)):
+                    self._answer(index, outcome, last=index == len(task.parts) - 1)
             else:
-                self._answer(0, self._do_other(job, descriptors), last=True)
+                self._answer(0, self._do_other(task, descriptors), last=True)
         finally:
             for descriptor in descriptors:
                 os.close(descriptor)
@@ -108,53 +108,55 @@ class _Worker:
     def _answer(self, part: int, outcome: Rendered | UltragrayError | None, *, last: bool) -> None:
         self._channel.send(Answer(part=part, outcome=outcome, last=last, resident=self._scenes.names()))
 
-    def _do_other(self, job: PackJob | LoadJob | UnloadJob, descriptors: list[int]) -> Rendered | UltragrayError | None:
+    def _do_other(
+        self, task: PackTask | LoadTask | UnloadTask, descriptors: list[int]
+    ) -> Rendered | UltragrayError | None:
         try:
-            if isinstance(job, PackJob):
-                return _pack(job, *descriptors)
-            if isinstance(job, LoadJob):
+            if isinstance(task, PackTask):
+                return _pack(task, *descriptors)
+            if isinstance(task, LoadTask):
                 for probe in _SMALL_PROBES:  # lets the kernels prepare the scene
-                    self._render_small(self._scenes.get(job.scene, job.path).scene, probe)
+                    self._render_small(self._scenes.get(task.scene, task.path).scene, probe)
             else:
-                self._scenes.drop(job.scene)
+                self._scenes.drop(task.scene)
         except Exception as error:
             return _as_reported(error)
         return None
 
-    def _render_parts(self, job: RenderJob, memories: Sequence[int]) -> Iterator[Rendered | UltragrayError]:
+    def _render_parts(self, task: RenderTask, memories: Sequence[int]) -> Iterator[Rendered | UltragrayError]:
         """One outcome per part, each as soon as its frames are written."""
         try:
-            loaded = self._scenes.get(job.scene, job.path)
+            loaded = self._scenes.get(task.scene, task.path)
         except Exception as error:
-            yield from [_as_reported(error)] * len(job.parts)
+            yield from [_as_reported(error)] * len(task.parts)
             return
-        poses = np.concatenate([part.poses for part in job.parts])  # [C, 4, 4]
+        poses = np.concatenate([part.poses for part in task.parts])  # [C, 4, 4]
         try:
-            extrapolations = loaded.assessor.assess(poses, job.probe)
+            extrapolations = loaded.assessor.assess(poses, task.view.probe)
         except Exception as error:
-            yield from [_as_reported(error)] * len(job.parts)
+            yield from [_as_reported(error)] * len(task.parts)
             return
-        refused = refusal(job, extrapolations)
-        if refused is not None and len(job.parts) == 1:
+        refused = refusal(task, extrapolations)
+        if refused is not None and len(task.parts) == 1:
             yield refused
             return
         wanted: dict[str, set[np.dtype[Any]]] = {}
-        for part in job.parts:
-            for name in part.outputs:
-                wanted.setdefault(name, set()).add(part.encoding.pixel_type)
+        for part in task.parts:
+            for name in part.settings.outputs:
+                wanted.setdefault(name, set()).add(part.settings.encoding.pixel_type)
         started = time.monotonic()
-        support = SupportWatch(below_limit(job, extrapolations))
+        support = SupportWatch(below_limit(task, extrapolations))
         frames = None
         try:
             if refused is None:
-                frames = self._render(loaded.scene, job, poses, wanted, support)
+                frames = self._render(loaded.scene, task.view, poses, wanted, support)
         except Exception as error:
-            if len(job.parts) == 1:
+            if len(task.parts) == 1:
                 yield _as_reported(error)
                 return
         if frames is None:  # out of the handler: the error holds on to memory of the GPU
-            for part, memory in zip(job.parts, memories, strict=True):  # alone: it may be one that fails
-                yield from self._render_parts(replace(job, parts=(part,)), [memory])
+            for part, memory in zip(task.parts, memories, strict=True):  # alone: it may be one that fails
+                yield from self._render_parts(replace(task, parts=(part,)), [memory])
             return
         rendered = Rendered(
             size=0,
@@ -165,30 +167,30 @@ class _Worker:
             encode_ms=0.0,
         )
         begin = 0
-        for part, memory in zip(job.parts, memories, strict=True):
+        for part, memory in zip(task.parts, memories, strict=True):
             end = begin + len(part.poses)
             told = partial(support.told, extrapolations[begin:end], begin)
-            yield _write_part(job.scene, part, frames, begin, memory, rendered, told)
+            yield _write_part(task.scene, part, frames, begin, memory, rendered, told)
             begin = end
 
     def _render(
         self,
         scene: GaussianScene,
-        job: RenderJob,
+        view: Resolved,
         poses: FloatArray,  # [C, 4, 4] mm
         wanted: Wanted,
         support: SupportWatch,
     ) -> Arriving:
         def shoot(some: FloatArray) -> dict[str, Tensor]:  # [C, 4, 4] -> each [C, H, W] of the picture
             frames = render(
-                scene, job.probe, some, height=job.height, width=job.width, outputs=needed, backend=self._backend
+                scene, view.probe, some, height=view.height, width=view.width, outputs=needed, backend=self._backend
             )
             assert frames.coverage is not None
             blackened = support.look(frames.coverage)
-            rendered = {name: getattr(frames, name) for name in outputs}
-            if job.display == AS_RENDERED and blackened is None:
+            rendered = {name: frames[name] for name in outputs}
+            if view.display == AS_RENDERED and blackened is None:
                 return rendered
-            return show(rendered, job.probe, job.display, blackened)
+            return show(rendered, view.probe, view.display, blackened)
 
         outputs = tuple(wanted)
         needed = tuple(dict.fromkeys((*outputs, "coverage")))
@@ -196,14 +198,13 @@ class _Worker:
             return render_to_host(shoot, poses, wanted, self._device)
         except torch.OutOfMemoryError as error:
             raise MemoryExceeded(
-                f"{len(poses)} frames of {job.height}x{job.width} pixels ({', '.join(outputs)}) do not fit into the "
+                f"{len(poses)} frames of {view.height}x{view.width} pixels ({', '.join(outputs)}) do not fit into the "
                 f"free memory of {self._device}; ask for fewer or smaller ones"
             ) from error
 
     def _render_small(self, scene: GaussianScene, probe: Probe) -> ByteArray:  # [16, 16]
-        pixel_type = Encoding.UINT8.pixel_type
-        job = RenderJob("", "", probe, 16, 16, AS_RENDERED, ANY_CONFIDENCE, ())
-        frames = self._render(scene, job, np.eye(4)[None], {"bmode": {pixel_type}}, SupportWatch([False]))
+        pixel_type, view = Encoding.UINT8.pixel_type, Resolved(probe, 16, 16)
+        frames = self._render(scene, view, np.eye(4)[None], {"bmode": {pixel_type}}, SupportWatch([False]))
         return to_uint8(frames.take("bmode", pixel_type, 0, 1)[0])
 
 
@@ -218,17 +219,18 @@ def _write_part(
 ) -> Rendered | UltragrayError:
     """Encodes a part into its request's memory: a whole file, or its share of the pixels."""
     started, waited_ms = time.monotonic(), frames.waited_ms
-    pixel_type, end = part.encoding.pixel_type, begin + len(part.poses)
+    outputs, encoding, end = part.settings.outputs, part.settings.encoding, begin + len(part.poses)
+    pixel_type = encoding.pixel_type
     try:
-        if part.encoding.is_image_file:
-            image = encode_image(frames.take(part.outputs[0], pixel_type, begin, end)[0], part.encoding)
+        if encoding.is_image_file:
+            image = encode_image(frames.take(outputs[0], pixel_type, begin, end)[0], encoding)
             write_at(memory, image.data, 0)
             size = image.nbytes
-        elif part.encoding is Encoding.NPZ and len(part.poses) == part.total:
+        elif encoding is Encoding.NPZ and len(part.poses) == part.total:
             with os.fdopen(os.dup(memory), "wb") as file:
                 size = write_npz(
                     file,
-                    {name: frames.take(name, pixel_type, begin, end) for name in part.outputs},
+                    {name: frames.take(name, pixel_type, begin, end) for name in outputs},
                     part.poses,
                     told(),
                     scene=scene,
@@ -237,13 +239,13 @@ def _write_part(
                 )
         else:
             for first in range(begin, end, CHUNK_POSES):  # each is written while the next one arrives
-                for number, name in enumerate(part.outputs):
+                for number, name in enumerate(outputs):
                     pixels = encode_pixels(
-                        frames.take(name, pixel_type, first, min(first + CHUNK_POSES, end)), part.encoding
+                        frames.take(name, pixel_type, first, min(first + CHUNK_POSES, end)), encoding
                     )
                     place = number * part.total + part.first + first - begin
                     write_at(memory, pixels.data.cast("B"), place * pixels[0].nbytes)
-            size = len(part.outputs) * part.total * pixels[0].nbytes
+            size = len(outputs) * part.total * pixels[0].nbytes
         extrapolations = told()
     except Exception as error:
         return _as_reported(error)
@@ -258,10 +260,11 @@ def _write_part(
     )
 
 
-def _pack(job: PackJob, pixels_memory: int, archive_memory: int) -> Rendered:
+def _pack(task: PackTask, pixels_memory: int, archive_memory: int) -> Rendered:
     """The .npz of float32 frames that parts left in memory, output after output."""
     started = time.monotonic()
-    shape = (len(job.outputs), len(job.poses), job.height, job.width)
+    picture = task.settings.picture
+    shape = (len(task.settings.outputs), len(task.poses), picture.height, picture.width)
     with (
         mmap.mmap(pixels_memory, 4 * int(np.prod(shape)), prot=mmap.PROT_READ) as pixels,
         os.fdopen(os.dup(archive_memory), "wb") as file,
@@ -269,18 +272,18 @@ def _pack(job: PackJob, pixels_memory: int, archive_memory: int) -> Rendered:
         frames = np.frombuffer(pixels, dtype="<f4").reshape(shape)
         size = write_npz(
             file,
-            dict(zip(job.outputs, frames, strict=True)),
-            job.poses,
-            job.extrapolations,
-            scene=job.scene,
-            scene_sha256=job.scene_sha256,
-            renderer=job.renderer,
+            dict(zip(task.settings.outputs, frames, strict=True)),
+            task.poses,
+            task.extrapolations,
+            scene=task.scene,
+            scene_sha256=task.scene_sha256,
+            renderer=task.renderer,
         )
         del frames  # the map cannot be closed while an array looks into it
     return Rendered(
         size=size,
-        scene_sha256=job.scene_sha256,
-        renderer=job.renderer,
+        scene_sha256=task.scene_sha256,
+        renderer=task.renderer,
         started=started,
         render_ms=0.0,
         encode_ms=_since_ms(started),

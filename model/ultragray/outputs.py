@@ -1,0 +1,102 @@
+"""The outputs of a renderer: what can be asked for at each pixel, and how each follows from what the backends draw.
+
+To add an output, register it here; its number on the wire goes into `proto/ultragray/v1/rendering.proto`. Free of
+torch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from .errors import UnknownOutput
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from .rendering import Drawing
+    from .scene_info import SceneInfo
+
+PLANES = ("bmode", "echo", "transmittance", "coverage")  # what a backend draws, in [0, 1], with gradients
+WEIGHT_SUM = "weight_sum"  # S of docs/physics.md §3, which backends draw too, without a gradient
+_AMOUNTS, _NUMBERS = np.dtype("<f4"), np.dtype("u1")
+
+
+@dataclass(frozen=True)
+class Output:
+    """One quantity of each pixel."""
+
+    name: str
+    meaning: str
+    planes: tuple[str, ...]
+    """What the backends draw for it."""
+    derive: Callable[[Drawing], Tensor]
+    """The output [C, H, W] of a drawing."""
+    dtype: np.dtype[Any] = _AMOUNTS
+    """float32: amounts in [0, 1]. uint8: numbers that stand for something, which nothing may interpolate or scale."""
+    is_toned: bool = False
+    """Whether gain, dynamic range and time-gain compensation change it."""
+    tells_support: bool = False
+    """Whether it keeps its values where pixels without support are blackened."""
+    lacks: Callable[[SceneInfo], str | None] = lambda _: None
+    """Which scenes give it, in words, where a scene does not; None where it does."""
+
+    @property
+    def is_numbers(self) -> bool:
+        """Whether its pixels are numbers, not amounts."""
+        return self.dtype == _NUMBERS
+
+
+OUTPUTS: dict[str, Output] = {}
+
+
+def _register(name: str, meaning: str, **properties: Any) -> Output:
+    properties.setdefault("planes", (name,))
+    properties.setdefault("derive", lambda drawing: drawing.plane(name))
+    OUTPUTS[name] = Output(name, meaning, **properties)
+    return OUTPUTS[name]
+
+
+def _labels(drawing: Drawing) -> Tensor:
+    from .backends.labels import render_labels  # needs torch
+
+    return render_labels(drawing.scene, drawing.shape, lambda part: drawing.plane_of(part, WEIGHT_SUM))
+
+
+def _lacks_labels(info: SceneInfo) -> str | None:
+    return None if info.label_names else "whose Gaussians carry labels; this one's carry none"
+
+
+BMODE = _register("bmode", "B = E T, what a scanner shows", is_toned=True)
+ECHO = _register("echo", "E, the reflected intensity")
+TRANSMITTANCE = _register("transmittance", "T, what is left of the beam at that depth")
+COVERAGE = _register("coverage", "1 - exp(-S): how far Gaussians support the pixel", tells_support=True)
+LABELS = _register(
+    "labels",
+    "the label that weighs most, 0: none; of a scene with label_names",
+    planes=(),
+    derive=_labels,
+    dtype=_NUMBERS,
+    lacks=_lacks_labels,
+)
+
+
+def check_outputs(outputs: Sequence[str], *, field: str = "outputs") -> tuple[str, ...]:
+    """`outputs` without repetitions, in the given order. Raises UnknownOutput for an unknown name or an empty list."""
+    names = (outputs,) if isinstance(outputs, str) else tuple(outputs)
+    for name in names:
+        if name not in OUTPUTS:
+            raise UnknownOutput(f"{field} must be some of {', '.join(OUTPUTS)}, got {name!r}", field=field)
+    if not names:
+        raise UnknownOutput(f"{field} must name at least one of {', '.join(OUTPUTS)}, got none", field=field)
+    return tuple(dict.fromkeys(names))
+
+
+def check_available(outputs: Sequence[str], info: SceneInfo, *, field: str = "outputs") -> None:
+    """Raises UnknownOutput for outputs that a scene cannot give."""
+    for name in outputs:
+        if (lacking := OUTPUTS[name].lacks(info)) is not None:
+            raise UnknownOutput(f"{field} may name {name} only for a scene {lacking}", field=field)

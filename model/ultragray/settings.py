@@ -1,0 +1,147 @@
+"""What every door takes beside the scene and the poses: what to render, how it is shown, and in which form it comes.
+
+A request's settings are checked and completed once, by `resolved`; what comes after trusts the result. Free of torch.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from .contract import Contract, described
+from .display import AS_RENDERED, Display
+from .errors import InvalidArgument, InvalidImageSize, InvalidProbe, UnknownOutput
+from .image_size import MAX_IMAGE_SIDE, check_image_size
+from .outputs import OUTPUTS, check_available, check_outputs
+from .probe import Picture, Probe
+from .scene_info import SceneInfo
+
+
+class Encoding(str, Enum):
+    """The form that pixels come in."""
+
+    UINT8 = "uint8"
+    FLOAT32 = "float32"
+    PNG = "png"
+    JPEG = "jpeg"
+    NPZ = "npz"
+
+    @property
+    def is_image_file(self) -> bool:
+        """Whether it holds exactly one frame of one output."""
+        return self in (Encoding.PNG, Encoding.JPEG)
+
+    @property
+    def pixel_type(self) -> np.dtype[Any]:
+        """The type that pixels are rounded to."""
+        return np.dtype("<f4") if self in (Encoding.FLOAT32, Encoding.NPZ) else np.dtype("u1")
+
+
+class Below(str, Enum):
+    """What becomes of a frame whose confidence is below the limit."""
+
+    REFUSE = "refuse"
+    MASK = "mask"
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameSettings(Contract):
+    """What to render, but for the scene and the poses. None: as the scene has it.
+
+    Raises InvalidProbe, InvalidImageSize, UnknownOutput, InvalidArgument.
+    """
+
+    height: int | None = described(
+        "Depth samples. Default: as trained, else 512.", None, low=1, high=MAX_IMAGE_SIDE, error=InvalidImageSize
+    )
+    width: int | None = described(
+        "Scan lines. Default: as trained, else 512.", None, low=1, high=MAX_IMAGE_SIDE, error=InvalidImageSize
+    )
+    probe: Probe | None = described("Instead of the scene's own.", None, error=InvalidProbe)
+    min_confidence: float | None = described("0 to 1; what is below is refused, or masked.", None, low=0.0, high=1.0)
+    below_min_confidence: Below = described(
+        "mask: pixels of such frames that Gaussians do not support are 0.", Below.REFUSE
+    )
+    display: Display | None = described("Gain, depth, scan conversion ...; default: as rendered.", None)
+    outputs: tuple[str, ...] = described(f"Some of {', '.join(OUTPUTS)}.", ("bmode",), error=UnknownOutput)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "outputs", check_outputs(self.outputs))
+
+    def resolved(self, info: SceneInfo, encoding: Encoding, *, max_image_side: int = MAX_IMAGE_SIDE) -> Resolved:
+        """The settings for a scene, with nothing left open.
+
+        Raises InvalidProbe where neither side knows a probe, InvalidImageSize beyond `max_image_side`, UnknownOutput
+        for outputs that the scene cannot give, InvalidArgument for a confidence that it cannot tell and for an encoding
+        that cannot hold the outputs.
+        """
+        check_available(self.outputs, info)
+        height, width = info.image_size_or(self.height, self.width)
+        check_image_size(height, width, limit=max_image_side)
+        _check_encoding(encoding, self.outputs)
+        if self.min_confidence is not None and not info.confidence:
+            raise InvalidArgument(
+                "min_confidence needs a scene that knows the confidence of its frames; this one was trained without",
+                field="min_confidence",
+            )
+        return Resolved(
+            probe=info.probe_or(self.probe),
+            height=height,
+            width=width,
+            outputs=self.outputs,
+            encoding=encoding,
+            display=self.display or AS_RENDERED,
+            min_confidence=self.min_confidence,
+            below_min_confidence=self.below_min_confidence,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class RenderSettings(FrameSettings):
+    """What to render, and the form that it comes in, where neither an Accept header nor a file format decides that."""
+
+    encoding: Encoding = described("Form of the pixels.", Encoding.UINT8)
+
+
+@dataclass(frozen=True)
+class Resolved:
+    """Settings of a request for one scene, checked, with nothing left open."""
+
+    probe: Probe
+    height: int  # depth samples that are rendered
+    width: int  # scan lines
+    outputs: tuple[str, ...] = ("bmode",)
+    encoding: Encoding = Encoding.UINT8
+    display: Display = AS_RENDERED
+    min_confidence: float | None = None
+    below_min_confidence: Below = Below.REFUSE
+
+    @cached_property
+    def picture(self) -> Picture:
+        """Size and place of what the frames are shown as. Raises InvalidImageSize for a huge one."""
+        return self.display.picture(self.probe, self.height, self.width)
+
+    @cached_property
+    def view(self) -> tuple[Any, ...]:
+        """All but outputs and encoding: frames that agree in this can be rendered together."""
+        return (self.probe, self.height, self.width, self.display, self.min_confidence, self.below_min_confidence)
+
+    @property
+    def pixels(self) -> int:
+        """What is rendered or shown for one pose, whichever is more, over all outputs."""
+        picture = self.picture
+        return max(self.height * self.width, picture.height * picture.width) * len(self.outputs)
+
+
+def _check_encoding(encoding: Encoding, outputs: tuple[str, ...]) -> None:
+    if encoding.is_image_file and len(outputs) != 1:
+        raise InvalidArgument(
+            f"encoding {encoding.value} holds exactly one output, got {len(outputs)}", field="encoding"
+        )
+    if encoding is Encoding.JPEG and OUTPUTS[outputs[0]].is_numbers:
+        raise InvalidArgument(f"encoding jpeg would change {outputs[0]}: ask for png, or raw pixels", field="encoding")

@@ -1,0 +1,26 @@
+"""Requests for frames of the small scenes of these tests."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ultragray import LinearProbe
+from ultragray.probe import FloatArray
+from ultragray.settings import Resolved
+from ultragray_workers import Priority, RenderRequest
+
+PROBE = LinearProbe(width_mm=30.0, near_mm=0.0, far_mm=40.0)
+HEIGHT, WIDTH = 24, 32
+
+
+def asking(
+    scene: str,
+    poses: FloatArray,  # [C, 4, 4] mm
+    *,
+    priority: Priority = Priority.INTERACTIVE,
+    deadline: float | None = None,
+    **settings: Any,
+) -> RenderRequest:
+    """A request; what is not given is as the scenes were trained."""
+    resolved = Resolved(**{"probe": PROBE, "height": HEIGHT, "width": WIDTH, **settings})
+    return RenderRequest(scene, resolved, poses, priority, deadline)
