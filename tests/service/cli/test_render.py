@@ -243,7 +243,7 @@ def test_threads_and_backend_are_used(scene_file: Path, tmp_path: Path) -> None:
         (["--probe", '{"kind": "sector"}'], 'kind "linear", "convex" or "phased"'),
         (["--poses", "absent.npy"], "absent.npy: no such file"),
         (["--scan-convert", 0.5], "--scan-convert draws PNGs of a convex or phased probe only"),
-        (["--scan-convert", 0.0, "--probe", CONVEX_JSON], "pixel_mm must be from"),
+        (["--scan-convert", 0.0, "--probe", CONVEX_JSON], "pixel_mm must be a finite number from"),
         (["-o", "frames.png"], "ends in .npz, .tar, .zarr.zip, .h5, .dcm, .igs.mha, or a folder"),
         (["-o", "frames.dcm", "--outputs", "echo"], "bmode alone in format dicom"),
         (["-o", "frames.tar", "--dtype", "int8"], "dtype must be one of"),
