@@ -26,7 +26,7 @@ from ultragray.datasets.sweep import Dataset
 from ultragray.evaluation.baselines import BASELINES, evaluate_baselines, predict
 from ultragray.evaluation.compounding import affordable_voxel_mm
 from ultragray.evaluation.scoring import render_sweep
-from ultragray.files.atomic import atomic_path
+from ultragray.files.atomic import write_whole
 from ultragray.machine import processor_name
 from ultragray.report.study import train_and_evaluate
 from ultragray.scene import GaussianScene
@@ -224,8 +224,7 @@ def _shadow_lines(run: Mapping[str, Any]) -> list[str]:
 
 
 def _write(path: Path, text: str) -> None:
-    with atomic_path(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    write_whole(path, text)
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from .errors import InvalidArgument
-from .files.atomic import atomic_path
+from .files.atomic import write_whole
 from .pose import check_poses
 from .probe import FloatArray
 from .scene_info import (
@@ -192,8 +192,7 @@ class GaussianScene:
     def save(self, path: str | Path) -> None:
         """Writes the scene file whole or not at all. Raises OSError where it cannot be written."""
         data = self.to_bytes()
-        with atomic_path(path) as temporary:
-            temporary.write_bytes(data)
+        write_whole(path, data)
 
     @classmethod
     def load(cls, path: str | Path) -> GaussianScene:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import CheckpointInvalid, DatasetInvalid, InvalidArgument, InvalidPose
-from ..files.atomic import atomic_path
+from ..files.atomic import atomic_path, write_whole
 from ..files.npy import map_npy
 from ..files.poses import read_pose_array
 from ..interchange.released_config import ReleasedConfig, probe_keys, read_released_config
@@ -105,8 +105,7 @@ def write_released(dataset: Dataset, folder: str | Path) -> None:
             np.save(file, array, allow_pickle=False)
         document[f"{kind}_file_{part}"] = f"data/{name}/{file_name}"
     document |= {"result_dir": f"results/{name}", **probe_keys(dataset.probe), "_source": dataset.name}
-    with atomic_path(folder / CONFIG_NAME) as temporary:
-        temporary.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+    write_whole(folder / CONFIG_NAME, json.dumps(document, indent=1) + "\n")
 
 
 def _array_name(kind: str, part: str) -> str:

@@ -20,7 +20,7 @@ from ..datasets.phantom import Tissue, load_phantom, tissue_at
 from ..datasets.phantom.shadow import BoneShadow
 from ..datasets.sweep import Dataset
 from ..evaluation.scoring import render_sweep
-from ..files.atomic import atomic_path
+from ..files.atomic import write_whole
 from ..probe import FloatArray
 from ..rendering import render
 from ..scene import GaussianScene
@@ -108,8 +108,7 @@ def write_pictures(scene: GaussianScene, folder: Path) -> None:
         frame = render(scene, None, pose, height=PICTURE_SIDE, width=PICTURE_SIDE, outputs=("bmode",)).bmode
         assert frame is not None
         picture = (255.0 * frame[0]).round().byte().numpy()
-        with atomic_path(folder / f"demo_{view}.png") as temporary:
-            temporary.write_bytes(cv2.imencode(".png", picture)[1].tobytes())
+        write_whole(folder / f"demo_{view}.png", cv2.imencode(".png", picture)[1].tobytes())
 
 
 if __name__ == "__main__":

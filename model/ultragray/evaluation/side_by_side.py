@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from ..datasets.sweep import Sweep
 from ..display.square_pixels import with_square_pixels
-from ..files.atomic import atomic_path
+from ..files.atomic import write_whole
 from ..scene import GaussianScene
 from .metrics import FrameMetrics
 from .scoring import render_sweep
@@ -43,8 +43,7 @@ def write_side_by_side(
         )
         picture = _row({title: images[place] for title, images in panels.items()}, sweep, told)
         paths.append(folder / f"frame_{number:05d}.png")
-        with atomic_path(paths[-1]) as temporary:
-            temporary.write_bytes(cv2.imencode(".png", picture)[1].tobytes())
+        write_whole(paths[-1], cv2.imencode(".png", picture)[1].tobytes())
     return paths
 
 

@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from ..errors import InvalidArgument, InvalidProbe
-from ..files.atomic import atomic_path
+from ..files.atomic import write_whole
 from ..probe import LinearProbe, Probe
 from ..scene import GaussianScene
 from ..scene_info import Vector
@@ -78,8 +78,7 @@ def export_checkpoint(scene: GaussianScene, checkpoint: str | Path) -> Checkpoin
     beside[checkpoint.name] = _saved({"step": _step(scene), "global_tic": 0.0, "splats": splats})
     folder.mkdir(exist_ok=True)
     for name, data in beside.items():  # the checkpoint last: where it lies, everything does
-        with atomic_path(folder / name) as temporary:
-            temporary.write_bytes(data)
+        write_whole(folder / name, data)
     files = tuple(checkpoint.parent / name for name in beside)
     return CheckpointExport(files, centre_mm, tuple(notes), largest_error)
 

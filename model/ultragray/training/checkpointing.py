@@ -20,7 +20,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from ..errors import InvalidArgument, TrainingStateInvalid
-from ..files.atomic import atomic_path
+from ..files.atomic import write_whole
 from ..scene_info import expected_shapes
 from .config import TrainingConfig
 from .optimizer import MOMENTS, is_trained
@@ -44,8 +44,7 @@ def write_checkpoint(path: Path, header: CheckpointHeader, tensors: Mapping[str,
     document = {"format_version": FORMAT_VERSION, **asdict(header)}
     stored = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     data = save(stored, metadata={METADATA_KEY: json.dumps(document, sort_keys=True)})
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(data)
+    write_whole(path, data)
 
 
 def read_checkpoint_header(path: Path) -> CheckpointHeader:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..files.atomic import atomic_path
+from ..files.atomic import write_whole
 
 SMOOTHING = 0.05  # weight of the newest step in the mean time of a step
 
@@ -51,8 +51,7 @@ class Journal:
 
     def __init__(self, path: Path, *, steps_done: int) -> None:
         """Begins the file anew, or goes on after the lines of the first `steps_done` steps; damage cuts it short."""
-        with atomic_path(path) as temporary:
-            temporary.write_bytes(b"".join(_lines_until(path, steps_done)))
+        write_whole(path, b"".join(_lines_until(path, steps_done)))
         self._file = path.open("a", encoding="utf-8")
 
     def write(self, line: Mapping[str, float]) -> None:

@@ -20,7 +20,7 @@ from ..backends import cuda
 from ..datasets.sweep import Dataset
 from ..errors import DatasetInvalid, MemoryExceeded, TrainingDiverged, TrainingStateInvalid
 from ..evaluation.scoring import evaluate
-from ..files.atomic import atomic_path, remove_stale_temporaries
+from ..files.atomic import remove_stale_temporaries, write_whole
 from ..rendering import choose_backend, render
 from ..scene import PARAMETERS, GaussianScene
 from ..scene_info import SceneInfo, check_training_pose_count
@@ -202,8 +202,7 @@ class Trainer:
         self.folder.mkdir(parents=True, exist_ok=True)
         for name in (CHECKPOINT_FILE, JOURNAL_FILE, CONFIG_FILE):
             remove_stale_temporaries(self.folder / name)
-        with atomic_path(self.folder / CONFIG_FILE) as temporary:
-            temporary.write_text(json.dumps(self.config.to_dict(), indent=2) + "\n", encoding="utf-8")
+        write_whole(self.folder / CONFIG_FILE, json.dumps(self.config.to_dict(), indent=2) + "\n")
         with contextlib.ExitStack() as stack:
             sinks: list[Journal | Board] = [Journal(self.folder / JOURNAL_FILE, steps_done=self.step)]
             stack.callback(sinks[0].close)

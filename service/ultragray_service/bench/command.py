@@ -23,7 +23,7 @@ from rich.table import Table
 import ultragray
 from ultragray.backends import cpu, cuda
 from ultragray.errors import BackendUnavailable, InvalidArgument
-from ultragray.files.atomic import atomic_path
+from ultragray.files.atomic import write_whole
 from ultragray.machine import processor_name
 
 from .clients import ClientsExtent, measure_clients
@@ -203,8 +203,7 @@ def bench_console() -> Console:
 def write_document(console: Console, output: Path | None, document: dict[str, Any]) -> None:
     """The figures as JSON, where a file was asked for."""
     if output is not None:
-        with atomic_path(output) as temporary:
-            temporary.write_text(json.dumps(document, indent=1) + "\n")
+        write_whole(output, json.dumps(document, indent=1) + "\n")
         console.print(f"written to {output}")
 
 

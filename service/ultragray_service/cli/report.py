@@ -92,7 +92,7 @@ def _write_report(dataset: Dataset, config: TrainingConfig, output: Path, option
     """The studies that could not be finished, and why; the page has the others."""
     from ultragray.evaluation.baselines import evaluate_baselines
     from ultragray.evaluation.scoring import evaluate
-    from ultragray.files.atomic import atomic_path
+    from ultragray.files.atomic import write_whole
     from ultragray.report.page import ReportContent, render_page
     from ultragray.report.study import Failed, ablations, attempt, study_tilt, train_and_evaluate
     from ultragray.scene import GaussianScene
@@ -119,8 +119,7 @@ def _write_report(dataset: Dataset, config: TrainingConfig, output: Path, option
     page = render_page(
         ReportContent(dataset=dataset, baselines=baselines, voxel_mm=options.voxel_mm, machine=_machine(), **content)
     )
-    with atomic_path(output) as temporary:
-        temporary.write_text(page, encoding="utf-8")
+    write_whole(output, page)
     studies = {**content.get("ablations", {}), TILT: content.get("tilt")}
     return {name: study.reason for name, study in studies.items() if isinstance(study, Failed)}
 
