@@ -40,16 +40,16 @@ def parse_crop(text: str | None, height: int, width: int) -> CropBox:
     match = re.fullmatch(r"\s*(\d{0,9}):(\d{0,9})\s*,\s*(\d{0,9}):(\d{0,9})\s*", text)
     if match is None:
         raise InvalidArgument(
-            f"--crop must be columns and rows such as 188:632,12:600 (the ends are left out), got {text[:80]!r}",
-            field="--crop",
+            f"crop must be columns and rows such as 188:632,12:600 (the ends are left out), got {text[:80]!r}",
+            field="crop",
         )
     left, right, top, bottom = (
         int(group) if group else default for group, default in zip(match.groups(), (0, width, 0, height), strict=True)
     )
     if not (left < right <= width and top < bottom <= height):
         raise InvalidArgument(
-            f"--crop must lie within columns 0:{width} and rows 0:{height} and hold a pixel, got {text!r}",
-            field="--crop",
+            f"crop must lie within columns 0:{width} and rows 0:{height} and hold a pixel, got {text!r}",
+            field="crop",
         )
     return CropBox(left, right, top, bottom)
 
@@ -60,8 +60,8 @@ def parse_image_size(text: str) -> tuple[int, int]:  # width, height
     size = (int(match[1]), int(match[2])) if match else (0, 0)
     if not all(1 <= side <= MAX_IMAGE_SIDE for side in size):
         raise InvalidArgument(
-            f"--image-size must be width x height such as 192x256, each 1 to {MAX_IMAGE_SIDE}, got {text[:80]!r}",
-            field="--image-size",
+            f"image_size must be width x height such as 192x256, each 1 to {MAX_IMAGE_SIDE}, got {text[:80]!r}",
+            field="image_size",
         )
     return size
 

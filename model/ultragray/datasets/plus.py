@@ -25,7 +25,6 @@ from .sweep import Sweep
 from .transforms import TransformName, find_path, parse_matrix, read_device_set, transform_name
 
 _READERS = {".mha": read_meta_image, ".mhd": read_meta_image, ".nrrd": read_nrrd, ".nhdr": read_nrrd}
-SEQUENCE_SUFFIXES = tuple(_READERS)
 IMAGE, WORLDS = "Image", ("Reference", "Tracker", "World")
 _TRANSFORM, _STATUS = "Transform", "TransformStatus"
 _IMAGE_STATUSES = ("ImageStatus", "Status")  # as MetaImage and NRRD sequences call it
@@ -44,7 +43,7 @@ def read_plus_sweep(
     """
     stored = _READERS[path.suffix.lower()](path)
     frame_count = len(stored.pixels)
-    chosen = range(frame_count) if frames is None else parse_frame_ranges(frames, frame_count, option="--frames")
+    chosen = range(frame_count) if frames is None else parse_frame_ranges(frames, frame_count, option="frames")
     _check_image_type(stored)
     orientation = _field(stored, "UltrasoundImageOrientation").upper()
     fixed = {} if device_set is None else read_device_set(device_set)
@@ -93,7 +92,7 @@ def _way_to_world(
         if way is not None:
             return way
     known = ", ".join(sorted("To".join(name) for name in {*names, *fixed})) or "none"
-    hint = "" if device_set else " (give the device set that holds ImageToProbe with --device-set)"
+    hint = "" if device_set else " (give the device set that holds ImageToProbe)"
     raise DatasetInvalid(
         f"{stored.path}: no transforms lead from {IMAGE} to {', '.join(WORLDS[:-1])} or {WORLDS[-1]}; there are {known}"
         f"{hint}"

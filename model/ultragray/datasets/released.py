@@ -46,6 +46,18 @@ def read_released(path: str | Path) -> Dataset:
     return Dataset(name=config.dataset_name or path.resolve().parent.name, train=train, val=val)
 
 
+def require_files_below(config_path: Path, folder: Path) -> None:
+    """Raise DatasetInvalid where a conf.json from a stranger names files that are not below `folder`."""
+    try:
+        config = read_released_config(config_path)
+    except CheckpointInvalid as error:
+        raise DatasetInvalid(error.detail) from error
+    for key, named in config.files.items():
+        found = config.find(key)
+        if found is None or not found.resolve().is_relative_to(folder):
+            raise DatasetInvalid(f"{config_path}: {key} names {named[:200]!r}, which is not in the upload")
+
+
 def _read_part(config: ReleasedConfig, part: str, probe: Probe) -> Sweep:
     images_path, poses_path = (_file(config, f"{kind}_file_{part}") for kind in ("images", "poses"))
     images, poses = _read_images(images_path), _read_poses(poses_path)

@@ -1,69 +1,199 @@
-"""load_dataset: every kind of source behind one call."""
+"""load_dataset: every format of tracked sweeps behind one call, and the registry of the formats.
+
+Readers are imported when they are needed, so that help texts and uploads can be told what there is without them.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from pathlib import Path
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields, replace
+from fnmatch import fnmatchcase
+from pathlib import Path, PurePath
+from typing import TYPE_CHECKING
 
+from ..contract import Contract, described
 from ..errors import DatasetInvalid, InvalidArgument
-from .images import parse_image_size, resize_frames
-from .plus import SEQUENCE_SUFFIXES, read_plus_sweep
-from .released import read_released
-from .splits import split_parts, split_sequence
-from .sweep import Dataset, Sweep
 
+if TYPE_CHECKING:
+    from .sweep import Dataset
+
+MAX_OPTION_LENGTH = 1000
 PHANTOM = "phantom"
 
 
 @dataclass(frozen=True)
-class SourceOptions:
+class SourceOptions(Contract):
     """How a source is read. None leaves the choice to the source."""
 
-    train_frames: str | None = None  # "0:90,100:120:2": places in the training part, or frame numbers of a sequence
-    val_frames: str | None = None
-    frames: str | None = None  # the frames of a sequence that are read at all
-    device_set: Path | None = None  # PLUS device set (XML) that holds the calibration of the image
-    crop: str | None = None  # "188:632,12:600": columns and rows, half open, of a sequence's image, x lateral, y depth
-    image_size: str | None = None  # "192x256": width x height after the crop
+    train_frames: str | None = described(
+        "Frames to train from, such as 0:90 or 0:90,100:120:2: places in the training file, or in the sequence.", None
+    )
+    val_frames: str | None = described("Frames to hold out, counted likewise.", None)
+    frames: str | None = described("Frames of a sequence to read at all, such as 0:90,100:120:2.", None)
+    device_set: Path | None = described("PLUS device set (.xml) with the calibration ImageToProbe of a sequence.", None)
+    crop: str | None = described(
+        "Region of a sequence's image that shows ultrasound: columns,rows, such as 188:632,12:600 (ends left out).",
+        None,
+    )
+    image_size: str | None = described("Resize the frames: WIDTHxHEIGHT, such as 192x256.", None)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if isinstance(value, str) and (len(value) > MAX_OPTION_LENGTH or not value.isprintable()):
+                raise InvalidArgument(
+                    f"{item.name} must be at most {MAX_OPTION_LENGTH} characters of text", field=item.name
+                )
+
+
+@dataclass(frozen=True)
+class DatasetFormat:
+    """A format of tracked sweeps.
+
+    `load` gives the dataset of a source with the options applied, all but `image_size`; it raises DatasetInvalid and
+    InvalidArgument. An upload in this format holds one file whose name, in lower case, matches one of `files`.
+    """
+
+    name: str
+    noun: str  # what a source in this format is, as messages say it
+    meaning: str  # the same with its files, for help texts
+    is_source: Callable[[str], bool]  # whether a user who writes this means the format
+    load: Callable[[str, SourceOptions], Dataset]
+    files: tuple[str, ...] = ()  # none: built in, never a file
+    options: tuple[str, ...] = ()  # fields of SourceOptions that it takes, beside EVERY_FORMAT_TAKES
+    companions: Mapping[str, str] = field(default_factory=dict)  # pattern of the file of an upload that is an option
+    check_upload: Callable[[Path, Path], None] = lambda source, folder: None  # raises where it needs files elsewhere
+
+    @property
+    def upload_meaning(self) -> str:
+        """The meaning, with the files that are options."""
+        files = (f", with its {option.replace('_', ' ')} ({pattern})" for option, pattern in self.companions.items())
+        return self.meaning + "".join(files)
+
+    def is_file(self, path: PurePath) -> bool:
+        """Whether a file of an upload is the one by which its source is known."""
+        return any(fnmatchcase(path.name.lower(), pattern) for pattern in self.files)
+
+
+EVERY_FORMAT_TAKES = ("train_frames", "val_frames", "image_size")
 
 
 def load_dataset(source: str | Path, options: SourceOptions | None = None) -> Dataset:
-    """The dataset in a folder of the released layout (or its conf.json), in a PLUS sequence, or the built-in `phantom`.
+    """The dataset that a source holds, in any of the FORMATS.
 
-    Sequences are .mha, .mhd, .nrrd (so also .igs.mha and .seq.nrrd); every fifth of their frames is held out unless
-    `options` says otherwise. Raises DatasetInvalid, naming the file, the frame and the reason; InvalidArgument for
-    options that cannot be met.
+    Every fifth frame of a sequence is held out unless `options` says otherwise. Raises DatasetInvalid, naming the file,
+    the frame and the reason; InvalidArgument, naming the field, for options that cannot be met.
     """
     options = options or SourceOptions()
-    path = Path(source)
-    if str(source) == PHANTOM:
-        from .phantom import load_phantom
-
-        return _from_parts(load_phantom(), options)
-    if path.is_dir() or path.suffix.lower() == ".json":
-        return _from_parts(read_released(path), options)
-    if not path.is_file():  # a pipe would never end
-        raise DatasetInvalid(f"{path}: no such file or folder")
-    if path.suffix.lower() not in SEQUENCE_SUFFIXES:
-        raise DatasetInvalid(
-            f"{path}: a dataset is a folder with conf.json, a PLUS sequence ({', '.join(SEQUENCE_SUFFIXES)}) or the "
-            f"word {PHANTOM}"
-        )
-    sweep, frame_count = read_plus_sweep(path, device_set=options.device_set, frames=options.frames, crop=options.crop)
-    train, val = split_sequence(_resized(sweep, options), frame_count, options.train_frames, options.val_frames)
-    return Dataset(name=path.name.split(".")[0], train=train, val=val)
-
-
-def _from_parts(dataset: Dataset, options: SourceOptions) -> Dataset:
-    for name in ("frames", "device_set", "crop"):
-        if getattr(options, name) is not None:
-            option = "--" + name.replace("_", "-")
-            raise InvalidArgument(f"{option} is for PLUS sequences, {dataset.name} is none", field=option)
-    train, val = split_parts(dataset.train, dataset.val, options.train_frames, options.val_frames)
-    return Dataset(name=dataset.name, train=_resized(train, options), val=_resized(val, options))
-
-
-def _resized(sweep: Sweep, options: SourceOptions) -> Sweep:
+    chosen = format_of(source)
+    for item in fields(options):
+        if getattr(options, item.name) is not None and item.name not in (*EVERY_FORMAT_TAKES, *chosen.options):
+            takers = " and ".join(f"{one.noun}s" for one in FORMATS.values() if item.name in one.options)
+            raise InvalidArgument(f"{item.name} is for {takers}, {Path(source).name} is none", field=item.name)
+    dataset = chosen.load(str(source), options)
     if options.image_size is None:
-        return sweep
-    return replace(sweep, images=resize_frames(sweep.images, *parse_image_size(options.image_size)))
+        return dataset
+    from .images import parse_image_size, resize_frames
+
+    size = parse_image_size(options.image_size)
+    train, val = (replace(part, images=resize_frames(part.images, *size)) for part in (dataset.train, dataset.val))
+    return replace(dataset, train=train, val=val)
+
+
+def format_of(source: str | Path) -> DatasetFormat:
+    """The format that a source is in, by its name. Raises DatasetInvalid."""
+    path = Path(source)
+    for one in FORMATS.values():
+        if one.is_source(str(source)):
+            if one.files and not (path.is_file() or path.is_dir()):  # a pipe would never end
+                break
+            return one
+    if not path.is_file():
+        raise DatasetInvalid(f"{path}: no such file or folder")
+    *meanings, last = (one.meaning for one in FORMATS.values())
+    raise DatasetInvalid(f"{path}: a dataset is {', '.join(meanings)} or {last}")
+
+
+def dataset_format(name: str) -> DatasetFormat:
+    """The format of this name. Raises DatasetInvalid."""
+    if name not in FORMATS:
+        raise DatasetInvalid(f"there is no dataset format {name[:80]!r}, there are {', '.join(FORMATS)}")
+    return FORMATS[name]
+
+
+def _load_released(source: str, options: SourceOptions) -> Dataset:
+    from .released import read_released
+
+    return _split(read_released(source), options)
+
+
+def _load_phantom(source: str, options: SourceOptions) -> Dataset:
+    from .phantom import load_phantom
+
+    return _split(load_phantom(), options)
+
+
+def _split(dataset: Dataset, options: SourceOptions) -> Dataset:
+    from .splits import split_parts
+
+    train, val = split_parts(dataset.train, dataset.val, options.train_frames, options.val_frames)
+    return replace(dataset, train=train, val=val)
+
+
+def _load_plus(source: str, options: SourceOptions) -> Dataset:
+    from .plus import read_plus_sweep
+    from .splits import split_sequence
+    from .sweep import Dataset
+
+    path = Path(source)
+    sweep, frame_count = read_plus_sweep(path, device_set=options.device_set, frames=options.frames, crop=options.crop)
+    parts = split_sequence(sweep, frame_count, options.train_frames, options.val_frames)
+    return Dataset(path.name.split(".")[0], *parts)
+
+
+def _check_released_upload(source: Path, folder: Path) -> None:
+    from .released import require_files_below
+
+    require_files_below(source, folder)
+
+
+PLUS_SUFFIXES = (".mha", ".mhd", ".nrrd", ".nhdr")
+FORMATS: Mapping[str, DatasetFormat] = {
+    one.name: one
+    for one in (
+        DatasetFormat(
+            name="released",
+            noun="folder of the released layout",
+            meaning="a folder with conf.json and .npy files (or its conf.json)",
+            is_source=lambda source: Path(source).is_dir() or source.lower().endswith(".json"),
+            load=_load_released,
+            files=("conf.json",),
+            check_upload=_check_released_upload,
+        ),
+        DatasetFormat(
+            name="plus",
+            noun="PLUS sequence",
+            meaning=f"a PLUS sequence ({', '.join(PLUS_SUFFIXES)})",
+            is_source=lambda source: source.lower().endswith(PLUS_SUFFIXES),
+            load=_load_plus,
+            files=tuple(f"*{suffix}" for suffix in PLUS_SUFFIXES),
+            options=("frames", "device_set", "crop"),
+            companions={"device_set": "*.xml"},
+        ),
+        DatasetFormat(
+            name=PHANTOM,
+            noun="built-in phantom",
+            meaning=f"the word {PHANTOM}",
+            is_source=lambda source: source == PHANTOM,
+            load=_load_phantom,
+        ),
+    )
+}
+UPLOADED_FORMATS = tuple(one for one in FORMATS.values() if one.files)
+# What an upload may be given in words; the other options are files of it.
+UPLOAD_OPTIONS = {
+    item.name: str(item.metadata["description"])
+    for item in fields(SourceOptions)
+    if not any(item.name in one.companions for one in FORMATS.values())
+}

@@ -47,14 +47,14 @@ def split_sequence(
 def _chosen(count: int, train_frames: str | None, val_frames: str | None) -> tuple[list[int] | None, list[int] | None]:
     train, val = (
         None if text is None else parse_frame_ranges(text, count, option=option)
-        for text, option in ((train_frames, "--train-frames"), (val_frames, "--val-frames"))
+        for text, option in ((train_frames, "train_frames"), (val_frames, "val_frames"))
     )
     shared = sorted(set(train or ()) & set(val or ()))
     if shared:
         raise InvalidArgument(
-            f"--train-frames and --val-frames share {len(shared)} frames, the first is {shared[0]}: a frame that was "
+            f"train_frames and val_frames share {len(shared)} frames, the first is {shared[0]}: a frame that was "
             "trained from cannot be held out",
-            field="--val-frames",
+            field="val_frames",
         )
     return train, val
 

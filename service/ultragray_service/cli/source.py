@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from ultragray.datasets.source import FORMATS, PHANTOM, SourceOptions, load_dataset
+
 if TYPE_CHECKING:
     from ultragray.datasets import Dataset
     from ultragray.datasets.checks import DatasetReport
@@ -17,8 +19,7 @@ DatasetArgument = Annotated[
     str,
     typer.Argument(
         metavar="DATASET",
-        help="Folder with conf.json and .npy files (or its conf.json), a PLUS sequence (.mha, .mhd, .nrrd), or the "
-        "word phantom.",
+        help=f"One of: {'; '.join(one.meaning for one in FORMATS.values())}.",
         show_default=False,
     ),
 ]
@@ -70,8 +71,6 @@ def read_dataset(
     image_size: str | None,
 ) -> Dataset:
     """The dataset that a command's argument and options name. Raises DatasetInvalid and InvalidArgument."""
-    from ultragray.datasets.source import PHANTOM, SourceOptions, load_dataset
-
     if source == PHANTOM:
         typer.echo("simulating the phantom …", err=True)
     return load_dataset(

@@ -8,7 +8,9 @@ from collections.abc import AsyncIterator, Awaitable
 from contextlib import asynccontextmanager
 from typing import Any, TypeVar
 
-from ultragray.errors import DatasetInvalid, InvalidArgument
+from ultragray.contract import from_dict
+from ultragray.datasets.source import SourceOptions
+from ultragray.errors import DatasetInvalid
 from ultragray_workers.datasets.incoming import IncomingDataset, remove_stale
 from ultragray_workers.datasets.intake import take_in
 from ultragray_workers.datasets.store import DatasetRecord, DatasetStore, check_dataset_name
@@ -19,8 +21,6 @@ from ..settings import Settings
 from .helper_processes import HelperProcesses
 
 MAX_UPLOADS = 8
-OPTION_NAMES = ("crop", "image_size", "frames", "train_frames", "val_frames")
-MAX_OPTION_LENGTH = 1000
 CHECK_TIMEOUT_S = 1800.0
 _BLOCK_BYTES = 1 << 20
 
@@ -48,9 +48,7 @@ class DatasetUploads:
         Raises InvalidArgument for a bad name or option, QueueFull, Draining, StorageFull.
         """
         check_dataset_name(name)
-        for option, value in options.items():
-            if len(value) > MAX_OPTION_LENGTH or not value.isprintable():
-                raise InvalidArgument(f"{option} must be at most {MAX_OPTION_LENGTH} characters of text", field=option)
+        from_dict(SourceOptions, options)
         if self._draining.is_set():
             raise Draining("the service is stopping")
         if self._count >= MAX_UPLOADS:

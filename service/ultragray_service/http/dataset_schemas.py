@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 from pydantic import BaseModel, Field
 
+from ultragray.datasets.source import UPLOADED_FORMATS
 from ultragray_workers.datasets.store import DatasetRecord
 
 from .schemas import ProbeBody, probe_body
@@ -15,7 +14,10 @@ class DatasetOut(BaseModel):
     """An accepted dataset."""
 
     name: str
-    kind: Literal["released", "plus"] = Field(description="The released layout, or a PLUS sequence.")
+    kind: str = Field(
+        description="Its format: " + "; ".join(f"{one.name}, {one.meaning}" for one in UPLOADED_FORMATS) + ".",
+        json_schema_extra={"enum": [one.name for one in UPLOADED_FORMATS]},
+    )
     sha256: str = Field(description="Of images, poses, probe and split, however they were sent.")
     bytes: int = Field(description="Of its files.")
     created_at: str = Field(description="ISO 8601, UTC.")
@@ -32,7 +34,7 @@ class DatasetOut(BaseModel):
         """The JSON of a record."""
         return cls(
             name=record.name,
-            kind="plus" if record.kind == "plus" else "released",
+            kind=record.kind,
             sha256=record.sha256,
             bytes=record.bytes,
             created_at=record.created_at,

@@ -6,13 +6,14 @@ import asyncio
 
 import grpc
 
+from ultragray.datasets.source import UPLOAD_OPTIONS
 from ultragray.errors import InvalidArgument
 from ultragray_proto.v1 import datasets_pb2
 from ultragray_workers.datasets.store import DatasetRecord
 
 from ..core.catalog import DEFAULT_PAGE_SIZE
 from ..core.dataset_catalog import contact_sheet, dataset_page
-from ..core.dataset_uploads import OPTION_NAMES, DatasetUpload
+from ..core.dataset_uploads import DatasetUpload
 from ..core.state import Service
 from .messages import probe_message
 
@@ -31,7 +32,7 @@ class DatasetService:
         if first is grpc.aio.EOF or first.WhichOneof("part") != "header":
             raise InvalidArgument("the first message must hold the header", field="header")
         header = first.header
-        options = {name: value for name in OPTION_NAMES if (value := getattr(header.options, name))}
+        options = {name: value for name in UPLOAD_OPTIONS if (value := getattr(header.options, name))}
         async with self._service.uploads.receive(header.dataset, options) as upload:
             if header.archive:
                 await upload.begin_archive()

@@ -23,7 +23,7 @@ from ultragray.errors import InvalidArgument
     ],
 )
 def test_ranges_are_those_of_python(text: str, frames: list[int]) -> None:
-    assert parse_frame_ranges(text, 10, option="--frames") == frames
+    assert parse_frame_ranges(text, 10, option="frames") == frames
 
 
 @pytest.mark.parametrize(
@@ -46,6 +46,6 @@ def test_ranges_are_those_of_python(text: str, frames: list[int]) -> None:
     ],
 )
 def test_ranges_that_cannot_be_are_refused(text: str, message: str) -> None:
-    with pytest.raises(InvalidArgument, match=f"^--frames.*{message}") as refused:
-        parse_frame_ranges(text, 10, option="--frames")
+    with pytest.raises(InvalidArgument, match=f"^frames.*{message}") as refused:
+        parse_frame_ranges(text, 10, option="frames")
     assert len(str(refused.value)) < 200

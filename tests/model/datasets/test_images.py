@@ -73,12 +73,12 @@ def test_crops() -> None:
     ],
 )
 def test_crops_outside_the_image_are_refused(text: str) -> None:
-    with pytest.raises(InvalidArgument, match=r"^--crop must"):
+    with pytest.raises(InvalidArgument, match=r"^crop must"):
         parse_crop(text, 616, 820)
 
 
 def test_image_sizes() -> None:
     assert parse_image_size("192x256") == (192, 256)
     for text in ("192", "0x5", "5x0", "x", "99999x9", "-1x5", f"5x{'9' * 5000}"):
-        with pytest.raises(InvalidArgument, match=r"^--image-size must be width x height"):
+        with pytest.raises(InvalidArgument, match=r"^image_size must be width x height"):
             parse_image_size(text)

@@ -172,13 +172,13 @@ def test_bad_recordings_are_one_clear_error(tmp_path: Path, plus_files: SimpleNa
 def test_what_is_missing_is_told(tmp_path: Path, plus_files: SimpleNamespace, device_set: Path) -> None:
     stored = plus_files.speckle(3, ROWS, COLUMNS)
     path = plus_files.write_mha(tmp_path / "s.mha", stored, plus_files.tracked_fields(3))
-    with pytest.raises(DatasetInvalid, match=r"no transforms lead .*there are ProbeToTracker .*--device-set"):
+    with pytest.raises(DatasetInvalid, match=r"no transforms lead .*there are ProbeToTracker .*give the device set"):
         read_plus_sweep(path)
     path = plus_files.write_mha(tmp_path / "s.mha", stored, {})
     with pytest.raises(DatasetInvalid, match=r"there are ImageToProbe$"):
         read_plus_sweep(path, device_set=device_set)
     path = plus_files.write_mha(tmp_path / "s.mha", stored, plus_files.tracked_fields(3))
-    with pytest.raises(InvalidArgument, match=r"--crop must lie within columns 0:20 and rows 0:30"):
+    with pytest.raises(InvalidArgument, match=r"crop must lie within columns 0:20 and rows 0:30"):
         read_plus_sweep(path, device_set=device_set, crop="0:21,0:30")
-    with pytest.raises(InvalidArgument, match=r"--frames.*only 3"):
+    with pytest.raises(InvalidArgument, match=r"^frames.*only 3"):
         read_plus_sweep(path, device_set=device_set, frames="0:9")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import fields
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -11,7 +12,7 @@ import pytest
 
 from ultragray.datasets import Dataset, Sweep, phantom
 from ultragray.datasets.released import write_released
-from ultragray.datasets.source import SourceOptions, load_dataset
+from ultragray.datasets.source import EVERY_FORMAT_TAKES, FORMATS, SourceOptions, dataset_format, load_dataset
 from ultragray.errors import DatasetInvalid, InvalidArgument
 
 
@@ -71,3 +72,20 @@ def test_sources_that_are_none_are_refused(folder: Path, tmp_path: Path) -> None
 def test_one_training_frame_is_not_enough(folder: Path) -> None:
     with pytest.raises(DatasetInvalid, match="at least two training frames, got 1"):
         load_dataset(folder, SourceOptions(train_frames="3"))
+
+
+def test_options_are_texts_of_bounded_length() -> None:
+    for given in ("x" * 1001, "0:2\n"):
+        with pytest.raises(InvalidArgument, match="train_frames must be at most 1000 characters") as refused:
+            SourceOptions(train_frames=given)
+        assert refused.value.field == "train_frames"
+
+
+def test_each_format_names_options_that_there_are() -> None:
+    known = {item.name for item in fields(SourceOptions)}
+    for one in FORMATS.values():
+        assert {*one.options, *one.companions, *EVERY_FORMAT_TAKES} <= known
+        assert set(one.companions) <= set(one.options)
+    assert dataset_format("plus") is FORMATS["plus"]
+    with pytest.raises(DatasetInvalid, match="no dataset format 'nifti', there are released, plus"):
+        dataset_format("nifti")

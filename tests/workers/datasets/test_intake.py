@@ -123,7 +123,7 @@ def changed_config(files: dict[str, bytes], **changes: object) -> dict[str, byte
         ),
         (
             lambda _, files: {name: files[name] for name in files if name != "conf.json"},
-            r"^the upload holds neither conf.json nor a PLUS sequence .*, it holds images_train.npy, ",
+            r"^the upload must hold a folder with conf.json .* or a PLUS sequence .*, it holds images_train.npy, ",
         ),
         (
             lambda _, files: {name: files[name] for name in files if name != "poses_val.npy"},
@@ -213,6 +213,25 @@ def test_the_same_content_twice_is_one_dataset(store: DatasetStore, receive: Rec
         add(store, receive, files, "tiny", train_frames="0:4")
     assert store.get("tiny") == before
     assert store.names() == ["tiny"]
+
+
+def test_a_manifest_of_an_unknown_format_is_damaged(
+    store: DatasetStore, receive: Receive, files: dict[str, bytes]
+) -> None:
+    add(store, receive, files, "tiny")
+    manifest = store.folder / "tiny" / "dataset.json"
+    manifest.write_text(manifest.read_text().replace('"released"', '"nifti"'))
+    with pytest.raises(DatasetInvalid, match=r"'tiny' is damaged: .*no dataset format 'nifti', there are released, "):
+        store.load("tiny")
+
+
+def test_a_manifest_of_an_earlier_version_is_read(
+    store: DatasetStore, receive: Receive, files: dict[str, bytes]
+) -> None:
+    add(store, receive, files, "tiny")
+    manifest = store.folder / "tiny" / "dataset.json"
+    manifest.write_text(json.dumps({**json.loads(manifest.read_text()), "source": "conf.json", "device_set": None}))
+    assert store.load("tiny").sha256 == store.get("tiny").sha256
 
 
 def test_deletion(store: DatasetStore, receive: Receive, files: dict[str, bytes]) -> None:

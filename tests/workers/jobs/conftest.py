@@ -70,8 +70,7 @@ def store_dataset(artifact_folder: Path, name: str) -> Path:
         width=16,
         probe=PROBE,
         warnings=(),
-        source="conf.json",
-        device_set=None,
+        options={},
     )
     write_manifest(record, folder)
     return folder

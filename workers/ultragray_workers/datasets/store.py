@@ -9,15 +9,17 @@ import re
 import secrets
 import shutil
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ultragray.datasets.source import dataset_format
 from ultragray.errors import DatasetInvalid, InvalidArgument, UltragrayError
 from ultragray.files.atomic import sync, write_whole
 from ultragray.probe import Probe, probe_from_dict, probe_to_dict
 
 from ..errors import DatasetExists, DatasetInUse, DatasetNotFound
+from .contents import find_source
 
 if TYPE_CHECKING:
     from ultragray.datasets import Dataset
@@ -34,7 +36,7 @@ class DatasetRecord:
     """What is known about an accepted dataset."""
 
     name: str
-    kind: str  # released or plus
+    kind: str  # the name of its format
     sha256: str  # Dataset.sha256: images, poses, probe and split
     bytes: int  # of the files
     created_at: str  # ISO 8601, UTC
@@ -44,9 +46,10 @@ class DatasetRecord:
     width: int
     probe: Probe | None
     warnings: tuple[str, ...]
-    source: str  # the file that load_dataset takes, below files/
-    device_set: str | None  # of a PLUS sequence, likewise
-    options: dict[str, str] = field(default_factory=dict)  # crop, image_size, frames, train_frames, val_frames
+    options: dict[str, str]  # those of UPLOAD_OPTIONS that were given
+
+    def __post_init__(self) -> None:
+        dataset_format(self.kind)
 
     def to_json(self) -> str:
         """The manifest."""
@@ -55,7 +58,7 @@ class DatasetRecord:
 
     @classmethod
     def from_json(cls, text: str) -> DatasetRecord:
-        """Its inverse. Raises ValueError, KeyError or TypeError for anything else."""
+        """Its inverse. Raises ValueError, KeyError, TypeError or DatasetInvalid for anything else."""
         document: dict[str, Any] = json.loads(text)
         values = {one.name: document[one.name] for one in fields(cls)}
         probe = None if values["probe"] is None else probe_from_dict(values["probe"])
@@ -84,7 +87,7 @@ class DatasetStore:
             return DatasetRecord.from_json(path.read_text(encoding="utf-8"))
         except FileNotFoundError:
             raise self._not_found(name) from None
-        except (ValueError, KeyError, TypeError) as error:
+        except (ValueError, KeyError, TypeError, DatasetInvalid) as error:
             raise DatasetInvalid(f"the manifest of the dataset {name!r} is damaged: {error!r}") from error
 
     def names_by_content(self) -> dict[str, str]:
@@ -97,12 +100,8 @@ class DatasetStore:
 
     def load(self, name: str) -> Dataset:
         """Read a dataset as it was when it was accepted. Raises DatasetNotFound, DatasetInvalid."""
-        from ultragray.datasets.source import SourceOptions, load_dataset
-
-        record, files = self.get(name), self._existing(name) / FILES_NAME
-        device_set = None if record.device_set is None else files / record.device_set
-        read = load_dataset(files / record.source, SourceOptions(**record.options, device_set=device_set))
-        return replace(read, name=name)
+        record = self.get(name)
+        return replace(find_source(self._existing(name) / FILES_NAME).load(record.options), name=name)
 
     def contact_sheet(self, name: str) -> Path:
         """The PNG. Raises DatasetNotFound."""

@@ -5,12 +5,14 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import AsyncIterator
+from inspect import Parameter, Signature
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Path, Query
+from fastapi import APIRouter, Depends, Path, Query
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response
 
+from ultragray.datasets.source import UPLOAD_OPTIONS, UPLOADED_FORMATS
 from ultragray_workers.errors import UploadTooLarge
 
 from ...core.catalog import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE
@@ -39,18 +41,25 @@ ARCHIVES = (
 DatasetName = Annotated[str, Path(description="Name of the dataset.", examples=["liver"])]
 PageSize = Annotated[int, Query(ge=1, le=MAX_PAGE_SIZE, description="Datasets on one page.")]
 PageToken = Annotated[str, Query(description="next_page_token of the page before.")]
-Crop = Annotated[str, Query(description="Region of a sequence's image: columns,rows, such as 188:632,12:600.")]
-ImageSize = Annotated[str, Query(description="Resize the frames: WIDTHxHEIGHT, such as 192x256.")]
-Frames = Annotated[str, Query(description="Frames of a sequence to read at all, such as 0:90,100:120:2.")]
-TrainFrames = Annotated[str, Query(description="Frames to train from.")]
-ValFrames = Annotated[str, Query(description="Frames to hold out.")]
+
+
+def _given_options(**given: str) -> dict[str, str]:
+    return {name: value for name, value in given.items() if value}
+
+
+_given_options.__signature__ = Signature(  # type: ignore[attr-defined]  # what FastAPI reads
+    [
+        Parameter(name, Parameter.KEYWORD_ONLY, default="", annotation=Annotated[str, Query(description=meaning)])
+        for name, meaning in UPLOAD_OPTIONS.items()
+    ]
+)
+GivenOptions = Annotated[dict[str, str], Depends(_given_options)]
 
 _BINARY = {"schema": {"type": "string", "format": "binary"}}
 _UPLOAD: dict[str, Any] = {
     "requestBody": {
         "required": True,
-        "description": "An archive, or separate files: conf.json and .npy files of the released layout, or a PLUS "
-        "sequence with its device set (.xml).",
+        "description": f"An archive, or separate files: {' or '.join(one.upload_meaning for one in UPLOADED_FORMATS)}.",
         "content": {
             **dict.fromkeys(ARCHIVES, _BINARY),
             MULTIPART: {
@@ -81,29 +90,17 @@ async def put_dataset(
     response: Response,
     service: ServiceDep,
     dataset: DatasetName,
-    crop: Crop = "",
-    image_size: ImageSize = "",
-    frames: Frames = "",
-    train_frames: TrainFrames = "",
-    val_frames: ValFrames = "",
+    options: GivenOptions,
 ) -> DatasetOut:
     """Uploads a dataset, checks it as `ultragray dataset check` does, and keeps it. Empty options: as it is stored."""
     service.require_serving()
     media_type = _media_type(request)
-    given = {
-        "crop": crop,
-        "image_size": image_size,
-        "frames": frames,
-        "train_frames": train_frames,
-        "val_frames": val_frames,
-    }
     announced = request.headers.get("content-length", "")
     if announced.isdigit() and int(announced) > service.settings.max_dataset_bytes:
         raise UploadTooLarge(
             f"a dataset may have at most {service.settings.max_dataset_bytes} bytes, {announced} were announced",
             field="body",
         )
-    options = {name: value for name, value in given.items() if value}
     async with service.uploads.receive(dataset, options) as upload:
         if media_type == MULTIPART:
             await _receive_files(request, upload)
