@@ -1,4 +1,4 @@
-"""What the kinds of clients get: a control loop, pages that stream, a tracked probe, a script that augments."""
+"""Frames as clients get them: a control loop, pages that stream, a tracked probe, a script that augments."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,7 @@ from ultragray_workers.errors import NotReady
 from ..core.job_client import JobClient
 from .igtl import PingPong
 from .kernel import BenchScene, bench_poses, measure_kernel
+from .report import Report, percentiles
 from .served import running_server
 
 SCENE, AUGMENTED = "demo", "augmented"
@@ -79,8 +80,28 @@ def measure_clients(extent: ClientsExtent, tell: Callable[[str], None]) -> dict[
     return measured
 
 
+def run(output: Path | None, quick: bool) -> None:
+    """Measure what each kind of client gets of a served demo scene."""
+    report = Report(output)
+    short = ClientsExtent(loop_s=5.0, stream_s=2.0, ping_pongs=100, frames=500, kernel_repeats=50)
+    extent = short if quick else ClientsExtent()
+    report.time_yard()
+    measured = measure_clients(extent, report.tell)
+    report.time_yard()
+    report.conclude(
+        report.cpu_document(extent=asdict(extent), clients=measured),
+        {"client": "{client}", "figure": "{figure}", "": "{value:,.2f}"},
+        [
+            {"client": client, "figure": figure, "value": value}
+            for client, figures in measured.items()
+            for figure, value in figures.items()
+        ],
+    )
+
+
 def _percentiles(times_ms: list[float]) -> dict[str, float]:
-    return {f"p{q:g}_ms": float(np.percentile(times_ms, q)) for q in (50, 99, 99.9)}
+    wanted = (50, 99, 99.9)
+    return {f"p{q:g}_ms": value for q, value in zip(wanted, percentiles(times_ms, *wanted), strict=True)}
 
 
 def _control_loop(port: int, extent: ClientsExtent) -> dict[str, float]:

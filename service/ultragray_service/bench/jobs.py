@@ -1,4 +1,4 @@
-"""What jobs cost: a page of a long list, the start of a service that has one, and frames beside a training."""
+"""The cost of jobs: a page of a long list, the start of a service that has one, and frames beside a training."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import time
 import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,7 @@ from ultragray_workers.errors import NotReady
 from ultragray_workers.jobs.database import JobDatabase
 
 from ..core.job_client import JobClient
+from .report import Report, percentiles
 from .served import running_server
 
 SCENE = "demo"
@@ -78,7 +79,25 @@ def measure_jobs(extent: JobsExtent, tell: Callable[[str], None]) -> dict[str, A
 
 
 def _percentiles(times_ms: list[float]) -> dict[str, float]:
-    return {"p50": float(np.percentile(times_ms, 50)), "p99": float(np.percentile(times_ms, 99))}
+    return dict(zip(("p50", "p99"), percentiles(times_ms, 50, 99), strict=True))
+
+
+def run(output: Path | None, quick: bool) -> None:
+    """Measure a full list of jobs, the start of a service that has one, and frames while a training runs."""
+    report = Report(output)
+    extent = JobsExtent(rounds=2, seconds=4.0) if quick else JobsExtent()
+    report.time_yard()
+    measured = measure_jobs(extent, report.tell)
+    report.time_yard()
+    report.conclude(
+        report.cpu_document(extent=asdict(extent), **measured),
+        {"": "{what}", "p50 ms": "{p50:.2f}", "p99 ms": "{p99:.2f}"},
+        [{"what": what, **times} for what, times in measured["latency_ms"].items()],
+        [
+            f"ready with {extent.jobs:,} jobs after {measured['start_s']:.2f} s",
+            f"p99 of frames with a training over that without: {measured['p99_ratio']:.2f}",
+        ],
+    )
 
 
 def _finish_one(client: JobClient) -> None:

@@ -1,10 +1,11 @@
-"""`ultragray bench --train`: what a training step costs, and which part of it."""
+"""`ultragray bench --train`: the cost of a training step, and of its parts."""
 
 from __future__ import annotations
 
 import time
 from dataclasses import dataclass
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from ultragray.training.optimizer import Optimizer
 
 from .clock import Mark, elapsed_ms, finish, mark
 from .kernel import BATCH, PROBE, BenchScene, bench_poses
+from .report import Report
 
 CPU = torch.device("cpu")
 PARTS = ("forward", "loss", "backward", "optimizer")
@@ -87,4 +89,37 @@ def measure_training(
         step_ms=spent.sum(axis=1).tolist(),
         part_ms={part: spent[:, k].tolist() for k, part in enumerate(PARTS)},
         wall_ms=wall_ms,
+    )
+
+
+def run(output: Path | None, quick: bool) -> None:
+    """Print the table; write it as JSON to `output`. `quick` takes few repetitions and leaves the large scene out."""
+    report = Report(output)
+    threads = torch.get_num_threads()
+    rows: list[dict[str, Any]] = []
+    for scene in training_scenes()[1 if quick else 0 :]:
+        report.tell(f"{scene.gaussian_count:,} Gaussians: training ...")
+        report.time_yard()
+        timing = measure_training(scene, threads, repeats=5 if quick else 20)
+        step_ms = float(np.median(timing.step_ms))
+        rows.append(
+            {
+                "gaussians": scene.gaussian_count,
+                "images": f"{BATCH} of {scene.height}x{scene.width}",
+                "threads": threads,
+                "step_ms": step_ms,
+                "step_yards": step_ms / report.time_yard(),
+                "shares": {part: timing.share(part) for part in PARTS},
+            }
+        )
+    report.conclude(
+        report.cpu_document(rows=rows),
+        {
+            "Gaussians": "{gaussians:,}",
+            "images": "{images}",
+            "step ms": "{step_ms:.0f}",
+            "yards": "{step_yards:.1f}",
+            **{part: f"{{shares[{part}]:.0%}}" for part in PARTS},
+        },
+        rows,
     )

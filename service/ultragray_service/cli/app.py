@@ -336,4 +336,7 @@ def bench(
 
     if output is not None:
         check_writable(output)
-    chosen_bench(backend, train=train, jobs=jobs, clients=clients)(output, quick)
+    chosen = [name for name, wanted in (("train", train), ("jobs", jobs), ("clients", clients)) if wanted]
+    if len(chosen) > 1:
+        raise InvalidArgument("give one of --train, --jobs and --clients", field=chosen[0])
+    chosen_bench(chosen[0] if chosen else "frames", backend)(output, quick)

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from ultragray_service.bench import command as bench
+from ultragray_service.bench import report
+from ultragray_service.bench import train as bench
 from ultragray_service.bench.kernel import BenchScene
 from ultragray_service.bench.train import PARTS
 
@@ -22,8 +23,8 @@ def test_training_bench(
 ) -> None:
     large, small = BenchScene(400, 0.1, height=24, width=20), BenchScene(300, 0.1, height=24, width=20)
     monkeypatch.setattr(bench, "training_scenes", lambda: [large, small])
-    monkeypatch.setattr(bench, "time_yard_ms", lambda: 4.0)
-    bench.run_training_bench(tmp_path / "bench.json", quick)
+    monkeypatch.setattr(report, "time_yard_ms", lambda: 4.0)
+    bench.run(tmp_path / "bench.json", quick)
     document = json.loads((tmp_path / "bench.json").read_text())
     assert [row["gaussians"] for row in document["rows"]] == gaussians
     assert document["yard_ms"] == 4.0

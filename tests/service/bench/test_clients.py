@@ -7,17 +7,17 @@ from pathlib import Path
 
 import pytest
 
-from ultragray.errors import InvalidArgument
-from ultragray_service.bench import command as bench
+from ultragray_service.bench import clients as bench
+from ultragray_service.bench import report
 from ultragray_service.bench.clients import ClientsExtent
 
 
 @pytest.mark.long
 def test_bench_of_clients(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     tiny = ClientsExtent(loop_s=1.0, stream_s=0.3, ping_pongs=5, frames=12, gaussians=500, kernel_repeats=3, side=32)
-    monkeypatch.setattr(bench, "time_yard_ms", lambda: 4.0)
+    monkeypatch.setattr(report, "time_yard_ms", lambda: 4.0)
     monkeypatch.setattr(bench, "ClientsExtent", lambda **less: tiny)
-    bench.run_clients_bench(tmp_path / "clients.json", quick=True)
+    bench.run(tmp_path / "clients.json", quick=True)
     clients = json.loads((tmp_path / "clients.json").read_text())["clients"]
     assert list(clients) == [
         "control loop",
@@ -32,10 +32,3 @@ def test_bench_of_clients(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     assert augmentation["share_of_kernel"] == pytest.approx(
         augmentation["frames_per_s"] / augmentation["kernel_frames_per_s"]
     )
-
-
-def test_choices_that_do_not_go_together() -> None:
-    with pytest.raises(InvalidArgument, match="--clients"):
-        bench.chosen_bench("cpu", train=True, jobs=False, clients=True)
-    with pytest.raises(InvalidArgument, match="--backend"):
-        bench.chosen_bench("cuda", train=False, jobs=True, clients=False)

@@ -30,17 +30,19 @@ def benched(tmp_path_factory: pytest.TempPathFactory) -> Benched:
     """What the command printed, and its two documents."""
     if not cuda.available():
         pytest.skip("there is no GPU, and Triton is not installed, which could interpret the kernels")
-    from ultragray_service.bench import cuda as bench_cuda
+    from ultragray_service.bench import cuda_frames, cuda_train
 
     folder = tmp_path_factory.mktemp("bench")
     printed, documents = "", []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(bench_cuda, "bench_scenes", lambda quick: [TINY])
-        patch.setattr(bench_cuda, "training_scenes", lambda: [TINY, TINY])
-        patch.setattr(bench_cuda, "measure_served", served)
-        for name, value in {"POSES": 2, "BATCHES": (1, 2), "ROUNDS": 8, "STEPS": 20, "BATCH": 2}.items():
-            patch.setattr(bench_cuda, name, value)
-        patch.setattr(bench_train, "BATCH", 2)
+        patch.setattr(cuda_frames, "bench_scenes", lambda quick: [TINY])
+        patch.setattr(cuda_train, "training_scenes", lambda: [TINY, TINY])
+        patch.setattr(cuda_frames, "measure_served", served)
+        for name, value in {"POSES": 2, "BATCHES": (1, 2), "ROUNDS": 8}.items():
+            patch.setattr(cuda_frames, name, value)
+        for module in (cuda_train, bench_train):
+            patch.setattr(module, "BATCH", 2)
+        patch.setattr(cuda_train, "STEPS", 20)
         for options in ([], ["--train"]):
             output = folder / "bench.json"
             arguments = ["bench", "--backend", "cuda", "--quick", "--output", str(output), *options]
@@ -74,7 +76,7 @@ def test_rates_stand_beside_the_limits(benched: Benched) -> None:
     assert document["machine"]["renderer"] == cuda.renderer(cuda.device())
     assert document["machine"]["triton"]
     assert "HTTP of cuda" in printed
-    assert f"{100 * rendered[0]['arithmetic_share']:.1f} %" in printed
+    assert f"{100 * rendered[0]['arithmetic_share']:.1f}%" in printed
 
 
 def test_training_step(benched: Benched) -> None:
@@ -91,7 +93,7 @@ def test_training_step(benched: Benched) -> None:
 def test_limits_are_those_of_multiply_adds() -> None:
     if not cuda.available():
         pytest.skip("there is no GPU, and Triton is not installed, which could interpret the kernel")
-    from ultragray_service.bench.limits import LANES, multiply_add
+    from ultragray_service.bench.gpu import LANES, multiply_add
 
     sums = torch.empty(2 * LANES, device=cuda.device())
     multiply_add[(2,)](sums, 0.5, 0.25, 3, LANES=LANES)
@@ -120,3 +122,8 @@ def test_says_what_is_missing_without_a_gpu(
 
 def test_other_backends_are_refused() -> None:
     assert refused("--backend", "reference") == "error: backend must be cpu or cuda, got 'reference'"
+
+
+def test_choices_that_do_not_go_together() -> None:
+    assert "give one of --train, --jobs and --clients" in refused("--train", "--clients")
+    assert "--jobs goes without --backend" in refused("--jobs", "--backend", "cuda")

@@ -11,8 +11,8 @@ import pytest
 from ultragray.datasets import Dataset, Sweep
 from ultragray.datasets.phantom import PHANTOM_PROBE as PROBE
 from ultragray.datasets.phantom import freehand_poses, simulate
-from ultragray_service.bench import command as bench
-from ultragray_service.bench import jobs as bench_jobs
+from ultragray_service.bench import jobs as bench
+from ultragray_service.bench import report
 from ultragray_service.bench.jobs import JobsExtent
 
 
@@ -25,11 +25,11 @@ def small_phantom() -> Dataset:
 
 @pytest.mark.long
 def test_bench_of_jobs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr(bench_jobs, "load_phantom", small_phantom)
-    monkeypatch.setattr(bench_jobs, "STEPS", 100_000)
-    monkeypatch.setattr(bench, "time_yard_ms", lambda: 4.0)
+    monkeypatch.setattr(bench, "load_phantom", small_phantom)
+    monkeypatch.setattr(bench, "STEPS", 100_000)
+    monkeypatch.setattr(report, "time_yard_ms", lambda: 4.0)
     monkeypatch.setattr(bench, "JobsExtent", lambda **less: JobsExtent(150, 3, 1, 0.3, 32))
-    bench.run_jobs_bench(tmp_path / "jobs.json", quick=True)
+    bench.run(tmp_path / "jobs.json", quick=True)
     document = json.loads((tmp_path / "jobs.json").read_text())
     assert document["extent"] == {"jobs": 150, "pages": 3, "rounds": 1, "seconds": 0.3, "side": 32}
     assert list(document["latency_ms"]) == [

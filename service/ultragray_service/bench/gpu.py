@@ -1,7 +1,9 @@
-"""What a GPU can do at most, measured in the same run: bytes moved by a copy, fp32 operations by multiply-adds."""
+"""A GPU as a machine, and its limits, measured in the same run: bytes copied, fp32 multiply-adds."""
 
 from __future__ import annotations
 
+import shutil
+import subprocess
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
@@ -11,9 +13,11 @@ import torch
 import triton
 import triton.language as tl
 
-from ultragray.backends.cuda import interpreted
+from ultragray.backends import cuda
+from ultragray.machine import processor_name
 
 from .clock import elapsed_ms, finish, mark
+from .report import versions
 
 COPY_BYTES = 2 << 30  # far more than any cache holds
 REPEATS = 10
@@ -32,7 +36,7 @@ class Limits:
 
 def measure_limits(device: torch.device) -> Limits:
     """By a copy within the device's memory, and by a kernel of nothing but fp32 multiply-adds in registers."""
-    copy_bytes, programs, rounds = (1 << 20, 2, 4) if interpreted() else (COPY_BYTES, PROGRAMS, ROUNDS)
+    copy_bytes, programs, rounds = (1 << 20, 2, 4) if cuda.interpreted() else (COPY_BYTES, PROGRAMS, ROUNDS)
     source = torch.zeros(copy_bytes, dtype=torch.uint8, device=device)
     target = torch.empty_like(source)
     values = torch.empty(programs * LANES, device=device)
@@ -65,3 +69,26 @@ def multiply_add(out: Any, factor: Any, term: Any, rounds: Any, LANES: tl.conste
         c = c * factor + term
         d = d * factor + term
     tl.store(out + places, a + b + c + d)
+
+
+def gpu_machine(device: torch.device) -> dict[str, Any]:
+    """The GPU, its driver and the versions of what is measured and measures."""
+    machine: dict[str, Any] = {"processor": processor_name(), "renderer": cuda.renderer(device)}
+    if device.type == "cuda":
+        properties = torch.cuda.get_device_properties(device)
+        machine |= {
+            "gpu": properties.name,
+            "gpu_memory_mb": properties.total_memory / 1e6,
+            "multiprocessors": properties.multi_processor_count,
+            "driver": _driver_version(),
+        }
+    return {**machine, "cuda": torch.version.cuda, "triton": triton.__version__, **versions()}
+
+
+def _driver_version() -> str | None:
+    """The version of the NVIDIA driver, where its own tool is there to tell."""
+    if (tool := shutil.which("nvidia-smi")) is None:
+        return None
+    command = [tool, "--query-gpu=driver_version", "--format=csv,noheader"]
+    told = subprocess.run(command, capture_output=True, text=True, check=False).stdout.split()
+    return told[0] if told else None

@@ -1,0 +1,129 @@
+"""The parts that benchmarks share: the machine and the yard, percentiles, the table that is printed, the JSON."""
+
+from __future__ import annotations
+
+import json
+import platform
+import subprocess
+from collections.abc import Iterable, Mapping, Sequence
+from datetime import datetime, timezone
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import grpc
+import numpy as np
+import torch
+from rich.console import Console
+from rich.table import Table
+
+import ultragray
+from ultragray.backends import cpu
+from ultragray.files.atomic import write_whole
+from ultragray.machine import processor_name
+
+from .kernel import time_yard_ms
+
+TABLE_WIDTH = 110  # columns, where no terminal says
+
+
+class Report:
+    """One benchmark on its way: says what is measured, then prints the table and writes the JSON."""
+
+    def __init__(self, output: Path | None) -> None:
+        console = Console()
+        self._console = console if console.is_terminal else Console(width=TABLE_WIDTH)
+        self._output = output
+        self._yards_ms: list[float] = []
+
+    def tell(self, what: str) -> None:
+        """Say what is measured now."""
+        self._console.print(what, style="dim")
+
+    def time_yard(self) -> float:
+        """The yard, ms, as it is about now: the median of this timing and the one before."""
+        self._yards_ms.append(time_yard_ms())
+        return float(np.median(self._yards_ms[-2:]))
+
+    def cpu_document(self, **figures: Any) -> dict[str, Any]:
+        """A document that begins with this machine and the yard."""
+        machine = {
+            "processor": processor_name(),
+            "threads": torch.get_num_threads(),
+            "instruction_set": cpu.INSTRUCTION_SETS[0],
+            **versions(),
+        }
+        return {"machine": machine, "yard_ms": float(np.median(self._yards_ms)), **figures}
+
+    def conclude(
+        self,
+        document: Mapping[str, Any],
+        columns: Mapping[str, str],
+        rows: Iterable[Mapping[str, Any]],
+        notes: Iterable[str] = (),
+    ) -> None:
+        """Print the figures as a table with notes below; write the document where a file was asked for.
+
+        A column is its head and the format string of a row's figures, such as `{p50_ms:.2f}`.
+        """
+        table = Table(title=_title(document))
+        for number, name in enumerate(columns):
+            table.add_column(name, justify="right" if number else "left")
+        for row in rows:
+            table.add_row(*(_cell(pattern, row) for pattern in columns.values()))
+        self._console.print(table)
+        for note in notes:
+            self._console.print(note)
+        if self._output is not None:
+            write_whole(self._output, json.dumps(document, indent=1) + "\n")
+            self._console.print(f"written to {self._output}")
+
+
+def _cell(pattern: str, row: Mapping[str, Any]) -> str:
+    """The figures of a row in a format string; empty where one is None."""
+    try:
+        return pattern.format_map(row)
+    except TypeError:
+        return ""
+
+
+def percentiles(times_ms: Sequence[float], *wanted: float) -> list[float]:
+    """Percentiles of some times, ms."""
+    return [float(one) for one in np.percentile(times_ms, wanted)]
+
+
+def versions() -> dict[str, str | None]:
+    """Versions of the system, of what is measured and what measures, and the time."""
+    return {
+        "system": platform.platform(),
+        "python": platform.python_version(),
+        "ultragray": ultragray.__version__,
+        "commit": _commit(),
+        "torch": torch.__version__,
+        "numpy": np.__version__,
+        "grpc": grpc.__version__,
+        "uvicorn": version("uvicorn"),
+        "measured_at": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+    }
+
+
+def _commit() -> str | None:
+    """The commit of the sources, where they are a checkout."""
+    command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty"]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return None
+
+
+def _title(document: Mapping[str, Any]) -> str:
+    machine = document["machine"]
+    if "renderer" in machine:  # of a GPU
+        return (
+            f"{machine.get('gpu', machine['processor'])}, {machine['renderer']}; driver {machine.get('driver')}, "
+            f"CUDA {machine['cuda']}, torch {machine['torch']}, triton {machine['triton']}"
+        )
+    return (
+        f"{machine['processor']}, {machine['threads']} threads, {machine['instruction_set']}; "
+        f"yard {document['yard_ms']:.1f} ms"
+    )
