@@ -22,7 +22,7 @@ from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
 import ultragray
 from ultragray.samplers import AroundSampler, SplineSampler
-from ultragray_client import Client, Frame, Scene
+from ultragray_client import Client, Frame, RenderSettings, Scene
 
 Sample = dict[str, torch.Tensor]
 PATH_POSES = 200
@@ -54,7 +54,7 @@ class SimulatedFrames(IterableDataset[Sample]):
         with Client(self._address) as client:
             scene = client.scenes.get(self._scene)
             poses = self._poses(scene)[first::step]
-            for frame in client.render_batch(self._scene, poses, outputs=self._outputs):
+            for frame in client.render_batch(self._scene, poses, RenderSettings(outputs=self._outputs)):
                 yield _sample(frame)
 
     def _poses(self, scene: Scene) -> ultragray.probe.FloatArray:  # [count, 4, 4] mm

@@ -21,7 +21,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from ultragray_client import AsyncClient, AsyncFrameStream, Frame, LinearProbe
+from ultragray_client import AsyncClient, AsyncFrameStream, Frame, LinearProbe, RenderSettings
 from ultragray_client.errors import DeadlineExceeded, StreamEnded
 
 Floats = npt.NDArray[np.float64]
@@ -217,11 +217,11 @@ class Servo:
 async def servo(address: str, *, scene: str = "demo", seconds: float = 10.0, rate_hz: float = 100.0) -> Record:
     """Runs the robot and returns what happened. Raises ClientError."""
     async with AsyncClient(address) as client:
-        first = await client.render(scene, Robot().pose(), height=IMAGE_SIDE, width=IMAGE_SIDE)
+        first = await client.render(scene, Robot().pose(), RenderSettings(height=IMAGE_SIDE, width=IMAGE_SIDE))
         if not isinstance(first.probe, LinearProbe):
             raise SystemExit(f"the template is made for a linear probe, {scene} has {first.probe}")
         loop = Servo(first.probe, rate_hz)
-        async with client.stream(scene, mode="latest", height=IMAGE_SIDE, width=IMAGE_SIDE) as stream:
+        async with client.stream(scene, RenderSettings(height=IMAGE_SIDE, width=IMAGE_SIDE), mode="latest") as stream:
             await loop.run(stream, seconds)
         return loop.record
 

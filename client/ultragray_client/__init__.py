@@ -7,18 +7,17 @@ is told as one of `ultragray_client.errors`.
 
 from __future__ import annotations
 
-from . import errors
+from . import contract, errors
 from .aio.client import AsyncClient
 from .aio.stream import AsyncFrameStream
-from .confidence import ConfidenceFit, Extrapolation
-from .datasets import Dataset, DatasetOptions
-from .display import Display, Picture
+from .contract import *  # noqa: F403
+from .datasets import Dataset
 from .errors import ClientError
-from .frames import Frame, Timings
-from .geometry import ConvexProbe, LinearProbe, PhasedProbe, Placement, PoseLike, Probe, Quaternion
+from .frames import Extrapolation, Frame, Picture, Timings
+from .geometry import Placement, PoseLike, Quaternion
 from .jobs import Job, JobError, JobEvent, JobKind, JobProgress, JobState
 from .pose_exchange import StreamMode
-from .scenes import Scene, SceneEntry
+from .scenes import ConfidenceFit, Scene, SceneEntry
 from .sync.client import Client
 from .sync.stream import FrameStream
 
@@ -28,10 +27,7 @@ __all__ = [
     "Client",
     "ClientError",
     "ConfidenceFit",
-    "ConvexProbe",
     "Dataset",
-    "DatasetOptions",
-    "Display",
     "Extrapolation",
     "Frame",
     "FrameStream",
@@ -41,12 +37,9 @@ __all__ = [
     "JobKind",
     "JobProgress",
     "JobState",
-    "LinearProbe",
-    "PhasedProbe",
     "Picture",
     "Placement",
     "PoseLike",
-    "Probe",
     "Quaternion",
     "Scene",
     "SceneEntry",
@@ -54,3 +47,4 @@ __all__ = [
     "Timings",
     "errors",
 ]
+__all__ += contract.__all__

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from itertools import islice
 
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2
@@ -12,7 +12,7 @@ from ultragray_proto.v1 import geometry_pb2, rendering_pb2
 from .connection import Conversation
 from .errors import ClientError, TooManyPoses
 from .frames import Frame, frame_from_message
-from .geometry import PoseLike, pose_message
+from .geometry import PoseLike, pose_messages
 from .retries import Retries
 
 _POSES_PER_CALL = 256  # halved where the service takes fewer
@@ -21,11 +21,9 @@ _POSES_PER_CALL = 256  # halved where the service takes fewer
 class Batch(Conversation[Frame]):
     """The poses that wait for their frames."""
 
-    method = "rendering.RenderBatch"
-
     def __init__(self, settings: rendering_pb2.RenderSettings, poses: Iterable[PoseLike]) -> None:
         self._settings = settings
-        self._poses = _messages(poses)
+        self._poses = pose_messages(poses)
         self._waiting: deque[geometry_pb2.Pose] = deque()
         self._first = 0  # sequence of the first that waits
         self._first_of_call = 0
@@ -67,7 +65,3 @@ class Batch(Conversation[Frame]):
         index = self._first if named[1] is None else self._first_of_call + int(named[1])
         detail, field = (text.replace(named[0], f"poses[{index}]", 1) for text in (error.detail, error.field or ""))
         return type(error)(detail, reason=error.reason, field=field, retry_after_s=error.retry_after_s)
-
-
-def _messages(poses: Iterable[PoseLike]) -> Iterator[geometry_pb2.Pose]:
-    return (pose_message(pose, field=f"poses[{index}]") for index, pose in enumerate(poses))

@@ -17,8 +17,6 @@ from .errors import Unreachable
 class Download(Conversation[jobs_pb2.ArtifactChunk]):
     """The part of a file that is there; each chunk goes to `write` before the next one is asked for."""
 
-    method = "jobs.DownloadArtifact"
-
     def __init__(self, job_id: str, name: str, descriptor: int) -> None:
         self._job_id, self._name = job_id, name
         self._descriptor = descriptor

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
@@ -11,28 +11,74 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ultragray_proto.codec import from_message, words
 from ultragray_proto.v1 import rendering_pb2
 
-from .confidence import Extrapolation, below_confidence_number, extrapolation_from_message
-from .display import Display, Picture, display_from_message, display_message, picture_from_message
-from .errors import InvalidArgument, UnknownOutput
-from .geometry import FloatArray, Probe, matrix_from_message, probe_from_message, probe_message
+from .contract import Display, Encoding, Probe, RenderSettings
+from .errors import InvalidArgument
+from .geometry import FloatArray
+from .messages import message_of
 
-_OUTPUT_PREFIX = "OUTPUT_"
-_ENCODINGS = {"uint8": rendering_pb2.ENCODING_UINT8, "float32": rendering_pb2.ENCODING_FLOAT32}
-_DTYPES: dict[int, np.dtype[Any]] = {
-    rendering_pb2.ENCODING_UINT8: np.dtype("u1"),
-    rendering_pb2.ENCODING_FLOAT32: np.dtype("<f4"),
+_PIXEL_TYPES: dict[str, np.dtype[Any]] = {
+    Encoding.UINT8: np.dtype("u1"),
+    Encoding.FLOAT32: np.dtype("<f4"),
 }
+_ENCODINGS = words(rendering_pb2.Encoding.DESCRIPTOR)
+_OUTPUTS = words(rendering_pb2.Output.DESCRIPTOR)
 
 
 @dataclass(frozen=True)
 class Timings:
-    """What a frame cost in the service, milliseconds."""
+    """Costs of a frame in the service, milliseconds."""
 
     queue_ms: float  # from the arrival of the request to the start of its rendering
     render_ms: float  # of the batch that it was rendered in
     encode_ms: float
+
+
+@dataclass(frozen=True)
+class Extrapolation:
+    """How far a frame extrapolates from what its scene was trained on; None is what the scene cannot tell."""
+
+    distance_mm: float | None  # to the nearest training views, a mean over the image
+    angle_deg: float | None  # likewise
+    confidence: float | None  # the MS-SSIM, 0 to 1, that a real frame is expected to have with this one
+    supported_share: float | None  # of the pixels, by Gaussians
+
+
+@dataclass(frozen=True)
+class Picture:
+    """Where pixels lie in the image plane of the probe.
+
+    Columns are mm along x (`column_unit` "mm"), or scan lines of a fan at degrees from its axis ("deg"); rows are mm
+    along z, or mm of range. The first values are those of the centre of pixel (0, 0), the steps lead to the next one.
+    """
+
+    column_unit: str
+    first_column: float
+    first_row_mm: float
+    column_step: float  # negative where left and right are exchanged
+    row_step_mm: float
+
+    def pixel_to_probe(self) -> FloatArray:  # [4, 4]
+        """Takes (column, row, k, 1) to mm in the probe's frame, k in mm against the elevation y.
+
+        Pixels are counted from 0 at their centres. Raises InvalidArgument where columns are angles.
+        """
+        if self.column_unit != "mm":
+            raise InvalidArgument(
+                f"no matrix takes pixels whose columns are in {self.column_unit} to mm; "
+                "ask for square ones: display=Display(pixel_mm=...)",
+                field="display.pixel_mm",
+            )
+        return np.array(
+            [
+                [self.column_step, 0.0, 0.0, self.first_column],
+                [0.0, 0.0, -1.0, 0.0],
+                [0.0, self.row_step_mm, 0.0, self.first_row_mm],
+                [0.0, 0.0, 0.0, 1.0],
+            ]
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,78 +109,34 @@ class Frame:
 
         k: mm out of the image plane, against the probe's elevation y. The inverse tells which pixel shows a point, and
         how far from the plane it lies. Raises InvalidArgument where columns are angles: ask for the frame of a fan
-        with `display=Display(pixel_mm=...)`.
+        with `Display(pixel_mm=...)`.
         """
         return self.pose @ self.picture.pixel_to_probe()
 
 
-def settings_message(
-    scene: str,
-    *,
-    outputs: Sequence[str],
-    dtype: str,
-    height: int | None,
-    width: int | None,
-    probe: Probe | None,
-    display: Display | None,
-    min_confidence: float | None,
-    below_min_confidence: str,
-) -> rendering_pb2.RenderSettings:
-    """Raises UnknownOutput, and InvalidArgument for a word that is none; the service checks the rest."""
-    if dtype not in _ENCODINGS:
-        raise InvalidArgument(f"dtype must be one of {', '.join(_ENCODINGS)}, got {dtype!r}", field="dtype")
-    return rendering_pb2.RenderSettings(
-        scene=scene,
-        height=height,
-        width=width,
-        outputs=output_numbers(outputs),
-        encoding=_ENCODINGS[dtype],
-        probe=None if probe is None else probe_message(probe),
-        display=None if display is None else display_message(display),
-        min_confidence=min_confidence,
-        below_min_confidence=below_confidence_number(below_min_confidence),
-    )
+def settings_message(scene: str, settings: RenderSettings | None) -> rendering_pb2.RenderSettings:
+    """The settings of a scene; None: the defaults. Raises UnknownOutput, and InvalidArgument for another word."""
+    settings = settings or RenderSettings()
+    if settings.encoding not in _PIXEL_TYPES:
+        names = " or ".join(Encoding(known).value for known in _PIXEL_TYPES)
+        raise InvalidArgument(
+            f"encoding must be {names}, whose pixels come as arrays, got {settings.encoding!r}", field="encoding"
+        )
+    return message_of(settings, rendering_pb2.RenderSettings, scene=scene)
 
 
-def output_numbers(outputs: Sequence[str]) -> list[Any]:
-    """The numbers of outputs by name. Raises UnknownOutput."""
-    known = {
-        name.removeprefix(_OUTPUT_PREFIX).lower(): number for name, number in rendering_pb2.Output.items() if number
-    }
-    names = (outputs,) if isinstance(outputs, str) else tuple(outputs)
-    for name in names:
-        if name not in known:
-            raise UnknownOutput(f"outputs must be some of {', '.join(known)}, got {name!r}", field="outputs")
-    return [known[name] for name in names]
-
-
-def output_names(numbers: Sequence[Any]) -> tuple[str, ...]:
-    """The names of outputs that the service tells."""
-    return tuple(rendering_pb2.Output.Name(number).removeprefix(_OUTPUT_PREFIX).lower() for number in numbers)
-
-
-def frame_from_message(message: rendering_pb2.Frame, *, sequence: int, dropped: int = 0) -> Frame:
+def frame_from_message(message: rendering_pb2.Frame, *, sequence: int = 0, dropped: int = 0) -> Frame:
     """The frame; its arrays are views of one buffer."""
-    dtype = _DTYPES[message.encoding]
+    dtype = _PIXEL_TYPES[_ENCODINGS[message.encoding]]
     pixels = np.frombuffer(message.data, dtype).reshape(-1, message.height, message.width)
-    probe = probe_from_message(message.probe)
-    assert probe is not None
-    timings = message.timings
+    names = [_OUTPUTS[number] for number in message.outputs]
     sent_ns = message.client_time_ns if message.HasField("client_time_ns") else None
-    return Frame(
-        arrays=MappingProxyType(dict(zip(output_names(message.outputs), pixels, strict=True))),
-        pose=matrix_from_message(message.pose),
-        probe=probe,
-        scene=message.scene,
-        scene_sha256=message.scene_sha256,
-        renderer=message.renderer,
+    frame: Frame = from_message(
+        message,
+        Frame,
+        arrays=MappingProxyType(dict(zip(names, pixels, strict=True))),
         sequence=sequence,
-        timings=Timings(timings.queue_ms, timings.render_ms, timings.encode_ms),
-        extrapolation=extrapolation_from_message(message.extrapolation),
-        picture=picture_from_message(message.picture),
-        rendered_height=message.rendered_height,
-        rendered_width=message.rendered_width,
-        display=display_from_message(message.display) if message.HasField("display") else None,
         dropped=dropped,
         latency_ms=None if sent_ns is None else (time.monotonic_ns() - sent_ns) / 1e6,
     )
+    return frame

@@ -1,4 +1,4 @@
-"""Poses and probes, as a caller writes them.
+"""Poses, as a caller writes them.
 
 Convention. Lengths are millimetres, angles degrees. A pose takes the probe's frame (x lateral, y elevation, z axial) to
 the scene's: p_scene = R p_probe + t. Worked value: `Placement((0, 0, 10), Quaternion(w=1, x=0, y=0, z=0))` is the
@@ -7,12 +7,14 @@ identity moved 10 mm along the scene's z, as `[[1,0,0,0],[0,1,0,0],[0,0,1,10],[0
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from typing import Any, TypeAlias
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
+from ultragray_proto.codec import to_message
 from ultragray_proto.v1 import geometry_pb2
 
 from .errors import InvalidPose
@@ -41,47 +43,10 @@ class Placement:
 PoseLike: TypeAlias = Placement | npt.ArrayLike  # an array is [4, 4], mm
 
 
-@dataclass(frozen=True)
-class LinearProbe:
-    """Parallel scan lines; 0 < width, 0 ≤ near < far."""
-
-    width_mm: float
-    near_mm: float
-    far_mm: float
-
-
-@dataclass(frozen=True)
-class ConvexProbe:
-    """A fan of scan lines; `near_mm` is the radius of the face; 0 < angle ≤ 175."""
-
-    opening_angle_deg: float
-    near_mm: float
-    far_mm: float
-
-
-@dataclass(frozen=True)
-class PhasedProbe:
-    """A fan of scan lines from the centre of the face; 0 < angle ≤ 175."""
-
-    opening_angle_deg: float
-    far_mm: float
-
-
-Probe: TypeAlias = LinearProbe | ConvexProbe | PhasedProbe
-_PROBES = {"linear": LinearProbe, "convex": ConvexProbe, "phased": PhasedProbe}
-_PROBE_NAMES = {cls: name for name, cls in _PROBES.items()}
-
-
 def pose_message(pose: PoseLike, *, field: str = "pose") -> geometry_pb2.Pose:
     """Raises InvalidPose for what is not a Placement nor sixteen numbers [4, 4]; the service checks the numbers."""
     if isinstance(pose, Placement):
-        x, y, z = pose.position_mm
-        return geometry_pb2.Pose(
-            placement=geometry_pb2.Placement(
-                position_mm=geometry_pb2.Position(x=x, y=y, z=z),
-                quaternion=geometry_pb2.Quaternion(**asdict(pose.quaternion)),
-            )
-        )
+        return geometry_pb2.Pose(placement=to_message(pose, geometry_pb2.Placement))
     try:
         matrix = np.asarray(pose, dtype=np.float64)
     except (TypeError, ValueError):
@@ -93,24 +58,6 @@ def pose_message(pose: PoseLike, *, field: str = "pose") -> geometry_pb2.Pose:
     return geometry_pb2.Pose(matrix=geometry_pb2.Matrix(values=matrix.ravel().tolist()))
 
 
-def matrix_from_message(message: geometry_pb2.Matrix) -> FloatArray:  # [4, 4] mm
-    """A pose that the service tells."""
-    return np.array(message.values, dtype=np.float64).reshape(4, 4)
-
-
-def probe_message(probe: Probe) -> geometry_pb2.Probe:
-    """The service checks the numbers."""
-    return geometry_pb2.Probe(**{_PROBE_NAMES[type(probe)]: asdict(probe)})
-
-
-def probe_from_message(message: geometry_pb2.Probe) -> Probe | None:
-    """The probe; None where the message holds none."""
-    kind = message.WhichOneof("kind")
-    if kind is None:
-        return None
-    values: Any = {
-        field.name: getattr(getattr(message, kind), field.name)
-        for field in message.DESCRIPTOR.fields_by_name[kind].message_type.fields
-    }
-    probe: Probe = _PROBES[kind](**values)
-    return probe
+def pose_messages(poses: Iterable[PoseLike]) -> Iterator[geometry_pb2.Pose]:
+    """The messages of many poses. Raises InvalidPose, naming the place of the pose."""
+    return (pose_message(pose, field=f"poses[{index}]") for index, pose in enumerate(poses))

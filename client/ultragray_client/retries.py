@@ -21,6 +21,7 @@ class Retries:
     def __init__(self, timeout_s: float | None, patience_s: float) -> None:
         self._deadline = None if timeout_s is None else time.monotonic() + timeout_s
         self._patience_s = patience_s
+        self.was_unavailable = False  # at any attempt: then it is not known whether that one worked
         self.progress()
 
     def progress(self) -> None:
@@ -37,6 +38,7 @@ class Retries:
 
         Raises `error` where another attempt cannot succeed, or would come too late.
         """
+        self.was_unavailable |= isinstance(error, Unavailable)
         overloaded = isinstance(error, ResourceExhausted) and error.retry_after_s is not None
         if not overloaded and not isinstance(error, Unavailable):
             raise error

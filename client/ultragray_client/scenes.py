@@ -1,15 +1,15 @@
-"""Scenes as values, and what can be asked about them."""
+"""Scenes, as the service tells them."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from ultragray_proto.v1 import geometry_pb2, scenes_pb2
+from ultragray_proto.codec import from_message
+from ultragray_proto.v1 import scenes_pb2
 
-from .confidence import ConfidenceFit, confidence_fit_from_message
-from .connection import Operation
-from .geometry import FloatArray, Probe, matrix_from_message, probe_from_message
+from .contract import Probe
+from .geometry import FloatArray
 
 Point = tuple[float, float, float]  # x, y, z in the scene's frame, mm
 
@@ -27,9 +27,17 @@ class SceneEntry:
     error: str | None  # why the file cannot be read
 
 
+@dataclass(frozen=True)
+class ConfidenceFit:
+    """How well a scene knows the confidence of its frames."""
+
+    error: float  # mean absolute error of the confidence on the views that it was fitted on
+    fitted_on: int  # how many those are
+
+
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What a scene says about itself; None, 0 or empty where it is not known."""
+    """A scene; None, 0 or empty where it is not known."""
 
     name: str
     loaded_processes: int  # render processes that hold it
@@ -54,68 +62,31 @@ class Scene:
     confidence: ConfidenceFit | None  # None: it cannot tell the confidence of its frames
 
 
-def list_scenes(page_size: int, page_token: str) -> Operation[tuple[list[SceneEntry], str]]:
-    request = scenes_pb2.ListScenesRequest(page_size=page_size, page_token=page_token)
-    return Operation(
-        "scenes.ListScenes",
-        request,
-        lambda answer: ([_entry(scene) for scene in answer.scenes], answer.next_page_token),
+def entry_from_message(message: scenes_pb2.SceneEntry) -> SceneEntry:
+    """A scene of the list."""
+    entry: SceneEntry = from_message(message, SceneEntry, error=message.error.detail or None)
+    return entry
+
+
+def scene_from_message(message: scenes_pb2.Scene) -> Scene:
+    """All that is told of a scene; of its training poses only where there are any."""
+    training = message.training_poses
+    known = from_message(training, _TrainingPoses) if training.count else None
+    scene: Scene = from_message(
+        message,
+        Scene,
+        training_pose_count=training.count,
+        training_position_min_mm=known and known.position_min_mm,
+        training_position_max_mm=known and known.position_max_mm,
+        training_poses=(known.first, known.middle, known.last) if known else (),
     )
+    return scene
 
 
-def get_scene(name: str) -> Operation[Scene]:
-    return Operation("scenes.GetScene", scenes_pb2.GetSceneRequest(scene=name), _scene)
-
-
-def load_scene(name: str) -> Operation[int]:
-    request = scenes_pb2.LoadSceneRequest(scene=name)
-    return Operation("scenes.LoadScene", request, lambda answer: int(answer.loaded_processes))
-
-
-def unload_scene(name: str) -> Operation[int]:
-    request = scenes_pb2.UnloadSceneRequest(scene=name)
-    return Operation("scenes.UnloadScene", request, lambda answer: int(answer.loaded_processes))
-
-
-def _entry(message: scenes_pb2.SceneEntry) -> SceneEntry:
-    return SceneEntry(
-        name=message.name,
-        loaded=message.loaded,
-        gaussian_count=message.gaussian_count,
-        image_height=message.image_height,
-        image_width=message.image_width,
-        file_bytes=message.file_bytes,
-        error=message.error.detail if message.HasField("error") else None,
-    )
-
-
-def _scene(message: scenes_pb2.Scene) -> Scene:
-    trained = message.training_poses
-    known = trained.count > 0
-    return Scene(
-        name=message.name,
-        loaded_processes=message.loaded_processes,
-        file_bytes=message.file_bytes,
-        gaussian_count=message.gaussian_count,
-        sh_degree=message.sh_degree,
-        intensity=message.intensity,
-        centre_mm=_point(message.centre_mm),
-        bounds_min_mm=_point(message.bounds_min_mm),
-        bounds_max_mm=_point(message.bounds_max_mm),
-        probe=probe_from_message(message.probe),
-        image_height=message.image_height,
-        image_width=message.image_width,
-        training_pose_count=trained.count,
-        training_position_min_mm=_point(trained.position_min_mm) if known else None,
-        training_position_max_mm=_point(trained.position_max_mm) if known else None,
-        training_poses=tuple(map(matrix_from_message, (trained.first, trained.middle, trained.last))) if known else (),
-        metrics=dict(message.metrics),
-        dataset_name=message.dataset_name,
-        dataset_sha256=message.dataset_sha256,
-        label_names=dict(message.label_names),
-        confidence=confidence_fit_from_message(message.confidence) if message.HasField("confidence") else None,
-    )
-
-
-def _point(message: geometry_pb2.Position) -> Point:
-    return (message.x, message.y, message.z)
+@dataclass(frozen=True)
+class _TrainingPoses:
+    position_min_mm: Point
+    position_max_mm: Point
+    first: FloatArray
+    middle: FloatArray
+    last: FloatArray

@@ -45,7 +45,7 @@ _KEEP_DEFAULT, _REQUIRED = object(), object()
 
 
 class MessageInvalid(ValueError):
-    """A message that no dataclass can be made of.
+    """A message that no dataclass can be made of, or a dataclass that no message can hold.
 
     `field` is the path of the value to blame, `problem` what is wrong with it. Where a dataclass refused its values,
     `original` is its error and `field` the path of the dataclass.
@@ -64,7 +64,10 @@ class MessageInvalid(ValueError):
 
 
 def to_message(value: Any, cls: type[_M], **others: Any) -> _M:
-    """The message of a value. `others` are fields that the value does not have, or has in another form."""
+    """The message of a value. `others` are fields that the value does not have, or has in another form.
+
+    Raises MessageInvalid for a word that its closed set does not have.
+    """
     return cls(**{**_told(value, cls.DESCRIPTOR), **others})  # type: ignore[attr-defined]
 
 
@@ -73,7 +76,7 @@ def from_message(message: Any, cls: Any, **others: Any) -> Any:
 
     Raises MessageInvalid.
     """
-    return _reader(message.DESCRIPTOR, cls)(message, **others)
+    return _reader(message.DESCRIPTOR, cls, frozenset(others))(message, **others)
 
 
 @cache
@@ -104,8 +107,11 @@ def _writer(cls: type[Any], descriptor: Descriptor) -> Callable[[Any], dict[str,
         told = {}
         for name, convert in steps:
             found = getattr(value, name)
-            if found is not None and (found := convert(found)) is not None:
-                told[name] = found
+            try:
+                if found is not None and (found := convert(found)) is not None:
+                    told[name] = found
+            except MessageInvalid as error:
+                raise error.under(name) from None
         for name, convert in oneofs:
             told |= convert(getattr(value, name))
         return told
@@ -126,8 +132,7 @@ def _field_writer(field: FieldDescriptor, default: Any) -> _Convert:
 
 def _value_writer(field: FieldDescriptor) -> _Convert:
     if field.enum_type is not None:
-        numbers = {word: number for number, word in words(field.enum_type).items()}
-        return lambda value: numbers[value.value if isinstance(value, Enum) else value]
+        return _word_writer({word: number for number, word in words(field.enum_type).items()})
     descriptor = field.message_type
     if descriptor is None:
         return lambda value: value.value if isinstance(value, Enum) else value
@@ -149,6 +154,16 @@ def _value_writer(field: FieldDescriptor) -> _Convert:
     return convert
 
 
+def _word_writer(numbers: Mapping[str, int]) -> _Convert:
+    def number(value: Any) -> int:
+        word = value.value if isinstance(value, Enum) else value
+        if word not in numbers:
+            raise MessageInvalid(f"must be one of {', '.join(numbers)}, got {word!r}")
+        return numbers[word]
+
+    return number
+
+
 def _oneof_writer(kinds: Mapping[str, Descriptor]) -> Callable[[Any], dict[str, Any]]:
     return lambda value: {value.kind: _told(value, kinds[value.kind])}
 
@@ -160,8 +175,8 @@ def _struct_of(values: Mapping[str, Any]) -> Struct:
 
 
 @cache
-def _reader(descriptor: Descriptor, annotation: Any) -> Callable[..., Any]:
-    """Reads a message as what an annotation says."""
+def _reader(descriptor: Descriptor, annotation: Any, others: frozenset[str] = frozenset()) -> Callable[..., Any]:
+    """Reads a message as what an annotation says, but for the attributes `others`."""
     kind, _ = _optional_of(annotation)
     if descriptor.full_name == _STRUCT:
         return _dict_of
@@ -176,12 +191,12 @@ def _reader(descriptor: Descriptor, annotation: Any) -> Callable[..., Any]:
     if get_origin(kind) is tuple:
         names = [one.name for one in descriptor.fields]
         return lambda message: tuple([getattr(message, name) for name in names])
-    return _dataclass_reader(descriptor, kind)
+    return _dataclass_reader(descriptor, kind, others)
 
 
-def _dataclass_reader(descriptor: Descriptor, cls: Any) -> Callable[..., Any]:
+def _dataclass_reader(descriptor: Descriptor, cls: Any, others: frozenset[str] = frozenset()) -> Callable[..., Any]:
     hints = get_type_hints(cls)
-    known = {*descriptor.fields_by_name, *_oneofs(descriptor)}
+    known = {*descriptor.fields_by_name, *_oneofs(descriptor)} - others
     steps = [
         (one.name, _attribute_reader(descriptor, one, hints[one.name]))
         for one in fields(cls)

@@ -12,7 +12,7 @@ import pytest
 
 from ultragray import GaussianScene, render
 from ultragray.confidence import Assessor
-from ultragray_client import ConfidenceFit, Extrapolation, errors
+from ultragray_client import Below, ConfidenceFit, Encoding, Extrapolation, FrameSettings, RenderSettings, errors
 
 from ..service.conftest import HEIGHT, WIDTH, RunningService, StartService
 from ..service.test_served_confidence import BESIDE, FAR, MODEL, NEAR, at
@@ -57,7 +57,7 @@ def test_what_a_scene_cannot_tell_is_none(client: Any) -> None:
     assert told.confidence is None
     assert told.distance_mm > 10.0
     with pytest.raises(errors.InvalidArgument) as caught:
-        client.render("demo", at(FAR), min_confidence=0.5)
+        client.render("demo", at(FAR), RenderSettings(min_confidence=0.5))
     assert caught.value.field == "settings.min_confidence"
 
 
@@ -67,16 +67,16 @@ def test_a_scene_tells_how_well_it_knows(client: Any) -> None:
 
 
 def test_a_pose_below_the_limit_is_refused(client: Any) -> None:
-    assert client.render("knowing", at(NEAR), min_confidence=0.5).extrapolation.confidence > 0.5
+    assert client.render("knowing", at(NEAR), RenderSettings(min_confidence=0.5)).extrapolation.confidence > 0.5
     with pytest.raises(errors.LowConfidence, match=r"16\.0 mm") as caught:
-        client.render("knowing", at(FAR), min_confidence=0.5)
+        client.render("knowing", at(FAR), RenderSettings(min_confidence=0.5))
     assert caught.value.field == "pose"
 
 
 def test_in_a_batch_by_its_place_in_the_whole(client: Any) -> None:
     """In the third of its calls, after some frames."""
     poses = np.stack([at(NEAR)] * 10 + [at(FAR)] + [at(NEAR)])
-    frames = client.render_batch("knowing", poses, min_confidence=0.5, height=8, width=8)
+    frames = client.render_batch("knowing", poses, RenderSettings(min_confidence=0.5, height=8, width=8))
     assert [next(frames).sequence for _ in range(10)] == list(range(10))
     with pytest.raises(errors.LowConfidence, match=r"poses\[10\] has a confidence") as caught:
         next(frames)
@@ -84,7 +84,7 @@ def test_in_a_batch_by_its_place_in_the_whole(client: Any) -> None:
 
 
 def test_in_a_stream_in_place_of_its_frame(client: Any) -> None:
-    with client.stream("knowing", min_confidence=0.5, height=8, width=8) as stream:
+    with client.stream("knowing", RenderSettings(min_confidence=0.5, height=8, width=8)) as stream:
         far = stream.send(at(FAR))
         near = stream.send(at(NEAR))
         with pytest.raises(errors.LowConfidence) as caught:
@@ -96,33 +96,35 @@ def test_or_its_pixels_without_support_are_masked(client: Any) -> None:
     frame = client.render(
         "knowing",
         at(BESIDE),
-        min_confidence=0.93,
-        below_min_confidence="mask",
-        outputs=("bmode", "coverage"),
-        dtype="float32",
+        RenderSettings(
+            min_confidence=0.93,
+            below_min_confidence=Below.MASK,
+            outputs=("bmode", "coverage"),
+            encoding=Encoding.FLOAT32,
+        ),
     )
     assert frame.extrapolation.confidence < 0.93
     supported = frame["coverage"] >= 0.3
     assert supported.mean() == pytest.approx(frame.extrapolation.supported_share)
-    whole = client.render("knowing", at(BESIDE), dtype="float32")["bmode"]
+    whole = client.render("knowing", at(BESIDE), RenderSettings(encoding=Encoding.FLOAT32))["bmode"]
     assert whole[~supported].max() > 0.0
     np.testing.assert_array_equal(frame["bmode"], np.where(supported, whole, 0.0))
 
 
 def test_another_word_is_refused(client: Any) -> None:
     with pytest.raises(errors.InvalidArgument, match="refuse, mask, got 'drop'") as caught:
-        client.render("knowing", at(NEAR), min_confidence=0.5, below_min_confidence="drop")
+        client.render("knowing", at(NEAR), RenderSettings(min_confidence=0.5, below_min_confidence="drop"))
     assert caught.value.field == "below_min_confidence"
     with pytest.raises(errors.InvalidArgument) as caught:
-        client.render("knowing", at(NEAR), min_confidence=1.5)
+        client.render("knowing", at(NEAR), RenderSettings(min_confidence=1.5))
     assert caught.value.field == "settings.min_confidence"
 
 
 def test_jobs_keep_within_it(client: Any, tmp_path: Path) -> None:
     with pytest.raises(errors.LowConfidence, match=r"poses\[1\]"):
-        client.jobs.render("knowing", poses=[at(NEAR), at(FAR)], min_confidence=0.5)
+        client.jobs.render("knowing", FrameSettings(min_confidence=0.5), poses=[at(NEAR), at(FAR)])
     sampler = {"kind": "around", "count": 4, "translation_mm": 3.0}
-    job = client.jobs.render("knowing", sampler=sampler, min_confidence=0.93, height=8, width=8)
+    job = client.jobs.render("knowing", FrameSettings(min_confidence=0.93, height=8, width=8), sampler=sampler)
     assert job.specification["min_confidence"] == 0.93
     client.jobs.wait(job.id)
     client.jobs.download(job.id, "frames.npz", tmp_path / "frames.npz")

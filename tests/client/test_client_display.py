@@ -12,18 +12,18 @@ from ultragray import GaussianScene, render
 from ultragray.display.frames import show
 from ultragray.display.settings import AS_RENDERED
 from ultragray.display.settings import Display as LibraryDisplay
-from ultragray_client import ConvexProbe, Display, Picture, Placement, Quaternion, errors
+from ultragray_client import ConvexProbe, Display, Encoding, Picture, Placement, Quaternion, RenderSettings, errors
 
 from ..service.conftest import DEMO_PROBE, HEIGHT, WIDTH
 
 FAN = ConvexProbe(opening_angle_deg=50.0, near_mm=20.0, far_mm=60.0)
-LIBRARY_FAN = LibraryConvexProbe(**vars(FAN))
+LIBRARY_FAN = LibraryConvexProbe(50.0, 20.0, 60.0)
 DISPLAY = Display(gain_db=6.0, dynamic_range_db=50.0, tgc_db=(0.0, 3.0), depth_mm=25.0, flip=True, pixel_mm=0.9)
 TILTED = Placement((1.0, 2.0, 3.0), Quaternion(w=0.8, x=0.36, y=0.48, z=0.0))
 
 
 def test_a_frame_is_shown_as_the_library_shows_it(client: Any, demo_scene: GaussianScene) -> None:
-    frame = client.render("demo", TILTED, probe=FAN, display=DISPLAY, dtype="float32")
+    frame = client.render("demo", TILTED, RenderSettings(probe=FAN, display=DISPLAY, encoding=Encoding.FLOAT32))
     rendered = render(demo_scene, LIBRARY_FAN, frame.pose, height=HEIGHT, width=WIDTH).bmode
     assert rendered is not None
     expected = show({"bmode": rendered}, LIBRARY_FAN, LibraryDisplay(**vars(DISPLAY)))["bmode"][0].numpy()
@@ -32,19 +32,21 @@ def test_a_frame_is_shown_as_the_library_shows_it(client: Any, demo_scene: Gauss
     again = client.render(
         frame.scene,
         frame.pose,
-        probe=frame.probe,
-        display=frame.display,
-        dtype="float32",
-        height=frame.rendered_height,
-        width=frame.rendered_width,
+        RenderSettings(
+            probe=frame.probe,
+            display=frame.display,
+            encoding=Encoding.FLOAT32,
+            height=frame.rendered_height,
+            width=frame.rendered_width,
+        ),
     )
     np.testing.assert_array_equal(again["bmode"], frame["bmode"])
 
 
 def test_every_way_takes_them(client: Any) -> None:
-    wanted = client.render("demo", np.eye(4), display=DISPLAY)["bmode"]
-    (of_batch,) = client.render_batch("demo", [np.eye(4)], display=DISPLAY)
-    with client.stream("demo", display=DISPLAY) as stream:
+    wanted = client.render("demo", np.eye(4), RenderSettings(display=DISPLAY))["bmode"]
+    (of_batch,) = client.render_batch("demo", [np.eye(4)], RenderSettings(display=DISPLAY))
+    with client.stream("demo", RenderSettings(display=DISPLAY)) as stream:
         stream.send(np.eye(4))
         of_stream = stream.receive()
     for frame in (of_batch, of_stream):
@@ -55,16 +57,16 @@ def test_every_way_takes_them(client: Any) -> None:
 def test_defaults_are_those_of_the_service(client: Any) -> None:
     assert vars(Display()) == vars(AS_RENDERED)
     assert client.render("demo", np.eye(4)).display is None
-    assert client.render("demo", np.eye(4), display=Display()).display is None
-    assert client.render("demo", np.eye(4), display=Display(flip=True)).display == Display(flip=True)
+    assert client.render("demo", np.eye(4), RenderSettings(display=Display())).display is None
+    assert client.render("demo", np.eye(4), RenderSettings(display=Display(flip=True))).display == Display(flip=True)
 
 
 def test_refusals_name_the_setting(client: Any) -> None:
     with pytest.raises(errors.InvalidArgument) as caught:
-        client.render("demo", np.eye(4), display=Display(tgc_db=(0.0, 1e6)))
+        client.render("demo", np.eye(4), RenderSettings(display=Display(tgc_db=(0.0, 1e6))))
     assert caught.value.field == "settings.display.tgc_db[1]"
     with pytest.raises(errors.InvalidImageSize):
-        client.render("demo", np.eye(4), display=Display(pixel_mm=0.001))
+        client.render("demo", np.eye(4), RenderSettings(display=Display(pixel_mm=0.001)))
 
 
 def test_pixels_lie_where_the_probe_says(client: Any) -> None:
@@ -80,12 +82,14 @@ def test_pixels_lie_where_the_probe_says(client: Any) -> None:
 
 
 def test_a_fan_has_a_matrix_once_its_pixels_are_square(client: Any) -> None:
-    polar = client.render("demo", np.eye(4), probe=FAN)
+    polar = client.render("demo", np.eye(4), RenderSettings(probe=FAN))
     assert polar.picture.column_unit == "deg"
     with pytest.raises(errors.InvalidArgument, match="pixel_mm") as caught:
         polar.pixel_to_scene()
     assert caught.value.field == "display.pixel_mm"
-    frame = client.render("demo", np.eye(4), probe=FAN, display=Display(pixel_mm=0.5, flip=True), outputs="coverage")
+    frame = client.render(
+        "demo", np.eye(4), RenderSettings(probe=FAN, display=Display(pixel_mm=0.5, flip=True), outputs=("coverage",))
+    )
     height, width = frame["coverage"].shape
     top_left = frame.pixel_to_scene() @ [0, 0, 0, 1]
     half_angle = np.radians(25.0)

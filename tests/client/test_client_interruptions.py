@@ -6,21 +6,24 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
+import grpc
 import numpy as np
 import pytest
 
-from ultragray_client import JobState, errors
-from ultragray_client.connection import Operation, is_done
+from ultragray_client import FrameSettings, JobState, RenderSettings, errors
 from ultragray_client.downloads import downloaded
 from ultragray_client.jobs import Watch
 from ultragray_client.retries import Retries
+from ultragray_client.sync.connection import Connection
 from ultragray_proto.v1 import jobs_pb2
 
 from ..service.conftest import RunningService
 from .conftest import KEY
+from .test_client_errors import FailedCall
 
 
 class Proxy:
@@ -88,7 +91,7 @@ def far_client(make_client: Callable[..., Any], proxy: Proxy) -> Any:
 def test_a_batch_goes_on(far_client: Any, proxy: Proxy) -> None:
     poses = np.tile(np.eye(4), (120, 1, 1))
     poses[:, 0, 3] = np.linspace(-4, 4, 120)
-    batch = far_client.render_batch("demo", poses, height=64, width=64)
+    batch = far_client.render_batch("demo", poses, RenderSettings(height=64, width=64))
     frames = [next(batch)]
     proxy.cut_after(150_000)
     frames += list(batch)
@@ -99,7 +102,9 @@ def test_a_batch_goes_on(far_client: Any, proxy: Proxy) -> None:
 
 def test_a_download_goes_on_and_is_whole(far_client: Any, client: Any, proxy: Proxy, tmp_path: Path) -> None:
     poses = np.tile(np.eye(4), (60, 1, 1))
-    job = client.jobs.render("demo", poses=poses, height=200, width=200, dtype="float32", outputs=("bmode", "echo"))
+    job = client.jobs.render(
+        "demo", FrameSettings(height=200, width=200, outputs=("bmode", "echo")), poses=poses, dtype="float32"
+    )
     assert client.jobs.wait(job.id).state is JobState.SUCCEEDED
     client.jobs.download(job.id, "frames.npz", tmp_path / "straight.npz")
     proxy.cut_after(8_000_000)
@@ -110,7 +115,7 @@ def test_a_download_goes_on_and_is_whole(far_client: Any, client: Any, proxy: Pr
 
 
 def test_a_watch_goes_on(far_client: Any, client: Any, proxy: Proxy) -> None:
-    job = client.jobs.render("demo", poses=np.tile(np.eye(4), (20_000, 1, 1)), height=300, width=300)
+    job = client.jobs.render("demo", FrameSettings(height=300, width=300), poses=np.tile(np.eye(4), (20_000, 1, 1)))
     events = far_client.jobs.watch(job.id)
     assert next(events).job.id == job.id
     proxy.cut_after(0)
@@ -160,13 +165,26 @@ def test_a_log_is_not_told_twice() -> None:
     assert new("elsewhere\n") == "elsewhere\n"
 
 
-def test_a_deletion_that_had_worked_is_no_error() -> None:
-    deletes = Operation("jobs.DeleteJob", None, lambda answer: None, deletes=True)
-    gone = errors.JobNotFound("gone")
-    assert is_done(deletes, gone, broke=True)
-    assert not is_done(deletes, gone, broke=False)
-    assert not is_done(deletes, errors.JobInUse("used"), broke=True)
-    assert not is_done(Operation("jobs.GetJob", None, str), gone, broke=True)
+@pytest.mark.parametrize(
+    ("failures", "is_refused"),
+    [
+        (["UNAVAILABLE", "NOT_FOUND"], False),
+        (["NOT_FOUND"], True),
+        (["UNAVAILABLE", "FAILED_PRECONDITION"], True),
+        (["UNAVAILABLE"], False),
+    ],
+)
+def test_a_deletion_that_had_worked_is_no_error(failures: list[str], is_refused: bool) -> None:
+    def call(request: str, **_: Any) -> str:
+        if left:
+            raise FailedCall(getattr(grpc.StatusCode, left.pop(0)), "no")
+        return request
+
+    left, connection = list(failures), Connection("127.0.0.1:1", None, 60.0)
+    with pytest.raises(errors.ClientError) if is_refused else nullcontext():
+        connection.delete(call, "job", None)
+    assert not left
+    connection.close()
 
 
 def test_a_silent_peer_does_not_hold_a_call(make_client: Callable[..., Any]) -> None:

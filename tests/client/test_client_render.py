@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from ultragray import GaussianScene, render
-from ultragray_client import AsyncClient, Client, LinearProbe, Placement, Quaternion, errors
+from ultragray_client import AsyncClient, Client, Encoding, LinearProbe, Placement, Quaternion, RenderSettings, errors
 from ultragray_client.geometry import FloatArray
 
 from ..service.conftest import DEMO_PROBE, HEIGHT, WIDTH, RunningService
@@ -24,7 +24,9 @@ def moved(x_mm: float) -> FloatArray:
 
 
 def test_a_frame_is_what_the_library_renders(client: Any, demo_scene: GaussianScene) -> None:
-    frame = client.render("demo", moved(2.0), outputs=("transmittance", "bmode"), dtype="float32")
+    frame = client.render(
+        "demo", moved(2.0), RenderSettings(outputs=("transmittance", "bmode"), encoding=Encoding.FLOAT32)
+    )
     expected = render(demo_scene, None, moved(2.0), height=HEIGHT, width=WIDTH, outputs=("bmode", "transmittance"))
     assert list(frame.arrays) == ["transmittance", "bmode"]
     for name in ("transmittance", "bmode"):
@@ -40,7 +42,7 @@ def test_a_frame_is_what_the_library_renders(client: Any, demo_scene: GaussianSc
 
 
 def test_arrays_are_views_of_one_buffer(client: Any) -> None:
-    frame = client.render("demo", moved(0.0), outputs=("bmode", "echo"))
+    frame = client.render("demo", moved(0.0), RenderSettings(outputs=("bmode", "echo")))
     assert frame["bmode"].base is not None
     assert (
         frame["bmode"].__array_interface__["data"][0] + HEIGHT * WIDTH == frame["echo"].__array_interface__["data"][0]
@@ -51,10 +53,14 @@ def test_poses_and_probes_may_be_written_in_words(client: Any) -> None:
     half = 0.5**0.5
     placement = Placement((1.0, 2.0, 3.0), Quaternion(w=half, x=0.0, y=0.0, z=half))
     probe = LinearProbe(width_mm=20.0, near_mm=1.0, far_mm=30.0)
-    frame = client.render("demo", placement, probe=probe, height=16, width=8)
+    frame = client.render("demo", placement, RenderSettings(probe=probe, height=16, width=8))
     expected = [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]
     np.testing.assert_allclose(frame.pose, expected, atol=1e-12)
     assert (frame.probe, frame["bmode"].shape) == (probe, (16, 8))
+
+
+def given(**settings: Any) -> dict[str, Any]:
+    return {"settings": RenderSettings(**settings)}
 
 
 @pytest.mark.parametrize(
@@ -64,11 +70,11 @@ def test_poses_and_probes_may_be_written_in_words(client: Any) -> None:
         ({"pose": 2 * np.eye(4)}, errors.InvalidPose, "pose.matrix"),
         ({"pose": np.eye(3)}, errors.InvalidPose, "pose"),
         ({"pose": "here"}, errors.InvalidPose, "pose"),
-        ({"height": 601}, errors.InvalidImageSize, "settings.height"),
-        ({"probe": LinearProbe(-1, 0, 1)}, errors.InvalidProbe, "settings.probe.linear.width_mm"),
-        ({"outputs": ("shadow",)}, errors.UnknownOutput, "outputs"),
-        ({"outputs": "labels"}, errors.UnknownOutput, "settings.outputs"),
-        ({"dtype": "float64"}, errors.InvalidArgument, "dtype"),
+        (given(height=601), errors.InvalidImageSize, "settings.height"),
+        (given(probe=LinearProbe(-1, 0, 1)), errors.InvalidProbe, "settings.probe.linear.width_mm"),
+        (given(outputs=("shadow",)), errors.UnknownOutput, "outputs"),
+        (given(outputs=("labels",)), errors.UnknownOutput, "settings.outputs"),
+        (given(encoding=Encoding.PNG), errors.InvalidArgument, "encoding"),
         ({"timeout_s": 0.0}, errors.InvalidArgument, "timeout_s"),
         ({"scene": "truncated"}, errors.SceneFileInvalid, "settings.scene"),
     ],
@@ -91,10 +97,10 @@ def test_a_key_is_needed(make_client: Any, client_service: RunningService) -> No
 
 def test_a_long_batch_is_split_into_calls_that_the_service_takes(client: Any) -> None:
     shifts = np.linspace(-4, 4, 3 * MAX_POSES + 7)
-    frames = list(client.render_batch("demo", (moved(x) for x in shifts), height=8, width=8))
+    frames = list(client.render_batch("demo", (moved(x) for x in shifts), RenderSettings(height=8, width=8)))
     assert [frame.sequence for frame in frames] == list(range(len(shifts)))
     assert [frame.pose[0, 3] for frame in frames] == shifts.tolist()
-    alone = client.render("demo", moved(shifts[-1]), height=8, width=8)
+    alone = client.render("demo", moved(shifts[-1]), RenderSettings(height=8, width=8))
     np.testing.assert_array_equal(frames[-1]["bmode"], alone["bmode"])
 
 
@@ -107,7 +113,7 @@ def test_a_batch_takes_poses_as_it_goes(client: Any) -> None:
             taken += 1
             yield np.eye(4)
 
-    batch = client.render_batch("demo", endless(), height=8, width=8)
+    batch = client.render_batch("demo", endless(), RenderSettings(height=8, width=8))
     for _ in range(10):
         next(batch)
     assert taken < 1000
@@ -117,7 +123,7 @@ def test_a_batch_takes_poses_as_it_goes(client: Any) -> None:
 def test_a_bad_pose_is_named_by_its_place_in_the_whole_batch(client: Any) -> None:
     poses = np.tile(np.eye(4), (MAX_POSES * 2 + 5, 1, 1))
     poses[-1] *= 2
-    frames = client.render_batch("demo", poses, height=8, width=8)
+    frames = client.render_batch("demo", poses, RenderSettings(height=8, width=8))
     assert next(frames).sequence == 0
     with pytest.raises(errors.InvalidPose, match=r"poses\[84\]") as caught:
         list(frames)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ultragray_client import DatasetOptions, JobKind, JobState, LinearProbe, errors
+from ultragray_client import DatasetOptions, FrameSettings, JobKind, JobState, LinearProbe, errors
 
 from ..service.http.test_http_datasets import poisoned_files, released_files
 
@@ -117,18 +117,20 @@ def test_the_life_of_a_training(client: Any, folder: Path, name: str, tmp_path: 
 
 def test_a_batch_of_frames_as_a_job(client: Any, tmp_path: Path) -> None:
     poses = np.tile(np.eye(4), (3, 1, 1))
-    job = client.jobs.render("demo", poses=poses, height=8, width=6, outputs=("bmode", "echo"), dtype="uint8")
+    job = client.jobs.render(
+        "demo", FrameSettings(height=8, width=6, outputs=("bmode", "echo")), poses=poses, dtype="uint8"
+    )
     assert (job.specification["pose_count"], job.specification["outputs"]) == (3, ("bmode", "echo"))
     assert client.jobs.wait(job.id).state is JobState.SUCCEEDED
     client.jobs.download(job.id, "frames.npz", tmp_path / "frames.npz")
     with np.load(tmp_path / "frames.npz") as frames:
         assert frames["echo"].shape == (3, 8, 6)
-    again = client.jobs.render("demo", poses=poses, height=8, width=6)
+    again = client.jobs.render("demo", FrameSettings(height=8, width=6), poses=poses)
     assert again.request_id != job.request_id != ""
     for sampler in ({"kind": "around", "number": 2}, {"kind": "around", "count": "many"}):
         with pytest.raises(errors.InvalidArgument, match="sampler"):
             client.jobs.render("demo", sampler=sampler)
-    with pytest.raises(errors.InvalidArgument, match="state and kind"):
+    with pytest.raises(errors.InvalidArgument, match="state must be one of queued"):
         client.jobs.list(state="lost")
 
 
@@ -143,13 +145,17 @@ def test_a_batch_of_frames_as_a_job(client: Any, tmp_path: Path) -> None:
     ],
 )
 def test_every_sampler_is_taken(client: Any, sampler: dict[str, Any], format: str, dtype: str) -> None:
-    job = client.jobs.render("demo", sampler=sampler, height=8, width=8, format=format, dtype=dtype, priority=-1000)
+    job = client.jobs.render(
+        "demo", FrameSettings(height=8, width=8), sampler=sampler, format=format, dtype=dtype, priority=-1000
+    )
     told = job.specification
     assert (told["sampler"], told["format"], told["dtype"]) == (sampler, format, dtype)
 
 
 def test_cancel_and_retry(client: Any) -> None:
-    job = client.jobs.render("demo", poses=np.tile(np.eye(4), (20_000, 1, 1)), height=300, width=300, priority=-5)
+    job = client.jobs.render(
+        "demo", FrameSettings(height=300, width=300), poses=np.tile(np.eye(4), (20_000, 1, 1)), priority=-5
+    )
     cancelled = client.jobs.cancel(job.id)
     assert client.jobs.wait(job.id).state is JobState.CANCELLED
     assert client.jobs.cancel(job.id).state is JobState.CANCELLED

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ultragray_client import errors
+from ultragray_client import RenderSettings, errors
 from ultragray_client.retries import Retries
 
 from ..service.conftest import RunningService, StartService
@@ -90,7 +90,7 @@ def test_a_service_that_comes_late_is_found(make_client: Any, start_service: Sta
     service: list[RunningService] = []
     starting = threading.Thread(target=lambda: service.append(start_service(grpc_port=port)))
     starting.start()
-    assert client.render("demo", moved(0.0), height=8, width=8)["bmode"].shape == (8, 8)
+    assert client.render("demo", moved(0.0), RenderSettings(height=8, width=8))["bmode"].shape == (8, 8)
     starting.join()
     service[0].terminate()
 
@@ -109,7 +109,7 @@ def test_a_batch_goes_on_where_a_service_is_restarted(make_client: Any, start_se
 
     restarting = threading.Thread(target=restart)
     frames = []
-    for frame in client.render_batch("demo", map(moved, shifts), height=150, width=150):
+    for frame in client.render_batch("demo", map(moved, shifts), RenderSettings(height=150, width=150)):
         frames.append(frame)
         if len(frames) == 10:
             restarting.start()
@@ -128,7 +128,9 @@ def test_a_full_queue_is_asked_again(make_client: Any, start_service: StartServi
     results: list[Any] = []
 
     def render() -> None:
-        results.append(client.render("demo", moved(0.0), height=600, width=600, outputs=("bmode", "echo")))
+        results.append(
+            client.render("demo", moved(0.0), RenderSettings(height=600, width=600, outputs=("bmode", "echo")))
+        )
 
     threads = [threading.Thread(target=render) for _ in range(5)]
     for thread in threads:

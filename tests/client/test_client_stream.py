@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ultragray_client import errors
+from ultragray_client import RenderSettings, errors
 from ultragray_client.frames import settings_message
 from ultragray_client.pose_exchange import PoseExchange
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2, scenes_pb2
@@ -17,21 +17,10 @@ from ultragray_proto.v1 import geometry_pb2, rendering_pb2, scenes_pb2
 from ..service.conftest import StartService
 from .test_client_render import moved
 
-SETTINGS: Any = {
-    "outputs": ("bmode",),
-    "dtype": "uint8",
-    "height": None,
-    "width": None,
-    "probe": None,
-    "display": None,
-    "min_confidence": None,
-    "below_min_confidence": "refuse",
-}
-
 
 def test_an_ordered_stream_answers_every_pose(client: Any) -> None:
     shifts = np.linspace(-4, 4, 120)
-    with client.stream("demo", height=16, width=16) as stream:
+    with client.stream("demo", RenderSettings(height=16, width=16)) as stream:
         sequences = [stream.send(moved(x)) for x in shifts[:60]]
         frames = [stream.receive() for _ in range(60)]
         sequences += [stream.send(moved(x)) for x in shifts[60:]]
@@ -48,7 +37,9 @@ def test_an_ordered_stream_answers_every_pose(client: Any) -> None:
 
 
 def test_a_latest_stream_counts_what_it_drops(client: Any) -> None:
-    with client.stream("demo", mode="latest", height=600, width=600, outputs=("bmode", "echo")) as stream:
+    with client.stream(
+        "demo", RenderSettings(height=600, width=600, outputs=("bmode", "echo")), mode="latest"
+    ) as stream:
         for x in np.linspace(-4, 4, 200):
             stream.send(moved(x))
         stream.done_sending()
@@ -60,13 +51,13 @@ def test_a_latest_stream_counts_what_it_drops(client: Any) -> None:
 
 
 def test_latency_counts_from_the_measurement(client: Any) -> None:
-    with client.stream("demo", height=8, width=8) as stream:
+    with client.stream("demo", RenderSettings(height=8, width=8)) as stream:
         stream.send(moved(0.0), measured_ns=time.monotonic_ns() - 5_000_000_000)
         assert stream.receive().latency_ms > 5000.0
 
 
 def test_a_pose_that_gets_no_frame_does_not_end_a_stream(client: Any) -> None:
-    with client.stream("demo", height=8, width=8) as stream:
+    with client.stream("demo", RenderSettings(height=8, width=8)) as stream:
         stream.send(moved(0.0))
         bad = stream.send(2 * np.eye(4))
         late = stream.send(moved(0.0), timeout_s=1e-9)
@@ -90,7 +81,7 @@ def test_refused_settings_are_told_first(client: Any) -> None:
 
 
 def test_a_stream_may_be_used_by_two_threads(client: Any) -> None:
-    with client.stream("demo", height=8, width=8) as stream:
+    with client.stream("demo", RenderSettings(height=8, width=8)) as stream:
 
         def send() -> None:
             for _ in range(300):
@@ -106,7 +97,7 @@ def test_a_stream_may_be_used_by_two_threads(client: Any) -> None:
 def test_a_service_that_stops_ends_a_stream(make_client: Any, start_service: StartService) -> None:
     service = start_service()
     client = make_client(service.grpc)
-    with client.stream("demo", height=8, width=8) as stream:
+    with client.stream("demo", RenderSettings(height=8, width=8)) as stream:
         stream.send(moved(0.0))
         stream.receive()
         service.terminate()
@@ -117,7 +108,7 @@ def test_a_service_that_stops_ends_a_stream(make_client: Any, start_service: Sta
 
 
 def test_what_was_dropped_before_an_error_is_told_with_the_next_frame() -> None:
-    exchange = PoseExchange(settings_message("demo", **SETTINGS), "latest")
+    exchange = PoseExchange(settings_message("demo", None), "latest")
     error = scenes_pb2.Error(reason="DEADLINE_EXCEEDED", detail="late")
     with pytest.raises(errors.DeadlineExceeded):
         exchange.frame(rendering_pb2.Frame(sequence=3, error=error, dropped=2))
@@ -130,6 +121,9 @@ def test_what_was_dropped_before_an_error_is_told_with_the_next_frame() -> None:
         data=b"ab",
         pose=geometry_pb2.Matrix(values=np.eye(4).ravel()),
         probe=geometry_pb2.Probe(linear=geometry_pb2.LinearProbe(width_mm=1, far_mm=1)),
+        timings=rendering_pb2.Timings(),
+        extrapolation=rendering_pb2.Extrapolation(),
+        picture=rendering_pb2.Picture(),
         dropped=1,
     )
     assert exchange.frame(answer, dropped_here=4).dropped == 7

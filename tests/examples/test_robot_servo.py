@@ -11,7 +11,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from ultragray_client import Client, Frame, LinearProbe
+from ultragray_client import Client, Frame, LinearProbe, RenderSettings
 from ultragray_client.errors import Unavailable
 
 from ..service.conftest import RunningService
@@ -28,7 +28,7 @@ def servo(load_example: Callable[[str], ModuleType]) -> ModuleType:
 
 def vessel_mm(client: Client, pose: np.ndarray) -> tuple[float, float]:
     """Where the vessel's middle is in truth: lateral from the centre of the image, and depth."""
-    labels = client.render("demo", pose, outputs=("labels",), height=128, width=128)["labels"]
+    labels = client.render("demo", pose, RenderSettings(outputs=("labels",), height=128, width=128))["labels"]
     row, column = np.argwhere(labels == VESSEL).mean(axis=0)
     return (column + 0.5) * MM_PER_PIXEL - 30.0, (row + 0.5) * MM_PER_PIXEL
 
@@ -40,7 +40,7 @@ def test_the_vessel_is_found_where_it_is_and_nowhere_else(servo: ModuleType, dem
             for x_mm, visible in ((-14.0, False), (0.0, True), (12.0, True), (25.0, True)):
                 pose = np.eye(4)
                 pose[:2, 3] = x_mm, y_mm
-                image = client.render("demo", pose, height=128, width=128)["bmode"]
+                image = client.render("demo", pose, RenderSettings(height=128, width=128))["bmode"]
                 found = finder.find(image, None)
                 assert (found is not None) == visible, (x_mm, y_mm)
                 if visible:

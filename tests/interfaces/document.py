@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import re
+from enum import Enum
 from pathlib import Path
 from typing import Any
 
@@ -40,8 +41,14 @@ def call_of(value: Any) -> str:
     """`name(parameters, with=defaults)` of a function or class."""
     parts: list[str] = []
     for parameter in inspect.signature(value).parameters.values():
+        if isinstance(value, type) and parameter.name == "kind" and parameter.default is not parameter.empty:
+            continue  # what tells a member of a family apart is never given
         if parameter.kind is parameter.KEYWORD_ONLY and "*" not in parts:
             parts.append("*")
-        default = "" if parameter.default is parameter.empty else f"={parameter.default!r}"
+        default = "" if parameter.default is parameter.empty else f"={_default(parameter.default)}"
         parts.append(parameter.name + default.replace("<factory>", "…"))
     return f"{value.__name__}({', '.join(parts)})"
+
+
+def _default(value: Any) -> str:
+    return f"{type(value).__name__}.{value.name}" if isinstance(value, Enum) else repr(value)

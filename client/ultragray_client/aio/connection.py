@@ -6,16 +6,17 @@ import asyncio
 from collections.abc import AsyncGenerator, AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
-from ..connection import Conversation, Operation, Pages, Stubs, call_metadata, check_timeout, is_done
-from ..errors import ClientError, Unavailable
+from ..connection import PAGE_SIZE, Conversation, call_metadata, check_timeout
+from ..errors import ClientError, NotFound
 from ..pose_exchange import PoseExchange
 from ..retries import Retries
 from ..statuses import client_errors
 from .transport import PoseCall, open_channel
 
 T = TypeVar("T")
+Call: TypeAlias = Callable[..., Any]  # a method of a stub
 
 
 class AsyncConnection:
@@ -25,35 +26,50 @@ class AsyncConnection:
         self.address = address
         self._timeout_s = check_timeout(timeout_s)
         self._metadata = call_metadata(api_key)
-        self._channel = open_channel(address)
-        self._stubs = Stubs(self._channel)
+        self.channel = open_channel(address)
 
     async def close(self) -> None:
-        await self._channel.close()
+        await self.channel.close()
 
-    async def answer(self, operation: Operation[T], timeout_s: float | None) -> T:
-        """The answer of an operation, within `timeout_s` (None: the client's) for all attempts together."""
-        retries = self._retries(self._timeout_s if timeout_s is None else timeout_s)
-        return await self._answer(operation, lambda: operation.request, retries)
+    async def answer(self, call: Call, request: Any, timeout_s: float | None) -> Any:
+        """The answer to a request, within `timeout_s` (None: the client's) for all attempts together."""
+        return await self._answer(call, lambda: request, self._short_retries(timeout_s))
 
-    async def answer_upload(
-        self, operation: Operation[T], messages: Callable[[], AsyncIterator[Any]], timeout_s: float | None
-    ) -> T:
-        """The answer of an operation that sends all `messages` at each attempt; None: as long as it takes."""
-        return await self._answer(operation, messages, self._retries(timeout_s))
+    async def delete(self, call: Call, request: Any, timeout_s: float | None) -> None:
+        """Asks for a deletion. What is not found any more where an attempt broke off was deleted by that."""
+        retries = self._short_retries(timeout_s)
+        try:
+            await self._answer(call, lambda: request, retries)
+        except NotFound:
+            if not retries.was_unavailable:
+                raise
 
-    async def all_pages(self, pages: Pages[T], timeout_s: float | None) -> tuple[T, ...]:
-        """The items of a list."""
-        for operation in pages.operations():
-            pages.take(await self.answer(operation, timeout_s))
-        return tuple(pages.items)
+    async def upload(self, call: Call, messages: Callable[[], AsyncIterator[Any]], timeout_s: float | None) -> Any:
+        """The answer to messages that each attempt sends from the first one on; None: as long as it takes."""
+        return await self._answer(call, messages, self._retries(timeout_s))
 
-    async def converse(self, conversation: Conversation[T], timeout_s: float | None) -> AsyncGenerator[T, None]:
+    async def listed(
+        self, call: Call, request: Any, items: str, timeout_s: float | None, *, limit: int | None = None
+    ) -> list[Any]:
+        """The items of a list that comes in pages, at most `limit` of them."""
+        found: list[Any] = []
+        while limit is None or len(found) < limit:
+            request.page_size = PAGE_SIZE if limit is None else min(PAGE_SIZE, limit - len(found))
+            page = await self.answer(call, request, timeout_s)
+            found += getattr(page, items)
+            request.page_token = page.next_page_token
+            if not page.next_page_token:
+                break
+        return found
+
+    async def converse(
+        self, call: Call, conversation: Conversation[T], timeout_s: float | None
+    ) -> AsyncGenerator[T, None]:
         """What a conversation makes of the messages as they come; None: as long as it takes."""
         retries = self._retries(timeout_s)
         while (request := conversation.request()) is not None:
             try:
-                async with self._streamed(conversation.method, request, retries) as messages:
+                async with self._streamed(call, request, retries) as messages:
                     async for message in messages:
                         retries.progress()
                         yield conversation.take(message)
@@ -61,35 +77,31 @@ class AsyncConnection:
             except ClientError as error:
                 await asyncio.sleep(conversation.pause_s(error, retries))
 
-    def pose_call(self, exchange: PoseExchange, timeout_s: float | None) -> PoseCall:
+    def pose_call(self, call: Call, exchange: PoseExchange, timeout_s: float | None) -> PoseCall:
         """The call of a stream, which ends after `timeout_s`; None: it may last."""
         timeout = None if timeout_s is None else check_timeout(timeout_s)
-        start = self._stubs.method("rendering.RenderStream")
-        return PoseCall(partial(start, timeout=timeout, metadata=self._metadata), exchange)
+        return PoseCall(partial(call, timeout=timeout, metadata=self._metadata), exchange)
 
     def _retries(self, timeout_s: float | None) -> Retries:
         return Retries(None if timeout_s is None else check_timeout(timeout_s), self._timeout_s)
 
-    async def _answer(self, operation: Operation[T], request: Callable[[], Any], retries: Retries) -> T:
-        method = self._stubs.method(operation.method)
-        broke = False
+    def _short_retries(self, timeout_s: float | None) -> Retries:
+        return self._retries(self._timeout_s if timeout_s is None else timeout_s)
+
+    async def _answer(self, call: Call, request: Callable[[], Any], retries: Retries) -> Any:
         while True:
             try:
                 with client_errors(self.address):
-                    answer = await method(request(), timeout=retries.remaining_s(), metadata=self._metadata)
-                return operation.convert(answer)
+                    return await call(request(), timeout=retries.remaining_s(), metadata=self._metadata)
             except ClientError as error:
-                if is_done(operation, error, broke):
-                    return operation.convert(None)
-                broke |= isinstance(error, Unavailable)
                 await asyncio.sleep(retries.pause_s(error))
 
     @asynccontextmanager
-    async def _streamed(self, method: str, request: Any, retries: Retries) -> AsyncIterator[Any]:
+    async def _streamed(self, call: Call, request: Any, retries: Retries) -> AsyncIterator[Any]:
         """The messages that a call streams; the call ends with the context."""
-        call = self._stubs.method(method)(request, timeout=retries.remaining_s(), metadata=self._metadata)
+        messages = call(request, timeout=retries.remaining_s(), metadata=self._metadata)
         try:
             with client_errors(self.address):
-                yield call
+                yield messages
         finally:
-            call.cancel()
+            messages.cancel()

@@ -6,19 +6,10 @@ from collections.abc import AsyncIterator
 from functools import partial
 from pathlib import Path
 
-from ultragray_proto.v1 import datasets_pb2
+from ultragray_proto.v1 import datasets_pb2, datasets_pb2_grpc
 
-from ..connection import Pages
-from ..datasets import (
-    Dataset,
-    DatasetOptions,
-    Upload,
-    contact_sheet,
-    delete_dataset,
-    get_dataset,
-    list_datasets,
-    upload_dataset,
-)
+from ..contract import DatasetOptions
+from ..datasets import Dataset, Upload, dataset_from_message
 from .connection import AsyncConnection
 from .transport import run_blocking
 
@@ -28,38 +19,40 @@ class AsyncDatasets:
 
     def __init__(self, connection: AsyncConnection) -> None:
         self._connection = connection
+        self._calls = datasets_pb2_grpc.DatasetServiceStub(connection.channel)
 
     async def upload(
-        self,
-        name: str,
-        path: str | Path,
-        *,
-        options: DatasetOptions | None = None,
-        timeout_s: float | None = None,
+        self, name: str, path: str | Path, *, options: DatasetOptions | None = None, timeout_s: float | None = None
     ) -> Dataset:
         """Uploads a folder with all below it, or an archive (.zip, .tar, .tar.gz, .tgz), and waits until it is checked.
 
         The same content and options again give the dataset that is there. Without `timeout_s` it takes as long as it
         takes. Raises DatasetInvalid with the file and the frame, DatasetExists, UploadTooLarge, StorageFull.
         """
-        upload = Upload(name, path, options or DatasetOptions())
-        return await self._connection.answer_upload(upload_dataset(), partial(_read, upload), timeout_s)
+        messages = partial(_read, Upload(name, path, options or DatasetOptions()))
+        answer = await self._connection.upload(self._calls.UploadDataset, messages, timeout_s)
+        return dataset_from_message(answer.dataset)
 
     async def list(self, *, timeout_s: float | None = None) -> tuple[Dataset, ...]:
         """All datasets by name."""
-        return await self._connection.all_pages(Pages(list_datasets, None), timeout_s)
+        request = datasets_pb2.ListDatasetsRequest()
+        datasets = await self._connection.listed(self._calls.ListDatasets, request, "datasets", timeout_s)
+        return tuple(map(dataset_from_message, datasets))
 
     async def get(self, name: str, *, timeout_s: float | None = None) -> Dataset:
         """One dataset."""
-        return await self._connection.answer(get_dataset(name), timeout_s)
+        request = datasets_pb2.GetDatasetRequest(dataset=name)
+        return dataset_from_message(await self._connection.answer(self._calls.GetDataset, request, timeout_s))
 
     async def contact_sheet(self, name: str, *, timeout_s: float | None = None) -> bytes:
         """A PNG of the image planes in space and of some frames."""
-        return await self._connection.answer(contact_sheet(name), timeout_s)
+        request = datasets_pb2.GetContactSheetRequest(dataset=name)
+        return bytes((await self._connection.answer(self._calls.GetContactSheet, request, timeout_s)).png)
 
     async def delete(self, name: str, *, timeout_s: float | None = None) -> None:
         """Raises DatasetInUse where a job needs it."""
-        await self._connection.answer(delete_dataset(name), timeout_s)
+        request = datasets_pb2.DeleteDatasetRequest(dataset=name)
+        await self._connection.delete(self._calls.DeleteDataset, request, timeout_s)
 
 
 async def _read(upload: Upload) -> AsyncIterator[datasets_pb2.UploadDatasetRequest]:

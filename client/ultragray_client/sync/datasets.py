@@ -7,19 +7,10 @@ from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
-from ultragray_proto.v1 import datasets_pb2
+from ultragray_proto.v1 import datasets_pb2, datasets_pb2_grpc
 
-from ..connection import Pages
-from ..datasets import (
-    Dataset,
-    DatasetOptions,
-    Upload,
-    contact_sheet,
-    delete_dataset,
-    get_dataset,
-    list_datasets,
-    upload_dataset,
-)
+from ..contract import DatasetOptions
+from ..datasets import Dataset, Upload, dataset_from_message
 from .connection import Connection
 from .transport import run_blocking
 
@@ -29,38 +20,40 @@ class Datasets:
 
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
+        self._calls = datasets_pb2_grpc.DatasetServiceStub(connection.channel)
 
     def upload(
-        self,
-        name: str,
-        path: str | Path,
-        *,
-        options: DatasetOptions | None = None,
-        timeout_s: float | None = None,
+        self, name: str, path: str | Path, *, options: DatasetOptions | None = None, timeout_s: float | None = None
     ) -> Dataset:
         """Uploads a folder with all below it, or an archive (.zip, .tar, .tar.gz, .tgz), and waits until it is checked.
 
         The same content and options again give the dataset that is there. Without `timeout_s` it takes as long as it
         takes. Raises DatasetInvalid with the file and the frame, DatasetExists, UploadTooLarge, StorageFull.
         """
-        upload = Upload(name, path, options or DatasetOptions())
-        return self._connection.answer_upload(upload_dataset(), partial(_read, upload), timeout_s)
+        messages = partial(_read, Upload(name, path, options or DatasetOptions()))
+        answer = self._connection.upload(self._calls.UploadDataset, messages, timeout_s)
+        return dataset_from_message(answer.dataset)
 
     def list(self, *, timeout_s: float | None = None) -> tuple[Dataset, ...]:
         """All datasets by name."""
-        return self._connection.all_pages(Pages(list_datasets, None), timeout_s)
+        request = datasets_pb2.ListDatasetsRequest()
+        datasets = self._connection.listed(self._calls.ListDatasets, request, "datasets", timeout_s)
+        return tuple(map(dataset_from_message, datasets))
 
     def get(self, name: str, *, timeout_s: float | None = None) -> Dataset:
         """One dataset."""
-        return self._connection.answer(get_dataset(name), timeout_s)
+        request = datasets_pb2.GetDatasetRequest(dataset=name)
+        return dataset_from_message(self._connection.answer(self._calls.GetDataset, request, timeout_s))
 
     def contact_sheet(self, name: str, *, timeout_s: float | None = None) -> bytes:
         """A PNG of the image planes in space and of some frames."""
-        return self._connection.answer(contact_sheet(name), timeout_s)
+        request = datasets_pb2.GetContactSheetRequest(dataset=name)
+        return bytes((self._connection.answer(self._calls.GetContactSheet, request, timeout_s)).png)
 
     def delete(self, name: str, *, timeout_s: float | None = None) -> None:
         """Raises DatasetInUse where a job needs it."""
-        self._connection.answer(delete_dataset(name), timeout_s)
+        request = datasets_pb2.DeleteDatasetRequest(dataset=name)
+        self._connection.delete(self._calls.DeleteDataset, request, timeout_s)
 
 
 def _read(upload: Upload) -> Iterator[datasets_pb2.UploadDatasetRequest]:

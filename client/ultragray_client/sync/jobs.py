@@ -3,30 +3,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+import uuid
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import closing
-from functools import partial
 from pathlib import Path
 from typing import Any
 
-from ..connection import Pages
+from ultragray_proto.v1 import jobs_pb2, jobs_pb2_grpc
+
+from ..contract import FrameSettings
 from ..downloads import downloaded
-from ..geometry import PoseLike
-from ..jobs import (
-    Job,
-    JobEvent,
-    JobKind,
-    JobState,
-    Watch,
-    cancel_job,
-    delete_job,
-    get_job,
-    job_log,
-    list_jobs,
-    retry_job,
-    submit_render,
-    submit_train,
-)
+from ..geometry import PoseLike, pose_messages
+from ..jobs import Job, JobEvent, JobFilter, JobKind, JobState, Watch, job_from_message, sampler_message
+from ..messages import message_of
 from .connection import Connection
 from .transport import run_blocking
 
@@ -40,6 +29,7 @@ class Jobs:
 
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
+        self._calls = jobs_pb2_grpc.JobServiceStub(connection.channel)
 
     def train(
         self,
@@ -58,29 +48,18 @@ class Jobs:
         `preset` "fast" or "paper"; `settings` replace some of its training settings. Raises DatasetNotFound,
         SceneExists, JobQueueFull, InvalidArgument.
         """
-        operation = submit_train(
-            dataset,
-            scene,
-            preset=preset,
-            settings=settings,
-            device=device,
-            request_id=request_id,
-            priority=priority,
-        )
-        return self._connection.answer(operation, timeout_s)
+        job = jobs_pb2.TrainJob(dataset=dataset, scene=scene, preset=preset, device=device, settings=settings)
+        return self._submit(jobs_pb2.SubmitJobRequest(train=job, priority=priority), request_id, timeout_s)
 
     def render(
         self,
         scene: str,
+        settings: FrameSettings | None = None,
         *,
         poses: Iterable[PoseLike] | None = None,
         sampler: Mapping[str, Any] | None = None,
-        height: int | None = None,
-        width: int | None = None,
-        outputs: Sequence[str] = ("bmode",),
         format: str = "npz",
         dtype: str = "",
-        min_confidence: float | None = None,
         request_id: str | None = None,
         priority: int = 0,
         timeout_s: float | None = None,
@@ -90,23 +69,24 @@ class Jobs:
 
         A sampler's `kind` is training, around, spline, fan or covered. `format` "npz", "tar", "zarr", "hdf5", "dicom"
         or "plus"; `dtype` "uint8" or "float32", empty: the format's own. A pose whose confidence is below
-        `min_confidence`, 0 to 1, is refused; a sampler keeps within it. Raises SceneNotFound, JobQueueFull,
+        `min_confidence` of the settings is refused; a sampler keeps within it. Raises SceneNotFound, JobQueueFull,
         ExtraMissing, StorageFull, LowConfidence and other kinds of InvalidArgument.
         """
-        operation = submit_render(
-            scene,
-            poses=poses,
-            sampler=sampler,
-            height=height,
-            width=width,
-            outputs=outputs,
-            archive_format=format,
+        job = message_of(
+            settings or FrameSettings(),
+            jobs_pb2.RenderJob,
+            scene=scene,
+            poses=() if poses is None else pose_messages(poses),
+            sampler=None if sampler is None else sampler_message(sampler),
+            format=format,
             dtype=dtype,
-            min_confidence=min_confidence,
-            request_id=request_id,
-            priority=priority,
         )
-        return self._connection.answer(operation, timeout_s)
+        return self._submit(jobs_pb2.SubmitJobRequest(render=job, priority=priority), request_id, timeout_s)
+
+    def _submit(self, request: jobs_pb2.SubmitJobRequest, request_id: str | None, timeout_s: float | None) -> Job:
+        # With an id of its own a submission that is sent again gives the same job.
+        request.request_id = uuid.uuid4().hex if request_id is None else request_id
+        return job_from_message((self._connection.answer(self._calls.SubmitJob, request, timeout_s)).job)
 
     def list(
         self,
@@ -117,18 +97,21 @@ class Jobs:
         timeout_s: float | None = None,
     ) -> tuple[Job, ...]:
         """The newest jobs first, at most `limit`; None: all that the service keeps."""
-        return self._connection.all_pages(Pages(partial(list_jobs, state, kind), limit), timeout_s)
+        request = message_of(JobFilter(state, kind), jobs_pb2.ListJobsRequest)
+        jobs = self._connection.listed(self._calls.ListJobs, request, "jobs", timeout_s, limit=limit)
+        return tuple(map(job_from_message, jobs))
 
     def get(self, job_id: str, *, timeout_s: float | None = None) -> Job:
         """One job."""
-        return self._connection.answer(get_job(job_id), timeout_s)
+        request = jobs_pb2.GetJobRequest(job=job_id)
+        return job_from_message(self._connection.answer(self._calls.GetJob, request, timeout_s))
 
     def watch(self, job_id: str, *, timeout_s: float | None = None) -> Iterator[JobEvent]:
         """The job at first and whenever it changed, and new lines of its log, until it is in its final state.
 
         Goes on where the service was restarted in the meantime. Without `timeout_s` it takes as long as the job.
         """
-        return self._connection.converse(Watch(job_id), timeout_s)
+        return self._connection.converse(self._calls.WatchJob, Watch(job_id), timeout_s)
 
     def wait(self, job_id: str, *, timeout_s: float | None = None) -> Job:
         """The job in its final state, whichever that is."""
@@ -140,19 +123,23 @@ class Jobs:
 
     def cancel(self, job_id: str, *, timeout_s: float | None = None) -> Job:
         """Stops a job within a second. Raises JobFinished for one that succeeded or failed."""
-        return self._connection.answer(cancel_job(job_id), timeout_s)
+        request = jobs_pb2.CancelJobRequest(job=job_id)
+        return job_from_message(self._connection.answer(self._calls.CancelJob, request, timeout_s))
 
     def retry(self, job_id: str, *, timeout_s: float | None = None) -> Job:
         """A new job in place of a failed or cancelled one; asked again, the same one. Raises JobNotFinished."""
-        return self._connection.answer(retry_job(job_id), timeout_s)
+        request = jobs_pb2.RetryJobRequest(job=job_id)
+        return job_from_message(self._connection.answer(self._calls.RetryJob, request, timeout_s))
 
     def delete(self, job_id: str, *, timeout_s: float | None = None) -> None:
         """Removes a finished job and its files; a scene that it trained stays. Raises JobInUse."""
-        self._connection.answer(delete_job(job_id), timeout_s)
+        request = jobs_pb2.DeleteJobRequest(job=job_id)
+        self._connection.delete(self._calls.DeleteJob, request, timeout_s)
 
     def log(self, job_id: str, *, max_bytes: int = 65536, timeout_s: float | None = None) -> str:
         """The end of what the job's process said."""
-        return self._connection.answer(job_log(job_id, max_bytes), timeout_s)
+        request = jobs_pb2.GetJobLogRequest(job=job_id, max_bytes=max_bytes)
+        return str((self._connection.answer(self._calls.GetJobLog, request, timeout_s)).log)
 
     def download(self, job_id: str, artifact: str, path: str | Path, *, timeout_s: float | None = None) -> None:
         """Writes an artifact to the file `path`, whole or not at all; goes on where the connection broke.
@@ -160,7 +147,7 @@ class Jobs:
         Raises ArtifactNotFound, and OSError where the file cannot be written.
         """
         with downloaded(job_id, artifact, Path(path)) as download:
-            chunks = self._connection.converse(download, timeout_s)
+            chunks = self._connection.converse(self._calls.DownloadArtifact, download, timeout_s)
             with closing(chunks):
                 for chunk in chunks:
                     run_blocking(download.write, chunk)

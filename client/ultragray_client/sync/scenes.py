@@ -3,8 +3,9 @@
 
 from __future__ import annotations
 
-from ..connection import Pages
-from ..scenes import Scene, SceneEntry, get_scene, list_scenes, load_scene, unload_scene
+from ultragray_proto.v1 import scenes_pb2, scenes_pb2_grpc
+
+from ..scenes import Scene, SceneEntry, entry_from_message, scene_from_message
 from .connection import Connection
 
 
@@ -13,19 +14,25 @@ class Scenes:
 
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
+        self._calls = scenes_pb2_grpc.SceneServiceStub(connection.channel)
 
     def list(self, *, timeout_s: float | None = None) -> tuple[SceneEntry, ...]:
         """All scenes by name."""
-        return self._connection.all_pages(Pages(list_scenes, None), timeout_s)
+        request = scenes_pb2.ListScenesRequest()
+        scenes = self._connection.listed(self._calls.ListScenes, request, "scenes", timeout_s)
+        return tuple(map(entry_from_message, scenes))
 
     def get(self, name: str, *, timeout_s: float | None = None) -> Scene:
-        """What a scene says about itself."""
-        return self._connection.answer(get_scene(name), timeout_s)
+        """All that a scene says about itself."""
+        request = scenes_pb2.GetSceneRequest(scene=name)
+        return scene_from_message(self._connection.answer(self._calls.GetScene, request, timeout_s))
 
     def load(self, name: str, *, timeout_s: float | None = None) -> int:
         """Loads a scene ahead of its first frame; the number of render processes that hold it."""
-        return self._connection.answer(load_scene(name), timeout_s)
+        request = scenes_pb2.LoadSceneRequest(scene=name)
+        return int((self._connection.answer(self._calls.LoadScene, request, timeout_s)).loaded_processes)
 
     def unload(self, name: str, *, timeout_s: float | None = None) -> int:
         """Frees a scene's memory; the number of render processes that still hold it."""
-        return self._connection.answer(unload_scene(name), timeout_s)
+        request = scenes_pb2.UnloadSceneRequest(scene=name)
+        return int((self._connection.answer(self._calls.UnloadScene, request, timeout_s)).loaded_processes)

@@ -11,16 +11,14 @@ from ..frames import Frame
 from ..geometry import PoseLike
 from ..pose_exchange import PoseExchange
 from ..statuses import client_errors
-from .connection import Connection
+from .transport import PoseCall
 
 
 class FrameStream:
     """Poses in, frames out; sending and receiving may go on side by side. Leaving it as a context ends it."""
 
-    def __init__(self, connection: Connection, exchange: PoseExchange, timeout_s: float | None) -> None:
-        self._address = connection.address
-        self._exchange = exchange
-        self._call = connection.pose_call(exchange, timeout_s)
+    def __init__(self, address: str, exchange: PoseExchange, call: PoseCall) -> None:
+        self._address, self._exchange, self._call = address, exchange, call
 
     def send(self, pose: PoseLike, *, timeout_s: float | None = None, measured_ns: int | None = None) -> int:
         """Sends a pose ([4, 4] mm, or a Placement) and returns the sequence that its frame will carry, from 1.
