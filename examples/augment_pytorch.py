@@ -61,7 +61,7 @@ class SimulatedFrames(IterableDataset[Sample]):
         """All poses of the epoch; `epoch` chooses others."""
         if scene.probe is None or not scene.training_poses:
             raise SystemExit(f"{scene.name} does not say which probe and poses it was trained with")
-        probe = getattr(ultragray, type(scene.probe).__name__)(**asdict(scene.probe))
+        probe = ultragray.probe.probe_from_dict(asdict(scene.probe))
         path = SplineSampler(count=PATH_POSES).poses(np.stack(scene.training_poses), probe)
         around = AroundSampler(
             count=self._count,
