@@ -162,6 +162,7 @@ def from_dict(cls: type[_T], document: Any) -> _T:
     if is_family and Family in cls.__bases__:
         cls = cls.member(document.get("kind"))  # type: ignore[attr-defined]
     known = {item.name: (item, annotation) for item, annotation in annotated_fields(cls)}
+    document = {name: value for name, value in document.items() if value is not None or not _needs_value(known, name)}
     for name in document:
         if name not in known:
             takes = ", ".join(one for one in known if one != "kind") or "nothing"
@@ -175,6 +176,11 @@ def from_dict(cls: type[_T], document: Any) -> _T:
         with under(name, error):
             values[name] = _read(value, known[name][1])
     return cls(**values)
+
+
+def _needs_value(known: Mapping[str, tuple[Field[Any], Any]], name: str) -> bool:
+    """Whether null for a field is as if it were left out: it allows none."""
+    return name in known and not optional_of(known[name][1])[1]
 
 
 def _title(cls: Any) -> str:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 import ultragray
-from ultragray import (
+from ultragray import contract, (
     ConvexProbe,
     GaussianScene,
     LinearProbe,
@@ -95,6 +95,7 @@ def test_other_modules() -> None:
         for value in (getattr(confidence, name) for name in confidence.__all__)
         if callable(value)
     }
+    found |= {f"{contract.__name__}.{call_of(function)}" for function in (contract.from_dict, contract.to_dict)}
     assert set(table("Other modules")) == found
 
 
@@ -107,8 +108,9 @@ def test_samplers() -> None:
         kind: {
             item.name: "required" if item.default is dataclasses.MISSING else item.default
             for item in dataclasses.fields(cls)
+            if item.name != "kind"
         }
-        for kind, cls in samplers.SAMPLERS.items()
+        for kind, cls in samplers.Sampler.members.items()
     }
 
 

@@ -1,7 +1,7 @@
 """Many poses made from few: pose samplers, as `ultragray render`, render jobs and scripts name them. Free of torch.
 
 A sampler is made of numbers, travels as a JSON object with a `kind`, and makes the same poses wherever it is asked:
-`sampler_from_dict({"kind": "fan", "tilt_deg": 10, "step_deg": 5}).poses(base, probe)`.
+`from_dict(Sampler, {"kind": "fan", "tilt_deg": 10, "step_deg": 5}).poses(base, probe)` (`ultragray.contract`).
 """
 
 from __future__ import annotations
@@ -10,14 +10,12 @@ from .around import AroundSampler
 from .confident import Assess, assessed_poses, confident_poses
 from .covered import CoveredSampler
 from .fan import FanSampler
-from .named import SAMPLERS, sampler_from_dict, sampler_to_dict
 from .sampler import MAX_POSES, Sampler
 from .spline import SplineSampler
 from .training import TrainingSampler
 
 __all__ = [
     "MAX_POSES",
-    "SAMPLERS",
     "AroundSampler",
     "Assess",
     "CoveredSampler",
@@ -27,6 +25,4 @@ __all__ = [
     "TrainingSampler",
     "assessed_poses",
     "confident_poses",
-    "sampler_from_dict",
-    "sampler_to_dict",
 ]

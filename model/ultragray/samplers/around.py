@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Literal
 
 import numpy as np
 
+from ..contract import described, kind_field
 from ..probe import FloatArray, Probe
 from .rotations import about_axes, random_directions
-from .sampler import MAX_ROTATION_DEG, MAX_TRANSLATION_MM, Sampler, is_number
+from .sampler import Sampler, count_field, seed_field
 
 
 @dataclass(frozen=True)
@@ -20,18 +21,13 @@ class AroundSampler(Sampler):
     shifts by a normal step of standard deviation `translation_mm` along each axis. Raises InvalidArgument.
     """
 
-    count: int
-    translation_mm: float = 2.0
-    rotation_deg: float = 5.0
-    seed: int = 0
+    count: int = count_field()
+    translation_mm: float = described("Standard deviation along each axis.", 2.0, low=0.0, high=1000.0)
+    rotation_deg: float = described("Standard deviation of the angle.", 5.0, low=0.0, high=180.0)
+    seed: int = seed_field()
+    kind: Literal["around"] = kind_field("around")
 
-    kind: ClassVar[str] = "around"
-
-    def __post_init__(self) -> None:
-        self._require_count()
-        for name, limit in (("translation_mm", MAX_TRANSLATION_MM), ("rotation_deg", MAX_ROTATION_DEG)):
-            self._require(is_number(getattr(self, name), 0.0, limit), name, f"between 0 and {limit:g}")
-        self._require_seed()
+    draws = True
 
     def _made(self, base: FloatArray, probe: Probe) -> FloatArray:
         random = np.random.default_rng(self.seed)

@@ -13,8 +13,6 @@ from ..confidence import Extrapolation, is_confident, require_confidence
 from ..errors import LowConfidence
 from ..pose import check_poses
 from ..probe import FloatArray, Probe
-from .around import AroundSampler
-from .covered import CoveredSampler
 from .sampler import Sampler
 
 MOST_DRAWS_PER_POSE, LEAST_DRAWS = 20, 1000  # where so many do not suffice, the search is given up
@@ -50,7 +48,7 @@ def confident_poses(
     does not have it. `assess` is an Assessor's, with the probe of the frames. Raises LowConfidence where no pose is
     left, or too few are found, and what `sampler.poses` raises.
     """
-    if isinstance(sampler, (AroundSampler, CoveredSampler)):
+    if sampler.draws:
         return _drawn_on(sampler, base, probe, assess, min_confidence)
     poses = sampler.poses(base, probe)
     extrapolations = list(assess(poses))
@@ -66,7 +64,7 @@ def confident_poses(
 
 
 def _drawn_on(
-    sampler: AroundSampler | CoveredSampler, base: Any, probe: Probe, assess: Assess, min_confidence: float
+    sampler: Any, base: Any, probe: Probe, assess: Assess, min_confidence: float
 ) -> tuple[FloatArray, list[Extrapolation]]:
     count, most = sampler.count, max(LEAST_DRAWS, MOST_DRAWS_PER_POSE * sampler.count)
     poses: list[FloatArray] = []

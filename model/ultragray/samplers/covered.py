@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Literal
 
 import numpy as np
 
+from ..contract import kind_field
 from ..errors import InvalidArgument
 from ..probe import FloatArray, Probe
 from .rotations import about_axes, blended, random_directions
-from .sampler import Sampler
+from .sampler import Sampler, count_field, seed_field
 
 MAX_BASE_POSES = 10_000  # all are compared with all
 LARGEST_GAP = 4.0  # in median lengths of the links
@@ -28,14 +29,11 @@ class CoveredSampler(Sampler):
     turned about a random axis by an angle uniform up to the angle between them. Raises InvalidArgument.
     """
 
-    count: int
-    seed: int = 0
+    count: int = count_field()
+    seed: int = seed_field()
+    kind: Literal["covered"] = kind_field("covered")
 
-    kind: ClassVar[str] = "covered"
-
-    def __post_init__(self) -> None:
-        self._require_count()
-        self._require_seed()
+    draws = True
 
     def _made(self, base: FloatArray, probe: Probe) -> FloatArray:
         if len(base) < 2:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Literal
 
 import numpy as np
 
+from ..contract import described, kind_field
 from ..probe import FloatArray, LinearProbe, Probe
 from .rotations import about_axes
-from .sampler import Sampler, is_number
+from .sampler import Sampler
 
 MAX_TILT_DEG = 90.0  # the beam lies along the skin then
 
@@ -24,18 +25,9 @@ class FanSampler(Sampler):
     `freehand_poses(tilt_deg=…)` of the phantom does. Raises InvalidArgument.
     """
 
-    tilt_deg: float
-    step_deg: float
-
-    kind: ClassVar[str] = "fan"
-
-    def __post_init__(self) -> None:
-        self._require(is_number(self.tilt_deg, 0.0, MAX_TILT_DEG), "tilt_deg", f"from 0 to {MAX_TILT_DEG:g}")
-        self._require(
-            is_number(self.step_deg, 0.0, MAX_TILT_DEG) and self.step_deg > 0.0,
-            "step_deg",
-            f"above 0, at most {MAX_TILT_DEG:g}",
-        )
+    tilt_deg: float = described("The largest tilt, to both sides.", low=0.0, high=MAX_TILT_DEG)
+    step_deg: float = described("Between two tilts.", above=0.0, high=MAX_TILT_DEG)
+    kind: Literal["fan"] = kind_field("fan")
 
     def _made(self, base: FloatArray, probe: Probe) -> FloatArray:
         steps = math.floor(min(self.tilt_deg / self.step_deg, 1e9) + 1e-9)

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Literal
 
 import numpy as np
 
+from ..contract import described, kind_field
 from ..errors import InvalidArgument
 from ..pose import rotation_angles_deg
 from ..probe import FloatArray, Probe
 from .rotations import blended
-from .sampler import MAX_POSES, Sampler, is_number
+from .sampler import MAX_POSES, Sampler, count_field
 
 SMALLEST_STEP_MM, SMALLEST_TURN_DEG = 1e-9, 1e-6
-MAX_SPACING_MM = 1000.0
 
 
 @dataclass(frozen=True)
@@ -28,19 +28,14 @@ class SplineSampler(Sampler):
     along the chords. Poses that repeat count once. Raises InvalidArgument.
     """
 
-    count: int | None = None
-    spacing_mm: float | None = None
-
-    kind: ClassVar[str] = "spline"
+    count: int | None = count_field(None)
+    spacing_mm: float | None = described("Instead of count: distance along the path.", None, above=0.0, high=1000.0)
+    kind: Literal["spline"] = kind_field("spline")
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if (self.count is None) == (self.spacing_mm is None):
             raise InvalidArgument("exactly one of count and spacing_mm must be given", field="count")
-        if self.count is not None:
-            self._require_count()
-        else:
-            holds = is_number(self.spacing_mm, 0.0, MAX_SPACING_MM) and self.spacing_mm != 0
-            self._require(holds, "spacing_mm", f"above 0, at most {MAX_SPACING_MM:g}")
 
     def _made(self, base: FloatArray, probe: Probe) -> FloatArray:
         knots = _without_repetitions(base)

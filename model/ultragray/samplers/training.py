@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Literal
 
+from ..contract import kind_field
 from ..probe import FloatArray, Probe
 from .sampler import Sampler
 
@@ -13,7 +14,7 @@ from .sampler import Sampler
 class TrainingSampler(Sampler):
     """The training poses of the scene as they are, in order."""
 
-    kind: ClassVar[str] = "training"
+    kind: Literal["training"] = kind_field("training")
 
     def _made(self, base: FloatArray, probe: Probe) -> FloatArray:
         return base

@@ -17,6 +17,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
 
 from ultragray.confidence import Assessor, Extrapolation, figure_arrays
+from ultragray.contract import from_dict
 from ultragray.display import AS_RENDERED, Display
 from ultragray.errors import InvalidArgument, InvalidProbe
 from ultragray.files.atomic import file_sha256
@@ -27,7 +28,7 @@ from ultragray.interchange.rendering import render_into
 from ultragray.outputs import check_outputs
 from ultragray.probe import LinearProbe, Probe, probe_from_dict
 from ultragray.rendering import renderer_name
-from ultragray.samplers import TrainingSampler, assessed_poses, sampler_from_dict
+from ultragray.samplers import Sampler, TrainingSampler, assessed_poses
 from ultragray.scene import GaussianScene
 from ultragray.settings import Encoding, FrameSettings
 from ultragray_workers.pool.process.placement import render_device
@@ -69,7 +70,7 @@ def render_to_files(options: RenderOptions) -> str:
     dtype = "uint8" if format is None else check_format(format, outputs, options.dtype)
     if format is not None:
         exporter_class(format)  # raises where its package is missing
-    sampler = None if options.sampler is None else sampler_from_dict(options.sampler)
+    sampler = None if options.sampler is None else from_dict(Sampler, options.sampler)
     given_probe = None if options.probe_json is None else _parse_probe(options.probe_json)
     given_poses = None if options.poses is None else load_poses(options.poses)
     scene = GaussianScene.load(options.scene)

@@ -9,17 +9,16 @@ import numpy as np
 import pytest
 
 from ultragray import ConvexProbe, LinearProbe
+from ultragray.contract import from_dict, to_dict
 from ultragray.errors import InvalidArgument
 from ultragray.pose import check_poses, position_distances_mm, rotation_angles_deg
 from ultragray.samplers import (
-    SAMPLERS,
     AroundSampler,
     CoveredSampler,
     FanSampler,
+    Sampler,
     SplineSampler,
     TrainingSampler,
-    sampler_from_dict,
-    sampler_to_dict,
 )
 
 PROBE = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)
@@ -54,11 +53,11 @@ def swept(count: int = 9, length_mm: float = 16.0) -> np.ndarray:
     ],
 )
 def test_there_and_back_and_again(sampler: Any) -> None:
-    document = json.loads(json.dumps(sampler_to_dict(sampler)))
-    assert sampler_from_dict(document) == sampler
+    document = json.loads(json.dumps(to_dict(sampler, with_none=False)))
+    assert from_dict(Sampler, document) == sampler
     poses = sampler.poses(swept(), PROBE)
     np.testing.assert_array_equal(check_poses(poses), poses)
-    np.testing.assert_array_equal(sampler_from_dict(document).poses(swept(), PROBE), poses)
+    np.testing.assert_array_equal(from_dict(Sampler, document).poses(swept(), PROBE), poses)
 
 
 def test_around_has_the_spread_asked_for() -> None:
@@ -169,17 +168,17 @@ def test_covered_turns_no_further_than_its_neighbours() -> None:
 @pytest.mark.parametrize(
     ("document", "field", "told"),
     [
-        (3, "kind", "an object"),
-        ({}, "kind", "one of training, around"),
+        (3, None, "an object"),
+        ({}, "kind", "one of around, covered"),
         ({"kind": ["fan"]}, "kind", "one of"),
-        ({"kind": "training", "count": 3}, "count", "nothing else"),
+        ({"kind": "training", "count": 3}, "count", "takes nothing"),
         ({"kind": "around"}, "count", "required"),
         ({"kind": "around", "count": True}, "count", "integer"),
         ({"kind": "around", "count": 100_001}, "count", "100000"),
-        ({"kind": "around", "count": 1, "translation_mm": -1}, "translation_mm", "between 0 and 1000"),
+        ({"kind": "around", "count": 1, "translation_mm": -1}, "translation_mm", "from 0 to 1000"),
         ({"kind": "around", "count": 1, "rotation_deg": float("nan")}, "rotation_deg", "180"),
         ({"kind": "around", "count": 1, "seed": 0.5}, "seed", "integer"),
-        ({"kind": "around", "count": 1, "tilt_deg": 3}, "tilt_deg", "it takes count, translation_mm"),
+        ({"kind": "around", "count": 1, "tilt_deg": 3}, "tilt_deg", "takes count, translation_mm"),
         ({"kind": "spline"}, "count", "exactly one"),
         ({"kind": "spline", "count": 3, "spacing_mm": 1.0}, "count", "exactly one"),
         ({"kind": "spline", "spacing_mm": 0}, "spacing_mm", "above 0"),
@@ -190,18 +189,18 @@ def test_covered_turns_no_further_than_its_neighbours() -> None:
         ({"kind": "covered", "count": 1, "seed": -1}, "seed", "integer"),
     ],
 )
-def test_mistakes_name_the_field(document: Any, field: str, told: str) -> None:
+def test_mistakes_name_the_field(document: Any, field: str | None, told: str) -> None:
     with pytest.raises(InvalidArgument, match=told) as caught:
-        sampler_from_dict(document)
+        from_dict(Sampler, document)
     assert caught.value.field == field
 
 
-@pytest.mark.parametrize("kind", SAMPLERS)
+@pytest.mark.parametrize("kind", Sampler.members)
 def test_no_base_poses(kind: str) -> None:
     numbers = {"around": {"count": 1}, "spline": {"count": 1}, "covered": {"count": 1}}
     numbers["fan"] = {"tilt_deg": 1, "step_deg": 1}
     with pytest.raises(InvalidArgument, match="needs base poses"):
-        sampler_from_dict({"kind": kind, **numbers.get(kind, {})}).poses(np.zeros((0, 4, 4)), PROBE)
+        from_dict(Sampler, {"kind": kind, **numbers.get(kind, {})}).poses(np.zeros((0, 4, 4)), PROBE)
 
 
 def test_needs_no_torch() -> None:

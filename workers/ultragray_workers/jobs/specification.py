@@ -12,14 +12,16 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from ultragray.contract import checked_number, under
+from ultragray.contract import from_dict as from_json
+from ultragray.contract import to_dict as to_json
 from ultragray.errors import InvalidArgument
 from ultragray.image_size import check_image_size
 from ultragray.interchange.exports import check_format
 from ultragray.outputs import check_outputs
 from ultragray.pose import check_poses
 from ultragray.probe import FloatArray
-from ultragray.samplers import MAX_POSES, Sampler, TrainingSampler, sampler_from_dict, sampler_to_dict
-from ultragray.samplers.sampler import is_number
+from ultragray.samplers import MAX_POSES, Sampler, TrainingSampler
 from ultragray.training.config import PRESETS, TrainingConfig
 
 from ..scenes import check_scene_name
@@ -103,9 +105,9 @@ class RenderJob:
         object.__setattr__(self, "outputs", check_outputs(self.outputs))
         check_format(self.format, self.outputs, self.dtype)
         if self.min_confidence is not None:
-            is_share = is_number(self.min_confidence, 0.0, 1.0)
-            _require(is_share, "min_confidence", "a number from 0 to 1", self.min_confidence)
-            object.__setattr__(self, "min_confidence", float(self.min_confidence))
+            with under("min_confidence"):
+                share = checked_number(self.min_confidence, float, low=0.0, high=1.0)
+            object.__setattr__(self, "min_confidence", share)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, RenderJob) and to_dict(self) == to_dict(other)
@@ -168,7 +170,7 @@ def _without_poses(specification: Specification) -> dict[str, Any]:
     values = {name: getattr(specification, name) for name in names}
     if isinstance(specification, RenderJob):
         values["outputs"] = list(specification.outputs)
-        values["sampler"] = None if specification.sampler is None else sampler_to_dict(specification.sampler)
+        values["sampler"] = None if specification.sampler is None else to_json(specification.sampler, with_none=False)
     return {"kind": specification.kind, **values}
 
 
@@ -194,12 +196,8 @@ def _check_settings(preset: str, settings: dict[str, Any]) -> None:
 
 
 def _sampler(document: Any) -> Sampler:
-    _require(isinstance(document, Mapping), "sampler", "an object", document)
-    try:
-        return sampler_from_dict(document)
-    except InvalidArgument as error:
-        name = f"sampler.{error.field}"
-        raise InvalidArgument(error.detail.replace(str(error.field), name, 1), field=name) from None
+    with under("sampler"):
+        return from_json(Sampler, document)
 
 
 def _make(cls: type[Any], values: dict[str, Any]) -> Any:
