@@ -10,12 +10,13 @@ from pathlib import Path
 import numpy as np
 
 import ultragray
-from ultragray import contract, (
+from ultragray import (
     ConvexProbe,
     GaussianScene,
     LinearProbe,
     PhasedProbe,
     confidence,
+    contract,
     demo,
     errors,
     pose,
