@@ -26,6 +26,9 @@ __all__ = ["postgres"]
 if not torch.cuda.is_available():
     os.environ.setdefault("TRITON_INTERPRET", "1")  # before any kernel is imported: they run on the CPU then
 
+RUN = f"PYTEST_RUN={os.getpid()}\0"  # in the environment of every process that these tests start
+os.environ["PYTEST_RUN"] = str(os.getpid())
+
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 LARGEST_FLIP = 5e-3  # a threshold that flips moves a pixel by about 1/255
 

@@ -12,9 +12,16 @@ import pytest
 
 from ultragray_client import AsyncClient, Client
 
-from ..service.conftest import RunningService, StartService, data_folder, demo_scene, start_service
+from ..service.conftest import (
+    RunningService,
+    StartService,
+    data_folder,
+    demo_scene,
+    start_service,
+    start_shared_service,
+)
 
-__all__ = ["data_folder", "demo_scene", "start_service"]
+__all__ = ["data_folder", "demo_scene", "start_service", "start_shared_service"]
 
 KEY = "0123456789abcdef-client"
 MAX_POSES = 40
@@ -75,9 +82,9 @@ def event_loop_thread() -> Iterator[asyncio.AbstractEventLoop]:
 
 
 @pytest.fixture(scope="session")
-def client_service(start_service: StartService, tmp_path_factory: pytest.TempPathFactory) -> RunningService:
+def client_service(start_shared_service: StartService, tmp_path_factory: pytest.TempPathFactory) -> RunningService:
     """It takes few poses at a time, and has a worker for jobs."""
-    return start_service(
+    return start_shared_service(
         artifact_folder=tmp_path_factory.mktemp("artifacts"),
         max_poses_per_request=MAX_POSES,
         max_image_side=600,

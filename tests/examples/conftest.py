@@ -12,9 +12,9 @@ import pytest
 
 from ultragray.demo import DEMO_FILE
 
-from ..service.conftest import ROOT, RunningService, StartService, start_service
+from ..service.conftest import ROOT, RunningService, StartService, start_shared_service
 
-__all__ = ["start_service"]
+__all__ = ["start_shared_service"]
 
 EXAMPLES = ROOT / "examples"
 
@@ -28,8 +28,8 @@ def data_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def demo_service(start_service: StartService) -> RunningService:
-    return start_service(preload="demo")
+def demo_service(start_shared_service: StartService) -> RunningService:
+    return start_shared_service(preload="demo")
 
 
 @pytest.fixture(scope="session")

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -21,18 +22,23 @@ import torch
 from ultragray import GaussianScene, LinearProbe, SceneInfo
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2, rendering_pb2_grpc, scenes_pb2_grpc
 
+from ..warm import SOURCE_FOLDERS, WARM_TEMPLATES, WarmProcess, WarmServer, fork
+
 ROOT = Path(__file__).resolve().parents[2]
-SOURCE_FOLDERS = ("model", "proto", "workers", "service")
 START_TIMEOUT_S = 60.0
 STOP_TIMEOUT_S = 30.0
 
+WARM_SERVICES = WarmServer("ultragray_service.__main__")
 HEIGHT, WIDTH = 64, 48  # of the training images of the test scene
 
 
 class RunningService:
-    """`python -m ultragray_service` and the addresses it told in its log."""
+    """The service in a process of its own, and the addresses it told in its log; ended with the `with` block."""
 
-    def __init__(self, data_folder: Path, log_path: Path, environment: dict[str, str]) -> None:
+    process: WarmProcess | subprocess.Popen[bytes]
+
+    def __init__(self, data_folder: Path, log_path: Path, environment: dict[str, str], *, cold: bool = False) -> None:
+        """`cold` starts `python -m ultragray_service`; else it is forked from a process with the imports done."""
         self.data_folder = data_folder
         self.log_path = log_path
         settings = {
@@ -43,13 +49,24 @@ class RunningService:
             "ULTRAGRAY_EMBEDDED_WORKER": "false",
             "PYTHONPATH": os.pathsep.join(str(ROOT / folder) for folder in SOURCE_FOLDERS),
         }
-        with log_path.open("wb") as log:
-            self.process = subprocess.Popen(
-                [sys.executable, "-m", "ultragray_service"],
-                env={**os.environ, **settings, **environment},
-                stderr=log,
-                cwd=log_path.parent,
-            )
+        whole = {**os.environ, **settings, **environment}
+        folder = log_path.parent
+        with log_path.open("wb") as log, Path(os.devnull).open("rb") as nothing:
+            if cold:
+                command = [sys.executable, "-m", "ultragray_service"]
+                self.process = subprocess.Popen(command, env=whole, stdin=nothing, stderr=log, cwd=folder)
+            else:
+                files = (nothing.fileno(), log.fileno(), log.fileno())
+                arguments = [str(WARM_TEMPLATES.path())]
+                self.process = fork(
+                    WARM_SERVICES.path(), "service", arguments, environment=whole, folder=folder, files=files
+                )
+
+    def __enter__(self) -> RunningService:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.terminate()
 
     def log(self) -> list[dict[str, Any]]:
         whole = self.log_path.read_text().rpartition("\n")[0]  # the last line may be half written
@@ -143,28 +160,37 @@ def data_folder(tmp_path_factory: pytest.TempPathFactory, demo_scene: GaussianSc
     return folder
 
 
-@pytest.fixture(scope="session")
-def start_service(tmp_path_factory: pytest.TempPathFactory, data_folder: Path) -> Iterator[StartService]:
+def service_starter(tmp_path_factory: pytest.TempPathFactory, data_folder: Path) -> Iterator[StartService]:
     """Starts services with settings as keywords: `start_service(max_image_side=128)`; all are stopped at the end."""
-    started: list[RunningService] = []
+    with ExitStack() as started:
 
-    def start(*, wait: bool = True, **settings: object) -> RunningService:
-        environment = {f"ULTRAGRAY_{name.upper()}": str(value) for name, value in settings.items()}
-        service = RunningService(data_folder, tmp_path_factory.mktemp("service") / "log", environment)
-        started.append(service)
-        if wait:
-            service.wait_until_serving()
-        return service
+        def start(*, wait: bool = True, cold: bool = False, **settings: object) -> RunningService:
+            environment = {f"ULTRAGRAY_{name.upper()}": str(value) for name, value in settings.items()}
+            log_path = tmp_path_factory.mktemp("service") / "log"
+            service = started.enter_context(RunningService(data_folder, log_path, environment, cold=cold))
+            if wait:
+                service.wait_until_serving()
+            return service
 
-    yield start
-    for service in started:
-        service.terminate()
+        yield start
+
+
+@pytest.fixture(scope="module")
+def start_service(tmp_path_factory: pytest.TempPathFactory, data_folder: Path) -> Iterator[StartService]:
+    """Starts services that live until the module ends."""
+    yield from service_starter(tmp_path_factory, data_folder)
 
 
 @pytest.fixture(scope="session")
-def service(start_service: StartService) -> RunningService:
+def start_shared_service(tmp_path_factory: pytest.TempPathFactory, data_folder: Path) -> Iterator[StartService]:
+    """Starts services that live until all tests have ended: for those that tests only read from."""
+    yield from service_starter(tmp_path_factory, data_folder)
+
+
+@pytest.fixture(scope="session")
+def service(start_shared_service: StartService) -> RunningService:
     """The service that most tests share."""
-    return start_service(
+    return start_shared_service(
         max_image_side=600, max_poses_per_request=40, queue_limit_frames=64, max_request_pixels=4_000_000
     )
 

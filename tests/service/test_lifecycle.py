@@ -32,7 +32,7 @@ def render(service: RunningService, client: httpx.Client, **body: Any) -> httpx.
 
 
 def test_sigterm_answers_what_is_in_flight_and_exits_cleanly(start_service: StartService) -> None:
-    service = start_service(**SLOW)
+    service = start_service(cold=True, **SLOW)
     frames = rendering_pb2.RenderSettings(scene="demo", **SMALL)
     with service.channel() as channel, httpx.Client() as client, ThreadPoolExecutor(8) as threads:
         stub = rendering_pb2_grpc.RenderServiceStub(channel)
@@ -159,7 +159,7 @@ def test_interactive_frames_go_before_a_batch(start_service: StartService) -> No
 def test_a_port_in_use_is_one_clear_error(start_service: StartService, service: RunningService) -> None:
     http_port, grpc_port = service.http.rsplit(":", 1)[1], service.grpc.rsplit(":", 1)[1]
     for settings, name in (({"http_port": http_port}, "HTTP"), ({"grpc_port": grpc_port}, "gRPC")):
-        second = start_service(wait=False, **settings)
+        second = start_service(wait=False, cold=name == "HTTP", **settings)
         assert second.process.wait(30) == 1
         said = second.log_path.read_text().splitlines()
         assert f"{name} cannot listen on 127.0.0.1:" in said[-1]

@@ -19,13 +19,32 @@ from ultragray import GaussianScene, render
 from ultragray.confidence import FIGURES
 from ultragray.settings import Encoding
 from ultragray_workers import PoolConfig, RenderPool, RenderRequest, RenderResult, SceneStore
+from ultragray_workers.pool import launcher
 
+from ..conftest import RUN
+from ..waiting import wait_until
+from ..warm import WARM_TEMPLATES, start_template
 from .asking import HEIGHT, PROBE, WIDTH
 
 TIME_LIMIT_S = 60.0
 
 T = TypeVar("T")
 OpenPool = Callable[..., contextlib.AbstractAsyncContextManager[RenderPool]]
+
+
+@pytest.fixture(autouse=True)
+def warm_templates(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pools of this process have their templates forked, but for tests that ask for `cold_templates`."""
+    monkeypatch.setattr(launcher, "start_template", lambda channel: start_template(WARM_TEMPLATES.path(), channel))
+
+
+_START_COLD = launcher.start_template
+
+
+@pytest.fixture
+def cold_templates(warm_templates: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pools start their templates as they do where there are no tests."""
+    monkeypatch.setattr(launcher, "start_template", _START_COLD)
 
 
 @pytest.fixture
@@ -99,35 +118,37 @@ def processes() -> Callable[[], dict[int, str]]:
 
 @pytest.fixture(autouse=True)
 def nothing_left_behind(processes: Callable[[], dict[int, str]]) -> Iterator[None]:
-    """Every test must end with the processes and open files it began with."""
+    """Every test must end without processes and open files of its own."""
     descriptors = open_channels_and_memories()
     yield
-    give_up = time.monotonic() + 2.0
-    while processes() and time.monotonic() < give_up:
-        time.sleep(0.01)
-    assert processes() == {}
-    assert open_channels_and_memories() == descriptors
+    wait_until(lambda: not processes(), within_s=20)
+    assert open_channels_and_memories() <= descriptors
 
 
-def open_channels_and_memories() -> list[str]:
+def open_channels_and_memories() -> set[str]:
     links = []
     for descriptor in Path("/proc/self/fd").iterdir():
         with contextlib.suppress(FileNotFoundError):
             links.append(os.readlink(descriptor))
-    return sorted(link for link in links if link.startswith(("socket:", "/memfd:")))
+    return {link for link in links if link.startswith(("socket:", "/memfd:"))}
+
+
+_NAMES = ("ug-worker", "ug-template")
+_TEMPLATE = b"ultragray_workers.pool.process.template"
 
 
 def _pool_processes() -> dict[int, str]:
-    """Workers and templates of this test run, by process id: `ug-worker`, `ug-template`, or `python` at the start."""
+    """Workers and templates of this test process, by process id; one that has just been started is called `python`."""
     found = {}
     for folder in Path("/proc").iterdir():
         if not folder.name.isdigit():
             continue
         try:
-            in_group = os.getpgid(int(folder.name)) == os.getpgid(0)
-            if in_group and b"ultragray_workers.pool.process.template" in (folder / "cmdline").read_bytes():
-                found[int(folder.name)] = (folder / "comm").read_text().strip()
-        except (FileNotFoundError, ProcessLookupError):
+            name = (folder / "comm").read_text().strip()
+            is_pools = name in _NAMES or _TEMPLATE in (folder / "cmdline").read_bytes()
+            if is_pools and RUN.encode() in (folder / "environ").read_bytes():
+                found[int(folder.name)] = name
+        except (FileNotFoundError, PermissionError, ProcessLookupError):
             continue
     return found
 

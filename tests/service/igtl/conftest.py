@@ -92,8 +92,8 @@ def igtl_folder(data_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> 
 
 
 @pytest.fixture(scope="session")
-def igtl_service(start_service: StartService, igtl_folder: Path) -> RunningService:
-    return start_service(data_folder=igtl_folder, igtl_port=0, igtl_scene="demo")
+def igtl_service(start_shared_service: StartService, igtl_folder: Path) -> RunningService:
+    return start_shared_service(data_folder=igtl_folder, igtl_port=0, igtl_scene="demo")
 
 
 def address_of(service: RunningService) -> str:

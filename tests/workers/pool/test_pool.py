@@ -287,7 +287,7 @@ def test_an_unknown_backend_fails_the_start(run, scene_folder, processes):
     run(main())
 
 
-def test_a_start_that_is_cancelled_leaves_no_process(run, scene_folder, processes, until):
+def test_a_start_that_is_cancelled_leaves_no_process(run, cold_templates, scene_folder, processes, until):
     async def main():
         start = asyncio.create_task(RenderPool(SceneStore(scene_folder), PoolConfig()).start())
         await until(lambda: processes() != {})

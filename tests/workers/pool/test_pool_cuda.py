@@ -80,7 +80,7 @@ def test_no_gpu_is_one_clear_error_and_no_process(run, scene_folder, processes, 
 
 
 @pytest.fixture
-def patch_workers(tmp_path, monkeypatch):
+def patch_workers(cold_templates, tmp_path, monkeypatch):
     """Runs code in each template before it forks workers: what only a GPU would do to them."""
 
     def patch(code):

@@ -20,6 +20,21 @@ from .peer import Peer
 _TEMPLATES = 2
 
 
+def start_template(descriptor: int) -> subprocess.Popen[bytes]:
+    """Starts a template process that serves the channel of a descriptor, which it inherits."""
+    program = (
+        f"import sys; sys.path[:] = {sys.path!r}; "
+        f"from ultragray_workers.pool.process.template import main; main({descriptor})"
+    )
+    return subprocess.Popen(
+        [sys.executable, "-c", program],
+        stdin=subprocess.DEVNULL,
+        pass_fds=[descriptor],
+        # numpy's OpenBLAS starts its threads on import, and a process with threads must not be forked
+        env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
+    )
+
+
 class Launcher:
     """Owns the template processes. Its methods belong to the event loop's thread."""
 
@@ -63,17 +78,7 @@ class Launcher:
 
     def _spawn_template(self) -> _Template:
         near, far = Channel.pair()
-        program = (
-            f"import sys; sys.path[:] = {sys.path!r}; "
-            f"from ultragray_workers.pool.process.template import main; main({far.fileno()})"
-        )
-        process = subprocess.Popen(
-            [sys.executable, "-c", program],
-            stdin=subprocess.DEVNULL,
-            pass_fds=[far.fileno()],
-            # numpy's OpenBLAS starts its threads on import, and a process with threads must not be forked
-            env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
-        )
+        process = start_template(far.fileno())
         far.close()
         template = _Template(process)
         template.peer = Peer(near, self._on_hello(template), self._on_gone(template))

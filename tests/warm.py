@@ -1,0 +1,207 @@
+"""Processes forked from one that has imported what they need, where a test would else wait for a second of imports.
+
+Run as a program, it is that process: `python warm.py SOCKET MODULE…` imports the modules, then forks for each client.
+A fork begins as the program would after its imports: with the folder, the environment and the files of its request.
+Tests about starting itself use real processes.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import gc
+import importlib
+import json
+import os
+import select
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+SOURCE_FOLDERS = ("model", "proto", "workers", "service")
+_MAX_REQUEST_BYTES = 2**17
+_STANDARD_FILES = 3
+_START_TIMEOUT_S = 120.0
+
+
+class WarmProcess:
+    """A process forked for us, with the methods of subprocess.Popen that the tests use."""
+
+    def __init__(self, pid: int, connection: socket.socket) -> None:
+        self.pid = pid
+        self.returncode: int | None = None
+        self._connection = connection  # its end brings the exit code
+
+    def poll(self) -> int | None:
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self.wait(0)
+        return self.returncode
+
+    def wait(self, timeout: float | None = None) -> int:
+        if self.returncode is None:
+            self._connection.settimeout(timeout)
+            try:
+                told = self._connection.recv(16)
+            except (BlockingIOError, TimeoutError):
+                raise subprocess.TimeoutExpired("a warm process", timeout or 0) from None
+            self._connection.close()
+            self.returncode = int(told) if told else -signal.SIGKILL  # the process that forks was ended with it
+        return self.returncode
+
+    def send_signal(self, number: int) -> None:
+        if self.poll() is None:
+            os.kill(self.pid, number)
+
+    def terminate(self) -> None:
+        self.send_signal(signal.SIGTERM)
+
+    def kill(self) -> None:
+        self.send_signal(signal.SIGKILL)
+
+
+class WarmServer:
+    """Starts the process that forks when it is first asked, and ends it with the tests."""
+
+    def __init__(self, *modules: str) -> None:
+        self._modules = modules
+        self._folder: Path | None = None
+
+    def path(self) -> Path:
+        """Where the process listens."""
+        if self._folder is None:
+            self._folder = Path(tempfile.mkdtemp(prefix="ultragray-warm-"))
+            process = subprocess.Popen(
+                [sys.executable, __file__, self._folder / "socket", *self._modules],
+                stdin=subprocess.PIPE,  # its end is that of the process
+                env={
+                    **os.environ,
+                    "OPENBLAS_NUM_THREADS": "1",  # a process with threads must not be forked
+                    "PYTHONPATH": os.pathsep.join(str(Path(__file__).parents[1] / folder) for folder in SOURCE_FOLDERS),
+                },
+            )
+            atexit.register(self._stop, process, self._folder)
+            end = time.monotonic() + _START_TIMEOUT_S
+            while not (self._folder / "socket").exists():
+                assert process.poll() is None, "the process that forks others did not start"
+                assert time.monotonic() < end, f"the process that forks others is not ready after {_START_TIMEOUT_S} s"
+                time.sleep(0.01)
+        return self._folder / "socket"
+
+    @staticmethod
+    def _stop(process: subprocess.Popen[bytes], folder: Path) -> None:
+        process.communicate()
+        shutil.rmtree(folder)
+
+
+def fork(
+    path: Path,
+    function: str,
+    arguments: list[object],
+    *,
+    environment: Mapping[str, str],
+    folder: Path,
+    files: tuple[int, ...],
+) -> WarmProcess:
+    """Has the process that listens at `path` fork one that calls `function` of this module.
+
+    `files` are descriptors: stdin, stdout, stderr, and more, which the function gets after its `arguments`.
+    """
+    connection = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    connection.connect(str(path))
+    request = {"function": function, "arguments": arguments, "environment": dict(environment), "folder": str(folder)}
+    socket.send_fds(connection, [json.dumps(request).encode()], files)
+    return WarmProcess(int(connection.recv(16)), connection)
+
+
+WARM_TEMPLATES = WarmServer("torch", "ultragray_workers.pool.process.worker")
+
+
+def start_template(path: Path, descriptor: int) -> WarmProcess:
+    """As ultragray_workers.pool.launcher.start_template."""
+    with open(os.devnull, "r+b") as null:
+        files = (null.fileno(), 1, 2, descriptor)
+        return fork(path, "template", [], environment=os.environ, folder=Path.cwd(), files=files)
+
+
+def template(descriptor: int) -> int:
+    """The template process of a pool."""
+    from ultragray_workers.pool.process.template import main
+
+    main(descriptor)
+
+
+def service(templates: str) -> int:
+    """The service, whose pool has its template forked as well."""
+    from ultragray_service.__main__ import main
+    from ultragray_workers.pool import launcher
+
+    launcher.start_template = lambda descriptor: start_template(Path(templates), descriptor)  # type: ignore[assignment,return-value]
+    return main()
+
+
+FUNCTIONS: dict[str, Callable[..., int]] = {"template": template, "service": service}
+
+
+def serve(path: str) -> int:
+    """Forks for whoever connects, until stdin ends. In a fork, the exit code of what it was forked for."""
+    running: dict[int, socket.socket] = {}
+    ended, wake = socket.socketpair()
+    wake.setblocking(False)
+    signal.set_wakeup_fd(wake.fileno(), warn_on_full_buffer=False)
+    signal.signal(signal.SIGCHLD, lambda *_: None)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    listener.bind(f"{path}.new")
+    listener.listen(64)
+    os.rename(f"{path}.new", path)
+    while True:
+        readable = select.select([sys.stdin, listener, ended], [], [])[0]
+        if ended in readable:
+            ended.recv(4096)
+            with contextlib.suppress(ChildProcessError):
+                while (found := os.waitpid(-1, os.WNOHANG))[0]:
+                    with running.pop(found[0]) as connection, contextlib.suppress(OSError):
+                        connection.send(str(os.waitstatus_to_exitcode(found[1])).encode())
+        if listener in readable:
+            connection, _ = listener.accept()
+            request, files, _, _ = socket.recv_fds(connection, _MAX_REQUEST_BYTES, 8)
+            pid = os.fork()
+            if pid == 0:
+                for ours in (listener, ended, wake, connection, *running.values()):
+                    ours.close()
+                return begin(json.loads(request), files)
+            for file in files:
+                os.close(file)
+            running[pid] = connection
+            connection.send(str(pid).encode())
+        if sys.stdin in readable:
+            return 0
+
+
+def begin(request: dict[str, object], files: list[int]) -> int:
+    """What a fork does: takes over the state of a fresh process, then calls the function."""
+    signal.set_wakeup_fd(-1)
+    signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    os.environ.clear()
+    os.environ.update(request["environment"])  # type: ignore[call-overload]
+    os.chdir(str(request["folder"]))
+    for number, file in enumerate(files[:_STANDARD_FILES]):
+        os.dup2(file, number)
+        os.close(file)
+    return FUNCTIONS[str(request["function"])](*request["arguments"], *files[_STANDARD_FILES:])  # type: ignore[misc]
+
+
+if __name__ == "__main__":
+    for module in sys.argv[2:]:
+        importlib.import_module(module)
+    gc.collect()
+    gc.freeze()
+    assert len(os.listdir("/proc/self/task")) == 1, "a process with threads must not be forked"
+    sys.exit(serve(sys.argv[1]))
