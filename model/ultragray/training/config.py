@@ -15,6 +15,7 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
+from ..contract import Contract, described
 from ..errors import InvalidArgument
 from ..scene_info import INTENSITIES, MAX_SH_DEGREE
 
@@ -35,62 +36,106 @@ GROWTHS = ("even", "threshold")
 
 
 @dataclass(frozen=True)
-class TrainingConfig:
+class TrainingConfig(Contract):
     """How to train. The defaults are the preset `fast`; `TrainingConfig.preset` gives the others.
 
     Rates are Adam's, for batches of one frame: the trainer multiplies them by √batch_size. Raises InvalidArgument,
     naming the field, for a value outside its range.
     """
 
-    steps: int | None = None  # None: from the number of frames
-    batch_size: int = 8  # frames of one step; fewer where the dataset has fewer
-    seed: int = 0
-    initial_gaussians: int | None = None  # None: max_gaussians, or half of them where refinements add to them
-    max_gaussians: int | None = None  # None: from the number of pixels
-    start: str = "informed"  # Gaussians begin on pixels of the frames; `random`: anywhere in a cube
-    initial_scale_mm: float | None = None  # standard deviation; None: from the spacing of frames and pixels
-    initial_elevation_mm: float | None = None  # the same along elevation, for an informed start
-    initial_transmittance: float = 0.99
-    intensity: str = "sigmoid"  # activation, docs/physics.md §2
-    shadow_start: float = 0.1  # up to this share of the run only the transmittances are trained
-    intensity_floor: float | None = None  # least intensity, up to floor_end; None: the frames' mean brightness
-    floor_end: float = 0.3  # share of the run
-    sh_degree: int = 1
-    sh_start: float = 1_000 / RELEASED_STEPS  # where degree 1 joins; degree d at d times that
-    transmittance: bool = True  # False: nothing absorbs
-    out_of_plane_mm: float | None = None  # full range of the shift along elevation; None: from the frames; 0: off
-    means_rate: float = 2e-4  # times the scene's scale, cm
-    scales_rate: float = 1e-2
-    quats_rate: float = 1e-2
-    transmittance_rate: float | None = 5e-2  # None: 5e-4, and more in runs of less than 30,000 steps
-    sh0_rate: float = 1e-2
-    shn_rate: float = 2e-5
-    final_rate: float = 0.1  # every rate decays exponentially to this share
-    scale_penalty: float = 1e-3  # λ of λ·mean(exp(scales)), cm
-    refinements: int = 0  # how often Gaussians are added and pruned
-    refinement_end: float = 17_500 / RELEASED_STEPS  # the last refinement
-    growth: str = "even"  # `threshold`: all above growth_gradient; `even`: the best, evenly up to max_gaussians
-    growth_gradient: float = 5e-6  # mean ‖∂L/∂mean‖ of a Gaussian that is refined
-    split_scale: float = 0.01  # × scene scale: above, a Gaussian is split, below, duplicated
-    split_intensity: float = 1.0  # factor on sh0 of the halves
-    prune_above: float = 0.1  # × scene scale, of the largest standard deviation
-    prune_below: float = 1e-5
-    confidence: bool = True  # a second, shorter training on a part of the frames fits the scene's confidence
-    memory_gb: float | None = None  # None: what the machine has to give
+    steps: int | None = described("Steps of the run; none: from the number of frames.", None, low=1, high=10_000_000)
+    batch_size: int = described("Frames of one step; fewer where the dataset has fewer.", 8, low=1, high=1_024)
+    seed: int = described("Of every random choice.", 0, low=0, high=2**63 - 1)
+    initial_gaussians: int | None = described(
+        "Gaussians at the start; none: max_gaussians, or half of them where refinements add to them.",
+        None,
+        low=1,
+        high=100_000_000,
+    )
+    max_gaussians: int | None = described(
+        "Gaussians at most; none: from the number of pixels.", None, low=1, high=100_000_000
+    )
+    start: str = described(
+        "informed: Gaussians begin on pixels of the frames; random: anywhere in a cube.", "informed", choices=STARTS
+    )
+    initial_scale_mm: float | None = described(
+        "Standard deviation at the start; none: from the spacing of frames and pixels.", None, low=1e-3, high=1e3
+    )
+    initial_elevation_mm: float | None = described(
+        "The same along elevation, for an informed start.", None, low=1e-3, high=1e3
+    )
+    initial_transmittance: float = described("Of each Gaussian at the start.", 0.99, low=0.5, high=0.9999)
+    intensity: str = described(
+        "Activation of the echo intensity (docs/physics.md §2): released, or sigmoid, without its floor.",
+        "sigmoid",
+        choices=INTENSITIES,
+    )
+    shadow_start: float = described(
+        "Up to this share of the run only the transmittances are trained.", 0.1, low=0.0, high=1.0
+    )
+    intensity_floor: float | None = described(
+        "Least intensity, up to floor_end; none: the frames' mean brightness.", None, low=0.0, high=MAX_FLOOR
+    )
+    floor_end: float = described("Where the floor ends, as a share of the run.", 0.3, low=0.0, high=1.0)
+    sh_degree: int = described("Degree of the spherical harmonics.", 1, low=0, high=MAX_SH_DEGREE)
+    sh_start: float = described(
+        "Where degree 1 joins, as a share of the run; degree d at d times that.",
+        1_000 / RELEASED_STEPS,
+        low=0.0,
+        high=1.0,
+    )
+    transmittance: bool = described("Whether Gaussians absorb: without, there are no shadows.", True)
+    out_of_plane_mm: float | None = described(
+        "Full range of the shift of a batch along elevation; none: from the frames; 0: no shift.",
+        None,
+        low=0.0,
+        high=MAX_RANGE_MM,
+    )
+    means_rate: float = described("Learning rate of the means, times the scene's scale in cm.", 2e-4, low=0.0, high=1.0)
+    scales_rate: float = described("Learning rate of the scales.", 1e-2, low=0.0, high=1.0)
+    quats_rate: float = described("Learning rate of the quaternions.", 1e-2, low=0.0, high=1.0)
+    transmittance_rate: float | None = described(
+        "Learning rate of the transmittances; none: 5e-4, and more in runs of less than 30,000 steps.",
+        5e-2,
+        low=0.0,
+        high=1.0,
+    )
+    sh0_rate: float = described("Learning rate of the intensities.", 1e-2, low=0.0, high=1.0)
+    shn_rate: float = described("Learning rate of the higher harmonics.", 2e-5, low=0.0, high=1.0)
+    final_rate: float = described("Every rate decays exponentially to this share.", 0.1, low=1e-6, high=1.0)
+    scale_penalty: float = described("λ of λ·mean(exp(scales)), scales in cm.", 1e-3, low=0.0, high=100.0)
+    refinements: int = described("How often Gaussians are added and pruned.", 0, low=0, high=1_000)
+    refinement_end: float = described(
+        "The last refinement, as a share of the run.", 17_500 / RELEASED_STEPS, low=0.0, high=1.0
+    )
+    growth: str = described(
+        "threshold: all above growth_gradient are refined; even: the best, evenly up to max_gaussians.",
+        "even",
+        choices=GROWTHS,
+    )
+    growth_gradient: float = described("Mean ‖∂L/∂mean‖ of a Gaussian that is refined.", 5e-6, low=0.0, high=1e6)
+    split_scale: float = described(
+        "Times the scene's scale: above, a Gaussian is split, below, duplicated.", 0.01, low=0.0, high=10.0
+    )
+    split_intensity: float = described("Factor on sh0 of the halves.", 1.0, low=-10.0, high=10.0)
+    prune_above: float = described(
+        "Times the scene's scale: Gaussians with a larger standard deviation are pruned.", 0.1, low=0.0, high=100.0
+    )
+    prune_below: float = described(
+        "Times the scene's scale: Gaussians whose largest standard deviation is smaller are pruned.",
+        1e-5,
+        low=0.0,
+        high=1.0,
+    )
+    confidence: bool = described(
+        "Whether a second, shorter training on a part of the frames fits the scene's confidence.", True
+    )
+    memory_gb: float | None = described(
+        "Memory that the training may take; none: what the machine has to give.", None, low=1e-3, high=1e6
+    )
 
     def __post_init__(self) -> None:
-        hints = typing.get_type_hints(type(self))
-        for item in fields(self):
-            _check_type(item.name, getattr(self, item.name), hints[item.name])
-        for name, (low, high) in _RANGES.items():
-            value = getattr(self, name)
-            if value is not None and not low <= value <= high:
-                raise InvalidArgument(f"{name} must be between {low:g} and {high:g}, got {value!r}", field=name)
-        for name, choices in (("start", STARTS), ("intensity", INTENSITIES), ("growth", GROWTHS)):
-            if getattr(self, name) not in choices:
-                raise InvalidArgument(
-                    f"{name} must be one of {', '.join(choices)}, got {getattr(self, name)!r}", field=name
-                )
+        super().__post_init__()
         if (self.initial_gaussians or 0) > (self.max_gaussians or math.inf):
             raise InvalidArgument(
                 f"initial_gaussians must be at most max_gaussians ({self.max_gaussians}), got {self.initial_gaussians}",
@@ -166,35 +211,6 @@ PRESETS: dict[str, dict[str, Any]] = {
     },
 }
 
-_RATES = ("means_rate", "scales_rate", "quats_rate", "transmittance_rate", "sh0_rate", "shn_rate")
-_RANGES: dict[str, tuple[float, float]] = {
-    "steps": (1, 10_000_000),
-    "batch_size": (1, 1_024),
-    "seed": (0, 2**63 - 1),
-    "initial_gaussians": (1, 100_000_000),
-    "max_gaussians": (1, 100_000_000),
-    "initial_scale_mm": (1e-3, 1e3),
-    "initial_transmittance": (0.5, 0.9999),
-    "initial_elevation_mm": (1e-3, 1e3),
-    "shadow_start": (0.0, 1.0),
-    "intensity_floor": (0.0, MAX_FLOOR),
-    "floor_end": (0.0, 1.0),
-    "sh_degree": (0, MAX_SH_DEGREE),
-    "sh_start": (0.0, 1.0),
-    "out_of_plane_mm": (0.0, MAX_RANGE_MM),
-    **dict.fromkeys(_RATES, (0.0, 1.0)),
-    "final_rate": (1e-6, 1.0),
-    "scale_penalty": (0.0, 100.0),
-    "refinements": (0, 1_000),
-    "refinement_end": (0.0, 1.0),
-    "growth_gradient": (0.0, 1e6),
-    "split_scale": (0.0, 10.0),
-    "split_intensity": (-10.0, 10.0),
-    "prune_above": (0.0, 100.0),
-    "prune_below": (0.0, 1.0),
-    "memory_gb": (1e-3, 1e6),
-}
-
 
 def scaled_transmittance_rate(steps: int) -> float:
     """The released rate for as many steps as it is meant for, in proportion more for fewer, so that shadows form."""
@@ -203,15 +219,6 @@ def scaled_transmittance_rate(steps: int) -> float:
 
 def _given_or(value: float | None, otherwise: float) -> float:
     return otherwise if value is None else value
-
-
-def _check_type(name: str, value: Any, hint: Any) -> None:
-    kinds = typing.get_args(hint) or (hint,)
-    allowed = {*kinds, int} if float in kinds else set(kinds)
-    if type(value) not in allowed or (isinstance(value, float) and not math.isfinite(value)):
-        words = {int: "an integer", float: "a finite number", str: "a word", bool: "true or false", type(None): "none"}
-        expected = " or ".join(words[kind] for kind in kinds)
-        raise InvalidArgument(f"{name} must be {expected}, got {value!r}", field=name)
 
 
 def read_config_file(path: str | Path) -> dict[str, Any]:

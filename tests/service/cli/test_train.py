@@ -108,7 +108,7 @@ def test_mistakes_give_one_line(dataset: Path, tmp_path: Path) -> None:
     output = tmp_path / "scene.ugr"
     assert "a training has no setting stepz" in refused(dataset, "-o", output, "--set", "stepz=3")
     assert "--set takes NAME=VALUE, got 'steps'" in refused(dataset, "-o", output, "--set", "steps")
-    assert "steps must be between 1 and" in refused(dataset, "-o", output, "--steps", 0)
+    assert "steps must be an integer from 1 to" in refused(dataset, "-o", output, "--steps", 0)
     assert "no checkpoint to resume from" in refused(dataset, "-o", output, "--resume")
     assert "output must end in .ugr, got 'scene.txt'" in refused(dataset, "-o", tmp_path / "scene.txt")
     assert "backend must be one of" in refused(dataset, "-o", output, *SMALL, "--backend", "gpu")
