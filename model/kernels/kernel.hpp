@@ -49,9 +49,8 @@ struct View {
     const double* dir_x;   // [W + kMaxLanes] direction of each scan line in the image plane
     const double* dir_z;
     double near, cull_far, row_step;  // row i lies at near + row_step * (i + 1/2)
-    double width;                     // linear: of the face
-    double opening;                   // convex: full angle, radians
-    bool convex;
+    double start, span;               // line j of W is at start + span * (j + 1/2) / W: cm along x, or radians from z
+    bool fanned;                      // the lines run from an apex at the origin, else side by side along z
     int height, lines;
 };
 

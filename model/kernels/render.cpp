@@ -34,10 +34,10 @@ struct ScanLines {
 
     ScanLines(const ProbeGeometry& probe, int width) {
         for (int j = 0; j < width + kMaxLanes; ++j) {
-            const double across = (std::min(j, width - 1) + 0.5) / width - 0.5;
-            x.push_back(probe.convex ? 0.0 : across * probe.width);
-            dir_x.push_back(probe.convex ? std::sin(across * probe.opening) : 0.0);
-            dir_z.push_back(probe.convex ? std::cos(across * probe.opening) : 1.0);
+            const double across = probe.start + probe.span * ((std::min(j, width - 1) + 0.5) / width);
+            x.push_back(probe.fanned ? 0.0 : across);
+            dir_x.push_back(probe.fanned ? std::sin(across) : 0.0);
+            dir_z.push_back(probe.fanned ? std::cos(across) : 1.0);
         }
     }
 };
@@ -51,7 +51,7 @@ View make_view(const ProbeGeometry& probe, const ScanLines& lines, const double*
     view.line_x = lines.x.data(), view.dir_x = lines.dir_x.data(), view.dir_z = lines.dir_z.data();
     view.near = probe.near, view.cull_far = probe.cull_far;
     view.row_step = (probe.far - probe.near) / height;
-    view.width = probe.width, view.opening = probe.opening, view.convex = probe.convex;
+    view.start = probe.start, view.span = probe.span, view.fanned = probe.fanned;
     view.height = height, view.lines = width;
     return view;
 }

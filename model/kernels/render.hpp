@@ -11,9 +11,8 @@ namespace ultragray {
 
 // Geometry as the Python side knows it, in cm and radians.
 struct ProbeGeometry {
-    bool convex;
-    double width;    // linear
-    double opening;  // convex, full angle
+    bool fanned;
+    double start, span;  // of the scan lines, as in View
     double near, far, cull_far;
 };
 
@@ -22,7 +21,8 @@ struct Outputs {
     float *bmode, *echo, *transmittance, *coverage, *weight_sum;
 };
 
-// Renders C poses [4, 4] (row-major, cm, probe to scene). The result does not depend on the number of threads.
+// Renders C poses [4, 4] (row-major, cm, probe to scene; columns 0 and 2 may be those of a plane that is sheared such that
+// its parallel lines run along z). The result does not depend on the number of threads.
 // Throws std::bad_alloc, or std::invalid_argument for an instruction set that this processor lacks.
 void render(const PreparedScene& scene, const ProbeGeometry& probe, const double* poses, int count, int height, int width,
             int threads, const std::string& instruction_set, const Outputs& outputs);

@@ -48,11 +48,11 @@ inline Floats activate(Intensity kind, Floats value) {
 
 // Scan lines whose ray comes within `room` of the slice in squared Mahalanobis distance. Widened by rounding to whole lines.
 inline void touched_lines(const View& view, double room, Slice& s) {
+    const auto line_at = [&view](double across) { return (across - view.start) / view.span * view.lines - 0.5; };
     double first, last;
-    if (!view.convex) {
+    if (!view.fanned) {
         const double reach = __builtin_sqrt(room * s.cov_xx);
-        first = ((s.mean_x - reach) / view.width + 0.5) * view.lines - 0.5;
-        last = ((s.mean_x + reach) / view.width + 0.5) * view.lines - 0.5;
+        first = line_at(s.mean_x - reach), last = line_at(s.mean_x + reach);
     } else {
         // The ellipse's tangents from the apex: roots in tan(angle).
         const double a = s.mean_z * s.mean_z - room * s.cov_zz, b = s.mean_x * s.mean_z - room * s.cov_xz;
@@ -61,8 +61,7 @@ inline void touched_lines(const View& view, double room, Slice& s) {
             first = 0, last = view.lines - 1;
         } else {
             const double root = __builtin_sqrt(discriminant);
-            first = (__builtin_atan((b - root) / a) / view.opening + 0.5) * view.lines - 0.5;
-            last = (__builtin_atan((b + root) / a) / view.opening + 0.5) * view.lines - 0.5;
+            first = line_at(__builtin_atan((b - root) / a)), last = line_at(__builtin_atan((b + root) / a));
         }
     }
     const double bound = view.lines - 1;
@@ -73,8 +72,8 @@ inline void touched_lines(const View& view, double room, Slice& s) {
 }
 
 inline bool inside_planes(const View& view, double x, double z) {
-    const double depth = view.convex ? __builtin_sqrt(x * x + z * z) : z;
-    return depth >= view.near && depth <= view.cull_far && (!view.convex || z > 0);
+    const double depth = view.fanned ? __builtin_sqrt(x * x + z * z) : z;
+    return depth >= view.near && depth <= view.cull_far && (!view.fanned || z > 0);
 }
 
 // kLanes Gaussians seen in the probe frame.
@@ -148,7 +147,7 @@ void slice_candidates(const SceneView& scene, const View& view, const Candidates
         Slice& s = next[written];
         s.mean_x = mean_x[k], s.mean_z = mean_z[k];
         s.cov_xx = cov_xx[k], s.cov_xz = cov_xz[k], s.cov_zz = cov_zz[k];
-        s.depth = view.convex ? __builtin_sqrt(s.mean_x * s.mean_x + s.mean_z * s.mean_z) : s.mean_z;
+        s.depth = view.fanned ? __builtin_sqrt(s.mean_x * s.mean_x + s.mean_z * s.mean_z) : s.mean_z;
         touched_lines(view, kMaxM2 - m2[k], s);
         if (s.first > s.last) continue;
         s.m2_plane = static_cast<float>(m2[k]);

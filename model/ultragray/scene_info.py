@@ -18,10 +18,11 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 
 from .confidence.assess import read_model
+from .contract import from_dict, to_dict
 from .errors import InvalidArgument, InvalidProbe, SceneFileInvalid
 from .image_size import DEFAULT_IMAGE_SIDE
 from .pose import check_poses
-from .probe import FloatArray, Probe, probe_from_dict, probe_to_dict
+from .probe import FloatArray, Probe
 
 FORMAT_VERSION = 1
 METADATA_KEY = "ultragray"
@@ -123,7 +124,7 @@ def info_to_json(info: SceneInfo) -> str:
     document = {
         "format_version": FORMAT_VERSION,
         **asdict(info),
-        "probe": None if info.probe is None else probe_to_dict(info.probe),
+        "probe": None if info.probe is None else to_dict(info.probe),
     }
     if not info.label_names:
         del document["label_names"]  # a scene without labels keeps its bytes, and its hash
@@ -142,7 +143,7 @@ def info_from_json(text: str) -> SceneInfo:
     if unknown:
         raise ValueError(f"its metadata has unknown keys {sorted(unknown)}")
     if document.get("probe") is not None:
-        document["probe"] = probe_from_dict(document["probe"])
+        document["probe"] = from_dict(Probe, document["probe"])
     return SceneInfo(**document)
 
 

@@ -71,7 +71,7 @@ def test_json_round_trip(info: SceneInfo) -> None:
         ({"training": None}, "training must be an object"),
         ({"label_names": {"0": "nothing"}}, "label_names must give labels from 1 to 255 a name each"),
         ({"label_names": ["bone"]}, "label_names must give"),
-        ({"probe": {"kind": "linear"}}, "keys"),
+        ({"probe": {"kind": "linear"}}, "width_mm is required by kind linear"),
     ],
 )
 def test_a_wrong_entry_is_named(change: dict[str, Any], message: str) -> None:

@@ -14,8 +14,9 @@ from torch.autograd.function import once_differentiable
 from .. import _cpu
 from ..errors import BackendUnavailable
 from ..outputs import PLANES, WEIGHT_SUM
-from ..probe import FloatArray, LinearProbe, Probe
+from ..probe import FloatArray, Probe
 from ..scene import PARAMETERS, GaussianScene
+from .scan_lines import KernelLines
 
 INSTRUCTION_SETS: tuple[str, ...] = tuple(_cpu.instruction_sets())  # what this processor can run, best first
 
@@ -60,14 +61,15 @@ def render_outputs(
 def _view_arguments(
     probe: Probe, poses_cm: FloatArray, height: int, width: int, instruction_set: str
 ) -> dict[str, Any]:
+    lines = KernelLines.of(probe)
     return {
-        "convex": not isinstance(probe, LinearProbe),
-        "width_cm": probe.width_mm / 10.0 if isinstance(probe, LinearProbe) else 0.0,
-        "opening_rad": 0.0 if isinstance(probe, LinearProbe) else math.radians(probe.opening_angle_deg),
+        "fanned": lines.fanned,
+        "start": lines.start,
+        "span": lines.span,
         "near_cm": probe.near_mm / 10.0,
         "far_cm": probe.far_mm / 10.0,
         "cull_far_cm": probe.cull_far_mm(height) / 10.0,
-        "poses": np.ascontiguousarray(poses_cm),
+        "poses": np.ascontiguousarray(lines.view_axes(poses_cm)),
         "height": height,
         "width": width,
         "threads": torch.get_num_threads(),

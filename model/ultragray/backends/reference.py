@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from ..outputs import WEIGHT_SUM
-from ..probe import FloatArray, LinearProbe, Probe
+from ..probe import FloatArray, Probe
 from ..scene import GaussianScene
 
 MIN_WEIGHT = 1.0 / 255.0  # the skip rule: a Gaussian is skipped where both w and α are below this
@@ -75,7 +75,8 @@ def _render_pose(scene: GaussianScene, probe: Probe, pose: Tensor, height: int, 
     weight_sum = like.new_zeros((height, width))
     weighted_intensity = like.new_zeros((height, width))
     transmittance = like.new_ones((height, width))
-    (kept,) = torch.nonzero(_inside_planes(probe, means, height), as_tuple=True)
+    x_mm, _, z_mm = 10.0 * means.detach().cpu().double().numpy().T
+    (kept,) = torch.nonzero(torch.from_numpy(probe.cull(x_mm, z_mm, height)).to(like.device), as_tuple=True)
     for ids in torch.split(kept, max(1, ELEMENTS_PER_CHUNK // (9 * width))):
         rays = _intersect(means[ids], inverse_root[ids], origins, directions)  # [n, W]
         near_enough = (rays.m2 <= -2.0 * math.log(MIN_WEIGHT)).any(dim=1)  # else w and α are below 1/255
@@ -91,15 +92,6 @@ def _render_pose(scene: GaussianScene, probe: Probe, pose: Tensor, height: int, 
             passed = 1.0 - alpha * (1.0 - tau[chosen])[:, None, None]
             transmittance = transmittance * passed.prod(dim=0)
     return Fields(weight_sum, weighted_intensity, transmittance)
-
-
-def _inside_planes(probe: Probe, means: Tensor, height: int) -> Tensor:  # [N, 3] -> [N] bool
-    """The depth cull: the mean lies between the face and the top edge of the last row."""
-    near, far = probe.near_mm / 10.0, probe.cull_far_mm(height) / 10.0
-    if isinstance(probe, LinearProbe):
-        return (means[:, 2] >= near) & (means[:, 2] <= far)
-    depth = torch.hypot(means[:, 0], means[:, 2])
-    return (means[:, 2] > 0) & (depth >= near) & (depth <= far)
 
 
 def _inverse_root_covariance(scene: GaussianScene, rotation: Tensor) -> Tensor:  # [N, 3, 3]

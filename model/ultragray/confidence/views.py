@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from ..pose import check_poses
-from ..probe import FloatArray, LinearProbe, Probe
+from ..probe import FloatArray, Probe
 
 POINTS_PER_SIDE = 6  # of the grid of image points at which distances are taken
 ANGLE_MM_PER_DEG = 0.02  # of views about as near, the one that is turned least counts as the nearest
@@ -82,11 +81,7 @@ class TrainingViews:
         """How far points lie off the planes of views along elevation, and beside the images within the planes."""
         x, elevation, z = (points @ self._axes[axis][:, views] - self._offsets[axis][views] for axis in range(3))
         probe = self._probe
-        if isinstance(probe, LinearProbe):
-            lateral, depth = np.abs(x) - 0.5 * probe.width_mm, z
-        else:
-            half = math.radians(probe.opening_angle_deg) / 2.0
-            lateral, depth = np.abs(x) * math.cos(half) - z * math.sin(half), np.sqrt(x * x + z * z)
+        lateral, depth = probe.lines.beside(x, z)
         middle, reach = 0.5 * (probe.near_mm + probe.far_mm), 0.5 * probe.scan_line_length_mm
         axial = np.abs(depth - middle) - reach
         return elevation, np.hypot(np.maximum(lateral, 0.0), np.maximum(axial, 0.0))

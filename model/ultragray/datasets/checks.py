@@ -14,8 +14,9 @@ from typing import Any
 
 import numpy as np
 
+from ..contract import to_dict
 from ..pose import rotation_angles_deg
-from ..probe import FloatArray, LinearProbe, Probe, probe_to_dict
+from ..probe import FloatArray, Probe
 from .sweep import Dataset, Sweep, corner_distances_mm
 from .swept_volume import swept_volume
 
@@ -25,9 +26,6 @@ SMALLEST_JUMP_MM = 1.0
 SATURATED_SHARE = 0.05
 DARKEST_PEAK = 16  # of 255
 SAME_POSE_MM = 1e-6
-USUAL_WIDTHS_MM = (5.0, 200.0)
-USUAL_SCAN_LINES_MM = (10.0, 400.0)
-SMALLEST_OPENING_DEG = 5.0
 SHORTEST_TRAVEL = 0.1  # of the length of the scan lines
 TURN_IN_PLACE_DEG = 5.0
 MAX_TILT_FRAMES = 300
@@ -82,7 +80,7 @@ class DatasetReport:
 
     def to_dict(self) -> dict[str, Any]:
         """The report as JSON can hold it."""
-        return {**asdict(self), "probe": probe_to_dict(self.probe)}
+        return {**asdict(self), "probe": to_dict(self.probe)}
 
 
 def check_dataset(dataset: Dataset) -> DatasetReport:
@@ -234,31 +232,12 @@ def _odd_images(sweep: Sweep) -> list[str]:
 def _dataset_warnings(dataset: Dataset) -> list[str]:
     told = [
         *dict.fromkeys((*dataset.train.notes, *dataset.val.notes)),
-        *(_unusual_probe(dataset.probe) or _hardly_moved(dataset.train)),
+        *(list(dataset.probe.oddities()) or _hardly_moved(dataset.train)),
     ]
     known = set(_contents(dataset.train))
     leaked = [place for place, frame in enumerate(_contents(dataset.val)) if frame in known]
     if leaked:
         told.append(f"held-out frames {_list(dataset.val, leaked)} are also training frames: metrics will flatter")
-    return told
-
-
-def _unusual_probe(probe: Probe) -> list[str]:
-    """Sizes that no probe has, as lengths and angles in other units give them."""
-    lengths = [("scan lines are", "long", probe.scan_line_length_mm, USUAL_SCAN_LINES_MM)]
-    if isinstance(probe, LinearProbe):
-        lengths.insert(0, ("image is", "wide", probe.width_mm, USUAL_WIDTHS_MM))
-    told = [
-        f"the {subject} {length_mm:.3g} mm {measure}, where {low:g} to {high:g} mm are usual: a length in another "
-        "unit? (conf.json is in centimetres, a calibration in millimetres)"
-        for subject, measure, length_mm, (low, high) in lengths
-        if not low <= length_mm <= high
-    ]
-    if not isinstance(probe, LinearProbe) and probe.opening_angle_deg < SMALLEST_OPENING_DEG:
-        told.append(
-            f"the fan opens by {probe.opening_angle_deg:.3g}°, where {SMALLEST_OPENING_DEG:g}° and more are usual: "
-            "an angle in radians? (conf.json is in degrees)"
-        )
     return told
 
 

@@ -10,8 +10,9 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from ..display.scan_conversion import with_square_pixels
 from ..files.atomic import atomic_path
-from ..probe import FloatArray, LinearProbe
+from ..probe import FloatArray
 from .sweep import Dataset, Sweep
 
 TRAIN_COLOUR, VAL_COLOUR = "#1f77b4", "#d62728"
@@ -25,7 +26,7 @@ def draw_dataset(dataset: Dataset, path: str | Path) -> None:
     """Writes a PNG: the planes seen from two sides, below them frames at even distances, held-out ones in red.
 
     Of many planes a few are drawn, at even distances, as the legend says. Axes are those of the tracker,
-    in mm. Frames of convex and phased probes are drawn as fans.
+    in mm. Frames are scan-converted.
     """
     shown = _sheet_frames(dataset)
     rows = math.ceil(len(shown) / SHEET_COLUMNS)
@@ -64,17 +65,8 @@ def _sheet_frames(dataset: Dataset) -> list[tuple[Sweep, int, str]]:
 
 
 def _tile(sweep: Sweep, frame: int) -> np.ndarray:  # [rows, columns]
-    """A frame with square pixels, no side longer than MAX_TILE_PIXELS."""
-    image = sweep.images[frame]
-    if not isinstance(sweep.probe, LinearProbe):
-        return sweep.probe.scan_convert(image, 2.0 * sweep.probe.far_mm / MAX_TILE_PIXELS)
-    axial_mm, lateral_mm = sweep.pixel_mm
-    pixel_mm = max(axial_mm * sweep.height, lateral_mm * sweep.width) / MAX_TILE_PIXELS
-    rows, columns = (
-        np.minimum((np.arange(max(1, round(size * own / pixel_mm))) + 0.5) * pixel_mm / own, size - 1).astype(np.intp)
-        for size, own in ((sweep.height, axial_mm), (sweep.width, lateral_mm))
-    )
-    return np.asarray(image[np.ix_(rows, columns)])
+    """A frame with square pixels, MAX_TILE_PIXELS on its longer side."""
+    return with_square_pixels(sweep.images[frame].astype(np.float32), sweep.probe, MAX_TILE_PIXELS)
 
 
 def _draw_planes(axes: Any, dataset: Dataset, elevation_deg: float, azimuth_deg: float) -> None:

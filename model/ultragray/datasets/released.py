@@ -108,6 +108,7 @@ def write_released(dataset: Dataset, folder: str | Path) -> None:
     for file_name in (CONFIG_NAME, *(_array_name(*key) for key in arrays)):
         if (folder / file_name).exists():
             raise InvalidArgument(f"{folder / file_name} already exists: choose another folder", field="output")
+    keys = probe_keys(dataset.probe)
     folder.mkdir(parents=True, exist_ok=True)
     name = folder.resolve().name
     document: dict[str, Any] = {}
@@ -116,7 +117,7 @@ def write_released(dataset: Dataset, folder: str | Path) -> None:
         with atomic_path(folder / file_name) as temporary, temporary.open("wb") as file:
             np.save(file, array, allow_pickle=False)
         document[f"{kind}_file_{part}"] = f"data/{name}/{file_name}"
-    document |= {"result_dir": f"results/{name}", **probe_keys(dataset.probe), "_source": dataset.name}
+    document |= {"result_dir": f"results/{name}", **keys, "_source": dataset.name}
     write_whole(folder / CONFIG_NAME, json.dumps(document, indent=1) + "\n")
 
 

@@ -14,9 +14,10 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from ..contract import to_dict
 from ..errors import DatasetInvalid, InvalidPose
 from ..pose import check_poses
-from ..probe import FloatArray, Probe, probe_to_dict
+from ..probe import FloatArray, Probe
 
 ByteArray: TypeAlias = npt.NDArray[np.uint8]
 IntArray: TypeAlias = npt.NDArray[np.int64]
@@ -146,7 +147,7 @@ class Dataset:
     @property
     def sha256(self) -> str:
         """What is in the dataset, however it is stored: images, poses, probe and split."""
-        digest = hashlib.sha256(json.dumps(probe_to_dict(self.probe), sort_keys=True).encode())
+        digest = hashlib.sha256(json.dumps(to_dict(self.probe), sort_keys=True).encode())
         for part in (self.train, self.val):
             digest.update(repr(part.images.shape).encode())
             digest.update(np.ascontiguousarray(part.images).reshape(-1).data)

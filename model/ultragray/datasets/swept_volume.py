@@ -51,9 +51,8 @@ def _counts(span_mm: FloatArray, voxel_mm: float) -> FloatArray:  # [3]
 
 def _plane_points(probe: Probe, spacing_mm: float) -> FloatArray:  # [P, 3]
     """Points on the image plane, at most `spacing_mm` apart where their number allows."""
-    left, right = probe.corners_mm()[[-2, -1]] if probe.kind == "linear" else probe.corners_mm()[[-3, -1]]
-    arc_mm = float(np.linalg.norm(right - left)) * (1.0 if probe.kind == "linear" else math.pi / 2)
-    lines, samples = (max(2, math.ceil(side / spacing_mm)) for side in (arc_mm, probe.scan_line_length_mm))
+    sides_mm = probe.lines.breadth_mm(probe.far_mm), probe.scan_line_length_mm
+    lines, samples = (max(2, math.ceil(side_mm / spacing_mm)) for side_mm in sides_mm)
     thinning = max(1.0, math.sqrt(lines * samples / MAX_POINTS))
     lines, samples = math.ceil(lines / thinning), math.ceil(samples / thinning)
     origins, directions = probe.scan_lines(lines)

@@ -12,6 +12,7 @@ from torch.nn.functional import grid_sample
 
 from ..outputs import OUTPUTS
 from ..probe import Probe
+from .scan_conversion import samples
 from .settings import FRAME_RANGE_DB, Display
 
 _CACHED_PICTURES = 8  # at 9 bytes a pixel
@@ -53,22 +54,25 @@ def _scan_converted(frames: Tensor, probe: Probe, pixel_mm: float, *, nearest: b
     _, height, width = frames.shape
     picture = probe.picture(pixel_mm)
     is_small = picture.height * picture.width <= _LARGEST_CACHED_PICTURE
-    samples = _cached_samples if is_small else _samples
-    grid, inside = samples(probe, height, width, pixel_mm, frames.device)
+    grid, inside = (_cached_grid if is_small else _grid)(probe, height, width, pixel_mm, frames.device)
     floats = frames if frames.is_floating_point() else frames.float()
+    if probe.lines.wrap:
+        floats = torch.cat([floats[..., -1:], floats, floats[..., :1]], dim=-1)
     mode = "nearest" if nearest else "bilinear"
     shown = grid_sample(floats[None], grid.to(floats), mode, padding_mode="border", align_corners=False)[0]
     shown *= inside
     return shown if frames.is_floating_point() else shown.round_().to(frames.dtype)
 
 
-def _samples(
+def _grid(
     probe: Probe, height: int, width: int, pixel_mm: float, device: torch.device
 ) -> tuple[Tensor, Tensor]:  # [1, H', W', 2], [H', W']
     """Where each pixel of the picture is sampled, from −1 to 1 across the frame, and whether anything is there."""
-    rows, columns, inside = probe.picture_samples((height, width), pixel_mm)
+    rows, columns, inside = samples(probe, (height, width), pixel_mm)
+    if probe.lines.wrap:  # the frame is then given the first column once more after the last, and the other way round
+        columns, width = columns + 1.0, width + 2
     grid = np.stack([(2 * columns + 1) / width - 1, (2 * rows + 1) / height - 1], axis=-1)
     return torch.from_numpy(grid.astype(np.float32))[None].to(device), torch.from_numpy(inside).to(device)
 
 
-_cached_samples = lru_cache(maxsize=_CACHED_PICTURES)(_samples)
+_cached_grid = lru_cache(maxsize=_CACHED_PICTURES)(_grid)

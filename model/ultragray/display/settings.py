@@ -12,7 +12,7 @@ import numpy as np
 from ..contract import Contract, described
 from ..errors import InvalidImageSize
 from ..image_size import MAX_IMAGE_SIDE
-from ..probe import FloatArray, LinearProbe, Picture, Probe
+from ..probe import FloatArray, Picture, Probe
 
 FRAME_RANGE_DB = 60.0  # a B-mode frame is taken as compressed logarithmically over this range, 1 being 0 dB
 MAX_TGC_POINTS = 16
@@ -48,8 +48,7 @@ class Display(Contract):
         """How many of H rows are not cut off, at least one."""
         if self.depth_mm is None:
             return height
-        face_mm = 0.0 if isinstance(probe, LinearProbe) else probe.near_mm
-        share = (face_mm + self.depth_mm - probe.near_mm) / probe.scan_line_length_mm
+        share = (probe.face_depth_mm + self.depth_mm - probe.near_mm) / probe.scan_line_length_mm
         return min(height, max(1, round(height * share)))
 
     def picture(self, probe: Probe, height: int, width: int) -> Picture:
@@ -78,12 +77,10 @@ AS_RENDERED = Display()
 
 
 def true_to_scale(probe: Probe, height: int, max_side: int = MAX_IMAGE_SIDE) -> Display:
-    """Shows frames with one size of a pixel: those of a linear probe as they are, fans scan-converted.
+    """Shows frames with one size of a pixel: as they are where they are true to scale, else scan-converted.
 
-    Pixels of a fan are as large as a depth sample, or larger where a side would have more than `max_side` of them.
+    Pixels are then as large as a depth sample, or larger where a side would have more than `max_side` of them.
     """
-    if isinstance(probe, LinearProbe):
+    if probe.is_true_to_scale:
         return AS_RENDERED
-    corners = probe.corners_mm()
-    sides_mm = corners.max(axis=0) - corners.min(axis=0)
-    return Display(pixel_mm=max(probe.scan_line_length_mm / height, float(sides_mm.max()) / (max_side - 1)))
+    return Display(pixel_mm=max(probe.scan_line_length_mm / height, probe.box_mm.longer_side / (max_side - 1)))

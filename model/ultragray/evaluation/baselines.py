@@ -7,16 +7,16 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
 
 from ..datasets.sweep import Dataset, IntArray, Sweep, corner_distances_mm
+from ..display.scan_conversion import interpolated, pixel_places
 from ..errors import InvalidArgument
 from ..pose import check_poses
-from ..probe import FloatArray, LinearProbe
+from ..probe import FloatArray
 from .compounding import METHODS as VOLUME_METHODS
 from .compounding import VOXEL_MM, compound, pixel_positions_mm
 from .scoring import Evaluation, evaluate_frames, require_frames
@@ -99,19 +99,8 @@ def _between(sweep: Sweep, points: FloatArray, frames: IntArray) -> FloatArray: 
 
 def _sample(sweep: Sweep, frame: int, local: FloatArray) -> tuple[npt.NDArray[np.bool_], FloatArray]:  # [P, 3] mm
     """Which points (probe frame) fall into the image when projected onto y = 0; their bilinear values in [0, 1]."""
-    probe, height, width = sweep.probe, sweep.height, sweep.width
-    if isinstance(probe, LinearProbe):
-        depth, lateral = local[:, 2], local[:, 0] / probe.width_mm
-    else:
-        depth = np.hypot(local[:, 0], local[:, 2])
-        lateral = np.arctan2(local[:, 0], local[:, 2]) / math.radians(probe.opening_angle_deg)
-    row = (depth - probe.near_mm) / probe.scan_line_length_mm * height - 0.5
-    column = (lateral + 0.5) * width - 0.5
-    inside = (np.abs(lateral) <= 0.5) & (depth >= probe.near_mm) & (depth <= probe.far_mm)
-    row, column = np.clip(row[inside], 0, height - 1), np.clip(column[inside], 0, width - 1)
-    i, j = np.minimum(row.astype(np.intp), max(height - 2, 0)), np.minimum(column.astype(np.intp), max(width - 2, 0))
-    below, right = np.minimum(i + 1, height - 1), np.minimum(j + 1, width - 1)
-    image = sweep.images[frame] / 255.0
-    upper = image[i, j] + (column - j) * (image[i, right] - image[i, j])
-    lower = image[below, j] + (column - j) * (image[below, right] - image[below, j])
-    return inside, upper + (row - i) * (lower - upper)
+    rows, columns = sweep.probe.image_coordinates(local[:, 0], local[:, 2])
+    inside = ~np.isnan(rows)
+    image = sweep.images[frame]
+    places = pixel_places(sweep.probe, image.shape, rows[inside], columns[inside])
+    return inside, interpolated(image, *places) / 255.0

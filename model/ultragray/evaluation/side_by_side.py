@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..datasets.sweep import Sweep
-from ..display.square_pixels import with_square_pixels
+from ..display.scan_conversion import with_square_pixels
 from ..files.atomic import write_whole
 from ..scene import GaussianScene
 from .metrics import FrameMetrics

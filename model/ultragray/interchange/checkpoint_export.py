@@ -13,7 +13,7 @@ import json
 import math
 from collections import OrderedDict
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,10 +23,10 @@ from torch import Tensor
 
 from ..errors import InvalidArgument, InvalidProbe
 from ..files.atomic import write_whole
-from ..probe import LinearProbe, Probe
+from ..probe import Probe
 from ..scene import GaussianScene
 from ..scene_info import Vector
-from .released_config import probe_keys, released_centre_mm
+from .released_config import WIDTH_KEY, probe_keys, released_centre_mm
 from .released_intensity import fit_released_intensity
 
 CONFIG_NAME = "conf.json"
@@ -62,7 +62,7 @@ def export_checkpoint(scene: GaussianScene, checkpoint: str | Path) -> Checkpoin
     else:
         released_probe, height, width = _released_view(scene)
         beside[CONFIG_NAME] = _config(released_probe, height, width, scene.sh_degree)
-        if not isinstance(released_probe, LinearProbe):
+        if WIDTH_KEY not in probe_keys(released_probe):
             notes.append(f"the released trainer knows linear probes only: it does not read this {CONFIG_NAME}")
         if len(scene.training_poses):
             x, y, z = released_centre_mm(released_probe, scene.training_poses).tolist()
@@ -91,7 +91,7 @@ def _released_view(scene: GaussianScene) -> tuple[Probe, int, int]:
     if not math.isfinite(far_mm):
         raise InvalidArgument("the released depth grid needs images of at least 2 rows, the scene's have 1")
     try:
-        return replace(probe, far_mm=round(far_mm, 9)), height, width
+        return probe.ending_at(round(far_mm, 9)), height, width
     except InvalidProbe as error:
         raise InvalidArgument(f"the scene's probe has no released depth grid: {error}") from error
 

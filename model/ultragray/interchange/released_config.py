@@ -8,7 +8,7 @@ images, and `probe_kind`, "phased" for a fan that begins at the face.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from ..files.npy import map_npy
 from ..probe import ConvexProbe, FloatArray, LinearProbe, PhasedProbe, Probe, stretch_released_far
 
 MAX_CONFIG_BYTES = 1 << 20
+WIDTH_KEY, ANGLE_KEY = "ultrasound_opening_width", "ultrasound_opening_angle"
 KIND_KEY = "probe_kind"
 FILE_KEYS = ("images_file_train", "poses_file_train", "images_file_val", "poses_file_val")
 
@@ -80,15 +81,23 @@ class ReleasedConfig:
 
 
 def probe_keys(released_probe: Probe) -> dict[str, float | str]:
-    """What conf.json says of a probe with its planes as released."""
-    keys: dict[str, float | str] = {
+    """A probe, its planes as released, in keys of conf.json. Raises InvalidProbe for a kind that it cannot tell."""
+    if released_probe.kind not in _KEYS_OF_KIND:
+        raise InvalidProbe(
+            f"the released format holds {', '.join(_KEYS_OF_KIND)} probes, got {released_probe}", field="probe"
+        )
+    return {
         "ultrasound_near_plane": _to_cm(released_probe.near_mm),
         "ultrasound_far_plane": _to_cm(released_probe.far_mm),
+        **_KEYS_OF_KIND[released_probe.kind](released_probe),
     }
-    if isinstance(released_probe, LinearProbe):
-        return keys | {"ultrasound_opening_width": _to_cm(released_probe.width_mm)}
-    keys["ultrasound_opening_angle"] = released_probe.opening_angle_deg
-    return keys | {KIND_KEY: released_probe.kind} if isinstance(released_probe, PhasedProbe) else keys
+
+
+_KEYS_OF_KIND: dict[str, Callable[[Any], dict[str, float | str]]] = {
+    "linear": lambda probe: {WIDTH_KEY: _to_cm(probe.width_mm)},
+    "convex": lambda probe: {ANGLE_KEY: probe.opening_angle_deg},
+    "phased": lambda probe: {ANGLE_KEY: probe.opening_angle_deg, KIND_KEY: probe.kind},
+}
 
 
 def released_centre_mm(released_probe: Probe, poses: FloatArray) -> FloatArray:  # [P, 4, 4] mm -> [3]
@@ -102,18 +111,18 @@ def read_released_config(path: str | Path) -> ReleasedConfig:
     """Reads conf.json and the shape of its images file. Raises CheckpointInvalid, naming the file."""
     path = Path(path)
     document = _read_object(path)
-    width_cm = _optional_number(path, document, "ultrasound_opening_width")
-    angle_deg = _optional_number(path, document, "ultrasound_opening_angle")
+    width_cm = _optional_number(path, document, WIDTH_KEY)
+    angle_deg = _optional_number(path, document, ANGLE_KEY)
     if (width_cm is None) == (angle_deg is None):
         raise CheckpointInvalid(
-            f"{path}: it must have exactly one of ultrasound_opening_width (linear, cm) and "
-            f"ultrasound_opening_angle (convex, degrees), got {'neither' if width_cm is None else 'both'}"
+            f"{path}: it must have exactly one of {WIDTH_KEY} (linear, cm) and "
+            f"{ANGLE_KEY} (convex, degrees), got {'neither' if width_cm is None else 'both'}"
         )
     near_mm = _to_mm(_number(path, document, "ultrasound_near_plane"))
     phased = document.get(KIND_KEY) == PhasedProbe.kind
     if phased and (angle_deg is None or near_mm != 0.0):
         raise CheckpointInvalid(
-            f"{path}: a phased probe has ultrasound_opening_angle and ultrasound_near_plane 0, got "
+            f"{path}: a phased probe has {ANGLE_KEY} and ultrasound_near_plane 0, got "
             f"{'no angle' if angle_deg is None else f'near plane {near_mm / 10.0:g}'}"
         )
     files = _named_files(path, document)

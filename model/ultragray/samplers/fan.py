@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from ..contract import described, kind_field
-from ..probe import FloatArray, LinearProbe, Probe
+from ..probe import FloatArray, Probe
 from .rotations import about_axes
 from .sampler import Sampler
 
@@ -38,10 +38,5 @@ class FanSampler(Sampler):
         fan = np.tile(base, (tilts, 1, 1, 1))  # [tilts, P, 4, 4]
         fan[..., :3, :3] = base[:, :3, :3] @ turns[:, None]
         axial = base[:, :3, 2] - fan[..., :3, 2]
-        fan[..., :3, 3] += face_depth_mm(probe) * axial
+        fan[..., :3, 3] += probe.face_depth_mm * axial
         return fan.reshape(-1, 4, 4)
-
-
-def face_depth_mm(probe: Probe) -> float:
-    """Where the middle of the face lies on the axial axis: a linear probe's frame begins there, a fan's at its apex."""
-    return 0.0 if isinstance(probe, LinearProbe) else probe.near_mm

@@ -11,7 +11,6 @@ from torch import Tensor
 from ..backends.spatial_order import spatial_order
 from ..datasets.sweep import Dataset
 from ..pose import quaternion_from_pose
-from ..probe import LinearProbe
 from ..scene import PARAMETERS
 from ..scene_info import expected_shapes
 from .config import TrainingConfig
@@ -68,12 +67,8 @@ def _on_pixels(
     frame = torch.randint(len(sweep), (count,), generator=generator)
     across, deep = torch.rand((2, count), generator=generator, dtype=torch.float64).numpy()  # share of the image
     elevation_mm = torch.randn(count, generator=generator, dtype=torch.float64).numpy() * geometry.frame_spacing_mm / 2
-    depth_mm = probe.near_mm + deep * probe.scan_line_length_mm
-    if isinstance(probe, LinearProbe):
-        points_mm = np.stack([probe.width_mm * (across - 0.5), elevation_mm, depth_mm], axis=1)
-    else:
-        angle = np.radians(probe.opening_angle_deg) * (across - 0.5)
-        points_mm = np.stack([depth_mm * np.sin(angle), elevation_mm, depth_mm * np.cos(angle)], axis=1)
+    points_mm = probe.points_mm(deep, across)
+    points_mm[:, 1] = elevation_mm
     poses = sweep.poses[frame.numpy()]
     tracked_mm = np.einsum("nij,nj->ni", poses[:, :3, :3], points_mm) + poses[:, :3, 3]
     rows, columns = (deep * sweep.height).astype(np.int64), (across * sweep.width).astype(np.int64)

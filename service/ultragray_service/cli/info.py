@@ -12,8 +12,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from ultragray.contract import to_dict
 from ultragray.files.atomic import file_sha256
-from ultragray.probe import probe_to_dict
 from ultragray.scene_info import SceneHeader, read_header
 
 
@@ -41,7 +41,7 @@ def _describe(path: Path, header: SceneHeader) -> dict[str, Any]:
         "file_bytes": header.file_bytes,
         **asdict(info),
         "confidence": {key: value for key, value in info.confidence.items() if key != "hardness"},
-        "probe": None if info.probe is None else probe_to_dict(info.probe),
+        "probe": None if info.probe is None else to_dict(info.probe),
         "training_poses": {
             "count": len(positions),
             **(

@@ -26,7 +26,7 @@ from ultragray.interchange.exports import FORMATS, ExportHeader, check_format, e
 from ultragray.interchange.exports.png_folder import export_pngs
 from ultragray.interchange.rendering import render_into
 from ultragray.outputs import check_outputs
-from ultragray.probe import LinearProbe, Probe, probe_from_dict
+from ultragray.probe import Probe
 from ultragray.rendering import renderer_name
 from ultragray.samplers import Sampler, TrainingSampler, assessed_poses
 from ultragray.scene import GaussianScene
@@ -145,7 +145,7 @@ def _format(output: Path) -> str | None:
 
 def _parse_probe(text: str) -> Probe:
     try:
-        return probe_from_dict(json.loads(text))
+        return from_dict(Probe, json.loads(text))
     except (json.JSONDecodeError, RecursionError) as error:
         raise InvalidArgument(f"--probe must be a JSON object: {error}", field="probe") from error
 
@@ -153,8 +153,10 @@ def _parse_probe(text: str) -> Probe:
 def _display(pixel_mm: float | None, probe: Probe, format: str | None) -> Display:
     if pixel_mm is None:
         return AS_RENDERED
-    if format is not None or isinstance(probe, LinearProbe):
-        raise InvalidArgument("--scan-convert draws PNGs of a convex or phased probe only", field="scan_convert")
+    if format is not None or probe.is_true_to_scale:
+        raise InvalidArgument(
+            "--scan-convert draws PNGs only, of probes whose frames are not true to scale", field="scan_convert"
+        )
     return Display(pixel_mm=pixel_mm)
 
 

@@ -93,6 +93,7 @@ def probe_body(probe: Probe) -> LinearProbeBody | ConvexProbeBody | PhasedProbeB
         return LinearProbeBody(kind="linear", width_mm=probe.width_mm, near_mm=probe.near_mm, far_mm=probe.far_mm)
     if isinstance(probe, PhasedProbe):
         return PhasedProbeBody(kind="phased", opening_angle_deg=probe.opening_angle_deg, far_mm=probe.far_mm)
+    assert isinstance(probe, ConvexProbe)
     return ConvexProbeBody(
         kind="convex", opening_angle_deg=probe.opening_angle_deg, near_mm=probe.near_mm, far_mm=probe.far_mm
     )

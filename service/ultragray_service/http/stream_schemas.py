@@ -10,8 +10,9 @@ from pydantic import BaseModel, Field
 from typing_extensions import TypedDict  # pydantic reads those of `typing` from Python 3.12 on
 
 from ultragray.confidence.assess import Extrapolation
+from ultragray.contract import to_dict
 from ultragray.errors import UltragrayError
-from ultragray.probe import Picture, probe_to_dict
+from ultragray.probe import Picture
 from ultragray_workers.pool.types import RenderResult
 
 from ..core.pose_stream import Answered, StreamMode
@@ -134,7 +135,7 @@ def frame_bytes(answered: Answered, result: RenderResult) -> bytes:
         "scene_sha256": result.scene_sha256,
         "renderer": result.renderer,
         "pose": result.poses[0].tolist(),
-        "probe": probe_to_dict(result.settings.probe),
+        "probe": to_dict(result.settings.probe),
         "rendered_height": result.settings.height,
         "rendered_width": result.settings.width,
         "display": asdict(result.settings.display),

@@ -104,6 +104,7 @@ def probe_message(probe: Probe) -> geometry_pb2.Probe:
     if isinstance(probe, PhasedProbe):
         phased = geometry_pb2.PhasedProbe(opening_angle_deg=probe.opening_angle_deg, far_mm=probe.far_mm)
         return geometry_pb2.Probe(phased=phased)
+    assert isinstance(probe, ConvexProbe)
     convex = geometry_pb2.ConvexProbe(
         opening_angle_deg=probe.opening_angle_deg, near_mm=probe.near_mm, far_mm=probe.far_mm
     )

@@ -12,11 +12,11 @@ import pytest
 
 from ultragray import ConvexProbe, GaussianScene, render
 from ultragray.confidence import SUPPORT_COVERAGE, Extrapolation
+from ultragray.contract import to_dict
 from ultragray.display import Display
 from ultragray.interchange import rendering
 from ultragray.interchange.exports import ExportHeader, export_to
 from ultragray.interchange.rendering import render_into
-from ultragray.probe import probe_to_dict
 
 PROBE = ConvexProbe(opening_angle_deg=60.0, near_mm=10.0, far_mm=50.0)
 POSES = np.tile(np.eye(4), (5, 1, 1))
@@ -44,7 +44,7 @@ def test_a_file_tells_how_its_frames_are_shown(
     with np.load(tmp_path / "frames.npz") as archive:
         picture = display.picture(PROBE, 24, 20)
         assert archive["bmode"].shape == (5, picture.height, picture.width)
-        assert json.loads(str(archive["probe"])) == probe_to_dict(PROBE)
+        assert json.loads(str(archive["probe"])) == to_dict(PROBE)
         assert json.loads(str(archive["display"])) == json.loads(json.dumps(asdict(display)))
         assert json.loads(str(archive["picture"])) == json.loads(json.dumps(asdict(picture)))
 

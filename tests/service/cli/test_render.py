@@ -19,6 +19,7 @@ from ultragray import ConvexProbe, GaussianScene, LinearProbe, PhasedProbe, Scen
 from ultragray.backends import cpu
 from ultragray.confidence import FIGURES, Assessor, ConfidenceModel, figure_arrays
 from ultragray.datasets.plus import read_plus_sweep
+from ultragray.display.scan_conversion import scan_convert, scan_convert_labels
 from ultragray.files.atomic import file_sha256
 from ultragray.interchange import rendering
 from ultragray.samplers import FanSampler
@@ -182,7 +183,7 @@ def test_render_with_another_probe_as_a_fan(scene_file: Path, tmp_path: Path) ->
     scene = GaussianScene.load(scene_file)
     frame = render(scene, CONVEX, scene.training_poses[:1], height=24, width=20).bmode
     assert frame is not None
-    np.testing.assert_array_equal(picture, np.rint(CONVEX.scan_convert(frame[0].numpy(), 0.5) * 255))
+    np.testing.assert_array_equal(picture, np.rint(scan_convert(frame[0].numpy(), CONVEX, 0.5) * 255))
 
 
 @pytest.fixture
@@ -211,7 +212,7 @@ def test_labels_are_written_as_they_are(labelled_file: Path, tmp_path: Path) -> 
         cv2.imread(str(tmp_path / name / "frame_00000_labels.png"), cv2.IMREAD_UNCHANGED) for name in ("flat", "fan")
     )
     np.testing.assert_array_equal(flat, truth[0])
-    np.testing.assert_array_equal(fan, PHASED.scan_convert_labels(truth[0].numpy(), 0.5))
+    np.testing.assert_array_equal(fan, scan_convert_labels(truth[0].numpy(), PHASED, 0.5))
 
 
 def test_info_tells_of_labels_and_a_phased_probe(labelled_file: Path) -> None:

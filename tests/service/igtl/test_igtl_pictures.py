@@ -10,6 +10,7 @@ import torch
 from ultragray import ConvexProbe, LinearProbe
 from ultragray.confidence import Extrapolation
 from ultragray.display.frames import show
+from ultragray.display.scan_conversion import scan_convert
 from ultragray.display.settings import true_to_scale
 from ultragray.probe import Probe
 from ultragray.settings import Resolved
@@ -73,7 +74,7 @@ def test_a_linear_frame_is_sent_as_it_is() -> None:
 def test_a_fan_is_scan_converted() -> None:
     frame = np.random.default_rng(0).integers(0, 256, (80, 60), np.uint8)
     image = image_of(result_of(frame, FAN, np.eye(4)))
-    expected = FAN.scan_convert(frame, 0.5)  # 40 mm in 80 samples
+    expected = scan_convert(frame, FAN, 0.5)  # 40 mm in 80 samples
     assert image.pixels.shape == expected.shape
     assert np.abs(image.pixels - expected).max() <= 0.51
     assert (image.pixels[expected == 0] == 0).all()

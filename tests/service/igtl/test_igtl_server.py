@@ -10,6 +10,7 @@ import numpy as np
 import pyigtl
 import pytest
 
+from ultragray.display.scan_conversion import scan_convert
 from ultragray.pose import check_poses
 from ultragray_proto.v1 import rendering_pb2, rendering_pb2_grpc
 from ultragray_service.igtl.contents import (
@@ -88,7 +89,7 @@ def test_tools_named_like_scenes_get_a_frame_each(peer: Peer, igtl_service: Runn
 def test_a_fan_is_sent_as_a_picture(peer: Peer, igtl_service: RunningService) -> None:
     peer.send_pose(np.eye(4), "ProbeTofan")
     image = peer.image()
-    expected = FAN.scan_convert(over_grpc(igtl_service, "fan", np.eye(4)), FAN.scan_line_length_mm / HEIGHT)
+    expected = scan_convert(over_grpc(igtl_service, "fan", np.eye(4)), FAN, FAN.scan_line_length_mm / HEIGHT)
     assert np.abs(image.pixels - expected).max() <= 8
     assert expected.max() > 50
 

@@ -13,10 +13,11 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ultragray.contract import from_dict, to_dict
 from ultragray.datasets.source import dataset_format
 from ultragray.errors import DatasetInvalid, InvalidArgument, UltragrayError
 from ultragray.files.atomic import sync, write_whole
-from ultragray.probe import Probe, probe_from_dict, probe_to_dict
+from ultragray.probe import Probe
 
 from ..errors import DatasetExists, DatasetInUse, DatasetNotFound
 from .contents import find_source
@@ -53,7 +54,7 @@ class DatasetRecord:
 
     def to_json(self) -> str:
         """The manifest."""
-        probe = None if self.probe is None else probe_to_dict(self.probe)
+        probe = None if self.probe is None else to_dict(self.probe)
         return json.dumps({**asdict(self), "probe": probe}, indent=1) + "\n"
 
     @classmethod
@@ -61,7 +62,7 @@ class DatasetRecord:
         """Its inverse. Raises ValueError, KeyError, TypeError or DatasetInvalid for anything else."""
         document: dict[str, Any] = json.loads(text)
         values = {one.name: document[one.name] for one in fields(cls)}
-        probe = None if values["probe"] is None else probe_from_dict(values["probe"])
+        probe = None if values["probe"] is None else from_dict(Probe, values["probe"])
         return cls(**{**values, "probe": probe, "warnings": tuple(values["warnings"])})
 
 

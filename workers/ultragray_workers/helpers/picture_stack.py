@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ultragray.contract import from_dict, to_dict
 from ultragray.display.pixels import to_uint8
-from ultragray.display.square_pixels import with_square_pixels
-from ultragray.probe import Probe, probe_from_dict, probe_to_dict
+from ultragray.display.scan_conversion import with_square_pixels
+from ultragray.probe import Probe
 
 PROBE_NAME, SUFFIX = "probe.json", ".npy"
 PICTURE_SIDE = 512  # pixels, the longer one
@@ -23,7 +24,7 @@ PICTURE_SIDE = 512  # pixels, the longer one
 
 def write_stacks(folder: Path, stacks: Mapping[str, npt.NDArray[Any]], probe: Probe) -> None:
     """Writes frames of one probe, [F, H, W], uint8 or float32 in [0, 1]."""
-    (folder / PROBE_NAME).write_text(json.dumps(probe_to_dict(probe)), encoding="utf-8")
+    (folder / PROBE_NAME).write_text(json.dumps(to_dict(probe)), encoding="utf-8")
     for name, frames in stacks.items():
         with (folder / f"{name}{SUFFIX}").open("wb") as file:
             header = {"descr": "|u1", "fortran_order": False, "shape": frames.shape}
@@ -33,10 +34,10 @@ def write_stacks(folder: Path, stacks: Mapping[str, npt.NDArray[Any]], probe: Pr
 
 
 def read_picture(folder: Path, name: str, index: int) -> npt.NDArray[np.uint8] | None:  # [H', W']
-    """One frame with square pixels, those of convex and phased probes as fans; None where it is not there."""
+    """One frame with square pixels, scan-converted; None where it is not there."""
     try:
         stack = np.load(folder / f"{name}{SUFFIX}", mmap_mode="r")
-        probe = probe_from_dict(json.loads((folder / PROBE_NAME).read_text(encoding="utf-8")))
+        probe = from_dict(Probe, json.loads((folder / PROBE_NAME).read_text(encoding="utf-8")))
     except FileNotFoundError:
         return None
     if not 0 <= index < len(stack):

@@ -17,7 +17,8 @@ import triton
 from torch import Tensor
 
 from ...outputs import PLANES, WEIGHT_SUM
-from ...probe import FloatArray, LinearProbe, Probe
+from ...probe import FloatArray, Probe
+from ..scan_lines import KernelLines
 from .device import interpreted
 from .kernels import constants
 from .kernels.drawing import draw_tiles, finish_frames
@@ -74,7 +75,7 @@ def launching(device: torch.device) -> Iterator[None]:
 class Geometry(NamedTuple):
     """What a probe and an image size mean to the kernels."""
 
-    convex: bool
+    fanned: bool
     height: int
     width: int
     pitch: float  # between scan lines: cm, or radians for a fan
@@ -82,17 +83,8 @@ class Geometry(NamedTuple):
 
     @classmethod
     def of(cls, probe: Probe, height: int, width: int) -> Geometry:
-        return cls(
-            not isinstance(probe, LinearProbe),
-            height,
-            width,
-            _span(probe) / width,
-            _row_cm(probe, height),
-        )
-
-
-def _span(probe: Probe) -> float:
-    return probe.width_mm / 10.0 if isinstance(probe, LinearProbe) else math.radians(probe.opening_angle_deg)
+        lines = KernelLines.of(probe)
+        return cls(lines.fanned, height, width, lines.span / width, _row_cm(probe, height))
 
 
 def _row_cm(probe: Probe, height: int) -> float:
@@ -101,10 +93,12 @@ def _row_cm(probe: Probe, height: int) -> float:
 
 def view_table(probe: Probe, poses_cm: FloatArray, height: int) -> FloatArray:  # [C, 4, 4] -> [C, VIEW]
     """Each pose as the kernels want it: the probe's axes and origin, and the probe."""
+    lines = KernelLines.of(probe)
     table = np.empty((len(poses_cm), constants.VIEW.value))
-    table[:, :9] = poses_cm[:, :3, :3].transpose(0, 2, 1).reshape(-1, 9)
+    table[:, :9] = lines.view_axes(poses_cm)[:, :3, :3].transpose(0, 2, 1).reshape(-1, 9)
     table[:, 9:12] = poses_cm[:, :3, 3]
-    table[:, 12:] = _span(probe), probe.near_mm / 10.0, probe.cull_far_mm(height) / 10.0, _row_cm(probe, height)
+    depths_cm = probe.near_mm / 10.0, probe.cull_far_mm(height) / 10.0, _row_cm(probe, height)
+    table[:, 12:] = *depths_cm, lines.start, lines.span
     return table
 
 
@@ -197,7 +191,7 @@ def cut(gaussians: Gaussians, views: Tensor, geometry: Geometry, *, record: bool
             gaussians.shn.stride(0),
             geometry.height,
             geometry.width,
-            CONVEX=geometry.convex,
+            FANNED=geometry.fanned,
             SIGMOID=gaussians.sigmoid,
             DEGREE=gaussians.degree,
             RECORD=record,
@@ -237,7 +231,7 @@ def draw(slices: Slices, geometry: Geometry, frames: Mapping[str, Tensor], *, ke
         width,
         geometry.pitch,
         geometry.row_cm,
-        CONVEX=geometry.convex,
+        FANNED=geometry.fanned,
         BLOCK=how.block,
         S_LANES=how.slices_at_once,
         TILE_ROWS=how.tile_rows,
@@ -314,7 +308,7 @@ def differentiate(
             width,
             geometry.pitch,
             geometry.row_cm,
-            CONVEX=geometry.convex,
+            FANNED=geometry.fanned,
             BLOCK=how.block,
             S_LANES=how.slices_at_once,
             ROWS=how.gather_rows,
@@ -338,7 +332,7 @@ def differentiate(
         count,
         gaussians.shn.stride(0),
         width,
-        CONVEX=geometry.convex,
+        FANNED=geometry.fanned,
         SIGMOID=gaussians.sigmoid,
         DEGREE=gaussians.degree,
         TERMS=max(2, triton.next_power_of_2(terms)),

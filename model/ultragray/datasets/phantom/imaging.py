@@ -14,8 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from ...errors import InvalidProbe
 from ...pose import check_poses
-from ...probe import FloatArray, LinearProbe
+from ...probe import FloatArray, Probe
 from ..sweep import ByteArray, IntArray
 from . import acoustics
 from .anatomy import Tissue, tissue_at
@@ -30,7 +31,7 @@ DYNAMIC_RANGE_DB = 60.0
 MUSCLE_GREY = 0.23  # of muscle's scatterers at their mean power; fibres and fascia are brighter
 
 
-def simulate(poses: npt.ArrayLike, *, probe: LinearProbe, height: int, width: int) -> ByteArray:  # [F, H, W]
+def simulate(poses: npt.ArrayLike, *, probe: Probe, height: int, width: int) -> ByteArray:  # [F, H, W]
     """B-mode frames of the phantom from poses [F, 4, 4], mm: the same scatterers in all, the same on every call.
 
     Raises InvalidPose for poses that are not rigid.
@@ -43,9 +44,7 @@ def simulate(poses: npt.ArrayLike, *, probe: LinearProbe, height: int, width: in
     return frames
 
 
-def bone_attenuation_db(
-    poses: npt.ArrayLike, *, probe: LinearProbe, height: int, width: int
-) -> Float32Array:  # [F, H, W]
+def bone_attenuation_db(poses: npt.ArrayLike, *, probe: Probe, height: int, width: int) -> Float32Array:  # [F, H, W]
     """What bone takes from the echo of each pixel, there and back, in dB: where the shadows are.
 
     Raises InvalidPose for poses that are not rigid.
@@ -64,16 +63,18 @@ def bone_attenuation_db(
 class Grid:
     """Two cells a pixel, one above the other, and a margin around the image: R rows of depth, C scan lines."""
 
-    probe: LinearProbe
+    probe: Probe
     height: int
     width: int
     cell_mm: tuple[float, float]  # depth, lateral
     margins: tuple[int, int]  # cells before the first row, and beside the first column
 
     @classmethod
-    def of(cls, probe: LinearProbe, height: int, width: int) -> Grid:
-        """The grid of an image of H rows and W scan lines."""
-        cell_mm = (probe.scan_line_length_mm / (CELLS_PER_ROW * height), probe.width_mm / width)
+    def of(cls, probe: Probe, height: int, width: int) -> Grid:
+        """The grid of an image of H rows and W scan lines. Raises InvalidProbe unless these are upright."""
+        if not probe.is_true_to_scale:
+            raise InvalidProbe(f"the phantom is scanned along upright lines, got {probe}", field="probe")
+        cell_mm = (probe.scan_line_length_mm / (CELLS_PER_ROW * height), probe.lines.span / width)
         depth_margin, lateral_margin = (math.ceil(MARGIN_MM / size) for size in cell_mm)
         return cls(probe, height, width, cell_mm, (depth_margin, lateral_margin))
 
@@ -85,7 +86,7 @@ class Grid:
     def first_mm(self) -> tuple[float, float]:
         """Depth and lateral position of the grid's corner."""
         depth = self.probe.near_mm - self.margins[0] * self.cell_mm[0]
-        return depth, -0.5 * self.probe.width_mm - self.margins[1] * self.cell_mm[1]
+        return depth, -0.5 * self.probe.lines.span - self.margins[1] * self.cell_mm[1]
 
     @property
     def depths_mm(self) -> Floats:  # [R]

@@ -8,7 +8,6 @@ import numpy as np
 import numpy.typing as npt
 
 from ...errors import DatasetInvalid
-from ...probe import LinearProbe
 from ..sweep import Sweep
 from .imaging import bone_attenuation_db
 from .scatterers import Float32Array
@@ -27,10 +26,11 @@ class BoneShadow:
     def of(cls, sweep: Sweep) -> BoneShadow:
         """Simulates the attenuation along each scan line.
 
-        Raises DatasetInvalid for a sweep of another probe than a linear one, or without a pixel behind bone.
+        Raises DatasetInvalid for a sweep of a probe that the phantom is not scanned with, or without a pixel behind
+        bone.
         """
-        if not isinstance(sweep.probe, LinearProbe):
-            raise DatasetInvalid(f"{sweep.source}: the phantom is scanned with a linear probe, got {sweep.probe}")
+        if not sweep.probe.is_true_to_scale:
+            raise DatasetInvalid(f"{sweep.source}: the phantom is scanned along upright lines, got {sweep.probe}")
         attenuation_db = bone_attenuation_db(sweep.poses, probe=sweep.probe, height=sweep.height, width=sweep.width)
         hidden = attenuation_db > SHADOW_DB
         if not hidden.any():

@@ -14,11 +14,12 @@ import numpy as np
 import numpy.typing as npt
 
 from ...confidence import Extrapolation, figure_arrays
+from ...contract import to_dict
 from ...display.pixels import PixelArray, to_uint8
 from ...display.settings import AS_RENDERED, Display
 from ...errors import InvalidArgument
 from ...outputs import OUTPUTS
-from ...probe import FloatArray, Picture, Probe, probe_to_dict
+from ...probe import FloatArray, Picture, Probe
 
 FRAME_TIME_MS = 40.0  # rendered frames have no time of their own: formats that need one show 25 a second
 
@@ -64,7 +65,7 @@ class ExportHeader:
             "scene": self.scene,
             "scene_sha256": self.scene_sha256,
             "renderer": self.renderer,
-            "probe": probe_to_dict(self.probe),
+            "probe": to_dict(self.probe),
             "display": asdict(self.display),
             "picture": asdict(self.picture),
         }

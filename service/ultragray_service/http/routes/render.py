@@ -10,8 +10,8 @@ from fastapi import APIRouter
 from starlette.requests import Request
 from starlette.responses import Response
 
+from ultragray.contract import to_dict
 from ultragray.outputs import OUTPUTS, check_outputs
-from ultragray.probe import probe_to_dict
 from ultragray.settings import Encoding
 from ultragray_workers.pool.types import Priority, RenderRequest, RenderResult
 
@@ -114,7 +114,7 @@ def _headers(result: RenderResult) -> dict[str, str]:
         "X-Ultragray-Shape": f"{len(result.settings.outputs)},{len(result.poses)},{result.height},{result.width}",
         "X-Ultragray-Dtype": _DTYPES.get(result.settings.encoding, "uint8"),
         "X-Ultragray-Outputs": ",".join(result.settings.outputs),
-        "X-Ultragray-Probe": json.dumps(probe_to_dict(result.settings.probe)),
+        "X-Ultragray-Probe": json.dumps(to_dict(result.settings.probe)),
         "X-Ultragray-Confidence": ",".join(
             "" if told.confidence is None else f"{told.confidence:.3f}" for told in result.extrapolations
         ),

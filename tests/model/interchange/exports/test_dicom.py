@@ -17,6 +17,7 @@ from ultragray import ConvexProbe, LinearProbe
 from ultragray.confidence import Extrapolation
 from ultragray.display import AS_RENDERED
 from ultragray.display.frames import show
+from ultragray.display.scan_conversion import scan_convert
 from ultragray.errors import InvalidArgument
 from ultragray.interchange.exports import FORMATS, ExportHeader, export_to
 
@@ -157,9 +158,9 @@ def test_pixels_and_their_places_of_a_convex_probe(tmp_path: Path) -> None:
     assert (region.PhysicalDeltaX, region.PhysicalDeltaY) == pytest.approx((pixel_cm, pixel_cm))
     assert "PixelAspectRatio" not in data
     bytes_ = np.rint(FRAMES[2] * 255)
-    fan = np.rint(CONVEX.scan_convert(bytes_, 10 * pixel_cm))
+    fan = np.rint(scan_convert(bytes_, CONVEX, 10 * pixel_cm))
     np.testing.assert_allclose(data.pixel_array[2], fan, atol=1)
-    inside = CONVEX.scan_convert(np.ones((21, 19)), 10 * pixel_cm) > 0
+    inside = scan_convert(np.ones((21, 19)), CONVEX, 10 * pixel_cm) > 0
     for row, column in zip(*np.nonzero(inside), strict=True):
         x, z = position_cm(region, int(column), int(row))
         assert 2.0 <= np.hypot(x, z) <= 6.0

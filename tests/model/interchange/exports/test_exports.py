@@ -20,11 +20,11 @@ from zarr.storage import ZipStore
 
 from ultragray import LinearProbe
 from ultragray.confidence import FIGURES, Extrapolation, figure_arrays
+from ultragray.contract import to_dict
 from ultragray.errors import ExtraMissing, InvalidArgument
 from ultragray.interchange.exports import FORMATS, ExportHeader, check_format, export_to
 from ultragray.interchange.exports.exporter import stored_pixels
 from ultragray.interchange.exports.npz import NpzExporter
-from ultragray.probe import probe_to_dict
 
 PROBE = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)
 POSES = np.tile(np.eye(4), (5, 1, 1))
@@ -102,7 +102,7 @@ def test_tar_loads_with_the_standard_library(tmp_path: Path) -> None:
         told = json.load(file)
     assert told["pose"] == POSES[2].tolist()
     assert {name: told[name] for name in FIGURES} == asdict(TOLD[2])
-    assert told["probe"] == probe_to_dict(PROBE)
+    assert told["probe"] == to_dict(PROBE)
 
 
 def test_what_is_not_known(tmp_path: Path) -> None:
@@ -144,7 +144,7 @@ def test_zarr(tmp_path: Path, dtype: str) -> None:
     poses: Any = group["poses"]
     np.testing.assert_array_equal(poses[:], POSES)
     assert group.attrs["scene"] == "one"
-    assert group.attrs["probe"] == probe_to_dict(PROBE)
+    assert group.attrs["probe"] == to_dict(PROBE)
     group.store.close()
 
 
@@ -160,7 +160,7 @@ def test_hdf5(tmp_path: Path, dtype: str) -> None:
             assert file[name].dtype == np.float32
             np.testing.assert_array_equal(file[name], figures)
         assert file.attrs["scene_sha256"] == "0" * 64
-        assert json.loads(file.attrs["probe"]) == probe_to_dict(PROBE)
+        assert json.loads(file.attrs["probe"]) == to_dict(PROBE)
 
 
 @pytest.mark.parametrize("format", FORMATS)

@@ -14,6 +14,7 @@ from ultragray.datasets.plus import read_plus_sweep
 from ultragray.datasets.transforms import parse_matrix
 from ultragray.display import AS_RENDERED
 from ultragray.display.frames import show
+from ultragray.display.scan_conversion import scan_convert
 from ultragray.interchange.exports import FORMATS, ExportHeader, export_to
 from ultragray.pose import pose_from_position_quaternion
 from ultragray.probe import Probe
@@ -97,7 +98,7 @@ def test_a_fan_is_scan_converted(tmp_path: Path) -> None:
     probe = ConvexProbe(opening_angle_deg=60.0, near_mm=20.0, far_mm=60.0)
     export(tmp_path / "sweep.igs.mha", probe)
     stored = read_meta_image(tmp_path / "sweep.igs.mha")
-    fan = np.rint(255 * probe.scan_convert(FRAMES[3], 2.0))
+    fan = np.rint(255 * scan_convert(FRAMES[3], probe, 2.0))
     np.testing.assert_allclose(stored.pixels[3], fan, atol=1)
     assert (stored.pixels[3] == fan).mean() > 0.99
     image = parse_matrix(stored.frame_fields[3]["ImageToProbeTransform"], "it")

@@ -40,7 +40,7 @@ def draw_tiles(
     width,
     pitch,
     row_cm,
-    CONVEX: tl.constexpr,
+    FANNED: tl.constexpr,
     BLOCK: tl.constexpr,
     S_LANES: tl.constexpr,
     TILE_ROWS: tl.constexpr,
@@ -86,7 +86,7 @@ def draw_tiles(
                         y1,
                         pitch,
                         row_cm,
-                        CONVEX,
+                        FANNED,
                         S_LANES,
                     )
                     picked = tl.min(tl.where(hits & (lane > picked), lane, NOTHING), 0)
@@ -109,7 +109,7 @@ def draw_tiles(
                         y1,
                         pitch,
                         row_cm,
-                        CONVEX,
+                        FANNED,
                         S_LANES,
                     )
             chosen = tl.min(tl.where(hit & (block > chosen), block, NOTHING), 0)
@@ -138,7 +138,7 @@ def add_slices(
     y1,
     pitch,
     row_cm,
-    CONVEX: tl.constexpr,
+    FANNED: tl.constexpr,
     S_LANES: tl.constexpr,
 ):
     """The accumulators of a tile, with some slices added."""
@@ -156,10 +156,10 @@ def add_slices(
         field(slices, slot, hits, 6),
         field(slices, slot, hits, 7),
         pitch,
-        CONVEX,
+        FANNED,
     )
     touched = touched & hits[:, None, None]
-    if CONVEX:  # a line of the far side of a wide fan meets the slice behind the apex
+    if FANNED:  # a line of the far side of a wide fan meets the slice behind the apex
         own = tl.load(rectangle, hits, 0)[:, None, None] <= columns_at
         touched = touched & own & (columns_at <= tl.load(rectangle + 1, hits, -1)[:, None, None])
     scale = 1.0 / sigma

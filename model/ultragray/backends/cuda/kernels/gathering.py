@@ -97,7 +97,7 @@ def gather_slices(
     width,
     pitch,
     row_cm,
-    CONVEX: tl.constexpr,
+    FANNED: tl.constexpr,
     BLOCK: tl.constexpr,
     S_LANES: tl.constexpr,
     ROWS: tl.constexpr,
@@ -134,7 +134,7 @@ def gather_slices(
             columns = first_column[:, None] + x + tl.arange(0, COLUMNS)[None, :]  # [S, columns]
             turn = (columns - column[:, None]).to(tl.float32)
             dx, dz, across, spread, m2, sigma, past, star, touched = cross(
-                turn, t, row_offset, r, m2_plane, tt, tr, rr, det, pitch, CONVEX
+                turn, t, row_offset, r, m2_plane, tt, tr, rr, det, pitch, FANNED
             )
             touched = touched & (columns <= last_column[:, None])
             scale = 1.0 / sigma

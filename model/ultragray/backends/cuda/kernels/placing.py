@@ -57,7 +57,7 @@ def place_gradients(
     count,
     shn_stride,
     width,
-    CONVEX: tl.constexpr,
+    FANNED: tl.constexpr,
     SIGMOID: tl.constexpr,
     DEGREE: tl.constexpr,
     TERMS: tl.constexpr,  # coefficients, to the next power of two
@@ -84,10 +84,10 @@ def place_gradients(
             on_t, on_r = tl.load(g, cut, 0.0).to(tl.float64), tl.load(g + 1, cut, 0.0).to(tl.float64)
             on_tt, on_tr = tl.load(g + 2, cut, 0.0).to(tl.float64), tl.load(g + 3, cut, 0.0).to(tl.float64)
             on_rr, on_m2 = tl.load(g + 4, cut, 0.0).to(tl.float64), tl.load(g + 5, cut, 0.0).to(tl.float64)
-            if CONVEX:  # from the axes of the slice's scan line to those of the probe
-                pitch, span = tl.load(view + 12) / width, tl.load(view + 12)
+            if FANNED:  # from the axes of the slice's scan line to those of the probe
+                start, pitch = tl.load(view + 15), tl.load(view + 16) / width
                 column = tl.load(rectangles + slot * RECTANGLE + 4, cut, 0)
-                theta = (column.to(tl.float64) + 0.5) * pitch - 0.5 * span
+                theta = start + (column.to(tl.float64) + 0.5) * pitch
                 dx, dz = tl.sin(theta), tl.cos(theta)
                 on_x, on_z = dz * on_t + dx * on_r, dz * on_r - dx * on_t
                 on_xx = dz * dz * on_tt + dx * dz * on_tr + dx * dx * on_rr

@@ -77,14 +77,14 @@ def profile_slopes(u, zero):
 
 
 @triton.jit
-def cross(turn, t, row_offset, r, m2_plane, tt, tr, rr, det, pitch, CONVEX: tl.constexpr):
+def cross(turn, t, row_offset, r, m2_plane, tt, tr, rr, det, pitch, FANNED: tl.constexpr):
     """Scan lines `turn` lines to the right of a slice's own: how they cross the slice.
 
     Returns the line's direction in the slice's axes, its distance across from the mean and one over the variance in
     that direction, m2, sigma along the line (cm), how far the slice's own row lies past s*, s*, and whether w reaches
     1/255.
     """
-    if CONVEX:
+    if FANNED:
         angle = turn * pitch
         dx, dz = tl.sin(angle), tl.cos(angle)
         half = tl.sin(0.5 * angle)

@@ -149,7 +149,7 @@ def slice_gaussians(
     shn_stride,
     height,
     width,
-    CONVEX: tl.constexpr,
+    FANNED: tl.constexpr,
     SIGMOID: tl.constexpr,
     DEGREE: tl.constexpr,
     RECORD: tl.constexpr,
@@ -185,23 +185,24 @@ def slice_gaussians(
         xx, xz, zz = xx - xy * xy * inverse, xz - xy * yz * inverse, zz - yz * yz * inverse
         det = xx * zz - xz * xz
 
-        span, near, cull_far, row_cm = tl.load(view + 12), tl.load(view + 13), tl.load(view + 14), tl.load(view + 15)
+        near, cull_far, row_cm = tl.load(view + 12), tl.load(view + 13), tl.load(view + 14)
+        start, span = tl.load(view + 15), tl.load(view + 16)
         pitch = span / width
-        if CONVEX:
+        if FANNED:
             depth = tl.sqrt(mean[0] * mean[0] + mean[2] * mean[2])
             inside = (depth >= near) & (depth <= cull_far) & (mean[2] > 0.0)
             angle = arc_tangent(x / tl.maximum(z, 1e-30))
-            line = (angle / span + 0.5) * width - 0.5
+            line = (angle - start) / span * width - 0.5
         else:
             inside = (mean[2] >= near) & (mean[2] <= cull_far)
-            line = (x / span + 0.5) * width - 0.5
+            line = (x - start) / span * width - 0.5
         kept = candidate & inside & (m2 <= MAX_M2) & (xx > 0.0) & (det > 0.0)
 
         # From here on about a scan line near the mean: t across that line, r along it. Distances stay small there, and
         # float32 keeps their digits.
         column = tl.minimum(tl.maximum(line, 0.0), width - 1.0).to(tl.int32)
-        if CONVEX:
-            theta = (column.to(tl.float64) + 0.5) * pitch - 0.5 * span
+        if FANNED:
+            theta = start + (column.to(tl.float64) + 0.5) * pitch
             dx, dz = tl.sin(theta), tl.cos(theta)
             t, r = dz * x - dx * z, dx * x + dz * z
             tt = dz * dz * xx - 2.0 * dx * dz * xz + dx * dx * zz
@@ -209,13 +210,13 @@ def slice_gaussians(
             rr = dx * dx * xx + 2.0 * dx * dz * xz + dz * dz * zz
             spread = tl.sqrt(tt + rr)
         else:
-            t, r = x - ((column.to(tl.float64) + 0.5) * pitch - 0.5 * span), z
+            t, r = x - (start + (column.to(tl.float64) + 0.5) * pitch), z
             tt, tr, rr = xx, xz, zz
             spread = tl.sqrt(rr)  # no standard deviation along a scan line is larger
 
         # Scan lines whose ray comes within MAX_M2.
         room = MAX_M2 - m2
-        if CONVEX:  # the ellipse's tangents from the apex: roots in tan(angle)
+        if FANNED:  # the ellipse's tangents from the apex: roots in tan(angle)
             qa, qb, qc = r * r - room * rr, t * r - room * tr, t * t - room * tt
             discriminant = qb * qb - qa * qc
             open_fan = (qa > 0.0) & (discriminant >= 0.0) & (r > 0.0)  # else it reaches the plane of the apex
@@ -235,7 +236,7 @@ def slice_gaussians(
         top = r - tl.sqrt(tl.maximum(room * rr, 0.0))
         below = tl.where(opaque, NEGLIGIBLE, MAX_M2) - m2
         bottom = r + tl.sqrt(tl.maximum(below * rr, 0.0))
-        if CONVEX:
+        if FANNED:
             side = tl.abs(t) + tl.sqrt(tl.maximum(below * tt, 0.0))
             bottom = tl.where(bottom > 0.0, tl.sqrt(bottom * bottom + side * side), side)
         bottom = tl.where(opaque, tl.maximum(bottom, 3.0 * spread), bottom)  # where depth 0 clips the window

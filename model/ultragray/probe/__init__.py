@@ -1,0 +1,27 @@
+"""Probes: where each pixel lies in the probe frame.
+
+Convention. Probe frame, right-handed: x lateral (image columns, left to right), y elevation, z axial (depth, image
+rows). Origin: centre of the transducer face (linear), apex of the fan (convex), both (phased). Images are [H, W]: H
+depth samples, W scan lines; sample i lies at depth near + (far − near)·(i+½)/H along its scan line, so the geometry in
+mm does not depend on H.
+
+A kind of probe is one class in one file (`linear.py`): its numbers, and the bundle of scan lines that they mean
+(`scan_lines.py`). `Probe` derives the rest, and nothing outside this package asks for a kind.
+"""
+
+from .convex import ConvexProbe
+from .linear import LinearProbe
+from .phased import PhasedProbe
+from .picture import Picture
+from .probe import Probe, stretch_released_far
+from .scan_lines import FloatArray
+
+__all__ = [
+    "ConvexProbe",
+    "FloatArray",
+    "LinearProbe",
+    "PhasedProbe",
+    "Picture",
+    "Probe",
+    "stretch_released_far",
+]

@@ -1,0 +1,20 @@
+"""The phased array."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from ..contract import kind_field
+from .fan import Fan, opening_field
+from .probe import length_field
+
+
+@dataclass(frozen=True)
+class PhasedProbe(Fan):
+    """A phased array: scan lines fan out from the centre of the face; `near_mm` is 0."""
+
+    opening_angle_deg: float = opening_field()
+    far_mm: float = length_field("Depth at which the image ends.", above=0.0)
+    near_mm: float = field(default=0.0, init=False, repr=False)
+    kind: Literal["phased"] = kind_field("phased")
