@@ -15,8 +15,9 @@ import torch
 
 from ultragray import ConvexProbe, Frames, GaussianScene, LinearProbe, Probe, SceneInfo
 from ultragray.backends import cuda
+from ultragray.interchange.released_config import stretch_released_far
 from ultragray.outputs import PLANES
-from ultragray.probe import FloatArray, stretch_released_far
+from ultragray.probe import FloatArray
 from ultragray.scene import PARAMETERS
 
 from .postgres import postgres

@@ -11,21 +11,21 @@ import numpy as np
 
 import ultragray
 from ultragray import (
-    ConvexProbe,
     GaussianScene,
     LinearProbe,
     PhasedProbe,
+    Probe,
     confidence,
     contract,
     demo,
     errors,
     pose,
-    probe,
     rendering,
     samplers,
 )
 from ultragray.datasets import Dataset, Sweep, checks, phantom, pictures, plus, released, source
 from ultragray.display import frames as display_frames
+from ultragray.display import scan_conversion
 from ultragray.display import settings as display
 from ultragray.evaluation import baselines, compounding, metrics, side_by_side
 from ultragray.evaluation import scoring as evaluation
@@ -48,11 +48,11 @@ LIBRARY_MODULES = (
     ply,
     pose,
     pose_file,
-    probe,
     rendering,
+    scan_conversion,
 )
 MEASURING_MODULES = (baselines, compounding, evaluation, metrics, side_by_side, png_folder)
-MEMBERS_OF = (GaussianScene, LinearProbe, ConvexProbe, PhasedProbe, errors.UltragrayError)
+MEMBERS_OF = (GaussianScene, Probe, errors.UltragrayError)
 
 
 def test_library() -> None:

@@ -18,7 +18,7 @@ import numpy as np
 from ..datasets.images import frame_size
 from ..errors import CheckpointInvalid, InvalidProbe
 from ..files.npy import map_npy
-from ..probe import ConvexProbe, FloatArray, LinearProbe, PhasedProbe, Probe, stretch_released_far
+from ..probe import ConvexProbe, FloatArray, LinearProbe, PhasedProbe, Probe
 
 MAX_CONFIG_BYTES = 1 << 20
 WIDTH_KEY, ANGLE_KEY = "ultrasound_opening_width", "ultrasound_opening_angle"
@@ -78,6 +78,13 @@ class ReleasedConfig:
             return ConvexProbe(opening_angle_deg=self.opening_angle_deg or 0.0, near_mm=self.near_mm, far_mm=far_mm)
         except InvalidProbe as error:
             raise CheckpointInvalid(f"{self.path}: {error}") from error
+
+
+def stretch_released_far(near: float, far_released: float, height: int) -> float:
+    """The far plane of ours that puts H rows where the released code's grid (i+½)/(H−1) has them (same unit)."""
+    if height < 2:
+        raise InvalidProbe(f"the released depth grid needs at least 2 rows, got {height}", field="height")
+    return near + (far_released - near) * height / (height - 1)
 
 
 def probe_keys(released_probe: Probe) -> dict[str, float | str]:

@@ -13,7 +13,7 @@ from .convex import ConvexProbe
 from .linear import LinearProbe
 from .phased import PhasedProbe
 from .picture import Picture
-from .probe import Probe, stretch_released_far
+from .probe import Probe
 from .scan_lines import FloatArray
 
 __all__ = [
@@ -23,5 +23,4 @@ __all__ = [
     "PhasedProbe",
     "Picture",
     "Probe",
-    "stretch_released_far",
 ]

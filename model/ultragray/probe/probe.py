@@ -145,10 +145,3 @@ def odd_length(subject: str, measure: str, length_mm: float, usual_mm: tuple[flo
 
 def _in_probe_frame(vectors: FloatArray) -> FloatArray:  # [..., 2] (x, z) -> [..., 3]
     return np.stack([vectors[..., 0], np.zeros(vectors.shape[:-1]), vectors[..., 1]], axis=-1)
-
-
-def stretch_released_far(near: float, far_released: float, height: int) -> float:
-    """The far plane of ours that puts H rows where the released code's grid (i+½)/(H−1) has them (same unit)."""
-    if height < 2:
-        raise InvalidProbe(f"the released depth grid needs at least 2 rows, got {height}", field="height")
-    return near + (far_released - near) * height / (height - 1)
