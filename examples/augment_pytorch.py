@@ -21,6 +21,7 @@ import torch
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
 import ultragray
+from ultragray.contract import from_dict
 from ultragray.samplers import AroundSampler, SplineSampler
 from ultragray_client import Client, Frame, RenderSettings, Scene
 
@@ -61,7 +62,7 @@ class SimulatedFrames(IterableDataset[Sample]):
         """All poses of the epoch; `epoch` chooses others."""
         if scene.probe is None or not scene.training_poses:
             raise SystemExit(f"{scene.name} does not say which probe and poses it was trained with")
-        probe = ultragray.probe.probe_from_dict(asdict(scene.probe))
+        probe = from_dict(ultragray.Probe, asdict(scene.probe))
         path = SplineSampler(count=PATH_POSES).poses(np.stack(scene.training_poses), probe)
         around = AroundSampler(
             count=self._count,
