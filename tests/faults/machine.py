@@ -21,11 +21,11 @@ _STOP_TIMEOUT_S = 30.0
 _PATCHES = f"""
 import sys
 line = " ".join(sys.orig_argv)
-if "ultragray_workers.jobs.run_job" in line:
-    from ultragray_workers.jobs import train_job
-    train_job.CHECKPOINT_INTERVAL_S = {CHECKPOINT_INTERVAL_S}
+if "ultragray_workers.jobs.worker.run_job" in line:
+    from ultragray_workers.jobs.kinds import train_run
+    train_run.CHECKPOINT_INTERVAL_S = {CHECKPOINT_INTERVAL_S}
 elif "worker" in line:
-    from ultragray_workers.jobs import heartbeat
+    from ultragray_workers.jobs.queue import heartbeat
     heartbeat.DEAD_AFTER_S = {DEAD_AFTER_S}
 """
 _SERVE = [sys.executable, "-m", "ultragray_service"]
@@ -115,7 +115,7 @@ class Machine:
                 continue
             if any(line.endswith(end) for end in embedded):
                 found["worker"].append(int(path.parent.name))
-            elif "jobs.run_job" in line and str(self.artifacts) in line:
+            elif "worker.run_job" in line and str(self.artifacts) in line:
                 found["job"].append(int(path.parent.name))
         return found
 

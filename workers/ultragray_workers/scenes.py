@@ -168,12 +168,11 @@ class SceneStore:
         return SceneNotFound(f"there is no scene {name[:128]!r}; {hint}", field="scene")
 
 
-def check_scene_name(name: Any) -> None:
+def check_scene_name(name: Any, field: str = "scene") -> None:
     """Raises InvalidArgument for a name that no scene can have."""
     if not isinstance(name, str) or not _NAME.fullmatch(name):
         raise InvalidArgument(
-            f"scene must be 1 to 128 letters, digits, '.', '_', '-', got {str(name)[:128]!r}",
-            field="scene",
+            f"{field} must be 1 to 128 letters, digits, '.', '_', '-', got {str(name)[:128]!r}", field=field
         )
 
 

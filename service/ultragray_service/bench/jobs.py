@@ -24,7 +24,7 @@ from ultragray.datasets.released import write_released
 from ultragray.demo import copy_demo_scene, demo_poses
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2, rendering_pb2_grpc
 from ultragray_workers.errors import NotReady
-from ultragray_workers.jobs.database import JobDatabase
+from ultragray_workers.jobs.queue.database import JobDatabase
 
 from ..core.job_client import JobClient
 from .report import Report, percentiles
@@ -118,9 +118,10 @@ def _copy_jobs(artifact_folder: Path, count: int) -> None:
     """As many jobs as the one that has finished, a second apart before it; without folders, which lists do not read."""
     jobs = JobDatabase(artifact_folder, None)
     try:
-        tables = jobs.client._sys_db.tables
+        tables = sa.MetaData()
+        tables.reflect(jobs.engine, only=("workflow_status", "workflow_input", "workflow_output"))
         with jobs.engine.begin() as connection:
-            for table in (tables.workflow_status, tables.workflow_input, tables.workflow_output):
+            for table in tables.sorted_tables:
                 original = connection.execute(sa.select(table)).mappings().first()
                 copies = [] if original is None else [_copy(dict(original), number) for number in range(1, count)]
                 for first in range(0, len(copies), _COPIED_AT_ONCE):

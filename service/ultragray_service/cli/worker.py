@@ -52,7 +52,7 @@ def worker(
 
 def run_worker(overrides: dict[str, Any], *, name: str | None = None, device: str = "auto") -> None:
     """Does jobs until SIGTERM or SIGINT, then ends the process. Raises StartupFailed, InvalidArgument."""
-    from ultragray_workers.jobs.worker import work
+    from ultragray_workers.jobs.worker.worker import work
 
     from ..logs import configure_logging
     from ..settings import load_settings

@@ -15,7 +15,7 @@ from ultragray.contract import under
 from ultragray.errors import DatasetInvalid, InvalidArgument, SceneFileInvalid, UltragrayError
 from ultragray_workers.errors import DatabaseUnavailable, DatasetNotFound, NotReady, SceneExists, SceneNotFound
 from ultragray_workers.jobs.folder import JobFolder
-from ultragray_workers.jobs.specification import Specification
+from ultragray_workers.jobs.kinds import Specification
 from ultragray_workers.jobs.store import Job, JobState, JobStore
 from ultragray_workers.scenes import SceneStore
 

@@ -9,11 +9,11 @@ from pathlib import Path
 
 from ultragray.errors import SceneFileInvalid
 from ultragray.files.atomic import file_sha256, sync
+from ultragray.files.link import link_or_copy
 from ultragray.scene_info import SceneHeader, read_header
 from ultragray_workers.claims import claimed_folder, remove_abandoned, storage_full
 from ultragray_workers.errors import QueueFull, SceneExists, SceneNotFound, UploadTooLarge
 from ultragray_workers.helpers.scene_check import check_scene_file
-from ultragray_workers.jobs.link import link_or_copy
 from ultragray_workers.jobs.publication import SCENES_FOLDER
 from ultragray_workers.scenes import SUFFIX, SceneStore, check_scene_name
 

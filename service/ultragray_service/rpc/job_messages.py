@@ -9,7 +9,8 @@ from google.protobuf.json_format import MessageToDict, SerializeToJsonError
 from ultragray.contract import under
 from ultragray.errors import InvalidArgument
 from ultragray_proto.v1 import jobs_pb2, scenes_pb2
-from ultragray_workers.jobs.specification import Specification, from_dict
+from ultragray_workers.jobs.kinds import Specification
+from ultragray_workers.jobs.specification import from_dict
 from ultragray_workers.jobs.store import Job
 
 from .messages import OUTPUT_NUMBERS, output_name, poses_from_messages

@@ -16,7 +16,7 @@ import pytest
 
 from ultragray.demo import copy_demo_scene
 from ultragray.samplers import AroundSampler
-from ultragray_workers.jobs.specification import RenderJob
+from ultragray_workers.jobs.kinds import RenderJob
 from ultragray_workers.jobs.store import Job, JobState, JobStore
 from ultragray_workers.scenes import SceneStore
 
@@ -24,7 +24,7 @@ from ...waiting import wait_until
 from ..conftest import RunningService
 
 StartService = Callable[..., RunningService]
-JOB = RenderJob("demo", sampler=AroundSampler(2), height=16, width=16)
+JOB = RenderJob(scene="demo", sampler=AroundSampler(2), height=16, width=16)
 WORKER = [sys.executable, "-c", "from ultragray_service.cli.app import app; app()", "worker"]
 
 

@@ -17,7 +17,7 @@ import pytest
 from ultragray.interchange.exports import FORMATS
 from ultragray.samplers import Sampler
 from ultragray_service.http.job_schemas import RenderSpecification, SamplerBody, TrainSpecification
-from ultragray_workers.jobs.specification import RenderJob, TrainJob
+from ultragray_workers.jobs.kinds import RenderJob, TrainJob
 
 from ...waiting import wait_until
 from ..conftest import RunningService, StartService

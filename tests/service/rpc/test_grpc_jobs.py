@@ -16,7 +16,7 @@ from google.rpc.status_pb2 import Status
 
 from ultragray_proto.v1 import geometry_pb2, jobs_pb2, jobs_pb2_grpc, rendering_pb2
 from ultragray_service.rpc.job_messages import specification_from_message
-from ultragray_workers.jobs.specification import TrainJob
+from ultragray_workers.jobs.kinds import TrainJob
 
 from ..conftest import RunningService, StartService
 

@@ -18,7 +18,7 @@ from ultragray import LinearProbe
 from ultragray.datasets.released import write_released
 from ultragray.datasets.sweep import Dataset, Sweep
 from ultragray_workers.datasets.store import FILES_NAME, DatasetRecord, write_manifest
-from ultragray_workers.jobs.specification import TrainJob
+from ultragray_workers.jobs.kinds import TrainJob
 from ultragray_workers.jobs.store import Job, JobState, JobStore
 
 FINAL = (JobState.SUCCEEDED, JobState.FAILED, JobState.CANCELLED)
@@ -26,8 +26,8 @@ PROBE = LinearProbe(width_mm=20.0, near_mm=0.0, far_mm=25.0)
 PROGRAM = """
 import os, signal, sys, threading
 from pathlib import Path
-from ultragray_workers.jobs import heartbeat
-from ultragray_workers.jobs.worker import work
+from ultragray_workers.jobs.queue import heartbeat
+from ultragray_workers.jobs.worker.worker import work
 heartbeat.DEAD_AFTER_S = 3.0
 stop = threading.Event()
 signal.signal(signal.SIGTERM, lambda number, frame: stop.set())
@@ -111,7 +111,7 @@ class RunningWorker:
         """The process of the job at hand."""
         for children in Path(f"/proc/{self.process.pid}/task").glob("*/children"):
             for pid in children.read_text().split():
-                if "jobs.run_job" in Path(f"/proc/{pid}/cmdline").read_text():
+                if "worker.run_job" in Path(f"/proc/{pid}/cmdline").read_text():
                     return int(pid)
         return None
 

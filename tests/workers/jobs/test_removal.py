@@ -14,11 +14,13 @@ import sqlalchemy as sa
 
 from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import DatasetInUse, DatasetNotFound, JobInUse, JobNotFound
-from ultragray_workers.jobs import housekeeping, removal
-from ultragray_workers.jobs.database import JobDatabase
+from ultragray_workers.jobs import removal
 from ultragray_workers.jobs.folder import JobFolder
-from ultragray_workers.jobs.housekeeping import DAY_S, Housekeeper
+from ultragray_workers.jobs.queue.database import JobDatabase
+from ultragray_workers.jobs.queue.internals import SCHEMA
 from ultragray_workers.jobs.store import Job, JobState, JobStore
+from ultragray_workers.jobs.worker import housekeeping
+from ultragray_workers.jobs.worker.housekeeping import DAY_S, Housekeeper
 
 from ...postgres import PostgresServer
 from .conftest import train_job
@@ -42,7 +44,8 @@ def jobs(artifact_folder: Path, database_url: str | None) -> Iterator[JobDatabas
 @pytest.fixture
 def finished(store: JobStore, jobs: JobDatabase, artifact_folder: Path) -> Callable[..., tuple[Job, Path]]:
     """Makes a cancelled job that ended so many days ago, with a folder as its process would have left it."""
-    rows = jobs.client._sys_db.tables.workflow_status
+    columns = (sa.Column("workflow_uuid"), sa.Column("completed_at"))
+    rows = sa.Table("workflow_status", sa.MetaData(), *columns, schema=SCHEMA)
 
     def make(scene: str, days_ago: float = 0.0) -> tuple[Job, Path]:
         job = store.cancel(store.submit(train_job(scene))[0].id)

@@ -18,8 +18,9 @@ from ultragray.errors import InvalidArgument, InvalidImageSize, InvalidProbe, Lo
 from ultragray.samplers import AroundSampler, SplineSampler, TrainingSampler
 from ultragray_workers.errors import DatabaseUnavailable, SceneNotFound, StorageFull
 from ultragray_workers.jobs import requirements
-from ultragray_workers.jobs.database import JobDatabase
-from ultragray_workers.jobs.specification import RenderJob
+from ultragray_workers.jobs.kinds import RenderJob, render
+from ultragray_workers.jobs.kinds.base import Surroundings
+from ultragray_workers.jobs.queue.database import JobDatabase
 from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.scenes import SceneStore
 
@@ -65,11 +66,11 @@ def kept(artifact_folder: Path, job_id: str) -> bytes:
 @pytest.mark.parametrize(
     ("job", "error"),
     [
-        (RenderJob("one", sampler=TrainingSampler(), height=65), InvalidImageSize),
-        (RenderJob("one", sampler=TrainingSampler(), outputs=("labels",)), UnknownOutput),
-        (RenderJob("one", poses=POSES, sampler=SplineSampler(count=3)), InvalidArgument),
-        (RenderJob("probeless", sampler=TrainingSampler()), InvalidProbe),
-        (RenderJob("none", sampler=TrainingSampler()), SceneNotFound),
+        (RenderJob(scene="one", sampler=TrainingSampler(), height=65), InvalidImageSize),
+        (RenderJob(scene="one", sampler=TrainingSampler(), outputs=("labels",)), UnknownOutput),
+        (RenderJob(scene="one", poses=POSES, sampler=SplineSampler(count=3)), InvalidArgument),
+        (RenderJob(scene="probeless", sampler=TrainingSampler()), InvalidProbe),
+        (RenderJob(scene="none", sampler=TrainingSampler()), SceneNotFound),
     ],
 )
 def test_refused(job: RenderJob, error: type[Exception], save: Callable[..., bytes], rendering_store: JobStore) -> None:
@@ -84,9 +85,12 @@ def test_refused(job: RenderJob, error: type[Exception], save: Callable[..., byt
 @pytest.mark.parametrize(
     ("job", "needed_bytes"),
     [
-        (RenderJob("one", poses=POSES), 3 * 24 * 20 * 4),
-        (RenderJob("one", poses=POSES, outputs=("bmode", "echo"), dtype="uint8", height=10, width=64), 3 * 10 * 64 * 2),
-        (RenderJob("one", sampler=AroundSampler(50), format="dicom"), 50 * 24 * 20),
+        (RenderJob(scene="one", poses=POSES), 3 * 24 * 20 * 4),
+        (
+            RenderJob(scene="one", poses=POSES, outputs=("bmode", "echo"), dtype="uint8", height=10, width=64),
+            3 * 10 * 64 * 2,
+        ),
+        (RenderJob(scene="one", sampler=AroundSampler(50), format="dicom"), 50 * 24 * 20),
     ],
 )
 def test_room_for_all_pixels(
@@ -99,30 +103,30 @@ def test_room_for_all_pixels(
 ) -> None:
     save("one")
     monkeypatch.setattr(shutil, "disk_usage", lambda path: Disk(needed_bytes))
-    requirements.check_rendering(job, scenes.header("one"), 64, tmp_path)
+    job.check(Surroundings(scenes.header("one"), tmp_path, 64))
     monkeypatch.setattr(shutil, "disk_usage", lambda path: Disk(needed_bytes - 1))
     with pytest.raises(StorageFull, match=r"frames of .* take up to .* left"):
-        requirements.check_rendering(job, scenes.header("one"), 64, tmp_path)
+        job.check(Surroundings(scenes.header("one"), tmp_path, 64))
 
 
 def test_given_poses_are_assessed_where_that_is_quick(
     save: Callable[..., bytes], scenes: SceneStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def check(job: RenderJob) -> None:
-        requirements.check_rendering(job, scenes.header(job.scene), 64, tmp_path)
+        job.check(Surroundings(scenes.header(job.scene), tmp_path, 64))
 
     save("one", confidence=MODEL)
     save("plain")
     far = POSES.copy()
     far[2, 1, 3] = 30.0
-    check(RenderJob("one", poses=POSES, min_confidence=0.5))
+    check(RenderJob(scene="one", poses=POSES, min_confidence=0.5))
     with pytest.raises(LowConfidence, match=r"poses\[2\] has a confidence of"):
-        check(RenderJob("one", poses=far, min_confidence=0.5))
-    check(RenderJob("one", poses=far, sampler=AroundSampler(5), min_confidence=0.5))
+        check(RenderJob(scene="one", poses=far, min_confidence=0.5))
+    check(RenderJob(scene="one", poses=far, sampler=AroundSampler(5), min_confidence=0.5))
     with pytest.raises(InvalidArgument, match="needs a scene that knows"):
-        check(RenderJob("plain", poses=POSES, min_confidence=0.5))
-    monkeypatch.setattr(requirements, "ASSESSED_AT_ONCE", 8)
-    check(RenderJob("one", poses=far, min_confidence=0.5))
+        check(RenderJob(scene="plain", poses=POSES, min_confidence=0.5))
+    monkeypatch.setattr(render, "ASSESSED_AT_ONCE", 8)
+    check(RenderJob(scene="one", poses=far, min_confidence=0.5))
 
 
 def test_submission_sent_again_after_a_failure_takes_the_scene_of_now(
@@ -135,9 +139,9 @@ def test_submission_sent_again_after_a_failure_takes_the_scene_of_now(
     with monkeypatch.context() as context:
         context.setattr(JobDatabase, "enqueue", away)
         with pytest.raises(DatabaseUnavailable):
-            rendering_store.submit(RenderJob("one", poses=POSES), request_id="mine")
+            rendering_store.submit(RenderJob(scene="one", poses=POSES), request_id="mine")
     now = save("one", seed=2)
-    job, _ = rendering_store.submit(RenderJob("one", poses=POSES), request_id="mine")
+    job, _ = rendering_store.submit(RenderJob(scene="one", poses=POSES), request_id="mine")
     assert kept(artifact_folder, job.id) == now
     rendering_store.close()
 
@@ -146,7 +150,7 @@ def test_retry_takes_the_scene_of_the_job_before(
     save: Callable[..., bytes], rendering_store: JobStore, artifact_folder: Path, tmp_path: Path
 ) -> None:
     then = save("one", seed=1)
-    job, _ = rendering_store.submit(RenderJob("one", poses=POSES))
+    job, _ = rendering_store.submit(RenderJob(scene="one", poses=POSES))
     rendering_store.cancel(job.id)
     save("one", seed=2)
     successor, _ = rendering_store.retry(job.id)
@@ -175,9 +179,9 @@ def test_scene_that_goes_meanwhile_and_a_disk_that_is_full(
 
     monkeypatch.setattr(requirements, "link_or_copy", full)
     with pytest.raises(StorageFull, match="no room for the scene"):
-        rendering_store.submit(RenderJob("one", poses=POSES))
+        rendering_store.submit(RenderJob(scene="one", poses=POSES))
     monkeypatch.setattr(requirements, "link_or_copy", gone)
     with pytest.raises(SceneNotFound):
-        rendering_store.submit(RenderJob("one", poses=POSES))
+        rendering_store.submit(RenderJob(scene="one", poses=POSES))
     assert not (tmp_path / "one.ugr").exists()
     rendering_store.close()

@@ -8,7 +8,8 @@ import pytest
 
 from ultragray.errors import InvalidArgument
 from ultragray.samplers import AroundSampler, FanSampler, SplineSampler, TrainingSampler
-from ultragray_workers.jobs.specification import RenderJob, TrainJob, digest, from_dict, in_short, to_dict
+from ultragray_workers.jobs.kinds import RenderJob, TrainJob
+from ultragray_workers.jobs.specification import from_dict, in_short, to_dict
 
 POSES = np.tile(np.eye(4), (3, 1, 1)).tolist()
 
@@ -17,12 +18,12 @@ POSES = np.tile(np.eye(4), (3, 1, 1)).tolist()
     "job",
     [
         TrainJob("liver", "liver-1", preset="paper", settings={"steps": 10, "start": "random"}, device="cuda:1"),
-        RenderJob("liver", poses=POSES, height=20, width=30, outputs=("echo", "bmode"), format="tar"),
-        RenderJob("liver", sampler=AroundSampler(4, 2.0, 5.0, 7), format="zarr", dtype="uint8"),
-        RenderJob("liver", sampler=AroundSampler(4), min_confidence=1),
-        RenderJob("liver", poses=POSES, sampler=FanSampler(10.0, 2.5), format="dicom"),
-        RenderJob("liver", sampler=SplineSampler(spacing_mm=0.5)),
-        RenderJob("liver", sampler=TrainingSampler()),
+        RenderJob(scene="liver", poses=POSES, height=20, width=30, outputs=("echo", "bmode"), format="tar"),
+        RenderJob(scene="liver", sampler=AroundSampler(4, 2.0, 5.0, 7), format="zarr", dtype="uint8"),
+        RenderJob(scene="liver", sampler=AroundSampler(4), min_confidence=1),
+        RenderJob(scene="liver", poses=POSES, sampler=FanSampler(10.0, 2.5), format="dicom"),
+        RenderJob(scene="liver", sampler=SplineSampler(spacing_mm=0.5)),
+        RenderJob(scene="liver", sampler=TrainingSampler()),
     ],
 )
 def test_there_and_back(job: Any) -> None:
@@ -32,33 +33,28 @@ def test_there_and_back(job: Any) -> None:
 def test_poses_as_lists_and_packed_are_the_same_and_exact() -> None:
     poses = np.tile(np.eye(4), (2, 1, 1))
     poses[:, :3, 3] = np.random.default_rng(0).normal(size=(2, 3))
-    listed, packed = RenderJob("liver", poses=poses.tolist()), from_dict(to_dict(RenderJob("liver", poses=poses)))
+    listed, packed = (
+        RenderJob(scene="liver", poses=poses.tolist()),
+        from_dict(to_dict(RenderJob(scene="liver", poses=poses))),
+    )
     assert isinstance(packed, RenderJob)
     np.testing.assert_array_equal(packed.poses, poses)
     assert packed == listed
-    assert digest(packed, 0) == digest(listed, 0)
     poses[1, 0, 3] += 1e-12
-    assert RenderJob("liver", poses=poses) != listed
-    assert digest(RenderJob("liver", poses=poses), 0) != digest(listed, 0)
+    assert RenderJob(scene="liver", poses=poses) != listed
 
 
 def test_long_names_are_cut() -> None:
     with pytest.raises(InvalidArgument) as caught:
         from_dict({"kind": "train", "dataset": "liver", "scene": "one", "x" * 10**6: 1})
-    assert caught.value.field == "x" * 64
+    assert caught.value.field == "x" * 100
     assert len(caught.value.detail) < 300
 
 
 def test_in_short_holds_no_poses() -> None:
-    short = in_short(RenderJob("liver", poses=POSES))
+    short = in_short(RenderJob(scene="liver", poses=POSES))
     assert short["pose_count"] == 3
     assert "poses" not in short
-
-
-def test_digest_tells_what_was_asked_for() -> None:
-    job = TrainJob("liver", "one")
-    assert digest(job, 0) == digest(TrainJob("liver", "one"), 0)
-    assert len({digest(job, 0), digest(job, 1), digest(TrainJob("liver", "two"), 0)}) == 3
 
 
 def train(**values: Any) -> dict[str, Any]:
@@ -105,7 +101,7 @@ def around(**values: Any) -> dict[str, Any]:
         (render(height=0), "height"),
         (render(width=True), "width"),
         (render(outputs=["colour"]), "outputs"),
-        (render(outputs=[[1]]), "outputs"),
+        (render(outputs=[[1]]), "outputs[0]"),
         (render(format="zip"), "format"),
         (render(dtype="int8"), "dtype"),
         (render(min_confidence=1.5), "min_confidence"),

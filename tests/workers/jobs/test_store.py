@@ -25,8 +25,8 @@ from ultragray_workers.errors import (
     SceneNotFound,
     StartupFailed,
 )
-from ultragray_workers.jobs.database import checked_url
-from ultragray_workers.jobs.specification import RenderJob
+from ultragray_workers.jobs.kinds import RenderJob
+from ultragray_workers.jobs.queue.database import checked_url
 from ultragray_workers.jobs.store import JobState, JobStore
 from ultragray_workers.scenes import SceneStore
 
@@ -60,7 +60,7 @@ def test_same_request_id_gives_the_same_job(store: JobStore) -> None:
     assert store.submit(train_job("one"), request_id="mine") == (job, False)
     store.cancel(job.id)
     assert store.submit(train_job("one"), request_id="mine") == (store.get(job.id), False)
-    for other in (train_job("two"), RenderJob("one", sampler=TRAINING_POSES)):
+    for other in (train_job("two"), RenderJob(scene="one", sampler=TRAINING_POSES)):
         with pytest.raises(JobConflict, match="'mine'"):
             store.submit(other, request_id="mine")
     with pytest.raises(JobConflict):
@@ -84,7 +84,7 @@ def test_refused_at_once(store: JobStore, artifact_folder: Path) -> None:
     with pytest.raises(DatasetNotFound):
         store.submit(train_job("one", dataset="none"))
     with pytest.raises(SceneNotFound):
-        store.submit(RenderJob("one", sampler=TRAINING_POSES))
+        store.submit(RenderJob(scene="one", sampler=TRAINING_POSES))
     store.submit(train_job("one"))
     with pytest.raises(SceneExists, match="another job"):
         store.submit(train_job("one"))
@@ -110,7 +110,7 @@ def test_scenes_of_the_service_may_be_rendered_and_not_replaced(
     (tmp_path / "data").mkdir()
     copy_demo_scene(tmp_path / "data" / "demo.ugr")
     store = JobStore(artifact_folder, database_url, scenes=SceneStore(tmp_path / "data"))
-    job, _ = store.submit(RenderJob("demo", sampler=TRAINING_POSES))
+    job, _ = store.submit(RenderJob(scene="demo", sampler=TRAINING_POSES))
     kept = artifact_folder / "jobs" / job.id / "demo.ugr"
     assert kept.read_bytes() == (tmp_path / "data" / "demo.ugr").read_bytes()
     with pytest.raises(SceneExists):
@@ -220,7 +220,8 @@ def test_database_that_cannot_be_reached_is_told_without_the_password(tmp_path: 
 
 def test_importing_the_store_and_the_worker_needs_no_torch() -> None:
     program = (
-        f"import sys; sys.path[:] = {sys.path!r}; import ultragray_workers.jobs.store, ultragray_workers.jobs.worker; "
+        f"import sys; sys.path[:] = {sys.path!r}; import ultragray_workers.jobs.store; "
+        "import ultragray_workers.jobs.worker.worker; "
         "print('torch' in sys.modules)"
     )
     told = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout

@@ -2,7 +2,7 @@
 
 job.json        what is asked for: written by the worker before its process starts
 lock            held by the one process that works in the folder
-NAME.ugr        the scene of a render job, as it was when the job was submitted
+NAME.ugr        the scene that the job needs, as it was when the job was submitted
 run/            the trainer's folder: checkpoint, journal, configuration
 progress.json   how far it is
 log.txt         what the process said
@@ -59,7 +59,7 @@ class Outcome:
     attempts: int = 1  # how often a process was started for it
 
     def to_dict(self) -> dict[str, Any]:
-        """What JSON holds of it."""
+        """The outcome as JSON holds it."""
         return {**asdict(self), "artifacts": list(self.artifacts)}
 
     @classmethod
@@ -73,7 +73,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Request:
-    """What a worker tells the process of a job."""
+    """The instructions of a worker to the process of a job."""
 
     specification: dict[str, Any]
     retry_of: str | None
@@ -99,7 +99,7 @@ class JobFolder:
         self._outcome = self.path / "outcome.json"
 
     def request(self) -> Request:
-        """What the worker wrote. Raises OSError, ValueError."""
+        """The worker's instructions. Raises OSError, ValueError."""
         return Request(**json.loads(self._request.read_text(encoding="utf-8")))
 
     def was_begun(self) -> bool:
@@ -145,11 +145,11 @@ class JobFolder:
             self.remove_partial_artifacts()
 
     def remove_partial_artifacts(self) -> None:
-        """Removes what is not complete."""
+        """Removes incomplete artifacts."""
         shutil.rmtree(self._partial, ignore_errors=True)
 
     def remove_leftovers(self) -> None:
-        """Removes what killed processes left half written; nobody may be at the job meanwhile."""
+        """Removes the half written files of killed processes; no process may be at the job meanwhile."""
         self.remove_partial_artifacts()
         with contextlib.suppress(OSError):
             self.reserve.unlink(missing_ok=True)
@@ -157,7 +157,7 @@ class JobFolder:
                 remove_stale_temporaries(path)
 
     def artifact_names(self) -> tuple[str, ...]:
-        """What can be downloaded, sorted."""
+        """The files to download, sorted."""
         return tuple(sorted(path.name for path in self.artifacts.iterdir()))
 
     def remove_checkpoints(self) -> None:

@@ -1,4 +1,4 @@
-"""A job as it is seen from outside, and how it follows from its row in the queue."""
+"""A job as callers see it, and how it follows from its row in the queue."""
 
 from __future__ import annotations
 
@@ -10,11 +10,9 @@ from typing import Any
 
 from dbos import WorkflowStatus
 
-from . import database
 from .folder import JobFolder, Outcome, Progress
-from .specification import RenderJob, TrainJob
+from .queue import database
 
-KINDS = (TrainJob.kind, RenderJob.kind)
 MAX_PRIORITY = 1000
 PRIORITY_ZERO = MAX_PRIORITY + 1  # DBOS takes the lowest number first, from 1
 
@@ -44,11 +42,11 @@ class Job:
     """A job as it is now. Times are ISO 8601, UTC."""
 
     id: str
-    kind: str  # train or render
+    kind: str  # one of kinds.KINDS
     state: JobState
     request_id: str | None
     specification: dict[str, Any]  # of poses only their number, as pose_count
-    priority: int  # higher ones go first
+    priority: int  # the higher, the earlier
     created_at: str
     started_at: str | None  # the last time
     finished_at: str | None
@@ -56,14 +54,14 @@ class Job:
     error: str | None  # the same, stable, such as DATASET_INVALID
     progress: Progress
     artifacts: tuple[str, ...]  # names of files
-    metrics: dict[str, float]  # of a trained scene on the held-out frames
+    metrics: dict[str, float]  # such as those of a trained scene on the held-out frames
     worker: str | None
     retry_of: str | None
     attempts: int  # how often it was started
 
 
 def job_of_row(row: WorkflowStatus, artifact_folder: Path) -> Job:
-    """The job that a row of the queue is about; of one that is not finished its folder says how far it is."""
+    """The job of a row of the queue; the folder of an unfinished one says how far it is."""
     state = _STATE_OF[row.status]
     outcome = _outcome(row)
     started = state is not JobState.QUEUED or bool(row.recovery_attempts)
@@ -105,7 +103,7 @@ def _outcome(row: WorkflowStatus) -> Outcome | None:
 
 
 def attribute(row: WorkflowStatus, name: str) -> Any:
-    """What the store kept with a row at its submission."""
+    """A value that the store kept with a row at its submission."""
     return (row.attributes or {}).get(name)
 
 

@@ -1,13 +1,13 @@
-"""A trained scene becomes one that is served: one rename or link, and never over another scene."""
+"""A scene that a job made becomes one that is served: one rename or link, and never over another scene."""
 
 from __future__ import annotations
 
 from ultragray.files.atomic import file_sha256
+from ultragray.files.link import link_or_copy
 
 from ..errors import SceneExists
 from ..scenes import SUFFIX
 from .folder import JobFolder
-from .link import link_or_copy
 
 SCENES_FOLDER = "scenes"  # of the artifact folder: scenes that jobs made
 

@@ -1,4 +1,4 @@
-"""Removing a job: its folder and its row. The row goes last: until then nobody can make another job of that id."""
+"""Removing a job: its folder, then its row, so that no other job can have the id before the folder is gone."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from ..errors import JobInUse
-from .database import JobDatabase
 from .folder import JobFolder
 from .job import attribute
+from .queue.database import JobDatabase
 
 DELETED_PREFIX = ".deleted-"
 _LOCK_WAIT_S = 2.0  # for the process of a job that was cancelled a moment ago
@@ -21,7 +21,7 @@ _LOCK_POLL_S = 0.05
 
 
 def sources_in_use(jobs: JobDatabase) -> dict[str, str]:
-    """The jobs that others, which wait or run, go on from: each with one of these."""
+    """Jobs that waiting or running jobs go on from: the id of each, and the id of one such job."""
     pairs = ((attribute(row, "retry_of"), row.workflow_id) for row in jobs.unfinished())
     return {source: job_id for source, job_id in pairs if source is not None}
 

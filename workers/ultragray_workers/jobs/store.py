@@ -28,16 +28,16 @@ from ..errors import (
     SceneExists,
 )
 from ..scenes import SceneStore
-from . import database
-from .counting import count_by_state
-from .database import JobDatabase
 from .folder import JobFolder, Progress
 from .job import MAX_PRIORITY, PRIORITY_ZERO, STATUSES, Job, JobState, attribute, job_of_row
-from .paging import iso_after, read_token, write_token
+from .kinds import Specification
 from .publication import SCENES_FOLDER
+from .queue import database
+from .queue.database import JobDatabase
+from .queue.listing import count_by_status, page_of_rows
 from .removal import remove_job, sources_in_use
-from .requirements import keep_scene
-from .specification import RenderJob, Specification, TrainJob, digest, from_dict, in_short, to_dict
+from .requirements import Requirements
+from .specification import from_dict, in_short, to_dict, value_in
 
 __all__ = ["SCENES_FOLDER", "Job", "JobState", "JobStore", "Progress"]
 
@@ -59,17 +59,19 @@ class JobStore:
         scenes: SceneStore | None = None,
         max_image_side: int = MAX_IMAGE_SIDE,
     ) -> None:
-        """`scenes`: those that render jobs may name, and whose names trainings may not take.
+        """`scenes`: those that jobs may need, and whose names they may not make. None: those that jobs made.
 
-        None: those that trainings made. `max_image_side`: of frames, pixels. Raises StartupFailed where the database
-        cannot be reached.
+        `max_image_side`: of frames, pixels. Raises StartupFailed where the database cannot be reached.
         """
         self._artifact_folder = Path(artifact_folder)
         self._database = JobDatabase(self._artifact_folder, database_url)
         self._queue_limit = queue_limit
-        self._max_image_side = max_image_side
-        self._scenes = scenes or SceneStore(self._artifact_folder / SCENES_FOLDER)
-        self._datasets = DatasetStore(self._artifact_folder)
+        self._requirements = Requirements(
+            datasets=DatasetStore(self._artifact_folder),
+            scenes=scenes or SceneStore(self._artifact_folder / SCENES_FOLDER),
+            artifact_folder=self._artifact_folder,
+            max_image_side=max_image_side,
+        )
         self._submitting = threading.Lock()  # so that one service keeps the queue limit to the job
 
     def submit(
@@ -82,8 +84,8 @@ class JobStore:
     ) -> tuple[Job, bool]:
         """The job, and whether it is new: the same `request_id` gives the same job, whatever became of it.
 
-        Raises JobConflict where that one asked for something else, JobQueueFull, DatasetNotFound, DatasetInvalid,
-        SceneNotFound, SceneFileInvalid, SceneExists, StorageFull, InvalidImageSize, InvalidProbe and InvalidArgument.
+        Raises JobConflict where that one asked for something else, JobQueueFull, and what `Requirements.provide`
+        raises.
         """
         if abs(priority) > MAX_PRIORITY:
             raise InvalidArgument(
@@ -95,20 +97,16 @@ class JobStore:
     def _submit(
         self, job_id: str, specification: Specification, request_id: str | None, priority: int, retry_of: str | None
     ) -> tuple[Job, bool]:
-        asked = digest(specification, priority)
+        short = in_short(specification)
+        made = value_in(short, "makes_scene")
         with self._submitting:
-            if (present := self._database.workflow(job_id, with_output=True)) is not None:
-                return self._same(present, asked), False
+            if self._database.workflow(job_id) is not None:
+                return self._same(job_id, specification, priority), False
             waiting = self._database.unfinished()
             if sum(row.status in database.QUEUED for row in waiting) >= self._queue_limit:
                 raise JobQueueFull(f"{self._queue_limit} jobs wait already: try again later, or cancel some")
-            self._check_resources(specification, job_id, retry_of)
-            attributes = {
-                "request_id": request_id,
-                "digest": asked,
-                "retry_of": retry_of,
-                "specification": in_short(specification),
-            }
+            before = None if retry_of is None else self._folder(retry_of)
+            self._requirements.provide(specification, self._folder(job_id), before)
             options: EnqueueOptions = {
                 "workflow_name": specification.kind,
                 "queue_name": database.QUEUE,
@@ -116,57 +114,38 @@ class JobStore:
                 "workflow_id_reuse_policy": "reject",
                 "app_version": database.VERSION,
                 "priority": PRIORITY_ZERO - priority,
-                "attributes": attributes,
+                "attributes": {"request_id": request_id, "retry_of": retry_of, "specification": short},
                 "serialization_type": WorkflowSerializationFormat.PORTABLE,
             }
-            if isinstance(specification, TrainJob):
-                options["deduplication_id"] = f"scene {specification.scene}"
+            if made is not None:
+                options["deduplication_id"] = f"scene {made}"
             try:
                 self._database.enqueue(options, {"specification": to_dict(specification), "retry_of": retry_of})
             except dbos_error.DBOSWorkflowIDInUseError:  # another service was quicker
-                present = self._database.workflow(job_id, with_output=True)
-                assert present is not None
-                return self._same(present, asked), False
+                return self._same(job_id, specification, priority), False
             except dbos_error.DBOSQueueDeduplicatedError:
-                assert isinstance(specification, TrainJob)
                 raise SceneExists(
-                    f"another job that waits or runs makes the scene {specification.scene!r}: choose another name",
-                    field="scene",
+                    f"another job that waits or runs makes the scene {made!r}: choose another name",
+                    field=specification.makes_scene,
                 ) from None
-            if isinstance(specification, TrainJob):
-                self._withdraw_without_dataset(specification.dataset, job_id)
+            try:  # again, now that a deletion of the dataset would see the job: one that came in between has won
+                self._requirements.require_dataset(specification)
+            except DatasetNotFound:
+                self._database.client.cancel_workflow(job_id)
+                self._database.client.delete_workflows([job_id])
+                raise
         return self.get(job_id), True
 
-    def _withdraw_without_dataset(self, dataset: str, job_id: str) -> None:
-        """Looks again, now that a deletion would see the job: one that came in between has won."""
-        try:
-            self._datasets.get(dataset)
-        except DatasetNotFound:
-            self._database.client.cancel_workflow(job_id)
-            self._database.client.delete_workflows([job_id])
-            raise
-
-    def _same(self, present: WorkflowStatus, asked: str) -> Job:
-        job = self._seen(present)
-        if (present.attributes or {}).get("digest") != asked:
+    def _same(self, job_id: str, specification: Specification, priority: int) -> Job:
+        """The job that is there already. Raises JobConflict where it is asked for something else."""
+        row = self._row(job_id, with_input=True)
+        job = self._seen(row)
+        if priority != job.priority or to_dict(_specification_of(row)) != to_dict(specification):
             raise JobConflict(
                 f"the request_id {job.request_id!r} was used for the job {job.id}, which asks for something else",
                 field="request_id",
             )
         return job
-
-    def _check_resources(self, specification: Specification, job_id: str, retry_of: str | None) -> None:
-        """Refuses what could not run, and keeps the scene of a rendering as it is now."""
-        if isinstance(specification, TrainJob):
-            self._datasets.get(specification.dataset)
-            if specification.scene in self._scenes.names():
-                raise SceneExists(
-                    f"there is already a scene {specification.scene!r}: choose another name", field="scene"
-                )
-            return
-        assert isinstance(specification, RenderJob)
-        before = None if retry_of is None else self._folder(retry_of)
-        keep_scene(specification, self._folder(job_id), self._scenes, before, self._max_image_side)
 
     def get(self, job_id: str) -> Job:
         """Raises JobNotFound."""
@@ -184,27 +163,11 @@ class JobStore:
 
         Raises InvalidArgument for a token that no page gave.
         """
-        before_ms, seen = (None, []) if page_token is None else read_token(page_token)
-        rows = [
-            row
-            for row in self._database.client.list_workflows(
-                name=kind,
-                status=None if state is None else list(STATUSES[state]),
-                end_time=None if before_ms is None else iso_after(before_ms),
-                sort_desc=True,
-                limit=page_size + len(seen) + 1,  # one more than the page tells whether there is another
-                load_input=False,
-            )
-            if row.workflow_id not in seen
-        ]
-        page, more = rows[:page_size], len(rows) > page_size
-        jobs = [self._seen(row) for row in page]
-        if not more:
-            return jobs, None
-        last_ms = page[-1].created_at
-        assert last_ms is not None
-        at_last = [row.workflow_id for row in page if row.created_at == last_ms]
-        return jobs, write_token(last_ms, at_last + (seen if before_ms == last_ms else []))
+        statuses = None if state is None else STATUSES[state]
+        rows, token = page_of_rows(
+            self._database, kind=kind, statuses=statuses, page_size=page_size, page_token=page_token
+        )
+        return [self._seen(row) for row in rows], token
 
     def cancel(self, job_id: str) -> Job:
         """Ends a job that waits or runs, its process within a second; nothing where it is cancelled already.
@@ -225,17 +188,13 @@ class JobStore:
         A training goes on from the last checkpoint of its predecessor. Raises JobNotFound, JobNotFinished, and what
         `submit` raises.
         """
-        rows = self._database.client.list_workflows(workflow_ids=[_checked_id(job_id)], load_input=True)
-        if not rows:
-            raise _not_found(job_id)
-        job = self._seen(rows[0])
+        row = self._row(job_id, with_input=True)
+        job = self._seen(row)
         if job.state not in (JobState.FAILED, JobState.CANCELLED):
             raise JobNotFinished(
                 f"only a failed or cancelled job can be retried, the job {job_id} is {job.state.value}", field="job"
             )
-        assert rows[0].input is not None
-        specification = from_dict(rows[0].input["args"][0]["specification"])
-        return self._submit(_hashed(f"retry {job_id}"), specification, None, job.priority, job_id)
+        return self._submit(_hashed(f"retry {job_id}"), _specification_of(row), None, job.priority, job_id)
 
     def delete(self, job_id: str) -> None:
         """Removes a finished job and its files; the scene that it made stays.
@@ -251,10 +210,11 @@ class JobStore:
 
     def counts(self) -> dict[JobState, int]:
         """How many jobs there are in each state."""
-        return count_by_state(self._database)
+        found = count_by_status(self._database)
+        return {state: sum(found.get(status, 0) for status in statuses) for state, statuses in STATUSES.items()}
 
     def log_tail(self, job_id: str, bytes: int = _TAIL_BYTES) -> str:
-        """The end of what a job's process said; empty before it said anything. Raises JobNotFound."""
+        """The end of the log of a job's process; empty where there is none yet. Raises JobNotFound."""
         self._row(job_id)
         try:
             with self._folder(job_id).log.open("rb") as file:
@@ -274,27 +234,28 @@ class JobStore:
 
     def uses_dataset(self, name: str) -> str | None:
         """The job that needs a dataset, in words; None where no job that waits or runs does."""
-        for row in self._database.unfinished():
-            if attribute(row, "specification").get("dataset") == name:
-                return f"the job {row.workflow_id}"
-        return None
+        return self._unfinished("needs_dataset", name)
 
     def makes_scene(self, name: str) -> str | None:
-        """The training that will serve a scene of that name, in words; None where no job that waits or runs does."""
-        for row in self._database.unfinished():
-            specification = attribute(row, "specification")
-            if "dataset" in specification and specification.get("scene") == name:
-                return f"the job {row.workflow_id}"
-        return None
+        """The job that will serve a scene of that name, in words; None where no job that waits or runs does."""
+        return self._unfinished("makes_scene", name)
 
     def close(self) -> None:
         """Ends the connections to the database."""
         self._database.close()
 
-    def _row(self, job_id: str) -> WorkflowStatus:
-        row = self._database.workflow(_checked_id(job_id), with_output=True)
+    def _unfinished(self, role: str, name: str) -> str | None:
+        for row in self._database.unfinished():
+            if value_in(attribute(row, "specification"), role) == name:
+                return f"the job {row.workflow_id}"
+        return None
+
+    def _row(self, job_id: str, *, with_input: bool = False) -> WorkflowStatus:
+        row = None
+        if _JOB_ID.fullmatch(job_id):
+            row = self._database.workflow(job_id, with_input=with_input, with_output=True)
         if row is None:
-            raise _not_found(job_id)
+            raise JobNotFound(f"there is no job {job_id[:64]!r}", field="job")
         return row
 
     def _seen(self, row: WorkflowStatus) -> Job:
@@ -317,11 +278,7 @@ def _hashed(text: str) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:24]
 
 
-def _checked_id(job_id: str) -> str:
-    if not _JOB_ID.fullmatch(job_id):
-        raise _not_found(job_id)
-    return job_id
-
-
-def _not_found(job_id: str) -> JobNotFound:
-    return JobNotFound(f"there is no job {job_id[:64]!r}", field="job")
+def _specification_of(row: WorkflowStatus) -> Specification:
+    """The specification of a row that was read with its input."""
+    assert row.input is not None
+    return from_dict(row.input["args"][0]["specification"])

@@ -15,14 +15,14 @@ from pathlib import Path
 from typing import Any
 
 from dbos import DBOS, PortableWorkflowError, WorkflowSerializationFormat
-from dbos import error as dbos_error
 
-from ..errors import StartupFailed
-from . import database
-from .database import JobDatabase, dbos_config, quiet_dbos
-from .heartbeat import Heartbeat
+from ...errors import StartupFailed
+from ..kinds import KINDS
+from ..queue import database
+from ..queue.database import JobDatabase, dbos_config, quiet_dbos
+from ..queue.heartbeat import Heartbeat
+from ..queue.internals import NotMine
 from .housekeeping import Housekeeper
-from .job import KINDS
 from .supervision import Interrupted, Supervisor, WorkerConfig
 
 POLLING_INTERVAL_S = 0.25
@@ -80,15 +80,14 @@ def _launch(url: str, config: WorkerConfig, supervisor: Supervisor) -> None:
         try:
             outcome = supervisor.supervise(job_id, request)
         except Interrupted:
-            # Any other error, or a step of DBOS's, would be kept as the job's end, even while another worker has it.
-            raise dbos_error.DBOSWorkflowConflictIDError(job_id) from None
+            raise NotMine(job_id) from None  # any other error would be kept as the job's end
         if outcome.error is not None:
             raise PortableWorkflowError(outcome.reason or outcome.error, outcome.error, data=outcome.to_dict())
         return outcome.to_dict()
 
     DBOS(config=dbos_config(url, config.executor))
     for kind in KINDS:
-        # A worker that dies is not the job's fault, however often.
+        # However often its worker dies, a job does not fail for it.
         DBOS.workflow(name=kind, max_recovery_attempts=None, serialization_type=WorkflowSerializationFormat.PORTABLE)(
             run
         )

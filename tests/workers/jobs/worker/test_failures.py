@@ -17,10 +17,11 @@ import pytest
 
 from ultragray.demo import copy_demo_scene
 from ultragray_workers.errors import StorageFull
-from ultragray_workers.jobs.specification import Poses, RenderJob
+from ultragray_workers.jobs.kinds import RenderJob
+from ultragray_workers.jobs.kinds.render import Poses
 from ultragray_workers.jobs.store import Job, JobState, JobStore
 
-from .conftest import RunningWorker, store_dataset, train_job
+from ..conftest import RunningWorker, store_dataset, train_job
 
 StartWorker = Callable[..., RunningWorker]
 Until = Callable[..., Job]
@@ -29,7 +30,7 @@ DISK_BYTES = 8 * 2**20
 # The loss of trainings with batches of three is NaN from the third step on.
 DIVERGENCE = """
 import sys
-if "ultragray_workers.jobs.run_job" in sys.orig_argv:
+if "ultragray_workers.jobs.worker.run_job" in sys.orig_argv:
     from ultragray.training import trainer
     image_loss, calls = trainer.image_loss, []
     def broken(rendered, truth):
@@ -132,7 +133,7 @@ def small_disk(artifact_folder: Path) -> Iterator[Path]:
 
 
 def test_full_disk(small_disk: Path, tmp_path: Path, start_worker: StartWorker) -> None:
-    from .conftest import FINAL
+    from ..conftest import FINAL
 
     store = JobStore(small_disk, None)
 
@@ -147,8 +148,8 @@ def test_full_disk(small_disk: Path, tmp_path: Path, start_worker: StartWorker) 
     (small_disk / "scenes").mkdir()
     copy_demo_scene(small_disk / "scenes" / "demo.ugr")
     with pytest.raises(StorageFull, match="60 frames of 512x512 take up to 63 MB"):
-        store.submit(RenderJob("demo", poses=poses(60), height=512, width=512))
-    job, _ = store.submit(RenderJob("demo", poses=poses(12), height=256, width=256))
+        store.submit(RenderJob(scene="demo", poses=poses(60), height=512, width=512))
+    job, _ = store.submit(RenderJob(scene="demo", poses=poses(12), height=256, width=256))
     with (small_disk / "ballast").open("wb") as ballast:
         os.posix_fallocate(ballast.fileno(), 0, shutil.disk_usage(small_disk).free - 2**20)
     start_worker()
@@ -174,7 +175,7 @@ def test_memory_that_does_not_suffice(
     (artifact_folder / "scenes").mkdir()
     copy_demo_scene(artifact_folder / "scenes" / "demo.ugr")
     worker = start_worker()
-    job, _ = store.submit(RenderJob("demo", poses=poses(400), height=1024, width=1024))
+    job, _ = store.submit(RenderJob(scene="demo", poses=poses(400), height=1024, width=1024))
     until(job, lambda job: (job.progress.frames_done or 0) > 0)
     process = process_of(worker)
     used = next(line for line in Path(f"/proc/{process}/status").read_text().splitlines() if line.startswith("VmSize"))

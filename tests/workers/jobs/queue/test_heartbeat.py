@@ -8,13 +8,14 @@ from pathlib import Path
 import pytest
 import sqlalchemy as sa
 
-from ultragray_workers.jobs import heartbeat as heartbeat_module
-from ultragray_workers.jobs.database import JobDatabase
-from ultragray_workers.jobs.heartbeat import Heartbeat
+from ultragray_workers.jobs.queue import heartbeat as heartbeat_module
+from ultragray_workers.jobs.queue.database import JobDatabase
+from ultragray_workers.jobs.queue.heartbeat import Heartbeat
+from ultragray_workers.jobs.queue.internals import WORKFLOWS
 from ultragray_workers.jobs.store import JobState, JobStore
 
-from ...postgres import PostgresServer
-from .conftest import train_job
+from ....postgres import PostgresServer
+from ..conftest import train_job
 
 
 @pytest.fixture(params=["sqlite", "postgresql"])
@@ -38,7 +39,7 @@ def running(store: JobStore, jobs: JobDatabase) -> Callable[[str], str]:
 
     def make(executor: str) -> str:
         job, _ = store.submit(train_job(f"scene-of-{executor}"))
-        rows = jobs.client._sys_db.tables.workflow_status
+        rows = WORKFLOWS
         with jobs.engine.begin() as connection:
             connection.execute(
                 sa.update(rows).where(rows.c.workflow_uuid == job.id).values(status="PENDING", executor_id=executor)

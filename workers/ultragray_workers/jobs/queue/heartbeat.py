@@ -71,7 +71,7 @@ class Heartbeat:
             row.workflow_id
             for row in running
             if (row.executor_id not in alive or row.workflow_id in twice)
-            and self._database.take_back(row.workflow_id, row.executor_id or "")
+            and self._database.put_back(row.workflow_id, row.executor_id or "")
         ]
         for job_id in taken:
             _log.warning(f"no worker is at the job {job_id} any more: it waits again")

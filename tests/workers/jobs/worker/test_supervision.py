@@ -9,12 +9,15 @@ from typing import Any
 import pytest
 import sqlalchemy as sa
 
-from ultragray_workers.jobs import database, publication, supervision
-from ultragray_workers.jobs.database import JobDatabase
+from ultragray_workers.jobs import publication
 from ultragray_workers.jobs.folder import JobFolder, Outcome, Progress
+from ultragray_workers.jobs.queue import database
+from ultragray_workers.jobs.queue.database import JobDatabase
+from ultragray_workers.jobs.queue.internals import WORKFLOWS
 from ultragray_workers.jobs.store import Job, JobState, JobStore
+from ultragray_workers.jobs.worker import supervision
 
-from .conftest import RunningWorker, train_job
+from ..conftest import RunningWorker, train_job
 
 
 @pytest.fixture
@@ -69,7 +72,7 @@ def test_scene_of_a_job_cancelled_at_the_last_moment_is_not_served(
     """The supervisor alone, in this process, as DBOS calls it."""
     job, _ = finished("late")
     jobs = JobDatabase(artifact_folder, None)
-    rows = jobs.client._sys_db.tables.workflow_status
+    rows = WORKFLOWS
     taken = {"status": database.RUNNING[0], "executor_id": "me"}
     with jobs.engine.begin() as connection:
         connection.execute(sa.update(rows).where(rows.c.workflow_uuid == job.id).values(**taken))

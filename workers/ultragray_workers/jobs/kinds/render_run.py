@@ -19,33 +19,32 @@ from ultragray.scene import GaussianScene
 from ultragray.scene_info import SceneHeader, read_header
 from ultragray.training.device import training_device
 
-from ..scenes import SUFFIX
-from .device import chosen_device, device_alone
-from .folder import Outcome, Progress
-from .poses import assessed_poses
-from .specification import RenderJob
-from .work import Stopped, Work
+from ...scenes import SUFFIX
+from ..folder import Outcome, Progress
+from ..worker.device import chosen_device, device_alone
+from ..worker.job_run import JobRun, Stopped
+from .render import RenderJob
 
 ASSESSED_AT_ONCE = 100_000  # poses times training poses, of about a tenth of a second
 
 
-def render(work: Work, job: RenderJob) -> Outcome:
+def run(job_run: JobRun, job: RenderJob) -> Outcome:
     """Renders all poses into `frames` with the suffix of the format.
 
     Raises Stopped, InvalidArgument, LowConfidence, InvalidProbe, SceneFileInvalid, ExtraMissing.
     """
-    torch.set_num_threads(work.request.threads)
-    name = chosen_device("auto", work.request.device)
+    torch.set_num_threads(job_run.request.threads)
+    name = chosen_device("auto", job_run.request.device)
     device = training_device(name, "auto")
-    with device_alone(work, name):
-        return _render_on(device, work, job)
+    with device_alone(job_run, name):
+        return _render_on(device, job_run, job)
 
 
-def _render_on(device: torch.device, work: Work, job: RenderJob) -> Outcome:
-    path = work.folder.path / f"{job.scene}{SUFFIX}"
+def _render_on(device: torch.device, job_run: JobRun, job: RenderJob) -> Outcome:
+    path = job_run.folder.path / f"{job.scene}{SUFFIX}"
     described = read_header(path)
     probe = described.info.probe_or(None)
-    poses, extrapolations = assessed_poses(job, described.training_poses, probe, _assessing(work, described))
+    poses, extrapolations = job.assessed_poses(described.training_poses, probe, _assessing(job_run, described))
     scene = GaussianScene.load(path).to(device)
     height, width = scene.info.image_size_or(job.height, job.width)
     chosen = FORMATS[job.format]
@@ -62,33 +61,33 @@ def _render_on(device: torch.device, work: Work, job: RenderJob) -> Outcome:
         display=chosen.shown(AS_RENDERED, probe, height),
     )
     sys.stderr.write(f"rendering {len(poses):,} frames of {height}x{width} of {job.scene} on {device}\n")
-    with work.folder.new_artifacts() as folder:
+    with job_run.folder.new_artifacts() as folder:
         started = time.monotonic()
 
         def before_portion(done: int) -> None:
-            if work.should_stop():
+            if job_run.should_stop():
                 raise Stopped
             rate = done / (time.monotonic() - started)
             left_s = (len(poses) - done) / rate if done else None
             progress = Progress(frames_done=done, frames=len(poses), rate_per_s=rate or None, seconds_left=left_s)
-            work.report(progress)
+            job_run.report(progress)
 
         sink = export_to(folder / f"frames{chosen.suffix}", job.format, header)
         render_into(sink, header, scene, extrapolations, before_portion=before_portion)
-    return Outcome(artifacts=work.folder.artifact_names())
+    return Outcome(artifacts=job_run.folder.artifact_names())
 
 
-def _assessing(work: Work, described: SceneHeader) -> Assess:
+def _assessing(job_run: JobRun, described: SceneHeader) -> Assess:
     """A function that tells how far poses extrapolate, until the job is to stop."""
     assessor = Assessor(described.info, described.training_poses)
     at_once = max(1, ASSESSED_AT_ONCE // max(1, len(described.training_poses)))
 
     def assess(poses: FloatArray) -> list[Extrapolation]:  # [C, 4, 4] -> [C]
-        told: list[Extrapolation] = []
+        found: list[Extrapolation] = []
         for first in range(0, len(poses), at_once):
-            if work.should_stop():
+            if job_run.should_stop():
                 raise Stopped
-            told.extend(assessor.assess(poses[first : first + at_once]))
-        return told
+            found.extend(assessor.assess(poses[first : first + at_once]))
+        return found
 
     return assess

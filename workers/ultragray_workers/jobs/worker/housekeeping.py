@@ -1,7 +1,7 @@
-"""Old jobs go, a few at a time: those that finished long ago, and folders of which the queue knows no job.
+"""Removal of old jobs, a few at a time: those that finished long ago, and folders of which the queue knows no job.
 
-Any number of workers may do this at once. Scenes that jobs made stay, and so does whatever a job that waits or runs
-still needs.
+Any number of workers may do this at once. Scenes that jobs made stay, and so does everything that a waiting or running
+job still needs.
 """
 
 from __future__ import annotations
@@ -12,20 +12,20 @@ import shutil
 import threading
 import time
 from collections.abc import Iterator
+from datetime import datetime, timezone
 from itertools import islice
 from pathlib import Path
 
-import sqlalchemy as sa
 from sqlalchemy.exc import SQLAlchemyError
 
 from ultragray.errors import UltragrayError
 
-from ..errors import JobInUse
-from . import database
-from .database import JobDatabase
-from .folder import FOLDER, JobFolder
-from .job import KINDS
-from .removal import DELETED_PREFIX, remove_folder, remove_job, sources_in_use
+from ...errors import JobInUse
+from ..folder import FOLDER, JobFolder
+from ..kinds import KINDS
+from ..queue import database
+from ..queue.database import JobDatabase
+from ..removal import DELETED_PREFIX, remove_folder, remove_job, sources_in_use
 
 INTERVAL_S = 3600.0
 STEP_PAUSE_S = 1.0
@@ -38,7 +38,7 @@ _log = logging.getLogger("ultragray.jobs")
 
 
 class Housekeeper:
-    """Removes what is older than `retention_days`, now and then."""
+    """Removes jobs that finished more than `retention_days` ago, every hour."""
 
     def __init__(self, jobs: JobDatabase, artifact_folder: Path, retention_days: float) -> None:
         self._database, self._artifact_folder = jobs, artifact_folder
@@ -51,11 +51,11 @@ class Housekeeper:
         self._thread.start()
 
     def stop(self) -> None:
-        """Ends soon: after what is being removed."""
+        """Ends after the removal at hand."""
         self._stop.set()
 
     def keep_house(self) -> int:
-        """One round: how many jobs and folders went. Raises UltragrayError where the database is away."""
+        """One round: how many jobs and folders were removed. Raises UltragrayError where the database is away."""
         removed = 0
         kept: set[str] = set()
         while not self._stop.is_set() and (old := self._finished_long_ago(kept | set(sources_in_use(self._database)))):
@@ -75,19 +75,18 @@ class Housekeeper:
         return removed
 
     def _finished_long_ago(self, kept: set[str]) -> list[str]:
-        rows = self._database.client._sys_db.tables.workflow_status
-        ended_ms = sa.func.coalesce(rows.c.completed_at, rows.c.updated_at)
-        chosen = sa.select(rows.c.workflow_uuid).where(
-            rows.c.name.in_(KINDS),
-            rows.c.status.in_(_FINISHED),
-            ended_ms < int((time.time() - self._retention_s) * 1000),
-            rows.c.workflow_uuid.not_in(kept),
+        rows = self._database.client.list_workflows(
+            name=list(KINDS),
+            status=list(_FINISHED),
+            completed_before=datetime.fromtimestamp(time.time() - self._retention_s, timezone.utc).isoformat(),
+            limit=AT_ONCE + len(kept),
+            load_input=False,
+            load_output=False,
         )
-        with self._database.engine.begin() as connection:
-            return list(connection.execute(chosen.order_by(ended_ms).limit(AT_ONCE)).scalars())
+        return [row.workflow_id for row in rows if row.workflow_id not in kept][:AT_ONCE]
 
     def _stray_folders(self) -> Iterator[Path]:
-        """Those that may be without a job: a day old, or as old as jobs get where work was done in them."""
+        """Folders that may be without a job: a day old, or of the retention's age where a process worked in them."""
         folder = self._artifact_folder / FOLDER
         for path in folder.iterdir() if folder.is_dir() else ():
             if path.name.startswith(DELETED_PREFIX):

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from ultragray_workers.jobs.curve import draw_training_curve
+from ultragray_workers.jobs.kinds.curve import draw_training_curve
 
 
 def drawn(folder: Path, lines: list[dict[str, Any]]) -> np.ndarray[Any, Any]:  # [H, W, 3]

@@ -1,4 +1,4 @@
-"""The database under the queue: where it is, and what both the store and the workers read from it."""
+"""The database under the queue: where it is, and what both the store and the workers do with it."""
 
 from __future__ import annotations
 
@@ -12,15 +12,21 @@ from dbos import DBOS, DBOSClient, DBOSPortableJSONSerializer, EnqueueOptions, W
 from sqlalchemy.engine import ExceptionContext
 from sqlalchemy.exc import SQLAlchemyError
 
-from ..errors import DatabaseUnavailable, StartupFailed, StorageFull
+from ...errors import DatabaseUnavailable, StartupFailed, StorageFull
+from .internals import SCHEMA, SQLITE_ISOLATION, SQLITE_SETTINGS, WORKFLOWS, put_back
 
 APPLICATION = "ultragray"
 VERSION = "1"  # of the workflow's inputs and steps: workers take the jobs of their own version only
 QUEUE = "ultragray-jobs"
 SQLITE_FILE = "jobs.sqlite"
 _POSTGRES_SCHEMES = ("postgresql", "postgres", "postgresql+psycopg")
-# libpq's: a server that cannot be reached, or from which nothing comes back any more, is given up. s, ms, ms
-_PATIENCE = {"connect_timeout": "5", "tcp_user_timeout": "10000", "options": "-c statement_timeout=30000"}
+# libpq's: a server that cannot be reached, or from which nothing comes back any more, is given up. s, ms, ms, ms
+_PATIENCE = {
+    "connect_timeout": "5",
+    "tcp_user_timeout": "10000",
+    "options": "-c statement_timeout=30000 -c idle_in_transaction_session_timeout=60000",
+}
+_CONNECTIONS = 5
 # SQLSTATE: the connection is gone, the server lacks the means, a statement took too long, the server stops or starts.
 _AWAY = ("08", "53", "57014", "57P")
 _DEADLOCK = "40P01"
@@ -31,11 +37,11 @@ SUCCEEDED = ("SUCCESS",)
 FAILED = ("ERROR", "MAX_RECOVERY_ATTEMPTS_EXCEEDED")
 CANCELLED = ("CANCELLED",)
 
-_TOLD_BY_US = (
+_REPORTED_BY_US = (
     "Exception encountered in background workflow",
     "no longer owned",  # by this worker
     "to verify existence of",  # the database, to which we have been connected
-    "psycopg.OperationalError",  # the heartbeat tells once what these tell several times a second
+    "psycopg.OperationalError",  # the heartbeat logs once what these log several times a second
     "psycopg.errors.AdminShutdown",
     "psycopg.errors.CannotConnectNow",
     "psycopg.errors.ConnectionTimeout",
@@ -78,7 +84,7 @@ def _connect_once(url: str) -> None:
         pass
 
 
-def _told_as_ours(context: ExceptionContext) -> None:
+def _raise_as_ours(context: ExceptionContext) -> None:
     if context.is_pre_ping:  # a connection that was lost while nobody used it is replaced
         return
     error = context.original_exception
@@ -95,8 +101,8 @@ class JobDatabase:
     def __init__(self, artifact_folder: Path, database_url: str | None) -> None:
         """Raises StartupFailed where the database cannot be used.
 
-        Whatever is asked of a database that goes away later raises DatabaseUnavailable, until it is back; StorageFull
-        where a SQLite file cannot grow.
+        While a database that was there is away, every use raises DatabaseUnavailable; StorageFull where a SQLite file
+        cannot grow.
         """
         quiet_dbos()
         try:
@@ -104,8 +110,9 @@ class JobDatabase:
             self.url = checked_url(database_url, artifact_folder)
             _connect_once(self.url)
             DBOS.migrate(self.url)
+            engine = _engine(self.url)
             self.client = DBOSClient(
-                system_database_url=self.url,
+                system_database_engine=engine,
                 application_name=APPLICATION,
                 serializer=SERIALIZER,
                 retry_connection_errors=False,
@@ -117,13 +124,11 @@ class JobDatabase:
                 "(ULTRAGRAY_DATABASE_URL names it: server and database must be there, user and password right)",
                 field="database_url",
             ) from error
-        sa.event.listen(self.engine, "handle_error", _told_as_ours)
-
-    @property
-    def engine(self) -> sa.Engine:
-        """For tables of our own beside those of the queue."""
-        engine: sa.Engine = self.client._sys_db.engine
-        return engine
+        sa.event.listen(engine, "handle_error", _raise_as_ours)
+        # Also for tables of our own beside those of the queue.
+        self.engine = engine.execution_options(
+            schema_translate_map={SCHEMA: None if engine.dialect.name == "sqlite" else SCHEMA}
+        )
 
     def enqueue(self, options: EnqueueOptions, *arguments: Any) -> None:
         """Puts a workflow into the queue behind all others of its priority.
@@ -135,12 +140,12 @@ class JobDatabase:
             try:
                 return self._enqueue(options, *arguments)
             except SQLAlchemyError as error:
-                # Two that submit the same job at once: PostgreSQL ends one of them, and for that one it is there now.
+                # Two submissions of one job at once: PostgreSQL ends one of them, which then finds the other's.
                 if getattr(getattr(error, "orig", None), "sqlstate", None) != _DEADLOCK:
                     raise
 
     def _enqueue(self, options: EnqueueOptions, *arguments: Any) -> None:
-        rows = self.client._sys_db.tables.workflow_status
+        rows = WORKFLOWS
         with self.engine.begin() as connection:
             self.client.enqueue_in_transaction(connection, options, *arguments)
             last_ms = sa.select(sa.func.coalesce(sa.func.max(rows.c.created_at), 0)).where(
@@ -151,9 +156,9 @@ class JobDatabase:
                 sa.update(rows).where(rows.c.workflow_uuid == options["workflow_id"]).values(created_at=submitted_ms)
             )
 
-    def workflow(self, job_id: str, *, with_output: bool = False) -> WorkflowStatus | None:
-        """The queue's row of a job."""
-        rows = self.client.list_workflows(workflow_ids=[job_id], load_input=False, load_output=with_output)
+    def workflow(self, job_id: str, *, with_input: bool = False, with_output: bool = False) -> WorkflowStatus | None:
+        """The queue's row of a job; None where there is no such job."""
+        rows = self.client.list_workflows(workflow_ids=[job_id], load_input=with_input, load_output=with_output)
         return rows[0] if rows else None
 
     def unfinished(self) -> list[WorkflowStatus]:
@@ -162,20 +167,32 @@ class JobDatabase:
             status=[*QUEUED, *RUNNING], queue_name=QUEUE, load_input=False, load_output=False
         )
 
-    def take_back(self, job_id: str, executor: str) -> bool:
-        """Puts a job that `executor` runs back into the queue; False where it does not run it (any more).
-
-        Not `resume_workflow`, which would also revive a job cancelled a moment ago.
-        """
-        return self.client._sys_db.reenqueue_for_recovery(job_id, [executor], QUEUE)
+    def put_back(self, job_id: str, executor: str) -> bool:
+        """Puts a job that `executor` runs back into the queue; False where it does not run it (any more)."""
+        return put_back(self.client, job_id, executor, QUEUE)
 
     def close(self) -> None:
         """Ends the connections."""
         self.client.destroy()
+        self.engine.dispose()
+
+
+def _engine(url: str) -> sa.Engine:
+    """An engine like the one that DBOS makes of a URL."""
+    engine = sa.create_engine(url, pool_size=_CONNECTIONS, max_overflow=0, pool_timeout=30, pool_pre_ping=True)
+    if engine.dialect.name == "sqlite":
+
+        @sa.event.listens_for(engine, "connect")
+        def configure(connection: Any, record: Any) -> None:
+            connection.isolation_level = SQLITE_ISOLATION
+            for name, value in SQLITE_SETTINGS.items():
+                connection.execute(f"PRAGMA {name}={value}")
+
+    return engine
 
 
 def quiet_dbos() -> None:
-    """DBOS tells its warnings through the handlers of the process, and nothing else."""
+    """Lets DBOS log its warnings, and nothing else, through the handlers of the process."""
     logger = logging.getLogger("dbos")
     logger.handlers.clear()
     logger.propagate = True
@@ -186,7 +203,7 @@ def quiet_dbos() -> None:
 def _is_news(record: logging.LogRecord) -> bool:
     """Not what is ordinary, or told by us: ends of jobs, and a database that is away."""
     told = record.getMessage()
-    return not any(known in told for known in _TOLD_BY_US)
+    return not any(known in told for known in _REPORTED_BY_US)
 
 
 def dbos_config(url: str, executor: str) -> Any:

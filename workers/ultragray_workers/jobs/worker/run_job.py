@@ -1,4 +1,4 @@
-"""`python -m ultragray_workers.jobs.run_job JOB_FOLDER WORKER_PID`: the process that does the work of one job.
+"""`python -m ultragray_workers.jobs.worker.run_job JOB_FOLDER WORKER_PID`: the process that does the work of one job.
 
 It dies with its worker, works alone in the folder, and as its last act says in outcome.json how the job ended. A job
 that fails is a process that ends well; SIGTERM ends it with exit code STOPPED and a checkpoint to go on from.
@@ -19,10 +19,10 @@ from pathlib import Path
 
 from ultragray.errors import InvalidArgument, MemoryExceeded, UltragrayError
 
-from ..errors import StorageFull
-from .folder import JobFolder, Outcome
-from .specification import RenderJob, from_dict
-from .work import Stopped, Work
+from ...errors import StorageFull
+from ..folder import JobFolder, Outcome
+from ..specification import from_dict
+from .job_run import JobRun, Stopped
 
 STOPPED, STORAGE_FULL = 75, 73
 _PR_SET_PDEATHSIG = 1
@@ -46,9 +46,9 @@ def main(folder_path: str, worker_pid: str) -> int:
         request = folder.request()
         os.nice(request.nice)
         Path("/proc/self/oom_score_adj").write_text(_OOM_SCORE_ADJ, encoding="ascii")
-        work = Work(folder, request, lambda: bool(received))
+        job_run = JobRun(folder, request, lambda: bool(received))
         try:
-            outcome = _outcome_of(work)
+            outcome = _outcome_of(job_run)
         except Stopped:
             return STOPPED
         try:
@@ -59,50 +59,41 @@ def main(folder_path: str, worker_pid: str) -> int:
     return 0
 
 
-def _outcome_of(work: Work) -> Outcome:
+def _outcome_of(job_run: JobRun) -> Outcome:
     try:
-        return replace(_do(work), progress=work.progress)
+        return replace(from_dict(job_run.request.specification).run(job_run), progress=job_run.progress)
     except Stopped:
         raise
     except UltragrayError as error:
         field = error.field if isinstance(error, InvalidArgument) else None
         given = f"{field}: " if field is not None and field not in error.detail else ""
-        return _failed(work, error.reason, given + error.detail)
+        return _failed(job_run, error.reason, given + error.detail)
     except OSError as error:
         if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-            return _broken(work, error)
-        work.folder.remove_partial_artifacts()
-        return _failed(work, StorageFull.reason, "the artifact folder has no room for what this job writes")
+            return _broken(job_run, error)
+        job_run.folder.remove_partial_artifacts()
+        return _failed(job_run, StorageFull.reason, "the artifact folder has no room for what this job writes")
     except (MemoryError, RuntimeError) as error:
         if isinstance(error, RuntimeError) and "allocate memory" not in str(error):
-            return _broken(work, error)
-        return _failed(work, MemoryExceeded.reason, "the memory of the machine did not suffice for this job")
+            return _broken(job_run, error)
+        return _failed(job_run, MemoryExceeded.reason, "the memory of the machine did not suffice for this job")
     except Exception as error:
-        return _broken(work, error)
+        return _broken(job_run, error)
 
 
-def _do(work: Work) -> Outcome:
-    specification = from_dict(work.request.specification)
-    if isinstance(specification, RenderJob):
-        from .render_job import render
-
-        return render(work, specification)
-    from .train_job import train
-
-    return train(work, specification)
-
-
-def _broken(work: Work, error: Exception) -> Outcome:
+def _broken(job_run: JobRun, error: Exception) -> Outcome:
     traceback.print_exc()
-    told = " ".join(str(error).split()) or "no message"
-    return _failed(work, "INTERNAL", f"the process of the job failed, see its log: {type(error).__name__}: {told}")
+    message = " ".join(str(error).split()) or "no message"
+    return _failed(
+        job_run, "INTERNAL", f"the process of the job failed, see its log: {type(error).__name__}: {message}"
+    )
 
 
-def _failed(work: Work, error: str, reason: str) -> Outcome:
-    told = reason.replace(f"{work.folder.artifact_folder}{os.sep}", "")  # where a service keeps its files is its own
+def _failed(job_run: JobRun, error: str, reason: str) -> Outcome:
+    shown = reason.replace(f"{job_run.folder.artifact_folder}{os.sep}", "")  # callers learn no paths of the service
     with suppress(OSError):
-        sys.stderr.write(f"failed: {told}\n")
-    return Outcome(error=error, reason=told, progress=work.progress)
+        sys.stderr.write(f"failed: {shown}\n")
+    return Outcome(error=error, reason=shown, progress=job_run.progress)
 
 
 if __name__ == "__main__":

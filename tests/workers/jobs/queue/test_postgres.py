@@ -19,18 +19,18 @@ from ultragray.datasets.source import load_dataset
 from ultragray.scene import GaussianScene
 from ultragray.training import TrainingConfig, train
 from ultragray_workers.errors import DatabaseUnavailable, StartupFailed
-from ultragray_workers.jobs.database import JobDatabase, checked_url
+from ultragray_workers.jobs.queue.database import JobDatabase, checked_url
 from ultragray_workers.jobs.store import Job, JobState, JobStore
 
-from ...postgres import PASSWORD, PostgresServer
-from .conftest import RunningWorker, train_job
+from ....postgres import PASSWORD, PostgresServer
+from ..conftest import RunningWorker, train_job
 
 StartWorker = Callable[..., RunningWorker]
 Until = Callable[..., Job]
 
 # `ultragray worker`, less patient with the dead.
 HOST = """
-from ultragray_workers.jobs import heartbeat
+from ultragray_workers.jobs.queue import heartbeat
 from ultragray_service.cli import app
 heartbeat.DEAD_AFTER_S = 3.0
 app()

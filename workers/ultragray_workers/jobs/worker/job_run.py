@@ -1,4 +1,4 @@
-"""What the work of a job has of its process: its folder, its request, a way to tell progress and to be stopped."""
+"""The run of a job in its process: its folder, its request, its progress, and whether it is to stop."""
 
 from __future__ import annotations
 
@@ -6,27 +6,27 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 
-from .folder import JobFolder, Progress, Request
+from ..folder import JobFolder, Progress, Request
 
 _PROGRESS_INTERVAL_S = 0.5
 
 
 class Stopped(Exception):
-    """The worker stops; the job goes on later."""
+    """Raised where the worker stops; the job goes on later."""
 
 
-class Work:
-    """One job at work."""
+class JobRun:
+    """One job in its process."""
 
     def __init__(self, folder: JobFolder, request: Request, should_stop: Callable[[], bool]) -> None:
         self.folder, self.request, self.should_stop = folder, request, should_stop
         self.progress = folder.progress()
-        self._told_at = float("-inf")
+        self._reported_at = float("-inf")
 
     def report(self, progress: Progress) -> None:
-        """Tells how far the job is, at most twice a second."""
+        """Writes how far the job is, at most twice a second."""
         self.progress = progress
-        if time.monotonic() - self._told_at >= _PROGRESS_INTERVAL_S:
+        if time.monotonic() - self._reported_at >= _PROGRESS_INTERVAL_S:
             with suppress(OSError):  # where there is no room, the work itself will say so
                 self.folder.write_progress(progress)
-            self._told_at = time.monotonic()
+            self._reported_at = time.monotonic()

@@ -1,4 +1,4 @@
-"""Supervision of one job: starts its process, watches it and the queue, and says how the job ended. Free of torch."""
+"""Supervision of one job: starts its process, watches it and the queue, and reports how the job ended."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ from dbos import WorkflowStatus
 
 from ultragray.errors import MemoryExceeded
 
-from ..errors import DatabaseUnavailable, SceneExists, StorageFull
-from . import database
-from .database import JobDatabase
-from .folder import JobFolder, Outcome, Request
-from .publication import publish_scene, withdraw_scene
+from ...errors import DatabaseUnavailable, SceneExists, StorageFull
+from ..folder import JobFolder, Outcome, Request
+from ..publication import publish_scene, withdraw_scene
+from ..queue import database
+from ..queue.database import JobDatabase
+from ..specification import value_in
 from .run_job import STOPPED, STORAGE_FULL
-from .specification import TrainJob
 
 WATCH_INTERVAL_S = 0.25
 _POLL_INTERVAL_S = 0.05
-_STOP_WAIT_S = 10.0  # for the checkpoint of a training that is told to stop
-MAX_CRASHES = 3  # of a process that got no further in between: then the job fails
-# Somebody who kills processes at random is not the job's fault; without end it is not tried either.
-MAX_KILLS = 20
+_STOP_WAIT_S = 10.0  # for the checkpoint of a training that is to stop
+# A job fails after so many deaths of its process without progress in between. Kills from outside are hardly the job's
+# fault, so more of them are allowed.
+MAX_CRASHES, MAX_KILLS = 3, 20
 _RESERVE_BYTES = 2**19
 
 _log = logging.getLogger("ultragray.jobs")
@@ -41,7 +41,7 @@ _log = logging.getLogger("ultragray.jobs")
 
 @dataclass(frozen=True)
 class WorkerConfig:
-    """What a worker gives the processes of its jobs."""
+    """Settings of a worker, most of them for the processes of its jobs."""
 
     artifact_folder: Path
     executor: str  # name of the worker, the same after a restart
@@ -51,7 +51,7 @@ class WorkerConfig:
 
 
 class Interrupted(Exception):
-    """The job is cancelled, is another worker's, or waits in the queue again: how it ends is not for us to say."""
+    """The job is cancelled, another worker's, or back in the queue: this worker must not write its end."""
 
 
 class Supervisor:
@@ -67,13 +67,13 @@ class Supervisor:
     def stop(self) -> None:
         """Ends the process at hand, which writes a checkpoint, and puts its job back into the queue.
 
-        Whatever DBOS starts from now on is put back too, and waits for the end of this worker.
+        Jobs that DBOS starts from now on are put back too.
         """
         self._stop.set()
         self._idle.wait(_STOP_WAIT_S + 5.0)
 
     def supervise(self, job_id: str, request: dict[str, Any]) -> Outcome:
-        """Does a job, from where an earlier process left it. Never raises for a job that fails.
+        """Does a job, from where an earlier process left it; returns also where the job fails.
 
         Raises Interrupted.
         """
@@ -87,11 +87,12 @@ class Supervisor:
             try:
                 folder.path.mkdir(parents=True, exist_ok=True)
                 attempt = row.recovery_attempts or 1
-                kept = folder.outcome()  # of a process whose worker died before it could say so
+                kept = folder.outcome()  # of a process that finished as its worker died
                 outcome = self._work(folder, request, attempt) if kept is None else replace(kept, attempts=attempt)
-                if outcome.error is None and request["specification"]["kind"] == TrainJob.kind:
+                made = value_in(request["specification"], "makes_scene")
+                if outcome.error is None and made is not None:
                     self._require_ours(job_id)
-                    self._publish(folder, request["specification"]["scene"])
+                    self._publish(folder, made)
                     folder.remove_checkpoints()
             except SceneExists as error:
                 outcome = replace(outcome, error=error.reason, reason=error.detail)  # the scene can be downloaded
@@ -130,7 +131,7 @@ class Supervisor:
             furthest = max(furthest, _furthest(folder))
             is_kill = code in (-signal.SIGKILL, -signal.SIGTERM, STOPPED) and _memory_kills() == memory_kills
             kills, crashes = kills + is_kill, crashes + (not is_kill)
-            _log.warning(f"the process of the job {folder.job_id} died ({_told(code)})")
+            _log.warning(f"the process of the job {folder.job_id} died ({_in_words(code)})")
             if kills >= MAX_KILLS or crashes >= MAX_CRASHES:
                 failed = _failure_of_process(code, crashes + kills, _memory_kills() > memory_kills)
                 return replace(failed, progress=folder.progress(), attempts=attempt)
@@ -141,7 +142,7 @@ class Supervisor:
         threads = str(self._config.threads)
         with folder.log.open("ab") as log:
             process = subprocess.Popen(
-                [sys.executable, "-m", "ultragray_workers.jobs.run_job", str(folder.path), str(os.getpid())],
+                [sys.executable, "-m", "ultragray_workers.jobs.worker.run_job", str(folder.path), str(os.getpid())],
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,
@@ -183,14 +184,14 @@ class Supervisor:
             raise
 
     def _give_back(self, job_id: str) -> NoReturn:
-        with suppress(DatabaseUnavailable, StorageFull):  # then this worker, when it is back, or another takes it
-            self._database.take_back(job_id, self._config.executor)
+        with suppress(DatabaseUnavailable, StorageFull):  # then the heartbeat of any worker puts it back
+            self._database.put_back(job_id, self._config.executor)
         self._idle.set()
-        while True:  # until the process ends: else DBOS would take the job once more
+        while True:  # until this worker's process ends: a return would let DBOS take the job again
             time.sleep(_STOP_WAIT_S)
 
     def _require_ours(self, job_id: str) -> WorkflowStatus:
-        """As `_raise_unless_ours`, after a wait where the database is away."""
+        """As `_raise_unless_ours`, but waits for a database that is away."""
         while True:
             try:
                 return self._raise_unless_ours(job_id)
@@ -209,7 +210,7 @@ class Supervisor:
 
 @contextmanager
 def _room_for_the_end(folder: JobFolder) -> Iterator[None]:
-    """Room that a job leaves on a disk that it fills: for its outcome, and for a queue on the same disk.
+    """Reserves room on the disk for the outcome of a job that fills it, and for a queue on the same disk.
 
     Raises OSError.
     """
@@ -245,7 +246,7 @@ def _failure_of_process(code: int, times: int, of_memory: bool) -> Outcome:
         )
     return Outcome(
         error="INTERNAL",
-        reason=f"the process of the job died {times} times without getting further ({_told(code)}); see its log",
+        reason=f"the process of the job died {times} times without getting further ({_in_words(code)}); see its log",
     )
 
 
@@ -259,5 +260,5 @@ def _storage_full() -> Outcome:
     return Outcome(error=StorageFull.reason, reason="the artifact folder has no room for what this job writes")
 
 
-def _told(code: int) -> str:
+def _in_words(code: int) -> str:
     return f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"

@@ -27,67 +27,67 @@ from ultragray.training import TrainingConfig
 from ultragray.training import train as train_scene
 from ultragray.training.trainer import CHECKPOINT_FILE, CONFIG_FILE, JOURNAL_FILE
 
-from ..datasets.store import DatasetStore
-from ..scenes import SUFFIX
+from ...datasets.store import DatasetStore
+from ...scenes import SUFFIX
+from ..folder import JobFolder, Outcome, Progress
+from ..worker.device import chosen_device, device_alone
+from ..worker.job_run import JobRun, Stopped
 from .curve import draw_training_curve
-from .device import chosen_device, device_alone
-from .folder import JobFolder, Outcome, Progress
-from .specification import TrainJob
-from .work import Stopped, Work
+from .train import TrainJob
 
 CHECKPOINT_INTERVAL_S = 10.0
 PICTURES, REPORT_FRAMES = 4, 24  # held-out frames, evenly spread
 _LINES = 20  # of the log in a run
 
 
-def train(work: Work, job: TrainJob) -> Outcome:
+def run(job_run: JobRun, job: TrainJob) -> Outcome:
     """Trains, or goes on from the checkpoint that an earlier process left, and completes the artifacts.
 
     Raises Stopped, DatasetNotFound, DatasetInvalid, InvalidArgument, and what `ultragray.training.train` raises.
     """
-    torch.set_num_threads(work.request.threads)
-    device = chosen_device(job.device, work.request.device)
-    with device_alone(work, device):
-        return _train_on(device, work, job)
+    torch.set_num_threads(job_run.request.threads)
+    device = chosen_device(job.device, job_run.request.device)
+    with device_alone(job_run, device):
+        return _train_on(device, job_run, job)
 
 
-def _train_on(device: str, work: Work, job: TrainJob) -> Outcome:
+def _train_on(device: str, job_run: JobRun, job: TrainJob) -> Outcome:
     config = TrainingConfig.preset(job.preset, **job.settings)
-    dataset = DatasetStore(work.folder.artifact_folder).load(job.dataset)
-    _take_over_run(work)
-    checkpoint = work.folder.run / CHECKPOINT_FILE
+    dataset = DatasetStore(job_run.folder.artifact_folder).load(job.dataset)
+    _take_over_run(job_run)
+    checkpoint = job_run.folder.run / CHECKPOINT_FILE
     resume = checkpoint.exists()
     sys.stderr.write(
-        f"training {job.scene} from {job.dataset} on {device}, {work.request.threads} threads"
+        f"training {job.scene} from {job.dataset} on {device}, {job_run.request.threads} threads"
         f"{', going on from a checkpoint' if resume else ''}\n"
     )
     scene = train_scene(
         dataset,
         config,
-        folder=work.folder.run,
+        folder=job_run.folder.run,
         resume=resume,
-        report=lambda state: _report(work, state),
-        should_stop=work.should_stop,
+        report=lambda state: _report(job_run, state),
+        should_stop=job_run.should_stop,
         device=device,
         checkpoint_interval_s=CHECKPOINT_INTERVAL_S,
     )
     if scene.info.training["step"] < scene.info.training["steps"]:
         raise Stopped
-    return _finish(work, job, dataset, scene, device)
+    return _finish(job_run, job, dataset, scene, device)
 
 
-def _take_over_run(work: Work) -> None:
+def _take_over_run(job_run: JobRun) -> None:
     """Puts the checkpoint of the job that this one replaces into the run's folder, unless there is a run already."""
-    before = work.request.retry_of
-    if before is None or work.folder.run.exists():
+    before = job_run.request.retry_of
+    if before is None or job_run.folder.run.exists():
         return
-    old = JobFolder(work.folder.artifact_folder, before)
+    old = JobFolder(job_run.folder.artifact_folder, before)
     if not (old.run / CHECKPOINT_FILE).exists():
         return
     outcome = old.outcome()
     if outcome is not None and outcome.error == TrainingStateInvalid.reason:
         return  # it cannot be resumed from: this job begins anew
-    partial = work.folder.path / "run.partial"
+    partial = job_run.folder.path / "run.partial"
     shutil.rmtree(partial, ignore_errors=True)
     with suppress(FileNotFoundError), old.lock.open("a") as lock:  # it may be deleted meanwhile: then anew
         fcntl.lockf(lock, fcntl.LOCK_EX)  # a process that was cancelled a moment ago may still write
@@ -95,11 +95,11 @@ def _take_over_run(work: Work) -> None:
         for name in (CHECKPOINT_FILE, JOURNAL_FILE, CONFIG_FILE):
             if (old.run / name).exists():
                 shutil.copyfile(old.run / name, partial / name)
-        partial.rename(work.folder.run)
+        partial.rename(job_run.folder.run)
 
 
-def _report(work: Work, state: TrainingProgress) -> None:
-    work.report(
+def _report(job_run: JobRun, state: TrainingProgress) -> None:
+    job_run.report(
         Progress(
             step=state.step,
             steps=state.steps,
@@ -119,12 +119,12 @@ def _report(work: Work, state: TrainingProgress) -> None:
         sys.stderr.flush()
 
 
-def _finish(work: Work, job: TrainJob, dataset: Dataset, scene: GaussianScene, device: str) -> Outcome:
-    work.progress = replace(work.progress, step=scene.info.training["step"], steps=scene.info.training["steps"])
+def _finish(job_run: JobRun, job: TrainJob, dataset: Dataset, scene: GaussianScene, device: str) -> Outcome:
+    job_run.progress = replace(job_run.progress, step=scene.info.training["step"], steps=scene.info.training["steps"])
     metrics = {name: float(value) for name, value in scene.info.metrics.items()}
-    with work.folder.new_artifacts() as folder:
+    with job_run.folder.new_artifacts() as folder:
         scene.save(folder / f"{job.scene}{SUFFIX}")
-        journal = work.folder.run / JOURNAL_FILE
+        journal = job_run.folder.run / JOURNAL_FILE
         shutil.copyfile(journal, folder / JOURNAL_FILE)
         draw_training_curve(journal, folder / "training_curve.png")
         document = {
@@ -139,7 +139,7 @@ def _finish(work: Work, job: TrainJob, dataset: Dataset, scene: GaussianScene, d
             scene = scene.to(device)
             evaluation = evaluate(scene, dataset.val)
             _draw_frames(scene, dataset, evaluation, folder)
-            processor = f"{processor_name()}, {work.request.threads} threads"
+            processor = f"{processor_name()}, {job_run.request.threads} threads"
             content = ReportContent(
                 dataset=dataset,
                 scene=scene,
@@ -150,7 +150,7 @@ def _finish(work: Work, job: TrainJob, dataset: Dataset, scene: GaussianScene, d
                 trained=trained_of_journal(scene, evaluation, journal),
             )
             (folder / "report.html").write_text(render_page(content), encoding="utf-8")
-    return Outcome(artifacts=work.folder.artifact_names(), metrics=metrics)
+    return Outcome(artifacts=job_run.folder.artifact_names(), metrics=metrics)
 
 
 def _draw_frames(scene: GaussianScene, dataset: Dataset, evaluation: Evaluation, folder: Path) -> None:

@@ -11,12 +11,12 @@ from pathlib import Path
 
 import pytest
 
-from ultragray_workers.jobs.device import device_alone, lock_path
 from ultragray_workers.jobs.folder import JobFolder, Progress, Request
 from ultragray_workers.jobs.store import Job, JobState, JobStore
-from ultragray_workers.jobs.work import Stopped, Work
+from ultragray_workers.jobs.worker.device import device_alone, lock_path
+from ultragray_workers.jobs.worker.job_run import JobRun, Stopped
 
-from .conftest import RunningWorker, train_job
+from ..conftest import RunningWorker, train_job
 
 HOLDER = """
 import fcntl, sys
@@ -41,10 +41,10 @@ def held(path: Path) -> Iterator[subprocess.Popen[bytes]]:
     holder.communicate()
 
 
-def work_of(folder: Path, should_stop: Callable[[], bool]) -> Work:
+def work_of(folder: Path, should_stop: Callable[[], bool]) -> JobRun:
     job = JobFolder(folder, "job")
     job.path.mkdir(parents=True)
-    return Work(job, Request({}, None, "cpu", 1, 0), should_stop)
+    return JobRun(job, Request({}, None, "cpu", 1, 0), should_stop)
 
 
 def test_waits_for_the_device_and_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

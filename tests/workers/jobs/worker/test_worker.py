@@ -20,11 +20,11 @@ from ultragray.samplers import AroundSampler
 from ultragray.scene import GaussianScene
 from ultragray.training import TrainingConfig, train
 from ultragray_workers.errors import JobFinished, JobNotFinished, StartupFailed
-from ultragray_workers.jobs.specification import RenderJob
+from ultragray_workers.jobs.kinds import RenderJob
 from ultragray_workers.jobs.store import Job, JobState, JobStore
-from ultragray_workers.jobs.worker import claim_name
+from ultragray_workers.jobs.worker.worker import claim_name
 
-from .conftest import RunningWorker, store_dataset, train_job
+from ..conftest import RunningWorker, store_dataset, train_job
 
 StartWorker = Callable[..., RunningWorker]
 Until = Callable[..., Job]
@@ -79,7 +79,7 @@ def test_good_jobs_run_in_order_and_bad_ones_fail_with_a_reason(
     with pytest.raises(JobNotFinished):
         store.retry(last.id)
 
-    render, _ = store.submit(RenderJob("good", sampler=AroundSampler(40, 1.0, 1.0), height=20, width=24))
+    render, _ = store.submit(RenderJob(scene="good", sampler=AroundSampler(40, 1.0, 1.0), height=20, width=24))
     render = until(render)
     assert render.state is JobState.SUCCEEDED, render
     assert (render.progress.frames_done, render.progress.frames, render.artifacts) == (40, 40, ("frames.npz",))
@@ -95,7 +95,7 @@ def test_name_of_a_worker_is_its_alone(tmp_path: Path) -> None:
         pass
     program = (
         f"import sys; sys.path[:] = {sys.path!r}\nfrom pathlib import Path\n"
-        "from ultragray_workers.jobs.worker import claim_name\n"
+        "from ultragray_workers.jobs.worker.worker import claim_name\n"
         f"with claim_name(Path({str(tmp_path)!r}), None) as name: print(name[-2:])\n"
         f"with claim_name(Path({str(tmp_path)!r}), 'mine'): pass"
     )

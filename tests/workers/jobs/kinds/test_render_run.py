@@ -17,10 +17,10 @@ from ultragray.datasets.plus import read_plus_sweep
 from ultragray.errors import ExtraMissing, InvalidArgument, InvalidProbe, LowConfidence
 from ultragray.interchange import rendering
 from ultragray.samplers import AroundSampler, CoveredSampler, FanSampler, SplineSampler, TrainingSampler
-from ultragray_workers.jobs import render_job
 from ultragray_workers.jobs.folder import JobFolder, Request
-from ultragray_workers.jobs.specification import RenderJob, to_dict
-from ultragray_workers.jobs.work import Stopped, Work
+from ultragray_workers.jobs.kinds import RenderJob, render_run
+from ultragray_workers.jobs.specification import to_dict
+from ultragray_workers.jobs.worker.job_run import JobRun, Stopped
 
 PROBE = LinearProbe(width_mm=30.0, near_mm=0.0, far_mm=40.0)
 TRAINING = np.tile(np.eye(4), (6, 1, 1))
@@ -34,25 +34,25 @@ def one_thread() -> None:
 
 
 @pytest.fixture
-def work(tmp_path: Path, random_scene: Callable[..., GaussianScene]) -> Callable[..., Work]:
+def work(tmp_path: Path, random_scene: Callable[..., GaussianScene]) -> Callable[..., JobRun]:
     """The work of a job whose folder holds its scene."""
     info = {"probe": PROBE, "image_height": 24, "image_width": 20}
 
-    def make(job: RenderJob, *, should_stop: Callable[[], bool] = lambda: False, **changes: object) -> Work:
+    def make(job: RenderJob, *, should_stop: Callable[[], bool] = lambda: False, **changes: object) -> JobRun:
         folder = JobFolder(tmp_path, "job")
         folder.path.mkdir(parents=True)
         made = random_scene(60, info=info | changes)
         scene = GaussianScene.from_splats(made.splats, info=made.info, training_poses=TRAINING)
         scene.save(folder.path / f"{job.scene}.ugr")
-        return Work(folder, Request(to_dict(job), None, "cpu", 1, 0), should_stop)
+        return JobRun(folder, Request(to_dict(job), None, "cpu", 1, 0), should_stop)
 
     return make
 
 
-def test_poses_of_the_sampler_are_rendered_and_in_the_archive(work: Callable[..., Work]) -> None:
-    job = RenderJob("one", sampler=CoveredSampler(50, seed=2), outputs=("bmode", "coverage"), dtype="uint8")
+def test_poses_of_the_sampler_are_rendered_and_in_the_archive(work: Callable[..., JobRun]) -> None:
+    job = RenderJob(scene="one", sampler=CoveredSampler(50, seed=2), outputs=("bmode", "coverage"), dtype="uint8")
     asked = work(job)
-    assert render_job.render(asked, job).artifacts == ("frames.npz",)
+    assert render_run.run(asked, job).artifacts == ("frames.npz",)
     assert (asked.progress.frames_done, asked.progress.frames) == (50, 50)
     scene = GaussianScene.load(asked.folder.path / "one.ugr")
     with np.load(asked.folder.artifacts / "frames.npz") as archive:
@@ -63,31 +63,33 @@ def test_poses_of_the_sampler_are_rendered_and_in_the_archive(work: Callable[...
             np.testing.assert_array_equal(archive[name], np.rint(getattr(frames, name).numpy() * 255))
 
 
-def test_dicom_of_given_poses_in_a_fan(work: Callable[..., Work]) -> None:
-    job = RenderJob("one", poses=TRAINING[:2].tolist(), sampler=FanSampler(5, 5), format="dicom", height=16, width=12)
+def test_dicom_of_given_poses_in_a_fan(work: Callable[..., JobRun]) -> None:
+    job = RenderJob(
+        scene="one", poses=TRAINING[:2].tolist(), sampler=FanSampler(5, 5), format="dicom", height=16, width=12
+    )
     asked = work(job)
-    assert render_job.render(asked, job).artifacts == ("frames.dcm",)
+    assert render_run.run(asked, job).artifacts == ("frames.dcm",)
     data = pydicom.dcmread(asked.folder.artifacts / "frames.dcm")
     assert data.pixel_array.shape == (6, 16, 12)
     poses = np.frombuffer(data.private_block(0x0019, "ULTRAGRAY")[0x01].value, "<f8").reshape(-1, 4, 4)
     np.testing.assert_array_equal(poses, FanSampler(5, 5).poses(TRAINING[:2], PROBE))
 
 
-def test_plus_sequence_of_the_spline(work: Callable[..., Work]) -> None:
-    job = RenderJob("one", sampler=SplineSampler(spacing_mm=0.5), format="plus")
+def test_plus_sequence_of_the_spline(work: Callable[..., JobRun]) -> None:
+    job = RenderJob(scene="one", sampler=SplineSampler(spacing_mm=0.5), format="plus")
     asked = work(job)
-    assert render_job.render(asked, job).artifacts == ("frames.igs.mha",)
+    assert render_run.run(asked, job).artifacts == ("frames.igs.mha",)
     sweep, count = read_plus_sweep(asked.folder.artifacts / "frames.igs.mha")
     assert (count, sweep.probe) == (11, PROBE)
     np.testing.assert_allclose(sweep.poses[:, 1, 3], np.arange(11) / 2, atol=1e-9)
 
 
-def test_figures_of_each_frame_are_in_the_archive(work: Callable[..., Work], monkeypatch: pytest.MonkeyPatch) -> None:
-    job = RenderJob("one", sampler=AroundSampler(40, translation_mm=8.0), min_confidence=0.6, outputs=("echo",))
+def test_figures_of_each_frame_are_in_the_archive(work: Callable[..., JobRun], monkeypatch: pytest.MonkeyPatch) -> None:
+    job = RenderJob(scene="one", sampler=AroundSampler(40, translation_mm=8.0), min_confidence=0.6, outputs=("echo",))
     asked = work(job, confidence=MODEL)
     monkeypatch.setattr(rendering, "frames_at_once", lambda height, width: 7)
-    monkeypatch.setattr(render_job, "ASSESSED_AT_ONCE", 60)
-    render_job.render(asked, job)
+    monkeypatch.setattr(render_run, "ASSESSED_AT_ONCE", 60)
+    render_run.run(asked, job)
     scene = GaussianScene.load(asked.folder.path / "one.ugr")
     with np.load(asked.folder.artifacts / "frames.npz") as archive:
         poses = archive["poses"]
@@ -102,50 +104,50 @@ def test_figures_of_each_frame_are_in_the_archive(work: Callable[..., Work], mon
         assert "coverage" not in archive
 
 
-def test_a_pose_below_the_limit_ends_the_job_before_it_renders(work: Callable[..., Work]) -> None:
+def test_a_pose_below_the_limit_ends_the_job_before_it_renders(work: Callable[..., JobRun]) -> None:
     far = TRAINING.copy()
     far[4, 1, 3] = 40.0
-    job = RenderJob("one", poses=far, min_confidence=0.5)
+    job = RenderJob(scene="one", poses=far, min_confidence=0.5)
     asked = work(job, confidence=MODEL)
     with pytest.raises(LowConfidence, match=r"poses\[4\] has"):
-        render_job.render(asked, job)
+        render_run.run(asked, job)
     assert not asked.folder.artifacts.exists()
 
 
-def test_a_long_search_stops_with_its_job(work: Callable[..., Work], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_long_search_stops_with_its_job(work: Callable[..., JobRun], monkeypatch: pytest.MonkeyPatch) -> None:
     stops = iter([False, False, True])
-    monkeypatch.setattr(render_job, "ASSESSED_AT_ONCE", 60)
-    job = RenderJob("one", sampler=AroundSampler(1000), min_confidence=0.99)
+    monkeypatch.setattr(render_run, "ASSESSED_AT_ONCE", 60)
+    job = RenderJob(scene="one", sampler=AroundSampler(1000), min_confidence=0.99)
     with pytest.raises(Stopped):
-        render_job.render(work(job, should_stop=lambda: next(stops), confidence=MODEL), job)
+        render_run.run(work(job, should_stop=lambda: next(stops), confidence=MODEL), job)
 
 
-def test_nothing_is_left_of_a_job_that_stops(work: Callable[..., Work]) -> None:
+def test_nothing_is_left_of_a_job_that_stops(work: Callable[..., JobRun]) -> None:
     stops = iter([False, True])
-    job = RenderJob("one", sampler=SplineSampler(count=100), height=256, width=256)
+    job = RenderJob(scene="one", sampler=SplineSampler(count=100), height=256, width=256)
     asked = work(job, should_stop=lambda: next(stops))
     with pytest.raises(Stopped):
-        render_job.render(asked, job)
+        render_run.run(asked, job)
     assert [path.name for path in asked.folder.path.iterdir() if path.name != "progress.json"] == ["one.ugr"]
 
 
-def test_a_sampler_that_cannot_use_the_poses(work: Callable[..., Work]) -> None:
-    job = RenderJob("one", poses=TRAINING[:1].tolist(), sampler=SplineSampler(count=5))
+def test_a_sampler_that_cannot_use_the_poses(work: Callable[..., JobRun]) -> None:
+    job = RenderJob(scene="one", poses=TRAINING[:1].tolist(), sampler=SplineSampler(count=5))
     with pytest.raises(InvalidArgument, match="two different base poses"):
-        render_job.render(work(job), job)
+        render_run.run(work(job), job)
 
 
-def test_a_scene_without_a_probe(work: Callable[..., Work]) -> None:
-    job = RenderJob("one", sampler=TrainingSampler())
+def test_a_scene_without_a_probe(work: Callable[..., JobRun]) -> None:
+    job = RenderJob(scene="one", sampler=TrainingSampler())
     with pytest.raises(InvalidProbe):
-        render_job.render(work(job, probe=None), job)
+        render_run.run(work(job, probe=None), job)
 
 
 def test_a_missing_package_is_told_before_anything_is_rendered(
-    work: Callable[..., Work], monkeypatch: pytest.MonkeyPatch
+    work: Callable[..., JobRun], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "h5py", None)
     monkeypatch.delitem(sys.modules, "ultragray.interchange.exports.hdf5", raising=False)
-    job = RenderJob("one", sampler=TrainingSampler(), format="hdf5")
+    job = RenderJob(scene="one", sampler=TrainingSampler(), format="hdf5")
     with pytest.raises(ExtraMissing, match=r"pip install 'ultragray\[hdf5\]'"):
-        render_job.render(work(job), job)
+        render_run.run(work(job), job)

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import torch
 
-from .work import Stopped, Work
+from .job_run import JobRun, Stopped
 
 LOCK_FOLDER = "workers"  # of the artifact folder, which several hosts may share
 _POLL_INTERVAL_S = 0.2
@@ -29,27 +29,27 @@ def chosen_device(asked: str, workers: str) -> str:
 
 
 @contextmanager
-def device_alone(work: Work, device: str) -> Iterator[None]:
-    """Holds `device` (cpu, cuda or cuda:N), once no other job of this host does; until then the job says that it waits.
+def device_alone(job_run: JobRun, device: str) -> Iterator[None]:
+    """Holds `device` (cpu, cuda or cuda:N) as soon as no other job of this host does; until then the job waits for it.
 
     Raises Stopped where the job is to stop meanwhile.
     """
-    path = lock_path(work.folder.artifact_folder, device)
+    path = lock_path(job_run.folder.artifact_folder, device)
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("a") as file:
-        told = False
+        is_announced = False
         while not _is_locked(file.fileno()):
-            if not told:
+            if not is_announced:
                 sys.stderr.write(f"waits for {device}: another job of this host is at work on it\n")
                 sys.stderr.flush()
-                work.report(replace(work.progress, waits_for=device))
-                told = True
-            if work.should_stop():
+                job_run.report(replace(job_run.progress, waits_for=device))
+                is_announced = True
+            if job_run.should_stop():
                 raise Stopped
             time.sleep(_POLL_INTERVAL_S)
-        if told:
-            work.report(replace(work.progress, waits_for=None))
-        work.progress = replace(work.progress, waits_for=None)  # also what a process that was killed said
+        if is_announced:
+            job_run.report(replace(job_run.progress, waits_for=None))
+        job_run.progress = replace(job_run.progress, waits_for=None)  # a process that was killed may have left it
         yield
 
 
@@ -64,7 +64,7 @@ def _device_name(device: str) -> str:
         return device
     index = int(device.partition(":")[2] or 0)
     if not torch.cuda.is_available() or index >= torch.cuda.device_count():
-        return f"cuda-{index}"  # the work itself will refuse it
+        return f"cuda-{index}"  # the work itself refuses it
     return f"gpu-{torch.cuda.get_device_properties(index).uuid}"
 
 

@@ -5,7 +5,7 @@ import base64
 import pytest
 
 from ultragray.errors import InvalidArgument
-from ultragray_workers.jobs.paging import read_token, write_token
+from ultragray_workers.jobs.queue.listing import read_token, write_token
 
 
 def test_there_and_back() -> None:

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from ultragray_workers.jobs.link import link_or_copy
+from ultragray.files.link import link_or_copy
 
 
 @pytest.fixture

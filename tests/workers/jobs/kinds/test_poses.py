@@ -9,8 +9,7 @@ from ultragray import LinearProbe
 from ultragray.confidence import Extrapolation
 from ultragray.errors import InvalidArgument, LowConfidence
 from ultragray.samplers import AroundSampler, FanSampler, TrainingSampler
-from ultragray_workers.jobs.poses import assessed_poses, poses_of
-from ultragray_workers.jobs.specification import RenderJob
+from ultragray_workers.jobs.kinds import RenderJob
 
 PROBE = LinearProbe(40.0, 0.0, 50.0)
 TRAINING = np.tile(np.eye(4), (2, 1, 1))
@@ -19,18 +18,18 @@ GIVEN = (np.eye(4) + 7.0 * np.eye(4, k=3))[None]
 
 
 def test_given_poses_and_training_poses_themselves() -> None:
-    np.testing.assert_array_equal(poses_of(RenderJob("one", poses=GIVEN.tolist()), TRAINING, PROBE), GIVEN)
-    job = RenderJob("one", sampler=TrainingSampler())
-    np.testing.assert_array_equal(poses_of(job, TRAINING, PROBE), TRAINING)
+    np.testing.assert_array_equal(RenderJob(scene="one", poses=GIVEN.tolist()).poses_of(TRAINING, PROBE), GIVEN)
+    job = RenderJob(scene="one", sampler=TrainingSampler())
+    np.testing.assert_array_equal(job.poses_of(TRAINING, PROBE), TRAINING)
     with pytest.raises(InvalidArgument, match="has none"):
-        poses_of(job, TRAINING[:0], PROBE)
+        job.poses_of(TRAINING[:0], PROBE)
 
 
 def test_a_sampler_makes_its_poses_of_given_ones_or_of_training_poses() -> None:
     sampler = AroundSampler(20, seed=3)
-    around = poses_of(RenderJob("one", sampler=sampler), TRAINING, PROBE)
+    around = RenderJob(scene="one", sampler=sampler).poses_of(TRAINING, PROBE)
     np.testing.assert_array_equal(around, sampler.poses(TRAINING, PROBE))
-    fan = poses_of(RenderJob("one", poses=GIVEN.tolist(), sampler=FanSampler(5.0, 5.0)), TRAINING[:0], PROBE)
+    fan = RenderJob(scene="one", poses=GIVEN.tolist(), sampler=FanSampler(5.0, 5.0)).poses_of(TRAINING[:0], PROBE)
     np.testing.assert_array_equal(fan[:, :3, 3], np.tile(GIVEN[:, :3, 3], (3, 1)))
 
 
@@ -40,15 +39,15 @@ def told(poses: Any) -> list[Extrapolation]:  # [C, 4, 4] -> [C]
 
 
 def test_given_poses_must_be_confident_and_samplers_keep_to_those_that_are() -> None:
-    poses, extrapolations = assessed_poses(RenderJob("one", poses=TRAINING), TRAINING, PROBE, told)
+    poses, extrapolations = RenderJob(scene="one", poses=TRAINING).assessed_poses(TRAINING, PROBE, told)
     np.testing.assert_array_equal(poses, TRAINING)
     assert [one.confidence for one in extrapolations] == [0.9, 0.2]
     with pytest.raises(LowConfidence, match=r"poses\[1\] .* 0\.20, 0\.5 is asked for: .* 1\.0 mm") as caught:
-        assessed_poses(RenderJob("one", poses=TRAINING, min_confidence=0.5), TRAINING, PROBE, told)
+        RenderJob(scene="one", poses=TRAINING, min_confidence=0.5).assessed_poses(TRAINING, PROBE, told)
     assert caught.value.field == "poses[1]"
-    sampled = RenderJob("one", poses=TRAINING, sampler=AroundSampler(20), min_confidence=0.5)
-    poses, extrapolations = assessed_poses(sampled, TRAINING[:0], PROBE, told)
+    sampled = RenderJob(scene="one", poses=TRAINING, sampler=AroundSampler(20), min_confidence=0.5)
+    poses, extrapolations = sampled.assessed_poses(TRAINING[:0], PROBE, told)
     assert len(poses) == 20
     assert {one.confidence for one in extrapolations} == {0.9}
     with pytest.raises(InvalidArgument, match="has none"):
-        assessed_poses(RenderJob("one", sampler=AroundSampler(20), min_confidence=0.5), TRAINING[:0], PROBE, told)
+        RenderJob(scene="one", sampler=AroundSampler(20), min_confidence=0.5).assessed_poses(TRAINING[:0], PROBE, told)

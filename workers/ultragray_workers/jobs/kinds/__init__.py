@@ -1,0 +1,12 @@
+"""The kinds of jobs. A new kind is a module with its specification, one with its work, and a line here. Free of torch.
+
+Modules that end in `_run` do the work of a kind and are imported in the job's process only.
+"""
+
+from .base import Specification
+from .render import RenderJob
+from .train import TrainJob
+
+__all__ = ["KINDS", "RenderJob", "Specification", "TrainJob"]
+
+KINDS = tuple(Specification.members)

@@ -1,0 +1,54 @@
+"""What every kind of job is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from ultragray.contract import Family
+from ultragray.scene_info import SceneHeader
+
+from ...scenes import check_scene_name
+
+if TYPE_CHECKING:
+    from ..folder import Outcome
+    from ..worker.job_run import JobRun
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """What a job finds at its submission."""
+
+    scene: SceneHeader | None  # the one that `needs_scene` names
+    artifact_folder: Path
+    max_image_side: int  # pixels
+
+
+class Specification(Family):
+    """What a job is asked to do: a member of this family for each kind of job, with all that is particular to the kind.
+
+    Those who queue, run and remove jobs know no kinds: they ask here which fields name a dataset or a scene.
+    """
+
+    kind: str
+    run_module: ClassVar[str]  # of this folder: its `run(job_run, specification)` does the work
+    needs_dataset: ClassVar[str | None] = None  # field: the dataset stays while the job waits or runs
+    needs_scene: ClassVar[str | None] = None  # field: the scene is kept for the job as it is at the submission
+    makes_scene: ClassVar[str | None] = None  # field: the scene among the artifacts is served when the job succeeds
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for field in (self.needs_scene, self.makes_scene):
+            if field is not None:
+                check_scene_name(getattr(self, field), field)
+
+    def check(self, surroundings: Surroundings) -> None:
+        """Raises what the job would fail with, as far as its submission can know."""
+
+    def run(self, job_run: JobRun) -> Outcome:
+        """Does the work; in the job's own process, for it imports torch."""
+        module: Any = import_module(f".{self.run_module}", __package__)
+        outcome: Outcome = module.run(job_run, self)
+        return outcome

@@ -1,0 +1,143 @@
+"""Batch rendering: frames of a scene become one archive."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, TypeAlias
+
+import numpy as np
+
+from ultragray.confidence import Assessor, Extrapolation, require_confidence
+from ultragray.contract import described, kind_field, shown
+from ultragray.errors import InvalidArgument
+from ultragray.image_size import check_image_size
+from ultragray.interchange.exports import check_format
+from ultragray.outputs import OUTPUTS, check_outputs
+from ultragray.pose import check_poses
+from ultragray.probe import FloatArray, Probe
+from ultragray.samplers import MAX_POSES, Assess, Sampler, TrainingSampler, assessed_poses
+from ultragray.settings import Encoding, FrameSettings
+
+from ...errors import StorageFull
+from .base import Specification, Surroundings
+
+ASSESSED_AT_ONCE = 250_000  # poses times training poses that submissions wait for: about a fifth of a second
+_MB, _GB = 1e6, 1e9
+
+Poses: TypeAlias = FloatArray | list[list[list[float]]]  # [C, 4, 4] mm
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RenderJob(Specification):
+    """Many frames of a scene become one archive, at `poses`, or at those that `sampler` makes.
+
+    The sampler makes them of `poses`, or where none are given of the scene's training poses. Poses are kept as an array
+    of exact ones: up to 100,000 of them would be millions of Python's objects. A sampler keeps to poses that have
+    `min_confidence`; `poses` without a sampler must all have it. Raises InvalidArgument, InvalidPose, InvalidImageSize,
+    UnknownOutput.
+    """
+
+    scene: str = described("Name of a scene.")
+    poses: Poses | None = described("4x4 matrices, mm, probe to scene.", None)
+    sampler: Sampler | None = described("Makes poses of the given ones, else of the scene's training poses.", None)
+    height: int | None = described("Depth samples. Default: as trained, else 512.", None)
+    width: int | None = described("Scan lines. Default: as trained, else 512.", None)
+    outputs: tuple[str, ...] = described("Some of bmode, echo, transmittance, coverage, labels.", ("bmode",))
+    format: str = described("tar: WebDataset; dicom and plus (.igs.mha): bmode in uint8.", "npz")
+    dtype: str | None = described("uint8 or float32. Default: the format's own.", None)
+    min_confidence: float | None = described(
+        "0 to 1. Poses below it are refused. Samplers keep within it: around and covered draw on until they have their "
+        "count, the others leave such poses out.",
+        None,
+        low=0.0,
+        high=1.0,
+    )
+    kind: Literal["render"] = kind_field("render")
+
+    run_module = "render_run"
+    needs_scene = "scene"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.poses is None and self.sampler is None:
+            raise InvalidArgument("poses or sampler must be given", field="poses")
+        if self.poses is not None and isinstance(self.sampler, TrainingSampler):
+            raise InvalidArgument("poses must be left out where sampler is of kind training", field="poses")
+        if self.poses is not None:
+            is_many = isinstance(self.poses, (list, np.ndarray))
+            length = len(self.poses) if is_many else self.poses
+            if not is_many or not 1 <= len(self.poses) <= MAX_POSES:
+                raise InvalidArgument(
+                    f"poses must be a list of 1 to {MAX_POSES} 4x4 matrices, got {shown(length)}", field="poses"
+                )
+            object.__setattr__(self, "poses", check_poses(self.poses))
+        check_image_size(1 if self.height is None else self.height, 1)
+        check_image_size(1, 1 if self.width is None else self.width)
+        object.__setattr__(self, "outputs", check_outputs(self.outputs))
+        check_format(self.format, self.outputs, self.dtype)
+
+    def __eq__(self, other: object) -> bool:
+        from ..specification import to_dict  # imports the kinds
+
+        return isinstance(other, RenderJob) and to_dict(self) == to_dict(other)
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def check(self, surroundings: Surroundings) -> None:
+        """Raises UnknownOutput, InvalidProbe, InvalidImageSize; InvalidArgument for a sampler without use for the poses
+        or a `min_confidence` that the scene cannot tell; LowConfidence for a given pose below it, unless there are too
+        many to look at each; StorageFull for more pixels than the disk has room for.
+        """
+        scene = surroundings.scene
+        assert scene is not None
+        asked = FrameSettings(
+            height=self.height, width=self.width, outputs=self.outputs, min_confidence=self.min_confidence
+        )
+        settings = asked.resolved(scene.info, Encoding.FLOAT32, max_image_side=surroundings.max_image_side)
+        poses = self.poses_of(scene.training_poses, settings.probe)
+        few = len(poses) * len(scene.training_poses) <= ASSESSED_AT_ONCE
+        if self.min_confidence is not None and self.sampler is None and few:
+            require_confidence(Assessor(scene.info, scene.training_poses).assess(poses), self.min_confidence)
+        self._check_room(len(poses), settings.height, settings.width, surroundings.artifact_folder)
+
+    def poses_of(self, training_poses: FloatArray, probe: Probe) -> FloatArray:  # [P, 4, 4] -> [C, 4, 4] mm
+        """The poses that the job asks for, whatever their confidence; the same training poses and probe give the same.
+
+        Raises InvalidArgument where a sampler needs training poses and the scene has none, or cannot use those it has.
+        """
+        base = self._base(training_poses)
+        return base if self.sampler is None else self.sampler.poses(base, probe)
+
+    def assessed_poses(
+        self, training_poses: FloatArray, probe: Probe, assess: Assess
+    ) -> tuple[FloatArray, Sequence[Extrapolation]]:  # [P, 4, 4] -> [C, 4, 4] mm, [C]
+        """The poses to render, each with its `min_confidence`, and what `assess` finds about each.
+
+        Raises LowConfidence for a given pose below it and for a sampler that keeps too few, and what `poses_of` raises.
+        """
+        return assessed_poses(self.sampler, self._base(training_poses), probe, assess, self.min_confidence)
+
+    def _base(self, training_poses: FloatArray) -> FloatArray:  # [P, 4, 4] -> [P, 4, 4]
+        if self.poses is not None:
+            return check_poses(self.poses)
+        if not len(training_poses):
+            raise InvalidArgument(f"sampler needs training poses, the scene {self.scene!r} has none", field="sampler")
+        return training_poses
+
+    def _check_room(self, frames: int, height: int, width: int, folder: Path) -> None:
+        dtype = np.dtype(check_format(self.format, self.outputs, self.dtype))
+        pixel_bytes = sum(1 if OUTPUTS[name].is_numbers else dtype.itemsize for name in self.outputs)
+        needed, free = frames * height * width * pixel_bytes, shutil.disk_usage(folder).free
+        if needed > free:
+            raise StorageFull(
+                f"{frames:,} frames of {height}x{width} take up to {_size(needed)}, the artifact folder has "
+                f"{_size(free)} left",
+                field="poses" if self.sampler is None else "sampler",
+            )
+
+
+def _size(size_bytes: int) -> str:
+    return f"{size_bytes / _MB:,.0f} MB" if size_bytes < _GB else f"{size_bytes / _GB:,.1f} GB"

@@ -1,0 +1,57 @@
+"""Training: a dataset becomes a scene that is served."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from ultragray.contract import described, kind_field, shown
+from ultragray.errors import InvalidArgument
+from ultragray.training.config import PRESETS, TrainingConfig
+
+from .base import Specification
+
+_MAX_SETTINGS, _MAX_SETTING_CHARACTERS = 100, 100
+_DEVICE = re.compile(r"auto|cpu|cuda(:\d{1,3})?")
+
+
+@dataclass(frozen=True)
+class TrainJob(Specification):
+    """A dataset becomes a scene that is served.
+
+    Raises InvalidArgument, also for a setting that no training has and for a value outside its range.
+    """
+
+    dataset: str = described("Name of an uploaded dataset.")
+    scene: str = described("Name that the scene will be served under.")
+    preset: str = described("fast, or paper: the released recipe.", "fast", choices=tuple(PRESETS))
+    settings: dict[str, Any] = described("Any training settings instead of the preset's.", factory=dict)
+    device: str = described("auto, cpu, cuda or cuda:N.", "auto")
+    kind: Literal["train"] = kind_field("train")
+
+    run_module = "train_run"
+    needs_dataset = "dataset"
+    makes_scene = "scene"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _require(self.dataset != "", "dataset", "the name of a dataset", self.dataset)
+        _require(_DEVICE.fullmatch(self.device) is not None, "device", "auto, cpu, cuda or cuda:N", self.device)
+        is_object = isinstance(self.settings, dict) and len(self.settings) <= _MAX_SETTINGS
+        _require(is_object, "settings", f"an object of at most {_MAX_SETTINGS} training settings", self.settings)
+        for name, value in self.settings.items():
+            short = len(name) <= _MAX_SETTING_CHARACTERS
+            _require(short, "settings", f"names of at most {_MAX_SETTING_CHARACTERS} characters", name)
+            is_plain = value is None or isinstance(value, (bool, int, float, str))
+            short = is_plain and len(str(value)) <= _MAX_SETTING_CHARACTERS
+            _require(short, f"settings.{name}", "a number, a word, true, false or null", value)
+        try:
+            TrainingConfig.preset(self.preset, **self.settings)
+        except InvalidArgument as error:
+            raise InvalidArgument(error.detail, field=f"settings.{error.field}") from None
+
+
+def _require(holds: bool, field: str, expected: str, given: Any) -> None:
+    if not holds:
+        raise InvalidArgument(f"{field} must be {expected}, got {shown(given)}", field=field)
