@@ -31,7 +31,7 @@ Until = Callable[..., Job]
 # `ultragray worker`, less patient with the dead.
 HOST = """
 from ultragray_workers.jobs.queue import heartbeat
-from ultragray_service.cli import app
+from ultragray_service.cli.app import app
 heartbeat.DEAD_AFTER_S = 3.0
 app()
 """
