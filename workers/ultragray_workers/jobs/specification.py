@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Mapping
-from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -51,7 +50,9 @@ def value_in(document: Mapping[str, Any], role: str) -> str | None:
 
 
 def _without_poses(specification: Specification) -> tuple[dict[str, Any], FloatArray | None]:
-    names = [item.name for item in fields(specification) if item.name not in ("kind", _POSES)]
+    names = [
+        item.name for item, _ in contract.annotated_fields(type(specification)) if item.name not in ("kind", _POSES)
+    ]
     values = {name: contract.to_dict(getattr(specification, name), with_none=False) for name in names}
     poses = getattr(specification, _POSES, None)
     return {"kind": specification.kind, **values}, None if poses is None else np.asarray(poses)
