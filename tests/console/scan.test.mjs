@@ -68,7 +68,7 @@ describe("scan", () => {
     await page.getByLabel("Depth", { exact: true }).fill("30");
     await until(() => canvasState(page, IMAGE), ({ height }) => height === 128, "the depth is not half of it");
     await page.getByRole("button", { name: "Reset" }).click();
-    await page.getByLabel("Flip left/right").check();
+    await page.getByLabel("Flip").check();
     await page.locator('[data-testid="orientation-marker"][data-side="right"]').waitFor();
     await page.getByRole("combobox", { name: "Samples" }).selectOption("512");
     await until(() => canvasState(page, IMAGE), ({ width }) => width === 512, "no 512 scan lines");

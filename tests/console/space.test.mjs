@@ -8,7 +8,7 @@ import { dragProbe, openScan, poseOf } from "./scan_page.mjs";
 
 const PROBES = ["convex", "linear", "phased", "own"];
 const CONVEX_RADIUS_MM = 40;
-const PLANE_NUMBERS = 12; // x, y, z of the corners of a linear probe's plane
+const PLANE_NUMBERS = 65 * 2 * 3; // x, y, z of both ends of the scan lines of a plane
 
 let service;
 let browser;

@@ -88,7 +88,8 @@ def test_bodies(openapi: dict[str, Any]) -> None:
     body = schemas.pop("RenderBody")["properties"]
     documented = {key: json.loads(code(default)[0]) for key, (default, _) in table("Render body").items()}
     assert documented == {key: value.get("default") for key, value in body.items()}
-    objects = {name: list(schema["properties"]) for name, schema in schemas.items()}
+    of_own_tables = {"StreamMessage", "StreamSettings", "FrameHeader", "Extrapolation"}
+    objects = {name: list(schema["properties"]) for name, schema in schemas.items() if name not in of_own_tables}
     assert {name: code(keys) for name, (keys, _) in table("Objects").items()} == objects
 
 

@@ -1,7 +1,8 @@
 /** The image as a PNG: square pixels, a centimetre scale, measurements and a line that says what it is. */
 
-import type { Frame } from "./api/stream";
-import { depthTicks, extent_mm, pixelAt, type Placed, type PlanePoint } from "./geometry/picture";
+import type { FrameHeader } from "./api/stream";
+import { depthTicks, extent_mm, pixelAt, type Placed } from "./geometry/picture";
+import type { PlanePoint } from "./geometry/plane";
 import { poseJson } from "./geometry/pose_json";
 import { length_mm, type Calliper } from "./state/callipers.svelte";
 
@@ -15,9 +16,12 @@ const MARKER = "#5bbde4";
 const KEPT_MS = 60_000;
 
 /** Throws where the browser cannot make a PNG of that size. */
-export async function screenshot(source: HTMLCanvasElement, frame: Frame, callipers: Calliper[]): Promise<Blob> {
-  const { header } = frame;
-  const placed: Placed = { picture: header.picture, height: header.height, width: header.width };
+export async function screenshot(
+  source: HTMLCanvasElement,
+  header: FrameHeader,
+  placed: Placed,
+  callipers: Calliper[],
+): Promise<Blob> {
   const { across, down } = extent_mm(placed);
   const scale = LONGER_SIDE / Math.max(across, down);
   const [width, height] = [across * scale, down * scale];
@@ -37,7 +41,7 @@ export async function screenshot(source: HTMLCanvasElement, frame: Frame, callip
   context.fillStyle = context.strokeStyle = TEXT;
   const rowAt = (row: number): number => MARGINS.top + ((row + 0.5) / placed.height) * height;
   const right = MARGINS.left + width;
-  for (const tick of depthTicks(placed, header.probe)) {
+  for (const tick of depthTicks(placed)) {
     context.fillRect(right + 4, rowAt(tick.at), tick.label === null ? 5 : 9, 1);
     if (tick.label !== null) context.fillText(`${tick.label}`, right + 18, rowAt(tick.at) + 4);
   }

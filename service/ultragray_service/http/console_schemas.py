@@ -9,6 +9,16 @@ from pydantic import BaseModel, Field
 FlatPose = list[float]
 
 
+class ImagePlane(BaseModel):
+    """The image plane of a probe, told by its scan lines: x lateral, z axial, mm."""
+
+    face_depth_mm: float = Field(description="Where the middle of the face lies on the axial axis.")
+    lines_mm: list[tuple[float, float, float, float]] = Field(
+        description="From the left edge of the image to its right one, at even distances: x and z where the image "
+        "begins, x and z where it ends."
+    )
+
+
 class ScenePoses(BaseModel):
     """Training poses of a scene, evenly taken."""
 

@@ -49,6 +49,10 @@ class PoseBody(RequestModel):
 class LinearProbeBody(RequestModel):
     """Parallel scan lines; 0 <= near_mm < far_mm."""
 
+    model_config = ConfigDict(
+        json_schema_extra={"examples": [{"kind": "linear", "width_mm": 40.0, "near_mm": 0.0, "far_mm": 50.0}]}
+    )
+
     kind: Literal["linear"]
     width_mm: float
     near_mm: float
@@ -62,6 +66,10 @@ class LinearProbeBody(RequestModel):
 class ConvexProbeBody(RequestModel):
     """A fan of scan lines; near_mm is the radius of the face from the apex."""
 
+    model_config = ConfigDict(
+        json_schema_extra={"examples": [{"kind": "convex", "opening_angle_deg": 60.0, "near_mm": 40.0, "far_mm": 90.0}]}
+    )
+
     kind: Literal["convex"]
     opening_angle_deg: float
     near_mm: float
@@ -74,6 +82,10 @@ class ConvexProbeBody(RequestModel):
 
 class PhasedProbeBody(RequestModel):
     """A fan of scan lines from the centre of the face."""
+
+    model_config = ConfigDict(
+        json_schema_extra={"examples": [{"kind": "phased", "opening_angle_deg": 80.0, "far_mm": 50.0}]}
+    )
 
     kind: Literal["phased"]
     opening_angle_deg: float

@@ -3,6 +3,7 @@
 /** A JSON schema with its references filled in. */
 export interface Described {
   type?: string;
+  /** Instead of the words of the name: given where a form is drawn. */
   title?: string;
   description?: string;
   default?: unknown;
@@ -16,4 +17,20 @@ export interface Described {
   properties?: Record<string, Described>;
   items?: Described;
   oneOf?: Described[];
+}
+
+const UNITS: Record<string, string> = { mm: "mm", deg: "°", db: "dB", s: "s", ms: "ms" };
+
+/** The name of a field as people read it, and its unit, by which the name ends. */
+export function labelOf(name: string): { label: string; unit: string } {
+  const words = name.split("_");
+  const unit = words.length > 1 ? UNITS[words.at(-1)!] : undefined;
+  if (unit !== undefined) words.pop();
+  const label = words.join(" ");
+  return { label: label.charAt(0).toUpperCase() + label.slice(1), unit: unit ?? "" };
+}
+
+/** The values that the fields of an object have where none is given. */
+export function defaultsOf({ properties = {} }: Described): Record<string, unknown> {
+  return Object.fromEntries(Object.entries(properties).map(([name, field]) => [name, field.default]));
 }

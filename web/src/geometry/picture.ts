@@ -1,79 +1,78 @@
-/** Where the pixels of a picture lie in the image plane of the probe: x lateral, z axial, both in mm. */
+/** Where the pixels of a picture lie in the image plane of the probe. */
 
-import type { Probe } from "../api/scenes";
+import type { FrameHeader } from "../api/stream";
+import {
+  breadth_mm,
+  pointOf,
+  shareAbove,
+  sharesOf,
+  shortened,
+  type ImagePlane,
+  type Line,
+  type PlanePoint,
+} from "./plane";
 
-/** As in a frame's header: columns in mm, or in degrees where each is a scan line of a fan. */
-export interface Picture {
-  column_unit: "mm" | "deg";
-  first: [number, number];
-  step: [number, number];
-}
+type Picture = FrameHeader["picture"];
 
-export interface PlanePoint {
-  x_mm: number;
-  z_mm: number;
-}
-
-/** A picture with its size, and what is needed to place pixels. */
+/** A picture with its size, and the scan lines that it shows. */
 export interface Placed {
   picture: Picture;
   height: number;
   width: number;
+  /** As far as the picture goes, which may end above the depth of the probe. */
+  lines: readonly Line[];
+  /** Of the face, on the axis. */
+  faceDepth_mm: number;
+  /** Whether each column is a scan line, as frames are stored; else the pixels are square. */
+  isStored: boolean;
 }
 
-/** The depth of the face on the axis: the radius of a convex array, else 0. */
-export function faceDepth_mm(probe: Probe): number {
-  return probe.kind === "convex" ? probe.near_mm : 0;
-}
-
-export function nearDepth_mm(probe: Probe): number {
-  return probe.kind === "phased" ? 0 : probe.near_mm;
+/** Puts a picture on the plane of its probe. `shownShare`: of stored scan lines, null for square pixels. */
+export function placedOn(
+  { lines_mm, face_depth_mm }: ImagePlane,
+  sized: { picture: Picture; height: number; width: number },
+  shownShare: number | null,
+): Placed {
+  const end_mm = sized.picture.first[1] + sized.picture.step[1] * (sized.height - 0.5);
+  const lines = shortened(lines_mm, shownShare ?? shareAbove(lines_mm, end_mm));
+  return { ...sized, lines, faceDepth_mm: face_depth_mm, isStored: shownShare !== null };
 }
 
 /** Width and height of the picture on a screen, in mm; of a fan as it is stored, its width is taken half way down. */
-export function extent_mm({ picture, height, width }: Placed): { across: number; down: number } {
+export function extent_mm({ picture, height, width, lines, isStored }: Placed): { across: number; down: number } {
   const down = Math.abs(picture.step[1]) * height;
-  const across = Math.abs(picture.step[0]) * width;
-  if (picture.column_unit === "mm") return { across, down };
-  return { across: (across / 180) * Math.PI * (picture.first[1] + down / 2), down };
+  return { across: isStored ? breadth_mm(lines, 0.5) : Math.abs(picture.step[0]) * width, down };
 }
 
 /** The point at a column and a row; centres of pixels have whole numbers. */
-export function pointAt({ picture }: Placed, column: number, row: number): PlanePoint {
-  const across = picture.first[0] + picture.step[0] * column;
-  const down = picture.first[1] + picture.step[1] * row;
-  if (picture.column_unit === "mm") return { x_mm: across, z_mm: down };
-  const angle = (across / 180) * Math.PI;
-  return { x_mm: down * Math.sin(angle), z_mm: down * Math.cos(angle) };
+export function pointAt({ picture, height, width, lines, isStored }: Placed, column: number, row: number): PlanePoint {
+  const { first, step } = picture;
+  if (!isStored) return { x_mm: first[0] + step[0] * column, z_mm: first[1] + step[1] * row };
+  const across = (column + 0.5) / width;
+  return pointOf(lines, step[0] < 0 ? 1 - across : across, (row + 0.5) / height);
 }
 
 /** Its inverse: column and row of a point. */
-export function pixelAt({ picture }: Placed, { x_mm, z_mm }: PlanePoint): { column: number; row: number } {
-  const polar = picture.column_unit === "deg";
-  const across = polar ? (Math.atan2(x_mm, z_mm) / Math.PI) * 180 : x_mm;
-  const down = polar ? Math.hypot(x_mm, z_mm) : z_mm;
-  return { column: (across - picture.first[0]) / picture.step[0], row: (down - picture.first[1]) / picture.step[1] };
-}
-
-/** The probe as far as a picture of it goes, which may end above the depth of the probe. */
-export function shownProbe({ picture, height }: Placed, probe: Probe): Probe {
-  const end_mm = picture.first[1] + picture.step[1] * (height - 0.5);
-  return { ...probe, far_mm: Math.min(probe.far_mm, end_mm) };
+export function pixelAt(
+  { picture, height, width, lines, isStored }: Placed,
+  point: PlanePoint,
+): { column: number; row: number } {
+  const { first, step } = picture;
+  if (!isStored) return { column: (point.x_mm - first[0]) / step[0], row: (point.z_mm - first[1]) / step[1] };
+  const { across, along } = sharesOf(lines, point);
+  return { column: (step[0] < 0 ? 1 - across : across) * width - 0.5, row: along * height - 0.5 };
 }
 
 /** Whether a pixel shows something: a scan-converted fan leaves corners. */
-export function isShown(placed: Placed, probe: Probe, column: number, row: number): boolean {
-  if (probe.kind === "linear" || placed.picture.column_unit === "deg") return true;
-  const { x_mm, z_mm } = pointAt(placed, column, row);
-  const range_mm = Math.hypot(x_mm, z_mm);
-  const half = (probe.opening_angle_deg / 360) * Math.PI;
-  const within = range_mm >= nearDepth_mm(probe) && range_mm <= shownProbe(placed, probe).far_mm;
-  return within && Math.abs(Math.atan2(x_mm, z_mm)) <= half;
+export function isShown(placed: Placed, column: number, row: number): boolean {
+  if (placed.isStored) return true;
+  const { across, along } = sharesOf(placed.lines, pointAt(placed, column, row));
+  return across >= 0 && across <= 1 && along >= 0 && along <= 1;
 }
 
 /** Depth below the face, as a scanner counts it: along z, of a fan as it is stored along the scan line. */
-export function depthAtRow({ picture }: Placed, row: number, probe: Probe): number {
-  return picture.first[1] + picture.step[1] * row - faceDepth_mm(probe);
+export function depthAtRow({ picture, faceDepth_mm }: Placed, row: number): number {
+  return picture.first[1] + picture.step[1] * row - faceDepth_mm;
 }
 
 export function distanceBetween_mm(a: PlanePoint, b: PlanePoint): number {
@@ -88,10 +87,10 @@ export interface Tick {
 }
 
 /** Ticks every 5 mm of depth. */
-export function depthTicks(placed: Placed, probe: Probe): Tick[] {
-  const start = depthAtRow(placed, -0.5, probe);
-  const end = depthAtRow(placed, placed.height - 0.5, probe);
-  return ticksOver(start, end, (depth) => (depth - depthAtRow(placed, 0, probe)) / placed.picture.step[1]);
+export function depthTicks(placed: Placed): Tick[] {
+  const start = depthAtRow(placed, -0.5);
+  const end = depthAtRow(placed, placed.height - 0.5);
+  return ticksOver(start, end, (depth) => (depth - depthAtRow(placed, 0)) / placed.picture.step[1]);
 }
 
 /** Ticks every 5 mm across, 0 being the axis; none where columns are angles. */

@@ -13,7 +13,7 @@ import {
 } from "three";
 
 import { outputPixels, type Frame } from "../api/stream";
-import { shownProbe } from "../geometry/picture";
+import type { Placed } from "../geometry/picture";
 import { placeObject } from "./place";
 import { planeShape, textureCoordinates } from "./shapes";
 
@@ -30,10 +30,10 @@ void main() {
   gl_FragColor = vec4(vec3(texture2D(image, place).r), 0.96);
 }`;
 
-export class ImagePlane {
+export class LiveImage {
   readonly object: Mesh<BufferGeometry, ShaderMaterial>;
   #texture: DataTexture | null = null;
-  #layout = "";
+  #placed: Placed | null = null;
 
   constructor() {
     const material = new ShaderMaterial({
@@ -48,11 +48,11 @@ export class ImagePlane {
     this.object.frustumCulled = false;
   }
 
-  set(frame: Frame): void {
+  set(frame: Frame, placed: Placed): void {
     const { header } = frame;
     const pixels = outputPixels(frame, "bmode");
     if (pixels === undefined) return;
-    this.#fitTo(frame);
+    if (placed !== this.#placed) this.#fitTo(placed, pixels);
     this.#texture!.image = { data: pixels as Uint8Array<ArrayBuffer>, width: header.width, height: header.height };
     this.#texture!.needsUpdate = true;
     placeObject(this.object, header.pose.flat());
@@ -66,20 +66,17 @@ export class ImagePlane {
   }
 
   /** A texture and a plane for frames of that size and place. */
-  #fitTo({ header, pixels }: Frame): void {
-    const { picture, height, width, probe } = header;
-    const layout = JSON.stringify([picture, height, width, probe]);
-    if (layout === this.#layout) return;
-    this.#layout = layout;
+  #fitTo(placed: Placed, pixels: Uint8Array): void {
+    this.#placed = placed;
     this.#texture?.dispose();
-    this.#texture = new DataTexture(pixels, width, height, RedFormat, UnsignedByteType);
+    this.#texture = new DataTexture(pixels as Uint8Array<ArrayBuffer>, placed.width, placed.height, RedFormat, UnsignedByteType);
     this.#texture.minFilter = this.#texture.magFilter = LinearFilter;
     this.#texture.unpackAlignment = 1;
     this.object.material.uniforms.image!.value = this.#texture;
-    const shape = planeShape(shownProbe({ picture, height, width }, probe));
+    const shape = planeShape(placed.lines);
     const geometry = new BufferGeometry();
     geometry.setAttribute("position", new BufferAttribute(shape.positions, 3));
-    geometry.setAttribute("uv", new BufferAttribute(textureCoordinates(shape, { picture, height, width }), 2));
+    geometry.setAttribute("uv", new BufferAttribute(textureCoordinates(placed), 2));
     geometry.setIndex(shape.indices);
     this.object.geometry.dispose();
     this.object.geometry = geometry;

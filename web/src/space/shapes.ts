@@ -1,10 +1,10 @@
 /** The image plane of a probe as triangles and as an outline, in the probe frame, in mm. */
 
-import type { Probe } from "../api/scenes";
-import { nearDepth_mm, pixelAt, type Placed } from "../geometry/picture";
+import { pixelAt, type Placed } from "../geometry/picture";
+import { areAllAround, type Line } from "../geometry/plane";
 
 export interface Shape {
-  /** x, y, z of each corner. */
+  /** x, y, z of each corner: of each line, where it begins and where it ends. */
   positions: Float32Array;
   /** Triangles. */
   indices: number[];
@@ -12,40 +12,31 @@ export interface Shape {
   outline: number[];
 }
 
-const FAN_STRIPS = 32;
-
-/** A strip from near to far with `FAN_STRIPS` pieces; of a linear probe one rectangle. */
-export function planeShape(probe: Probe): Shape {
-  const strips = probe.kind === "linear" ? 1 : FAN_STRIPS;
-  const near = nearDepth_mm(probe);
-  const positions: number[] = [];
+export function planeShape(lines: readonly Line[]): Shape {
+  const last = 2 * (lines.length - 1);
   const indices: number[] = [];
-  const outline: number[] = [0, 1, strips * 2, strips * 2 + 1];
-  for (let strip = 0; strip <= strips; strip++) {
-    const share = strip / strips - 0.5;
-    for (const depth of [near, probe.far_mm]) positions.push(...pointOn(probe, share, depth));
-    if (strip === strips) break;
-    const first = strip * 2;
+  const outline: number[] = areAllAround(lines) ? [] : [0, 1, last, last + 1];
+  for (let first = 0; first < last; first += 2) {
     indices.push(first, first + 1, first + 2, first + 2, first + 1, first + 3);
     outline.push(first, first + 2, first + 1, first + 3);
   }
-  return { positions: new Float32Array(positions), indices, outline };
+  const positions = new Float32Array(lines.flatMap(([x0, z0, x1, z1]) => [x0, 0, z0, x1, 0, z1]));
+  return { positions, indices, outline };
 }
 
-function pointOn(probe: Probe, share: number, depth: number): [number, number, number] {
-  if (probe.kind === "linear") return [probe.width_mm * share, 0, depth];
-  const angle = (probe.opening_angle_deg / 180) * Math.PI * share;
-  return [depth * Math.sin(angle), 0, depth * Math.cos(angle)];
-}
-
-/** Where each corner lies in the texture of a picture, 0 to 1, the first row at v = 0. */
-export function textureCoordinates({ positions }: Shape, placed: Placed): Float32Array {
-  const coordinates = new Float32Array((positions.length / 3) * 2);
-  for (let corner = 0; corner < positions.length / 3; corner++) {
-    const point = { x_mm: positions[corner * 3]!, z_mm: positions[corner * 3 + 2]! };
-    const { column, row } = pixelAt(placed, point);
-    coordinates[corner * 2] = (column + 0.5) / placed.width;
-    coordinates[corner * 2 + 1] = (row + 0.5) / placed.height;
-  }
-  return coordinates;
+/** Where each corner of the plane of a picture lies in its texture, 0 to 1, the first row at v = 0. */
+export function textureCoordinates(placed: Placed): Float32Array {
+  const { lines, width, height, picture, isStored } = placed;
+  const corners = lines.flatMap(([x0, z0, x1, z1], index) => {
+    if (isStored) {
+      const share = index / (lines.length - 1);
+      const u = picture.step[0] < 0 ? 1 - share : share;
+      return [u, 0, u, 1];
+    }
+    return [{ x_mm: x0, z_mm: z0 }, { x_mm: x1, z_mm: z1 }].flatMap((end) => {
+      const { column, row } = pixelAt(placed, end);
+      return [(column + 0.5) / width, (row + 0.5) / height];
+    });
+  });
+  return new Float32Array(corners);
 }

@@ -18,12 +18,13 @@ import {
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
 import { TransformControls } from "three/examples/jsm/controls/TransformControls.js";
 
-import type { GaussianPoints, Probe } from "../api/scenes";
+import type { GaussianPoints } from "../api/scenes";
 import type { Frame } from "../api/stream";
-import { faceDepth_mm } from "../geometry/picture";
+import type { Placed } from "../geometry/picture";
+import type { ImagePlane } from "../geometry/plane";
 import { axis, fromPositionQuaternion, IDENTITY, translated, type Pose } from "../geometry/pose";
 import { drop } from "./drop";
-import { ImagePlane } from "./image_plane";
+import { LiveImage } from "./image_plane";
 import { placeObject } from "./place";
 import { PointCloud, type PointColour } from "./points";
 import { probeBody } from "./probe_body";
@@ -48,7 +49,7 @@ export class SpaceView {
   #probe = new Group();
   #pose: Pose = IDENTITY;
   #faceDepth_mm = 0;
-  #image = new ImagePlane();
+  #image = new LiveImage();
   #sweep: Group | null = null;
   #points: PointCloud | null = null;
   #cut = true;
@@ -129,7 +130,7 @@ export class SpaceView {
   }
 
   /** The box that the scene fills, and its training views: they tell which way is up. */
-  setSurroundings(low: readonly number[], high: readonly number[], views: readonly Pose[], probe: Probe): void {
+  setSurroundings(low: readonly number[], high: readonly number[], views: readonly Pose[], plane: ImagePlane): void {
     const box: [Vector3, Vector3] = [new Vector3(...low), new Vector3(...high)];
     const same = this.#looked && box.every((corner, i) => corner.equals(this.#box[i]!));
     this.#box = box;
@@ -139,7 +140,7 @@ export class SpaceView {
     this.#camera.up.copy(this.#up);
     const visible = this.#sweep?.visible ?? true;
     if (this.#sweep) drop(this.#sweep);
-    this.#sweep = sweepPlanes(views, probe, this.#cutPlane);
+    this.#sweep = sweepPlanes(views, plane.lines_mm, this.#cutPlane);
     this.#sweep.visible = visible;
     this.#scene.add(this.#sweep, this.#boxLines());
     if (same) this.#touch();
@@ -171,10 +172,11 @@ export class SpaceView {
     this.#touch();
   }
 
-  setProbe(probe: Probe): void {
+  /** The probe that is held, told by its image plane. */
+  setProbe(plane: ImagePlane): void {
     for (const body of [...this.#probe.children]) drop(body);
-    this.#faceDepth_mm = faceDepth_mm(probe);
-    const body = probeBody(probe);
+    this.#faceDepth_mm = plane.face_depth_mm;
+    const body = probeBody(plane);
     body.position.z = -this.#faceDepth_mm;
     this.#probe.add(body);
     this.#place();
@@ -190,8 +192,8 @@ export class SpaceView {
     this.#touch();
   }
 
-  setFrame(frame: Frame): void {
-    this.#image.set(frame);
+  setFrame(frame: Frame, placed: Placed): void {
+    this.#image.set(frame, placed);
     this.#touch();
   }
 

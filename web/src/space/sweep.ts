@@ -13,7 +13,7 @@ import {
   Vector3,
 } from "three";
 
-import type { Probe } from "../api/scenes";
+import type { Line } from "../geometry/plane";
 import type { Pose } from "../geometry/pose";
 import { matrixOf } from "./place";
 import { planeShape } from "./shapes";
@@ -22,10 +22,10 @@ const MOST_PLANES = 40; // more would only be a solid block
 const COLOUR = 0x3d9ac4;
 
 /** At most MOST_PLANES of the poses, evenly taken; `cut` leaves out what of the planes lies behind it. */
-export function sweepPlanes(poses: readonly Pose[], probe: Probe, cut: Plane): Group {
+export function sweepPlanes(poses: readonly Pose[], lines: readonly Line[], cut: Plane): Group {
   const step = Math.max(1, Math.ceil(poses.length / MOST_PLANES));
   const shown = poses.filter((_, index) => index % step === 0);
-  const shape = planeShape(probe);
+  const shape = planeShape(lines);
   const geometry = new BufferGeometry();
   geometry.setAttribute("position", new BufferAttribute(shape.positions, 3));
   geometry.setIndex(shape.indices);
@@ -39,14 +39,14 @@ export function sweepPlanes(poses: readonly Pose[], probe: Probe, cut: Plane): G
   });
   const planes = new InstancedMesh(geometry, fill, shown.length);
   planes.frustumCulled = false;
-  const lines: number[] = [];
+  const ends: number[] = [];
   for (const [index, pose] of shown.entries()) {
     const matrix = matrixOf(pose);
     planes.setMatrixAt(index, matrix);
     for (const corner of shape.outline)
-      lines.push(...new Vector3().fromArray(shape.positions, corner * 3).applyMatrix4(matrix).toArray());
+      ends.push(...new Vector3().fromArray(shape.positions, corner * 3).applyMatrix4(matrix).toArray());
   }
-  const outlines = new BufferGeometry().setAttribute("position", new BufferAttribute(new Float32Array(lines), 3));
+  const outlines = new BufferGeometry().setAttribute("position", new BufferAttribute(new Float32Array(ends), 3));
   const stroke = new LineBasicMaterial({ color: COLOUR, transparent: true, opacity: 0.28 });
   return new Group().add(planes, new LineSegments(outlines, stroke));
 }

@@ -1,6 +1,7 @@
 /** Distances measured in the image, in mm of the image plane. */
 
-import { distanceBetween_mm, type PlanePoint } from "../geometry/picture";
+import { distanceBetween_mm } from "../geometry/picture";
+import type { PlanePoint } from "../geometry/plane";
 
 export interface Calliper {
   a: PlanePoint;

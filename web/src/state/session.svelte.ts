@@ -1,9 +1,12 @@
 /** One scene as it is scanned: its description, the probe, where it is held and how its frames are shown. */
 
 import { explain, mayPass, ServiceError, Unreachable } from "../api/client";
-import { describeScene, trainingPoses, type Probe, type SceneDescription } from "../api/scenes";
-import type { StreamSettings } from "../api/stream";
-import { faceDepth_mm, nearDepth_mm } from "../geometry/picture";
+import { defaultsOf } from "../api/described";
+import { settings } from "../api/generated/contract";
+import { exampleProbe, PROBE_KINDS, type Probe } from "../api/probes";
+import { describeScene, trainingPoses, type SceneDescription } from "../api/scenes";
+import type { Display, StreamSettings } from "../api/stream";
+import { areUpright, boxOf, type ImagePlane } from "../geometry/plane";
 import {
   between,
   IDENTITY,
@@ -15,6 +18,13 @@ import {
   type Quaternion,
   type Vector,
 } from "../geometry/pose";
+import { planes } from "./planes.svelte";
+
+/** A probe with its image plane. */
+interface Held {
+  probe: Probe;
+  plane: ImagePlane;
+}
 
 /** Poses to play, of the scene's own probe. */
 export interface Trajectory {
@@ -22,10 +32,16 @@ export interface Trajectory {
   poses: Pose[];
 }
 
-export const TGC_POINTS = 6;
-const AS_RENDERED_DB = 60; // the dynamic range that frames have
+export const DISPLAY = settings.properties!.display!;
+const AS_RENDERED = defaultsOf(DISPLAY) as Display;
 const MOST_PICTURE_PIXELS = 640; // on the longer side of a scan-converted fan
-const WITHOUT_PROBE: Probe = { kind: "linear", width_mm: 40, near_mm: 0, far_mm: 50 };
+/** In place of the own probe of a scene that has none. */
+const SUBSTITUTE = exampleProbe([...PROBE_KINDS.keys()][0]!, 50);
+/** Until a scene is known. */
+const NOTHING: Held = {
+  probe: SUBSTITUTE,
+  plane: { face_depth_mm: 0, lines_mm: [[-20, 0, -20, 50], [20, 0, 20, 50]] }, // prettier-ignore
+};
 
 export class Session {
   description = $state.raw<SceneDescription | null>(null);
@@ -39,13 +55,8 @@ export class Session {
   trajectory = $state.raw<Trajectory | null>(null);
   /** Where the probe was put last on the track, in its poses; between them too. */
   place = $state(0);
-  /** null: the scene's own. */
-  chosenProbe = $state.raw<Probe | null>(null);
-  gain_db = $state(0);
-  dynamicRange_db = $state(AS_RENDERED_DB);
-  tgc_db = $state.raw<number[]>(new Array<number>(TGC_POINTS).fill(0));
-  depth_mm = $state<number | null>(null);
-  flip = $state(false);
+  /** How frames are shown, but for the scan conversion. */
+  display = $state.raw<Display>(AS_RENDERED);
   scanConverted = $state(true);
   /** Depth samples and scan lines; null: as trained. */
   samples = $state<number | null>(null);
@@ -57,13 +68,21 @@ export class Session {
 
   readonly known = $derived(this.description !== null);
   readonly track = $derived(this.trajectory?.poses ?? this.views);
-  readonly sceneProbe = $derived(this.description?.probe ?? WITHOUT_PROBE);
-  readonly probe = $derived(this.chosenProbe ?? this.sceneProbe);
+  #own = $state.raw<Held>(NOTHING);
+  /** null: the scene's own. */
+  #chosen = $state.raw<Held | null>(null);
+  readonly #held = $derived(this.#chosen ?? this.#own);
+  readonly chosenProbe = $derived(this.#chosen?.probe ?? null);
+  readonly sceneProbe = $derived(this.#own.probe);
+  readonly scenePlane = $derived(this.#own.plane);
+  readonly probe = $derived(this.#held.probe);
+  readonly plane = $derived(this.#held.plane);
   readonly home = $derived(this.views[Math.floor(this.views.length / 2)] ?? middleOf(this.description));
   #placed = $state.raw<Pose | null>(null);
   /** Whether the probe is where the track last put it. */
   readonly onTrack = $derived(this.pose === this.#placed);
   #asking = false;
+  #choices = 0;
   #sha256: string | null = null;
 
   constructor(readonly name: string) {}
@@ -76,8 +95,11 @@ export class Session {
     try {
       const description = await describeScene(this.name);
       if (!sameScene(this.description, description)) {
+        const probe = description.probe ?? SUBSTITUTE;
+        const plane = await planes.get(probe);
         this.views = description.training_poses.count > 0 ? await viewsOf(this.name) : [];
         this.description = description;
+        this.#own = { probe, plane };
         this.#beginAnew();
       }
       if (sha256 === this.#sha256) this.outdated = false;
@@ -97,20 +119,16 @@ export class Session {
     this.#sha256 = sha256;
   }
 
-  /** What to ask the stream for; `plain`: without gain, range and TGC. */
+  /** What to ask the stream for; `plain`: without what changes the values of pixels. */
   settings(outputs: string[], { plain = false } = {}): StreamSettings {
-    const tgc = !plain && this.tgc_db.some((gain) => gain !== 0);
+    const { depth_mm, flip } = this.display;
     return {
       height: this.samples,
       width: this.samples,
       probe: this.description?.probe ? this.chosenProbe : this.probe,
       display: {
-        gain_db: plain ? 0 : this.gain_db,
-        dynamic_range_db: plain ? AS_RENDERED_DB : this.dynamicRange_db,
-        tgc_db: tgc ? this.tgc_db : [],
-        depth_mm: this.depth_mm,
-        flip: this.flip,
-        pixel_mm: this.scanConverted ? squarePixel_mm(this.probe) : null,
+        ...(plain ? { ...AS_RENDERED, depth_mm, flip } : this.display),
+        pixel_mm: this.scanConverted ? squarePixel_mm(this.plane) : null,
       },
       outputs,
       min_confidence: this.hidesUnsupported && this.description?.confidence ? 1 : null,
@@ -125,12 +143,12 @@ export class Session {
 
   /** Turns the probe about its own axes, its face staying where it is. */
   turnBy(angles_deg: Vector): void {
-    this.pose = rotated(this.pose, angles_deg, faceDepth_mm(this.probe));
+    this.pose = rotated(this.pose, angles_deg, this.plane.face_depth_mm);
   }
 
   /** Gives the probe another orientation, its face staying where it is. */
   turnTo(orientation: Quaternion): void {
-    this.pose = pivoted(this.pose, orientation, faceDepth_mm(this.probe));
+    this.pose = pivoted(this.pose, orientation, this.plane.face_depth_mm);
   }
 
   /** To the middle of the sweep. */
@@ -161,12 +179,12 @@ export class Session {
 
   /** The pose that puts the face of the probe in use where that of the scene's own probe was. */
   held(view: Pose): Pose {
-    return translated(view, [0, 0, faceDepth_mm(this.sceneProbe) - faceDepth_mm(this.probe)]);
+    return translated(view, [0, 0, this.scenePlane.face_depth_mm - this.plane.face_depth_mm]);
   }
 
   /** The pose of the scene's own probe with its face where that of the probe in use is. */
   get trainedPose(): Pose {
-    return translated(this.pose, [0, 0, faceDepth_mm(this.probe) - faceDepth_mm(this.sceneProbe)]);
+    return translated(this.pose, [0, 0, this.plane.face_depth_mm - this.scenePlane.face_depth_mm]);
   }
 
   /** To the nearest training view. */
@@ -177,27 +195,28 @@ export class Session {
     else this.pose = this.held(this.views[index]!);
   }
 
-  /** Takes another probe, its face where that of the one before was. */
-  chooseProbe(probe: Probe | null): void {
-    const before = faceDepth_mm(this.probe);
-    this.chosenProbe = probe;
-    this.depth_mm = null;
+  /** Takes another probe, its face where that of the one before was. Throws ServiceError for one that cannot be. */
+  async chooseProbe(probe: Probe | null): Promise<void> {
+    const choice = ++this.#choices;
+    const chosen = probe && { probe, plane: await planes.get(probe) };
+    if (choice !== this.#choices) return; // another one was chosen meanwhile
+    const before = this.plane.face_depth_mm;
+    this.#chosen = chosen;
+    this.display = { ...this.display, depth_mm: null };
     const { onTrack } = this;
-    this.pose = translated(this.pose, [0, 0, before - faceDepth_mm(this.probe)]);
+    this.pose = translated(this.pose, [0, 0, before - this.plane.face_depth_mm]);
     if (onTrack) this.#placed = this.pose;
   }
 
   resetDisplay(): void {
-    this.gain_db = 0;
-    this.dynamicRange_db = AS_RENDERED_DB;
-    this.tgc_db = new Array<number>(TGC_POINTS).fill(0);
-    this.depth_mm = null;
-    this.flip = false;
+    this.display = AS_RENDERED;
   }
 
   /** What was chosen for another scene of that name does not fit this one. */
   #beginAnew(): void {
-    this.chosenProbe = this.trajectory = this.depth_mm = this.samples = null;
+    this.#choices += 1;
+    this.#chosen = this.trajectory = this.samples = null;
+    this.display = { ...this.display, depth_mm: null };
     this.goHome();
   }
 }
@@ -222,12 +241,10 @@ function middleOf(description: SceneDescription | null): Pose {
 }
 
 /** The pixel of a scan-converted picture; null for probes whose frames are pictures already. */
-function squarePixel_mm(probe: Probe): number | null {
-  if (probe.kind === "linear") return null;
-  const half = (probe.opening_angle_deg / 360) * Math.PI;
-  const across = 2 * probe.far_mm * Math.sin(Math.min(half, Math.PI / 2));
-  const down = probe.far_mm - nearDepth_mm(probe) * Math.cos(half);
-  return Math.max(across, down) / MOST_PICTURE_PIXELS;
+function squarePixel_mm({ lines_mm }: ImagePlane): number | null {
+  if (areUpright(lines_mm)) return null;
+  const { left, right, top, bottom } = boxOf(lines_mm);
+  return Math.max(right - left, bottom - top) / MOST_PICTURE_PIXELS;
 }
 
 const sessions = new Map<string, Session>();
