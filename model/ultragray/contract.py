@@ -50,7 +50,18 @@ def described(
     metadata: dict[str, Any] = {"description": meaning}
     limits = {"low": low, "high": high, "above": above, "choices": choices, "most": most, "error": error}
     metadata |= {name: limit for name, limit in limits.items() if limit is not None}
+    if schema := _schema(**limits):
+        metadata["json_schema_extra"] = schema  # the key that pydantic reads
     return field(default=default, default_factory=factory, metadata=metadata, **options)
+
+
+def _schema(**limits: Any) -> dict[str, Any]:
+    """The limits of a field in the words of JSON Schema; those of a list's elements stand under `items`."""
+    words = {"low": "minimum", "high": "maximum", "above": "exclusiveMinimum", "choices": "enum"}
+    schema = {word: limits[name] for name, word in words.items() if limits[name] is not None}
+    if limits["most"] is None:
+        return schema
+    return {"maxItems": limits["most"], "items": {"type": "number", **schema}}
 
 
 class Contract:
@@ -207,7 +218,7 @@ def _checked(value: Any, annotation: Any, item: Field[Any]) -> Any:
     if get_origin(kind) is tuple:
         _require(isinstance(value, (list, tuple)), "a list", value)
         most = item.metadata.get("most")
-        _require(most is None or len(value) <= most, f"at most {most} values", len(value))
+        _require(most is None or len(value) <= most, f"a list of at most {most} values", len(value))
         element = get_args(kind)[0]
         return tuple(_checked_element(one, element, item, index) for index, one in enumerate(value))
     if not isinstance(kind, type):

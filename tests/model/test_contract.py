@@ -39,7 +39,7 @@ class Drawing(Contract):
     shape: Shape | None = described("What is drawn.", None)
     colour: Colour = described("Of the line.", Colour.RED)
     copies: int = described("How many.", 1, low=1, high=9)
-    offsets_mm: tuple[float, ...] = described("Of the copies.", (), low=-5.0, high=5.0)
+    offsets_mm: tuple[float, ...] = described("Of the copies.", (), low=-5.0, high=5.0, most=3)
     mirrored: bool = described("Left and right change places.", False)
     paper: str = described("What it is drawn on.", "plain", choices=("plain", "ruled"))
 
@@ -51,6 +51,7 @@ class Drawing(Contract):
         ({"copies": True}, "copies", "copies must be an integer from 1 to 9, got True"),
         ({"copies": 1.5}, "copies", "copies must be an integer from 1 to 9, got 1.5"),
         ({"offsets_mm": (1.0, 6.0)}, "offsets_mm[1]", r"offsets_mm\[1\] must be a finite number from -5 to 5, got 6.0"),
+        ({"offsets_mm": (0.0,) * 4}, "offsets_mm", "offsets_mm must be a list of at most 3 values, got 4"),
         ({"offsets_mm": 3.0}, "offsets_mm", "offsets_mm must be a list, got 3.0"),
         ({"mirrored": 1}, "mirrored", "mirrored must be true or false, got 1"),
         ({"colour": "green"}, "colour", "colour must be one of red, blue, got 'green'"),
@@ -122,5 +123,8 @@ def test_pydantic_reads_the_same_classes() -> None:
     (error,) = refused.value.errors()
     assert isinstance(error["ctx"]["error"], InvalidProbe)
     schema = adapter.json_schema()
-    assert schema["properties"]["copies"]["description"] == "How many."
+    copies, offsets, paper = (schema["properties"][name] for name in ("copies", "offsets_mm", "paper"))
+    assert (copies["description"], copies["minimum"], copies["maximum"]) == ("How many.", 1, 9)
+    assert (offsets["maxItems"], offsets["items"]) == (3, {"type": "number", "minimum": -5.0, "maximum": 5.0})
+    assert list(paper["enum"]) == ["plain", "ruled"]
     assert schema["properties"]["shape"]["anyOf"][0]["discriminator"]["propertyName"] == "kind"
