@@ -32,7 +32,7 @@ def test_lines_of_a_fan_begin_at_its_face(http: httpx.Client) -> None:
     assert face_depth_mm == 40.0
     np.testing.assert_allclose(np.linalg.norm(lines, axis=2), np.tile([40.0, 90.0], (len(lines), 1)), atol=1e-5)
     angles_deg = np.degrees(np.arctan2(lines[:, 1, 0], lines[:, 1, 1]))
-    np.testing.assert_allclose(angles_deg, np.linspace(-30.0, 30.0, len(lines)), atol=1e-2)
+    np.testing.assert_allclose(angles_deg, np.linspace(-30.0, 30.0, len(lines)), atol=1e-4)
 
 
 def test_each_kind_has_an_example_that_can_be(http: httpx.Client) -> None:
