@@ -145,7 +145,7 @@ def test_the_reference_by_finite_differences(
     def outputs(*splats: Tensor) -> tuple[Tensor, ...]:
         moved = GaussianScene.from_splats(dict(zip(scene.splats, splats, strict=True)), info=scene.info)
         frames = render(moved, probe, pose, height=5, width=4, backend="reference")
-        return tuple(vars(frames)[name] for name in PLANES)
+        return tuple(frames[name] for name in PLANES)
 
     leaves = tuple(tensor.clone().requires_grad_() for tensor in scene.splats.values())
     assert torch.autograd.gradcheck(outputs, leaves, eps=1e-7, atol=1e-6, rtol=1e-4)
