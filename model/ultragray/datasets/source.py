@@ -15,7 +15,7 @@ from ..contract import Contract, described
 from ..errors import DatasetInvalid, InvalidArgument
 
 if TYPE_CHECKING:
-    from .sweep import Dataset
+    from .sweep import Dataset, Sweep
 
 MAX_OPTION_LENGTH = 1000
 PHANTOM = "phantom"
@@ -141,21 +141,33 @@ def _split(dataset: Dataset, options: SourceOptions) -> Dataset:
     return replace(dataset, train=train, val=val)
 
 
-def _load_plus(source: str, options: SourceOptions) -> Dataset:
-    from .plus import read_plus_sweep
+def _split_sequence(path: Path, options: SourceOptions, sweep: Sweep, frame_count: int) -> Dataset:
     from .splits import split_sequence
     from .sweep import Dataset
 
-    path = Path(source)
-    sweep, frame_count = read_plus_sweep(path, device_set=options.device_set, frames=options.frames, crop=options.crop)
     parts = split_sequence(sweep, frame_count, options.train_frames, options.val_frames)
     return Dataset(path.name.split(".")[0], *parts)
+
+
+def _load_plus(source: str, options: SourceOptions) -> Dataset:
+    from .plus import read_plus_sweep
+
+    path = Path(source)
+    read = read_plus_sweep(path, device_set=options.device_set, frames=options.frames, crop=options.crop)
+    return _split_sequence(path, options, *read)
 
 
 def _check_released_upload(source: Path, folder: Path) -> None:
     from .released import require_files_below
 
     require_files_below(source, folder)
+
+
+def _load_dicom(source: str, options: SourceOptions) -> Dataset:
+    from .dicom import read_dicom_sweep
+
+    path = Path(source)
+    return _split_sequence(path, options, *read_dicom_sweep(path, frames=options.frames, crop=options.crop))
 
 
 PLUS_SUFFIXES = (".mha", ".mhd", ".nrrd", ".nhdr")
@@ -180,6 +192,15 @@ FORMATS: Mapping[str, DatasetFormat] = {
             files=tuple(f"*{suffix}" for suffix in PLUS_SUFFIXES),
             options=("frames", "device_set", "crop"),
             companions={"device_set": "*.xml"},
+        ),
+        DatasetFormat(
+            name="dicom",
+            noun="DICOM cine loop",
+            meaning="a DICOM cine loop (.dcm) with its poses beside it (.poses.npy or .poses.json)",
+            is_source=lambda source: source.lower().endswith(".dcm"),
+            load=_load_dicom,
+            files=("*.dcm",),
+            options=("frames", "crop"),
         ),
         DatasetFormat(
             name=PHANTOM,

@@ -23,6 +23,7 @@ from ultragray.datasets import Dataset, Sweep
 from ultragray.datasets.released import write_released
 from ultragray_service.core.dataset_uploads import MAX_UPLOADS
 
+from ...dicom_files import write_cine
 from ...waiting import wait_until
 from ..conftest import RunningService, StartService
 
@@ -236,6 +237,17 @@ def test_a_plus_sequence_with_its_device_set(http: httpx.Client) -> None:
     assert (dataset["kind"], dataset["train_frames"], dataset["val_frames"]) == ("plus", 8, 2)
     assert dataset["probe"] == {"kind": "linear", "width_mm": 13.0, "near_mm": 0.0, "far_mm": 18.0}
     http.delete("/v1/datasets/sweep")
+
+
+def test_a_dicom_cine_loop_with_its_poses(http: httpx.Client, tmp_path: Path) -> None:
+    path = write_cine(tmp_path)
+    files = {name: (tmp_path / name).read_bytes() for name in (path.name, "sweep.poses.npy")}
+    dataset = put(http, "cine", zipped(files), train_frames="0:6").json()
+    assert (dataset["kind"], dataset["train_frames"], dataset["val_frames"]) == ("dicom", 6, 4)
+    assert dataset["probe"] == {"kind": "linear", "width_mm": 10.0, "near_mm": 0.0, "far_mm": 5.0}
+    http.delete("/v1/datasets/cine")
+    answer = put(http, "cine", zipped({path.name: files[path.name]}))
+    assert_problem(answer, 422, "DATASET_INVALID", "must lie beside it in sweep.poses.npy or sweep.poses.json")
 
 
 def test_what_cannot_be_used_is_refused_with_the_frame(http: httpx.Client, files: dict[str, bytes]) -> None:

@@ -21,6 +21,8 @@ from ultragray_workers.datasets.intake import take_in
 from ultragray_workers.datasets.store import DatasetStore, check_dataset_name
 from ultragray_workers.errors import DatasetExists, DatasetInUse, DatasetNotFound
 
+from ...dicom_files import write_cine
+
 
 def sweep(count: int, offset_mm: float) -> Sweep:
     poses = np.tile(np.eye(4), (count, 1, 1))
@@ -288,3 +290,15 @@ def test_importing_the_store_and_the_intake_needs_no_torch() -> None:
         "ultragray_workers.datasets.incoming; sys.exit('torch' in sys.modules or 'matplotlib' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
+
+
+def test_a_cine_loop_with_its_poses_becomes_a_dataset(store: DatasetStore, receive: Receive, tmp_path: Path) -> None:
+    path = write_cine(tmp_path)
+    incoming = receive({f"deep/{name}": (tmp_path / name).read_bytes() for name in (path.name, "sweep.poses.npy")})
+    take_in(**arguments(incoming, crop="4:24,2:22"))
+    record, _ = incoming.accept("tiny")
+    assert (record.kind, record.train_frames, record.val_frames, record.width) == ("dicom", 8, 2, 20)
+    assert store.load("tiny").sha256 == record.sha256
+    alone = receive({path.name: path.read_bytes()})
+    with pytest.raises(DatasetInvalid, match=r"^sweep\.dcm: the poses of its frames must lie beside it"):
+        take_in(**arguments(alone))

@@ -1,0 +1,216 @@
+"""DICOM cine loops: a multi-frame ultrasound image (.dcm) of a linear probe, and the poses of its frames beside it.
+
+`sweep.dcm` goes with `sweep.poses.npy` or `sweep.poses.json`: one pose for each frame, probe→tracker, mm, whose origin
+is the top centre of the region that shows the image (SequenceOfUltrasoundRegions, PS3.3 C.8.5.5), x along its rows of
+pixels, z down its columns. Where a file has no regions, the whole image is the region and PixelSpacing its scale. The
+extra `dicom`.
+"""
+
+from __future__ import annotations
+
+import io
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import DatasetInvalid, ExtraMissing, InvalidPose
+from ..files.poses import load_poses
+from ..probe import FloatArray
+from .calibration import poses_from_image_transforms
+from .frame_ranges import parse_frame_ranges
+from .images import CropBox, parse_crop
+from .payload import MAX_PIXEL_BYTES
+from .sweep import ByteArray, IntArray, Sweep
+
+POSE_SUFFIXES = (".poses.npy", ".poses.json")
+MAX_HEADER_BYTES = 16 << 20  # of all that stands before the pixels
+DEFLATED = "1.2.840.10008.1.2.1.99"  # the whole data set is compressed: it could inflate without bounds
+CENTIMETRES, TISSUE_2D = 3, 1
+SMALLEST_PIXEL_MM, LARGEST_PIXEL_MM = 1e-4, 10.0
+
+
+def read_dicom_sweep(path: Path, *, frames: str | None = None, crop: str | None = None) -> tuple[Sweep, int]:
+    """The frames of a cine loop, and their number in the file.
+
+    `frames` (ranges, `parse_frame_ranges`) chooses among them; `crop` is "columns,rows" of the stored image, default:
+    the region. Raises DatasetInvalid, naming the file, the frame and the reason; InvalidArgument for `frames` and
+    `crop` that do not fit; ExtraMissing without pydicom.
+    """
+    header = _read_header(path)
+    shape = _shape(path, header)
+    region, pixel_mm = _region(path, header, shape)
+    poses = _read_poses(path, shape[0])
+    ranges = range(shape[0]) if frames is None else parse_frame_ranges(frames, shape[0], option="frames")
+    chosen = np.array(ranges, np.int64)
+    box = region if crop is None else parse_crop(crop, *shape[1:])
+    lateral_mm, axial_mm = pixel_mm
+    image_to_probe = np.array(
+        [
+            [lateral_mm, 0.0, 0.0, -lateral_mm * (region.left + region.right - 1) / 2],
+            [0.0, 0.0, 1.0, 0.0],
+            [0.0, axial_mm, 0.0, -axial_mm * (region.top - 0.5)],
+            [0.0, 0.0, 0.0, 1.0],
+        ]
+    )
+    box_poses, probe = poses_from_image_transforms(poses[chosen] @ image_to_probe, box, chosen, path)
+    images = _read_frames(path, header, shape, chosen)[:, box.top : box.bottom, box.left : box.right]
+    notes = () if "TransducerType" in header else ("the file does not name its transducer: taken as a linear one",)
+    sweep = Sweep(np.ascontiguousarray(images), box_poses, probe, chosen, str(path), notes)
+    return sweep, shape[0]
+
+
+@contextmanager
+def _in_our_words(where: Path | str) -> Iterator[None]:
+    """Whatever pydicom raises about a file is DatasetInvalid; what it warns of is left out."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    except (DatasetInvalid, MemoryError):
+        raise
+    except ImportError:
+        raise ExtraMissing("DICOM needs the package pydicom: pip install 'ultragray[dicom]'") from None
+    except Exception as error:
+        raise DatasetInvalid(f"{where}: it cannot be read as DICOM: {error}") from error
+
+
+class _BoundedFile(io.FileIO):
+    """Reads no more than a header may hold."""
+
+    left = MAX_HEADER_BYTES
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        most = self.left + 1
+        data = super().read(most if size is None or size < 0 else min(size, most)) or b""
+        self.left -= len(data)
+        if self.left < 0:
+            raise DatasetInvalid(f"{self.name}: over {MAX_HEADER_BYTES >> 20} MiB stand before its pixels")
+        return data
+
+
+def _read_header(path: Path) -> Any:
+    """The data set without its pixels."""
+    with _in_our_words(path):
+        import pydicom
+        from pydicom.filereader import read_file_meta_info
+
+        if read_file_meta_info(path).get("TransferSyntaxUID", "") == DEFLATED:
+            raise DatasetInvalid(f"{path}: its data set is deflated, which is not read: save it in another syntax")
+        with _BoundedFile(path) as file:
+            return pydicom.dcmread(file, stop_before_pixels=True)
+
+
+def _value(path: Path, header: Any, name: str) -> Any:
+    value = header.get(name)
+    if value is None or value == "":
+        raise DatasetInvalid(f"{path}: it lacks {name}")
+    return value
+
+
+def _shape(path: Path, header: Any) -> tuple[int, int, int]:  # frames, rows, columns
+    """The size of the frames. Raises DatasetInvalid for what is no grey cine loop of 8 bits of a linear probe."""
+    expected = {
+        "SamplesPerPixel": (1, "frames must be grey"),
+        "PhotometricInterpretation": ("MONOCHROME2", "frames must be grey, 0 black"),
+        "BitsAllocated": (8, "pixels must have 8 bits"),
+    }
+    for name, (wanted, why) in expected.items():
+        if (given := _value(path, header, name)) != wanted:
+            raise DatasetInvalid(f"{path}: {why} ({name} {wanted}), got {str(given)[:40]}")
+    transducer = str(header.get("TransducerType", "LINEAR"))
+    if transducer not in ("LINEAR", ""):
+        raise DatasetInvalid(
+            f"{path}: the probe must be linear, TransducerType is {transducer[:40]}: a fan on a screen"
+        )
+    names = ("NumberOfFrames", "Rows", "Columns")
+    with _in_our_words(path):
+        frames, rows, columns = (int(_value(path, header, name)) for name in names)
+    if min(frames, rows, columns) < 1 or frames * rows * columns > MAX_PIXEL_BYTES:
+        raise DatasetInvalid(
+            f"{path}: it must have 1 to {MAX_PIXEL_BYTES:,} pixels, its header says {frames} x {rows} x {columns}"
+        )
+    return frames, rows, columns
+
+
+def _region(path: Path, header: Any, shape: tuple[int, int, int]) -> tuple[CropBox, tuple[float, float]]:
+    """The part of the image that shows ultrasound, and the lateral and axial size of its pixels, mm."""
+    _, rows, columns = shape
+    with _in_our_words(path):
+        regions = [one for one in header.get("SequenceOfUltrasoundRegions", []) if _is_tissue(one)]
+        if len(regions) > 1:
+            raise DatasetInvalid(f"{path}: it has {len(regions)} regions that show a plane, one is expected")
+        if regions:
+            (region,) = regions
+            left, top, right, bottom = (
+                int(_value(path, region, f"RegionLocation{name}")) for name in ("MinX0", "MinY0", "MaxX1", "MaxY1")
+            )
+            box = CropBox(left, right + 1, top, bottom + 1)
+            lateral_mm, axial_mm = (10.0 * float(_value(path, region, f"PhysicalDelta{axis}")) for axis in "XY")
+        else:
+            box = CropBox(0, columns, 0, rows)
+            if "PixelSpacing" not in header:
+                raise DatasetInvalid(
+                    f"{path}: it does not say how large a pixel is: no region of SequenceOfUltrasoundRegions in "
+                    "centimetres, and no PixelSpacing"
+                )
+            axial_mm, lateral_mm = (float(spacing) for spacing in header.PixelSpacing)
+    if not (0 <= box.left < box.right <= columns and 0 <= box.top < box.bottom <= rows):
+        raise DatasetInvalid(f"{path}: its region {box} does not lie within {columns} x {rows} pixels")
+    if not all(SMALLEST_PIXEL_MM <= size <= LARGEST_PIXEL_MM for size in (lateral_mm, axial_mm)):
+        raise DatasetInvalid(
+            f"{path}: a pixel must be {SMALLEST_PIXEL_MM:g} to {LARGEST_PIXEL_MM:g} mm, it is {lateral_mm:g} x "
+            f"{axial_mm:g} mm"
+        )
+    return box, (lateral_mm, axial_mm)
+
+
+def _is_tissue(region: Any) -> bool:
+    units = (region.get("PhysicalUnitsXDirection"), region.get("PhysicalUnitsYDirection"))
+    return region.get("RegionSpatialFormat") == TISSUE_2D and units == (CENTIMETRES, CENTIMETRES)
+
+
+def _read_poses(path: Path, count: int) -> FloatArray:  # [F, 4, 4]
+    named = [path.with_name(f"{path.name[: -len(path.suffix)]}{suffix}") for suffix in POSE_SUFFIXES]
+    found = [file for file in named if file.is_file()]
+    if len(found) != 1:
+        wanted = " or ".join(file.name for file in named)
+        raise DatasetInvalid(f"{path}: the poses of its frames must lie beside it in {wanted}, found {len(found)}")
+    try:
+        poses = load_poses(found[0])
+    except InvalidPose as error:
+        raise DatasetInvalid(error.detail) from error
+    if len(poses) != count:
+        raise DatasetInvalid(f"{path} holds {count} frames, but {found[0]} {len(poses)} poses")
+    return poses
+
+
+def _read_frames(path: Path, header: Any, shape: tuple[int, int, int], chosen: IntArray) -> ByteArray:
+    """The chosen frames [C, rows, columns], decoded one at a time."""
+    frames = np.empty((len(chosen), *shape[1:]), np.uint8)
+    with _in_our_words(path):
+        from pydicom.pixels import get_decoder, iter_pixels
+
+        syntax = header.file_meta.TransferSyntaxUID
+        try:
+            decoder = get_decoder(syntax) if syntax.is_compressed else None
+        except NotImplementedError:
+            raise DatasetInvalid(f"{path}: pixels compressed as {syntax.name} cannot be read") from None
+        if decoder is not None and not decoder.is_available:
+            needed = "; ".join(decoder.missing_dependencies)
+            raise DatasetInvalid(
+                f"{path}: pixels compressed as {syntax.name} cannot be read without a decoder: {needed}"
+            )
+        pixels = iter_pixels(path, indices=[int(number) for number in chosen], raw=True)
+        for number, out in zip(chosen, frames, strict=True):
+            with _in_our_words(f"{path}: frame {number}"):
+                frame = next(pixels)
+            if frame.shape != out.shape or frame.dtype != out.dtype:
+                raise DatasetInvalid(
+                    f"{path}: frame {number} must be uint8 {list(out.shape)}, got {frame.dtype} {list(frame.shape)}"
+                )
+            out[:] = frame
+    return frames

@@ -1,0 +1,140 @@
+"""DICOM cine loops with poses beside them, in files that pydicom writes."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pydicom
+import pytest
+from pydicom.encaps import encapsulate
+from pydicom.uid import UID, DeflatedExplicitVRLittleEndian, JPEG2000Lossless, JPEGBaseline8Bit, RLELossless
+
+from ultragray import LinearProbe
+from ultragray.datasets import dicom
+from ultragray.datasets.source import SourceOptions, load_dataset
+from ultragray.errors import DatasetInvalid, ExtraMissing, InvalidArgument
+
+from ...dicom_files import FRAMES, POSES, region, write_cine
+
+Write = Callable[..., Path]
+
+
+@pytest.fixture
+def write(tmp_path: Path) -> Write:
+    return partial(write_cine, tmp_path)
+
+
+def test_a_cine_loop_is_the_region_with_its_poses(write: Write) -> None:
+    dataset = load_dataset(write())
+    assert (dataset.name, dataset.probe) == ("sweep", LinearProbe(10.0, 0.0, 5.0))
+    assert dataset.val.frame_numbers.tolist() == [2, 7]
+    np.testing.assert_array_equal(dataset.val.images, FRAMES[[2, 7], 2:22, 4:24])
+    np.testing.assert_allclose(dataset.val.poses, POSES[[2, 7]], atol=1e-12)
+    assert not dataset.train.notes
+
+
+def test_a_crop_moves_the_origin_to_its_own_top_centre(write: Write) -> None:
+    dataset = load_dataset(write(), SourceOptions(crop="4:14,6:22", frames="0:6", val_frames="3", image_size="5x8"))
+    assert dataset.probe == LinearProbe(5.0, 0.0, 4.0)
+    assert dataset.train.frame_numbers.tolist() == [0, 1, 2, 4, 5]
+    assert dataset.train.images.shape == (5, 8, 5)
+    centre = np.array([-2.5, 0.0, 1.0, 1.0])  # mm, from the top centre of the region
+    np.testing.assert_allclose(dataset.val.poses[0, :, 3], POSES[3] @ centre, atol=1e-12)
+
+
+def test_poses_in_json_and_a_scale_without_regions(write: Write, tmp_path: Path) -> None:
+    path = write(SequenceOfUltrasoundRegions=None, PixelSpacing=[0.2, 0.4], TransducerType=None, poses=None)
+    (tmp_path / "sweep.poses.json").write_text(json.dumps(POSES[:, :3].tolist()))
+    dataset = load_dataset(path)
+    assert dataset.probe == LinearProbe(12.8, 0.0, 4.8)
+    assert dataset.train.notes == ("the file does not name its transducer: taken as a linear one",)
+
+
+def test_compressed_frames_are_read_where_there_is_a_decoder(write: Write) -> None:
+    path = write()
+    data = pydicom.dcmread(path)
+    data.compress(RLELossless)
+    data.save_as(path)
+    np.testing.assert_array_equal(load_dataset(path).val.images, FRAMES[[2, 7], 2:22, 4:24])
+
+
+COMPRESSED = encapsulate([b"\xff\xd8\xff\xd9"] * len(FRAMES))
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [
+        ({"poses": None}, r"must lie beside it in sweep\.poses\.npy or sweep\.poses\.json, found 0"),
+        ({"poses": POSES[:7]}, r"sweep\.dcm holds 10 frames, but .*sweep\.poses\.npy 7 poses"),
+        ({"poses": POSES * 2.0}, r"sweep\.poses\.npy: poses\[0\] must end in the row"),
+        ({"SamplesPerPixel": 3}, r"frames must be grey \(SamplesPerPixel 1\), got 3"),
+        ({"PhotometricInterpretation": "MONOCHROME1"}, r"0 black .*got MONOCHROME1"),
+        ({"BitsAllocated": 16}, r"pixels must have 8 bits \(BitsAllocated 8\), got 16"),
+        ({"TransducerType": "CURVED LINEAR"}, r"must be linear, TransducerType is CURVED LINEAR"),
+        ({"NumberOfFrames": None}, r"it lacks NumberOfFrames"),
+        ({"NumberOfFrames": 2_000_000_000}, r"its header says 2000000000 x 24 x 32"),
+        (
+            {"NumberOfFrames": 11, "poses": np.concatenate([POSES, POSES[:1]])},
+            r"sweep\.dcm: frame 10: it cannot be read",
+        ),
+        ({"SequenceOfUltrasoundRegions": None}, r"does not say how large a pixel is"),
+        ({"SequenceOfUltrasoundRegions": [region(PhysicalUnitsXDirection=4)]}, r"does not say how large a pixel is"),
+        ({"SequenceOfUltrasoundRegions": [region(), region()]}, r"has 2 regions that show a plane"),
+        ({"SequenceOfUltrasoundRegions": [region(PhysicalDeltaX=None)]}, r"it lacks PhysicalDeltaX"),
+        ({"SequenceOfUltrasoundRegions": [region(PhysicalDeltaY=0.0)]}, r"a pixel must be 0\.0001 to 10 mm"),
+        ({"SequenceOfUltrasoundRegions": [region(RegionLocationMaxX1=32)]}, r"does not lie within 32 x 24 pixels"),
+        ({"SequenceOfUltrasoundRegions": None, "PixelSpacing": [0.1]}, r"it cannot be read as DICOM"),
+        ({"syntax": UID("1.2.840.10008.1.2.4.100"), "data": COMPRESSED}, r"compressed as .* cannot be read"),
+        (
+            {"syntax": JPEGBaseline8Bit, "data": COMPRESSED},
+            r"sweep\.dcm: (frame 0: it cannot be read|.* need a decoder)",
+        ),
+        ({"syntax": DeflatedExplicitVRLittleEndian}, r"its data set is deflated"),
+        ({"EncapsulatedDocument": b"x" * 200_000}, r"over 0 MiB stand before its pixels"),
+    ],
+    ids=lambda value: next(iter(value)) if isinstance(value, dict) else None,
+)
+def test_what_cannot_be_used_is_one_clear_error(
+    write: Write, values: dict[str, Any], expected: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(dicom._BoundedFile, "left", 100_000)
+    monkeypatch.setattr(dicom, "MAX_HEADER_BYTES", 100_000)
+    with pytest.raises(DatasetInvalid, match=expected):
+        load_dataset(write(**values))
+
+
+def test_a_decoder_that_is_not_installed_is_named(write: Write) -> None:
+    path = write(syntax=JPEG2000Lossless, data=COMPRESSED)
+    with pytest.raises(DatasetInvalid, match=r"JPEG 2000.* need a decoder: |sweep\.dcm: frame 0: it cannot"):
+        load_dataset(path)
+
+
+def test_files_that_are_no_dicom(tmp_path: Path, write: Write) -> None:
+    whole = write().read_bytes()
+    for name, content in (("text.dcm", b"no DICOM"), ("empty.dcm", b""), ("cut.dcm", whole[:300])):
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(DatasetInvalid, match=name):
+            load_dataset(tmp_path / name)
+    (tmp_path / "sweep.dcm").write_bytes(whole[:-500])
+    with pytest.raises(DatasetInvalid, match=r"sweep\.dcm: "):
+        load_dataset(tmp_path / "sweep.dcm")
+
+
+def test_options_of_other_formats_are_refused(write: Write, tmp_path: Path) -> None:
+    with pytest.raises(InvalidArgument, match=r"device_set is for PLUS sequences, sweep\.dcm is none"):
+        load_dataset(write(), SourceOptions(device_set=tmp_path / "set.xml"))
+    with pytest.raises(InvalidArgument, match=r"crop must lie within columns 0:32 and rows 0:24"):
+        load_dataset(write(), SourceOptions(crop="0:99,0:9"))
+
+
+def test_without_pydicom_the_extra_is_named(write: Write, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write()
+    monkeypatch.setitem(sys.modules, "pydicom", None)
+    with pytest.raises(ExtraMissing, match=r"ultragray\[dicom\]"):
+        load_dataset(path)
