@@ -53,7 +53,7 @@ def gradients(
 
 
 def by_reference(probe: Probe, poses: Any) -> Callable[[GaussianScene], Mapping[str, Tensor]]:
-    return lambda scene: vars(render(scene, probe, poses, height=HEIGHT, width=WIDTH, backend="reference"))
+    return lambda scene: render(scene, probe, poses, height=HEIGHT, width=WIDTH, backend="reference")
 
 
 def by_kernel(
