@@ -8,7 +8,7 @@ import { existsSync, mkdirSync, readFileSync, writeFileSync } from "node:fs";
 import openapiTS, { astToString } from "openapi-typescript";
 
 const FOLDER = new URL("src/api/generated/", import.meta.url);
-const KEPT = ["description", "default", "minimum", "exclusiveMinimum", "maximum", "enum", "const", "examples"];
+const KEPT = ["description", "default", "minimum", "exclusiveMinimum", "maximum", "enum", "const", "examples", "x-numbers"];
 
 const document = JSON.parse(readFileSync(new URL("openapi.json", import.meta.url), "utf8"));
 const { schemas } = document.components;
@@ -37,6 +37,7 @@ const texts = {
   "contract.ts": `import type { Described } from "../described";
 
 export const settings: Described = ${JSON.stringify(described(schemas.StreamSettings), null, 1)};
+export const scene: Described = ${JSON.stringify(described(schemas.SceneOut), null, 1)};
 `,
 };
 mkdirSync(FOLDER, { recursive: true });

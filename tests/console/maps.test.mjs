@@ -5,16 +5,20 @@ import { after, before, describe, it } from "node:test";
 
 import { canvasState, launch, openPage, picture, seriousFindings, Service, until } from "./harness.mjs";
 
-const OUTPUTS = ["bmode", "echo", "transmittance", "coverage", "labels"];
 const SIDE = 256; // of the frames of the demo scene
-const LABELS = { 0: "none", 1: "bone", 2: "muscle", 3: "fat", 4: "vessel" };
 
 let service;
 let browser;
+let outputs;
+let labels;
 
 before(async () => {
   service = await Service.start();
   browser = await launch();
+  const scene = await (await fetch(`${service.url}/v1/scenes/demo`)).json();
+  outputs = scene.outputs;
+  labels = { 0: "none", ...scene.label_names };
+  assert.ok(outputs.includes("bmode") && outputs.includes("labels"), `${outputs}`);
 });
 after(async () => {
   await browser?.close();
@@ -23,7 +27,7 @@ after(async () => {
 
 async function openMaps(options) {
   const page = await openPage(browser, service, "#/maps/demo", options);
-  for (const output of OUTPUTS)
+  for (const output of outputs)
     await until(() => canvasState(page, `[data-testid="map-${output}"]`), ({ width }) => width === SIDE, `no ${output}`);
   return page;
 }
@@ -36,10 +40,10 @@ async function rendered() {
   const answer = await fetch(`${service.url}/v1/scenes/demo/render`, {
     method: "POST",
     headers: { "Content-Type": "application/json", Accept: "application/octet-stream;dtype=uint8" },
-    body: JSON.stringify({ pose: { matrix }, outputs: OUTPUTS }),
+    body: JSON.stringify({ pose: { matrix }, outputs }),
   });
   const pixels = new Uint8Array(await answer.arrayBuffer());
-  return Object.fromEntries(OUTPUTS.map((output, i) => [output, pixels.subarray(i * SIDE * SIDE, (i + 1) * SIDE * SIDE)]));
+  return Object.fromEntries(outputs.map((output, i) => [output, pixels.subarray(i * SIDE * SIDE, (i + 1) * SIDE * SIDE)]));
 }
 
 describe("maps", () => {
@@ -50,14 +54,14 @@ describe("maps", () => {
     for (const [column, row] of [[128, 40], [200, 128], [60, 180]]) {
       await page.mouse.move(box.x + ((column + 0.5) / SIDE) * box.width, box.y + ((row + 0.5) / SIDE) * box.height);
       await page.getByText(`${column}, ${row}`).waitFor();
-      for (const output of OUTPUTS) {
+      for (const output of outputs) {
         const value = expected[output][row * SIDE + column];
-        const written = output === "labels" ? LABELS[value] : (value / 255).toFixed(3);
+        const written = output === "labels" ? labels[value] : (value / 255).toFixed(3);
         assert.equal(await page.getByTestId(`value-${output}`).textContent(), written, `${output} at ${column}, ${row}`);
       }
     }
     assert.equal(await page.getByTestId("cursor-lateral").textContent(), "-15.82 mm"); // (60.5 / 256 - 1/2) 60 mm
-    assert.equal(await page.locator('[data-testid^="map-"] svg.overlay rect').count(), OUTPUTS.length);
+    assert.equal(await page.locator('[data-testid^="map-"] svg.overlay rect').count(), outputs.length);
     await picture(page, "maps");
     assert.deepEqual([page.faults, page.foreign], [[], []]);
     await page.context().close();
@@ -90,7 +94,7 @@ describe("maps", () => {
       assert.ok(Math.abs((await value("bmode")) - product) < 0.01, `${await value("bmode")} is not ${product}`);
     }
     await page.mouse.move(box.x + 3, box.y + 3);
-    for (const output of OUTPUTS)
+    for (const output of outputs)
       await until(() => page.getByTestId(`value-${output}`).textContent(), (text) => text === "–", `${output} beside the fan`);
     await page.context().close();
   });

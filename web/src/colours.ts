@@ -1,11 +1,11 @@
 /** Colours of maps: one ramp for each kind of value, categories for labels. */
 
-export type Ramp = "echo" | "transmittance" | "coverage";
+export type Ramp = keyof typeof STOPS;
 export type Colour = readonly [number, number, number];
 
 /** From low to high; each is even in lightness, so that it can be read without colour. */
-const STOPS: Record<Ramp, Colour[]> = {
-  echo: [
+const STOPS = {
+  intensity: [
     [20, 16, 38],
     [85, 30, 105],
     [168, 48, 98],
@@ -29,7 +29,7 @@ const STOPS: Record<Ramp, Colour[]> = {
     [120, 178, 190],
     [40, 120, 160],
   ],
-};
+} satisfies Record<string, Colour[]>;
 
 /** Of labels from 1 on; 0 is nothing. */
 const CATEGORIES: Colour[] = [
@@ -43,9 +43,14 @@ const CATEGORIES: Colour[] = [
   [120, 190, 200],
 ];
 
+/** Whether values of that name have a ramp of their own. */
+export function isRamp(name: string): name is Ramp {
+  return name in STOPS;
+}
+
 /** The colour of a share of a ramp, 0 to 1. */
 export function ramp(name: Ramp, share: number): Colour {
-  const stops = STOPS[name];
+  const stops: readonly Colour[] = STOPS[name];
   const at = Math.max(0, Math.min(1, share)) * (stops.length - 1);
   const index = Math.min(stops.length - 2, Math.floor(at));
   const [low, high] = [stops[index]!, stops[index + 1]!];

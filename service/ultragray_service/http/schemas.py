@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, WithJsonSchema
 
 from ultragray.display.settings import FRAME_RANGE_DB, Display
+from ultragray.outputs import OUTPUTS
 from ultragray.pose import quaternion_from_pose
 from ultragray.probe import ConvexProbe, FloatArray, LinearProbe, PhasedProbe, Probe
 
@@ -149,6 +150,20 @@ class RenderBody(RequestModel):
     )
 
 
+OutputName = Annotated[
+    str,
+    WithJsonSchema(
+        {
+            "type": "string",
+            "oneOf": [
+                {"const": output.name, "description": output.meaning, "x-numbers": output.is_numbers}
+                for output in OUTPUTS.values()
+            ],
+        }
+    ),
+]
+
+
 class PoseOut(BaseModel):
     """A pose in both forms."""
 
@@ -244,6 +259,7 @@ class SceneOut(BaseModel):
     metrics: dict[str, float]
     dataset_name: str | None
     dataset_sha256: str | None
+    outputs: list[OutputName] = Field(description="What can be rendered of it.")
     label_names: dict[int, str] = Field(description="What the values of the output labels mean; empty: it has none.")
     confidence: ConfidenceOut | None = Field(description="null: the scene cannot tell the confidence of its frames.")
 

@@ -16,7 +16,7 @@ from ultragray.probe import Picture
 from ultragray_workers.pool.types import RenderResult
 
 from ..core.pose_stream import Answered, StreamMode
-from .schemas import DisplayBody, MatrixRows, PoseBody, ProbeBody, RequestModel
+from .schemas import DisplayBody, MatrixRows, OutputName, PoseBody, ProbeBody, RequestModel
 
 _ALIGNMENT = 8  # so that a client may look at float32 pixels where they lie
 
@@ -82,7 +82,7 @@ class FrameHeader(Answer):
     height: int
     width: int
     picture: PictureOut
-    outputs: list[str]
+    outputs: list[OutputName]
     encoding: str
     extrapolation: Extrapolation
     queue_ms: float

@@ -14,11 +14,13 @@ export interface Described {
   enum?: string[];
   const?: string;
   examples?: unknown[];
+  "x-numbers"?: boolean;
   properties?: Record<string, Described>;
   items?: Described;
   oneOf?: Described[];
 }
 
+const UNUSUAL: Record<string, string> = { bmode: "B-mode", tgc: "TGC" };
 const UNITS: Record<string, string> = { mm: "mm", deg: "°", db: "dB", s: "s", ms: "ms" };
 
 /** The name of a field as people read it, and its unit, by which the name ends. */
@@ -26,7 +28,7 @@ export function labelOf(name: string): { label: string; unit: string } {
   const words = name.split("_");
   const unit = words.length > 1 ? UNITS[words.at(-1)!] : undefined;
   if (unit !== undefined) words.pop();
-  const label = words.join(" ");
+  const label = words.map((word) => UNUSUAL[word] ?? word).join(" ");
   return { label: label.charAt(0).toUpperCase() + label.slice(1), unit: unit ?? "" };
 }
 

@@ -2,6 +2,7 @@
 
 import type { Pose } from "../geometry/pose";
 import { apiKey, type Schemas } from "./client";
+import type { Output } from "./outputs";
 
 export type StreamSettings = Omit<Schemas["StreamSettings"], "encoding">;
 export type Display = Schemas["FrameHeader"]["display"];
@@ -210,7 +211,7 @@ export function decodeFrame(message: ArrayBuffer): Frame {
 }
 
 /** The pixels of one output of a frame; undefined where it was not asked for. */
-export function outputPixels({ header, pixels }: Frame, output: string): Uint8Array | undefined {
+export function outputPixels({ header, pixels }: Frame, output: Output): Uint8Array | undefined {
   const index = header.outputs.indexOf(output);
   if (index < 0) return undefined;
   const count = header.height * header.width;

@@ -41,7 +41,7 @@ export class PointCloud {
     const range = (sorted[Math.floor(count * 0.98)] ?? 1) - low || 1;
     for (let i = 0; i < count; i++) {
       const share = Math.max(0, Math.min(1, (values[i]! - low) / range));
-      this.#colours.set(ramp(colour === "intensity" ? "echo" : "transmittance", share), i * 3);
+      this.#colours.set(ramp(colour, share), i * 3);
     }
     this.object.geometry.attributes.color!.needsUpdate = true;
   }

@@ -3,6 +3,7 @@
 import { explain, mayPass, ServiceError, Unreachable } from "../api/client";
 import { defaultsOf } from "../api/described";
 import { settings } from "../api/generated/contract";
+import type { Output } from "../api/outputs";
 import { exampleProbe, PROBE_KINDS, type Probe } from "../api/probes";
 import { describeScene, trainingPoses, type SceneDescription } from "../api/scenes";
 import type { Display, StreamSettings } from "../api/stream";
@@ -120,7 +121,7 @@ export class Session {
   }
 
   /** What to ask the stream for; `plain`: without what changes the values of pixels. */
-  settings(outputs: string[], { plain = false } = {}): StreamSettings {
+  settings(outputs: Output[], { plain = false } = {}): StreamSettings {
     const { depth_mm, flip } = this.display;
     return {
       height: this.samples,

@@ -7,6 +7,7 @@ from typing import Annotated
 from fastapi import APIRouter, Query
 
 from ultragray.confidence.assess import read_model
+from ultragray.outputs import OUTPUTS
 from ultragray.scene_info import SceneHeader
 
 from ...core.catalog import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE, CatalogEntry, finite_metrics, summarise_training
@@ -104,6 +105,7 @@ def scene_out(name: str, header: SceneHeader, loaded_processes: int) -> SceneOut
         metrics=finite_metrics(header),
         dataset_name=None if info.dataset_name is None else str(info.dataset_name),
         dataset_sha256=None if info.dataset_sha256 is None else str(info.dataset_sha256),
+        outputs=[name for name, output in OUTPUTS.items() if output.lacks(info) is None],
         label_names=info.label_names,
         confidence=None if told is None else ConfidenceOut(error=told.error, fitted_on=told.fitted_on),
     )

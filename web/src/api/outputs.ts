@@ -1,0 +1,21 @@
+/** What can be rendered of a scene, as the service describes it. */
+
+import { labelOf } from "./described";
+import { scene } from "./generated/contract";
+import type { Schemas } from "./client";
+
+export type Output = Schemas["SceneOut"]["outputs"][number];
+
+interface DescribedOutput {
+  title: string;
+  meaning: string;
+  /** Whether its pixels are numbers that stand for something; else they are shares. */
+  isNumbers: boolean;
+}
+
+export const OUTPUTS = Object.fromEntries(
+  (scene.properties?.outputs?.items?.oneOf ?? []).map((one) => [
+    one.const,
+    { title: labelOf(one.const!).label, meaning: one.description ?? "", isNumbers: one["x-numbers"] ?? false },
+  ]),
+) as Record<Output, DescribedOutput>;
