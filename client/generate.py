@@ -1,26 +1,54 @@
-"""Generates client/ultragray_client/sync from aio with unasync: `python client/generate.py`.
+"""Generates what the client does not write by hand: `python client/generate.py`.
 
-`transport.py` and `__init__.py` are written by hand in both folders.
+`sync/` is `aio/` without its asyncio, by unasync; `transport.py` and `__init__.py` are written by hand in both.
+`contract.py` are the dataclasses of `ultragray` that callers fill in, without its checks, so that the client needs
+neither `ultragray` nor torch.
 """
 
 from __future__ import annotations
 
+import inspect
 import re
 import subprocess
 import sys
 import tempfile
+import textwrap
+from collections.abc import Iterable, Iterator
+from dataclasses import MISSING, Field, is_dataclass
+from enum import Enum
 from pathlib import Path
+from typing import Any, get_args, get_type_hints
 
 import unasync
+
+from ultragray.contract import Contract, Family, annotated_fields
+from ultragray.datasets.source import SourceOptions
+from ultragray.settings import RenderSettings
+from ultragray_workers.jobs.kinds import Specification
 
 PACKAGE = Path(__file__).resolve().parent / "ultragray_client"
 MODULES = ("client", "connection", "datasets", "jobs", "scenes", "stream")
 
+# The classes that callers fill in, each with all that it is made of, and the names that the client gives them.
+ROOTS = {"RenderSettings": RenderSettings, "DatasetOptions": SourceOptions, "Specification": Specification}
+LEFT_OUT = {"device_set"}  # a file is uploaded with its dataset
+OWN_TYPES = {"Poses": "Iterable[PoseLike]"}  # what the client takes in their place
+
+_CONTRACT_HEADER = '''# Generated from the dataclasses of ultragray by client/generate.py; change those.
+"""What callers fill in. The service checks the values."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Any, Literal, TypeAlias
+
+from .geometry import PoseLike
+'''
+_RAISES = re.compile(r"\s*\bRaises\s.*?(?=\n\n|\Z)", flags=re.DOTALL)
 _HEADER = "# Generated from aio/{name}.py by client/generate.py; change that file.\n"
-_REPLACEMENTS = {
-    "asyncio": "time",
-    "aclosing": "closing",
-}  # beyond those that unasync knows; asyncio.sleep alone is used
+_REPLACEMENTS = {"asyncio": "time", "aclosing": "closing"}  # of asyncio, `sleep` alone is used
 _KEYWORD = re.compile(r"\b(?:async|await) ")
 
 
@@ -44,6 +72,80 @@ def generate_sync(output_folder: Path) -> list[Path]:
     return formatted(written)
 
 
+def generate_contract(output_folder: Path) -> Path:
+    """Writes contract.py and returns its path."""
+    sources: dict[str, str] = {}
+    for name, cls in ROOTS.items():
+        _add(sources, cls, name)
+    target = output_folder / "contract.py"
+    target.write_text("\n".join([_CONTRACT_HEADER, f"__all__ = {sorted(sources)!r}", *sources.values()]))
+    return formatted([target])[0]
+
+
+def _add(sources: dict[str, str], cls: Any, name: str) -> None:
+    """Adds the source of a class under its name, after those of all that it is made of."""
+    if name in sources:
+        return
+    if issubclass(cls, Enum):
+        sources[name] = _enum_source(cls)
+    elif Family in cls.__bases__:
+        for member in cls.members.values():
+            _add(sources, member, member.__name__)
+        sources[name] = f"{name}: TypeAlias = {' | '.join(member.__name__ for member in cls.members.values())}"
+    else:
+        bases = [base for base in cls.__bases__ if is_dataclass(base)]
+        for other in (*bases, *_classes_in(get_type_hints(cls).values())):
+            _add(sources, other, other.__name__)
+        sources[name] = _dataclass_source(cls, name, bases)
+
+
+def _classes_in(annotations: Iterable[Any]) -> Iterator[Any]:
+    for annotation in annotations:
+        if isinstance(annotation, type) and issubclass(annotation, (Contract, Enum)):
+            yield annotation
+        yield from _classes_in(get_args(annotation))
+
+
+def _enum_source(cls: type[Enum]) -> str:
+    members = "\n".join(f"    {member.name} = {member.value!r}" for member in cls)
+    return f"class {cls.__name__}(str, Enum):\n    {_docstring(cls)}\n\n{members}\n"
+
+
+def _dataclass_source(cls: Any, name: str, bases: list[Any]) -> str:
+    names = inspect.get_annotations(cls).keys() - LEFT_OUT
+    own = [item for item, _ in annotated_fields(cls) if item.name in names]
+    options = ["frozen=True"]
+    if not cls.__dataclass_params__.eq:
+        options.append("eq=False")
+    if all(item.kw_only for item in own):
+        options.append("kw_only=True")
+    head = f"class {name}" + (f"({', '.join(base.__name__ for base in bases)})" if bases else "")
+    body = "\n".join(map(_field_source, own))
+    return f"@dataclass({', '.join(options)})\n{head}:\n    {_docstring(cls)}\n\n{body}\n"
+
+
+def _field_source(item: Field[Any]) -> str:
+    if item.name == "kind":
+        return f"    kind: Literal[{item.default!r}] = field(default={item.default!r}, repr=False, kw_only=True)"
+    default = ""
+    if item.default is not MISSING:
+        default = f" = {item.default if isinstance(item.default, Enum) else repr(item.default)}"
+    elif item.default_factory is not MISSING:
+        default = f" = field(default_factory={item.default_factory.__name__})"
+    annotation = re.sub(r"\w+", lambda word: OWN_TYPES.get(word[0], word[0]), str(item.type))
+    meaning = "\n    ".join(textwrap.wrap(item.metadata["description"], 110))
+    return f"    {item.name}: {annotation}{default}\n    {_quoted(meaning)}"
+
+
+def _docstring(cls: Any) -> str:
+    """The docstring, but for the errors: the client leaves checks to the service."""
+    return _quoted(_RAISES.sub("", inspect.cleandoc(cls.__doc__)).strip().replace("\n", "\n    "))
+
+
+def _quoted(text: str) -> str:
+    return f'"""{text}' + ('\n    """' if "\n" in text else '"""')
+
+
 def formatted(paths: list[Path]) -> list[Path]:
     """The files, in the project's format."""
     configuration = ["--config", str(PACKAGE.parents[1] / "pyproject.toml"), "--quiet", *map(str, paths)]
@@ -56,4 +158,5 @@ def formatted(paths: list[Path]) -> list[Path]:
 
 
 if __name__ == "__main__":
+    generate_contract(PACKAGE)
     generate_sync(PACKAGE / "sync")

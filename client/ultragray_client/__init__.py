@@ -15,7 +15,7 @@ from .datasets import Dataset
 from .errors import ClientError
 from .frames import Extrapolation, Frame, Picture, Timings
 from .geometry import Placement, PoseLike, Quaternion
-from .jobs import Job, JobError, JobEvent, JobKind, JobProgress, JobState
+from .jobs import Job, JobError, JobEvent, JobProgress, JobState
 from .pose_exchange import StreamMode
 from .scenes import ConfidenceFit, Scene, SceneEntry
 from .sync.client import Client
@@ -34,7 +34,6 @@ __all__ = [
     "Job",
     "JobError",
     "JobEvent",
-    "JobKind",
     "JobProgress",
     "JobState",
     "Picture",

@@ -1,66 +1,76 @@
+# Generated from the dataclasses of ultragray by client/generate.py; change those.
 """What callers fill in. The service checks the values."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
+
+from .geometry import PoseLike
 
 __all__ = [
+    "AroundSampler",
     "Below",
     "ConvexProbe",
+    "CoveredSampler",
     "DatasetOptions",
     "Display",
     "Encoding",
+    "FanSampler",
     "FrameSettings",
     "LinearProbe",
     "PhasedProbe",
     "Probe",
+    "RenderJob",
     "RenderSettings",
+    "Sampler",
+    "Specification",
+    "SplineSampler",
+    "TrainJob",
+    "TrainingSampler",
 ]
 
 
 @dataclass(frozen=True)
-class LinearProbe:
-    """Parallel scan lines; 0 < width, 0 ≤ near < far."""
-
-    width_mm: float
-    near_mm: float
-    far_mm: float
-    kind: Literal["linear"] = field(default="linear", repr=False, kw_only=True)
-
-
-@dataclass(frozen=True)
 class ConvexProbe:
-    """A fan of scan lines; `near_mm` is the radius of the face; 0 < angle ≤ 175."""
+    """A curved array: scan lines fan out from the apex, which is the origin."""
 
     opening_angle_deg: float
+    """Full angle of the fan."""
     near_mm: float
+    """Radius of the face: distance from the apex at which the image begins."""
     far_mm: float
+    """Distance from the apex at which the image ends, beyond `near_mm`."""
     kind: Literal["convex"] = field(default="convex", repr=False, kw_only=True)
 
 
 @dataclass(frozen=True)
+class LinearProbe:
+    """A linear array: parallel scan lines along +z, the face centred on the origin."""
+
+    width_mm: float
+    """Width of the face."""
+    near_mm: float
+    """Depth at which the image begins."""
+    far_mm: float
+    """Depth at which the image ends, beyond `near_mm`."""
+    kind: Literal["linear"] = field(default="linear", repr=False, kw_only=True)
+
+
+@dataclass(frozen=True)
 class PhasedProbe:
-    """A fan of scan lines from the centre of the face; 0 < angle ≤ 175."""
+    """A phased array: scan lines fan out from the centre of the face; `near_mm` is 0."""
 
     opening_angle_deg: float
+    """Full angle of the fan."""
     far_mm: float
+    """Depth at which the image ends."""
     kind: Literal["phased"] = field(default="phased", repr=False, kw_only=True)
 
 
-Probe: TypeAlias = LinearProbe | ConvexProbe | PhasedProbe
-
-
-@dataclass(frozen=True, kw_only=True)
-class DatasetOptions:
-    """How a dataset is read, as the options of `ultragray dataset check`; empty: as it is stored."""
-
-    crop: str = ""  # columns,rows of a sequence's image: 188:632,12:600
-    image_size: str = ""  # WIDTHxHEIGHT
-    frames: str = ""  # frames of a sequence to read at all: 0:90,100:120:2
-    train_frames: str = ""
-    val_frames: str = ""
+Probe: TypeAlias = ConvexProbe | LinearProbe | PhasedProbe
 
 
 class Below(str, Enum):
@@ -127,3 +137,152 @@ class RenderSettings(FrameSettings):
 
     encoding: Encoding = Encoding.UINT8
     """Form of the pixels."""
+
+
+@dataclass(frozen=True)
+class DatasetOptions:
+    """How a source is read. None leaves the choice to the source."""
+
+    train_frames: str | None = None
+    """Frames to train from, such as 0:90 or 0:90,100:120:2: places in the training file, or in the sequence."""
+    val_frames: str | None = None
+    """Frames to hold out, counted likewise."""
+    frames: str | None = None
+    """Frames of a sequence to read at all, such as 0:90,100:120:2."""
+    crop: str | None = None
+    """Region of a sequence's image that shows ultrasound: columns,rows, such as 188:632,12:600 (ends left out)."""
+    image_size: str | None = None
+    """Resize the frames: WIDTHxHEIGHT, such as 192x256."""
+
+
+@dataclass(frozen=True)
+class AroundSampler:
+    """`count` of the base poses, drawn at random with repetition, each turned and shifted at random.
+
+    It turns about a random axis through the probe's origin by a normal angle of standard deviation `rotation_deg`, and
+    shifts by a normal step of standard deviation `translation_mm` along each axis.
+    """
+
+    count: int
+    """How many poses."""
+    translation_mm: float = 2.0
+    """Standard deviation along each axis."""
+    rotation_deg: float = 5.0
+    """Standard deviation of the angle."""
+    seed: int = 0
+    """Of the random choices."""
+    kind: Literal["around"] = field(default="around", repr=False, kw_only=True)
+
+
+@dataclass(frozen=True)
+class CoveredSampler:
+    """`count` poses, uniform within the region that the base poses cover.
+
+    How far apart two poses are is the mean distance of the corresponding corners of their image planes, mm, so that
+    a turn counts by what it moves. The shortest links that join all base poses (a minimum spanning tree) say which are
+    neighbours; links longer than 4 times their median are gaps between sweeps and not covered. A pose is drawn by its
+    place on the links, uniform in their length: the blend of the two neighbours there (positions linear, orientations
+    by slerp), shifted by a step that is uniform in the ball whose radius is the neighbours' distance in position, and
+    turned about a random axis by an angle uniform up to the angle between them.
+    """
+
+    count: int
+    """How many poses."""
+    seed: int = 0
+    """Of the random choices."""
+    kind: Literal["covered"] = field(default="covered", repr=False, kw_only=True)
+
+
+@dataclass(frozen=True)
+class FanSampler:
+    """The base poses, tilted by every multiple of `step_deg` from −`tilt_deg` to +`tilt_deg`: one sweep a tilt.
+
+    The probe turns about its lateral axis x through the middle of its face, which stays where it is (linear: the
+    origin; otherwise `near_mm` along the axial axis). A positive tilt turns the beam towards −y, as
+    `freehand_poses(tilt_deg=…)` of the phantom does.
+    """
+
+    tilt_deg: float
+    """The largest tilt, to both sides."""
+    step_deg: float
+    """Between two tilts."""
+    kind: Literal["fan"] = field(default="fan", repr=False, kw_only=True)
+
+
+@dataclass(frozen=True)
+class SplineSampler:
+    """Poses on a path through the base poses in their order: `count` of them, or one every `spacing_mm`.
+
+    Positions lie on the natural cubic spline (continuous to its second derivative) over the length of the chords;
+    orientations go from base pose to base pose on the shortest way at even speed (slerp). Both ends are base poses
+    where `count` is above 1; with `spacing_mm` the last one is reached where the length allows it. Spacing is measured
+    along the chords. Poses that repeat count once.
+    """
+
+    count: int | None = None
+    """How many poses."""
+    spacing_mm: float | None = None
+    """Instead of count: distance along the path."""
+    kind: Literal["spline"] = field(default="spline", repr=False, kw_only=True)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainingSampler:
+    """The training poses of the scene as they are, in order."""
+
+    kind: Literal["training"] = field(default="training", repr=False, kw_only=True)
+
+
+Sampler: TypeAlias = AroundSampler | CoveredSampler | FanSampler | SplineSampler | TrainingSampler
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RenderJob:
+    """Many frames of a scene become one archive, at `poses`, or at those that `sampler` makes.
+
+    The sampler makes them of `poses`, or where none are given of the scene's training poses. Poses are kept as an array
+    of exact ones: up to 100,000 of them would be millions of Python's objects. A sampler keeps to poses that have
+    `min_confidence`; `poses` without a sampler must all have it.
+    """
+
+    scene: str
+    """Name of a scene."""
+    poses: Iterable[PoseLike] | None = None
+    """4x4 matrices, mm, probe to scene."""
+    sampler: Sampler | None = None
+    """Makes poses of the given ones, else of the scene's training poses."""
+    height: int | None = None
+    """Depth samples. Default: as trained, else 512."""
+    width: int | None = None
+    """Scan lines. Default: as trained, else 512."""
+    outputs: tuple[str, ...] = ("bmode",)
+    """Some of bmode, echo, transmittance, coverage, labels."""
+    format: str = "npz"
+    """tar: WebDataset; dicom and plus (.igs.mha): bmode in uint8."""
+    dtype: str | None = None
+    """uint8 or float32. Default: the format's own."""
+    min_confidence: float | None = None
+    """0 to 1. Poses below it are refused. Samplers keep within it: around and covered draw on until they have their
+    count, the others leave such poses out.
+    """
+    kind: Literal["render"] = field(default="render", repr=False, kw_only=True)
+
+
+@dataclass(frozen=True)
+class TrainJob:
+    """A dataset becomes a scene that is served."""
+
+    dataset: str
+    """Name of an uploaded dataset."""
+    scene: str
+    """Name that the scene will be served under."""
+    preset: str = "fast"
+    """fast, or paper: the released recipe."""
+    settings: dict[str, Any] = field(default_factory=dict)
+    """Any training settings instead of the preset's."""
+    device: str = "auto"
+    """auto, cpu, cuda or cuda:N."""
+    kind: Literal["train"] = field(default="train", repr=False, kw_only=True)
+
+
+Specification: TypeAlias = RenderJob | TrainJob

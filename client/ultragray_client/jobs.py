@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
+import uuid
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
 from typing import Any
 
-from google.protobuf.json_format import MessageToDict, ParseDict, ParseError
+from google.protobuf.json_format import MessageToDict
 
 from ultragray_proto.codec import from_message, words
 from ultragray_proto.v1 import jobs_pb2
 
 from .connection import Conversation
-from .errors import ClientError, InvalidArgument
+from .contract import Specification
+from .errors import ClientError
+from .geometry import pose_messages
+from .messages import message_of
 from .retries import Retries
-
-
-class JobKind(str, Enum):
-    TRAIN = "train"
-    RENDER = "render"
 
 
 class JobState(str, Enum):
@@ -60,10 +59,10 @@ class JobError:
 
 @dataclass(frozen=True)
 class Job:
-    """A training or a batch of frames. Times are ISO 8601, UTC; None: not yet."""
+    """What the service does in the background. Times are ISO 8601, UTC; None: not yet."""
 
     id: str
-    kind: JobKind
+    kind: str  # that of its specification
     state: JobState
     request_id: str
     specification: Mapping[str, Any]  # as it was asked for; of the poses only `pose_count`
@@ -93,7 +92,7 @@ class JobFilter:
     """Which jobs to list; None: all."""
 
     state: JobState | str | None
-    kind: JobKind | str | None
+    kind: str | None
 
 
 class Watch(Conversation[JobEvent]):
@@ -128,21 +127,26 @@ class Watch(Conversation[JobEvent]):
         return log
 
 
+def submission(specification: Specification, request_id: str | None, priority: int) -> jobs_pb2.SubmitJobRequest:
+    """The request for a job. With an id of its own a submission that is sent again gives the same job.
+
+    Raises InvalidPose, and InvalidArgument for a word that is none; the service checks the rest.
+    """
+    request_id = uuid.uuid4().hex if request_id is None else request_id
+    request = jobs_pb2.SubmitJobRequest(request_id=request_id, priority=priority)
+    job = getattr(request, specification.kind)
+    poses = getattr(specification, "poses", None)
+    others = {} if poses is None else {"poses": pose_messages(poses)}
+    job.MergeFrom(message_of(specification, type(job), **others))
+    job.SetInParent()
+    return request
+
+
 def job_from_message(message: jobs_pb2.Job) -> Job:
     """A job as the service tells it."""
     specification = _specification(getattr(message, message.WhichOneof("specification")))
     job: Job = from_message(message, Job, specification=specification)
     return job
-
-
-def sampler_message(sampler: Mapping[str, Any]) -> jobs_pb2.PoseSampler:
-    """Raises InvalidArgument for a field that does not exist."""
-    message = jobs_pb2.PoseSampler()
-    try:
-        ParseDict(dict(sampler), message)
-    except ParseError as error:
-        raise InvalidArgument(f"sampler {dict(sampler)} cannot be read: {error}", field="sampler") from None
-    return message
 
 
 def _specification(message: jobs_pb2.TrainJob | jobs_pb2.RenderJob) -> dict[str, Any]:

@@ -68,7 +68,8 @@ def to_message(value: Any, cls: type[_M], **others: Any) -> _M:
 
     Raises MessageInvalid for a word that its closed set does not have.
     """
-    return cls(**{**_told(value, cls.DESCRIPTOR), **others})  # type: ignore[attr-defined]
+    descriptor: Descriptor = cls.DESCRIPTOR  # type: ignore[attr-defined]
+    return cls(**_told(value, descriptor, frozenset(others)), **others)
 
 
 def from_message(message: Any, cls: Any, **others: Any) -> Any:
@@ -86,19 +87,21 @@ def words(enum: EnumDescriptor) -> Mapping[int, str]:
     return {one.number: one.name.removeprefix(prefix).lower() for one in enum.values if one.number != 0}
 
 
-def _told(value: Any, descriptor: Descriptor) -> dict[str, Any]:
-    """The fields of a message that a value has."""
+def _told(value: Any, descriptor: Descriptor, others: frozenset[str] = frozenset()) -> dict[str, Any]:
+    """The fields of a message that a value has, but for `others`."""
     cls: Any = type(value)
-    return _writer(cls, descriptor)(value)
+    return _writer(cls, descriptor, others)(value)
 
 
 @cache
-def _writer(cls: type[Any], descriptor: Descriptor) -> Callable[[Any], dict[str, Any]]:
-    """Makes the fields of a message from a value of a class that has attributes of these names."""
+def _writer(
+    cls: type[Any], descriptor: Descriptor, others: frozenset[str] = frozenset()
+) -> Callable[[Any], dict[str, Any]]:
+    """Makes the fields of a message, but for `others`, from a value of a class that has attributes of these names."""
     defaults = {one.name: one.default for one in fields(cls)} if is_dataclass(cls) else {}
 
     def has(name: str) -> bool:
-        return name in defaults or hasattr(cls, name)
+        return name not in others and (name in defaults or hasattr(cls, name))
 
     steps = [(one.name, _field_writer(one, defaults.get(one.name))) for one in descriptor.fields if has(one.name)]
     oneofs = [(name, _oneof_writer(kinds)) for name, kinds in _oneofs(descriptor).items() if has(name)]

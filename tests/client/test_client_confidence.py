@@ -12,7 +12,16 @@ import pytest
 
 from ultragray import GaussianScene, render
 from ultragray.confidence import Assessor
-from ultragray_client import Below, ConfidenceFit, Encoding, Extrapolation, FrameSettings, RenderSettings, errors
+from ultragray_client import (
+    AroundSampler,
+    Below,
+    ConfidenceFit,
+    Encoding,
+    Extrapolation,
+    RenderJob,
+    RenderSettings,
+    errors,
+)
 
 from ..service.conftest import HEIGHT, WIDTH, RunningService, StartService
 from ..service.test_served_confidence import BESIDE, FAR, MODEL, NEAR, at
@@ -122,9 +131,9 @@ def test_another_word_is_refused(client: Any) -> None:
 
 def test_jobs_keep_within_it(client: Any, tmp_path: Path) -> None:
     with pytest.raises(errors.LowConfidence, match=r"poses\[1\]"):
-        client.jobs.render("knowing", FrameSettings(min_confidence=0.5), poses=[at(NEAR), at(FAR)])
-    sampler = {"kind": "around", "count": 4, "translation_mm": 3.0}
-    job = client.jobs.render("knowing", FrameSettings(min_confidence=0.93, height=8, width=8), sampler=sampler)
+        client.jobs.submit(RenderJob(scene="knowing", poses=[at(NEAR), at(FAR)], min_confidence=0.5))
+    sampler = AroundSampler(count=4, translation_mm=3.0)
+    job = client.jobs.submit(RenderJob(scene="knowing", sampler=sampler, min_confidence=0.93, height=8, width=8))
     assert job.specification["min_confidence"] == 0.93
     client.jobs.wait(job.id)
     client.jobs.download(job.id, "frames.npz", tmp_path / "frames.npz")

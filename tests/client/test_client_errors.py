@@ -15,7 +15,9 @@ from ultragray_client.statuses import error_of_call, error_of_frame
 from ultragray_proto.v1 import scenes_pb2
 from ultragray_service.errors import STATUSES
 from ultragray_service.rpc.status import status_of
+from ultragray_workers import errors as workers_errors
 
+assert workers_errors, "imported, so that its classes are there"
 ALL = [cls for cls in error_classes() if cls.reason in STATUSES]
 OWN = {
     "UNREACHABLE",

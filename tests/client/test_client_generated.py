@@ -1,12 +1,17 @@
-"""The committed client for threads is the one that client/generate.py makes of the client for asyncio."""
+"""What client/generate.py writes is committed as it writes it."""
 
 from __future__ import annotations
 
 import importlib.util
+from dataclasses import asdict
 from pathlib import Path
 from types import ModuleType
 
 import pytest
+
+from ultragray import settings
+from ultragray.display import AS_RENDERED
+from ultragray_client import Display, RenderSettings
 
 CLIENT = Path(__file__).resolve().parents[2] / "client"
 BY_HAND = {"__init__.py", "transport.py"}
@@ -26,6 +31,16 @@ def test_the_client_for_threads_is_current(generator: ModuleType, tmp_path: Path
     generated = {path.name: path.read_text() for path in generator.generate_sync(tmp_path)}
     committed = {path.name: path.read_text() for path in (CLIENT / "ultragray_client" / "sync").glob("*.py")}
     assert {name: text for name, text in committed.items() if name not in BY_HAND} == generated
+
+
+def test_the_contract_is_current(generator: ModuleType, tmp_path: Path) -> None:
+    committed = CLIENT / "ultragray_client" / "contract.py"
+    assert committed.read_text() == generator.generate_contract(tmp_path).read_text()
+
+
+def test_the_contract_has_the_defaults_of_the_library() -> None:
+    for own, library in ((RenderSettings(), settings.RenderSettings()), (Display(), AS_RENDERED)):
+        assert asdict(own) == asdict(library)
 
 
 def test_nothing_of_asyncio_is_left_in_it(generator: ModuleType, tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ import grpc
 import numpy as np
 import pytest
 
-from ultragray_client import FrameSettings, JobState, RenderSettings, errors
+from ultragray_client import JobState, RenderJob, RenderSettings, errors
 from ultragray_client.downloads import downloaded
 from ultragray_client.jobs import Watch
 from ultragray_client.retries import Retries
@@ -102,8 +102,8 @@ def test_a_batch_goes_on(far_client: Any, proxy: Proxy) -> None:
 
 def test_a_download_goes_on_and_is_whole(far_client: Any, client: Any, proxy: Proxy, tmp_path: Path) -> None:
     poses = np.tile(np.eye(4), (60, 1, 1))
-    job = client.jobs.render(
-        "demo", FrameSettings(height=200, width=200, outputs=("bmode", "echo")), poses=poses, dtype="float32"
+    job = client.jobs.submit(
+        RenderJob(scene="demo", poses=poses, height=200, width=200, dtype="float32", outputs=("bmode", "echo"))
     )
     assert client.jobs.wait(job.id).state is JobState.SUCCEEDED
     client.jobs.download(job.id, "frames.npz", tmp_path / "straight.npz")
@@ -115,7 +115,7 @@ def test_a_download_goes_on_and_is_whole(far_client: Any, client: Any, proxy: Pr
 
 
 def test_a_watch_goes_on(far_client: Any, client: Any, proxy: Proxy) -> None:
-    job = client.jobs.render("demo", FrameSettings(height=300, width=300), poses=np.tile(np.eye(4), (20_000, 1, 1)))
+    job = client.jobs.submit(RenderJob(scene="demo", poses=np.tile(np.eye(4), (20_000, 1, 1)), height=300, width=300))
     events = far_client.jobs.watch(job.id)
     assert next(events).job.id == job.id
     proxy.cut_after(0)

@@ -10,7 +10,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ultragray_client import DatasetOptions, FrameSettings, JobKind, JobState, LinearProbe, errors
+from ultragray_client import (
+    AroundSampler,
+    CoveredSampler,
+    DatasetOptions,
+    FanSampler,
+    JobState,
+    LinearProbe,
+    RenderJob,
+    Sampler,
+    SplineSampler,
+    TrainingSampler,
+    TrainJob,
+    errors,
+)
 
 from ..service.http.test_http_datasets import poisoned_files, released_files
 
@@ -83,18 +96,18 @@ def test_uploads_that_are_refused(client: Any, folder: Path, name: str, tmp_path
 
 def test_the_life_of_a_training(client: Any, folder: Path, name: str, tmp_path: Path) -> None:
     client.datasets.upload(name, folder)
-    job = client.jobs.train(name, f"{name}.scene", settings=SETTINGS, device="cpu", request_id=name)
-    assert (job.kind, job.specification["settings"], job.request_id) == (JobKind.TRAIN, SETTINGS, name)
-    again = client.jobs.train(name, f"{name}.scene", settings=SETTINGS, device="cpu", request_id=name)
+    job = client.jobs.submit(TrainJob(name, f"{name}.scene", settings=SETTINGS, device="cpu"), request_id=name)
+    assert (job.kind, job.specification["settings"], job.request_id) == ("train", SETTINGS, name)
+    again = client.jobs.submit(TrainJob(name, f"{name}.scene", settings=SETTINGS, device="cpu"), request_id=name)
     assert again.id == job.id
     with pytest.raises(errors.RequestIdConflict):
-        client.jobs.train(name, f"{name}.other", settings=SETTINGS, device="cpu", request_id=name)
+        client.jobs.submit(TrainJob(name, f"{name}.other", settings=SETTINGS, device="cpu"), request_id=name)
     events = list(client.jobs.watch(job.id))
     done = [event.job for event in events if event.job][-1]
     assert (done.state, done.progress.step, done.error) == (JobState.SUCCEEDED, 20, None)
     assert done.state.final
     assert done == client.jobs.wait(job.id) == client.jobs.get(job.id)
-    assert done in client.jobs.list(state="succeeded", kind=JobKind.TRAIN)
+    assert done in client.jobs.list(state="succeeded", kind="train")
     assert len(client.jobs.list(limit=1)) == 1
     assert isinstance(client.jobs.log(job.id), str)
 
@@ -117,19 +130,22 @@ def test_the_life_of_a_training(client: Any, folder: Path, name: str, tmp_path: 
 
 def test_a_batch_of_frames_as_a_job(client: Any, tmp_path: Path) -> None:
     poses = np.tile(np.eye(4), (3, 1, 1))
-    job = client.jobs.render(
-        "demo", FrameSettings(height=8, width=6, outputs=("bmode", "echo")), poses=poses, dtype="uint8"
+    job = client.jobs.submit(
+        RenderJob(scene="demo", poses=poses, height=8, width=6, outputs=("bmode", "echo"), dtype="uint8")
     )
     assert (job.specification["pose_count"], job.specification["outputs"]) == (3, ("bmode", "echo"))
     assert client.jobs.wait(job.id).state is JobState.SUCCEEDED
     client.jobs.download(job.id, "frames.npz", tmp_path / "frames.npz")
     with np.load(tmp_path / "frames.npz") as frames:
         assert frames["echo"].shape == (3, 8, 6)
-    again = client.jobs.render("demo", FrameSettings(height=8, width=6), poses=poses)
+    again = client.jobs.submit(RenderJob(scene="demo", poses=poses, height=8, width=6))
     assert again.request_id != job.request_id != ""
-    for sampler in ({"kind": "around", "number": 2}, {"kind": "around", "count": "many"}):
-        with pytest.raises(errors.InvalidArgument, match="sampler"):
-            client.jobs.render("demo", sampler=sampler)
+    with pytest.raises(errors.InvalidArgument, match="count"):
+        client.jobs.submit(RenderJob(scene="demo", sampler=AroundSampler(count=0)))
+    with pytest.raises(errors.UnknownOutput, match="shadow"):
+        client.jobs.submit(RenderJob(scene="demo", poses=poses, outputs=("shadow",)))
+    with pytest.raises(errors.InvalidPose, match=r"poses\[1\] must be"):
+        client.jobs.submit(RenderJob(scene="demo", poses=[np.eye(4), np.eye(3)]))
     with pytest.raises(errors.InvalidArgument, match="state must be one of queued"):
         client.jobs.list(state="lost")
 
@@ -137,25 +153,23 @@ def test_a_batch_of_frames_as_a_job(client: Any, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("sampler", "format", "dtype"),
     [
-        ({"kind": "training"}, "tar", "float32"),
-        ({"kind": "around", "count": 2, "translation_mm": 1.5, "rotation_deg": 3.0, "seed": 1}, "npz", "uint8"),
-        ({"kind": "spline", "spacing_mm": 2.0}, "zarr", "float32"),
-        ({"kind": "fan", "tilt_deg": 4.0, "step_deg": 2.0}, "hdf5", "uint8"),
-        ({"kind": "covered", "count": 2, "seed": 5}, "plus", "uint8"),
+        (TrainingSampler(), "tar", "float32"),
+        (AroundSampler(count=2, translation_mm=1.5, rotation_deg=3.0, seed=1), "npz", "uint8"),
+        (SplineSampler(spacing_mm=2.0), "zarr", "float32"),
+        (FanSampler(tilt_deg=4.0, step_deg=2.0), "hdf5", "uint8"),
+        (CoveredSampler(count=2, seed=5), "plus", "uint8"),
     ],
 )
-def test_every_sampler_is_taken(client: Any, sampler: dict[str, Any], format: str, dtype: str) -> None:
-    job = client.jobs.render(
-        "demo", FrameSettings(height=8, width=8), sampler=sampler, format=format, dtype=dtype, priority=-1000
-    )
-    told = job.specification
-    assert (told["sampler"], told["format"], told["dtype"]) == (sampler, format, dtype)
+def test_every_sampler_is_taken(client: Any, sampler: Sampler, format: str, dtype: str) -> None:
+    specification = RenderJob(scene="demo", sampler=sampler, height=8, width=8, format=format, dtype=dtype)
+    told = client.jobs.submit(specification, priority=-1000).specification
+    given = {name: value for name, value in vars(sampler).items() if value is not None}
+    assert (told["sampler"], told["format"], told["dtype"]) == (given, format, dtype)
 
 
 def test_cancel_and_retry(client: Any) -> None:
-    job = client.jobs.render(
-        "demo", FrameSettings(height=300, width=300), poses=np.tile(np.eye(4), (20_000, 1, 1)), priority=-5
-    )
+    poses = np.tile(np.eye(4), (20_000, 1, 1))
+    job = client.jobs.submit(RenderJob(scene="demo", poses=poses, height=300, width=300), priority=-5)
     cancelled = client.jobs.cancel(job.id)
     assert client.jobs.wait(job.id).state is JobState.CANCELLED
     assert client.jobs.cancel(job.id).state is JobState.CANCELLED

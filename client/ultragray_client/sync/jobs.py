@@ -3,18 +3,15 @@
 
 from __future__ import annotations
 
-import uuid
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 from ultragray_proto.v1 import jobs_pb2, jobs_pb2_grpc
 
-from ..contract import FrameSettings
+from ..contract import Specification
 from ..downloads import downloaded
-from ..geometry import PoseLike, pose_messages
-from ..jobs import Job, JobEvent, JobFilter, JobKind, JobState, Watch, job_from_message, sampler_message
+from ..jobs import Job, JobEvent, JobFilter, JobState, Watch, job_from_message, submission
 from ..messages import message_of
 from .connection import Connection
 from .transport import run_blocking
@@ -31,68 +28,28 @@ class Jobs:
         self._connection = connection
         self._calls = jobs_pb2_grpc.JobServiceStub(connection.channel)
 
-    def train(
+    def submit(
         self,
-        dataset: str,
-        scene: str,
+        specification: Specification,
         *,
-        preset: str = "fast",
-        settings: Mapping[str, Any] | None = None,
-        device: str = "auto",
         request_id: str | None = None,
         priority: int = 0,
         timeout_s: float | None = None,
     ) -> Job:
-        """Puts a training into the queue: the dataset becomes a scene that is served under the name `scene`.
+        """Puts a job into the queue: `TrainJob(dataset="liver", scene="liver")` makes a scene that is served,
+        `RenderJob(scene="demo", sampler=FanSampler(tilt_deg=10, step_deg=2))` an archive of frames.
 
-        `preset` "fast" or "paper"; `settings` replace some of its training settings. Raises DatasetNotFound,
-        SceneExists, JobQueueFull, InvalidArgument.
+        Raises DatasetNotFound, SceneNotFound, SceneExists, JobQueueFull, ExtraMissing, StorageFull, LowConfidence and
+        other kinds of InvalidArgument.
         """
-        job = jobs_pb2.TrainJob(dataset=dataset, scene=scene, preset=preset, device=device, settings=settings)
-        return self._submit(jobs_pb2.SubmitJobRequest(train=job, priority=priority), request_id, timeout_s)
-
-    def render(
-        self,
-        scene: str,
-        settings: FrameSettings | None = None,
-        *,
-        poses: Iterable[PoseLike] | None = None,
-        sampler: Mapping[str, Any] | None = None,
-        format: str = "npz",
-        dtype: str = "",
-        request_id: str | None = None,
-        priority: int = 0,
-        timeout_s: float | None = None,
-    ) -> Job:
-        """Puts frames into the queue that become one archive: of `poses`, mm, or of a `sampler` such as
-        `{"kind": "fan", "tilt_deg": 10, "step_deg": 2}`, around the poses or else the scene's training poses.
-
-        A sampler's `kind` is training, around, spline, fan or covered. `format` "npz", "tar", "zarr", "hdf5", "dicom"
-        or "plus"; `dtype` "uint8" or "float32", empty: the format's own. A pose whose confidence is below
-        `min_confidence` of the settings is refused; a sampler keeps within it. Raises SceneNotFound, JobQueueFull,
-        ExtraMissing, StorageFull, LowConfidence and other kinds of InvalidArgument.
-        """
-        job = message_of(
-            settings or FrameSettings(),
-            jobs_pb2.RenderJob,
-            scene=scene,
-            poses=() if poses is None else pose_messages(poses),
-            sampler=None if sampler is None else sampler_message(sampler),
-            format=format,
-            dtype=dtype,
-        )
-        return self._submit(jobs_pb2.SubmitJobRequest(render=job, priority=priority), request_id, timeout_s)
-
-    def _submit(self, request: jobs_pb2.SubmitJobRequest, request_id: str | None, timeout_s: float | None) -> Job:
-        # With an id of its own a submission that is sent again gives the same job.
-        request.request_id = uuid.uuid4().hex if request_id is None else request_id
+        request = submission(specification, request_id, priority)
         return job_from_message((self._connection.answer(self._calls.SubmitJob, request, timeout_s)).job)
 
     def list(
         self,
         *,
         state: JobState | str | None = None,
-        kind: JobKind | str | None = None,
+        kind: str | None = None,
         limit: int | None = None,
         timeout_s: float | None = None,
     ) -> tuple[Job, ...]:
