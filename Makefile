@@ -3,6 +3,8 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+# A file of tests belongs to one process, which shares its services among them.
+PYTEST := $(BIN)/pytest --numprocesses auto --maxprocesses 4 --dist loadfile
 KERNEL_SOURCES := $(wildcard model/kernels/*) CMakeLists.txt pyproject.toml
 PYTHON_SOURCES := model service workers proto client tests benchmarks docs examples
 NPM := $(shell command -v npm)
@@ -13,7 +15,7 @@ DATA ?= ../shared/data
 ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help serve console test test-long test-console test-faults check format bench bench-console bench-cuda results demo-scene generate clean
+.PHONY: help serve console test test-fast test-long test-console test-faults check format bench bench-console bench-cuda results demo-scene generate clean
 
 help:  ## say what there is
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
@@ -26,10 +28,14 @@ console: $(CONSOLE)  ## build the console, which the service serves at / (needs 
 
 test: $(VENV)/installed-dev  ## set up, then run the tests (ARGS="-k probe" for some)
 	@$(CONSOLE_IF_POSSIBLE)
-	$(BIN)/pytest -m "not long" $(ARGS)
+	$(PYTEST) -m "not long" $(ARGS)
 
-test-long: $(VENV)/installed-dev  ## the tests that take long
-	$(BIN)/pytest -m long $(ARGS)
+test-fast: $(VENV)/installed-dev  ## those that take a minute together, for while one works: without processes of their own
+	$(PYTEST) -m "not slow and not long" $(ARGS)
+
+test-long: $(VENV)/installed-dev  ## those that make test leaves out; what came of it goes to tests/long-run.json
+	@$(CONSOLE_IF_POSSIBLE)
+	$(PYTEST) -m long --record-in tests/long-run.json $(ARGS)
 
 test-console: $(VENV)/installed-dev $(CONSOLE)  ## the console in Debian's Chromium against a real service; leaves screenshots in build
 	node --test --test-concurrency=1 tests/console/*.test.mjs

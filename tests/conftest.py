@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
+import subprocess
+import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +34,7 @@ if not torch.cuda.is_available():
 RUN = f"PYTEST_RUN={os.getpid()}\0"  # in the environment of every process that these tests start
 os.environ["PYTEST_RUN"] = str(os.getpid())
 
+BEGAN = time.monotonic()
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 LARGEST_FLIP = 5e-3  # a threshold that flips moves a pixel by about 1/255
 
@@ -154,13 +159,53 @@ def random_poses() -> Callable[..., FloatArray]:
     return make
 
 
+# Fixtures that start processes: tests that use them are `slow`.
+_STARTING = {
+    "benched",
+    "machine",
+    "open_pool",
+    "postgres",
+    "start_service",
+    "start_shared_service",
+    "start_worker",
+    "wanted",
+}
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Tests marked `gpu` are skipped where there is none."""
-    if torch.cuda.is_available():
-        return
+    """Tests marked `gpu` are skipped where there is none; tests that start processes are `slow`."""
+    without_gpu = pytest.mark.skip(reason="there is no CUDA device")
     for item in items:
-        if item.get_closest_marker("gpu"):
-            item.add_marker(pytest.mark.skip(reason="there is no CUDA device"))
+        if item.get_closest_marker("gpu") and not torch.cuda.is_available():
+            item.add_marker(without_gpu)
+        if _STARTING.intersection(getattr(item, "fixturenames", ())):
+            item.add_marker(pytest.mark.slow)
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--record-in", type=Path, help="write when, at which commit and how this run ended to a JSON file")
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_terminal_summary(terminalreporter: Any, exitstatus: int, config: pytest.Config) -> None:
+    """Writes the file of `--record-in`."""
+    path: Path | None = config.getoption("--record-in")
+    if path is None:
+        return
+    commit = ["git", "describe", "--always", "--dirty", "--exclude=*", "--abbrev=12"]
+    counts = {kind: len(terminalreporter.stats.get(kind, ())) for kind in ("passed", "failed", "error", "skipped")}
+    record = {
+        "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        "commit": subprocess.run(commit, cwd=Path(__file__).parent, capture_output=True, text=True).stdout.strip(),
+        "seconds": round(time.monotonic() - BEGAN),
+        "cpus": os.cpu_count(),
+        "exit_status": int(exitstatus),
+        **counts,
+        "not_passed": sorted(
+            report.nodeid for kind in ("failed", "error") for report in terminalreporter.stats.get(kind, ())
+        ),
+    }
+    path.write_text(json.dumps(record, indent=2) + "\n")
 
 
 @pytest.fixture(scope="session")

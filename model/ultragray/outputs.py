@@ -32,7 +32,7 @@ class Output:
     name: str
     meaning: str
     planes: tuple[str, ...]
-    """The planes that the backends draw for it."""
+    """What the backends draw for it."""
     derive: Callable[[Drawing], Tensor]
     """The output [C, H, W] of a drawing."""
     dtype: np.dtype[Any] = _AMOUNTS
@@ -42,7 +42,7 @@ class Output:
     tells_support: bool = False
     """Whether it keeps its values where pixels without support are blackened."""
     lacks: Callable[[SceneInfo], str | None] = lambda _: None
-    """The scenes that give it, in words, where a scene does not; None where it does."""
+    """Which scenes give it, in words, where a scene does not; None where it does."""
 
     @property
     def is_numbers(self) -> bool:

@@ -1,4 +1,4 @@
-"""The console in Debian's Chromium against a real service: what is quick of `make test-console`."""
+"""The console in Debian's Chromium against a real service: one view in `make test`, the others in `make test-long`."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ ROOT = HERE.parents[1]
 CHROMIUM = os.environ.get("ULTRAGRAY_TEST_CHROMIUM", "/usr/bin/chromium")
 BUILT = ROOT / "service/ultragray_service/console"
 MAX_BUNDLE_BYTES = 350_000  # gzipped
+IN_EVERY_RUN = "key.test.mjs"
 TIMEOUT_S = 600.0
 MIN_NODE = 20
 
@@ -50,11 +51,16 @@ def test_bundle_is_small() -> None:
     assert 0 < total < MAX_BUNDLE_BYTES
 
 
-@pytest.mark.slow
-def test_scan() -> None:
-    """One view; `make test-console` looks at all of them."""
+@pytest.mark.parametrize(
+    "view",
+    [
+        pytest.param(path.name, marks=pytest.mark.slow if path.name == IN_EVERY_RUN else pytest.mark.long)
+        for path in sorted(HERE.glob("*.test.mjs"))
+    ],
+)
+def test_view(view: str) -> None:
     outcome = subprocess.run(
-        ["node", "--test", "--test-reporter=spec", str(HERE / "scan.test.mjs")],
+        ["node", "--test", "--test-reporter=spec", str(HERE / view)],
         env={**os.environ, "ULTRAGRAY_TEST_PYTHON": sys.executable},
         capture_output=True,
         text=True,

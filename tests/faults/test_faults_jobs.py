@@ -148,7 +148,7 @@ def steps_done(jobs: dict[str, Job]) -> int:
     return sum(job.progress.step or 0 for job in jobs.values() if job.kind == "train")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_every_job_ends_as_if_nothing_had_been_killed(machine: Machine) -> None:
     began = time.monotonic()
     machine.start_without_workers()

@@ -124,7 +124,7 @@ def test_copying_it_needs_no_torch(tmp_path: Path) -> None:
 # Its figures
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_its_figures_are_good_and_those_of_the_held_out_sweep(scene: GaussianScene, held_out: Sweep) -> None:
     stored = scene.info.metrics
     assert stored["psnr_db"] > 21.0

@@ -182,6 +182,7 @@ def test_bad_settings_are_one_clear_error(start_service: StartService, settings:
     assert "Traceback" not in said
 
 
+@pytest.mark.slow
 def test_the_service_process_never_imports_torch() -> None:
     code = "import sys, ultragray_service.server; sys.exit('torch' in sys.modules)"
     path = os.pathsep.join(str(ROOT / folder) for folder in SOURCE_FOLDERS)

@@ -79,6 +79,7 @@ def run_render(data_folder: Path, output: Path, interpret: str) -> subprocess.Co
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("interpret", "renderer"), WHERE)
 def test_the_command_line_renders_what_the_cpu_renders(
     data_folder: Path, demo_scene: GaussianScene, tmp_path: Path, interpret: str, renderer: str
@@ -91,6 +92,7 @@ def test_the_command_line_renders_what_the_cpu_renders(
         assert f" {renderer}" in str(archive["renderer"])
 
 
+@pytest.mark.slow
 @needs_no_gpu
 def test_the_command_line_without_a_gpu_says_so_in_one_line(data_folder: Path, tmp_path: Path) -> None:
     done = run_render(data_folder, tmp_path / "frames.npz", "0")

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import httpx
+import pytest
 
 from ..postgres import PASSWORD, PostgresServer
 from ..waiting import wait_until
@@ -36,6 +37,7 @@ def watch(client: httpx.Client, job_id: str, told: list[dict[str, Any]]) -> None
         told += [json.loads(line[6:]) for line in answer.iter_lines() if line.startswith('data: {"id"')]
 
 
+@pytest.mark.long
 def test_scene_is_trained_and_served_and_an_outage_passes(
     start_service: StartService, postgres: PostgresServer, tmp_path: Path, pose_body: dict[str, Any]
 ) -> None:

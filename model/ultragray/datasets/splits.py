@@ -1,4 +1,4 @@
-"""The split of frames into those trained from and those held out."""
+"""Which frames are trained from and which are held out."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Settings of a scanner's display, and frames as they look with them. Free of torch but for `frames`."""
+"""What a sonographer sets on a scanner, and how frames look with it. Free of torch but for `frames`."""
 
 from .settings import AS_RENDERED, FRAME_RANGE_DB, Display, true_to_scale
 

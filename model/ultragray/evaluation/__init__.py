@@ -1,1 +1,1 @@
-"""The quality of a scene: metrics on held-out frames, beside classical baselines."""
+"""How good a scene is: metrics on held-out frames, beside classical baselines."""

@@ -1,4 +1,4 @@
-"""Progress of a training, and the journal that keeps it: one JSON object a step in `metrics.jsonl`."""
+"""How far a training is, and the journal that keeps it: one JSON object a step in `metrics.jsonl`."""
 
 from __future__ import annotations
 

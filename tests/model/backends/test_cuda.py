@@ -53,8 +53,9 @@ def gradient(scene: GaussianScene, probe: Probe, poses: Any, backend: str) -> di
     return {name: leaf.grad.cpu().double().numpy() for name, leaf in leaves.items() if leaf.grad is not None}
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("shapes_of_a_gpu")
-@pytest.mark.parametrize("probe", [LINEAR, CONVEX], ids=["linear", "convex"])
+@pytest.mark.parametrize("probe", [pytest.param(LINEAR, marks=pytest.mark.long), CONVEX], ids=["linear", "convex"])
 def test_cut_up_as_on_a_gpu(probe: Probe, random_scene: Callable[..., GaussianScene], random_poses: Any) -> None:
     """Several blocks, tiles and chunks; frames and gradients as the reference's in float64."""
     scene, poses = random_scene(150, transmittance_logit=(-4, 2)), random_poses(1, seed=8)
@@ -201,6 +202,7 @@ def test_a_device_that_is_not_there_is_named() -> None:
         cuda.device(99)
 
 
+@pytest.mark.slow
 def test_importing_the_library_imports_no_triton() -> None:
     program = "import sys, ultragray; ultragray.render; sys.exit('triton' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
@@ -229,7 +231,8 @@ def compile_only(kernel, *arguments, grid, warmup, **options):
     compiled.setdefault(made.hash, (kernel.__name__, made.asm["cubin"]))
 
 JITFunction.run = compile_only
-for degree, probe in ((0, LinearProbe(40, 0, 50)), (3, ConvexProbe(60, near_mm=10, far_mm=60))):
+probes = {0: LinearProbe(40, 0, 50), 3: ConvexProbe(60, near_mm=10, far_mm=60)}
+for degree, probe in ((degree, probes[degree]) for degree in map(int, sys.argv[3:])):
     raw = {"means": (9, 3), "scales": (9, 3), "quats": (9, 4), "transmittances": (9,), "sh0": (9, 1, 1)}
     splats = {name: torch.rand(shape) for name, shape in raw.items()}
     splats["shN"] = torch.rand(9, (degree + 1) ** 2 - 1, 1)
@@ -247,13 +250,22 @@ for name, code in compiled.values():
 """
 
 
-@pytest.mark.parametrize("capability", [80, 90])
-def test_every_launch_compiles_for_gpus_and_keeps_to_its_registers(capability: int, tmp_path: Any) -> None:
+@pytest.mark.parametrize(
+    ("capability", "degrees"),
+    [
+        pytest.param("90", ["3"], marks=pytest.mark.slow),
+        pytest.param("90", ["0"], marks=pytest.mark.long),
+        pytest.param("80", ["0", "3"], marks=pytest.mark.long),
+    ],
+)
+def test_every_launch_compiles_for_gpus_and_keeps_to_its_registers(
+    capability: str, degrees: list[str], tmp_path: Any
+) -> None:
     """Triton's compiler needs no GPU, and sees what the interpreter does not, such as a type that changes in a loop."""
     environment = {name: value for name, value in os.environ.items() if name != "TRITON_INTERPRET"}
     environment["TRITON_CACHE_DIR"] = str(tmp_path)
     done = subprocess.run(
-        [sys.executable, "-c", COMPILE, str(capability), str(tmp_path)],
+        [sys.executable, "-c", COMPILE, capability, str(tmp_path), *degrees],
         env=environment,
         capture_output=True,
         text=True,

@@ -62,6 +62,7 @@ def test_a_depth_plane_off_by_one_row_does_not_match(
         assert_agrees(frames, file.expected, tolerance=5e-4, stable=file.stable)
 
 
+@pytest.mark.slow
 def test_reference_gradient_is_the_true_gradient(golden: Callable[[str], Any]) -> None:
     file = golden("g05")
     scene = file.scene(torch.float64)

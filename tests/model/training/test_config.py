@@ -54,6 +54,7 @@ def test_an_unknown_setting_is_refused_with_the_known_ones() -> None:
     assert caught.value.field == "stepz"
 
 
+@pytest.mark.slow
 def test_a_configuration_needs_no_torch() -> None:
     program = (
         f"import sys; sys.path[:] = {sys.path!r}; from ultragray.training import TrainingConfig; "

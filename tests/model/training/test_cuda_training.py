@@ -38,6 +38,7 @@ def learned(
     return train(dataset, config, report=seen.append, device=device, backend=backend), seen
 
 
+@pytest.mark.slow
 def test_learns_what_the_cpu_learns(dataset: Dataset, config: TrainingConfig) -> None:
     config = replace(config, refinements=0)  # whose random halves turn with quaternions that nothing decides yet
     expected, by_cpu = learned(dataset, config, "cpu", "cpu")
@@ -50,6 +51,7 @@ def test_learns_what_the_cpu_learns(dataset: Dataset, config: TrainingConfig) ->
     assert {tensor.device.type for tensor in found.splats.values()} == {"cpu"}
 
 
+@pytest.mark.long
 def test_resumed_run_ends_in_the_same_scene(dataset: Dataset, config: TrainingConfig, tmp_path: Path) -> None:
     expected = train(dataset, config, device="cuda", backend="cuda").to_bytes()
     steps = iter(range(100))

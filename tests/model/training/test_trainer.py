@@ -114,6 +114,7 @@ train(tiny.make_tiny_dataset(), tiny.make_tiny_config(), folder=pathlib.Path({fo
 """
 
 
+@pytest.mark.slow
 def test_killed_run_that_is_resumed_ends_in_the_same_scene(
     tiny_dataset: Datasets, tiny_config: Configs, tmp_path: Path
 ) -> None:

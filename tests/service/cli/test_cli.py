@@ -189,6 +189,7 @@ def test_mistakes_of_serve_are_named(scene_file: Path, tmp_path: Path) -> None:
     assert "backend" in refused("serve", scene_file, "--backend", "gpu")
 
 
+@pytest.mark.slow
 def test_serve_serves_the_given_file_until_sigterm(scene_file: Path, tmp_path: Path) -> None:
     arguments = ("serve", scene_file, "--http-port", 0, "--grpc-port", 0, "--threads", 1)
     program = "from ultragray_service.cli.app import app; app()"

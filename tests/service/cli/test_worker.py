@@ -53,6 +53,7 @@ def demo_store(tmp_path: Path) -> JobStore:
     return JobStore(tmp_path / "artifacts", None, scenes=SceneStore(tmp_path / "data"))
 
 
+@pytest.mark.slow
 def test_worker_command_does_a_job_and_stops(demo_store: JobStore, tmp_path: Path) -> None:
     job, _ = demo_store.submit(JOB)
     options = ["--artifact-folder", str(tmp_path / "artifacts"), "--name", "mine", "--device", "cpu", "--threads", "1"]

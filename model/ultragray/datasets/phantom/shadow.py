@@ -1,4 +1,4 @@
-"""The shadow of bone in the phantom, and the error of a rendering there."""
+"""Where bone hides the phantom from the probe, and what a rendering shows there."""
 
 from __future__ import annotations
 

@@ -72,6 +72,7 @@ def hosts(artifact_folder: Path, database_url: str, tmp_path: Path) -> Iterator[
         process.wait()
 
 
+@pytest.mark.long
 def test_hosts_share_one_queue_and_one_takes_over_from_the_other(
     store: JobStore,
     artifact_folder: Path,

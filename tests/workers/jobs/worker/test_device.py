@@ -78,6 +78,7 @@ def test_gpu_is_one_device_by_any_name(tmp_path: Path) -> None:
     assert len({lock_path(tmp_path, device) for device in ("cpu", "cuda:0", "cuda:1")}) == 3
 
 
+@pytest.mark.long
 def test_two_workers_of_a_host_do_one_job_at_a_time(
     store: JobStore, start_worker: Callable[..., RunningWorker], until: Callable[..., Job]
 ) -> None:

@@ -132,6 +132,7 @@ def small_disk(artifact_folder: Path) -> Iterator[Path]:
     subprocess.run(["umount", "--lazy", artifact_folder], check=True)
 
 
+@pytest.mark.long
 def test_full_disk(small_disk: Path, tmp_path: Path, start_worker: StartWorker) -> None:
     from ..conftest import FINAL
 
@@ -169,6 +170,7 @@ def test_full_disk(small_disk: Path, tmp_path: Path, start_worker: StartWorker) 
     store.close()
 
 
+@pytest.mark.long
 def test_memory_that_does_not_suffice(
     store: JobStore, artifact_folder: Path, start_worker: StartWorker, until: Until
 ) -> None:

@@ -1,4 +1,4 @@
-"""The device that a backend's scenes must be on."""
+"""Where a backend's scenes must lie."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ class LoadedScene:
 
     @cached_property
     def assessor(self) -> Assessor:
-        """The assessor of its frames' extrapolation."""
+        """What tells how far its frames extrapolate."""
         return Assessor(self.scene.info, self.scene.training_poses)
 
 
