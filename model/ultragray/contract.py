@@ -112,7 +112,7 @@ class Family(Contract):
 
     @classmethod
     def __get_pydantic_core_schema__(cls, source: Any, handler: Any) -> Any:
-        """How pydantic, where it is used, reads the family: as the member that `kind` names."""
+        """The schema by which pydantic reads the family, as the member that `kind` names."""
         if Family not in cls.__bases__:
             return handler(source)
         from pydantic import Discriminator  # called by pydantic only
@@ -147,7 +147,7 @@ def optional_of(annotation: Any) -> tuple[Any, bool]:
 
 
 def to_dict(value: Any, *, with_none: bool = True) -> Any:
-    """What JSON holds of a contract dataclass: `{"kind": "convex", "opening_angle_deg": 60.0, …}`."""
+    """A contract dataclass as JSON holds it: `{"kind": "convex", "opening_angle_deg": 60.0, …}`."""
     if isinstance(value, Enum):
         return value.value
     if isinstance(value, (list, tuple)):

@@ -1,4 +1,4 @@
-"""What measures: the processor, as a table of figures names it."""
+"""The processor that figures were measured on, as a table names it."""
 
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ class Output:
     name: str
     meaning: str
     planes: tuple[str, ...]
-    """What the backends draw for it."""
+    """The planes that the backends draw for it."""
     derive: Callable[[Drawing], Tensor]
     """The output [C, H, W] of a drawing."""
     dtype: np.dtype[Any] = _AMOUNTS
@@ -42,7 +42,7 @@ class Output:
     tells_support: bool = False
     """Whether it keeps its values where pixels without support are blackened."""
     lacks: Callable[[SceneInfo], str | None] = lambda _: None
-    """Which scenes give it, in words, where a scene does not; None where it does."""
+    """The scenes that give it, in words, where a scene does not; None where it does."""
 
     @property
     def is_numbers(self) -> bool:

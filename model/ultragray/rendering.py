@@ -136,7 +136,7 @@ def choose_backend(name: str, scene: GaussianScene) -> str:
 
 
 def renderer_name(backend: str, scene: GaussianScene) -> str:
-    """What renders a scene, as every frame says it: `ultragray/0.1.0 cpu-avx512`, `ultragray/0.1.0 cuda-sm90`."""
+    """The name of a scene's renderer, as in every frame: `ultragray/0.1.0 cpu-avx512`, `ultragray/0.1.0 cuda-sm90`."""
     chosen = choose_backend(backend, scene)
     if chosen == "cpu":
         by = f"cpu-{cpu.INSTRUCTION_SETS[0]}"

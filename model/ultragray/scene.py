@@ -42,7 +42,7 @@ Prepared = TypeVar("Prepared")
 
 
 class _Kept(NamedTuple):
-    """What was made of a scene, and of what: holding the tensors keeps their identity from being reused."""
+    """A preparation of a scene and its sources: holding the tensors keeps their identity from being reused."""
 
     tensors: tuple[Tensor, ...]
     versions: tuple[int, ...]
@@ -150,7 +150,7 @@ class GaussianScene:
         return GaussianScene(**moved, info=self.info, training_poses=self.training_poses, labels=labels)
 
     def prepared(self, name: str, make: Callable[[], Prepared]) -> Prepared:
-        """What a backend makes of the scene, kept under its name until one of the tensors, or the activation, changes.
+        """A backend's preparation of the scene, kept by name until one of the tensors, or the activation, changes.
 
         A change that torch does not count (through `.data`) is not noticed.
         """

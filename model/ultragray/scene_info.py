@@ -1,4 +1,4 @@
-"""What a scene file says about itself, readable without torch: the header of the safetensors bundle.
+"""A scene file's description of itself, readable without torch: the header of the safetensors bundle.
 
 The file is one safetensors bundle. Tensors: means [N, 3] cm, scales [N, 3] log cm, quats [N, 4] wxyz, transmittances
 [N] logit, sh0 [N, 1, 1], shN [N, K−1, 1], all float32, training_poses [P, 4, 4] float64 mm, and, where the Gaussians
@@ -161,7 +161,7 @@ def expected_shapes(count: int, sh_degree: int) -> dict[str, tuple[int, ...]]:
 
 @dataclass(frozen=True)
 class SceneHeader:
-    """What `read_header` finds: the description and the training poses, no Gaussians."""
+    """The description and the training poses of a scene file, without the Gaussians."""
 
     info: SceneInfo
     training_poses: FloatArray  # [P, 4, 4] mm, probe→scene

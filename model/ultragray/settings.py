@@ -1,4 +1,4 @@
-"""What every door takes beside the scene and the poses: what to render, how it is shown, and in which form it comes.
+"""Settings of frames, as every door takes them beside the scene and the poses: content, display and encoding.
 
 A request's settings are checked and completed once, by `resolved`; what comes after trusts the result. Free of torch.
 """
@@ -42,7 +42,7 @@ class Encoding(str, Enum):
 
 
 class Below(str, Enum):
-    """What becomes of a frame whose confidence is below the limit."""
+    """The fate of a frame whose confidence is below the limit."""
 
     REFUSE = "refuse"
     MASK = "mask"
@@ -50,7 +50,7 @@ class Below(str, Enum):
 
 @dataclass(frozen=True, kw_only=True)
 class FrameSettings(Contract):
-    """What to render, but for the scene and the poses. None: as the scene has it.
+    """Settings of what is rendered, but for the scene and the poses. None: as the scene has it.
 
     Raises InvalidProbe, InvalidImageSize, UnknownOutput, InvalidArgument.
     """
@@ -103,7 +103,7 @@ class FrameSettings(Contract):
 
 @dataclass(frozen=True, kw_only=True)
 class RenderSettings(FrameSettings):
-    """What to render, and the form that it comes in, where neither an Accept header nor a file format decides that."""
+    """Settings with an encoding, for doors where neither an Accept header nor a file format decides it."""
 
     encoding: Encoding = described("Form of the pixels.", Encoding.UINT8)
 
@@ -133,7 +133,7 @@ class Resolved:
 
     @property
     def pixels(self) -> int:
-        """What is rendered or shown for one pose, whichever is more, over all outputs."""
+        """The number of pixels rendered or shown for one pose, whichever is more, over all outputs."""
         picture = self.picture
         return max(self.height * self.width, picture.height * picture.width) * len(self.outputs)
 

@@ -65,7 +65,7 @@ class _KeptHeaders:
         self._bytes = 0
 
     def get(self, name: str, version: FileVersion) -> SceneHeader | None:
-        """The header of a scene if it is of this version; another one goes."""
+        """The header of a scene if it is of this version; one of another version is dropped."""
         with self._lock:
             kept = self._kept.get(name)
             if kept is None or kept[0] != version:

@@ -1,1 +1,1 @@
-"""What renders: the reference, the C++ kernel of the CPU, the Triton kernels of the GPU."""
+"""The backends: the reference, the C++ kernel of the CPU, the Triton kernels of the GPU."""

@@ -1,4 +1,4 @@
-"""What lies at each pixel: the label whose Gaussians weigh most there (docs/physics.md §3)."""
+"""The label of each pixel: the one whose Gaussians weigh most there (docs/physics.md §3)."""
 
 from __future__ import annotations
 

@@ -109,7 +109,7 @@ def _inverse_root_covariance(scene: GaussianScene, rotation: Tensor) -> Tensor: 
 
 
 class Rays(NamedTuple):
-    """How a Gaussian meets a scan line, each [n, W]."""
+    """The crossing of a Gaussian and a scan line, each [n, W]."""
 
     s_star: Tensor  # depth of the largest weight, cm
     sigma: Tensor  # standard deviation along the ray, cm

@@ -1,4 +1,4 @@
-"""How far a frame extrapolates from what its scene was trained on, and how much it can be trusted."""
+"""The extrapolation of a frame from what its scene was trained on, and the confidence in it."""
 
 from .assess import SUPPORT_COVERAGE, Assessor, Extrapolation, supported
 from .figures import FIGURES, figure_arrays

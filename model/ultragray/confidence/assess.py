@@ -1,4 +1,4 @@
-"""What a frame says of itself: how far it extrapolates, and how much a real one would look like it. Needs no torch."""
+"""The assessment of a frame: its extrapolation, and how much a real frame would look like it. Needs no torch."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class Assessor:
 
 
 def supported(coverage: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:  # [C, H, W] -> [C, H, W]
-    """Which pixels Gaussians support: γ of at least SUPPORT_COVERAGE."""
+    """A mask of the pixels that Gaussians support: γ of at least SUPPORT_COVERAGE."""
     mask: npt.NDArray[np.bool_] = np.asarray(coverage) >= SUPPORT_COVERAGE
     return mask
 

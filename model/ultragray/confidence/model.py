@@ -93,7 +93,7 @@ class ConfidenceModel:
 
 
 def terms_of(measures: ViewMeasures, hardness: FloatArray) -> FloatArray:  # [P] -> [C, 1 + TERMS]
-    """What the weights are multiplied with: 1 and the negative terms of the formula."""
+    """The factors of the weights: 1 and the negative terms of the formula."""
     columns = (
         np.full(len(measures.distance_mm), -1.0),
         np.log1p(measures.interpolation_mm / NEAR_MM),

@@ -22,7 +22,7 @@ class SupportWatch:
         self._count = 0
 
     def look(self, coverage: Tensor) -> Tensor | None:  # [C, H, W] -> [C, H, W]
-        """Which pixels of the next C poses are to be black; None where none are."""
+        """A mask of the pixels of the next C poses that are to be black; None where none are."""
         masked = self._masked[self._count : self._count + len(coverage)]
         self._count += len(coverage)
         self._shares.append(_supported_shares(coverage))

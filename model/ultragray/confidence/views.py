@@ -1,4 +1,4 @@
-"""How a pose lies to the views that a scene was trained on. Needs no torch."""
+"""The place of a pose relative to the views that a scene was trained on. Needs no torch."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ class TrainingViews:
     def _offsets_mm(
         self, points: FloatArray, views: slice | npt.NDArray[np.intp]
     ) -> tuple[FloatArray, FloatArray]:  # [K, 3] mm -> [K, P] both
-        """How far points lie off the planes of views along elevation, and beside the images within the planes."""
+        """Distances of points off the planes of views along elevation, and beside the images within the planes."""
         x, elevation, z = (points @ self._axes[axis][:, views] - self._offsets[axis][views] for axis in range(3))
         probe = self._probe
         lateral, depth = probe.lines.beside(x, z)

@@ -1,4 +1,4 @@
-"""What is in a dataset, in numbers, and what looks wrong about it.
+"""Checks of a dataset: its contents in numbers, and what looks wrong about it.
 
 What cannot be used at all is refused when a dataset is read (`Sweep`, `Dataset`);
 warnings leave the choice to a person.

@@ -115,13 +115,6 @@ def format_of(source: str | Path) -> DatasetFormat:
     raise DatasetInvalid(f"{path}: a dataset is {', '.join(meanings)} or {last}")
 
 
-def dataset_format(name: str) -> DatasetFormat:
-    """The format of this name. Raises DatasetInvalid."""
-    if name not in FORMATS:
-        raise DatasetInvalid(f"there is no dataset format {name[:80]!r}, there are {', '.join(FORMATS)}")
-    return FORMATS[name]
-
-
 def _load_released(source: str, options: SourceOptions) -> Dataset:
     from .released import read_released
 

@@ -1,4 +1,4 @@
-"""Which frames are trained from and which are held out."""
+"""The split of frames into those trained from and those held out."""
 
 from __future__ import annotations
 

@@ -106,7 +106,7 @@ class Sweep:
 
 
 def corner_distances_mm(corners: FloatArray, others: FloatArray) -> FloatArray:  # [..., K, 3] both -> [...]
-    """How far image planes lie from each other: the mean distance of corresponding corners, mm; shapes broadcast."""
+    """Distances between image planes: the mean over corresponding corners, mm; shapes broadcast."""
     distances: FloatArray = np.linalg.norm(corners - others, axis=-1).mean(axis=-1)
     return distances
 
@@ -146,7 +146,7 @@ class Dataset:
 
     @property
     def sha256(self) -> str:
-        """What is in the dataset, however it is stored: images, poses, probe and split."""
+        """A hash of images, poses, probe and split, however they are stored."""
         digest = hashlib.sha256(json.dumps(to_dict(self.probe), sort_keys=True).encode())
         for part in (self.train, self.val):
             digest.update(repr(part.images.shape).encode())

@@ -1,4 +1,4 @@
-"""How much of the space around a sweep its image planes cross."""
+"""The share of the space around a sweep that its image planes cross."""
 
 from __future__ import annotations
 

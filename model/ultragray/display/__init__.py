@@ -1,4 +1,4 @@
-"""What a sonographer sets on a scanner, and how frames look with it. Free of torch but for `frames`."""
+"""Settings of a scanner's display, and frames as they look with them. Free of torch but for `frames`."""
 
 from .settings import AS_RENDERED, FRAME_RANGE_DB, Display, true_to_scale
 

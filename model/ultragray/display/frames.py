@@ -67,7 +67,7 @@ def _scan_converted(frames: Tensor, probe: Probe, pixel_mm: float, *, nearest: b
 def _grid(
     probe: Probe, height: int, width: int, pixel_mm: float, device: torch.device
 ) -> tuple[Tensor, Tensor]:  # [1, H', W', 2], [H', W']
-    """Where each pixel of the picture is sampled, from −1 to 1 across the frame, and whether anything is there."""
+    """The place of each pixel of the picture, from −1 to 1 across the frame, and whether anything is there."""
     rows, columns, inside = samples(probe, (height, width), pixel_mm)
     if probe.lines.wrap:  # the frame is then given the first column once more after the last, and the other way round
         columns, width = columns + 1.0, width + 2

@@ -39,7 +39,7 @@ def with_square_pixels(frame: FloatImage, probe: Probe, longer_side: int) -> Flo
 def samples(
     probe: Probe, shape: tuple[int, ...], pixel_mm: float
 ) -> tuple[FloatArray, FloatArray, BoolArray]:  # [H', W'] each
-    """Where each pixel of a picture lies in a frame of `shape` [H, W], in rows and columns, and whether it does."""
+    """Row and column of each pixel of a picture in a frame of `shape` [H, W], and whether it lies in the frame."""
     x, z = probe.picture(pixel_mm).positions_mm()
     rows, columns = probe.image_coordinates(x, z)
     inside = ~np.isnan(rows)

@@ -1,4 +1,4 @@
-"""What a sonographer sets on a scanner: gain, dynamic range, time-gain compensation, depth, flip, scan conversion.
+"""The settings of a scanner's display: gain, dynamic range, time-gain compensation, depth, flip, scan conversion.
 
 Free of torch; `show` in `ultragray.display.frames` applies it.
 """
@@ -45,7 +45,7 @@ class Display(Contract):
         return self.gain_db != 0.0 or self.dynamic_range_db != FRAME_RANGE_DB or any(self.tgc_db)
 
     def rows_shown(self, probe: Probe, height: int) -> int:
-        """How many of H rows are not cut off, at least one."""
+        """The number of H rows that are not cut off, at least one."""
         if self.depth_mm is None:
             return height
         share = (probe.face_depth_mm + self.depth_mm - probe.near_mm) / probe.scan_line_length_mm
@@ -65,7 +65,7 @@ class Display(Contract):
         return picture.flipped() if self.flip else picture
 
     def gains(self, rows: int) -> FloatArray:  # [rows]
-        """What is added to each row shown, in dB."""
+        """The gain that is added to each row shown, in dB."""
         gains = np.full(rows, self.gain_db)
         if self.tgc_db:
             points = np.linspace(0.0, 1.0, len(self.tgc_db))

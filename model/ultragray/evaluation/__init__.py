@@ -1,1 +1,1 @@
-"""How good a scene is: metrics on held-out frames, beside classical baselines."""
+"""The quality of a scene: metrics on held-out frames, beside classical baselines."""

@@ -1,4 +1,4 @@
-"""What a scene is measured against: frames predicted from the training frames themselves, without learning.
+"""Classical baselines: frames predicted from the training frames themselves, without learning.
 
 - median, mean, maximum: a compounded volume, re-sliced (ultragray.evaluation.compounding);
 - linear: each pixel between the two training planes that enclose it, by its distance to them along their normals;
@@ -42,7 +42,7 @@ def predict(sweep: Sweep, poses: FloatArray, method: str, *, voxel_mm: float = V
 def evaluate_baselines(
     dataset: Dataset, methods: Sequence[str] = BASELINES, voxel_mm: float = VOXEL_MM
 ) -> dict[str, Evaluation]:
-    """What each method reaches on the held-out frames. Raises DatasetInvalid where there are none."""
+    """The scores of each method on the held-out frames. Raises DatasetInvalid where there are none."""
     require_frames(dataset.val)
     return {
         method: evaluate_frames(predict(dataset.train, dataset.val.poses, method, voxel_mm=voxel_mm), dataset.val)
@@ -98,7 +98,7 @@ def _between(sweep: Sweep, points: FloatArray, frames: IntArray) -> FloatArray: 
 
 
 def _sample(sweep: Sweep, frame: int, local: FloatArray) -> tuple[npt.NDArray[np.bool_], FloatArray]:  # [P, 3] mm
-    """Which points (probe frame) fall into the image when projected onto y = 0; their bilinear values in [0, 1]."""
+    """A mask of the points that fall into the image when projected onto y = 0, and their bilinear values in [0, 1]."""
     rows, columns = sweep.probe.image_coordinates(local[:, 0], local[:, 2])
     inside = ~np.isnan(rows)
     image = sweep.images[frame]

@@ -113,7 +113,7 @@ def mean_axes(poses: FloatArray) -> FloatArray:  # [F, 4, 4] -> [3, 3]
 
 
 def pixel_positions_mm(probe: Probe, height: int, width: int) -> FloatArray:  # [H·W, 3], row by row
-    """Where each pixel lies in the probe frame, mm."""
+    """The place of each pixel in the probe frame, mm."""
     origins, directions = probe.scan_lines(width)
     positions: FloatArray = origins + probe.depths_mm(height)[:, None, None] * directions
     return positions.reshape(-1, 3)

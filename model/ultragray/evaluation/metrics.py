@@ -1,4 +1,4 @@
-"""How near a rendered frame comes to the real one: PSNR, MS-SSIM, GMS and GMSD, each per frame on [0, 1].
+"""Nearness of a rendered frame to the real one: PSNR, MS-SSIM, GMS and GMSD, each per frame on [0, 1].
 
 - PSNR = −10 log10(mean squared error), at most MAX_PSNR_DB, which identical frames get.
 - MS-SSIM of Wang, Simoncelli and Bovik (2003): five scales of an 11x11 Gaussian window, σ = 1.5, constants 0.01² and
@@ -32,7 +32,7 @@ CHUNK_PIXELS = 1 << 22  # measured at once
 
 @dataclass(frozen=True)
 class FrameMetrics:
-    """What one frame reaches, or the mean or standard deviation of several. Higher is better but for `gmsd`."""
+    """Metrics of one frame, or their mean or standard deviation over several. Higher is better but for `gmsd`."""
 
     psnr_db: float
     ms_ssim: float
@@ -45,7 +45,7 @@ class FrameMetrics:
 
 
 def ms_ssim_scales(height: int, width: int) -> int:
-    """How many of the five scales of MS-SSIM fit an image.
+    """The number of MS-SSIM's five scales that fit an image.
 
     Raises InvalidImageSize for a side under 11 pixels, which holds not even one window.
     """

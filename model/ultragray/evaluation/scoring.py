@@ -1,4 +1,4 @@
-"""How well a scene, or any other prediction, meets frames that it has not seen."""
+"""Scores of a scene, or of any other prediction, on frames that it has not seen."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def _measured(predictions: Iterable[npt.NDArray[np.float32]], sweep: Sweep) -> E
 
 
 def frames_at_once(height: int, width: int) -> int:
-    """How many frames of this size are rendered and measured together."""
+    """The number of frames of this size that are rendered and measured together."""
     return min(CHUNK_FRAMES, max(1, CHUNK_PIXELS // (height * width)))
 
 

@@ -33,7 +33,7 @@ def load_poses(path: str | Path) -> FloatArray:  # [P, 4, 4]
 
 
 def read_pose_array(path: str | Path) -> npt.NDArray[Any]:
-    """What a `.npy` or `.json` file holds, the last row completed, not yet checked for being poses.
+    """The array of a `.npy` or `.json` file, the last row completed, not yet checked for being poses.
 
     For a caller that checks them itself, frame by frame. Raises InvalidPose, naming a file that cannot be read.
     """

@@ -36,7 +36,7 @@ SPLATS = ("means", "quats", "scales", "sh0", "shN", "transmittances")  # in the 
 
 @dataclass(frozen=True)
 class CheckpointExport:
-    """What an export wrote, where its Gaussians' origin lies in the tracker's frame, and what it could not say."""
+    """The files that an export wrote, the place of its Gaussians' origin in the tracker's frame, and what was lost."""
 
     files: tuple[Path, ...]
     centre_mm: Vector

@@ -38,7 +38,7 @@ class TrainingImages:
 
 @dataclass(frozen=True)
 class ReleasedConfig:
-    """What a reader needs from conf.json, in mm and degrees. Exactly one of width and angle is given."""
+    """The values of conf.json that a reader needs, in mm and degrees. Exactly one of width and angle is given."""
 
     path: Path
     near_mm: float

@@ -36,7 +36,7 @@ BASELINE_NAMES = {
 
 @dataclass(frozen=True, eq=False)
 class ReportContent:
-    """What a report shows. `trained` is None for a scene that was read from a file; what failed says why.
+    """Contents of a report. `trained` is None for a scene that was read from a file; a part that failed says why.
 
     `spread` is how many held-out frames are shown at most, from the first to the last; None: the worst, a typical one
     and the best.
@@ -192,7 +192,7 @@ def _pictures(content: ReportContent) -> list[dict[str, Any]]:
 
 
 def _telling_places(content: ReportContent) -> dict[int, str]:
-    """Where the scene does worst, as usual, and best among the held-out frames; perhaps fewer than three."""
+    """The held-out frames where the scene does worst, as usual, and best; perhaps fewer than three."""
     order = np.argsort([-frame.psnr_db for frame in content.evaluation.frames], kind="stable")
     return {int(order[-1]): ", worst", int(order[len(order) // 2]): ", typical", int(order[0]): ", best"}
 

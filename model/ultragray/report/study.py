@@ -1,4 +1,4 @@
-"""What a report measures: a trained scene, the baselines, the ablations of the paper, and growing tilt."""
+"""The measurements of a report: a trained scene, the baselines, the ablations of the paper, and growing tilt."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Failed:
 
 
 def attempt(study: Callable[[], Result]) -> Result | Failed:
-    """What `study` gives, or why it could not: one of several studies must not take the others with it."""
+    """The result of `study`, or why there is none: a study that fails must not end the others."""
     try:
         return study()
     except UltragrayError as error:

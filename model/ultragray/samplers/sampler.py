@@ -42,10 +42,10 @@ class Sampler(Family):
 
 
 def count_field(*default: Any) -> Any:
-    """How many poses a sampler makes."""
+    """The field for the number of poses."""
     return described("How many poses.", *default, low=1, high=MAX_POSES)
 
 
 def seed_field() -> Any:
-    """What makes random choices the same again."""
+    """The field for the seed of random choices."""
     return described("Of the random choices.", 0, low=0, high=MAX_SEED)

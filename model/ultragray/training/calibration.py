@@ -84,6 +84,6 @@ def _some(places: IntArray, count: int) -> IntArray:
 
 
 def _black_ms_ssim(sweep: Sweep) -> float:
-    """What a black frame reaches against the training frames on average."""
+    """The mean score of a black frame against the training frames."""
     some = sweep.select(_some(np.arange(len(sweep)), BLACK_FRAMES))
     return evaluate_frames(np.zeros(some.images.shape, np.float32), some).mean.ms_ssim

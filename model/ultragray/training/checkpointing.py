@@ -31,7 +31,7 @@ METADATA_KEY = "ultragray-training"
 
 @dataclass(frozen=True)
 class CheckpointHeader:
-    """What a checkpoint says about its run."""
+    """The description of its run that a checkpoint holds."""
 
     step: int  # steps done
     elapsed_s: float

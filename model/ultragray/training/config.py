@@ -37,7 +37,7 @@ GROWTHS = ("even", "threshold")
 
 @dataclass(frozen=True)
 class TrainingConfig(Contract):
-    """How to train. The defaults are the preset `fast`; `TrainingConfig.preset` gives the others.
+    """Settings of a training. The defaults are the preset `fast`; `TrainingConfig.preset` gives the others.
 
     Rates are Adam's, for batches of one frame: the trainer multiplies them by √batch_size. Raises InvalidArgument,
     naming the field, for a value outside its range.

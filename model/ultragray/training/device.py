@@ -9,7 +9,7 @@ from ..errors import BackendUnavailable
 
 
 def training_device(name: str, backend: str) -> torch.device:
-    """Where the tensors of a training live: `cpu`, `cuda` (the first GPU) or `cuda:N`.
+    """The device of a training's tensors: `cpu`, `cuda` (the first GPU) or `cuda:N`.
 
     Raises BackendUnavailable for any other name, for a device that is not there, and for one that the backend does not
     render on, saying what to give instead.
@@ -34,7 +34,7 @@ def training_device(name: str, backend: str) -> torch.device:
 
 
 def forget_peak_memory(device: torch.device) -> None:
-    """What `peak_memory_mb` says begins anew."""
+    """Start the count of `peak_memory_mb` anew."""
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
 

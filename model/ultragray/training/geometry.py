@@ -1,4 +1,4 @@
-"""What training takes from a dataset: how large it is, how far apart its frames and pixels are, how bright."""
+"""Facts of a dataset that a training needs: its size, the spacing of its frames and pixels, its brightness."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MIN_GAUSSIANS, MAX_GAUSSIANS = 2_000, 150_000  # fewer hold no anatomy, more tak
 
 @dataclass(frozen=True)
 class Geometry:
-    """What a training takes from the data where its configuration leaves it open.
+    """Values that follow from the data where a training's settings leave them open.
 
     The scene scale is 1.1 × the largest distance of a corner of a training image from the centre.
     """

@@ -1,4 +1,4 @@
-"""How hard the place of each training view is to predict, from the frames alone: no learning, small pictures."""
+"""The difficulty of predicting each training view from the other frames alone: no learning, small pictures."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SMOOTHING = 0.01
 
 
 def hardness_of_views(sweep: Sweep) -> FloatArray:  # [F]
-    """How much worse than usual at such distances each frame is predicted by others, as a difference of logits.
+    """The shortfall of each frame's prediction by others against the usual one at such distances, in logits.
 
     Some frames are interpolated linearly between others (`baselines.interpolate_planes`), once with all of them and
     then without those near by; what the distances do not explain is the hardness, smoothed over the views around.

@@ -1,4 +1,4 @@
-"""Which training frames a calibration leaves out, so that what it measures mixes gaps, ends and tilts."""
+"""The choice of training frames that a calibration leaves out: a mix of gaps, ends and tilts."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def held_out_frames(sweep: Sweep) -> IntArray:  # [H] places, ascending
 
 
 def _path(sweep: Sweep) -> FloatArray:  # [F] in [0, 1]
-    """How far each frame is along the direction in which the middles of the images spread most."""
+    """The place of each frame along the direction in which the middles of the images spread most."""
     middles = sweep.corners_mm().mean(axis=1)
     offsets = middles - middles.mean(axis=0)
     _, _, directions = np.linalg.svd(offsets, full_matrices=False)

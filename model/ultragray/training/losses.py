@@ -1,4 +1,4 @@
-"""What a rendered frame costs: half L1, half structural dissimilarity.
+"""The loss of a rendered frame: half L1, half structural dissimilarity.
 
 Written in torch for any device and dtype; where both images are float32 on the CPU, the C++ kernel gives the same.
 """

@@ -71,7 +71,7 @@ def comparison_bytes(dataset: Dataset) -> int:
 
 
 def available_bytes() -> int | None:
-    """What this process may still take: free memory, less where its control group allows less; None: unknown."""
+    """Memory that is left for this process: what is free, less where its control group allows less; None: unknown."""
     found = [value for value in (_free_memory(), _left_in_group()) if value is not None]
     return min(found) if found else None
 
@@ -137,7 +137,7 @@ def check_comparison_memory(dataset: Dataset, config: TrainingConfig) -> None:
 
 
 def _missing(needed: int, config: TrainingConfig, free: int | None, place: str = "this machine") -> str | None:
-    """Who allows how much, where that is less than needed."""
+    """The limits that are lower than what is needed, and who sets them."""
     limit = free if config.memory_gb is None else int(config.memory_gb * GIB)
     if limit is None or needed <= limit:
         return None

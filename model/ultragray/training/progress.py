@@ -1,4 +1,4 @@
-"""How far a training is, and the journal that keeps it: one JSON object a step in `metrics.jsonl`."""
+"""Progress of a training, and the journal that keeps it: one JSON object a step in `metrics.jsonl`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which frames a step sees, and from how far out of their planes."""
+"""The frames of a step, and their shift out of their planes."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class BatchSampler:
 
 
 def out_of_plane_range_mm(sweep: Sweep, spacing_mm: float) -> float:
-    """How far the frames themselves say that a slice is blurred along elevation: the full range of the shift.
+    """The blur of a slice along elevation that the frames themselves show, as the full range of the shift.
 
     Each frame is predicted by its neighbours within ± half a range, with the weights that the shift is drawn with.
     Half the range with the best mean PSNR is taken (PSNR likes blur; the half has most of the gain and keeps detail),

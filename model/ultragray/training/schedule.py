@@ -48,11 +48,11 @@ class Schedule:
         return self._config.intensity_floor if step < self._config.floor_end * self.steps else 0.0
 
     def refinement(self, done: int) -> int | None:
-        """Which refinement, from 0, is due after `done` steps; None: none, as before the first and after the last."""
+        """The number, from 0, of the refinement that is due after `done` steps; None where none is due."""
         return self._refinements.get(done) if done > 0 else None
 
     def gaussian_limit(self, refinement: int) -> int:
-        """How many Gaussians there may be after a refinement."""
+        """The number of Gaussians that there may be after a refinement."""
         config = self._config
         assert config.initial_gaussians is not None
         assert config.max_gaussians is not None

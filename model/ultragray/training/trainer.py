@@ -190,7 +190,7 @@ class Trainer:
 
     @contextlib.contextmanager
     def logs(self, tensorboard: bool) -> Iterator[Log]:
-        """What takes the metrics of each step: the files of the run's folder, where it has one."""
+        """The sink of each step's metrics: the files of the run's folder, where it has one."""
         if self.folder is None:
             yield lambda line: None
             return

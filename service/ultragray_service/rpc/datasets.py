@@ -8,14 +8,13 @@ import grpc
 
 from ultragray.datasets.source import UPLOAD_OPTIONS
 from ultragray.errors import InvalidArgument
+from ultragray_proto.codec import to_message
 from ultragray_proto.v1 import datasets_pb2
-from ultragray_workers.datasets.store import DatasetRecord
 
 from ..core.catalog import DEFAULT_PAGE_SIZE
-from ..core.dataset_catalog import contact_sheet, dataset_page
 from ..core.dataset_uploads import DatasetUpload
+from ..core.datasets import contact_sheet, dataset_page
 from ..core.state import Service
-from .messages import probe_message
 
 
 class DatasetService:
@@ -38,21 +37,20 @@ class DatasetService:
                 await upload.begin_archive()
             await _receive(context, upload, archive=header.archive)
             record, is_new = await upload.finish()
-        return datasets_pb2.UploadDatasetResponse(dataset=_dataset(record), created=is_new)
+        return datasets_pb2.UploadDatasetResponse(dataset=to_message(record, datasets_pb2.Dataset), created=is_new)
 
     async def ListDatasets(  # noqa: N802
         self, request: datasets_pb2.ListDatasetsRequest, context: grpc.aio.ServicerContext
     ) -> datasets_pb2.ListDatasetsResponse:
         page_size = request.page_size or DEFAULT_PAGE_SIZE
-        records, next_page_token = await dataset_page(self._service.datasets, page_size, request.page_token)
-        return datasets_pb2.ListDatasetsResponse(
-            datasets=[_dataset(record) for record in records], next_page_token=next_page_token
-        )
+        page = await dataset_page(self._service.datasets, page_size, request.page_token)
+        return to_message(page, datasets_pb2.ListDatasetsResponse)
 
     async def GetDataset(  # noqa: N802
         self, request: datasets_pb2.GetDatasetRequest, context: grpc.aio.ServicerContext
     ) -> datasets_pb2.Dataset:
-        return _dataset(await asyncio.to_thread(self._service.datasets.get, request.dataset))
+        record = await asyncio.to_thread(self._service.datasets.get, request.dataset)
+        return to_message(record, datasets_pb2.Dataset)
 
     async def GetContactSheet(  # noqa: N802
         self, request: datasets_pb2.GetContactSheetRequest, context: grpc.aio.ServicerContext
@@ -76,20 +74,3 @@ async def _receive(context: grpc.aio.ServicerContext, upload: DatasetUpload, *, 
         else:
             expected = "chunk" if archive else "file or chunk"
             raise InvalidArgument(f"a message after the header must hold {expected}, got {part or 'neither'}")
-
-
-def _dataset(record: DatasetRecord) -> datasets_pb2.Dataset:
-    return datasets_pb2.Dataset(
-        name=record.name,
-        kind=record.kind,
-        sha256=record.sha256,
-        bytes=record.bytes,
-        created_at=record.created_at,
-        train_frames=record.train_frames,
-        val_frames=record.val_frames,
-        height=record.height,
-        width=record.width,
-        probe=None if record.probe is None else probe_message(record.probe),
-        warnings=record.warnings,
-        options=datasets_pb2.DatasetOptions(**record.options),
-    )

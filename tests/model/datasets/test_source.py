@@ -12,7 +12,7 @@ import pytest
 
 from ultragray.datasets import Dataset, Sweep, phantom
 from ultragray.datasets.released import write_released
-from ultragray.datasets.source import EVERY_FORMAT_TAKES, FORMATS, SourceOptions, dataset_format, load_dataset
+from ultragray.datasets.source import EVERY_FORMAT_TAKES, FORMATS, SourceOptions, load_dataset
 from ultragray.errors import DatasetInvalid, InvalidArgument
 
 
@@ -86,6 +86,3 @@ def test_each_format_names_options_that_there_are() -> None:
     for one in FORMATS.values():
         assert {*one.options, *one.companions, *EVERY_FORMAT_TAKES} <= known
         assert set(one.companions) <= set(one.options)
-    assert dataset_format("plus") is FORMATS["plus"]
-    with pytest.raises(DatasetInvalid, match="no dataset format 'nifti', there are released, plus"):
-        dataset_format("nifti")

@@ -223,7 +223,7 @@ def test_a_manifest_of_an_unknown_format_is_damaged(
     add(store, receive, files, "tiny")
     manifest = store.folder / "tiny" / "dataset.json"
     manifest.write_text(manifest.read_text().replace('"released"', '"nifti"'))
-    with pytest.raises(DatasetInvalid, match=r"'tiny' is damaged: .*no dataset format 'nifti', there are released, "):
+    with pytest.raises(DatasetInvalid, match=r"'tiny' is damaged: .*kind must be one of released, .*'nifti'"):
         store.load("tiny")
 
 

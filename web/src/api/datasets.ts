@@ -3,7 +3,7 @@
 import { address, getJson, remove, type Schemas } from "./client";
 import { putFile, type Told } from "./upload";
 
-export type Dataset = Schemas["DatasetOut"];
+export type Dataset = Schemas["DatasetRecord"];
 export type DatasetPoses = Schemas["DatasetPoses"];
 export type Part = keyof DatasetPoses;
 /** How an upload is read; what is empty is left as it is stored. */

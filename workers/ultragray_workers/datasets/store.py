@@ -9,12 +9,12 @@ import re
 import secrets
 import shutil
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ultragray.contract import from_dict, to_dict
-from ultragray.datasets.source import dataset_format
+from ultragray.contract import Contract, described, from_dict, to_dict
+from ultragray.datasets.source import UPLOADED_FORMATS
 from ultragray.errors import DatasetInvalid, InvalidArgument, UltragrayError
 from ultragray.files.atomic import sync, write_whole
 from ultragray.probe import Probe
@@ -33,37 +33,30 @@ _NAMES_IN_MESSAGE = 5
 
 
 @dataclass(frozen=True)
-class DatasetRecord:
-    """What is known about an accepted dataset."""
+class DatasetRecord(Contract):
+    """An accepted dataset."""
 
-    name: str
-    kind: str  # the name of its format
-    sha256: str  # Dataset.sha256: images, poses, probe and split
-    bytes: int  # of the files
-    created_at: str  # ISO 8601, UTC
-    train_frames: int
-    val_frames: int
-    height: int
-    width: int
-    probe: Probe | None
-    warnings: tuple[str, ...]
-    options: dict[str, str]  # those of UPLOAD_OPTIONS that were given
-
-    def __post_init__(self) -> None:
-        dataset_format(self.kind)
-
-    def to_json(self) -> str:
-        """The manifest."""
-        probe = None if self.probe is None else to_dict(self.probe)
-        return json.dumps({**asdict(self), "probe": probe}, indent=1) + "\n"
+    name: str = described("Of letters, digits, '.', '_' and '-'.")
+    kind: str = described(
+        f"Its format: {'; '.join(f'{one.name}, {one.meaning}' for one in UPLOADED_FORMATS)}.",
+        choices=tuple(one.name for one in UPLOADED_FORMATS),
+    )
+    sha256: str = described("Of images, poses, probe and split, however they were sent.")
+    bytes: int = described("Of its files.")
+    created_at: str = described("ISO 8601, UTC.")
+    train_frames: int = described("Number of frames to train from.")
+    val_frames: int = described("Number of frames held out.")
+    height: int = described("Of a frame, pixels.")
+    width: int = described("Of a frame, pixels.")
+    probe: Probe | None = described("The probe that recorded it.")
+    warnings: tuple[str, ...] = described("What looks wrong, for a person to decide.")
+    options: dict[str, str] = described("How it was read: the query parameters of its upload.")
 
     @classmethod
     def from_json(cls, text: str) -> DatasetRecord:
-        """Its inverse. Raises ValueError, KeyError, TypeError or DatasetInvalid for anything else."""
+        """The record of a manifest. Raises ValueError, KeyError or TypeError for anything else."""
         document: dict[str, Any] = json.loads(text)
-        values = {one.name: document[one.name] for one in fields(cls)}
-        probe = None if values["probe"] is None else from_dict(Probe, values["probe"])
-        return cls(**{**values, "probe": probe, "warnings": tuple(values["warnings"])})
+        return from_dict(cls, {one.name: document[one.name] for one in fields(cls)})
 
 
 class DatasetStore:
@@ -88,7 +81,7 @@ class DatasetStore:
             return DatasetRecord.from_json(path.read_text(encoding="utf-8"))
         except FileNotFoundError:
             raise self._not_found(name) from None
-        except (ValueError, KeyError, TypeError, DatasetInvalid) as error:
+        except (ValueError, KeyError, TypeError) as error:
             raise DatasetInvalid(f"the manifest of the dataset {name!r} is damaged: {error!r}") from error
 
     def names_by_content(self) -> dict[str, str]:
@@ -183,4 +176,4 @@ def check_dataset_name(name: str) -> None:
 
 def write_manifest(record: DatasetRecord, folder: Path) -> None:
     """Writes the manifest of a dataset whose other files are complete."""
-    write_whole(folder / MANIFEST_NAME, record.to_json())
+    write_whole(folder / MANIFEST_NAME, json.dumps(to_dict(record), indent=1) + "\n")

@@ -1,4 +1,4 @@
-"""What the service and its child processes say to each other. Free of torch."""
+"""Messages between the service and its child processes. Free of torch."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ Task = RenderTask | PackTask | LoadTask | UnloadTask
 
 @dataclass(frozen=True)
 class Rendered:
-    """What a worker did for one part."""
+    """A worker's report on one part."""
 
     size: int  # bytes of the reply so far: all of `data` when this was the request's only part
     scene_sha256: str

@@ -39,7 +39,7 @@ class Command:
 
 @dataclass(eq=False)
 class Assignment:
-    """What a worker is busy with: the parts of a batch that it has not answered yet, or a command."""
+    """The work in a worker's hands: the parts of a batch that it has not answered yet, or a command."""
 
     parts: dict[int, Step] = field(default_factory=dict)
     command: Command | None = None

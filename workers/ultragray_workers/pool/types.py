@@ -1,4 +1,4 @@
-"""What the render pool is asked and what it answers. Free of torch: the service process imports this."""
+"""Requests to the render pool and its results. Free of torch: the service process imports this."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What waits to be rendered, in which order, and what is rendered together."""
+"""The queue of requests that wait: their order, and batches of those that can be rendered together."""
 
 from __future__ import annotations
 
@@ -174,7 +174,7 @@ class WaitingQueue:
         self._tickets[priority].pop(ticket, None)
 
     def take_batch(self) -> list[Step]:
-        """What is to be rendered next, together; empty when nothing waits. Drops what is past its deadline."""
+        """The steps to be done next, together; empty when nothing waits. Drops tickets past their deadline."""
         priorities = list(Priority)
         if time.monotonic() - self._last_batch_turn >= _BATCH_PATIENCE_S:
             priorities.reverse()
@@ -234,7 +234,7 @@ class WaitingQueue:
         return work
 
     def _poses_together(self, ticket: Ticket) -> int:
-        """How many poses make a full batch: fewer for images of more than 512x512 pixels."""
+        """The number of poses in a full batch: fewer for images of more than 512x512 pixels."""
         share = _BATCH_PRIORITY_SHARE if ticket.request.priority is Priority.BATCH else 1
         settings = ticket.request.settings
         pixels = settings.height * settings.width * len(settings.outputs)

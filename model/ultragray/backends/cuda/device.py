@@ -1,4 +1,4 @@
-"""Which device the CUDA backend renders on, and what to say where there is none. Needs neither Triton nor a context."""
+"""The device of the CUDA backend, and the error where there is none. Needs neither Triton nor a context."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def device_count() -> int:
 
 
 def device(index: int = 0) -> torch.device:
-    """Where a scene's tensors must live: the CUDA device of that number, or the CPU where the kernels are interpreted.
+    """The device of a scene's tensors: the CUDA device of that number, or the CPU where the kernels are interpreted.
 
     Raises BackendUnavailable.
     """
@@ -72,7 +72,7 @@ def upload(tensor: Tensor, device: torch.device) -> Tensor:
 
 
 def renderer(device: torch.device) -> str:
-    """What renders on a device, as frames say it: `cuda-sm90`."""
+    """The name of the renderer on a device, as frames carry it: `cuda-sm90`."""
     if interpreted():
         return "cuda-interpreted"
     major, minor = torch.cuda.get_device_capability(device)

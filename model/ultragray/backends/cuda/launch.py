@@ -31,7 +31,7 @@ MAX_POSES = 65_535  # of one launch, by CUDA's limit for a grid
 
 @dataclass(frozen=True)
 class Shapes:
-    """How the work is cut: Gaussians of a block, tiles of an image, and what one warp takes at a time."""
+    """The partition of the work: Gaussians of a block, tiles of an image, and what one warp takes at a time."""
 
     block: int = 128
     tile_rows: int = 16
@@ -66,14 +66,14 @@ INTERPRETER_SHAPES = Shapes(
 
 @contextlib.contextmanager
 def launching(device: torch.device) -> Iterator[None]:
-    """What every launch needs around it: Triton launches on the current device, and interpreted kernels warn of
+    """The context of every launch: Triton launches on the current device, and interpreted kernels warn of
     infinities, where a GPU just has them."""
     with torch.cuda.device(device) if device.type == "cuda" else np.errstate(all="ignore"):
         yield
 
 
 class Geometry(NamedTuple):
-    """What a probe and an image size mean to the kernels."""
+    """A probe and an image size in the terms of the kernels."""
 
     fanned: bool
     height: int
@@ -131,7 +131,7 @@ class Gaussians:
 
 @dataclass(frozen=True)
 class Slices:
-    """What one pass over the Gaussians leaves on the device, for C poses and B blocks."""
+    """The results of one pass over the Gaussians on the device, for C poses and B blocks."""
 
     slices: Tensor  # [C, B, BLOCK, FIELDS]
     rectangles: Tensor  # [C, B, BLOCK, RECTANGLE] int32

@@ -1,4 +1,4 @@
-"""How much a frame is: what the kernels read, write and compute, counted from the slices of real poses.
+"""The work of a frame: bytes read and written and operations of the kernels, counted from the slices of real poses.
 
 The counts turn a measured time into a share of what the hardware could do. Importing this imports Triton.
 """

@@ -1,4 +1,4 @@
-"""How each tissue of the phantom scatters and absorbs, and the probe's pulse and beam."""
+"""Scattering and absorption of the phantom's tissues, and the probe's pulse and beam."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ COMPENSATED = 0.6  # dB/(cm·MHz) that the scanner's time-gain compensation expe
 
 
 def round_trip_db_per_mm() -> FloatArray:  # [tissues]
-    """What each tissue takes from an echo over a millimetre of depth, there and back."""
+    """The loss of an echo in each tissue over a millimetre of depth, there and back."""
     return np.array([0.2 * FREQUENCY_MHZ * ACOUSTICS[tissue].attenuation for tissue in Tissue])
 
 
@@ -53,7 +53,7 @@ def backscatter_amplitudes() -> FloatArray:  # [tissues]
 
 
 def compensated_db_per_mm() -> float:
-    """What the time-gain compensation adds over a millimetre of depth."""
+    """The gain of the time-gain compensation over a millimetre of depth."""
     return 0.2 * FREQUENCY_MHZ * COMPENSATED
 
 
@@ -70,6 +70,6 @@ def elevation_sigma_mm(depth_mm: Floats) -> Floats:
 
 
 def elevation_weight(elevation_mm: Floats, depth_mm: Floats) -> Floats:
-    """What the beam leaves of an echo from beside the image plane."""
+    """The share of an echo from beside the image plane that the beam leaves."""
     sigmas = elevation_mm / elevation_sigma_mm(depth_mm)
     return np.where(np.abs(sigmas) < ELEVATION_REACH, np.exp(-0.5 * sigmas * sigmas), 0.0)

@@ -1,4 +1,4 @@
-"""Which tissue lies where in the phantom: the one map that scatterers, attenuation and labels are taken from.
+"""The anatomy of the phantom: the one map that scatterers, attenuation and labels are taken from.
 
 Shapes are drawn straight and symmetric; `straightened` takes a point of the phantom to where it lies in the drawing.
 """
@@ -24,7 +24,7 @@ CANAL_HALF_WIDTH_MM = 11.0
 
 
 class Tissue(IntEnum):
-    """What a point of the phantom is made of."""
+    """The tissue of a point of the phantom."""
 
     OUTSIDE = 0  # gel, before the skin
     SKIN = 1

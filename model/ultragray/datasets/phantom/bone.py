@@ -39,7 +39,7 @@ def _local(points: Floats) -> Place:
 
 
 def _posterior(local: Place) -> Floats:
-    """What lies behind the canal: spinous process, laminae, articular and transverse processes."""
+    """The bone behind the canal: spinous process, laminae, articular and transverse processes."""
     x, y, z = local
     crest = _capsule(local, (0.0, -3.0, 17.6), (0.0, 10.0, 17.0), 3.5)
     blade = _box(local, (0.0, 3.5, 24.0), (0.6, 8.0, 9.0), 1.6)

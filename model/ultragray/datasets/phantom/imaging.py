@@ -45,7 +45,7 @@ def simulate(poses: npt.ArrayLike, *, probe: Probe, height: int, width: int) -> 
 
 
 def bone_attenuation_db(poses: npt.ArrayLike, *, probe: Probe, height: int, width: int) -> Float32Array:  # [F, H, W]
-    """What bone takes from the echo of each pixel, there and back, in dB: where the shadows are.
+    """The loss of each pixel's echo in bone, there and back, in dB: where the shadows are.
 
     Raises InvalidPose for poses that are not rigid.
     """
@@ -97,7 +97,7 @@ class Grid:
         return self.first_mm[1] + (np.arange(self.shape[1]) + 0.5) * self.cell_mm[1]
 
     def cells(self, x: Float32Array, z: Float32Array) -> tuple[npt.NDArray[np.bool_], IntArray]:  # [N], [M]
-        """Which points lie in the grid, and the number of the cell of each that does."""
+        """A mask of the points that lie in the grid, and the number of the cell of each that does."""
         row = np.floor((z - self.first_mm[0]) / self.cell_mm[0]).astype(np.int64)
         column = np.floor((x - self.first_mm[1]) / self.cell_mm[1]).astype(np.int64)
         rows, columns = self.shape
@@ -105,7 +105,7 @@ class Grid:
         return inside, row[inside] * columns + column[inside]
 
     def tissue(self, pose: FloatArray) -> npt.NDArray[np.uint8]:  # [R, C]
-        """What lies in the middle of each cell."""
+        """The tissue in the middle of each cell."""
         across = pose[:3, 3] + self.laterals_mm[:, None] * pose[:3, 0]
         middles = across + self.depths_mm[:, None, None] * pose[:3, 2]  # [R, C, 3]
         return tissue_at(middles.reshape(-1, 3).astype(np.float32)).reshape(self.shape)

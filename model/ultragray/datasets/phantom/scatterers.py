@@ -1,4 +1,4 @@
-"""What the beam meets: point scatterers at random in the tissue and on its interfaces, made block by block.
+"""The scatterers of the phantom: points at random in the tissue and on its interfaces, made block by block.
 
 A block's scatterers follow from its place alone, so every frame of every sweep sees the same ones.
 """

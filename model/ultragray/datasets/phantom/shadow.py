@@ -1,4 +1,4 @@
-"""Where bone hides the phantom from the probe, and what a rendering shows there."""
+"""The shadow of bone in the phantom, and the error of a rendering there."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ FRAME_TIME_MS = 40.0  # rendered frames have no time of their own: formats that 
 
 @dataclass(frozen=True)
 class ExportHeader:
-    """What the frames of an export have in common, and all it takes to render them again.
+    """The facts that the frames of an export share, and all it takes to render them again.
 
     The frames of a file are `picture`s: height x width samples of the probe, shown with `display`.
     """
@@ -57,7 +57,7 @@ class ExportHeader:
         return np.dtype("<u1" if OUTPUTS[output].is_numbers or self.dtype == "uint8" else "<f4")
 
     def origin(self) -> dict[str, Any]:
-        """Where the frames come from and how they are shown, as JSON holds it.
+        """The origin of the frames and their display, as JSON holds it.
 
         `picture` has the fields of `ultragray.probe.Picture`.
         """

@@ -13,15 +13,15 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response
 
 from ultragray.datasets.source import UPLOAD_OPTIONS, UPLOADED_FORMATS
+from ultragray_workers.datasets.store import DatasetRecord
 from ultragray_workers.errors import UploadTooLarge
 
 from ...core.catalog import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE
-from ...core.dataset_catalog import contact_sheet, dataset_page
 from ...core.dataset_uploads import DatasetUpload
+from ...core.datasets import DatasetPage, contact_sheet, dataset_page
 from ...core.helper_processes import PATIENCE_S
 from ...errors import UnsupportedMediaType
 from ..accept import PNG
-from ..dataset_schemas import DatasetOut, DatasetPage
 from ..deps import ServiceDep, problems
 from ..disconnect import finish_or_abandon
 from ..multipart import FileParts
@@ -73,7 +73,7 @@ _UPLOAD: dict[str, Any] = {
 }
 _Answers = dict[int | str, dict[str, Any]]
 _PRESENT: _Answers = {
-    200: {"model": DatasetOut, "description": "It is there already, with this content and these options."}
+    200: {"model": DatasetRecord, "description": "It is there already, with this content and these options."}
 }
 _PICTURE: _Answers = {200: {"description": "The image planes in space and some frames.", "content": {PNG: _BINARY}}}
 
@@ -81,7 +81,6 @@ _PICTURE: _Answers = {200: {"description": "The image planes in space and some f
 @router.put(
     "/{dataset}",
     status_code=201,
-    response_model=DatasetOut,
     openapi_extra=_UPLOAD,
     responses=_PRESENT | problems(401, 409, 413, 415, 422, 429, 500, 503, 504, 507),
 )
@@ -91,7 +90,7 @@ async def put_dataset(
     service: ServiceDep,
     dataset: DatasetName,
     options: GivenOptions,
-) -> DatasetOut:
+) -> DatasetRecord:
     """Uploads a dataset, checks it as `ultragray dataset check` does, and keeps it. Empty options: as it is stored."""
     service.require_serving()
     media_type = _media_type(request)
@@ -109,7 +108,7 @@ async def put_dataset(
         deadline = time.monotonic() + PATIENCE_S
         record, is_new = await finish_or_abandon(upload.finish(), request.receive, deadline)
     response.status_code = 201 if is_new else 200
-    return DatasetOut.of(record)
+    return record
 
 
 @router.get("", responses=problems(401, 422))
@@ -117,14 +116,13 @@ async def list_datasets(
     service: ServiceDep, page_size: PageSize = DEFAULT_PAGE_SIZE, page_token: PageToken = ""
 ) -> DatasetPage:
     """The datasets by name."""
-    records, next_page_token = await dataset_page(service.datasets, page_size, page_token)
-    return DatasetPage(datasets=[DatasetOut.of(record) for record in records], next_page_token=next_page_token)
+    return await dataset_page(service.datasets, page_size, page_token)
 
 
 @router.get("/{dataset}", responses=problems(401, 404, 422))
-async def get_dataset(service: ServiceDep, dataset: DatasetName) -> DatasetOut:
+async def get_dataset(service: ServiceDep, dataset: DatasetName) -> DatasetRecord:
     """Size, probe, split, and what the check warned of."""
-    return DatasetOut.of(await asyncio.to_thread(service.datasets.get, dataset))
+    return await asyncio.to_thread(service.datasets.get, dataset)
 
 
 @router.get(

@@ -1,4 +1,4 @@
-"""Where a backend's scenes must lie."""
+"""The device that a backend's scenes must be on."""
 
 from __future__ import annotations
 

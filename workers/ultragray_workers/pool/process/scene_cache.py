@@ -31,7 +31,7 @@ class LoadedScene:
 
     @cached_property
     def assessor(self) -> Assessor:
-        """What tells how far its frames extrapolate."""
+        """The assessor of its frames' extrapolation."""
         return Assessor(self.scene.info, self.scene.training_poses)
 
 

@@ -12,7 +12,7 @@ from ..messages import RenderTask
 
 
 def below_limit(task: RenderTask, extrapolations: Sequence[Extrapolation]) -> list[bool]:
-    """Which poses have less confidence than the task wants; a scene without a model has none."""
+    """For each pose, whether it has less confidence than the task wants; a scene without a model has none."""
     limit = task.view.min_confidence
     return [limit is not None and not is_confident(told, limit) for told in extrapolations]
 

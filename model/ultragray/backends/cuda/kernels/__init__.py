@@ -1,1 +1,1 @@
-"""What runs on the device. Triton's compiler reads these functions; they carry no Python types. Lengths are in cm."""
+"""The code of the device. Triton's compiler reads these functions; they carry no Python types. Lengths are in cm."""

@@ -80,7 +80,7 @@ def harmonics_gradient(
     SIGMOID: tl.constexpr,
     TERMS: tl.constexpr,
 ):
-    """What intensity passes back: by the mean through the direction of view, and by each coefficient, [N, TERMS]."""
+    """Gradients of intensity: by the mean, through the direction of view, and by each coefficient, [N, TERMS]."""
     value = harmonics(ox, oy, oz, sh0, shn, stride, index, mask, DEGREE)
     activated = activate(value, SIGMOID)
     if SIGMOID:

@@ -1,0 +1,48 @@
+"""The datasets as all front doors tell them, read without blocking the event loop."""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import suppress
+from dataclasses import dataclass
+
+from ultragray.contract import described
+from ultragray.errors import DatasetInvalid
+from ultragray_workers.datasets.store import DatasetRecord, DatasetStore
+from ultragray_workers.errors import DatasetNotFound
+
+from .catalog import page_of_names
+
+
+@dataclass(frozen=True)
+class DatasetPage:
+    """One page of datasets by name."""
+
+    datasets: list[DatasetRecord]
+    next_page_token: str = described("Empty on the last page.")
+
+
+async def dataset_page(store: DatasetStore, page_size: int, page_token: str) -> DatasetPage:
+    """The datasets of one page; those whose manifest is damaged are left out. Raises InvalidArgument."""
+
+    def read() -> DatasetPage:
+        names, next_page_token = page_of_names(store.names(), page_size, page_token)
+        records = []
+        for name in names:
+            with suppress(DatasetNotFound, DatasetInvalid):
+                records.append(store.get(name))
+        return DatasetPage(records, next_page_token)
+
+    return await asyncio.to_thread(read)
+
+
+async def contact_sheet(store: DatasetStore, name: str) -> bytes:
+    """The PNG of a dataset. Raises DatasetNotFound."""
+
+    def read() -> bytes:
+        try:
+            return store.contact_sheet(name).read_bytes()
+        except FileNotFoundError:  # deleted a moment ago
+            raise DatasetNotFound(f"there is no dataset {name!r} any more", field="dataset") from None
+
+    return await asyncio.to_thread(read)
