@@ -77,10 +77,10 @@ results: $(VENV)/installed  ## train on every data set of DATA and write docs/re
 demo-scene: $(VENV)/installed  ## simulate the phantom, train the demo scene from it and put it in its place
 	$(BIN)/python -m ultragray.demo.make
 
-generate: $(VENV)/installed-dev  ## rewrite what is generated: the gRPC stubs, the client for threads and its settings
+generate: $(VENV)/installed-dev  ## rewrite what is generated: the gRPC stubs, most of the client, tables of the documents
 	$(BIN)/python proto/generate.py
-	$(BIN)/python docs/generate.py
 	$(BIN)/python client/generate.py
+	$(BIN)/python docs/generate.py
 
 clean:  ## remove what was built
 	rm -rf $(VENV) build web/node_modules $(dir $(CONSOLE))

@@ -1,8 +1,8 @@
 """Generates what the client does not write by hand: `python client/generate.py`.
 
 `sync/` is `aio/` without its asyncio, by unasync; `transport.py` and `__init__.py` are written by hand in both.
-`contract.py` are the dataclasses of `ultragray` that callers fill in, without its checks, so that the client needs
-neither `ultragray` nor torch.
+`contract.py` are the dataclasses of `ultragray` that callers fill in, without its checks, and `errors.py` the errors
+that calls may end with, so that the client needs neither `ultragray` nor torch.
 """
 
 from __future__ import annotations
@@ -23,7 +23,9 @@ import unasync
 
 from ultragray.contract import Contract, Family, annotated_fields
 from ultragray.datasets.source import SourceOptions
+from ultragray.errors import error_classes
 from ultragray.settings import RenderSettings
+from ultragray_service.errors import STATUSES
 from ultragray_workers.jobs.kinds import Specification
 
 PACKAGE = Path(__file__).resolve().parent / "ultragray_client"
@@ -34,6 +36,39 @@ ROOTS = {"RenderSettings": RenderSettings, "DatasetOptions": SourceOptions, "Spe
 LEFT_OUT = {"device_set"}  # a file is uploaded with its dataset
 OWN_TYPES = {"Poses": "Iterable[PoseLike]"}  # what the client takes in their place
 
+NOT_OVER_GRPC = {  # reasons of other doors, and of jobs that failed
+    "ORIGIN_REFUSED",
+    "BODY_TOO_LARGE",
+    "NOT_ACCEPTABLE",
+    "UNSUPPORTED_MEDIA_TYPE",
+    "ROUTE_NOT_FOUND",
+    "METHOD_NOT_ALLOWED",
+    "SCENE_READ_ONLY",
+    "IGTL_MESSAGE_INVALID",
+    "CHECKPOINT_INVALID",
+    "TRAINING_DIVERGED",
+    "TRAINING_STATE_INVALID",
+    "STARTUP_FAILED",
+}
+OWN_ERRORS = {  # of the client, by their reason: base, meaning
+    "UNREACHABLE": ("Unavailable", "Nobody answers at the address, or the connection broke."),
+    "STREAM_ENDED": ("ClientError", "A stream of poses that is over was asked to go on."),
+}
+_ALSO = {"InvalidArgument": ["ValueError"], "DeadlineExceeded": ["TimeoutError"]}  # what they are beside
+
+_ERRORS_HEADER = '''# Generated from the errors of the service by client/generate.py; change those.
+"""Every error of the client, in one tree. Programs match the class, or `reason`, which never changes.
+
+{tree}
+
+A reason that this client does not know is told with the class of its gRPC status, or ClientError.
+"""
+
+from __future__ import annotations
+
+from .client_error import ClientError as ClientError
+
+'''
 _CONTRACT_HEADER = '''# Generated from the dataclasses of ultragray by client/generate.py; change those.
 """What callers fill in. The service checks the values."""
 
@@ -70,6 +105,66 @@ def generate_sync(output_folder: Path) -> list[Path]:
             target.write_text(_HEADER.format(name=name) + _KEYWORD.sub("", text))  # those left are in docstrings
             written.append(target)
     return formatted(written)
+
+
+def generate_errors(output_folder: Path) -> Path:
+    """Writes errors.py and returns its path."""
+    classes = {name: (base, source) for name, base, source in _error_classes()}
+    tree = _below("ClientError", {name: base for name, (base, _) in classes.items()})
+    drawn = "\n".join(["ClientError", *(line for line, _ in tree)])
+    names = [name for _, name in tree]
+    listed = f"ERRORS = (ClientError, {', '.join(names)})\n"
+    target = output_folder / "errors.py"
+    sources = (classes[name][1] for name in names)
+    target.write_text(_ERRORS_HEADER.format(tree=drawn) + "\n".join([*sources, listed]))
+    return formatted([target])[0]
+
+
+def _error_classes() -> Iterator[tuple[str, str, str]]:
+    """Name, base and source of each class: below that of its gRPC status, which stands for all its reasons."""
+    meanings = {
+        cls.reason: " ".join(inspect.cleandoc(cls.__doc__ or "").split("\n\n")[0].split()) for cls in error_classes()
+    }
+    roots = {"INTERNAL"}
+    for reason, statuses in STATUSES.items():
+        status = statuses.grpc
+        if reason in NOT_OVER_GRPC:
+            continue
+        if status not in roots:
+            roots.add(status)
+            meaning = meanings.get(status, f"Base of the errors whose gRPC status is {status}.")
+            yield _error_class(status, "ClientError", meaning, f"grpc_status = {status!r}")
+        if reason not in roots:
+            yield _error_class(reason, "ClientError" if status == "INTERNAL" else _camel(status), meanings[reason])
+    for reason, (base, meaning) in OWN_ERRORS.items():
+        yield _error_class(reason, base, meaning)
+
+
+def _error_class(reason: str, base: str, meaning: str, status: str = "") -> tuple[str, str, str]:
+    name = _camel(reason)
+    bases = ", ".join([base, *_ALSO.get(name, ())])
+    lines = (
+        f"class {name}({bases}):",
+        f"    {_quoted(_wrapped(meaning))}",
+        "",
+        f"    reason = {reason!r}",
+        status and f"    {status}",
+    )
+    return name, base, "\n".join(lines)
+
+
+def _camel(reason: str) -> str:
+    return reason.title().replace("_", "")
+
+
+def _below(base: str, bases: dict[str, str], indent: str = "") -> list[tuple[str, str]]:
+    """The classes below a base, in their order, each with its line of the drawn tree."""
+    below = [name for name, own in bases.items() if own == base]
+    found = []
+    for name in below:
+        branch, further = ("└── ", "    ") if name == below[-1] else ("├── ", "│   ")
+        found += [(f"{indent}{branch}{name}", name), *_below(name, bases, indent + further)]
+    return found
 
 
 def generate_contract(output_folder: Path) -> Path:
@@ -133,13 +228,16 @@ def _field_source(item: Field[Any]) -> str:
     elif item.default_factory is not MISSING:
         default = f" = field(default_factory={item.default_factory.__name__})"
     annotation = re.sub(r"\w+", lambda word: OWN_TYPES.get(word[0], word[0]), str(item.type))
-    meaning = "\n    ".join(textwrap.wrap(item.metadata["description"], 110))
-    return f"    {item.name}: {annotation}{default}\n    {_quoted(meaning)}"
+    return f"    {item.name}: {annotation}{default}\n    {_quoted(_wrapped(item.metadata['description']))}"
 
 
 def _docstring(cls: Any) -> str:
     """The docstring, but for the errors: the client leaves checks to the service."""
     return _quoted(_RAISES.sub("", inspect.cleandoc(cls.__doc__)).strip().replace("\n", "\n    "))
+
+
+def _wrapped(text: str) -> str:
+    return "\n    ".join(textwrap.wrap(text, 110))
 
 
 def _quoted(text: str) -> str:
@@ -158,5 +256,6 @@ def formatted(paths: list[Path]) -> list[Path]:
 
 
 if __name__ == "__main__":
+    generate_errors(PACKAGE)
     generate_contract(PACKAGE)
     generate_sync(PACKAGE / "sync")

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from ultragray import errors
+from ultragray_client import errors as client_errors
 from ultragray_service import errors as service_errors
 from ultragray_service.errors import statuses_of
 from ultragray_workers import errors as workers_errors
@@ -57,7 +58,13 @@ def _meaning(thing: object) -> str:
     return " ".join((inspect.getdoc(thing) or "").partition("\n\n")[0].split()).removesuffix(".")
 
 
-TABLES: dict[str, Callable[[], list[Row]]] = {"errors": error_table}
+def client_error_table() -> list[Row]:
+    """The errors of the client, in their order there."""
+    rows = ((cls.reason, cls.__name__, cls.__mro__[1].__name__) for cls in client_errors.ERRORS)
+    return [("Reason", "Class", "Kind of"), *([f"`{cell}`" for cell in row] for row in rows)]
+
+
+TABLES: dict[str, Callable[[], list[Row]]] = {"errors": error_table, "client_errors": client_error_table}
 
 
 if __name__ == "__main__":

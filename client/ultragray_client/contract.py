@@ -74,7 +74,7 @@ Probe: TypeAlias = ConvexProbe | LinearProbe | PhasedProbe
 
 
 class Below(str, Enum):
-    """What becomes of a frame whose confidence is below the limit."""
+    """The fate of a frame whose confidence is below the limit."""
 
     REFUSE = "refuse"
     MASK = "mask"
@@ -103,7 +103,7 @@ class Display:
 
 @dataclass(frozen=True, kw_only=True)
 class FrameSettings:
-    """What to render, but for the scene and the poses. None: as the scene has it."""
+    """Settings of what is rendered, but for the scene and the poses. None: as the scene has it."""
 
     height: int | None = None
     """Depth samples. Default: as trained, else 512."""
@@ -133,7 +133,7 @@ class Encoding(str, Enum):
 
 @dataclass(frozen=True, kw_only=True)
 class RenderSettings(FrameSettings):
-    """What to render, and the form that it comes in, where neither an Accept header nor a file format decides that."""
+    """Settings with an encoding, for doors where neither an Accept header nor a file format decides it."""
 
     encoding: Encoding = Encoding.UINT8
     """Form of the pixels."""

@@ -1,256 +1,365 @@
+# Generated from the errors of the service by client/generate.py; change those.
 """Every error of the client, in one tree. Programs match the class, or `reason`, which never changes.
 
-ClientError                         what the service refused or could not do, or did not answer
-├── InvalidArgument                 a value that cannot be used; names the field (also a ValueError)
-│   ├── InvalidPose                 INVALID_POSE
-│   ├── InvalidProbe                INVALID_PROBE
-│   ├── InvalidImageSize            INVALID_IMAGE_SIZE
-│   ├── UnknownOutput               UNKNOWN_OUTPUT
-│   ├── LowConfidence               LOW_CONFIDENCE: a pose too far from the training views
-│   ├── TooManyPoses                TOO_MANY_POSES
-│   ├── DatasetInvalid              DATASET_INVALID
-│   └── UploadTooLarge              UPLOAD_TOO_LARGE
-├── Unauthenticated                 no API key, or an unknown one
+ClientError
+├── InvalidArgument
+│   ├── InvalidPose
+│   ├── InvalidProbe
+│   ├── InvalidImageSize
+│   ├── UnknownOutput
+│   ├── LowConfidence
+│   ├── TooManyPoses
+│   ├── DatasetInvalid
+│   └── UploadTooLarge
+├── Unauthenticated
 ├── NotFound
-│   ├── SceneNotFound               SCENE_NOT_FOUND
-│   ├── DatasetNotFound             DATASET_NOT_FOUND
-│   ├── JobNotFound                 JOB_NOT_FOUND
-│   └── ArtifactNotFound            ARTIFACT_NOT_FOUND
+│   ├── SceneNotFound
+│   ├── DatasetNotFound
+│   ├── JobNotFound
+│   └── ArtifactNotFound
+├── FailedPrecondition
+│   ├── SceneFileInvalid
+│   ├── DatasetInUse
+│   ├── JobFinished
+│   ├── JobNotFinished
+│   └── JobInUse
 ├── AlreadyExists
-│   ├── SceneExists                 SCENE_EXISTS
-│   ├── DatasetExists               DATASET_EXISTS
-│   └── RequestIdConflict           REQUEST_ID_CONFLICT
-├── FailedPrecondition              not in the state that things are in
-│   ├── SceneFileInvalid            SCENE_FILE_INVALID
-│   ├── DatasetInUse                DATASET_IN_USE
-│   ├── JobFinished                 JOB_FINISHED
-│   ├── JobNotFinished              JOB_NOT_FINISHED
-│   └── JobInUse                    JOB_IN_USE
+│   ├── DatasetExists
+│   ├── SceneExists
+│   └── RequestIdConflict
 ├── ResourceExhausted
-│   ├── QueueFull                   QUEUE_FULL; asked again
-│   ├── JobQueueFull                JOB_QUEUE_FULL; asked again
-│   ├── StorageFull                 STORAGE_FULL
-│   ├── MemoryExceeded              MEMORY_EXCEEDED
-│   └── SceneTooLarge               SCENE_TOO_LARGE
-├── Unavailable                     asked again, until the time is over
-│   ├── NotReady                    NOT_READY
-│   ├── Draining                    DRAINING
-│   ├── DatabaseUnavailable         DATABASE_UNAVAILABLE
-│   └── Unreachable                 UNREACHABLE: nobody answers at the address, or the connection broke
-├── Unimplemented                   what this service cannot do
-│   ├── BackendUnavailable          BACKEND_UNAVAILABLE
-│   └── ExtraMissing                EXTRA_MISSING: a format whose package is not installed there
-├── DeadlineExceeded                DEADLINE_EXCEEDED (also a TimeoutError)
-├── RenderFailed                    RENDER_FAILED
-└── StreamEnded                     STREAM_ENDED: a stream of poses that is over was asked for another frame
+│   ├── StorageFull
+│   ├── MemoryExceeded
+│   ├── JobQueueFull
+│   ├── SceneTooLarge
+│   └── QueueFull
+├── Unavailable
+│   ├── DatabaseUnavailable
+│   ├── NotReady
+│   ├── Draining
+│   └── Unreachable
+├── Unimplemented
+│   ├── BackendUnavailable
+│   └── ExtraMissing
+├── DeadlineExceeded
+├── RenderFailed
+└── StreamEnded
 
 A reason that this client does not know is told with the class of its gRPC status, or ClientError.
 """
 
 from __future__ import annotations
 
-
-class ClientError(Exception):
-    """A call that failed: the stable `reason`, and `detail`, one sentence for people.
-
-    None where there is none: `field` (the path of what is to blame), `retry_after_s` (seconds after which it may
-    succeed), and in a stream `sequence` (of the pose that gets no frame).
-    """
-
-    reason = "INTERNAL"
-    grpc_status = "INTERNAL"
-
-    def __init__(
-        self,
-        detail: str,
-        *,
-        reason: str | None = None,
-        field: str | None = None,
-        retry_after_s: float | None = None,
-        sequence: int | None = None,
-    ) -> None:
-        super().__init__(detail)
-        self.detail = detail
-        self.reason = reason or self.reason
-        self.field = field
-        self.retry_after_s = retry_after_s
-        self.sequence = sequence
-
-    def __str__(self) -> str:
-        return f"{self.reason}: {self.detail}"
+from .client_error import ClientError as ClientError
 
 
 class InvalidArgument(ClientError, ValueError):
-    reason = grpc_status = "INVALID_ARGUMENT"
+    """A value that cannot be used; `field` names it as the caller wrote it."""
+
+    reason = "INVALID_ARGUMENT"
+    grpc_status = "INVALID_ARGUMENT"
 
 
 class InvalidPose(InvalidArgument):
+    """Not a rigid probe→scene transform."""
+
     reason = "INVALID_POSE"
 
 
 class InvalidProbe(InvalidArgument):
+    """A probe that no transducer could have, such as far ≤ near."""
+
     reason = "INVALID_PROBE"
 
 
 class InvalidImageSize(InvalidArgument):
+    """Height or width outside the limits."""
+
     reason = "INVALID_IMAGE_SIZE"
 
 
 class UnknownOutput(InvalidArgument):
+    """An output that does not exist, none at all, or one that the scene does not have."""
+
     reason = "UNKNOWN_OUTPUT"
 
 
 class LowConfidence(InvalidArgument):
+    """A pose below the `min_confidence` that was asked for."""
+
     reason = "LOW_CONFIDENCE"
 
 
 class TooManyPoses(InvalidArgument):
+    """More poses, or pixels, than one request may have; send several."""
+
     reason = "TOO_MANY_POSES"
 
 
 class DatasetInvalid(InvalidArgument):
+    """A tracked sweep that cannot be used; names the file, the frame and the reason."""
+
     reason = "DATASET_INVALID"
 
 
 class UploadTooLarge(InvalidArgument):
+    """An upload over `ULTRAGRAY_MAX_DATASET_BYTES`, packed or unpacked, or of too many files."""
+
     reason = "UPLOAD_TOO_LARGE"
 
 
 class Unauthenticated(ClientError):
-    reason = grpc_status = "UNAUTHENTICATED"
+    """No API key, or an unknown one."""
+
+    reason = "UNAUTHENTICATED"
+    grpc_status = "UNAUTHENTICATED"
 
 
 class NotFound(ClientError):
-    reason = grpc_status = "NOT_FOUND"
+    """Base of the errors whose gRPC status is NOT_FOUND."""
+
+    reason = "NOT_FOUND"
+    grpc_status = "NOT_FOUND"
 
 
 class SceneNotFound(NotFound):
+    """No scene of that name."""
+
     reason = "SCENE_NOT_FOUND"
 
 
 class DatasetNotFound(NotFound):
+    """No dataset of that name."""
+
     reason = "DATASET_NOT_FOUND"
 
 
 class JobNotFound(NotFound):
+    """No job of that id."""
+
     reason = "JOB_NOT_FOUND"
 
 
 class ArtifactNotFound(NotFound):
+    """The job has no file of that name."""
+
     reason = "ARTIFACT_NOT_FOUND"
 
 
-class AlreadyExists(ClientError):
-    reason = grpc_status = "ALREADY_EXISTS"
-
-
-class SceneExists(AlreadyExists):
-    reason = "SCENE_EXISTS"
-
-
-class DatasetExists(AlreadyExists):
-    reason = "DATASET_EXISTS"
-
-
-class RequestIdConflict(AlreadyExists):
-    reason = "REQUEST_ID_CONFLICT"
-
-
 class FailedPrecondition(ClientError):
-    reason = grpc_status = "FAILED_PRECONDITION"
+    """Base of the errors whose gRPC status is FAILED_PRECONDITION."""
+
+    reason = "FAILED_PRECONDITION"
+    grpc_status = "FAILED_PRECONDITION"
 
 
 class SceneFileInvalid(FailedPrecondition):
+    """A scene file that is truncated, foreign or inconsistent."""
+
     reason = "SCENE_FILE_INVALID"
 
 
 class DatasetInUse(FailedPrecondition):
+    """A job needs the dataset."""
+
     reason = "DATASET_IN_USE"
 
 
 class JobFinished(FailedPrecondition):
+    """A job that succeeded or failed cannot be cancelled."""
+
     reason = "JOB_FINISHED"
 
 
 class JobNotFinished(FailedPrecondition):
+    """Only a failed or cancelled job can be retried."""
+
     reason = "JOB_NOT_FINISHED"
 
 
 class JobInUse(FailedPrecondition):
+    """A job that waits or runs, or that another of those goes on from, cannot be deleted."""
+
     reason = "JOB_IN_USE"
 
 
+class AlreadyExists(ClientError):
+    """Base of the errors whose gRPC status is ALREADY_EXISTS."""
+
+    reason = "ALREADY_EXISTS"
+    grpc_status = "ALREADY_EXISTS"
+
+
+class DatasetExists(AlreadyExists):
+    """A dataset of that name has another content or other options; delete it first."""
+
+    reason = "DATASET_EXISTS"
+
+
+class SceneExists(AlreadyExists):
+    """A scene of that name is there, or a job is making it."""
+
+    reason = "SCENE_EXISTS"
+
+
+class RequestIdConflict(AlreadyExists):
+    """The `request_id` was used for something else."""
+
+    reason = "REQUEST_ID_CONFLICT"
+
+
 class ResourceExhausted(ClientError):
-    reason = grpc_status = "RESOURCE_EXHAUSTED"
+    """Base of the errors whose gRPC status is RESOURCE_EXHAUSTED."""
 
-
-class QueueFull(ResourceExhausted):
-    reason = "QUEUE_FULL"
-
-
-class JobQueueFull(ResourceExhausted):
-    reason = "JOB_QUEUE_FULL"
+    reason = "RESOURCE_EXHAUSTED"
+    grpc_status = "RESOURCE_EXHAUSTED"
 
 
 class StorageFull(ResourceExhausted):
+    """The artifact folder has no room, or a render job would write more than it has room for."""
+
     reason = "STORAGE_FULL"
 
 
 class MemoryExceeded(ResourceExhausted):
+    """The check of a dataset or scene file, a comparison, a training, or a frame or scene on a GPU, that does not
+    fit into memory; also where the machine has none left.
+    """
+
     reason = "MEMORY_EXCEEDED"
 
 
+class JobQueueFull(ResourceExhausted):
+    """Too many jobs wait; retry."""
+
+    reason = "JOB_QUEUE_FULL"
+
+
 class SceneTooLarge(ResourceExhausted):
+    """A scene that does not fit `ULTRAGRAY_MEMORY_BUDGET_MB` at all."""
+
     reason = "SCENE_TOO_LARGE"
 
 
+class QueueFull(ResourceExhausted):
+    """Too many frames wait, or too many uploads are under way; retry."""
+
+    reason = "QUEUE_FULL"
+
+
 class Unavailable(ClientError):
-    reason = grpc_status = "UNAVAILABLE"
+    """Base of the errors whose gRPC status is UNAVAILABLE."""
+
+    reason = "UNAVAILABLE"
+    grpc_status = "UNAVAILABLE"
+
+
+class DatabaseUnavailable(Unavailable):
+    """The database of the jobs does not answer; scenes are rendered all the same; retry."""
+
+    reason = "DATABASE_UNAVAILABLE"
 
 
 class NotReady(Unavailable):
+    """The service is starting; retry."""
+
     reason = "NOT_READY"
 
 
 class Draining(Unavailable):
+    """The service is stopping; retry elsewhere."""
+
     reason = "DRAINING"
 
 
-class DatabaseUnavailable(Unavailable):
-    reason = "DATABASE_UNAVAILABLE"
-
-
 class Unreachable(Unavailable):
+    """Nobody answers at the address, or the connection broke."""
+
     reason = "UNREACHABLE"
 
 
 class Unimplemented(ClientError):
-    reason = grpc_status = "UNIMPLEMENTED"
+    """Base of the errors whose gRPC status is UNIMPLEMENTED."""
+
+    reason = "UNIMPLEMENTED"
+    grpc_status = "UNIMPLEMENTED"
 
 
 class BackendUnavailable(Unimplemented):
+    """A backend that cannot run here."""
+
     reason = "BACKEND_UNAVAILABLE"
 
 
 class ExtraMissing(Unimplemented):
+    """A format whose package is not installed: `pip install 'ultragray[dicom]'` and the like (jobs, command line,
+    library).
+    """
+
     reason = "EXTRA_MISSING"
 
 
 class DeadlineExceeded(ClientError, TimeoutError):
-    reason = grpc_status = "DEADLINE_EXCEEDED"
+    """The deadline passed first."""
+
+    reason = "DEADLINE_EXCEEDED"
+    grpc_status = "DEADLINE_EXCEEDED"
 
 
 class RenderFailed(ClientError):
+    """A worker could not render the frame."""
+
     reason = "RENDER_FAILED"
 
 
 class StreamEnded(ClientError):
+    """A stream of poses that is over was asked to go on."""
+
     reason = "STREAM_ENDED"
 
-    @classmethod
-    def for_sending(cls) -> StreamEnded:
-        """The error of a pose that comes too late."""
-        return cls("the stream takes no more poses: done_sending was called, or it is over")
 
-
-ERRORS = tuple(value for value in vars().values() if isinstance(value, type) and issubclass(value, ClientError))
+ERRORS = (
+    ClientError,
+    InvalidArgument,
+    InvalidPose,
+    InvalidProbe,
+    InvalidImageSize,
+    UnknownOutput,
+    LowConfidence,
+    TooManyPoses,
+    DatasetInvalid,
+    UploadTooLarge,
+    Unauthenticated,
+    NotFound,
+    SceneNotFound,
+    DatasetNotFound,
+    JobNotFound,
+    ArtifactNotFound,
+    FailedPrecondition,
+    SceneFileInvalid,
+    DatasetInUse,
+    JobFinished,
+    JobNotFinished,
+    JobInUse,
+    AlreadyExists,
+    DatasetExists,
+    SceneExists,
+    RequestIdConflict,
+    ResourceExhausted,
+    StorageFull,
+    MemoryExceeded,
+    JobQueueFull,
+    SceneTooLarge,
+    QueueFull,
+    Unavailable,
+    DatabaseUnavailable,
+    NotReady,
+    Draining,
+    Unreachable,
+    Unimplemented,
+    BackendUnavailable,
+    ExtraMissing,
+    DeadlineExceeded,
+    RenderFailed,
+    StreamEnded,
+)

@@ -12,6 +12,8 @@ from .frames import Frame, frame_from_message
 from .geometry import PoseLike, pose_message
 from .statuses import error_of_frame
 
+TAKES_NO_MORE = "the stream takes no more poses: done_sending was called, or it is over"
+
 
 class StreamMode(str, Enum):
     """What becomes of a pose that still waits when the next one comes."""

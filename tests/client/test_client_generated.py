@@ -12,6 +12,7 @@ import pytest
 from ultragray import settings
 from ultragray.display import AS_RENDERED
 from ultragray_client import Display, RenderSettings
+from ultragray_service.errors import STATUSES
 
 CLIENT = Path(__file__).resolve().parents[2] / "client"
 BY_HAND = {"__init__.py", "transport.py"}
@@ -36,6 +37,12 @@ def test_the_client_for_threads_is_current(generator: ModuleType, tmp_path: Path
 def test_the_contract_is_current(generator: ModuleType, tmp_path: Path) -> None:
     committed = CLIENT / "ultragray_client" / "contract.py"
     assert committed.read_text() == generator.generate_contract(tmp_path).read_text()
+
+
+def test_the_errors_are_current(generator: ModuleType, tmp_path: Path) -> None:
+    committed = CLIENT / "ultragray_client" / "errors.py"
+    assert committed.read_text() == generator.generate_errors(tmp_path).read_text()
+    assert STATUSES.keys() > generator.NOT_OVER_GRPC
 
 
 def test_the_contract_has_the_defaults_of_the_library() -> None:

@@ -9,7 +9,7 @@ from ultragray_client.sync import datasets as client_datasets
 from ultragray_client.sync import jobs as client_jobs
 from ultragray_client.sync import scenes as client_scenes
 
-from .document import call_of, code, rows, table
+from .document import call_of, table
 
 
 def test_python_client() -> None:
@@ -37,9 +37,3 @@ def test_client_methods() -> None:
         if not name.startswith("_")
     ]
     assert list(table("Client methods")) == found
-
-
-def test_client_errors() -> None:
-    documented = [tuple(code(cell)[0] for cell in row) for row in rows("Client errors")]
-    found = [(cls.reason, cls.__name__, cls.__mro__[1].__name__) for cls in ultragray_client.errors.ERRORS]
-    assert documented == found

@@ -10,7 +10,7 @@ import grpc
 
 from ..connection import CHANNEL_OPTIONS
 from ..errors import StreamEnded
-from ..pose_exchange import PoseExchange
+from ..pose_exchange import TAKES_NO_MORE, PoseExchange
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -43,7 +43,7 @@ class PoseCall:
                     await self._call.write(opening)
                 await self._call.write(message)
             except asyncio.InvalidStateError:
-                raise StreamEnded.for_sending() from None
+                raise StreamEnded(TAKES_NO_MORE) from None
 
     async def done_sending(self) -> None:
         """Takes no more poses."""

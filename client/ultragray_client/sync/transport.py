@@ -11,7 +11,7 @@ import grpc
 
 from ..connection import CHANNEL_OPTIONS
 from ..errors import StreamEnded
-from ..pose_exchange import PoseExchange, StreamMode
+from ..pose_exchange import TAKES_NO_MORE, PoseExchange, StreamMode
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -60,7 +60,7 @@ class PoseCall:
                 self._changed.notify_all()
                 return
         if self._call.is_active() or self._call.code() is grpc.StatusCode.OK:
-            raise StreamEnded.for_sending()
+            raise StreamEnded(TAKES_NO_MORE)
         raise self._call  # grpc's calls are their own errors
 
     def done_sending(self) -> None:
