@@ -38,11 +38,12 @@ Outputs planes_of(const std::array<OptionalPlanes, 5>& arrays, size_t count, int
 }
 
 // The arguments that rendering and recording share.
-#define RENDER_ARGUMENTS                                                                                               \
-    nb::arg("scene"), nb::arg("fanned"), nb::arg("start"), nb::arg("span"), nb::arg("near_cm"), nb::arg("far_cm"),     \
-        nb::arg("cull_far_cm"), nb::arg("poses").noconvert(), nb::arg("height"), nb::arg("width"), nb::arg("threads"), \
-        nb::arg("instruction_set"), nb::arg("bmode").noconvert().none(), nb::arg("echo").noconvert().none(),           \
-        nb::arg("transmittance").noconvert().none(), nb::arg("coverage").noconvert().none()
+#define RENDER_ARGUMENTS                                                                                              \
+    nb::arg("scene"), nb::arg("fanned"), nb::arg("wrap"), nb::arg("start"), nb::arg("span"), nb::arg("near_cm"),      \
+        nb::arg("far_cm"), nb::arg("cull_far_cm"), nb::arg("poses").noconvert(), nb::arg("height"), nb::arg("width"), \
+        nb::arg("threads"), nb::arg("instruction_set"), nb::arg("bmode").noconvert().none(),                          \
+        nb::arg("echo").noconvert().none(), nb::arg("transmittance").noconvert().none(),                              \
+        nb::arg("coverage").noconvert().none()
 
 }  // namespace
 
@@ -79,13 +80,13 @@ NB_MODULE(_cpu, m) {
 
     m.def(
         "render",
-        [](const PreparedScene& scene, bool fanned, double start, double span, double near_cm, double far_cm,
+        [](const PreparedScene& scene, bool fanned, bool wrap, double start, double span, double near_cm, double far_cm,
            double cull_far_cm, Poses poses, int height, int width, int threads, const std::string& instruction_set,
            OptionalPlanes bmode, OptionalPlanes echo, OptionalPlanes transmittance, OptionalPlanes coverage,
            OptionalPlanes weight_sum) {
             const Outputs outputs =
                 planes_of({bmode, echo, transmittance, coverage, weight_sum}, poses.shape(0), height, width);
-            const ProbeGeometry probe{fanned, start, span, near_cm, far_cm, cull_far_cm};
+            const ProbeGeometry probe{fanned, wrap, start, span, near_cm, far_cm, cull_far_cm};
             nb::gil_scoped_release release;
             render(scene, probe, poses.data(), int(poses.shape(0)), height, width, threads, instruction_set, outputs);
         },
@@ -94,12 +95,12 @@ NB_MODULE(_cpu, m) {
     nb::class_<Recording>(m, "Recording")
         .def(
             "__init__",
-            [](Recording* self, const PreparedScene& scene, bool fanned, double start, double span, double near_cm,
-               double far_cm, double cull_far_cm, Poses poses, int height, int width, int threads,
+            [](Recording* self, const PreparedScene& scene, bool fanned, bool wrap, double start, double span,
+               double near_cm, double far_cm, double cull_far_cm, Poses poses, int height, int width, int threads,
                const std::string& instruction_set, OptionalPlanes bmode, OptionalPlanes echo, OptionalPlanes transmittance,
                OptionalPlanes coverage) {
                 const Outputs outputs = planes_of({bmode, echo, transmittance, coverage, {}}, poses.shape(0), height, width);
-                const ProbeGeometry probe{fanned, start, span, near_cm, far_cm, cull_far_cm};
+                const ProbeGeometry probe{fanned, wrap, start, span, near_cm, far_cm, cull_far_cm};
                 nb::gil_scoped_release release;
                 new (self) Recording(scene, probe, poses.data(), int(poses.shape(0)), height, width, threads,
                                      instruction_set, outputs);

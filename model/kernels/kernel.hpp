@@ -50,6 +50,7 @@ struct View {
     const double* dir_z;
     double near, cull_far, row_step;  // row i lies at near + row_step * (i + 1/2)
     double start, span;               // line j of W is at start + span * (j + 1/2) / W: cm along x, or radians from z
+    bool wrap;                        // fanned all the way round: the first line follows the last
     bool fanned;                      // the lines run from an apex at the origin, else side by side along z
     int height, lines;
 };

@@ -51,7 +51,7 @@ View make_view(const ProbeGeometry& probe, const ScanLines& lines, const double*
     view.line_x = lines.x.data(), view.dir_x = lines.dir_x.data(), view.dir_z = lines.dir_z.data();
     view.near = probe.near, view.cull_far = probe.cull_far;
     view.row_step = (probe.far - probe.near) / height;
-    view.start = probe.start, view.span = probe.span, view.fanned = probe.fanned;
+    view.start = probe.start, view.span = probe.span, view.fanned = probe.fanned, view.wrap = probe.wrap;
     view.height = height, view.lines = width;
     return view;
 }

@@ -11,7 +11,7 @@ namespace ultragray {
 
 // Geometry as the Python side knows it, in cm and radians.
 struct ProbeGeometry {
-    bool fanned;
+    bool fanned, wrap;
     double start, span;  // of the scan lines, as in View
     double near, far, cull_far;
 };

@@ -71,9 +71,31 @@ inline void touched_lines(const View& view, double room, Slice& s) {
     s.last = last < first - 1 ? -1 : static_cast<int32_t>(last + 1 < bound ? last + 1 : bound);
 }
 
+// The same of lines all the way round, in the axes of the line through the mean, where r is its distance from the apex, tt
+// the variance across that line, and so on. A slice that lies on the seam has its first line behind its last.
+inline void touched_lines_of_turn(const View& view, double room, Slice& s) {
+    const double r = s.depth, ex = r > 0 ? s.mean_x / r : 0.0, ez = r > 0 ? s.mean_z / r : 1.0;
+    const double tt = ez * ez * s.cov_xx - 2 * ex * ez * s.cov_xz + ex * ex * s.cov_zz;
+    const double tr = ex * ez * (s.cov_xx - s.cov_zz) + s.cov_xz * (ez * ez - ex * ex);
+    const double rr = ex * ex * s.cov_xx + 2 * ex * ez * s.cov_xz + ez * ez * s.cov_zz;
+    const double a = r * r - room * rr, b = -room * tr, discriminant = b * b + a * room * tt;
+    s.first = 0, s.last = view.lines - 1;
+    if (!(a > 0) || !(discriminant >= 0)) return;  // it reaches behind the apex
+    const double root = __builtin_sqrt(discriminant), pitch = view.span / view.lines;
+    const double own = (__builtin_atan2(ex, ez) - view.start) / pitch - 0.5;
+    const double first = __builtin_floor(own + __builtin_atan((b - root) / a) / pitch);
+    const double last = __builtin_ceil(own + __builtin_atan((b + root) / a) / pitch);
+    if (!(last - first + 1 + kMaxLanes <= view.lines)) return;  // a vector that starts before the seam must not come round
+    const auto wrapped = [&view](double line) {
+        const int32_t turned = static_cast<int32_t>(line) % view.lines;
+        return turned < 0 ? turned + view.lines : turned;
+    };
+    s.first = wrapped(first), s.last = wrapped(last);
+}
+
 inline bool inside_planes(const View& view, double x, double z) {
     const double depth = view.fanned ? __builtin_sqrt(x * x + z * z) : z;
-    return depth >= view.near && depth <= view.cull_far && (!view.fanned || z > 0);
+    return depth >= view.near && depth <= view.cull_far && (!view.fanned || view.wrap || z > 0);
 }
 
 // kLanes Gaussians seen in the probe frame.
@@ -139,7 +161,8 @@ void slice_candidates(const SceneView& scene, const View& view, const Candidates
     const Floats value = spherical_harmonics(load_harmonics(scene, c), scene.sh_degree, v.x, v.y, v.z);
     const Floats intensity = activate(scene.intensity, value);
 
-    Slice* next = out.append(c.count);
+    const int room = view.wrap ? 2 * c.count : c.count;
+    Slice* next = out.append(room);
     int written = 0;
     for (int k = 0; k < c.count; ++k) {
         if (!(m2[k] <= kMaxM2) || !inside_planes(view, p.mu[0][k], p.mu[2][k])) continue;
@@ -148,15 +171,23 @@ void slice_candidates(const SceneView& scene, const View& view, const Candidates
         s.mean_x = mean_x[k], s.mean_z = mean_z[k];
         s.cov_xx = cov_xx[k], s.cov_xz = cov_xz[k], s.cov_zz = cov_zz[k];
         s.depth = view.fanned ? __builtin_sqrt(s.mean_x * s.mean_x + s.mean_z * s.mean_z) : s.mean_z;
-        touched_lines(view, kMaxM2 - m2[k], s);
-        if (s.first > s.last) continue;
+        if (view.wrap)
+            touched_lines_of_turn(view, kMaxM2 - m2[k], s);
+        else
+            touched_lines(view, kMaxM2 - m2[k], s);
+        if (s.first > s.last && !view.wrap) continue;
         s.m2_plane = static_cast<float>(m2[k]);
         s.intensity = intensity[k];
         s.absorb = scene.gaussians[c.ids[k]].absorb;
         s.gaussian = static_cast<int32_t>(c.ids[k]);
         ++written;
+        if (s.first <= s.last) continue;
+        next[written] = s;  // on the seam: once for either side of it
+        next[written].first = 0;
+        s.last = view.lines - 1;
+        ++written;
     }
-    out.shrink_by(c.count - written);
+    out.shrink_by(room - written);
 }
 
 void slice_clusters(const SceneView& scene, const View& view, int64_t first, int64_t last, SliceList& out) {

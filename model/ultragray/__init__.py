@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from .errors import UltragrayError
 from .pose import check_poses, pose_from_position_quaternion, quaternion_from_pose
-from .probe import ConvexProbe, LinearProbe, PhasedProbe, Probe
+from .probe import ConvexProbe, LinearProbe, PhasedProbe, Probe, RadialProbe
 from .scene_info import SceneHeader, SceneInfo, read_header
 
 if TYPE_CHECKING:
@@ -27,6 +27,7 @@ __all__ = [
     "LinearProbe",
     "PhasedProbe",
     "Probe",
+    "RadialProbe",
     "SceneHeader",
     "SceneInfo",
     "UltragrayError",

@@ -64,6 +64,7 @@ def _view_arguments(
     lines = KernelLines.of(probe)
     return {
         "fanned": lines.fanned,
+        "wrap": lines.wrap,
         "start": lines.start,
         "span": lines.span,
         "near_cm": probe.near_mm / 10.0,

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..probe import FloatArray, Probe
-from ..probe.scan_lines import FannedLines, ParallelLines
+from ..probe.scan_lines import FannedLines, ParallelLines, RadialLines
 
 
 class KernelLines(NamedTuple):
@@ -22,6 +22,7 @@ class KernelLines(NamedTuple):
     """
 
     fanned: bool
+    wrap: bool  # whether the first line follows the last, a full turn later
     start: float
     span: float
     axes: FloatArray  # [3, 3]
@@ -34,9 +35,9 @@ class KernelLines(NamedTuple):
                 along_x, along_z = lines.direction
                 axes = np.eye(3)
                 axes[2] = -along_x / along_z, 0.0, 1.0 / along_z
-                return cls(False, lines.start / 10.0, lines.span / 10.0, axes)
-            case FannedLines() as lines:
-                return cls(True, math.radians(lines.start), math.radians(lines.span), np.eye(3))
+                return cls(False, False, lines.start / 10.0, lines.span / 10.0, axes)
+            case FannedLines() | RadialLines() as lines:
+                return cls(True, lines.wrap, math.radians(lines.start), math.radians(lines.span), np.eye(3))
 
     def view_axes(self, poses: FloatArray) -> FloatArray:  # [C, 4, 4] -> [C, 4, 4]
         """Poses whose axes are those of the sheared plane."""

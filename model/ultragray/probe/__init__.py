@@ -14,6 +14,7 @@ from .linear import LinearProbe
 from .phased import PhasedProbe
 from .picture import Picture
 from .probe import Probe
+from .radial import RadialProbe
 from .scan_lines import FloatArray
 
 __all__ = [
@@ -23,4 +24,5 @@ __all__ = [
     "PhasedProbe",
     "Picture",
     "Probe",
+    "RadialProbe",
 ]

@@ -19,7 +19,6 @@ _P = TypeVar("_P", bound="Probe")
 BoolArray = npt.NDArray[np.bool_]
 
 MAX_LENGTH_MM = 10_000.0
-USUAL_SCAN_LINES_MM = (10.0, 400.0)
 
 
 def length_field(meaning: str, **options: Any) -> Any:
@@ -34,6 +33,7 @@ class Probe(Family):
     """
 
     error: ClassVar[type[InvalidProbe]] = InvalidProbe
+    usual_scan_lines_mm: ClassVar[tuple[float, float]] = (10.0, 400.0)  # their length
     kind: str
     near_mm: float  # depth at which the image begins
     far_mm: float  # and ends
@@ -52,8 +52,13 @@ class Probe(Family):
 
     @property
     def face_depth_mm(self) -> float:
-        """Depth of the face, which depths are counted from on a scanner; the middle of the face lies there on z."""
+        """Depth of the face, from which depths are counted on a scanner."""
         raise NotImplementedError
+
+    @property
+    def pivot_depth_mm(self) -> float:
+        """Where on z the middle of the face lies, about which a probe is tilted."""
+        return self.face_depth_mm
 
     @property
     def scan_line_length_mm(self) -> float:
@@ -130,8 +135,9 @@ class Probe(Family):
 
     def oddities(self) -> Iterator[str]:
         """Sizes that no probe has, as lengths and angles in other units give them, in words."""
-        if not USUAL_SCAN_LINES_MM[0] <= self.scan_line_length_mm <= USUAL_SCAN_LINES_MM[1]:
-            yield odd_length("scan lines are", "long", self.scan_line_length_mm, USUAL_SCAN_LINES_MM)
+        low, high = self.usual_scan_lines_mm
+        if not low <= self.scan_line_length_mm <= high:
+            yield odd_length("scan lines are", "long", self.scan_line_length_mm, self.usual_scan_lines_mm)
 
 
 def odd_length(subject: str, measure: str, length_mm: float, usual_mm: tuple[float, float]) -> str:

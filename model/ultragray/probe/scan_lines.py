@@ -118,19 +118,27 @@ class ParallelLines(ScanLines):
         return self.steering_deg == 0.0
 
 
-@dataclass(frozen=True)
-class FannedLines(ScanLines):
-    """Lines from an apex at the origin, `span` degrees wide, less than 180; `across` is the angle from z towards +x."""
-
-    span: float
+class _Angular(ScanLines):
+    """Lines at even angles from a point at the origin; `across` is the angle from z towards +x."""
 
     unit: ClassVar[str] = "deg"
-    corner_shares: ClassVar[tuple[float, ...]] = (0.0, 0.5, 1.0)
 
     def rays(self, across: FloatArray) -> tuple[FloatArray, FloatArray]:
         angle = np.radians(across)
         directions = np.stack([np.sin(angle), np.cos(angle)], axis=-1)
         return np.zeros_like(directions), directions
+
+    def breadth_mm(self, depth_mm: float) -> float:
+        return depth_mm * math.radians(self.span)
+
+
+@dataclass(frozen=True)
+class FannedLines(_Angular):
+    """A fan about z, `span` degrees wide, less than 180."""
+
+    span: float
+
+    corner_shares: ClassVar[tuple[float, ...]] = (0.0, 0.5, 1.0)
 
     def coordinates(self, x: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray]:
         return np.where(z > 0, np.hypot(x, z), np.nan), np.degrees(np.arctan2(x, z))
@@ -144,8 +152,25 @@ class FannedLines(ScanLines):
         side = far_mm * math.sin(half)
         return Box(-side, side, near_mm * math.cos(half), far_mm)
 
-    def breadth_mm(self, depth_mm: float) -> float:
-        return depth_mm * math.radians(self.span)
+
+@dataclass(frozen=True)
+class RadialLines(_Angular):
+    """Lines all the way round, the left edge of the first one along z."""
+
+    span: ClassVar[float] = 360.0  # type: ignore[misc]  # of all of them
+    start: ClassVar[float] = 0.0
+    corner_shares: ClassVar[tuple[float, ...]] = (0.0, 0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875)
+    wrap: ClassVar[bool] = True
+
+    def coordinates(self, x: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray]:
+        return np.hypot(x, z), np.degrees(np.arctan2(x, z)) % self.span
+
+    def beside(self, x: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray]:
+        depth = np.sqrt(x * x + z * z)
+        return np.zeros_like(depth), depth
+
+    def box(self, near_mm: float, far_mm: float) -> Box:
+        return Box(-far_mm, far_mm, -far_mm, far_mm)
 
 
-Lines: TypeAlias = ParallelLines | FannedLines
+Lines: TypeAlias = ParallelLines | FannedLines | RadialLines

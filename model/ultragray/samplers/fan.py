@@ -38,5 +38,5 @@ class FanSampler(Sampler):
         fan = np.tile(base, (tilts, 1, 1, 1))  # [tilts, P, 4, 4]
         fan[..., :3, :3] = base[:, :3, :3] @ turns[:, None]
         axial = base[:, :3, 2] - fan[..., :3, 2]
-        fan[..., :3, 3] += probe.face_depth_mm * axial
+        fan[..., :3, 3] += probe.pivot_depth_mm * axial
         return fan.reshape(-1, 4, 4)

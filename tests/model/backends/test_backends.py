@@ -11,7 +11,16 @@ import numpy as np
 import pytest
 import torch
 
-from ultragray import ConvexProbe, Frames, GaussianScene, LinearProbe, PhasedProbe, Probe, render
+from ultragray import (
+    ConvexProbe,
+    Frames,
+    GaussianScene,
+    LinearProbe,
+    PhasedProbe,
+    Probe,
+    RadialProbe,
+    render,
+)
 from ultragray.backends import cpu
 from ultragray.errors import BackendUnavailable
 from ultragray.outputs import PLANES
@@ -20,6 +29,8 @@ RENDERERS = ("reference", "cuda", "cpu", *(f"cpu-{name}" for name in cpu.INSTRUC
 LINEAR = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)
 CONVEX = ConvexProbe(opening_angle_deg=60.0, near_mm=10.0, far_mm=60.0)
 PHASED = PhasedProbe(opening_angle_deg=90.0, far_mm=60.0)
+
+RADIAL = RadialProbe(near_mm=1.0, far_mm=30.0)
 
 Renderer = Callable[..., Frames]
 
@@ -36,7 +47,7 @@ def renderer(request: pytest.FixtureRequest, on_device: Callable[[GaussianScene]
     def forced(scene: GaussianScene, probe: Probe, poses: Any, *, height: int, width: int) -> Frames:
         inside = scene.poses_to_scene_cm(np.atleast_3d(poses).reshape(-1, 4, 4))
         planes = cpu.render_outputs(scene, probe, inside, height, width, PLANES, instruction_set=instruction_set)
-        return Frames(**planes)
+        return Frames(planes)
 
     return forced
 
@@ -60,6 +71,10 @@ CASES = {
     "face_beyond_apex_zero": Case(probe=ConvexProbe(opening_angle_deg=45.0, near_mm=0.0, far_mm=50.0)),
     "phased": Case(probe=PHASED),
     "phased_at_the_face": Case({"centre_cm": (0, 0, 0.3), "extent_cm": (1, 0.4, 0.8)}, probe=PHASED),
+    "radial": Case({"centre_cm": (0, 0, 0)}, probe=RADIAL),
+    "radial_about_the_centre": Case({"centre_cm": (0, 0, 0), "extent_cm": (1, 1, 1), "sigma_cm": (0.02, 0.4)}, RADIAL),
+    "radial_of_few_lines": Case({"centre_cm": (0, 0, 0)}, probe=RADIAL, width=5),
+    "radial_of_many_lines": Case({"centre_cm": (0, 0, 0), "count": 600}, probe=RADIAL, width=301, poses=3),
     "near_plane_inside": Case(probe=LinearProbe(width_mm=30.0, near_mm=15.0, far_mm=35.0)),
     "at_the_face": Case({"centre_cm": (0, 0, 0.02), "extent_cm": (3, 0.2, 0.3), "sigma_cm": (0.02, 0.3)}, tilt_deg=3.0),
     "large": Case({"count": 40, "sigma_cm": (1.0, 3.0)}),
@@ -108,6 +123,10 @@ def prepared(
         return done[name]
 
     return prepare
+
+
+def test_every_kind_of_probe_is_tested() -> None:
+    assert {case.probe.kind for case in CASES.values()} == set(Probe.members)
 
 
 @pytest.mark.parametrize("name", CASES)

@@ -215,7 +215,7 @@ import numpy as np, torch, triton
 from triton.backends.compiler import GPUTarget
 from triton.runtime import driver
 from triton.runtime.jit import JITFunction
-from ultragray import ConvexProbe, GaussianScene, LinearProbe
+from ultragray import ConvexProbe, GaussianScene, LinearProbe, RadialProbe
 from ultragray.backends import cuda
 
 class Driver:  # of a GPU that is only compiled for
@@ -231,7 +231,7 @@ def compile_only(kernel, *arguments, grid, warmup, **options):
     compiled.setdefault(made.hash, (kernel.__name__, made.asm["cubin"]))
 
 JITFunction.run = compile_only
-probes = {0: LinearProbe(40, 0, 50), 3: ConvexProbe(60, near_mm=10, far_mm=60)}
+probes = {0: LinearProbe(40, 0, 50), 1: RadialProbe(1, 20), 3: ConvexProbe(60, near_mm=10, far_mm=60)}
 for degree, probe in ((degree, probes[degree]) for degree in map(int, sys.argv[3:])):
     raw = {"means": (9, 3), "scales": (9, 3), "quats": (9, 4), "transmittances": (9,), "sh0": (9, 1, 1)}
     splats = {name: torch.rand(shape) for name, shape in raw.items()}
@@ -254,8 +254,8 @@ for name, code in compiled.values():
     ("capability", "degrees"),
     [
         pytest.param("90", ["3"], marks=pytest.mark.slow),
-        pytest.param("90", ["0"], marks=pytest.mark.long),
-        pytest.param("80", ["0", "3"], marks=pytest.mark.long),
+        pytest.param("90", ["0", "1"], marks=pytest.mark.long),
+        pytest.param("80", ["0", "1", "3"], marks=pytest.mark.long),
     ],
 )
 def test_every_launch_compiles_for_gpus_and_keeps_to_its_registers(

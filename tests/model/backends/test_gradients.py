@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from ultragray import ConvexProbe, GaussianScene, LinearProbe, PhasedProbe, Probe, render
+from ultragray import ConvexProbe, GaussianScene, LinearProbe, PhasedProbe, Probe, RadialProbe, render
 from ultragray.backends import cpu, cuda
 from ultragray.outputs import PLANES
 
@@ -24,6 +24,11 @@ SCENES: dict[str, tuple[Mapping[str, Any], Probe]] = {
     "convex": ({}, CONVEX),
     "phased": ({"centre_cm": (0, 0, 1.5)}, PhasedProbe(opening_angle_deg=90.0, far_mm=50.0)),
     "wide fan": ({}, ConvexProbe(opening_angle_deg=150.0, near_mm=5.0, far_mm=50.0)),
+    "radial": ({"centre_cm": (0, 0, 0)}, RadialProbe(near_mm=1.0, far_mm=30.0)),
+    "radial about the centre": (
+        {"centre_cm": (0, 0, 0), "extent_cm": (1, 1, 1), "sigma_cm": (0.05, 0.4)},
+        RadialProbe(near_mm=0.0, far_mm=20.0),
+    ),
     "one Gaussian": ({"count": 1, "extent_cm": (0.1, 0.01, 0.1), "sigma_cm": (0.2, 0.3)}, LINEAR),
     "shadows": ({"count": 400, "transmittance_logit": (-6, 0), "sigma_cm": (0.1, 0.3)}, LINEAR),
     "shadows in a fan": ({"count": 400, "transmittance_logit": (-6, 0), "sigma_cm": (0.1, 0.3)}, CONVEX),

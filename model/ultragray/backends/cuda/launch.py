@@ -76,6 +76,7 @@ class Geometry(NamedTuple):
     """A probe and an image size in the terms of the kernels."""
 
     fanned: bool
+    wrap: bool  # the first line follows the last
     height: int
     width: int
     pitch: float  # between scan lines: cm, or radians for a fan
@@ -84,7 +85,7 @@ class Geometry(NamedTuple):
     @classmethod
     def of(cls, probe: Probe, height: int, width: int) -> Geometry:
         lines = KernelLines.of(probe)
-        return cls(lines.fanned, height, width, lines.span / width, _row_cm(probe, height))
+        return cls(lines.fanned, lines.wrap, height, width, lines.span / width, _row_cm(probe, height))
 
 
 def _row_cm(probe: Probe, height: int) -> float:
@@ -192,6 +193,7 @@ def cut(gaussians: Gaussians, views: Tensor, geometry: Geometry, *, record: bool
             geometry.height,
             geometry.width,
             FANNED=geometry.fanned,
+            WRAP=geometry.wrap,
             SIGMOID=gaussians.sigmoid,
             DEGREE=gaussians.degree,
             RECORD=record,
@@ -232,6 +234,7 @@ def draw(slices: Slices, geometry: Geometry, frames: Mapping[str, Tensor], *, ke
         geometry.pitch,
         geometry.row_cm,
         FANNED=geometry.fanned,
+        WRAP=geometry.wrap,
         BLOCK=how.block,
         S_LANES=how.slices_at_once,
         TILE_ROWS=how.tile_rows,
@@ -309,6 +312,7 @@ def differentiate(
             geometry.pitch,
             geometry.row_cm,
             FANNED=geometry.fanned,
+            WRAP=geometry.wrap,
             BLOCK=how.block,
             S_LANES=how.slices_at_once,
             ROWS=how.gather_rows,

@@ -9,13 +9,16 @@ import triton
 import triton.language as tl
 
 from .constants import FIELDS, HALF_LOG2_E, LOG2_E, MAX_M2, MAX_WEIGHT, MIN_PSI, NOTHING, RECTANGLE
-from .profile import clipped_profile, cross, peak_of, polynomial_profile
+from .profile import clipped_profile, cross, peak_of, polynomial_profile, shortest_turn
 
 
 @triton.jit
-def touches(rectangle, mask, x0, x1, y0, y1):
+def touches(rectangle, mask, x0, x1, y0, y1, width, WRAP: tl.constexpr):
     """Whether rectangles (first and last column, first and last row) have pixels in common with one."""
-    across = (tl.load(rectangle, mask, NOTHING) <= x1) & (tl.load(rectangle + 1, mask, -1) >= x0)
+    last = tl.load(rectangle + 1, mask, -1)
+    across = (tl.load(rectangle, mask, NOTHING) <= x1) & (last >= x0)
+    if WRAP:
+        across = across | (last - width >= x0)
     return across & (tl.load(rectangle + 2, mask, NOTHING) <= y1) & (tl.load(rectangle + 3, mask, -1) >= y0)
 
 
@@ -41,6 +44,7 @@ def draw_tiles(
     pitch,
     row_cm,
     FANNED: tl.constexpr,
+    WRAP: tl.constexpr,
     BLOCK: tl.constexpr,
     S_LANES: tl.constexpr,
     TILE_ROWS: tl.constexpr,
@@ -62,14 +66,16 @@ def draw_tiles(
     for start in range(0, blocks, CHUNK):
         block = start + tl.arange(0, CHUNK)
         known = block < blocks
-        hit = touches(bounds + (pose * blocks + block) * 4, known, x0, x1, y0, y1)
+        hit = touches(bounds + (pose * blocks + block) * 4, known, x0, x1, y0, y1, width, WRAP)
         chosen = tl.min(tl.where(hit, block, NOTHING), 0)
         while chosen < NOTHING:
             group = pose * blocks + chosen
             count = tl.load(counts + group)
             if S_LANES == 1:  # a warp picks those that touch the tile out of the whole block at once
                 lane = tl.arange(0, BLOCK)
-                hits = touches(rectangles + (group * BLOCK + lane) * RECTANGLE, lane < count, x0, x1, y0, y1)
+                hits = touches(
+                    rectangles + (group * BLOCK + lane) * RECTANGLE, lane < count, x0, x1, y0, y1, width, WRAP
+                )
                 picked = tl.min(tl.where(hits, lane, NOTHING), 0)
                 while picked < NOTHING:
                     total, echo, passing, ending = add_slices(
@@ -86,7 +92,9 @@ def draw_tiles(
                         y1,
                         pitch,
                         row_cm,
+                        width,
                         FANNED,
+                        WRAP,
                         S_LANES,
                     )
                     picked = tl.min(tl.where(hits & (lane > picked), lane, NOTHING), 0)
@@ -94,7 +102,7 @@ def draw_tiles(
                 for first in range(0, count, S_LANES):
                     lane = first + tl.arange(0, S_LANES)
                     slot = group * BLOCK + lane
-                    hits = touches(rectangles + slot * RECTANGLE, lane < count, x0, x1, y0, y1)
+                    hits = touches(rectangles + slot * RECTANGLE, lane < count, x0, x1, y0, y1, width, WRAP)
                     total, echo, passing, ending = add_slices(
                         total,
                         echo,
@@ -109,7 +117,9 @@ def draw_tiles(
                         y1,
                         pitch,
                         row_cm,
+                        width,
                         FANNED,
+                        WRAP,
                         S_LANES,
                     )
             chosen = tl.min(tl.where(hit & (block > chosen), block, NOTHING), 0)
@@ -138,7 +148,9 @@ def add_slices(
     y1,
     pitch,
     row_cm,
+    width,
     FANNED: tl.constexpr,
+    WRAP: tl.constexpr,
     S_LANES: tl.constexpr,
 ):
     """The accumulators of a tile, with some slices added."""
@@ -146,7 +158,7 @@ def add_slices(
     turn = columns_at - tl.load(rectangle + 4, hits, 0).to(tl.float32)[:, None, None]  # [S, 1, columns]
     down = rows_at - tl.load(rectangle + 5, hits, 0).to(tl.float32)[:, None, None]  # [S, rows, 1]
     _, _, _, _, m2, sigma, past, star, touched = cross(
-        turn,
+        shortest_turn(turn, width, WRAP),
         field(slices, slot, hits, 0),
         field(slices, slot, hits, 1),
         field(slices, slot, hits, 2),
@@ -160,8 +172,11 @@ def add_slices(
     )
     touched = touched & hits[:, None, None]
     if FANNED:  # a line of the far side of a wide fan meets the slice behind the apex
-        own = tl.load(rectangle, hits, 0)[:, None, None] <= columns_at
-        touched = touched & own & (columns_at <= tl.load(rectangle + 1, hits, -1)[:, None, None])
+        last = tl.load(rectangle + 1, hits, -1)[:, None, None]
+        own = (tl.load(rectangle, hits, 0)[:, None, None] <= columns_at) & (columns_at <= last)
+        if WRAP:
+            own = own | (columns_at + width <= last)
+        touched = touched & own
     scale = 1.0 / sigma
     peak = peak_of(m2, sigma, touched) * -LOG2_E
     echo_peak = m2 * -HALF_LOG2_E

@@ -8,7 +8,7 @@ import triton
 import triton.language as tl
 
 from .constants import FIELDS, GRADIENTS, HALF_LOG2_E, LOG2_E, MAX_M2, MAX_WEIGHT, MIN_PSI, RECTANGLE
-from .profile import cross, peak_of, profile_slopes
+from .profile import cross, peak_of, profile_slopes, shortest_turn
 
 
 @triton.jit(do_not_specialize=["height", "width", "has_bmode", "has_echo", "has_transmittance", "has_coverage"])
@@ -98,6 +98,7 @@ def gather_slices(
     pitch,
     row_cm,
     FANNED: tl.constexpr,
+    WRAP: tl.constexpr,
     BLOCK: tl.constexpr,
     S_LANES: tl.constexpr,
     ROWS: tl.constexpr,
@@ -134,9 +135,11 @@ def gather_slices(
             columns = first_column[:, None] + x + tl.arange(0, COLUMNS)[None, :]  # [S, columns]
             turn = (columns - column[:, None]).to(tl.float32)
             dx, dz, across, spread, m2, sigma, past, star, touched = cross(
-                turn, t, row_offset, r, m2_plane, tt, tr, rr, det, pitch, FANNED
+                shortest_turn(turn, width, WRAP), t, row_offset, r, m2_plane, tt, tr, rr, det, pitch, FANNED
             )
             touched = touched & (columns <= last_column[:, None])
+            if WRAP:
+                columns = tl.where(columns >= width, columns - width, columns)
             scale = 1.0 / sigma
             peak = peak_of(m2, sigma, touched)
             zero = -star * scale

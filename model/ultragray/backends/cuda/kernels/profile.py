@@ -77,6 +77,15 @@ def profile_slopes(u, zero):
 
 
 @triton.jit
+def shortest_turn(turn, width, WRAP: tl.constexpr):
+    """From one scan line to another, in lines: the shorter way round where they go all the way."""
+    if WRAP:
+        return turn - width * tl.floor(turn / width + 0.5)
+    else:
+        return turn
+
+
+@triton.jit
 def cross(turn, t, row_offset, r, m2_plane, tt, tr, rr, det, pitch, FANNED: tl.constexpr):
     """Scan lines `turn` lines to the right of a slice's own: how they cross the slice.
 

@@ -43,6 +43,14 @@ def arc_tangent(x):
 
 
 @triton.jit
+def angle_from_z(x, z):
+    """Of a point, towards +x, from 0 up to a full turn."""
+    steep = tl.where(z == 0.0, 1e-30, z)
+    angle = arc_tangent(x / steep) + tl.where(steep < 0.0, 3.141592653589793, 0.0)
+    return tl.where(angle < 0.0, angle + 6.283185307179586, angle)
+
+
+@triton.jit
 def load3(base, index, stride, mask):
     """Three numbers of a row."""
     at = base + index * stride
@@ -150,6 +158,7 @@ def slice_gaussians(
     height,
     width,
     FANNED: tl.constexpr,
+    WRAP: tl.constexpr,
     SIGMOID: tl.constexpr,
     DEGREE: tl.constexpr,
     RECORD: tl.constexpr,
@@ -190,8 +199,12 @@ def slice_gaussians(
         pitch = span / width
         if FANNED:
             depth = tl.sqrt(mean[0] * mean[0] + mean[2] * mean[2])
-            inside = (depth >= near) & (depth <= cull_far) & (mean[2] > 0.0)
-            angle = arc_tangent(x / tl.maximum(z, 1e-30))
+            inside = (depth >= near) & (depth <= cull_far)
+            if WRAP:
+                angle = angle_from_z(x, z)
+            else:
+                inside = inside & (mean[2] > 0.0)
+                angle = arc_tangent(x / tl.maximum(z, 1e-30))
             line = (angle - start) / span * width - 0.5
         else:
             inside = (mean[2] >= near) & (mean[2] <= cull_far)
@@ -227,8 +240,15 @@ def slice_gaussians(
         else:
             half = tl.sqrt(tl.maximum(room * tt, 0.0))
             first, last = column + (t - half) / pitch, column + (t + half) / pitch
-        first_column = tl.minimum(tl.maximum(tl.floor(first), 0.0), width + 0.0).to(tl.int32)
-        last_column = tl.maximum(tl.minimum(tl.ceil(last), width - 1.0), -1.0).to(tl.int32)
+        if WRAP:  # columns go on over the seam: from one of the frame to at most the one before it, a turn later
+            first, last = tl.floor(first), tl.ceil(last)
+            every = last - first + 1.0 >= width
+            turned = tl.where(first < 0.0, width + 0.0, 0.0)
+            first_column = tl.where(every, 0.0, first + turned).to(tl.int32)
+            last_column = tl.where(every, width - 1.0, last + turned).to(tl.int32)
+        else:
+            first_column = tl.minimum(tl.maximum(tl.floor(first), 0.0), width + 0.0).to(tl.int32)
+            last_column = tl.maximum(tl.minimum(tl.ceil(last), width - 1.0), -1.0).to(tl.int32)
 
         # Rows: down to where the echo is nothing and the absorption complete, that row included.
         opaque = (m2 <= MAX_M2_ATTENUATION) & (tl.exp(-0.5 * m2) * spread * FULL_PROFILE >= MIN_PSI)

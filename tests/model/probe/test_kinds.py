@@ -1,0 +1,117 @@
+"""What holds of every kind of probe, whatever its scan lines."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ultragray import ConvexProbe, LinearProbe, PhasedProbe, Probe, RadialProbe
+from ultragray.contract import from_dict, to_dict
+from ultragray.display.scan_conversion import scan_convert
+
+PROBES = [
+    LinearProbe(width_mm=40.0, near_mm=10.0, far_mm=50.0),
+    ConvexProbe(opening_angle_deg=60.0, near_mm=50.0, far_mm=150.0),
+    PhasedProbe(opening_angle_deg=90.0, far_mm=120.0),
+    RadialProbe(near_mm=1.0, far_mm=12.0),
+]
+each_probe = pytest.mark.parametrize("probe", PROBES, ids=str)
+
+
+def test_every_kind_is_here() -> None:
+    assert {probe.kind for probe in PROBES} == set(Probe.members)
+
+
+@each_probe
+def test_pixels_lie_on_scan_lines(probe: Probe) -> None:
+    origins, directions = probe.scan_lines(7)
+    np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1.0)
+    on_lines = origins + probe.depths_mm(5)[:, None, None] * directions
+    rows, columns = np.meshgrid((np.arange(5) + 0.5) / 5, (np.arange(7) + 0.5) / 7, indexing="ij")
+    np.testing.assert_allclose(probe.points_mm(rows, columns), on_lines, atol=1e-9)
+
+
+@each_probe
+def test_image_coordinates_and_back(probe: Probe) -> None:
+    rows, columns = np.random.default_rng(0).uniform(0.01, 0.99, (2, 200))
+    points = probe.points_mm(rows, columns)
+    found = probe.image_coordinates(points[:, 0], points[:, 2])
+    np.testing.assert_allclose(found, [rows, columns], atol=1e-9)
+    lateral, depth = probe.lines.beside(points[:, 0], points[:, 2])
+    assert (lateral <= 0.0).all()
+    np.testing.assert_allclose(depth, probe.near_mm + rows * probe.scan_line_length_mm)
+
+
+@each_probe
+def test_points_outside_the_image_have_no_coordinates(probe: Probe) -> None:
+    beyond = probe.ending_at(probe.far_mm + 10.0).points_mm(np.ones(9), np.linspace(0.0, 1.0, 9))
+    assert np.isnan(probe.image_coordinates(beyond[:, 0], beyond[:, 2])).all()
+    box = probe.box_mm
+    assert np.isnan(probe.image_coordinates(np.array(box.right + 1.0), np.array(box.bottom + 1.0))).all()
+
+
+@each_probe
+def test_the_box_just_holds_the_image(probe: Probe) -> None:
+    rows, columns = np.meshgrid(np.linspace(0, 1, 201), np.linspace(0, 1, 721))
+    x, _, z = np.moveaxis(probe.points_mm(rows, columns), -1, 0)
+    box = probe.box_mm
+    np.testing.assert_allclose([x.min(), x.max(), z.min(), z.max()], box, atol=1e-3)
+
+
+@each_probe
+def test_a_mean_is_culled_by_its_depth(probe: Probe) -> None:
+    last = (10 - 1) / 10
+    points = probe.points_mm(np.array([0.001, last - 0.001, last + 0.001]), np.full(3, 0.3))
+    np.testing.assert_array_equal(probe.cull(points[:, 0], points[:, 2], 10), [True, True, False])
+    before = probe.points_mm(np.array([-0.01]), np.array([0.3]))
+    assert not probe.cull(before[:, 0], before[:, 2], 10).any()
+
+
+@each_probe
+def test_scan_conversion_shows_each_pixel_where_it_lies(probe: Probe) -> None:
+    """A frame that holds the z of its pixels, then their x, shows them."""
+    height, width = 200, 360
+    rows, columns = np.meshgrid((np.arange(height) + 0.5) / height, (np.arange(width) + 0.5) / width, indexing="ij")
+    x, _, z = np.moveaxis(probe.points_mm(rows, columns), -1, 0)
+    pixel_mm = probe.box_mm.longer_side / 150
+    across, down = np.broadcast_arrays(*probe.picture(pixel_mm).positions_mm())
+    shown_x, shown_z = scan_convert(x, probe, pixel_mm), scan_convert(z, probe, pixel_mm)
+    rows, columns = probe.image_coordinates(across, down)
+    margin = 0.0 if probe.lines.wrap else 1 / width
+    inside = (rows > 1 / height) & (rows < 1 - 1 / height) & (columns >= margin) & (columns <= 1 - margin)
+    tolerance = 2e-4 * probe.box_mm.longer_side
+    np.testing.assert_allclose(shown_x[inside], across[inside], atol=tolerance)
+    np.testing.assert_allclose(shown_z[inside], down[inside], atol=tolerance)
+    assert not shown_x[np.isnan(rows)].any()
+
+
+@each_probe
+def test_json_and_repr_give_the_probe_back(probe: Probe) -> None:
+    assert from_dict(Probe, to_dict(probe)) == probe
+    assert to_dict(probe)["kind"] == probe.kind
+    assert eval(repr(probe)) == probe
+
+
+def test_a_radial_picture_is_a_disc_with_a_hole() -> None:
+    picture = scan_convert(np.ones((50, 64)), RadialProbe(near_mm=4.0, far_mm=20.0), 0.25)
+    assert picture.shape == (160, 160)
+    x, z = (np.arange(160) - 79.5) * 0.25, (np.arange(160)[:, None] - 79.5) * 0.25
+    radius = np.hypot(x, z)
+    np.testing.assert_array_equal(picture > 0, (radius >= 4.0) & (radius <= 20.0))
+
+
+def test_the_first_radial_line_runs_along_z_and_the_next_towards_x() -> None:
+    _, directions = RadialProbe(near_mm=1.0, far_mm=10.0).scan_lines(360)
+    angles = np.degrees(np.arctan2(directions[:, 0], directions[:, 2])) % 360
+    np.testing.assert_allclose(angles, np.arange(360) + 0.5)
+
+
+def test_radial_scan_conversion_mixes_the_last_line_with_the_first() -> None:
+    frame = np.zeros((20, 8))
+    frame[:, 0], frame[:, 7] = 1.0, 1.0
+    probe = RadialProbe(near_mm=1.0, far_mm=20.0)
+    picture = scan_convert(frame, probe, 0.5)  # its middle column lies on the seam, below the centre
+    assert picture.shape == (80, 80)
+    np.testing.assert_allclose(picture[45:79, 39:41], 1.0)
+    frame[:, 7] = 0.0
+    assert (np.abs(scan_convert(frame, probe, 0.5)[60:79, 39:41].mean(axis=1) - 0.5) < 0.02).all()
