@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from .errors import UltragrayError
 from .pose import check_poses, pose_from_position_quaternion, quaternion_from_pose
-from .probe import ConvexProbe, LinearProbe, PhasedProbe, Probe, RadialProbe
+from .probe import ConvexProbe, LinearProbe, PhasedProbe, Probe, RadialProbe, SteeredProbe
 from .scene_info import SceneHeader, SceneInfo, read_header
 
 if TYPE_CHECKING:
@@ -30,6 +30,7 @@ __all__ = [
     "RadialProbe",
     "SceneHeader",
     "SceneInfo",
+    "SteeredProbe",
     "UltragrayError",
     "check_poses",
     "pose_from_position_quaternion",

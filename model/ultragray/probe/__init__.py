@@ -16,6 +16,7 @@ from .picture import Picture
 from .probe import Probe
 from .radial import RadialProbe
 from .scan_lines import FloatArray
+from .steered import SteeredProbe
 
 __all__ = [
     "ConvexProbe",
@@ -25,4 +26,5 @@ __all__ = [
     "Picture",
     "Probe",
     "RadialProbe",
+    "SteeredProbe",
 ]

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from ultragray import ConvexProbe, GaussianScene, LinearProbe, PhasedProbe, Probe, RadialProbe, render
+from ultragray import ConvexProbe, GaussianScene, LinearProbe, PhasedProbe, Probe, RadialProbe, SteeredProbe, render
 from ultragray.backends import cpu, cuda
 from ultragray.outputs import PLANES
 
@@ -29,6 +29,7 @@ SCENES: dict[str, tuple[Mapping[str, Any], Probe]] = {
         {"centre_cm": (0, 0, 0), "extent_cm": (1, 1, 1), "sigma_cm": (0.05, 0.4)},
         RadialProbe(near_mm=0.0, far_mm=20.0),
     ),
+    "steered": ({}, SteeredProbe(width_mm=40.0, steering_deg=-30.0, near_mm=0.0, far_mm=50.0)),
     "one Gaussian": ({"count": 1, "extent_cm": (0.1, 0.01, 0.1), "sigma_cm": (0.2, 0.3)}, LINEAR),
     "shadows": ({"count": 400, "transmittance_logit": (-6, 0), "sigma_cm": (0.1, 0.3)}, LINEAR),
     "shadows in a fan": ({"count": 400, "transmittance_logit": (-6, 0), "sigma_cm": (0.1, 0.3)}, CONVEX),

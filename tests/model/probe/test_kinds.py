@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ultragray import ConvexProbe, LinearProbe, PhasedProbe, Probe, RadialProbe
+from ultragray import ConvexProbe, LinearProbe, PhasedProbe, Probe, RadialProbe, SteeredProbe
 from ultragray.contract import from_dict, to_dict
 from ultragray.display.scan_conversion import scan_convert
 
@@ -14,6 +14,8 @@ PROBES = [
     ConvexProbe(opening_angle_deg=60.0, near_mm=50.0, far_mm=150.0),
     PhasedProbe(opening_angle_deg=90.0, far_mm=120.0),
     RadialProbe(near_mm=1.0, far_mm=12.0),
+    SteeredProbe(width_mm=40.0, steering_deg=25.0, near_mm=5.0, far_mm=50.0),
+    SteeredProbe(width_mm=40.0, steering_deg=-45.0, near_mm=0.0, far_mm=30.0),
 ]
 each_probe = pytest.mark.parametrize("probe", PROBES, ids=str)
 
@@ -115,3 +117,15 @@ def test_radial_scan_conversion_mixes_the_last_line_with_the_first() -> None:
     np.testing.assert_allclose(picture[45:79, 39:41], 1.0)
     frame[:, 7] = 0.0
     assert (np.abs(scan_convert(frame, probe, 0.5)[60:79, 39:41].mean(axis=1) - 0.5) < 0.02).all()
+
+
+def test_steered_lines_leave_the_face_at_their_angle() -> None:
+    origins, directions = SteeredProbe(width_mm=40.0, steering_deg=30.0, near_mm=0.0, far_mm=50.0).scan_lines(4)
+    np.testing.assert_allclose(origins, [[-15, 0, 0], [-5, 0, 0], [5, 0, 0], [15, 0, 0]])
+    np.testing.assert_allclose(directions, np.tile([0.5, 0.0, np.sqrt(0.75)], (4, 1)))
+
+
+def test_lines_that_are_not_steered_are_those_of_a_linear_probe() -> None:
+    steered, linear = SteeredProbe(40.0, 0.0, 5.0, 50.0), LinearProbe(40.0, 5.0, 50.0)
+    assert steered.lines == linear.lines
+    assert steered.is_true_to_scale
