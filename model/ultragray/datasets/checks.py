@@ -84,7 +84,7 @@ class DatasetReport:
 
 
 def check_dataset(dataset: Dataset) -> DatasetReport:
-    """Describes both parts and how far the held-out frames lie from the training frames."""
+    """Describe both parts and how far the held-out frames lie from the training frames."""
     distances, angles = _nearest_training_frames(dataset)
     return DatasetReport(
         name=dataset.name,
@@ -100,7 +100,7 @@ def check_dataset(dataset: Dataset) -> DatasetReport:
 
 
 def check_sweep(sweep: Sweep) -> SweepReport:
-    """Describes the frames of a sweep (at least one) and lists what looks wrong, with frame numbers."""
+    """Describe the frames of a sweep (at least one) and list what looks wrong, with frame numbers."""
     corners = sweep.corners_mm()
     steps_mm = corner_distances_mm(corners[:-1], corners[1:])
     steps_deg = np.array([rotation_angles_deg(a[None], b[None])[0, 0] for a, b in pairwise(sweep.poses)])
@@ -173,36 +173,36 @@ def _jumps(sweep: Sweep, steps_mm: FloatArray) -> list[str]:
     spread = 1.4826 * float(np.median(np.abs(speeds - usual)))
     limit = max(JUMP_FACTOR * usual, usual + JUMP_SPREADS * spread, SMALLEST_JUMP_MM)
     jumps = [int(place) for place in np.flatnonzero(speeds > limit)]
-    numbers, told, skip = sweep.frame_numbers, [], -1
+    numbers, found, skip = sweep.frame_numbers, [], -1
     for place in jumps:
         if place == skip:
             continue
         if place + 1 in jumps:
-            told.append(
+            found.append(
                 f"frame {numbers[place + 1]} lies {steps_mm[place]:.1f} mm off the frame before and "
                 f"{steps_mm[place + 1]:.1f} mm off the one after it, where {usual:.2g} mm are usual: a wrong pose?"
             )
             skip = place + 1
         else:
-            told.append(
+            found.append(
                 f"a jump of {steps_mm[place]:.1f} mm from frame {numbers[place]} to {numbers[place + 1]}, where "
                 f"{usual:.2g} mm are usual: another sweep, or lost tracking?"
             )
-    return told
+    return found
 
 
 def _repeats(sweep: Sweep) -> list[str]:
     poses = np.round(sweep.poses / SAME_POSE_MM).astype(np.int64)
-    told = []
+    found = []
     for places in _groups(poses):
         if len({_digest(sweep.images[place]) for place in places}) == 1:
-            told.append(f"frames {_list(sweep, places)} are the same frame: one pose, one image")
+            found.append(f"frames {_list(sweep, places)} are the same frame: one pose, one image")
         else:
-            told.append(f"frames {_list(sweep, places)} share one pose, but show different images: tracking stalled?")
+            found.append(f"frames {_list(sweep, places)} share one pose, but show different images: tracking stalled?")
     for places in _groups(sweep.images):
         if len({_digest(poses[place]) for place in places}) > 1:
-            told.append(f"frames {_list(sweep, places)} show one image at different poses: a frozen picture?")
-    return told
+            found.append(f"frames {_list(sweep, places)} show one image at different poses: a frozen picture?")
+    return found
 
 
 def _groups(arrays: np.ndarray) -> list[list[int]]:
@@ -221,24 +221,24 @@ def _odd_images(sweep: Sweep) -> list[str]:
     def where(is_odd: Callable[[np.ndarray], bool]) -> list[int]:
         return [place for place, image in enumerate(sweep.images) if is_odd(image)]
 
-    told = []
+    found = []
     if dark := where(lambda image: bool(image.max() < DARKEST_PEAK)):
-        told.append(f"frames {_list(sweep, dark)} are nearly black: no pixel reaches {DARKEST_PEAK} of 255")
+        found.append(f"frames {_list(sweep, dark)} are nearly black: no pixel reaches {DARKEST_PEAK} of 255")
     if bright := where(lambda image: float(np.mean(image == 255)) > SATURATED_SHARE):
-        told.append(f"frames {_list(sweep, bright)} are saturated: over {SATURATED_SHARE:.0%} of the pixels are 255")
-    return told
+        found.append(f"frames {_list(sweep, bright)} are saturated: over {SATURATED_SHARE:.0%} of the pixels are 255")
+    return found
 
 
 def _dataset_warnings(dataset: Dataset) -> list[str]:
-    told = [
+    found = [
         *dict.fromkeys((*dataset.train.notes, *dataset.val.notes)),
         *(list(dataset.probe.oddities()) or _hardly_moved(dataset.train)),
     ]
     known = set(_contents(dataset.train))
     leaked = [place for place, frame in enumerate(_contents(dataset.val)) if frame in known]
     if leaked:
-        told.append(f"held-out frames {_list(dataset.val, leaked)} are also training frames: metrics will flatter")
-    return told
+        found.append(f"held-out frames {_list(dataset.val, leaked)} are also training frames: metrics will flatter")
+    return found
 
 
 def _hardly_moved(sweep: Sweep) -> list[str]:

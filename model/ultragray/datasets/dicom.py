@@ -21,9 +21,8 @@ from ..errors import DatasetInvalid, ExtraMissing, InvalidPose
 from ..files.poses import load_poses
 from ..probe import FloatArray
 from .calibration import poses_from_image_transforms
-from .frame_ranges import parse_frame_ranges
-from .images import CropBox, parse_crop
-from .payload import MAX_PIXEL_BYTES
+from .images import MAX_PIXEL_BYTES, CropBox, parse_crop
+from .splits import parse_frame_ranges
 from .sweep import ByteArray, IntArray, Sweep
 
 POSE_SUFFIXES = (".poses.npy", ".poses.json")

@@ -14,6 +14,8 @@ from ..errors import DatasetInvalid, InvalidArgument
 from ..image_size import MAX_IMAGE_SIDE
 from .sweep import ByteArray
 
+MAX_PIXEL_BYTES = 4 << 30  # of the frames in a file
+
 
 @dataclass(frozen=True)
 class CropBox:

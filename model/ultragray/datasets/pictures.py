@@ -23,7 +23,7 @@ VIEWS_DEG = ((20.0, -60.0), (20.0, 30.0))  # elevation and azimuth of the eye
 
 
 def draw_dataset(dataset: Dataset, path: str | Path) -> None:
-    """Writes a PNG: the planes seen from two sides, below them frames at even distances, held-out ones in red.
+    """Write a PNG: the planes seen from two sides, below them frames at even distances, held-out ones in red.
 
     Of many planes a few are drawn, at even distances, as the legend says. Axes are those of the tracker,
     in mm. Frames are scan-converted.

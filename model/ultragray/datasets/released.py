@@ -96,7 +96,7 @@ def _read_poses(path: Path) -> FloatArray:  # [F, 4, 4]
 
 
 def write_released(dataset: Dataset, folder: str | Path) -> None:
-    """Writes the dataset in this layout; conf.json comes last, so that a folder which has it is complete.
+    """Write the dataset in this layout; conf.json comes last, so that a folder which has it is complete.
 
     Our reader gives the same dataset back (`Dataset.sha256`) where the planes are whole multiples of 1e-9 mm. Paths in
     conf.json are written as the released trainer expects them, from the folder that holds `data/`. Raises

@@ -138,7 +138,7 @@ def _centre_mm(
 
 
 def _read_checkpoint(path: Path) -> tuple[int | None, dict[str, Tensor]]:
-    """The training step, where it is told, and the six raw tensors as float32."""
+    """The training step, where it is known, and the six raw tensors as float32."""
     document = _load_without_code(path)
     splats = document.get("splats", document) if isinstance(document, Mapping) else document
     if not isinstance(splats, Mapping):

@@ -48,7 +48,7 @@ def export_checkpoint(scene: GaussianScene, checkpoint: str | Path) -> Checkpoin
     """Writes `checkpoint` (`ckpt_29999.pt`) and, beside it, conf.json and poses_train.npy.
 
     The folder is made where only it is missing. conf.json needs the scene's probe, poses_train.npy its training poses;
-    what is left out for want of them is told in the notes, and so is how well the released activation fits a `sigmoid`
+    what is left out for want of them is in the notes, and so is how well the released activation fits a `sigmoid`
     scene. Raises InvalidArgument where a conf.json or poses_train.npy of something else lies there already, which is
     never replaced, and for a scene of images with one row, which the released depth grid does not have; OSError.
     """

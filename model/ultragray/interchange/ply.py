@@ -175,7 +175,7 @@ def _read_header(start: bytes) -> _Header:
             case _:
                 raise ValueError(f"its header has a line that it cannot have: {line[:80]!r}")
     if layout != "binary_little_endian 1.0":
-        raise ValueError(f"its format is {layout or 'not told'}, expected binary_little_endian 1.0")
+        raise ValueError(f"its format is {layout or 'missing'}, expected binary_little_endian 1.0")
     if not metadata:
         raise ValueError("it has no comments `ultragray …` that say what it is a scene of")
     elements = tuple(_element(*element) for element in found)

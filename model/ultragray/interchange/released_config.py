@@ -115,7 +115,7 @@ def released_centre_mm(released_probe: Probe, poses: FloatArray) -> FloatArray: 
 
 
 def read_released_config(path: str | Path) -> ReleasedConfig:
-    """Reads conf.json and the shape of its images file. Raises CheckpointInvalid, naming the file."""
+    """Read conf.json and the shape of its images file. Raises CheckpointInvalid, naming the file."""
     path = Path(path)
     document = _read_object(path)
     width_cm = _optional_number(path, document, WIDTH_KEY)

@@ -61,9 +61,9 @@ def fit_released_intensity(scene: GaussianScene) -> ReleasedIntensity:
         normal = torch.einsum("nmk,nml->nkl", weighted, basis)
         target = torch.einsum("nmk,nm->nk", weighted, wanted.clamp(LOWEST, HIGHEST) - 1.0)
         fitted[ids] = torch.linalg.solve(normal, target)
-        told = seen if len(origins) else everywhere
-        shown = (torch.einsum("nmk,nk->nm", told, fitted[ids]) + 1.0).clamp(LOWEST, HIGHEST)
-        errors = (shown - wanted[:, : told.shape[1]]).abs()
+        compared = seen if len(origins) else everywhere
+        shown = (torch.einsum("nmk,nk->nm", compared, fitted[ids]) + 1.0).clamp(LOWEST, HIGHEST)
+        errors = (shown - wanted[:, : compared.shape[1]]).abs()
         largest = max(largest, float(errors.max()))
         total, terms = total + float(errors.sum()), terms + errors.numel()
     parameters = fitted.to(scene.sh0.dtype)[..., None]

@@ -1,1 +1,1 @@
-"""What the front doors share: requests, streams, scenes, datasets, jobs."""
+"""Shared by the front doors: requests, streams, scenes, datasets, jobs."""

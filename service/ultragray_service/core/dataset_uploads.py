@@ -95,19 +95,19 @@ class DatasetUpload:
         self._finishing = asyncio.Lock()
 
     async def next(self, arriving: Awaitable[T]) -> T:
-        """What the client sends next.
+        """The next part of what the client sends.
 
         Raises DeadlineExceeded where it sends nothing for too long, Draining where the service stops.
         """
         return await arrival(arriving, self._settings.upload_idle_timeout_s, self._stopping)
 
     async def begin_file(self, name: str) -> None:
-        """What is written next belongs to the file `name`. Raises DatasetInvalid, UploadTooLarge, StorageFull."""
+        """Begin the file `name`. Raises DatasetInvalid, UploadTooLarge, StorageFull."""
         await self._flush()
         await asyncio.to_thread(self._incoming.begin_file, name)
 
     async def begin_archive(self) -> None:
-        """What is written next is one archive. Raises StorageFull."""
+        """Begin the one archive. Raises StorageFull."""
         await asyncio.to_thread(self._incoming.begin_archive)
 
     async def write(self, data: bytes) -> None:

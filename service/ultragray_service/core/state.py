@@ -38,7 +38,7 @@ class Phase(Enum):
 
 
 class Service:
-    """What both front doors share."""
+    """All that the front doors share."""
 
     def __init__(self, settings: Settings) -> None:
         if not settings.data_folder.is_dir():

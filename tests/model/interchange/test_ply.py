@@ -134,7 +134,7 @@ def test_a_tool_may_reorder_and_take_gaussians_away(tmp_path: Path, make_scene: 
         (b"ply\n", b"PLY\n", "does not begin like a PLY file"),
         (b"binary_little_endian", b"ascii", "its format is ascii 1.0, expected binary_little_endian 1.0"),
         (b"binary_little_endian", b"binary_big_endian", "its format is binary_big_endian 1.0"),
-        (b"format binary_little_endian 1.0\n", b"", "its format is not told"),
+        (b"format binary_little_endian 1.0\n", b"", "its format is missing"),
         (b"property float transmittance\n", b"", "its vertex lacks transmittance"),
         (b"property float transmittance\n", b"property float opacity\n", "its vertex lacks transmittance"),
         (b"property float opacity\n", b"property float opacity\nproperty float x\n", "its vertex has a property twice"),

@@ -9,9 +9,9 @@ import torch
 
 from ultragray import ConvexProbe, LinearProbe
 from ultragray.confidence import Extrapolation
-from ultragray.datasets.meta_image import read_meta_image
 from ultragray.datasets.plus import read_plus_sweep
-from ultragray.datasets.transforms import parse_matrix
+from ultragray.datasets.plus.meta_image import read_meta_image
+from ultragray.datasets.plus.transforms import parse_matrix
 from ultragray.display import AS_RENDERED
 from ultragray.display.frames import show
 from ultragray.display.scan_conversion import scan_convert

@@ -11,17 +11,17 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import DatasetInvalid, InvalidPose
-from ..pose import check_poses
-from ..probe import FloatArray
-from .calibration import poses_from_image_transforms
-from .frame_ranges import parse_frame_ranges
-from .images import grey_frames, parse_crop
+from ...errors import DatasetInvalid, InvalidPose
+from ...pose import check_poses
+from ...probe import FloatArray
+from ..calibration import poses_from_image_transforms
+from ..images import grey_frames, parse_crop
+from ..splits import parse_frame_ranges
+from ..sweep import Sweep
 from .meta_image import read_meta_image
 from .nrrd import read_nrrd
 from .orientation import UNKNOWN, orient_frames
 from .sequence import StoredSequence
-from .sweep import Sweep
 from .transforms import TransformName, find_path, parse_matrix, read_device_set, transform_name
 
 _READERS = {".mha": read_meta_image, ".mhd": read_meta_image, ".nrrd": read_nrrd, ".nhdr": read_nrrd}

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import DatasetInvalid
-from .sweep import ByteArray
+from ...errors import DatasetInvalid
+from ..sweep import ByteArray
 
 UNKNOWN = ("", "XX")
 

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ..errors import DatasetInvalid
-from .payload import read_payload
-from .sequence import StoredSequence, header_lines, pixel_shape, split_fields, whole_numbers
+from ...errors import DatasetInvalid
+from .sequence import StoredSequence, header_lines, pixel_shape, read_payload, split_fields, whole_numbers
 
 
 def read_meta_image(path: Path) -> StoredSequence:

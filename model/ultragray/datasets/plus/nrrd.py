@@ -5,9 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import BinaryIO
 
-from ..errors import DatasetInvalid
-from .payload import read_payload
-from .sequence import StoredSequence, header_lines, pixel_shape, split_fields, whole_numbers
+from ...errors import DatasetInvalid
+from .sequence import StoredSequence, header_lines, pixel_shape, read_payload, split_fields, whole_numbers
 
 _BYTE_TYPES = ("uchar", "unsigned char", "uint8", "uint8_t")
 _TIME_KINDS = ("list", "time")

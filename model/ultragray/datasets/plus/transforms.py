@@ -12,8 +12,8 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from ..errors import DatasetInvalid
-from ..probe import FloatArray
+from ...errors import DatasetInvalid
+from ...probe import FloatArray
 
 MAX_DEVICE_SET_BYTES = 8 << 20
 _NAME = re.compile(r"([A-Z]\w*?)To([A-Z]\w*)")
