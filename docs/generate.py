@@ -7,17 +7,22 @@ from __future__ import annotations
 
 import inspect
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 from pathlib import Path
+from typing import Any
+
+import typer
 
 from ultragray import errors
 from ultragray_client import errors as client_errors
 from ultragray_service import errors as service_errors
+from ultragray_service.cli.app import app as command_line
 from ultragray_service.errors import statuses_of
 from ultragray_workers import errors as workers_errors
 
 DOCUMENT = Path(__file__).resolve().parent / "interfaces.md"
-_GENERATED = re.compile(r"(?<=<!-- generated: )(\w+)( -->\n).*?(?=<!-- end -->)", flags=re.DOTALL)
+_GENERATED = re.compile(r"(?<=<!-- generated: )([\w -]+?)( -->\n).*?(?=<!-- end -->)", flags=re.DOTALL)
 
 Row = Iterable[str]
 
@@ -64,7 +69,39 @@ def client_error_table() -> list[Row]:
     return [("Reason", "Class", "Kind of"), *([f"`{cell}`" for cell in row] for row in rows)]
 
 
-TABLES: dict[str, Callable[[], list[Row]]] = {"errors": error_table, "client_errors": client_error_table}
+def commands() -> Iterator[tuple[str, Any]]:
+    """Every command of `ultragray` that does something itself, by its words."""
+    waiting = list(typer.main.get_command(command_line).commands.items())  # type: ignore[attr-defined]
+    while waiting:
+        name, command = waiting.pop(0)
+        if hasattr(command, "commands"):
+            waiting += [(f"{name} {word}", inner) for word, inner in command.commands.items()]
+        else:
+            yield name, command
+
+
+def option_table(command: Any) -> list[Row]:
+    """The arguments and options of a command, as its `--help` explains them."""
+    table: list[Row] = [("Argument, option", "Meaning")]
+    for parameter in command.params:
+        is_argument = parameter.param_type_name == "argument"
+        names = [parameter.name.upper()] if is_argument else parameter.opts
+        meaning = str(parameter.help or "").replace("|", "\\|")
+        if parameter.required and not is_argument:
+            meaning += " Required."
+        elif isinstance(parameter.show_default, str):
+            meaning += f" Default: {parameter.show_default}."
+        elif parameter.show_default and parameter.default not in (None, False):
+            meaning += f" Default: {getattr(parameter.default, 'value', parameter.default)}."
+        table.append((", ".join(f"`{name}`" for name in names), meaning))
+    return table
+
+
+TABLES: dict[str, Callable[[], list[Row]]] = {
+    "errors": error_table,
+    "client_errors": client_error_table,
+    **{f"options of {name}": partial(option_table, command) for name, command in commands()},
+}
 
 
 if __name__ == "__main__":

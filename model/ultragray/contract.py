@@ -262,6 +262,11 @@ def checked_number(
     return number
 
 
+def range_of(item: Field[Any]) -> str:
+    """The limits of a field's numbers in words, such as " from 0 to 1"; empty where there are none."""
+    return _range(*(item.metadata.get(name) for name in ("low", "high", "above")))
+
+
 def _range(low: float | None, high: float | None, above: float | None) -> str:
     """The limits in words, beginning with a space; empty where there are none."""
     if low is not None:

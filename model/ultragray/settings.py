@@ -73,6 +73,11 @@ class FrameSettings(Contract):
         super().__post_init__()
         object.__setattr__(self, "outputs", check_outputs(self.outputs))
 
+    @property
+    def least_confidence(self) -> float | None:
+        """The confidence without which poses are refused, or left out by a sampler; None: any."""
+        return self.min_confidence if self.below_min_confidence is Below.REFUSE else None
+
     def resolved(self, info: SceneInfo, encoding: Encoding, *, max_image_side: int = MAX_IMAGE_SIDE) -> Resolved:
         """The settings for a scene, with nothing left open.
 

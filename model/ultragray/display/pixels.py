@@ -1,10 +1,9 @@
-"""Pixels as bytes, and as a PNG file. Free of torch."""
+"""Pixels as bytes, and as a PNG file. Free of torch; OpenCV is imported once there are pixels."""
 
 from __future__ import annotations
 
 from typing import Any
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -16,12 +15,16 @@ def to_uint8(frames: PixelArray) -> ByteArray:
     """round(255·min(x, 1)), half to even, the same shape; labels as they are. No output of a renderer is negative."""
     if frames.dtype == np.uint8:
         return frames
+    import cv2
+
     rows = frames.reshape(-1, frames.shape[-1])
     return cv2.convertScaleAbs(rows, alpha=255.0).astype(np.uint8, copy=False).reshape(frames.shape)
 
 
 def image_file(frame: PixelArray, suffix: str, *options: int) -> ByteArray:  # [H, W] -> [bytes]
     """A frame as the bytes of a grey image file: `.png` at OpenCV's default settings, `.jpg`."""
+    import cv2
+
     written, data = cv2.imencode(suffix, to_uint8(frame), options)
     assert written  # the sides of a picture are far below what either format holds
     return data.astype(np.uint8, copy=False)

@@ -1,55 +1,74 @@
-"""Rendering to files: the frames of many poses, portion by portion, into what an exporter or a folder of PNGs takes."""
+"""Rendering to files: the frames of many poses, portion by portion, into an archive or a folder of PNGs."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
+from pathlib import Path
 
 import torch
 
-from ..confidence import Extrapolation
+from ..confidence import Extrapolation, is_confident
 from ..confidence.support import SupportWatch
 from ..display.frames import show
 from ..evaluation.scoring import frames_at_once
-from ..rendering import render
+from ..probe import FloatArray
+from ..rendering import render, renderer_name
 from ..scene import GaussianScene
-from .exports import Add, ExportHeader
+from ..settings import Below, Resolved
+from .exports import FORMATS, ExportHeader, check_format, export_to
+from .exports.png_folder import export_pngs
 
 
-def render_into(
-    sink: AbstractContextManager[Add],
-    header: ExportHeader,
+def render_to_file(
+    path: Path,
+    format: str | None,
     scene: GaussianScene,
+    settings: Resolved,
+    poses: FloatArray,  # [C, 4, 4] mm
     extrapolations: Sequence[Extrapolation],  # [C]
     *,
-    masked: Sequence[bool] | None = None,  # [C]
+    dtype: str | None = None,
+    scene_name: str,
+    scene_sha256: str,
     backend: str = "auto",
     before_portion: Callable[[int], object] | None = None,
 ) -> list[Extrapolation]:  # [C]
-    """Render the frames that a header describes, and give them to a sink: `export_to(…)`, `export_pngs(…)`.
+    """Render frames into a file of a format (None: a folder of PNGs), which appears whole or not at all.
 
-    `scene` lies where the backend renders. `masked`: for each pose whether pixels without support are black.
-    `before_portion` is told how many frames are done, at last all of them; to stop, it raises. Returns the
-    extrapolations with the share of each frame that has support. Raises what `render` and the sink raise.
+    `scene` lies where the backend renders; `poses` and `extrapolations` are those of `assessed_poses`. `before_portion`
+    is told how many frames are done, at last all of them; to stop, it raises. Returns the extrapolations with the share
+    of each frame that has support. Raises what `render` raises, InvalidArgument, ExtraMissing and OSError.
     """
-    masked = [False] * len(header.poses) if masked is None else masked
-    wanted = tuple(dict.fromkeys((*header.outputs, "coverage")))
-    size = {"height": header.height, "width": header.width}
+    if format is not None:
+        dtype = check_format(format, settings.outputs, dtype)
+        settings = FORMATS[format].shown(settings)
+    header = ExportHeader(
+        settings=settings,
+        dtype=dtype or "uint8",
+        poses=poses,
+        scene=scene_name,
+        scene_sha256=scene_sha256,
+        renderer=renderer_name(backend, scene),
+    )
+    limit = settings.min_confidence if settings.below_min_confidence is Below.MASK else None
+    masked = [limit is not None and not is_confident(one, limit) for one in extrapolations]
+    wanted = tuple(dict.fromkeys((*settings.outputs, "coverage")))
+    size = {"height": settings.height, "width": settings.width}
     portion = frames_at_once(**size)
     found: list[Extrapolation] = []
-    with sink as add, torch.no_grad():
-        for first in range(0, len(header.poses), portion):
+    with export_pngs(path, header) if format is None else export_to(path, format, header) as add, torch.no_grad():
+        for first in range(0, len(poses), portion):
             if before_portion is not None:
                 before_portion(first)
             places = slice(first, first + portion)
-            frames = render(scene, header.probe, header.poses[places], **size, outputs=wanted, backend=backend)
+            frames = render(scene, settings.probe, poses[places], **size, outputs=wanted, backend=backend)
             assert frames.coverage is not None
             watch = SupportWatch(masked[places])
             blackened = watch.look(frames.coverage)
-            asked = {name: getattr(frames, name) for name in header.outputs}
-            shown = show(asked, header.probe, header.display, blackened)
+            asked = {name: getattr(frames, name) for name in settings.outputs}
+            shown = show(asked, settings.probe, settings.display, blackened)
             found.extend(watch.told(extrapolations[places]))
             add({name: pixels.cpu().numpy() for name, pixels in shown.items()}, found[first:])
         if before_portion is not None:
-            before_portion(len(header.poses))
+            before_portion(len(poses))
     return found

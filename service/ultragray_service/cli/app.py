@@ -14,15 +14,18 @@ from typer.core import TyperGroup
 
 import ultragray
 from ultragray.errors import InvalidArgument, UltragrayError
+from ultragray.interchange.exports.formats import DTYPES, FORMATS
+from ultragray.samplers import Sampler
+from ultragray.settings import FrameSettings
 
 from . import convert as cli_convert
 from . import dataset as cli_dataset
 from . import eval as cli_eval
 from . import jobs as cli_jobs
 from . import report as cli_report
-from . import sampler as cli_sampler
 from . import train as cli_train
 from . import worker as cli_worker
+from .options import with_options
 
 USER_ERROR = 2  # the exit code of a mistake that the caller can mend
 
@@ -140,6 +143,7 @@ def serve(
 
 
 @app.command()
+@with_options
 def render(
     scene: Scene,
     output: Annotated[
@@ -147,9 +151,12 @@ def render(
         typer.Option(
             "--output",
             "-o",
-            help="A file (.npz, .tar, .zarr.zip, .h5, .dcm, .igs.mha), or a folder for PNGs (frame_00000_bmode.png).",
+            help=f"A file ({', '.join(one.suffix for one in FORMATS.values())}), or a folder for PNGs "
+            "(frame_00000_bmode.png).",
         ),
     ],
+    sampler: Sampler | None,
+    settings: FrameSettings,
     poses: Annotated[
         Path | None,
         typer.Option(
@@ -157,71 +164,16 @@ def render(
             show_default="the scene's training poses",
         ),
     ] = None,
-    sampler: cli_sampler.Kind = None,
-    count: cli_sampler.Count = None,
-    translation_mm: cli_sampler.TranslationMm = None,
-    rotation_deg: cli_sampler.RotationDeg = None,
-    seed: cli_sampler.Seed = None,
-    spacing_mm: cli_sampler.SpacingMm = None,
-    tilt_deg: cli_sampler.TiltDeg = None,
-    step_deg: cli_sampler.StepDeg = None,
-    min_confidence: cli_sampler.MinConfidence = None,
-    height: Annotated[int | None, typer.Option(help="Depth samples.", show_default="as trained, else 512")] = None,
-    width: Annotated[int | None, typer.Option(help="Scan lines.", show_default="as trained, else 512")] = None,
-    outputs: Annotated[
-        str, typer.Option(help="Some of bmode, echo, transmittance, coverage, labels, with commas.")
-    ] = "bmode",
     dtype: Annotated[
-        str | None, typer.Option(help="uint8 or float32, of a file.", show_default="the format's own")
-    ] = None,
-    probe: Annotated[
-        str | None,
-        typer.Option(
-            help='Another probe, as JSON: {"kind": "linear", "width_mm": 40, "near_mm": 0, "far_mm": 50} or '
-            '{"kind": "convex", "opening_angle_deg": 60, "near_mm": 50, "far_mm": 200} or '
-            '{"kind": "phased", "opening_angle_deg": 90, "far_mm": 150}.',
-            show_default="the scene's own",
-        ),
-    ] = None,
-    scan_convert: Annotated[
-        float | None,
-        typer.Option(
-            metavar="PIXEL_MM",
-            help="Draw the PNGs of a convex or phased probe as a fan, with square pixels of this size.",
-            show_default=False,
-        ),
+        str | None, typer.Option(help=f"{' or '.join(DTYPES)}, of a file.", show_default="the format's own")
     ] = None,
     backend: Annotated[str, typer.Option(help="auto, cpu, cuda or reference.")] = "auto",
     threads: Annotated[int, typer.Option(min=0, help="Render threads; 0: all cores.")] = 0,
 ) -> None:
     """Render frames from poses into one file or a folder of PNGs."""
-    from .render import RenderOptions, render_to_files
+    from .render import render_frames
 
-    options = RenderOptions(
-        scene=scene,
-        output=output,
-        poses=poses,
-        sampler=cli_sampler.sampler_document(
-            sampler,
-            count=count,
-            translation_mm=translation_mm,
-            rotation_deg=rotation_deg,
-            seed=seed,
-            spacing_mm=spacing_mm,
-            tilt_deg=tilt_deg,
-            step_deg=step_deg,
-        ),
-        min_confidence=min_confidence,
-        height=height,
-        width=width,
-        outputs=tuple(name.strip() for name in outputs.split(",") if name.strip()),
-        dtype=dtype,
-        probe_json=probe,
-        scan_convert_mm=scan_convert,
-        backend=backend,
-        threads=threads,
-    )
-    typer.echo(render_to_files(options))
+    typer.echo(render_frames(scene, output, poses, sampler, settings, dtype=dtype, backend=backend, threads=threads))
 
 
 @app.command()

@@ -7,17 +7,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from .source import (
-    Crop,
-    DatasetArgument,
-    DeviceSet,
-    Frames,
-    ImageSize,
-    TrainFrames,
-    ValFrames,
-    read_dataset,
-    warnings_of,
-)
+from ultragray.datasets.source import SourceOptions
+
+from .options import with_options
+from .source import DatasetArgument, read_dataset, warnings_of
 
 if TYPE_CHECKING:
     from ultragray.datasets.checks import DatasetReport, SweepReport
@@ -26,22 +19,19 @@ dataset_app = typer.Typer(no_args_is_help=True, help="Look at a tracked sweep, c
 
 
 @dataset_app.command()
+@with_options
 def check(
     dataset: DatasetArgument,
-    train_frames: TrainFrames = None,
-    val_frames: ValFrames = None,
-    frames: Frames = None,
-    device_set: DeviceSet = None,
-    crop: Crop = None,
-    image_size: ImageSize = None,
     json: Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")] = False,
+    *,
+    source: SourceOptions,
 ) -> None:
     """Tell what is in a dataset, and what looks wrong. Exit code 2 where it cannot be used at all."""
     from json import dumps
 
     from ultragray.datasets.checks import check_dataset
 
-    report = check_dataset(read_dataset(dataset, train_frames, val_frames, frames, device_set, crop, image_size))
+    report = check_dataset(read_dataset(dataset, source))
     if json:
         typer.echo(dumps(report.to_dict(), indent=2))
     else:
@@ -49,22 +39,19 @@ def check(
 
 
 @dataset_app.command()
+@with_options
 def convert(
     dataset: DatasetArgument,
     output: Annotated[
         Path, typer.Option("--output", "-o", help="Folder for conf.json and the .npy files.", show_default=False)
     ],
-    train_frames: TrainFrames = None,
-    val_frames: ValFrames = None,
-    frames: Frames = None,
-    device_set: DeviceSet = None,
-    crop: Crop = None,
-    image_size: ImageSize = None,
+    *,
+    source: SourceOptions,
 ) -> None:
     """Write a dataset in the layout of the released trainer."""
     from ultragray.datasets.released import write_released
 
-    read = read_dataset(dataset, train_frames, val_frames, frames, device_set, crop, image_size)
+    read = read_dataset(dataset, source)
     write_released(read, output)
     typer.echo(
         f"wrote {output}: {len(read.train)} training and {len(read.val)} held-out frames of "
@@ -73,15 +60,12 @@ def convert(
 
 
 @dataset_app.command()
+@with_options
 def show(
     dataset: DatasetArgument,
     output: Annotated[Path, typer.Option("--output", "-o", help="Picture to write (.png).", show_default=False)],
-    train_frames: TrainFrames = None,
-    val_frames: ValFrames = None,
-    frames: Frames = None,
-    device_set: DeviceSet = None,
-    crop: Crop = None,
-    image_size: ImageSize = None,
+    *,
+    source: SourceOptions,
 ) -> None:
     """Draw the image planes in space and a contact sheet of the frames."""
     from ultragray.datasets.pictures import draw_dataset
@@ -92,7 +76,7 @@ def show(
     if output.suffix.lower() != ".png":
         raise InvalidArgument(f"output must be a .png file, got {output}", field="output")
     check_writable(output)
-    draw_dataset(read_dataset(dataset, train_frames, val_frames, frames, device_set, crop, image_size), output)
+    draw_dataset(read_dataset(dataset, source), output)
     typer.echo(f"wrote {output}")
 
 

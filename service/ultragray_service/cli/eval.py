@@ -9,18 +9,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from ultragray.datasets.source import SourceOptions
+
+from .options import with_options
 from .output import check_picture_folder
-from .source import (
-    Crop,
-    DatasetArgument,
-    DeviceSet,
-    Frames,
-    ImageSize,
-    TrainFrames,
-    ValFrames,
-    check_scene_fits,
-    read_dataset,
-)
+from .source import DatasetArgument, check_scene_fits, read_dataset
 
 if TYPE_CHECKING:
     from ultragray.evaluation.scoring import Evaluation
@@ -50,6 +43,7 @@ class Method(str, enum.Enum):
     NEAREST = "nearest"
 
 
+@with_options
 def evaluate(
     scene: Annotated[Path, typer.Argument(help="Scene file (.ugr).", show_default=False)],
     dataset: DatasetArgument,
@@ -65,12 +59,8 @@ def evaluate(
     split: Annotated[Split, typer.Option(help="Frames to measure on.")] = Split.VAL,
     json: Annotated[bool, typer.Option("--json", help="One JSON object, with every frame.")] = False,
     backend: Annotated[str, typer.Option(help="auto, cpu, cuda or reference.")] = "auto",
-    train_frames: TrainFrames = None,
-    val_frames: ValFrames = None,
-    frames: Frames = None,
-    device_set: DeviceSet = None,
-    crop: Crop = None,
-    image_size: ImageSize = None,
+    *,
+    source: SourceOptions,
 ) -> None:
     """Measure a scene on the held-out frames of a dataset: PSNR, MS-SSIM, GMS, GMSD."""
     from ultragray.evaluation.scoring import evaluate as evaluate_scene
@@ -81,7 +71,7 @@ def evaluate(
     if output is not None:
         check_picture_folder(output)
     loaded = GaussianScene.load(scene).to(render_device(backend))
-    read = read_dataset(dataset, train_frames, val_frames, frames, device_set, crop, image_size)
+    read = read_dataset(dataset, source)
     sweep = read.val if split is Split.VAL else read.train
     require_frames(sweep)
     check_scene_fits(loaded.info, read)
@@ -97,6 +87,7 @@ def evaluate(
         typer.echo(f"wrote {len(paths)} pictures into {output}", err=json)
 
 
+@with_options
 def compound(
     dataset: DatasetArgument,
     method: Annotated[
@@ -105,18 +96,14 @@ def compound(
     ] = Method.ALL,
     voxel_mm: VoxelMm = None,
     json: Annotated[bool, typer.Option("--json", help="One JSON object, with every frame.")] = False,
-    train_frames: TrainFrames = None,
-    val_frames: ValFrames = None,
-    frames: Frames = None,
-    device_set: DeviceSet = None,
-    crop: Crop = None,
-    image_size: ImageSize = None,
+    *,
+    source: SourceOptions,
 ) -> None:
     """Measure classical compounding of the training frames on the held-out ones, as eval measures a scene."""
     from ultragray.evaluation.baselines import BASELINES, evaluate_baselines
     from ultragray.evaluation.compounding import affordable_voxel_mm
 
-    read = read_dataset(dataset, train_frames, val_frames, frames, device_set, crop, image_size)
+    read = read_dataset(dataset, source)
     voxel_mm = affordable_voxel_mm(read.train) if voxel_mm is None else voxel_mm
     methods = BASELINES if method is Method.ALL else (method.value,)
     evaluations = evaluate_baselines(read, methods, voxel_mm)

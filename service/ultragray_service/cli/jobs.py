@@ -1,18 +1,30 @@
-"""`ultragray jobs …`: training and batch rendering on a running service."""
+"""`ultragray jobs …`: training, batch rendering and the other kinds of jobs on a running service."""
 
 from __future__ import annotations
 
+import inspect
 import json as json_text
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, get_type_hints
 
+import numpy as np
 import typer
 
-from . import jobs_submit as cli_jobs_submit
-from .jobs_options import ApiKey, JobArgument, Server
+from ultragray.contract import to_dict
+from ultragray.samplers import TrainingSampler
+from ultragray_workers.jobs.kinds import KINDS, Specification
+
+from .options import parameters_of, values_of, with_parameters
 
 jobs_app = typer.Typer(no_args_is_help=True, help="Train and render in the background, on a running service.")
-jobs_app.add_typer(cli_jobs_submit.submit_app, name="submit")
+submit_app = typer.Typer(no_args_is_help=True, help="Put a job into the queue; its id is printed.")
+jobs_app.add_typer(submit_app, name="submit")
+
+JobArgument = Annotated[str, typer.Argument(help="Id of the job.", show_default=False)]
+Server = Annotated[str, typer.Option(help="URL of the service.", envvar="ULTRAGRAY_SERVER")]
+ApiKey = Annotated[
+    str | None, typer.Option(help="Where the service asks for one.", envvar="ULTRAGRAY_API_KEY", show_default=False)
+]
 
 _COLUMNS = ("id", "kind", "state", "scene", "progress", "created", "reason")
 _PIPE_COLUMNS = 400  # where no terminal says how wide it is, nothing is cut
@@ -23,7 +35,7 @@ def list_jobs(
     state: Annotated[
         str, typer.Option(help="Only queued, running, succeeded, failed or cancelled ones.", show_default="all")
     ] = "",
-    kind: Annotated[str, typer.Option(help="Only train or render ones.", show_default="all")] = "",
+    kind: Annotated[str, typer.Option(help=f"Only {' or '.join(KINDS)} ones.", show_default="all")] = "",
     limit: Annotated[int, typer.Option(min=1, help="How many at most.")] = 20,
     json: Annotated[bool, typer.Option("--json", help="A JSON list, for scripts.")] = False,
     server: Server = "http://127.0.0.1:8000",
@@ -105,6 +117,58 @@ def download(
     check_writable(path)
     JobClient(server, api_key).download(job, name, path)
     typer.echo(f"wrote {path}: {path.stat().st_size:,} bytes")
+
+
+def _submit(
+    kind: str,
+    specification: dict[str, Any],
+    *,
+    request_id: Annotated[
+        str | None,
+        typer.Option(help="A name of your own: given again, it gives the same job.", show_default=False),
+    ] = None,
+    priority: Annotated[int, typer.Option(min=-1000, max=1000, help="Higher ones go first.")] = 0,
+    wait: Annotated[bool, typer.Option("--wait", help="Follow the job to its end, as `jobs watch` does.")] = False,
+    server: Server = "http://127.0.0.1:8000",
+    api_key: ApiKey = None,
+) -> None:
+    from ..core.job_client import JobClient
+    from .jobs_watch import follow
+
+    client = JobClient(server, api_key)
+    body = {"kind": kind, "specification": specification, "request_id": request_id, "priority": priority}
+    job, _ = client.submit(body)
+    typer.echo(job["id"])
+    if wait:
+        follow(client, job["id"])
+
+
+def _add_submit_command(kind: str, cls: type[Specification]) -> None:
+    """`jobs submit KIND`, with an option for each field of the specification."""
+    hints = get_type_hints(_submit, include_extras=True)
+    common = [
+        parameter.replace(annotation=hints[parameter.name])
+        for parameter in inspect.signature(_submit).parameters.values()
+        if parameter.kind is parameter.KEYWORD_ONLY
+    ]
+
+    def submit(**given: Any) -> None:
+        values = values_of(cls, given)
+        if {"sampler", "poses"} <= given.keys() and not {"sampler", "poses"} & values.keys():
+            values["sampler"] = TrainingSampler()
+        document = {name: _as_json(value) for name, value in values.items()}
+        _submit(kind, document, **{parameter.name: given[parameter.name] for parameter in common})
+
+    summary = inspect.getdoc(cls) or ""
+    submit_app.command(kind, help=summary.split("\n\n")[0])(with_parameters(submit, [*parameters_of(cls), *common]))
+
+
+def _as_json(value: Any) -> Any:
+    return value.tolist() if isinstance(value, np.ndarray) else to_dict(value, with_none=False)
+
+
+for _kind, _class in Specification.members.items():
+    _add_submit_command(_kind, _class)
 
 
 def _print_jobs(jobs: list[dict[str, Any]]) -> None:

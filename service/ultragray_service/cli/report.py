@@ -11,20 +11,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from ultragray.datasets.source import SourceOptions
+
 from .eval import VoxelMm
+from .options import with_options
 from .output import check_writable
-from .source import (
-    Crop,
-    DatasetArgument,
-    DeviceSet,
-    Frames,
-    ImageSize,
-    TrainFrames,
-    ValFrames,
-    check_scene_fits,
-    read_dataset,
-    warn_about_dataset,
-)
+from .source import DatasetArgument, check_scene_fits, read_dataset, warn_about_dataset
 
 if TYPE_CHECKING:
     from ultragray.datasets import Dataset
@@ -43,6 +35,7 @@ class ReportOptions:
     voxel_mm: float
 
 
+@with_options
 def report(
     dataset: DatasetArgument,
     output: Annotated[Path, typer.Option("--output", "-o", help="Page to write (.html).", show_default=False)],
@@ -59,12 +52,8 @@ def report(
     ] = False,
     voxel_mm: VoxelMm = None,
     threads: Annotated[int, typer.Option(min=0, help="Threads; 0: all cores.")] = 0,
-    train_frames: TrainFrames = None,
-    val_frames: ValFrames = None,
-    frames: Frames = None,
-    device_set: DeviceSet = None,
-    crop: Crop = None,
-    image_size: ImageSize = None,
+    *,
+    source: SourceOptions,
 ) -> None:
     """Train and measure a scene, the baselines and the paper's ablations; write one self-contained HTML page."""
     from ultragray.evaluation.compounding import affordable_voxel_mm
@@ -78,7 +67,7 @@ def report(
         import torch
 
         torch.set_num_threads(threads)
-    read = read_dataset(dataset, train_frames, val_frames, frames, device_set, crop, image_size)
+    read = read_dataset(dataset, source)
     require_frames(read.val)
     warn_about_dataset(read)
     voxel_mm = affordable_voxel_mm(read.train) if voxel_mm is None else voxel_mm

@@ -14,20 +14,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ultragray.errors import InvalidArgument, MemoryExceeded, TrainingDiverged, TrainingStateInvalid
+from ultragray.datasets.source import SourceOptions
+from ultragray.errors import MemoryExceeded, TrainingDiverged, TrainingStateInvalid
 
+from .options import parse_settings, with_options
 from .output import SCENE_SUFFIX, check_writable
-from .source import (
-    Crop,
-    DatasetArgument,
-    DeviceSet,
-    Frames,
-    ImageSize,
-    TrainFrames,
-    ValFrames,
-    read_dataset,
-    warn_about_dataset,
-)
+from .source import DatasetArgument, read_dataset, warn_about_dataset
 
 if TYPE_CHECKING:
     from ultragray.scene import GaussianScene
@@ -37,6 +29,7 @@ INTERRUPTED = 130  # the exit code of a run that Ctrl-C or SIGTERM stopped
 METRIC_NAMES = {"psnr_db": "PSNR, dB", "ms_ssim": "MS-SSIM", "gms": "GMS", "gmsd": "GMSD"}
 
 
+@with_options
 def train(
     dataset: DatasetArgument,
     output: Annotated[Path, typer.Option("--output", "-o", help="Scene file to write (.ugr).", show_default=False)],
@@ -93,12 +86,8 @@ def train(
     device: Annotated[str, typer.Option(help="cpu, or a GPU: cuda, or cuda:N for one of several.")] = "cpu",
     backend: Annotated[str, typer.Option(help="auto (the one for the device), cpu, cuda or reference.")] = "auto",
     threads: Annotated[int, typer.Option(min=0, help="Threads; 0: all cores.")] = 0,
-    train_frames: TrainFrames = None,
-    val_frames: ValFrames = None,
-    frames: Frames = None,
-    device_set: DeviceSet = None,
-    crop: Crop = None,
-    image_size: ImageSize = None,
+    *,
+    source: SourceOptions,
 ) -> None:
     """Train a scene from a tracked sweep. Ctrl-C leaves a usable scene; --resume goes on."""
     flags = {
@@ -137,7 +126,7 @@ def train(
         import torch
 
         torch.set_num_threads(threads)
-    read = read_dataset(dataset, train_frames, val_frames, frames, device_set, crop, image_size)
+    read = read_dataset(dataset, source)
     warn_about_dataset(read)
     _train(read, chosen, run)
 
@@ -161,19 +150,6 @@ def _from_file(path: Path | None) -> dict[str, Any]:
     from ultragray.training.config import read_config_file
 
     return read_config_file(path)
-
-
-def parse_settings(settings: list[str]) -> dict[str, Any]:
-    """NAME=VALUE pairs, the value as in TOML; a bare word is itself."""
-    from ultragray.training.config import parse_value
-
-    found = {}
-    for text in settings:
-        name, equals, value = text.partition("=")
-        if not equals:
-            raise InvalidArgument(f"--set takes NAME=VALUE, got {text!r}", field="set")
-        found[name.strip()] = parse_value(value.strip())
-    return found
 
 
 def _check_device(device: str, backend: str) -> None:

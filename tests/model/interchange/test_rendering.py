@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,17 +15,22 @@ from ultragray.confidence import SUPPORT_COVERAGE, Extrapolation
 from ultragray.contract import to_dict
 from ultragray.display import Display
 from ultragray.interchange import rendering
-from ultragray.interchange.exports import ExportHeader, export_to
-from ultragray.interchange.rendering import render_into
+from ultragray.interchange.rendering import render_to_file
+from ultragray.settings import Below, Resolved
 
 PROBE = ConvexProbe(opening_angle_deg=60.0, near_mm=10.0, far_mm=50.0)
 POSES = np.tile(np.eye(4), (5, 1, 1))
 POSES[:, 1, 3] = np.arange(5)
-UNKNOWN = [Extrapolation(None, None, None, None)] * 5
+CONFIDENCES = (0.2, 0.9, 0.2, 0.9, 0.9)
 
 
-def header(display: Display, outputs: tuple[str, ...] = ("bmode", "coverage")) -> ExportHeader:
-    return ExportHeader(outputs, "float32", POSES, 24, 20, PROBE, "one", "0" * 64, "ultragray/0 cpu", display)
+def settings(display: Display, **more: Any) -> Resolved:
+    return Resolved(probe=PROBE, height=24, width=20, outputs=("bmode", "coverage"), display=display, **more)
+
+
+def written(path: Path, scene: GaussianScene, settings: Resolved, **more: Any) -> list[Extrapolation]:
+    assessed = [Extrapolation(1.0, 1.0, confidence, None) for confidence in CONFIDENCES]
+    return render_to_file(path, "npz", scene, settings, POSES, assessed, scene_name="one", scene_sha256="0", **more)
 
 
 @pytest.mark.parametrize("display", [Display(), Display(depth_mm=20.0, flip=True), Display(pixel_mm=1.0)])
@@ -33,41 +38,35 @@ def test_a_file_tells_how_its_frames_are_shown(
     tmp_path: Path, random_scene: Callable[..., GaussianScene], monkeypatch: pytest.MonkeyPatch, display: Display
 ) -> None:
     monkeypatch.setattr(rendering, "frames_at_once", lambda height, width: 2)
-    scene, asked, done = random_scene(60), header(display), []
-    sink = export_to(tmp_path / "frames.npz", "npz", asked)
-    found = render_into(sink, asked, scene, UNKNOWN, before_portion=done.append)
+    scene, asked, done = random_scene(60), settings(display), []
+    found = written(tmp_path / "frames.npz", scene, asked, before_portion=done.append)
     assert done == [0, 2, 4, 5]
     coverage = render(scene, PROBE, POSES, height=24, width=20, outputs=("coverage",)).coverage
     assert coverage is not None
     shares = [one.supported_share for one in found]
     np.testing.assert_allclose(shares, (coverage.numpy() >= SUPPORT_COVERAGE).mean(axis=(1, 2)))
     with np.load(tmp_path / "frames.npz") as archive:
-        picture = display.picture(PROBE, 24, 20)
-        assert archive["bmode"].shape == (5, picture.height, picture.width)
-        assert json.loads(str(archive["probe"])) == to_dict(PROBE)
-        assert json.loads(str(archive["display"])) == json.loads(json.dumps(asdict(display)))
-        assert json.loads(str(archive["picture"])) == json.loads(json.dumps(asdict(picture)))
+        assert archive["bmode"].shape == (5, asked.picture.height, asked.picture.width)
+        for name in ("probe", "display", "picture"):
+            assert json.loads(str(archive[name])) == to_dict(getattr(asked, name))
 
 
 def test_pixels_without_support_are_black_where_they_are_masked(
     tmp_path: Path, random_scene: Callable[..., GaussianScene]
 ) -> None:
-    scene, asked, masked = random_scene(60), header(Display(gain_db=20.0)), [True, False, True, False, False]
-    render_into(export_to(tmp_path / "frames.npz", "npz", asked), asked, scene, UNKNOWN, masked=masked)
+    asked = settings(Display(gain_db=20.0), min_confidence=0.5, below_min_confidence=Below.MASK)
+    written(tmp_path / "frames.npz", random_scene(60), asked)
     with np.load(tmp_path / "frames.npz") as archive:
-        for pixels, coverage, is_masked in zip(archive["bmode"], archive["coverage"], masked, strict=True):
+        for pixels, coverage, confidence in zip(archive["bmode"], archive["coverage"], CONFIDENCES, strict=True):
             unsupported = coverage < SUPPORT_COVERAGE
             assert unsupported.any()
-            assert (pixels[unsupported] == 0.0).all() == is_masked
+            assert (pixels[unsupported] == 0.0).all() == (confidence < 0.5)
 
 
 def test_what_is_stopped_leaves_nothing(tmp_path: Path, random_scene: Callable[..., GaussianScene]) -> None:
     def stop(done: int) -> None:
         raise KeyboardInterrupt
 
-    asked = header(Display())
     with pytest.raises(KeyboardInterrupt):
-        render_into(
-            export_to(tmp_path / "frames.npz", "npz", asked), asked, random_scene(3), UNKNOWN, before_portion=stop
-        )
+        written(tmp_path / "frames.npz", random_scene(3), settings(Display()), before_portion=stop)
     assert list(tmp_path.iterdir()) == []

@@ -154,11 +154,11 @@ def test_a_cancelled_job_has_its_own_exit_code_and_can_be_retried(server: Runnin
         (("list", "--server", "http://127.0.0.1:9"), "no service answers at http://127.0.0.1:9"),
         (("list", "--api-key", "x" * 16), "API key"),
         (("submit", "render", "demo", "--count", "3"), "--count is of a sampler: name it with --sampler"),
-        (("submit", "render", "demo", "--sampler", "fan", "--count", "3"), "it takes tilt_deg, step_deg"),
+        (("submit", "render", "demo", "--sampler", "fan", "--count", "3"), "kind fan takes tilt_deg, step_deg"),
         (("submit", "render", "demo", "--format", "dicom", "--outputs", "echo"), "bmode alone in format dicom"),
         (("submit", "render", "gone"), "no scene"),
         (("submit", "train", "tiny", "--scene", "new", "--set", "stepz=3"), "no setting stepz; it has steps, "),
-        (("submit", "train", "tiny", "--scene", "new", "--set", "steps=0"), "steps must be between 1 and"),
+        (("submit", "train", "tiny", "--scene", "new", "--set", "steps=0"), "steps must be an integer from 1 to"),
         (("download", "0" * 24, "name", "-o", "nowhere/name"), "output must lie in a folder that exists"),
     ],
 )

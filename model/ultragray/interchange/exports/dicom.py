@@ -43,7 +43,7 @@ class DicomExporter(Exporter):
         if self._bytes > MAX_PIXEL_BYTES:
             raise InvalidArgument(
                 f"format dicom holds at most {MAX_PIXEL_BYTES:,} pixels in a file, {len(header.poses):,} frames of "
-                f"{header.picture.height}x{header.picture.width} are {self._bytes:,}",
+                f"{header.settings.picture.height}x{header.settings.picture.width} are {self._bytes:,}",
                 field="format",
             )
         self._file = self._held.enter_context(self._path.open("wb"))
@@ -97,7 +97,7 @@ class DicomExporter(Exporter):
 
     def _describe_pixels(self, data: Dataset) -> None:
         """The modules Image Pixel, Cine, Multi-frame and US Image."""
-        picture = self._header.picture
+        picture = self._header.settings.picture
         data.SamplesPerPixel, data.PhotometricInterpretation, data.PixelRepresentation = 1, "MONOCHROME2", 0
         data.BitsAllocated, data.BitsStored, data.HighBit = 8, 8, 7
         data.Rows, data.Columns = picture.height, picture.width
@@ -109,7 +109,7 @@ class DicomExporter(Exporter):
             data.PixelAspectRatio = [aspect.numerator, aspect.denominator]
 
     def _region(self) -> Dataset:
-        picture = self._header.picture
+        picture = self._header.settings.picture
         region = Dataset()
         region.RegionSpatialFormat, region.RegionDataType = TISSUE_2D, TISSUE
         region.RegionFlags = 0  # high priority, not protected from scaling
@@ -126,7 +126,7 @@ class DicomExporter(Exporter):
 def _uids(header: ExportHeader) -> tuple[str, str, str]:
     """Of the image, the series and the study."""
     poses = hashlib.sha256(np.ascontiguousarray(header.poses, "<f8").tobytes()).hexdigest()
-    made_of = json.dumps([header.origin(), header.height, header.width, poses], sort_keys=True)
+    made_of = json.dumps([header.origin(), header.settings.height, header.settings.width, poses], sort_keys=True)
     image, series = (f"{name} {made_of}" for name in ("image", "series"))
     names = (image, series, f"study {header.scene_sha256}")
     image_uid, series_uid, study_uid = (f"2.25.{uuid.uuid5(_UIDS, name).int}" for name in names)

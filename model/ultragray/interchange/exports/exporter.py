@@ -5,8 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import asdict, dataclass
-from functools import cached_property
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,41 +15,29 @@ import numpy.typing as npt
 from ...confidence import Extrapolation, figure_arrays
 from ...contract import to_dict
 from ...display.pixels import PixelArray, to_uint8
-from ...display.settings import AS_RENDERED, Display
 from ...errors import InvalidArgument
 from ...outputs import OUTPUTS
-from ...probe import FloatArray, Picture, Probe
+from ...probe import FloatArray
+from ...settings import Resolved
 
 FRAME_TIME_MS = 40.0  # rendered frames have no time of their own: formats that need one show 25 a second
 
 
 @dataclass(frozen=True)
 class ExportHeader:
-    """The facts that the frames of an export share, and all it takes to render them again.
+    """The facts that the frames of an export share, and all it takes to render them again."""
 
-    The frames of a file are `picture`s: height x width samples of the probe, shown with `display`.
-    """
-
-    outputs: tuple[str, ...]
+    settings: Resolved
     dtype: str  # "uint8": round(255·x), or "float32"; labels are uint8 as they are
     poses: FloatArray  # [C, 4, 4] mm
-    height: int
-    width: int
-    probe: Probe
     scene: str
     scene_sha256: str
     renderer: str
-    display: Display = AS_RENDERED
-
-    @cached_property
-    def picture(self) -> Picture:
-        """Size and place of the pixels of each frame. Raises InvalidImageSize for a huge one."""
-        return self.display.picture(self.probe, self.height, self.width)
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """[C, H, W] of each output."""
-        return len(self.poses), self.picture.height, self.picture.width
+        """[C, H, W] of each output. Raises InvalidImageSize for a huge picture."""
+        return len(self.poses), self.settings.picture.height, self.settings.picture.width
 
     def pixel_type(self, output: str) -> np.dtype[Any]:
         """The type that the pixels of an output are stored in."""
@@ -65,9 +52,9 @@ class ExportHeader:
             "scene": self.scene,
             "scene_sha256": self.scene_sha256,
             "renderer": self.renderer,
-            "probe": to_dict(self.probe),
-            "display": asdict(self.display),
-            "picture": asdict(self.picture),
+            "probe": to_dict(self.settings.probe),
+            "display": to_dict(self.settings.display),
+            "picture": to_dict(self.settings.picture),
         }
 
 

@@ -9,9 +9,9 @@ import importlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from ...display.settings import Display, true_to_scale
+from ...display.settings import true_to_scale
 from ...errors import ExtraMissing, InvalidArgument
-from ...probe import Probe
+from ...settings import Resolved
 from .exporter import Exporter
 
 DTYPES = ("float32", "uint8")
@@ -31,11 +31,12 @@ class Format:
     package: str | None = None  # what it needs, as it is imported
     extra: str | None = None  # of ours, that installs it
 
-    def shown(self, display: Display, probe: Probe, height: int) -> Display:
-        """The display that frames have in a file of this format: the given one, scan-converted where it must be."""
-        if not self.in_mm or display.pixel_mm is not None:
-            return display
-        return replace(display, pixel_mm=true_to_scale(probe, height).pixel_mm)
+    def shown(self, settings: Resolved) -> Resolved:
+        """The settings as frames have them in a file of this format: scan-converted where it must be."""
+        if not self.in_mm or settings.display.pixel_mm is not None:
+            return settings
+        pixel_mm = true_to_scale(settings.probe, settings.height).pixel_mm
+        return replace(settings, display=replace(settings.display, pixel_mm=pixel_mm))
 
 
 _ALL = (

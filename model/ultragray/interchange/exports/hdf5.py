@@ -31,7 +31,7 @@ class Hdf5Exporter(Exporter):
                 chunks=(1, *header.shape[1:]),
                 dtype=header.pixel_type(name),
             )
-            for name in header.outputs
+            for name in header.settings.outputs
         }
 
     def _write(self, frames: Mapping[str, PixelArray], count: int) -> None:

@@ -21,7 +21,7 @@ class NpzExporter(Exporter):
     def _open(self) -> None:
         header = self._header
         self._archive = self._held.enter_context(zipfile.ZipFile(self._path, "w"))
-        first, *others = header.outputs
+        first, *others = header.settings.outputs
         self._waiting = {name: self._held.enter_context(self._nameless()) for name in others}
         self._first = self._held.enter_context(self._member(first))
         self._files: dict[str, IO[bytes]] = {first: self._first, **self._waiting}

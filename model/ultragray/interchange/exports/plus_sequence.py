@@ -52,7 +52,7 @@ class PlusExporter(Exporter):
         self._line("ElementDataFile", "LOCAL")
 
     def _fields(self) -> dict[str, str]:
-        header, picture, origin = self._header, self._header.picture, self._header.origin()
+        header, picture, origin = self._header, self._header.settings.picture, self._header.origin()
         return {
             "ObjectType": "Image",
             "NDims": "3",
@@ -79,7 +79,7 @@ class PlusExporter(Exporter):
         self._file.write(f"{key} = {value}\n".encode())
 
     def _image_to_probe(self) -> FloatArray:  # [4, 4] pixels -> mm
-        picture = self._header.picture
+        picture = self._header.settings.picture
         matrix = np.eye(4)
         matrix[:3, 0] = picture.step[0], 0.0, 0.0
         matrix[:3, 1] = 0.0, 0.0, picture.step[1]

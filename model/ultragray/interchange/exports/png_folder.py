@@ -27,7 +27,7 @@ def export_pngs(folder: Path, header: ExportHeader) -> Iterator[Add]:
         folder.mkdir(parents=True, exist_ok=True)  # only now: a mistake that the rendering finds leaves no folder
         for place, extrapolation in enumerate(extrapolations):
             number = len(documents)
-            for name in header.outputs:
+            for name in header.settings.outputs:
                 data = image_file(frames[name][place], ".png")
                 (folder / f"frame_{number:05d}_{name}.png").write_bytes(data.tobytes())
             documents.append({"frame": number, "pose": header.poses[number].tolist(), **asdict(extrapolation)})

@@ -23,7 +23,7 @@ class TarExporter(Exporter):
     def _write(self, frames: Mapping[str, PixelArray], count: int) -> None:
         for place in range(count):
             number = self._done + place
-            for name in self._header.outputs:
+            for name in self._header.settings.outputs:
                 frame = frames[name][place]
                 suffix, data = (
                     ("png", image_file(frame, ".png").tobytes()) if frame.dtype == np.uint8 else ("npy", _npy(frame))

@@ -54,7 +54,9 @@ def _beside(exporter: Exporter, header: ExportHeader) -> Iterator[Add]:
                 continue
             frames, extrapolations = portion
             try:
-                stored = {name: stored_pixels(frames[name], header.pixel_type(name)) for name in header.outputs}
+                stored = {
+                    name: stored_pixels(frames[name], header.pixel_type(name)) for name in header.settings.outputs
+                }
                 exporter.add(stored, extrapolations)
             except BaseException as error:
                 failed.append(error)

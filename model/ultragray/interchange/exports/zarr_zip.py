@@ -32,7 +32,7 @@ class ZarrExporter(Exporter):
                 dimension_names=("frame", "depth", "line"),
                 config={"write_empty_chunks": True},
             )
-            for name in header.outputs
+            for name in header.settings.outputs
         }
 
     def _write(self, frames: Mapping[str, PixelArray], count: int) -> None:

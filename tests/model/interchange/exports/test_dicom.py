@@ -15,11 +15,11 @@ from pydicom.uid import ExplicitVRLittleEndian, UltrasoundMultiFrameImageStorage
 
 from ultragray import ConvexProbe, LinearProbe
 from ultragray.confidence import Extrapolation
-from ultragray.display import AS_RENDERED
 from ultragray.display.frames import show
 from ultragray.display.scan_conversion import scan_convert
 from ultragray.errors import InvalidArgument
 from ultragray.interchange.exports import FORMATS, ExportHeader, export_to
+from ultragray.settings import Resolved
 
 LINEAR = LinearProbe(width_mm=38.0, near_mm=2.0, far_mm=52.0)
 CONVEX = ConvexProbe(opening_angle_deg=60.0, near_mm=20.0, far_mm=60.0)
@@ -80,14 +80,16 @@ def strict_reading(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 def header(**changes: object) -> ExportHeader:
-    one = ExportHeader(("bmode",), "uint8", POSES, 21, 19, LINEAR, "one", "0" * 64, "ultragray/0 cpu")
-    asked = dataclasses.replace(one, **changes)  # type: ignore[arg-type]
-    return dataclasses.replace(asked, display=FORMATS["dicom"].shown(AS_RENDERED, asked.probe, asked.height))
+    settings = Resolved(probe=changes.pop("probe", LINEAR), height=21, width=19)  # type: ignore[arg-type]
+    one = ExportHeader(FORMATS["dicom"].shown(settings), "uint8", POSES, "one", "0" * 64, "ultragray/0 cpu")
+    return dataclasses.replace(one, **changes)  # type: ignore[arg-type]
 
 
 def export(path: Path, header: ExportHeader) -> FileDataset:
     with export_to(path, "dicom", header) as add:
-        shown = show({"bmode": torch.from_numpy(FRAMES)}, header.probe, header.display)["bmode"].numpy()
+        shown = show({"bmode": torch.from_numpy(FRAMES)}, header.settings.probe, header.settings.display)[
+            "bmode"
+        ].numpy()
         add({"bmode": shown[:2]}, TOLD[:2])
         add({"bmode": shown[2:]}, TOLD[2:])
     data = pydicom.dcmread(path)
@@ -206,7 +208,11 @@ def test_more_than_an_element_holds_is_refused(tmp_path: Path) -> None:
     many = np.broadcast_to(np.eye(4), (20_000, 4, 4))
     with (
         pytest.raises(InvalidArgument, match="at most") as caught,
-        export_to(tmp_path / "frames.dcm", "dicom", header(poses=many, height=512, width=512)),
+        export_to(
+            tmp_path / "frames.dcm",
+            "dicom",
+            dataclasses.replace(header(), poses=many, settings=Resolved(LINEAR, 512, 512)),
+        ),
     ):
         pass
     assert caught.value.field == "format"

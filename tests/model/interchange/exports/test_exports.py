@@ -25,6 +25,7 @@ from ultragray.errors import ExtraMissing, InvalidArgument
 from ultragray.interchange.exports import FORMATS, ExportHeader, check_format, export_to
 from ultragray.interchange.exports.exporter import stored_pixels
 from ultragray.interchange.exports.npz import NpzExporter
+from ultragray.settings import Resolved
 
 PROBE = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)
 POSES = np.tile(np.eye(4), (5, 1, 1))
@@ -36,12 +37,9 @@ UNKNOWN = Extrapolation(None, None, None, 0.25)
 
 def header(outputs: tuple[str, ...] = OUTPUTS, dtype: str = "float32") -> ExportHeader:
     return ExportHeader(
-        outputs=outputs,
+        settings=Resolved(PROBE, 6, 7, outputs),
         dtype=dtype,
         poses=POSES,
-        height=6,
-        width=7,
-        probe=PROBE,
         scene="one",
         scene_sha256="0" * 64,
         renderer="ultragray/0 cpu",
@@ -58,7 +56,7 @@ def rendered(outputs: tuple[str, ...] = OUTPUTS) -> dict[str, Any]:
 
 def export(path: Path, format: str, header: ExportHeader) -> dict[str, Any]:
     """Writes five frames in portions of two; what the file must hold, by output."""
-    frames = rendered(header.outputs)
+    frames = rendered(header.settings.outputs)
     with export_to(path, format, header) as add:
         for first in (0, 2, 4):
             add({name: values[first : first + 2] for name, values in frames.items()}, TOLD[first : first + 2])
@@ -279,8 +277,9 @@ def test_a_full_disk_is_told_as_such(tmp_path: Path, format: str) -> None:
         "from ultragray.confidence import Extrapolation\n"
         "from ultragray.interchange.exports import FORMATS, ExportHeader, export_to, exporter_class\n"
         f"path, format = {str(tmp_path / 'frames')!r}, {format!r}\n"
-        "poses, probe = np.tile(np.eye(4), (40, 1, 1)), LinearProbe(40.0, 0.0, 50.0)\n"
-        "header = ExportHeader(('bmode',), FORMATS[format].dtypes[0], poses, 300, 300, probe, 'one', '0' * 64, 'r')\n"
+        "from ultragray.settings import Resolved\n"
+        "poses, settings = np.tile(np.eye(4), (40, 1, 1)), Resolved(LinearProbe(40.0, 0.0, 50.0), 300, 300)\n"
+        "header = ExportHeader(settings, FORMATS[format].dtypes[0], poses, 'one', '0' * 64, 'r')\n"
         "exporter_class(format)\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, resource.RLIM_INFINITY))\n"
         "frames = np.random.default_rng(0).random((4, 300, 300), np.float32)\n"

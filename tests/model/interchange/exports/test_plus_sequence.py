@@ -12,12 +12,12 @@ from ultragray.confidence import Extrapolation
 from ultragray.datasets.plus import read_plus_sweep
 from ultragray.datasets.plus.meta_image import read_meta_image
 from ultragray.datasets.plus.transforms import parse_matrix
-from ultragray.display import AS_RENDERED
 from ultragray.display.frames import show
 from ultragray.display.scan_conversion import scan_convert
 from ultragray.interchange.exports import FORMATS, ExportHeader, export_to
 from ultragray.pose import pose_from_position_quaternion
 from ultragray.probe import Probe
+from ultragray.settings import Resolved
 
 FRAMES = np.random.default_rng(0).random((12, 20, 16), np.float32)
 TOLD = [Extrapolation(number / 3.0, 1234.5, None, 1e-4 * number) for number in range(12)]
@@ -35,9 +35,9 @@ def poses(count: int) -> np.ndarray:
 
 
 def export(path: Path, probe: Probe) -> ExportHeader:
-    header = ExportHeader(("bmode",), "uint8", poses(12), 20, 16, probe, "one", "0" * 64, "ultragray/0 cpu")
-    header = dataclasses.replace(header, display=FORMATS["plus"].shown(AS_RENDERED, probe, 20))
-    shown = show({"bmode": torch.from_numpy(FRAMES)}, probe, header.display)["bmode"].numpy()
+    settings = FORMATS["plus"].shown(Resolved(probe, 20, 16))
+    header = ExportHeader(settings, "uint8", poses(12), "one", "0" * 64, "ultragray/0 cpu")
+    shown = show({"bmode": torch.from_numpy(FRAMES)}, probe, settings.display)["bmode"].numpy()
     with export_to(path, "plus", header) as add:
         add({"bmode": shown[:7]}, TOLD[:7])
         add({"bmode": shown[7:]}, TOLD[7:])
@@ -112,7 +112,7 @@ def test_ten_thousand_frames_keep_their_order(tmp_path: Path) -> None:
     many = np.tile(np.eye(4), (10_050, 1, 1))
     many[:, 1, 3] = np.arange(10_050)
     header = export(tmp_path / "few.igs.mha", LinearProbe(40.0, 0.0, 50.0))
-    header = dataclasses.replace(header, poses=many, height=1, width=2)
+    header = dataclasses.replace(header, poses=many, settings=Resolved(header.settings.probe, 1, 2))
     with export_to(tmp_path / "many.igs.mha", "plus", header) as add:
         add({"bmode": np.tile(np.array([[[0.0, 1.0]]], np.float32), (10_050, 1, 1))}, TOLD[:1] * 10_050)
     sweep, count = read_plus_sweep(tmp_path / "many.igs.mha", frames="10000:10050")

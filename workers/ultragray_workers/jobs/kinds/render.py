@@ -13,13 +13,14 @@ import numpy as np
 from ultragray.confidence import Assessor, Extrapolation, require_confidence
 from ultragray.contract import described, kind_field, shown
 from ultragray.errors import InvalidArgument
-from ultragray.image_size import check_image_size
+from ultragray.image_size import MAX_IMAGE_SIDE, check_image_size
 from ultragray.interchange.exports import check_format
 from ultragray.outputs import OUTPUTS, check_outputs
 from ultragray.pose import check_poses
 from ultragray.probe import FloatArray, Probe
 from ultragray.samplers import MAX_POSES, Assess, Sampler, TrainingSampler, assessed_poses
-from ultragray.settings import Encoding, FrameSettings
+from ultragray.scene_info import SceneInfo
+from ultragray.settings import Encoding, FrameSettings, Resolved
 
 from ...errors import StorageFull
 from .base import Specification, Surroundings
@@ -93,15 +94,19 @@ class RenderJob(Specification):
         """
         scene = surroundings.scene
         assert scene is not None
-        asked = FrameSettings(
-            height=self.height, width=self.width, outputs=self.outputs, min_confidence=self.min_confidence
-        )
-        settings = asked.resolved(scene.info, Encoding.FLOAT32, max_image_side=surroundings.max_image_side)
+        settings = self.settings(scene.info, surroundings.max_image_side)
         poses = self.poses_of(scene.training_poses, settings.probe)
         few = len(poses) * len(scene.training_poses) <= ASSESSED_AT_ONCE
         if self.min_confidence is not None and self.sampler is None and few:
             require_confidence(Assessor(scene.info, scene.training_poses).assess(poses), self.min_confidence)
         self._check_room(len(poses), settings.height, settings.width, surroundings.artifact_folder)
+
+    def settings(self, info: SceneInfo, max_image_side: int = MAX_IMAGE_SIDE) -> Resolved:
+        """How the frames are rendered. Raises as FrameSettings.resolved."""
+        asked = FrameSettings(
+            height=self.height, width=self.width, outputs=self.outputs, min_confidence=self.min_confidence
+        )
+        return asked.resolved(info, Encoding.FLOAT32, max_image_side=max_image_side)
 
     def poses_of(self, training_poses: FloatArray, probe: Probe) -> FloatArray:  # [P, 4, 4] -> [C, 4, 4] mm
         """The poses that the job asks for, whatever their confidence; the same training poses and probe give the same.

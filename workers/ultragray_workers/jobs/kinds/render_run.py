@@ -8,12 +8,10 @@ import time
 import torch
 
 from ultragray.confidence import Assessor, Extrapolation
-from ultragray.display import AS_RENDERED
 from ultragray.files.atomic import file_sha256
-from ultragray.interchange.exports import FORMATS, ExportHeader, check_format, export_to
-from ultragray.interchange.rendering import render_into
+from ultragray.interchange.exports import FORMATS
+from ultragray.interchange.rendering import render_to_file
 from ultragray.probe import FloatArray
-from ultragray.rendering import renderer_name
 from ultragray.samplers import Assess
 from ultragray.scene import GaussianScene
 from ultragray.scene_info import SceneHeader, read_header
@@ -43,37 +41,35 @@ def run(job_run: JobRun, job: RenderJob) -> Outcome:
 def _render_on(device: torch.device, job_run: JobRun, job: RenderJob) -> Outcome:
     path = job_run.folder.path / f"{job.scene}{SUFFIX}"
     described = read_header(path)
-    probe = described.info.probe_or(None)
-    poses, extrapolations = job.assessed_poses(described.training_poses, probe, _assessing(job_run, described))
+    settings = job.settings(described.info)
+    assess = _assessing(job_run, described)
+    poses, extrapolations = job.assessed_poses(described.training_poses, settings.probe, assess)
     scene = GaussianScene.load(path).to(device)
-    height, width = scene.info.image_size_or(job.height, job.width)
-    chosen = FORMATS[job.format]
-    header = ExportHeader(
-        outputs=job.outputs,
-        dtype=check_format(job.format, job.outputs, job.dtype),
-        poses=poses,
-        height=height,
-        width=width,
-        probe=probe,
-        scene=job.scene,
-        scene_sha256=file_sha256(path),
-        renderer=renderer_name("auto", scene),
-        display=chosen.shown(AS_RENDERED, probe, height),
-    )
-    sys.stderr.write(f"rendering {len(poses):,} frames of {height}x{width} of {job.scene} on {device}\n")
+    size = f"{settings.height}x{settings.width}"
+    sys.stderr.write(f"rendering {len(poses):,} frames of {size} of {job.scene} on {device}\n")
+    started = time.monotonic()
+
+    def before_portion(done: int) -> None:
+        if job_run.should_stop():
+            raise Stopped
+        rate = done / (time.monotonic() - started)
+        left_s = (len(poses) - done) / rate if done else None
+        progress = Progress(frames_done=done, frames=len(poses), rate_per_s=rate or None, seconds_left=left_s)
+        job_run.report(progress)
+
     with job_run.folder.new_artifacts() as folder:
-        started = time.monotonic()
-
-        def before_portion(done: int) -> None:
-            if job_run.should_stop():
-                raise Stopped
-            rate = done / (time.monotonic() - started)
-            left_s = (len(poses) - done) / rate if done else None
-            progress = Progress(frames_done=done, frames=len(poses), rate_per_s=rate or None, seconds_left=left_s)
-            job_run.report(progress)
-
-        sink = export_to(folder / f"frames{chosen.suffix}", job.format, header)
-        render_into(sink, header, scene, extrapolations, before_portion=before_portion)
+        render_to_file(
+            folder / f"frames{FORMATS[job.format].suffix}",
+            job.format,
+            scene,
+            settings,
+            poses,
+            extrapolations,
+            dtype=job.dtype,
+            scene_name=job.scene,
+            scene_sha256=file_sha256(path),
+            before_portion=before_portion,
+        )
     return Outcome(artifacts=job_run.folder.artifact_names())
 
 

@@ -1,0 +1,221 @@
+"""Options of commands, made of the contract: `--min-confidence` of the field `min_confidence`, with its meaning.
+
+    @app.command()
+    @with_options
+    def render(scene: Scene, settings: FrameSettings, sampler: Sampler | None) -> None:
+
+A parameter whose type is a contract dataclass becomes an option for each of its fields, those of dataclasses within it
+included. Of a sampler it becomes `--sampler KIND` and the fields of all kinds; other families are written as JSON, and
+lists with commas. What is not given keeps its default.
+"""
+
+from __future__ import annotations
+
+import inspect
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import MISSING, Field
+from enum import Enum
+from functools import wraps
+from pathlib import Path
+from typing import Annotated, Any, get_args, get_origin, get_type_hints
+
+import typer
+
+from ultragray.contract import Contract, Family, annotated_fields, from_dict, optional_of, range_of
+from ultragray.errors import InvalidArgument
+from ultragray.files.poses import load_poses
+from ultragray.samplers import Sampler
+
+FLAGS = {"settings": ("--set",), "pixel_mm": ("--pixel-mm", "--scan-convert"), "out_of_plane_mm": ("--out-of-plane",)}
+_WITH_AN_OPTION_A_FIELD = (Sampler,)  # of all families
+_PARSED = (bool, int, float, Path)
+
+
+def with_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Make a command of typer out of a function that takes contract dataclasses."""
+    hints = get_type_hints(command, include_extras=True)
+    contracts: dict[str, Any] = {}
+    parameters: list[inspect.Parameter] = []
+    for name, parameter in inspect.signature(command).parameters.items():
+        cls, _ = optional_of(hints[name])
+        if isinstance(cls, type) and issubclass(cls, Contract):
+            contracts[name] = cls
+            parameters += parameters_of(cls, name)
+        else:
+            parameters.append(parameter.replace(annotation=hints[name], kind=parameter.KEYWORD_ONLY))
+
+    @wraps(command)
+    def run(**given: Any) -> Any:
+        made = {
+            name: _part(cls, name, given) if issubclass(cls, Family) else cls(**values_of(cls, given))
+            for name, cls in contracts.items()
+        }
+        return command(**{name: made[name] if name in made else given[name] for name in hints if name != "return"})
+
+    return with_parameters(run, parameters)
+
+
+def with_parameters(command: Callable[..., Any], parameters: list[inspect.Parameter]) -> Callable[..., Any]:
+    """The command, as typer sees it, with these parameters."""
+    command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    command.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    return command
+
+
+def parameters_of(cls: Any, name: str = "") -> list[inspect.Parameter]:
+    """The options of a contract dataclass, or of a family under a name. The first required field is an argument."""
+    if issubclass(cls, _WITH_AN_OPTION_A_FIELD):
+        return [*_family_parameters(cls, name)]
+    argument = next((item for item, _ in _fields(cls) if _is_required(item)), None)
+    found: list[inspect.Parameter] = []
+    for item, kind in _fields(cls):
+        if _is_within(kind):
+            found += parameters_of(kind, item.name)
+        elif item is argument:
+            found.insert(0, _parameter(item, kind, is_argument=True))
+        else:
+            found.append(_parameter(item, kind))
+    return found
+
+
+def values_of(cls: Any, given: Mapping[str, Any]) -> dict[str, Any]:
+    """The fields of a contract dataclass that options gave, as Python has them.
+
+    Raises InvalidArgument and its kind, naming the option for what cannot be read.
+    """
+    found = {}
+    for item, kind in _fields(cls):
+        if kind is bool:
+            value = (not item.default) if given[item.name] else None
+        elif _is_within(kind):
+            value = _part(kind, item.name, given)
+        else:
+            value = None if given[item.name] is None else _read(given[item.name], kind, item.name)
+        if value is not None:
+            found[item.name] = value
+    return found
+
+
+def _fields(cls: Any) -> Iterator[tuple[Field[Any], Any]]:
+    for item, annotation in annotated_fields(cls):
+        if item.name != "kind":
+            yield item, optional_of(annotation)[0]
+
+
+def _is_within(kind: Any) -> bool:
+    """Whether the fields of this type have options of their own."""
+    is_contract = isinstance(kind, type) and issubclass(kind, Contract)
+    return is_contract and (not issubclass(kind, Family) or kind in _WITH_AN_OPTION_A_FIELD)
+
+
+def _family_parameters(family: Any, name: str) -> Iterator[inspect.Parameter]:
+    help = f"One of {', '.join(family.members)}; each takes its own options only."
+    yield _keyword(name, Annotated[str | None, typer.Option(_flag(name), help=help, show_default=False)], None)
+    members = {kind: {item.name: (item, of) for item, of in _fields(cls)} for kind, cls in family.members.items()}
+    for option in dict.fromkeys(option for taken in members.values() for option in taken):
+        takers = [kind for kind, taken in members.items() if option in taken]
+        item, kind = members[takers[0]][option]
+        yield _parameter(item, kind, takers=takers)
+
+
+def _parameter(
+    item: Field[Any], kind: Any, *, is_argument: bool = False, takers: Sequence[str] = ()
+) -> inspect.Parameter:
+    """The option of a field; `takers`: the kinds of a family that take it, each in its own right."""
+    meaning = str(item.metadata["description"])
+    if takers:
+        meaning = f"{', '.join(takers)}: {meaning[:1].lower()}{meaning[1:]}"
+    if item.name == "poses":
+        meaning = f"{meaning.rstrip('.')}: .npy or .json, [P, 4, 4] or [P, 3, 4]."
+    limits = range_of(item).strip().removeprefix("of ")
+    meaning += f" {limits[:1].upper()}{limits[1:]}." if limits else ""
+    if isinstance(kind, type) and issubclass(kind, Family):
+        meaning += f" As JSON, a kind with its numbers: {'; '.join(map(_signature, kind.members.values()))}."
+    is_switch, is_table = kind is bool, get_origin(kind) is dict
+    parsed: Any = list[str] if is_table else Path if item.name == "poses" else kind if kind in _PARSED else str
+    flags = FLAGS.get(item.name, (_flag(f"no_{item.name}" if item.default is True else item.name),))
+    shown = not is_switch and _shown_default(item)
+    option = typer.Option(*flags, help=meaning, metavar="NAME=VALUE" if is_table else None, show_default=shown)
+    if is_switch:
+        return _keyword(item.name, Annotated[bool, option], False)
+    if is_argument:
+        return _keyword(item.name, Annotated[parsed, typer.Argument(help=meaning, show_default=False)])
+    if _is_required(item) and not takers:
+        return _keyword(item.name, Annotated[parsed, option])
+    return _keyword(item.name, Annotated[parsed | None, option], None)
+
+
+def _signature(member: Any) -> str:
+    """A member of a family as JSON without its values."""
+    return "{" + ", ".join([f'"kind": "{member.kind}"', *(f'"{item.name}": …' for item, _ in _fields(member))]) + "}"
+
+
+def _keyword(name: str, annotation: Any, default: Any = inspect.Parameter.empty) -> inspect.Parameter:
+    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
+
+
+def _is_required(item: Field[Any]) -> bool:
+    return item.default is MISSING and item.default_factory is MISSING
+
+
+def _shown_default(item: Field[Any]) -> str | bool:
+    """The default as it would be typed; False where the meaning tells what is taken."""
+    default = item.default.value if isinstance(item.default, Enum) else item.default
+    if isinstance(default, tuple):
+        default = ",".join(map(str, default))
+    return False if default in (None, MISSING, "") else str(default)
+
+
+def _part(cls: Any, name: str, given: Mapping[str, Any]) -> Any:
+    """The object that the options of a part or of a sampler give; None where none of them was given."""
+    if not issubclass(cls, Family):
+        values = values_of(cls, given)
+        return cls(**values) if values else None
+    options = dict.fromkeys(item.name for member in cls.members.values() for item, _ in _fields(member))
+    document = {option: given[option] for option in options if given[option] is not None}
+    if given[name] is not None:
+        return from_dict(cls, {"kind": given[name], **document})
+    for option in document:
+        raise InvalidArgument(f"{_flag(option)} is of a {name}: name it with {_flag(name)}", field=option)
+    return None
+
+
+def _read(value: Any, kind: Any, name: str) -> Any:
+    """What an option holds, as the type of its field."""
+    if get_origin(kind) is tuple:
+        return tuple(_read(word.strip(), get_args(kind)[0], name) for word in value.split(",") if word.strip())
+    if get_origin(kind) is dict:
+        return parse_settings(value)
+    if isinstance(kind, type) and issubclass(kind, Family):
+        return from_dict(kind, _parsed_json(value, name))
+    if name == "poses":
+        return load_poses(value)
+    try:
+        return kind(value) if kind in (int, float) else value
+    except ValueError:
+        raise InvalidArgument(f"{_flag(name)} takes numbers with commas, got {value!r}", field=name) from None
+
+
+def _parsed_json(text: str, name: str) -> Any:
+    try:
+        return json.loads(text)
+    except (json.JSONDecodeError, RecursionError) as error:
+        raise InvalidArgument(f"{_flag(name)} must be a JSON object: {error}", field=name) from error
+
+
+def parse_settings(settings: list[str]) -> dict[str, Any]:
+    """NAME=VALUE pairs, the value as in TOML; a bare word is itself."""
+    from ultragray.training.config import parse_value
+
+    found = {}
+    for text in settings:
+        name, equals, value = text.partition("=")
+        if not equals:
+            raise InvalidArgument(f"--set takes NAME=VALUE, got {text!r}", field="set")
+        found[name.strip()] = parse_value(value.strip())
+    return found
+
+
+def _flag(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
