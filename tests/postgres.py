@@ -20,7 +20,7 @@ from psycopg import sql
 from typing_extensions import LiteralString
 
 PASSWORD = "s3cret/with@signs"
-_START_TIMEOUT_S = 30.0
+_START_TIMEOUT_S = 120.0
 _UNPRIVILEGED = "nobody"  # PostgreSQL refuses to run as root
 
 
@@ -85,7 +85,7 @@ class PostgresServer:
         """Ends all connections, as a restart of the server does."""
         assert self._process is not None
         self._process.send_signal(signal.SIGINT)
-        self._process.wait(20)
+        self._process.wait(60)
 
     def pause(self) -> None:
         """Whoever is connected hears nothing any more, and is not told why."""
@@ -132,7 +132,7 @@ class PostgresServer:
             password=PASSWORD,
             dbname="postgres",
             autocommit=True,
-            connect_timeout=5,
+            connect_timeout=60,
         )
 
 

@@ -78,7 +78,7 @@ class Observer:
             return
         known = set(self.known)
         try:
-            with httpx.Client(base_url=address, timeout=20) as client:
+            with httpx.Client(base_url=address, timeout=60) as client:
                 jobs = client.get("/v1/jobs", params={"page_size": 1000})
                 scenes = client.get("/v1/scenes")
         except httpx.TransportError:  # it was killed

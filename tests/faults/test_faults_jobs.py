@@ -71,7 +71,7 @@ def submit(machine: Machine, body: dict[str, Any], over_grpc: bool) -> tuple[str
         return None
     if not over_grpc:
         try:
-            answer = httpx.post(f"{machine.http}/v1/jobs", json=body, timeout=20)
+            answer = httpx.post(f"{machine.http}/v1/jobs", json=body, timeout=60)
         except httpx.TransportError:
             return None
         if answer.status_code == 503:
@@ -217,7 +217,7 @@ def check_artifacts_are_told(machine: Machine, jobs: dict[str, Job]) -> None:
     """Over HTTP, each artifact is the file of the store."""
     for job in jobs.values():
         for name in job.artifacts:
-            answer = httpx.get(f"{machine.http}/v1/jobs/{job.id}/artifacts/{name}", timeout=20)
+            answer = httpx.get(f"{machine.http}/v1/jobs/{job.id}/artifacts/{name}", timeout=60)
             assert answer.status_code == 200, answer.text
             assert answer.content == (machine.artifacts / "jobs" / job.id / "artifacts" / name).read_bytes()
 

@@ -25,8 +25,8 @@ from ultragray_proto.v1 import geometry_pb2, rendering_pb2, rendering_pb2_grpc, 
 from ..warm import SOURCE_FOLDERS, WARM_TEMPLATES, WarmProcess, WarmServer, fork
 
 ROOT = Path(__file__).resolve().parents[2]
-START_TIMEOUT_S = 60.0
-STOP_TIMEOUT_S = 30.0
+START_TIMEOUT_S = 120.0
+STOP_TIMEOUT_S = 60.0
 
 WARM_SERVICES = WarmServer("ultragray_service.__main__")
 HEIGHT, WIDTH = 64, 48  # of the training images of the test scene
@@ -95,7 +95,7 @@ class RunningService:
 
     def metric(self, name: str) -> float:
         """The sum of all lines of /metrics that begin with `name`."""
-        lines = httpx.get(f"{self.http}/metrics").text.splitlines()
+        lines = httpx.get(f"{self.http}/metrics", timeout=60).text.splitlines()
         return sum(float(line.rpartition(" ")[2]) for line in lines if line.startswith(name))
 
     def resident_bytes(self) -> int:

@@ -23,7 +23,7 @@ def guarded(start_service: StartService) -> RunningService:
     [{"Authorization": f"Bearer {KEY}"}, {"Authorization": f"bearer {OTHER_KEY}"}, {"X-API-Key": KEY}],
 )
 def test_a_known_key_opens_both_doors(guarded: RunningService, headers: dict[str, str]) -> None:
-    assert httpx.get(f"{guarded.http}/v1/scenes", headers=headers).status_code == 200
+    assert httpx.get(f"{guarded.http}/v1/scenes", headers=headers, timeout=60).status_code == 200
     with guarded.channel() as channel:
         stub = scenes_pb2_grpc.SceneServiceStub(channel)
         metadata = tuple((key.lower(), value) for key, value in headers.items())
@@ -33,7 +33,7 @@ def test_a_known_key_opens_both_doors(guarded: RunningService, headers: dict[str
 @pytest.mark.parametrize("headers", [{}, {"Authorization": f"Basic {KEY}"}, {"X-API-Key": KEY[:-1]}])
 def test_no_key_or_another_opens_none(guarded: RunningService, headers: dict[str, str]) -> None:
     for path in ("/v1/scenes", "/metrics", "/v1/nothing"):
-        answer = httpx.get(f"{guarded.http}{path}", headers=headers)
+        answer = httpx.get(f"{guarded.http}{path}", headers=headers, timeout=60)
         assert (answer.status_code, answer.json()["reason"]) == (401, "UNAUTHENTICATED")
         assert answer.headers["www-authenticate"] == "Bearer"
     with guarded.channel() as channel:
@@ -47,8 +47,8 @@ def test_no_key_or_another_opens_none(guarded: RunningService, headers: dict[str
 
 def test_health_and_documentation_stay_open(guarded: RunningService) -> None:
     for path in ("/v1/health/live", "/v1/health/ready", "/docs"):
-        assert httpx.get(f"{guarded.http}{path}").status_code == 200
-    document = httpx.get(f"{guarded.http}/openapi.json").json()
+        assert httpx.get(f"{guarded.http}{path}", timeout=60).status_code == 200
+    document = httpx.get(f"{guarded.http}/openapi.json", timeout=60).json()
     assert set(document["components"]["securitySchemes"]) == {"Bearer", "ApiKey"}
     with guarded.channel() as channel:
         answer = health_pb2_grpc.HealthStub(channel).Check(health_pb2.HealthCheckRequest())

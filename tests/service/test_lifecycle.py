@@ -17,7 +17,7 @@ import pytest
 
 from ultragray_proto.v1 import rendering_pb2, rendering_pb2_grpc
 
-from ..waiting import wait_until
+from ..waiting import at_this_load, wait_until
 from .conftest import ROOT, SOURCE_FOLDERS, RunningService, StartService
 from .rpc.test_grpc_render import Conversation, error_info, moved
 
@@ -34,7 +34,7 @@ def render(service: RunningService, client: httpx.Client, **body: Any) -> httpx.
 def test_sigterm_answers_what_is_in_flight_and_exits_cleanly(start_service: StartService) -> None:
     service = start_service(cold=True, **SLOW)
     frames = rendering_pb2.RenderSettings(scene="demo", **SMALL)
-    with service.channel() as channel, httpx.Client() as client, ThreadPoolExecutor(8) as threads:
+    with service.channel() as channel, httpx.Client(timeout=60) as client, ThreadPoolExecutor(8) as threads:
         stub = rendering_pb2_grpc.RenderServiceStub(channel)
         conversation = Conversation(stub)
         conversation.send(settings=frames)
@@ -52,26 +52,26 @@ def test_sigterm_answers_what_is_in_flight_and_exits_cleanly(start_service: Star
             next(conversation.call)
         assert caught.value.code() is grpc.StatusCode.UNAVAILABLE
         assert error_info(caught.value)[0].reason == "DRAINING"
-        assert service.process.wait(30) == 0
+        assert service.process.wait(60) == 0
         with pytest.raises(httpx.ConnectError):
             client.get(f"{service.http}/v1/health/live")
 
 
 def test_sigint_stops_an_idle_service_at_once(start_service: StartService) -> None:
     service = start_service()
-    with httpx.Client() as idle, service.channel() as channel:
+    with httpx.Client(timeout=60) as idle, service.channel() as channel:
         idle.get(f"{service.http}/v1/health/live")
-        grpc.channel_ready_future(channel).result(5)
+        grpc.channel_ready_future(channel).result(60)
         began = time.monotonic()
         service.process.send_signal(signal.SIGINT)
-        assert service.process.wait(30) == 0
-    assert time.monotonic() - began < 5
+        assert service.process.wait(60) == 0
+    assert time.monotonic() - began < at_this_load(5)
     assert service.log()[-1]["message"] == "stopped"
 
 
 def test_a_second_signal_stops_at_once(start_service: StartService) -> None:
     service = start_service(**SLOW)
-    with httpx.Client() as client, ThreadPoolExecutor(4) as threads:
+    with httpx.Client(timeout=60) as client, ThreadPoolExecutor(4) as threads:
         pending = [threads.submit(render, service, client, height=256, width=256) for _ in range(4)]
         wait_until(lambda: service.metric(WAITING))
         service.process.send_signal(signal.SIGTERM)
@@ -79,8 +79,8 @@ def test_a_second_signal_stops_at_once(start_service: StartService) -> None:
             time.sleep(0.02)
         began = time.monotonic()
         service.process.send_signal(signal.SIGTERM)
-        assert service.process.wait(30) == 0
-        assert time.monotonic() - began < 3
+        assert service.process.wait(60) == 0
+        assert time.monotonic() - began < at_this_load(3)
         for answer in pending:
             error = answer.exception()
             assert isinstance(error, httpx.TransportError) if error else answer.result().status_code == 503
@@ -95,7 +95,7 @@ def test_sigterm_while_starting(start_service: StartService) -> None:
 
 def test_a_full_queue_is_told_with_a_time_to_retry(start_service: StartService) -> None:
     service = start_service(**SLOW, queue_limit_frames=2)
-    with httpx.Client() as client, ThreadPoolExecutor(12) as threads:
+    with httpx.Client(timeout=60) as client, ThreadPoolExecutor(12) as threads:
         answers = list(threads.map(lambda _: render(service, client, **SMALL), range(12)))
         statuses = [answer.status_code for answer in answers]
         assert set(statuses) == {200, 429}
@@ -119,7 +119,7 @@ def test_a_full_queue_is_told_with_a_time_to_retry(start_service: StartService) 
 
 def test_frames_of_a_client_that_has_gone_are_dropped(start_service: StartService) -> None:
     service = start_service(**SLOW)
-    with httpx.Client() as client:
+    with httpx.Client(timeout=60) as client:
         host, port = service.http.removeprefix("http://").split(":")
         body = (
             b'{"height": 80, "width": 80, "poses": ['
@@ -135,13 +135,13 @@ def test_frames_of_a_client_that_has_gone_are_dropped(start_service: StartServic
         with socket.create_connection((host, int(port))) as connection:
             connection.sendall(head.encode() + body)
             wait_until(lambda: service.metric(WAITING))
-        wait_until(lambda: service.metric(WAITING) == 0, within_s=3)
+        wait_until(lambda: service.metric(WAITING) == 0, within_s=at_this_load(3))
         assert render(service, client).status_code == 200
 
 
 def test_interactive_frames_go_before_a_batch(start_service: StartService) -> None:
     service = start_service(**SLOW)
-    with service.channel() as channel, httpx.Client() as client:
+    with service.channel() as channel, httpx.Client(timeout=60) as client:
         stub = rendering_pb2_grpc.RenderServiceStub(channel)
         settings = rendering_pb2.RenderSettings(scene="demo", **SMALL)
         batch = rendering_pb2.RenderBatchRequest(settings=settings, poses=[moved(0)] * 12)
@@ -160,7 +160,7 @@ def test_a_port_in_use_is_one_clear_error(start_service: StartService, service: 
     http_port, grpc_port = service.http.rsplit(":", 1)[1], service.grpc.rsplit(":", 1)[1]
     for settings, name in (({"http_port": http_port}, "HTTP"), ({"grpc_port": grpc_port}, "gRPC")):
         second = start_service(wait=False, cold=name == "HTTP", **settings)
-        assert second.process.wait(30) == 1
+        assert second.process.wait(60) == 1
         said = second.log_path.read_text().splitlines()
         assert f"{name} cannot listen on 127.0.0.1:" in said[-1]
         assert "Traceback" not in second.log_path.read_text()

@@ -62,7 +62,7 @@ def knowing_service(
 
 @pytest.fixture(scope="module")
 def client(knowing_service: RunningService) -> Iterator[httpx.Client]:
-    with httpx.Client(base_url=f"{knowing_service.http}/v1/scenes/") as client:
+    with httpx.Client(base_url=f"{knowing_service.http}/v1/scenes/", timeout=60) as client:
         yield client
 
 
@@ -179,7 +179,7 @@ def test_render_jobs(knowing_service: RunningService) -> None:
         return answer["reason"], answer["field"]
 
     near, far = at(NEAR).tolist(), at(FAR).tolist()
-    with httpx.Client(base_url=knowing_service.http) as http:
+    with httpx.Client(base_url=knowing_service.http, timeout=60) as http:
         assert refusal(job("knowing", poses=[near, far])) == ("LOW_CONFIDENCE", "specification.poses[1]")
         assert refusal(job("demo", poses=[near])) == ("INVALID_ARGUMENT", "specification.min_confidence")
         taken = http.post("/v1/jobs", json=job("knowing", poses=[near, near]))

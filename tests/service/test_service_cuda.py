@@ -61,7 +61,7 @@ def test_a_service_without_a_gpu_says_so_in_one_line(
 ) -> None:
     monkeypatch.delenv("TRITON_INTERPRET", raising=False)
     service = start_service(wait=False, backend="cuda")
-    assert service.process.wait(30) == 1
+    assert service.process.wait(60) == 1
     said = service.log_path.read_text()
     assert "backend cuda needs an NVIDIA GPU" in said.splitlines()[-1]
     assert "Traceback" not in said

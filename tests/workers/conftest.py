@@ -155,7 +155,7 @@ def _pool_processes() -> dict[int, str]:
 
 @pytest.fixture
 def until() -> Callable[..., Coroutine[Any, Any, None]]:
-    async def wait(condition: Callable[[], bool], timeout_s: float = 20.0) -> None:
+    async def wait(condition: Callable[[], bool], timeout_s: float = 60.0) -> None:
         """Returns once the condition holds."""
         give_up = time.monotonic() + timeout_s
         while not condition():

@@ -63,7 +63,7 @@ def test_worker_command_does_a_job_and_stops(demo_store: JobStore, tmp_path: Pat
         assert (job.state, job.worker) == (JobState.SUCCEEDED, "mine"), job
     finally:
         process.send_signal(signal.SIGTERM)
-        _, told = process.communicate(timeout=20)
+        _, told = process.communicate(timeout=60)
     assert process.returncode == 0, told
     messages = [json.loads(line)["message"] for line in told.splitlines()]
     assert "worker mine takes jobs" in messages
@@ -94,7 +94,7 @@ def test_embedded_worker_comes_back_and_goes_with_the_service(
     second = worker()
     job = until_final(demo_store, demo_store.submit(JOB)[0])
     assert job.state is JobState.SUCCEEDED, job
-    assert httpx.get(f"{service.http}/v1/health/ready").status_code == 200
+    assert httpx.get(f"{service.http}/v1/health/ready", timeout=60).status_code == 200
     assert service.terminate() == 0
     assert not Path(f"/proc/{second}").exists()
     assert sum("the worker for jobs ended with -9" in record["message"] for record in service.log()) == 1

@@ -109,7 +109,7 @@ def test_the_policy_names_the_sockets_of_its_host(page: httpx.AsyncClient, host:
 
 
 def test_a_service_with_keys_serves_the_page_to_everyone(start_service: StartService) -> None:
-    with httpx.Client(base_url=start_service(api_keys=KEY).http) as http:
+    with httpx.Client(base_url=start_service(api_keys=KEY).http, timeout=60) as http:
         assert http.get("/").status_code == 200
         head = http.head("/")
         assert (head.status_code, head.content) == (200, b"")

@@ -188,7 +188,7 @@ def test_a_service_that_stops_or_dies_while_it_lays_a_dataset_out(start_service:
         def begin() -> tuple[RunningService, Future[httpx.Response]]:
             service = start_service(artifact_folder=tmp_path / "artifacts")
             if not (tmp_path / "tiny").is_dir():
-                with httpx.Client(base_url=service.http) as client:
+                with httpx.Client(base_url=service.http, timeout=60) as client:
                     upload(client, "tiny", DATASET, tmp_path / "tiny")
             asked = executor.submit(httpx.get, f"{service.http}/v1/datasets/tiny/poses", timeout=60)
             os.kill(wait_until(lambda: helper_process(service, "lay_out")), signal.SIGSTOP)

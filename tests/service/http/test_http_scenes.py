@@ -95,7 +95,7 @@ def test_pages_of_allowed_origins_may_call(start_service: StartService) -> None:
     for origin, allowed in (("https://console.example", True), ("https://other.example", False)):
         answer = httpx.options(f"{service.http}/v1/scenes/demo/render", headers={"Origin": origin, **asked})
         assert (answer.headers.get("access-control-allow-origin") == origin) is allowed
-    answer = httpx.get(f"{service.http}/v1/scenes", headers={"Origin": "https://console.example"})
+    answer = httpx.get(f"{service.http}/v1/scenes", headers={"Origin": "https://console.example"}, timeout=60)
     assert "X-Ultragray-Shape" in answer.headers["access-control-expose-headers"]
 
 

@@ -35,7 +35,7 @@ def over_grpc(service: RunningService, scene: str, pose: np.ndarray) -> np.ndarr
     with service.channel() as channel:
         stub = rendering_pb2_grpc.RenderServiceStub(channel)
         settings = rendering_pb2.RenderSettings(scene=scene)
-        frame = stub.Render(rendering_pb2.RenderRequest(settings=settings, pose=matrix_pose(pose)), timeout=20)
+        frame = stub.Render(rendering_pb2.RenderRequest(settings=settings, pose=matrix_pose(pose)), timeout=60)
         return np.frombuffer(frame.data, np.uint8).reshape(frame.height, frame.width)
 
 
@@ -49,7 +49,7 @@ def test_pyigtl_gets_the_frame_of_its_pose_in_its_place(igtl_service: RunningSer
     theirs.header_version = version
     with pyigtl_client(address_of(igtl_service)) as client:
         client.send_message(theirs)
-        answer = client.wait_for_message("Image_Reference", timeout=20)
+        answer = client.wait_for_message("Image_Reference", timeout=60)
     assert isinstance(answer, pyigtl.ImageMessage)
     assert (answer.timestamp, answer.header_version) == (1234.5, version)
     assert np.array_equal(answer.image[0], over_grpc(igtl_service, "demo", pose))
@@ -263,5 +263,5 @@ def test_a_port_in_use_and_keys_stop_the_start(start_service: StartService, igtl
     taken = start_service(wait=False, igtl_port=port)
     keys = start_service(wait=False, igtl_port=0, api_keys="0123456789abcdef")
     for service, words in ((taken, "ULTRAGRAY_IGTL_PORT to another port"), (keys, "cannot ask for an API key")):
-        assert service.process.wait(30) != 0
+        assert service.process.wait(60) != 0
         assert words in service.log_path.read_text()

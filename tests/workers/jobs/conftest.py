@@ -105,7 +105,7 @@ class RunningWorker:
     def terminate(self) -> int:
         """As a service manager does."""
         self.process.send_signal(signal.SIGTERM)
-        return self.process.wait(20)
+        return self.process.wait(60)
 
     def job_process(self) -> int | None:
         """The process of the job at hand."""
