@@ -23,11 +23,13 @@ __all__ = [
     "LinearProbe",
     "PhasedProbe",
     "Probe",
+    "RadialProbe",
     "RenderJob",
     "RenderSettings",
     "Sampler",
     "Specification",
     "SplineSampler",
+    "SteeredProbe",
     "TrainJob",
     "TrainingSampler",
 ]
@@ -70,7 +72,36 @@ class PhasedProbe:
     kind: Literal["phased"] = field(default="phased", repr=False, kw_only=True)
 
 
-Probe: TypeAlias = ConvexProbe | LinearProbe | PhasedProbe
+@dataclass(frozen=True)
+class RadialProbe:
+    """Scan lines all the way round in the image plane, outwards from a ring about the origin.
+
+    Line j of W runs at the angle 360°·(j+½)/W from z towards +x; the last is followed by the first.
+    """
+
+    near_mm: float
+    """Radius of the ring: distance from the centre at which the image begins."""
+    far_mm: float
+    """Distance from the centre at which the image ends, beyond `near_mm`."""
+    kind: Literal["radial"] = field(default="radial", repr=False, kw_only=True)
+
+
+@dataclass(frozen=True)
+class SteeredProbe:
+    """A linear array whose scan lines, parallel, leave the face at an angle; depths are along the lines."""
+
+    width_mm: float
+    """Width of the face."""
+    steering_deg: float
+    """Angle of the scan lines from the axial axis, positive towards +x."""
+    near_mm: float
+    """Depth along the scan lines at which the image begins."""
+    far_mm: float
+    """Depth along the scan lines at which the image ends, beyond `near_mm`."""
+    kind: Literal["steered"] = field(default="steered", repr=False, kw_only=True)
+
+
+Probe: TypeAlias = ConvexProbe | LinearProbe | PhasedProbe | RadialProbe | SteeredProbe
 
 
 class Below(str, Enum):

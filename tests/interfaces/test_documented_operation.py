@@ -18,9 +18,9 @@ from ultragray import (
     errors,
     image_size,
     pose,
-    probe,
     scene_info,
 )
+from ultragray.probe import probe
 from ultragray.training import TrainingConfig
 from ultragray_service import server
 from ultragray_service.cli.app import USER_ERROR

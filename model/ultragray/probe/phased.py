@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal
 
 from ..contract import kind_field
@@ -16,5 +16,6 @@ class PhasedProbe(Fan):
 
     opening_angle_deg: float = opening_field()
     far_mm: float = length_field("Depth at which the image ends.", above=0.0)
-    near_mm: float = field(default=0.0, init=False, repr=False)
     kind: Literal["phased"] = kind_field("phased")
+
+    near_mm = 0.0

@@ -78,12 +78,36 @@ class PhasedProbe(_message.Message):
     far_mm: float
     def __init__(self, opening_angle_deg: _Optional[float] = ..., far_mm: _Optional[float] = ...) -> None: ...
 
+class RadialProbe(_message.Message):
+    __slots__ = ("near_mm", "far_mm")
+    NEAR_MM_FIELD_NUMBER: _ClassVar[int]
+    FAR_MM_FIELD_NUMBER: _ClassVar[int]
+    near_mm: float
+    far_mm: float
+    def __init__(self, near_mm: _Optional[float] = ..., far_mm: _Optional[float] = ...) -> None: ...
+
+class SteeredProbe(_message.Message):
+    __slots__ = ("width_mm", "steering_deg", "near_mm", "far_mm")
+    WIDTH_MM_FIELD_NUMBER: _ClassVar[int]
+    STEERING_DEG_FIELD_NUMBER: _ClassVar[int]
+    NEAR_MM_FIELD_NUMBER: _ClassVar[int]
+    FAR_MM_FIELD_NUMBER: _ClassVar[int]
+    width_mm: float
+    steering_deg: float
+    near_mm: float
+    far_mm: float
+    def __init__(self, width_mm: _Optional[float] = ..., steering_deg: _Optional[float] = ..., near_mm: _Optional[float] = ..., far_mm: _Optional[float] = ...) -> None: ...
+
 class Probe(_message.Message):
-    __slots__ = ("linear", "convex", "phased")
+    __slots__ = ("linear", "convex", "phased", "radial", "steered")
     LINEAR_FIELD_NUMBER: _ClassVar[int]
     CONVEX_FIELD_NUMBER: _ClassVar[int]
     PHASED_FIELD_NUMBER: _ClassVar[int]
+    RADIAL_FIELD_NUMBER: _ClassVar[int]
+    STEERED_FIELD_NUMBER: _ClassVar[int]
     linear: LinearProbe
     convex: ConvexProbe
     phased: PhasedProbe
-    def __init__(self, linear: _Optional[_Union[LinearProbe, _Mapping]] = ..., convex: _Optional[_Union[ConvexProbe, _Mapping]] = ..., phased: _Optional[_Union[PhasedProbe, _Mapping]] = ...) -> None: ...
+    radial: RadialProbe
+    steered: SteeredProbe
+    def __init__(self, linear: _Optional[_Union[LinearProbe, _Mapping]] = ..., convex: _Optional[_Union[ConvexProbe, _Mapping]] = ..., phased: _Optional[_Union[PhasedProbe, _Mapping]] = ..., radial: _Optional[_Union[RadialProbe, _Mapping]] = ..., steered: _Optional[_Union[SteeredProbe, _Mapping]] = ...) -> None: ...
