@@ -15,7 +15,7 @@ DATA ?= ../shared/data
 ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help serve console test test-fast test-long test-console test-faults check format bench bench-console bench-cuda results demo-scene generate clean
+.PHONY: ALWAYS help serve console test test-fast test-long test-console test-faults check format bench bench-console bench-cuda results demo-scene generate clean
 
 help:  ## say what there is
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
@@ -92,7 +92,12 @@ $(VENV)/python: Makefile
 	@$(PYTHON) -m venv $(VENV)
 	@touch $@
 
-$(VENV)/installed: $(VENV)/python $(KERNEL_SOURCES)
+# An editable install knows each module by its file: one that moved is found again after another install.
+$(VENV)/modules: ALWAYS | $(VENV)/python
+	@find model workers service proto client -name '*.py' | sort > $@.new
+	@cmp --quiet $@.new $@ && rm $@.new || mv $@.new $@
+
+$(VENV)/installed: $(VENV)/python $(VENV)/modules $(KERNEL_SOURCES)
 	@echo "Installing the libraries and compiling the kernel (a minute or two the first time) ..."
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable .
 	@touch $@
