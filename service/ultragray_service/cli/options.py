@@ -7,6 +7,10 @@
 A parameter whose type is a contract dataclass becomes an option for each of its fields, those of dataclasses within it
 included. Of a sampler it becomes `--sampler KIND` and the fields of all kinds; other families are written as JSON, and
 lists with commas. What is not given keeps its default.
+
+    def train(settings: Annotated[dict[str, Any], FieldsOf(TrainingConfig)]) -> None:
+
+takes only what was given, by the names of the fields.
 """
 
 from __future__ import annotations
@@ -32,6 +36,13 @@ _WITH_AN_OPTION_A_FIELD = (Sampler,)  # of all families
 _PARSED = (bool, int, float, Path)
 
 
+class FieldsOf:
+    """What a dict of a command holds: fields of a contract dataclass that were given, of all or of some."""
+
+    def __init__(self, cls: type[Contract], *names: str) -> None:
+        self.cls, self.names = cls, names or tuple(item.name for item, _ in _fields(cls))
+
+
 def with_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Make a command of typer out of a function that takes contract dataclasses."""
     hints = get_type_hints(command, include_extras=True)
@@ -39,7 +50,10 @@ def with_options(command: Callable[..., Any]) -> Callable[..., Any]:
     parameters: list[inspect.Parameter] = []
     for name, parameter in inspect.signature(command).parameters.items():
         cls, _ = optional_of(hints[name])
-        if isinstance(cls, type) and issubclass(cls, Contract):
+        if isinstance(asked := getattr(cls, "__metadata__", (None,))[0], FieldsOf):
+            contracts[name] = asked
+            parameters += [one for one in parameters_of(asked.cls) if one.name in asked.names]
+        elif isinstance(cls, type) and issubclass(cls, Contract):
             contracts[name] = cls
             parameters += parameters_of(cls, name)
         else:
@@ -47,13 +61,16 @@ def with_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
     @wraps(command)
     def run(**given: Any) -> Any:
-        made = {
-            name: _part(cls, name, given) if issubclass(cls, Family) else cls(**values_of(cls, given))
-            for name, cls in contracts.items()
-        }
+        made = {name: _made(cls, name, given) for name, cls in contracts.items()}
         return command(**{name: made[name] if name in made else given[name] for name in hints if name != "return"})
 
     return with_parameters(run, parameters)
+
+
+def _made(cls: Any, name: str, given: Mapping[str, Any]) -> Any:
+    if isinstance(cls, FieldsOf):
+        return values_of(cls.cls, {item.name: given.get(item.name) for item, _ in _fields(cls.cls)})
+    return _part(cls, name, given) if issubclass(cls, Family) else cls(**values_of(cls, given))
 
 
 def with_parameters(command: Callable[..., Any], parameters: list[inspect.Parameter]) -> Callable[..., Any]:

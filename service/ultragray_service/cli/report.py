@@ -12,15 +12,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ultragray.datasets.source import SourceOptions
+from ultragray.training.config import TrainingConfig
 
 from .eval import VoxelMm
-from .options import with_options
+from .options import FieldsOf, with_options
 from .output import check_writable
 from .source import DatasetArgument, check_scene_fits, read_dataset, warn_about_dataset
 
 if TYPE_CHECKING:
     from ultragray.datasets import Dataset
-    from ultragray.training import Progress, TrainingConfig
+    from ultragray.training import Progress
 
 TILT = "growing tilt"
 Follow = Callable[["Progress"], None]
@@ -44,25 +45,21 @@ def report(
         typer.Option(help="Scene file (.ugr) to report on.", show_default="one is trained"),
     ] = None,
     preset: Annotated[str, typer.Option(help="Of every training: fast or paper.")] = "fast",
-    steps: Annotated[int | None, typer.Option(help="Steps of every training.", show_default="preset")] = None,
-    max_gaussians: Annotated[int | None, typer.Option(help="Gaussians at the end.", show_default="preset")] = None,
-    seed: Annotated[int | None, typer.Option(help="Of every random choice.", show_default="0")] = None,
     no_ablations: Annotated[
         bool, typer.Option("--no-ablations", help="Leave out the ablations and growing tilt: seven trainings.")
     ] = False,
     voxel_mm: VoxelMm = None,
     threads: Annotated[int, typer.Option(min=0, help="Threads; 0: all cores.")] = 0,
     *,
+    settings: Annotated[dict[str, Any], FieldsOf(TrainingConfig, "steps", "max_gaussians", "seed")],
     source: SourceOptions,
 ) -> None:
     """Train and measure a scene, the baselines and the paper's ablations; write one self-contained HTML page."""
     from ultragray.evaluation.compounding import affordable_voxel_mm
     from ultragray.evaluation.scoring import require_frames
-    from ultragray.training import TrainingConfig
 
     check_writable(output, ".html")
-    given = {"steps": steps, "max_gaussians": max_gaussians, "seed": seed}
-    config = TrainingConfig.preset(preset, **{name: value for name, value in given.items() if value is not None})
+    config = TrainingConfig.preset(preset, **settings)
     if threads:
         import torch
 

@@ -16,14 +16,15 @@ import typer
 
 from ultragray.datasets.source import SourceOptions
 from ultragray.errors import MemoryExceeded, TrainingDiverged, TrainingStateInvalid
+from ultragray.training.config import TrainingConfig, read_config_file
 
-from .options import parse_settings, with_options
+from .options import FieldsOf, parse_settings, with_options
 from .output import SCENE_SUFFIX, check_writable
 from .source import DatasetArgument, read_dataset, warn_about_dataset
 
 if TYPE_CHECKING:
     from ultragray.scene import GaussianScene
-    from ultragray.training import Progress, TrainingConfig
+    from ultragray.training import Progress
 
 INTERRUPTED = 130  # the exit code of a run that Ctrl-C or SIGTERM stopped
 METRIC_NAMES = {"psnr_db": "PSNR, dB", "ms_ssim": "MS-SSIM", "gms": "GMS", "gmsd": "GMSD"}
@@ -45,35 +46,6 @@ def train(
         list[str] | None,
         typer.Option("--set", metavar="NAME=VALUE", help="Any field of TrainingConfig; repeat.", show_default=False),
     ] = None,
-    steps: Annotated[
-        int | None,
-        typer.Option(help="Steps of one batch; every schedule follows.", show_default="from the number of frames"),
-    ] = None,
-    max_gaussians: Annotated[
-        int | None, typer.Option(help="Gaussians at most.", show_default="from the number of pixels")
-    ] = None,
-    initial_gaussians: Annotated[
-        int | None, typer.Option(help="Gaussians at the start.", show_default="all; half where they are refined")
-    ] = None,
-    batch_size: Annotated[int | None, typer.Option(help="Frames of one step.", show_default="8")] = None,
-    seed: Annotated[int | None, typer.Option(help="Of every random choice.", show_default="0")] = None,
-    start: Annotated[
-        str | None, typer.Option(help="informed (on pixels of the frames) or random.", show_default="preset")
-    ] = None,
-    intensity: Annotated[
-        str | None, typer.Option(help="Activation: released, or sigmoid, without its floor.", show_default="preset")
-    ] = None,
-    sh_degree: Annotated[int | None, typer.Option(help="Spherical harmonics, 0 to 3.", show_default="1")] = None,
-    out_of_plane_mm: Annotated[
-        float | None,
-        typer.Option(
-            "--out-of-plane",
-            metavar="MM",
-            help="Full range of the shift of a batch along elevation; 0: none.",
-            show_default="from the spacing of the frames",
-        ),
-    ] = None,
-    no_transmittance: Annotated[bool, typer.Option("--no-transmittance", help="Nothing absorbs: no shadows.")] = False,
     folder: Annotated[
         Path | None,
         typer.Option(help="Folder of the run: checkpoint, metrics.jsonl, config.json.", show_default="OUTPUT.run"),
@@ -87,25 +59,14 @@ def train(
     backend: Annotated[str, typer.Option(help="auto (the one for the device), cpu, cuda or reference.")] = "auto",
     threads: Annotated[int, typer.Option(min=0, help="Threads; 0: all cores.")] = 0,
     *,
+    settings: Annotated[dict[str, Any], FieldsOf(TrainingConfig)],
     source: SourceOptions,
 ) -> None:
     """Train a scene from a tracked sweep. Ctrl-C leaves a usable scene; --resume goes on."""
-    flags = {
-        "steps": steps,
-        "max_gaussians": max_gaussians,
-        "initial_gaussians": initial_gaussians,
-        "batch_size": batch_size,
-        "seed": seed,
-        "start": start,
-        "intensity": intensity,
-        "sh_degree": sh_degree,
-        "out_of_plane_mm": out_of_plane_mm,
-        "transmittance": False if no_transmittance else None,
-    }
     given = {
-        **_from_file(config),
+        **({} if config is None else read_config_file(config)),
         **parse_settings(setting or []),
-        **{name: value for name, value in flags.items() if value is not None},
+        **settings,
         **({} if preset is None else {"preset": preset}),
     }
     check_writable(output, SCENE_SUFFIX)
@@ -144,14 +105,6 @@ class RunOptions:
     backend: str
 
 
-def _from_file(path: Path | None) -> dict[str, Any]:
-    if path is None:
-        return {}
-    from ultragray.training.config import read_config_file
-
-    return read_config_file(path)
-
-
 def _check_device(device: str, backend: str) -> None:
     """Raises BackendUnavailable before the dataset is read, which may take long."""
     from ultragray.training.device import training_device
@@ -177,7 +130,6 @@ def _check_resumable(run: RunOptions) -> None:
 
 def _config_of(run: RunOptions, given: Mapping[str, Any]) -> TrainingConfig:
     """The preset with what was given; of a resumed run the one it was begun with, and what was given again."""
-    from ultragray.training import TrainingConfig
     from ultragray.training.checkpointing import read_checkpoint_header
     from ultragray.training.trainer import CHECKPOINT_FILE
 
