@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ultragray.errors import InvalidArgument
+from ultragray.errors import InvalidArgument, SceneFileInvalid
 from ultragray.scene_info import SceneHeader, SceneInfo, read_header, scene_file_invalid
 
 from .errors import SceneNotFound
@@ -184,3 +184,14 @@ def _names_in(folder: Path) -> list[str]:
     return [
         entry.stem for entry in entries if entry.suffix == SUFFIX and _NAME.fullmatch(entry.stem) and entry.is_file()
     ]
+
+
+def check_scene_file(path: str) -> None:
+    """Load a scene file that somebody sent, in a helper process. Raises SceneFileInvalid, which calls it the body."""
+    try:
+        read_header(path)
+        from ultragray.scene import GaussianScene  # torch, which a file that is no scene does not need
+
+        GaussianScene.load(path)
+    except SceneFileInvalid as error:
+        raise SceneFileInvalid(error.detail.replace(path, "the body"), field="body") from error

@@ -13,9 +13,8 @@ from ultragray.files.link import link_or_copy
 from ultragray.scene_info import SceneHeader, read_header
 from ultragray_workers.claims import claimed_folder, remove_abandoned, storage_full
 from ultragray_workers.errors import QueueFull, SceneExists, SceneNotFound, UploadTooLarge
-from ultragray_workers.helpers.scene_check import check_scene_file
 from ultragray_workers.jobs.publication import SCENES_FOLDER
-from ultragray_workers.scenes import SUFFIX, SceneStore, check_scene_name
+from ultragray_workers.scenes import SUFFIX, SceneStore, check_scene_file, check_scene_name
 
 from ..errors import SceneReadOnly
 from ..settings import Settings

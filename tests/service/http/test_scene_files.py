@@ -254,9 +254,6 @@ def helpers_of(service: RunningService) -> list[int]:
     for folder in Path("/proc").glob("[0-9]*"):
         with contextlib.suppress(OSError):
             parent = int((folder / "stat").read_text().rpartition(")")[2].split()[1])
-            if (
-                parent == service.process.pid
-                and "ultragray_workers.helpers.scene_check" in (folder / "cmdline").read_text()
-            ):
+            if parent == service.process.pid and "check_scene_file" in (folder / "cmdline").read_text():
                 found.append(int(folder.name))
     return found

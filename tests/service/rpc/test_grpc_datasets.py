@@ -8,6 +8,7 @@ from typing import Any
 import grpc
 import pytest
 
+from ultragray.datasets.source import UPLOAD_OPTIONS
 from ultragray_proto.v1 import datasets_pb2, datasets_pb2_grpc
 
 from ...waiting import wait_until
@@ -141,3 +142,7 @@ def test_a_client_that_goes_away(datasets: datasets_pb2_grpc.DatasetServiceStub,
     call.cancel()
     wait_until(lambda: not uploads_under_way(artifacts))
     assert time.monotonic() - started < IDLE_TIMEOUT_S - 0.1
+
+
+def test_the_message_has_the_options_of_an_upload() -> None:
+    assert set(datasets_pb2.DatasetOptions.DESCRIPTOR.fields_by_name) == set(UPLOAD_OPTIONS)

@@ -11,8 +11,8 @@ from typing import IO
 from ultragray.errors import DatasetInvalid
 from ultragray.files.atomic import sync
 
-from ..claims import claimed_folder, remove_abandoned, storage_full
-from .store import DELETED_PREFIX, FILES_NAME, DatasetRecord, DatasetStore
+from ..claims import DELETED_PREFIX, claimed_folder, remove_abandoned, storage_full
+from .store import FILES_NAME, DatasetRecord, DatasetStore
 from .unpack import FileBudget, create_below
 
 PREFIX = ".incoming-"

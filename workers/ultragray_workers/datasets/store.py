@@ -6,8 +6,6 @@ import contextlib
 import errno
 import json
 import re
-import secrets
-import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -19,6 +17,7 @@ from ultragray.errors import DatasetInvalid, InvalidArgument, UltragrayError
 from ultragray.files.atomic import sync, write_whole
 from ultragray.probe import Probe
 
+from ..claims import out_of_sight
 from ..errors import DatasetExists, DatasetInUse, DatasetNotFound
 from .contents import find_source
 
@@ -27,7 +26,6 @@ if TYPE_CHECKING:
 
 FOLDER = "datasets"
 MANIFEST_NAME, FILES_NAME, CONTACT_SHEET_NAME = "dataset.json", "files", "contact_sheet.png"
-DELETED_PREFIX = ".deleted-"
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
 _NAMES_IN_MESSAGE = 5
 
@@ -132,19 +130,11 @@ class DatasetStore:
         """
         path = self._existing(name)
         self._require_unused(name)
-        doomed = self.folder / f"{DELETED_PREFIX}{secrets.token_hex(8)}"
-        try:
-            path.rename(doomed)
-        except FileNotFoundError:
-            raise self._not_found(name) from None
-        try:
+        with out_of_sight(path) as found:
+            if not found:
+                raise self._not_found(name)
             self._require_unused(name)
-        except Exception:
-            with contextlib.suppress(OSError):
-                doomed.rename(path)
-            raise
         sync(self.folder)
-        shutil.rmtree(doomed, ignore_errors=True)
 
     def _require_unused(self, name: str) -> None:
         if (user := self.in_use(name)) is not None:

@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
-import secrets
-import shutil
 import time
 from collections.abc import Iterator
-from pathlib import Path
 
+from ..claims import out_of_sight
 from ..errors import JobInUse
 from .folder import JobFolder
 from .job import attribute
 from .queue.database import JobDatabase
 
-DELETED_PREFIX = ".deleted-"
 _LOCK_WAIT_S = 2.0  # for the process of a job that was cancelled a moment ago
 _LOCK_POLL_S = 0.05
 
@@ -34,31 +31,8 @@ def remove_job(jobs: JobDatabase, folder: JobFolder) -> None:
     with contextlib.ExitStack() as stack:
         if folder.path.is_dir():
             stack.enter_context(_locked(folder))
-        doomed = _out_of_sight(folder.path)
-        try:
-            jobs.client.delete_workflows([folder.job_id])
-        except Exception:
-            if doomed is not None:
-                doomed.rename(folder.path)
-            raise
-        if doomed is not None:
-            shutil.rmtree(doomed, ignore_errors=True)
-
-
-def remove_folder(path: Path) -> None:
-    """Removes a folder without a job. Raises OSError."""
-    if (doomed := _out_of_sight(path)) is not None:
-        shutil.rmtree(doomed, ignore_errors=True)
-
-
-def _out_of_sight(path: Path) -> Path | None:
-    """Where the folder is now; None where there is none."""
-    doomed = path.with_name(f"{DELETED_PREFIX}{secrets.token_hex(8)}")
-    try:
-        path.rename(doomed)
-    except FileNotFoundError:
-        return None
-    return doomed
+        stack.enter_context(out_of_sight(folder.path))
+        jobs.client.delete_workflows([folder.job_id])
 
 
 @contextlib.contextmanager

@@ -20,12 +20,13 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from ultragray.errors import UltragrayError
 
+from ...claims import DELETED_PREFIX, remove_whole
 from ...errors import JobInUse
 from ..folder import FOLDER, JobFolder
 from ..kinds import KINDS
 from ..queue import database
 from ..queue.database import JobDatabase
-from ..removal import DELETED_PREFIX, remove_folder, remove_job, sources_in_use
+from ..removal import remove_job, sources_in_use
 
 INTERVAL_S = 3600.0
 STEP_PAUSE_S = 1.0
@@ -69,7 +70,7 @@ class Housekeeper:
         strays = self._stray_folders()
         while not self._stop.is_set() and (some := list(islice(strays, AT_ONCE))):
             for folder in self._without_job(some):
-                remove_folder(folder)
+                remove_whole(folder)
                 removed += 1
             self._stop.wait(STEP_PAUSE_S)
         return removed
