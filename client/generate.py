@@ -1,7 +1,7 @@
 """Generates what the client does not write by hand: `python client/generate.py`.
 
 `sync/` is `aio/` without its asyncio, by unasync; `transport.py` and `__init__.py` are written by hand in both.
-`contract.py` are the dataclasses of `ultragray` that callers fill in, without its checks, and `errors.py` the errors
+`contract.py` are the service's dataclasses that callers fill in or get, without its checks, and `errors.py` the errors
 that calls may end with, so that the client needs neither `ultragray` nor torch.
 """
 
@@ -26,13 +26,19 @@ from ultragray.datasets.source import SourceOptions
 from ultragray.errors import error_classes
 from ultragray.settings import RenderSettings
 from ultragray_service.errors import STATUSES
+from ultragray_workers.datasets.store import DatasetRecord
 from ultragray_workers.jobs.kinds import Specification
 
 PACKAGE = Path(__file__).resolve().parent / "ultragray_client"
 MODULES = ("client", "connection", "datasets", "jobs", "scenes", "stream")
 
-# The classes that callers fill in, each with all that it is made of, and the names that the client gives them.
-ROOTS = {"RenderSettings": RenderSettings, "DatasetOptions": SourceOptions, "Specification": Specification}
+# The classes that callers fill in or get, each with all that it is made of, and the names that the client gives them.
+ROOTS = {
+    "RenderSettings": RenderSettings,
+    "DatasetOptions": SourceOptions,
+    "Dataset": DatasetRecord,
+    "Specification": Specification,
+}
 LEFT_OUT = {"device_set"}  # a file is uploaded with its dataset
 OWN_TYPES = {"Poses": "Iterable[PoseLike]"}  # what the client takes in their place
 
@@ -70,7 +76,7 @@ from .client_error import ClientError as ClientError
 
 '''
 _CONTRACT_HEADER = '''# Generated from the dataclasses of ultragray by client/generate.py; change those.
-"""What callers fill in. The service checks the values."""
+"""The dataclasses that callers fill in, or get. The service checks the values."""
 
 from __future__ import annotations
 
@@ -220,7 +226,7 @@ def _dataclass_source(cls: Any, name: str, bases: list[Any]) -> str:
 
 
 def _field_source(item: Field[Any]) -> str:
-    if item.name == "kind":
+    if str(item.type).startswith("Literal"):  # what tells a member of a family apart
         return f"    kind: Literal[{item.default!r}] = field(default={item.default!r}, repr=False, kw_only=True)"
     default = ""
     if item.default is not MISSING:

@@ -8,13 +8,15 @@ from __future__ import annotations
 import inspect
 import re
 from collections.abc import Callable, Iterable, Iterator
+from enum import Enum
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import typer
 
 from ultragray import errors
+from ultragray_client import contract as client_contract
 from ultragray_client import errors as client_errors
 from ultragray_service import errors as service_errors
 from ultragray_service.cli.app import app as command_line
@@ -69,6 +71,29 @@ def client_error_table() -> list[Row]:
     return [("Reason", "Class", "Kind of"), *([f"`{cell}`" for cell in row] for row in rows)]
 
 
+def client_contract_table() -> list[Row]:
+    """The classes that the client has from the library, and the sets that they form."""
+    table: list[Row] = [("Name in `ultragray_client`", "Meaning")]
+    for name in client_contract.__all__:
+        thing = getattr(client_contract, name)
+        if not isinstance(thing, type):
+            members = ", ".join(f"`{member.__name__}`" for member in get_args(thing))
+            table.append((f"`{name}`", f"Any of {members}"))
+        elif issubclass(thing, Enum):
+            table.append((f"`{name}`", f"{_meaning(thing)}: {', '.join(f'`{member.name}`' for member in thing)}"))
+        else:
+            table.append((f"`{_call(thing)}`", _meaning(thing)))
+    return table
+
+
+def _call(cls: type) -> str:
+    """`Name(field, with=default)` of a dataclass, but for the `kind` that tells a member of a family apart."""
+    given = inspect.signature(cls).parameters.values()
+    parameters = [one.replace(annotation=one.empty) for one in given if one.name != "kind" or one.default is one.empty]
+    text = str(inspect.Signature(parameters)).replace("<factory>", "…")
+    return cls.__name__ + re.sub(r"<(\w+\.\w+): [^>]*>", r"\1", text)
+
+
 def commands() -> Iterator[tuple[str, Any]]:
     """Every command of `ultragray` that does something itself, by its words."""
     waiting = list(typer.main.get_command(command_line).commands.items())  # type: ignore[attr-defined]
@@ -99,6 +124,7 @@ def option_table(command: Any) -> list[Row]:
 
 TABLES: dict[str, Callable[[], list[Row]]] = {
     "errors": error_table,
+    "client_contract": client_contract_table,
     "client_errors": client_error_table,
     **{f"options of {name}": partial(option_table, command) for name, command in commands()},
 }

@@ -11,7 +11,6 @@ from . import contract, errors
 from .aio.client import AsyncClient
 from .aio.stream import AsyncFrameStream
 from .contract import *  # noqa: F403
-from .datasets import Dataset
 from .errors import ClientError
 from .frames import Extrapolation, Frame, Picture, Timings
 from .geometry import Placement, PoseLike, Quaternion
@@ -27,7 +26,6 @@ __all__ = [
     "Client",
     "ClientError",
     "ConfidenceFit",
-    "Dataset",
     "Extrapolation",
     "Frame",
     "FrameStream",

@@ -1,5 +1,5 @@
 # Generated from the dataclasses of ultragray by client/generate.py; change those.
-"""What callers fill in. The service checks the values."""
+"""The dataclasses that callers fill in, or get. The service checks the values."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ __all__ = [
     "Below",
     "ConvexProbe",
     "CoveredSampler",
+    "Dataset",
     "DatasetOptions",
     "Display",
     "Encoding",
@@ -184,6 +185,38 @@ class DatasetOptions:
     """Region of a sequence's image that shows ultrasound: columns,rows, such as 188:632,12:600 (ends left out)."""
     image_size: str | None = None
     """Resize the frames: WIDTHxHEIGHT, such as 192x256."""
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """An accepted dataset."""
+
+    name: str
+    """Of letters, digits, '.', '_' and '-'."""
+    kind: str
+    """Its format: released, a folder with conf.json and .npy files (or its conf.json); plus, a PLUS sequence (.mha,
+    .mhd, .nrrd, .nhdr); dicom, a DICOM cine loop (.dcm) with its poses beside it (.poses.npy or .poses.json).
+    """
+    sha256: str
+    """Of images, poses, probe and split, however they were sent."""
+    bytes: int
+    """Of its files."""
+    created_at: str
+    """ISO 8601, UTC."""
+    train_frames: int
+    """Number of frames to train from."""
+    val_frames: int
+    """Number of frames held out."""
+    height: int
+    """Of a frame, pixels."""
+    width: int
+    """Of a frame, pixels."""
+    probe: Probe | None
+    """The probe that recorded it."""
+    warnings: tuple[str, ...]
+    """What looks wrong, for a person to decide."""
+    options: dict[str, str]
+    """How it was read: the query parameters of its upload."""
 
 
 @dataclass(frozen=True)

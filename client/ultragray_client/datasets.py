@@ -1,38 +1,19 @@
-"""Datasets, as the service tells them, and an upload as messages."""
+"""Datasets from and to messages."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 from ultragray_proto.codec import from_message
 from ultragray_proto.v1 import datasets_pb2
 
-from .contract import DatasetOptions, Probe
+from .contract import Dataset, DatasetOptions
 from .errors import InvalidArgument
 from .messages import message_of
 
 _CHUNK_BYTES = 2**20
 _ARCHIVE_SUFFIXES = (".zip", ".tar", ".tar.gz", ".tgz")
-
-
-@dataclass(frozen=True)
-class Dataset:
-    """A tracked sweep that the service keeps."""
-
-    name: str
-    kind: str  # "released" or "plus"
-    sha256: str
-    bytes: int
-    created_at: str  # ISO 8601, UTC
-    train_frames: int
-    val_frames: int
-    height: int
-    width: int
-    probe: Probe | None
-    warnings: tuple[str, ...]
-    options: DatasetOptions
 
 
 class Upload:

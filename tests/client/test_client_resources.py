@@ -64,7 +64,7 @@ def test_scenes(client: Any) -> None:
 def test_the_life_of_a_dataset(client: Any, folder: Path, name: str) -> None:
     made = client.datasets.upload(name, folder, options=DatasetOptions(train_frames="0:6"))
     assert (made.name, made.kind, made.train_frames, made.val_frames) == (name, "released", 6, 3)
-    assert (made.probe, made.options.train_frames) == (LinearProbe(40.0, 0.0, 50.0), "0:6")
+    assert (made.probe, made.options) == (LinearProbe(40.0, 0.0, 50.0), {"train_frames": "0:6"})
     assert client.datasets.get(name) == made
     assert made in client.datasets.list()
     assert client.datasets.contact_sheet(name).startswith(b"\x89PNG")

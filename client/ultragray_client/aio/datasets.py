@@ -8,8 +8,8 @@ from pathlib import Path
 
 from ultragray_proto.v1 import datasets_pb2, datasets_pb2_grpc
 
-from ..contract import DatasetOptions
-from ..datasets import Dataset, Upload, dataset_from_message
+from ..contract import Dataset, DatasetOptions
+from ..datasets import Upload, dataset_from_message
 from .connection import AsyncConnection
 from .transport import run_blocking
 
