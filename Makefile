@@ -15,7 +15,7 @@ DATA ?= ../shared/data
 ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: ALWAYS help serve console test test-fast test-long test-console test-faults check format bench bench-console bench-cuda results demo-scene generate clean
+.PHONY: ALWAYS help serve console test test-fast test-long test-console test-faults check check-lint check-types check-web format bench bench-console bench-cuda results demo-scene generate clean
 
 help:  ## say what there is
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
@@ -44,12 +44,19 @@ test-faults: $(VENV)/installed-dev  ## processes killed at random: render worker
 	ULTRAGRAY_FAULT_SECONDS=30 $(BIN)/pytest tests/workers/pool/test_faults.py -s $(ARGS)
 	ULTRAGRAY_FAULT_KILLS=32 $(BIN)/pytest tests/faults -s $(ARGS)
 
-check: $(VENV)/installed-dev  ## lint, types, formatting
+check: $(VENV)/installed-dev  ## lint, types, formatting; all at the same time
+	@$(MAKE) --no-print-directory --keep-going --jobs --output-sync=target check-lint check-types check-web
+
+check-lint:
 	$(BIN)/ruff check $(PYTHON_SOURCES)
 	$(BIN)/ruff format --check $(PYTHON_SOURCES)
-	$(BIN)/mypy
 	$(BIN)/clang-format --dry-run --Werror model/kernels/*.[ch]pp model/kernels/*.inl
 	$(BIN)/hadolint docker/Dockerfile.cpu docker/Dockerfile.cuda
+
+check-types:
+	$(BIN)/mypy
+
+check-web:
 	@[ ! -d web/node_modules ] || npm --prefix web run --silent check
 
 format: $(VENV)/installed-dev  ## rewrite the sources in the project's format
