@@ -14,12 +14,12 @@ from .errors import UltragrayError
 from .pose import check_poses, pose_from_position_quaternion, quaternion_from_pose
 from .probe import ConvexProbe, LinearProbe, PhasedProbe, Probe, RadialProbe, SteeredProbe
 from .scene_info import SceneHeader, SceneInfo, read_header
+from .version import __version__ as __version__
 
 if TYPE_CHECKING:
     from .rendering import Frames, render
     from .scene import GaussianScene
 
-__version__ = "0.1.0"
 __all__ = [
     "ConvexProbe",
     "Frames",

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -17,12 +17,28 @@ from .errors import UnknownOutput
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from .rendering import Drawing
+    from .scene import GaussianScene
     from .scene_info import SceneInfo
 
 PLANES = ("bmode", "echo", "transmittance", "coverage")  # what a backend draws, in [0, 1], with gradients
 WEIGHT_SUM = "weight_sum"  # S of docs/physics.md §3, which backends draw too, without a gradient
 _AMOUNTS, _NUMBERS = np.dtype("<f4"), np.dtype("u1")
+
+
+class Drawing(Protocol):
+    """Views of a scene by one backend: what outputs are derived from."""
+
+    @property
+    def scene(self) -> GaussianScene: ...
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """C, H, W."""
+
+    def plane(self, name: str) -> Tensor:  # [C, H, W]
+        """One of the planes that the output names."""
+
+    def plane_of(self, part: GaussianScene, name: str) -> Tensor:  # [C, H, W]
+        """A plane of some of the scene's Gaussians alone."""
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,6 @@ from typing import Any
 
 from torch import Tensor
 
-from . import __version__
 from .backends import cpu, cuda, reference
 from .errors import BackendUnavailable
 from .image_size import check_image_size
@@ -15,6 +14,7 @@ from .outputs import OUTPUTS, PLANES, check_available, check_outputs
 from .pose import check_poses
 from .probe import FloatArray, Probe
 from .scene import GaussianScene
+from .version import __version__
 
 Backend = Callable[[GaussianScene, Probe, FloatArray, int, int, Sequence[str]], dict[str, Tensor]]
 

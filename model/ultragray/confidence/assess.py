@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -13,9 +13,6 @@ from ..pose import check_poses
 from ..probe import FloatArray, Probe
 from .model import ConfidenceModel
 from .views import TrainingViews
-
-if TYPE_CHECKING:
-    from ..scene_info import SceneInfo
 
 SUPPORT_COVERAGE = 0.3  # γ below which a pixel's error is more than twice that of the others
 
@@ -34,10 +31,20 @@ class Extrapolation:
     supported_share: float | None
 
 
+class Trained(Protocol):
+    """What a scene's description tells of its training; `ultragray.SceneInfo` does."""
+
+    @property
+    def probe(self) -> Probe | None: ...
+    @property
+    def confidence(self) -> dict[str, Any]: ...
+    def probe_or(self, asked: Probe | None) -> Probe: ...
+
+
 class Assessor:
     """Tells the extrapolation of frames of one scene. Its distances and confidence need the pose alone."""
 
-    def __init__(self, info: SceneInfo, training_poses: FloatArray) -> None:  # [P, 4, 4] mm
+    def __init__(self, info: Trained, training_poses: FloatArray) -> None:  # [P, 4, 4] mm
         """Raises InvalidArgument where the scene's `confidence` is damaged or made for other training poses."""
         known = info.probe is not None and len(training_poses) > 0
         self._info = info

@@ -12,7 +12,6 @@ import numpy as np
 import numpy.typing as npt
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from .. import __version__
 from ..datasets.sweep import Dataset
 from ..evaluation.baselines import predict
 from ..evaluation.compounding import VOXEL_MM
@@ -20,6 +19,7 @@ from ..evaluation.metrics import FrameMetrics
 from ..evaluation.scoring import Evaluation
 from ..evaluation.side_by_side import as_picture, side_by_side_panels
 from ..scene import GaussianScene
+from ..version import __version__
 from .plots import LABELS, plot_counts, plot_frames, plot_tilt, plot_training
 from .study import GAUSSIAN_SHARES, Failed, TiltStudy, Trained
 

@@ -159,7 +159,7 @@ class TrainingConfig(Contract):
         """The same with everything that was left to the data filled in."""
         steps = self.steps or geometry.steps
         limit = self.max_gaussians or max(geometry.gaussian_count, self.initial_gaussians or 0)
-        out_of_plane_mm = _given_or(self.out_of_plane_mm, geometry.out_of_plane_mm)
+        out_of_plane_mm = _given_or(self.out_of_plane_mm, min(geometry.out_of_plane_mm, MAX_RANGE_MM))
         return replace(
             self,
             steps=steps,

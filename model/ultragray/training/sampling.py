@@ -10,7 +10,6 @@ from torch import Tensor
 
 from ..datasets.sweep import IntArray, Sweep, corner_distances_mm
 from ..probe import FloatArray
-from .config import MAX_RANGE_MM
 
 LEAST_RANGE = 1.5  # × the spacing of the frames
 TELLING_NEIGHBOURS = 8  # with fewer, PSNR only says that speckle averages out
@@ -45,7 +44,7 @@ def out_of_plane_range_mm(sweep: Sweep, spacing_mm: float) -> float:
     at most MAX_SLICE_MM, if the median frame has eight others or more within ± half that range: among fewer the mean of
     all wins, however far apart they are. Else, and at least, 1.5 spacings: no gap may stay between frames.
     """
-    least = min(LEAST_RANGE * spacing_mm, MAX_RANGE_MM)
+    least = LEAST_RANGE * spacing_mm
     corners = sweep.corners_mm()  # [F, K, 3]
     distances = np.stack([corner_distances_mm(own, corners) for own in corners])  # [F, F]
     np.fill_diagonal(distances, np.inf)

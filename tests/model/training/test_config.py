@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,13 @@ def test_half_of_the_gaussians_start_where_only_the_end_is_given(tiny_dataset: C
     geometry = Geometry.of(tiny_dataset())
     assert TrainingConfig.preset("paper", max_gaussians=60_000).resolved(geometry).initial_gaussians == 30_000
     assert TrainingConfig.preset("paper", max_gaussians=60_000, initial_gaussians=7).initial_gaussians == 7
+
+
+def test_frames_however_far_apart_shift_a_batch_by_at_most_ten_centimetres(
+    tiny_dataset: Callable[..., Dataset],
+) -> None:
+    geometry = replace(Geometry.of(tiny_dataset()), out_of_plane_mm=500.0)
+    assert TrainingConfig().resolved(geometry).out_of_plane_mm == 100.0
 
 
 def test_what_is_left_open_follows_from_the_data(tiny_dataset: Callable[..., Dataset]) -> None:

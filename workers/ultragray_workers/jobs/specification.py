@@ -13,7 +13,7 @@ from ultragray.errors import InvalidArgument
 from ultragray.probe import FloatArray
 from ultragray.samplers import MAX_POSES
 
-from .kinds import Specification
+from .kinds.base import Specification
 
 _POSES, _POSE_COUNT = "poses", "pose_count"
 

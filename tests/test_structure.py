@@ -1,0 +1,134 @@
+"""The architecture as the source tree has it: no import circles, folders one recognises, no probe kinds in the open."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+SOURCE_ROOTS = [ROOT / name for name in ("model", "workers", "service", "client", "proto")]
+MAX_MODULES = 12  # of a folder, beside its __init__ and its subfolders
+STILL_LARGER = {  # may shrink, and leaves the list then
+    "model/ultragray/training",
+    "service/ultragray_service/http",
+    "service/ultragray_service/cli",
+    "service/ultragray_service/core",
+    "service/ultragray_service/bench",
+    "client/ultragray_client",
+}
+PROBE_PACKAGE = "ultragray.probe"
+CONVERTERS = {"ultragray_service.rpc.messages", "ultragray_service.http.schemas"}  # until the codec has their place
+
+
+@cache
+def modules() -> dict[str, Path]:
+    """Every module of the product by its name; those compiled by their stubs."""
+    found = {}
+    for root in SOURCE_ROOTS:
+        for path in (*root.rglob("*.py"), *root.rglob("*.pyi")):
+            package, *_ = parts = path.relative_to(root).with_suffix("").parts
+            if package.startswith("ultragray"):
+                found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+    return found
+
+
+@cache
+def tree(name: str) -> ast.Module:
+    return ast.parse(modules()[name].read_text(encoding="utf-8"))
+
+
+def imports_of(name: str) -> set[str]:
+    """The product's modules that a module names in imports, wherever they stand: in functions and for types too."""
+    is_package = modules()[name].stem == "__init__"
+    found = set()
+    for node in ast.walk(tree(name)):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            parts = name.split(".")
+            above = parts[: len(parts) - node.level + is_package] if node.level else []
+            base = ".".join([*above, *([node.module] if node.module else [])])
+            found |= {inner if (inner := f"{base}.{alias.name}") in modules() else base for alias in node.names}
+    return (found & modules().keys()) - {name}
+
+
+def circles() -> Iterator[list[str]]:
+    """Sets of modules that all lead to each other (Tarjan's algorithm)."""
+    graph = {name: imports_of(name) for name in modules()}
+    order: dict[str, int] = {}
+    lowest: dict[str, int] = {}
+    waiting: list[str] = []
+
+    def visit(name: str) -> Iterator[list[str]]:
+        order[name] = lowest[name] = len(order)
+        waiting.append(name)
+        for other in graph[name]:
+            if other not in order:
+                yield from visit(other)
+                lowest[name] = min(lowest[name], lowest[other])
+            elif other in waiting:
+                lowest[name] = min(lowest[name], order[other])
+        if lowest[name] == order[name]:
+            place = waiting.index(name)
+            together = waiting[place:]
+            del waiting[place:]
+            if len(together) > 1:
+                yield sorted(together)
+
+    for name in graph:
+        if name not in order:
+            yield from visit(name)
+
+
+def test_no_module_imports_itself_by_way_of_others() -> None:
+    assert list(circles()) == []
+
+
+def test_folders_hold_at_most_a_dozen_modules() -> None:
+    folders = {path.parent for path in modules().values()}
+    sizes = {
+        str(folder.relative_to(ROOT)): sum(path.name != "__init__.py" for path in folder.glob("*.py"))
+        for folder in folders
+        if "v1" not in folder.parts  # generated
+    }
+    assert {folder for folder, size in sizes.items() if size > MAX_MODULES} == STILL_LARGER
+
+
+def test_nobody_outside_its_package_asks_for_the_kind_of_a_probe() -> None:
+    found = [
+        f"{name}:{node.lineno}"
+        for name in modules()
+        if not name.startswith(PROBE_PACKAGE) and name not in CONVERTERS
+        for node in ast.walk(tree(name))
+        if isinstance(node, (ast.Call, ast.Compare)) and asks_for_a_kind(node)
+    ]
+    assert found == []
+
+
+def asks_for_a_kind(node: ast.Call | ast.Compare) -> bool:
+    """`isinstance(probe, LinearProbe)`, or `probe.kind == "linear"`."""
+    if isinstance(node, ast.Call):
+        is_check = ast.unparse(node.func) in ("isinstance", "issubclass")
+        return is_check and any(isinstance(part, ast.Name) and part.id in kinds_of_probes() for part in ast.walk(node))
+    of_probe = ast.unparse(node.left).endswith("probe.kind")
+    return of_probe and any(isinstance(other, ast.Constant) for other in node.comparators)
+
+
+@cache
+def kinds_of_probes() -> set[str]:
+    """The classes of the probe package that define a `kind` of their own."""
+    return {
+        node.name
+        for name in modules()
+        if name.startswith(PROBE_PACKAGE)
+        for node in tree(name).body
+        if isinstance(node, ast.ClassDef)
+        for item in node.body
+        if isinstance(item, ast.AnnAssign) and ast.unparse(item.target) == "kind" and item.value
+    }
+
+
+def test_the_kinds_of_probes_are_found() -> None:
+    assert {"LinearProbe", "RadialProbe"} <= kinds_of_probes()
