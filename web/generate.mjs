@@ -32,10 +32,16 @@ function parameter(method, path, name) {
   return document.paths[path][method].parameters.find((one) => one.name === name).schema;
 }
 
+/** The specification of each kind of job. */
+function jobKinds({ kind, specification }) {
+  return Object.fromEntries(kind.enum.map((one, index) => [one, described(specification.anyOf[index])]));
+}
+
 const texts = {
   "schema.d.ts": astToString(await openapiTS(structuredClone(document))),
   "contract.ts": `import type { Described } from "../described";
 
+export const jobs: Record<string, Described> = ${JSON.stringify(jobKinds(schemas.JobBody.properties), null, 1)};
 export const settings: Described = ${JSON.stringify(described(schemas.StreamSettings), null, 1)};
 export const scene: Described = ${JSON.stringify(described(schemas.SceneOut), null, 1)};
 `,

@@ -2,28 +2,20 @@
 
 import assert from "node:assert/strict";
 import { readFileSync } from "node:fs";
-import { after, before, describe, it } from "node:test";
+import { describe, it } from "node:test";
 
-import { hold, launch, openPage, picture, seriousFindings, Service, until } from "./harness.mjs";
-import { makeSweep, put } from "./sweep.mjs";
+import { hold, openPage, picture, seriousFindings, until } from "./harness.mjs";
+import { put } from "./sweep.mjs";
+import { tested } from "./tested.mjs";
 
 const HELD_OUT = 5;
 
-let service;
-let browser;
-let files;
-
-before(async () => {
-  files = makeSweep();
-  service = await Service.start();
-  browser = await launch();
-  await put(service, "/v1/datasets/sweep", readFileSync(files.sweep), "application/zip");
-  await put(service, "/v1/scenes/compared", readFileSync(files.compared), "application/octet-stream");
-});
-after(async () => {
-  await browser?.close();
-  await service?.stop();
-  files?.remove();
+const at = tested({
+  sweep: true,
+  prepare: async ({ service, files }) => {
+    await put(service, "/v1/datasets/sweep", readFileSync(files.sweep), "application/zip");
+    await put(service, "/v1/scenes/compared", readFileSync(files.compared), "application/octet-stream");
+  },
 });
 
 /** Bytes of a picture as the page shows it. */
@@ -41,9 +33,9 @@ const rms = (a, b) => Math.sqrt(a.reduce((sum, value, i) => sum + (value - b[i])
 
 describe("compare", () => {
   it("computes the comparison, then steps through the frames with their metrics", async () => {
-    const page = await openPage(browser, service, "#/compare/compared");
+    const page = await openPage(at, "#/compare/compared");
     await page.getByTestId("comparison").waitFor();
-    const { frames } = await (await fetch(`${service.url}/v1/scenes/compared/comparison`)).json();
+    const { frames } = await (await fetch(`${at.service.url}/v1/scenes/compared/comparison`)).json();
     assert.equal(frames.length, HELD_OUT);
     const row = page.getByRole("row", { name: /^PSNR/ });
     await until(() => row.textContent(), (text) => text.includes(frames[0].psnr_db.toFixed(2)), "not its PSNR");
@@ -67,11 +59,10 @@ describe("compare", () => {
     await until(() => page.getByTestId("frame-number").textContent(), (text) => text === `Frame ${frames[0].frame_number}`, "no pick");
     assert.deepEqual([page.faults, page.foreign], [[], []]);
     await picture(page, "compare");
-    await page.context().close();
   });
 
   it("tells a picture that is late or did not come, and gets it", async () => {
-    const page = await openPage(browser, service, "#/compare/compared");
+    const page = await openPage(at, "#/compare/compared");
     const truth = page.getByRole("region", { name: "Truth", exact: true });
     await truth.locator('img[aria-busy="false"]').waitFor();
     const release = await hold(page, /comparison\/1\/truth\.png$/);
@@ -86,15 +77,14 @@ describe("compare", () => {
     await truth.getByText("The service does not answer.").waitFor();
     down = false;
     await truth.locator('img[aria-busy="false"]').waitFor();
-    await page.context().close();
   });
 
   it("can be asked again after it failed", async () => {
-    const page = await openPage(browser, service, "#/scenes");
+    const page = await openPage(at, "#/scenes");
     let failing = true;
     const failed = { state: "failed", progress: 0, dataset: "sweep", frames: [], reason: "there was not enough memory" };
     await page.route(/\/comparison$/, (route) => (failing ? route.fulfill({ json: failed }) : route.continue()));
-    await page.goto(`${service.url}/#/compare/compared`);
+    await page.goto(`${at.service.url}/#/compare/compared`);
     await page.getByRole("alert").getByText("there was not enough memory").waitFor();
     const failedAgain = page.waitForResponse(/\/comparison$/);
     await page.getByRole("button", { name: "Try again" }).click();
@@ -103,12 +93,11 @@ describe("compare", () => {
     failing = false;
     await page.getByRole("button", { name: "Try again" }).click();
     await page.getByTestId("comparison").waitFor();
-    await page.context().close();
   });
 
   it("is usable by readers of the screen and on a tablet", async () => {
     for (const [width, height, scheme] of [[1280, 800, "dark"], [820, 1180, "light"]]) {
-      const page = await openPage(browser, service, "#/compare/compared", { width, height, scheme });
+      const page = await openPage(at, "#/compare/compared", { width, height, scheme });
       await page.getByRole("region", { name: "Truth", exact: true }).locator("img").waitFor();
       assert.deepEqual(await seriousFindings(page), []);
       await picture(page, `compare-${width}`);
@@ -117,10 +106,9 @@ describe("compare", () => {
   });
 
   it("says what is missing where the service has not the scene's dataset", async () => {
-    const page = await openPage(browser, service, "#/compare/demo");
+    const page = await openPage(at, "#/compare/demo");
     await page.getByRole("alert").getByText("is not among those of the service").waitFor();
     await page.getByText("Upload the same sweep").waitFor();
     await picture(page, "compare-without-dataset");
-    await page.context().close();
   });
 });

@@ -98,7 +98,7 @@ export function launch() {
  *
  * `init`: what runs in it before its own scripts.
  */
-export async function openPage(browser, service, hash, { width = 1280, height = 800, scheme = "light", init } = {}) {
+export async function openPage({ browser, service }, hash, { width = 1280, height = 800, scheme = "light", init } = {}) {
   const context = await browser.newContext({ viewport: { width, height }, colorScheme: scheme, acceptDownloads: true });
   await context.grantPermissions(["clipboard-read", "clipboard-write"], { origin: service.url });
   const page = await context.newPage();

@@ -3,31 +3,18 @@
 import assert from "node:assert/strict";
 import { readFileSync } from "node:fs";
 import path from "node:path";
-import { after, before, describe, it } from "node:test";
+import { describe, it } from "node:test";
 
-import { canvasState, launch, openPage, picture, seriousFindings, Service, until } from "./harness.mjs";
-import { makeSweep } from "./sweep.mjs";
+import { canvasState, openPage, picture, seriousFindings, until } from "./harness.mjs";
+import { tested } from "./tested.mjs";
 
 const KEY = "a-key-of-the-tests";
 
-let service;
-let browser;
-let files;
-
-before(async () => {
-  files = makeSweep();
-  service = await Service.start({ ULTRAGRAY_API_KEYS: KEY });
-  browser = await launch();
-});
-after(async () => {
-  await browser?.close();
-  await service?.stop();
-  files?.remove();
-});
+const at = tested({ environment: { ULTRAGRAY_API_KEYS: KEY }, sweep: true });
 
 describe("a key", () => {
   it("opens the page, the stream included, and is kept over a reload", async () => {
-    const page = await openPage(browser, service, "#/scan/demo");
+    const page = await openPage(at, "#/scan/demo");
     await page.getByText("This service asks for a key").waitFor();
     assert.deepEqual(await seriousFindings(page), []);
     await picture(page, "key");
@@ -43,14 +30,13 @@ describe("a key", () => {
     await until(image, ({ mean }) => mean > 5, "no frame came");
     await page.reload();
     await until(image, ({ mean }) => mean > 5, "the key was not kept");
-    await page.context().close();
   });
 
   it("goes with uploads, pictures and downloads", async () => {
-    const page = await openPage(browser, service, "#/train");
+    const page = await openPage(at, "#/train");
     await page.getByLabel("API key").fill(KEY);
     await page.getByRole("button", { name: "Open" }).click();
-    await page.getByLabel("Add a sweep").setInputFiles(files.sweep);
+    await page.getByLabel("Add a sweep").setInputFiles(at.files.sweep);
     await page.getByRole("button", { name: "Upload and check" }).click();
     await page.getByText("28 to train from, 5 held out").waitFor();
     await page.getByRole("img", { name: "Contact sheet of sweep" }).waitFor();
@@ -60,7 +46,6 @@ describe("a key", () => {
       page.getByTestId("scene-demo").getByRole("button", { name: "Download" }).click(),
     ]);
     assert.equal(download.suggestedFilename(), "demo.ugr");
-    assert.deepEqual(readFileSync(await download.path()), readFileSync(path.join(service.data, "demo.ugr")));
-    await page.context().close();
+    assert.deepEqual(readFileSync(await download.path()), readFileSync(path.join(at.service.data, "demo.ugr")));
   });
 });

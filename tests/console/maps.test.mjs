@@ -1,32 +1,26 @@
 /** Maps: every output of one view side by side, with one cursor and the values that the service gives. */
 
 import assert from "node:assert/strict";
-import { after, before, describe, it } from "node:test";
+import { describe, it } from "node:test";
 
-import { canvasState, launch, openPage, picture, seriousFindings, Service, until } from "./harness.mjs";
+import { canvasState, openPage, picture, seriousFindings, until } from "./harness.mjs";
+import { tested } from "./tested.mjs";
 
 const SIDE = 256; // of the frames of the demo scene
 
-let service;
-let browser;
 let outputs;
 let labels;
-
-before(async () => {
-  service = await Service.start();
-  browser = await launch();
-  const scene = await (await fetch(`${service.url}/v1/scenes/demo`)).json();
-  outputs = scene.outputs;
-  labels = { 0: "none", ...scene.label_names };
-  assert.ok(outputs.includes("bmode") && outputs.includes("labels"), `${outputs}`);
-});
-after(async () => {
-  await browser?.close();
-  await service?.stop();
+const at = tested({
+  prepare: async ({ service }) => {
+    const scene = await (await fetch(`${service.url}/v1/scenes/demo`)).json();
+    outputs = scene.outputs;
+    labels = { 0: "none", ...scene.label_names };
+    assert.ok(outputs.includes("bmode") && outputs.includes("labels"), `${outputs}`);
+  },
 });
 
 async function openMaps(options) {
-  const page = await openPage(browser, service, "#/maps/demo", options);
+  const page = await openPage(at, "#/maps/demo", options);
   for (const output of outputs)
     await until(() => canvasState(page, `[data-testid="map-${output}"]`), ({ width }) => width === SIDE, `no ${output}`);
   return page;
@@ -34,10 +28,10 @@ async function openMaps(options) {
 
 /** What the service renders at the pose that the page starts with: each output's uint8 pixels. */
 async function rendered() {
-  const { poses } = await (await fetch(`${service.url}/v1/scenes/demo/training-poses`)).json();
+  const { poses } = await (await fetch(`${at.service.url}/v1/scenes/demo/training-poses`)).json();
   const pose = poses[Math.floor(poses.length / 2)];
   const matrix = [0, 4, 8, 12].map((start) => pose.slice(start, start + 4));
-  const answer = await fetch(`${service.url}/v1/scenes/demo/render`, {
+  const answer = await fetch(`${at.service.url}/v1/scenes/demo/render`, {
     method: "POST",
     headers: { "Content-Type": "application/json", Accept: "application/octet-stream;dtype=uint8" },
     body: JSON.stringify({ pose: { matrix }, outputs }),
@@ -64,7 +58,6 @@ describe("maps", () => {
     assert.equal(await page.locator('[data-testid^="map-"] svg.overlay rect').count(), outputs.length);
     await picture(page, "maps");
     assert.deepEqual([page.faults, page.foreign], [[], []]);
-    await page.context().close();
   });
 
   it("is worked by keyboard, and readers of the screen find their way", async () => {
@@ -75,11 +68,10 @@ describe("maps", () => {
     await page.getByText(`${SIDE / 2 + 1}, ${SIDE / 2 + 10}`).waitFor();
     assert.deepEqual(await seriousFindings(page), []);
     await picture(page, "maps-1024");
-    await page.context().close();
   });
 
   it("shows B-mode as the product of its neighbours whatever gain Scan has, and nothing beside a fan", async () => {
-    const page = await openPage(browser, service, "#/scan/demo");
+    const page = await openPage(at, "#/scan/demo");
     await page.getByLabel("Gain", { exact: true }).fill("12");
     await page.getByRole("combobox", { name: "Probe" }).selectOption("convex");
     await page.getByRole("link", { name: "Maps", exact: true }).click();
@@ -96,7 +88,6 @@ describe("maps", () => {
     await page.mouse.move(box.x + 3, box.y + 3);
     for (const output of outputs)
       await until(() => page.getByTestId(`value-${output}`).textContent(), (text) => text === "–", `${output} beside the fan`);
-    await page.context().close();
   });
 
   it("follows the sweep, and keeps the view of Scan", async () => {
@@ -106,6 +97,5 @@ describe("maps", () => {
     await until(() => canvasState(page, '[data-testid="map-bmode"]'), ({ print }) => print !== first.print, "it stood still");
     await page.getByRole("link", { name: "Scan", exact: true }).click();
     await page.getByText("view 11 of").waitFor();
-    await page.context().close();
   });
 });

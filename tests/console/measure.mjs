@@ -36,13 +36,13 @@ async function heapBytes(session) {
 const service = await Service.start();
 const browser = await launch();
 try {
-  const cold = await openPage(browser, service, "#/scan/demo");
+  const cold = await openPage({ browser, service }, "#/scan/demo");
   await until(() => canvasState(cold, IMAGE), ({ mean }) => mean > 5, "no frame came");
   const paint_ms = await firstPaint_ms(cold);
   const image_ms = await cold.evaluate(() => performance.now());
   await cold.context().close();
 
-  const page = await openPage(browser, service, "#/scan/demo");
+  const page = await openPage({ browser, service }, "#/scan/demo");
   await page.getByRole("combobox", { name: "Samples" }).selectOption("512");
   await until(() => canvasState(page, IMAGE), ({ width }) => width === 512, "no 512 scan lines");
   await page.evaluate(() => {

@@ -1,29 +1,22 @@
 /** Pages that browsers trust little, and connections that are refused, cut, dead or overloaded. */
 
 import assert from "node:assert/strict";
-import { after, before, describe, it } from "node:test";
+import { after, describe, it } from "node:test";
 
-import { canvasState, launch, openPage, picture, seriousFindings, Service, until } from "./harness.mjs";
+import { canvasState, openPage, picture, seriousFindings, until } from "./harness.mjs";
 import { Proxy } from "./proxy.mjs";
 import { changed, IMAGE, openScan, poseOf } from "./scan_page.mjs";
+import { tested } from "./tested.mjs";
 
 const MAX_SIDE = 512; // of images, in this service
 const CUTS = 4;
 
-let service;
-let browser;
 let proxy;
-
-before(async () => {
-  service = await Service.start({ ULTRAGRAY_MAX_IMAGE_SIDE: String(MAX_SIDE) });
-  browser = await launch();
-  proxy = await Proxy.start(service);
+const at = tested({
+  environment: { ULTRAGRAY_MAX_IMAGE_SIDE: String(MAX_SIDE) },
+  prepare: async ({ service }) => (proxy = await Proxy.start(service)),
 });
-after(async () => {
-  await browser?.close();
-  await proxy?.stop();
-  await service?.stop();
-});
+after(() => proxy?.stop());
 
 /** What browsers do to pages over plain HTTP from another machine. */
 function distrust() {
@@ -52,7 +45,7 @@ function countBuffers() {
 
 describe("a page that the browser does not trust", () => {
   it("shows Scan and Maps without gamepads, and offers the pose for copying by hand", async () => {
-    const { page } = await openScan(browser, service, { init: distrust });
+    const { page } = await openScan(at, { init: distrust });
     await page.getByLabel("Copy the pose as JSON").click();
     const alert = page.getByText("press Ctrl+C");
     await alert.waitFor();
@@ -67,14 +60,13 @@ describe("a page that the browser does not trust", () => {
     await page.getByRole("link", { name: "Maps", exact: true }).click();
     await until(() => canvasState(page, '[data-testid="map-echo"]'), ({ mean }) => mean > 1, "no map came");
     assert.deepEqual(page.faults, []);
-    await page.context().close();
   });
 });
 
 describe("a proxy", () => {
   it("that refuses streams is told, without asking for the scene all the time, and left when it takes them", async () => {
     proxy.refuses = true;
-    const page = await openPage(browser, proxy, "#/scenes");
+    const page = await openPage({ ...at, service: proxy }, "#/scenes");
     const descriptions = countDescriptions(page);
     await page.goto(`${proxy.url}/#/scan/demo`);
     await page.getByTestId("stream-barred").waitFor();
@@ -84,11 +76,10 @@ describe("a proxy", () => {
     proxy.refuses = false;
     await until(() => canvasState(page, IMAGE), ({ mean }) => mean > 5, "no frame came");
     await page.getByTestId("stream-barred").waitFor({ state: "detached" });
-    await page.context().close();
   });
 
   it("that cuts streams changes nothing in the 3D view, and the image follows again", async () => {
-    const { page, first } = await openScan(browser, proxy, { init: countBuffers });
+    const { page, first } = await openScan({ ...at, service: proxy }, { init: countBuffers });
     const buffersMade = () => page.evaluate(() => globalThis.buffersMade);
     let before = -1;
     let same = 0;
@@ -110,11 +101,10 @@ describe("a proxy", () => {
     assert.ok(descriptions.count <= 2 * CUTS, `asked ${descriptions.count} times`);
     const made = (await buffersMade()) - before; // a part may be drawn for the first time; the whole view has dozens
     assert.ok(made < 10, `the 3D view was made anew: ${made} buffers`);
-    await page.context().close();
   });
 
   it("that lets a stream die silently does not stop the image for long", async () => {
-    const page = await openPage(browser, proxy, "#/scenes");
+    const page = await openPage({ ...at, service: proxy }, "#/scenes");
     await page.clock.install();
     await page.goto(`${proxy.url}/#/scan/demo`);
     const first = await until(() => canvasState(page, IMAGE), ({ mean }) => mean > 5, "no frame came");
@@ -124,13 +114,12 @@ describe("a proxy", () => {
     await page.clock.fastForward(15_000);
     await reconnected;
     await changed(page, first.print);
-    await page.context().close();
   });
 });
 
 describe("a slow service", () => {
   it("is given more time for its frame after it was taken for dead", async () => {
-    const page = await openPage(browser, service, "#/scenes");
+    const page = await openPage(at, "#/scenes");
     await page.clock.install();
     let slow = false;
     const late = [];
@@ -138,7 +127,7 @@ describe("a slow service", () => {
       const there = socket.connectToServer();
       socket.onMessage((message) => (slow ? late.push(() => there.send(message)) : there.send(message)));
     });
-    await page.goto(`${service.url}/#/scan/demo`);
+    await page.goto(`${at.service.url}/#/scan/demo`);
     const first = await until(() => canvasState(page, IMAGE), ({ mean }) => mean > 5, "no frame came");
     slow = true;
     await page.getByLabel("Position Y", { exact: true }).fill("3");
@@ -149,13 +138,12 @@ describe("a slow service", () => {
     late[1]();
     await changed(page, first.print);
     assert.equal(late.length, 2);
-    await page.context().close();
   });
 });
 
 describe("a refused pose", () => {
   it("is asked for again where the refusal may pass", async () => {
-    const page = await openPage(browser, service, "#/scenes");
+    const page = await openPage(at, "#/scenes");
     let full = false;
     await page.routeWebSocket(/\/stream$/, (socket) => {
       const there = socket.connectToServer();
@@ -166,7 +154,7 @@ describe("a refused pose", () => {
         else there.send(message);
       });
     });
-    await page.goto(`${service.url}/#/scan/demo`);
+    await page.goto(`${at.service.url}/#/scan/demo`);
     const first = await until(() => canvasState(page, IMAGE), ({ mean }) => mean > 5, "no frame came");
     full = true;
     await page.getByLabel("Position Y", { exact: true }).fill("3");
@@ -174,18 +162,17 @@ describe("a refused pose", () => {
     full = false;
     await changed(page, first.print);
     await page.getByTestId("refusal").waitFor({ state: "detached" });
-    await page.context().close();
   });
 
   it("stays told while its settings are refused: the image before is not taken for theirs", async () => {
-    const page = await openPage(browser, service, "#/scenes");
+    const page = await openPage(at, "#/scenes");
     const refusals = [];
     page.on("websocket", (socket) => {
       socket.on("framereceived", ({ payload }) => {
         if (typeof payload === "string") refusals.push(payload);
       });
     });
-    await page.goto(`${service.url}/#/scan/demo`);
+    await page.goto(`${at.service.url}/#/scan/demo`);
     const first = await until(() => canvasState(page, IMAGE), ({ mean }) => mean > 5, "no frame came");
     await page.getByRole("combobox", { name: "Samples" }).selectOption("768");
     await page.getByTestId("refusal").waitFor();
@@ -196,6 +183,5 @@ describe("a refused pose", () => {
     assert.equal((await canvasState(page, IMAGE)).print, first.print, "an image with the settings before was shown");
     await page.getByRole("combobox", { name: "Samples" }).selectOption("256");
     await page.getByTestId("refusal").waitFor({ state: "detached" });
-    await page.context().close();
   });
 });

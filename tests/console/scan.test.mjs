@@ -2,35 +2,25 @@
 
 import assert from "node:assert/strict";
 import { readFileSync } from "node:fs";
-import { after, before, describe, it } from "node:test";
+import { describe, it } from "node:test";
 
-import { canvasState, launch, openPage, picture, seriousFindings, Service, until } from "./harness.mjs";
+import { canvasState, openPage, picture, seriousFindings, until } from "./harness.mjs";
 import { changed, dragProbe, enterPose, IMAGE, openScan, poseOf } from "./scan_page.mjs";
+import { tested } from "./tested.mjs";
 
 const PROBE_WIDTH_MM = 60; // of the demo scene
 
-let service;
-let browser;
-
-before(async () => {
-  service = await Service.start();
-  browser = await launch();
-});
-after(async () => {
-  await browser?.close();
-  await service?.stop();
-});
+const at = tested();
 
 describe("scan", () => {
   it("is the page at the address of the service, with the first scene", async () => {
-    const page = await openPage(browser, service, "");
+    const page = await openPage(at, "");
     await until(() => page.url(), (url) => url.endsWith("#/scan/demo"), "no scene was chosen");
     await until(() => canvasState(page, IMAGE), ({ mean }) => mean > 5, "no frame came");
-    await page.context().close();
   });
 
   it("shows the frame of where the probe is, and follows keys, sliders and JSON", async () => {
-    const { page, first } = await openScan(browser, service);
+    const { page, first } = await openScan(at);
     assert.deepEqual([first.width, first.height], [256, 256]);
     const pose = await poseOf(page);
     await page.locator(`${IMAGE} .steer`).focus();
@@ -52,11 +42,10 @@ describe("scan", () => {
     await page.getByLabel("Copy the pose as JSON").click();
     assert.deepEqual(JSON.parse(await page.evaluate(() => navigator.clipboard.readText())), pose);
     assert.deepEqual([page.faults, page.foreign], [[], []]);
-    await page.context().close();
   });
 
   it("shows what gain, range, TGC, depth, flip, samples and another probe make of it", async () => {
-    const { page, first } = await openScan(browser, service);
+    const { page, first } = await openScan(at);
     await page.getByLabel("Gain", { exact: true }).fill("12");
     const brighter = await changed(page, first.print);
     assert.ok(brighter.mean > first.mean + 10, `${brighter.mean} after ${first.mean}`);
@@ -78,11 +67,10 @@ describe("scan", () => {
     await picture(page, "scan-convex");
     await page.getByRole("button", { name: "Scan lines" }).click();
     await until(() => canvasState(page, IMAGE), ({ width }) => width === 512, "no scan lines came");
-    await page.context().close();
   });
 
   it("freezes, goes through the cine loop, measures and saves", async () => {
-    const { page, first } = await openScan(browser, service);
+    const { page, first } = await openScan(at);
     await page.getByLabel("Position Y", { exact: true }).fill("0");
     const second = await changed(page, first.print);
     await page.getByRole("button", { name: "Freeze" }).click();
@@ -115,11 +103,10 @@ describe("scan", () => {
     await page.getByRole("button", { name: "Freeze" }).click();
     await changed(page, first.print);
     assert.deepEqual(page.faults, []);
-    await page.context().close();
   });
 
   it("snaps to training views, plays them, and says how far the view is from them", async () => {
-    const { page, first } = await openScan(browser, service);
+    const { page, first } = await openScan(at);
     const confidence = page.getByTestId("confidence");
     await until(() => confidence.textContent(), (text) => text === "Well supported", "home is a training view");
     await page.getByLabel("Tilt, about the lateral axis", { exact: true }).fill("60");
@@ -132,11 +119,10 @@ describe("scan", () => {
     const playing = await changed(page, first.print);
     await changed(page, playing.print);
     await page.getByRole("button", { name: "Pause the sweep" }).click();
-    await page.context().close();
   });
 
   it("is steered by a gamepad", async () => {
-    const { page, first } = await openScan(browser, service);
+    const { page, first } = await openScan(at);
     await page.evaluate(() => {
       const pad = { id: "Pad of the test", connected: true, axes: [0, 1, 0, 0], buttons: [] };
       navigator.getGamepads = () => [pad];
@@ -146,11 +132,10 @@ describe("scan", () => {
     await changed(page, first.print);
     const slid = ({ position_mm }) => position_mm.y > -15; // it was at -18.9
     await until(() => poseOf(page), slid, "the stick does not slide the probe in elevation");
-    await page.context().close();
   });
 
   it("shows the scene in space, where the probe can be dragged", async () => {
-    const { page } = await openScan(browser, service);
+    const { page } = await openScan(at);
     const room = page.getByTestId("room");
     await room.locator("canvas").waitFor();
     await until(() => room.locator("canvas").evaluate((canvas) => canvas.width), (width) => width > 300, "no 3D view");
@@ -170,12 +155,11 @@ describe("scan", () => {
     assert.ok(await dragProbe(page, room, pose), "there is no handle where the probe is");
     await picture(page, "scan");
     assert.deepEqual(page.faults, []);
-    await page.context().close();
   });
 
   it("is usable by keyboard and by readers of the screen, at 1280 and at 1024 pixels", async () => {
     for (const [width, height, scheme] of [[1280, 800, "light"], [1024, 768, "dark"]]) {
-      const { page } = await openScan(browser, service, { width, height, scheme });
+      const { page } = await openScan(at, { width, height, scheme });
       assert.deepEqual(await seriousFindings(page), []);
       const wider = await page.evaluate(() => document.documentElement.scrollWidth > innerWidth);
       assert.equal(wider, false, `wider than ${width} pixels`);
@@ -185,24 +169,22 @@ describe("scan", () => {
   });
 
   it("says that the service is down, and goes on when it is back", async () => {
-    const { page, first } = await openScan(browser, service);
-    await service.down();
+    const { page, first } = await openScan(at);
+    await at.service.down();
     await page.getByTestId("service-down").waitFor();
     await page.getByText("No connection").waitFor();
     await picture(page, "scan-down");
     await page.getByLabel("Position Y", { exact: true }).fill("3");
-    await service.up();
+    await at.service.up();
     await page.getByTestId("service-down").waitFor({ state: "detached" });
     await changed(page, first.print);
-    await page.context().close();
   });
 
   it("says that a scene is missing and which there are", async () => {
-    const page = await openPage(browser, service, "#/scan/nobody");
+    const page = await openPage(at, "#/scan/nobody");
     await page.getByTestId("scene-missing").getByText("There is no scene nobody here.").waitFor();
     await picture(page, "scan-missing");
     await page.getByTestId("scene-missing").getByRole("link", { name: "demo" }).click();
     await until(() => canvasState(page, IMAGE), ({ mean }) => mean > 5, "no frame came");
-    await page.context().close();
   });
 });

@@ -5,8 +5,8 @@ import { canvasState, openPage, until } from "./harness.mjs";
 export const IMAGE = '[aria-label="Live image"]';
 
 /** Opens Scan on a scene and waits for its image; `first` is its state. */
-export async function openScan(browser, service, { scene = "demo", ...options } = {}) {
-  const page = await openPage(browser, service, `#/scan/${scene}`, options);
+export async function openScan(at, { scene = "demo", ...options } = {}) {
+  const page = await openPage(at, `#/scan/${scene}`, options);
   const first = await until(() => canvasState(page, IMAGE), ({ mean }) => mean > 5, "no frame came");
   return { page, first };
 }

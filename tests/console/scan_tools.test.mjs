@@ -3,24 +3,15 @@
 import assert from "node:assert/strict";
 import { readFileSync } from "node:fs";
 import path from "node:path";
-import { after, before, describe, it } from "node:test";
+import { describe, it } from "node:test";
 
-import { canvasState, launch, picture, seriousFindings, Service, until } from "./harness.mjs";
+import { canvasState, picture, seriousFindings, until } from "./harness.mjs";
 import { changed, enterPose, IMAGE, openScan, poseOf } from "./scan_page.mjs";
+import { tested } from "./tested.mjs";
 
 const POSES = [0, 4, 8].map((y) => [[1, 0, 0, 2], [0, 1, 0, y], [0, 0, 1, 0], [0, 0, 0, 1]]);
 
-let service;
-let browser;
-
-before(async () => {
-  service = await Service.start();
-  browser = await launch();
-});
-after(async () => {
-  await browser?.close();
-  await service?.stop();
-});
+const at = tested();
 
 /** Notes the words that are drawn into pictures, and whether they fit. */
 function watchWords() {
@@ -51,7 +42,7 @@ function poseFile(document) {
 
 describe("poses", () => {
   it("that are no rigid transforms are refused in words", async () => {
-    const { page } = await openScan(browser, service);
+    const { page } = await openScan(at);
     const pose = await poseOf(page);
     const refused = [
       ["null", "a pose is an object"],
@@ -67,11 +58,10 @@ describe("poses", () => {
     assert.deepEqual(await poseOf(page), pose);
     await enterPose(page, JSON.stringify({ matrix: POSES[1] }));
     await until(() => poseOf(page), ({ position_mm: { x, y } }) => x === 2 && y === 4, "the matrix was not taken");
-    await page.context().close();
   });
 
   it("of a file are played, and the training sweep comes back", async () => {
-    const { page } = await openScan(browser, service);
+    const { page } = await openScan(at);
     await page.getByText("view 106 of 211").waitFor();
     await page.getByLabel("Position X", { exact: true }).fill("9");
     await page.getByText("beside the views").waitFor();
@@ -92,11 +82,10 @@ describe("poses", () => {
     await page.getByRole("button", { name: "Back to the training sweep" }).click();
     await page.getByText("view 106 of 211").waitFor();
     assert.deepEqual(page.faults, []);
-    await page.context().close();
   });
 
   it("are steered by keys after a button was pressed, finely with Alt", async () => {
-    const { page } = await openScan(browser, service);
+    const { page } = await openScan(at);
     await page.getByRole("button", { name: "Snap" }).click();
     const before = await poseOf(page);
     await page.keyboard.press("ArrowRight");
@@ -106,13 +95,12 @@ describe("poses", () => {
     await until(() => poseOf(page), ({ position_mm }) => position_mm.z > moved.position_mm.z, "Alt is not heard");
     const [coarse_mm, fine_mm] = [await tap_mm(page, "ArrowRight", false), await tap_mm(page, "ArrowRight", true)];
     assert.ok(Math.abs(fine_mm - coarse_mm / 5) < 0.01, `${fine_mm} mm with Alt, ${coarse_mm} mm without`);
-    await page.context().close();
   });
 });
 
 describe("the image", () => {
   it("is measured by keyboard, and by two clicks", async () => {
-    const { page } = await openScan(browser, service);
+    const { page } = await openScan(at);
     const lengths = () => page.getByTestId("calliper-length").allTextContents();
     await page.getByRole("button", { name: "Measure" }).focus();
     await page.keyboard.press("Enter");
@@ -129,11 +117,10 @@ describe("the image", () => {
     await page.mouse.click(box.x + box.width * 0.3, box.y + box.height * 0.7);
     await page.keyboard.press("Escape");
     await until(lengths, (all) => all.length === 1, "a measurement that was not ended stays");
-    await page.context().close();
   });
 
   it("goes back to its full depth by the slider where that is no whole number", async () => {
-    const { page } = await openScan(browser, service);
+    const { page } = await openScan(at);
     await page.route(/\/v1\/scenes\/demo$/, async (route) => {
       const scene = await (await route.fetch()).json();
       await route.fulfill({ json: { ...scene, probe: { ...scene.probe, far_mm: 59.35 } } });
@@ -145,12 +132,11 @@ describe("the image", () => {
     await until(() => canvasState(page, IMAGE), ({ height }) => height === 128, "the depth is not half of it");
     await depth.fill("60");
     await until(() => canvasState(page, IMAGE), ({ height }) => height === 256, "the depth is not full again");
-    await page.context().close();
   });
 
   it("is black where nothing supports it, if that is asked for, and tells how sure its figure is", async () => {
-    const { page, first } = await openScan(browser, service);
-    const { confidence } = await (await fetch(`${service.url}/v1/scenes/demo`)).json();
+    const { page, first } = await openScan(at);
+    const { confidence } = await (await fetch(`${at.service.url}/v1/scenes/demo`)).json();
     const told = new RegExp(`\\d+ %\\s+± ${Math.round(confidence.error * 100)} %`);
     await until(() => page.getByTestId("similarity").textContent(), (text) => told.test(text), "no error is told");
     await page.getByLabel("Tilt, about the lateral axis", { exact: true }).fill("60");
@@ -161,11 +147,10 @@ describe("the image", () => {
     await page.getByLabel("Black where nothing supports it").uncheck();
     await until(() => canvasState(page, IMAGE), ({ print }) => print !== black.print, "it stays black");
     await picture(page, "scan-unsupported");
-    await page.context().close();
   });
 
   it("is saved with all words of what it is, and its side", async () => {
-    const { page, first } = await openScan(browser, service, { init: watchWords });
+    const { page, first } = await openScan(at, { init: watchWords });
     await page.getByRole("combobox", { name: "Probe" }).selectOption("linear"); // narrower than the words are long
     await changed(page, first.print);
     await page.getByText("view 106 of 211").waitFor(); // the probe is where it was
@@ -180,15 +165,14 @@ describe("the image", () => {
       await page.getByLabel("Flip left/right").check();
       await page.locator('[data-testid="orientation-marker"][data-side="right"]').waitFor();
     }
-    await page.context().close();
   });
 });
 
 describe("a scene that another takes the place of", () => {
   it("is not scanned with the probe that was chosen for it", async () => {
-    const file = readFileSync(path.join(service.data, "demo.ugr"));
+    const file = readFileSync(path.join(at.service.data, "demo.ugr"));
     await putOther(file);
-    const { page, first } = await openScan(browser, service, { scene: "other" });
+    const { page, first } = await openScan(at, { scene: "other" });
     await page.getByRole("combobox", { name: "Probe" }).selectOption("convex");
     await changed(page, first.print);
     await deleteOther();
@@ -203,9 +187,9 @@ describe("a scene that another takes the place of", () => {
   });
 
   it("is known while Scan stays open, also where the service was full when it was asked", async () => {
-    const file = readFileSync(path.join(service.data, "demo.ugr"));
+    const file = readFileSync(path.join(at.service.data, "demo.ugr"));
     await putOther(file);
-    const { page, first } = await openScan(browser, service, { scene: "other" });
+    const { page, first } = await openScan(at, { scene: "other" });
     await page.getByRole("combobox", { name: "Probe" }).selectOption("convex");
     await changed(page, first.print);
     await deleteOther();
@@ -224,11 +208,11 @@ describe("a scene that another takes the place of", () => {
 });
 
 async function putOther(body) {
-  assert.equal((await fetch(`${service.url}/v1/scenes/other`, { method: "PUT", body })).status, 201);
+  assert.equal((await fetch(`${at.service.url}/v1/scenes/other`, { method: "PUT", body })).status, 201);
 }
 
 async function deleteOther() {
-  assert.ok((await fetch(`${service.url}/v1/scenes/other`, { method: "DELETE" })).ok);
+  assert.ok((await fetch(`${at.service.url}/v1/scenes/other`, { method: "DELETE" })).ok);
 }
 
 /** The scene file as if it were trained from another dataset. */

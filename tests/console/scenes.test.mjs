@@ -3,31 +3,21 @@
 import assert from "node:assert/strict";
 import { readFileSync, writeFileSync } from "node:fs";
 import path from "node:path";
-import { after, before, describe, it } from "node:test";
+import { describe, it } from "node:test";
 
-import { focused, hold, launch, openPage, picture, seriousFindings, Service, until } from "./harness.mjs";
-import { makeSweep, put } from "./sweep.mjs";
+import { focused, hold, openPage, picture, seriousFindings, until } from "./harness.mjs";
+import { put } from "./sweep.mjs";
+import { tested } from "./tested.mjs";
 
-let service;
-let browser;
-let files;
-
-before(async () => {
-  files = makeSweep();
-  service = await Service.start();
-  browser = await launch();
-  writeFileSync(path.join(service.data, "damaged.ugr"), "no scene");
-});
-after(async () => {
-  await browser?.close();
-  await service?.stop();
-  files?.remove();
+const at = tested({
+  sweep: true,
+  prepare: async ({ service }) => writeFileSync(path.join(service.data, "damaged.ugr"), "no scene"),
 });
 
 describe("scenes and service", () => {
   it("imports, loads, unloads, gives back and deletes a scene", async () => {
-    const page = await openPage(browser, service, "#/scenes");
-    await page.getByLabel("Import a scene").setInputFiles(files.compared);
+    const page = await openPage(at, "#/scenes");
+    await page.getByLabel("Import a scene").setInputFiles(at.files.compared);
     await page.getByLabel("Name", { exact: true }).fill("mine");
     await page.getByRole("button", { name: "Import", exact: true }).click();
     await page.getByRole("status").getByText("mine is there.").waitFor();
@@ -39,7 +29,7 @@ describe("scenes and service", () => {
     await row.getByRole("button", { name: "Load", exact: true }).waitFor();
     const [download] = await Promise.all([page.waitForEvent("download"), row.getByRole("link", { name: "Download" }).click()]);
     assert.equal(download.suggestedFilename(), "mine.ugr");
-    assert.deepEqual(readFileSync(await download.path()), readFileSync(files.compared));
+    assert.deepEqual(readFileSync(await download.path()), readFileSync(at.files.compared));
     await row.getByRole("link", { name: "mine", exact: true }).click();
     await page.getByRole("link", { name: "Scenes and service" }).click();
     for (const answer of ["Enter", "Escape"]) {
@@ -54,13 +44,12 @@ describe("scenes and service", () => {
     assert.equal(await page.getByRole("banner").getByLabel("Scene").inputValue(), "demo");
     assert.equal(await page.getByRole("link", { name: "Compare", exact: true }).getAttribute("href"), "#/compare/demo");
     assert.deepEqual([page.faults, page.foreign], [[], []]);
-    await page.context().close();
   });
 
   it("begins anew with a scene that takes the place of a deleted one", async () => {
-    const scene = readFileSync(files.compared);
-    await put(service, "/v1/scenes/again", scene, "application/octet-stream");
-    const page = await openPage(browser, service, "#/scan/again");
+    const scene = readFileSync(at.files.compared);
+    await put(at.service, "/v1/scenes/again", scene, "application/octet-stream");
+    const page = await openPage(at, "#/scan/again");
     const gain = page.getByRole("slider", { name: "Gain", exact: true });
     await gain.fill("6");
     await page.getByRole("link", { name: "Scenes and service" }).click();
@@ -68,16 +57,15 @@ describe("scenes and service", () => {
     await row.getByRole("button", { name: "Delete" }).click();
     await row.getByRole("group", { name: "Delete again?" }).getByRole("button", { name: "Delete" }).click();
     await row.waitFor({ state: "detached" });
-    await put(service, "/v1/scenes/again", scene, "application/octet-stream");
+    await put(at.service, "/v1/scenes/again", scene, "application/octet-stream");
     await row.getByRole("link", { name: "again", exact: true }).click();
     assert.equal(await gain.inputValue(), "0");
-    await page.context().close();
   });
 
   it("goes on with an import while other views are looked at", async () => {
-    const page = await openPage(browser, service, "#/scenes");
+    const page = await openPage(at, "#/scenes");
     const release = await hold(page, /\/v1\/scenes\/late$/);
-    await page.getByLabel("Import a scene").setInputFiles(files.compared);
+    await page.getByLabel("Import a scene").setInputFiles(at.files.compared);
     await page.getByLabel("Name", { exact: true }).fill("late");
     await page.getByRole("button", { name: "Import", exact: true }).click();
     await page.getByLabel("Import", { exact: true }).waitFor();
@@ -86,32 +74,30 @@ describe("scenes and service", () => {
     await page.getByLabel("Import", { exact: true }).waitFor();
     release();
     await page.getByRole("status").getByText("late is there.").waitFor();
-    await page.context().close();
   });
 
   it("says what cannot be imported or read, and offers no deletion of what is not the service's", async () => {
-    const page = await openPage(browser, service, "#/scenes");
+    const page = await openPage(at, "#/scenes");
     await page.getByTestId("scene-damaged").getByText("not a scene file").waitFor();
     await page.getByLabel("Import a scene").setInputFiles({ name: "a b.ugr", mimeType: "", buffer: Buffer.from("nothing") });
     assert.equal(await page.getByLabel("Name", { exact: true }).inputValue(), "a-b");
     await page.getByRole("button", { name: "Import", exact: true }).click();
     await page.getByTestId("import-problem").getByText("not a scene file").waitFor();
-    await put(service, "/v1/scenes/removable", readFileSync(files.compared), "application/octet-stream");
+    await put(at.service, "/v1/scenes/removable", readFileSync(at.files.compared), "application/octet-stream");
     await page.getByTestId("scene-removable").getByRole("button", { name: "Delete" }).waitFor();
     for (const name of ["demo", "damaged"])
       assert.equal(await page.getByTestId(`scene-${name}`).getByRole("button", { name: "Delete" }).count(), 0);
-    await page.context().close();
   });
 
   it("shows frames, times and errors of the last minutes", async () => {
-    const page = await openPage(browser, service, "#/scenes");
+    const page = await openPage(at, "#/scenes");
     const frames = page.getByTestId("frames-rendered");
     const before = Number(await frames.textContent());
     const matrix = [[1, 0, 0, 0], [0, 1, 0, 5], [0, 0, 1, 0], [0, 0, 0, 1]];
     const headers = { "Content-Type": "application/json" };
     for (let i = 0; i < 12; i++)
-      await fetch(`${service.url}/v1/scenes/demo/render`, { method: "POST", headers, body: JSON.stringify({ pose: { matrix } }) });
-    await fetch(`${service.url}/v1/scenes/demo/render`, {
+      await fetch(`${at.service.url}/v1/scenes/demo/render`, { method: "POST", headers, body: JSON.stringify({ pose: { matrix } }) });
+    await fetch(`${at.service.url}/v1/scenes/demo/render`, {
       method: "POST",
       headers,
       body: JSON.stringify({ pose: { matrix }, height: 512, width: 512, timeout_ms: 0.001 }),
@@ -124,20 +110,18 @@ describe("scenes and service", () => {
     await page.getByRole("img", { name: /^Errors over/ }).waitFor();
     assert.deepEqual(await seriousFindings(page), []);
     await picture(page, "service");
-    await page.context().close();
   });
 
   it("says that the service is down, and goes on when it is back", async () => {
-    const page = await openPage(browser, service, "#/scenes", { width: 820, height: 1180 });
+    const page = await openPage(at, "#/scenes", { width: 820, height: 1180 });
     await page.getByTestId("frames-rendered").waitFor();
     assert.deepEqual(await seriousFindings(page), []);
-    await service.down();
+    await at.service.down();
     await page.getByText("The list may be out of date.").waitFor();
     await page.getByText("The service does not answer. Trying again.").waitFor();
     await picture(page, "scenes-down");
-    await service.up();
+    await at.service.up();
     await page.getByText("The list may be out of date.").waitFor({ state: "detached" });
     await page.getByText("The service does not answer. Trying again.").waitFor({ state: "detached" });
-    await page.context().close();
   });
 });

@@ -1,26 +1,17 @@
 /** The 3D view: what it holds on the graphics card, the image in its plane, the probe that is turned. */
 
 import assert from "node:assert/strict";
-import { after, before, describe, it } from "node:test";
+import { describe, it } from "node:test";
 
-import { launch, picture, Service, until } from "./harness.mjs";
+import { picture, until } from "./harness.mjs";
 import { dragProbe, openScan, poseOf } from "./scan_page.mjs";
+import { tested } from "./tested.mjs";
 
 const PROBES = ["convex", "linear", "phased", "own"];
 const CONVEX_RADIUS_MM = 40;
 const PLANE_NUMBERS = 65 * 2 * 3; // x, y, z of both ends of the scan lines of a plane
 
-let service;
-let browser;
-
-before(async () => {
-  service = await Service.start();
-  browser = await launch();
-});
-after(async () => {
-  await browser?.close();
-  await service?.stop();
-});
+const at = tested();
 
 /** Counts the buffers on the graphics card, and notes how deep the planes go that are put there. */
 function watchGraphics(planeNumbers) {
@@ -43,7 +34,7 @@ function watchGraphics(planeNumbers) {
 }
 
 async function openSpace() {
-  const { page } = await openScan(browser, service, { init: `(${watchGraphics})(${PLANE_NUMBERS})` });
+  const { page } = await openScan(at, { init: `(${watchGraphics})(${PLANE_NUMBERS})` });
   const room = page.getByTestId("room");
   await room.locator("canvas").waitFor();
   await steadyBuffers(page);
@@ -76,7 +67,6 @@ describe("the scene in space", () => {
     assert.ok(Math.max(...counts) <= Math.max(...earlier), `${earlier} buffers, then ${counts}`);
     await page.getByRole("link", { name: "Train", exact: true }).click();
     await until(() => page.evaluate(() => globalThis.buffers), (count) => count <= 2, "buffers stay");
-    await page.context().close();
   });
 
   it("ends the image in its plane where the depth cuts it", async () => {
@@ -90,7 +80,6 @@ describe("the scene in space", () => {
     await deepest(60);
     await page.getByLabel("Depth", { exact: true }).fill("30");
     await deepest(30);
-    await page.context().close();
   });
 
   it("is drawn again after the graphics card was lost", async () => {
@@ -117,7 +106,6 @@ describe("the scene in space", () => {
     const before = await drawn();
     await page.getByLabel("Sweep", { exact: true }).uncheck();
     await until(async () => (await drawn()) !== before, Boolean, "the view stays as it was");
-    await page.context().close();
   });
 
   it("turns a convex probe about the middle of its face", async () => {
@@ -132,7 +120,6 @@ describe("the scene in space", () => {
     const away_mm = Math.hypot(...face.map((value, i) => value - turned[i]));
     assert.ok(away_mm < 0.05, `the face moved by ${away_mm} mm`);
     await picture(page, "scan-turned");
-    await page.context().close();
   });
 });
 

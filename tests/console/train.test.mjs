@@ -1,25 +1,14 @@
 /** Train: from a file on somebody's disk to a scene that is scanned, and what stands in the way. */
 
 import assert from "node:assert/strict";
-import { after, before, describe, it } from "node:test";
+import { describe, it } from "node:test";
 
-import { canvasState, launch, openPage, picture, seriousFindings, Service, until } from "./harness.mjs";
-import { makeSweep } from "./sweep.mjs";
+import { canvasState, openPage, picture, seriousFindings, until } from "./harness.mjs";
+import { tested } from "./tested.mjs";
 
-let service;
-let browser;
-let files;
-
-before(async () => {
-  files = makeSweep();
-  const settings = { ULTRAGRAY_EMBEDDED_WORKER: "true", ULTRAGRAY_TRAINING_THREADS: "1" };
-  service = await Service.start(settings);
-  browser = await launch();
-});
-after(async () => {
-  await browser?.close();
-  await service?.stop();
-  files?.remove();
+const at = tested({
+  environment: { ULTRAGRAY_EMBEDDED_WORKER: "true", ULTRAGRAY_TRAINING_THREADS: "1" },
+  sweep: true,
 });
 
 async function upload(page, file, name) {
@@ -41,8 +30,8 @@ function state(page) {
 
 describe("train", () => {
   it("takes a sweep in, shows it, trains, tells how far it is, and opens the scene", async () => {
-    const page = await openPage(browser, service, "#/train");
-    await upload(page, files.sweep, "sweep");
+    const page = await openPage(at, "#/train");
+    await upload(page, at.files.sweep, "sweep");
     await page.getByText("28 to train from, 5 held out").waitFor();
     await page.getByRole("img", { name: "Contact sheet of sweep" }).waitFor();
     const frame = page.getByRole("img", { name: "Frame 0 of sweep" });
@@ -76,11 +65,10 @@ describe("train", () => {
     await until(() => canvasState(page, '[aria-label="Live image"]'), ({ mean }) => mean > 2, "the scene gives no frame");
     assert.ok(page.url().endsWith("#/scan/made"));
     assert.deepEqual([page.faults, page.foreign], [[], []]);
-    await page.context().close();
   });
 
   it("shows the rendering as it is, keeps on after the service was down, and cancels", async () => {
-    const page = await openPage(browser, service, "#/train", { scheme: "dark" });
+    const page = await openPage(at, "#/train", { scheme: "dark" });
     await page.getByText("28 to train from, 5 held out").waitFor();
     await start(page, "long", { Steps: "100000", "Most Gaussians": "800" });
     const preview = page.getByRole("img", { name: "A held-out frame and its rendering" });
@@ -88,20 +76,19 @@ describe("train", () => {
     await picture(page, "train-running");
     const steps = page.getByText(/^Step [\d,]+ of 100,000$/);
     const stepNow = async () => Number((await steps.textContent()).split(" ")[1].replaceAll(",", ""));
-    await service.down();
+    await at.service.down();
     await page.getByText("The service does not answer. Trying again.").waitFor();
     const before = await stepNow();
-    await service.up();
+    await at.service.up();
     await until(stepNow, (step) => step > before, "it did not go on");
     await page.getByRole("button", { name: "Cancel" }).click();
     await until(() => state(page), (text) => text === "cancelled", "it was not cancelled");
     await page.getByRole("button", { name: "Go on from the last checkpoint" }).waitFor();
-    await page.context().close();
   });
 
   it("says why an upload or a training is refused", async () => {
-    const page = await openPage(browser, service, "#/train");
-    await upload(page, files.broken, "broken");
+    const page = await openPage(at, "#/train");
+    await upload(page, at.files.broken, "broken");
     const problem = page.getByTestId("upload-problem");
     await problem.getByText("frame 5").waitFor();
     await picture(page, "train-refused");
@@ -111,14 +98,12 @@ describe("train", () => {
     await page.getByLabel("Scene", { exact: true }).last().fill("demo");
     await page.getByRole("button", { name: "Start the training" }).click();
     await page.getByRole("alert").getByText("there is already a scene 'demo'").waitFor();
-    const names = (await (await fetch(`${service.url}/v1/datasets`)).json()).datasets.map(({ name }) => name);
+    const names = (await (await fetch(`${at.service.url}/v1/datasets`)).json()).datasets.map(({ name }) => name);
     assert.deepEqual(names, ["sweep"]);
-    await page.context().close();
   });
 
   it("says that a job is gone", async () => {
-    const page = await openPage(browser, service, "#/train/0123456789abcdef01234567");
+    const page = await openPage(at, "#/train/0123456789abcdef01234567");
     await page.getByText("There is no such job").waitFor();
-    await page.context().close();
   });
 });

@@ -2,25 +2,15 @@
 
 import assert from "node:assert/strict";
 import { readFileSync } from "node:fs";
-import { after, before, describe, it } from "node:test";
+import { describe, it } from "node:test";
 
-import { hold, launch, openPage, Service, until } from "./harness.mjs";
-import { makeSweep, put } from "./sweep.mjs";
+import { hold, openPage, until } from "./harness.mjs";
+import { put } from "./sweep.mjs";
+import { tested } from "./tested.mjs";
 
-let service;
-let browser;
-let files;
-
-before(async () => {
-  files = makeSweep();
-  service = await Service.start();
-  browser = await launch();
-  await put(service, "/v1/datasets/sweep", readFileSync(files.sweep), "application/zip");
-});
-after(async () => {
-  await browser?.close();
-  await service?.stop();
-  files?.remove();
+const at = tested({
+  sweep: true,
+  prepare: ({ service, files }) => put(service, "/v1/datasets/sweep", readFileSync(files.sweep), "application/zip"),
 });
 
 /** Closes the page as a person does; whether it asked first. */
@@ -38,7 +28,7 @@ async function asksBeforeClosing(page) {
 
 describe("an upload", () => {
   it("goes on while other views are looked at, and leaving the page asks first", async () => {
-    const page = await openPage(browser, service, "#/train");
+    const page = await openPage(at, "#/train");
     await page.locator("summary", { hasText: /^Settings$/ }).click();
     const scene = page.getByRole("textbox", { name: "Scene" });
     assert.equal(await scene.inputValue(), "sweep");
@@ -50,12 +40,12 @@ describe("an upload", () => {
     await page.getByLabel("Steps").fill("77");
 
     const release = await hold(page, /\/v1\/datasets\/slow\?/);
-    await page.getByLabel("Add a sweep").setInputFiles(files.sweep);
+    await page.getByLabel("Add a sweep").setInputFiles(at.files.sweep);
     await page.getByLabel("Name", { exact: true }).fill("slow");
     await page.getByRole("button", { name: "Upload and check" }).click();
     const progress = page.getByLabel("Upload", { exact: true });
     await progress.waitFor();
-    await page.getByRole("region", { name: "Trainings" }).getByRole("link").click();
+    await page.getByRole("region", { name: "Jobs" }).getByRole("link").click();
     await page.getByText("It waits for its turn.").waitFor();
     assert.equal(await progress.count(), 1);
     assert.equal(await page.getByLabel("Steps").inputValue(), "77");
@@ -70,13 +60,12 @@ describe("an upload", () => {
     assert.equal(await progress.count(), 0);
     assert.deepEqual([page.faults, page.foreign], [[], []]);
     assert.equal(await asksBeforeClosing(page), false);
-    await page.context().close();
   });
 });
 
 describe("a dataset", () => {
   it("stays as it is looked at while the list is asked for again", async () => {
-    const page = await openPage(browser, service, "#/scenes");
+    const page = await openPage(at, "#/scenes");
     await page.addInitScript(() => {
       globalThis.buffersMade = 0;
       const { prototype } = WebGL2RenderingContext;
@@ -86,7 +75,7 @@ describe("a dataset", () => {
         return createBuffer.call(this);
       };
     });
-    await page.goto(`${service.url}/#/train`);
+    await page.goto(`${at.service.url}/#/train`);
     await page.reload();
     const room = page.getByTestId("space").locator("canvas");
     const shown = async () => (await room.screenshot()).toString("base64");
@@ -106,13 +95,12 @@ describe("a dataset", () => {
     await page.evaluate(() => new Promise((resolve) => requestAnimationFrame(() => requestAnimationFrame(resolve))));
     assert.equal(await page.evaluate(() => globalThis.buffersMade), made, "it is built anew at each answer");
     assert.equal(await shown(), before, "it was looked at from elsewhere");
-    await page.context().close();
   });
 });
 
 describe("a long training", () => {
   it("asks for a thinner curve once, and goes on where that fails", async () => {
-    const page = await openPage(browser, service, "#/scenes");
+    const page = await openPage(at, "#/scenes");
     const steps = 1700;
     const job = (step, state) => ({
       id: "long", kind: "train", state, specification: { dataset: "sweep", scene: "long" },
@@ -131,6 +119,5 @@ describe("a long training", () => {
     assert.ok(asked <= 3, `${asked} times`); // the first, the thinner one, that of the next connection
     await page.getByText("The service does not answer. Trying again.").waitFor();
     assert.deepEqual(page.faults.filter((fault) => !fault.startsWith("Failed to load resource")), []);
-    await page.context().close();
   });
 });

@@ -31,3 +31,22 @@ export function nameOfFile(file: string): string {
 }
 
 export const NAME_PATTERN = "[A-Za-z0-9][A-Za-z0-9._\\-]{0,127}";
+
+/** `name = value` a line, the values as JSON, or as text where they are none. Throws an Error in words. */
+export function namedValues(lines: string): Record<string, unknown> {
+  const values: Record<string, unknown> = {};
+  for (const line of lines.split("\n").filter((one) => one.trim() !== "")) {
+    const [name = "", ...value] = line.split("=");
+    if (value.length === 0) throw new Error(`"${line.trim()}" must be written as name = value.`);
+    values[name.trim()] = readValue(value.join("=").trim());
+  }
+  return values;
+}
+
+function readValue(text: string): unknown {
+  try {
+    return JSON.parse(text) as unknown;
+  } catch {
+    return text;
+  }
+}

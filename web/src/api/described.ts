@@ -36,3 +36,8 @@ export function labelOf(name: string): { label: string; unit: string } {
 export function defaultsOf({ properties = {} }: Described): Record<string, unknown> {
   return Object.fromEntries(Object.entries(properties).map(([name, field]) => [name, field.default]));
 }
+
+/** Whether one input is enough for a value. */
+export function isSimple({ type, enum: choices }: Described): boolean {
+  return choices !== undefined || ["number", "integer", "boolean", "string"].includes(type ?? "");
+}

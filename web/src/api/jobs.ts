@@ -1,10 +1,11 @@
-/** Jobs: trainings above all, followed while they run. */
+/** Jobs: trainings above all, started and followed while they run. */
 
 import { address, getJson, postJson, request, type Schemas } from "./client";
+import type { Described } from "./described";
+import { jobs } from "./generated/contract";
 
-export type Training = Schemas["TrainSpecification"];
-/** One that trains: the only kind that the console asks for. */
-export type Job = Omit<Schemas["JobOut"], "specification"> & { specification: Training };
+/** The specifications of jobs have these beside what their kind needs. */
+export type Job = Schemas["JobOut"] & { specification: { scene?: string; dataset?: string; preset?: string } };
 export type JobState = Job["state"];
 export type CurvePoint = Schemas["CurvePointOut"];
 
@@ -14,13 +15,16 @@ export function isFinal(job: Job): boolean {
   return FINAL.includes(job.state);
 }
 
-/** The newest trainings. */
-export async function listTrainings(count: number): Promise<Job[]> {
-  return (await getJson("/v1/jobs", {}, { query: { kind: "train", page_size: String(count) } })).jobs as unknown as Job[];
+/** What a job of each kind is specified by. */
+export const JOB_KINDS: ReadonlyMap<string, Described> = new Map(Object.entries(jobs));
+
+/** The newest jobs. */
+export async function listJobs(count: number): Promise<Job[]> {
+  return (await getJson("/v1/jobs", {}, { query: { page_size: String(count) } })).jobs as Job[];
 }
 
-export function startTraining(specification: Partial<Training>): Promise<Job> {
-  return postJson("/v1/jobs", {}, { kind: "train", specification }) as Promise<unknown> as Promise<Job>;
+export function startJob(kind: string, specification: Record<string, unknown>): Promise<Job> {
+  return postJson("/v1/jobs", {}, { kind, specification }) as Promise<Job>;
 }
 
 export function cancelJob(job: string): Promise<unknown> {
@@ -28,7 +32,7 @@ export function cancelJob(job: string): Promise<unknown> {
 }
 
 export function retryJob(job: string): Promise<Job> {
-  return postJson("/v1/jobs/{job}:retry", { job }) as Promise<unknown> as Promise<Job>;
+  return postJson("/v1/jobs/{job}:retry", { job }) as Promise<Job>;
 }
 
 /** The training so far, in a few hundred points. */

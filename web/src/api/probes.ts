@@ -4,7 +4,7 @@ import { postJson, type Schemas } from "./client";
 import { labelOf, type Described } from "./described";
 import { settings } from "./generated/contract";
 
-export type Probe = Schemas["FrameHeader"]["probe"];
+export type Probe = NonNullable<Schemas["DatasetRecord"]["probe"]>;
 /** Where the scan lines run in the image plane. */
 export type ImagePlane = Schemas["ImagePlane"];
 

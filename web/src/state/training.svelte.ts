@@ -1,8 +1,8 @@
-/** Datasets and trainings of the service, as the Train view lists them. */
+/** Datasets and jobs of the service, as the Train view lists them. */
 
 import { explain } from "../api/client";
 import { listDatasets, type Dataset } from "../api/datasets";
-import { listTrainings, type Job } from "../api/jobs";
+import { listJobs, type Job } from "../api/jobs";
 
 const POLL_MS = 4000;
 const JOBS_LISTED = 20;
@@ -21,7 +21,7 @@ class TrainingState {
   async refresh(): Promise<void> {
     const asked = ++this.#asked;
     try {
-      const [datasets, jobs] = await Promise.all([listDatasets(), listTrainings(JOBS_LISTED)]);
+      const [datasets, jobs] = await Promise.all([listDatasets(), listJobs(JOBS_LISTED)]);
       if (asked < this.#taken) return;
       this.#taken = asked;
       this.datasets = datasets.map((dataset) => this.#known(dataset));
