@@ -50,7 +50,7 @@ class TrainJob(_message.Message):
     def __init__(self, dataset: _Optional[str] = ..., scene: _Optional[str] = ..., preset: _Optional[str] = ..., settings: _Optional[_Union[_struct_pb2.Struct, _Mapping]] = ..., device: _Optional[str] = ...) -> None: ...
 
 class RenderJob(_message.Message):
-    __slots__ = ("scene", "poses", "sampler", "height", "width", "outputs", "format", "pose_count", "dtype", "min_confidence")
+    __slots__ = ("scene", "poses", "sampler", "height", "width", "outputs", "format", "pose_count", "dtype", "min_confidence", "probe", "display", "below_min_confidence")
     SCENE_FIELD_NUMBER: _ClassVar[int]
     POSES_FIELD_NUMBER: _ClassVar[int]
     SAMPLER_FIELD_NUMBER: _ClassVar[int]
@@ -61,6 +61,9 @@ class RenderJob(_message.Message):
     POSE_COUNT_FIELD_NUMBER: _ClassVar[int]
     DTYPE_FIELD_NUMBER: _ClassVar[int]
     MIN_CONFIDENCE_FIELD_NUMBER: _ClassVar[int]
+    PROBE_FIELD_NUMBER: _ClassVar[int]
+    DISPLAY_FIELD_NUMBER: _ClassVar[int]
+    BELOW_MIN_CONFIDENCE_FIELD_NUMBER: _ClassVar[int]
     scene: str
     poses: _containers.RepeatedCompositeFieldContainer[_geometry_pb2.Pose]
     sampler: PoseSampler
@@ -71,7 +74,10 @@ class RenderJob(_message.Message):
     pose_count: int
     dtype: str
     min_confidence: float
-    def __init__(self, scene: _Optional[str] = ..., poses: _Optional[_Iterable[_Union[_geometry_pb2.Pose, _Mapping]]] = ..., sampler: _Optional[_Union[PoseSampler, _Mapping]] = ..., height: _Optional[int] = ..., width: _Optional[int] = ..., outputs: _Optional[_Iterable[_Union[_rendering_pb2.Output, str]]] = ..., format: _Optional[str] = ..., pose_count: _Optional[int] = ..., dtype: _Optional[str] = ..., min_confidence: _Optional[float] = ...) -> None: ...
+    probe: _geometry_pb2.Probe
+    display: _rendering_pb2.Display
+    below_min_confidence: _rendering_pb2.BelowConfidence
+    def __init__(self, scene: _Optional[str] = ..., poses: _Optional[_Iterable[_Union[_geometry_pb2.Pose, _Mapping]]] = ..., sampler: _Optional[_Union[PoseSampler, _Mapping]] = ..., height: _Optional[int] = ..., width: _Optional[int] = ..., outputs: _Optional[_Iterable[_Union[_rendering_pb2.Output, str]]] = ..., format: _Optional[str] = ..., pose_count: _Optional[int] = ..., dtype: _Optional[str] = ..., min_confidence: _Optional[float] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., display: _Optional[_Union[_rendering_pb2.Display, _Mapping]] = ..., below_min_confidence: _Optional[_Union[_rendering_pb2.BelowConfidence, str]] = ...) -> None: ...
 
 class PoseSampler(_message.Message):
     __slots__ = ("kind", "count", "translation_mm", "rotation_deg", "seed", "spacing_mm", "tilt_deg", "step_deg")

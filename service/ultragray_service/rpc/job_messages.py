@@ -1,103 +1,69 @@
-"""Between the messages of jobs and the values of the job store."""
+"""Between the messages of jobs and the values of the job store. Knows no kinds: a specification has the fields of the
+message that the oneof `specification` holds under its kind.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
-from google.protobuf.json_format import MessageToDict, SerializeToJsonError
+from google.protobuf.descriptor import Descriptor, EnumDescriptor, FieldDescriptor
+from google.protobuf.json_format import ParseDict
 
-from ultragray.contract import under
-from ultragray.errors import InvalidArgument
+from ultragray.contract import annotated_fields, under
+from ultragray.errors import InvalidArgument, UltragrayError
+from ultragray_proto.codec import MessageInvalid, from_message, to_message, words
 from ultragray_proto.v1 import jobs_pb2, scenes_pb2
-from ultragray_workers.jobs.kinds import Specification
-from ultragray_workers.jobs.specification import from_dict
+from ultragray_workers.jobs.kinds import KINDS, Specification
 from ultragray_workers.jobs.store import Job
 
-from .messages import OUTPUT_NUMBERS, output_name, poses_from_messages
+from .messages import poses_from_messages
 
-STATES: dict[int, str] = {
-    jobs_pb2.JOB_STATE_UNSPECIFIED: "",
-    jobs_pb2.JOB_STATE_QUEUED: "queued",
-    jobs_pb2.JOB_STATE_RUNNING: "running",
-    jobs_pb2.JOB_STATE_SUCCEEDED: "succeeded",
-    jobs_pb2.JOB_STATE_FAILED: "failed",
-    jobs_pb2.JOB_STATE_CANCELLED: "cancelled",
-}
-KINDS: dict[int, str] = {
-    jobs_pb2.JOB_KIND_UNSPECIFIED: "",
-    jobs_pb2.JOB_KIND_TRAIN: "train",
-    jobs_pb2.JOB_KIND_RENDER: "render",
-}
-_SAMPLER_NUMBERS = ("count", "translation_mm", "rotation_deg", "seed", "spacing_mm", "tilt_deg", "step_deg")
-_OPTIONAL = ("height", "width", "min_confidence")
-_PROGRESS = (
-    "step",
-    "steps",
-    "loss",
-    "val_psnr_db",
-    "gaussians",
-    "frames_done",
-    "frames",
-    "rate_per_s",
-    "seconds_left",
-    "waits_for",
-)
+_STRUCT = "google.protobuf.Struct"
 
 
-def filter_from_number(number: int, names: dict[int, str], field: str) -> str:
-    """The name of an enum's value, empty for none. Raises InvalidArgument."""
-    if number not in names:
+def filter_from_number(number: int, enum: EnumDescriptor, field: str) -> str:
+    """The word of an enum's value, empty for UNSPECIFIED. Raises InvalidArgument."""
+    known = {0: "", **words(enum)}
+    if number not in known:
         raise InvalidArgument(f"{field} must be one of its enum's values, got {number}", field=field)
-    return names[number]
+    return known[number]
 
 
 def specification_from_message(message: jobs_pb2.SubmitJobRequest) -> tuple[Specification, str]:
     """The checked specification, and the field that holds it.
 
-    Raises InvalidArgument, InvalidPose, UnknownOutput; their field is a path.
+    Raises InvalidArgument, InvalidPose, InvalidProbe, UnknownOutput; their field is a path.
     """
     kind = message.WhichOneof("specification")
     if kind is None:
-        raise InvalidArgument("train or render is required", field="train")
+        raise InvalidArgument(f"specification must hold one of {', '.join(KINDS)}", field="specification")
+    part = getattr(message, kind)
     with under(kind):
-        written = _written_train(message.train) if kind == "train" else _written_render(message.render)
-        return from_dict({"kind": kind, **written}), kind
+        others = {}
+        if "poses" in part.DESCRIPTOR.fields_by_name:  # read all at once: there may be many
+            others = {"poses": poses_from_messages(part.poses, "poses") if part.poses else None}
+        return _read(part, Specification.member(kind), **others), kind
 
 
-def _written_train(message: jobs_pb2.TrainJob) -> dict[str, Any]:
-    written = {"dataset": message.dataset, "scene": message.scene, "settings": _settings(message)}
-    return written | {name: value for name in ("preset", "device") if (value := getattr(message, name))}
-
-
-def _settings(message: jobs_pb2.TrainJob) -> dict[str, Any]:
-    """A Struct holds every number as a double: those without a fraction are integers again."""
+def _read(message: Any, cls: Any, **others: Any) -> Specification:
     try:
-        settings = MessageToDict(message.settings)
-    except (ValueError, SerializeToJsonError) as error:  # of a number that is not finite
-        raise InvalidArgument(f"settings must hold finite numbers: {error}", field="settings") from None
-    return {
-        name: int(value) if isinstance(value, float) and value.is_integer() else value
-        for name, value in settings.items()
-    }
-
-
-def _written_render(message: jobs_pb2.RenderJob) -> dict[str, Any]:
-    written: dict[str, Any] = {"scene": message.scene}
-    if message.poses:
-        written["poses"] = poses_from_messages(message.poses, "poses")
-    if message.HasField("sampler"):
-        sampler = message.sampler
-        numbers = {name: getattr(sampler, name) for name in _SAMPLER_NUMBERS if sampler.HasField(name)}
-        written["sampler"] = {"kind": sampler.kind, **numbers}
-    written |= {name: getattr(message, name) for name in _OPTIONAL if message.HasField(name)}
-    if message.outputs:
-        written["outputs"] = [output_name(number) for number in message.outputs]
-    return written | {name: value for name in ("format", "dtype") if (value := getattr(message, name))}
+        specification: Specification = from_message(message, cls, **others)
+    except MessageInvalid as error:
+        if not isinstance(error.original, UltragrayError):
+            known = {item.name: item.metadata for item, _ in annotated_fields(cls)}
+            cause = known.get(error.field.partition(".")[0], {}).get("error", InvalidArgument)
+            raise cause(str(error), field=error.field) from None
+        if not error.field:
+            raise error.original from None
+        with under(error.field):
+            raise error.original from None
+    return specification
 
 
 def job_message(job: Job) -> jobs_pb2.Job:
     """The message of a job."""
-    progress = {name: value for name in _PROGRESS if (value := getattr(job.progress, name)) is not None}
+    error = scenes_pb2.Error(reason=job.error or "", detail=job.reason) if job.reason else None
     message = jobs_pb2.Job(
         id=job.id,
         kind=f"JOB_KIND_{job.kind.upper()}",
@@ -107,34 +73,38 @@ def job_message(job: Job) -> jobs_pb2.Job:
         created_at=job.created_at,
         started_at=job.started_at or "",
         finished_at=job.finished_at or "",
-        error=scenes_pb2.Error(reason=job.error or "", detail=job.reason) if job.reason else None,
-        progress=jobs_pb2.JobProgress(**progress),
+        error=error,
+        progress=to_message(job.progress, jobs_pb2.JobProgress),
         artifacts=job.artifacts,
         metrics=job.metrics,
         worker=job.worker or "",
         retry_of=job.retry_of or "",
         attempts=job.attempts,
     )
-    if job.kind == "train":
-        _tell_train(message.train, job.specification)
-    else:
-        _tell_render(message.render, job.specification)
+    part = getattr(message, job.kind)
+    part.SetInParent()
+    ParseDict(_fields_of(job.specification, part.DESCRIPTOR), part)
     return message
 
 
-def _tell_train(message: jobs_pb2.TrainJob, specification: dict[str, Any]) -> None:
-    for name in ("dataset", "scene", "preset", "device"):
-        setattr(message, name, specification[name])
-    message.settings.update(specification["settings"])
+def _fields_of(document: Mapping[str, Any], descriptor: Descriptor) -> dict[str, Any]:
+    """A specification's JSON, or a part of it, in protobuf's JSON."""
+    found = {}
+    for field in descriptor.fields:
+        value = document.get(field.name)
+        if value is not None:
+            found[field.name] = (
+                [_value_of(one, field) for one in value] if field.is_repeated else _value_of(value, field)
+            )
+    return found
 
 
-def _tell_render(message: jobs_pb2.RenderJob, specification: dict[str, Any]) -> None:
-    message.scene, message.format = specification["scene"], specification["format"]
-    message.dtype = specification.get("dtype") or ""
-    message.pose_count = specification.get("pose_count", 0)
-    message.outputs.extend(OUTPUT_NUMBERS[name] for name in specification["outputs"])
-    for name in _OPTIONAL:
-        if specification.get(name) is not None:
-            setattr(message, name, specification[name])
-    if specification.get("sampler") is not None:
-        message.sampler.CopyFrom(jobs_pb2.PoseSampler(**specification["sampler"]))
+def _value_of(value: Any, field: FieldDescriptor) -> Any:
+    if field.enum_type is not None:
+        return {word: number for number, word in words(field.enum_type).items()}[value]
+    if field.message_type is None or field.message_type.full_name == _STRUCT:
+        return value
+    member = field.message_type.fields_by_name.get(value.get("kind", ""))
+    if member is not None:  # a oneof by kinds
+        return {member.name: _fields_of(value, member.message_type)}
+    return _fields_of(value, field.message_type)

@@ -14,7 +14,7 @@ from ultragray_workers.errors import Draining
 from ..core.catalog import DEFAULT_PAGE_SIZE
 from ..core.job_log import DEFAULT_LOG_BYTES, MAX_LOG_BYTES
 from ..core.state import Service
-from .job_messages import KINDS, STATES, filter_from_number, job_message, specification_from_message
+from .job_messages import filter_from_number, job_message, specification_from_message
 
 _CHUNK_BYTES = 2**20
 _LOOK_AROUND_S = 15.0  # how long a watch waits for news at a time
@@ -40,8 +40,8 @@ class JobService:
         self, request: jobs_pb2.ListJobsRequest, context: grpc.aio.ServicerContext
     ) -> jobs_pb2.ListJobsResponse:
         jobs, next_page_token = await self._service.jobs.page(
-            state=filter_from_number(request.state, STATES, "state"),
-            kind=filter_from_number(request.kind, KINDS, "kind"),
+            state=filter_from_number(request.state, jobs_pb2.JobState.DESCRIPTOR, "state"),
+            kind=filter_from_number(request.kind, jobs_pb2.JobKind.DESCRIPTOR, "kind"),
             page_size=request.page_size or DEFAULT_PAGE_SIZE,
             page_token=request.page_token,
         )

@@ -89,7 +89,7 @@ def test_the_same_request_id_gives_the_same_job(jobs: jobs_pb2_grpc.JobServiceSt
 @pytest.mark.parametrize(
     ("request_message", "expected"),
     [
-        (jobs_pb2.SubmitJobRequest(), ("INVALID_ARGUMENT", "INVALID_ARGUMENT", "train")),
+        (jobs_pb2.SubmitJobRequest(), ("INVALID_ARGUMENT", "INVALID_ARGUMENT", "specification")),
         (
             jobs_pb2.SubmitJobRequest(train=jobs_pb2.TrainJob(scene="new")),
             ("INVALID_ARGUMENT", "INVALID_ARGUMENT", "train.dataset"),
@@ -230,7 +230,7 @@ def test_settings_that_no_training_takes_are_refused(jobs: jobs_pb2_grpc.JobServ
         train = jobs_pb2.TrainJob(dataset="gone", scene="new")
         train.settings.update({"means_rate": number})
         refused = refusal(lambda: jobs.SubmitJob(jobs_pb2.SubmitJobRequest(train=train)))  # noqa: B023
-        assert refused == ("INVALID_ARGUMENT", "INVALID_ARGUMENT", "train.settings")
+        assert refused == ("INVALID_ARGUMENT", "INVALID_ARGUMENT", "train.settings.means_rate")
 
 
 def test_whole_numbers_of_settings_are_integers() -> None:

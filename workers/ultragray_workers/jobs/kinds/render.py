@@ -11,16 +11,15 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from ultragray.confidence import Assessor, Extrapolation, require_confidence
-from ultragray.contract import described, kind_field, shown
+from ultragray.contract import described, kind_field, shown, under
 from ultragray.errors import InvalidArgument
-from ultragray.image_size import MAX_IMAGE_SIDE, check_image_size
-from ultragray.interchange.exports import check_format
-from ultragray.outputs import OUTPUTS, check_outputs
+from ultragray.interchange.exports import FORMATS, check_format
+from ultragray.interchange.exports.formats import DTYPES
+from ultragray.outputs import OUTPUTS
 from ultragray.pose import check_poses
-from ultragray.probe import FloatArray, Probe
+from ultragray.probe import FloatArray, Picture, Probe
 from ultragray.samplers import MAX_POSES, Assess, Sampler, TrainingSampler, assessed_poses
-from ultragray.scene_info import SceneInfo
-from ultragray.settings import Encoding, FrameSettings, Resolved
+from ultragray.settings import Encoding, FrameSettings
 
 from ...errors import StorageFull
 from .base import Specification, Surroundings
@@ -31,31 +30,23 @@ _MB, _GB = 1e6, 1e9
 Poses: TypeAlias = FloatArray | list[list[list[float]]]  # [C, 4, 4] mm
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class RenderJob(Specification):
+@dataclass(frozen=True, eq=False)
+class RenderJob(FrameSettings, Specification):
     """Many frames of a scene become one archive, at `poses`, or at those that `sampler` makes.
 
     The sampler makes them of `poses`, or where none are given of the scene's training poses. Poses are kept as an array
-    of exact ones: up to 100,000 of them would be millions of Python's objects. A sampler keeps to poses that have
-    `min_confidence`; `poses` without a sampler must all have it. Raises InvalidArgument, InvalidPose, InvalidImageSize,
-    UnknownOutput.
+    of exact ones: up to 100,000 of them would be millions of Python's objects. Where `below_min_confidence` is refuse,
+    a sampler keeps to poses that have `min_confidence`, and `poses` without a sampler must all have it. Raises
+    InvalidArgument, InvalidPose, InvalidProbe, InvalidImageSize, UnknownOutput.
     """
 
     scene: str = described("Name of a scene.")
     poses: Poses | None = described("4x4 matrices, mm, probe to scene.", None)
     sampler: Sampler | None = described("Makes poses of the given ones, else of the scene's training poses.", None)
-    height: int | None = described("Depth samples. Default: as trained, else 512.", None)
-    width: int | None = described("Scan lines. Default: as trained, else 512.", None)
-    outputs: tuple[str, ...] = described("Some of bmode, echo, transmittance, coverage, labels.", ("bmode",))
-    format: str = described("tar: WebDataset; dicom and plus (.igs.mha): bmode in uint8.", "npz")
-    dtype: str | None = described("uint8 or float32. Default: the format's own.", None)
-    min_confidence: float | None = described(
-        "0 to 1. Poses below it are refused. Samplers keep within it: around and covered draw on until they have their "
-        "count, the others leave such poses out.",
-        None,
-        low=0.0,
-        high=1.0,
+    format: str = described(
+        "tar: WebDataset; dicom and plus (.igs.mha): bmode in uint8, true to scale.", "npz", choices=tuple(FORMATS)
     )
+    dtype: str | None = described("Default: the format's own.", None, choices=DTYPES)
     kind: Literal["render"] = kind_field("render")
 
     run_module = "render_run"
@@ -75,9 +66,6 @@ class RenderJob(Specification):
                     f"poses must be a list of 1 to {MAX_POSES} 4x4 matrices, got {shown(length)}", field="poses"
                 )
             object.__setattr__(self, "poses", check_poses(self.poses))
-        check_image_size(1 if self.height is None else self.height, 1)
-        check_image_size(1, 1 if self.width is None else self.width)
-        object.__setattr__(self, "outputs", check_outputs(self.outputs))
         check_format(self.format, self.outputs, self.dtype)
 
     def __eq__(self, other: object) -> bool:
@@ -94,19 +82,15 @@ class RenderJob(Specification):
         """
         scene = surroundings.scene
         assert scene is not None
-        settings = self.settings(scene.info, surroundings.max_image_side)
+        settings = self.resolved(scene.info, Encoding.FLOAT32, max_image_side=surroundings.max_image_side)
         poses = self.poses_of(scene.training_poses, settings.probe)
         few = len(poses) * len(scene.training_poses) <= ASSESSED_AT_ONCE
-        if self.min_confidence is not None and self.sampler is None and few:
-            require_confidence(Assessor(scene.info, scene.training_poses).assess(poses), self.min_confidence)
-        self._check_room(len(poses), settings.height, settings.width, surroundings.artifact_folder)
-
-    def settings(self, info: SceneInfo, max_image_side: int = MAX_IMAGE_SIDE) -> Resolved:
-        """How the frames are rendered. Raises as FrameSettings.resolved."""
-        asked = FrameSettings(
-            height=self.height, width=self.width, outputs=self.outputs, min_confidence=self.min_confidence
-        )
-        return asked.resolved(info, Encoding.FLOAT32, max_image_side=max_image_side)
+        if self.least_confidence is not None and self.sampler is None and few:
+            assessor = Assessor(scene.info, scene.training_poses)
+            require_confidence(assessor.assess(poses, probe=settings.probe), self.least_confidence)
+        with under("display"):
+            picture = FORMATS[self.format].shown(settings).picture
+        self._check_room(len(poses), picture, surroundings.artifact_folder)
 
     def poses_of(self, training_poses: FloatArray, probe: Probe) -> FloatArray:  # [P, 4, 4] -> [C, 4, 4] mm
         """The poses that the job asks for, whatever their confidence; the same training poses and probe give the same.
@@ -119,11 +103,11 @@ class RenderJob(Specification):
     def assessed_poses(
         self, training_poses: FloatArray, probe: Probe, assess: Assess
     ) -> tuple[FloatArray, Sequence[Extrapolation]]:  # [P, 4, 4] -> [C, 4, 4] mm, [C]
-        """The poses to render, each with its `min_confidence`, and what `assess` finds about each.
+        """The poses to render, each with its `least_confidence`, and what `assess` finds about each.
 
         Raises LowConfidence for a given pose below it and for a sampler that keeps too few, and what `poses_of` raises.
         """
-        return assessed_poses(self.sampler, self._base(training_poses), probe, assess, self.min_confidence)
+        return assessed_poses(self.sampler, self._base(training_poses), probe, assess, self.least_confidence)
 
     def _base(self, training_poses: FloatArray) -> FloatArray:  # [P, 4, 4] -> [P, 4, 4]
         if self.poses is not None:
@@ -132,14 +116,14 @@ class RenderJob(Specification):
             raise InvalidArgument(f"sampler needs training poses, the scene {self.scene!r} has none", field="sampler")
         return training_poses
 
-    def _check_room(self, frames: int, height: int, width: int, folder: Path) -> None:
+    def _check_room(self, frames: int, picture: Picture, folder: Path) -> None:
         dtype = np.dtype(check_format(self.format, self.outputs, self.dtype))
         pixel_bytes = sum(1 if OUTPUTS[name].is_numbers else dtype.itemsize for name in self.outputs)
-        needed, free = frames * height * width * pixel_bytes, shutil.disk_usage(folder).free
+        needed, free = frames * picture.height * picture.width * pixel_bytes, shutil.disk_usage(folder).free
         if needed > free:
             raise StorageFull(
-                f"{frames:,} frames of {height}x{width} take up to {_size(needed)}, the artifact folder has "
-                f"{_size(free)} left",
+                f"{frames:,} frames of {picture.height}x{picture.width} take up to {_size(needed)}, the artifact "
+                f"folder has {_size(free)} left",
                 field="poses" if self.sampler is None else "sampler",
             )
 

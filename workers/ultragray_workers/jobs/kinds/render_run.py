@@ -11,10 +11,11 @@ from ultragray.confidence import Assessor, Extrapolation
 from ultragray.files.atomic import file_sha256
 from ultragray.interchange.exports import FORMATS
 from ultragray.interchange.rendering import render_to_file
-from ultragray.probe import FloatArray
+from ultragray.probe import FloatArray, Probe
 from ultragray.samplers import Assess
 from ultragray.scene import GaussianScene
 from ultragray.scene_info import SceneHeader, read_header
+from ultragray.settings import Encoding
 from ultragray.training.device import training_device
 
 from ...scenes import SUFFIX
@@ -41,8 +42,8 @@ def run(job_run: JobRun, job: RenderJob) -> Outcome:
 def _render_on(device: torch.device, job_run: JobRun, job: RenderJob) -> Outcome:
     path = job_run.folder.path / f"{job.scene}{SUFFIX}"
     described = read_header(path)
-    settings = job.settings(described.info)
-    assess = _assessing(job_run, described)
+    settings = job.resolved(described.info, Encoding.FLOAT32)
+    assess = _assessing(job_run, described, settings.probe)
     poses, extrapolations = job.assessed_poses(described.training_poses, settings.probe, assess)
     scene = GaussianScene.load(path).to(device)
     size = f"{settings.height}x{settings.width}"
@@ -73,7 +74,7 @@ def _render_on(device: torch.device, job_run: JobRun, job: RenderJob) -> Outcome
     return Outcome(artifacts=job_run.folder.artifact_names())
 
 
-def _assessing(job_run: JobRun, described: SceneHeader) -> Assess:
+def _assessing(job_run: JobRun, described: SceneHeader, probe: Probe) -> Assess:
     """A function that tells how far poses extrapolate, until the job is to stop."""
     assessor = Assessor(described.info, described.training_poses)
     at_once = max(1, ASSESSED_AT_ONCE // max(1, len(described.training_poses)))
@@ -83,7 +84,7 @@ def _assessing(job_run: JobRun, described: SceneHeader) -> Assess:
         for first in range(0, len(poses), at_once):
             if job_run.should_stop():
                 raise Stopped
-            found.extend(assessor.assess(poses[first : first + at_once]))
+            found.extend(assessor.assess(poses[first : first + at_once], probe=probe))
         return found
 
     return assess
