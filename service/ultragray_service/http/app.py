@@ -52,8 +52,7 @@ _READ: tuple[Any, ...] = (
     RenderBody,
     StreamMessage,
     job_schemas.JobBody,
-    job_schemas.TrainSpecification,
-    job_schemas.RenderSpecification,
+    *job_schemas.SPECIFICATIONS,
 )
 _WRITTEN: tuple[Any, ...] = (problems.Problem, FrameHeader, RefusalMessage)
 

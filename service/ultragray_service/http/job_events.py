@@ -8,7 +8,7 @@ from starlette.responses import StreamingResponse
 from starlette.types import Receive, Scope, Send
 
 from ..core.job_hub import JobChange, JobWatch
-from .job_schemas import JobOut
+from .job_schemas import JOB_OUT, JobOut
 
 EVENTS_TYPE = "text/event-stream"
 KEEP_ALIVE_S = 15.0
@@ -42,7 +42,7 @@ def _written(change: JobChange) -> bytes:
     if change.log:
         text += _event("log", change.log)
     if change.job is not None:
-        text += _event("progress", JobOut.of(change.job).model_dump_json())
+        text += _event("progress", JOB_OUT.dump_json(JobOut.of(change.job)).decode())
     return text.encode()
 
 

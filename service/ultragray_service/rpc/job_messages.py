@@ -51,8 +51,8 @@ def _read(message: Any, cls: Any, **others: Any) -> Specification:
         specification: Specification = from_message(message, cls, **others)
     except MessageInvalid as error:
         if not isinstance(error.original, UltragrayError):
-            known = {item.name: item.metadata for item, _ in annotated_fields(cls)}
-            cause = known.get(error.field.partition(".")[0], {}).get("error", InvalidArgument)
+            errors = {item.name: item.metadata.get("error") for item, _ in annotated_fields(cls)}
+            cause = errors.get(error.field.partition(".")[0]) or InvalidArgument
             raise cause(str(error), field=error.field) from None
         if not error.field:
             raise error.original from None

@@ -5,19 +5,16 @@ from __future__ import annotations
 import json
 import threading
 import time
-import typing
 from collections.abc import Iterator
-from dataclasses import MISSING, fields
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 import httpx
 import pytest
 
-from ultragray.interchange.exports import FORMATS
-from ultragray.samplers import Sampler
-from ultragray_service.http.job_schemas import RenderSpecification, SamplerBody, TrainSpecification
-from ultragray_workers.jobs.kinds import RenderJob, TrainJob
+from ultragray_service.http.job_schemas import SPECIFICATIONS
+from ultragray_workers.jobs.kinds import Specification
 
 from ...waiting import at_this_load, wait_until
 from ..conftest import RunningService, StartService
@@ -260,23 +257,12 @@ def test_a_watcher_that_goes_away_is_let_go(client: httpx.Client, jobs_service: 
     wait_until(lambda: [line for line in jobs_service.log() if line.get("path") == route])  # logged when it has ended
 
 
-def test_the_documented_specifications_are_those_that_are_taken() -> None:
-    for model, taken in ((TrainSpecification, TrainJob), (RenderSpecification, RenderJob)):
-        asked = [field for field in fields(taken) if field.name != "kind"]
-        assert list(model.model_fields) == [field.name for field in asked]
-        defaults = {
-            field.name: field.default if field.default is not MISSING else {}
-            for field in asked
-            if not (field.default is MISSING and field.default_factory is MISSING)
-        }
-        documented = {name: field.default for name, field in model.model_fields.items() if not field.is_required()}
-        assert documented == defaults | ({"outputs": ["bmode"]} if taken is RenderJob else {})
-    assert set(SamplerBody.model_fields) == {"kind"} | {
-        field.name for cls in Sampler.members.values() for field in fields(cls)
-    }
-    kinds = typing.get_args(SamplerBody.model_fields["kind"].annotation)
-    formats = typing.get_args(RenderSpecification.model_fields["format"].annotation)
-    assert (set(kinds), formats) == (set(Sampler.members), tuple(FORMATS))
+def test_each_kind_has_a_documented_specification() -> None:
+    for model, (kind, taken) in zip(SPECIFICATIONS, Specification.members.items(), strict=True):
+        assert model.__name__ == f"{kind.title()}Specification"
+        assert set(model.model_fields) == {field.name for field in fields(taken)} - {"kind"}
+        required = {name for name, field in model.model_fields.items() if field.is_required()}
+        assert required == {"dataset", "scene"} & set(model.model_fields)
 
 
 def test_a_full_queue_refuses_and_a_stopping_service_ends_the_events_at_once(

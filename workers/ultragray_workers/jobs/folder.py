@@ -19,8 +19,9 @@ import shutil
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
+from ultragray.contract import described
 from ultragray.files.atomic import remove_stale_temporaries, sync, write_whole
 
 FOLDER = "jobs"
@@ -28,18 +29,20 @@ FOLDER = "jobs"
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a job is; None for what does not apply to its kind, or is not known yet."""
+    """How far a job is; null for what does not apply, or not yet."""
 
-    step: int | None = None  # of a training
+    __pydantic_config__: ClassVar[dict[str, Any]] = {"json_schema_serialization_defaults_required": True}
+
+    step: int | None = described("Steps of a training that are done.", None)
     steps: int | None = None
     loss: float | None = None
-    val_psnr_db: float | None = None
+    val_psnr_db: float | None = described("On the held-out frames, the last time it was measured.", None)
     gaussians: int | None = None
-    frames_done: int | None = None  # of a rendering
+    frames_done: int | None = described("Frames that are done, such as those of a render job in its archive.", None)
     frames: int | None = None
-    rate_per_s: float | None = None  # steps or frames
+    rate_per_s: float | None = described("Steps or frames.", None)
     seconds_left: float | None = None
-    waits_for: str | None = None  # the device, while another job of its host is at work on it
+    waits_for: str | None = described("The device, while another job of the same host is at work on it.", None)
 
     @classmethod
     def from_dict(cls, document: Mapping[str, Any]) -> Progress:

@@ -10,6 +10,8 @@ from typing import Any
 
 from dbos import WorkflowStatus
 
+from ultragray.contract import described
+
 from .folder import JobFolder, Outcome, Progress
 from .queue import database
 
@@ -37,27 +39,27 @@ STATUSES = {
 _STATE_OF = {status: state for state, statuses in STATUSES.items() for status in statuses}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Job:
-    """A job as it is now. Times are ISO 8601, UTC."""
+    """A job as it is now."""
 
     id: str
-    kind: str  # one of kinds.KINDS
+    kind: str
     state: JobState
     request_id: str | None
-    specification: dict[str, Any]  # of poses only their number, as pose_count
-    priority: int  # the higher, the earlier
-    created_at: str
-    started_at: str | None  # the last time
+    specification: dict[str, Any] = described("As it was sent; of poses only their number, as pose_count.")
+    priority: int
+    created_at: str = described("ISO 8601, UTC; likewise the other times.")
+    started_at: str | None = described("The last time.")
     finished_at: str | None
-    reason: str | None  # why it failed: one sentence
-    error: str | None  # the same, stable, such as DATASET_INVALID
+    reason: str | None = described("Why it failed: one sentence.")
+    error: str | None = described("Why it failed: the stable reason, such as DATASET_INVALID.")
     progress: Progress
-    artifacts: tuple[str, ...]  # names of files
-    metrics: dict[str, float]  # such as those of a trained scene on the held-out frames
+    artifacts: tuple[str, ...] = described("Names of the files to download.")
+    metrics: dict[str, float] = described("Of a scene on the held-out frames.")
     worker: str | None
-    retry_of: str | None
-    attempts: int  # how often it was started
+    retry_of: str | None = described("The job that this one goes on from.")
+    attempts: int = described("How often it was started.")
 
 
 def job_of_row(row: WorkflowStatus, artifact_folder: Path) -> Job:

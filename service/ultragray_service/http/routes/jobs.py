@@ -19,7 +19,7 @@ from ..accept import NPZ, PNG
 from ..deps import ServiceDep, problems
 from ..examples import JOB_EXAMPLES
 from ..job_events import EVENTS_TYPE, JobEvents
-from ..job_schemas import JobBody, JobOut, JobPage
+from ..job_schemas import JobBody, JobKindFilter, JobOut, JobPage
 from ..json_body import read_json_body
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
@@ -43,7 +43,7 @@ StateFilter = Annotated[
     Literal["", "queued", "running", "succeeded", "failed", "cancelled"],
     Query(description="Only jobs in this state; empty: all."),
 ]
-KindFilter = Annotated[Literal["", "train", "render"], Query(description="Only jobs of this kind; empty: all.")]
+KindFilter = Annotated[JobKindFilter, Query(description="Only jobs of this kind; empty: all.")]
 PageSize = Annotated[int, Query(ge=1, le=MAX_PAGE_SIZE, description="Jobs on one page.")]
 PageToken = Annotated[str, Query(description="next_page_token of the page before.")]
 LogBytes = Annotated[int, Query(ge=1, le=MAX_LOG_BYTES, description="How much of the log's end is given.")]
