@@ -300,13 +300,13 @@ class TrainingSampler:
 Sampler: TypeAlias = AroundSampler | CoveredSampler | FanSampler | SplineSampler | TrainingSampler
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class RenderJob:
+@dataclass(frozen=True, eq=False)
+class RenderJob(FrameSettings):
     """Many frames of a scene become one archive, at `poses`, or at those that `sampler` makes.
 
     The sampler makes them of `poses`, or where none are given of the scene's training poses. Poses are kept as an array
-    of exact ones: up to 100,000 of them would be millions of Python's objects. A sampler keeps to poses that have
-    `min_confidence`; `poses` without a sampler must all have it.
+    of exact ones: up to 100,000 of them would be millions of Python's objects. Where `below_min_confidence` is refuse,
+    a sampler keeps to poses that have `min_confidence`, and `poses` without a sampler must all have it.
     """
 
     scene: str
@@ -315,20 +315,10 @@ class RenderJob:
     """4x4 matrices, mm, probe to scene."""
     sampler: Sampler | None = None
     """Makes poses of the given ones, else of the scene's training poses."""
-    height: int | None = None
-    """Depth samples. Default: as trained, else 512."""
-    width: int | None = None
-    """Scan lines. Default: as trained, else 512."""
-    outputs: tuple[str, ...] = ("bmode",)
-    """Some of bmode, echo, transmittance, coverage, labels."""
     format: str = "npz"
-    """tar: WebDataset; dicom and plus (.igs.mha): bmode in uint8."""
-    dtype: str | None = None
-    """uint8 or float32. Default: the format's own."""
-    min_confidence: float | None = None
-    """0 to 1. Poses below it are refused. Samplers keep within it: around and covered draw on until they have their
-    count, the others leave such poses out.
-    """
+    """tar: WebDataset; dicom and plus (.igs.mha): bmode in uint8, true to scale."""
+    dtype: Literal["uint8", "float32"] | None = None
+    """Default: the format's own."""
     kind: Literal["render"] = field(default="render", repr=False, kw_only=True)
 
 

@@ -6,8 +6,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ultragray.display import Display
 from ultragray.errors import InvalidArgument
+from ultragray.probe import ConvexProbe
 from ultragray.samplers import AroundSampler, FanSampler, SplineSampler, TrainingSampler
+from ultragray.settings import Below
 from ultragray_workers.jobs.kinds import RenderJob, TrainJob
 from ultragray_workers.jobs.specification import from_dict, in_short, to_dict
 
@@ -24,6 +27,14 @@ POSES = np.tile(np.eye(4), (3, 1, 1)).tolist()
         RenderJob(scene="liver", poses=POSES, sampler=FanSampler(10.0, 2.5), format="dicom"),
         RenderJob(scene="liver", sampler=SplineSampler(spacing_mm=0.5)),
         RenderJob(scene="liver", sampler=TrainingSampler()),
+        RenderJob(
+            scene="liver",
+            sampler=TrainingSampler(),
+            probe=ConvexProbe(60.0, 50.0, 200.0),
+            display=Display(gain_db=3.0, tgc_db=(0.0, 6.0), depth_mm=80.0, pixel_mm=0.5),
+            min_confidence=0.5,
+            below_min_confidence=Below.MASK,
+        ),
     ],
 )
 def test_there_and_back(job: Any) -> None:
@@ -49,6 +60,14 @@ def test_long_names_are_cut() -> None:
         from_dict({"kind": "train", "dataset": "liver", "scene": "one", "x" * 10**6: 1})
     assert caught.value.field == "x" * 100
     assert len(caught.value.detail) < 300
+
+
+def test_a_row_of_an_earlier_release_is_read() -> None:
+    row = {"kind": "render", "scene": "liver", "sampler": {"kind": "fan", "tilt_deg": 5.0, "step_deg": 2.5}}
+    row |= {"height": None, "width": 30, "outputs": ["echo"], "format": "tar", "dtype": None, "min_confidence": None}
+    assert from_dict(row) == RenderJob(
+        scene="liver", sampler=FanSampler(5.0, 2.5), width=30, outputs=("echo",), format="tar"
+    )
 
 
 def test_in_short_holds_no_poses() -> None:
@@ -101,6 +120,11 @@ def around(**values: Any) -> dict[str, Any]:
         (render(height=0), "height"),
         (render(width=True), "width"),
         (render(outputs=["colour"]), "outputs"),
+        (render(probe={"kind": "round"}), "probe.kind"),
+        (render(probe={"kind": "linear", "width_mm": 0, "near_mm": 0, "far_mm": 1}), "probe.width_mm"),
+        (render(display={"gain_db": "loud"}), "display.gain_db"),
+        (render(display={"brightness": 1}), "display.brightness"),
+        (render(below_min_confidence="hide"), "below_min_confidence"),
         (render(outputs=[[1]]), "outputs[0]"),
         (render(format="zip"), "format"),
         (render(dtype="int8"), "dtype"),

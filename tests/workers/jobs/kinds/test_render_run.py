@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -11,12 +12,16 @@ import pydicom
 import pytest
 import torch
 
-from ultragray import GaussianScene, LinearProbe, render
+from ultragray import ConvexProbe, GaussianScene, LinearProbe, render
 from ultragray.confidence import Assessor, ConfidenceModel, figure_arrays
+from ultragray.contract import to_dict as to_json
 from ultragray.datasets.plus import read_plus_sweep
+from ultragray.display import Display
+from ultragray.display.frames import show
 from ultragray.errors import ExtraMissing, InvalidArgument, InvalidProbe, LowConfidence
 from ultragray.interchange import rendering
 from ultragray.samplers import AroundSampler, CoveredSampler, FanSampler, SplineSampler, TrainingSampler
+from ultragray.settings import Below
 from ultragray_workers.jobs.folder import JobFolder, Request
 from ultragray_workers.jobs.kinds import RenderJob, render_run
 from ultragray_workers.jobs.specification import to_dict
@@ -151,3 +156,33 @@ def test_a_missing_package_is_told_before_anything_is_rendered(
     job = RenderJob(scene="one", sampler=TrainingSampler(), format="hdf5")
     with pytest.raises(ExtraMissing, match=r"pip install 'ultragray\[hdf5\]'"):
         render_run.run(work(job), job)
+
+
+def test_frames_are_shown_as_asked_and_the_archive_says_where_their_pixels_lie(work: Callable[..., JobRun]) -> None:
+    probe, display = ConvexProbe(50.0, 20.0, 60.0), Display(gain_db=2.0, depth_mm=30.0, pixel_mm=0.8, flip=True)
+    job = RenderJob(scene="one", sampler=TrainingSampler(), probe=probe, display=display)
+    asked = work(job)
+    render_run.run(asked, job)
+    picture = display.picture(probe, 24, 20)
+    with np.load(asked.folder.artifacts / "frames.npz") as archive:
+        origin = {name: json.loads(str(archive[name])) for name in ("probe", "display", "picture")}
+        assert archive["bmode"].shape == (len(TRAINING), picture.height, picture.width)
+        assert origin["probe"] == to_json(probe)
+        assert origin["display"]["pixel_mm"] == 0.8
+        assert origin["picture"]["first"] == list(picture.first)
+        scene = GaussianScene.load(asked.folder.path / "one.ugr")
+        rendered = {"bmode": render(scene, probe, TRAINING, height=24, width=20)["bmode"]}
+        np.testing.assert_allclose(archive["bmode"], show(rendered, probe, display)["bmode"].numpy(), atol=1e-6)
+
+
+def test_frames_below_the_limit_are_masked_instead_of_refused(work: Callable[..., JobRun]) -> None:
+    far = TRAINING.copy()
+    far[4, 1, 3] = 40.0
+    job = RenderJob(
+        scene="one", poses=far, min_confidence=0.6, below_min_confidence=Below.MASK, outputs=("bmode", "coverage")
+    )
+    asked = work(job, confidence=MODEL)
+    render_run.run(asked, job)
+    with np.load(asked.folder.artifacts / "frames.npz") as archive:
+        assert archive["bmode"].shape[0] == len(far)
+        assert (archive["bmode"][4] > 0).sum() < (archive["bmode"][0] > 0).sum()
