@@ -317,8 +317,7 @@ class RenderJob(FrameSettings):
     """Makes poses of the given ones, else of the scene's training poses."""
     format: str = "npz"
     """tar: WebDataset; dicom and plus (.igs.mha): bmode in uint8, true to scale."""
-    dtype: Literal["uint8", "float32"] | None = None
-    """Default: the format's own."""
+    kind: Literal[None] = field(default=None, repr=False, kw_only=True)
     kind: Literal["render"] = field(default="render", repr=False, kw_only=True)
 
 
