@@ -317,7 +317,8 @@ class RenderJob(FrameSettings):
     """Makes poses of the given ones, else of the scene's training poses."""
     format: str = "npz"
     """tar: WebDataset; dicom and plus (.igs.mha): bmode in uint8, true to scale."""
-    kind: Literal[None] = field(default=None, repr=False, kw_only=True)
+    dtype: str | None = None
+    """Default: the format's own."""
     kind: Literal["render"] = field(default="render", repr=False, kw_only=True)
 
 

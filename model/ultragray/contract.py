@@ -51,6 +51,8 @@ def described(
     limits = {"low": low, "high": high, "above": above, "choices": choices, "most": most, "error": error}
     metadata |= {name: limit for name, limit in limits.items() if limit is not None}
     if schema := _schema(**limits):
+        if choices is not None and default is None:
+            schema["enum"] = [*choices, None]
         metadata["json_schema_extra"] = schema  # the key that pydantic reads
     return field(default=default, default_factory=factory, metadata=metadata, **options)
 

@@ -14,6 +14,7 @@ from ultragray.confidence import Assessor, Extrapolation, require_confidence
 from ultragray.contract import described, kind_field, shown, under
 from ultragray.errors import InvalidArgument
 from ultragray.interchange.exports import FORMATS, check_format
+from ultragray.interchange.exports.formats import DTYPES
 from ultragray.outputs import OUTPUTS
 from ultragray.pose import check_poses
 from ultragray.probe import FloatArray, Picture, Probe
@@ -45,7 +46,7 @@ class RenderJob(FrameSettings, Specification):
     format: str = described(
         "tar: WebDataset; dicom and plus (.igs.mha): bmode in uint8, true to scale.", "npz", choices=tuple(FORMATS)
     )
-    dtype: Literal["uint8", "float32"] | None = described("Default: the format's own.", None)
+    dtype: str | None = described("Default: the format's own.", None, choices=DTYPES)
     kind: Literal["render"] = kind_field("render")
 
     run_module = "render_run"
