@@ -41,8 +41,7 @@ class TrainingViews:
         self._axes = np.ascontiguousarray(poses[:, :3, :3].transpose(2, 1, 0))  # [axis, xyz, P]
         self._offsets = np.einsum("axp,px->ap", self._axes, poses[:, :3, 3])  # [axis, P]
         self._rotations = poses[:, :3, :3].reshape(len(poses), 9)
-        middle = np.array([0.0, 0.0, 0.5 * (probe.near_mm + probe.far_mm)])
-        self._middles = poses[:, :3, :3] @ middle + poses[:, :3, 3]  # [P, 3] mm
+        self._middles = poses[:, :3, :3] @ _image_points(probe).mean(axis=0) + poses[:, :3, 3]  # [P, 3] mm
 
     def __len__(self) -> int:
         return len(self._rotations)

@@ -7,7 +7,7 @@ import time
 import numpy as np
 import pytest
 
-from ultragray import ConvexProbe, LinearProbe, PhasedProbe, Probe
+from ultragray import ConvexProbe, LinearProbe, PhasedProbe, Probe, RadialProbe, SteeredProbe
 from ultragray.confidence.views import MAX_VIEWS, POINTS_PER_SIDE, TrainingViews
 from ultragray.errors import InvalidPose
 from ultragray.probe import FloatArray
@@ -15,6 +15,8 @@ from ultragray.probe import FloatArray
 LINEAR = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)
 CONVEX = ConvexProbe(opening_angle_deg=60.0, near_mm=40.0, far_mm=120.0)
 PHASED = PhasedProbe(opening_angle_deg=80.0, far_mm=100.0)
+RADIAL = RadialProbe(near_mm=2.0, far_mm=30.0)
+STEERED = SteeredProbe(width_mm=40.0, steering_deg=-25.0, near_mm=5.0, far_mm=50.0)
 
 
 def parallel(*elevations_mm: float) -> FloatArray:
@@ -39,7 +41,7 @@ def in_plane(angle_deg: float) -> FloatArray:
     return pose[None]
 
 
-@pytest.mark.parametrize("probe", [LINEAR, CONVEX, PHASED])
+@pytest.mark.parametrize("probe", [LINEAR, CONVEX, PHASED, RADIAL, STEERED])
 def test_a_training_view_is_no_distance_away(probe: Probe) -> None:
     measured = TrainingViews(parallel(0.0, 3.0), probe).measure(parallel(3.0), probe)
     for values in (measured.nearest_mm, measured.distance_mm, measured.interpolation_mm, measured.angle_deg):
@@ -66,7 +68,7 @@ def test_a_view_of_a_probe_that_was_turned_round_is_on_the_same_side() -> None:
     assert measured.interpolation_mm == pytest.approx([1.0])
 
 
-@pytest.mark.parametrize("probe", [LINEAR, CONVEX, PHASED])
+@pytest.mark.parametrize("probe", [LINEAR, CONVEX, PHASED, RADIAL, STEERED])
 def test_distance_to_an_image_and_not_to_its_plane(probe: Probe) -> None:
     pose = tilted(12.0)
     pose[0, :3, 3] = (15.0, 4.0, 9.0)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ultragray import ConvexProbe, LinearProbe, PhasedProbe, Probe
+from ultragray import ConvexProbe, LinearProbe, PhasedProbe, Probe, RadialProbe, SteeredProbe
 from ultragray.datasets import Dataset, Sweep
 from ultragray.datasets.source import load_dataset
 from ultragray.errors import DatasetInvalid, InvalidArgument
@@ -18,6 +18,8 @@ from ultragray.probe import FloatArray
 LINEAR = LinearProbe(width_mm=8.0, near_mm=0.0, far_mm=10.0)
 CONVEX = ConvexProbe(opening_angle_deg=60.0, near_mm=8.0, far_mm=20.0)
 PHASED = PhasedProbe(opening_angle_deg=80.0, far_mm=20.0)
+RADIAL = RadialProbe(near_mm=1.0, far_mm=8.0)
+STEERED = SteeredProbe(width_mm=8.0, steering_deg=20.0, near_mm=0.0, far_mm=10.0)
 
 
 def at(*elevations_mm: float, tilt_deg: float = 0.0) -> FloatArray:
@@ -35,7 +37,7 @@ def sweep_of(poses: FloatArray, probe: Probe = LINEAR, *, height: int = 20, widt
     return Sweep(images, poses, probe, np.arange(len(poses)), "made")
 
 
-@pytest.mark.parametrize("probe", [LINEAR, CONVEX, PHASED], ids=["linear", "convex", "phased"])
+@pytest.mark.parametrize("probe", [LINEAR, CONVEX, PHASED, RADIAL, STEERED], ids=lambda probe: probe.kind)
 def test_between_two_planes_the_distance_decides(probe: Probe) -> None:
     sweep = sweep_of(at(0.0, 1.0, 4.0), probe)
     images = sweep.images / 255.0

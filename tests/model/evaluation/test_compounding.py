@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ultragray import ConvexProbe, LinearProbe, Probe
+from ultragray import ConvexProbe, LinearProbe, Probe, RadialProbe, SteeredProbe
 from ultragray.datasets import Sweep
 from ultragray.datasets.source import load_dataset
 from ultragray.errors import InvalidArgument
@@ -165,3 +165,30 @@ def test_a_real_sweep_is_predicted_as_well_as_by_an_independent_prototype(data_f
     assert mean.ms_ssim == pytest.approx(0.821, abs=0.005)
     assert mean.gms == pytest.approx(0.898, abs=0.025)
     assert mean.gmsd == pytest.approx(0.167, abs=0.025)
+
+
+@pytest.mark.parametrize(
+    "probe",
+    [
+        LinearProbe(width_mm=20.0, near_mm=0.0, far_mm=20.0),
+        ConvexProbe(opening_angle_deg=60.0, near_mm=10.0, far_mm=30.0),
+        RadialProbe(near_mm=1.0, far_mm=10.0),
+        SteeredProbe(width_mm=20.0, steering_deg=25.0, near_mm=0.0, far_mm=20.0),
+    ],
+    ids=lambda probe: probe.kind,
+)
+def test_a_smooth_volume_comes_back_whatever_the_probe(probe: Probe) -> None:
+    size = (80, 100)
+    points = pixel_positions_mm(probe, *size)
+
+    def frames(poses: FloatArray) -> FloatArray:  # [C, H, W] in [0, 1]
+        places = np.einsum("cij,pj->cpi", poses[:, :3, :3], points) + poses[:, None, :3, 3]
+        return (0.5 + 0.15 * np.sin(places / (3.0, 4.0, 5.0)).sum(axis=2)).reshape(-1, *size)
+
+    poses, between = at(*np.arange(0.0, 6.0, 0.5)), at(1.25, 3.25)
+    images = np.rint(255 * frames(poses)).astype(np.uint8)
+    sweep = Sweep(images, poses, probe, np.arange(len(poses)), "made")
+    planes = compound(sweep, "mean").reslice(probe, between, *size)
+    inside = planes > 0.0
+    assert inside.mean() > 0.95
+    assert np.abs(planes - frames(between))[inside].mean() < 0.01
