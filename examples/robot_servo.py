@@ -27,6 +27,7 @@ from ultragray_client.errors import DeadlineExceeded, StreamEnded
 Floats = npt.NDArray[np.float64]
 
 IMAGE_SIDE = 128
+SETTINGS = RenderSettings(height=IMAGE_SIDE, width=IMAGE_SIDE)
 VESSEL_RADIUS_MM, WALL_MM = 2.4, 1.0
 FIND_CORRELATION = 0.68  # with the template: the vessel has 0.73, what else is in the scene at most 0.63
 KEEP_CORRELATION, WINDOW_MM = 0.5, 6.0  # once found, it is looked for this far around
@@ -217,11 +218,11 @@ class Servo:
 async def servo(address: str, *, scene: str = "demo", seconds: float = 10.0, rate_hz: float = 100.0) -> Record:
     """Runs the robot and returns what happened. Raises ClientError."""
     async with AsyncClient(address) as client:
-        first = await client.render(scene, Robot().pose(), RenderSettings(height=IMAGE_SIDE, width=IMAGE_SIDE))
+        first = await client.render(scene, Robot().pose(), SETTINGS)
         if not isinstance(first.probe, LinearProbe):
             raise SystemExit(f"the template is made for a linear probe, {scene} has {first.probe}")
         loop = Servo(first.probe, rate_hz)
-        async with client.stream(scene, RenderSettings(height=IMAGE_SIDE, width=IMAGE_SIDE), mode="latest") as stream:
+        async with client.stream(scene, SETTINGS, mode="latest") as stream:
             await loop.run(stream, seconds)
         return loop.record
 

@@ -1,4 +1,4 @@
-"""What both clients share of a connection: its options, and calls that go on where they broke off."""
+"""Options of a connection, and calls that go on where they broke off."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Conversation(ABC, Generic[T]):
 
 
 def call_metadata(api_key: str | None) -> tuple[tuple[str, str], ...]:
-    """What every call carries."""
+    """The metadata of every call."""
     return () if api_key is None else (("x-api-key", api_key),)
 
 

@@ -38,7 +38,7 @@ class Timings:
 
 @dataclass(frozen=True)
 class Extrapolation:
-    """How far a frame extrapolates from what its scene was trained on; None is what the scene cannot tell."""
+    """Distance of a frame from what its scene was trained on; None: the scene cannot tell."""
 
     distance_mm: float | None  # to the nearest training views, a mean over the image
     angle_deg: float | None  # likewise

@@ -35,7 +35,7 @@ class JobState(str, Enum):
 
 @dataclass(frozen=True)
 class JobProgress:
-    """How far a job is; None is what does not apply, or not yet."""
+    """Progress of a job; None: does not apply, or not yet."""
 
     step: int | None
     steps: int | None
@@ -59,7 +59,7 @@ class JobError:
 
 @dataclass(frozen=True)
 class Job:
-    """What the service does in the background. Times are ISO 8601, UTC; None: not yet."""
+    """Work that the service does in the background. Times are ISO 8601, UTC; None: not yet."""
 
     id: str
     kind: str  # that of its specification
@@ -89,7 +89,7 @@ class JobEvent:
 
 @dataclass(frozen=True)
 class JobFilter:
-    """Which jobs to list; None: all."""
+    """The jobs to list; None: all."""
 
     state: JobState | str | None
     kind: str | None

@@ -16,14 +16,14 @@ TAKES_NO_MORE = "the stream takes no more poses: done_sending was called, or it 
 
 
 class StreamMode(str, Enum):
-    """What becomes of a pose that still waits when the next one comes."""
+    """The fate of a pose that still waits when the next one comes."""
 
     ORDERED = "ordered"  # every pose gets its frame, in order
     LATEST = "latest"  # for control loops: the newer pose takes its place; it gets no frame and is counted
 
 
 class PoseExchange:
-    """What a stream sends and gets: poses numbered from 1 (0 are its settings), and their frames."""
+    """The messages of a stream: poses numbered from 1 (0 are its settings), and their frames."""
 
     def __init__(self, settings: rendering_pb2.RenderSettings, mode: StreamMode | str) -> None:
         """Raises InvalidArgument for a mode that does not exist."""

@@ -34,7 +34,7 @@ class Retries:
         return None if self._deadline is None else max(self._deadline - time.monotonic(), 0.0)
 
     def pause_s(self, error: ClientError) -> float:
-        """How long to wait before the next attempt: exponential, with jitter, after any delay that the service told.
+        """The seconds to wait before the next attempt: exponential, with jitter, after any delay that the service told.
 
         Raises `error` where another attempt cannot succeed, or would come too late.
         """

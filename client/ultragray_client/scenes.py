@@ -29,7 +29,7 @@ class SceneEntry:
 
 @dataclass(frozen=True)
 class ConfidenceFit:
-    """How well a scene knows the confidence of its frames."""
+    """Quality of the confidence that a scene tells of its frames."""
 
     error: float  # mean absolute error of the confidence on the views that it was fitted on
     fitted_on: int  # how many those are

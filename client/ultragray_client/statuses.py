@@ -31,7 +31,7 @@ def client_errors(address: str) -> Iterator[None]:
 
 
 def error_of_call(error: grpc.RpcError, address: str) -> ClientError:
-    """What a failed call tells: the facts of ErrorInfo and RetryInfo, else those of its status."""
+    """The error of a failed call, from its ErrorInfo and RetryInfo, else from its status."""
     status, sentence = error.code().name, error.details() or ""
     reason, field, retry_after_s = _told(dict(error.trailing_metadata() or ()).get(_DETAILS_KEY, b""))
     if reason is None and status == "UNAVAILABLE":
@@ -41,7 +41,7 @@ def error_of_call(error: grpc.RpcError, address: str) -> ClientError:
 
 
 def error_of_frame(error: scenes_pb2.Error, sequence: int) -> ClientError:
-    """What a stream tells in place of a frame."""
+    """The error that a stream has in place of a frame."""
     cls = _BY_REASON.get(error.reason, ClientError)
     return cls(error.detail, reason=error.reason, field=error.field or None, sequence=sequence)
 

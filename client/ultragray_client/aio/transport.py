@@ -56,7 +56,7 @@ class PoseCall:
         return None if answer is grpc.aio.EOF else answer
 
     def take_replaced(self) -> int:
-        """How many poses were replaced here since this was asked last: none, each is sent at once."""
+        """The number of poses replaced here since the last call: none, each is sent at once."""
         return 0
 
     async def close(self) -> None:

@@ -64,7 +64,7 @@ class Connection:
         return found
 
     def converse(self, call: Call, conversation: Conversation[T], timeout_s: float | None) -> Generator[T, None]:
-        """What a conversation makes of the messages as they come; None: as long as it takes."""
+        """The results of a conversation as its messages come; `timeout_s` None: as long as it takes."""
         retries = self._retries(timeout_s)
         while (request := conversation.request()) is not None:
             try:

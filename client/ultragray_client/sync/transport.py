@@ -74,7 +74,7 @@ class PoseCall:
         return next(self._call, None)
 
     def take_replaced(self) -> int:
-        """How many poses were replaced here since this was asked last."""
+        """The number of poses replaced here since the last call."""
         with self._changed:
             replaced, self._replaced = self._replaced, 0
             return replaced
