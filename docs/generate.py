@@ -16,11 +16,13 @@ from typing import Any, get_args
 import typer
 
 from ultragray import errors
+from ultragray.contract import annotated_fields, range_of
 from ultragray_client import contract as client_contract
 from ultragray_client import errors as client_errors
 from ultragray_service import errors as service_errors
 from ultragray_service.cli.app import app as command_line
 from ultragray_service.errors import statuses_of
+from ultragray_service.settings import ENVIRONMENT_PREFIX, Settings
 from ultragray_workers import errors as workers_errors
 
 DOCUMENT = Path(__file__).resolve().parent / "interfaces.md"
@@ -94,6 +96,19 @@ def _call(cls: type) -> str:
     return cls.__name__ + re.sub(r"<(\w+\.\w+): [^>]*>", r"\1", text)
 
 
+def settings_table() -> list[Row]:
+    """The settings of the service, by their environment variables."""
+    table: list[Row] = [("Variable", "Default", "Limits", "Meaning")]
+    for item, _ in annotated_fields(Settings):
+        default = "" if item.default in (None, ()) else f"`{item.default}`"
+        choices = ", ".join(f"`{word}`" for word in item.metadata.get("choices", ()))
+        meaning = str(item.metadata["description"])
+        table.append(
+            (f"`{ENVIRONMENT_PREFIX}{item.name.upper()}`", default, choices or range_of(item).strip(), meaning)
+        )
+    return table
+
+
 def commands() -> Iterator[tuple[str, Any]]:
     """Every command of `ultragray` that does something itself, by its words."""
     waiting = list(typer.main.get_command(command_line).commands.items())  # type: ignore[attr-defined]
@@ -126,6 +141,7 @@ TABLES: dict[str, Callable[[], list[Row]]] = {
     "errors": error_table,
     "client_contract": client_contract_table,
     "client_errors": client_error_table,
+    "settings": settings_table,
     **{f"options of {name}": partial(option_table, command) for name, command in commands()},
 }
 

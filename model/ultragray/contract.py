@@ -17,6 +17,7 @@ from contextlib import contextmanager
 from dataclasses import MISSING, Field, field, fields, is_dataclass
 from enum import Enum
 from functools import cache
+from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, ClassVar, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -26,6 +27,7 @@ from .errors import InvalidArgument, UltragrayError
 
 _T = TypeVar("_T")
 _SHOWN_CHARACTERS = 100
+_BOOLEANS = {"true": True, "1": True, "yes": True, "on": True, "false": False, "0": False, "no": False, "off": False}
 
 
 def described(
@@ -146,6 +148,22 @@ def optional_of(annotation: Any) -> tuple[Any, bool]:
         if len(types) == 1:
             return types[0], len(get_args(annotation)) == 2
     return annotation, False
+
+
+def from_text(text: str, annotation: Any) -> Any:
+    """A value that a person wrote, such as an environment variable: lists with commas, booleans as `true` or `1`.
+
+    What cannot be read stays a text, so that the check of its field says what was expected.
+    """
+    kind, _ = optional_of(annotation)
+    if get_origin(kind) is tuple:
+        return tuple(from_text(word.strip(), get_args(kind)[0]) for word in text.split(",") if word.strip())
+    if kind is bool:
+        return _BOOLEANS.get(text.strip().lower(), text)
+    try:
+        return kind(text) if kind in (int, float, Path) else text
+    except ValueError:
+        return text
 
 
 def to_dict(value: Any, *, with_none: bool = True) -> Any:

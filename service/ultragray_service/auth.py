@@ -7,8 +7,6 @@ import binascii
 import hmac
 from collections.abc import Iterable, Sequence
 
-from pydantic import SecretStr
-
 from .errors import Unauthenticated
 
 STREAM_PROTOCOL = "ultragray.v1"  # WebSocket subprotocol
@@ -33,8 +31,8 @@ def key_of_subprotocols(offered: Iterable[str]) -> str | None:
 class KeyGuard:
     """Knows the keys. Without keys everyone may pass."""
 
-    def __init__(self, keys: Sequence[SecretStr]) -> None:
-        self._keys = [key.get_secret_value().encode() for key in keys]
+    def __init__(self, keys: Sequence[str]) -> None:
+        self._keys = [key.encode() for key in keys]
 
     def check(self, authorization: str | None, x_api_key: str | None) -> None:
         """Raises Unauthenticated unless `Authorization: Bearer KEY` or `X-API-Key: KEY` has a known key."""

@@ -18,6 +18,7 @@ from ultragray.interchange.exports.formats import DTYPES, FORMATS
 from ultragray.samplers import Sampler
 from ultragray.settings import FrameSettings
 
+from ..settings import ENVIRONMENT_PREFIX, Settings
 from . import convert as cli_convert
 from . import dataset as cli_dataset
 from . import eval as cli_eval
@@ -25,7 +26,7 @@ from . import jobs as cli_jobs
 from . import report as cli_report
 from . import train as cli_train
 from . import worker as cli_worker
-from .options import with_options
+from .options import FieldsOf, with_options
 
 USER_ERROR = 2  # the exit code of a mistake that the caller can mend
 
@@ -74,72 +75,27 @@ def main(
 
 
 @app.command(epilog="Every other setting has an environment variable: see docs/interfaces.md.")
+@with_options
 def serve(
     scenes: Annotated[
         list[Path] | None,
         typer.Argument(help="Scene files to serve instead of a data folder.", show_default=False),
     ] = None,
-    data_folder: Annotated[
-        Path | None,
-        typer.Option(
-            help="Existing folder of scene files (*.ugr); where it holds none, the demo scene is put there. "
-            "[ULTRAGRAY_DATA_FOLDER]",
-            show_default="data",
+    *,
+    options: Annotated[
+        dict[str, Any],
+        FieldsOf(
+            Settings,
+            *("data_folder", "host", "http_port", "grpc_port", "igtl_port"),
+            *("processes", "threads_per_process", "backend", "log_level"),
+            environment=ENVIRONMENT_PREFIX,
         ),
-    ] = None,
-    host: Annotated[
-        str | None,
-        typer.Option(help="Address to listen on; 0.0.0.0 for all. [ULTRAGRAY_HOST]", show_default="127.0.0.1"),
-    ] = None,
-    http_port: Annotated[
-        int | None,
-        typer.Option(help="Port of HTTP; 0 takes a free one. [ULTRAGRAY_HTTP_PORT]", show_default="8000"),
-    ] = None,
-    grpc_port: Annotated[
-        int | None,
-        typer.Option(help="Port of gRPC; 0 takes a free one. [ULTRAGRAY_GRPC_PORT]", show_default="50051"),
-    ] = None,
-    igtl_port: Annotated[
-        int | None,
-        typer.Option(
-            help="Port of OpenIGTLink, usually 18944; 0 takes a free one. [ULTRAGRAY_IGTL_PORT]", show_default="off"
-        ),
-    ] = None,
-    processes: Annotated[
-        int | None,
-        typer.Option(help="Render processes; 0: one per GPU, on the CPU one. [ULTRAGRAY_PROCESSES]", show_default="0"),
-    ] = None,
-    threads: Annotated[
-        int | None,
-        typer.Option(
-            help="Render threads of each process; 0: cores // processes. [ULTRAGRAY_THREADS_PER_PROCESS]",
-            show_default="0",
-        ),
-    ] = None,
-    backend: Annotated[
-        str | None,
-        typer.Option(help="auto, cpu, cuda or reference. [ULTRAGRAY_BACKEND]", show_default="auto"),
-    ] = None,
-    log_level: Annotated[
-        str | None,
-        typer.Option(help="debug, info, warning or error. [ULTRAGRAY_LOG_LEVEL]", show_default="info"),
-    ] = None,
+    ],
 ) -> None:
     """Serve scenes over HTTP and gRPC, in the foreground, until Ctrl-C or SIGTERM."""
     from .serve import serve_scenes
 
-    options = {
-        "data_folder": data_folder,
-        "host": host,
-        "http_port": http_port,
-        "grpc_port": grpc_port,
-        "igtl_port": igtl_port,
-        "processes": processes,
-        "threads_per_process": threads,
-        "backend": backend,
-        "log_level": log_level,
-    }
-    serve_scenes(scenes or [], {name: value for name, value in options.items() if value is not None})
+    serve_scenes(scenes or [], options)
 
 
 @app.command()

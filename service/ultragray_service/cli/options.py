@@ -22,25 +22,35 @@ from dataclasses import MISSING, Field
 from enum import Enum
 from functools import wraps
 from pathlib import Path
-from typing import Annotated, Any, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, get_origin, get_type_hints
 
 import typer
 
-from ultragray.contract import Contract, Family, annotated_fields, from_dict, optional_of, range_of
+from ultragray.contract import Contract, Family, annotated_fields, from_dict, from_text, optional_of, range_of
 from ultragray.errors import InvalidArgument
 from ultragray.files.poses import load_poses
 from ultragray.samplers import Sampler
 
-FLAGS = {"settings": ("--set",), "pixel_mm": ("--pixel-mm", "--scan-convert"), "out_of_plane_mm": ("--out-of-plane",)}
+FLAGS = {
+    "settings": ("--set",),
+    "pixel_mm": ("--pixel-mm", "--scan-convert"),
+    "out_of_plane_mm": ("--out-of-plane",),
+    "threads_per_process": ("--threads",),
+    "training_threads": ("--threads",),
+}
 _WITH_AN_OPTION_A_FIELD = (Sampler,)  # of all families
 _PARSED = (bool, int, float, Path)
 
 
 class FieldsOf:
-    """What a dict of a command holds: fields of a contract dataclass that were given, of all or of some."""
+    """What a dict of a command holds: fields of a contract dataclass that were given, of all or of some.
 
-    def __init__(self, cls: type[Contract], *names: str) -> None:
+    `environment` begins the names of the environment variables that hold the fields as well.
+    """
+
+    def __init__(self, cls: type[Contract], *names: str, environment: str | None = None) -> None:
         self.cls, self.names = cls, names or tuple(item.name for item, _ in _fields(cls))
+        self.environment = environment
 
 
 def with_options(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -52,7 +62,7 @@ def with_options(command: Callable[..., Any]) -> Callable[..., Any]:
         cls, _ = optional_of(hints[name])
         if isinstance(asked := getattr(cls, "__metadata__", (None,))[0], FieldsOf):
             contracts[name] = asked
-            parameters += [one for one in parameters_of(asked.cls) if one.name in asked.names]
+            parameters += _chosen_parameters(asked)
         elif isinstance(cls, type) and issubclass(cls, Contract):
             contracts[name] = cls
             parameters += parameters_of(cls, name)
@@ -94,6 +104,15 @@ def parameters_of(cls: Any, name: str = "") -> list[inspect.Parameter]:
         else:
             found.append(_parameter(item, kind))
     return found
+
+
+def _chosen_parameters(asked: FieldsOf) -> Iterator[inspect.Parameter]:
+    for parameter in parameters_of(asked.cls):
+        if parameter.name in asked.names:
+            if asked.environment is not None:
+                option = parameter.annotation.__metadata__[0]
+                option.help += f" [{asked.environment}{parameter.name.upper()}]"
+            yield parameter
 
 
 def values_of(cls: Any, given: Mapping[str, Any]) -> dict[str, Any]:
@@ -147,6 +166,9 @@ def _parameter(
         meaning = f"{meaning.rstrip('.')}: .npy or .json, [P, 4, 4] or [P, 3, 4]."
     limits = range_of(item).strip().removeprefix("of ")
     meaning += f" {limits[:1].upper()}{limits[1:]}." if limits else ""
+    is_enum = isinstance(kind, type) and issubclass(kind, Enum)
+    if choices := [one.value for one in kind] if is_enum else item.metadata.get("choices"):
+        meaning += f" One of {', '.join(choices)}."
     if isinstance(kind, type) and issubclass(kind, Family):
         meaning += f" As JSON, a kind with its numbers: {'; '.join(map(_signature, kind.members.values()))}."
     is_switch, is_table = kind is bool, get_origin(kind) is dict
@@ -201,17 +223,12 @@ def _part(cls: Any, name: str, given: Mapping[str, Any]) -> Any:
 def _read(value: Any, kind: Any, name: str) -> Any:
     """What an option holds, as the type of its field."""
     if get_origin(kind) is tuple:
-        return tuple(_read(word.strip(), get_args(kind)[0], name) for word in value.split(",") if word.strip())
+        return from_text(value, kind)
     if get_origin(kind) is dict:
         return parse_settings(value)
     if isinstance(kind, type) and issubclass(kind, Family):
         return from_dict(kind, _parsed_json(value, name))
-    if name == "poses":
-        return load_poses(value)
-    try:
-        return kind(value) if kind in (int, float) else value
-    except ValueError:
-        raise InvalidArgument(f"{_flag(name)} takes numbers with commas, got {value!r}", field=name) from None
+    return load_poses(value) if name == "poses" else value
 
 
 def _parsed_json(text: str, name: str) -> Any:

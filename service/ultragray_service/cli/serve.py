@@ -30,7 +30,7 @@ def serve_scenes(scenes: Iterable[Path], options: Mapping[str, Any]) -> None:
     files = list(scenes)
     if not files:
         settings = load_settings(**options)
-        if settings.data_folder == Settings.model_fields["data_folder"].default:
+        if settings.data_folder == Settings().data_folder:
             settings.data_folder.mkdir(exist_ok=True)  # any other folder must exist: its name may be mistyped
         ensure_scenes(settings.data_folder)
         run(settings)

@@ -7,7 +7,6 @@ import os
 import signal
 import sys
 import threading
-from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -15,39 +14,33 @@ import typer
 from ultragray.errors import UltragrayError
 from ultragray_workers.errors import StartupFailed
 
+from ..settings import ENVIRONMENT_PREFIX, Settings, load_settings
+from .options import FieldsOf, with_options
+
 _PR_SET_PDEATHSIG = 1
 
 
+@with_options
 def worker(
-    data_folder: Annotated[
-        Path | None, typer.Option(help="Folder whose `artifacts` hold the jobs.", show_default="./data")
-    ] = None,
-    artifact_folder: Annotated[
-        Path | None,
-        typer.Option(help="Folder of datasets and jobs, which all workers share.", show_default="in the data folder"),
-    ] = None,
-    database_url: Annotated[
-        str | None, typer.Option(help="PostgreSQL URL of the queue.", show_default="SQLite in the artifact folder")
-    ] = None,
     name: Annotated[
         str | None, typer.Option(help="Name of this worker, its alone.", show_default="of the host, numbered")
     ] = None,
     device: Annotated[str, typer.Option(help="auto, cpu, cuda or cuda:N; a GPU where there is one.")] = "auto",
-    threads: Annotated[
-        int | None, typer.Option(min=0, help="Threads of a job's process.", show_default="all cores but one")
-    ] = None,
+    *,
+    options: Annotated[
+        dict[str, Any],
+        FieldsOf(
+            Settings,
+            *("data_folder", "artifact_folder", "database_url", "training_threads"),
+            environment=ENVIRONMENT_PREFIX,
+        ),
+    ],
 ) -> None:
     """Train and render in the background: take jobs from the queue, one at a time, until Ctrl-C.
 
     What is not given here comes from the settings (ULTRAGRAY_…). A job at hand is put back with a checkpoint.
     """
-    given = {
-        "data_folder": data_folder,
-        "artifact_folder": artifact_folder,
-        "database_url": database_url,
-        "training_threads": threads,
-    }
-    run_worker({key: value for key, value in given.items() if value is not None}, name=name, device=device)
+    run_worker(options, name=name, device=device)
 
 
 def run_worker(overrides: dict[str, Any], *, name: str | None = None, device: str = "auto") -> None:
@@ -55,7 +48,6 @@ def run_worker(overrides: dict[str, Any], *, name: str | None = None, device: st
     from ultragray_workers.jobs.worker.worker import work
 
     from ..logs import configure_logging
-    from ..settings import load_settings
 
     settings = load_settings(**overrides)
     configure_logging(settings.log_level)

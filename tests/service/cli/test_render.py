@@ -243,7 +243,7 @@ def test_threads_and_backend_are_used(scene_file: Path, tmp_path: Path) -> None:
         (["--probe", '{"kind": "linear", "width_mm": 40, "near_mm": 50, "far_mm": 50}'], "far_mm must be greater"),
         (["--probe", '{"kind": "sector"}'], "kind must be one of convex, linear, phased"),
         (["--poses", "absent.npy"], "absent.npy: no such file"),
-        (["--tgc-db", "1,two"], "--tgc-db takes numbers with commas, got 'two'"),
+        (["--tgc-db", "1,two"], "tgc_db[1] must be a finite number from -100 to 100, got 'two'"),
         (["--gain-db", 1000], "gain_db must be a finite number from -100 to 100"),
         (["--below-min-confidence", "hide"], "below_min_confidence must be one of refuse, mask"),
         (["--scan-convert", 0.0, "--probe", CONVEX_JSON], "pixel_mm must be a finite number from"),
