@@ -5,7 +5,9 @@ from __future__ import annotations
 import inspect
 import re
 from enum import Enum
+from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 DOCUMENT = (Path(__file__).resolve().parents[2] / "docs" / "interfaces.md").read_text(encoding="utf-8")
@@ -35,6 +37,19 @@ def table(heading: str) -> dict[str, list[str]]:
 
 def numbers(cell: str) -> list[float]:
     return [float(number) for number in re.findall(r"\d+(?:\.\d+)?(?:e-?\d+)?", cell)]
+
+
+def headers_read(package: ModuleType) -> set[str]:
+    """The names, in lower case, of the headers or metadata that the modules of a package look up, from their text."""
+    found = set()
+    for path in Path(package.__path__[0]).rglob("*.py"):
+        text = path.read_text(encoding="utf-8")
+        for literal, constant in re.findall(
+            r'eaders(?:\(scope=scope\))?(?:\.get\(|\[)(?:"([\w-]+)"|([A-Z_]+))(?!\] =)', text
+        ):
+            module = ".".join((package.__name__, *path.relative_to(package.__path__[0]).with_suffix("").parts))
+            found.add((literal or getattr(import_module(module), constant)).lower())
+    return found
 
 
 def call_of(value: Any) -> str:

@@ -6,9 +6,10 @@ from google.protobuf.descriptor_pb2 import DescriptorProto, FieldDescriptorProto
 
 from ultragray.errors import error_classes
 from ultragray_proto.v1 import datasets_pb2, geometry_pb2, jobs_pb2, rendering_pb2, scenes_pb2
+from ultragray_service import rpc
 from ultragray_service.rpc import status
 
-from .document import code, table
+from .document import code, headers_read, table
 
 PROTO_MODULES = (geometry_pb2, rendering_pb2, scenes_pb2, datasets_pb2, jobs_pb2)
 
@@ -74,4 +75,4 @@ def test_error_details() -> None:
 
 
 def test_call_metadata() -> None:
-    assert set(table("Call metadata")) == {"authorization", "x-api-key", status.REQUEST_ID_KEY}
+    assert set(table("Call metadata")) == headers_read(rpc)

@@ -17,7 +17,7 @@ from ultragray import (
     pose,
     scene_info,
 )
-from ultragray.probe import probe
+from ultragray.probe import fan, probe
 from ultragray.training import TrainingConfig
 from ultragray_service import server
 from ultragray_service.cli.app import USER_ERROR
@@ -99,7 +99,7 @@ def test_fixed_limits() -> None:
         "Rotation tolerance": pose.ROTATION_TOLERANCE,
         "Largest coordinate of a pose": pose.MAX_POSITION_MM,
         "Largest length of a probe": probe.MAX_LENGTH_MM,
-        "Largest opening angle": 175,
+        "Largest opening angle": fan.LARGEST_OPENING_DEG,
         "Largest height and width of the library": image_size.MAX_IMAGE_SIDE,
         "Height and width where the scene knows none": image_size.DEFAULT_IMAGE_SIDE,
         "Training poses of a scene": scene_info.MAX_TRAINING_POSES,
@@ -122,9 +122,9 @@ def test_fixed_limits() -> None:
         "Retry after": STATUSES["QUEUE_FULL"].retry_after_s,
         "Shortest API key": LEAST_KEY_LENGTH,
     }
-    ConvexProbe(175, 1, 2)
+    ConvexProbe(fan.LARGEST_OPENING_DEG, 1, 2)
     with pytest.raises(errors.InvalidProbe):
-        ConvexProbe(math.nextafter(175, 180), 1, 2)
-    load_settings(api_keys="k" * 16)
+        ConvexProbe(math.nextafter(fan.LARGEST_OPENING_DEG, 180), 1, 2)
+    load_settings(api_keys="k" * LEAST_KEY_LENGTH)
     with pytest.raises(errors.InvalidArgument):
-        load_settings(api_keys="k" * 15)
+        load_settings(api_keys="k" * (LEAST_KEY_LENGTH - 1))
