@@ -14,7 +14,7 @@ from ..display.scan_conversion import with_square_pixels
 from ..files.atomic import write_whole
 from ..scene import GaussianScene
 from .metrics import FrameMetrics
-from .scoring import render_sweep
+from .scoring import Evaluation, render_sweep
 
 ByteImage = npt.NDArray[np.uint8]
 MAX_SIDE_PIXELS = 512  # of one panel
@@ -45,6 +45,12 @@ def write_side_by_side(
         paths.append(folder / f"frame_{number:05d}.png")
         write_whole(paths[-1], cv2.imencode(".png", picture)[1].tobytes())
     return paths
+
+
+def write_spread(scene: GaussianScene, sweep: Sweep, evaluation: Evaluation, folder: str | Path, count: int) -> None:
+    """As `write_side_by_side`, of at most `count` frames of an evaluated sweep, evenly spread."""
+    places = np.linspace(0, len(sweep) - 1, min(len(sweep), count)).round().astype(np.int64)
+    write_side_by_side(scene, sweep.select(places), [evaluation.frames[place] for place in places], folder)
 
 
 def side_by_side_panels(

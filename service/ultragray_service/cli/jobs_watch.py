@@ -74,7 +74,7 @@ def _display(job_id: str) -> Iterator[Callable[[dict[str, Any]], None]]:
 
         def show(job: dict[str, Any]) -> None:
             nonlocal last
-            done, of = work_done(job)
+            done, of, _ = work_done(job)
             if console.is_terminal:
                 bar.update(task, description=f"{job_id} {job['state']}", completed=done, total=of, told=told(job))
                 return
@@ -86,17 +86,17 @@ def _display(job_id: str) -> Iterator[Callable[[dict[str, Any]], None]]:
         yield show
 
 
-def work_done(job: dict[str, Any]) -> tuple[int, int | None]:
-    """Steps or frames that are done, and how many there are (None: not known yet)."""
+def work_done(job: dict[str, Any]) -> tuple[int, int | None, str]:
+    """Steps or frames that are done, how many there are (None: not known yet), and which of the two."""
     progress = job["progress"]
-    done, of = ("step", "steps") if job["kind"] == "train" else ("frames_done", "frames")
-    return progress[done] or 0, progress[of]
+    done, of = ("frames_done", "frames") if progress["steps"] is None else ("step", "steps")
+    return progress[done] or 0, progress[of], of
 
 
 def amount(job: dict[str, Any]) -> str:
     """Such as "120 of 500 steps"; empty where it is not known yet."""
-    done, of = work_done(job)
-    return "" if of is None else f"{done:,} of {of:,} {'steps' if job['kind'] == 'train' else 'frames'}"
+    done, of, unit = work_done(job)
+    return "" if of is None else f"{done:,} of {of:,} {unit}"
 
 
 def told(job: dict[str, Any]) -> str:

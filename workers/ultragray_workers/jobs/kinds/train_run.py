@@ -9,15 +9,13 @@ import shutil
 import sys
 from contextlib import suppress
 from dataclasses import replace
-from pathlib import Path
 
-import numpy as np
 import torch
 
 from ultragray.datasets.sweep import Dataset
 from ultragray.errors import TrainingStateInvalid
-from ultragray.evaluation.scoring import Evaluation, evaluate
-from ultragray.evaluation.side_by_side import write_side_by_side
+from ultragray.evaluation.scoring import evaluate
+from ultragray.evaluation.side_by_side import write_spread
 from ultragray.machine import processor_name
 from ultragray.report.page import ReportContent, render_page
 from ultragray.report.study import trained_of_journal
@@ -138,7 +136,7 @@ def _finish(job_run: JobRun, job: TrainJob, dataset: Dataset, scene: GaussianSce
         if len(dataset.val):
             scene = scene.to(device)
             evaluation = evaluate(scene, dataset.val)
-            _draw_frames(scene, dataset, evaluation, folder)
+            write_spread(scene, dataset.val, evaluation, folder, PICTURES)
             processor = f"{processor_name()}, {job_run.request.threads} threads"
             content = ReportContent(
                 dataset=dataset,
@@ -151,10 +149,3 @@ def _finish(job_run: JobRun, job: TrainJob, dataset: Dataset, scene: GaussianSce
             )
             (folder / "report.html").write_text(render_page(content), encoding="utf-8")
     return Outcome(artifacts=job_run.folder.artifact_names(), metrics=metrics)
-
-
-def _draw_frames(scene: GaussianScene, dataset: Dataset, evaluation: Evaluation, folder: Path) -> None:
-    count = len(dataset.val)
-    places = np.linspace(0, count - 1, min(count, PICTURES)).round().astype(np.int64)
-    metrics = [evaluation.frames[place] for place in places]
-    write_side_by_side(scene, dataset.val.select(places), metrics, folder)
