@@ -19,6 +19,7 @@ __all__ = [
     "DatasetOptions",
     "Display",
     "Encoding",
+    "EvaluateJob",
     "FanSampler",
     "FrameSettings",
     "LinearProbe",
@@ -220,6 +221,22 @@ class Dataset:
 
 
 @dataclass(frozen=True)
+class EvaluateJob:
+    """A scene is scored on the held-out frames of a dataset: PSNR, MS-SSIM, GMS and GMSD.
+
+    The means are the metrics of the job; evaluation.json has those of every frame.
+    """
+
+    dataset: str
+    """Name of an uploaded dataset, which need not be the one that the scene was trained from."""
+    scene: str
+    """Name of a scene."""
+    baselines: bool = False
+    """Also score compounding of the training frames: the classical way."""
+    kind: Literal["evaluate"] = field(default="evaluate", repr=False, kw_only=True)
+
+
+@dataclass(frozen=True)
 class AroundSampler:
     """`count` of the base poses, drawn at random with repetition, each turned and shifted at random.
 
@@ -339,4 +356,4 @@ class TrainJob:
     kind: Literal["train"] = field(default="train", repr=False, kw_only=True)
 
 
-Specification: TypeAlias = RenderJob | TrainJob
+Specification: TypeAlias = EvaluateJob | RenderJob | TrainJob

@@ -99,6 +99,10 @@ def test_the_same_request_id_gives_the_same_job(jobs: jobs_pb2_grpc.JobServiceSt
             ("NOT_FOUND", "DATASET_NOT_FOUND", "train.dataset"),
         ),
         (
+            jobs_pb2.SubmitJobRequest(evaluate=jobs_pb2.EvaluateJob(dataset="gone", scene="demo", baselines=True)),
+            ("NOT_FOUND", "DATASET_NOT_FOUND", "evaluate.dataset"),
+        ),
+        (
             jobs_pb2.SubmitJobRequest(render=jobs_pb2.RenderJob(scene="demo")),
             ("INVALID_ARGUMENT", "INVALID_ARGUMENT", "render.poses"),
         ),

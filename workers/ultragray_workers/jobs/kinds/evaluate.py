@@ -1,0 +1,27 @@
+"""Evaluation: a scene is scored on the held-out frames of a dataset."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from ultragray.contract import described, kind_field
+
+from .base import Specification
+
+
+@dataclass(frozen=True)
+class EvaluateJob(Specification):
+    """A scene is scored on the held-out frames of a dataset: PSNR, MS-SSIM, GMS and GMSD.
+
+    The means are the metrics of the job; evaluation.json has those of every frame. Raises InvalidArgument.
+    """
+
+    dataset: str = described("Name of an uploaded dataset, which need not be the one that the scene was trained from.")
+    scene: str = described("Name of a scene.")
+    baselines: bool = described("Also score compounding of the training frames: the classical way.", False)
+    kind: Literal["evaluate"] = kind_field("evaluate")
+
+    run_module = "evaluate_run"
+    needs_dataset = "dataset"
+    needs_scene = "scene"

@@ -1,0 +1,89 @@
+"""The work of an evaluation: scores of every held-out frame, and a few pictures. Interrupted, it begins anew."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+
+import numpy as np
+import torch
+
+from ultragray.datasets.sweep import Sweep
+from ultragray.evaluation.baselines import evaluate_baselines
+from ultragray.evaluation.compounding import affordable_voxel_mm
+from ultragray.evaluation.metrics import FrameMetrics
+from ultragray.evaluation.scoring import Evaluation, check_same_origin, evaluate, frames_at_once, require_frames
+from ultragray.evaluation.side_by_side import write_spread
+from ultragray.files.atomic import file_sha256
+from ultragray.scene import GaussianScene
+from ultragray.training.device import training_device
+
+from ...datasets.store import DatasetStore
+from ...scenes import SUFFIX
+from ..folder import Outcome, Progress
+from ..worker.device import chosen_device, device_alone
+from ..worker.job_run import JobRun, Stopped
+from .evaluate import EvaluateJob
+
+RESULT_FILE = "evaluation.json"
+PICTURES = 8  # held-out frames, evenly spread
+
+
+def run(job_run: JobRun, job: EvaluateJob) -> Outcome:
+    """Scores the scene, and where asked the baselines, and writes evaluation.json and side-by-side pictures.
+
+    Raises Stopped, DatasetNotFound, DatasetInvalid also for a dataset without held-out frames or of another kind of
+    probe, SceneFileInvalid, InvalidImageSize.
+    """
+    torch.set_num_threads(job_run.request.threads)
+    name = chosen_device("auto", job_run.request.device)
+    with device_alone(job_run, name):
+        return _evaluate_on(training_device(name, "auto"), job_run, job)
+
+
+def _evaluate_on(device: torch.device, job_run: JobRun, job: EvaluateJob) -> Outcome:
+    path = job_run.folder.path / f"{job.scene}{SUFFIX}"
+    dataset = DatasetStore(job_run.folder.artifact_folder).load(job.dataset)
+    require_frames(dataset.val)
+    scene = GaussianScene.load(path).to(device)
+    warnings = check_same_origin(scene.info, dataset)
+    for warning in warnings:
+        sys.stderr.write(f"warning: {warning}\n")
+    sys.stderr.write(f"scoring {job.scene} on {len(dataset.val):,} frames of {job.dataset} on {device}\n")
+    evaluation = _scored(job_run, scene, dataset.val)
+    voxel_mm = affordable_voxel_mm(dataset.train)
+    baselines = evaluate_baselines(dataset, voxel_mm=voxel_mm) if job.baselines else {}
+    document = {
+        "scene": job.scene,
+        "scene_sha256": file_sha256(path),
+        "dataset": job.dataset,
+        "dataset_sha256": dataset.sha256,
+        "warnings": warnings,
+        **evaluation.to_dict(),
+        "baselines": {method: found.to_dict() for method, found in baselines.items()},
+        "voxel_mm": voxel_mm if baselines else None,
+    }
+    metrics = evaluation.mean.to_dict()
+    for method, found in baselines.items():
+        metrics |= {f"{method}_{name}": value for name, value in found.mean.to_dict().items()}
+    with job_run.folder.new_artifacts() as folder:
+        (folder / RESULT_FILE).write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+        write_spread(scene, dataset.val, evaluation, folder, PICTURES)
+    return Outcome(artifacts=job_run.folder.artifact_names(), metrics=metrics)
+
+
+def _scored(job_run: JobRun, scene: GaussianScene, sweep: Sweep) -> Evaluation:
+    """The scores of the frames, portion by portion."""
+    started, portion = time.monotonic(), frames_at_once(sweep.height, sweep.width)
+    frames: list[FrameMetrics] = []
+    scales = 0
+    while len(frames) < len(sweep):
+        if job_run.should_stop():
+            raise Stopped
+        scored = evaluate(scene, sweep.select(np.arange(len(frames), min(len(frames) + portion, len(sweep)))))
+        frames, scales = frames + scored.frames, scored.ms_ssim_scales
+        rate = len(frames) / (time.monotonic() - started)
+        left_s = (len(sweep) - len(frames)) / rate
+        job_run.report(Progress(frames_done=len(frames), frames=len(sweep), rate_per_s=rate, seconds_left=left_s))
+    return Evaluation(frames=frames, frame_numbers=sweep.frame_numbers, ms_ssim_scales=scales)
