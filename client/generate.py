@@ -215,14 +215,10 @@ def _enum_source(cls: type[Enum]) -> str:
 def _dataclass_source(cls: Any, name: str, bases: list[Any]) -> str:
     names = inspect.get_annotations(cls).keys() - LEFT_OUT
     own = [item for item, _ in annotated_fields(cls) if item.name in names]
-    options = ["frozen=True"]
-    if not cls.__dataclass_params__.eq:
-        options.append("eq=False")
-    if all(item.kw_only for item in own):
-        options.append("kw_only=True")
+    options = "frozen=True, kw_only=True" if all(item.kw_only for item in own) else "frozen=True"
     head = f"class {name}" + (f"({', '.join(base.__name__ for base in bases)})" if bases else "")
     body = "\n".join(map(_field_source, own))
-    return f"@dataclass({', '.join(options)})\n{head}:\n    {_docstring(cls)}\n\n{body}\n"
+    return f"@dataclass({options})\n{head}:\n    {_docstring(cls)}\n\n{body}\n"
 
 
 def _field_source(item: Field[Any]) -> str:

@@ -317,7 +317,7 @@ class TrainingSampler:
 Sampler: TypeAlias = AroundSampler | CoveredSampler | FanSampler | SplineSampler | TrainingSampler
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class RenderJob(FrameSettings):
     """Many frames of a scene become one archive, at `poses`, or at those that `sampler` makes.
 

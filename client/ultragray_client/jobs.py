@@ -6,11 +6,9 @@ import uuid
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
-from typing import Any
+from typing import Any, get_args
 
-from google.protobuf.json_format import MessageToDict
-
-from ultragray_proto.codec import from_message, words
+from ultragray_proto.codec import from_message
 from ultragray_proto.v1 import jobs_pb2
 
 from .connection import Conversation
@@ -19,6 +17,8 @@ from .errors import ClientError
 from .geometry import pose_messages
 from .messages import message_of
 from .retries import Retries
+
+_KINDS: dict[str, Any] = {cls.kind: cls for cls in get_args(Specification)}
 
 
 class JobState(str, Enum):
@@ -65,7 +65,8 @@ class Job:
     kind: str  # that of its specification
     state: JobState
     request_id: str
-    specification: Mapping[str, Any]  # as it was asked for; of the poses only `pose_count`
+    specification: Specification  # as it was asked for, but for the poses
+    pose_count: int  # how many of those there were
     priority: int
     created_at: str
     started_at: str | None
@@ -144,20 +145,9 @@ def submission(specification: Specification, request_id: str | None, priority: i
 
 def job_from_message(message: jobs_pb2.Job) -> Job:
     """A job as the service tells it."""
-    specification = _specification(getattr(message, message.WhichOneof("specification")))
-    job: Job = from_message(message, Job, specification=specification)
+    kind = message.WhichOneof("specification")
+    cls = _KINDS[kind]
+    others = {"poses": None} if hasattr(cls, "poses") else {}
+    specification = from_message(getattr(message, kind), cls, **others)
+    job: Job = from_message(message, Job, specification=specification, pose_count=message.render.pose_count)
     return job
-
-
-def _specification(message: jobs_pb2.TrainJob | jobs_pb2.RenderJob) -> dict[str, Any]:
-    told: dict[str, Any] = {}
-    for field, value in message.ListFields():
-        if field.name == "outputs":
-            told[field.name] = tuple(words(field.enum_type)[number] for number in value)
-        elif field.name == "settings":
-            told[field.name] = MessageToDict(value)
-        elif field.name == "sampler":
-            told[field.name] = {part.name: number for part, number in value.ListFields()}
-        else:
-            told[field.name] = value
-    return told

@@ -134,7 +134,7 @@ def test_jobs_keep_within_it(client: Any, tmp_path: Path) -> None:
         client.jobs.submit(RenderJob(scene="knowing", poses=[at(NEAR), at(FAR)], min_confidence=0.5))
     sampler = AroundSampler(count=4, translation_mm=3.0)
     job = client.jobs.submit(RenderJob(scene="knowing", sampler=sampler, min_confidence=0.93, height=8, width=8))
-    assert job.specification["min_confidence"] == 0.93
+    assert job.specification.min_confidence == 0.93
     client.jobs.wait(job.id)
     client.jobs.download(job.id, "frames.npz", tmp_path / "frames.npz")
     with np.load(tmp_path / "frames.npz") as archive:
