@@ -292,8 +292,8 @@ class BackendUnavailable(Unimplemented):
 
 
 class ExtraMissing(Unimplemented):
-    """A format whose package is not installed: `pip install 'ultragray[dicom]'` and the like (jobs, command line,
-    library).
+    """A format whose package is not installed: `pip install 'ultragray[dicom]'` and the like (uploads, jobs, command
+    line, library).
     """
 
     reason = "EXTRA_MISSING"

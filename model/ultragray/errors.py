@@ -160,8 +160,8 @@ class BackendUnavailable(UltragrayError):
 
 
 class ExtraMissing(UltragrayError):
-    """A format whose package is not installed: `pip install 'ultragray[dicom]'` and the like (jobs, command line,
-    library).
+    """A format whose package is not installed: `pip install 'ultragray[dicom]'` and the like (uploads, jobs,
+    command line, library).
     """
 
     reason = "EXTRA_MISSING"

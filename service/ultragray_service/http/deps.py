@@ -43,6 +43,7 @@ _MEANINGS = {
     "UNKNOWN_OUTPUT, TOO_MANY_POSES, SCENE_FILE_INVALID, DATASET_INVALID. `field` names it.",
     429: "Too many frames, uploads or jobs wait (QUEUE_FULL, JOB_QUEUE_FULL); retry after the seconds of Retry-After.",
     500: "Rendering failed (RENDER_FAILED, INTERNAL).",
+    501: "The format needs an optional package that the service lacks (EXTRA_MISSING).",
     503: "The service is starting or stopping (NOT_READY, DRAINING); retry after the seconds of Retry-After.",
     504: "The deadline passed before the answer was ready, or an upload came to a halt (DEADLINE_EXCEEDED).",
     507: "The memory or the disk has no room (SCENE_TOO_LARGE, MEMORY_EXCEEDED, STORAGE_FULL).",

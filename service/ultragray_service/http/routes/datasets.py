@@ -82,7 +82,7 @@ _PICTURE: _Answers = {200: {"description": "The image planes in space and some f
     "/{dataset}",
     status_code=201,
     openapi_extra=_UPLOAD,
-    responses=_PRESENT | problems(401, 409, 413, 415, 422, 429, 500, 503, 504, 507),
+    responses=_PRESENT | problems(401, 409, 413, 415, 422, 429, 500, 501, 503, 504, 507),
 )
 async def put_dataset(
     request: Request,
