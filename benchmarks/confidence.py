@@ -1,4 +1,4 @@
-"""Whether a scene's confidence is true: in-silico sweeps that mix causes, predicted against actual MS-SSIM.
+"""The truth of a scene's confidence: in-silico sweeps that mix causes, predicted against actual MS-SSIM.
 
     python benchmarks/confidence.py [--only NAME ...]
     python benchmarks/confidence.py --recorded FOLDER
@@ -38,7 +38,7 @@ FIRST_MM = -36.0  # where the sweeps begin
 
 @dataclass(frozen=True)
 class Mixture:
-    """What is trained from: sweeps of `count` frames at `tilts`, without `gaps` and what lies beyond `end_mm`."""
+    """A training set: sweeps of `count` frames at `tilts`, without `gaps` and what lies beyond `end_mm`."""
 
     seed: int
     tilts: tuple[float, ...]

@@ -135,7 +135,7 @@ def measure(run: Run, data_folder: Path) -> dict[str, Any]:
 
 
 def measure_shadow(scene: GaussianScene, dataset: Dataset, voxel_mm: float) -> dict[str, float]:
-    """What the scene and median compounding show on the phantom's held-out frames where bone hides everything."""
+    """The scene and median compounding on the phantom's held-out frames where bone hides everything."""
     shadow = BoneShadow.of(dataset.val)
     compounded = predict(dataset.train, dataset.val.poses, "median", voxel_mm=voxel_mm)
     return {

@@ -109,6 +109,13 @@ def settings_table() -> list[Row]:
     return table
 
 
+def command_table() -> list[Row]:
+    """The commands of `ultragray`, as its `--help` lists them."""
+    found = typer.main.get_command(command_line).commands  # type: ignore[attr-defined]
+    rows = ((f"`{name}`", " ".join(command.help.split())) for name, command in found.items())
+    return [("Command", "Meaning"), *rows]
+
+
 def commands() -> Iterator[tuple[str, Any]]:
     """Every command of `ultragray` that does something itself, by its words."""
     waiting = list(typer.main.get_command(command_line).commands.items())  # type: ignore[attr-defined]
@@ -127,6 +134,8 @@ def option_table(command: Any) -> list[Row]:
         is_argument = parameter.param_type_name == "argument"
         names = [parameter.name.upper()] if is_argument else parameter.opts
         meaning = str(parameter.help or "").replace("|", "\\|")
+        if parameter.envvar:
+            meaning += f" [{parameter.envvar}]"
         if parameter.required and not is_argument:
             meaning += " Required."
         elif isinstance(parameter.show_default, str):
@@ -142,6 +151,7 @@ TABLES: dict[str, Callable[[], list[Row]]] = {
     "client_contract": client_contract_table,
     "client_errors": client_error_table,
     "settings": settings_table,
+    "commands": command_table,
     **{f"options of {name}": partial(option_table, command) for name, command in commands()},
 }
 

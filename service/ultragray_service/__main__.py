@@ -11,7 +11,7 @@ from .settings import load_settings
 
 
 def main() -> int:
-    """Serves until SIGTERM or SIGINT: 0 after a clean stop, 1 and a sentence on stderr if it cannot start."""
+    """Serve until SIGTERM or SIGINT: 0 after a clean stop, 1 and a sentence on stderr where it cannot start."""
     try:
         run(load_settings())
     except UltragrayError as error:

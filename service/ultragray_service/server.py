@@ -38,14 +38,14 @@ _log = logging.getLogger("ultragray.service")
 
 
 def run(settings: Settings) -> None:
-    """Serves until SIGTERM or SIGINT. Raises StartupFailed where it cannot start."""
+    """Serve until SIGTERM or SIGINT. Raises StartupFailed where it cannot start."""
     configure_logging(settings.log_level)
     _return_large_blocks()
     uvloop.run(serve(settings))
 
 
 async def serve(settings: Settings) -> None:
-    """Serves HTTP, gRPC and, where it has a port, OpenIGTLink, until SIGTERM or SIGINT.
+    """Serve HTTP, gRPC and, where it has a port, OpenIGTLink, until SIGTERM or SIGINT.
 
     Then drains: ready turns false, what waits is answered. A second signal stops at once.
     Raises StartupFailed: a port in use, no data folder, a bad preload, API keys with OpenIGTLink.
@@ -100,7 +100,7 @@ def _tell_where(settings: Settings, http_port: int, grpc_port: int, igtl_port: i
 
 
 def _return_large_blocks() -> None:
-    """Has glibc hand freed blocks of a MiB and more back to the system: by itself it stops after the first ones."""
+    """Make glibc hand freed blocks of a MiB and more back to the system; by itself it stops after the first ones."""
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is not None:
         mallopt(_M_MMAP_THRESHOLD, _LARGE_BLOCK_BYTES)
@@ -120,11 +120,11 @@ class _StopSignals:
         (self.force if self.stop.is_set() else self.stop).set()
 
     async def unless_stopped(self, work: Awaitable[Any]) -> bool:
-        """Awaits `work` and returns True; False where it was cancelled by the first signal."""
+        """Await `work` and return True; False where the first signal cancelled it."""
         return await _unless(self.stop, work)
 
     async def unless_forced(self, work: Awaitable[Any]) -> bool:
-        """Awaits `work` and returns True; False where it was cancelled by the second signal."""
+        """Await `work` and return True; False where the second signal cancelled it."""
         return await _unless(self.force, work)
 
 
@@ -213,7 +213,7 @@ async def _start_igtl(server: IgtlServer, settings: Settings, sockets: contextli
 
 
 async def _mirror_health(service: Service, server: GrpcServer) -> None:
-    """gRPC health follows the readiness that HTTP tells."""
+    """Keep the health of gRPC equal to the readiness of HTTP."""
     told = False
     while True:
         if service.ready is not told:

@@ -1,4 +1,4 @@
-"""What can be set, with units, defaults and limits: environment variables ULTRAGRAY_ + upper-case name."""
+"""Settings of the service, with units, defaults and limits: environment variables ULTRAGRAY_ + upper-case name."""
 
 from __future__ import annotations
 

@@ -171,7 +171,7 @@ def _load_without_code(path: Path) -> Any:
 
 
 def _is_compressed(path: Path) -> bool:
-    """Whether the file could inflate to more than its own size."""
+    """Tell whether the file could inflate to more than its own size."""
     if not zipfile.is_zipfile(path):
         return False
     with zipfile.ZipFile(path) as archive:

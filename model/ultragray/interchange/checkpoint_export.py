@@ -45,7 +45,7 @@ class CheckpointExport:
 
 
 def export_checkpoint(scene: GaussianScene, checkpoint: str | Path) -> CheckpointExport:
-    """Writes `checkpoint` (`ckpt_29999.pt`) and, beside it, conf.json and poses_train.npy.
+    """Write `checkpoint` (`ckpt_29999.pt`) and, beside it, conf.json and poses_train.npy.
 
     The folder is made where only it is missing. conf.json needs the scene's probe, poses_train.npy its training poses;
     what is left out for want of them is in the notes, and so is how well the released activation fits a `sigmoid`

@@ -43,7 +43,7 @@ def _parameter_properties(sh_degree: int) -> tuple[str, ...]:
 
 
 def write_ply(scene: GaussianScene, path: str | Path) -> None:
-    """Writes the scene whole or not at all. Raises OSError where it cannot be written."""
+    """Write the scene, whole or not at all. Raises OSError where it cannot be written."""
     columns = {name: tensor.detach().to("cpu", torch.float32).numpy() for name, tensor in scene.splats.items()}
     opacity = np.ones((scene.gaussian_count, 1), np.float32)
     parameters = np.concatenate(

@@ -21,9 +21,8 @@ from ultragray.backends.cuda.work import Work, count_work
 from ultragray.probe import FloatArray
 from ultragray_workers.pool.transfer import to_uint8
 
-from .clock import elapsed_ms, finish, mark
 from .gpu import Limits, gpu_machine, measure_limits
-from .kernel import PROBE, BenchScene, bench_poses, bench_scenes
+from .kernel import PROBE, BenchScene, bench_poses, bench_scenes, elapsed_ms, finish, mark
 from .report import Report, percentiles
 from .served import measure_served
 

@@ -16,7 +16,7 @@ import triton.language as tl
 from ultragray.backends import cuda
 from ultragray.machine import processor_name
 
-from .clock import elapsed_ms, finish, mark
+from .kernel import elapsed_ms, finish, mark
 from .report import versions
 
 COPY_BYTES = 2 << 30  # far more than any cache holds

@@ -115,7 +115,7 @@ def _until(client: JobClient, job_id: str, reached: Callable[[dict[str, Any]], b
 
 
 def _copy_jobs(artifact_folder: Path, count: int) -> None:
-    """As many jobs as the one that has finished, a second apart before it; without folders, which lists do not read."""
+    """Insert copies of the finished job, a second apart before it; they have no folders, which lists do not read."""
     jobs = JobDatabase(artifact_folder, None)
     try:
         tables = sa.MetaData()

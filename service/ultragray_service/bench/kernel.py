@@ -1,4 +1,4 @@
-"""The kernel's own time, and the yard it is measured with."""
+"""The kernel's own time, the yard it is measured with, and time as a device counts it."""
 
 from __future__ import annotations
 
@@ -18,6 +18,8 @@ from ultragray.probe import FloatArray
 BLOCK_CM = 5.0
 PROBE = LinearProbe(width_mm=50.0, near_mm=0.0, far_mm=50.0)
 BATCH = 8
+
+Mark = float | torch.cuda.Event  # seconds of the host's clock, or a place in the device's queue
 
 
 @dataclass(frozen=True)
@@ -114,3 +116,27 @@ def time_yard_ms() -> float:
         times.append(1000.0 * (time.perf_counter() - started))
     torch.set_num_threads(before)
     return float(np.median(times))
+
+
+def mark(device: torch.device) -> Mark:
+    """The time now, or on a GPU when all that was queued before is done."""
+    if device.type == "cpu":
+        return time.perf_counter()
+    event = torch.cuda.Event(enable_timing=True)  # type: ignore[no-untyped-call]
+    event.record()
+    return event
+
+
+def elapsed_ms(first: Mark, last: Mark) -> float:
+    """The time between two marks of one device, which has done what was queued before the last."""
+    if isinstance(first, float) or isinstance(last, float):
+        assert isinstance(first, float)
+        assert isinstance(last, float)
+        return 1000.0 * (last - first)
+    return float(first.elapsed_time(last))
+
+
+def finish(device: torch.device) -> None:
+    """Wait until the device has done what was queued."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)

@@ -43,14 +43,14 @@ class FrontDoor:
 
 @dataclass(frozen=True)
 class Served:
-    """What the service did, and the memory of its worker (resident, shared pages counted by share) in MB."""
+    """The figures of a service, and the memory of its worker (resident, shared pages counted by share) in MB."""
 
     front_doors: list[FrontDoor]
     worker_memory_mb: float
 
 
 def measure_served(bench: BenchScene, repeats: int, backend: str) -> Served:
-    """Raises NotReady where the server does not come up."""
+    """Measure each front door of a service of the scene. Raises NotReady where it does not come up."""
     poses = bench_poses(repeats + WARM_UP)
     with tempfile.TemporaryDirectory(prefix="ultragray-bench-") as folder:
         bench.scene.save(Path(folder) / f"{SCENE}.ugr")
@@ -141,7 +141,7 @@ def _grpc_stream(server: RunningServer, poses: FloatArray) -> FrontDoor:  # [C, 
 
 
 class _Turns:
-    """Lets a request iterator yield only after `release`, so that a known number is in flight."""
+    """A request iterator that yields only after `release`, so that a known number is in flight."""
 
     def __init__(self) -> None:
         self._turns: queue.Queue[None] = queue.Queue()

@@ -16,8 +16,7 @@ from ultragray.backends.spatial_order import spatial_order
 from ultragray.training.losses import image_loss
 from ultragray.training.optimizer import Optimizer
 
-from .clock import Mark, elapsed_ms, finish, mark
-from .kernel import BATCH, PROBE, BenchScene, bench_poses
+from .kernel import BATCH, PROBE, BenchScene, Mark, bench_poses, elapsed_ms, finish, mark
 from .report import Report
 
 CPU = torch.device("cpu")
@@ -36,7 +35,7 @@ class TrainingTiming:
     wall_ms: float
 
     def share(self, part: str) -> float:
-        """Of a part in the step, by medians."""
+        """The share of a part in the step, by medians."""
         return float(np.median(self.part_ms[part]) / np.median(self.step_ms))
 
 

@@ -32,7 +32,7 @@ USER_ERROR = 2  # the exit code of a mistake that the caller can mend
 
 
 class _Commands(TyperGroup):
-    """Turns the errors of the project's tree and of the file system into one red line and exit code 2."""
+    """A group that turns the errors of the project and of the file system into one red line and exit code 2."""
 
     def invoke(self, context: Any) -> Any:
         try:
@@ -143,58 +143,6 @@ def info(
     (print_json if json else print_table)(scene)
 
 
-@app.command()
-def import_checkpoint(
-    checkpoint: Annotated[Path, typer.Argument(help="Checkpoint of the released trainer (.pt).", show_default=False)],
-    config: Annotated[Path, typer.Option(help="conf.json of its dataset.", show_default=False)],
-    output: Annotated[Path, typer.Option("--output", "-o", help="Scene file to write (.ugr).", show_default=False)],
-    poses: Annotated[
-        Path | None,
-        typer.Option(help="Its training poses (poses_train.npy); they give the centre.", show_default=False),
-    ] = None,
-    center: Annotated[
-        tuple[float, float, float] | None,
-        typer.Option(metavar="X Y Z", help="Instead of --poses: the scene centre in mm.", show_default=False),
-    ] = None,
-    centered: Annotated[
-        bool, typer.Option("--centered", help="Instead of --poses: poses will be relative to the centre.")
-    ] = False,
-    image_height: Annotated[
-        int | None,
-        typer.Option(help="Height of the training images.", show_default="from the images file that conf.json names"),
-    ] = None,
-) -> None:
-    """Turn a released UltraG-Ray checkpoint into a scene file, with its place in the tracker's frame."""
-    from ultragray.interchange.checkpoint import import_checkpoint as read_checkpoint
-
-    from .output import SCENE_SUFFIX, check_writable
-
-    if [poses is not None, center is not None, centered].count(True) != 1:
-        raise InvalidArgument(
-            "give exactly one of --poses (its training poses), --center X Y Z (the scene centre in mm) and "
-            "--centered (poses relative to the centre)",
-            field="poses",
-        )
-    check_writable(output, SCENE_SUFFIX)
-    try:
-        scene = read_checkpoint(
-            checkpoint,
-            config=config,
-            poses=poses,
-            center_mm=center,
-            centered=centered,
-            image_height=image_height,
-        )
-    except InvalidArgument as error:
-        option = "--image-height: " if error.field == "image_height" else ""
-        raise InvalidArgument(f"{option}{error.detail}", field=error.field) from error
-    scene.save(output)
-    x, y, z = scene.info.centre_mm
-    typer.echo(
-        f"wrote {output}: {scene.gaussian_count:,} Gaussians about ({x:.2f}, {y:.2f}, {z:.2f}) mm, {scene.info.probe}"
-    )
-
-
 app.add_typer(cli_dataset.dataset_app, name="dataset")
 app.add_typer(cli_jobs.jobs_app, name="jobs")
 app.command()(cli_train.train)
@@ -203,6 +151,7 @@ app.command()(cli_eval.compound)
 app.command()(cli_report.report)
 app.command()(cli_convert.export)
 app.command()(cli_convert.import_ply)
+app.command()(cli_convert.import_checkpoint)
 app.command()(cli_worker.worker)
 
 

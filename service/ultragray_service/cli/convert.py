@@ -1,4 +1,4 @@
-"""`ultragray export` and `ultragray import-ply`: scenes for other programs, and back."""
+"""`ultragray export`, `import-ply` and `import-checkpoint`: scenes for other programs, and back."""
 
 from __future__ import annotations
 
@@ -70,3 +70,52 @@ def import_ply(
     scene = read_ply(file)
     scene.save(output)
     typer.echo(f"wrote {output}: {scene.gaussian_count:,} Gaussians, {len(scene.training_poses)} training poses")
+
+
+def import_checkpoint(
+    checkpoint: Annotated[Path, typer.Argument(help="Checkpoint of the released trainer (.pt).", show_default=False)],
+    config: Annotated[Path, typer.Option(help="conf.json of its dataset.", show_default=False)],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Scene file to write (.ugr).", show_default=False)],
+    poses: Annotated[
+        Path | None,
+        typer.Option(help="Its training poses (poses_train.npy); they give the centre.", show_default=False),
+    ] = None,
+    center: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option(metavar="X Y Z", help="Instead of --poses: the scene centre in mm.", show_default=False),
+    ] = None,
+    centered: Annotated[
+        bool, typer.Option("--centered", help="Instead of --poses: poses will be relative to the centre.")
+    ] = False,
+    image_height: Annotated[
+        int | None,
+        typer.Option(help="Height of the training images.", show_default="from the images file that conf.json names"),
+    ] = None,
+) -> None:
+    """Turn a released UltraG-Ray checkpoint into a scene file, with its place in the tracker's frame."""
+    from ultragray.interchange.checkpoint import import_checkpoint as read_checkpoint
+
+    if [poses is not None, center is not None, centered].count(True) != 1:
+        raise InvalidArgument(
+            "give exactly one of --poses (its training poses), --center X Y Z (the scene centre in mm) and "
+            "--centered (poses relative to the centre)",
+            field="poses",
+        )
+    check_writable(output, SCENE_SUFFIX)
+    try:
+        scene = read_checkpoint(
+            checkpoint,
+            config=config,
+            poses=poses,
+            center_mm=center,
+            centered=centered,
+            image_height=image_height,
+        )
+    except InvalidArgument as error:
+        option = "--image-height: " if error.field == "image_height" else ""
+        raise InvalidArgument(f"{option}{error.detail}", field=error.field) from error
+    scene.save(output)
+    x, y, z = scene.info.centre_mm
+    typer.echo(
+        f"wrote {output}: {scene.gaussian_count:,} Gaussians about ({x:.2f}, {y:.2f}, {z:.2f}) mm, {scene.info.probe}"
+    )

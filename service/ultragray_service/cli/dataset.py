@@ -1,21 +1,57 @@
-"""`ultragray dataset check | convert | show`: what is in a sweep, as a table, as files, as a picture."""
+"""`ultragray dataset check | convert | show`, and the dataset that other commands name."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ultragray.datasets.source import SourceOptions
+from ultragray.datasets.source import FORMATS, PHANTOM, SourceOptions, load_dataset
 
 from .options import with_options
-from .source import DatasetArgument, read_dataset, warnings_of
 
 if TYPE_CHECKING:
+    from ultragray.datasets import Dataset
     from ultragray.datasets.checks import DatasetReport, SweepReport
+    from ultragray.scene_info import SceneInfo
 
+DatasetArgument = Annotated[
+    str,
+    typer.Argument(
+        metavar="DATASET",
+        help=f"One of: {'; '.join(one.meaning for one in FORMATS.values())}.",
+        show_default=False,
+    ),
+]
 dataset_app = typer.Typer(no_args_is_help=True, help="Look at a tracked sweep, check it, convert it.")
+
+
+def read_dataset(source: str, options: SourceOptions) -> Dataset:
+    """The dataset that a command's argument and options name. Raises DatasetInvalid and InvalidArgument."""
+    if source == PHANTOM:
+        typer.echo("simulating the phantom …", err=True)
+    return load_dataset(source, options)
+
+
+def warn_about_dataset(dataset: Dataset) -> None:
+    """Say on stderr what `dataset check` warns of."""
+    from ultragray.datasets.checks import check_dataset
+
+    _warn(check_dataset(dataset).labelled_warnings)
+
+
+def check_scene_fits(info: SceneInfo, dataset: Dataset) -> None:
+    """Say on stderr what makes figures of a scene on a dataset doubtful; raises as `check_same_origin`."""
+    from ultragray.evaluation.scoring import check_same_origin
+
+    _warn(check_same_origin(info, dataset))
+
+
+def _warn(warnings: Iterable[str]) -> None:
+    for text in warnings:
+        typer.secho(f"warning: {text}", fg=typer.colors.YELLOW, err=True)
 
 
 @dataset_app.command()
@@ -102,7 +138,7 @@ def _print_report(report: DatasetReport) -> None:
             f"mm and up to {report.val_angle_max_deg:.2f}° from the nearest training frame",
             soft_wrap=True,
         )
-    warnings = warnings_of(report)
+    warnings = report.labelled_warnings
     for warning in warnings:
         console.print(f"[yellow]warning:[/] {escape(warning)}", soft_wrap=True)
     if not warnings:

@@ -11,9 +11,9 @@ import typer
 
 from ultragray.datasets.source import SourceOptions
 
+from .dataset import DatasetArgument, check_scene_fits, read_dataset
 from .options import with_options
 from .output import check_picture_folder
-from .source import DatasetArgument, check_scene_fits, read_dataset
 
 if TYPE_CHECKING:
     from ultragray.evaluation.scoring import Evaluation

@@ -1,4 +1,4 @@
-"""`ultragray info`: what a scene file says about itself, as a table or as JSON."""
+"""`ultragray info`: the description in a scene file, as a table or as JSON."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def print_json(path: Path) -> None:
 
 
 def print_table(path: Path) -> None:
-    """The same for people."""
+    """The same as a table, for people."""
     table = Table(show_header=False, box=None, pad_edge=False)
     table.add_column(style="bold", no_wrap=True)
     table.add_column(overflow="fold")

@@ -23,7 +23,7 @@ _GONE_S = 60.0  # a service that comes back within this time is asked again
 
 
 def follow(client: JobClient, job_id: str) -> None:
-    """Returns when the job has succeeded. Exits with 3 where it failed, 4 where it was cancelled, 130 at Ctrl-C.
+    """Return when the job has succeeded; exit with 3 where it failed, 4 where it was cancelled, 130 at Ctrl-C.
 
     Raises UltragrayError: no such job, or a service that stays away.
     """

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import inspect
 import json
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, Field
 from enum import Enum
@@ -43,7 +44,7 @@ _PARSED = (bool, int, float, Path)
 
 
 class FieldsOf:
-    """What a dict of a command holds: fields of a contract dataclass that were given, of all or of some.
+    """An annotation of a dict: it holds the fields of a contract dataclass that were given, of all or of some.
 
     `environment` begins the names of the environment variables that hold the fields as well.
     """
@@ -79,7 +80,7 @@ def with_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 def _made(cls: Any, name: str, given: Mapping[str, Any]) -> Any:
     if isinstance(cls, FieldsOf):
-        return values_of(cls.cls, {item.name: given.get(item.name) for item, _ in _fields(cls.cls)})
+        return values_of(cls.cls, defaultdict(lambda: None, given))
     return _part(cls, name, given) if issubclass(cls, Family) else cls(**values_of(cls, given))
 
 
@@ -140,7 +141,7 @@ def _fields(cls: Any) -> Iterator[tuple[Field[Any], Any]]:
 
 
 def _is_within(kind: Any) -> bool:
-    """Whether the fields of this type have options of their own."""
+    """Tell whether the fields of this type have options of their own."""
     is_contract = isinstance(kind, type) and issubclass(kind, Contract)
     return is_contract and (not issubclass(kind, Family) or kind in _WITH_AN_OPTION_A_FIELD)
 
@@ -221,7 +222,7 @@ def _part(cls: Any, name: str, given: Mapping[str, Any]) -> Any:
 
 
 def _read(value: Any, kind: Any, name: str) -> Any:
-    """What an option holds, as the type of its field."""
+    """The value of an option in the type of its field."""
     if get_origin(kind) is tuple:
         return from_text(value, kind)
     if get_origin(kind) is dict:

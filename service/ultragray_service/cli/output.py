@@ -1,4 +1,4 @@
-"""Where a command writes, checked before the work starts."""
+"""Checks of where a command writes, before the work starts."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ SCENE_SUFFIX = ".ugr"  # the service lists no other files
 
 
 def check_writable(path: Path, suffix: str | None = None) -> None:
-    """Raises InvalidArgument where `path` is a folder or does not end in `suffix`, or where it could not be made."""
+    """Raise InvalidArgument where `path` is a folder, does not end in `suffix`, or could not be made."""
     if path.is_dir():
         raise InvalidArgument(f"output must be a file, {path} is a folder", field="output")
     if suffix is not None and path.suffix != suffix:
@@ -24,7 +24,7 @@ def check_writable(path: Path, suffix: str | None = None) -> None:
 
 
 def check_picture_folder(path: Path) -> None:
-    """Raises InvalidArgument where `path` is a file, or a folder with files: pictures of two runs would mix."""
+    """Raise InvalidArgument where `path` is a file, or a folder with files: pictures of two runs would mix."""
     if path.exists() and not path.is_dir():
         raise InvalidArgument(f"output must be a folder for pictures, {path} is a file", field="output")
     if path.is_dir() and next(path.iterdir(), None) is not None:

@@ -87,7 +87,7 @@ def render_frames(
 
 
 def _trust(found: Sequence[Extrapolation]) -> str:
-    """In words: the confidence where it is known, and how much of the frames has support."""
+    """A few words on the confidence, where it is known, and on how much of the frames has support."""
     figures = figure_arrays(found)
     confidence = figures["confidence"]
     words = [f"Gaussians support {figures['supported_share'].mean():.0%} of the pixels"]

@@ -14,10 +14,10 @@ import typer
 from ultragray.datasets.source import SourceOptions
 from ultragray.training.config import TrainingConfig
 
+from .dataset import DatasetArgument, check_scene_fits, read_dataset, warn_about_dataset
 from .eval import VoxelMm
 from .options import FieldsOf, with_options
 from .output import check_writable
-from .source import DatasetArgument, check_scene_fits, read_dataset, warn_about_dataset
 
 if TYPE_CHECKING:
     from ultragray.datasets import Dataset
@@ -29,7 +29,7 @@ Follow = Callable[["Progress"], None]
 
 @dataclass(frozen=True)
 class ReportOptions:
-    """What goes into the page besides the dataset."""
+    """The contents of the page besides the dataset."""
 
     scene: Path | None
     ablations: bool

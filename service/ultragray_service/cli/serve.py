@@ -21,7 +21,7 @@ DEMO_NAME = "demo"
 
 
 def serve_scenes(scenes: Iterable[Path], options: Mapping[str, Any]) -> None:
-    """Serves the given scene files, or the data folder of the settings; returns when the service has stopped.
+    """Serve the given scene files, or the data folder of the settings, until the service has stopped.
 
     Given files are served by their stem from a folder of links that lasts as long as the service. A data
     folder without a scene gets the demo scene; the default one is made.
@@ -44,7 +44,7 @@ def serve_scenes(scenes: Iterable[Path], options: Mapping[str, Any]) -> None:
 
 
 def ensure_scenes(folder: Path) -> None:
-    """Puts the demo scene into a data folder that holds no scene, and says so on stderr.
+    """Put the demo scene into a data folder that holds no scene, and say so on stderr.
 
     Raises InvalidArgument where there is no such folder.
     """
@@ -61,7 +61,7 @@ def ensure_scenes(folder: Path) -> None:
 
 
 def link_scenes(files: Iterable[Path], folder: Path) -> None:
-    """Links scene files into `folder`; refuses what could not be served under its own name."""
+    """Link scene files into `folder`; refuse what could not be served under its own name."""
     for file in files:
         read_header(file)
         link = folder / f"{file.stem}{SUFFIX}"

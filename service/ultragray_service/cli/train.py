@@ -18,9 +18,9 @@ from ultragray.datasets.source import SourceOptions
 from ultragray.errors import MemoryExceeded, TrainingDiverged, TrainingStateInvalid
 from ultragray.training.config import TrainingConfig, read_config_file
 
+from .dataset import DatasetArgument, read_dataset, warn_about_dataset
 from .options import FieldsOf, parse_settings, with_options
 from .output import SCENE_SUFFIX, check_writable
-from .source import DatasetArgument, read_dataset, warn_about_dataset
 
 if TYPE_CHECKING:
     from ultragray.scene import GaussianScene
@@ -106,14 +106,14 @@ class RunOptions:
 
 
 def _check_device(device: str, backend: str) -> None:
-    """Raises BackendUnavailable before the dataset is read, which may take long."""
+    """Raise BackendUnavailable before the dataset is read, which may take long."""
     from ultragray.training.device import training_device
 
     training_device(device, backend)
 
 
 def _check_resumable(run: RunOptions) -> None:
-    """Raises TrainingStateInvalid where the folder of the run holds no checkpoint, with the reason."""
+    """Raise TrainingStateInvalid, with the reason, where the folder of the run holds no checkpoint."""
     from ultragray.training.trainer import CHECKPOINT_FILE, CONFIG_FILE, JOURNAL_FILE
 
     if (run.folder / CHECKPOINT_FILE).exists():
@@ -194,14 +194,14 @@ def _train(dataset: Any, config: TrainingConfig, run: RunOptions) -> None:
 
 
 def _cost(state: Progress) -> str:
-    """What a step took at the end, and of a GPU's memory the most at a time."""
+    """The time of a step at the end, and the most memory of a GPU that was in use."""
     step = f"{1000.0 / state.steps_per_s:.1f} ms a step"
     return step if state.peak_memory_mb is None else f"{step}, at most {state.peak_memory_mb:,.0f} MB of the GPU"
 
 
 @contextlib.contextmanager
 def _stop_on_signal() -> Iterator[Callable[[], bool]]:
-    """Whether SIGINT or SIGTERM came. More of them change nothing: a stopping process writes its scene and ends."""
+    """A function that tells whether SIGINT or SIGTERM came; a process that is stopping ignores more of them."""
     received: list[int] = []
     numbers = (signal.SIGINT, signal.SIGTERM)
     before = [signal.signal(number, lambda came, frame: received.append(came)) for number in numbers]

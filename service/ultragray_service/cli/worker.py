@@ -44,7 +44,7 @@ def worker(
 
 
 def run_worker(overrides: dict[str, Any], *, name: str | None = None, device: str = "auto") -> None:
-    """Does jobs until SIGTERM or SIGINT, then ends the process. Raises StartupFailed, InvalidArgument."""
+    """Do jobs until SIGTERM or SIGINT, then end the process. Raises StartupFailed, InvalidArgument."""
     from ultragray_workers.jobs.worker.worker import work
 
     from ..logs import configure_logging

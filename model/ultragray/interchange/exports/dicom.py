@@ -35,7 +35,7 @@ _UIDS = uuid.UUID("0f2bb0a1-93a5-5ab2-8a2c-5d1f1e4a7c60")
 
 
 class DicomExporter(Exporter):
-    """Writes the data set at once, then the frames into its last element, and the figures over their place."""
+    """A writer of the data set at once, then of the frames into its last element, then of the figures."""
 
     def _open(self) -> None:
         header = self._header
@@ -124,7 +124,7 @@ class DicomExporter(Exporter):
 
 
 def _uids(header: ExportHeader) -> tuple[str, str, str]:
-    """Of the image, the series and the study."""
+    """The UIDs of the image, the series and the study."""
     poses = hashlib.sha256(np.ascontiguousarray(header.poses, "<f8").tobytes()).hexdigest()
     made_of = json.dumps([header.origin(), header.settings.height, header.settings.width, poses], sort_keys=True)
     image, series = (f"{name} {made_of}" for name in ("image", "series"))

@@ -66,7 +66,7 @@ class Exporter(ABC):
     """
 
     def __init__(self, path: Path, header: ExportHeader) -> None:
-        """Raises InvalidArgument for frames that the format cannot hold, OSError."""
+        """Open the file. Raises InvalidArgument for frames that the format cannot hold, OSError."""
         self._path, self._header, self._done = path, header, 0
         self._extrapolations: list[Extrapolation] = []  # of the frames that are there
         self._held = ExitStack()

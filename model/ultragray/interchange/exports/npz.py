@@ -16,7 +16,7 @@ from .exporter import Exporter
 
 
 class NpzExporter(Exporter):
-    """Writes the first output into the archive as it comes; the others wait in files without a name beside it."""
+    """A writer of the first output into the archive as it comes; the others wait in files without a name beside it."""
 
     def _open(self) -> None:
         header = self._header

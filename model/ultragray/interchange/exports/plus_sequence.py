@@ -27,7 +27,7 @@ FIGURE_WIDTH = 12  # of any number from 0 on, so that those found later take the
 
 
 class PlusExporter(Exporter):
-    """Writes the whole header at once, then the pixels as they come, and the figures over their place in the header."""
+    """A writer of the whole header at once, then of the pixels, and of the figures over their place in the header."""
 
     def _open(self) -> None:
         self._file = self._held.enter_context(self._path.open("wb"))

@@ -15,7 +15,7 @@ from .exporter import Exporter
 
 
 class TarExporter(Exporter):
-    """Of frame 12: 000012.OUTPUT.png (float32: .npy) of each output, and 000012.json: pose, figures, origin."""
+    """A writer of 000012.OUTPUT.png (float32: .npy) for each output and 000012.json (pose, figures, origin)."""
 
     def _open(self) -> None:
         self._tar = self._held.enter_context(tarfile.TarFile(self._path, "w"))

@@ -24,7 +24,7 @@ Portion: TypeAlias = tuple[Mapping[str, PixelArray], Sequence[Extrapolation]]
 
 @contextmanager
 def export_to(path: str | Path, format: str, header: ExportHeader) -> Iterator[Add]:
-    """Gives a function that takes the rendered frames in order; at the end `path` is there, whole, or not at all.
+    """A function that takes the rendered frames in order; at the end `path` is there, whole, or not at all.
 
     The frames are converted and written by a thread of its own: the function returns at once unless two portions
     wait. An error of the writing is raised by the next call, or at the end. Raises ExtraMissing, InvalidArgument,
