@@ -16,7 +16,7 @@ from ultragray.datasets import Dataset, Sweep
 from ultragray.datasets.released import write_released
 from ultragray.datasets.source import SourceOptions, load_dataset
 from ultragray.errors import DatasetInvalid
-from ultragray.training.geometry import Geometry
+from ultragray.training.data.geometry import Geometry
 
 SCRIPT = Path(__file__).resolve().parents[1] / "benchmarks" / "results_tables.py"
 SETTINGS = {"steps": 3, "max_gaussians": 40}

@@ -1,4 +1,4 @@
-"""The extension module built from model/kernels; see cpu.py and training/cpu_loss.py for what the arguments mean."""
+"""The extension module built from model/kernels; see cpu.py and training/steps/cpu_loss.py for what the arguments mean."""
 
 from typing import Any
 

@@ -23,7 +23,7 @@ from ..errors import InvalidArgument, TrainingStateInvalid
 from ..files.atomic import write_whole
 from ..scene_info import expected_shapes
 from .config import TrainingConfig
-from .optimizer import MOMENTS, is_trained
+from .steps.optimizer import MOMENTS, is_trained
 
 FORMAT_VERSION = 1
 METADATA_KEY = "ultragray-training"

@@ -20,7 +20,7 @@ from ..errors import InvalidArgument
 from ..scene_info import INTENSITIES, MAX_SH_DEGREE
 
 if typing.TYPE_CHECKING:
-    from .geometry import Geometry
+    from .data.geometry import Geometry
 
 if sys.version_info >= (3, 11):
     import tomllib

@@ -15,7 +15,7 @@ from ..datasets.sweep import Dataset
 from ..errors import MemoryExceeded
 from ..evaluation.scoring import CHUNK_PIXELS, frames_at_once
 from .config import TrainingConfig
-from .sampling import PREDICTED_PIXELS
+from .data.sampling import PREDICTED_PIXELS
 
 BASE_BYTES = 440 << 20  # the process with torch loaded, and the scratch memory of its kernels
 RAW_FLOATS = 3 + 3 + 4 + 1 + 1  # of a Gaussian, without the harmonics above degree 0

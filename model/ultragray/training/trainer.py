@@ -25,7 +25,6 @@ from ..rendering import choose_backend, render
 from ..scene import PARAMETERS, GaussianScene
 from ..scene_info import SceneInfo, check_training_pose_count
 from .board import Board, require_tensorboard
-from .calibration import fit_confidence, shorter
 from .checkpointing import (
     CheckpointHeader,
     check_same_run,
@@ -34,18 +33,19 @@ from .checkpointing import (
     read_checkpoint_header,
     write_checkpoint,
 )
+from .confidence.calibration import fit_confidence, shorter
 from .config import TrainingConfig
+from .data.geometry import Geometry
+from .data.initial import initial_parameters
+from .data.sampling import BatchSampler, out_of_plane_shift_mm, shift_out_of_plane
 from .device import forget_peak_memory, peak_memory_mb, training_device
-from .geometry import Geometry
-from .initial import initial_parameters
-from .intensity import project_sh0
-from .losses import SSIM_WINDOW, image_loss
 from .memory import check_comparison_memory, check_memory
-from .optimizer import Optimizer, is_trained
 from .progress import Journal, Progress, StepTimer
-from .refinement import PullStatistics, refine
-from .sampling import BatchSampler, out_of_plane_shift_mm, shift_out_of_plane
-from .schedule import Schedule
+from .steps.intensity import project_sh0
+from .steps.losses import SSIM_WINDOW, image_loss
+from .steps.optimizer import Optimizer, is_trained
+from .steps.refinement import PullStatistics, refine
+from .steps.schedule import Schedule
 
 CHECKPOINT_FILE = "checkpoint.safetensors"
 JOURNAL_FILE = "metrics.jsonl"

@@ -13,8 +13,8 @@ import torch
 
 from ultragray import GaussianScene, render
 from ultragray.backends.spatial_order import spatial_order
-from ultragray.training.losses import image_loss
-from ultragray.training.optimizer import Optimizer
+from ultragray.training.steps.losses import image_loss
+from ultragray.training.steps.optimizer import Optimizer
 
 from .kernel import BATCH, PROBE, BenchScene, Mark, bench_poses, elapsed_ms, finish, mark
 from .report import Report

@@ -17,7 +17,7 @@ from ultragray.report import page as page_module
 from ultragray.report.page import ReportContent, metric_rows, render_page
 from ultragray.report.study import Failed, ablations, study_tilt, train_and_evaluate
 from ultragray.training import TrainingConfig
-from ultragray.training.geometry import Geometry
+from ultragray.training.data.geometry import Geometry
 
 VOID = {"meta", "img", "link", "br"}
 

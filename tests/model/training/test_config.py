@@ -15,7 +15,7 @@ import pytest
 from ultragray.datasets.sweep import Dataset
 from ultragray.errors import InvalidArgument
 from ultragray.training.config import TrainingConfig, parse_value, read_config_file, scaled_transmittance_rate
-from ultragray.training.geometry import Geometry
+from ultragray.training.data.geometry import Geometry
 
 
 def test_presets() -> None:

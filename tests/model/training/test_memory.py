@@ -15,7 +15,7 @@ import torch
 from ultragray.datasets.sweep import Dataset
 from ultragray.errors import MemoryExceeded
 from ultragray.training import TrainingConfig, memory, train
-from ultragray.training.geometry import Geometry
+from ultragray.training.data.geometry import Geometry
 
 
 def test_names_what_to_lower(tiny_dataset: Callable[..., Dataset]) -> None:

@@ -31,7 +31,7 @@ from ultragray.errors import (
     TrainingStateInvalid,
 )
 from ultragray.training import Progress, TrainingConfig, train, trainer
-from ultragray.training.geometry import Geometry
+from ultragray.training.data.geometry import Geometry
 
 Datasets = Callable[..., Dataset]
 Configs = Callable[..., TrainingConfig]

@@ -20,7 +20,7 @@ from typer.testing import CliRunner, Result
 from ultragray import GaussianScene, LinearProbe
 from ultragray.datasets.source import load_dataset
 from ultragray.training import TrainingConfig, trainer
-from ultragray.training.geometry import Geometry
+from ultragray.training.data.geometry import Geometry
 from ultragray_service.cli.app import app
 
 SMALL = ("--steps", 24, "--max-gaussians", 60, "--threads", 1)

@@ -12,7 +12,7 @@ import torch
 from ultragray import LinearProbe
 from ultragray.datasets.sweep import Dataset, Sweep
 from ultragray.probe import FloatArray
-from ultragray.training.sampling import (
+from ultragray.training.data.sampling import (
     BatchSampler,
     out_of_plane_range_mm,
     out_of_plane_shift_mm,

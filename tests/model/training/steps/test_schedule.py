@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from ultragray.training import TrainingConfig
-from ultragray.training.schedule import Schedule
+from ultragray.training.steps.schedule import Schedule
 
 
 def schedule_of(**settings: object) -> Schedule:

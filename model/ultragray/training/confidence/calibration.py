@@ -9,12 +9,12 @@ from typing import TypeAlias
 
 import numpy as np
 
-from ..confidence.model import ConfidenceModel, fit_weights, predicted, terms_of
-from ..confidence.views import TrainingViews
-from ..datasets.sweep import Dataset, IntArray, Sweep
-from ..evaluation.scoring import evaluate, evaluate_frames
-from ..scene import GaussianScene
-from .config import TrainingConfig
+from ...confidence.model import ConfidenceModel, fit_weights, predicted, terms_of
+from ...confidence.views import TrainingViews
+from ...datasets.sweep import Dataset, IntArray, Sweep
+from ...evaluation.scoring import evaluate, evaluate_frames
+from ...scene import GaussianScene
+from ..config import TrainingConfig
 from .hardness import hardness_of_views
 from .held_out import held_out_frames
 

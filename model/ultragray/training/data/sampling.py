@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..datasets.sweep import IntArray, Sweep, corner_distances_mm
-from ..probe import FloatArray
+from ...datasets.sweep import IntArray, Sweep, corner_distances_mm
+from ...probe import FloatArray
 
 LEAST_RANGE = 1.5  # × the spacing of the frames
 TELLING_NEIGHBOURS = 8  # with fewer, PSNR only says that speckle averages out

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from ultragray.backends import cpu
-from ultragray.training.cpu_loss import image_loss
-from ultragray.training.losses import plain_image_loss
+from ultragray.training.steps.cpu_loss import image_loss
+from ultragray.training.steps.losses import plain_image_loss
 
 
 @pytest.mark.parametrize("shape", [(3, 40, 53), (1, 11, 11), (2, 64, 16), (1, 12, 300)])

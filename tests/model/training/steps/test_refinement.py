@@ -8,7 +8,7 @@ from typing import Any
 import torch
 
 from ultragray.training import TrainingConfig
-from ultragray.training.refinement import PullStatistics, Refined, refine, rotate
+from ultragray.training.steps.refinement import PullStatistics, Refined, refine, rotate
 
 SCENE_SCALE_CM = 10.0
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from .config import TrainingConfig
+from ..config import TrainingConfig
 
 
 class Schedule:

@@ -8,12 +8,12 @@ import numpy as np
 import torch
 from torch.nn import functional
 
-from ..confidence.model import NEAR_MM
-from ..confidence.views import TrainingViews
-from ..datasets.sweep import ByteArray, Sweep
-from ..evaluation.baselines import interpolate_planes
-from ..evaluation.metrics import frame_metrics
-from ..probe import FloatArray
+from ...confidence.model import NEAR_MM
+from ...confidence.views import TrainingViews
+from ...datasets.sweep import ByteArray, Sweep
+from ...evaluation.baselines import interpolate_planes
+from ...evaluation.metrics import frame_metrics
+from ...probe import FloatArray
 
 PICTURE_SIDE = 64  # what is smaller than its pixels is speckle
 MAX_FRAMES = 192  # looked at; the others take after their neighbours

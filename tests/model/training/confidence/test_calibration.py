@@ -16,8 +16,8 @@ from ultragray.errors import TrainingDiverged
 from ultragray.evaluation.scoring import evaluate
 from ultragray.probe import FloatArray
 from ultragray.training import TrainingConfig, train, trainer
-from ultragray.training.calibration import fit_confidence, shorter
-from ultragray.training.geometry import Geometry
+from ultragray.training.confidence.calibration import fit_confidence, shorter
+from ultragray.training.data.geometry import Geometry
 
 Datasets = Callable[..., Dataset]
 Configs = Callable[..., TrainingConfig]

@@ -14,9 +14,9 @@ from ultragray import GaussianScene, Probe, SceneInfo
 from ultragray.backends import reference
 from ultragray.datasets.sweep import Dataset
 from ultragray.training import TrainingConfig
-from ultragray.training.geometry import Geometry
-from ultragray.training.initial import initial_parameters
-from ultragray.training.refinement import rotate
+from ultragray.training.data.geometry import Geometry
+from ultragray.training.data.initial import initial_parameters
+from ultragray.training.steps.refinement import rotate
 
 
 def start_of(dataset: Dataset, config: TrainingConfig) -> dict[str, torch.Tensor]:

@@ -7,7 +7,7 @@ import pytest
 
 from ultragray import LinearProbe
 from ultragray.datasets.sweep import Sweep
-from ultragray.training.hardness import hardness_of_views
+from ultragray.training.confidence.hardness import hardness_of_views
 
 PROBE = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=40.0)
 

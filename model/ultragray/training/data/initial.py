@@ -8,14 +8,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..backends.spatial_order import spatial_order
-from ..datasets.sweep import Dataset
-from ..pose import quaternion_from_pose
-from ..scene import PARAMETERS
-from ..scene_info import expected_shapes
-from .config import TrainingConfig
+from ...backends.spatial_order import spatial_order
+from ...datasets.sweep import Dataset
+from ...pose import quaternion_from_pose
+from ...scene import PARAMETERS
+from ...scene_info import expected_shapes
+from ..config import TrainingConfig
+from ..steps.intensity import sh0_of_intensity
 from .geometry import Geometry
-from .intensity import sh0_of_intensity
 
 NO_ABSORPTION_LOGIT = 30.0  # τ = 1 to the last bit of a float32
 RELEASED_INTENSITY = 0.6  # of the released start: sh0 = (0.1 − 0.5) / 0.28209

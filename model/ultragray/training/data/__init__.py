@@ -1,0 +1,1 @@
+"""What training takes from a dataset: its geometry, the first Gaussians, batches."""

@@ -1,0 +1,1 @@
+"""One step: losses, the optimizer and its rates, Gaussians added and pruned."""
