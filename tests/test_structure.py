@@ -14,7 +14,6 @@ STILL_LARGER = {  # may shrink, and leaves the list then
     "service/ultragray_service/http",
     "service/ultragray_service/cli",
     "service/ultragray_service/core",
-    "service/ultragray_service/bench",
     "client/ultragray_client",
 }
 PROBE_PACKAGE = "ultragray.probe"

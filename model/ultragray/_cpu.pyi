@@ -1,4 +1,4 @@
-"""The extension module built from model/kernels; see cpu.py and training/steps/cpu_loss.py for what the arguments mean."""
+"""The extension module built from model/kernels; backends/cpu.py and training/steps/cpu_loss.py tell its arguments."""
 
 from typing import Any
 
