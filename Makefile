@@ -6,6 +6,7 @@ BIN := $(VENV)/bin
 # A file of tests belongs to one process, which shares its services among them.
 PYTEST := $(BIN)/pytest --numprocesses auto --maxprocesses 4 --dist loadfile
 KERNEL_SOURCES := $(wildcard model/kernels/*) CMakeLists.txt pyproject.toml
+GENERATED_TESTS := tests/proto tests/client/test_client_generated.py tests/interfaces/test_generated_tables.py tests/service/test_snapshots.py
 PYTHON_SOURCES := model service workers proto client tests benchmarks docs examples
 NPM := $(shell command -v npm)
 CONSOLE := service/ultragray_service/console/index.html
@@ -15,7 +16,7 @@ DATA ?= ../shared/data
 ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: ALWAYS help serve console test test-fast test-long test-console test-faults check check-lint check-types check-web format bench bench-console bench-cuda results demo-scene generate clean
+.PHONY: ALWAYS help serve console test test-fast test-long test-console test-faults check check-lint check-types check-generated check-web format bench bench-console bench-cuda results demo-scene generate clean
 
 help:  ## say what there is
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
@@ -44,8 +45,8 @@ test-faults: $(VENV)/installed-dev  ## processes killed at random: render worker
 	ULTRAGRAY_FAULT_SECONDS=30 $(BIN)/pytest tests/workers/pool/test_faults.py -s $(ARGS)
 	ULTRAGRAY_FAULT_KILLS=32 $(BIN)/pytest tests/faults -s $(ARGS)
 
-check: $(VENV)/installed-dev  ## lint, types, formatting; all at the same time
-	@$(MAKE) --no-print-directory --keep-going --jobs --output-sync=target check-lint check-types check-web
+check: $(VENV)/installed-dev  ## lint, types, formatting, and whether what is generated is current; all at the same time
+	@$(MAKE) --no-print-directory --keep-going --jobs --output-sync=target check-lint check-types check-generated check-web
 
 check-lint:
 	$(BIN)/ruff check $(PYTHON_SOURCES)
@@ -56,7 +57,11 @@ check-lint:
 check-types:
 	$(BIN)/mypy
 
+check-generated:
+	$(BIN)/pytest --quiet $(GENERATED_TESTS)
+
 check-web:
+	@$(CONSOLE_IF_POSSIBLE)
 	@[ ! -d web/node_modules ] || npm --prefix web run --silent check
 
 format: $(VENV)/installed-dev  ## rewrite the sources in the project's format
