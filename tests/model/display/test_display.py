@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from ultragray import ConvexProbe, LinearProbe, PhasedProbe, Probe
+from ultragray import ConvexProbe, LinearProbe, PhasedProbe, Probe, RadialProbe, SteeredProbe
 from ultragray.display.frames import show
 from ultragray.display.scan_conversion import scan_convert, scan_convert_labels
 from ultragray.display.settings import Display
@@ -86,13 +86,16 @@ def test_pixels_of_a_picture_lie_where_it_says(probe: Probe, flip: bool) -> None
     np.testing.assert_allclose(z_shown[eroded], np.broadcast_to(z, eroded.shape)[eroded], atol=0.05)
 
 
-def test_scan_conversion_is_that_of_the_probe() -> None:
+@pytest.mark.parametrize(
+    "probe", [CONVEX, RadialProbe(2.0, 20.0), SteeredProbe(30.0, 20.0, 0.0, 40.0)], ids=lambda probe: probe.kind
+)
+def test_frames_are_scan_converted_as_arrays_are(probe: Probe) -> None:
     given = frames()
-    shown = show(given, CONVEX, Display(pixel_mm=0.8))
+    shown = show(given, probe, Display(pixel_mm=0.8))
     for k in range(2):
-        expected = scan_convert(given["bmode"][k].numpy(), CONVEX, 0.8)
+        expected = scan_convert(given["bmode"][k].numpy(), probe, 0.8)
         np.testing.assert_allclose(shown["bmode"][k].numpy(), expected, atol=2e-5)
-    labels = scan_convert_labels(given["labels"][0].numpy(), CONVEX, 0.8)
+    labels = scan_convert_labels(given["labels"][0].numpy(), probe, 0.8)
     assert (shown["labels"][0].numpy() == labels).mean() > 0.999  # samples half-way between two
 
 
