@@ -14,10 +14,10 @@ from .scan_lines import Box, FloatArray
 class Picture:
     """The grid of a picture [H, W].
 
-    Columns are counted in mm along x (`column_unit` "mm") or, where each is one of angular scan lines, in degrees from z
-    ("deg"); rows in mm along z, or along the scan lines. Where these are steered, a column is where its line leaves the
-    face. `first` is the centre of pixel (0, 0), (column, row), `step`
-    the way to the next one, negative where the picture is flipped.
+    Columns are counted in mm along x (`column_unit` "mm") or, where each is one of angular scan lines, in degrees from
+    z ("deg"); rows in mm along z, or along the scan lines. Where these are steered, a column is where its line leaves
+    the face. `first` is the centre of pixel (0, 0), (column, row), `step` the way to the next one, negative where the
+    picture is flipped.
     """
 
     height: int
