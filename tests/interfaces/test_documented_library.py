@@ -23,7 +23,7 @@ from ultragray import (
     rendering,
     samplers,
 )
-from ultragray.datasets import Dataset, Sweep, checks, phantom, pictures, plus, released, source
+from ultragray.datasets import Dataset, Sweep, checks, dicom, phantom, pictures, plus, released, source
 from ultragray.display import frames as display_frames
 from ultragray.display import scan_conversion
 from ultragray.display import settings as display
@@ -75,7 +75,7 @@ def test_members() -> None:
 def test_other_modules() -> None:
     found = {
         f"{module.__name__}.{call_of(value)}"
-        for module in (*LIBRARY_MODULES, *MEASURING_MODULES, checks, pictures, plus, released, source)
+        for module in (*LIBRARY_MODULES, *MEASURING_MODULES, checks, dicom, pictures, released, source)
         for name, value in vars(module).items()
         if inspect.isfunction(value) and value.__module__ == module.__name__
         if not name.startswith("_") and name not in ultragray.__all__
@@ -87,7 +87,7 @@ def test_other_modules() -> None:
     }
     found |= {
         f"{package.__name__}.{call_of(value)}"
-        for package in (samplers, exports)
+        for package in (samplers, exports, plus)
         for value in (getattr(package, name) for name in package.__all__)
         if inspect.isfunction(value)
     }

@@ -86,7 +86,7 @@ def load_dataset(source: str | Path, options: SourceOptions | None = None) -> Da
     the frame and the reason; InvalidArgument, naming the field, for options that cannot be met.
     """
     options = options or SourceOptions()
-    chosen = format_of(source)
+    chosen = _format_of(source)
     for item in fields(options):
         if getattr(options, item.name) is not None and item.name not in (*EVERY_FORMAT_TAKES, *chosen.options):
             takers = " and ".join(f"{one.noun}s" for one in FORMATS.values() if item.name in one.options)
@@ -101,7 +101,7 @@ def load_dataset(source: str | Path, options: SourceOptions | None = None) -> Da
     return replace(dataset, train=train, val=val)
 
 
-def format_of(source: str | Path) -> DatasetFormat:
+def _format_of(source: str | Path) -> DatasetFormat:
     """The format that a source is in, by its name. Raises DatasetInvalid."""
     path = Path(source)
     for one in FORMATS.values():
