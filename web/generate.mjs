@@ -16,6 +16,7 @@ const { schemas } = document.components;
 /** A JSON schema with its references filled in, as far as a form needs it: see `Described` of web/src/api/described.ts. */
 function described({ $ref, anyOf, oneOf, properties, items, ...schema }) {
   const kept = Object.fromEntries(Object.entries(schema).filter(([key]) => KEPT.includes(key)));
+  if (kept.enum) kept.enum = kept.enum.filter((one) => one !== null); // then it is nullable
   if ($ref) return { ...described(schemas[$ref.split("/").at(-1)]), ...kept };
   if (anyOf) {
     const [one, ...others] = anyOf.filter(({ type }) => type !== "null");

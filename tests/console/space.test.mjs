@@ -3,11 +3,10 @@
 import assert from "node:assert/strict";
 import { describe, it } from "node:test";
 
-import { picture, until } from "./harness.mjs";
-import { dragProbe, openScan, poseOf } from "./scan_page.mjs";
+import { canvasState, picture, until } from "./harness.mjs";
+import { dragProbe, IMAGE, openScan, poseOf } from "./scan_page.mjs";
 import { tested } from "./tested.mjs";
 
-const PROBES = ["convex", "linear", "phased", "own"];
 const CONVEX_RADIUS_MM = 40;
 const PLANE_NUMBERS = 65 * 2 * 3; // x, y, z of both ends of the scan lines of a plane
 
@@ -41,14 +40,14 @@ async function openSpace() {
   return { page, room };
 }
 
-/** The number of buffers once it stands still. */
-async function steadyBuffers(page) {
+/** The number of buffers once it stands still for so many tenths of a second. */
+async function steadyBuffers(page, tenths = 5) {
   let before = -1;
   let same = 0;
   const stands = (count) => {
     same = count > 8 && count === before ? same + 1 : 0;
     before = count;
-    return same >= 5;
+    return same >= tenths;
   };
   return until(() => page.evaluate(() => globalThis.buffers), stands, "the 3D view does not come to rest");
 }
@@ -56,14 +55,16 @@ async function steadyBuffers(page) {
 describe("the scene in space", () => {
   it("keeps nothing of probes that were changed, nor of itself when it is left", async () => {
     const { page } = await openSpace();
-    const choose = async (probe) => {
-      await page.getByRole("combobox", { name: "Probe" }).selectOption(probe);
-      await until(() => page.getByRole("combobox", { name: "Probe" }).inputValue(), (value) => value === probe, probe);
-      return steadyBuffers(page);
+    const probe = page.getByRole("combobox", { name: "Probe" });
+    const kinds = (await probe.locator("option").evaluateAll((options) => options.map(({ value }) => value))).reverse();
+    const choose = async (kind) => {
+      await probe.selectOption(kind);
+      await until(() => probe.inputValue(), (value) => value === kind, kind);
+      return steadyBuffers(page, 20); // what is drawn slowly is put there late
     };
     const counts = [];
-    for (const probe of [...PROBES, ...PROBES, ...PROBES]) counts.push(await choose(probe));
-    const earlier = counts.splice(0, 2 * PROBES.length); // parts are put there when they are first drawn
+    for (const kind of [...kinds, ...kinds, ...kinds]) counts.push(await choose(kind));
+    const earlier = counts.splice(0, 2 * kinds.length); // parts are put there when they are first drawn
     assert.ok(Math.max(...counts) <= Math.max(...earlier), `${earlier} buffers, then ${counts}`);
     await page.getByRole("link", { name: "Train", exact: true }).click();
     await until(() => page.evaluate(() => globalThis.buffers), (count) => count <= 2, "buffers stay");
@@ -80,6 +81,28 @@ describe("the scene in space", () => {
     await deepest(60);
     await page.getByLabel("Depth", { exact: true }).fill("30");
     await deepest(30);
+  });
+
+  it("has a picture, a plane and a ruler for every kind of probe, as a sector and as scan lines", async () => {
+    const { page } = await openScan(at);
+    const probe = page.getByRole("combobox", { name: "Probe" });
+    const kinds = await probe.locator("option").evaluateAll((options) => options.map(({ value }) => value));
+    assert.ok(kinds.length >= 4, `${kinds}`);
+    for (const kind of kinds.filter((one) => one !== "own")) {
+      const { print } = await canvasState(page, IMAGE);
+      await probe.selectOption(kind);
+      await until(() => canvasState(page, IMAGE), (state) => state.print !== print && state.mean > 1, `no ${kind} image`);
+      await page.getByTestId("depth-ruler").getByText("1", { exact: true }).first().waitFor();
+      await page.waitForTimeout(1500); // the 3D view follows when there is time
+      await picture(page, `scan-${kind}`);
+      const stored = page.getByRole("button", { name: "Scan lines" });
+      if ((await stored.count()) === 0) continue;
+      await stored.click();
+      await until(() => canvasState(page, IMAGE), ({ width }) => width === 256, `no scan lines of ${kind}`);
+      await picture(page, `scan-${kind}-lines`);
+      await page.getByRole("button", { name: "Sector" }).click();
+    }
+    assert.deepEqual(page.faults, []);
   });
 
   it("is drawn again after the graphics card was lost", async () => {

@@ -12,7 +12,10 @@ FlatPose = list[float]
 class ImagePlane(BaseModel):
     """The image plane of a probe, told by its scan lines: x lateral, z axial, mm."""
 
-    face_depth_mm: float = Field(description="Where the middle of the face lies on the axial axis.")
+    face_depth_mm: float = Field(description="Depth of the face, from which a scanner counts.")
+    pivot_depth_mm: float = Field(
+        description="Where the middle of the face lies on the axial axis: a probe is turned about it."
+    )
     lines_mm: list[tuple[float, float, float, float]] = Field(
         description="From the left edge of the image to its right one, at even distances: x and z where the image "
         "begins, x and z where it ends."

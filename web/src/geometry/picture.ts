@@ -21,21 +21,22 @@ export interface Placed {
   width: number;
   /** As far as the picture goes, which may end above the depth of the probe. */
   lines: readonly Line[];
-  /** Of the face, on the axis. */
-  faceDepth_mm: number;
+  /** Where rulers begin: at the middle of the face, or where the face lies on each stored line. */
+  zero_mm: number;
   /** Whether each column is a scan line, as frames are stored; else the pixels are square. */
   isStored: boolean;
 }
 
 /** Puts a picture on the plane of its probe. `shownShare`: of stored scan lines, null for square pixels. */
 export function placedOn(
-  { lines_mm, face_depth_mm }: ImagePlane,
+  { lines_mm, face_depth_mm, pivot_depth_mm }: ImagePlane,
   sized: { picture: Picture; height: number; width: number },
   shownShare: number | null,
 ): Placed {
   const end_mm = sized.picture.first[1] + sized.picture.step[1] * (sized.height - 0.5);
   const lines = shortened(lines_mm, shownShare ?? shareAbove(lines_mm, end_mm));
-  return { ...sized, lines, faceDepth_mm: face_depth_mm, isStored: shownShare !== null };
+  const isStored = shownShare !== null;
+  return { ...sized, lines, zero_mm: isStored ? face_depth_mm : pivot_depth_mm, isStored };
 }
 
 /** Width and height of the picture on a screen, in mm; of a fan as it is stored, its width is taken half way down. */
@@ -71,8 +72,8 @@ export function isShown(placed: Placed, column: number, row: number): boolean {
 }
 
 /** Depth below the face, as a scanner counts it: along z, of a fan as it is stored along the scan line. */
-export function depthAtRow({ picture, faceDepth_mm }: Placed, row: number): number {
-  return picture.first[1] + picture.step[1] * row - faceDepth_mm;
+export function depthAtRow({ picture, zero_mm }: Placed, row: number): number {
+  return picture.first[1] + picture.step[1] * row - zero_mm;
 }
 
 export function distanceBetween_mm(a: PlanePoint, b: PlanePoint): number {

@@ -22,7 +22,7 @@ const HANDLE_MM = 26;
 const LEAST_FACE_MM = 14;
 
 /** In the probe frame; what it sends into is +z, or all around it: then it is a catheter along the elevation. */
-export function probeBody({ lines_mm, face_depth_mm: face }: ImagePlane): Group {
+export function probeBody({ lines_mm, pivot_depth_mm: face }: ImagePlane): Group {
   const { left, right } = boxOf(shortened(lines_mm, 0));
   const width = Math.max(LEAST_FACE_MM, right - left);
   const body = new Group();

@@ -48,7 +48,7 @@ export class SpaceView {
   /** Lies in the middle of the face, about which the probe is turned. */
   #probe = new Group();
   #pose: Pose = IDENTITY;
-  #faceDepth_mm = 0;
+  #pivotDepth_mm = 0;
   #image = new LiveImage();
   #sweep: Group | null = null;
   #points: PointCloud | null = null;
@@ -175,9 +175,9 @@ export class SpaceView {
   /** The probe that is held, told by its image plane. */
   setProbe(plane: ImagePlane): void {
     for (const body of [...this.#probe.children]) drop(body);
-    this.#faceDepth_mm = plane.face_depth_mm;
+    this.#pivotDepth_mm = plane.pivot_depth_mm;
     const body = probeBody(plane);
-    body.position.z = -this.#faceDepth_mm;
+    body.position.z = -this.#pivotDepth_mm;
     this.#probe.add(body);
     this.#place();
   }
@@ -188,7 +188,7 @@ export class SpaceView {
   }
 
   #place(): void {
-    placeObject(this.#probe, translated(this.#pose, [0, 0, this.#faceDepth_mm]));
+    placeObject(this.#probe, translated(this.#pose, [0, 0, this.#pivotDepth_mm]));
     this.#touch();
   }
 
@@ -250,7 +250,7 @@ export class SpaceView {
   #report(): void {
     const { position: p, quaternion: q } = this.#probe;
     const face = fromPositionQuaternion([p.x, p.y, p.z], [q.w, q.x, q.y, q.z]);
-    this.moved(translated(face, [0, 0, -this.#faceDepth_mm]));
+    this.moved(translated(face, [0, 0, -this.#pivotDepth_mm]));
   }
 
   /** A fence of the context that was lost would never be signalled. */

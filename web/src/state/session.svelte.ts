@@ -41,7 +41,7 @@ const SUBSTITUTE = exampleProbe([...PROBE_KINDS.keys()][0]!, 50);
 /** Until a scene is known. */
 const NOTHING: Held = {
   probe: SUBSTITUTE,
-  plane: { face_depth_mm: 0, lines_mm: [[-20, 0, -20, 50], [20, 0, 20, 50]] }, // prettier-ignore
+  plane: { face_depth_mm: 0, pivot_depth_mm: 0, lines_mm: [[-20, 0, -20, 50], [20, 0, 20, 50]] }, // prettier-ignore
 };
 
 export class Session {
@@ -144,12 +144,12 @@ export class Session {
 
   /** Turns the probe about its own axes, its face staying where it is. */
   turnBy(angles_deg: Vector): void {
-    this.pose = rotated(this.pose, angles_deg, this.plane.face_depth_mm);
+    this.pose = rotated(this.pose, angles_deg, this.plane.pivot_depth_mm);
   }
 
   /** Gives the probe another orientation, its face staying where it is. */
   turnTo(orientation: Quaternion): void {
-    this.pose = pivoted(this.pose, orientation, this.plane.face_depth_mm);
+    this.pose = pivoted(this.pose, orientation, this.plane.pivot_depth_mm);
   }
 
   /** To the middle of the sweep. */
@@ -180,12 +180,12 @@ export class Session {
 
   /** The pose that puts the face of the probe in use where that of the scene's own probe was. */
   held(view: Pose): Pose {
-    return translated(view, [0, 0, this.scenePlane.face_depth_mm - this.plane.face_depth_mm]);
+    return translated(view, [0, 0, this.scenePlane.pivot_depth_mm - this.plane.pivot_depth_mm]);
   }
 
   /** The pose of the scene's own probe with its face where that of the probe in use is. */
   get trainedPose(): Pose {
-    return translated(this.pose, [0, 0, this.plane.face_depth_mm - this.scenePlane.face_depth_mm]);
+    return translated(this.pose, [0, 0, this.plane.pivot_depth_mm - this.scenePlane.pivot_depth_mm]);
   }
 
   /** To the nearest training view. */
@@ -201,11 +201,11 @@ export class Session {
     const choice = ++this.#choices;
     const chosen = probe && { probe, plane: await planes.get(probe) };
     if (choice !== this.#choices) return; // another one was chosen meanwhile
-    const before = this.plane.face_depth_mm;
+    const before = this.plane.pivot_depth_mm;
     this.#chosen = chosen;
     this.display = { ...this.display, depth_mm: null };
     const { onTrack } = this;
-    this.pose = translated(this.pose, [0, 0, before - this.plane.face_depth_mm]);
+    this.pose = translated(this.pose, [0, 0, before - this.plane.pivot_depth_mm]);
     if (onTrack) this.#placed = this.pose;
   }
 

@@ -23,4 +23,4 @@ async def probe_plane(probe: Annotated[ProbeBody, Body()]) -> ImagePlane:
     rows, columns = np.broadcast_arrays([0.0, 1.0], np.linspace(0.0, 1.0, _LINES)[:, None])
     ends = known.points_mm(rows, columns)[..., [0, 2]]  # [_LINES, 2, 2]: line, near or far, x and z
     lines_mm = [(x0, z0, x1, z1) for x0, z0, x1, z1 in ends.reshape(_LINES, 4).round(6).tolist()]
-    return ImagePlane(face_depth_mm=known.face_depth_mm, lines_mm=lines_mm)
+    return ImagePlane(face_depth_mm=known.face_depth_mm, pivot_depth_mm=known.pivot_depth_mm, lines_mm=lines_mm)
