@@ -14,7 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 from .settings import ENVIRONMENT_PREFIX, Settings
 
 _FIRST_WAIT_S, _LONGEST_WAIT_S = 0.5, 30.0
-_STEADY_S = 60.0  # after which a death is a new misfortune
+_STEADY_S = 60.0  # a worker that lived so long is started again after the first wait
 _STOP_WAIT_S = 20.0
 _PASSED_ON = (
     "data_folder",
@@ -52,7 +52,7 @@ class EmbeddedWorker:
             return
         try:
             await asyncio.wait({self._task}, timeout=_STOP_WAIT_S)
-        finally:  # also where nobody waits any longer
+        finally:  # also where the caller was cancelled
             if self._process is not None and self._process.poll() is None:
                 self._process.kill()
         await self._task

@@ -21,7 +21,7 @@ FINAL_STATES = (JobState.SUCCEEDED, JobState.FAILED, JobState.CANCELLED)
 
 @dataclass(frozen=True)
 class JobChange:
-    """What is new about a job: its state and progress where they changed, and new lines of its log."""
+    """News of a job: its state and progress where they changed, and new lines of its log."""
 
     job: Job | None
     log: str
@@ -34,15 +34,15 @@ class JobWatch:
         self._leave = leave
         self._job: Job | None = None
         self._log = ""
-        self.finished = False  # whether the final state was told
+        self.finished = False  # whether the final state was given
         self._ended = False
         self._error: Exception | None = None
         self._news = asyncio.Event()
 
     async def next(self, timeout_s: float) -> JobChange | None:
-        """What changed since the last time, after at most `timeout_s` seconds (nothing: an empty change).
+        """The changes since the last call, after at most `timeout_s` seconds (none: an empty change).
 
-        None after the job's final state was told, or when the service stops. Raises what reading the job raises.
+        None after the job's final state was given, or when the service stops. Raises what reading the job raises.
         """
         if not self._news.is_set() and not self._ended:
             try:
@@ -73,7 +73,7 @@ class JobWatch:
         self._news.set()
 
     def close(self) -> None:
-        """The watcher goes away: what was kept for it is freed."""
+        """Frees what is kept for the watcher."""
         self._leave(self)
 
 
@@ -90,7 +90,7 @@ class _Reader:
         self.task = asyncio.ensure_future(self._run())
 
     def add(self, watch: JobWatch) -> None:
-        """A watcher begins with the job as it is known and the last lines of its log."""
+        """Adds a watcher, whose first news are the job as it is known and the last lines of its log."""
         self.watches.add(watch)
         if self._job is not None:
             watch.tell(self._job, self._tail)

@@ -6,8 +6,8 @@ import os
 from pathlib import Path
 
 DEFAULT_LOG_BYTES, MAX_LOG_BYTES = 65536, 2**20  # of the log's end, given at once
-TAIL_BYTES = 8192  # of the log, told to a watcher who comes late
-_STEP_BYTES = 65536  # a log that grows faster is told from its end
+TAIL_BYTES = 8192  # of the log, for a watcher who comes late
+_STEP_BYTES = 65536  # of a log that grows faster, only the end is given
 
 
 class GrowingLog:

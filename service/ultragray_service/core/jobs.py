@@ -1,4 +1,4 @@
-"""Jobs for both front doors: the store, without blocking the event loop, and who watches."""
+"""Jobs for both front doors: the store, without blocking the event loop, and those who watch a job."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ import asyncio
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
-from typing import TypeVar
+from typing import Concatenate, ParamSpec, TypeVar
 
 from sqlalchemy.exc import SQLAlchemyError
 
@@ -28,11 +29,12 @@ _BESIDE_SPECIFICATION = ("request_id", "priority")
 _THREADS = 4
 _PATIENCE_S = 10.0  # with a database that is there and says nothing
 
+P = ParamSpec("P")
 T = TypeVar("T")
 
 
 class Jobs:
-    """The jobs of one service. Everything but `watch` goes to the store in a thread."""
+    """The jobs of one service."""
 
     def __init__(self, settings: Settings, scenes: SceneStore) -> None:
         self._settings = settings
@@ -63,6 +65,20 @@ class Jobs:
         )
         self._counting = asyncio.create_task(self._count())
 
+    async def do(self, method: Callable[Concatenate[JobStore, P], T], *arguments: P.args, **options: P.kwargs) -> T:
+        """Calls a method of the store in a thread: `do(JobStore.get, job_id)`.
+
+        Raises what the method raises, NotReady before the start, DatabaseUnavailable where the database is silent.
+        """
+        call = partial(method, self._store, *arguments, **options)
+        answer = asyncio.get_running_loop().run_in_executor(self._threads, call)
+        try:
+            return await asyncio.wait_for(answer, _PATIENCE_S)
+        except asyncio.TimeoutError:
+            raise DatabaseUnavailable(
+                f"the database of the jobs has not answered for {_PATIENCE_S:g} s: try again later"
+            ) from None
+
     async def submit(
         self, specification: Specification, *, field: str, request_id: str | None, priority: int
     ) -> tuple[Job, bool]:
@@ -72,11 +88,7 @@ class Jobs:
         SceneFileInvalid, SceneExists.
         """
         with _specification_to_blame(field):
-            return await self._do(lambda store: store.submit(specification, request_id=request_id, priority=priority))
-
-    async def get(self, job_id: str) -> Job:
-        """Raises JobNotFound."""
-        return await self._do(lambda store: store.get(job_id))
+            return await self.do(JobStore.submit, specification, request_id=request_id, priority=priority)
 
     async def page(self, *, state: str, kind: str, page_size: int, page_token: str) -> tuple[list[Job], str]:
         """One page of jobs, newest first, and the token of the next (empty on the last); empty filters pass all.
@@ -87,38 +99,14 @@ class Jobs:
             raise InvalidArgument(
                 f"page_size must be an integer from 1 to {MAX_PAGE_SIZE}, got {page_size}", field="page_size"
             )
-        jobs, token = await self._do(
-            lambda store: store.list(
-                state=JobState(state) if state else None,
-                kind=kind or None,
-                page_size=page_size,
-                page_token=page_token or None,
-            )
+        jobs, token = await self.do(
+            JobStore.list,
+            state=JobState(state) if state else None,
+            kind=kind or None,
+            page_size=page_size,
+            page_token=page_token or None,
         )
         return jobs, token or ""
-
-    async def cancel(self, job_id: str) -> Job:
-        """Raises JobNotFound, and JobFinished for one that succeeded or failed."""
-        return await self._do(lambda store: store.cancel(job_id))
-
-    async def retry(self, job_id: str) -> tuple[Job, bool]:
-        """The job that goes on where a failed or cancelled one stopped, and whether it is new.
-
-        Raises JobNotFound, JobNotFinished, and what `submit` raises.
-        """
-        return await self._do(lambda store: store.retry(job_id))
-
-    async def delete(self, job_id: str) -> None:
-        """Removes a finished job. Raises JobNotFound, JobInUse."""
-        await self._do(lambda store: store.delete(job_id))
-
-    async def log_tail(self, job_id: str, max_bytes: int) -> str:
-        """The end of a job's log. Raises JobNotFound."""
-        return await self._do(lambda store: store.log_tail(job_id, max_bytes))
-
-    async def artifact(self, job_id: str, name: str) -> Path:
-        """The file of an artifact. Raises JobNotFound, ArtifactNotFound."""
-        return await self._do(lambda store: store.artifact(job_id, name))
 
     async def watch(self, job_id: str) -> JobWatch:
         """A watcher of a job, to be closed. Raises JobNotFound."""
@@ -127,10 +115,6 @@ class Jobs:
     def uses_dataset(self, name: str) -> str | None:
         """The waiting or running job that needs a dataset; blocks. Raises NotReady before the start."""
         return self._store.uses_dataset(name)
-
-    async def makes_scene(self, name: str) -> str | None:
-        """The waiting or running job that makes a scene, in words; None where none does."""
-        return await self._do(lambda store: store.makes_scene(name))
 
     def end_watches(self) -> None:
         """Ends all watchers, now and from now on: the service stops."""
@@ -146,20 +130,10 @@ class Jobs:
     async def _count(self) -> None:
         while True:
             try:
-                self.counts = await self._do(lambda store: store.counts())
+                self.counts = await self.do(JobStore.counts)
             except (UltragrayError, SQLAlchemyError):
                 self.counts = {}
             await asyncio.sleep(COUNT_INTERVAL_S)
-
-    async def _do(self, work: Callable[[JobStore], T]) -> T:
-        store = self._store
-        answer = asyncio.get_running_loop().run_in_executor(self._threads, work, store)
-        try:
-            return await asyncio.wait_for(answer, _PATIENCE_S)
-        except asyncio.TimeoutError:
-            raise DatabaseUnavailable(
-                f"the database of the jobs has not answered for {_PATIENCE_S:g} s: try again later"
-            ) from None
 
     def _log_path(self, job_id: str) -> Path:
         return JobFolder(self._settings.artifacts, job_id).log

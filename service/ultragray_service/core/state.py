@@ -9,7 +9,7 @@ from enum import Enum
 from ultragray.errors import UltragrayError
 from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import Draining, NotReady, StartupFailed
-from ultragray_workers.jobs.store import SCENES_FOLDER
+from ultragray_workers.jobs.store import SCENES_FOLDER, JobStore
 from ultragray_workers.pool.pool import PoolConfig, RenderPool
 from ultragray_workers.pool.types import RenderRequest, RenderResult
 from ultragray_workers.pool.waiting import Turn
@@ -73,7 +73,7 @@ class Service:
         checks, pictures = (HelperProcesses(settings.dataset_memory_mb << 20) for _ in range(2))
         self.uploads = DatasetUploads(self.datasets, settings, self.draining, checks)
         self.datasets.in_use = self.jobs.uses_dataset
-        self.imports = SceneImports(store, settings, self.jobs.makes_scene, checks)
+        self.imports = SceneImports(store, settings, lambda name: self.jobs.do(JobStore.makes_scene, name), checks)
         self.dataset_views = DatasetViews(self.datasets, settings, pictures)
         self.comparisons = Comparisons(store, self.catalog, self.datasets, settings, pictures)
         self.training_views = TrainingViews(self.jobs, self.datasets, settings, pictures)
@@ -150,7 +150,7 @@ class Service:
 
     async def delete_job(self, job_id: str) -> None:
         """Deletes a finished job and its files. Raises JobNotFound, JobInUse, DatabaseUnavailable."""
-        await self.jobs.delete(job_id)
+        await self.jobs.do(JobStore.delete, job_id)
         await self.training_views.forget_job(job_id)
 
     async def _forget(self, is_doomed: Callable[[str], bool]) -> None:

@@ -10,6 +10,7 @@ import grpc
 from ultragray.errors import InvalidArgument
 from ultragray_proto.v1 import jobs_pb2
 from ultragray_workers.errors import Draining
+from ultragray_workers.jobs.store import JobStore
 
 from ..core.catalog import DEFAULT_PAGE_SIZE
 from ..core.job_log import DEFAULT_LOG_BYTES, MAX_LOG_BYTES
@@ -50,18 +51,18 @@ class JobService:
     async def GetJob(  # noqa: N802
         self, request: jobs_pb2.GetJobRequest, context: grpc.aio.ServicerContext
     ) -> jobs_pb2.Job:
-        return job_message(await self._service.jobs.get(request.job))
+        return job_message(await self._service.jobs.do(JobStore.get, request.job))
 
     async def CancelJob(  # noqa: N802
         self, request: jobs_pb2.CancelJobRequest, context: grpc.aio.ServicerContext
     ) -> jobs_pb2.Job:
-        return job_message(await self._service.jobs.cancel(request.job))
+        return job_message(await self._service.jobs.do(JobStore.cancel, request.job))
 
     async def RetryJob(  # noqa: N802
         self, request: jobs_pb2.RetryJobRequest, context: grpc.aio.ServicerContext
     ) -> jobs_pb2.Job:
         self._service.require_serving()
-        job, _ = await self._service.jobs.retry(request.job)
+        job, _ = await self._service.jobs.do(JobStore.retry, request.job)
         return job_message(job)
 
     async def DeleteJob(  # noqa: N802
@@ -76,12 +77,12 @@ class JobService:
         max_bytes = request.max_bytes or DEFAULT_LOG_BYTES
         if not 1 <= max_bytes <= MAX_LOG_BYTES:
             raise InvalidArgument(f"max_bytes must be from 1 to {MAX_LOG_BYTES}, got {max_bytes}", field="max_bytes")
-        return jobs_pb2.GetJobLogResponse(log=await self._service.jobs.log_tail(request.job, max_bytes))
+        return jobs_pb2.GetJobLogResponse(log=await self._service.jobs.do(JobStore.log_tail, request.job, max_bytes))
 
     async def DownloadArtifact(  # noqa: N802
         self, request: jobs_pb2.DownloadArtifactRequest, context: grpc.aio.ServicerContext
     ) -> None:
-        path = await self._service.jobs.artifact(request.job, request.name)
+        path = await self._service.jobs.do(JobStore.artifact, request.job, request.name)
         with await asyncio.to_thread(path.open, "rb") as file:
             file_bytes = os.fstat(file.fileno()).st_size
             if not 0 <= request.offset <= file_bytes:

@@ -14,7 +14,7 @@ from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import ArtifactNotFound
 from ultragray_workers.helpers.training_preview import PICTURES, draw_preview
 from ultragray_workers.jobs.folder import JobFolder
-from ultragray_workers.jobs.store import Job
+from ultragray_workers.jobs.store import Job, JobStore
 
 from ..core.helper_processes import HelperProcesses
 from ..core.jobs import Jobs
@@ -46,7 +46,7 @@ class TrainingViews(Prepared):
 
     async def curve(self, job_id: str) -> list[CurvePoint]:
         """At most MAX_POINTS points of the training so far; none before its first step. Raises JobNotFound."""
-        job = await self._jobs.get(job_id)
+        job = await self._jobs.do(JobStore.get, job_id)
         folder = JobFolder(self._artifacts, job.id)
         return await asyncio.to_thread(_curve_of, (folder.artifacts / _JOURNAL, folder.run / _JOURNAL))
 
@@ -55,11 +55,11 @@ class TrainingViews(Prepared):
 
         Raises JobNotFound, ArtifactNotFound without a checkpoint, DatasetNotFound, and as `Prepared.path`.
         """
-        job = await self._jobs.get(job_id)
+        job = await self._jobs.do(JobStore.get, job_id)
         await self.settled(lambda key: key.startswith(f"{job_id}-"))  # one a job at a time: the newest
         checkpoint = JobFolder(self._artifacts, job.id).run / _CHECKPOINT
         version = await asyncio.to_thread(_version_of, checkpoint)
-        if version is None or "dataset" not in job.specification:
+        if version is None:
             raise self._none(job)
         dataset = await asyncio.to_thread(self._datasets.get, job.specification["dataset"])
         key = f"{job.id}-{version}-{dataset.sha256}"

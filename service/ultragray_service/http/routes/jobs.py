@@ -12,6 +12,7 @@ from starlette.responses import FileResponse, PlainTextResponse, Response, Strea
 from ultragray.contract import under
 from ultragray.errors import InvalidArgument
 from ultragray_workers.jobs.specification import from_dict
+from ultragray_workers.jobs.store import JobStore
 
 from ...core.catalog import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE
 from ...core.job_log import DEFAULT_LOG_BYTES, MAX_LOG_BYTES
@@ -120,13 +121,13 @@ async def list_jobs(
 @router.get("/{job}", responses=problems(401, 404, 422, 503))
 async def get_job(service: ServiceDep, job: JobId) -> JobOut:
     """State, progress, metrics, and the names of the artifacts."""
-    return JobOut.of(await service.jobs.get(job))
+    return JobOut.of(await service.jobs.do(JobStore.get, job))
 
 
 @router.post("/{job}:cancel", responses=problems(401, 404, 409, 422, 503))
 async def cancel_job(service: ServiceDep, job: JobId) -> JobOut:
     """Stops a job within a second; no error where it is cancelled already."""
-    return JobOut.of(await service.jobs.cancel(job))
+    return JobOut.of(await service.jobs.do(JobStore.cancel, job))
 
 
 @router.post(
@@ -138,7 +139,7 @@ async def cancel_job(service: ServiceDep, job: JobId) -> JobOut:
 async def retry_job(response: Response, service: ServiceDep, job: JobId) -> JobOut:
     """A new job in place of a failed or cancelled one; a training goes on from its last checkpoint."""
     service.require_serving()
-    successor, is_new = await service.jobs.retry(job)
+    successor, is_new = await service.jobs.do(JobStore.retry, job)
     response.status_code = 201 if is_new else 200
     return JobOut.of(successor)
 
@@ -156,7 +157,7 @@ async def delete_job(service: ServiceDep, job: JobId) -> None:
 )
 async def get_job_log(service: ServiceDep, job: JobId, max_bytes: LogBytes = DEFAULT_LOG_BYTES) -> PlainTextResponse:
     """What the job's process wrote."""
-    return PlainTextResponse(await service.jobs.log_tail(job, max_bytes))
+    return PlainTextResponse(await service.jobs.do(JobStore.log_tail, job, max_bytes))
 
 
 @router.get(
@@ -168,7 +169,7 @@ async def get_artifact(
     service: ServiceDep, job: JobId, name: Annotated[str, Path(description="One of the job's artifacts.")]
 ) -> FileResponse:
     """Downloads a file that the job made. Ranges are answered, so that a download can go on."""
-    path = await service.jobs.artifact(job, name)
+    path = await service.jobs.do(JobStore.artifact, job, name)
     return FileResponse(path, media_type=MEDIA_TYPES.get(path.suffix, _ANY_FILE), filename=name)
 
 

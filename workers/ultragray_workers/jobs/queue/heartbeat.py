@@ -1,8 +1,8 @@
 """Which workers are alive: a small table beside the queue, and the take-over of the jobs of those that are not.
 
 DBOS hands a dead worker's jobs to nobody. Here each worker beats every second, by the clock of the database, and puts
-the jobs of workers that have not beaten for a while back into the queue. So it does with jobs of its own that it is
-not at: DBOS forgets a job whose end it cannot write, such as on a full disk.
+the jobs of workers that have not beaten for a while back into the queue. It does the same with jobs of its own that it
+does not run: DBOS forgets a job whose end it cannot write, such as on a full disk.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ _workers = sa.Table(
 
 
 class Heartbeat:
-    """The life sign of one worker, and its eye on the others."""
+    """The life sign of one worker, and its watch over the others."""
 
     def __init__(self, jobs: JobDatabase, executor: str, job_at_hand: Callable[[], str | None]) -> None:
         """The first beat is done when this returns."""
         self._database, self._executor, self._job_at_hand = jobs, executor, job_at_hand
-        self._forgotten: set[str] = set()  # own jobs that nobody was at when it was looked last
+        self._forgotten: set[str] = set()  # own jobs that were not running at the last look
         self._look_at_s = float("-inf")
         self._stop = threading.Event()
         with jobs.engine.begin() as connection:
@@ -52,7 +52,7 @@ class Heartbeat:
         self._thread.start()
 
     def beat(self) -> None:
-        """Says that the worker is alive."""
+        """Writes that the worker is alive."""
         now_s = self._now_s()
         with self._database.engine.begin() as connection:
             mine = _workers.c.executor == self._executor
@@ -60,7 +60,7 @@ class Heartbeat:
                 connection.execute(sa.insert(_workers).values(executor=self._executor, seen_at_s=now_s))
 
     def take_over(self) -> list[str]:
-        """Puts the jobs that nobody is at back into the queue, and returns their ids."""
+        """Puts the jobs that no living worker runs back into the queue, and returns their ids."""
         running = [row for row in self._database.unfinished() if row.status in database.RUNNING]
         mine = {row.workflow_id for row in running if row.executor_id == self._executor} - {self._job_at_hand()}
         twice, self._forgotten = mine & self._forgotten, mine
@@ -78,7 +78,7 @@ class Heartbeat:
         return taken
 
     def stop(self) -> None:
-        """The worker is gone from now on."""
+        """Ends the beats: from now on the others take the worker for gone."""
         self._stop.set()
         self._thread.join()
         with suppress(UltragrayError, SQLAlchemyError), self._database.engine.begin() as connection:

@@ -45,9 +45,9 @@ def work(
 ) -> None:
     """Does jobs until `stop` is set; then the one at hand is put back into the queue with a checkpoint.
 
-    `name` (None: of the host, numbered) must be the worker's alone; a worker that comes back under its name goes on
-    with its jobs at once. `threads` 0: all cores but one. Finished jobs are removed after `retention_days`; 0: never.
-    Threads of DBOS are left behind: end the process by os._exit. Raises StartupFailed.
+    No other worker may have the `name` (None: that of the host, numbered); a worker that is started again under its
+    name goes on with its jobs at once. `threads` 0: all cores but one. Finished jobs are removed after
+    `retention_days`; 0: never. Threads of DBOS are left behind: end the process by os._exit. Raises StartupFailed.
     """
     jobs = JobDatabase(artifact_folder, database_url)
     with claim_name(artifact_folder, name) as executor:
