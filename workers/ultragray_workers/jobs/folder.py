@@ -52,7 +52,7 @@ class Progress:
 
 @dataclass(frozen=True)
 class Outcome:
-    """How the work of a job ended: with artifacts, or with a reason."""
+    """The end of a job's work: artifacts, or a reason."""
 
     error: str | None = None  # stable reason, such as DATASET_INVALID; None: it succeeded
     reason: str | None = None  # one sentence
@@ -106,7 +106,7 @@ class JobFolder:
         return Request(**json.loads(self._request.read_text(encoding="utf-8")))
 
     def was_begun(self) -> bool:
-        """Whether a worker has started a process in the folder."""
+        """True where a worker has started a process in the folder."""
         return self._request.exists()
 
     def write_request(self, request: Request) -> None:
@@ -114,7 +114,7 @@ class JobFolder:
         _write(self._request, asdict(request))
 
     def progress(self) -> Progress:
-        """How far the job is, as far as its folder says."""
+        """The progress of the job, as far as its folder says."""
         document = _read(self._progress)
         return Progress() if document is None else Progress.from_dict(document)
 
@@ -123,7 +123,7 @@ class JobFolder:
         _write(self._progress, asdict(progress))
 
     def outcome(self) -> Outcome | None:
-        """How the work ended; None where it did not."""
+        """The end of the work; None where it goes on."""
         document = _read(self._outcome)
         return None if document is None else Outcome.from_dict(document)
 

@@ -93,7 +93,7 @@ def job_of_row(row: WorkflowStatus, artifact_folder: Path) -> Job:
 
 
 def _outcome(row: WorkflowStatus) -> Outcome | None:
-    """How a finished job ended, as the queue keeps it."""
+    """The outcome of a finished job, as the queue keeps it."""
     if isinstance(row.output, dict):
         return Outcome.from_dict(row.output)
     if row.error is None:

@@ -19,7 +19,7 @@ _POSES, _POSE_COUNT = "poses", "pose_count"
 
 
 def to_dict(specification: Specification) -> dict[str, Any]:
-    """What JSON holds of it; `kind` comes first. Poses are base64 of float64, row by row, the low byte first."""
+    """The specification in JSON; `kind` comes first. Poses are base64 of float64, row by row, the low byte first."""
     document, poses = _without_poses(specification)
     if poses is not None:
         document[_POSES] = base64.b64encode(poses.astype("<f8").tobytes()).decode("ascii")

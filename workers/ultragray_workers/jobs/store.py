@@ -209,7 +209,7 @@ class JobStore:
         remove_job(self._database, self._folder(job_id))
 
     def counts(self) -> dict[JobState, int]:
-        """How many jobs there are in each state."""
+        """The number of jobs in each state."""
         found = count_by_status(self._database)
         return {state: sum(found.get(status, 0) for status in statuses) for state, statuses in STATUSES.items()}
 

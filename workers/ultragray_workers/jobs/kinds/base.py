@@ -1,4 +1,4 @@
-"""What every kind of job is."""
+"""The base of the kinds of jobs."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What a job finds at its submission."""
+    """The surroundings of a job at its submission."""
 
     scene: SceneHeader | None  # the one that `needs_scene` names
     artifact_folder: Path
@@ -27,7 +27,7 @@ class Surroundings:
 
 
 class Specification(Family):
-    """What a job is asked to do: a member of this family for each kind of job, with all that is particular to the kind.
+    """The task of a job, a member of this family for each kind of job, with all that is particular to the kind.
 
     Those who queue, run and remove jobs know no kinds: they ask here which fields name a dataset or a scene.
     """

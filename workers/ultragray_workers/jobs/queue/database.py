@@ -201,9 +201,9 @@ def quiet_dbos() -> None:
 
 
 def _is_news(record: logging.LogRecord) -> bool:
-    """Not what is ordinary, or told by us: ends of jobs, and a database that is away."""
-    told = record.getMessage()
-    return not any(known in told for known in _REPORTED_BY_US)
+    """Keeps out what is ordinary or logged by us: ends of jobs, and a database that is away."""
+    message = record.getMessage()
+    return not any(known in message for known in _REPORTED_BY_US)
 
 
 def dbos_config(url: str, executor: str) -> Any:

@@ -228,7 +228,7 @@ def _furthest(folder: JobFolder) -> int:
 
 
 def _memory_kills() -> int:
-    """How many processes of this machine, or of our own control group, the kernel has killed to free memory."""
+    """The number of processes that the kernel killed to free memory, on this machine or in our own control group."""
     count = 0
     for path in ("/proc/vmstat", "/sys/fs/cgroup/memory.events"):
         with suppress(OSError, ValueError):
