@@ -31,6 +31,12 @@ __all__ = ["postgres"]
 if not torch.cuda.is_available():
     os.environ.setdefault("TRITON_INTERPRET", "1")  # before any kernel is imported: they run on the CPU then
 
+for name in list(os.environ):  # settings of whoever runs the tests are not theirs
+    if name.startswith("ULTRAGRAY_") and not name.startswith(
+        ("ULTRAGRAY_FAULT_", "ULTRAGRAY_TEST_", "ULTRAGRAY_UPDATE_")
+    ):
+        del os.environ[name]
+
 RUN = f"PYTEST_RUN={os.getpid()}\0"  # in the environment of every process that these tests start
 os.environ["PYTEST_RUN"] = str(os.getpid())
 

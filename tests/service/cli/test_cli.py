@@ -195,12 +195,16 @@ def test_serve_serves_the_given_file_until_sigterm(scene_file: Path, tmp_path: P
     arguments = ("serve", scene_file, "--http-port", 0, "--grpc-port", 0, "--threads", 1)
     program = "from ultragray_service.cli.app import app; app()"
     with subprocess.Popen(
-        python(program, *arguments), stderr=subprocess.STDOUT, stdout=subprocess.PIPE, text=True
+        python(program, *arguments),
+        stderr=subprocess.STDOUT,
+        stdout=subprocess.PIPE,
+        text=True,
+        cwd=tmp_path,  # away from the scenes of ./data
     ) as service:
         try:
             assert service.stdout is not None
             address = next(m[0] for line in service.stdout if (m := re.search(r"http://127\.0\.0\.1:\d+", line)))
-            with urllib.request.urlopen(f"{address}/v1/scenes", timeout=10) as answer:
+            with urllib.request.urlopen(f"{address}/v1/scenes", timeout=60) as answer:
                 assert [scene["name"] for scene in json.load(answer)["scenes"]] == ["scene"]
             service.send_signal(signal.SIGTERM)
             started = time.monotonic()
