@@ -37,7 +37,7 @@ def read_released(path: str | Path) -> Dataset:
         path = path / CONFIG_NAME
     try:
         config = read_released_config(path)
-        probe = config.released_probe()
+        probe = config.released_probe
     except CheckpointInvalid as error:
         raise DatasetInvalid(error.detail) from error
     train = _read_part(config, "train", probe)

@@ -68,7 +68,7 @@ def import_checkpoint(
         image_width=width,
         intensity="released",
         dataset_name=released.dataset_name,
-        training={"imported_from": Path(checkpoint).name, "released_far_mm": released.far_mm},
+        training={"imported_from": Path(checkpoint).name, "released_far_mm": released.released_probe.far_mm},
     )
     step, splats = _read_checkpoint(Path(checkpoint))
     if step is not None:
@@ -124,7 +124,7 @@ def _centre_mm(
 ) -> Vector:
     """The origin of the released scene in the tracker's frame: the mean training image corner (§6)."""
     if training_poses is not None:
-        x, y, z = released_centre_mm(released.released_probe(), training_poses).tolist()
+        x, y, z = released_centre_mm(released.released_probe, training_poses).tolist()
         return (x, y, z)
     if center_mm is None:
         return (0.0, 0.0, 0.0)

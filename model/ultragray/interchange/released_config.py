@@ -38,14 +38,10 @@ class TrainingImages:
 
 @dataclass(frozen=True)
 class ReleasedConfig:
-    """The values of conf.json that a reader needs, in mm and degrees. Exactly one of width and angle is given."""
+    """The values of conf.json that a reader needs."""
 
     path: Path
-    near_mm: float
-    far_mm: float  # as released: on the grid (i+½)/(H−1)
-    width_mm: float | None
-    opening_angle_deg: float | None
-    phased: bool
+    released_probe: Probe  # its far plane as released: on the grid (i+½)/(H−1)
     dataset_name: str | None
     files: Mapping[str, str]  # those of FILE_KEYS that it has, as written
     images: TrainingImages | None
@@ -58,24 +54,11 @@ class ReleasedConfig:
         named = self.files.get(key)
         return None if named is None else _find(self.path, named)
 
-    def released_probe(self) -> Probe:
-        """The probe with the planes as released."""
-        return self._probe(self.far_mm)
-
     def probe(self, image_height: int) -> Probe:
         """The probe of ours for training images of `image_height` rows: the stretch of docs/physics.md §3."""
+        released = self.released_probe
         try:
-            return self._probe(stretch_released_far(self.near_mm, self.far_mm, image_height))
-        except InvalidProbe as error:
-            raise CheckpointInvalid(f"{self.path}: {error}") from error
-
-    def _probe(self, far_mm: float) -> Probe:
-        try:
-            if self.width_mm is not None:
-                return LinearProbe(self.width_mm, self.near_mm, far_mm)
-            if self.phased:
-                return PhasedProbe(opening_angle_deg=self.opening_angle_deg or 0.0, far_mm=far_mm)
-            return ConvexProbe(opening_angle_deg=self.opening_angle_deg or 0.0, near_mm=self.near_mm, far_mm=far_mm)
+            return released.ending_at(stretch_released_far(released.near_mm, released.far_mm, image_height))
         except InvalidProbe as error:
             raise CheckpointInvalid(f"{self.path}: {error}") from error
 
@@ -87,24 +70,67 @@ def stretch_released_far(near: float, far_released: float, height: int) -> float
     return near + (far_released - near) * height / (height - 1)
 
 
+@dataclass(frozen=True)
+class _Kind:
+    """How conf.json writes a kind of probe: the key of its size across, that size, and the way back."""
+
+    key: str
+    size: Callable[[Any], float]
+    probe: Callable[[float, float, float], Probe]  # of the size, near_mm, far_mm
+
+
+_KINDS = {
+    "linear": _Kind(
+        WIDTH_KEY,
+        lambda probe: _to_cm(probe.width_mm),
+        lambda width_cm, near_mm, far_mm: LinearProbe(_to_mm(width_cm), near_mm, far_mm),
+    ),
+    "convex": _Kind(ANGLE_KEY, lambda probe: float(probe.opening_angle_deg), ConvexProbe),
+    "phased": _Kind(
+        ANGLE_KEY,
+        lambda probe: float(probe.opening_angle_deg),
+        lambda angle_deg, near_mm, far_mm: PhasedProbe(angle_deg, far_mm),
+    ),
+}
+_IMPLIED_KIND = {WIDTH_KEY: "linear", ANGLE_KEY: "convex"}
+
+
 def probe_keys(released_probe: Probe) -> dict[str, float | str]:
     """A probe, its planes as released, in keys of conf.json. Raises InvalidProbe for a kind that it cannot tell."""
-    if released_probe.kind not in _KEYS_OF_KIND:
-        raise InvalidProbe(
-            f"the released format holds {', '.join(_KEYS_OF_KIND)} probes, got {released_probe}", field="probe"
-        )
-    return {
+    name = released_probe.kind
+    if name not in _KINDS:
+        raise InvalidProbe(f"the released format holds {', '.join(_KINDS)} probes, got {released_probe}", field="probe")
+    kind = _KINDS[name]
+    keys: dict[str, float | str] = {
         "ultrasound_near_plane": _to_cm(released_probe.near_mm),
         "ultrasound_far_plane": _to_cm(released_probe.far_mm),
-        **_KEYS_OF_KIND[released_probe.kind](released_probe),
+        kind.key: kind.size(released_probe),
     }
+    return keys if _IMPLIED_KIND[kind.key] == name else keys | {KIND_KEY: name}
 
 
-_KEYS_OF_KIND: dict[str, Callable[[Any], dict[str, float | str]]] = {
-    "linear": lambda probe: {WIDTH_KEY: _to_cm(probe.width_mm)},
-    "convex": lambda probe: {ANGLE_KEY: probe.opening_angle_deg},
-    "phased": lambda probe: {ANGLE_KEY: probe.opening_angle_deg, KIND_KEY: probe.kind},
-}
+def _read_probe(path: Path, document: Mapping[str, Any]) -> Probe:
+    sizes = {key: size for key in (WIDTH_KEY, ANGLE_KEY) if (size := _optional_number(path, document, key)) is not None}
+    if len(sizes) != 1:
+        raise CheckpointInvalid(
+            f"{path}: it must have exactly one of {WIDTH_KEY} (linear, cm) and "
+            f"{ANGLE_KEY} (convex, degrees), got {'both' if sizes else 'neither'}"
+        )
+    ((key, size),) = sizes.items()
+    near_mm, far_mm = (_to_mm(_number(path, document, f"ultrasound_{plane}_plane")) for plane in ("near", "far"))
+    name = _IMPLIED_KIND[key] if document.get(KIND_KEY) is None else document[KIND_KEY]
+    if not isinstance(name, str) or name not in _KINDS:
+        raise CheckpointInvalid(f"{path}: {KIND_KEY} must be one of {', '.join(_KINDS)}, got {repr(name)[:40]}")
+    kind = _KINDS[name]
+    if kind.key != key:
+        raise CheckpointInvalid(f"{path}: a {name} probe has {kind.key}, got {key}")
+    try:
+        probe = kind.probe(size, near_mm, far_mm)
+    except InvalidProbe as error:
+        raise CheckpointInvalid(f"{path}: {error}") from error
+    if probe.near_mm != near_mm:
+        raise CheckpointInvalid(f"{path}: a {name} probe has ultrasound_near_plane 0, got {near_mm / 10.0:g}")
+    return probe
 
 
 def released_centre_mm(released_probe: Probe, poses: FloatArray) -> FloatArray:  # [P, 4, 4] mm -> [3]
@@ -118,29 +144,11 @@ def read_released_config(path: str | Path) -> ReleasedConfig:
     """Read conf.json and the shape of its images file. Raises CheckpointInvalid, naming the file."""
     path = Path(path)
     document = _read_object(path)
-    width_cm = _optional_number(path, document, WIDTH_KEY)
-    angle_deg = _optional_number(path, document, ANGLE_KEY)
-    if (width_cm is None) == (angle_deg is None):
-        raise CheckpointInvalid(
-            f"{path}: it must have exactly one of {WIDTH_KEY} (linear, cm) and "
-            f"{ANGLE_KEY} (convex, degrees), got {'neither' if width_cm is None else 'both'}"
-        )
-    near_mm = _to_mm(_number(path, document, "ultrasound_near_plane"))
-    phased = document.get(KIND_KEY) == PhasedProbe.kind
-    if phased and (angle_deg is None or near_mm != 0.0):
-        raise CheckpointInvalid(
-            f"{path}: a phased probe has {ANGLE_KEY} and ultrasound_near_plane 0, got "
-            f"{'no angle' if angle_deg is None else f'near plane {near_mm / 10.0:g}'}"
-        )
     files = _named_files(path, document)
     images, images_missing = _find_images(path, files)
-    config = ReleasedConfig(
+    return ReleasedConfig(
         path=path,
-        near_mm=near_mm,
-        far_mm=_to_mm(_number(path, document, "ultrasound_far_plane")),
-        width_mm=None if width_cm is None else _to_mm(width_cm),
-        opening_angle_deg=angle_deg,
-        phased=phased,
+        released_probe=_read_probe(path, document),
         dataset_name=_dataset_name(path, files),
         files=files,
         images=images,
@@ -148,8 +156,6 @@ def read_released_config(path: str | Path) -> ReleasedConfig:
         image_height=_optional_count(path, document, "image_height", at_least=2),
         image_width=_optional_count(path, document, "image_width", at_least=1),
     )
-    config.released_probe()  # refuses planes, widths and angles that no probe has
-    return config
 
 
 def _read_object(path: Path) -> Mapping[str, Any]:
