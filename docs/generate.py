@@ -6,8 +6,11 @@ Such a table stands between `<!-- generated: NAME -->` and `<!-- end -->`, and T
 from __future__ import annotations
 
 import inspect
+import json
 import re
+import tempfile
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import MISSING, Field
 from enum import Enum
 from functools import partial
 from pathlib import Path
@@ -16,55 +19,121 @@ from typing import Any, get_args
 import typer
 
 from ultragray import errors
-from ultragray.contract import annotated_fields, range_of
+from ultragray.confidence import Extrapolation
+from ultragray.contract import annotated_fields, limits_in_words, range_of, to_dict
+from ultragray.display.settings import Display
+from ultragray.outputs import OUTPUTS
+from ultragray.settings import RenderSettings
 from ultragray_client import contract as client_contract
 from ultragray_client import errors as client_errors
 from ultragray_service import errors as service_errors
 from ultragray_service.cli.app import app as command_line
+from ultragray_service.core.state import Service
 from ultragray_service.errors import statuses_of
+from ultragray_service.http.app import create_app
+from ultragray_service.http.bodies import RenderBody, StreamMessage
+from ultragray_service.http.stream_messages import FrameMessage
 from ultragray_service.settings import ENVIRONMENT_PREFIX, Settings
 from ultragray_workers import errors as workers_errors
 
-DOCUMENT = Path(__file__).resolve().parent / "interfaces.md"
+DOCS = Path(__file__).resolve().parent
+DOCUMENT = DOCS / "interfaces.md"
+PROTO_FILES = sorted((DOCS.parent / "proto" / "ultragray" / "v1").glob("*.proto"))
 _GENERATED = re.compile(r"(?<=<!-- generated: )([\w -]+?)( -->\n).*?(?=<!-- end -->)", flags=re.DOTALL)
+_BLOCK = re.compile(r"^(message|enum) (\w+) \{\n(.*?)^\}", flags=re.DOTALL | re.MULTILINE)
+_DECLARATION = re.compile(r"^ +((?:\w|[.<>, ])+? = \d+);(?: +// (.*))?$", flags=re.MULTILINE)
 
 Row = Iterable[str]
+Table = Iterable[Row]  # its head first
 
 
 def generated(document: str) -> str:
     """The document with its tables as the code has them now."""
-    return _GENERATED.sub(lambda match: f"{match[1]}{match[2]}{_table(*TABLES[match[1]]())}", document)
+    return _GENERATED.sub(lambda match: f"{match[1]}{match[2]}{_written(TABLES[match[1]]())}", document)
 
 
-def _table(head: Row, *rows: Row) -> str:
-    first = f"| {' | '.join(head)} |\n{'|---' * len(list(head))}|\n"
-    return first + "".join(f"| {' | '.join(row)} |\n" for row in rows)
+def _written(table: Table) -> str:
+    head, *rows = (list(row) for row in table)
+    return f"| {' | '.join(head)} |\n{'|---' * len(head)}|\n" + "".join(f"| {' | '.join(row)} |\n" for row in rows)
 
 
-def error_table() -> list[Row]:
+def error_table() -> Iterator[Row]:
     """The errors of each module, in their order there."""
-    table: list[Row] = [("Reason", "Class", "In", "HTTP", "gRPC", "Meaning")]
+    yield "Reason", "Class", "In", "HTTP", "gRPC", "Meaning"
     for module in (errors, workers_errors, service_errors):
         for cls in errors.error_classes():
             if cls.__module__ == module.__name__:
-                arrow = "↳ " if cls.__base__ is errors.InvalidArgument else ""
-                statuses = statuses_of(cls)
-                table.append(
-                    (
-                        f"`{cls.reason}`",
-                        f"{arrow}`{cls.__name__}`",
-                        f"`{module.__name__}`",
-                        str(statuses.http),
-                        statuses.grpc,
-                        _meaning(cls),
-                    )
-                )
-    return table
+                arrow, statuses = "↳ " if cls.__base__ is errors.InvalidArgument else "", statuses_of(cls)
+                name = f"{arrow}`{cls.__name__}`"
+                yield f"`{cls.reason}`", name, f"`{module.__name__}`", str(statuses.http), statuses.grpc, _meaning(cls)
+
+
+def output_table() -> Iterator[Row]:
+    """The registry of outputs."""
+    yield "Output", "Meaning", "Pixels"
+    for output in OUTPUTS.values():
+        yield f"`{output.name}`", output.meaning, "whole numbers" if output.is_numbers else "0 to 1"
+
+
+def field_table(cls: type[Any], head: str) -> Iterator[Row]:
+    """The fields of a class of the contract."""
+    yield head, "Default", "Meaning"
+    for item, _ in annotated_fields(cls):
+        yield f"`{item.name}`", f"`{_default(item)}`", _described(item)
+
+
+def told_table(cls: type[Any], head: str) -> Iterator[Row]:
+    """The fields of a class that the service tells."""
+    yield head, "Meaning"
+    for item, _ in annotated_fields(cls):
+        yield f"`{item.name}`", _described(item)
+
+
+def object_table() -> Iterator[Row]:
+    """The schemas of the OpenAPI document that have keys, but for those with tables of their own."""
+    yield "Object", "Keys", "Meaning"
+    with tempfile.TemporaryDirectory() as folder:
+        document = create_app(Service(Settings(data_folder=Path(folder)))).openapi()
+    tabled = {cls.__name__ for cls in (RenderBody, StreamMessage, RenderSettings, FrameMessage, Display, Extrapolation)}
+    for name, schema in sorted(document["components"]["schemas"].items()):
+        if name not in tabled and "properties" in schema:
+            keys = schema["properties"]
+            told = [f"`{key}`: {_joined(one['description'])}" for key, one in keys.items() if "description" in one]
+            summary = _joined(schema.get("description", "").partition("\n\n")[0])
+            yield f"`{name}`", ", ".join(f"`{key}`" for key in keys), "; ".join([summary, *told])
+
+
+def proto_table(block: str, head: Row) -> Iterator[Row]:
+    """The messages or enums of the .proto files, with their comments."""
+    yield head
+    for path in PROTO_FILES:
+        for kind, name, body in _BLOCK.findall(path.read_text(encoding="utf-8")):
+            if kind == block:
+                lines = [
+                    f"`{line.replace('google.protobuf.', '')}`{f' ({comment})' if comment else ''}"
+                    for line, comment in _DECLARATION.findall(body)
+                ]
+                yield f"`{name}`", ", ".join(lines)
+
+
+def _default(item: Field[Any]) -> str:
+    if item.default_factory is not MISSING:
+        return json.dumps(to_dict(item.default_factory()))
+    return "required" if item.default is MISSING else json.dumps(to_dict(item.default))
+
+
+def _described(item: Field[Any]) -> str:
+    limits = limits_in_words(item)
+    return ". ".join(part for part in (_joined(item.metadata.get("description", "")), limits) if part)
 
 
 def _meaning(thing: object) -> str:
     """The first paragraph of a docstring."""
-    return " ".join((inspect.getdoc(thing) or "").partition("\n\n")[0].split()).removesuffix(".")
+    return _joined((inspect.getdoc(thing) or "").partition("\n\n")[0])
+
+
+def _joined(text: str) -> str:
+    return " ".join(text.split()).removesuffix(".")
 
 
 def client_error_table() -> list[Row]:
@@ -146,8 +215,18 @@ def option_table(command: Any) -> list[Row]:
     return table
 
 
-TABLES: dict[str, Callable[[], list[Row]]] = {
+TABLES: dict[str, Callable[[], Table]] = {
     "errors": error_table,
+    "outputs": output_table,
+    "render_body": partial(field_table, RenderBody, "Key"),
+    "display": partial(field_table, Display, "Setting"),
+    "confidence": partial(told_table, Extrapolation, "Figure"),
+    "stream_messages": partial(field_table, StreamMessage, "Key"),
+    "stream_settings": partial(field_table, RenderSettings, "Key"),
+    "stream_frames": partial(told_table, FrameMessage, "Key"),
+    "objects": object_table,
+    "messages": partial(proto_table, "message", ("Message", "Fields")),
+    "enums": partial(proto_table, "enum", ("Enum", "Values")),
     "client_contract": client_contract_table,
     "client_errors": client_error_table,
     "settings": settings_table,

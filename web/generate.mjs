@@ -43,8 +43,8 @@ const texts = {
   "contract.ts": `import type { Described } from "../described";
 
 export const jobs: Record<string, Described> = ${JSON.stringify(jobKinds(schemas.JobBody.properties), null, 1)};
-export const settings: Described = ${JSON.stringify(described(schemas.StreamSettings), null, 1)};
-export const scene: Described = ${JSON.stringify(described(schemas.SceneOut), null, 1)};
+export const settings: Described = ${JSON.stringify(described(schemas.RenderSettings), null, 1)};
+export const scene: Described = ${JSON.stringify(described(schemas.Scene), null, 1)};
 `,
 };
 mkdirSync(FOLDER, { recursive: true });

@@ -12,7 +12,7 @@ such as the probes) is told apart by its `kind`.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import MISSING, Field, field, fields, is_dataclass
 from enum import Enum
@@ -41,17 +41,18 @@ def described(
     choices: tuple[str, ...] | None = None,
     most: int | None = None,
     error: type[InvalidArgument] | None = None,
+    example: Any = None,
     **options: Any,
 ) -> Any:
     """A dataclass field that says what it means.
 
     A number must lie from `low` (or above `above`) to `high`; a word must be one of `choices`, a list may have `most`
-    elements, each within the limits. `error`: what is raised instead of the error of the class. `options` are those of
-    `dataclasses.field`.
+    elements, each within the limits. `error`: what is raised instead of the error of the class. `example`: a value of a
+    usual member of a family. `options` are those of `dataclasses.field`.
     """
     metadata: dict[str, Any] = {"description": meaning}
     limits = {"low": low, "high": high, "above": above, "choices": choices, "most": most, "error": error}
-    metadata |= {name: limit for name, limit in limits.items() if limit is not None}
+    metadata |= {name: fact for name, fact in {**limits, "example": example}.items() if fact is not None}
     if schema := _schema(**limits):
         if choices is not None and default is None:
             schema["enum"] = [*choices, None]
@@ -84,7 +85,7 @@ class Contract:
             try:
                 checked = _checked(value, annotation, item)
             except UltragrayError as inner:
-                raise _under(item.name, inner, item.metadata.get("error", self.error)) from None
+                raise error_under(item.name, inner, item.metadata.get("error", self.error)) from None
             if checked is not value:
                 object.__setattr__(self, item.name, checked)
 
@@ -104,6 +105,20 @@ class Family(Contract):
             cls.members = {}
         elif isinstance(kind := cls.__dict__.get("kind"), Field):
             cls.members[str(kind.default)] = cls
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, source: Any, handler: Any) -> Any:
+        """What pydantic tells of a member: its kind is required, and there is an example of it."""
+        document = handler(source)
+        if Family not in cls.__bases__:
+            schema = handler.resolve_ref_schema(document)
+            schema["required"] = ["kind", *schema.get("required", ())]
+            examples = {
+                item.name: item.metadata["example"] for item, _ in annotated_fields(cls) if "example" in item.metadata
+            }
+            if examples:
+                schema["examples"] = [{"kind": schema["properties"]["kind"]["const"], **examples}]
+        return document
 
     @classmethod
     def member(cls: type[_T], kind: Any) -> type[_T]:
@@ -214,6 +229,30 @@ def _needs_value(known: Mapping[str, tuple[Field[Any], Any]], name: str) -> bool
     return name in known and not optional_of(known[name][1])[1]
 
 
+def blamed(cls: Any, location: Iterable[str | int]) -> tuple[str, type[InvalidArgument], Any]:
+    """The path of a value below a contract class, the error for it, and its type.
+
+    The error is that of the field, else of the class around it.
+
+    The location may also name the members of families on the way, as pydantic does.
+    """
+    path, error = "", getattr(cls, "error", InvalidArgument)
+    for part in location:
+        if part in getattr(cls, "members", ()):
+            cls = cls.members[part]
+            continue
+        path = join(path, f"[{part}]" if isinstance(part, int) else part)
+        if get_origin(cls) in (list, tuple):
+            cls, _ = optional_of(get_args(cls)[0])
+        elif is_dataclass(cls):
+            for item, annotation in annotated_fields(cls):
+                if item.name == part:
+                    cls, _ = optional_of(annotation)
+                    error = item.metadata.get("error", getattr(cls, "error", error))
+                    break
+    return path, error, cls
+
+
 def _title(cls: Any) -> str:
     kind = getattr(cls, "kind", None)
     return cls.__name__ if kind is None else f"kind {kind}"
@@ -287,6 +326,18 @@ def range_of(item: Field[Any]) -> str:
     return _range(*(item.metadata.get(name) for name in ("low", "high", "above")))
 
 
+def limits_in_words(item: Field[Any]) -> str:
+    """The limits of a field, such as "From 0 to 1"; empty where there are none."""
+    given = item.metadata.get
+    words = [_range(given("low"), given("high"), given("above")).strip()]
+    if (choices := given("choices")) is not None:
+        words.append(f"one of {', '.join(choices)}")
+    if (most := given("most")) is not None:
+        words.append(f"at most {most} values")
+    joined = ", ".join(word for word in words if word)
+    return joined[:1].upper() + joined[1:]
+
+
 def _range(low: float | None, high: float | None, above: float | None) -> str:
     """The limits in words, beginning with a space; empty where there are none."""
     if low is not None:
@@ -317,10 +368,11 @@ def under(prefix: str, error: type[UltragrayError] | None = None) -> Iterator[No
     try:
         yield
     except UltragrayError as inner:
-        raise _under(prefix, inner, error) from inner
+        raise error_under(prefix, inner, error) from inner
 
 
-def _under(prefix: str, inner: UltragrayError, error: type[UltragrayError] | None) -> UltragrayError:
+def error_under(prefix: str, inner: UltragrayError, error: type[UltragrayError] | None = None) -> UltragrayError:
+    """The error of a part, as the whole sees it; InvalidArgument itself becomes `error`."""
     path = prefix if inner.field is None else join(prefix, inner.field)
     cls = error if error is not None and type(inner) is InvalidArgument else type(inner)
     detail = inner.detail
@@ -333,4 +385,4 @@ def _under(prefix: str, inner: UltragrayError, error: type[UltragrayError] | Non
 
 def join(prefix: str, path: str) -> str:
     """The path of a part: `probe` and `near_mm` make `probe.near_mm`, `poses` and `[3]` make `poses[3]`."""
-    return f"{prefix}{path}" if path.startswith("[") else f"{prefix}.{path}"
+    return f"{prefix}{path}" if path.startswith("[") or not prefix else f"{prefix}.{path}"

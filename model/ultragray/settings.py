@@ -41,6 +41,10 @@ class Encoding(str, Enum):
         return np.dtype("<f4") if self in (Encoding.FLOAT32, Encoding.NPZ) else np.dtype("u1")
 
 
+FRAME_ENCODINGS = tuple(one.value for one in Encoding if one is not Encoding.NPZ)
+"""Those of one frame; npz is an archive of many."""
+
+
 class Below(str, Enum):
     """The fate of a frame whose confidence is below the limit."""
 
@@ -110,7 +114,14 @@ class FrameSettings(Contract):
 class RenderSettings(FrameSettings):
     """Settings with an encoding, for doors where neither an Accept header nor a file format decides it."""
 
-    encoding: Encoding = described("Form of the pixels.", Encoding.UINT8)
+    encoding: Encoding = described("Form of the pixels.", Encoding.UINT8, choices=tuple(FRAME_ENCODINGS))
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.encoding.value not in FRAME_ENCODINGS:
+            raise InvalidArgument(
+                f"encoding must be one of {', '.join(FRAME_ENCODINGS)}, got {self.encoding.value!r}", field="encoding"
+            )
 
 
 @dataclass(frozen=True)

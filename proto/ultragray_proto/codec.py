@@ -8,7 +8,7 @@ A field of a message and the attribute of the same name of a dataclass hold the 
     sequence                         repeated
     sequence of numbers              message of as many numbers, in their order, such as Position
     array [4, 4]                     Matrix
-    dict                             map; Struct; message whose fields are the keys
+    dict                             map; Struct; message that has the keys as fields
     dataclass                        message
     member of a family               oneof with a field for each kind, or message with a field `kind`
 
@@ -26,7 +26,7 @@ import re
 from collections.abc import Callable, Mapping
 from dataclasses import MISSING, Field, fields, is_dataclass
 from enum import Enum
-from functools import cache, reduce
+from functools import cache, partial, reduce
 from operator import or_
 from types import NoneType, UnionType
 from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -89,34 +89,38 @@ def words(enum: EnumDescriptor) -> Mapping[int, str]:
 
 def _told(value: Any, descriptor: Descriptor, others: frozenset[str] = frozenset()) -> dict[str, Any]:
     """The fields of a message that a value has, but for `others`."""
+    if isinstance(value, Mapping):
+        return _writer(frozenset(value), descriptor, others)(value.__getitem__)
     cls: Any = type(value)
-    return _writer(cls, descriptor, others)(value)
+    return _writer(cls, descriptor, others)(partial(getattr, value))
 
 
 @cache
-def _writer(
-    cls: type[Any], descriptor: Descriptor, others: frozenset[str] = frozenset()
-) -> Callable[[Any], dict[str, Any]]:
-    """Makes the fields of a message, but for `others`, from a value of a class that has attributes of these names."""
+def _writer(cls: Any, descriptor: Descriptor, others: frozenset[str]) -> Callable[[_Convert], dict[str, Any]]:
+    """Makes the fields of a message, but for `others`, from what gives a value by the name of its attribute or key.
+
+    The names are those of a class, or a set of keys.
+    """
     defaults = {one.name: one.default for one in fields(cls)} if is_dataclass(cls) else {}
 
     def has(name: str) -> bool:
-        return name not in others and (name in defaults or hasattr(cls, name))
+        given = name in cls if isinstance(cls, frozenset) else name in defaults or hasattr(cls, name)
+        return given and name not in others
 
     steps = [(one.name, _field_writer(one, defaults.get(one.name))) for one in descriptor.fields if has(one.name)]
     oneofs = [(name, _oneof_writer(kinds)) for name, kinds in _oneofs(descriptor).items() if has(name)]
 
-    def write(value: Any) -> dict[str, Any]:
+    def write(get: _Convert) -> dict[str, Any]:
         told = {}
         for name, convert in steps:
-            found = getattr(value, name)
+            found = get(name)
             try:
                 if found is not None and (found := convert(found)) is not None:
                     told[name] = found
             except MessageInvalid as error:
                 raise error.under(name) from None
         for name, convert in oneofs:
-            told |= convert(getattr(value, name))
+            told |= convert(get(name))
         return told
 
     return write
@@ -148,8 +152,6 @@ def _value_writer(field: FieldDescriptor) -> _Convert:
     names = [one.name for one in descriptor.fields]
 
     def convert(value: Any) -> Any:
-        if isinstance(value, Mapping):
-            return value
         if isinstance(value, (tuple, list, np.ndarray)):
             return dict(zip(names, map(float, value), strict=True))
         return _told(value, descriptor)
@@ -168,7 +170,11 @@ def _word_writer(numbers: Mapping[str, int]) -> _Convert:
 
 
 def _oneof_writer(kinds: Mapping[str, Descriptor]) -> Callable[[Any], dict[str, Any]]:
-    return lambda value: {value.kind: _told(value, kinds[value.kind])}
+    def convert(value: Any) -> dict[str, Any]:
+        kind = value["kind"] if isinstance(value, Mapping) else value.kind
+        return {kind: _told(value, kinds[kind])}
+
+    return convert
 
 
 def _struct_of(values: Mapping[str, Any]) -> Struct:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from ultragray.contract import described
 from ultragray.errors import UltragrayError
 
 
@@ -68,6 +69,20 @@ class SceneReadOnly(UltragrayError):
 
     reason = "SCENE_READ_ONLY"
     title = "Scene cannot be deleted"
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """An error where a call as a whole does not fail."""
+
+    reason: str = described("Stable, for programs.")
+    detail: str = described("One sentence for a person.")
+    field: str | None = described("Path of the value to blame, null if none is.")
+
+    @classmethod
+    def of(cls, error: UltragrayError) -> Refusal:
+        """The facts of an error."""
+        return cls(error.reason, error.detail, error.field)
 
 
 @dataclass(frozen=True)

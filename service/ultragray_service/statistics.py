@@ -7,15 +7,26 @@ import random
 import time
 from collections import deque
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
+
+from ultragray.contract import described
 
 STEP_S = 5
 STEPS = 120
-STAGES = ("queue", "render", "encode")
 _SAMPLES = 500  # of a step and stage; more are sampled
 
-Times = dict[str, float]  # ms by stage
+
+@dataclass(frozen=True)
+class StageTimes:
+    """Where the time of a request went, ms."""
+
+    queue: float
+    render: float
+    encode: float
+
+
+STAGES = tuple(stage.name for stage in fields(StageTimes))
 
 
 @dataclass
@@ -25,9 +36,9 @@ class _Step:
     requests: int = 0
     errors: int = 0
     samples: dict[str, list[float]] = field(default_factory=lambda: {stage: [] for stage in STAGES})
-    final: tuple[Times, Times] | None = None  # p50 and p99, in place of the samples, of a step that has ended
+    final: tuple[StageTimes, StageTimes] | None = None  # p50 and p99, in place of the samples, of a step that has ended
 
-    def quantiles(self, *, ended: bool) -> tuple[Times, Times] | tuple[None, None]:
+    def quantiles(self, *, ended: bool) -> tuple[StageTimes, StageTimes] | tuple[None, None]:
         if not self.requests:
             return None, None
         if self.final is not None:
@@ -39,16 +50,33 @@ class _Step:
         return found
 
 
-@dataclass(frozen=True)
-class StepSummary:
-    """What happened in one step; times are None where nothing was rendered."""
+@dataclass(frozen=True, kw_only=True)
+class StatisticsStep:
+    """What happened in one step."""
 
-    seconds_ago: int  # 0: it is going on; 5: it ended up to 5 s ago, and so on
+    seconds_ago: int = described("0: it is going on; 5: it ended up to 5 s ago, and so on.")
     frames: int
-    requests: int  # rendered ones: a request may have many frames
-    errors: int
-    p50_ms: Times | None
-    p99_ms: Times | None
+    requests: int = described("Rendered ones; a request may have many frames.")
+    errors: int = described(
+        "Requests and messages that the service could not answer as asked: 429 and 5xx, not mistakes of clients."
+    )
+    p50_ms: StageTimes | None = described("null where nothing was rendered.")
+    p99_ms: StageTimes | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class ServiceStatistics:
+    """The service now and in the last minutes."""
+
+    step_s: int = described("Length of a step.", STEP_S)
+    steps: list[StatisticsStep] = described("The oldest first.")
+    waiting_frames: int
+    busy_processes: int
+    processes: int = described("Render processes alive.")
+    process_restarts: int
+    memory_bytes: int = described("Of the service and its render processes.")
+    loaded_scenes: int
+    jobs: dict[str, int] = described("By state, counted every 10 s; empty where that is not known.")
 
 
 class Statistics:
@@ -75,7 +103,7 @@ class Statistics:
         """One request or message that the service could not answer as asked."""
         self._now().errors += 1
 
-    def summaries(self) -> list[StepSummary]:
+    def summaries(self) -> list[StatisticsStep]:
         """The steps of the last minutes, the oldest first; one for each, also where nothing happened."""
         now = self._step_number()
         found = {step.start: step for step in self._steps}
@@ -103,12 +131,22 @@ def memory_bytes(pids: Iterable[int]) -> int:
     return total
 
 
-def _summary(step: _Step, age: int) -> StepSummary:
+def _summary(step: _Step, age: int) -> StatisticsStep:
     p50_ms, p99_ms = step.quantiles(ended=age > 0)
-    return StepSummary(age * STEP_S, step.frames, step.requests, step.errors, p50_ms, p99_ms)
+    return StatisticsStep(
+        seconds_ago=age * STEP_S,
+        frames=step.frames,
+        requests=step.requests,
+        errors=step.errors,
+        p50_ms=p50_ms,
+        p99_ms=p99_ms,
+    )
 
 
-def _quantile(ordered: dict[str, list[float]], share: float) -> Times:
-    return {
-        stage: round(samples[min(int(share * len(samples)), len(samples) - 1)], 3) for stage, samples in ordered.items()
-    }
+def _quantile(ordered: dict[str, list[float]], share: float) -> StageTimes:
+    return StageTimes(
+        **{
+            stage: round(samples[min(int(share * len(samples)), len(samples) - 1)], 3)
+            for stage, samples in ordered.items()
+        }
+    )

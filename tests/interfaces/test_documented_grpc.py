@@ -40,7 +40,8 @@ def test_messages() -> None:
             message = DescriptorProto()
             descriptor.CopyToProto(message)
             found[name] = declarations(message)
-    assert {name: code(fields) for name, (fields,) in table("Messages").items()} == found
+    documented = {name: [one for one in code(cell) if " = " in one] for name, (cell,) in table("Messages").items()}
+    assert documented == found
 
 
 def test_enums() -> None:

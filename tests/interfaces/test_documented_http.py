@@ -2,34 +2,29 @@
 
 from __future__ import annotations
 
-import json
 import re
-from dataclasses import asdict, fields
 from typing import Any
 
 import numpy as np
 import pytest
-from pydantic import BaseModel
 
 from ultragray import (
     LinearProbe,
 )
 from ultragray.confidence import Extrapolation
-from ultragray.display.settings import AS_RENDERED
 from ultragray.errors import error_classes
 from ultragray.settings import Resolved
 from ultragray_service import http
-from ultragray_service.core.pose_stream import Answered
 from ultragray_service.core.state import Service
 from ultragray_service.http import accept, middleware, problems
 from ultragray_service.http.app import create_app
+from ultragray_service.http.bodies import RenderBody
 from ultragray_service.http.docs import DOCS_PATH
+from ultragray_service.http.json_body import read_json
 from ultragray_service.http.routes import render as render_route
-from ultragray_service.http.schemas import DisplayBody, RenderBody
-from ultragray_service.http.stream_schemas import StreamMessage, StreamSettings, frame_bytes
 from ultragray_workers.pool.types import RenderResult
 
-from .document import DOCUMENT, code, headers_read, numbers, table
+from .document import DOCUMENT, headers_read, numbers, table
 
 
 @pytest.fixture
@@ -60,44 +55,6 @@ def test_query_parameters(openapi: dict[str, Any]) -> None:
     assert documented == {name: f"`{value}`" if value else "empty" for name, value in found.items()}
 
 
-@pytest.mark.parametrize(
-    ("heading", "model"), [("Stream messages", StreamMessage), ("Stream settings", StreamSettings)]
-)
-def test_stream_messages(heading: str, model: type[BaseModel]) -> None:
-    documented = {key: json.loads(code(default)[0]) for key, (default, _) in table(heading).items()}
-    assert documented == {key: field.default for key, field in model.model_fields.items()}
-
-
-def test_display_settings() -> None:
-    documented = {key: json.loads(code(default)[0]) for key, (default, _) in table("Display settings").items()}
-    assert documented == {**asdict(AS_RENDERED), "tgc_db": []}
-    assert documented == DisplayBody().model_dump()
-
-
-def test_confidence() -> None:
-    assert list(table("Confidence")) == [figure.name for figure in fields(Extrapolation)]
-
-
-def test_stream_frames(rendered: RenderResult) -> None:
-    message = frame_bytes(Answered(0, None, rendered), rendered)
-    header = json.loads(message[4 : 4 + int.from_bytes(message[:4], "little")])
-    assert list(header) == list(table("Stream frames"))
-
-
-def test_bodies(openapi: dict[str, Any]) -> None:
-    schemas = openapi["components"]["schemas"]
-    body = schemas.pop("RenderBody")["properties"]
-    documented = {key: json.loads(code(default)[0]) for key, (default, _) in table("Render body").items()}
-    assert documented == {key: value.get("default") for key, value in body.items()}
-    of_own_tables = {"StreamMessage", "StreamSettings", "FrameHeader", "Extrapolation"}
-    objects = {
-        name: list(schema["properties"])
-        for name, schema in schemas.items()
-        if name not in of_own_tables and "enum" not in schema
-    }
-    assert {name: code(keys) for name, (keys, _) in table("Objects").items()} == objects
-
-
 def test_accept_types() -> None:
     assert list(table("Accept")) == list(accept.MEDIA_TYPES)
 
@@ -124,7 +81,7 @@ def rendered() -> RenderResult:
 
 
 def test_render_headers(rendered: RenderResult) -> None:
-    sent = {*render_route._headers(rendered), middleware.REQUEST_ID_HEADER}
+    sent = {*render_route.render_headers(rendered), middleware.REQUEST_ID_HEADER}
     assert set(table("Render headers")) == sent == set(render_route.RENDER_HEADERS)
 
 
@@ -138,4 +95,4 @@ def test_example_bodies() -> None:
     examples = re.findall(r"-d '(\{.*?\})'", DOCUMENT, flags=re.DOTALL)
     assert examples
     for example in examples:
-        RenderBody.model_validate_json(example)
+        read_json(example, RenderBody)

@@ -12,17 +12,44 @@ from google.protobuf.descriptor import Descriptor
 
 from ultragray.confidence import Extrapolation
 from ultragray.display.settings import Display
-from ultragray.probe import ConvexProbe, LinearProbe, PhasedProbe
+from ultragray.outputs import OUTPUTS
+from ultragray.probe import Probe
+from ultragray.samplers import Sampler as PoseSampler
+from ultragray.settings import FRAME_ENCODINGS, RenderSettings
 from ultragray_proto.codec import MessageInvalid, from_message, to_message, words
 from ultragray_proto.v1 import datasets_pb2, geometry_pb2, jobs_pb2, rendering_pb2, scenes_pb2
+from ultragray_service.core import scenes
+from ultragray_service.core.frames import FrameHeader
+from ultragray_service.errors import Refusal
+from ultragray_workers.datasets.store import DatasetRecord
+from ultragray_workers.jobs.folder import Progress
+from ultragray_workers.jobs.job import Job
+from ultragray_workers.jobs.kinds import RenderJob, Specification, TrainJob
 
 # A dataclass and its message, and the fields that stand on one side only, for a reason.
 PAIRS: list[tuple[type[Any], type[Any], set[str]]] = [
-    (LinearProbe, geometry_pb2.LinearProbe, set()),
-    (ConvexProbe, geometry_pb2.ConvexProbe, set()),
-    (PhasedProbe, geometry_pb2.PhasedProbe, set()),
+    *(
+        (Probe.members[one.name], one.message_type._concrete_class, set())
+        for one in geometry_pb2.Probe.DESCRIPTOR.fields
+    ),
     (Display, rendering_pb2.Display, set()),
     (Extrapolation, rendering_pb2.Extrapolation, set()),
+    (RenderSettings, rendering_pb2.RenderSettings, {"scene"}),
+    (TrainJob, jobs_pb2.TrainJob, set()),
+    (RenderJob, jobs_pb2.RenderJob, {"pose_count"}),
+    (Job, jobs_pb2.Job, {"reason"}),
+    (Progress, jobs_pb2.JobProgress, set()),
+    (DatasetRecord, datasets_pb2.Dataset, set()),
+    (scenes.Scene, scenes_pb2.Scene, {"outputs", "bounds", "bounds_min_mm", "bounds_max_mm"}),
+    (scenes.SceneEntry, scenes_pb2.SceneEntry, {"removable"}),
+    (scenes.TrainingPoses, scenes_pb2.TrainingPoses, set()),
+    (scenes.ConfidenceFit, scenes_pb2.ConfidenceFit, set()),
+    (Refusal, scenes_pb2.Error, set()),
+    (
+        FrameHeader,
+        rendering_pb2.Frame,
+        {"sequence", "data", "error", "dropped", "client_time_ns", "timings", "queue_ms", "render_ms", "encode_ms"},
+    ),
 ]
 
 
@@ -40,6 +67,18 @@ def names_of_message(descriptor: Descriptor) -> set[str]:
 def test_fields_stand_on_both_sides(cls: type[Any], message: type[Any], alone: set[str]) -> None:
     given = {one.name for one in fields(cls) if one.init and one.name != "kind"}
     assert given ^ (names_of_message(message.DESCRIPTOR) - {"kind"}) == alone
+
+
+def test_every_kind_has_a_message() -> None:
+    """And every word its number."""
+    assert {one.name for one in geometry_pb2.Probe.DESCRIPTOR.fields} == set(Probe.members)
+    (specification,) = jobs_pb2.SubmitJobRequest.DESCRIPTOR.oneofs
+    assert {one.name for one in specification.fields} == set(Specification.members)
+    assert set(words(jobs_pb2.JobKind.DESCRIPTOR).values()) == set(Specification.members)
+    assert set(words(rendering_pb2.Output.DESCRIPTOR).values()) == set(OUTPUTS)
+    assert set(words(rendering_pb2.Encoding.DESCRIPTOR).values()) == set(FRAME_ENCODINGS)
+    numbers = {item.name for member in PoseSampler.members.values() for item in fields(member)}
+    assert numbers == {one.name for one in jobs_pb2.PoseSampler.DESCRIPTOR.fields}
 
 
 @dataclass(frozen=True)

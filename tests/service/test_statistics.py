@@ -9,7 +9,7 @@ from websockets.sync.client import connect
 
 from ultragray_service.core.state import Service
 from ultragray_service.settings import load_settings
-from ultragray_service.statistics import STEP_S, STEPS, Statistics
+from ultragray_service.statistics import STEP_S, STEPS, StageTimes, Statistics
 from ultragray_workers.errors import DeadlineExceeded
 
 from .conftest import StartService
@@ -44,7 +44,7 @@ def test_each_step_tells_what_happened_in_it(statistics: Statistics, clock: Cloc
     now, before = summaries[-1], summaries[-2]
     assert (now.frames, now.requests, now.errors, now.p50_ms) == (0, 0, 1, None)
     assert (before.frames, before.requests, before.errors) == (200, 100, 0)
-    assert before.p50_ms == {"queue": 1.0, "render": 51.0, "encode": 2.0}
+    assert before.p50_ms == StageTimes(queue=1.0, render=51.0, encode=2.0)
     assert before.p99_ms == {"queue": 1.0, "render": 100.0, "encode": 2.0}
 
 
@@ -63,7 +63,7 @@ def test_a_step_that_is_going_on_takes_more(statistics: Statistics) -> None:
     for render_ms in (1.0, 3.0):
         statistics.observe(1, 1.0, render_ms, 2.0)
         summary = statistics.summaries()[-1]
-        assert summary.p99_ms == {"queue": 1.0, "render": render_ms, "encode": 2.0}
+        assert summary.p99_ms == StageTimes(queue=1.0, render=render_ms, encode=2.0)
 
 
 def test_what_is_older_than_ten_minutes_goes(statistics: Statistics, clock: Clock) -> None:
@@ -80,7 +80,7 @@ def test_many_requests_are_sampled(statistics: Statistics) -> None:
     summary = statistics.summaries()[-1]
     assert summary.requests == 5000
     assert summary.p50_ms is not None
-    assert 35 < summary.p50_ms["render"] < 65
+    assert 35 < summary.p50_ms.render < 65
 
 
 def test_only_what_the_service_could_not_do_is_an_error(start_service: StartService) -> None:

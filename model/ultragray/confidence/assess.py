@@ -8,6 +8,7 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from ..contract import described
 from ..errors import InvalidArgument
 from ..pose import check_poses
 from ..probe import FloatArray, Probe
@@ -19,16 +20,14 @@ SUPPORT_COVERAGE = 0.3  # γ below which a pixel's error is more than twice that
 
 @dataclass(frozen=True)
 class Extrapolation:
-    """Of one frame. None: the scene does not know its training views, has no model, or no coverage was given.
+    """Of one frame. None: the scene does not know its training views, has no model, or no coverage was given."""
 
-    distance_mm and angle_deg lead to the nearest training views, as a mean over the image; confidence is the MS-SSIM
-    that a real frame is expected to have with the rendered one; supported_share is the share of pixels with support.
-    """
-
-    distance_mm: float | None
-    angle_deg: float | None
-    confidence: float | None
-    supported_share: float | None
+    distance_mm: float | None = described("Distance to the nearest training views, a mean over the image.")
+    angle_deg: float | None = described("Angle to them.")
+    confidence: float | None = described(
+        "The MS-SSIM that a real frame at this pose is expected to have with the rendered one, 0 to 1."
+    )
+    supported_share: float | None = described("Share of the pixels that Gaussians support: coverage of at least 0.3.")
 
 
 class Trained(Protocol):

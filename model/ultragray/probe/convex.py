@@ -15,6 +15,8 @@ class ConvexProbe(Fan):
     """A curved array: scan lines fan out from the apex, which is the origin."""
 
     opening_angle_deg: float = opening_field()
-    near_mm: float = length_field("Radius of the face: distance from the apex at which the image begins.")
-    far_mm: float = length_field("Distance from the apex at which the image ends, beyond `near_mm`.", above=0.0)
+    near_mm: float = length_field("Radius of the face: distance from the apex at which the image begins.", example=40.0)
+    far_mm: float = length_field(
+        "Distance from the apex at which the image ends, beyond `near_mm`.", above=0.0, example=90.0
+    )
     kind: Literal["convex"] = kind_field("convex")

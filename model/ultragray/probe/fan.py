@@ -15,7 +15,7 @@ SMALLEST_USUAL_OPENING_DEG = 5.0
 
 def opening_field() -> Any:
     """The field for the angle of a fan."""
-    return described("Full angle of the fan.", above=0.0, high=LARGEST_OPENING_DEG)
+    return described("Full angle of the fan.", above=0.0, high=LARGEST_OPENING_DEG, example=60.0)
 
 
 class Fan(Probe):

@@ -17,9 +17,9 @@ USUAL_WIDTHS_MM = (5.0, 200.0)
 class LinearProbe(Probe):
     """A linear array: parallel scan lines along +z, the face centred on the origin."""
 
-    width_mm: float = length_field("Width of the face.", above=0.0)
-    near_mm: float = length_field("Depth at which the image begins.")
-    far_mm: float = length_field("Depth at which the image ends, beyond `near_mm`.", above=0.0)
+    width_mm: float = length_field("Width of the face.", above=0.0, example=40.0)
+    near_mm: float = length_field("Depth at which the image begins.", example=0.0)
+    far_mm: float = length_field("Depth at which the image ends, beyond `near_mm`.", above=0.0, example=50.0)
     kind: Literal["linear"] = kind_field("linear")
 
     face_depth_mm = 0.0

@@ -15,7 +15,7 @@ class PhasedProbe(Fan):
     """A phased array: scan lines fan out from the centre of the face; `near_mm` is 0."""
 
     opening_angle_deg: float = opening_field()
-    far_mm: float = length_field("Depth at which the image ends.", above=0.0)
+    far_mm: float = length_field("Depth at which the image ends.", above=0.0, example=50.0)
     kind: Literal["phased"] = kind_field("phased")
 
     near_mm = 0.0

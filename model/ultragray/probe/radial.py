@@ -17,8 +17,12 @@ class RadialProbe(Probe):
     Line j of W runs at the angle 360°·(j+½)/W from z towards +x; the last is followed by the first.
     """
 
-    near_mm: float = length_field("Radius of the ring: distance from the centre at which the image begins.")
-    far_mm: float = length_field("Distance from the centre at which the image ends, beyond `near_mm`.", above=0.0)
+    near_mm: float = length_field(
+        "Radius of the ring: distance from the centre at which the image begins.", example=1.0
+    )
+    far_mm: float = length_field(
+        "Distance from the centre at which the image ends, beyond `near_mm`.", above=0.0, example=20.0
+    )
     kind: Literal["radial"] = kind_field("radial")
 
     usual_scan_lines_mm = (1.0, 150.0)

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from typing import Any
 
 from ultragray.errors import InvalidArgument, SceneFileInvalid, UltragrayError
-from ultragray.probe import FloatArray
 from ultragray.scene_info import SceneHeader
 from ultragray_workers.errors import SceneNotFound, SceneTooLarge
 from ultragray_workers.scenes import FileVersion, SceneStore
@@ -32,18 +31,6 @@ class CatalogEntry:
     name: str
     header: SceneHeader | None
     error: UltragrayError | None
-
-
-@dataclass(frozen=True)
-class TrainingSummary:
-    """The poses that a scene was trained from, in short; positions in mm."""
-
-    count: int
-    position_min_mm: FloatArray  # [3]
-    position_max_mm: FloatArray  # [3]
-    first: FloatArray  # [4, 4]
-    middle: FloatArray  # [4, 4]
-    last: FloatArray  # [4, 4]
 
 
 class SceneCatalog:
@@ -115,22 +102,6 @@ def scene_to_blame() -> Iterator[None]:
         yield
     except (SceneNotFound, SceneFileInvalid, SceneTooLarge) as error:
         raise type(error)(error.detail, field=error.field or "scene") from error
-
-
-def summarise_training(header: SceneHeader) -> TrainingSummary | None:
-    """The training poses in short; None where the scene knows none."""
-    poses = header.training_poses
-    if not len(poses):
-        return None
-    positions = poses[:, :3, 3]
-    return TrainingSummary(
-        count=len(poses),
-        position_min_mm=positions.min(axis=0),
-        position_max_mm=positions.max(axis=0),
-        first=poses[0],
-        middle=poses[len(poses) // 2],
-        last=poses[-1],
-    )
 
 
 def finite_metrics(header: SceneHeader) -> dict[str, float]:

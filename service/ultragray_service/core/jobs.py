@@ -6,13 +6,14 @@ import asyncio
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Concatenate, ParamSpec, TypeVar
 
 from sqlalchemy.exc import SQLAlchemyError
 
-from ultragray.contract import under
+from ultragray.contract import described, under
 from ultragray.errors import DatasetInvalid, InvalidArgument, SceneFileInvalid, UltragrayError
 from ultragray_workers.errors import DatabaseUnavailable, DatasetNotFound, NotReady, SceneExists, SceneNotFound
 from ultragray_workers.jobs.folder import JobFolder
@@ -31,6 +32,14 @@ _PATIENCE_S = 10.0  # with a database that is there and says nothing
 
 P = ParamSpec("P")
 T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class JobPage:
+    """One page of jobs, newest first."""
+
+    jobs: list[Job]
+    next_page_token: str = described("Empty on the last page.")
 
 
 class Jobs:
@@ -90,8 +99,8 @@ class Jobs:
         with _specification_to_blame(field):
             return await self.do(JobStore.submit, specification, request_id=request_id, priority=priority)
 
-    async def page(self, *, state: str, kind: str, page_size: int, page_token: str) -> tuple[list[Job], str]:
-        """One page of jobs, newest first, and the token of the next (empty on the last); empty filters pass all.
+    async def page(self, *, state: str, kind: str, page_size: int, page_token: str) -> JobPage:
+        """One page of jobs; empty filters pass all.
 
         Raises InvalidArgument for a page_size outside 1 to 1000 and for a token that no page gave.
         """
@@ -106,7 +115,7 @@ class Jobs:
             page_size=page_size,
             page_token=page_token or None,
         )
-        return jobs, token or ""
+        return JobPage(jobs, token or "")
 
     async def watch(self, job_id: str) -> JobWatch:
         """A watcher of a job, to be closed. Raises JobNotFound."""

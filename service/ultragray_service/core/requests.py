@@ -2,17 +2,10 @@
 
 from __future__ import annotations
 
-import asyncio
 import time
-from collections.abc import Callable
-from typing import Any
-
-import numpy as np
 
 from ultragray.contract import under
-from ultragray.errors import InvalidArgument, InvalidImageSize, TooManyPoses
-from ultragray.pose import check_poses
-from ultragray.probe import FloatArray
+from ultragray.errors import InvalidImageSize, TooManyPoses
 from ultragray.settings import Encoding, FrameSettings, Resolved
 
 from ..settings import Settings
@@ -67,26 +60,3 @@ class RequestPlanner:
     def deadline(self, timeout_s: float | None) -> float:
         """The time.monotonic() seconds by which a request must begin; None: the default timeout."""
         return time.monotonic() + (self._settings.default_timeout_s if timeout_s is None else timeout_s)
-
-
-def check_pose_count(count: int, limit: int) -> None:
-    """Raises TooManyPoses above `limit`, InvalidArgument for none."""
-    if count > limit:
-        raise TooManyPoses(f"poses must be at most {limit}, got {count}", field="poses")
-    if count == 0:
-        raise InvalidArgument("poses must hold at least one pose, got none", field="poses")
-
-
-async def gather_poses(count: int, pose: Callable[[int], FloatArray]) -> FloatArray:  # [C, 4, 4]
-    """The checked poses 0 to count − 1, each from `pose`."""
-
-    def stack() -> FloatArray:
-        return np.stack([pose(index) for index in range(count)])
-
-    return stack() if count <= _POSES_CHECKED_INLINE else await asyncio.to_thread(stack)
-
-
-def one_pose(matrix: Any, *, field: str) -> FloatArray:  # [4, 4] mm
-    """The exact pose of a 4x4 matrix. Raises InvalidPose."""
-    pose: FloatArray = check_poses(matrix, field=field)[0]
-    return pose

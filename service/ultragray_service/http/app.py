@@ -12,11 +12,14 @@ from starlette.middleware.cors import CORSMiddleware
 
 from ultragray import __version__
 from ultragray.errors import UltragrayError
+from ultragray.probe import Probe
 
 from ..core.state import Service
-from . import job_schemas, problems
+from . import problems
+from .bodies import SPECIFICATIONS, JobBody, RenderBody, StreamMessage
 from .console import add_console
 from .docs import add_docs
+from .json_body import adapter_of
 from .middleware import LimitBody, RequestContext, RequireKey
 from .routes import (
     comparison,
@@ -32,8 +35,7 @@ from .routes import (
     stream,
     training,
 )
-from .schemas import RenderBody
-from .stream_schemas import FrameHeader, RefusalMessage, StreamMessage
+from .stream_messages import FrameMessage, RefusalMessage
 
 _DESCRIPTION = """B-mode frames from trained 3D-Gaussian ultrasound scenes.
 
@@ -48,13 +50,8 @@ _SECURITY_SCHEMES = {
 }
 
 
-_READ: tuple[Any, ...] = (
-    RenderBody,
-    StreamMessage,
-    job_schemas.JobBody,
-    *job_schemas.SPECIFICATIONS,
-)
-_WRITTEN: tuple[Any, ...] = (problems.Problem, FrameHeader, RefusalMessage)
+_READ: tuple[Any, ...] = (RenderBody, StreamMessage, JobBody, *SPECIFICATIONS, Probe)
+_WRITTEN: tuple[Any, ...] = (problems.Problem, FrameMessage, RefusalMessage)
 
 
 def create_app(service: Service) -> FastAPI:
@@ -109,12 +106,13 @@ class _Application(FastAPI):
     def openapi(self) -> dict[str, Any]:
         if self.openapi_schema is None:
             document = super().openapi()
-            _, extra = TypeAdapter.json_schemas(
-                [(cls, "validation", TypeAdapter(cls)) for cls in _READ]
-                + [(cls, "serialization", TypeAdapter(cls)) for cls in _WRITTEN],
+            found, extra = TypeAdapter.json_schemas(
+                [(cls, "validation", adapter_of(cls)) for cls in _READ]
+                + [(cls, "serialization", adapter_of(cls)) for cls in _WRITTEN],
                 ref_template="#/components/schemas/{model}",
             )
             schemas = document.setdefault("components", {}).setdefault("schemas", {})
+            schemas.update({cls.__name__: schema for (cls, _), schema in found.items() if "$ref" not in schema})
             schemas.update(extra["$defs"])
             for unused in ("HTTPValidationError", "ValidationError"):
                 schemas.pop(unused, None)

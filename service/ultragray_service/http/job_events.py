@@ -7,8 +7,10 @@ from collections.abc import AsyncIterator
 from starlette.responses import StreamingResponse
 from starlette.types import Receive, Scope, Send
 
+from ultragray_workers.jobs.job import Job
+
 from ..core.job_hub import JobChange, JobWatch
-from .job_schemas import JOB_OUT, JobOut
+from .json_body import adapter_of
 
 EVENTS_TYPE = "text/event-stream"
 KEEP_ALIVE_S = 15.0
@@ -42,7 +44,7 @@ def _written(change: JobChange) -> bytes:
     if change.log:
         text += _event("log", change.log)
     if change.job is not None:
-        text += _event("progress", JOB_OUT.dump_json(JobOut.of(change.job)).decode())
+        text += _event("progress", adapter_of(Job).dump_json(change.job).decode())
     return text.encode()
 
 

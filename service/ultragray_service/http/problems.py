@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 from fastapi.exceptions import RequestValidationError
@@ -12,22 +12,14 @@ from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import Response
 
-from ultragray.errors import InvalidArgument, InvalidImageSize, InvalidPose, InvalidProbe, UltragrayError, UnknownOutput
+from ultragray.contract import blamed, error_under, join
+from ultragray.errors import InvalidArgument, UltragrayError
 
 from ..errors import MethodNotAllowed, RouteNotFound, statuses_of
 from ..logs import request_id
 
 PROBLEM_TYPE = "application/problem+json"
 
-_CLASS_OF_FIELD: dict[str, type[InvalidArgument]] = {
-    "pose": InvalidPose,
-    "poses": InvalidPose,
-    "probe": InvalidProbe,
-    "height": InvalidImageSize,
-    "width": InvalidImageSize,
-    "outputs": UnknownOutput,
-}
-_PROBE_KINDS = ("linear", "convex", "phased")  # pydantic puts the tag of a union into the path
 _SHOWN_INPUT = 60
 
 
@@ -88,37 +80,26 @@ async def answer_validation_error(request: Request, error: Exception) -> Respons
     return problem_response(invalid_argument({**first, "loc": first["loc"][1:]}))  # without "query" or "path"
 
 
-def invalid_argument(first: Mapping[str, Any]) -> InvalidArgument:
-    """A pydantic error as one sentence that names the field, what was expected and what came."""
-    path = _path(first["loc"])
-    kind = str(first["type"])
-    root = str(first["loc"][0]) if first["loc"] else ""
-    if kind == "json_invalid":
-        return InvalidArgument(f"this must be JSON: {first.get('ctx', {}).get('error', 'it cannot be read')}")
-    if kind == "missing":
-        detail = f"{path} is required"
-    elif kind == "extra_forbidden":
-        return InvalidArgument(f"{path} is not a known key", field=path)
-    elif kind in ("union_tag_not_found", "union_tag_invalid"):
-        path = f"{path}.kind"
-        detail = f"{path} must be one of {', '.join(_PROBE_KINDS)}"
-    else:
-        message = str(first["msg"])
-        _, verb, expected = message.partition(" should ")
-        detail = f"{path or 'the body'} must {expected}" if verb else f"{path}: {message}"
-        detail += f", got {_shown(first.get('input'))}"
-    return _CLASS_OF_FIELD.get(root, InvalidArgument)(detail, field=path or None)
-
-
-def _path(location: Iterable[int | str]) -> str:
-    path = ""
-    parts = list(location)
-    for index, part in enumerate(parts):
-        if isinstance(part, int):
-            path += f"[{part}]"
-        elif not (part in _PROBE_KINDS and index == 1 and parts[0] == "probe"):
-            path += f".{part}" if path else part
-    return path
+def invalid_argument(first: Mapping[str, Any], cls: Any = None) -> UltragrayError:
+    """A pydantic error of a value of a class: one sentence that names the field, what was expected and what came."""
+    path, error, kind_of_value = blamed(cls, first["loc"])
+    match first["type"]:
+        case "value_error" if isinstance(original := first["ctx"]["error"], UltragrayError):
+            return error_under(path, original) if path else original
+        case "json_invalid":
+            return InvalidArgument(f"this must be JSON: {first['ctx']['error']}")
+        case "missing":
+            return error(f"{path} is required", field=path)
+        case "extra_forbidden" | "unexpected_keyword_argument":
+            return InvalidArgument(f"{path} is not a known key", field=path)
+        case "union_tag_not_found" | "union_tag_invalid":
+            kinds = ", ".join(kind_of_value.members)
+            path = join(path, "kind")
+            return error(f"{path} must be one of {kinds}, got {_shown(first['input'].get('kind'))}", field=path)
+    message = str(first["msg"])
+    _, verb, expected = message.partition(" should ")
+    detail = f"{path or 'the body'} must {expected}" if verb else f"{path}: {message}"
+    return error(f"{detail}, got {_shown(first.get('input'))}", field=path or None)
 
 
 def _shown(value: Any) -> str:

@@ -15,7 +15,8 @@ from ultragray_workers.jobs.store import JobStore
 from ..core.catalog import DEFAULT_PAGE_SIZE
 from ..core.job_log import DEFAULT_LOG_BYTES, MAX_LOG_BYTES
 from ..core.state import Service
-from .job_messages import filter_from_number, job_message, specification_from_message
+from .job_messages import job_message, read_specification
+from .messages import read_word
 
 _CHUNK_BYTES = 2**20
 _LOOK_AROUND_S = 15.0  # how long a watch waits for news at a time
@@ -31,7 +32,7 @@ class JobService:
         self, request: jobs_pb2.SubmitJobRequest, context: grpc.aio.ServicerContext
     ) -> jobs_pb2.SubmitJobResponse:
         self._service.require_serving()
-        specification, field = await asyncio.to_thread(specification_from_message, request)  # of many poses
+        specification, field = await asyncio.to_thread(read_specification, request)  # of many poses
         job, is_new = await self._service.jobs.submit(
             specification, field=field, request_id=request.request_id or None, priority=request.priority
         )
@@ -40,13 +41,14 @@ class JobService:
     async def ListJobs(  # noqa: N802
         self, request: jobs_pb2.ListJobsRequest, context: grpc.aio.ServicerContext
     ) -> jobs_pb2.ListJobsResponse:
-        jobs, next_page_token = await self._service.jobs.page(
-            state=filter_from_number(request.state, jobs_pb2.JobState.DESCRIPTOR, "state"),
-            kind=filter_from_number(request.kind, jobs_pb2.JobKind.DESCRIPTOR, "kind"),
+        page = await self._service.jobs.page(
+            state=read_word(request, "state"),
+            kind=read_word(request, "kind"),
             page_size=request.page_size or DEFAULT_PAGE_SIZE,
             page_token=request.page_token,
         )
-        return jobs_pb2.ListJobsResponse(jobs=[job_message(job) for job in jobs], next_page_token=next_page_token)
+        jobs = [job_message(job) for job in page.jobs]
+        return jobs_pb2.ListJobsResponse(jobs=jobs, next_page_token=page.next_page_token)
 
     async def GetJob(  # noqa: N802
         self, request: jobs_pb2.GetJobRequest, context: grpc.aio.ServicerContext

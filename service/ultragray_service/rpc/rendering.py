@@ -8,16 +8,18 @@ from collections import deque
 
 import grpc
 
+from ultragray.contract import under
 from ultragray.errors import InvalidArgument, LowConfidence
+from ultragray.settings import Resolved
 from ultragray_proto.v1 import rendering_pb2
 from ultragray_workers.errors import QueueFull
 from ultragray_workers.pool.types import Priority, RenderRequest, RenderResult
 
-from ..core.requests import check_pose_count, gather_poses
+from ..core.poses import check_pose_count, exact_poses
 from ..core.state import Service
-from .messages import frame_message, pose_from_message
-from .planning import resolved_settings
-from .stream import FrameStream
+from ..core.stream import FrameStream
+from .messages import frame_message, read_pose, read_settings
+from .stream import CallTransport
 
 _RETRY_S = 0.02
 
@@ -32,10 +34,10 @@ class RenderService:
         self, request: rendering_pb2.RenderRequest, context: grpc.aio.ServicerContext
     ) -> rendering_pb2.Frame:
         deadline = self._service.planner.deadline(context.time_remaining())
-        scene, settings = await resolved_settings(self._service, request)
+        scene, settings = await self._resolved(request)
         if not request.HasField("pose"):
             raise InvalidArgument("pose is required", field="pose")
-        pose = pose_from_message(request.pose, "pose")
+        pose = read_pose(request.pose, "pose")
         asked = RenderRequest(scene, settings, pose[None], deadline=deadline)
         return frame_message(await self._service.render(asked), 0)
 
@@ -44,10 +46,8 @@ class RenderService:
     ) -> None:
         planner = self._service.planner
         check_pose_count(len(request.poses), planner.max_poses)
-        scene, settings = await resolved_settings(self._service, request)
-        poses = await gather_poses(
-            len(request.poses), lambda index: pose_from_message(request.poses[index], f"poses[{index}]")
-        )
+        scene, settings = await self._resolved(request)
+        poses = await exact_poses(len(request.poses), lambda index: read_pose(request.poses[index], f"poses[{index}]"))
         window = min(2 * self._service.settings.max_batch_poses, self._service.settings.queue_limit_frames)
         in_flight: deque[asyncio.Task[RenderResult]] = deque()
         started = 0
@@ -75,7 +75,15 @@ class RenderService:
     async def RenderStream(  # noqa: N802
         self, messages: object, context: grpc.aio.ServicerContext
     ) -> None:
-        await FrameStream(self._service, context).run()
+        await FrameStream(self._service, CallTransport(context)).run()
+
+    async def _resolved(
+        self, request: rendering_pb2.RenderRequest | rendering_pb2.RenderBatchRequest
+    ) -> tuple[str, Resolved]:
+        """The scene and the settings of a request. Raises what RequestPlanner.resolve raises; the field is a path."""
+        scene, asked = read_settings(request)
+        with under("settings"):
+            return scene, await self._service.planner.resolve(scene, asked, asked.encoding)
 
     async def _render_when_room(self, request: RenderRequest) -> RenderResult:
         """Renders a frame of a batch that was let in already: a full queue delays it."""

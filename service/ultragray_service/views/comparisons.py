@@ -6,8 +6,9 @@ import asyncio
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Literal
 
+from ultragray.contract import described
 from ultragray.files.atomic import file_sha256
 from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import ArtifactNotFound, DatasetNotFound
@@ -21,13 +22,32 @@ from ..settings import Settings
 from .prepared import Preparation, Prepared
 
 
-@dataclass(frozen=True)
-class Comparison:
-    """How far a comparison is; `frames` (metrics of each held-out frame) once it is ready."""
+@dataclass(frozen=True, kw_only=True)
+class ComparedFrame:
+    """How near the scene, and median compounding, come to a held-out frame."""
 
+    index: int
+    frame_number: int = described("As the dataset numbers it.")
+    psnr_db: float
+    ms_ssim: float
+    gms: float
+    gmsd: float
+    median_psnr_db: float
+    median_ms_ssim: float
+    median_gms: float
+    median_gmsd: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Comparison:
+    """A scene beside the held-out frames of its dataset."""
+
+    state: Literal["running", "ready", "failed"] = described("A failed one is tried again after a minute.")
+    progress: float = described("0 to 1.")
     dataset: str
-    preparation: Preparation
-    frames: list[dict[str, Any]]
+    frames: list[ComparedFrame] = described("Empty until it is ready.")
+    reason: str | None = described("Why it failed: one sentence.")
+    error: str | None = described("Why it failed: the stable reason, such as DATASET_INVALID.")
 
 
 class Comparisons(Prepared):
@@ -56,13 +76,22 @@ class Comparisons(Prepared):
         """
         key, dataset, path = await self._wanted(scene)
         preparation = await self.prepare(key, dataset=dataset, scene_path=str(path))
-        frames: list[dict[str, Any]] = []
+        frames: list[ComparedFrame] = []
         if preparation.state == "ready":
             try:
-                frames = json.loads(await asyncio.to_thread((self.folder / key / FRAMES_NAME).read_bytes))
+                document = await asyncio.to_thread((self.folder / key / FRAMES_NAME).read_bytes)
+                frames = [ComparedFrame(**frame) for frame in json.loads(document)]
             except FileNotFoundError:  # it went this very moment
                 preparation = Preparation("running", 0.0)
-        return Comparison(dataset, preparation, frames)
+        reason, error = (preparation.error.detail, preparation.error.reason) if preparation.error else (None, None)
+        return Comparison(
+            state=preparation.state,
+            progress=preparation.progress,
+            dataset=dataset,
+            frames=frames,
+            reason=reason,
+            error=error,
+        )
 
     async def key(self, scene: str) -> str:
         """The key of a comparison, ready or not. Raises as `get`."""

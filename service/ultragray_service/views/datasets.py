@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+from dataclasses import dataclass
 from pathlib import Path
 
+from ultragray.contract import described
 from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import ArtifactNotFound, DatasetNotFound
 from ultragray_workers.helpers.dataset_view import POSES_NAME, lay_out
@@ -12,6 +14,14 @@ from ultragray_workers.helpers.dataset_view import POSES_NAME, lay_out
 from ..core.helper_processes import HelperProcesses
 from ..settings import Settings
 from .prepared import Prepared
+
+
+@dataclass(frozen=True)
+class DatasetPoses:
+    """The poses of a dataset."""
+
+    train: list[list[float]] = described("16 numbers each, row by row, mm.")
+    val: list[list[float]] = described("Of the held-out frames.")
 
 
 class DatasetViews(Prepared):
@@ -28,7 +38,7 @@ class DatasetViews(Prepared):
         return (await asyncio.to_thread(self._store.get, name)).sha256
 
     async def poses_json(self, name: str) -> bytes:
-        """`train` and `val`, each a list of poses, 16 numbers row by row, mm.
+        """The JSON of DatasetPoses.
 
         Raises DatasetNotFound, DatasetInvalid, MemoryExceeded, StorageFull, DeadlineExceeded, Draining.
         """

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ultragray.contract import described
 from ultragray.errors import TrainingStateInvalid
 from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import ArtifactNotFound
@@ -27,11 +28,18 @@ _JOURNAL, _CHECKPOINT = "metrics.jsonl", "checkpoint.safetensors"  # of a run: `
 
 @dataclass(frozen=True)
 class CurvePoint:
-    """Neighbouring steps of a training as one: their last step, their mean loss, what was measured last in them."""
+    """Neighbouring steps of a training as one."""
 
-    step: int
-    loss: float
-    val_psnr_db: float | None
+    step: int = described("The last of them.")
+    loss: float = described("Their mean.")
+    val_psnr_db: float | None = described("On held-out frames, measured last; null where it was not.")
+
+
+@dataclass(frozen=True)
+class TrainingCurve:
+    """A training so far."""
+
+    points: list[CurvePoint] = described(f"At most {MAX_POINTS}; none before the first step.")
 
 
 class TrainingViews(Prepared):
@@ -44,11 +52,11 @@ class TrainingViews(Prepared):
         self._jobs = jobs
         self._datasets = datasets
 
-    async def curve(self, job_id: str) -> list[CurvePoint]:
-        """At most MAX_POINTS points of the training so far; none before its first step. Raises JobNotFound."""
+    async def curve(self, job_id: str) -> TrainingCurve:
+        """The training so far. Raises JobNotFound."""
         job = await self._jobs.do(JobStore.get, job_id)
         folder = JobFolder(self._artifacts, job.id)
-        return await asyncio.to_thread(_curve_of, (folder.artifacts / _JOURNAL, folder.run / _JOURNAL))
+        return TrainingCurve(await asyncio.to_thread(_curve_of, (folder.artifacts / _JOURNAL, folder.run / _JOURNAL)))
 
     async def preview_png(self, job_id: str) -> bytes:
         """Truth, and to its right the rendering, PNG.

@@ -37,7 +37,7 @@ def test_lines_of_a_fan_begin_at_its_face(http: httpx.Client) -> None:
 
 def test_each_kind_has_an_example_that_can_be(http: httpx.Client) -> None:
     schemas = http.get("/openapi.json").json()["components"]["schemas"]
-    mapping = schemas["StreamSettings"]["properties"]["probe"]["anyOf"][0]["discriminator"]["mapping"]
+    mapping = schemas["RenderSettings"]["properties"]["probe"]["anyOf"][0]["discriminator"]["mapping"]
     assert {"linear", "convex", "phased"} <= mapping.keys()
     for kind, reference in mapping.items():
         (example,) = schemas[reference.rpartition("/")[2]]["examples"]

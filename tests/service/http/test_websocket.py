@@ -9,6 +9,7 @@ import socket
 import struct
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import fields
 from typing import Any
 
 import cv2
@@ -19,7 +20,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from ultragray import GaussianScene, render
-from ultragray_service.http.stream_schemas import FrameHeader, RefusalMessage
+from ultragray_service.http.stream_messages import FrameMessage, RefusalMessage
 
 from ...waiting import wait_until
 from ..conftest import HEIGHT, WIDTH, RunningService
@@ -40,7 +41,7 @@ def checked(kind: Any, text: str | bytes) -> dict[str, Any]:
     """The JSON of a message, which must be as the OpenAPI document says."""
     TypeAdapter(kind).validate_json(text)
     document: dict[str, Any] = json.loads(text)
-    assert document.keys() == kind.__required_keys__
+    assert document.keys() == {field.name for field in fields(kind)}
     return document
 
 
@@ -59,7 +60,7 @@ class Stream:
             return checked(RefusalMessage, message), b""
         (length,) = struct.unpack_from("<I", message)
         assert (4 + length) % 8 == 0
-        return checked(FrameHeader, message[4 : 4 + length]), message[4 + length :]
+        return checked(FrameMessage, message[4 : 4 + length]), message[4 + length :]
 
     def ask(self, **message: Any) -> tuple[dict[str, Any], bytes]:
         self.send(**message)

@@ -15,7 +15,7 @@ from google.rpc.error_details_pb2 import ErrorInfo
 from google.rpc.status_pb2 import Status
 
 from ultragray_proto.v1 import geometry_pb2, jobs_pb2, jobs_pb2_grpc, rendering_pb2
-from ultragray_service.rpc.job_messages import specification_from_message
+from ultragray_service.rpc.job_messages import read_specification
 from ultragray_workers.jobs.kinds import TrainJob
 
 from ..conftest import RunningService, StartService
@@ -242,7 +242,7 @@ def test_whole_numbers_of_settings_are_integers() -> None:
     train.settings.update(
         {"steps": 250, "prune_above": 0.5, "transmittance": False, "memory_gb": None, "start": "random"}
     )
-    specification, field = specification_from_message(jobs_pb2.SubmitJobRequest(train=train))
+    specification, field = read_specification(jobs_pb2.SubmitJobRequest(train=train))
     assert field == "train"
     assert isinstance(specification, TrainJob)
     assert (specification.preset, specification.device) == ("fast", "auto")

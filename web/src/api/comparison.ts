@@ -3,7 +3,7 @@
 import { address, getJson, type Schemas } from "./client";
 import type { paths } from "./generated/schema";
 
-export type Comparison = Schemas["ComparisonOut"];
+export type Comparison = Schemas["Comparison"];
 type MetricOf<Field> = Field extends `median_${infer Name}` ? Name : never;
 export type Metric = MetricOf<keyof Schemas["ComparedFrame"]>;
 export type ComparedPicture =

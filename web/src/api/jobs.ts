@@ -5,9 +5,9 @@ import type { Described } from "./described";
 import { jobs } from "./generated/contract";
 
 /** The specifications of jobs have these beside what their kind needs. */
-export type Job = Schemas["JobOut"] & { specification: { scene?: string; dataset?: string; preset?: string } };
+export type Job = Schemas["Job"] & { specification: { scene?: string; dataset?: string; preset?: string } };
 export type JobState = Job["state"];
-export type CurvePoint = Schemas["CurvePointOut"];
+export type CurvePoint = Schemas["CurvePoint"];
 
 const FINAL: readonly JobState[] = ["succeeded", "failed", "cancelled"];
 

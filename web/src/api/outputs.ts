@@ -4,7 +4,7 @@ import { labelOf } from "./described";
 import { scene } from "./generated/contract";
 import type { Schemas } from "./client";
 
-export type Output = Schemas["SceneOut"]["outputs"][number];
+export type Output = Schemas["Scene"]["outputs"][number];
 
 interface DescribedOutput {
   title: string;

@@ -3,7 +3,7 @@
 import { address, getJson, request, type Schemas } from "./client";
 
 export type SceneEntry = Schemas["SceneEntry"];
-export type SceneDescription = Schemas["SceneOut"];
+export type SceneDescription = Schemas["Scene"];
 
 /** The Gaussians of a scene as points: float32 [N, 6], x, y, z in mm, intensity, transmittance, mean sigma in mm. */
 export interface GaussianPoints {

@@ -2,7 +2,7 @@
 
 import { getJson, type Schemas } from "./client";
 
-export type Statistics = Schemas["StatisticsOut"];
+export type Statistics = Schemas["ServiceStatistics"];
 export type StageTimes = Schemas["StageTimes"];
 
 export function statistics(signal: AbortSignal): Promise<Statistics> {

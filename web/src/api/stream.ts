@@ -4,9 +4,9 @@ import type { Pose } from "../geometry/pose";
 import { apiKey, type Schemas } from "./client";
 import type { Output } from "./outputs";
 
-export type StreamSettings = Omit<Schemas["StreamSettings"], "encoding">;
-export type Display = Schemas["FrameHeader"]["display"];
-export type FrameHeader = Schemas["FrameHeader"];
+export type StreamSettings = Omit<Schemas["RenderSettings"], "encoding">;
+export type Display = Schemas["FrameMessage"]["display"];
+export type FrameHeader = Schemas["FrameMessage"];
 export type Extrapolation = FrameHeader["extrapolation"];
 /** Why a pose got no frame. */
 export type Refusal = Schemas["RefusalMessage"]["error"];

@@ -13,6 +13,7 @@ from dbos import WorkflowStatus
 from ultragray.contract import described
 
 from .folder import JobFolder, Outcome, Progress
+from .kinds import KINDS
 from .queue import database
 
 MAX_PRIORITY = 1000
@@ -44,7 +45,7 @@ class Job:
     """A job as it is now."""
 
     id: str
-    kind: str
+    kind: str = described("What is done.", choices=KINDS)
     state: JobState
     request_id: str | None
     specification: dict[str, Any] = described("As it was sent; of poses only their number, as pose_count.")
@@ -76,7 +77,7 @@ def job_of_row(row: WorkflowStatus, artifact_folder: Path) -> Job:
         kind=row.name,
         state=state,
         request_id=attribute(row, "request_id"),
-        specification=attribute(row, "specification"),
+        specification={name: value for name, value in attribute(row, "specification").items() if name != "kind"},
         priority=PRIORITY_ZERO - (row.priority or 0),
         created_at=_iso(row.created_at),
         started_at=_iso_not_before(row.created_at, row.dequeued_at),

@@ -9,8 +9,8 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from ...views.comparisons import Comparison
+from ...views.datasets import DatasetPoses
 from ..accept import PNG
-from ..console_schemas import ComparedFrame, ComparisonOut, DatasetPoses
 from ..deps import SceneName, ServiceDep, problems
 from ..revalidation import NOT_MODIFIED, revalidated
 from .datasets import DatasetName
@@ -30,10 +30,10 @@ _POSES: _Answers = {200: {"model": DatasetPoses}, 304: {"description": NOT_MODIF
 
 
 @router.get("/scenes/{scene}/comparison", responses=problems(401, 404, 422, 503))
-async def get_comparison(service: ServiceDep, scene: SceneName) -> ComparisonOut:
+async def get_comparison(service: ServiceDep, scene: SceneName) -> Comparison:
     """Metrics on the held-out frames of the scene's dataset. The first request begins to compute them."""
     service.require_serving()
-    return _comparison(await service.comparisons.get(scene))
+    return await service.comparisons.get(scene)
 
 
 @router.get(
@@ -87,15 +87,3 @@ async def get_dataset_frame(
         return Response(await service.dataset_views.frame_png(dataset, part, index), media_type=PNG)
 
     return await revalidated(request, f"{await service.dataset_views.key(dataset)}-{part}-{index}", frame)
-
-
-def _comparison(comparison: Comparison) -> ComparisonOut:
-    error = comparison.preparation.error
-    return ComparisonOut(
-        state=comparison.preparation.state,
-        progress=comparison.preparation.progress,
-        dataset=comparison.dataset,
-        frames=[ComparedFrame.model_validate(frame) for frame in comparison.frames],
-        reason=None if error is None else error.detail,
-        error=None if error is None else error.reason,
-    )

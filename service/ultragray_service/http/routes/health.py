@@ -2,10 +2,27 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Literal
+
 from fastapi import APIRouter
 
 from ..deps import ServiceDep, problems
-from ..schemas import Live, Ready
+
+
+@dataclass(frozen=True)
+class Live:
+    """The process runs."""
+
+    status: Literal["live"] = "live"
+
+
+@dataclass(frozen=True)
+class Ready:
+    """Frames are rendered."""
+
+    status: Literal["ready"] = "ready"
+
 
 router = APIRouter(prefix="/v1/health", tags=["health"])
 

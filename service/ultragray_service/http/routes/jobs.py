@@ -11,17 +11,20 @@ from starlette.responses import FileResponse, PlainTextResponse, Response, Strea
 
 from ultragray.contract import under
 from ultragray.errors import InvalidArgument
+from ultragray_workers.jobs.job import Job, JobState
+from ultragray_workers.jobs.kinds import KINDS
 from ultragray_workers.jobs.specification import from_dict
 from ultragray_workers.jobs.store import JobStore
 
 from ...core.catalog import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE
 from ...core.job_log import DEFAULT_LOG_BYTES, MAX_LOG_BYTES
+from ...core.jobs import JobPage
 from ..accept import NPZ, PNG
+from ..bodies import JobBody
 from ..deps import ServiceDep, problems
 from ..examples import JOB_EXAMPLES
 from ..job_events import EVENTS_TYPE, JobEvents
-from ..job_schemas import JobBody, JobKindFilter, JobOut, JobPage
-from ..json_body import read_json_body
+from ..json_body import body_schema, read_json_body
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 
@@ -40,29 +43,18 @@ _SPECIFICATION = "specification"  # the key of the body
 _ANY_FILE = "application/octet-stream"
 
 JobId = Annotated[str, Path(description="Id of the job.")]
-StateFilter = Annotated[
-    Literal["", "queued", "running", "succeeded", "failed", "cancelled"],
-    Query(description="Only jobs in this state; empty: all."),
-]
-KindFilter = Annotated[JobKindFilter, Query(description="Only jobs of this kind; empty: all.")]
+_AnyState: Any = Literal.__getitem__(("", *(state.value for state in JobState)))
+_AnyKind: Any = Literal.__getitem__(("", *KINDS))
+StateFilter = Annotated[_AnyState, Query(description="Only jobs in this state; empty: all.")]
+KindFilter = Annotated[_AnyKind, Query(description="Only jobs of this kind; empty: all.")]
 PageSize = Annotated[int, Query(ge=1, le=MAX_PAGE_SIZE, description="Jobs on one page.")]
 PageToken = Annotated[str, Query(description="next_page_token of the page before.")]
 LogBytes = Annotated[int, Query(ge=1, le=MAX_LOG_BYTES, description="How much of the log's end is given.")]
 
-_SUBMIT: dict[str, Any] = {
-    "requestBody": {
-        "required": True,
-        "content": {
-            "application/json": {
-                "schema": {"$ref": f"#/components/schemas/{JobBody.__name__}"},
-                "examples": JOB_EXAMPLES,
-            }
-        },
-    }
-}
+_SUBMIT = body_schema(JobBody, JOB_EXAMPLES)
 _Answers = dict[int | str, dict[str, Any]]
-_SAME_JOB: _Answers = {200: {"model": JobOut, "description": "The job that this request_id made before."}}
-_SAME_RETRY: _Answers = {200: {"model": JobOut, "description": "The job that an earlier call made."}}
+_SAME_JOB: _Answers = {200: {"model": Job, "description": "The job that this request_id made before."}}
+_SAME_RETRY: _Answers = {200: {"model": Job, "description": "The job that an earlier call made."}}
 _LOG: _Answers = {200: {"description": "The end of the log.", "content": {"text/plain": {}}}}
 _FILE: _Answers = {
     200: {
@@ -75,7 +67,7 @@ _FILE: _Answers = {
 }
 _EVENTS: _Answers = {
     200: {
-        "description": "Server-sent events: `progress` with the job (JobOut) at first and whenever it changed, at most "
+        "description": "Server-sent events: `progress` with the job (Job) at first and whenever it changed, at most "
         "twice a second; `log` with new lines. The stream ends after the job's final state.",
         "content": {EVENTS_TYPE: {"schema": {"type": "string"}}},
     }
@@ -85,11 +77,11 @@ _EVENTS: _Answers = {
 @router.post(
     "",
     status_code=201,
-    response_model=JobOut,
+    response_model=Job,
     openapi_extra=_SUBMIT,
     responses=_SAME_JOB | problems(401, 404, 409, 413, 415, 422, 429, 503, 507),
 )
-async def submit_job(request: Request, response: Response, service: ServiceDep) -> JobOut:
+async def submit_job(request: Request, response: Response, service: ServiceDep) -> Job:
     """Puts a job into the queue. The same request_id with the same body gives the same job, whatever its state."""
     service.require_serving()
     body = await read_json_body(request, JobBody)
@@ -102,7 +94,7 @@ async def submit_job(request: Request, response: Response, service: ServiceDep) 
         specification, field=_SPECIFICATION, request_id=body.request_id, priority=body.priority
     )
     response.status_code = 201 if is_new else 200
-    return JobOut.of(job)
+    return job
 
 
 @router.get("", responses=problems(401, 422, 503))
@@ -114,34 +106,33 @@ async def list_jobs(
     page_token: PageToken = "",
 ) -> JobPage:
     """The jobs, newest first."""
-    jobs, next_page_token = await service.jobs.page(state=state, kind=kind, page_size=page_size, page_token=page_token)
-    return JobPage(jobs=[JobOut.of(job) for job in jobs], next_page_token=next_page_token)
+    return await service.jobs.page(state=state, kind=kind, page_size=page_size, page_token=page_token)
 
 
 @router.get("/{job}", responses=problems(401, 404, 422, 503))
-async def get_job(service: ServiceDep, job: JobId) -> JobOut:
+async def get_job(service: ServiceDep, job: JobId) -> Job:
     """State, progress, metrics, and the names of the artifacts."""
-    return JobOut.of(await service.jobs.do(JobStore.get, job))
+    return await service.jobs.do(JobStore.get, job)
 
 
 @router.post("/{job}:cancel", responses=problems(401, 404, 409, 422, 503))
-async def cancel_job(service: ServiceDep, job: JobId) -> JobOut:
+async def cancel_job(service: ServiceDep, job: JobId) -> Job:
     """Stops a job within a second; no error where it is cancelled already."""
-    return JobOut.of(await service.jobs.do(JobStore.cancel, job))
+    return await service.jobs.do(JobStore.cancel, job)
 
 
 @router.post(
     "/{job}:retry",
     status_code=201,
-    response_model=JobOut,
+    response_model=Job,
     responses=_SAME_RETRY | problems(401, 404, 409, 422, 429, 503, 507),
 )
-async def retry_job(response: Response, service: ServiceDep, job: JobId) -> JobOut:
+async def retry_job(response: Response, service: ServiceDep, job: JobId) -> Job:
     """A new job in place of a failed or cancelled one; a training goes on from its last checkpoint."""
     service.require_serving()
     successor, is_new = await service.jobs.do(JobStore.retry, job)
     response.status_code = 201 if is_new else 200
-    return JobOut.of(successor)
+    return successor
 
 
 @router.delete("/{job}", status_code=204, responses=problems(401, 404, 409, 422, 503))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
 from typing import Any
 
 from fastapi import APIRouter
@@ -11,23 +10,28 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from ultragray.contract import to_dict
-from ultragray.outputs import OUTPUTS, check_outputs
-from ultragray.settings import Encoding
+from ultragray.outputs import OUTPUTS
 from ultragray_workers.pool.types import Priority, RenderRequest, RenderResult
 
+from ...core.frames import FrameHeader
+from ...core.poses import exact_poses
 from ...core.state import Service
+from ...statistics import STAGES
 from ..accept import JPEG, NPZ, PNG, RAW, choose
+from ..bodies import RenderBody
 from ..deps import SCENE_NAME, problems
 from ..disconnect import finish_or_abandon
 from ..examples import RENDER_EXAMPLES
-from ..json_body import read_json_body
-from ..render_body import asked_settings, checked_poses, poses_as_written
-from ..schemas import RenderBody
-from ..stream_schemas import picture_json
+from ..json_body import body_schema, read_json_body
 
 router = APIRouter(prefix="/v1/scenes", tags=["render"])
 
-_DTYPES = {Encoding.FLOAT32: "float32", Encoding.NPZ: "float32"}
+_PREFIX = "X-Ultragray-"
+_OF_ALL_FRAMES = (
+    *("scene", "scene_sha256", "renderer", "outputs", "probe", "picture"),
+    *(f"{stage}_ms" for stage in STAGES),
+)
+_OF_ONE_FRAME = ("pose", "extrapolation")
 
 RENDER_HEADERS = {
     "X-Ultragray-Scene": "Name of the scene.",
@@ -51,15 +55,7 @@ RENDER_HEADERS = {
 
 _OPENAPI: dict[str, Any] = {
     "parameters": [{"name": "scene", "in": "path", "required": True, **SCENE_NAME}],
-    "requestBody": {
-        "required": True,
-        "content": {
-            "application/json": {
-                "schema": {"$ref": f"#/components/schemas/{RenderBody.__name__}"},
-                "examples": RENDER_EXAMPLES,
-            }
-        },
-    },
+    **body_schema(RenderBody, RENDER_EXAMPLES),
 }
 _BINARY = {"schema": {"type": "string", "format": "binary"}}
 _ANSWER: dict[int | str, dict[str, Any]] = {
@@ -88,43 +84,40 @@ async def render(request: Request) -> Response:
     body = await read_json_body(request, RenderBody)
     planner = service.planner
     deadline = planner.deadline(None if body.timeout_ms is None else body.timeout_ms / 1000)
-    written = poses_as_written(body, planner.max_poses_at_once)
-    outputs = check_outputs(body.outputs)
+    poses = body.poses_by_path(planner.max_poses_at_once)
     choice = choose(
         request.headers.get("accept", ""),
-        frames=len(written),
-        outputs=len(outputs),
+        frames=len(poses),
+        outputs=len(body.outputs),
         dtype=body.dtype,
-        lossless=any(OUTPUTS[name].is_numbers for name in outputs),
+        lossless=any(OUTPUTS[name].is_numbers for name in body.outputs),
     )
-    settings = await planner.resolve(scene, asked_settings(body), choice.encoding)
-    planner.check_pixels(settings, len(written))
+    settings = await planner.resolve(scene, body, choice.encoding)
+    planner.check_pixels(settings, len(poses))
+    exact = await exact_poses(len(poses), lambda index: poses[index][1].exact(poses[index][0]))
     priority = Priority.INTERACTIVE if body.poses is None else Priority.BATCH
-    asked = RenderRequest(scene, settings, await checked_poses(written), priority, deadline)
+    asked = RenderRequest(scene, settings, exact, priority, deadline)
     result = await finish_or_abandon(service.render(asked), request.receive, deadline)
-    return Response(result.data, 200, _headers(result), choice.media_type)
+    return Response(result.data, 200, render_headers(result), choice.media_type)
 
 
-def _headers(result: RenderResult) -> dict[str, str]:
-    queue, render_time, encode = (f"{ms:.3f}" for ms in (result.queue_ms, result.render_ms, result.encode_ms))
-    headers = {
-        "X-Ultragray-Scene": result.scene,
-        "X-Ultragray-Scene-Sha256": result.scene_sha256,
-        "X-Ultragray-Renderer": result.renderer,
-        "X-Ultragray-Shape": f"{len(result.settings.outputs)},{len(result.poses)},{result.height},{result.width}",
-        "X-Ultragray-Dtype": _DTYPES.get(result.settings.encoding, "uint8"),
-        "X-Ultragray-Outputs": ",".join(result.settings.outputs),
-        "X-Ultragray-Probe": json.dumps(to_dict(result.settings.probe)),
-        "X-Ultragray-Confidence": ",".join(
-            "" if told.confidence is None else f"{told.confidence:.3f}" for told in result.extrapolations
-        ),
-        "X-Ultragray-Picture": json.dumps(picture_json(result.settings.picture)),
-        "X-Ultragray-Queue-Ms": queue,
-        "X-Ultragray-Render-Ms": render_time,
-        "X-Ultragray-Encode-Ms": encode,
-        "Server-Timing": f"queue;dur={queue}, render;dur={render_time}, encode;dur={encode}",
+def render_headers(result: RenderResult) -> dict[str, str]:
+    """What the answer says beside the pixels: the fields of FrameHeader that hold for all frames, of one frame all."""
+    header = FrameHeader.of(result)
+    names = _OF_ALL_FRAMES if len(result.poses) > 1 else (*_OF_ALL_FRAMES, *_OF_ONE_FRAME)
+    headers = {f"{_PREFIX}{name.title().replace('_', '-')}": _text(getattr(header, name)) for name in names}
+    confidences = ("" if one.confidence is None else f"{one.confidence:.3f}" for one in result.extrapolations)
+    return headers | {
+        f"{_PREFIX}Shape": f"{len(header.outputs)},{len(result.poses)},{header.height},{header.width}",
+        f"{_PREFIX}Dtype": header.encoding.pixel_type.name,
+        f"{_PREFIX}Confidence": ",".join(confidences),
+        "Server-Timing": ", ".join(f"{name};dur={getattr(header, f'{name}_ms'):.3f}" for name in STAGES),
     }
-    if len(result.poses) == 1:
-        headers["X-Ultragray-Extrapolation"] = json.dumps(asdict(result.extrapolations[0]))
-        headers["X-Ultragray-Pose"] = json.dumps(result.poses[0].tolist())
-    return headers
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, (str, float)):
+        return value if isinstance(value, str) else f"{value:.3f}"
+    if isinstance(value, tuple):
+        return ",".join(value)
+    return json.dumps(to_dict(value))

@@ -6,27 +6,35 @@ import asyncio
 import json
 import time
 from collections.abc import AsyncIterator
+from dataclasses import dataclass
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import FileResponse, Response
 
+from ultragray.contract import described
 from ultragray.probe import FloatArray
 from ultragray_workers.errors import UploadTooLarge
 from ultragray_workers.scenes import SUFFIX
 
 from ...arrival import arrival
 from ...core.helper_processes import PATIENCE_S
+from ...core.scenes import Scene
 from ...errors import UnsupportedMediaType
 from ...views.scene_points import DEFAULT_POINTS, MAX_POINTS, MAX_POSES, even_selection
 from ..accept import RAW
-from ..console_schemas import ScenePoses
 from ..deps import SceneName, ServiceDep, problems
 from ..disconnect import finish_or_abandon
 from ..revalidation import NOT_MODIFIED, revalidated
-from ..schemas import SceneOut
-from .scenes import scene_out
+
+
+@dataclass(frozen=True)
+class ScenePoses:
+    """Training poses of a scene, evenly taken."""
+
+    poses: list[list[float]] = described("16 numbers each, row by row, mm.")
+
 
 router = APIRouter(prefix="/v1/scenes", tags=["scenes"])
 
@@ -84,7 +92,7 @@ async def download_scene(service: ServiceDep, scene: SceneName) -> FileResponse:
     openapi_extra=_IMPORT,
     responses=problems(401, 409, 413, 415, 422, 429, 500, 503, 504, 507),
 )
-async def import_scene(request: Request, service: ServiceDep, scene: SceneName) -> SceneOut:
+async def import_scene(request: Request, service: ServiceDep, scene: SceneName) -> Scene:
     """Takes a scene file in and serves it. It is checked first, and appears whole or not at all."""
     service.require_serving()
     if request.headers.get("content-encoding", "identity").lower() != "identity":
@@ -96,7 +104,7 @@ async def import_scene(request: Request, service: ServiceDep, scene: SceneName) 
     async with service.imports.receive(scene, _blocks(request, service)) as received:
         deadline = time.monotonic() + PATIENCE_S
         header = await finish_or_abandon(service.imports.accept(received, scene), request.receive, deadline)
-    return scene_out(scene, header, 0)
+    return Scene.of(scene, header, 0)
 
 
 @router.delete("/{scene}", status_code=204, responses=problems(401, 403, 404, 422, 503))

@@ -6,22 +6,18 @@ import asyncio
 
 from fastapi import APIRouter
 
-from ...statistics import STEP_S, memory_bytes
-from ..console_schemas import StatisticsOut, StatisticsStep
+from ...statistics import ServiceStatistics, memory_bytes
 from ..deps import ServiceDep, problems
 
 router = APIRouter(prefix="/v1/statistics", tags=["statistics"])
 
 
 @router.get("", responses=problems(401))
-async def get_statistics(service: ServiceDep) -> StatisticsOut:
+async def get_statistics(service: ServiceDep) -> ServiceStatistics:
     """Frames, times and errors of the last ten minutes in steps of 5 s, and what waits and runs now."""
     pool = service.pool.statistics()
-    return StatisticsOut(
-        step_s=STEP_S,
-        steps=[
-            StatisticsStep.model_validate(step, from_attributes=True) for step in service.metrics.statistics.summaries()
-        ],
+    return ServiceStatistics(
+        steps=service.metrics.statistics.summaries(),
         waiting_frames=pool.waiting_frames,
         busy_processes=pool.busy,
         processes=pool.processes_alive,

@@ -4,24 +4,28 @@ from __future__ import annotations
 
 import asyncio
 import time
+from dataclasses import dataclass
+from typing import Annotated
 from urllib.parse import urlsplit
 
 from fastapi import APIRouter, WebSocket, WebSocketDisconnect
-from pydantic import ValidationError
+from pydantic import Field, FiniteFloat, TypeAdapter
 
-from ultragray.contract import under
 from ultragray.errors import InvalidArgument, UltragrayError
-from ultragray.settings import Encoding, Resolved
+from ultragray.probe import FloatArray
+from ultragray.settings import RenderSettings
 from ultragray_workers.errors import Draining
 
 from ...auth import STREAM_PROTOCOL
-from ...core.pose_stream import Answered, Asked, PoseStream
+from ...core.pose_stream import Answered, StreamMode
 from ...core.state import Service
+from ...core.stream import FrameStream, Message, SceneSettings
 from ...errors import OriginRefused, statuses_of
+from ..bodies import StreamMessage
 from ..deps import SceneName
-from ..problems import invalid_argument, problem_response
-from ..render_body import asked_settings, checked_pose
-from ..stream_schemas import StreamMessage, StreamSettings, error_text, frame_bytes, message_numbers
+from ..json_body import read_json
+from ..problems import problem_response
+from ..stream_messages import frame_bytes, refusal_text
 
 router = APIRouter(prefix="/v1/scenes", tags=["render"])
 
@@ -46,7 +50,7 @@ async def stream(websocket: WebSocket, scene: SceneName) -> None:
     await websocket.accept(STREAM_PROTOCOL if STREAM_PROTOCOL in websocket.scope["subprotocols"] else None)
     status = "closed"
     try:
-        await _WebSocketStream(service, websocket, scene).run()
+        await FrameStream(service, _WebSocketTransport(websocket, scene), (scene, RenderSettings())).run()
     except WebSocketDisconnect:
         pass
     except Draining as error:
@@ -79,80 +83,91 @@ def _check_subprotocols(offered: list[str]) -> None:
         )
 
 
-class _WebSocketStream:
-    """One connection."""
+class _Message:
+    """A message that could be read."""
 
-    def __init__(self, service: Service, websocket: WebSocket, scene: str) -> None:
-        self._service = service
+    def __init__(self, message: StreamMessage, scene: str) -> None:
+        self.sequence = message.sequence
+        self.client_time = message.client_time_ms
+        self.mode = message.mode
+        self._message = message
+        self._scene = scene
+
+    def settings(self) -> SceneSettings | None:
+        return None if self._message.settings is None else (self._scene, self._message.settings)
+
+    @property
+    def asks(self) -> bool:
+        return self._message.pose is not None
+
+    def pose(self) -> FloatArray:  # [4, 4] mm
+        assert self._message.pose is not None
+        return self._message.pose.exact("pose")
+
+    def timeout_s(self) -> float | None:
+        return None if self._message.timeout_ms is None else self._message.timeout_ms / 1000.0
+
+
+class _Unreadable:
+    """A message that could not: it has its numbers, as far as they can be read, and raises why."""
+
+    def __init__(self, text: str | None, error: UltragrayError) -> None:
+        try:
+            numbers = _NUMBERS.validate_json(text or "")
+        except (ValueError, RecursionError):
+            numbers = _Numbers()
+        self.sequence, self.client_time = numbers.sequence, numbers.client_time_ms
+        self._error = error
+
+    def settings(self) -> SceneSettings | None:
+        if (self._error.field or "").startswith("settings"):
+            raise self._error
+        return None
+
+    asks = True
+
+    def pose(self) -> FloatArray:
+        raise self._error
+
+    def timeout_s(self) -> float | None:
+        return None
+
+
+@dataclass(frozen=True)
+class _Numbers:
+    sequence: Annotated[int, Field(ge=0, le=2**64 - 1)] = 0
+    client_time_ms: FiniteFloat | None = None
+
+
+_NUMBERS = TypeAdapter(_Numbers)
+
+
+class _WebSocketTransport:
+    """One connection. Its mode is read from the first message that can be read."""
+
+    def __init__(self, websocket: WebSocket, scene: str) -> None:
         self._websocket = websocket
         self._scene = scene
-        self._settings: Resolved | None = None
-        self._has_defaults = True  # until the client sends settings
 
-    async def run(self) -> None:
-        """Until the client goes. Raises WebSocketDisconnect, Draining."""
-        stream = PoseStream(self._service)
-
-        async def read() -> None:
-            message = await self._receive(stream)
-            stream.mode = message.stream_mode()
-            while True:
-                await self._take(message, stream)
-                await asyncio.sleep(0)  # reading does not wait while the buffer is full: others get their turn
-                message = await self._receive(stream)
-
-        await stream.run(read, self._write)
-
-    async def _receive(self, stream: PoseStream) -> StreamMessage:
-        """The next message that can be read; others are refused. Raises WebSocketDisconnect."""
-        while True:
-            received = await self._websocket.receive()
-            if received["type"] == "websocket.disconnect":
-                raise WebSocketDisconnect(received.get("code", 1005))
-            try:
-                if received.get("text") is None:
-                    raise InvalidArgument("messages must be JSON in text frames, got a binary one")
-                return StreamMessage.model_validate_json(received["text"])
-            except ValidationError as error:
-                sequence, client_time_ms = message_numbers(received["text"])
-                await stream.refuse(sequence, client_time_ms, invalid_argument(error.errors(include_url=False)[0]))
-            except InvalidArgument as error:
-                await stream.refuse(0, None, error)
-
-    async def _take(self, message: StreamMessage, stream: PoseStream) -> None:
+    async def receive(self) -> _Message | _Unreadable:
+        """Raises WebSocketDisconnect."""
+        await asyncio.sleep(0)  # reading does not wait while the buffer is full: others get their turn
+        received = await self._websocket.receive()
+        if received["type"] == "websocket.disconnect":
+            raise WebSocketDisconnect(received.get("code", 1005))
+        text = received.get("text")
         try:
-            if message.settings is not None:
-                self._has_defaults = False
-                self._settings = await self._plan(message.settings)
-            if message.pose is None:
-                return
-            if self._settings is None:
-                if not self._has_defaults:
-                    raise InvalidArgument("settings were refused, and none are known yet", field="settings")
-                self._settings = await self._plan(StreamSettings())
-            asked = Asked(
-                sequence=message.sequence,
-                client_time=message.client_time_ms,
-                scene=self._scene,
-                settings=self._settings,
-                pose=checked_pose("pose", message.pose),
-                deadline=self._service.planner.deadline(
-                    None if message.timeout_ms is None else message.timeout_ms / 1000.0
-                ),
-            )
+            if text is None:
+                raise InvalidArgument("messages must be JSON in text frames, got a binary one")
+            return _Message(read_json(text, StreamMessage), self._scene)
         except UltragrayError as error:
-            await stream.refuse(message.sequence, message.client_time_ms, error)
-        else:
-            await stream.ask(asked)
+            return _Unreadable(text, error)
 
-    async def _plan(self, settings: StreamSettings) -> Resolved:
-        with under("settings"):
-            return await self._service.planner.resolve(
-                self._scene, asked_settings(settings), Encoding(settings.encoding)
-            )
+    def mode(self, message: Message) -> StreamMode | None:
+        return (message.mode or StreamMode.ORDERED) if isinstance(message, _Message) else None
 
-    async def _write(self, answered: Answered) -> None:
+    async def send(self, answered: Answered) -> None:
         if isinstance(answered.outcome, UltragrayError):
-            await self._websocket.send_text(error_text(answered, answered.outcome))
+            await self._websocket.send_text(refusal_text(answered))
         else:
-            await self._websocket.send_bytes(frame_bytes(answered, answered.outcome))
+            await self._websocket.send_bytes(frame_bytes(answered))

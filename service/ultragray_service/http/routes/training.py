@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from typing import Any
 
 from fastapi import APIRouter
 from starlette.responses import Response
 
+from ...views.training import TrainingCurve
 from ..accept import PNG
-from ..console_schemas import CurvePointOut, TrainingCurve
 from ..deps import ServiceDep, problems
 from .jobs import JobId
 
@@ -27,8 +26,7 @@ _PREVIEW: _Answers = {
 @router.get("/{job}/curve", responses=problems(401, 404, 422, 503))
 async def get_curve(service: ServiceDep, job: JobId) -> TrainingCurve:
     """Loss and held-out PSNR of a training so far, in at most 500 points."""
-    points = await service.training_views.curve(job)
-    return TrainingCurve(points=[CurvePointOut.model_validate(asdict(point)) for point in points])
+    return await service.training_views.curve(job)
 
 
 @router.get(

@@ -1,0 +1,118 @@
+"""A rendered frame as all front doors tell it: what renders it again, and what it cost."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+from pydantic import WithJsonSchema
+from typing_extensions import Self
+
+from ultragray.confidence import Extrapolation
+from ultragray.contract import described
+from ultragray.display.settings import AS_RENDERED, Display
+from ultragray.outputs import OUTPUTS
+from ultragray.probe import Picture, Probe
+from ultragray.settings import Encoding
+from ultragray_workers.pool.types import RenderResult
+
+from .poses import MatrixRows
+
+OutputName = Annotated[
+    str,
+    WithJsonSchema(
+        {
+            "type": "string",
+            "oneOf": [
+                {"const": output.name, "description": output.meaning, "x-numbers": output.is_numbers}
+                for output in OUTPUTS.values()
+            ],
+        }
+    ),
+]
+
+
+@dataclass(frozen=True, kw_only=True)
+class FramePicture:
+    """Where the pixels of a frame lie: `first` is the centre of pixel (0, 0), `step` the way to the next one.
+
+    Column and row: x and z in mm, or, where the columns are degrees, the angle from the z axis and the range in mm.
+    """
+
+    column_unit: str = described("mm or deg.", choices=("mm", "deg"))
+    first: tuple[float, float]
+    step: tuple[float, float]
+
+    @classmethod
+    def of(cls, picture: Picture) -> FramePicture:
+        """The place of a picture, whose size stands beside it."""
+        return cls(column_unit=picture.column_unit, first=picture.first, step=picture.step)
+
+    @property
+    def first_column(self) -> float:
+        return self.first[0]
+
+    @property
+    def first_row_mm(self) -> float:
+        return self.first[1]
+
+    @property
+    def column_step(self) -> float:
+        return self.step[0]
+
+    @property
+    def row_step_mm(self) -> float:
+        return self.step[1]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FrameHeader:
+    """All that is needed to render a frame again, and what it cost."""
+
+    scene: str = described("Name.")
+    scene_sha256: str = described("Of the scene file.")
+    renderer: str = described("Name, version and backend of the renderer.")
+    pose: MatrixRows = described("Matrix as used.")
+    probe: Probe = described("As used.")
+    rendered_height: int = described("Depth samples, before the display settings were applied.")
+    rendered_width: int = described("Scan lines, likewise.")
+    display: Display = described("As used.", AS_RENDERED)
+    height: int = described("H.")
+    width: int = described("W.")
+    picture: FramePicture = described("Where the pixels lie.")
+    outputs: tuple[OutputName, ...] = described("In the order of the data.")
+    encoding: Encoding = described("Of the pixels.")
+    extrapolation: Extrapolation = described("How far the frame lies from the training views.")
+    queue_ms: float = described("Waiting time.")
+    render_ms: float = described("Of the batch that it was rendered in.")
+    encode_ms: float = described("Encoding time.")
+
+    @classmethod
+    def of(cls, result: RenderResult, **others: Any) -> Self:
+        """The header of a result; its pose and extrapolation are those of the first of several."""
+        settings = result.settings
+        return cls(
+            scene=result.scene,
+            scene_sha256=result.scene_sha256,
+            renderer=result.renderer,
+            pose=result.poses[0].tolist(),
+            probe=settings.probe,
+            rendered_height=settings.height,
+            rendered_width=settings.width,
+            display=settings.display,
+            height=result.height,
+            width=result.width,
+            picture=FramePicture.of(settings.picture),
+            outputs=settings.outputs,
+            encoding=settings.encoding,
+            extrapolation=result.extrapolations[0],
+            queue_ms=round(result.queue_ms, 3),
+            render_ms=round(result.render_ms, 3),
+            encode_ms=round(result.encode_ms, 3),
+            **others,
+        )
+
+    @property
+    def timings(self) -> FrameHeader:
+        """Itself: gRPC has the three times in a message of their own."""
+        return self

@@ -1,0 +1,124 @@
+"""A stream of one client: its messages in their order, whatever they come through."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from ultragray.contract import under
+from ultragray.errors import InvalidArgument, UltragrayError
+from ultragray.probe import FloatArray
+from ultragray.settings import RenderSettings, Resolved
+
+from .pose_stream import Answered, Asked, PoseStream, StreamMode
+from .state import Service
+
+MAX_TIMEOUT_MS = 3_600_000.0
+
+SceneSettings = tuple[str, RenderSettings]
+
+
+class Message(Protocol):
+    """A message of the client. What cannot be used is raised, as InvalidArgument, by the method that would give it."""
+
+    @property
+    def sequence(self) -> int: ...
+
+    @property
+    def client_time(self) -> float | None: ...
+
+    def settings(self) -> SceneSettings | None:
+        """The scene and what to render of it from now on; None: as before."""
+
+    @property
+    def asks(self) -> bool:
+        """Whether it asks for a frame."""
+
+    def pose(self) -> FloatArray:  # [4, 4] mm, exact
+        """The pose to render, of a message that asks."""
+
+    def timeout_s(self) -> float | None:
+        """How long the pose may wait; None: the default of the service."""
+
+
+class Transport(Protocol):
+    """What messages come through."""
+
+    async def receive(self) -> Message | None:
+        """The next message; None after the last."""
+
+    def mode(self, message: Message) -> StreamMode | None:
+        """The mode that the first message asks for; None where it cannot be read: then the next one may."""
+
+    async def send(self, answered: Answered) -> None:
+        """Sends a frame, or why there is none."""
+
+
+class FrameStream:
+    """Poses in, frames out. Refused settings change nothing: those before them stay, `unset` at the beginning.
+
+    A client whose first settings are refused gets no frames with settings that it did not ask for.
+    """
+
+    def __init__(self, service: Service, transport: Transport, unset: SceneSettings | None = None) -> None:
+        self._service = service
+        self._transport = transport
+        self._unset = unset
+        self._resolved: tuple[str, Resolved] | None = None
+        self._poses = PoseStream(service)
+
+    async def run(self) -> None:
+        """Answers until the client has sent its last message and got its last frame.
+
+        Raises Draining when the service stops, and what the transport raises.
+        """
+        await self._poses.run(self._read, self._transport.send)
+
+    async def _read(self) -> None:
+        mode = None
+        while (message := await self._transport.receive()) is not None:
+            if mode is None and (mode := self._transport.mode(message)) is not None:
+                self._poses.mode = mode
+            await self._take(message)
+
+    async def _take(self, message: Message) -> None:
+        try:
+            asked = await self._asked(message)
+        except UltragrayError as error:
+            await self._poses.refuse(message.sequence, message.client_time, error)
+        else:
+            if asked is not None:
+                await self._poses.ask(asked)
+
+    async def _asked(self, message: Message) -> Asked | None:
+        await self._change_settings(message)
+        if not message.asks:
+            return None
+        if self._resolved is None:
+            if self._unset is None:
+                raise InvalidArgument("settings must be given, and accepted, before the first pose", field="settings")
+            self._resolved = await self._resolve(self._unset)
+        scene, settings = self._resolved
+        pose, deadline = message.pose(), self._service.planner.deadline(message.timeout_s())
+        return Asked(message.sequence, message.client_time, scene, settings, pose, deadline)
+
+    async def _change_settings(self, message: Message) -> None:
+        unset, self._unset = self._unset, None  # as long as the message's own are not known to be none
+        settings = message.settings()
+        if settings is None:
+            self._unset = unset
+        else:
+            self._resolved = await self._resolve(settings)
+
+    async def _resolve(self, settings: SceneSettings) -> tuple[str, Resolved]:
+        with under("settings"):
+            scene, asked = settings
+            return scene, await self._service.planner.resolve(scene, asked, asked.encoding)
+
+
+def checked_timeout_s(timeout_ms: float) -> float:
+    """The seconds of a timeout that a client gave. Raises InvalidArgument."""
+    if not 0.0 < timeout_ms <= MAX_TIMEOUT_MS:
+        raise InvalidArgument(
+            f"timeout_ms must be above 0 and at most {MAX_TIMEOUT_MS:g}, got {timeout_ms:g}", field="timeout_ms"
+        )
+    return timeout_ms / 1000.0

@@ -1,0 +1,103 @@
+"""What HTTP and WebSocket take: the contract's settings, with the poses and the times of a request."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import Field, dataclass, field, make_dataclass
+from typing import Any, Literal, get_args
+
+import numpy as np
+
+from ultragray.contract import Contract, annotated_fields, described
+from ultragray.errors import InvalidArgument, InvalidPose
+from ultragray.settings import FrameSettings, RenderSettings
+from ultragray_workers.jobs.job import MAX_PRIORITY
+from ultragray_workers.jobs.kinds import KINDS, Specification
+
+from ..core.pose_stream import StreamMode
+from ..core.poses import Pose, check_pose_count
+from ..core.stream import MAX_TIMEOUT_MS
+
+
+@dataclass(frozen=True, kw_only=True)
+class RenderBody(FrameSettings):
+    """What to render. Exactly one of `pose` and `poses`; all else has a default from the scene."""
+
+    pose: Pose | None = described("One pose; rendered before frames of `poses` that wait.", None, error=InvalidPose)
+    poses: list[Pose] | None = described("Many poses, answered together, in order.", None, error=InvalidPose)
+    dtype: Literal["uint8", "float32"] | None = described(
+        "Of application/octet-stream; a dtype in the Accept header goes first. Default: uint8.", None
+    )
+    timeout_ms: float | None = described(
+        "A frame that still waits after this time is dropped (504).", None, above=0, high=MAX_TIMEOUT_MS
+    )
+
+    def poses_by_path(self, limit: int) -> Sequence[tuple[str, Pose]]:
+        """The poses, each with its path in the body. Raises InvalidArgument, TooManyPoses."""
+        if (self.pose is None) == (self.poses is None):
+            raise InvalidArgument("the body must hold exactly one of pose and poses", field="pose")
+        if self.pose is not None:
+            return [("pose", self.pose)]
+        poses = self.poses or []
+        check_pose_count(len(poses), limit)
+        return [(f"poses[{index}]", pose) for index, pose in enumerate(poses)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class StreamMessage(Contract):
+    """One message of the client of a WebSocket."""
+
+    sequence: int = described("Any number; the answer to this message carries it.", 0, low=0, high=2**64 - 1)
+    settings: RenderSettings | None = described("Replaces all settings, from this pose on.", None)
+    pose: Pose | None = described("null: only the settings change.", None, error=InvalidPose)
+    mode: StreamMode | None = described("Of the stream; read from its first message. Default: ordered.", None)
+    timeout_ms: float | None = described("Later this pose is not rendered.", None, above=0, high=MAX_TIMEOUT_MS)
+    client_time_ms: float | None = described("Any number; the answer carries it.", None)
+
+
+def _body_of(kind: str) -> type[Any]:
+    """The class of a specification's JSON, which `kind` stands beside: poses are lists."""
+    cls = Specification.member(kind)
+    given = [(item, annotation) for item, annotation in annotated_fields(cls) if item.name != "kind"]
+    described_fields: list[tuple[str, Any, Any]] = [
+        (item.name, _without_arrays(annotation), _again(item)) for item, annotation in given
+    ]
+    name = f"{kind.title()}Specification"
+    return make_dataclass(name, described_fields, namespace={"__doc__": cls.__doc__}, kw_only=True)
+
+
+def _again(item: Field[Any]) -> Any:
+    return field(default=item.default, default_factory=item.default_factory, metadata=item.metadata)
+
+
+def _without_arrays(annotation: Any) -> Any:
+    """An annotation without the arrays that it allows beside lists."""
+    kinds = [one for one in get_args(annotation) if getattr(one, "__origin__", None) is not np.ndarray]
+    if len(kinds) == len(get_args(annotation)):
+        return annotation
+    first, *others = kinds
+    for other in others:
+        first = first | other
+    return first
+
+
+SPECIFICATIONS = tuple(map(_body_of, KINDS))
+
+
+@dataclass(frozen=True, kw_only=True)
+class JobBody(Contract):
+    """A job to be done in the background."""
+
+    kind: str = described("What is to be done.", choices=KINDS)
+    specification: dict[str, Any] = field(
+        metadata={
+            "description": f"{' or '.join(one.__name__ for one in SPECIFICATIONS)}, by kind.",
+            "json_schema_extra": {
+                "anyOf": [{"$ref": f"#/components/schemas/{one.__name__}"} for one in SPECIFICATIONS]
+            },
+        }
+    )
+    request_id: str | None = described(
+        "Chosen by the client, 1 to 128 characters: sent again, it gives the same job.", None
+    )
+    priority: int = described("Higher ones go first.", 0, low=-MAX_PRIORITY, high=MAX_PRIORITY)
