@@ -157,8 +157,8 @@ class FannedLines(_Angular):
 class RadialLines(_Angular):
     """Lines all the way round, the left edge of the first one along z."""
 
-    span: ClassVar[float] = 360.0  # type: ignore[misc]  # of all of them
-    start: ClassVar[float] = 0.0
+    span = 360.0
+    start = 0.0
     corner_shares: ClassVar[tuple[float, ...]] = (0.0, 0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875)
     wrap: ClassVar[bool] = True
 
