@@ -17,7 +17,6 @@ STILL_LARGER = {  # may shrink, and leaves the list then
     "client/ultragray_client",
 }
 PROBE_PACKAGE = "ultragray.probe"
-CONVERTERS = {"ultragray_service.rpc.messages", "ultragray_service.http.schemas"}  # until the codec has their place
 
 
 @cache
@@ -98,7 +97,7 @@ def test_nobody_outside_its_package_asks_for_the_kind_of_a_probe() -> None:
     found = [
         f"{name}:{node.lineno}"
         for name in modules()
-        if not name.startswith(PROBE_PACKAGE) and name not in CONVERTERS
+        if not name.startswith(PROBE_PACKAGE)
         for node in ast.walk(tree(name))
         if isinstance(node, (ast.Call, ast.Compare)) and asks_for_a_kind(node)
     ]
