@@ -128,23 +128,20 @@ class DatasetUpload:
         MemoryExceeded, StorageFull, DeadlineExceeded.
         """
         async with self._finishing:
-            return await self._finish()
+            await self._flush()
+            await asyncio.to_thread(self._incoming.finish)
+            arguments = {
+                "folder": str(self._incoming.folder),
+                "name": self._name,
+                "options": self._options,
+                "max_bytes": self._settings.max_dataset_bytes,
+            }
+            await self._checks.run(
+                take_in, arguments, what="checking the dataset", timeout_s=CHECK_TIMEOUT_S, killed=DatasetInvalid
+            )
+            return await asyncio.to_thread(self._incoming.accept, self._name)
 
     async def ended(self) -> None:
         """Returns when a `finish` that was cancelled has ended its process."""
         async with self._finishing:
             pass
-
-    async def _finish(self) -> tuple[DatasetRecord, bool]:
-        await self._flush()
-        await asyncio.to_thread(self._incoming.finish)
-        arguments = {
-            "folder": str(self._incoming.folder),
-            "name": self._name,
-            "options": self._options,
-            "max_bytes": self._settings.max_dataset_bytes,
-        }
-        await self._checks.run(
-            take_in, arguments, what="checking the dataset", timeout_s=CHECK_TIMEOUT_S, killed=DatasetInvalid
-        )
-        return await asyncio.to_thread(self._incoming.accept, self._name)
