@@ -22,6 +22,7 @@ from ultragray import errors
 from ultragray.confidence import Extrapolation
 from ultragray.contract import annotated_fields, limits_in_words, range_of, to_dict
 from ultragray.display.settings import Display
+from ultragray.interchange.exports import FORMATS
 from ultragray.outputs import OUTPUTS
 from ultragray.settings import RenderSettings
 from ultragray_client import contract as client_contract
@@ -178,6 +179,21 @@ def settings_table() -> list[Row]:
     return table
 
 
+def format_table() -> list[Row]:
+    """The formats of exported frames."""
+    rows = (
+        (
+            f"`{one.name}`",
+            f"`{one.suffix}`",
+            ", ".join(f"`{dtype}`" for dtype in one.dtypes),
+            "" if one.extra is None else f"`{one.extra}`",
+            one.meaning,
+        )
+        for one in FORMATS.values()
+    )
+    return [("Format", "Suffix", "Pixels, the default first", "Extra", "Holds"), *rows]
+
+
 def command_table() -> list[Row]:
     """The commands of `ultragray`, as its `--help` lists them."""
     found = typer.main.get_command(command_line).commands  # type: ignore[attr-defined]
@@ -231,6 +247,7 @@ TABLES: dict[str, Callable[[], Table]] = {
     "client_errors": client_error_table,
     "settings": settings_table,
     "commands": command_table,
+    "formats": format_table,
     **{f"options of {name}": partial(option_table, command) for name, command in commands()},
 }
 

@@ -6,7 +6,7 @@ and no person. The UIDs are 2.25 and a UUID (PS3.5 B.2) made of what the frames 
 scene's hash; those of the series and the image, also of the renderer, the probe, the size and the poses. So the same
 frames have the same UIDs wherever they are rendered. Of the creator ULTRAGRAY are the private elements (0019,1001), OD:
 the poses [C, 4, 4], mm, and (0019,1002), OF: the figures [C, 4] of each frame in the order of `confidence.FIGURES`, NaN
-where one is not known.
+where one is not known, and (0019,1003), UT: the origin as JSON, probe and display settings included.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from ...display.pixels import PixelArray
 from ...errors import InvalidArgument
 from .exporter import FRAME_TIME_MS, Exporter, ExportHeader
 
-PRIVATE_GROUP, PRIVATE_CREATOR, POSES_ELEMENT, FIGURES_ELEMENT = 0x0019, "ULTRAGRAY", 0x01, 0x02
+PRIVATE_GROUP, PRIVATE_CREATOR, POSES_ELEMENT, FIGURES_ELEMENT, ORIGIN_ELEMENT = 0x0019, "ULTRAGRAY", 0x01, 0x02, 0x03
 MAX_PIXEL_BYTES = 2**32 - 2  # the length of an element (PS3.5 7.1.1)
 TISSUE_2D, TISSUE, CENTIMETRES = 1, 1, 3  # C.8.5.5.1.1, .2, .15
 MAX_WORDS_BYTES = 64  # of a value of VR LO, with its padding
@@ -77,6 +77,7 @@ class DicomExporter(Exporter):
         block = data.private_block(PRIVATE_GROUP, PRIVATE_CREATOR, create=True)
         block.add_new(POSES_ELEMENT, "OD", poses.tobytes())
         block.add_new(FIGURES_ELEMENT, "OF", figures.tobytes())
+        block.add_new(ORIGIN_ELEMENT, "UT", json.dumps(self._header.origin()))
         return data
 
     def _describe(self, data: Dataset) -> None:

@@ -40,14 +40,35 @@ class Format:
 
 
 _ALL = (
-    Format("npz", ".npz", "NumPy arrays", "npz"),
-    Format("tar", ".tar", "WebDataset: PNGs (float32: .npy) and JSON", "webdataset", dtypes=("uint8", "float32")),
-    Format("zarr", ".zarr.zip", "Zarr arrays", "zarr_zip", package="zarr", extra="zarr"),
-    Format("hdf5", ".h5", "HDF5 data sets", "hdf5", package="h5py", extra="hdf5"),
+    Format("npz", ".npz", "NumPy arrays, the npz keys, not compressed; objects of the origin as JSON", "npz"),
+    Format(
+        "tar",
+        ".tar",
+        "WebDataset, for any reader of tar: 000000.bmode.png (float32: .npy) of each output and 000000.json with pose, "
+        "figures and origin; then 000001 and so on",
+        "webdataset",
+        dtypes=("uint8", "float32"),
+    ),
+    Format(
+        "zarr",
+        ".zarr.zip",
+        "A Zarr 3 group in a zip: an array of each output in chunks of a frame, poses, figures; origin as attributes",
+        "zarr_zip",
+        package="zarr",
+        extra="zarr",
+    ),
+    Format(
+        "hdf5",
+        ".h5",
+        "HDF5: a data set of each output in chunks of a frame, poses, figures; origin as attributes, objects as JSON",
+        "hdf5",
+        package="h5py",
+        extra="hdf5",
+    ),
     Format(
         "dicom",
         ".dcm",
-        "DICOM ultrasound multi-frame image",
+        "A DICOM ultrasound multi-frame image: bmode alone, true to scale",
         "dicom",
         dtypes=("uint8",),
         bmode_only=True,
@@ -55,7 +76,15 @@ _ALL = (
         package="pydicom",
         extra="dicom",
     ),
-    Format("plus", ".igs.mha", "PLUS sequence", "plus_sequence", dtypes=("uint8",), bmode_only=True, in_mm=True),
+    Format(
+        "plus",
+        ".igs.mha",
+        "A PLUS sequence: bmode alone, true to scale",
+        "plus_sequence",
+        dtypes=("uint8",),
+        bmode_only=True,
+        in_mm=True,
+    ),
 )
 FORMATS: dict[str, Format] = {format.name: format for format in _ALL}
 

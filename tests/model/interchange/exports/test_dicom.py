@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -197,6 +198,14 @@ def test_figures_of_each_frame_are_beside_the_poses(tmp_path: Path) -> None:
     figures = np.frombuffer(element.value, "<f4").reshape(-1, 4)
     np.testing.assert_array_equal(figures, [[0.5 * number, 2.0, np.nan, 0.25] for number in range(5)])
     np.testing.assert_array_equal(data.pixel_array, np.rint(FRAMES * 255))
+
+
+def test_the_origin_is_beside_the_poses(tmp_path: Path) -> None:
+    asked = header(probe=CONVEX)
+    data = export(tmp_path / "frames.dcm", asked)
+    origin = json.loads(data.private_block(0x0019, "ULTRAGRAY")[0x03].value)
+    assert origin == json.loads(json.dumps(asked.origin()))
+    assert origin["display"]["pixel_mm"] == asked.settings.display.pixel_mm
 
 
 def test_any_name_of_a_scene(tmp_path: Path) -> None:
