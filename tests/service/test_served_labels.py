@@ -14,7 +14,8 @@ import numpy.typing as npt
 import pytest
 import torch
 
-from ultragray import GaussianScene, PhasedProbe, SceneInfo, render
+from ultragray import GaussianScene, PhasedProbe, Probe, RadialProbe, SceneInfo, SteeredProbe, render
+from ultragray.contract import to_dict
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2, rendering_pb2_grpc, scenes_pb2, scenes_pb2_grpc
 
 from .conftest import DEMO_PROBE, RunningService, StartService, make_scene
@@ -155,15 +156,21 @@ def test_a_scene_tells_its_names_and_its_phased_probe(client: httpx.Client, grpc
     assert message.probe == geometry_pb2.Probe(phased=geometry_pb2.PhasedProbe(opening_angle_deg=80.0, far_mm=40.0))
 
 
-def test_a_phased_probe_may_be_asked_for(client: httpx.Client, grpc_channel: grpc.Channel) -> None:
+@pytest.mark.parametrize(
+    "asked",
+    [PHASED, RadialProbe(near_mm=1.0, far_mm=30.0), SteeredProbe(40.0, 25.0, near_mm=0.0, far_mm=40.0)],
+    ids=lambda asked: asked.kind,
+)
+def test_another_probe_may_be_asked_for(asked: Probe, client: httpx.Client, grpc_channel: grpc.Channel) -> None:
     plain = make_scene(20, probe=DEMO_PROBE)
-    frames = render(plain, PHASED, np.eye(4), height=HEIGHT, width=WIDTH, outputs=("bmode",))
+    frames = render(plain, asked, np.eye(4), height=HEIGHT, width=WIDTH, outputs=("bmode",))
     assert frames.bmode is not None
-    over_http = post(client, f"{RAW};dtype=float32", scene="plain", outputs=["bmode"], probe=PHASED_BODY)
+    over_http = post(client, f"{RAW};dtype=float32", scene="plain", outputs=["bmode"], probe=to_dict(asked))
     pixels = np.frombuffer(over_http.content, "<f4").reshape(HEIGHT, WIDTH)
     assert pixels.max() > 0.05
     np.testing.assert_allclose(pixels, frames.bmode[0], atol=1e-5)
-    probe = geometry_pb2.Probe(phased=geometry_pb2.PhasedProbe(opening_angle_deg=80.0, far_mm=40.0))
+    numbers = {name: value for name, value in to_dict(asked).items() if name != "kind"}
+    probe = geometry_pb2.Probe(**{asked.kind: numbers})
     outputs = [rendering_pb2.OUTPUT_BMODE]
     frame = ask(grpc_channel, rendering_pb2.ENCODING_FLOAT32, scene="plain", outputs=outputs, probe=probe)
     assert frame.probe == probe
