@@ -12,6 +12,7 @@ from typing import Any
 
 import httpx
 from google.protobuf.descriptor import Descriptor, FileDescriptor
+from pydantic import TypeAdapter
 
 from ultragray_proto.v1 import datasets_pb2, geometry_pb2, jobs_pb2, rendering_pb2, scenes_pb2
 from ultragray_service.errors import STATUSES
@@ -83,5 +84,5 @@ def test_reasons() -> None:
 
 
 def test_settings() -> None:
-    schema = Settings.model_json_schema()
+    schema = TypeAdapter(Settings).json_schema()
     check(FOLDER / "settings.json", without_words(schema["properties"], named=True))
