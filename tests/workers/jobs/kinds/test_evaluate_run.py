@@ -20,11 +20,11 @@ from ultragray_workers.errors import DatasetNotFound, SceneNotFound
 from ultragray_workers.jobs.folder import JobFolder, Request
 from ultragray_workers.jobs.kinds import EvaluateJob, evaluate_run
 from ultragray_workers.jobs.specification import from_dict, to_dict
-from ultragray_workers.jobs.store import JobStore
+from ultragray_workers.jobs.store import Job, JobState, JobStore
 from ultragray_workers.jobs.worker.job_run import JobRun, Stopped
 from ultragray_workers.scenes import SceneStore
 
-from ..conftest import PROBE, tiny_dataset
+from ..conftest import PROBE, RunningWorker, tiny_dataset
 
 JOB = EvaluateJob("tiny", "one")
 
@@ -92,3 +92,21 @@ def test_the_queue_keeps_its_scene_and_its_dataset(
     with pytest.raises(SceneNotFound):
         store.submit(EvaluateJob("tiny", "gone"))
     store.close()
+
+
+def test_a_worker_does_it(
+    store: JobStore,
+    artifact_folder: Path,
+    start_worker: Callable[..., RunningWorker],
+    until: Callable[..., Job],
+    random_scene: Callable[..., GaussianScene],
+) -> None:
+    (artifact_folder / "scenes").mkdir()
+    random_scene(20, info={"probe": PROBE}).save(artifact_folder / "scenes" / "one.ugr")
+    job, _ = store.submit(JOB)
+    start_worker("one")
+    done = until(job)
+    assert (done.state, done.kind) == (JobState.SUCCEEDED, "evaluate"), done.reason
+    assert "evaluation.json" in done.artifacts
+    assert done.metrics["psnr_db"] > 0
+    assert [path.name for path in (artifact_folder / "scenes").iterdir()] == ["one.ugr"]
