@@ -29,8 +29,10 @@ function described({ $ref, anyOf, oneOf, properties, items, ...schema }) {
   return { ...type, ...kept, ...fields, ...(items && { items: described(items) }), ...(oneOf && { oneOf: oneOf.map(described) }) };
 }
 
-function parameter(method, path, name) {
-  return document.paths[path][method].parameters.find((one) => one.name === name).schema;
+/** The query parameters of a route. */
+function queryOf({ parameters }) {
+  const asked = parameters.filter((one) => one.in === "query");
+  return Object.fromEntries(asked.map(({ name, schema }) => [name, described(schema)]));
 }
 
 /** The specification of each kind of job. */
@@ -43,6 +45,7 @@ const texts = {
   "contract.ts": `import type { Described } from "../described";
 
 export const jobs: Record<string, Described> = ${JSON.stringify(jobKinds(schemas.JobBody.properties), null, 1)};
+export const uploadOptions: Record<string, Described> = ${JSON.stringify(queryOf(document.paths["/v1/datasets/{dataset}"].put), null, 1)};
 export const settings: Described = ${JSON.stringify(described(schemas.RenderSettings), null, 1)};
 export const scene: Described = ${JSON.stringify(described(schemas.Scene), null, 1)};
 `,

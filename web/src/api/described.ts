@@ -20,7 +20,7 @@ export interface Described {
   oneOf?: Described[];
 }
 
-const UNUSUAL: Record<string, string> = { bmode: "B-mode", tgc: "TGC" };
+const UNUSUAL: Record<string, string> = { bmode: "B-mode", tgc: "TGC", val: "held-out" };
 const UNITS: Record<string, string> = { mm: "mm", deg: "°", db: "dB", s: "s", ms: "ms" };
 
 /** The name of a field as people read it, and its unit, by which the name ends. */

@@ -126,7 +126,7 @@ export class Session {
     return {
       height: this.samples,
       width: this.samples,
-      probe: (this.description?.probe ? this.chosenProbe : this.probe) as StreamSettings["probe"],
+      probe: this.description?.probe ? this.chosenProbe : this.probe,
       display: {
         ...(plain ? { ...AS_RENDERED, depth_mm, flip } : this.display),
         pixel_mm: this.scanConverted ? squarePixel_mm(this.plane) : null,

@@ -5,12 +5,10 @@ import { nameOfFile } from "../text";
 import { Sending } from "./sending.svelte";
 import { training } from "./training.svelte";
 
-const NO_OPTIONS: DatasetOptions = { crop: "", image_size: "", frames: "", train_frames: "", val_frames: "" };
-
 class SweepUpload extends Sending {
   files = $state.raw<File[]>([]);
   name = $state("");
-  options = $state<DatasetOptions>({ ...NO_OPTIONS });
+  options = $state<DatasetOptions>({});
 
   choose(files: File[]): void {
     this.files = files;
@@ -22,7 +20,7 @@ class SweepUpload extends Sending {
   /** Lets go of the files and of what was entered for them. */
   discard(): void {
     this.files = [];
-    this.options = { ...NO_OPTIONS };
+    this.options = {};
   }
 
   /** Sends the files; what comes of them is the dataset that is looked at. */
