@@ -309,15 +309,17 @@ def checked_number(
     value: Any, kind: type, *, low: float | None = None, high: float | None = None, above: float | None = None
 ) -> int | float:
     """The number as an int or a float. Raises InvalidArgument for one beyond the limits, and for what is none."""
-    expected = f"{'an integer' if kind is int else 'a finite number'}{_range(low, high, above)}"
     is_number = isinstance(value, (int, np.integer) if kind is int else (int, float, np.integer, np.floating))
-    _require(is_number and not isinstance(value, bool), expected, value)
-    try:
-        number: int | float = int(value) if kind is int else float(value)
-    except OverflowError:  # an int of hundreds of digits
-        number = math.inf
-    fits = math.isfinite(number) and (low is None or number >= low) and (high is None or number <= high)
-    _require(fits and (above is None or number > above), expected, value)
+    number: int | float = math.nan
+    if is_number and not isinstance(value, bool):
+        try:
+            number = int(value) if kind is int else float(value)
+        except OverflowError:  # an int of hundreds of digits
+            number = math.inf
+    is_finite = isinstance(number, int) or math.isfinite(number)
+    fits = is_finite and (low is None or number >= low) and (high is None or number <= high)
+    if not fits or (above is not None and number <= above):
+        _require(False, f"{'an integer' if kind is int else 'a finite number'}{_range(low, high, above)}", value)
     return number
 
 

@@ -120,4 +120,4 @@ def _text(value: Any) -> str:
         return value if isinstance(value, str) else f"{value:.3f}"
     if isinstance(value, tuple):
         return ",".join(value)
-    return json.dumps(to_dict(value))
+    return json.dumps(value if isinstance(value, list) else to_dict(value))
