@@ -192,7 +192,7 @@ def test_render_jobs(knowing_service: RunningService) -> None:
         plain = jobs_pb2.RenderJob(scene="knowing", sampler=jobs_pb2.PoseSampler(kind="training"))
         assert not stub.SubmitJob(jobs_pb2.SubmitJobRequest(render=plain)).job.render.HasField("min_confidence")
         plain.min_confidence = 1.5
-        with pytest.raises(grpc.RpcError, match="min_confidence must be a number from 0 to 1"):
+        with pytest.raises(grpc.RpcError, match="min_confidence must be a finite number from 0 to 1"):
             stub.SubmitJob(jobs_pb2.SubmitJobRequest(render=plain))
 
 
