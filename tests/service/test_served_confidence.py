@@ -156,7 +156,7 @@ def test_grpc(knowing_service: RunningService) -> None:
         masked = stub.Render(rendering_pb2.RenderRequest(settings=settings, pose=pose(FAR)))
         assert masked.extrapolation.confidence < 0.5
         settings.below_min_confidence = 7
-        with pytest.raises(grpc.RpcError, match="BelowConfidence"):
+        with pytest.raises(grpc.RpcError, match="BELOW_CONFIDENCE_MASK"):
             stub.Render(rendering_pb2.RenderRequest(settings=settings, pose=pose(NEAR)))
 
 

@@ -45,7 +45,7 @@ def test_each_step_tells_what_happened_in_it(statistics: Statistics, clock: Cloc
     assert (now.frames, now.requests, now.errors, now.p50_ms) == (0, 0, 1, None)
     assert (before.frames, before.requests, before.errors) == (200, 100, 0)
     assert before.p50_ms == StageTimes(queue=1.0, render=51.0, encode=2.0)
-    assert before.p99_ms == {"queue": 1.0, "render": 100.0, "encode": 2.0}
+    assert before.p99_ms == StageTimes(queue=1.0, render=100.0, encode=2.0)
 
 
 def test_the_times_of_a_step_that_ended_are_worked_out_once(statistics: Statistics, clock: Clock) -> None:
