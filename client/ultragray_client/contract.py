@@ -151,7 +151,7 @@ class FrameSettings:
     display: Display | None = None
     """Gain, depth, scan conversion ...; default: as rendered."""
     outputs: tuple[str, ...] = ("bmode",)
-    """Some of bmode, echo, transmittance, coverage, labels."""
+    """Some of bmode, echo, transmittance, coverage, attenuation, labels."""
 
 
 class Encoding(str, Enum):

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 PLANES = ("bmode", "echo", "transmittance", "coverage")  # what a backend draws, in [0, 1], with gradients
 WEIGHT_SUM = "weight_sum"  # S of docs/physics.md §3, which backends draw too, without a gradient
+SPENT_BEAM = 1e-4  # a transmittance below it is noise: nothing can be said of what is taken from it
 _AMOUNTS, _NUMBERS = np.dtype("<f4"), np.dtype("u1")
 
 
@@ -82,6 +83,13 @@ def _labels(drawing: Drawing) -> Tensor:
     return render_labels(drawing.scene, drawing.shape, lambda part: drawing.plane_of(part, WEIGHT_SUM))
 
 
+def _attenuation(drawing: Drawing) -> Tensor:
+    transmittance = drawing.plane("transmittance")
+    above = transmittance.roll(1, dims=1)
+    above[:, 0] = 1.0
+    return (1.0 - transmittance / above.clamp(min=SPENT_BEAM)).clamp(0.0, 1.0) * (above >= SPENT_BEAM)
+
+
 def _lacks_labels(info: SceneInfo) -> str | None:
     return None if info.label_names else "whose Gaussians carry labels; this one's carry none"
 
@@ -90,6 +98,12 @@ BMODE = _register("bmode", "B = E T, what a scanner shows", is_toned=True)
 ECHO = _register("echo", "E, the reflected intensity")
 TRANSMITTANCE = _register("transmittance", "T, what is left of the beam at that depth")
 COVERAGE = _register("coverage", "1 - exp(-S): how far Gaussians support the pixel", tells_support=True)
+ATTENUATION = _register(
+    "attenuation",
+    "1 - T of the pixel alone: the share of the beam that reaches it and ends there; 0 where none does",
+    planes=("transmittance",),
+    derive=_attenuation,
+)
 LABELS = _register(
     "labels",
     "the label that weighs most, 0: none; of a scene with label_names",

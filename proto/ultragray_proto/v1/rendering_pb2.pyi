@@ -17,6 +17,7 @@ class Output(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     OUTPUT_TRANSMITTANCE: _ClassVar[Output]
     OUTPUT_COVERAGE: _ClassVar[Output]
     OUTPUT_LABELS: _ClassVar[Output]
+    OUTPUT_ATTENUATION: _ClassVar[Output]
 
 class Encoding(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
@@ -43,6 +44,7 @@ OUTPUT_ECHO: Output
 OUTPUT_TRANSMITTANCE: Output
 OUTPUT_COVERAGE: Output
 OUTPUT_LABELS: Output
+OUTPUT_ATTENUATION: Output
 ENCODING_UNSPECIFIED: Encoding
 ENCODING_UINT8: Encoding
 ENCODING_FLOAT32: Encoding
