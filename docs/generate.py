@@ -19,7 +19,7 @@ from typing import Any, get_args
 import typer
 
 from ultragray import errors
-from ultragray.confidence import Extrapolation
+from ultragray.confidence import FIGURES, Extrapolation
 from ultragray.contract import annotated_fields, limits_in_words, range_of, to_dict
 from ultragray.display.settings import Display
 from ultragray.interchange.exports import FORMATS
@@ -231,9 +231,23 @@ def option_table(command: Any) -> list[Row]:
     return table
 
 
+def npz_table() -> Table:
+    """The arrays of an .npz archive."""
+    yield "Key", "Type", "Shape", "Meaning"
+    for output in OUTPUTS.values():
+        yield f"`{output.name}`", f"`{output.dtype.name}`", "`[C, H, W]`", "Only where it was asked for"
+    yield "`poses`", "`float64`", "`[C, 4, 4]`", "As used, mm"
+    for figure in FIGURES:
+        yield f"`{figure}`", "`float32`", "`[C]`", "See [confidence](#confidence); NaN: not known"
+    yield "`scene`", "`str`", "`[]`", "Name of the scene"
+    yield "`scene_sha256`", "`str`", "`[]`", "SHA-256 of the scene file"
+    yield "`renderer`", "`str`", "`[]`", "Name, version, backend, such as `ultragray/0.1.0 cpu-avx512`"
+
+
 TABLES: dict[str, Callable[[], Table]] = {
     "errors": error_table,
     "outputs": output_table,
+    "npz": npz_table,
     "render_body": partial(field_table, RenderBody, "Key"),
     "display": partial(field_table, Display, "Setting"),
     "confidence": partial(told_table, Extrapolation, "Figure"),

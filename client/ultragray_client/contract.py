@@ -117,7 +117,7 @@ class Below(str, Enum):
 class Display:
     """Settings of a display. The defaults show frames as they are.
 
-    Gain, dynamic range and time-gain compensation change B-mode only; the others change every output.
+    Gain, dynamic range, time-gain compensation and edge enhancement change B-mode only; the others change every output.
     """
 
     gain_db: float = 0.0
@@ -132,6 +132,8 @@ class Display:
     """Left and right change places."""
     pixel_mm: float | None = None
     """Scan conversion to square pixels of this size."""
+    edge: float = 0.0
+    """Edge enhancement: how much of what a blur over 3x3 samples takes away is added."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -271,8 +271,7 @@ REFUSED: list[tuple[Any, Any, str, str]] = [
         rendering_pb2.RenderSettings(outputs=[1, 77]),
         Settings,
         "outputs",
-        "outputs must be some of OUTPUT_BMODE, OUTPUT_ECHO, OUTPUT_TRANSMITTANCE, OUTPUT_COVERAGE, OUTPUT_LABELS, "
-        "got number 77",
+        f"outputs must be some of {', '.join(rendering_pb2.Output.keys()[1:])}, got number 77",
     ),
     (rendering_pb2.RenderSettings(outputs=[0]), Settings, "outputs", "got number 0"),
     (

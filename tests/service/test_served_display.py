@@ -11,6 +11,7 @@ import pytest
 from websockets.sync.client import connect
 
 from ultragray import ConvexProbe, GaussianScene, render
+from ultragray.contract import to_dict
 from ultragray.display.frames import show
 from ultragray.display.settings import Display
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2
@@ -116,7 +117,7 @@ def test_websocket(service: RunningService, expected: Any) -> None:
     assert isinstance(message, bytes)
     length = int.from_bytes(message[:4], "little")
     about = json.loads(message[4 : 4 + length])
-    assert about["display"] == BODY
+    assert about["display"] == to_dict(Display()) | BODY
     assert (about["rendered_height"], about["rendered_width"]) == (HEIGHT, WIDTH)
     assert about["picture"]["step"] == [-0.9, 0.9]
     pixels = np.frombuffer(message[4 + length :], "<f4").reshape(2, about["height"], about["width"])

@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import grid_sample
+from torch.nn.functional import avg_pool2d, grid_sample, pad
 
 from ..outputs import OUTPUTS
 from ..probe import Probe
@@ -32,6 +32,8 @@ def show(
         shown[name] = pixels[:, :rows]
         if OUTPUTS[name].is_toned and display.changes_tone:
             shown[name] = _toned(shown[name], display)
+        if OUTPUTS[name].is_toned and display.edge:
+            shown[name] = _edged(shown[name], display.edge)
         if blackened is not None and not OUTPUTS[name].tells_support:
             shown[name] = shown[name].masked_fill(blackened[:, :rows], 0)
         if display.pixel_mm is not None:
@@ -48,6 +50,12 @@ def _toned(bmode: Tensor, display: Display) -> Tensor:  # [C, H, W] -> [C, H, W]
     gains = torch.from_numpy(display.gains(bmode.shape[1])).to(bmode)[:, None]
     scale = FRAME_RANGE_DB / display.dynamic_range_db
     return (bmode * scale + (1.0 - scale + gains / display.dynamic_range_db)).clamp_(0.0, 1.0)
+
+
+def _edged(bmode: Tensor, edge: float) -> Tensor:  # [C, H, W] -> [C, H, W]
+    """Unsharp masking by the mean of 3x3 samples; at the border the outermost ones count twice."""
+    blurred = avg_pool2d(pad(bmode[None], (1, 1, 1, 1), mode="replicate"), 3, stride=1)[0]
+    return (bmode + edge * (bmode - blurred)).clamp_(0.0, 1.0)
 
 
 def _scan_converted(frames: Tensor, probe: Probe, pixel_mm: float, *, nearest: bool) -> Tensor:  # -> [C, H', W']

@@ -22,8 +22,8 @@ MAX_TGC_POINTS = 16
 class Display(Contract):
     """Settings of a display. The defaults show frames as they are.
 
-    Gain, dynamic range and time-gain compensation change B-mode only; the others change every output. Raises
-    InvalidArgument for numbers beyond the limits.
+    Gain, dynamic range, time-gain compensation and edge enhancement change B-mode only; the others change every output.
+    Raises InvalidArgument for numbers beyond the limits.
     """
 
     gain_db: float = described("Added to every echo.", 0.0, low=-100.0, high=100.0)
@@ -38,6 +38,9 @@ class Display(Contract):
     depth_mm: float | None = described("Deeper rows, counted from the face, are cut off.", None, low=1e-3)
     flip: bool = described("Left and right change places.", False)
     pixel_mm: float | None = described("Scan conversion to square pixels of this size.", None, low=1e-3, high=100.0)
+    edge: float = described(
+        "Edge enhancement: how much of what a blur over 3x3 samples takes away is added.", 0.0, low=0.0, high=4.0
+    )
 
     @property
     def changes_tone(self) -> bool:

@@ -92,20 +92,22 @@ class Extrapolation(_message.Message):
     def __init__(self, distance_mm: _Optional[float] = ..., angle_deg: _Optional[float] = ..., confidence: _Optional[float] = ..., supported_share: _Optional[float] = ...) -> None: ...
 
 class Display(_message.Message):
-    __slots__ = ("gain_db", "dynamic_range_db", "tgc_db", "depth_mm", "flip", "pixel_mm")
+    __slots__ = ("gain_db", "dynamic_range_db", "tgc_db", "depth_mm", "flip", "pixel_mm", "edge")
     GAIN_DB_FIELD_NUMBER: _ClassVar[int]
     DYNAMIC_RANGE_DB_FIELD_NUMBER: _ClassVar[int]
     TGC_DB_FIELD_NUMBER: _ClassVar[int]
     DEPTH_MM_FIELD_NUMBER: _ClassVar[int]
     FLIP_FIELD_NUMBER: _ClassVar[int]
     PIXEL_MM_FIELD_NUMBER: _ClassVar[int]
+    EDGE_FIELD_NUMBER: _ClassVar[int]
     gain_db: float
     dynamic_range_db: float
     tgc_db: _containers.RepeatedScalarFieldContainer[float]
     depth_mm: float
     flip: bool
     pixel_mm: float
-    def __init__(self, gain_db: _Optional[float] = ..., dynamic_range_db: _Optional[float] = ..., tgc_db: _Optional[_Iterable[float]] = ..., depth_mm: _Optional[float] = ..., flip: _Optional[bool] = ..., pixel_mm: _Optional[float] = ...) -> None: ...
+    edge: float
+    def __init__(self, gain_db: _Optional[float] = ..., dynamic_range_db: _Optional[float] = ..., tgc_db: _Optional[_Iterable[float]] = ..., depth_mm: _Optional[float] = ..., flip: _Optional[bool] = ..., pixel_mm: _Optional[float] = ..., edge: _Optional[float] = ...) -> None: ...
 
 class Picture(_message.Message):
     __slots__ = ("column_unit", "first_column", "first_row_mm", "column_step", "row_step_mm")

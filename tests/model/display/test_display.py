@@ -126,3 +126,16 @@ def test_settings_beyond_their_limits_are_refused(field: str, settings: dict[str
 def test_a_huge_picture_is_refused() -> None:
     with pytest.raises(InvalidImageSize, match=r"pixels of 0\.001 mm"):
         Display(pixel_mm=0.001).picture(CONVEX, HEIGHT, WIDTH)
+
+
+def test_edge_enhancement_raises_the_bright_side_of_an_edge_and_lowers_the_dark_one() -> None:
+    step = torch.full((1, 9, 12), 0.4)
+    step[..., 6:] = 0.6
+    shown = show({"bmode": step, "echo": step}, LINEAR, Display(edge=1.0))
+    assert torch.equal(shown["echo"], step)
+    bmode = shown["bmode"]
+    flat = torch.ones(12, dtype=torch.bool)
+    flat[5:7] = False
+    torch.testing.assert_close(bmode[..., flat], step[..., flat])
+    torch.testing.assert_close(bmode[..., 5], torch.full((1, 9), 0.4 - 0.2 / 3))
+    torch.testing.assert_close(bmode[..., 6], torch.full((1, 9), 0.6 + 0.2 / 3))
