@@ -4,7 +4,7 @@ import assert from "node:assert/strict";
 import { readFileSync } from "node:fs";
 import { describe, it } from "node:test";
 
-import { hold, openPage, until } from "./harness.mjs";
+import { hold, openPage, picture, seriousFindings, until } from "./harness.mjs";
 import { put } from "./sweep.mjs";
 import { tested } from "./tested.mjs";
 
@@ -95,6 +95,24 @@ describe("a dataset", () => {
     await page.evaluate(() => new Promise((resolve) => requestAnimationFrame(() => requestAnimationFrame(resolve))));
     assert.equal(await page.evaluate(() => globalThis.buffersMade), made, "it is built anew at each answer");
     assert.equal(await shown(), before, "it was looked at from elsewhere");
+  });
+});
+
+describe("a job of any kind", () => {
+  it("is specified by what the service says of the kind, and followed", async () => {
+    const page = await openPage(at, "#/train");
+    await page.getByText("Other jobs").click();
+    await page.getByRole("combobox", { name: "Kind" }).selectOption("evaluate");
+    await page.getByRole("combobox", { name: "Dataset" }).selectOption("sweep");
+    await page.getByLabel("Baselines").check();
+    assert.equal(await page.getByRole("combobox", { name: "Scene", exact: true }).last().inputValue(), "demo");
+    assert.deepEqual(await seriousFindings(page), []);
+    await picture(page, "train-other-jobs");
+    await page.getByRole("button", { name: "Start the job" }).click();
+    await page.getByText("It waits for its turn.").waitFor();
+    const [job] = (await (await fetch(`${at.service.url}/v1/jobs?kind=evaluate`)).json()).jobs;
+    assert.deepEqual(job.specification, { dataset: "sweep", scene: "demo", baselines: true });
+    assert.deepEqual(page.faults, []);
   });
 });
 
