@@ -12,9 +12,7 @@ SOURCE_ROOTS = [ROOT / name for name in ("model", "workers", "service", "client"
 MAX_MODULES = 12  # of a folder, beside its __init__ and its subfolders
 STILL_LARGER = {  # may shrink, and leaves the list then
     "service/ultragray_service/http",
-    "service/ultragray_service/cli",
     "service/ultragray_service/core",
-    "client/ultragray_client",
 }
 PROBE_PACKAGE = "ultragray.probe"
 

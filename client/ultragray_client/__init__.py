@@ -10,12 +10,12 @@ from __future__ import annotations
 from . import contract, errors
 from .aio.client import AsyncClient
 from .aio.stream import AsyncFrameStream
+from .calls.pose_exchange import StreamMode
 from .contract import *  # noqa: F403
 from .errors import ClientError
 from .frames import Extrapolation, Frame, Picture, Timings
 from .geometry import Placement, PoseLike, Quaternion
 from .jobs import Job, JobError, JobEvent, JobProgress, JobState
-from .pose_exchange import StreamMode
 from .scenes import ConfidenceFit, Scene, SceneEntry
 from .sync.client import Client
 from .sync.stream import FrameStream

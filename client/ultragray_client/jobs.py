@@ -11,12 +11,12 @@ from typing import Any, get_args
 from ultragray_proto.codec import from_message
 from ultragray_proto.v1 import jobs_pb2
 
-from .connection import Conversation
+from .calls.connection import Conversation
+from .calls.retries import Retries
 from .contract import Specification
 from .errors import ClientError
 from .geometry import pose_messages
 from .messages import message_of
-from .retries import Retries
 
 _KINDS: dict[str, Any] = {cls.kind: cls for cls in get_args(Specification)}
 

@@ -21,9 +21,9 @@ from .core.state import Service
 from .embedded_worker import EmbeddedWorker
 from .http.app import create_app
 from .igtl.server import IgtlServer
-from .logs import configure_logging
 from .rpc.server import GrpcServer
 from .settings import ENVIRONMENT_PREFIX, Settings
+from .telemetry.logs import configure_logging
 
 _HEALTH_POLL_S = 0.2
 _CANCEL_WAIT_S = 1.0

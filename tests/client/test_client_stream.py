@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from ultragray_client import RenderSettings, errors
+from ultragray_client.calls.pose_exchange import PoseExchange
 from ultragray_client.frames import settings_message
-from ultragray_client.pose_exchange import PoseExchange
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2, scenes_pb2
 
 from ..service.conftest import StartService

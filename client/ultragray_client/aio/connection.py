@@ -8,11 +8,11 @@ from contextlib import asynccontextmanager
 from functools import partial
 from typing import Any, TypeAlias, TypeVar
 
-from ..connection import PAGE_SIZE, Conversation, call_metadata, check_timeout
+from ..calls.connection import PAGE_SIZE, Conversation, call_metadata, check_timeout
+from ..calls.pose_exchange import PoseExchange
+from ..calls.retries import Retries
+from ..calls.statuses import client_errors
 from ..errors import ClientError, NotFound
-from ..pose_exchange import PoseExchange
-from ..retries import Retries
-from ..statuses import client_errors
 from .transport import PoseCall, open_channel
 
 T = TypeVar("T")

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from ultragray_proto.v1 import jobs_pb2, jobs_pb2_grpc
 
+from ..calls.downloads import downloaded
 from ..contract import Specification
-from ..downloads import downloaded
 from ..jobs import Job, JobEvent, JobFilter, JobState, Watch, job_from_message, submission
 from ..messages import message_of
 from .connection import AsyncConnection

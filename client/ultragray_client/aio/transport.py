@@ -8,9 +8,9 @@ from typing import Any, ParamSpec, TypeVar
 
 import grpc
 
-from ..connection import CHANNEL_OPTIONS
+from ..calls.connection import CHANNEL_OPTIONS
+from ..calls.pose_exchange import TAKES_NO_MORE, PoseExchange
 from ..errors import StreamEnded
-from ..pose_exchange import TAKES_NO_MORE, PoseExchange
 
 P = ParamSpec("P")
 R = TypeVar("R")

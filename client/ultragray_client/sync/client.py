@@ -8,12 +8,12 @@ from types import TracebackType
 
 from ultragray_proto.v1 import rendering_pb2, rendering_pb2_grpc
 
-from ..batch import Batch
-from ..connection import DEFAULT_ADDRESS, DEFAULT_TIMEOUT_S
+from ..calls.batch import Batch
+from ..calls.connection import DEFAULT_ADDRESS, DEFAULT_TIMEOUT_S
+from ..calls.pose_exchange import PoseExchange, StreamMode
 from ..contract import RenderSettings
 from ..frames import Frame, frame_from_message, settings_message
 from ..geometry import PoseLike, pose_message
-from ..pose_exchange import PoseExchange, StreamMode
 from .connection import Connection
 from .datasets import Datasets
 from .jobs import Jobs

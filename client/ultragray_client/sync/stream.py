@@ -6,11 +6,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from types import TracebackType
 
+from ..calls.pose_exchange import PoseExchange
+from ..calls.statuses import client_errors
 from ..errors import StreamEnded
 from ..frames import Frame
 from ..geometry import PoseLike
-from ..pose_exchange import PoseExchange
-from ..statuses import client_errors
 from .transport import PoseCall
 
 

@@ -9,9 +9,9 @@ from typing import Any, ParamSpec, TypeVar
 
 import grpc
 
-from ..connection import CHANNEL_OPTIONS
+from ..calls.connection import CHANNEL_OPTIONS
+from ..calls.pose_exchange import TAKES_NO_MORE, PoseExchange, StreamMode
 from ..errors import StreamEnded
-from ..pose_exchange import TAKES_NO_MORE, PoseExchange, StreamMode
 
 P = ParamSpec("P")
 R = TypeVar("R")

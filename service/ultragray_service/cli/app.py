@@ -22,10 +22,10 @@ from ..settings import ENVIRONMENT_PREFIX, Settings
 from . import convert as cli_convert
 from . import dataset as cli_dataset
 from . import eval as cli_eval
-from . import jobs as cli_jobs
 from . import report as cli_report
 from . import train as cli_train
 from . import worker as cli_worker
+from .jobs import commands as cli_jobs
 from .options import FieldsOf, with_options
 
 USER_ERROR = 2  # the exit code of a mistake that the caller can mend

@@ -47,7 +47,7 @@ def run_worker(overrides: dict[str, Any], *, name: str | None = None, device: st
     """Do jobs until SIGTERM or SIGINT, then end the process. Raises StartupFailed, InvalidArgument."""
     from ultragray_workers.jobs.worker.worker import work
 
-    from ..logs import configure_logging
+    from ..telemetry.logs import configure_logging
 
     settings = load_settings(**overrides)
     configure_logging(settings.log_level)

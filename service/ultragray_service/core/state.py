@@ -16,8 +16,8 @@ from ultragray_workers.pool.waiting import Turn
 from ultragray_workers.scenes import SceneStore
 
 from ..auth import KeyGuard
-from ..metrics import Metrics
 from ..settings import Settings
+from ..telemetry.metrics import Metrics
 from ..views.comparisons import Comparisons
 from ..views.datasets import DatasetViews
 from ..views.training import TrainingViews

@@ -13,8 +13,8 @@ from ultragray.errors import UltragrayError
 
 from ..auth import KeyGuard, key_of_subprotocols
 from ..errors import BodyTooLarge, Unauthenticated
-from ..logs import choose_request_id, request_id
-from ..metrics import Metrics
+from ..telemetry.logs import choose_request_id, request_id
+from ..telemetry.metrics import Metrics
 from .console import ASSETS_PATH, CONSOLE_PATHS
 from .problems import problem_response
 

@@ -16,7 +16,7 @@ from ultragray.contract import blamed, error_under, join
 from ultragray.errors import InvalidArgument, UltragrayError
 
 from ..errors import MethodNotAllowed, RouteNotFound, statuses_of
-from ..logs import request_id
+from ..telemetry.logs import request_id
 
 PROBLEM_TYPE = "application/problem+json"
 

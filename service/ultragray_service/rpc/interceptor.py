@@ -14,8 +14,8 @@ from ultragray.errors import UltragrayError
 
 from ..auth import KeyGuard
 from ..errors import Unauthenticated, statuses_of
-from ..logs import choose_request_id, request_id
-from ..metrics import Metrics
+from ..telemetry.logs import choose_request_id, request_id
+from ..telemetry.metrics import Metrics
 from .status import REQUEST_ID_KEY, abort
 
 _OPEN_PREFIX = "/grpc.health.v1."

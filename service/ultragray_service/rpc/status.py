@@ -13,7 +13,7 @@ from google.rpc.status_pb2 import Status
 from ultragray.errors import InvalidArgument, UltragrayError
 
 from ..errors import statuses_of
-from ..logs import request_id
+from ..telemetry.logs import request_id
 
 ERROR_DOMAIN = "ultragray"
 REQUEST_ID_KEY = "x-request-id"

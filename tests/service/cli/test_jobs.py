@@ -22,7 +22,7 @@ from ultragray import LinearProbe
 from ultragray.datasets import Dataset, Sweep
 from ultragray.datasets.released import write_released
 from ultragray_service.cli.app import app
-from ultragray_service.cli.jobs_watch import JOB_CANCELLED, JOB_FAILED
+from ultragray_service.cli.jobs.watch import JOB_CANCELLED, JOB_FAILED
 
 from ..conftest import ROOT, SOURCE_FOLDERS, RunningService, StartService
 

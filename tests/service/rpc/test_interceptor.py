@@ -12,8 +12,8 @@ import pytest
 from google.protobuf.empty_pb2 import Empty
 
 from ultragray_service.auth import KeyGuard
-from ultragray_service.metrics import Metrics
 from ultragray_service.rpc.interceptor import CallContext
+from ultragray_service.telemetry.metrics import Metrics
 from ultragray_workers import PoolConfig, RenderPool, SceneStore
 
 METHOD = "/ultragray.v1.TestService/Stream"

@@ -16,7 +16,7 @@ from ultragray_workers.pool.types import Priority, RenderRequest, RenderResult
 from ...core.frames import FrameHeader
 from ...core.poses import exact_poses
 from ...core.state import Service
-from ...statistics import STAGES
+from ...telemetry.statistics import STAGES
 from ..accept import JPEG, NPZ, PNG, RAW, choose
 from ..bodies import RenderBody
 from ..deps import SCENE_NAME, problems

@@ -6,7 +6,7 @@ import asyncio
 
 from fastapi import APIRouter
 
-from ...statistics import ServiceStatistics, memory_bytes
+from ...telemetry.statistics import ServiceStatistics, memory_bytes
 from ..deps import ServiceDep, problems
 
 router = APIRouter(prefix="/v1/statistics", tags=["statistics"])

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from typing import Any, Generic, TypeVar
 
-from .errors import ClientError, InvalidArgument
+from ..errors import ClientError, InvalidArgument
 from .retries import Retries
 
 T = TypeVar("T")

@@ -14,7 +14,7 @@ from ultragray.contract import to_dict
 from ultragray.samplers import TrainingSampler
 from ultragray_workers.jobs.kinds import KINDS, Specification
 
-from .options import parameters_of, values_of, with_parameters
+from ..options import parameters_of, values_of, with_parameters
 
 jobs_app = typer.Typer(no_args_is_help=True, help="Train and render in the background, on a running service.")
 submit_app = typer.Typer(no_args_is_help=True, help="Put a job into the queue; its id is printed.")
@@ -42,7 +42,7 @@ def list_jobs(
     api_key: ApiKey = None,
 ) -> None:
     """List the jobs, newest first."""
-    from ..core.job_client import JobClient
+    from ...core.job_client import JobClient
 
     jobs = JobClient(server, api_key).jobs(state=state, kind=kind, limit=limit)
     if json:
@@ -54,8 +54,8 @@ def list_jobs(
 @jobs_app.command()
 def watch(job: JobArgument, server: Server = "http://127.0.0.1:8000", api_key: ApiKey = None) -> None:
     """Follow a job to its end. Exit code 0: it succeeded, 3: it failed, 4: it was cancelled."""
-    from ..core.job_client import JobClient
-    from .jobs_watch import follow
+    from ...core.job_client import JobClient
+    from .watch import follow
 
     follow(JobClient(server, api_key), job)
 
@@ -63,7 +63,7 @@ def watch(job: JobArgument, server: Server = "http://127.0.0.1:8000", api_key: A
 @jobs_app.command()
 def cancel(job: JobArgument, server: Server = "http://127.0.0.1:8000", api_key: ApiKey = None) -> None:
     """Stop a job."""
-    from ..core.job_client import JobClient
+    from ...core.job_client import JobClient
 
     cancelled = JobClient(server, api_key).cancel(job)
     typer.echo(f"{cancelled['id']} {cancelled['state']}")
@@ -72,7 +72,7 @@ def cancel(job: JobArgument, server: Server = "http://127.0.0.1:8000", api_key: 
 @jobs_app.command()
 def retry(job: JobArgument, server: Server = "http://127.0.0.1:8000", api_key: ApiKey = None) -> None:
     """Put a new job in place of a failed or cancelled one; it goes on from the last checkpoint."""
-    from ..core.job_client import JobClient
+    from ...core.job_client import JobClient
 
     typer.echo(JobClient(server, api_key).retry(job)["id"])
 
@@ -80,7 +80,7 @@ def retry(job: JobArgument, server: Server = "http://127.0.0.1:8000", api_key: A
 @jobs_app.command()
 def delete(job: JobArgument, server: Server = "http://127.0.0.1:8000", api_key: ApiKey = None) -> None:
     """Remove a finished job and its files; the scene that it trained stays."""
-    from ..core.job_client import JobClient
+    from ...core.job_client import JobClient
 
     JobClient(server, api_key).delete(job)
     typer.echo(f"{job} deleted")
@@ -94,7 +94,7 @@ def logs(
     api_key: ApiKey = None,
 ) -> None:
     """Print the end of a job's log."""
-    from ..core.job_client import JobClient
+    from ...core.job_client import JobClient
 
     typer.echo(JobClient(server, api_key).log(job, max_bytes), nl=False)
 
@@ -110,8 +110,8 @@ def download(
     api_key: ApiKey = None,
 ) -> None:
     """Download a file that a job made."""
-    from ..core.job_client import JobClient
-    from .output import check_writable
+    from ...core.job_client import JobClient
+    from ..output import check_writable
 
     path = Path(Path(name).name) if output is None else output
     check_writable(path)
@@ -132,8 +132,8 @@ def _submit(
     server: Server = "http://127.0.0.1:8000",
     api_key: ApiKey = None,
 ) -> None:
-    from ..core.job_client import JobClient
-    from .jobs_watch import follow
+    from ...core.job_client import JobClient
+    from .watch import follow
 
     client = JobClient(server, api_key)
     body = {"kind": kind, "specification": specification, "request_id": request_id, "priority": priority}
@@ -175,7 +175,7 @@ def _print_jobs(jobs: list[dict[str, Any]]) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from .jobs_watch import amount
+    from .watch import amount
 
     console = Console()
     if not console.is_terminal:

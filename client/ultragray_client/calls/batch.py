@@ -9,10 +9,10 @@ from itertools import islice
 
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2
 
+from ..errors import ClientError, TooManyPoses
+from ..frames import Frame, frame_from_message
+from ..geometry import PoseLike, pose_messages
 from .connection import Conversation
-from .errors import ClientError, TooManyPoses
-from .frames import Frame, frame_from_message
-from .geometry import PoseLike, pose_messages
 from .retries import Retries
 
 _POSES_PER_CALL = 256  # halved where the service takes fewer

@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 import time
 
-from .errors import ClientError, ResourceExhausted, Unavailable
+from ..errors import ClientError, ResourceExhausted, Unavailable
 
 _FIRST_PAUSE_S = 0.1
 _LONGEST_PAUSE_S = 5.0

@@ -13,7 +13,7 @@ from ultragray_workers.jobs.job import JobState
 from ultragray_workers.pool.pool import RenderPool
 from ultragray_workers.pool.types import RenderResult
 
-from .errors import statuses_of
+from ..errors import statuses_of
 from .statistics import Statistics
 
 _SECONDS = (

@@ -10,8 +10,8 @@ from pathlib import Path
 
 from ultragray_proto.v1 import jobs_pb2
 
+from ..errors import Unreachable
 from .connection import Conversation
-from .errors import Unreachable
 
 
 class Download(Conversation[jobs_pb2.ArtifactChunk]):

@@ -7,9 +7,9 @@ from enum import Enum
 
 from ultragray_proto.v1 import rendering_pb2
 
-from .errors import InvalidArgument
-from .frames import Frame, frame_from_message
-from .geometry import PoseLike, pose_message
+from ..errors import InvalidArgument
+from ..frames import Frame, frame_from_message
+from ..geometry import PoseLike, pose_message
 from .statuses import error_of_frame
 
 TAKES_NO_MORE = "the stream takes no more poses: done_sending was called, or it is over"

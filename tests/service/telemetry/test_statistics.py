@@ -9,10 +9,10 @@ from websockets.sync.client import connect
 
 from ultragray_service.core.state import Service
 from ultragray_service.settings import load_settings
-from ultragray_service.statistics import STEP_S, STEPS, StageTimes, Statistics
+from ultragray_service.telemetry.statistics import STEP_S, STEPS, StageTimes, Statistics
 from ultragray_workers.errors import DeadlineExceeded
 
-from .conftest import StartService
+from ..conftest import StartService
 
 POSE = {"position_mm": {"x": 0, "y": 1, "z": 0}, "quaternion": {"w": 1, "x": 0, "y": 0, "z": 0}}
 

@@ -14,7 +14,7 @@ from google.protobuf.unknown_fields import UnknownFieldSet
 
 from ultragray_proto.v1 import scenes_pb2
 
-from .errors import ERRORS, ClientError, Unreachable
+from ..errors import ERRORS, ClientError, Unreachable
 
 _DETAILS_KEY = "grpc-status-details-bin"
 _BY_REASON = {error.reason: error for error in ERRORS}

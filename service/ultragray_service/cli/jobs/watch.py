@@ -12,8 +12,8 @@ import typer
 
 from ultragray_workers.errors import NotReady
 
-from ..core.job_client import JobClient
-from .train import INTERRUPTED
+from ...core.job_client import JobClient
+from ..train import INTERRUPTED
 
 JOB_FAILED = 3  # the exit code of a command that watched a job fail
 JOB_CANCELLED = 4

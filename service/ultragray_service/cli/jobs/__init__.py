@@ -1,0 +1,1 @@
+"""`ultragray jobs`: commands for the jobs of a running service."""

@@ -1,0 +1,1 @@
+"""Logs, metrics and statistics: what the service says about itself."""
