@@ -113,12 +113,14 @@ class Family(Contract):
         if Family not in cls.__bases__:
             schema = handler.resolve_ref_schema(document)
             schema["required"] = ["kind", *schema.get("required", ())]
-            examples = {
-                item.name: item.metadata["example"] for item, _ in annotated_fields(cls) if "example" in item.metadata
-            }
-            if examples:
+            if examples := cls.example():
                 schema["examples"] = [{"kind": schema["properties"]["kind"]["const"], **examples}]
         return document
+
+    @classmethod
+    def example(cls) -> dict[str, Any]:
+        """The values of a usual member; empty where its fields give none."""
+        return {item.name: item.metadata["example"] for item, _ in annotated_fields(cls) if "example" in item.metadata}
 
     @classmethod
     def member(cls: type[_T], kind: Any) -> type[_T]:

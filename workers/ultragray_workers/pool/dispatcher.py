@@ -93,13 +93,13 @@ class Dispatcher:
             self._assign(slot, batch)
 
     def _assign(self, slot: Slot, batch: list[Step]) -> None:
-        parts = [work for work in batch if isinstance(work, Part)]
-        for work in batch:
-            work.ticket.in_flight += 1
-            work.ticket.batch_size = max(work.ticket.batch_size, sum(part.frames for part in parts))
-            if work.ticket.memory is None:
-                work.ticket.memory = self._memories.acquire()
-        assignment = Assignment(parts=dict(enumerate(batch)))
+        parts = [step for step in batch if isinstance(step, Part)]
+        for step in batch:
+            step.ticket.in_flight += 1
+            step.ticket.batch_size = max(step.ticket.batch_size, sum(part.frames for part in parts))
+            if step.ticket.memory is None:
+                step.ticket.memory = self._memories.acquire()
+        assignment = Assignment(steps=dict(enumerate(batch)))
         ticket = batch[0].ticket
         if parts:
             slot.assign(_render_task(ticket, parts), assignment, _descriptors(part.ticket.memory for part in parts))
@@ -109,30 +109,30 @@ class Dispatcher:
             slot.assign(_pack_task(ticket), assignment, _descriptors((ticket.memory, ticket.archive)))
 
     def on_idle(self) -> None:
-        """A slot has a worker without work."""
+        """Gives the worker of a slot that has just become idle something to do."""
         self._dispatch()
 
     def on_answer(self, assignment: Assignment, answer: Answer) -> None:
-        """A worker has done a part, or a command."""
+        """Takes over what a worker says of a step, or of a command."""
         outcome = answer.outcome
-        if assignment.command is not None:
+        if (command := assignment.command) is not None:
             if isinstance(outcome, UltragrayError):
-                assignment.command.fail(outcome)
-            elif not assignment.command.done.done():
-                assignment.command.done.set_result(None)
+                command.fail(outcome)
+            elif not command.done.done():
+                command.done.set_result(None)
             return
-        work = assignment.parts.pop(answer.part)
-        ticket = work.ticket
+        step = assignment.steps.pop(answer.part)
+        ticket = step.ticket
         ticket.in_flight -= 1
         if ticket.done.done():
             return
         if isinstance(outcome, Rendered):
-            self._advance(ticket, work, outcome)
+            self._advance(ticket, step, outcome)
         else:
             self._fail_ticket(ticket, outcome or RenderFailed("a worker answered nothing"))
 
     def on_death(self, slot: Slot, assignment: Assignment) -> None:
-        """A worker died with work it had not answered: that is done again, unless it has killed too many."""
+        """Has done again what a dead worker had not answered, unless that has killed too many workers."""
         failure = RenderFailed(f"the worker process died {_MAX_DEATHS} times while it was rendering this")
         if (command := assignment.command) is not None and not command.done.done():
             command.attempts += 1
@@ -140,24 +140,24 @@ class Dispatcher:
                 command.fail(failure)
             else:
                 slot.commands.appendleft(command)
-        for work in reversed(assignment.parts.values()):
-            work.ticket.in_flight -= 1
-            if work.ticket.done.done():
+        for step in reversed(assignment.steps.values()):
+            step.ticket.in_flight -= 1
+            if step.ticket.done.done():
                 continue
-            if work.attempts + 1 >= _MAX_DEATHS:
-                self._fail_ticket(work.ticket, failure)
+            if step.attempts + 1 >= _MAX_DEATHS:
+                self._fail_ticket(step.ticket, failure)
                 continue
-            for again in reversed(work.for_retry()):
+            for again in reversed(step.for_retry()):
                 self._waiting.put_first(again)
         self._dispatch()
 
-    def _advance(self, ticket: Ticket, work: Step, outcome: Rendered) -> None:
+    def _advance(self, ticket: Ticket, step: Step, outcome: Rendered) -> None:
         """Takes a step of a ticket as done; completes it after its last."""
-        if isinstance(work, Packing):
+        if isinstance(step, Packing):
             ticket.done.set_result(_summary([*ticket.rendered, outcome]))
             return
         ticket.rendered.append(outcome)
-        ticket.rendered_poses += work.frames
+        ticket.rendered_poses += step.frames
         if ticket.rendered_poses < len(ticket.request.poses):
             return
         if len({rendered.scene_sha256 for rendered in ticket.rendered}) > 1:
@@ -195,7 +195,7 @@ def _summary(steps: list[Rendered]) -> Rendered:
 
 def _extrapolations(steps: Iterable[Rendered]) -> tuple[Extrapolation, ...]:
     """In the order of the poses."""
-    return tuple(told for step in sorted(steps, key=lambda step: step.first) for told in step.extrapolations)
+    return tuple(one for step in sorted(steps, key=lambda step: step.first) for one in step.extrapolations)
 
 
 def _render_task(ticket: Ticket, parts: list[Part]) -> RenderTask:

@@ -42,15 +42,12 @@ def write_at(descriptor: int, data: memoryview, offset: int) -> None:
 
 def read_start(descriptor: int, size: int) -> bytes:
     """The first `size` bytes, read without holding the interpreter lock."""
-    data = os.pread(descriptor, size, 0)
-    if len(data) == size:
-        return data
-    blocks = [data]  # one read gives at most 2 GiB
-    position = len(data)
-    while position < size:
+    blocks: list[bytes] = []
+    position = 0
+    while position < size:  # one read gives at most 2 GiB
         block = os.pread(descriptor, size - position, position)
         if not block:
             raise EOFError(f"expected {size} bytes of frames, found {position}")
         blocks.append(block)
         position += len(block)
-    return b"".join(blocks)
+    return b"".join(blocks)  # which copies no single block

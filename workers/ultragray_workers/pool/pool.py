@@ -14,6 +14,7 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from ultragray.contract import Contract, described
 from ultragray.errors import InvalidArgument, RenderFailed
 
 from ..errors import Draining, NotReady
@@ -34,27 +35,21 @@ _READ_IN_THREAD_BYTES = 2**20
 
 
 @dataclass(frozen=True)
-class PoolConfig:
+class PoolConfig(Contract):
     """Sizes of a pool. Raises InvalidArgument for values that no pool can have."""
 
-    processes: int = 0  # 0: one per GPU that renders; on the CPU one
-    threads_per_process: int = 0  # 0: the cores this process may use, divided by the number of processes
-    queue_limit_frames: int = 256  # poses that may wait, for each priority
-    max_batch_poses: int = 16  # rendered together; fewer for images of more than 512x512 pixels
-    memory_budget_bytes: int = 4 * 2**30  # of loaded scenes, per process, where they are rendered
+    processes: int = described("0: one per GPU that renders; on the CPU one.", 0, low=0, high=1024)
+    threads_per_process: int = described(
+        "0: the cores this process may use, divided by the number of processes.", 0, low=0, high=1024
+    )
+    queue_limit_frames: int = described("Poses that may wait, for each priority.", 256, low=1, high=2**31)
+    max_batch_poses: int = described(
+        "Poses rendered together; fewer for images of more than 512x512 pixels.", 16, low=1, high=MAX_BATCH_POSES
+    )
+    memory_budget_bytes: int = described(
+        "Of loaded scenes, per process, where they are rendered.", 4 * 2**30, low=1, high=2**63
+    )
     backend: str = "auto"
-
-    def __post_init__(self) -> None:
-        limits = {
-            "processes": (0, 1024),
-            "threads_per_process": (0, 1024),
-            "queue_limit_frames": (1, 2**31),
-            "max_batch_poses": (1, MAX_BATCH_POSES),
-            "memory_budget_bytes": (1, 2**63),
-        }
-        for name, (low, high) in limits.items():
-            if not low <= getattr(self, name) <= high:
-                raise InvalidArgument(f"{name} must be from {low} to {high}, got {getattr(self, name)}", field=name)
 
 
 @dataclass(frozen=True)

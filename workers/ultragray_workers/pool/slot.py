@@ -39,9 +39,9 @@ class Command:
 
 @dataclass(eq=False)
 class Assignment:
-    """The work in a worker's hands: the parts of a batch that it has not answered yet, or a command."""
+    """The steps of a batch that a worker has not answered yet, or its command."""
 
-    parts: dict[int, Step] = field(default_factory=dict)
+    steps: dict[int, Step] = field(default_factory=dict)
     command: Command | None = None
 
 
@@ -56,6 +56,8 @@ class SlotListener(Protocol):
 
 
 class Slot:
+    """A worker process and what it is doing; started again whenever it dies."""
+
     def __init__(self, launcher: Launcher, settings: ForkWorker, listener: SlotListener) -> None:
         self.resident: tuple[str, ...] = ()  # scenes its worker holds
         self.commands: deque[Command] = deque()
@@ -65,7 +67,7 @@ class Slot:
         self._settings = settings
         self._listener = listener
         self._peer: Peer | None = None
-        self._greeted = False  # its worker has said Hello and works
+        self.alive = False  # whether its worker has said Hello and works
         self._assignment: Assignment | None = None
         self._settled = asyncio.Event()  # it has once been ready, or could not be started
         self._failed_starts = 0
@@ -74,17 +76,13 @@ class Slot:
         self._closing = False
 
     @property
-    def alive(self) -> bool:
-        return self._greeted
-
-    @property
     def pid(self) -> int | None:
         """The process at work here; None while there is none."""
-        return self._peer.pid if self._greeted and self._peer is not None else None
+        return self._peer.pid if self.alive and self._peer is not None else None
 
     @property
     def idle(self) -> bool:
-        return self._greeted and self._assignment is None
+        return self.alive and self._assignment is None
 
     @property
     def busy(self) -> bool:
@@ -130,7 +128,7 @@ class Slot:
                 self._start_error = message.error  # the process exits now
                 return
             self.gpus = message.gpus
-            self._greeted = True
+            self.alive = True
             self._failed_starts = 0
             self._settled.set()
             self._listener.on_idle()
@@ -145,18 +143,14 @@ class Slot:
             self._listener.on_idle()
 
     def _on_gone(self) -> None:
-        worked, self._greeted = self._greeted, False
+        worked, self.alive = self.alive, False
         assignment, self._assignment = self._assignment, None
         self.resident = ()
-        if self._closing:
-            if assignment is not None:
-                self._listener.on_death(self, assignment)
-            return
-        if worked:
+        if worked and not self._closing:
             logger.warning("a render worker died (process %s); replacing it", self._peer and self._peer.pid)
             self.replacements += 1
             self._launch()
-        else:
+        elif not self._closing:
             self._start_again_later()
         if assignment is not None:
             self._listener.on_death(self, assignment)

@@ -70,7 +70,7 @@ class Ticket:
 
 @dataclass(eq=False)
 class Turn:
-    """One caller's place in the queue, which a newer pose of his may take while it waits."""
+    """One caller's place in the queue, which a newer pose may take while it waits."""
 
     ticket: Ticket | None = None  # None until the request is queued
     expiry: Expiry | None = None
@@ -124,7 +124,7 @@ Step = Part | Packing
 
 
 class WaitingQueue:
-    """Tickets with work that waits: by priority, then in turn, one part of a ticket at a time.
+    """Tickets with steps that wait: by priority, then in turn, one part of a ticket at a time.
 
     Batches wait for as long as interactive requests do, but get one part rendered per second at the least.
 
@@ -157,11 +157,11 @@ class WaitingQueue:
         for first in range(0, count, size):
             self._append(Part(ticket, first, min(first + size, count)))
 
-    def put_first(self, work: Step) -> None:
-        """Step that was begun and lost comes back ahead of all that waits."""
-        ticket = work.ticket
-        ticket.waiting.appendleft(work)
-        self._frames[ticket.request.priority] += work.frames
+    def put_first(self, step: Step) -> None:
+        """Puts a step that was begun and lost ahead of all that waits."""
+        ticket = step.ticket
+        ticket.waiting.appendleft(step)
+        self._frames[ticket.request.priority] += step.frames
         tickets = self._tickets[ticket.request.priority]
         tickets[ticket] = None
         tickets.move_to_end(ticket, last=False)
@@ -169,7 +169,7 @@ class WaitingQueue:
     def remove(self, ticket: Ticket) -> None:
         """Drops all of a ticket that waits."""
         priority = ticket.request.priority
-        self._frames[priority] -= sum(work.frames for work in ticket.waiting)
+        self._frames[priority] -= sum(step.frames for step in ticket.waiting)
         ticket.waiting.clear()
         self._tickets[priority].pop(ticket, None)
 
@@ -185,8 +185,8 @@ class WaitingQueue:
                 if ticket.expired:
                     self.expire(ticket)
                     continue
-                work = self._take(ticket)
-                return [work, *self._take_company(work)] if isinstance(work, Part) else [work]
+                step = self._take(ticket)
+                return [step, *self._take_company(step)] if isinstance(step, Part) else [step]
         return []
 
     def expire(self, ticket: Ticket) -> None:
@@ -207,12 +207,12 @@ class WaitingQueue:
             if ticket.batch_key != first.ticket.batch_key or ticket.expired:
                 continue
             while ticket.waiting:
-                work = ticket.waiting[0]
-                if not isinstance(work, Part) or work.frames > room or work.attempts >= _ATTEMPTS_IN_COMPANY:
+                step = ticket.waiting[0]
+                if not isinstance(step, Part) or step.frames > room or step.attempts >= _ATTEMPTS_IN_COMPANY:
                     break
                 self._take(ticket)
-                company.append(work)
-                room -= work.frames
+                company.append(step)
+                room -= step.frames
         return company
 
     def _append(self, part: Part) -> None:
@@ -225,13 +225,13 @@ class WaitingQueue:
         priority = ticket.request.priority
         if priority is Priority.BATCH:
             self._last_batch_turn = time.monotonic()
-        work = ticket.waiting.popleft()
-        self._frames[priority] -= work.frames
+        step = ticket.waiting.popleft()
+        self._frames[priority] -= step.frames
         if ticket.waiting:
             self._tickets[priority].move_to_end(ticket)  # others get their turn before its next part
         else:
             del self._tickets[priority][ticket]
-        return work
+        return step
 
     def _poses_together(self, ticket: Ticket) -> int:
         """The number of poses in a full batch: fewer for images of more than 512x512 pixels."""

@@ -49,10 +49,10 @@ class SceneCache:
     def get(self, name: str, path: str) -> LoadedScene:
         """The scene of a file as it is now. Raises SceneFileInvalid, SceneTooLarge, MemoryExceeded."""
         try:
-            version = FileVersion.of(path)
-        except OSError as error:
+            version = _version(path)
+        except SceneFileInvalid:
             self.drop(name)
-            raise scene_file_invalid(path, error) from error
+            raise
         held = self._scenes.get(name)
         if held is not None and held.version == version:
             self._scenes.move_to_end(name)

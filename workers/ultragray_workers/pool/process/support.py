@@ -14,7 +14,7 @@ from ..messages import RenderTask
 def below_limit(task: RenderTask, extrapolations: Sequence[Extrapolation]) -> list[bool]:
     """For each pose, whether it has less confidence than the task wants; a scene without a model has none."""
     limit = task.view.min_confidence
-    return [limit is not None and not is_confident(told, limit) for told in extrapolations]
+    return [limit is not None and not is_confident(one, limit) for one in extrapolations]
 
 
 def refusal(task: RenderTask, extrapolations: Sequence[Extrapolation]) -> LowConfidence | None:
@@ -22,8 +22,8 @@ def refusal(task: RenderTask, extrapolations: Sequence[Extrapolation]) -> LowCon
     limit = task.view.min_confidence
     if limit is None or task.view.below_min_confidence is not Below.REFUSE:
         return None
-    for index, told in enumerate(extrapolations):
-        if not is_confident(told, limit):
+    for index, one in enumerate(extrapolations):
+        if not is_confident(one, limit):
             part = task.parts[0]
-            return low_confidence(told, limit, "pose" if part.total == 1 else f"poses[{part.first + index}]")
+            return low_confidence(one, limit, "pose" if part.total == 1 else f"poses[{part.first + index}]")
     return None

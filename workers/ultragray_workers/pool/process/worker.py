@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ultragray import ConvexProbe, GaussianScene, LinearProbe, Probe, render
+from ultragray import GaussianScene, Probe, render
 from ultragray.backends import cuda
 from ultragray.confidence import Extrapolation
 from ultragray.confidence.support import SupportWatch
@@ -40,7 +40,6 @@ from .scene_cache import SceneCache
 from .support import below_limit, refusal
 
 MAX_DETAIL_LENGTH = 2000
-_SMALL_PROBES = (LinearProbe(width_mm=10.0, near_mm=0.0, far_mm=10.0), ConvexProbe(60.0, near_mm=5.0, far_mm=10.0))
 
 logger = logging.getLogger(__name__)
 
@@ -90,8 +89,8 @@ class _Worker:
         shapes = {"means": (1, 3), "scales": (1, 3), "transmittances": (1,), "sh0": (1, 1, 1)}
         splats = {name: torch.zeros(shape) for name, shape in shapes.items()} | {"quats": torch.ones(1, 4)}
         scene = GaussianScene.from_splats(splats).to(self._device)
-        for probe in _SMALL_PROBES:
-            encode_image(self._render_small(scene, probe), Encoding.PNG)
+        for frame in self._render_small(scene):
+            encode_image(frame, Encoding.PNG)
 
     def do(self, task: Task, descriptors: list[int]) -> None:
         """Does one task and answers it, whatever happens."""
@@ -115,8 +114,7 @@ class _Worker:
             if isinstance(task, PackTask):
                 return _pack(task, *descriptors)
             if isinstance(task, LoadTask):
-                for probe in _SMALL_PROBES:  # lets the kernels prepare the scene
-                    self._render_small(self._scenes.get(task.scene, task.path).scene, probe)
+                self._render_small(self._scenes.get(task.scene, task.path).scene)  # lets the kernels prepare it
             else:
                 self._scenes.drop(task.scene)
         except Exception as error:
@@ -127,11 +125,7 @@ class _Worker:
         """One outcome per part, each as soon as its frames are written."""
         try:
             loaded = self._scenes.get(task.scene, task.path)
-        except Exception as error:
-            yield from [_as_reported(error)] * len(task.parts)
-            return
-        poses = np.concatenate([part.poses for part in task.parts])  # [C, 4, 4]
-        try:
+            poses = np.concatenate([part.poses for part in task.parts])  # [C, 4, 4]
             extrapolations = loaded.assessor.assess(poses, task.view.probe)
         except Exception as error:
             yield from [_as_reported(error)] * len(task.parts)
@@ -169,8 +163,8 @@ class _Worker:
         begin = 0
         for part, memory in zip(task.parts, memories, strict=True):
             end = begin + len(part.poses)
-            told = partial(support.told, extrapolations[begin:end], begin)
-            yield _write_part(task.scene, part, frames, begin, memory, rendered, told)
+            assessed = partial(support.told, extrapolations[begin:end], begin)
+            yield _write_part(task.scene, part, frames, begin, memory, rendered, assessed)
             begin = end
 
     def _render(
@@ -202,10 +196,20 @@ class _Worker:
                 f"free memory of {self._device}; ask for fewer or smaller ones"
             ) from error
 
-    def _render_small(self, scene: GaussianScene, probe: Probe) -> ByteArray:  # [16, 16]
-        pixel_type, view = Encoding.UINT8.pixel_type, Resolved(probe, 16, 16)
-        frames = self._render(scene, view, np.eye(4)[None], {"bmode": {pixel_type}}, SupportWatch([False]))
-        return to_uint8(frames.take("bmode", pixel_type, 0, 1)[0])
+    def _render_small(self, scene: GaussianScene) -> list[ByteArray]:  # each [16, 16]
+        """A frame for each bundle of scan lines, as kernels differ by it."""
+        pixel_type, small = Encoding.UINT8.pixel_type, []
+        for probe in example_probes():
+            view = Resolved(probe, 16, 16)
+            frames = self._render(scene, view, np.eye(4)[None], {"bmode": {pixel_type}}, SupportWatch([False]))
+            small.append(to_uint8(frames.take("bmode", pixel_type, 0, 1)[0]))
+        return small
+
+
+def example_probes() -> tuple[Probe, ...]:
+    """One probe for each bundle of scan lines that probes have."""
+    examples: list[Probe] = [member(**member.example()) for member in Probe.members.values()]
+    return tuple({type(probe.lines): probe for probe in examples}.values())
 
 
 def _write_part(
@@ -215,7 +219,7 @@ def _write_part(
     begin: int,
     memory: int,
     rendered: Rendered,
-    told: Callable[[], tuple[Extrapolation, ...]],
+    assessed: Callable[[], tuple[Extrapolation, ...]],
 ) -> Rendered | UltragrayError:
     """Encodes a part into its request's memory: a whole file, or its share of the pixels."""
     started, waited_ms = time.monotonic(), frames.waited_ms
@@ -232,7 +236,7 @@ def _write_part(
                     file,
                     {name: frames.take(name, pixel_type, begin, end) for name in outputs},
                     part.poses,
-                    told(),
+                    assessed(),
                     scene=scene,
                     scene_sha256=rendered.scene_sha256,
                     renderer=rendered.renderer,
@@ -246,7 +250,7 @@ def _write_part(
                     place = number * part.total + part.first + first - begin
                     write_at(memory, pixels.data.cast("B"), place * pixels[0].nbytes)
             size = len(outputs) * part.total * pixels[0].nbytes
-        extrapolations = told()
+        extrapolations = assessed()
     except Exception as error:
         return _as_reported(error)
     waiting_ms = frames.waited_ms - waited_ms
