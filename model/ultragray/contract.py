@@ -278,10 +278,15 @@ def _checked(value: Any, annotation: Any, item: Field[Any]) -> Any:
         return value
     if get_origin(kind) is tuple:
         _require(isinstance(value, (list, tuple)), "a list", value)
-        most = item.metadata.get("most")
+        most, elements = item.metadata.get("most"), get_args(kind)
         _require(most is None or len(value) <= most, f"a list of at most {most} values", len(value))
-        element = get_args(kind)[0]
-        return tuple(_checked_element(one, element, item, index) for index, one in enumerate(value))
+        _require(Ellipsis in elements or len(value) == len(elements), f"a list of {len(elements)} values", value)
+        return tuple(_checked_element(one, elements[0], item, index) for index, one in enumerate(value))
+    if get_origin(kind) is dict:
+        _require(isinstance(value, dict), "an object", value)
+        most = item.metadata.get("most")
+        _require(most is None or len(value) <= most, f"an object of at most {most} entries", len(value))
+        return value
     if not isinstance(kind, type):
         return value
     if issubclass(kind, Enum):

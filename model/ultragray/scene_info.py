@@ -9,8 +9,7 @@ All but the Gaussians is bounded, so that the description of any file is read in
 from __future__ import annotations
 
 import json
-import math
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 
 from .confidence.assess import read_model
-from .contract import from_dict, to_dict
+from .contract import Contract, described, from_dict, to_dict
 from .errors import InvalidArgument, InvalidProbe, SceneFileInvalid
 from .image_size import DEFAULT_IMAGE_SIDE
 from .pose import check_poses
@@ -39,45 +38,28 @@ Vector = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
-class SceneInfo:
+class SceneInfo(Contract):
     """A scene's own description. Positions are in mm; `bounds` and `centre` in the frame of the training sweep."""
 
     centre_mm: Vector = (0.0, 0.0, 0.0)
     probe: Probe | None = None
-    image_height: int | None = None  # H of the training images
-    image_width: int | None = None  # W
-    intensity: str = "released"  # activation of docs/physics.md §2: released or sigmoid
-    sh_degree: int = 0
-    gaussian_count: int = 0
+    image_height: int | None = described("H of the training images.", None, low=1)
+    image_width: int | None = described("W of the training images.", None, low=1)
+    intensity: str = described("Activation of docs/physics.md §2.", "released", choices=INTENSITIES)
+    sh_degree: int = described("Of the Gaussians' spherical harmonics.", 0, low=0, high=MAX_SH_DEGREE)
+    gaussian_count: int = described("N.", 0, low=0)
     bounds_min_mm: Vector = (0.0, 0.0, 0.0)  # of the Gaussians' means
     bounds_max_mm: Vector = (0.0, 0.0, 0.0)
     dataset_name: str | None = None
     dataset_sha256: str | None = None
-    metrics: dict[str, float] = field(default_factory=dict)
-    training: dict[str, Any] = field(default_factory=dict)  # the configuration the scene was made with
-    confidence: dict[str, Any] = field(default_factory=dict)  # of ultragray.confidence.ConfidenceModel; empty: none
-    label_names: dict[int, str] = field(default_factory=dict)  # by label, 1 to 255; empty: the scene carries none
+    metrics: dict[str, float] = described("Of held-out frames.", factory=dict, most=MAX_METRICS)
+    training: dict[str, Any] = described("The configuration the scene was made with.", factory=dict)
+    confidence: dict[str, Any] = described("Of ultragray.confidence.ConfidenceModel; empty: none.", factory=dict)
+    label_names: dict[int, str] = described("By label, 1 to 255; empty: the scene carries none.", factory=dict)
 
     def __post_init__(self) -> None:
-        for name in ("centre_mm", "bounds_min_mm", "bounds_max_mm"):
-            object.__setattr__(self, name, _vector(name, getattr(self, name)))
-        if self.intensity not in INTENSITIES:
-            raise InvalidArgument(
-                f"intensity must be one of {', '.join(INTENSITIES)}, got {self.intensity!r}",
-                field="intensity",
-            )
-        for name in ("image_height", "image_width"):
-            value = getattr(self, name)
-            if value is not None and (not isinstance(value, int) or isinstance(value, bool) or value < 1):
-                raise InvalidArgument(f"{name} must be a positive integer, got {value!r}", field=name)
-        for name in ("metrics", "training", "confidence"):
-            if not isinstance(getattr(self, name), dict):
-                raise InvalidArgument(f"{name} must be an object, got {getattr(self, name)!r}", field=name)
-        if len(self.metrics) > MAX_METRICS:
-            raise InvalidArgument(
-                f"metrics must have at most {MAX_METRICS} entries, got {len(self.metrics)}", field="metrics"
-            )
         object.__setattr__(self, "label_names", _label_names(self.label_names))
+        super().__post_init__()
 
     def probe_or(self, asked: Probe | None) -> Probe:
         """The probe asked for, else the one the scene was trained with. Raises InvalidProbe where neither is known."""
@@ -96,16 +78,6 @@ class SceneInfo:
         )
 
 
-def _vector(name: str, value: Any) -> Vector:
-    try:
-        x, y, z = (float(v) for v in value)
-    except (TypeError, ValueError, OverflowError):
-        raise InvalidArgument(f"{name} must be three numbers, got {value!r}", field=name) from None
-    if not all(map(math.isfinite, (x, y, z))):
-        raise InvalidArgument(f"{name} must be finite, got {value!r}", field=name)
-    return (x, y, z)
-
-
 def _label_names(names: Any) -> dict[int, str]:
     """With numbers for keys, which JSON writes as text, in their order."""
     try:
@@ -121,11 +93,7 @@ def _label_names(names: Any) -> dict[int, str]:
 
 def info_to_json(info: SceneInfo) -> str:
     """The metadata entry of a scene file."""
-    document = {
-        "format_version": FORMAT_VERSION,
-        **asdict(info),
-        "probe": None if info.probe is None else to_dict(info.probe),
-    }
+    document = {"format_version": FORMAT_VERSION, **to_dict(info)}
     if not info.label_names:
         del document["label_names"]  # a scene without labels keeps its bytes, and its hash
     return json.dumps(document, allow_nan=False, sort_keys=True)
@@ -208,8 +176,6 @@ def check_training_pose_count(count: int) -> None:
 
 def _check_tensors(bundle: Any, info: SceneInfo) -> None:
     names = set(bundle.keys())
-    if not isinstance(info.sh_degree, int) or not 0 <= info.sh_degree <= MAX_SH_DEGREE:
-        raise ValueError(f"its sh_degree is {info.sh_degree!r}, expected 0 to {MAX_SH_DEGREE}")
     shapes = expected_shapes(info.gaussian_count, info.sh_degree)
     if info.label_names:
         shapes[LABELS_TENSOR] = (info.gaussian_count,)
@@ -245,10 +211,5 @@ def with_summary(info: SceneInfo, means_cm: FloatArray, sh_degree: int) -> Scene
         low, high = centre + 10.0 * means_cm.min(axis=0), centre + 10.0 * means_cm.max(axis=0)
     else:
         low = high = centre
-    return replace(
-        info,
-        gaussian_count=len(means_cm),
-        sh_degree=sh_degree,
-        bounds_min_mm=_vector("bounds_min_mm", low),
-        bounds_max_mm=_vector("bounds_max_mm", high),
-    )
+    bounds = {"bounds_min_mm": low.tolist(), "bounds_max_mm": high.tolist()}
+    return replace(info, gaussian_count=len(means_cm), sh_degree=sh_degree, **bounds)

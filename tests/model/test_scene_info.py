@@ -61,12 +61,12 @@ def test_json_round_trip(info: SceneInfo) -> None:
         ({"format_version": 2}, "format_version is 2"),
         ({"format_version": None}, "format_version"),
         ({"surprise": 1}, r"unknown keys \['surprise'\]"),
-        ({"centre_mm": [1, 2]}, "centre_mm must be three numbers"),
-        ({"centre_mm": [1, 2, None]}, "centre_mm must be three numbers"),
-        ({"centre_mm": [1, 2, float("inf")]}, "centre_mm must be finite"),
+        ({"centre_mm": [1, 2]}, "centre_mm must be a list of 3 values"),
+        ({"centre_mm": [1, 2, None]}, r"centre_mm\[2\] must be a finite number"),
+        ({"centre_mm": [1, 2, float("inf")]}, r"centre_mm\[2\] must be a finite number"),
         ({"intensity": "linear"}, "released, sigmoid"),
-        ({"image_height": 0}, "image_height must be a positive integer"),
-        ({"image_width": 1.5}, "image_width must be a positive integer"),
+        ({"image_height": 0}, "image_height must be an integer of at least 1"),
+        ({"image_width": 1.5}, "image_width must be an integer of at least 1"),
         ({"metrics": [1]}, "metrics must be an object"),
         ({"training": None}, "training must be an object"),
         ({"label_names": {"0": "nothing"}}, "label_names must give labels from 1 to 255 a name each"),
@@ -89,7 +89,7 @@ def test_other_text_is_refused(text: str) -> None:
 def test_nan_cannot_be_written() -> None:
     with pytest.raises(ValueError, match="JSON"):
         info_to_json(SceneInfo(metrics={"psnr_db": float("nan")}))
-    with pytest.raises(InvalidArgument, match="centre_mm must be finite"):
+    with pytest.raises(InvalidArgument, match=r"centre_mm\[1\] must be a finite number"):
         SceneInfo(centre_mm=(0.0, float("nan"), 0.0))
 
 

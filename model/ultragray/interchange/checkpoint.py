@@ -9,7 +9,6 @@ rest; the imported scene then answers poses in the tracker's own frame, in mm. T
 from __future__ import annotations
 
 import logging
-import math
 import pickle
 import re
 import warnings
@@ -21,6 +20,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..contract import checked_number, under
 from ..errors import CheckpointInvalid, InvalidArgument
 from ..files.poses import load_poses
 from ..probe import FloatArray
@@ -50,7 +50,8 @@ def import_checkpoint(
     the file and the reason; InvalidArgument for options that do not go together. The checkpoint is read with
     `weights_only=True`: it never runs code.
     """
-    given = [name for name, used in _placements(poses, center_mm, centered).items() if used]
+    placements = {"poses": poses is not None, "center_mm": center_mm is not None, "centered": centered}
+    given = [name for name, used in placements.items() if used]
     if len(given) != 1:
         raise InvalidArgument(
             "exactly one of poses (the training poses, from which the scene centre follows), center_mm (the "
@@ -79,10 +80,6 @@ def import_checkpoint(
         raise CheckpointInvalid(f"{checkpoint}: {error}") from error
 
 
-def _placements(poses: object, center_mm: object, centered: bool) -> dict[str, bool]:
-    return {"poses": poses is not None, "center_mm": center_mm is not None, "centered": centered}
-
-
 def _image_size(released: ReleasedConfig, image_height: int | None) -> tuple[int, int | None]:
     """Height and, where it is known, width of the training images."""
     if image_height is None and released.image_height is not None:
@@ -95,10 +92,8 @@ def _image_size(released: ReleasedConfig, image_height: int | None) -> tuple[int
                 field="image_height",
             )
         return released.images.height, released.images.width
-    if isinstance(image_height, bool) or not isinstance(image_height, int) or image_height < 2:
-        raise InvalidArgument(
-            f"image_height must be an integer of at least 2, got {image_height!r}", field="image_height"
-        )
+    with under("image_height"):
+        checked_number(image_height, int, low=2)
     same = released.images is not None and released.images.height == image_height
     return image_height, released.images.width if released.images is not None and same else None
 
@@ -124,16 +119,13 @@ def _centre_mm(
 ) -> Vector:
     """The origin of the released scene in the tracker's frame: the mean training image corner (§6)."""
     if training_poses is not None:
-        x, y, z = released_centre_mm(released.released_probe, training_poses).tolist()
-        return (x, y, z)
+        return tuple(released_centre_mm(released.released_probe, training_poses).tolist())
     if center_mm is None:
         return (0.0, 0.0, 0.0)
     try:
-        x, y, z = (float(value) for value in center_mm)
+        x, y, z = (checked_number(value, float) for value in center_mm)
     except (TypeError, ValueError):
-        raise InvalidArgument(f"center_mm must be three numbers, got {center_mm!r}", field="center_mm") from None
-    if not all(map(math.isfinite, (x, y, z))):
-        raise InvalidArgument(f"center_mm must be finite, got {center_mm!r}", field="center_mm")
+        raise InvalidArgument(f"center_mm must be three finite numbers, got {center_mm!r}", field="center_mm") from None
     return (x, y, z)
 
 

@@ -13,10 +13,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
+from ..contract import checked_number
 from ..datasets.images import frame_size
-from ..errors import CheckpointInvalid, InvalidProbe
+from ..errors import CheckpointInvalid, InvalidArgument, InvalidProbe
 from ..files.npy import map_npy
 from ..probe import ConvexProbe, FloatArray, LinearProbe, PhasedProbe, Probe
 
@@ -110,7 +109,7 @@ def probe_keys(released_probe: Probe) -> dict[str, float | str]:
 
 
 def _read_probe(path: Path, document: Mapping[str, Any]) -> Probe:
-    sizes = {key: size for key in (WIDTH_KEY, ANGLE_KEY) if (size := _optional_number(path, document, key)) is not None}
+    sizes = {key: _number(path, document, key) for key in (WIDTH_KEY, ANGLE_KEY) if document.get(key) is not None}
     if len(sizes) != 1:
         raise CheckpointInvalid(
             f"{path}: it must have exactly one of {WIDTH_KEY} (linear, cm) and "
@@ -153,8 +152,8 @@ def read_released_config(path: str | Path) -> ReleasedConfig:
         files=files,
         images=images,
         images_missing=images_missing,
-        image_height=_optional_count(path, document, "image_height", at_least=2),
-        image_width=_optional_count(path, document, "image_width", at_least=1),
+        image_height=_count(path, document, "image_height", at_least=2),
+        image_width=_count(path, document, "image_width", at_least=1),
     )
 
 
@@ -174,27 +173,20 @@ def _read_object(path: Path) -> Mapping[str, Any]:
     return document
 
 
-def _optional_number(path: Path, document: Mapping[str, Any], key: str) -> float | None:
-    return None if document.get(key) is None else _number(path, document, key)
-
-
 def _number(path: Path, document: Mapping[str, Any], key: str) -> float:
-    value = document.get(key)
-    if value is None:
+    if document.get(key) is None:
         raise CheckpointInvalid(f"{path}: it lacks {key}")
     try:
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(float(value)):
-            raise ValueError
-        return float(value)
-    except (ValueError, OverflowError):
-        raise CheckpointInvalid(f"{path}: {key} must be a finite number, got {repr(value)[:40]}") from None
+        return checked_number(document[key], float)
+    except InvalidArgument as error:
+        raise CheckpointInvalid(f"{path}: {key} {error}") from None
 
 
-def _optional_count(path: Path, document: Mapping[str, Any], key: str, *, at_least: int) -> int | None:
-    value = document.get(key)
-    if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < at_least):
-        raise CheckpointInvalid(f"{path}: {key} must be an integer of at least {at_least}, got {repr(value)[:40]}")
-    return value
+def _count(path: Path, document: Mapping[str, Any], key: str, *, at_least: int) -> int | None:
+    try:
+        return None if document.get(key) is None else int(checked_number(document[key], int, low=at_least))
+    except InvalidArgument as error:
+        raise CheckpointInvalid(f"{path}: {key} {error}") from None
 
 
 def _named_files(path: Path, document: Mapping[str, Any]) -> dict[str, str]:
