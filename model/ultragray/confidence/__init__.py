@@ -1,7 +1,6 @@
 """The extrapolation of a frame from what its scene was trained on, and the confidence in it."""
 
-from .assess import SUPPORT_COVERAGE, Assessor, Extrapolation, supported
-from .figures import FIGURES, figure_arrays
+from .assess import FIGURES, SUPPORT_COVERAGE, Assessor, Extrapolation, figure_arrays, supported
 from .limit import is_confident, low_confidence, require_confidence
 from .model import ConfidenceModel
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 from typing import Any, Protocol
 
 import numpy as np
@@ -30,8 +31,16 @@ class Extrapolation:
     supported_share: float | None = described("Share of the pixels that Gaussians support: coverage of at least 0.3.")
 
 
+FIGURES = tuple(figure.name for figure in fields(Extrapolation))
+
+
+def figure_arrays(extrapolations: Sequence[Extrapolation]) -> dict[str, npt.NDArray[np.float32]]:
+    """Each of FIGURES as [C], NaN where it is not known."""
+    return {name: np.array([getattr(one, name) for one in extrapolations], dtype=np.float32) for name in FIGURES}
+
+
 class Trained(Protocol):
-    """What a scene's description tells of its training; `ultragray.SceneInfo` does."""
+    """A description of a scene that tells of its training, such as `ultragray.SceneInfo`."""
 
     @property
     def probe(self) -> Probe | None: ...

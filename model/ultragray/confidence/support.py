@@ -30,11 +30,10 @@ class SupportWatch:
             return None
         return torch.tensor(masked, device=coverage.device)[:, None, None] & (coverage < SUPPORT_COVERAGE)
 
-    def told(self, extrapolations: Sequence[Extrapolation], first: int = 0) -> tuple[Extrapolation, ...]:
-        """Those of the poses from `first` on, with their shares; waits for a GPU to have rendered them."""
+    def with_shares(self, extrapolations: Sequence[Extrapolation], first: int = 0) -> tuple[Extrapolation, ...]:
+        """The extrapolations of the poses from `first` on, with their shares; waits for a GPU to have rendered them."""
         shares = torch.cat(self._shares)[first : first + len(extrapolations)].tolist()
-        told = zip(extrapolations, shares, strict=True)
-        return tuple(replace(one, supported_share=share) for one, share in told)
+        return tuple(replace(one, supported_share=share) for one, share in zip(extrapolations, shares, strict=True))
 
 
 def _supported_shares(coverage: Tensor) -> Tensor:  # [C, H, W] -> [C]

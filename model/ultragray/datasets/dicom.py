@@ -64,7 +64,7 @@ def read_dicom_sweep(path: Path, *, frames: str | None = None, crop: str | None 
 
 @contextmanager
 def _in_our_words(where: Path | str) -> Iterator[None]:
-    """Whatever pydicom raises about a file is DatasetInvalid; what it warns of is left out."""
+    """Turns every error of pydicom about a file into DatasetInvalid, and leaves its warnings out."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")

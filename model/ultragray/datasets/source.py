@@ -1,6 +1,6 @@
 """load_dataset: every format of tracked sweeps behind one call, and the registry of the formats.
 
-Readers are imported when they are needed, so that help texts and uploads can be told what there is without them.
+Readers are imported when they are needed, so that help texts and uploads can list the formats without them.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ PHANTOM = "phantom"
 
 @dataclass(frozen=True)
 class SourceOptions(Contract):
-    """How a source is read. None leaves the choice to the source."""
+    """Options of reading a source. None leaves the choice to the source."""
 
     train_frames: str | None = described(
         "Frames to train from, such as 0:90 or 0:90,100:120:2: places in the training file, or in the sequence.", None

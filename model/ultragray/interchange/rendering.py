@@ -67,7 +67,7 @@ def render_to_file(
             blackened = watch.look(frames.coverage)
             asked = {name: getattr(frames, name) for name in settings.outputs}
             shown = show(asked, settings.probe, settings.display, blackened)
-            found.extend(watch.told(extrapolations[places]))
+            found.extend(watch.with_shares(extrapolations[places]))
             add({name: pixels.cpu().numpy() for name, pixels in shown.items()}, found[first:])
         if before_portion is not None:
             before_portion(len(poses))

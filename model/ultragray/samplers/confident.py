@@ -41,7 +41,7 @@ def assessed_poses(
 def confident_poses(
     sampler: Sampler, base: Any, probe: Probe, assess: Assess, min_confidence: float
 ) -> tuple[FloatArray, list[Extrapolation]]:  # base [P, 4, 4] -> [C, 4, 4] mm, [C]
-    """Those poses of a sampler that have at least `min_confidence`, and what `assess` tells of each.
+    """Those poses of a sampler that have at least `min_confidence`, and what `assess` finds about each.
 
     A random sampler draws on until it has its `count`, at most 20 poses for each of them (at least 1000): the same
     arguments give the same poses, and where all of its first poses will do, they are these. The others leave out what
@@ -52,9 +52,9 @@ def confident_poses(
         return _drawn_on(sampler, base, probe, assess, min_confidence)
     poses = sampler.poses(base, probe)
     extrapolations = list(assess(poses))
-    kept = [place for place, told in enumerate(extrapolations) if is_confident(told, min_confidence)]
+    kept = [place for place, one in enumerate(extrapolations) if is_confident(one, min_confidence)]
     if not kept:
-        best = max(told.confidence or 0.0 for told in extrapolations)
+        best = max(one.confidence or 0.0 for one in extrapolations)
         raise LowConfidence(
             f"sampler {sampler.kind} makes {len(poses):,} poses, none with a confidence of at least "
             f"{min_confidence:g}: the best has {best:.2f}",
@@ -72,10 +72,10 @@ def _drawn_on(
     drawn, rounds, draw = 0, 0, sampler
     while True:
         made = draw.poses(base, probe)
-        for pose, told in zip(made, assess(made), strict=True):
-            if is_confident(told, min_confidence):
+        for pose, extrapolation in zip(made, assess(made), strict=True):
+            if is_confident(extrapolation, min_confidence):
                 poses.append(pose)
-                extrapolations.append(told)
+                extrapolations.append(extrapolation)
         drawn, rounds, found = drawn + len(made), rounds + 1, len(poses)
         if found >= count:
             return np.stack(poses[:count]), extrapolations[:count]

@@ -1,1 +1,1 @@
-"""How far a trained scene can be trusted: frames held out, places that are hard, the fit."""
+"""The fit of a trained scene's confidence: the frames held out for it, and the places that are hard."""

@@ -1,1 +1,1 @@
-"""What training takes from a dataset: its geometry, the first Gaussians, batches."""
+"""The data of a training: the geometry of its dataset, the first Gaussians, batches."""

@@ -1,4 +1,4 @@
-"""When what happens in a run: learning rates, harmonics, refinements. Fractions of the config become steps here."""
+"""The schedule of a run: learning rates, harmonics, refinements. Fractions of the config become steps here."""
 
 from __future__ import annotations
 

@@ -163,7 +163,7 @@ class _Worker:
         begin = 0
         for part, memory in zip(task.parts, memories, strict=True):
             end = begin + len(part.poses)
-            assessed = partial(support.told, extrapolations[begin:end], begin)
+            assessed = partial(support.with_shares, extrapolations[begin:end], begin)
             yield _write_part(task.scene, part, frames, begin, memory, rendered, assessed)
             begin = end
 
