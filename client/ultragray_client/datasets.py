@@ -1,14 +1,13 @@
-"""Datasets from and to messages."""
+"""The messages of an upload."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
 
-from ultragray_proto.codec import from_message
 from ultragray_proto.v1 import datasets_pb2
 
-from .contract import Dataset, DatasetOptions
+from .contract import DatasetOptions
 from .errors import InvalidArgument
 from .messages import message_of
 
@@ -40,9 +39,3 @@ class Upload:
             with path.open("rb") as file:
                 while chunk := file.read(_CHUNK_BYTES):
                     yield request(chunk=chunk)
-
-
-def dataset_from_message(message: datasets_pb2.Dataset) -> Dataset:
-    """A dataset as the service tells it."""
-    dataset: Dataset = from_message(message, Dataset)
-    return dataset

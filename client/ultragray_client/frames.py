@@ -131,7 +131,7 @@ def frame_from_message(message: rendering_pb2.Frame, *, sequence: int = 0, dropp
     pixels = np.frombuffer(message.data, dtype).reshape(-1, message.height, message.width)
     names = [_OUTPUTS[number] for number in message.outputs]
     sent_ns = message.client_time_ns if message.HasField("client_time_ns") else None
-    frame: Frame = from_message(
+    return from_message(
         message,
         Frame,
         arrays=MappingProxyType(dict(zip(names, pixels, strict=True))),
@@ -139,4 +139,3 @@ def frame_from_message(message: rendering_pb2.Frame, *, sequence: int = 0, dropp
         dropped=dropped,
         latency_ms=None if sent_ns is None else (time.monotonic_ns() - sent_ns) / 1e6,
     )
-    return frame

@@ -149,5 +149,4 @@ def job_from_message(message: jobs_pb2.Job) -> Job:
     cls = _KINDS[kind]
     others = {"poses": None} if hasattr(cls, "poses") else {}
     specification = from_message(getattr(message, kind), cls, **others)
-    job: Job = from_message(message, Job, specification=specification, pose_count=message.render.pose_count)
-    return job
+    return from_message(message, Job, specification=specification, pose_count=message.render.pose_count)

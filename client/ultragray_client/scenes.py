@@ -64,15 +64,14 @@ class Scene:
 
 def entry_from_message(message: scenes_pb2.SceneEntry) -> SceneEntry:
     """A scene of the list."""
-    entry: SceneEntry = from_message(message, SceneEntry, error=message.error.detail or None)
-    return entry
+    return from_message(message, SceneEntry, error=message.error.detail or None)
 
 
 def scene_from_message(message: scenes_pb2.Scene) -> Scene:
     """All that is told of a scene; of its training poses only where there are any."""
     training = message.training_poses
     known = from_message(training, _TrainingPoses) if training.count else None
-    scene: Scene = from_message(
+    return from_message(
         message,
         Scene,
         training_pose_count=training.count,
@@ -80,7 +79,6 @@ def scene_from_message(message: scenes_pb2.Scene) -> Scene:
         training_position_max_mm=known and known.position_max_mm,
         training_poses=(known.first, known.middle, known.last) if known else (),
     )
-    return scene
 
 
 @dataclass(frozen=True)

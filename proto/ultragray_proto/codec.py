@@ -72,12 +72,14 @@ def to_message(value: Any, cls: type[_M], **others: Any) -> _M:
     return cls(**_told(value, descriptor, frozenset(others)), **others)
 
 
-def from_message(message: Any, cls: Any, **others: Any) -> Any:
+def from_message(message: Any, cls: type[_M], **others: Any) -> _M:
     """The dataclass, or the member of a family, that a message tells. `others` are attributes that are known otherwise.
 
     Raises MessageInvalid.
     """
-    return _reader(message.DESCRIPTOR, cls, frozenset(others))(message, **others)
+    annotation: Any = cls
+    value: _M = _reader(message.DESCRIPTOR, annotation, frozenset(others))(message, **others)
+    return value
 
 
 @cache

@@ -47,7 +47,8 @@ class EmbeddedWorker:
     async def stop(self) -> None:
         """Ends the worker, which puts the job at hand back into the queue."""
         self._stop.set()
-        self._terminate()
+        if self._process is not None and self._process.poll() is None:
+            self._process.terminate()
         if self._task is None:
             return
         try:
@@ -71,10 +72,6 @@ class EmbeddedWorker:
             with contextlib.suppress(asyncio.TimeoutError):
                 await asyncio.wait_for(self._stop.wait(), wait_s)
             wait_s = min(2.0 * wait_s, _LONGEST_WAIT_S)
-
-    def _terminate(self) -> None:
-        if self._process is not None and self._process.poll() is None:
-            self._process.terminate()
 
     def _spawn(self) -> subprocess.Popen[bytes]:
         values = {name: getattr(self._settings, name) for name in _PASSED_ON}

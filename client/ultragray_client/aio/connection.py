@@ -8,7 +8,7 @@ from contextlib import asynccontextmanager
 from functools import partial
 from typing import Any, TypeAlias, TypeVar
 
-from ..calls.connection import PAGE_SIZE, Conversation, call_metadata, check_timeout
+from ..calls.connection import PAGE_SIZE, Conversation, check_timeout
 from ..calls.pose_exchange import PoseExchange
 from ..calls.retries import Retries
 from ..calls.statuses import client_errors
@@ -25,7 +25,7 @@ class AsyncConnection:
     def __init__(self, address: str, api_key: str | None, timeout_s: float) -> None:
         self.address = address
         self._timeout_s = check_timeout(timeout_s)
-        self._metadata = call_metadata(api_key)
+        self._metadata = () if api_key is None else (("x-api-key", api_key),)
         self.channel = open_channel(address)
 
     async def close(self) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import AsyncIterator
-from types import TracebackType
 
 from ..calls.pose_exchange import PoseExchange
 from ..calls.statuses import client_errors
@@ -59,7 +58,5 @@ class AsyncFrameStream:
     async def __aenter__(self) -> AsyncFrameStream:
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         await self._call.close()

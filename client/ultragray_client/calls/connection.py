@@ -42,11 +42,6 @@ class Conversation(ABC, Generic[T]):
         return retries.pause_s(error)
 
 
-def call_metadata(api_key: str | None) -> tuple[tuple[str, str], ...]:
-    """The metadata of every call."""
-    return () if api_key is None else (("x-api-key", api_key),)
-
-
 def check_timeout(timeout_s: float) -> float:
     """Raises InvalidArgument unless above 0."""
     if not timeout_s > 0.0:

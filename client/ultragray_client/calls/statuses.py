@@ -33,7 +33,7 @@ def client_errors(address: str) -> Iterator[None]:
 def error_of_call(error: grpc.RpcError, address: str) -> ClientError:
     """The error of a failed call, from its ErrorInfo and RetryInfo, else from its status."""
     status, sentence = error.code().name, error.details() or ""
-    reason, field, retry_after_s = _told(dict(error.trailing_metadata() or ()).get(_DETAILS_KEY, b""))
+    reason, field, retry_after_s = _details(dict(error.trailing_metadata() or ()).get(_DETAILS_KEY, b""))
     if reason is None and status == "UNAVAILABLE":
         return Unreachable(f"no service answers at {address} ({sentence})")
     cls = _BY_REASON.get(reason or status) or _BY_STATUS.get(status, ClientError)
@@ -46,7 +46,7 @@ def error_of_frame(error: scenes_pb2.Error, sequence: int) -> ClientError:
     return cls(error.detail, reason=error.reason, field=error.field or None, sequence=sequence)
 
 
-def _told(status: bytes) -> tuple[str | None, str | None, float | None]:
+def _details(status: bytes) -> tuple[str | None, str | None, float | None]:
     """Reason, field and delay in seconds of a google.rpc.Status, whose messages protobuf does not come with."""
     reason = field = retry_after_s = None
     for packed in _values(status, 3):

@@ -7,10 +7,11 @@ from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
+from ultragray_proto.codec import from_message
 from ultragray_proto.v1 import datasets_pb2, datasets_pb2_grpc
 
 from ..contract import Dataset, DatasetOptions
-from ..datasets import Upload, dataset_from_message
+from ..datasets import Upload
 from .connection import Connection
 from .transport import run_blocking
 
@@ -32,18 +33,18 @@ class Datasets:
         """
         messages = partial(_read, Upload(name, path, options or DatasetOptions()))
         answer = self._connection.upload(self._calls.UploadDataset, messages, timeout_s)
-        return dataset_from_message(answer.dataset)
+        return from_message(answer.dataset, Dataset)
 
     def list(self, *, timeout_s: float | None = None) -> tuple[Dataset, ...]:
         """All datasets by name."""
         request = datasets_pb2.ListDatasetsRequest()
         datasets = self._connection.listed(self._calls.ListDatasets, request, "datasets", timeout_s)
-        return tuple(map(dataset_from_message, datasets))
+        return tuple(from_message(dataset, Dataset) for dataset in datasets)
 
     def get(self, name: str, *, timeout_s: float | None = None) -> Dataset:
         """One dataset."""
         request = datasets_pb2.GetDatasetRequest(dataset=name)
-        return dataset_from_message(self._connection.answer(self._calls.GetDataset, request, timeout_s))
+        return from_message(self._connection.answer(self._calls.GetDataset, request, timeout_s), Dataset)
 
     def contact_sheet(self, name: str, *, timeout_s: float | None = None) -> bytes:
         """A PNG of the image planes in space and of some frames."""

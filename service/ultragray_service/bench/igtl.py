@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import socket
-from types import TracebackType
 
 from ultragray.probe import FloatArray
 from ultragray_workers.errors import NotReady
@@ -26,9 +25,7 @@ class PingPong:
     def __enter__(self) -> PingPong:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._file.close()
         self._socket.close()
 

@@ -134,20 +134,9 @@ def pack_image(image: Image) -> bytes:
     vectors = image.matrix[:3].copy()
     vectors[:, 3] += vectors[:, :2] @ ((columns - 1) / 2, (rows - 1) / 2)
     size = (columns, rows, 1)
-    header = _IMAGE.pack(
-        _IMAGE_VERSION,
-        _SCALAR,
-        _UINT8,
-        _LITTLE_ENDIAN,
-        _RAS,
-        *size,
-        vectors.T.astype(">f4").tobytes(),
-        0,
-        0,
-        0,
-        *size,
-    )
-    return header + image.pixels.tobytes()
+    kind = (_IMAGE_VERSION, _SCALAR, _UINT8, _LITTLE_ENDIAN, _RAS)
+    part = (0, 0, 0, *size)  # the whole image
+    return _IMAGE.pack(*kind, *size, vectors.T.astype(">f4").tobytes(), *part) + image.pixels.tobytes()
 
 
 def unpack_status(content: bytes) -> Status:

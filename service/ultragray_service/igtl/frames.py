@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
 
+import numpy as np
+
 from ultragray.display.settings import true_to_scale
 from ultragray.settings import Encoding, FrameSettings
 from ultragray_workers.pool.types import RenderRequest, RenderResult
@@ -11,9 +13,10 @@ from ultragray_workers.pool.types import RenderRequest, RenderResult
 from ..core.state import Service
 from .contents import Image, Tool, pack_image, pack_position, pack_tools, pack_transform
 from .messages import Message
-from .pictures import image_of
 from .routes import SceneChooser, image_name
 from .waiting import PoseMessage, Underway
+
+_SLICE_MM = 1.0  # nominal thickness: an image of one slice has none
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,3 +80,17 @@ class FrameMaker:
         )
         result = await self._service.render(asked, underway.turn)
         return Frame(underway.posed, result, image_of(result))
+
+
+def image_of(result: RenderResult) -> Image:
+    """The frame of a result of one pose, uint8 and B-mode with pixels in mm, as an image in the frame of its pose.
+
+    i runs along lateral x, j along depth z, k against elevation y, so that i, j, k is right-handed.
+    """
+    picture = result.settings.picture
+    in_probe = np.zeros((4, 4))  # pixel→probe
+    in_probe[0, 0], in_probe[2, 1] = picture.step
+    in_probe[1, 2] = -_SLICE_MM
+    in_probe[:, 3] = (picture.first[0], 0.0, picture.first[1], 1.0)
+    pixels = np.frombuffer(result.data, np.uint8).reshape(picture.height, picture.width)
+    return Image(pixels, result.poses[0] @ in_probe)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, ProcessCollector, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
@@ -16,27 +17,8 @@ from ultragray_workers.pool.types import RenderResult
 from ..errors import statuses_of
 from .statistics import Statistics
 
-_SECONDS = (
-    0.0005,
-    0.001,
-    0.002,
-    0.004,
-    0.006,
-    0.008,
-    0.012,
-    0.016,
-    0.024,
-    0.032,
-    0.064,
-    0.125,
-    0.25,
-    0.5,
-    1,
-    2,
-    5,
-    10,
-    30,
-)
+_MILLISECONDS = (0.5, 1, 2, 4, 6, 8, 12, 16, 24, 32, 64, 125, 250, 500, 1000, 2000, 5000, 10_000, 30_000)
+_SECONDS = tuple(ms / 1000 for ms in _MILLISECONDS)
 _OVERLOADED = ("429", "RESOURCE_EXHAUSTED", "UNAVAILABLE", "DEADLINE_EXCEEDED", "INTERNAL")
 _HEALTH_ROUTES = "/v1/health/"  # not ready is what they are asked for
 _POSES = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1024)
@@ -54,20 +36,13 @@ class _PoolCollector(Collector):
         self._pool = pool
 
     def collect(self) -> Iterator[Metric]:
-        statistics = self._pool.statistics()
-        yield GaugeMetricFamily("ultragray_waiting_frames", "Frames that wait.", value=statistics.waiting_frames)
-        yield GaugeMetricFamily("ultragray_busy_processes", "Processes that render now.", value=statistics.busy)
-        yield GaugeMetricFamily(
-            "ultragray_processes_alive", "Render processes alive.", value=statistics.processes_alive
-        )
-        yield CounterMetricFamily(
-            "ultragray_process_restarts",
-            "Render processes replaced after they died.",
-            value=statistics.restarts_total,
-        )
-        yield GaugeMetricFamily(
-            "ultragray_loaded_scenes", "Scenes that a process holds.", value=len(self._pool.loaded())
-        )
+        now = self._pool.statistics()
+        yield GaugeMetricFamily("ultragray_waiting_frames", "Frames that wait.", now.waiting_frames)
+        yield GaugeMetricFamily("ultragray_busy_processes", "Processes that render now.", now.busy)
+        yield GaugeMetricFamily("ultragray_processes_alive", "Render processes alive.", now.processes_alive)
+        restarts = "Render processes replaced after they died."
+        yield CounterMetricFamily("ultragray_process_restarts", restarts, now.restarts_total)
+        yield GaugeMetricFamily("ultragray_loaded_scenes", "Scenes that a process holds.", len(self._pool.loaded()))
 
 
 class _JobsCollector(Collector):
@@ -89,44 +64,34 @@ class Metrics:
     def __init__(self, pool: RenderPool, jobs: Callable[[], Mapping[JobState, int]]) -> None:
         self.registry = CollectorRegistry()
         self.statistics = Statistics()
-        self._requests = Counter(
+        counter = partial(Counter, registry=self.registry)
+        histogram = partial(Histogram, registry=self.registry)
+        seconds = partial(histogram, buckets=_SECONDS)
+        self._requests = counter(
             "ultragray_requests",
             "Requests answered; a stream counts once, at its end.",
             ["door", "route", "status"],
-            registry=self.registry,
         )
-        self._request_seconds = Histogram(
+        self._request_seconds = seconds(
             "ultragray_request_seconds",
             "From the arrival of a request to the end of its answer.",
             ["door", "route"],
-            buckets=_SECONDS,
-            registry=self.registry,
         )
-        self._frame_errors = Counter(
-            "ultragray_stream_frame_errors",
-            "Messages of a stream that were answered with an error.",
-            ["reason"],
-            registry=self.registry,
+        self._frame_errors = counter(
+            "ultragray_stream_frame_errors", "Messages of a stream that were answered with an error.", ["reason"]
         )
         self._streams = Gauge("ultragray_open_streams", "Streams of poses that are open.", registry=self.registry)
-        self._dropped = Counter(
-            "ultragray_stream_dropped_poses",
-            "Poses of streams that newer ones replaced before they were rendered.",
-            registry=self.registry,
+        self._dropped = counter(
+            "ultragray_stream_dropped_poses", "Poses of streams that newer ones replaced before they were rendered."
         )
-        self._frames = Counter("ultragray_frames", "Frames rendered.", registry=self.registry)
-        self._queue = self._histogram("queue", "Waiting time of a request before it was rendered.")
-        self._render = self._histogram("render", "Render time of the batch that a request was in.")
-        self._encode = self._histogram("encode", "Encoding time of a request's frames.")
-        self._batch = Histogram(
-            "ultragray_batch_poses", "Poses rendered together.", buckets=_POSES, registry=self.registry
-        )
+        self._frames = counter("ultragray_frames", "Frames rendered.")
+        self._queue = seconds("ultragray_queue_seconds", "Waiting time of a request before it was rendered.")
+        self._render = seconds("ultragray_render_seconds", "Render time of the batch that a request was in.")
+        self._encode = seconds("ultragray_encode_seconds", "Encoding time of a request's frames.")
+        self._batch = histogram("ultragray_batch_poses", "Poses rendered together.", buckets=_POSES)
         self.registry.register(_PoolCollector(pool))
         self.registry.register(_JobsCollector(jobs))
         ProcessCollector(registry=self.registry)
-
-    def _histogram(self, stage: str, documentation: str) -> Histogram:
-        return Histogram(f"ultragray_{stage}_seconds", documentation, buckets=_SECONDS, registry=self.registry)
 
     def count_request(self, door: str, route: str, status: str, seconds: float) -> None:
         """One answered request of `door` http, websocket, grpc or igtl, whose errors are also frame errors."""

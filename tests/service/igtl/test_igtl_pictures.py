@@ -14,7 +14,7 @@ from ultragray.display.scan_conversion import scan_convert
 from ultragray.display.settings import true_to_scale
 from ultragray.probe import Probe
 from ultragray.settings import Resolved
-from ultragray_service.igtl.pictures import image_of
+from ultragray_service.igtl.frames import image_of
 from ultragray_workers.pool.types import RenderResult
 
 from .conftest import FAN, random_pose
