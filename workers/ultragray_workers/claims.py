@@ -84,12 +84,17 @@ def _is_abandoned(folder: Path) -> bool:
     return False
 
 
+def is_no_room(error: OSError) -> bool:
+    """Whether a disk, or the share of it that one may use, is full."""
+    return error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+
+
 @contextlib.contextmanager
 def storage_full(what: str) -> Iterator[None]:
     """Raise StorageFull where a disk has no room."""
     try:
         yield
     except OSError as error:
-        if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        if is_no_room(error):
             raise StorageFull(f"the artifact folder has no room for {what}") from error
         raise

@@ -6,6 +6,7 @@ import asyncio
 from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from ultragray_workers.errors import DatabaseUnavailable
@@ -153,11 +154,10 @@ class JobHub:
             over.end()
             return over
         if reader is None or reader.task.done():
-            reader = _Reader(lambda: self._get(job_id), self._log_path(job_id), self._threads)
+            reader = _Reader(partial(self._get, job_id), self._log_path(job_id), self._threads)
             self._readers[job_id] = reader
-        chosen = reader
-        watch = JobWatch(lambda leaving: self._remove(job_id, chosen, leaving))
-        chosen.add(watch)
+        watch = JobWatch(partial(self._remove, job_id, reader))
+        reader.add(watch)
         return watch
 
     def _remove(self, job_id: str, reader: _Reader, watch: JobWatch) -> None:
@@ -168,7 +168,7 @@ class JobHub:
                 del self._readers[job_id]
 
     def close(self) -> None:
-        """Ends every watcher: the service stops."""
+        """Ends every watcher, now and from now on: the service stops."""
         self._closed = True
         for reader in self._readers.values():
             reader.task.cancel()

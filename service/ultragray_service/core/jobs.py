@@ -23,7 +23,7 @@ from ultragray_workers.scenes import SceneStore
 
 from ..settings import Settings
 from .catalog import MAX_PAGE_SIZE, scene_to_blame
-from .job_hub import JobHub, JobWatch
+from .job_hub import JobHub
 
 COUNT_INTERVAL_S = 10.0
 _BESIDE_SPECIFICATION = ("request_id", "priority")
@@ -117,17 +117,9 @@ class Jobs:
         )
         return JobPage(jobs, token or "")
 
-    async def watch(self, job_id: str) -> JobWatch:
-        """A watcher of a job, to be closed. Raises JobNotFound."""
-        return await self.hub.watch(job_id)
-
     def uses_dataset(self, name: str) -> str | None:
         """The waiting or running job that needs a dataset; blocks. Raises NotReady before the start."""
         return self._store.uses_dataset(name)
-
-    def end_watches(self) -> None:
-        """Ends all watchers, now and from now on: the service stops."""
-        self.hub.close()
 
     async def close(self) -> None:
         """Closes the store."""

@@ -161,6 +161,6 @@ class Service:
         """From now on frames are refused with Draining; streams end after the frames they have in flight."""
         self.phase = Phase.DRAINING
         self.draining.set()
-        self.jobs.end_watches()
+        self.jobs.hub.close()
         for prepared in self._prepared:
             prepared.end()

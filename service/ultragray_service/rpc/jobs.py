@@ -100,7 +100,7 @@ class JobService:
         self, request: jobs_pb2.WatchJobRequest, context: grpc.aio.ServicerContext
     ) -> None:
         self._service.require_serving()
-        watch = await self._service.jobs.watch(request.job)
+        watch = await self._service.jobs.hub.watch(request.job)
         try:
             while (change := await watch.next(_LOOK_AROUND_S)) is not None:
                 if change.job is None and not change.log:

@@ -134,7 +134,7 @@ class JobFolder:
     @contextlib.contextmanager
     def new_artifacts(self) -> Iterator[Path]:
         """An empty folder for the artifacts, which becomes `artifacts` at the end; nothing where the body raises."""
-        self.remove_partial_artifacts()
+        shutil.rmtree(self._partial, ignore_errors=True)
         shutil.rmtree(self.artifacts, ignore_errors=True)  # of a process that died before it wrote its outcome
         self._partial.mkdir()
         try:
@@ -145,15 +145,11 @@ class JobFolder:
             self._partial.rename(self.artifacts)
             sync(self.path)
         finally:
-            self.remove_partial_artifacts()
-
-    def remove_partial_artifacts(self) -> None:
-        """Removes incomplete artifacts."""
-        shutil.rmtree(self._partial, ignore_errors=True)
+            shutil.rmtree(self._partial, ignore_errors=True)
 
     def remove_leftovers(self) -> None:
         """Removes the half written files of killed processes; no process may be at the job meanwhile."""
-        self.remove_partial_artifacts()
+        shutil.rmtree(self._partial, ignore_errors=True)
         with contextlib.suppress(OSError):
             self.reserve.unlink(missing_ok=True)
             for path in (self._request, self._progress, self._outcome):

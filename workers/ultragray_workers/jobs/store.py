@@ -80,7 +80,6 @@ class JobStore:
         *,
         request_id: str | None = None,
         priority: int = 0,
-        retry_of: str | None = None,
     ) -> tuple[Job, bool]:
         """The job, and whether it is new: the same `request_id` gives the same job, whatever became of it.
 
@@ -92,7 +91,7 @@ class JobStore:
                 f"priority must be an integer from {-MAX_PRIORITY} to {MAX_PRIORITY}, got {priority}", field="priority"
             )
         job_id = uuid.uuid4().hex[:24] if request_id is None else _id_of_request(request_id)
-        return self._submit(job_id, specification, request_id, priority, retry_of)
+        return self._submit(job_id, specification, request_id, priority, None)
 
     def _submit(
         self, job_id: str, specification: Specification, request_id: str | None, priority: int, retry_of: str | None

@@ -11,6 +11,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from .channel import Channel
@@ -81,34 +82,28 @@ class Launcher:
         process = start_template(far.fileno())
         far.close()
         template = _Template(process)
-        template.peer = Peer(near, self._on_hello(template), self._on_gone(template))
+        template.peer = Peer(near, partial(self._on_hello, template), partial(self._on_gone, template))
         self._templates.append(template)
         return template
 
     def _fork_template(self) -> None:
         template = _Template(None)
-        template.peer = self.launch(ForkTemplate(), self._on_hello(template), self._on_gone(template))
+        template.peer = self.launch(ForkTemplate(), partial(self._on_hello, template), partial(self._on_gone, template))
         self._templates.append(template)
 
-    def _on_hello(self, template: _Template) -> Callable[[Hello], None]:
-        def on_hello(hello: Hello) -> None:
-            template.ready = True
-            template.peer.pid = hello.pid
+    def _on_hello(self, template: _Template, hello: Hello) -> None:
+        template.ready = True
+        template.peer.pid = hello.pid
+        self._top_up()
+
+    def _on_gone(self, template: _Template) -> None:
+        self._templates.remove(template)
+        if template.process is not None:
+            reaping = asyncio.get_running_loop().run_in_executor(None, template.process.wait)
+            self._reaping.add(reaping)
+            reaping.add_done_callback(self._reaping.discard)
+        if template.ready:  # one that cannot even start is tried again only when a worker is wanted
             self._top_up()
-
-        return on_hello
-
-    def _on_gone(self, template: _Template) -> Callable[[], None]:
-        def on_gone() -> None:
-            self._templates.remove(template)
-            if template.process is not None:
-                reaping = asyncio.get_running_loop().run_in_executor(None, template.process.wait)
-                self._reaping.add(reaping)
-                reaping.add_done_callback(self._reaping.discard)
-            if template.ready:  # one that cannot even start is tried again only when a worker is wanted
-                self._top_up()
-
-        return on_gone
 
     def _top_up(self) -> None:
         if self._closing:

@@ -19,6 +19,7 @@ from ultragray.errors import InvalidArgument, RenderFailed
 
 from ..errors import Draining, NotReady
 from ..scenes import SceneStore
+from .channel import MAX_DESCRIPTORS
 from .dispatcher import Dispatcher, SceneChangedError
 from .launcher import Launcher
 from .memory import read_start
@@ -28,7 +29,7 @@ from .waiting import Expiry, Ticket, Turn, WaitingQueue
 
 logger = logging.getLogger(__name__)
 
-MAX_BATCH_POSES = 128  # file descriptors that go along with one message
+MAX_BATCH_POSES = MAX_DESCRIPTORS  # the memory of each part goes along with the task
 MAX_REPLY_BYTES = 2**31 - 2**20
 _MAX_SCENE_CHANGES = 3
 _READ_IN_THREAD_BYTES = 2**20

@@ -172,4 +172,4 @@ async def get_artifact(
 async def watch_job(service: ServiceDep, job: JobId) -> JobEvents:
     """Follows a job. A stream that ends before the final state (the service stopped) can be asked for again."""
     service.require_serving()
-    return JobEvents(await service.jobs.watch(job))
+    return JobEvents(await service.jobs.hub.watch(job))

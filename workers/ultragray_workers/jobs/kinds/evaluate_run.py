@@ -22,7 +22,7 @@ from ultragray.training.device import training_device
 from ...datasets.store import DatasetStore
 from ...scenes import SUFFIX
 from ..folder import Outcome, Progress
-from ..worker.device import chosen_device, device_alone
+from ..worker.device import device_for
 from ..worker.job_run import JobRun, Stopped
 from .evaluate import EvaluateJob
 
@@ -36,10 +36,8 @@ def run(job_run: JobRun, job: EvaluateJob) -> Outcome:
     Raises Stopped, DatasetNotFound, DatasetInvalid also for a dataset without held-out frames or of another kind of
     probe, SceneFileInvalid, InvalidImageSize.
     """
-    torch.set_num_threads(job_run.request.threads)
-    name = chosen_device("auto", job_run.request.device)
-    with device_alone(job_run, name):
-        return _evaluate_on(training_device(name, "auto"), job_run, job)
+    with device_for(job_run) as device:
+        return _evaluate_on(training_device(device, "auto"), job_run, job)
 
 
 def _evaluate_on(device: torch.device, job_run: JobRun, job: EvaluateJob) -> Outcome:

@@ -20,7 +20,7 @@ from ultragray.training.device import training_device
 
 from ...scenes import SUFFIX
 from ..folder import Outcome, Progress
-from ..worker.device import chosen_device, device_alone
+from ..worker.device import device_for
 from ..worker.job_run import JobRun, Stopped
 from .render import RenderJob
 
@@ -32,11 +32,8 @@ def run(job_run: JobRun, job: RenderJob) -> Outcome:
 
     Raises Stopped, InvalidArgument, LowConfidence, InvalidProbe, SceneFileInvalid, ExtraMissing.
     """
-    torch.set_num_threads(job_run.request.threads)
-    name = chosen_device("auto", job_run.request.device)
-    device = training_device(name, "auto")
-    with device_alone(job_run, name):
-        return _render_on(device, job_run, job)
+    with device_for(job_run) as device:
+        return _render_on(training_device(device, "auto"), job_run, job)
 
 
 def _render_on(device: torch.device, job_run: JobRun, job: RenderJob) -> Outcome:

@@ -28,7 +28,7 @@ from ultragray.training.trainer import CHECKPOINT_FILE, CONFIG_FILE, JOURNAL_FIL
 from ...datasets.store import DatasetStore
 from ...scenes import SUFFIX
 from ..folder import JobFolder, Outcome, Progress
-from ..worker.device import chosen_device, device_alone
+from ..worker.device import device_for
 from ..worker.job_run import JobRun, Stopped
 from .curve import draw_training_curve
 from .train import TrainJob
@@ -43,9 +43,7 @@ def run(job_run: JobRun, job: TrainJob) -> Outcome:
 
     Raises Stopped, DatasetNotFound, DatasetInvalid, InvalidArgument, and what `ultragray.training.train` raises.
     """
-    torch.set_num_threads(job_run.request.threads)
-    device = chosen_device(job.device, job_run.request.device)
-    with device_alone(job_run, device):
+    with device_for(job_run, job.device) as device:
         return _train_on(device, job_run, job)
 
 

@@ -20,12 +20,18 @@ LOCK_FOLDER = "workers"  # of the artifact folder, which several hosts may share
 _POLL_INTERVAL_S = 0.2
 
 
-def chosen_device(asked: str, workers: str) -> str:
-    """The device of a job: its own wish, else its worker's, else a GPU where there is one."""
-    device = workers if asked == "auto" else asked
+@contextmanager
+def device_for(job_run: JobRun, asked: str = "auto") -> Iterator[str]:
+    """The device of a job, held alone: its own wish, else its worker's, else a GPU where there is one.
+
+    Also sets the number of torch's threads. Raises Stopped where the job is to stop meanwhile.
+    """
+    torch.set_num_threads(job_run.request.threads)
+    device = job_run.request.device if asked == "auto" else asked
     if device == "auto":
-        return "cuda" if torch.cuda.is_available() else "cpu"
-    return device
+        device = "cuda" if torch.cuda.is_available() else "cpu"
+    with device_alone(job_run, device):
+        yield device
 
 
 @contextmanager

@@ -7,7 +7,6 @@ that fails is a process that ends well; SIGTERM ends it with exit code STOPPED a
 from __future__ import annotations
 
 import ctypes
-import errno
 import fcntl
 import os
 import signal
@@ -19,7 +18,7 @@ from pathlib import Path
 
 from ultragray.errors import InvalidArgument, MemoryExceeded, UltragrayError
 
-from ...errors import StorageFull
+from ...claims import storage_full
 from ..folder import JobFolder, Outcome
 from ..specification import from_dict
 from .job_run import JobRun, Stopped
@@ -61,32 +60,23 @@ def main(folder_path: str, worker_pid: str) -> int:
 
 def _outcome_of(job_run: JobRun) -> Outcome:
     try:
-        return replace(from_dict(job_run.request.specification).run(job_run), progress=job_run.progress)
+        with storage_full("what this job writes"):
+            outcome = from_dict(job_run.request.specification).run(job_run)
+        return replace(outcome, progress=job_run.progress)
     except Stopped:
         raise
     except UltragrayError as error:
         field = error.field if isinstance(error, InvalidArgument) else None
         given = f"{field}: " if field is not None and field not in error.detail else ""
         return _failed(job_run, error.reason, given + error.detail)
-    except OSError as error:
-        if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-            return _broken(job_run, error)
-        job_run.folder.remove_partial_artifacts()
-        return _failed(job_run, StorageFull.reason, "the artifact folder has no room for what this job writes")
-    except (MemoryError, RuntimeError) as error:
-        if isinstance(error, RuntimeError) and "allocate memory" not in str(error):
-            return _broken(job_run, error)
-        return _failed(job_run, MemoryExceeded.reason, "the memory of the machine did not suffice for this job")
     except Exception as error:
-        return _broken(job_run, error)
-
-
-def _broken(job_run: JobRun, error: Exception) -> Outcome:
-    traceback.print_exc()
-    message = " ".join(str(error).split()) or "no message"
-    return _failed(
-        job_run, "INTERNAL", f"the process of the job failed, see its log: {type(error).__name__}: {message}"
-    )
+        if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and "allocate memory" in str(error)):
+            return _failed(job_run, MemoryExceeded.reason, "the memory of the machine did not suffice for this job")
+        traceback.print_exc()
+        message = " ".join(str(error).split()) or "no message"
+        return _failed(
+            job_run, "INTERNAL", f"the process of the job failed, see its log: {type(error).__name__}: {message}"
+        )
 
 
 def _failed(job_run: JobRun, error: str, reason: str) -> Outcome:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import logging
 import os
 import signal
@@ -20,6 +19,7 @@ from dbos import WorkflowStatus
 
 from ultragray.errors import MemoryExceeded
 
+from ...claims import is_no_room
 from ...errors import DatabaseUnavailable, SceneExists, StorageFull
 from ..folder import JobFolder, Outcome, Request
 from ..publication import publish_scene, withdraw_scene
@@ -251,7 +251,7 @@ def _failure_of_process(code: int, times: int, of_memory: bool) -> Outcome:
 
 
 def _failure_of_storage(error: OSError) -> Outcome:
-    if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+    if is_no_room(error):
         return _storage_full()
     return Outcome(error="INTERNAL", reason=f"the folder of the job cannot be used: {error.strerror}")
 
