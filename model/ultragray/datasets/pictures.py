@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from ..display.scan_conversion import with_square_pixels
 from ..files.atomic import atomic_path
 from ..probe import FloatArray
-from .sweep import Dataset, Sweep
+from .sweep import Dataset, Sweep, spread_places
 
 TRAIN_COLOUR, VAL_COLOUR = "#1f77b4", "#d62728"
 MAX_PLANES = 16  # outlines of one part: more are a thicket; the path of the probe shows every frame
@@ -56,11 +56,8 @@ def _sheet_frames(dataset: Dataset) -> list[tuple[Sweep, int, str]]:
     train_count = min(len(dataset.train), MAX_SHEET_FRAMES - val_count)
     return [
         (sweep, int(frame), colour)
-        for sweep, count, colour in (
-            (dataset.train, train_count, TRAIN_COLOUR),
-            (dataset.val, val_count, VAL_COLOUR),
-        )
-        for frame in np.linspace(0, len(sweep) - 1, count).round()
+        for sweep, count, colour in ((dataset.train, train_count, TRAIN_COLOUR), (dataset.val, val_count, VAL_COLOUR))
+        for frame in spread_places(len(sweep), count)
     ]
 
 
@@ -78,10 +75,9 @@ def _draw_planes(axes: Any, dataset: Dataset, elevation_deg: float, azimuth_deg:
             continue
         faces = part_corners[:, : part_corners.shape[1] // 2].mean(axis=1)  # middle of the near edge
         axes.plot(*faces.T, ".", color=colour, markersize=dot_size)
-        count = min(len(part), MAX_PLANES)
-        thinned = part_corners[np.linspace(0, len(part) - 1, count).round().astype(np.intp)]
-        label = f"{name}: {count} of {len(part)} planes" if count < len(part) else f"{name}: every plane"
-        axes.plot(*_outlines(thinned).T, style, color=colour, linewidth=0.7, alpha=0.6, label=label)
+        thinned = part_corners[spread_places(len(part), MAX_PLANES)]
+        shown = f"{len(thinned)} of {len(part)} planes" if len(thinned) < len(part) else "every plane"
+        axes.plot(*_outlines(thinned).T, style, color=colour, linewidth=0.7, alpha=0.6, label=f"{name}: {shown}")
     for line in axes.legend(loc="upper left", fontsize=9).get_lines():
         line.set(alpha=1.0, linewidth=1.5)
     every = np.concatenate([part.reshape(-1, 3) for part in corners])

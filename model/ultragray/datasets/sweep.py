@@ -105,6 +105,11 @@ class Sweep:
         return corners + self.poses[:, None, :3, 3]
 
 
+def spread_places(count: int, most: int) -> IntArray:
+    """At most `most` of the places 0 … count − 1, evenly spread."""
+    return np.linspace(0, count - 1, min(count, most)).round().astype(np.int64)
+
+
 def corner_distances_mm(corners: FloatArray, others: FloatArray) -> FloatArray:  # [..., K, 3] both -> [...]
     """Distances between image planes: the mean over corresponding corners, mm; shapes broadcast."""
     distances: FloatArray = np.linalg.norm(corners - others, axis=-1).mean(axis=-1)

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from ..datasets.sweep import Sweep
+from ..datasets.sweep import Sweep, spread_places
 from ..display.scan_conversion import with_square_pixels
 from ..files.atomic import write_whole
 from ..scene import GaussianScene
@@ -49,7 +49,7 @@ def write_side_by_side(
 
 def write_spread(scene: GaussianScene, sweep: Sweep, evaluation: Evaluation, folder: str | Path, count: int) -> None:
     """As `write_side_by_side`, of at most `count` frames of an evaluated sweep, evenly spread."""
-    places = np.linspace(0, len(sweep) - 1, min(len(sweep), count)).round().astype(np.int64)
+    places = spread_places(len(sweep), count)
     write_side_by_side(scene, sweep.select(places), [evaluation.frames[place] for place in places], folder)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from ..datasets.sweep import Dataset
+from ..datasets.sweep import Dataset, spread_places
 from ..evaluation.baselines import predict
 from ..evaluation.compounding import VOXEL_MM
 from ..evaluation.metrics import FrameMetrics
@@ -198,9 +198,7 @@ def _telling_places(content: ReportContent) -> dict[int, str]:
 
 
 def _spread_places(content: ReportContent, most: int) -> dict[int, str]:
-    count = len(content.dataset.val)
-    places = np.linspace(0, count - 1, min(count, most)).round().astype(np.int64)
-    return dict.fromkeys(places.tolist(), "")
+    return dict.fromkeys(spread_places(len(content.dataset.val), most).tolist(), "")
 
 
 def _data_uri(picture: npt.NDArray[np.uint8]) -> str:

@@ -6,6 +6,7 @@ Gaussian that a frame touches, which nobody can foresee.
 
 from __future__ import annotations
 
+import math
 import os
 from pathlib import Path
 
@@ -14,11 +15,11 @@ import torch
 from ..datasets.sweep import Dataset
 from ..errors import MemoryExceeded
 from ..evaluation.scoring import CHUNK_PIXELS, frames_at_once
+from ..scene_info import expected_shapes
 from .config import TrainingConfig
 from .data.sampling import PREDICTED_PIXELS
 
 BASE_BYTES = 440 << 20  # the process with torch loaded, and the scratch memory of its kernels
-RAW_FLOATS = 3 + 3 + 4 + 1 + 1  # of a Gaussian, without the harmonics above degree 0
 COPIES = 16  # parameters, gradients, moments; what refinements, checkpoints and the kernel copy (measured: 14)
 STATISTICS = 2
 PIXEL_FLOATS = 25  # of a pixel of a batch: the outputs and what the backward pass keeps of them (measured: 17)
@@ -38,8 +39,6 @@ CONTROL_GROUPS = Path("/sys/fs/cgroup")
 def required_bytes(dataset: Dataset, config: TrainingConfig) -> int:
     """An upper bound of the process's memory, dataset included."""
     assert config.max_gaussians is not None
-    harmonics = (config.sh_degree + 1) ** 2 - 1
-    gaussians = 4 * config.max_gaussians * ((RAW_FLOATS + harmonics) * COPIES + STATISTICS)
     frames = min(config.batch_size, len(dataset.train))
     height, width = dataset.train.height, dataset.train.width
     stepping = 4 * PIXEL_FLOATS * frames * height * (width + PADDING)
@@ -48,20 +47,24 @@ def required_bytes(dataset: Dataset, config: TrainingConfig) -> int:
     slices = frames * -(-config.max_gaussians // LIST_GAUSSIANS) * LIST_BYTES  # as if all touched all planes
     copies = 3 if config.confidence else 2  # the dataset's, the trainer's and that of the frames it calibrates with
     images = copies * dataset.train.images.nbytes + dataset.val.images.nbytes
-    return BASE_BYTES + gaussians + slices + max(stepping, measuring, comparison_bytes(dataset)) + images
+    return BASE_BYTES + _gaussian_bytes(config) + slices + max(stepping, measuring, comparison_bytes(dataset)) + images
 
 
 def required_device_bytes(dataset: Dataset, config: TrainingConfig) -> int:
     """An upper bound of what a training takes of a GPU."""
     assert config.max_gaussians is not None
-    harmonics = (config.sh_degree + 1) ** 2 - 1
-    gaussians = 4 * config.max_gaussians * ((RAW_FLOATS + harmonics) * COPIES + STATISTICS)
     height, width = dataset.train.height, dataset.train.width
     per_frame = config.max_gaussians * CUDA_SLICE_BYTES + 4 * CUDA_PLANES * height * width
     frames = min(config.batch_size, len(dataset.train))
     stepping = frames * (per_frame + 4 * CUDA_LOSS_FLOATS * height * width)
     measuring = min(len(dataset.val), frames_at_once(height, width)) * per_frame
-    return CUDA_BASE_BYTES + gaussians + max(stepping, measuring) + dataset.train.images.nbytes
+    return CUDA_BASE_BYTES + _gaussian_bytes(config) + max(stepping, measuring) + dataset.train.images.nbytes
+
+
+def _gaussian_bytes(config: TrainingConfig) -> int:
+    assert config.max_gaussians is not None
+    floats = sum(math.prod(shape) for shape in expected_shapes(1, config.sh_degree).values())
+    return 4 * config.max_gaussians * (floats * COPIES + STATISTICS)
 
 
 def comparison_bytes(dataset: Dataset) -> int:

@@ -12,12 +12,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from ..backends import cuda
-from ..datasets.sweep import Dataset
+from ..datasets.sweep import Dataset, spread_places
 from ..errors import DatasetInvalid, MemoryExceeded, TrainingDiverged, TrainingStateInvalid
 from ..evaluation.scoring import evaluate
 from ..files.atomic import remove_stale_temporaries, write_whole
@@ -376,9 +375,7 @@ class Trainer:
 
     def _validate(self) -> float:
         """Mean PSNR over some of the held-out frames, dB."""
-        count = len(self.dataset.val)
-        chosen = np.linspace(0, count - 1, min(count, VALIDATION_FRAMES)).round().astype(np.int64)
-        val = self.dataset.val.select(chosen)
+        val = self.dataset.val.select(spread_places(len(self.dataset.val), VALIDATION_FRAMES))
         truth = torch.tensor(val.images, device=self._device).float().div_(255.0)
         with torch.no_grad():
             rendered = self._rendered(val.poses, self._schedule.sh_degree(self.step))

@@ -11,7 +11,7 @@ import numpy as np
 
 from ...confidence.model import ConfidenceModel, fit_weights, predicted, terms_of
 from ...confidence.views import TrainingViews
-from ...datasets.sweep import Dataset, IntArray, Sweep
+from ...datasets.sweep import Dataset, Sweep, spread_places
 from ...evaluation.scoring import evaluate, evaluate_frames
 from ...scene import GaussianScene
 from ..config import TrainingConfig
@@ -53,14 +53,10 @@ def fit_confidence(dataset: Dataset, train_shorter: TrainShorter, *, backend: st
     scene = train_shorter(part)
     if scene is None:
         return None
-    seen = sweep.select(_some(kept, MEASURED_FRAMES // 3))
-    unseen = sweep.select(_some(held_out, MEASURED_FRAMES))
+    seen = sweep.select(kept[spread_places(len(kept), MEASURED_FRAMES // 3)])
+    unseen = sweep.select(held_out[spread_places(len(held_out), MEASURED_FRAMES)])
     ms_ssim = np.array(
-        [
-            frame.ms_ssim
-            for part_of_it in (unseen, seen)
-            for frame in evaluate(scene, part_of_it, backend=backend).frames
-        ]
+        [frame.ms_ssim for some in (unseen, seen) for frame in evaluate(scene, some, backend=backend).frames]
     )
     poses = np.concatenate([unseen.poses, seen.poses])
     views = TrainingViews(part.train.poses, sweep.probe)
@@ -77,13 +73,7 @@ def fit_confidence(dataset: Dataset, train_shorter: TrainShorter, *, backend: st
     )
 
 
-def _some(places: IntArray, count: int) -> IntArray:
-    """At most `count` of them, evenly."""
-    chosen: IntArray = places[np.unique(np.linspace(0, len(places) - 1, count).round().astype(np.int64))]
-    return chosen
-
-
 def _black_ms_ssim(sweep: Sweep) -> float:
     """The mean score of a black frame against the training frames."""
-    some = sweep.select(_some(np.arange(len(sweep)), BLACK_FRAMES))
+    some = sweep.select(spread_places(len(sweep), BLACK_FRAMES))
     return evaluate_frames(np.zeros(some.images.shape, np.float32), some).mean.ms_ssim

@@ -10,7 +10,7 @@ from torch.nn import functional
 
 from ...confidence.model import NEAR_MM
 from ...confidence.views import TrainingViews
-from ...datasets.sweep import ByteArray, Sweep
+from ...datasets.sweep import ByteArray, Sweep, spread_places
 from ...evaluation.baselines import interpolate_planes
 from ...evaluation.metrics import frame_metrics
 from ...probe import FloatArray
@@ -31,7 +31,7 @@ def hardness_of_views(sweep: Sweep) -> FloatArray:  # [F]
     """
     small = replace(sweep, images=_pooled(sweep.images))
     views = TrainingViews(sweep.poses, sweep.probe)
-    targets = np.unique(np.linspace(0, len(sweep) - 1, MAX_FRAMES).round().astype(np.int64))
+    targets = spread_places(len(sweep), MAX_FRAMES)
     distances = views.mean_distances_mm(sweep.poses[targets], sweep.probe)  # [T, F]
     distances[np.arange(len(targets)), targets] = -1.0
     found, measured = [], []

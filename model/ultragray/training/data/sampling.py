@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...datasets.sweep import IntArray, Sweep, corner_distances_mm
+from ...datasets.sweep import IntArray, Sweep, corner_distances_mm, spread_places
 from ...probe import FloatArray
 
 LEAST_RANGE = 1.5  # × the spacing of the frames
@@ -54,7 +54,7 @@ def out_of_plane_range_mm(sweep: Sweep, spacing_mm: float) -> float:
     pixels = sweep.images.reshape(len(sweep), -1)
     stride = max(1, pixels.shape[1] // PREDICTED_PIXELS) | 1  # odd: it must not fall into step with the columns
     images = torch.from_numpy(pixels[:, ::stride].astype(np.float32)) / 255.0  # [F, P]
-    targets = np.unique(np.linspace(0, len(sweep) - 1, PREDICTED_FRAMES).round().astype(np.int64))
+    targets = spread_places(len(sweep), PREDICTED_FRAMES)
     ranges_mm = [factor * step_mm for factor in RANGES]
     scores = [_psnr_from_neighbours(images, distances[targets], targets, range_mm) for range_mm in ranges_mm]
     best_mm = ranges_mm[int(np.argmax(scores))]

@@ -26,24 +26,25 @@ class Optimizer:
     """
 
     def __init__(self, parameters: Mapping[str, Tensor], *, batch_size: int) -> None:
-        self._names = [name for name, tensor in parameters.items() if tensor.requires_grad]
+        trained = {name: tensor for name, tensor in parameters.items() if tensor.requires_grad}
         self._adam = torch.optim.Adam(
-            [{"params": [parameters[name]], "lr": 0.0} for name in self._names],
+            [{"params": [tensor], "lr": 0.0} for tensor in trained.values()],
             betas=(max(0.0, 1.0 - 0.1 * batch_size), max(0.0, 1.0 - 0.001 * batch_size)),
             eps=1e-15 / batch_size**0.5,
             fused=True,
         )
+        self._groups = dict(zip(trained, self._adam.param_groups, strict=True))
 
     def step(self, rates: Mapping[str, float]) -> None:
         """One update in place, with a rate for each parameter; those without a gradient stay."""
-        for name, group in zip(self._names, self._adam.param_groups, strict=True):
+        for name, group in self._groups.items():
             group["lr"] = rates[name]
         self._adam.step()
         self._adam.zero_grad(set_to_none=True)
 
     def replace(self, parameters: Mapping[str, Tensor], origin: Tensor) -> None:
         """Goes on with new tensors: row i was row `origin[i]` of the old, or is a new Gaussian where that is −1."""
-        for name, group in zip(self._names, self._adam.param_groups, strict=True):
+        for name, group in self._groups.items():
             (old,), new = group["params"], parameters[name]
             state = self._adam.state.pop(old, None)
             group["params"] = [new]
@@ -57,14 +58,14 @@ class Optimizer:
     def tensors(self) -> dict[str, Tensor]:
         """The moments and step counts by name, as `load` takes them."""
         found = {}
-        for name, group in zip(self._names, self._adam.param_groups, strict=True):
+        for name, group in self._groups.items():
             for key, value in self._adam.state.get(group["params"][0], {}).items():
                 found[f"{name}.{key}"] = value
         return found
 
     def load(self, tensors: Mapping[str, Tensor]) -> None:
         """Inverse of `tensors`, which may lie on another device than the parameters."""
-        for name, group in zip(self._names, self._adam.param_groups, strict=True):
+        for name, group in self._groups.items():
             (parameter,) = group["params"]
             stored = {key: tensors.get(f"{name}.{key}") for key in (*MOMENTS, "step")}
             state = {key: value.to(parameter.device) for key, value in stored.items() if value is not None}

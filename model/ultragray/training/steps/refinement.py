@@ -68,12 +68,9 @@ def refine(
     largest = _largest_cm(grown["scales"])
     useful = (largest <= config.prune_above * scene_scale_cm) & (largest >= config.prune_below * scene_scale_cm)
     origin = torch.cat([kept, kept.new_full((len(useful) - len(kept),), -1)])
-    return _in_order({name: tensor[useful] for name, tensor in grown.items()}, origin[useful])
-
-
-def _in_order(parameters: dict[str, Tensor], origin: Tensor) -> Refined:
-    order = spatial_order(parameters["means"])
-    return Refined({name: tensor[order] for name, tensor in parameters.items()}, origin[order])
+    (left,) = torch.nonzero(useful, as_tuple=True)
+    order = left[spatial_order(grown["means"][left])]
+    return Refined({name: tensor[order] for name, tensor in grown.items()}, origin[order])
 
 
 def _candidates(pull: Tensor, room: int, config: TrainingConfig) -> Tensor:  # [N] -> [n]
