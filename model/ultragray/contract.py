@@ -12,14 +12,15 @@ such as the probes) is told apart by its `kind`.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import MISSING, Field, field, fields, is_dataclass
 from enum import Enum
-from functools import cache
+from functools import cache, partial
+from operator import is_
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Annotated, Any, ClassVar, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, ClassVar, Literal, NoReturn, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
@@ -80,14 +81,17 @@ class Contract:
     __pydantic_config__: ClassVar[dict[str, Any]] = {"extra": "forbid", "strict": True, "allow_inf_nan": False}
 
     def __post_init__(self) -> None:
-        for item, annotation in annotated_fields(type(self)):
-            value = getattr(self, item.name)
+        cls: Any = type(self)
+        for name, default, check, error in _checks(cls):
+            value = getattr(self, name)
+            if value is default:
+                continue
             try:
-                checked = _checked(value, annotation, item)
+                checked = check(value)
             except UltragrayError as inner:
-                raise error_under(item.name, inner, item.metadata.get("error", self.error)) from None
+                raise error_under(name, inner, error) from None
             if checked is not value:
-                object.__setattr__(self, item.name, checked)
+                object.__setattr__(self, name, checked)
 
 
 class Family(Contract):
@@ -191,11 +195,15 @@ def to_dict(value: Any, *, with_none: bool = True) -> Any:
         return [to_dict(item, with_none=with_none) for item in value]
     if not is_dataclass(value) or isinstance(value, type):
         return value
-    names = [item.name for item in fields(value) if item.init]
-    if isinstance(value, Family):
-        names = ["kind", *(name for name in names if name != "kind")]
-    found = {name: to_dict(getattr(value, name), with_none=with_none) for name in names}
+    cls: Any = type(value)
+    found = {name: to_dict(getattr(value, name), with_none=with_none) for name in _keys(cls)}
     return found if with_none else {name: one for name, one in found.items() if one is not None}
+
+
+@cache
+def _keys(cls: Any) -> tuple[str, ...]:
+    """The keys of a dataclass in JSON, `kind` first."""
+    return tuple(sorted((item.name for item in fields(cls) if item.init), key=lambda name: name != "kind"))
 
 
 def from_dict(cls: type[_T], document: Any) -> _T:
@@ -268,48 +276,97 @@ def _read(value: Any, annotation: Any) -> Any:
     return value
 
 
-def _checked(value: Any, annotation: Any, item: Field[Any]) -> Any:
-    """The value of a field in its own type. Raises InvalidArgument."""
+_Check = Callable[[Any], Any]  # the value in its own type; raises InvalidArgument
+
+
+@cache
+def _checks(cls: type[Contract]) -> tuple[tuple[str, Any, _Check, type[InvalidArgument]], ...]:
+    """Each field's name, its default in its own type, which needs no check, its check, and the error of that."""
+    found = []
+    for item, annotation in annotated_fields(cls):
+        check = _check_of(annotation, item)
+        default = MISSING if item.default is MISSING else check(item.default)
+        found.append((item.name, default, check, item.metadata.get("error", cls.error)))
+    return tuple(found)
+
+
+def _check_of(annotation: Any, item: Field[Any]) -> _Check:
+    """The check of a field, or of the elements of its list."""
     kind, optional = optional_of(annotation)
-    if value is None and (optional or item.default is None):
-        return None
+    check = _check_of_kind(kind, item)
+    if optional or item.default is None:
+        return lambda value: None if value is None else check(value)
+    return check
+
+
+def _check_of_kind(kind: Any, item: Field[Any]) -> _Check:
+    given = item.metadata.get
     if get_origin(kind) is Literal:
-        _require(value in get_args(kind), f"one of {', '.join(map(str, get_args(kind)))}", value)
-        return value
+        return partial(_word, get_args(kind))
     if get_origin(kind) is tuple:
-        _require(isinstance(value, (list, tuple)), "a list", value)
-        most, elements = item.metadata.get("most"), get_args(kind)
-        _require(most is None or len(value) <= most, f"a list of at most {most} values", len(value))
-        _require(Ellipsis in elements or len(value) == len(elements), f"a list of {len(elements)} values", value)
-        return tuple(_checked_element(one, elements[0], item, index) for index, one in enumerate(value))
+        elements = get_args(kind)
+        count = None if Ellipsis in elements else len(elements)
+        return partial(_list, _check_of(elements[0], item), given("most"), count)
     if get_origin(kind) is dict:
-        _require(isinstance(value, dict), "an object", value)
-        most = item.metadata.get("most")
-        _require(most is None or len(value) <= most, f"an object of at most {most} entries", len(value))
-        return value
+        return partial(_object, given("most"))
     if not isinstance(kind, type):
-        return value
+        return _any
     if issubclass(kind, Enum):
-        try:
-            return kind(value)
-        except ValueError:
-            return _require(False, f"one of {', '.join(one.value for one in kind)}", value)
+        return partial(_enum, kind)
     if kind in (int, float):
-        return checked_number(value, kind, **{name: item.metadata.get(name) for name in ("low", "high", "above")})
+        return partial(checked_number, kind=kind, low=given("low"), high=given("high"), above=given("above"))
+    if kind is str:
+        return partial(_text, given("choices"))
     if kind is bool:
-        _require(isinstance(value, (bool, np.bool_)), "true or false", value)
-    elif kind is str:
-        _require(isinstance(value, str), "a text", value)
-        choices = item.metadata.get("choices")
-        _require(choices is None or value in choices, f"one of {', '.join(choices or ())}", value)
-    elif issubclass(kind, Contract):
-        _require(isinstance(value, kind), f"a {kind.__name__}", value)
+        return partial(_instance, (bool, np.bool_), "true or false")
+    return partial(_instance, kind, f"a {kind.__name__}") if issubclass(kind, Contract) else _any
+
+
+def _any(value: Any) -> Any:
     return value
 
 
-def _checked_element(value: Any, annotation: Any, item: Field[Any], index: int) -> Any:
-    with under(f"[{index}]"):
-        return _checked(value, annotation, item)
+def _word(words: tuple[Any, ...], value: Any) -> Any:
+    return value if value in words else _refuse(f"one of {', '.join(map(str, words))}", value)
+
+
+def _list(check: _Check, most: int | None, count: int | None, value: Any) -> tuple[Any, ...]:
+    if not isinstance(value, (list, tuple)):
+        _refuse("a list", value)
+    if most is not None and len(value) > most:
+        _refuse(f"a list of at most {most} values", len(value))
+    if count is not None and len(value) != count:
+        _refuse(f"a list of {count} values", value)
+    checked = []
+    for index, one in enumerate(value):
+        with under(f"[{index}]"):
+            checked.append(check(one))
+    if isinstance(value, tuple) and all(map(is_, checked, value)):
+        return value
+    return tuple(checked)
+
+
+def _object(most: int | None, value: Any) -> dict[Any, Any]:
+    if not isinstance(value, dict):
+        _refuse("an object", value)
+    return value if most is None or len(value) <= most else _refuse(f"an object of at most {most} entries", len(value))
+
+
+def _enum(kind: type[Enum], value: Any) -> Enum:
+    try:
+        return kind(value)
+    except ValueError:
+        _refuse(f"one of {', '.join(one.value for one in kind)}", value)
+
+
+def _text(choices: tuple[str, ...] | None, value: Any) -> str:
+    if not isinstance(value, str):
+        _refuse("a text", value)
+    return value if choices is None or value in choices else _refuse(f"one of {', '.join(choices)}", value)
+
+
+def _instance(kind: Any, expected: str, value: Any) -> Any:
+    return value if isinstance(value, kind) else _refuse(expected, value)
 
 
 def checked_number(
@@ -326,7 +383,7 @@ def checked_number(
     is_finite = isinstance(number, int) or math.isfinite(number)
     fits = is_finite and (low is None or number >= low) and (high is None or number <= high)
     if not fits or (above is not None and number <= above):
-        _require(False, f"{'an integer' if kind is int else 'a finite number'}{_range(low, high, above)}", value)
+        _refuse(f"{'an integer' if kind is int else 'a finite number'}{_range(low, high, above)}", value)
     return number
 
 
@@ -360,9 +417,8 @@ def _plain(limit: float) -> str:
     return str(limit) if isinstance(limit, int) else f"{limit:g}"
 
 
-def _require(holds: bool, expected: str, given: Any) -> Any:
-    if not holds:
-        raise InvalidArgument(f"must be {expected}, got {shown(given)}")
+def _refuse(expected: str, given: Any) -> NoReturn:
+    raise InvalidArgument(f"must be {expected}, got {shown(given)}")
 
 
 def shown(value: Any) -> str:
