@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Annotated, Any
 
 from pydantic import WithJsonSchema
@@ -13,7 +14,7 @@ from ultragray.contract import described
 from ultragray.display.settings import AS_RENDERED, Display
 from ultragray.outputs import OUTPUTS
 from ultragray.probe import Picture, Probe
-from ultragray.settings import Encoding
+from ultragray.settings import Encoding, Resolved
 from ultragray_workers.pool.types import RenderResult
 
 from .poses import MatrixRows
@@ -65,14 +66,10 @@ class FramePicture:
         return self.step[1]
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class FrameHeader:
-    """All that is needed to render a frame again, and what it cost."""
+@dataclass(frozen=True, kw_only=True)
+class SettingsUsed:
+    """The settings of a frame, as used: the same for all frames of a stream."""
 
-    scene: str = described("Name.")
-    scene_sha256: str = described("Of the scene file.")
-    renderer: str = described("Name, version and backend of the renderer.")
-    pose: MatrixRows = described("Matrix as used.")
     probe: Probe = described("As used.")
     rendered_height: int = described("Depth samples, before the display settings were applied.")
     rendered_width: int = described("Scan lines, likewise.")
@@ -82,6 +79,16 @@ class FrameHeader:
     picture: FramePicture = described("Where the pixels lie.")
     outputs: tuple[OutputName, ...] = described("In the order of the data.")
     encoding: Encoding = described("Of the pixels.")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FrameFacts:
+    """The facts of one frame beside its settings: its origin, its pose, and what it cost."""
+
+    scene: str = described("Name.")
+    scene_sha256: str = described("Of the scene file.")
+    renderer: str = described("Name, version and backend of the renderer.")
+    pose: MatrixRows = described("Matrix as used.")
     extrapolation: Extrapolation = described("How far the frame lies from the training views.")
     queue_ms: float = described("Waiting time.")
     render_ms: float = described("Of the batch that it was rendered in.")
@@ -89,22 +96,12 @@ class FrameHeader:
 
     @classmethod
     def of(cls, result: RenderResult, **others: Any) -> Self:
-        """The header of a result; its pose and extrapolation are those of the first of several."""
-        settings = result.settings
+        """The facts of a result of one pose; `others` are what else the class has."""
         return cls(
             scene=result.scene,
             scene_sha256=result.scene_sha256,
             renderer=result.renderer,
             pose=result.poses[0].tolist(),
-            probe=settings.probe,
-            rendered_height=settings.height,
-            rendered_width=settings.width,
-            display=settings.display,
-            height=result.height,
-            width=result.width,
-            picture=FramePicture.of(settings.picture),
-            outputs=settings.outputs,
-            encoding=settings.encoding,
             extrapolation=result.extrapolations[0],
             queue_ms=round(result.queue_ms, 3),
             render_ms=round(result.render_ms, 3),
@@ -113,6 +110,27 @@ class FrameHeader:
         )
 
     @property
-    def timings(self) -> FrameHeader:
+    def timings(self) -> FrameFacts:
         """Itself: gRPC has the three times in a message of their own."""
         return self
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FrameHeader(SettingsUsed, FrameFacts):
+    """All that is needed to render a frame again, and what it cost."""
+
+
+@lru_cache(maxsize=256)
+def settings_used(settings: Resolved) -> SettingsUsed:
+    """The settings of a request, as frames tell them."""
+    return SettingsUsed(
+        probe=settings.probe,
+        rendered_height=settings.height,
+        rendered_width=settings.width,
+        display=settings.display,
+        height=settings.picture.height,
+        width=settings.picture.width,
+        picture=FramePicture.of(settings.picture),
+        outputs=settings.outputs,
+        encoding=settings.encoding,
+    )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from functools import lru_cache
 
 from ultragray.contract import under
 from ultragray.errors import InvalidImageSize, TooManyPoses
@@ -10,8 +11,6 @@ from ultragray.settings import Encoding, FrameSettings, Resolved
 
 from ..settings import Settings
 from .catalog import SceneCatalog
-
-_POSES_CHECKED_INLINE = 16  # more go to a thread, so that the loop keeps answering
 
 
 class RequestPlanner:
@@ -37,7 +36,7 @@ class RequestPlanner:
         Raises SceneNotFound, SceneFileInvalid, InvalidProbe, InvalidImageSize, UnknownOutput, InvalidArgument.
         """
         header = await self._catalog.header(scene)
-        settings = asked.resolved(header.info, encoding, max_image_side=self._settings.max_image_side)
+        settings = _the_same(asked.resolved(header.info, encoding, max_image_side=self._settings.max_image_side))
         with under("display"):
             pixels = settings.pixels
         if pixels > self._settings.max_request_pixels:
@@ -60,3 +59,9 @@ class RequestPlanner:
     def deadline(self, timeout_s: float | None) -> float:
         """The time.monotonic() seconds by which a request must begin; None: the default timeout."""
         return time.monotonic() + (self._settings.default_timeout_s if timeout_s is None else timeout_s)
+
+
+@lru_cache(maxsize=256)
+def _the_same(settings: Resolved) -> Resolved:
+    """One object for equal settings, so that their picture is worked out once."""
+    return settings

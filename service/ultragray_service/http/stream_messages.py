@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from ultragray.contract import described
 from ultragray.errors import UltragrayError
 
-from ..core.frames import FrameHeader
+from ..core.frames import FrameHeader, settings_used
 from ..core.pose_stream import Answered
 from ..errors import Refusal
 from .json_body import adapter_of
@@ -45,6 +45,7 @@ def frame_bytes(answered: Answered) -> bytes:
     header: bytes = adapter_of(FrameMessage).dump_json(
         FrameMessage.of(
             answered.outcome,
+            **vars(settings_used(answered.outcome.settings)),
             sequence=answered.sequence,
             client_time_ms=answered.client_time,
             dropped=answered.dropped,

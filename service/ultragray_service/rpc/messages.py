@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -12,12 +13,12 @@ from ultragray.contract import blamed, under
 from ultragray.errors import InvalidArgument, InvalidPose, UltragrayError
 from ultragray.pose import check_poses, pose_from_position_quaternion
 from ultragray.probe import FloatArray
-from ultragray.settings import RenderSettings
+from ultragray.settings import RenderSettings, Resolved
 from ultragray_proto.codec import MessageInvalid, from_message, to_message, words
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2
 from ultragray_workers.pool.types import RenderResult
 
-from ..core.frames import FrameHeader
+from ..core.frames import FrameFacts, settings_used
 from ..core.poses import exact_pose
 
 
@@ -86,5 +87,12 @@ def read_poses(messages: Sequence[geometry_pb2.Pose], field: str) -> FloatArray:
 
 def frame_message(result: RenderResult, sequence: int, **others: Any) -> rendering_pb2.Frame:
     """The frame of a result of one pose."""
-    header = FrameHeader.of(result)
-    return to_message(header, rendering_pb2.Frame, sequence=sequence, data=result.data, **others)
+    frame = to_message(FrameFacts.of(result), rendering_pb2.Frame, sequence=sequence, data=result.data, **others)
+    frame.MergeFrom(_settings_message(result.settings))
+    return frame
+
+
+@lru_cache(maxsize=256)
+def _settings_message(settings: Resolved) -> rendering_pb2.Frame:
+    """The part of a frame that is the same for all frames of a stream."""
+    return to_message(settings_used(settings), rendering_pb2.Frame)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
+from functools import lru_cache
 from typing import Any
 
 from fastapi import APIRouter
@@ -11,9 +13,10 @@ from starlette.responses import Response
 
 from ultragray.contract import to_dict
 from ultragray.outputs import OUTPUTS
+from ultragray.settings import Resolved
 from ultragray_workers.pool.types import Priority, RenderRequest, RenderResult
 
-from ...core.frames import FrameHeader
+from ...core.frames import settings_used
 from ...core.poses import exact_poses
 from ...core.state import Service
 from ...telemetry.statistics import STAGES
@@ -25,13 +28,6 @@ from ..examples import RENDER_EXAMPLES
 from ..json_body import body_schema, read_json_body
 
 router = APIRouter(prefix="/v1/scenes", tags=["render"])
-
-_PREFIX = "X-Ultragray-"
-_OF_ALL_FRAMES = (
-    *("scene", "scene_sha256", "renderer", "outputs", "probe", "picture"),
-    *(f"{stage}_ms" for stage in STAGES),
-)
-_OF_ONE_FRAME = ("pose", "extrapolation")
 
 RENDER_HEADERS = {
     "X-Ultragray-Scene": "Name of the scene.",
@@ -102,22 +98,33 @@ async def render(request: Request) -> Response:
 
 
 def render_headers(result: RenderResult) -> dict[str, str]:
-    """What the answer says beside the pixels: the fields of FrameHeader that hold for all frames, of one frame all."""
-    header = FrameHeader.of(result)
-    names = _OF_ALL_FRAMES if len(result.poses) > 1 else (*_OF_ALL_FRAMES, *_OF_ONE_FRAME)
-    headers = {f"{_PREFIX}{name.title().replace('_', '-')}": _text(getattr(header, name)) for name in names}
-    confidences = ("" if one.confidence is None else f"{one.confidence:.3f}" for one in result.extrapolations)
-    return headers | {
-        f"{_PREFIX}Shape": f"{len(header.outputs)},{len(result.poses)},{header.height},{header.width}",
-        f"{_PREFIX}Dtype": header.encoding.pixel_type.name,
-        f"{_PREFIX}Confidence": ",".join(confidences),
-        "Server-Timing": ", ".join(f"{name};dur={getattr(header, f'{name}_ms'):.3f}" for name in STAGES),
+    """The facts of an answer that stand beside the pixels."""
+    settings, poses = result.settings, result.poses
+    times = {stage: f"{getattr(result, f'{stage}_ms'):.3f}" for stage in STAGES}
+    confidences = ["" if one.confidence is None else f"{one.confidence:.3f}" for one in result.extrapolations]
+    headers = {
+        "X-Ultragray-Scene": result.scene,
+        "X-Ultragray-Scene-Sha256": result.scene_sha256,
+        "X-Ultragray-Renderer": result.renderer,
+        "X-Ultragray-Shape": f"{len(settings.outputs)},{len(poses)},{settings.picture.height},{settings.picture.width}",
+        "X-Ultragray-Confidence": ",".join(confidences),
+        "Server-Timing": ", ".join([f"{stage};dur={milliseconds}" for stage, milliseconds in times.items()]),
+        **{f"X-Ultragray-{stage.title()}-Ms": milliseconds for stage, milliseconds in times.items()},
+        **_settings_headers(settings),
     }
+    if len(poses) == 1:
+        headers["X-Ultragray-Pose"] = json.dumps(poses[0].tolist())
+        headers["X-Ultragray-Extrapolation"] = json.dumps(asdict(result.extrapolations[0]))
+    return headers
 
 
-def _text(value: Any) -> str:
-    if isinstance(value, (str, float)):
-        return value if isinstance(value, str) else f"{value:.3f}"
-    if isinstance(value, tuple):
-        return ",".join(value)
-    return json.dumps(value if isinstance(value, list) else to_dict(value))
+@lru_cache(maxsize=256)
+def _settings_headers(settings: Resolved) -> dict[str, str]:
+    """The headers that settings alone decide."""
+    used = settings_used(settings)
+    return {
+        "X-Ultragray-Dtype": settings.encoding.pixel_type.name,
+        "X-Ultragray-Outputs": ",".join(settings.outputs),
+        "X-Ultragray-Probe": json.dumps(to_dict(used.probe)),
+        "X-Ultragray-Picture": json.dumps(to_dict(used.picture)),
+    }
