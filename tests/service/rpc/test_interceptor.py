@@ -48,7 +48,7 @@ async def vanish(folder: Path) -> None:
         call = channel.unary_stream(METHOD, Empty.SerializeToString, Empty.FromString)(Empty())
         await call.read()
         call.cancel()
-        await asyncio.wait_for(streaming.ended.wait(), 10)
+    await asyncio.wait_for(streaming.ended.wait(), 60)  # the connection is closed, too
     await server.stop(5)
 
 
