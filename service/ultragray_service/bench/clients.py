@@ -19,14 +19,14 @@ from websockets.sync.client import connect
 
 from ultragray.demo import copy_demo_scene, demo_poses
 from ultragray.probe import FloatArray
-from ultragray_proto.v1 import geometry_pb2, rendering_pb2, rendering_pb2_grpc
+from ultragray_proto.v1 import rendering_pb2, rendering_pb2_grpc
 from ultragray_workers.errors import NotReady
 
 from ..core.job_client import JobClient
 from .igtl import PingPong
-from .kernel import BenchScene, bench_poses, measure_kernel
+from .kernel import BenchScene, bench_poses, measure_kernel, time_ms
 from .report import Report, percentiles
-from .served import running_server
+from .served import pose_message, running_server
 
 SCENE, AUGMENTED = "demo", "augmented"
 SIDE = 512
@@ -68,7 +68,7 @@ def measure_clients(extent: ClientsExtent, tell: Callable[[str], None]) -> dict[
             tell("OpenIGTLink, one pose after another ...")
             measured["OpenIGTLink"] = _ping_pong(server.igtl_port, extent.ping_pongs)
             tell(f"{extent.frames:,} frames to an archive ...")
-            frames_per_s = _augment(JobClient(f"http://127.0.0.1:{server.http_port}", None), extent)
+            frames_per_s = _augment(server.jobs(), extent)
         tell("the kernel by itself ...")
         timings = measure_kernel(bench, [threads], extent.kernel_repeats)
         kernel_frames_per_s = max(1000.0 / float(np.median(timing.frame_ms)) for timing in timings)
@@ -115,7 +115,7 @@ def _control_loop(port: int, extent: ClientsExtent) -> dict[str, float]:
         started = time.perf_counter()
         for tick in range(count):
             time.sleep(max(0.0, started + tick / LOOP_HZ - time.perf_counter()))
-            pose = geometry_pb2.Pose(matrix=geometry_pb2.Matrix(values=poses[tick % len(poses)].ravel().tolist()))
+            pose = pose_message(poses[tick % len(poses)])
             yield rendering_pb2.RenderStreamRequest(sequence=tick, pose=pose, client_time_ns=time.perf_counter_ns())
 
     latency_ms, arrived_s, dropped = [], [], 0
@@ -151,8 +151,8 @@ def _stream_to_pages(port: int, pages: int, extent: ClientsExtent) -> dict[str, 
             frames, started = 0, time.perf_counter()
             while time.perf_counter() - started < extent.stream_s:
                 connection.send(poses[frames % len(poses)])
-                if isinstance(told := connection.recv(), str):
-                    raise NotReady(f"the benchmark's frame failed: {told}")
+                if isinstance(answer := connection.recv(), str):
+                    raise NotReady(f"the benchmark's frame failed: {answer}")
                 frames += 1
             counts[number] = frames / (time.perf_counter() - started)
 
@@ -166,13 +166,8 @@ def _stream_to_pages(port: int, pages: int, extent: ClientsExtent) -> dict[str, 
 
 def _ping_pong(port: int, repeats: int) -> dict[str, float]:
     poses: FloatArray = demo_poses(50)
-    latency_ms = []
     with PingPong(port, SCENE) as client:
-        for number in range(repeats):
-            started = time.perf_counter()
-            client.render(poses[number % len(poses)])
-            latency_ms.append(1000.0 * (time.perf_counter() - started))
-    return _percentiles(latency_ms)
+        return _percentiles([time_ms(client.render, poses[number % len(poses)]) for number in range(repeats)])
 
 
 def _augment(client: JobClient, extent: ClientsExtent) -> float:

@@ -90,5 +90,5 @@ def _driver_version() -> str | None:
     if (tool := shutil.which("nvidia-smi")) is None:
         return None
     command = [tool, "--query-gpu=driver_version", "--format=csv,noheader"]
-    told = subprocess.run(command, capture_output=True, text=True, check=False).stdout.split()
-    return told[0] if told else None
+    versions_of_gpus = subprocess.run(command, capture_output=True, text=True, check=False).stdout.split()
+    return versions_of_gpus[0] if versions_of_gpus else None

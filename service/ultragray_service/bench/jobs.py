@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import http.client
 import io
+import itertools
 import json
 import tempfile
 import time
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -22,13 +23,14 @@ from ultragray.datasets import Dataset
 from ultragray.datasets.phantom import load_phantom
 from ultragray.datasets.released import write_released
 from ultragray.demo import copy_demo_scene, demo_poses
-from ultragray_proto.v1 import geometry_pb2, rendering_pb2, rendering_pb2_grpc
+from ultragray_proto.v1 import rendering_pb2, rendering_pb2_grpc
 from ultragray_workers.errors import NotReady
 from ultragray_workers.jobs.queue.database import JobDatabase
 
 from ..core.job_client import JobClient
+from .kernel import time_ms
 from .report import Report, percentiles
-from .served import running_server
+from .served import pose_message, running_server
 
 SCENE = "demo"
 SIDE = 512
@@ -57,13 +59,13 @@ def measure_jobs(extent: JobsExtent, tell: Callable[[str], None]) -> dict[str, A
         copy_demo_scene(folder / f"{SCENE}.ugr")
         tell("one job, which is then copied ...")
         with running_server(folder, "cpu", SCENE) as server:
-            _finish_one(JobClient(f"http://127.0.0.1:{server.http_port}", None))
+            _finish_one(server.jobs())
         _copy_jobs(folder / "artifacts", extent.jobs)
         tell(f"start with {extent.jobs:,} jobs, and pages of them ...")
         started = time.perf_counter()
         with running_server(folder, "cpu", SCENE) as server:
             start_s = time.perf_counter() - started
-            port, client = server.http_port, JobClient(f"http://127.0.0.1:{server.http_port}", None)
+            port, client = server.http_port, server.jobs()
             pages = {
                 f"page of {PAGE}, newest": _pages(port, extent.pages, f"/v1/jobs?page_size={PAGE}"),
                 f"page of {PAGE}, in the middle": _pages(port, extent.pages, _middle(port, extent.jobs)),
@@ -103,14 +105,14 @@ def run(output: Path | None, quick: bool) -> None:
 def _finish_one(client: JobClient) -> None:
     specification = {"scene": SCENE, "sampler": {"kind": "training"}, "height": 8, "width": 8}
     job, _ = client.submit({"kind": "render", "specification": specification})
-    _until(client, job["id"], lambda told: told["state"] == "succeeded")
+    _until(client, job["id"], lambda job: job["state"] == "succeeded")
 
 
 def _until(client: JobClient, job_id: str, reached: Callable[[dict[str, Any]], bool]) -> None:
     end = time.monotonic() + WAIT_S
-    while not reached(told := client.get(job_id)):
-        if time.monotonic() > end or told["state"] == "failed":
-            raise NotReady(f"the job of the benchmark is {told['state']}: {told['reason']}")
+    while not reached(job := client.get(job_id)):
+        if time.monotonic() > end or job["state"] == "failed":
+            raise NotReady(f"the job of the benchmark is {job['state']}: {job['reason']}")
         time.sleep(0.1)
 
 
@@ -172,7 +174,7 @@ def _frames_beside_training(
             settings = {"steps": STEPS}
             specification = {"dataset": "phantom", "scene": f"beside-{number}", "settings": settings}
             job, _ = client.submit({"kind": "train", "specification": specification})
-            _until(client, job["id"], lambda told: bool(told["progress"]["step"]))
+            _until(client, job["id"], lambda job: bool(job["progress"]["step"]))
             frames["frame, beside a training"].append(_render_for(stub, extent))
             client.cancel(job["id"])
             time.sleep(REST_S)
@@ -183,19 +185,11 @@ def _render_for(stub: rendering_pb2_grpc.RenderServiceStub, extent: JobsExtent) 
     settings = rendering_pb2.RenderSettings(scene=SCENE, height=extent.side, width=extent.side)
     times_ms: list[float] = []
     end = time.monotonic() + extent.seconds
-    for pose in _poses_again_and_again():
+    for pose in itertools.cycle(map(pose_message, demo_poses(50))):
         if time.monotonic() > end and times_ms:
-            return times_ms
-        started = time.perf_counter()
-        stub.Render(rendering_pb2.RenderRequest(settings=settings, pose=pose))
-        times_ms.append(1000.0 * (time.perf_counter() - started))
+            break
+        times_ms.append(time_ms(stub.Render, rendering_pb2.RenderRequest(settings=settings, pose=pose)))
     return times_ms
-
-
-def _poses_again_and_again() -> Iterator[geometry_pb2.Pose]:
-    poses = [geometry_pb2.Pose(matrix=geometry_pb2.Matrix(values=pose.ravel().tolist())) for pose in demo_poses(50)]
-    while True:
-        yield from poses
 
 
 def _upload(port: int, dataset: Dataset) -> None:
@@ -207,6 +201,6 @@ def _upload(port: int, dataset: Dataset) -> None:
     with closing(http.client.HTTPConnection("127.0.0.1", port, timeout=WAIT_S)) as connection:
         connection.request("PUT", "/v1/datasets/phantom", packed.getvalue(), {"Content-Type": "application/zip"})
         answer = connection.getresponse()
-        told = answer.read()
+        content = answer.read()
     if answer.status != 201:
-        raise NotReady(f"the benchmark's dataset was refused: {told[:500]!r}")
+        raise NotReady(f"the benchmark's dataset was refused: {content[:500]!r}")

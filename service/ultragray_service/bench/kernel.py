@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
@@ -91,15 +92,20 @@ def measure_kernel(bench: BenchScene, thread_counts: Sequence[int], repeats: int
                 poses_cm = scene.poses_to_scene_cm(bench_poses(max(repeats, 10 * poses)))
                 frame_ms = []
                 for first in range(0, len(poses_cm) - poses + 1, poses):
-                    started = time.perf_counter()
-                    cpu.render_outputs(
-                        scene, PROBE, poses_cm[first : first + poses], bench.height, bench.width, ("bmode",)
-                    )
-                    frame_ms.append(1000.0 * (time.perf_counter() - started) / poses)
+                    views = poses_cm[first : first + poses]
+                    size = (bench.height, bench.width)
+                    frame_ms.append(time_ms(cpu.render_outputs, scene, PROBE, views, *size, ("bmode",)) / poses)
                 timings.append(KernelTiming("kernel", threads, poses, frame_ms[1:]))
     finally:
         torch.set_num_threads(before)
     return timings
+
+
+def time_ms(work: Callable[..., object], *arguments: Any) -> float:
+    """The time of one call by the host's clock, ms."""
+    started = time.perf_counter()
+    work(*arguments)
+    return 1000.0 * (time.perf_counter() - started)
 
 
 def time_yard_ms() -> float:

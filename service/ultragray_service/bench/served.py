@@ -24,7 +24,8 @@ from ultragray.probe import FloatArray
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2, rendering_pb2_grpc
 from ultragray_workers.errors import NotReady
 
-from .kernel import BenchScene, bench_poses
+from ..core.job_client import JobClient
+from .kernel import BenchScene, bench_poses, time_ms
 
 SCENE = "bench"
 IN_FLIGHT = 8
@@ -67,6 +68,10 @@ class RunningServer:
     grpc_port: int
     igtl_port: int
     pid: int
+
+    def jobs(self) -> JobClient:
+        """A client of its jobs."""
+        return JobClient(f"http://127.0.0.1:{self.http_port}", None)
 
 
 @contextmanager
@@ -112,7 +117,8 @@ def _wait_ready(process: subprocess.Popen[bytes], port: int) -> None:
     raise NotReady(f"the server of the benchmark was not ready within {START_TIMEOUT_S:g} s")
 
 
-def _message(pose: FloatArray) -> geometry_pb2.Pose:  # [4, 4] mm
+def pose_message(pose: FloatArray) -> geometry_pb2.Pose:  # [4, 4] mm
+    """A pose as gRPC takes it."""
     return geometry_pb2.Pose(matrix=geometry_pb2.Matrix(values=pose.ravel().tolist()))
 
 
@@ -155,7 +161,7 @@ class _Turns:
         for sequence, pose in enumerate(poses):
             self._turns.get()
             yield rendering_pb2.RenderStreamRequest(
-                sequence=sequence, pose=_message(pose), settings=settings if sequence == 0 else None
+                sequence=sequence, pose=pose_message(pose), settings=settings if sequence == 0 else None
             )
 
 
@@ -171,7 +177,7 @@ def _grpc_unary(server: RunningServer, poses: FloatArray) -> FrontDoor:
         return _one_by_one(
             "gRPC unary",
             poses,
-            lambda pose: stub.Render(rendering_pb2.RenderRequest(settings=settings, pose=_message(pose))),
+            lambda pose: stub.Render(rendering_pb2.RenderRequest(settings=settings, pose=pose_message(pose))),
         )
 
 
@@ -194,12 +200,7 @@ def _http(what: str, media_type: str, server: RunningServer, poses: FloatArray) 
 
 
 def _one_by_one(what: str, poses: FloatArray, render: Callable[[FloatArray], object]) -> FrontDoor:
-    latency_ms = []
-    for pose in poses:
-        started = time.perf_counter()
-        render(pose)
-        latency_ms.append(1000.0 * (time.perf_counter() - started))
-    counted = latency_ms[WARM_UP:]
+    counted = [time_ms(render, pose) for pose in poses][WARM_UP:]
     return FrontDoor(what, counted, 1000.0 * len(counted) / sum(counted))
 
 

@@ -35,6 +35,9 @@ def print_table(path: Path) -> None:
 
 def _describe(path: Path, header: SceneHeader) -> dict[str, Any]:
     info, positions = header.info, header.training_poses[:, :3, 3]
+    poses: dict[str, Any] = {"count": len(positions)}
+    if len(positions):
+        poses |= {"position_min_mm": positions.min(axis=0).tolist(), "position_max_mm": positions.max(axis=0).tolist()}
     return {
         "file": str(path),
         "sha256": file_sha256(path),
@@ -42,17 +45,7 @@ def _describe(path: Path, header: SceneHeader) -> dict[str, Any]:
         **asdict(info),
         "confidence": {key: value for key, value in info.confidence.items() if key != "hardness"},
         "probe": None if info.probe is None else to_dict(info.probe),
-        "training_poses": {
-            "count": len(positions),
-            **(
-                {
-                    "position_min_mm": positions.min(axis=0).tolist(),
-                    "position_max_mm": positions.max(axis=0).tolist(),
-                }
-                if len(positions)
-                else {}
-            ),
-        },
+        "training_poses": poses,
     }
 
 

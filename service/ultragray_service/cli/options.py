@@ -148,7 +148,7 @@ def _is_within(kind: Any) -> bool:
 
 def _family_parameters(family: Any, name: str) -> Iterator[inspect.Parameter]:
     help = f"One of {', '.join(family.members)}; each takes its own options only."
-    yield _keyword(name, Annotated[str | None, typer.Option(_flag(name), help=help, show_default=False)], None)
+    yield keyword(name, Annotated[str | None, typer.Option(_flag(name), help=help, show_default=False)], None)
     members = {kind: {item.name: (item, of) for item, of in _fields(cls)} for kind, cls in family.members.items()}
     for option in dict.fromkeys(option for taken in members.values() for option in taken):
         takers = [kind for kind, taken in members.items() if option in taken]
@@ -178,12 +178,12 @@ def _parameter(
     shown = not is_switch and _shown_default(item)
     option = typer.Option(*flags, help=meaning, metavar="NAME=VALUE" if is_table else None, show_default=shown)
     if is_switch:
-        return _keyword(item.name, Annotated[bool, option], False)
+        return keyword(item.name, Annotated[bool, option], False)
     if is_argument:
-        return _keyword(item.name, Annotated[parsed, typer.Argument(help=meaning, show_default=False)])
+        return keyword(item.name, Annotated[parsed, typer.Argument(help=meaning, show_default=False)])
     if _is_required(item) and not takers:
-        return _keyword(item.name, Annotated[parsed, option])
-    return _keyword(item.name, Annotated[parsed | None, option], None)
+        return keyword(item.name, Annotated[parsed, option])
+    return keyword(item.name, Annotated[parsed | None, option], None)
 
 
 def _signature(member: Any) -> str:
@@ -191,7 +191,8 @@ def _signature(member: Any) -> str:
     return "{" + ", ".join([f'"kind": "{member.kind}"', *(f'"{item.name}": …' for item, _ in _fields(member))]) + "}"
 
 
-def _keyword(name: str, annotation: Any, default: Any = inspect.Parameter.empty) -> inspect.Parameter:
+def keyword(name: str, annotation: Any, default: Any = inspect.Parameter.empty) -> inspect.Parameter:
+    """A parameter of a command, as typer annotates it."""
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
 
 

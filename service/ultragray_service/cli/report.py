@@ -76,9 +76,12 @@ def report(
 
 def _write_report(dataset: Dataset, config: TrainingConfig, output: Path, options: ReportOptions) -> dict[str, str]:
     """The studies that could not be finished, and why; the page has the others."""
+    import torch
+
     from ultragray.evaluation.baselines import evaluate_baselines
     from ultragray.evaluation.scoring import evaluate
     from ultragray.files.atomic import write_whole
+    from ultragray.machine import processor_name
     from ultragray.report.page import ReportContent, render_page
     from ultragray.report.study import Failed, ablations, attempt, study_tilt, train_and_evaluate
     from ultragray.scene import GaussianScene
@@ -102,20 +105,13 @@ def _write_report(dataset: Dataset, config: TrainingConfig, output: Path, option
             content["tilt"] = attempt(
                 partial(study_tilt, dataset.train, config, voxel_mm=options.voxel_mm, report=follow(TILT))
             )
+    machine = f"{processor_name()}, {torch.get_num_threads()} threads"
     page = render_page(
-        ReportContent(dataset=dataset, baselines=baselines, voxel_mm=options.voxel_mm, machine=_machine(), **content)
+        ReportContent(dataset=dataset, baselines=baselines, voxel_mm=options.voxel_mm, machine=machine, **content)
     )
     write_whole(output, page)
     studies = {**content.get("ablations", {}), TILT: content.get("tilt")}
     return {name: study.reason for name, study in studies.items() if isinstance(study, Failed)}
-
-
-def _machine() -> str:
-    import torch
-
-    from ultragray.machine import processor_name
-
-    return f"{processor_name()}, {torch.get_num_threads()} threads"
 
 
 @contextlib.contextmanager

@@ -63,6 +63,8 @@ def train(
     source: SourceOptions,
 ) -> None:
     """Train a scene from a tracked sweep. Ctrl-C leaves a usable scene; --resume goes on."""
+    from ultragray.training.device import training_device
+
     given = {
         **({} if config is None else read_config_file(config)),
         **parse_settings(setting or []),
@@ -70,7 +72,7 @@ def train(
         **({} if preset is None else {"preset": preset}),
     }
     check_writable(output, SCENE_SUFFIX)
-    _check_device(device, backend)
+    training_device(device, backend)  # refused before the dataset is read, which may take long
     run = RunOptions(
         output=output,
         folder=folder or output.with_name(f"{output.name}.run"),
@@ -103,13 +105,6 @@ class RunOptions:
     tensorboard: bool
     device: str
     backend: str
-
-
-def _check_device(device: str, backend: str) -> None:
-    """Raise BackendUnavailable before the dataset is read, which may take long."""
-    from ultragray.training.device import training_device
-
-    training_device(device, backend)
 
 
 def _check_resumable(run: RunOptions) -> None:
@@ -219,20 +214,20 @@ def _progress_bar() -> Iterator[Callable[[Any], None]]:
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
     console = Console(stderr=True)
-    columns = ("training", BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[told]}"))
+    columns = ("training", BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[figures]}"))
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
-        task = progress.add_task("", total=None, told="")
+        task = progress.add_task("", total=None, figures="")
 
         def report(state: Any) -> None:
             if console.is_terminal:
-                progress.update(task, completed=state.step, total=state.steps, told=_told(state))
+                progress.update(task, completed=state.step, total=state.steps, figures=_figures(state))
             elif state.step * 10 // state.steps > (state.step - 1) * 10 // state.steps:
-                sys.stderr.write(f"step {state.step:,} of {state.steps:,}: {_told(state)}\n")
+                sys.stderr.write(f"step {state.step:,} of {state.steps:,}: {_figures(state)}\n")
 
         yield report
 
 
-def _told(state: Any) -> str:
+def _figures(state: Any) -> str:
     held_out = "" if state.val_psnr_db is None else f" · held out {state.val_psnr_db:.2f} dB"
     minutes, seconds = divmod(round(state.seconds_left), 60)
     return (

@@ -67,21 +67,26 @@ def _display(job_id: str) -> Iterator[Callable[[dict[str, Any]], None]]:
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
     console = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[told]}"))
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[figures]}"),
+    )
     last: tuple[str, int] | None = None
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task(f"{job_id}", total=None, told="")
+        task = bar.add_task(f"{job_id}", total=None, figures="")
 
         def show(job: dict[str, Any]) -> None:
             nonlocal last
             done, of, _ = work_done(job)
             if console.is_terminal:
-                bar.update(task, description=f"{job_id} {job['state']}", completed=done, total=of, told=told(job))
+                bar.update(task, description=f"{job_id} {job['state']}", completed=done, total=of, figures=figures(job))
                 return
             current = (job["state"], done * 10 // of if of else 0)
             if current != last:
                 last = current
-                sys.stderr.write(" ".join(filter(None, (job_id, job["state"], amount(job), told(job)))) + "\n")
+                sys.stderr.write(" ".join(filter(None, (job_id, job["state"], amount(job), figures(job)))) + "\n")
 
         yield show
 
@@ -99,7 +104,7 @@ def amount(job: dict[str, Any]) -> str:
     return "" if of is None else f"{done:,} of {of:,} {unit}"
 
 
-def told(job: dict[str, Any]) -> str:
+def figures(job: dict[str, Any]) -> str:
     """The figures of the progress that are known, in short."""
     progress = job["progress"]
     parts = []
