@@ -176,7 +176,7 @@ class RenderSettings(FrameSettings):
 
 @dataclass(frozen=True)
 class DatasetOptions:
-    """How a source is read. None leaves the choice to the source."""
+    """Options of reading a source. None leaves the choice to the source."""
 
     train_frames: str | None = None
     """Frames to train from, such as 0:90 or 0:90,100:120:2: places in the training file, or in the sequence."""

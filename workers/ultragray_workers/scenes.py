@@ -47,7 +47,7 @@ class FileVersion:
 
     @property
     def tag(self) -> str:
-        """The same as a word."""
+        """The version as a word."""
         return f"{self.mtime_ns:x}-{self.size:x}-{self.inode:x}"
 
     @classmethod
@@ -125,7 +125,7 @@ class SceneStore:
         raise self._not_found(name)
 
     def file(self, name: str) -> Path:
-        """Where the file of a scene lies; in the first folder where there is none."""
+        """The path of a scene's file; in the first folder where there is none."""
         paths = [folder / f"{name}{SUFFIX}" for folder in self.folders]
         return next((path for path in paths if path.is_file()), paths[0])
 
@@ -140,7 +140,7 @@ class SceneStore:
         return header
 
     def version(self, name: str) -> FileVersion:
-        """Which content the file of a scene has now. Raises SceneNotFound, SceneFileInvalid."""
+        """The version of a scene's file as it is now. Raises SceneNotFound, SceneFileInvalid."""
         path = self.path(name)
         try:
             return FileVersion.of(path)

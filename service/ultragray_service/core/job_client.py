@@ -41,19 +41,19 @@ class JobClient:
 
     def get(self, job_id: str) -> dict[str, Any]:
         """The job as it is now."""
-        return self._json("GET", f"/v1/jobs/{quote(job_id, safe='')}")
+        return self._json("GET", _route(job_id))
 
     def cancel(self, job_id: str) -> dict[str, Any]:
         """The job, cancelled."""
-        return self._json("POST", f"/v1/jobs/{quote(job_id, safe='')}:cancel")
+        return self._json("POST", _route(job_id, ":cancel"))
 
     def retry(self, job_id: str) -> dict[str, Any]:
         """The job in its place."""
-        return self._json("POST", f"/v1/jobs/{quote(job_id, safe='')}:retry")
+        return self._json("POST", _route(job_id, ":retry"))
 
     def delete(self, job_id: str) -> None:
         """Removes a finished job and its files."""
-        self._open("DELETE", f"/v1/jobs/{quote(job_id, safe='')}").close()
+        self._open("DELETE", _route(job_id)).close()
 
     def jobs(self, *, state: str, kind: str, limit: int) -> list[dict[str, Any]]:
         """The newest jobs, at most `limit`."""
@@ -70,12 +70,12 @@ class JobClient:
 
     def log(self, job_id: str, max_bytes: int) -> str:
         """The end of its log."""
-        with self._open("GET", f"/v1/jobs/{quote(job_id, safe='')}/log?max_bytes={max_bytes}") as answer:
+        with self._open("GET", _route(job_id, f"/log?max_bytes={max_bytes}")) as answer:
             return answer.read().decode("utf-8", "replace")
 
     def download(self, job_id: str, name: str, path: Path) -> None:
         """Writes an artifact to `path`, whole or not at all."""
-        route = f"/v1/jobs/{quote(job_id, safe='')}/artifacts/{quote(name, safe='')}"
+        route = _route(job_id, f"/artifacts/{quote(name, safe='')}")
         with self._open("GET", route) as answer, atomic_path(path) as temporary, temporary.open("wb") as file:
             shutil.copyfileobj(answer, file)
             announced = answer.headers.get("Content-Length")
@@ -84,7 +84,7 @@ class JobClient:
 
     def changes(self, job_id: str) -> Iterator[dict[str, Any]]:
         """The job at first and whenever it changed; ends after its final state, or where the service goes away."""
-        with self._open("GET", f"/v1/jobs/{quote(job_id, safe='')}/events") as answer:
+        with self._open("GET", _route(job_id, "/events")) as answer:
             event = ""
             try:
                 for line in answer:
@@ -117,6 +117,10 @@ class JobClient:
                 "--server"
             ) from error
         return answer
+
+
+def _route(job_id: str, suffix: str = "") -> str:
+    return f"/v1/jobs/{quote(job_id, safe='')}{suffix}"
 
 
 def _refusal(status: int, content: bytes, server: str) -> UltragrayError:

@@ -140,7 +140,7 @@ class JobHub:
 
     @property
     def readers(self) -> int:
-        """How many jobs are being read."""
+        """The number of jobs that are being read."""
         return len(self._readers)
 
     async def watch(self, job_id: str) -> JobWatch:

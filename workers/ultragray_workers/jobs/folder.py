@@ -29,7 +29,7 @@ FOLDER = "jobs"
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a job is; null for what does not apply, or not yet."""
+    """The progress of a job; null for what does not apply, or not yet."""
 
     __pydantic_config__: ClassVar[dict[str, Any]] = {"json_schema_serialization_defaults_required": True}
 

@@ -21,7 +21,7 @@ PRIORITY_ZERO = MAX_PRIORITY + 1  # DBOS takes the lowest number first, from 1
 
 
 class JobState(str, Enum):
-    """Where a job is in its life."""
+    """The state of a job in its life."""
 
     QUEUED = "queued"
     RUNNING = "running"

@@ -1,4 +1,4 @@
-"""Which workers are alive: a small table beside the queue, and the take-over of the jobs of those that are not.
+"""The workers that are alive: a small table beside the queue, and the take-over of the jobs of those that are not.
 
 DBOS hands a dead worker's jobs to nobody. Here each worker beats every second, by the clock of the database, and puts
 the jobs of workers that have not beaten for a while back into the queue. It does the same with jobs of its own that it

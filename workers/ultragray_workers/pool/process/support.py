@@ -18,7 +18,7 @@ def below_limit(task: RenderTask, extrapolations: Sequence[Extrapolation]) -> li
 
 
 def refusal(task: RenderTask, extrapolations: Sequence[Extrapolation]) -> LowConfidence | None:
-    """Why a task of one part is not rendered; None where it is."""
+    """The reason not to render a task of one part; None where it is rendered."""
     limit = task.view.min_confidence
     if limit is None or task.view.below_min_confidence is not Below.REFUSE:
         return None
