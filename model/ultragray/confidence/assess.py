@@ -89,8 +89,7 @@ class Assessor:
 
 def supported(coverage: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:  # [C, H, W] -> [C, H, W]
     """A mask of the pixels that Gaussians support: γ of at least SUPPORT_COVERAGE."""
-    mask: npt.NDArray[np.bool_] = np.asarray(coverage) >= SUPPORT_COVERAGE
-    return mask
+    return np.asarray(coverage) >= SUPPORT_COVERAGE
 
 
 def read_model(document: dict[str, Any], view_count: int) -> ConfidenceModel | None:

@@ -101,14 +101,12 @@ def terms_of(measures: ViewMeasures, hardness: FloatArray) -> FloatArray:  # [P]
         measures.angle_deg / ANGLE_DEG,
         measures.weights @ hardness,
     )
-    terms: FloatArray = -np.stack(columns, axis=1)
-    return terms
+    return -np.stack(columns, axis=1)
 
 
 def predicted(weights: FloatArray, terms: FloatArray, black_ms_ssim: float) -> FloatArray:  # [C]
     """The formula."""
-    figures: FloatArray = black_ms_ssim + (1.0 - black_ms_ssim) * _logistic(terms @ weights)
-    return figures
+    return black_ms_ssim + (1.0 - black_ms_ssim) * _logistic(terms @ weights)
 
 
 def fit_weights(terms: FloatArray, ms_ssim: FloatArray, black_ms_ssim: float) -> FloatArray:  # [C, 1 + TERMS], [C]
@@ -143,8 +141,7 @@ def fit_weights(terms: FloatArray, ms_ssim: FloatArray, black_ms_ssim: float) ->
 
 
 def _logistic(values: FloatArray) -> FloatArray:
-    figures: FloatArray = 1.0 / (1.0 + np.exp(-np.clip(values, -500.0, 500.0)))
-    return figures
+    return 1.0 / (1.0 + np.exp(-np.clip(values, -500.0, 500.0)))
 
 
 def _numbers(name: str, values: Any) -> tuple[float, ...]:

@@ -109,8 +109,7 @@ class TrainingViews:
     def _angles_deg(self, pose: FloatArray) -> FloatArray:  # [P]
         """Angle of the rotation from the pose to each view."""
         cosine = 0.5 * (self._rotations @ pose[:3, :3].ravel() - 1.0)
-        angles: FloatArray = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
-        return angles
+        return np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
 
 
 def _image_points(probe: Probe) -> FloatArray:  # [K, 3] mm, probe frame

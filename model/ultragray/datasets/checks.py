@@ -8,13 +8,11 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 
-from ..contract import to_dict
 from ..pose import rotation_angles_deg
 from ..probe import FloatArray, Probe
 from .sweep import Dataset, Sweep, corner_distances_mm
@@ -77,10 +75,6 @@ class DatasetReport:
             *(f"val: {text}" for text in (self.val.warnings if self.val else ())),
             *self.warnings,
         )
-
-    def to_dict(self) -> dict[str, Any]:
-        """The report as JSON can hold it."""
-        return {**asdict(self), "probe": to_dict(self.probe)}
 
 
 def check_dataset(dataset: Dataset) -> DatasetReport:

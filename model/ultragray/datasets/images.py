@@ -122,8 +122,7 @@ def _as_uint8(frame: npt.NDArray[Any], number: int, source: str) -> ByteArray:
         raise DatasetInvalid(
             f"{source}: frame {number} must be uint8 or lie in [0, 1], its values go from {low:g} to {high:g}"
         )
-    scaled: ByteArray = np.rint(np.asarray(frame, np.float64) * 255.0).astype(np.uint8)
-    return scaled
+    return np.rint(np.asarray(frame, np.float64) * 255.0).astype(np.uint8)
 
 
 def _luma(frame: ByteArray, size: tuple[int, int]) -> ByteArray:

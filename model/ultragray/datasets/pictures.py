@@ -95,5 +95,4 @@ def _outlines(corners: FloatArray) -> FloatArray:  # [F, P, 3] -> [F * (P + 2), 
     half = corners.shape[1] // 2
     order = [*range(half), *reversed(range(half, 2 * half)), 0]
     lifts = np.full((len(corners), 1, 3), np.nan)
-    outlines: FloatArray = np.concatenate([corners[:, order], lifts], axis=1).reshape(-1, 3)
-    return outlines
+    return np.concatenate([corners[:, order], lifts], axis=1).reshape(-1, 3)

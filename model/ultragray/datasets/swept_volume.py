@@ -45,8 +45,7 @@ def swept_volume(sweep: Sweep) -> SweptVolume:
 
 
 def _counts(span_mm: FloatArray, voxel_mm: float) -> FloatArray:  # [3]
-    counts: FloatArray = np.maximum(np.ceil(span_mm / voxel_mm - 1e-9), 1.0)
-    return counts
+    return np.maximum(np.ceil(span_mm / voxel_mm - 1e-9), 1.0)
 
 
 def _plane_points(probe: Probe, spacing_mm: float) -> FloatArray:  # [P, 3]

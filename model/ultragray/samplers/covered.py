@@ -42,7 +42,8 @@ class CoveredSampler(Sampler):
             raise InvalidArgument(
                 f"sampler covered takes at most {MAX_BASE_POSES:,} base poses, got {len(base):,}", field="kind"
             )
-        links, lengths = _shortest_links(_corners_mm(base, probe))
+        corners = np.einsum("pij,kj->pki", base[:, :3, :3], probe.corners_mm()) + base[:, None, :3, 3]  # [P, K, 3] mm
+        links, lengths = _shortest_links(corners)
         lengths = np.where(lengths > LARGEST_GAP * np.median(lengths), 0.0, lengths)
         ends = np.cumsum(lengths)
         if not ends[-1] > 0.0:
@@ -61,11 +62,6 @@ class CoveredSampler(Sampler):
         turns = _angles_rad(first, second) * random.uniform(size=self.count)
         made[:, :3, :3] = made[:, :3, :3] @ about_axes(random_directions(random, self.count), turns)
         return made
-
-
-def _corners_mm(base: FloatArray, probe: Probe) -> FloatArray:  # [P, K, 3]
-    corners: FloatArray = np.einsum("pij,kj->pki", base[:, :3, :3], probe.corners_mm()) + base[:, None, :3, 3]
-    return corners
 
 
 def _shortest_links(corners: FloatArray) -> tuple[np.ndarray, FloatArray]:  # [P, K, 3] -> [P-1, 2], [P-1] mm

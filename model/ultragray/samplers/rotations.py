@@ -28,8 +28,7 @@ def blended(first: FloatArray, second: FloatArray, shares: FloatArray) -> FloatA
     """The rotations [C, 3, 3] on the shortest way from the first (share 0) to the second (1), at even speed (slerp)."""
     relative = first.transpose(0, 2, 1) @ second
     axes, angles = _axes_and_angles(relative)
-    turned: FloatArray = first @ about_axes(axes, shares * angles)
-    return turned
+    return first @ about_axes(axes, shares * angles)
 
 
 def _axes_and_angles(rotations: FloatArray) -> tuple[FloatArray, FloatArray]:  # [C, 3, 3] -> [C, 3], [C] rad in [0, π]

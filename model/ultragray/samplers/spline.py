@@ -53,8 +53,7 @@ class SplineSampler(Sampler):
 
     def _places(self, length_mm: float) -> FloatArray:  # [C]
         if self.count is not None:
-            places: FloatArray = np.linspace(0.0, length_mm, self.count)
-            return places
+            return np.linspace(0.0, length_mm, self.count)
         assert self.spacing_mm is not None
         steps = min(length_mm / self.spacing_mm + 1e-9, 10.0 * MAX_POSES)
         self._require_few(math.floor(steps) + 1, "spacing_mm")

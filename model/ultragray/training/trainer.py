@@ -151,6 +151,8 @@ class Trainer:
         config = config.resolved(self._geometry)
         check_memory(dataset, config, self._device)
         self.dataset, self.config, self.folder = dataset, config, folder
+        self._checkpoint = None if folder is None else folder / CHECKPOINT_FILE
+        self._dataset_sha256 = dataset.sha256
         forget_peak_memory(self._device)
         self._images = torch.tensor(dataset.train.images, device=self._device)  # [F, H, W] uint8
         x, y, z = self._geometry.centre_mm.tolist()
@@ -161,7 +163,7 @@ class Trainer:
             image_width=dataset.train.width,
             intensity=config.intensity,
             dataset_name=dataset.name,
-            dataset_sha256=dataset.sha256,
+            dataset_sha256=self._dataset_sha256,
         )
         self._generator = torch.Generator().manual_seed(config.seed)
         self._sampler = BatchSampler(len(dataset.train), config.batch_size, self._generator)
@@ -370,7 +372,7 @@ class Trainer:
         return TrainingDiverged(f"training diverged in step {step}: {what}{self._kept()}")
 
     def _kept(self) -> str:
-        path = None if self.folder is None else self.folder / CHECKPOINT_FILE
+        path = self._checkpoint
         return f"; the last good checkpoint is kept in {path}" if path is not None and path.exists() else ""
 
     def _validate(self) -> float:
@@ -385,7 +387,7 @@ class Trainer:
     def save_checkpoint(self) -> None:
         """Writes what a resumed run needs, where the run has a folder. Raises TrainingDiverged rather than keep NaN."""
         self._check_finite()
-        if self.folder is None:
+        if self._checkpoint is None:
             return
         tensors = {
             **{f"parameter.{name}": tensor for name, tensor in self.parameters.items()},
@@ -395,18 +397,15 @@ class Trainer:
             "waiting": self._sampler.waiting,
             "generator": self._generator.get_state(),
         }
-        assert self._info.dataset_sha256 is not None
-        header = CheckpointHeader(self.step, self._timer.elapsed_s, self._info.dataset_sha256, self.config)
-        write_checkpoint(self.folder / CHECKPOINT_FILE, header, tensors)
+        header = CheckpointHeader(self.step, self._timer.elapsed_s, self._dataset_sha256, self.config)
+        write_checkpoint(self._checkpoint, header, tensors)
 
     def restore(self) -> None:
         """Takes over the run of the folder's checkpoint. Raises TrainingStateInvalid where it is another run's."""
-        if self.folder is None:
+        if (path := self._checkpoint) is None:
             raise TrainingStateInvalid("a run without a folder cannot be resumed")
-        path = self.folder / CHECKPOINT_FILE
         header, tensors = read_checkpoint(path)
-        assert self._info.dataset_sha256 is not None
-        check_same_run(path, header, self.config, self._info.dataset_sha256)
+        check_same_run(path, header, self.config, self._dataset_sha256)
         check_tensors(path, header, tensors, len(self.dataset.train))
         try:
             self._generator.set_state(tensors["generator"])

@@ -65,11 +65,12 @@ def check(
     """Tell what is in a dataset, and what looks wrong. Exit code 2 where it cannot be used at all."""
     from json import dumps
 
+    from ultragray.contract import to_dict
     from ultragray.datasets.checks import check_dataset
 
     report = check_dataset(read_dataset(dataset, source))
     if json:
-        typer.echo(dumps(report.to_dict(), indent=2))
+        typer.echo(dumps(to_dict(report), indent=2))
     else:
         _print_report(report)
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from ultragray import ConvexProbe, LinearProbe, Probe
+from ultragray.contract import to_dict
 from ultragray.datasets import Dataset, Sweep
 from ultragray.datasets.checks import check_dataset, check_sweep
 from ultragray.datasets.source import load_dataset
@@ -96,7 +97,7 @@ def test_held_out_frames_are_measured_from_the_nearest_training_frame(make_sweep
         "something was assumed",
         "held-out frames 3 are also training frames: metrics will flatter",
     )
-    document = json.loads(json.dumps(report.to_dict()))
+    document = json.loads(json.dumps(to_dict(report)))
     assert document["probe"] == {"kind": "linear", "width_mm": 40.0, "near_mm": 0.0, "far_mm": 50.0}
     assert document["train"]["frames"] == 5
 

@@ -43,5 +43,4 @@ def read_picture(folder: Path, name: str, index: int) -> npt.NDArray[np.uint8] |
     if not 0 <= index < len(stack):
         return None
     drawn = with_square_pixels(stack[index].astype(np.float32), probe, PICTURE_SIDE)
-    picture: npt.NDArray[np.uint8] = np.rint(drawn).astype(np.uint8)
-    return picture
+    return np.rint(drawn).astype(np.uint8)

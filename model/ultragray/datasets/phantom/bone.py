@@ -65,8 +65,7 @@ def _box(place: Place, middle: Triple, half: Triple, radius: float) -> Floats:
 
 
 def _length(x: Floats, y: Floats, z: Floats) -> Floats:
-    length: Floats = np.sqrt(x * x + y * y + z * z)
-    return length
+    return np.sqrt(x * x + y * y + z * z)
 
 
 def _blend(a: Floats, b: Floats) -> Floats:

@@ -113,8 +113,7 @@ class Grid:
     def above(self, per_mm: FloatArray) -> FloatArray:  # [R, C] -> [R, C]
         """The sum of something over each scan line, from the probe's face down to the middle of each cell."""
         seen = np.where(self.depths_mm[:, None] > 0.0, per_mm, 0.0)
-        total: FloatArray = self.cell_mm[0] * (np.cumsum(seen, axis=0) - 0.5 * seen)
-        return total
+        return self.cell_mm[0] * (np.cumsum(seen, axis=0) - 0.5 * seen)
 
     def pixels(self, values: Floats) -> Floats:  # [R, C] -> [H, W]
         """The mean over the cells of each pixel."""
@@ -158,8 +157,7 @@ def _reflected(scatterers: Scatterers, pose: FloatArray) -> Float32Array:  # [M]
     """Amplitudes of the scatterers on interfaces for the beam of this pose."""
     cosine = np.minimum(np.abs(scatterers.normals @ pose[:3, 2].astype(np.float32)), 1.0)
     lobe = np.exp(-0.5 * (np.arccos(cosine) / scatterers.lobe_rad) ** 2)
-    reflected: Float32Array = scatterers.diffuse + scatterers.specular * lobe
-    return reflected
+    return scatterers.diffuse + scatterers.specular * lobe
 
 
 def _blurred(echoes: Complex64Array, grid: Grid) -> Complex64Array:  # [R, C]

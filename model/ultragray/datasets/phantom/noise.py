@@ -31,12 +31,10 @@ class LatticeNoise:
 
         def along_y(i: IntArray) -> Floats:
             near = along_z(i, j)
-            value: Floats = near + v * (along_z(i, (j + 1) & _LAST) - near)
-            return value
+            return near + v * (along_z(i, (j + 1) & _LAST) - near)
 
         near = along_y(i)
-        value: Floats = near + u * (along_y((i + 1) & _LAST) - near)
-        return value
+        return near + u * (along_y((i + 1) & _LAST) - near)
 
     @staticmethod
     def _cell(scaled: Floats) -> tuple[IntArray, Floats]:

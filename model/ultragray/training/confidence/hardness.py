@@ -62,8 +62,7 @@ def hardness_of_views(sweep: Sweep) -> FloatArray:  # [F]
     counts = np.bincount(rows, minlength=len(targets))
     own = np.bincount(rows, misses, len(targets)) / np.maximum(counts, 1)  # [T]
     weights = TrainingViews(sweep.poses[targets], sweep.probe).measure(sweep.poses, sweep.probe).weights  # [F, T]
-    hardness: FloatArray = weights @ own
-    return hardness
+    return weights @ own
 
 
 def _pooled(images: ByteArray) -> ByteArray:  # [F, H, W] -> [F, h, w]

@@ -37,8 +37,7 @@ def held_out_frames(sweep: Sweep) -> IntArray:  # [H] places, ascending
     singles = rest[np.argsort(path[rest], kind="stable")][SINGLE_EVERY // 2 :: SINGLE_EVERY]
     wanted = np.concatenate([stretches[np.argsort(path[stretches], kind="stable")], singles])
     allowed = min(math.floor(MAX_SHARE * len(sweep)), len(sweep) - LEAST_KEPT)
-    places: IntArray = np.sort(wanted[: max(allowed, 0)]).astype(np.int64)
-    return places
+    return np.sort(wanted[: max(allowed, 0)]).astype(np.int64)
 
 
 def _path(sweep: Sweep) -> FloatArray:  # [F] in [0, 1]
