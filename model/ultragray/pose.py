@@ -28,23 +28,20 @@ def check_poses(poses: Any, *, field: str = "poses") -> FloatArray:  # [C, 4, 4]
     Raises InvalidPose, naming the pose, for anything else: wrong shape, non-finite, scaled, sheared, mirrored, a last
     row other than 0 0 0 1, or a position beyond a kilometre.
     """
-    array = _as_float64(poses, field)
-    if array.ndim == 2:
-        array, names = array[None], [field]
-    else:
-        names = [f"{field}[{c}]" for c in range(len(array))] if array.ndim else []
+    given = _as_float64(poses, field)
+    array = given[None] if given.ndim == 2 else given
     if array.ndim != 3 or array.shape[1:] != (4, 4):
-        given = list(array.shape[1:] if names == [field] else array.shape)
-        raise InvalidPose(f"{field} must have shape [C, 4, 4] or [4, 4], got {given}", field=field)
+        raise InvalidPose(f"{field} must have shape [C, 4, 4] or [4, 4], got {list(given.shape)}", field=field)
     rotations = array[:, :3, :3]
-    with np.errstate(all="ignore"):  # NaN and infinity fail the comparisons and are told below
+    with np.errstate(all="ignore"):  # NaN and infinity fail the comparisons and are named below
         deviations = np.abs(rotations.transpose(0, 2, 1) @ rotations - _IDENTITY[:3, :3]).max(axis=(1, 2), initial=0.0)
         rigid = (deviations <= ROTATION_TOLERANCE) & (np.linalg.det(rotations) > 0)
         rigid &= np.abs(array[:, 3] - _IDENTITY[3]).max(axis=1, initial=0.0) <= ROTATION_TOLERANCE
         rigid &= np.abs(array[:, :3, 3]).max(axis=1, initial=0.0) <= MAX_POSITION_MM
     if not rigid.all():
         first = int(np.argmin(rigid))
-        raise _why_not_rigid(array[first], float(deviations[first]), names[first])
+        name = field if given.ndim == 2 else f"{field}[{first}]"
+        raise _why_not_rigid(array[first], float(deviations[first]), name)
     exact: FloatArray = array.copy()
     exact[:, 3] = _IDENTITY[3]
     rough = deviations > EXACT  # the others stay as they are: a pose that was used once comes back to the bit

@@ -191,8 +191,7 @@ class GaussianScene:
 
     def save(self, path: str | Path) -> None:
         """Writes the scene file whole or not at all. Raises OSError where it cannot be written."""
-        data = self.to_bytes()
-        write_whole(path, data)
+        write_whole(path, self.to_bytes())
 
     @classmethod
     def load(cls, path: str | Path) -> GaussianScene:
@@ -202,10 +201,9 @@ class GaussianScene:
             with safe_open(path, framework="pt") as bundle:
                 splats = {name: bundle.get_tensor(name) for name in PARAMETERS}
                 labels = bundle.get_tensor(LABELS_TENSOR) if header.info.label_names else None
-            scene = cls.from_splats(splats, info=header.info, training_poses=header.training_poses, labels=labels)
+            return cls.from_splats(splats, info=header.info, training_poses=header.training_poses, labels=labels)
         except (OSError, SafetensorError, ValueError) as error:
             raise scene_file_invalid(path, error) from error
-        return scene
 
 
 def _names_of_labels(labels: Any, means: Tensor, known: Mapping[int, str]) -> dict[int, str]:

@@ -12,13 +12,13 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
 
 from ..datasets.phantom import Tissue, load_phantom, tissue_at
 from ..datasets.phantom.shadow import BoneShadow
 from ..datasets.sweep import Dataset
+from ..display.pixels import image_file
 from ..evaluation.scoring import render_sweep
 from ..files.atomic import write_whole
 from ..probe import FloatArray
@@ -55,7 +55,7 @@ def main() -> None:
 
 def make_scene(dataset: Dataset, config: TrainingConfig) -> GaussianScene:
     """The demo scene, trained from the phantom's dataset and measured on its held-out sweep, shadows included."""
-    scene = train(dataset, config, report=_teller())
+    scene = train(dataset, config, report=_progress_logger())
     shadow = BoneShadow.of(dataset.val)
     metrics = {
         **scene.info.metrics,
@@ -76,13 +76,13 @@ def labelled(scene: GaussianScene) -> GaussianScene:
     return replace(scene, info=replace(scene.info, label_names=names), labels=labels)
 
 
-def _teller() -> Callable[[Progress], None]:
-    told_at = time.monotonic()
+def _progress_logger() -> Callable[[Progress], None]:
+    logged_at = time.monotonic()
 
-    def tell(progress: Progress) -> None:
-        nonlocal told_at
-        if time.monotonic() - told_at >= SECONDS_PER_LINE:
-            told_at = time.monotonic()
+    def log_progress(progress: Progress) -> None:
+        nonlocal logged_at
+        if time.monotonic() - logged_at >= SECONDS_PER_LINE:
+            logged_at = time.monotonic()
             log.info(
                 "step %d of %d, loss %.4f, %.0f s left",
                 progress.step,
@@ -91,7 +91,7 @@ def _teller() -> Callable[[Progress], None]:
                 progress.seconds_left,
             )
 
-    return tell
+    return log_progress
 
 
 def picture_poses() -> dict[str, FloatArray]:  # each [4, 4] mm
@@ -107,8 +107,7 @@ def write_pictures(scene: GaussianScene, folder: Path) -> None:
     for view, pose in picture_poses().items():
         frame = render(scene, None, pose, height=PICTURE_SIDE, width=PICTURE_SIDE, outputs=("bmode",)).bmode
         assert frame is not None
-        picture = (255.0 * frame[0]).round().byte().numpy()
-        write_whole(folder / f"demo_{view}.png", cv2.imencode(".png", picture)[1].tobytes())
+        write_whole(folder / f"demo_{view}.png", image_file(frame[0].numpy(), ".png").tobytes())
 
 
 if __name__ == "__main__":

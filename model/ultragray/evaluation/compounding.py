@@ -52,15 +52,11 @@ class Volume:
         last = np.array(self.values.shape) - 1
         planes = np.zeros((len(poses), height, width), np.float32)
         for plane, pose in zip(planes, check_poses(poses) if len(poses) else poses, strict=True):
-            places = self._places(points, pose) * (2.0 / last) - 1.0
+            places = _on_grid(points, pose, self.axes, self.origin_mm, self.voxel_mm) * (2.0 / last) - 1.0
             grid = torch.from_numpy(places[:, ::-1].astype(np.float32))  # grid_sample wants the last axis first
             value, known = functional.grid_sample(volume, grid[None, None, None], align_corners=True)[0, :, 0, 0]
             plane[:] = torch.where(known > 0, value / known.clamp_min(1e-6), 0.0).view(height, width).numpy()
         return planes
-
-    def _places(self, points: FloatArray, pose: FloatArray) -> FloatArray:  # [P, 3] mm, probe frame -> [P, 3] voxels
-        places: FloatArray = _on_grid(points, pose, self.axes, self.origin_mm, self.voxel_mm)
-        return places
 
 
 def compound(sweep: Sweep, method: str = "median", voxel_mm: float = VOXEL_MM) -> Volume:

@@ -10,13 +10,13 @@ import numpy as np
 import numpy.typing as npt
 
 from ..datasets.sweep import Sweep, spread_places
+from ..display.pixels import ByteArray, image_file, to_uint8
 from ..display.scan_conversion import with_square_pixels
 from ..files.atomic import write_whole
 from ..scene import GaussianScene
 from .metrics import FrameMetrics
 from .scoring import Evaluation, render_sweep
 
-ByteImage = npt.NDArray[np.uint8]
 MAX_SIDE_PIXELS = 512  # of one panel
 GAP_PIXELS = 6
 TITLE_PIXELS = 22
@@ -37,13 +37,13 @@ def write_side_by_side(
     folder.mkdir(parents=True, exist_ok=True)
     paths = []
     for place, (number, reached) in enumerate(zip(sweep.frame_numbers, metrics, strict=True)):
-        told = (
+        caption = (
             f"frame {number}: PSNR {reached.psnr_db:.2f} dB, MS-SSIM {reached.ms_ssim:.3f}, "
             f"GMS {reached.gms:.3f}, GMSD {reached.gmsd:.3f}"
         )
-        picture = _row({title: images[place] for title, images in panels.items()}, sweep, told)
+        picture = _row({title: images[place] for title, images in panels.items()}, sweep, caption)
         paths.append(folder / f"frame_{number:05d}.png")
-        write_whole(paths[-1], cv2.imencode(".png", picture)[1].tobytes())
+        write_whole(paths[-1], image_file(picture, ".png").tobytes())
     return paths
 
 
@@ -68,14 +68,12 @@ def side_by_side_panels(
     }
 
 
-def as_picture(frame: npt.NDArray[np.float32], sweep: Sweep, max_side: int = MAX_SIDE_PIXELS) -> ByteImage:
+def as_picture(frame: npt.NDArray[np.float32], sweep: Sweep, max_side: int = MAX_SIDE_PIXELS) -> ByteArray:
     """A frame [H, W] in [0, 1] as the eye expects it: square pixels, a fan as one, the longer side `max_side`."""
-    drawn = with_square_pixels(frame, sweep.probe, max_side)
-    picture: ByteImage = np.rint(np.clip(drawn, 0.0, 1.0) * 255.0).astype(np.uint8)
-    return picture
+    return to_uint8(with_square_pixels(frame, sweep.probe, max_side))
 
 
-def _row(panels: Mapping[str, npt.NDArray[np.float32]], sweep: Sweep, told: str) -> ByteImage:
+def _row(panels: Mapping[str, npt.NDArray[np.float32]], sweep: Sweep, caption: str) -> ByteArray:
     drawn = {title: as_picture(frame, sweep) for title, frame in panels.items()}
     height, width = next(iter(drawn.values())).shape
     canvas = np.full((height + 2 * TITLE_PIXELS, len(drawn) * (width + GAP_PIXELS) - GAP_PIXELS), BACKGROUND, np.uint8)
@@ -83,9 +81,9 @@ def _row(panels: Mapping[str, npt.NDArray[np.float32]], sweep: Sweep, told: str)
         left = place * (width + GAP_PIXELS)
         canvas[TITLE_PIXELS : TITLE_PIXELS + height, left : left + width] = picture
         _write(canvas, title, left + 2, TITLE_PIXELS - 7)
-    _write(canvas, told, 2, height + 2 * TITLE_PIXELS - 7)
+    _write(canvas, caption, 2, height + 2 * TITLE_PIXELS - 7)
     return canvas
 
 
-def _write(canvas: ByteImage, text: str, left: int, baseline: int) -> None:
+def _write(canvas: ByteArray, text: str, left: int, baseline: int) -> None:
     cv2.putText(canvas, text, (left, baseline), cv2.FONT_HERSHEY_SIMPLEX, 0.42, INK, 1, cv2.LINE_AA)

@@ -65,8 +65,7 @@ def export_checkpoint(scene: GaussianScene, checkpoint: str | Path) -> Checkpoin
         if WIDTH_KEY not in probe_keys(released_probe):
             notes.append(f"the released trainer knows linear probes only: it does not read this {CONFIG_NAME}")
         if len(scene.training_poses):
-            x, y, z = released_centre_mm(released_probe, scene.training_poses).tolist()
-            centre_mm = (x, y, z)
+            centre_mm = tuple(released_centre_mm(released_probe, scene.training_poses).tolist())
             beside[POSES_NAME] = _npy(scene.training_poses)
         else:
             notes.append(f"no {POSES_NAME}: the scene has no training poses; poses are relative to its centre, {at}")

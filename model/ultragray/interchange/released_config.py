@@ -71,7 +71,7 @@ def stretch_released_far(near: float, far_released: float, height: int) -> float
 
 @dataclass(frozen=True)
 class _Kind:
-    """How conf.json writes a kind of probe: the key of its size across, that size, and the way back."""
+    """A kind of probe in conf.json: the key of its size across, that size, and the way back."""
 
     key: str
     size: Callable[[Any], float]

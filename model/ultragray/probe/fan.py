@@ -1,4 +1,4 @@
-"""What convex and phased arrays share."""
+"""The base of convex and phased arrays."""
 
 from __future__ import annotations
 

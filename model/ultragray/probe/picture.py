@@ -1,4 +1,4 @@
-"""Where the pixels of a picture lie in the image plane of a probe."""
+"""The place of a picture's pixels in the image plane of a probe."""
 
 from __future__ import annotations
 

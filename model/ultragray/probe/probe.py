@@ -57,7 +57,7 @@ class Probe(Family):
 
     @property
     def pivot_depth_mm(self) -> float:
-        """Where on z the middle of the face lies, about which a probe is tilted."""
+        """Depth of the middle of the face, about which a probe is tilted."""
         return self.face_depth_mm
 
     @property
@@ -85,18 +85,18 @@ class Probe(Family):
         return self.near_mm + self.scan_line_length_mm * (height - 1) / height
 
     def cull(self, x_mm: FloatArray, z_mm: FloatArray, height: int) -> BoolArray:  # [N] each
-        """Which means of Gaussians count, by their depth: up to the top edge of the last row."""
+        """A mask of the means of Gaussians that count, by their depth: up to the top edge of the last row."""
         depth, _ = self.lines.coordinates(x_mm, z_mm)
         seen: BoolArray = (depth >= self.near_mm) & (depth <= self.cull_far_mm(height))
         return seen
 
     def scan_lines(self, width: int) -> tuple[FloatArray, FloatArray]:  # [W, 3] mm, [W, 3]
-        """Where each scan line has depth 0 (mm), and its unit direction, in the probe frame."""
+        """The point of depth 0 of each scan line (mm), and its unit direction, in the probe frame."""
         origins, directions = self.lines.rays(self.lines.across(width))
         return _in_probe_frame(origins), _in_probe_frame(directions)
 
     def points_mm(self, rows: FloatArray, columns: FloatArray) -> FloatArray:  # [...] both -> [..., 3]
-        """Where image coordinates, from 0 to 1 down and across the image, lie in the probe frame, mm."""
+        """Image coordinates, from 0 to 1 down and across the image, as points in the probe frame, mm."""
         origins, directions = self.lines.rays(self.lines.start + self.lines.span * columns)
         depth = self.near_mm + self.scan_line_length_mm * rows
         return _in_probe_frame(origins + depth[..., None] * directions)

@@ -1,8 +1,8 @@
 """Bundles of scan lines in an image plane: where they run, and which of them goes through a point.
 
-A line is told by its `across`, a number that grows evenly from line to line, in mm or degrees: of W lines, line j has
-start + span·(j+½)/W. A point of the plane is told by x and z, lateral and axial, or by its depth along the line through
-it and the across of that line.
+The place of a line is its `across`, a number that grows evenly from line to line, in mm or degrees: of W lines, line j
+has start + span·(j+½)/W. A point of the plane has x and z, lateral and axial, or its depth along the line through it
+and the across of that line.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Box(NamedTuple):
 
 
 class ScanLines(ABC):
-    """What all bundles of scan lines tell of themselves. Lengths are in mm."""
+    """The base of the bundles. Lengths are in mm."""
 
     span: float  # from the left edge of the first line to the right edge of the last one, in `unit`
     unit: ClassVar[str]  # of `across`: "mm" or "deg"
@@ -50,7 +50,7 @@ class ScanLines(ABC):
 
     @abstractmethod
     def rays(self, across: FloatArray) -> tuple[FloatArray, FloatArray]:  # [...] -> [..., 2] both
-        """Where the lines begin, at depth 0, and their unit directions: x and z of each."""
+        """Origins of the lines, at depth 0, and their unit directions: x and z of each."""
 
     @abstractmethod
     def coordinates(self, x: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -58,7 +58,7 @@ class ScanLines(ABC):
 
     @abstractmethod
     def beside(self, x: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """How far points lie beside the outermost lines, 0 or less between them, and their depth."""
+        """Distance of points from the outermost lines, 0 or less between them, and their depth."""
 
     @abstractmethod
     def box(self, near_mm: float, far_mm: float) -> Box:

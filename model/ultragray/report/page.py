@@ -7,12 +7,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-import cv2
 import numpy as np
-import numpy.typing as npt
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from ..datasets.sweep import Dataset, spread_places
+from ..display.pixels import ByteArray, image_file
 from ..evaluation.baselines import predict
 from ..evaluation.compounding import VOXEL_MM
 from ..evaluation.metrics import FrameMetrics
@@ -201,6 +200,5 @@ def _spread_places(content: ReportContent, most: int) -> dict[int, str]:
     return dict.fromkeys(spread_places(len(content.dataset.val), most).tolist(), "")
 
 
-def _data_uri(picture: npt.NDArray[np.uint8]) -> str:
-    encoded = cv2.imencode(".png", picture)[1].tobytes()
-    return "data:image/png;base64," + base64.b64encode(encoded).decode()
+def _data_uri(picture: ByteArray) -> str:
+    return "data:image/png;base64," + base64.b64encode(image_file(picture, ".png").tobytes()).decode()

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from ...outputs import PLANES, WEIGHT_SUM
 from ...probe import FloatArray, Probe
+from ...scene_info import expected_shapes
 from ..scan_lines import KernelLines
 from .device import interpreted
 from .kernels import constants
@@ -126,6 +127,11 @@ class Gaussians:
         )
 
     @property
+    def tensors(self) -> tuple[Tensor, ...]:
+        """The six, in the order in which the kernels take them."""
+        return self.means, self.scales, self.quats, self.transmittances, self.sh0, self.shn
+
+    @property
     def degree(self) -> int:
         return math.isqrt(self.shn.shape[1] + 1) - 1
 
@@ -177,17 +183,8 @@ def cut(gaussians: Gaussians, views: Tensor, geometry: Geometry, *, record: bool
     if places:
         slice_gaussians[(blocks, poses)](
             views,
-            gaussians.means,
-            gaussians.scales,
-            gaussians.quats,
-            gaussians.transmittances,
-            gaussians.sh0,
-            gaussians.shn,
-            made.slices,
-            made.rectangles,
-            made.bounds,
-            made.counts,
-            made.places,
+            *gaussians.tensors,
+            *vars(made).values(),
             count,
             gaussians.shn.stride(0),
             geometry.height,
@@ -273,14 +270,8 @@ def differentiate(
     height, width = geometry.height, geometry.width
     poses, blocks = slices.counts.shape
     count, terms = len(gaussians.means), (gaussians.degree + 1) ** 2
-    found = {
-        "means": torch.empty((count, 3), device=device),
-        "scales": torch.empty((count, 3), device=device),
-        "quats": torch.empty((count, 4), device=device),
-        "transmittances": torch.empty(count, device=device),
-        "sh0": torch.empty((count, 1, 1), device=device),
-        "shN": torch.empty((count, terms - 1, 1), device=device),
-    }
+    shapes_by_name = expected_shapes(count, gaussians.degree)  # in the order in which the kernel takes them
+    found = {name: torch.empty(shape, device=device) for name, shape in shapes_by_name.items()}
     if not count:
         return found
     by_pixel = [torch.empty_like(planes.weight) for _ in range(4)]
@@ -321,12 +312,7 @@ def differentiate(
         )
     place_gradients[(blocks,)](
         views,
-        gaussians.means,
-        gaussians.scales,
-        gaussians.quats,
-        gaussians.transmittances,
-        gaussians.sh0,
-        gaussians.shn,
+        *gaussians.tensors,
         slices.rectangles,
         slices.counts,
         slices.places,

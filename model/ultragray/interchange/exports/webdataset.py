@@ -29,8 +29,8 @@ class TarExporter(Exporter):
                     ("png", image_file(frame, ".png").tobytes()) if frame.dtype == np.uint8 else ("npy", _npy(frame))
                 )
                 self._member(f"{number:06d}.{name}.{suffix}", data)
-            told = asdict(self._extrapolations[number])
-            document = {"pose": self._header.poses[number].tolist(), **told, **self._header.origin()}
+            figures = asdict(self._extrapolations[number])
+            document = {"pose": self._header.poses[number].tolist(), **figures, **self._header.origin()}
             self._member(f"{number:06d}.json", json.dumps(document).encode())
 
     def _member(self, name: str, data: bytes) -> None:

@@ -17,7 +17,7 @@ from .formats import exporter_class
 
 WAITING_PORTIONS = 2
 
-# The next frames, each output [B, H, W], and what is told of each, [B]; neither is changed after.
+# The next frames, each output [B, H, W], and the extrapolation of each, [B]; neither is changed after.
 Add: TypeAlias = Callable[[Mapping[str, PixelArray], Sequence[Extrapolation]], None]
 Portion: TypeAlias = tuple[Mapping[str, PixelArray], Sequence[Extrapolation]]
 
