@@ -10,14 +10,12 @@ from functools import partial
 from pathlib import Path
 
 from ultragray_workers.errors import DatabaseUnavailable
-from ultragray_workers.jobs.store import Job, JobState
+from ultragray_workers.jobs.store import Job
 
 from .job_log import TAIL_BYTES, GrowingLog
 
 READ_INTERVAL_S = 0.5
 _WAITING_LOG_CHARACTERS = 65536  # of a watcher that reads slowly; the oldest go
-
-FINAL_STATES = (JobState.SUCCEEDED, JobState.FAILED, JobState.CANCELLED)
 
 
 @dataclass(frozen=True)
@@ -63,7 +61,7 @@ class JobWatch:
         """Adds to what the watcher has not read yet."""
         if job is not None:
             self._job = job
-            self.finished = job.state in FINAL_STATES
+            self.finished = job.state.is_final
         self._log = (self._log + log)[-_WAITING_LOG_CHARACTERS:]
         self._news.set()
 
@@ -99,7 +97,7 @@ class _Reader:
     async def _run(self) -> None:
         error: Exception | None = None
         try:
-            while self._job is None or self._job.state not in FINAL_STATES:
+            while self._job is None or not self._job.state.is_final:
                 if self._job is not None:
                     await asyncio.sleep(READ_INTERVAL_S)
                 try:

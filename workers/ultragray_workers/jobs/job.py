@@ -29,6 +29,11 @@ class JobState(str, Enum):
     FAILED = "failed"
     CANCELLED = "cancelled"
 
+    @property
+    def is_final(self) -> bool:
+        """Whether the job neither waits nor runs."""
+        return self not in (JobState.QUEUED, JobState.RUNNING)
+
 
 STATUSES = {
     JobState.QUEUED: database.QUEUED,

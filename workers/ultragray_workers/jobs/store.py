@@ -174,7 +174,7 @@ class JobStore:
         Raises JobNotFound, and JobFinished for one that succeeded or failed.
         """
         job = self.get(job_id)
-        if job.state in (JobState.QUEUED, JobState.RUNNING):
+        if not job.state.is_final:
             self._database.client.cancel_workflow(job_id)
             job = self.get(job_id)
         if job.state is not JobState.CANCELLED:
@@ -201,7 +201,7 @@ class JobStore:
         Raises JobNotFound, and JobInUse for a job that waits or runs, or that another of those goes on from.
         """
         job = self.get(job_id)
-        if job.state in (JobState.QUEUED, JobState.RUNNING):
+        if not job.state.is_final:
             raise JobInUse(f"the job {job_id} is {job.state.value}: cancel it first", field="job")
         if (successor := sources_in_use(self._database).get(job_id)) is not None:
             raise JobInUse(f"the job {successor} goes on from the job {job_id}", field="job")
