@@ -184,7 +184,7 @@ def test_between_two_vertebrae_the_beam_reaches_the_canal(scene: GaussianScene) 
 
 
 def test_paramedian_sagittal_view_shows_the_saw_tooth_of_laminae(scene: GaussianScene) -> None:
-    frame = view(scene, make.picture_poses()["sagittal"])
+    frame = view(scene, make.picture_views()["sagittal"][1])
     cranial, caudal = (patch(frame["bmode"], x, (24.0, 45.0)) for x in ((-7.0, -5.0), (7.0, 9.0)))
     depth = [24.0 + np.median(part.argmax(axis=0)) * MM_PER_PIXEL for part in (cranial, caudal)]
     assert depth[0] - depth[1] > 2.5  # the lamina rises towards its caudal edge
@@ -227,8 +227,8 @@ def test_making_a_small_one(
         },
         rel=1e-4,
     )
-    for picture in ("demo_transverse.png", "demo_sagittal.png"):
-        assert cv2.imread(str(tmp_path / picture), cv2.IMREAD_UNCHANGED).shape == (512, 512)
+    for view in make.picture_views():
+        assert max(cv2.imread(str(tmp_path / f"demo_{view}.png"), cv2.IMREAD_UNCHANGED).shape) in (511, 512)
     assert "shadow_transmittance" in caplog.text
 
 

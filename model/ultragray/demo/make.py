@@ -18,10 +18,12 @@ import torch
 from ..datasets.phantom import Tissue, load_phantom, tissue_at
 from ..datasets.phantom.shadow import BoneShadow
 from ..datasets.sweep import Dataset
+from ..display import true_to_scale
+from ..display.frames import show
 from ..display.pixels import image_file
 from ..evaluation.scoring import render_sweep
 from ..files.atomic import write_whole
-from ..probe import FloatArray
+from ..probe import FloatArray, Probe, RadialProbe, SteeredProbe
 from ..rendering import render
 from ..scene import GaussianScene
 from ..training import Progress, TrainingConfig, train
@@ -32,6 +34,7 @@ MAX_GAUSSIANS = 50_000  # 3 MB, small enough to come with the code
 PICTURES_FOLDER = Path(__file__).parents[3] / "docs" / "images"
 PICTURE_SIDE = 512
 PARAMEDIAN_MM = 12.0  # from the midline, across the laminae
+CATHETER_MM = (12.0, 0.0, 22.0)  # within the muscle, beside the vessel
 SECONDS_PER_LINE = 10.0
 LABELS: dict[int, tuple[str, tuple[Tissue, ...]]] = {
     1: ("bone", (Tissue.BONE,)),
@@ -94,20 +97,31 @@ def _progress_logger() -> Callable[[Progress], None]:
     return log_progress
 
 
-def picture_poses() -> dict[str, FloatArray]:  # each [4, 4] mm
-    """The README's views, by name: transverse over the middle vertebra, paramedian sagittal across the laminae."""
-    sagittal = np.eye(4)
+def picture_views() -> dict[str, tuple[Probe | None, FloatArray]]:  # poses [4, 4] mm
+    """The README's views, by name, with a probe other than the scene's where one is meant.
+
+    Transverse over the middle vertebra, also steered and from a catheter within the muscle; paramedian sagittal across
+    the laminae.
+    """
+    sagittal, inside = np.eye(4), np.eye(4)
     sagittal[:3, :3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]  # columns of the image run caudal
     sagittal[0, 3] = PARAMEDIAN_MM
-    return {"transverse": np.eye(4), "sagittal": sagittal}
+    inside[:3, 3] = CATHETER_MM
+    return {
+        "transverse": (None, np.eye(4)),
+        "sagittal": (None, sagittal),
+        "steered": (SteeredProbe(width_mm=38.0, steering_deg=15.0, near_mm=0.0, far_mm=45.0), np.eye(4)),
+        "radial": (RadialProbe(near_mm=1.5, far_mm=20.0), inside),
+    }
 
 
 def write_pictures(scene: GaussianScene, folder: Path) -> None:
-    """Writes `demo_<view>.png` of each of `picture_poses` into an existing folder."""
-    for view, pose in picture_poses().items():
-        frame = render(scene, None, pose, height=PICTURE_SIDE, width=PICTURE_SIDE, outputs=("bmode",)).bmode
-        assert frame is not None
-        write_whole(folder / f"demo_{view}.png", image_file(frame[0].numpy(), ".png").tobytes())
+    """Writes `demo_<view>.png` of each of `picture_views` into an existing folder, true to scale."""
+    for view, (asked, pose) in picture_views().items():
+        probe = scene.info.probe_or(asked)
+        frames = render(scene, probe, pose, height=PICTURE_SIDE, width=PICTURE_SIDE, outputs=("bmode",))
+        shown = show(frames, probe, true_to_scale(probe, PICTURE_SIDE, PICTURE_SIDE))["bmode"]
+        write_whole(folder / f"demo_{view}.png", image_file(shown[0].numpy(), ".png").tobytes())
 
 
 if __name__ == "__main__":
