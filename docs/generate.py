@@ -32,7 +32,7 @@ from ultragray_service.cli.app import app as command_line
 from ultragray_service.core.state import Service
 from ultragray_service.errors import statuses_of
 from ultragray_service.http.app import create_app
-from ultragray_service.http.bodies import RenderBody, StreamMessage
+from ultragray_service.http.reading.bodies import RenderBody, StreamMessage
 from ultragray_service.http.stream_messages import FrameMessage
 from ultragray_service.settings import ENVIRONMENT_PREFIX, Settings
 from ultragray_workers import errors as workers_errors

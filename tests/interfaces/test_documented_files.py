@@ -16,7 +16,7 @@ from ultragray.confidence import Extrapolation
 from ultragray.interchange import checkpoint_export, ply
 from ultragray.outputs import OUTPUTS
 from ultragray.settings import Encoding
-from ultragray_service.http import accept
+from ultragray_service.http.reading import accept
 from ultragray_workers.pool.process import encoding as pixels
 
 from .document import code, rows, table

@@ -16,11 +16,12 @@ from ultragray.errors import error_classes
 from ultragray.settings import Resolved
 from ultragray_service import http
 from ultragray_service.core.state import Service
-from ultragray_service.http import accept, middleware, problems
+from ultragray_service.http import middleware, problems
 from ultragray_service.http.app import create_app
-from ultragray_service.http.bodies import RenderBody
 from ultragray_service.http.docs import DOCS_PATH
-from ultragray_service.http.json_body import read_json
+from ultragray_service.http.reading import accept
+from ultragray_service.http.reading.bodies import RenderBody
+from ultragray_service.http.reading.json_body import read_json
 from ultragray_service.http.routes import render as render_route
 from ultragray_workers.pool.types import RenderResult
 

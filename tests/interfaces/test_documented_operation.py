@@ -24,8 +24,9 @@ from ultragray_service.cli.app import USER_ERROR
 from ultragray_service.cli.app import app as command_line
 from ultragray_service.cli.jobs.watch import JOB_CANCELLED, JOB_FAILED
 from ultragray_service.cli.train import INTERRUPTED
-from ultragray_service.core import catalog, dataset_uploads, pose_stream
+from ultragray_service.core import catalog, dataset_uploads
 from ultragray_service.core.state import Service
+from ultragray_service.core.streams import pose_stream
 from ultragray_service.errors import STATUSES
 from ultragray_service.rpc import server as grpc_server
 from ultragray_service.settings import LEAST_KEY_LENGTH, load_settings

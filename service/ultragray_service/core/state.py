@@ -24,7 +24,7 @@ from ..views.training import TrainingViews
 from .catalog import SceneCatalog, scene_to_blame
 from .dataset_uploads import DatasetUploads
 from .helper_processes import HelperProcesses
-from .jobs import Jobs
+from .jobs.jobs import Jobs
 from .requests import RequestPlanner
 from .scene_imports import SceneImports
 

@@ -16,11 +16,11 @@ from ultragray.probe import Probe
 
 from ..core.state import Service
 from . import problems
-from .bodies import SPECIFICATIONS, JobBody, RenderBody, StreamMessage
 from .console import add_console
 from .docs import add_docs
-from .json_body import adapter_of
 from .middleware import LimitBody, RequestContext, RequireKey
+from .reading.bodies import SPECIFICATIONS, JobBody, RenderBody, StreamMessage
+from .reading.json_body import adapter_of
 from .routes import (
     comparison,
     datasets,

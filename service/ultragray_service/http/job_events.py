@@ -9,8 +9,8 @@ from starlette.types import Receive, Scope, Send
 
 from ultragray_workers.jobs.job import Job
 
-from ..core.job_hub import JobChange, JobWatch
-from .json_body import adapter_of
+from ..core.jobs.hub import JobChange, JobWatch
+from .reading.json_body import adapter_of
 
 EVENTS_TYPE = "text/event-stream"
 KEEP_ALIVE_S = 15.0

@@ -8,9 +8,9 @@ from ultragray.contract import described
 from ultragray.errors import UltragrayError
 
 from ..core.frames import FrameHeader, settings_used
-from ..core.pose_stream import Answered
+from ..core.streams.pose_stream import Answered
 from ..errors import Refusal
-from .json_body import adapter_of
+from .reading.json_body import adapter_of
 
 _ALIGNMENT = 8  # so that a client may look at float32 pixels where they lie
 

@@ -13,7 +13,7 @@ from ultragray_workers.errors import Draining
 from ultragray_workers.jobs.store import JobStore
 
 from ..core.catalog import DEFAULT_PAGE_SIZE
-from ..core.job_log import DEFAULT_LOG_BYTES, MAX_LOG_BYTES
+from ..core.jobs.log import DEFAULT_LOG_BYTES, MAX_LOG_BYTES
 from ..core.state import Service
 from .job_messages import job_message, read_specification
 from .messages import read_word

@@ -17,7 +17,7 @@ from ultragray_workers.pool.types import Priority, RenderRequest, RenderResult
 
 from ..core.poses import check_pose_count, exact_poses
 from ..core.state import Service
-from ..core.stream import FrameStream
+from ..core.streams.stream import FrameStream
 from .messages import frame_message, read_pose, read_settings
 from .stream import CallTransport
 

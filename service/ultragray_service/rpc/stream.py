@@ -11,8 +11,8 @@ from ultragray.probe import FloatArray
 from ultragray_proto.codec import to_message
 from ultragray_proto.v1 import rendering_pb2, scenes_pb2
 
-from ..core.pose_stream import Answered, StreamMode
-from ..core.stream import SceneSettings, checked_timeout_s
+from ..core.streams.pose_stream import Answered, StreamMode
+from ..core.streams.stream import SceneSettings, checked_timeout_s
 from ..errors import Refusal
 from .messages import frame_message, read_pose, read_settings, read_word
 

@@ -18,7 +18,7 @@ from ultragray_workers.jobs.folder import JobFolder
 from ultragray_workers.jobs.store import Job, JobStore
 
 from ..core.helper_processes import HelperProcesses
-from ..core.jobs import Jobs
+from ..core.jobs.jobs import Jobs
 from ..settings import Settings
 from .prepared import Prepared
 

@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from ultragray_service.core import job_hub
-from ultragray_service.core.job_hub import JobChange, JobHub, JobWatch
-from ultragray_service.core.job_log import TAIL_BYTES, GrowingLog
+from ultragray_service.core.jobs import hub as job_hub
+from ultragray_service.core.jobs.hub import JobChange, JobHub, JobWatch
+from ultragray_service.core.jobs.log import TAIL_BYTES, GrowingLog
 from ultragray_workers.errors import JobNotFound
 from ultragray_workers.jobs.store import Job, JobState, Progress
 

@@ -10,8 +10,8 @@ from starlette.responses import Response
 
 from ...views.comparisons import Comparison
 from ...views.datasets import DatasetPoses
-from ..accept import PNG
 from ..deps import SceneName, ServiceDep, problems
+from ..reading.accept import PNG
 from ..revalidation import NOT_MODIFIED, revalidated
 from .datasets import DatasetName
 

@@ -21,10 +21,10 @@ from ...core.dataset_uploads import DatasetUpload
 from ...core.datasets import DatasetPage, contact_sheet, dataset_page
 from ...core.helper_processes import PATIENCE_S
 from ...errors import UnsupportedMediaType
-from ..accept import PNG
 from ..deps import ServiceDep, problems
 from ..disconnect import finish_or_abandon
-from ..multipart import FileParts
+from ..reading.accept import PNG
+from ..reading.multipart import FileParts
 
 router = APIRouter(prefix="/v1/datasets", tags=["datasets"])
 

@@ -17,14 +17,14 @@ from ultragray_workers.jobs.specification import from_dict
 from ultragray_workers.jobs.store import JobStore
 
 from ...core.catalog import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE
-from ...core.job_log import DEFAULT_LOG_BYTES, MAX_LOG_BYTES
-from ...core.jobs import JobPage
-from ..accept import NPZ, PNG
-from ..bodies import JobBody
+from ...core.jobs.jobs import JobPage
+from ...core.jobs.log import DEFAULT_LOG_BYTES, MAX_LOG_BYTES
 from ..deps import ServiceDep, problems
 from ..examples import JOB_EXAMPLES
 from ..job_events import EVENTS_TYPE, JobEvents
-from ..json_body import body_schema, read_json_body
+from ..reading.accept import NPZ, PNG
+from ..reading.bodies import JobBody
+from ..reading.json_body import body_schema, read_json_body
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 

@@ -12,7 +12,7 @@ from ultragray.contract import described
 from ultragray.probe import Probe
 
 from ..deps import problems
-from ..json_body import body_schema, read_json_body
+from ..reading.json_body import body_schema, read_json_body
 
 router = APIRouter(prefix="/v1/probes", tags=["probes"])
 

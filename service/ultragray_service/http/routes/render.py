@@ -20,12 +20,12 @@ from ...core.frames import settings_used
 from ...core.poses import exact_poses
 from ...core.state import Service
 from ...telemetry.statistics import STAGES
-from ..accept import JPEG, NPZ, PNG, RAW, choose
-from ..bodies import RenderBody
 from ..deps import SCENE_NAME, problems
 from ..disconnect import finish_or_abandon
 from ..examples import RENDER_EXAMPLES
-from ..json_body import body_schema, read_json_body
+from ..reading.accept import JPEG, NPZ, PNG, RAW, choose
+from ..reading.bodies import RenderBody
+from ..reading.json_body import body_schema, read_json_body
 
 router = APIRouter(prefix="/v1/scenes", tags=["render"])
 

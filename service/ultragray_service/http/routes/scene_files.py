@@ -23,9 +23,9 @@ from ...core.helper_processes import PATIENCE_S
 from ...core.scenes import Scene
 from ...errors import UnsupportedMediaType
 from ...views.scene_points import DEFAULT_POINTS, MAX_POINTS, MAX_POSES, even_selection
-from ..accept import RAW
 from ..deps import SceneName, ServiceDep, problems
 from ..disconnect import finish_or_abandon
+from ..reading.accept import RAW
 from ..revalidation import NOT_MODIFIED, revalidated
 
 

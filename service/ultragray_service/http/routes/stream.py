@@ -17,14 +17,14 @@ from ultragray.settings import RenderSettings
 from ultragray_workers.errors import Draining
 
 from ...auth import STREAM_PROTOCOL
-from ...core.pose_stream import Answered, StreamMode
 from ...core.state import Service
-from ...core.stream import FrameStream, Message, SceneSettings
+from ...core.streams.pose_stream import Answered, StreamMode
+from ...core.streams.stream import FrameStream, Message, SceneSettings
 from ...errors import OriginRefused, statuses_of
-from ..bodies import StreamMessage
 from ..deps import SceneName
-from ..json_body import read_json
 from ..problems import problem_response
+from ..reading.bodies import StreamMessage
+from ..reading.json_body import read_json
 from ..stream_messages import frame_bytes, refusal_text
 
 router = APIRouter(prefix="/v1/scenes", tags=["render"])

@@ -8,8 +8,8 @@ from fastapi import APIRouter
 from starlette.responses import Response
 
 from ...views.training import TrainingCurve
-from ..accept import PNG
 from ..deps import ServiceDep, problems
+from ..reading.accept import PNG
 from .jobs import JobId
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])

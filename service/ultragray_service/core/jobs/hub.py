@@ -12,7 +12,7 @@ from pathlib import Path
 from ultragray_workers.errors import DatabaseUnavailable
 from ultragray_workers.jobs.store import Job
 
-from .job_log import TAIL_BYTES, GrowingLog
+from .log import TAIL_BYTES, GrowingLog
 
 READ_INTERVAL_S = 0.5
 _WAITING_LOG_CHARACTERS = 65536  # of a watcher that reads slowly; the oldest go

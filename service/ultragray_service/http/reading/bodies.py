@@ -14,9 +14,9 @@ from ultragray.settings import FrameSettings, RenderSettings
 from ultragray_workers.jobs.job import MAX_PRIORITY
 from ultragray_workers.jobs.kinds import KINDS, Specification
 
-from ..core.pose_stream import StreamMode
-from ..core.poses import Pose, check_pose_count
-from ..core.stream import MAX_TIMEOUT_MS
+from ...core.poses import Pose, check_pose_count
+from ...core.streams.pose_stream import StreamMode
+from ...core.streams.stream import MAX_TIMEOUT_MS
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -21,9 +21,9 @@ from ultragray_workers.jobs.kinds import Specification
 from ultragray_workers.jobs.store import Job, JobState, JobStore
 from ultragray_workers.scenes import SceneStore
 
-from ..settings import Settings
-from .catalog import MAX_PAGE_SIZE, scene_to_blame
-from .job_hub import JobHub
+from ...settings import Settings
+from ..catalog import MAX_PAGE_SIZE, scene_to_blame
+from .hub import JobHub
 
 COUNT_INTERVAL_S = 10.0
 _BESIDE_SPECIFICATION = ("request_id", "priority")

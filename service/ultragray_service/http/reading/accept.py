@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from ultragray.settings import Encoding
 
-from ..errors import NotAcceptable
+from ...errors import NotAcceptable
 
 PNG = "image/png"
 JPEG = "image/jpeg"

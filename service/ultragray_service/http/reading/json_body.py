@@ -8,8 +8,8 @@ from typing import Any, TypeVar
 from pydantic import TypeAdapter, ValidationError
 from starlette.requests import Request
 
-from ..errors import UnsupportedMediaType
-from .problems import invalid_argument
+from ...errors import UnsupportedMediaType
+from ..problems import invalid_argument
 
 T = TypeVar("T")
 

@@ -9,8 +9,8 @@ from ultragray.errors import InvalidArgument, UltragrayError
 from ultragray.probe import FloatArray
 from ultragray.settings import RenderSettings, Resolved
 
+from ..state import Service
 from .pose_stream import Answered, Asked, PoseStream, StreamMode
-from .state import Service
 
 MAX_TIMEOUT_MS = 3_600_000.0
 

@@ -17,7 +17,7 @@ from ultragray_workers.errors import Draining
 from ultragray_workers.pool.types import RenderRequest, RenderResult
 from ultragray_workers.pool.waiting import Turn
 
-from .state import Service
+from ..state import Service
 
 MAX_FRAMES_IN_FLIGHT = 8  # of an ordered stream; then it stops reading
 MAX_BYTES_IN_FLIGHT = 32 * 2**20  # of their frames, if there is more than one

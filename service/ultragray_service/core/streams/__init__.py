@@ -1,0 +1,1 @@
+"""Streams of poses for all front doors."""

@@ -1,0 +1,1 @@
+"""Requests as HTTP brings them: accepted types, JSON bodies, uploads in parts."""
