@@ -112,7 +112,7 @@ class Family(Contract):
 
     @classmethod
     def __get_pydantic_json_schema__(cls, source: Any, handler: Any) -> Any:
-        """What pydantic tells of a member: its kind is required, and there is an example of it."""
+        """The JSON Schema of a member: its kind is required, and there is an example of it."""
         document = handler(source)
         if Family not in cls.__bases__:
             schema = handler.resolve_ref_schema(document)

@@ -69,7 +69,7 @@ def to_message(value: Any, cls: type[_M], **others: Any) -> _M:
     Raises MessageInvalid for a word that its closed set does not have.
     """
     descriptor: Descriptor = cls.DESCRIPTOR  # type: ignore[attr-defined]
-    return cls(**_told(value, descriptor, frozenset(others)), **others)
+    return cls(**_fields_of(value, descriptor, frozenset(others)), **others)
 
 
 def from_message(message: Any, cls: type[_M], **others: Any) -> _M:
@@ -89,7 +89,7 @@ def words(enum: EnumDescriptor) -> Mapping[int, str]:
     return {one.number: one.name.removeprefix(prefix).lower() for one in enum.values if one.number != 0}
 
 
-def _told(value: Any, descriptor: Descriptor, others: frozenset[str] = frozenset()) -> dict[str, Any]:
+def _fields_of(value: Any, descriptor: Descriptor, others: frozenset[str] = frozenset()) -> dict[str, Any]:
     """The fields of a message that a value has, but for `others`."""
     if isinstance(value, Mapping):
         return _writer(frozenset(value), descriptor, others)(value.__getitem__)
@@ -113,17 +113,17 @@ def _writer(cls: Any, descriptor: Descriptor, others: frozenset[str]) -> Callabl
     oneofs = [(name, _oneof_writer(kinds)) for name, kinds in _oneofs(descriptor).items() if has(name)]
 
     def write(get: _Convert) -> dict[str, Any]:
-        told = {}
+        found = {}
         for name, convert in steps:
-            found = get(name)
+            value = get(name)
             try:
-                if found is not None and (found := convert(found)) is not None:
-                    told[name] = found
+                if value is not None and (value := convert(value)) is not None:
+                    found[name] = value
             except MessageInvalid as error:
                 raise error.under(name) from None
         for name, convert in oneofs:
-            told |= convert(get(name))
-        return told
+            found |= convert(get(name))
+        return found
 
     return write
 
@@ -156,7 +156,7 @@ def _value_writer(field: FieldDescriptor) -> _Convert:
     def convert(value: Any) -> Any:
         if isinstance(value, (tuple, list, np.ndarray)):
             return dict(zip(names, map(float, value), strict=True))
-        return _told(value, descriptor)
+        return _fields_of(value, descriptor)
 
     return convert
 
@@ -174,7 +174,7 @@ def _word_writer(numbers: Mapping[str, int]) -> _Convert:
 def _oneof_writer(kinds: Mapping[str, Descriptor]) -> Callable[[Any], dict[str, Any]]:
     def convert(value: Any) -> dict[str, Any]:
         kind = value["kind"] if isinstance(value, Mapping) else value.kind
-        return {kind: _told(value, kinds[kind])}
+        return {kind: _fields_of(value, kinds[kind])}
 
     return convert
 
@@ -382,7 +382,7 @@ def _only_oneof(descriptor: Descriptor) -> dict[str, Descriptor] | None:
 
 
 def _optional_of(annotation: Any) -> tuple[Any, bool]:
-    """What an annotation allows beside None, and whether it allows None."""
+    """The type that an annotation allows beside None, and whether it allows None."""
     if get_origin(annotation) not in (Union, UnionType):
         return annotation, False
     kinds = [one for one in get_args(annotation) if one is not NoneType]

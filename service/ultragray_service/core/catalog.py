@@ -1,4 +1,4 @@
-"""What the service knows about scenes, read from their files without blocking the event loop."""
+"""Facts about scenes, read from their files without blocking the event loop."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class SceneCatalog:
             return cached if cached is not None else await asyncio.to_thread(self._store.header, name)
 
     async def version(self, name: str) -> FileVersion:
-        """Which content the file of a scene has now. Raises SceneNotFound, SceneFileInvalid."""
+        """The version of the content that the file of a scene has now. Raises SceneNotFound, SceneFileInvalid."""
         with scene_to_blame():
             return await asyncio.to_thread(self._store.version, name)
 

@@ -35,7 +35,7 @@ OutputName = Annotated[
 
 @dataclass(frozen=True, kw_only=True)
 class FramePicture:
-    """Where the pixels of a frame lie: `first` is the centre of pixel (0, 0), `step` the way to the next one.
+    """The place of the pixels of a frame: `first` is the centre of pixel (0, 0), `step` the way to the next one.
 
     Column and row: x and z in mm, or, where the columns are degrees, the angle from the z axis and the range in mm.
     """

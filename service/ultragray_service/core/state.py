@@ -30,7 +30,7 @@ from .scene_imports import SceneImports
 
 
 class Phase(Enum):
-    """Where the service is in its life."""
+    """The phases of the service's life."""
 
     STARTING = "starting"
     SERVING = "serving"

@@ -1,4 +1,4 @@
-"""What routes ask for."""
+"""Parameters and error answers that routes share."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the service sends over a WebSocket."""
+"""Messages of the service over a WebSocket."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What surrounds every call: API keys, request id, errors as statuses, log line and metrics."""
+"""The surroundings of every call: API keys, request id, errors as statuses, log line and metrics."""
 
 from __future__ import annotations
 

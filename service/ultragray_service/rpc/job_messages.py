@@ -32,5 +32,5 @@ def read_specification(message: jobs_pb2.SubmitJobRequest) -> tuple[Specificatio
 def job_message(job: Job) -> jobs_pb2.Job:
     """The message of a job."""
     error = None if job.reason is None else scenes_pb2.Error(reason=job.error or "", detail=job.reason)
-    told = replace(job, specification={"kind": job.kind, **job.specification}, error=None)
-    return to_message(told, jobs_pb2.Job, error=error)
+    shown = replace(job, specification={"kind": job.kind, **job.specification}, error=None)
+    return to_message(shown, jobs_pb2.Job, error=error)

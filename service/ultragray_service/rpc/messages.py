@@ -1,4 +1,4 @@
-"""What the services of gRPC read and write, by the codec."""
+"""Messages of gRPC as the service reads and writes them, by the codec."""
 
 from __future__ import annotations
 

@@ -72,7 +72,7 @@ class GrpcServer:
         await self._server.start()
 
     async def tell_health(self, *, serving: bool) -> None:
-        """What grpc.health.v1 answers from now on."""
+        """Sets the answer of grpc.health.v1 from now on."""
         code = health_pb2.HealthCheckResponse.SERVING if serving else health_pb2.HealthCheckResponse.NOT_SERVING
         for name in ("", *SERVICE_NAMES):
             await self._health.set(name, code)

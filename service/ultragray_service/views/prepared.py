@@ -37,7 +37,7 @@ _log = logging.getLogger("ultragray.service")
 
 @dataclass(frozen=True)
 class Preparation:
-    """How far a folder is; `error` where it could not be made."""
+    """The progress of a folder; `error` where it could not be made."""
 
     state: Literal["running", "ready", "failed"]
     progress: float  # 0 to 1

@@ -27,7 +27,7 @@ _log = logging.getLogger("ultragray.stream")
 
 
 class StreamMode(str, Enum):
-    """What becomes of a pose that still waits when the next one comes."""
+    """The fate of a pose that still waits when the next one comes."""
 
     ORDERED = "ordered"  # every pose gets its frame
     LATEST = "latest"  # the newer pose takes its place in the queue; it gets no frame, and is counted

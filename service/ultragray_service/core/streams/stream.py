@@ -37,11 +37,11 @@ class Message(Protocol):
         """The pose to render, of a message that asks."""
 
     def timeout_s(self) -> float | None:
-        """How long the pose may wait; None: the default of the service."""
+        """The time that the pose may wait; None: the default of the service."""
 
 
 class Transport(Protocol):
-    """What messages come through."""
+    """The connection that messages come through."""
 
     async def receive(self) -> Message | None:
         """The next message; None after the last."""

@@ -29,7 +29,7 @@ class MediaRange:
     quality: float
 
     def specificity(self, media_type: str) -> int:
-        """How closely it matches: 3 with a dtype, 2 exactly, 1 by kind, 0 as */*, −1 not at all."""
+        """The closeness of a match: 3 with a dtype, 2 exactly, 1 by kind, 0 as */*, −1 not at all."""
         kind, _, subtype = media_type.partition("/")
         if (self.kind, self.subtype) == (kind, subtype):
             if self.dtype is None:
@@ -42,7 +42,7 @@ class MediaRange:
 
 @dataclass(frozen=True)
 class Choice:
-    """What an answer will be."""
+    """The form of an answer."""
 
     media_type: str
     encoding: Encoding

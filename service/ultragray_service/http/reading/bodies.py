@@ -1,4 +1,4 @@
-"""What HTTP and WebSocket take: the contract's settings, with the poses and the times of a request."""
+"""Bodies of HTTP and messages over a WebSocket: the contract's settings, with poses and the times of a request."""
 
 from __future__ import annotations
 

@@ -16,12 +16,12 @@ T = TypeVar("T")
 
 @cache
 def adapter_of(cls: Any) -> TypeAdapter[Any]:
-    """What reads and writes the JSON of a class."""
+    """The reader and writer of a class's JSON."""
     return TypeAdapter(cls)
 
 
 def body_schema(cls: Any, examples: dict[str, Any] | None = None) -> dict[str, Any]:
-    """What the OpenAPI document says of a body that a route reads by itself."""
+    """The part of the OpenAPI document about a body that a route reads by itself."""
     content: dict[str, Any] = {"schema": {"$ref": f"#/components/schemas/{cls.__name__}"}}
     if examples is not None:
         content["examples"] = examples

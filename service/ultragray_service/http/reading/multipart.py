@@ -38,7 +38,7 @@ class FileParts:
             raise InvalidArgument("Content-Type multipart/form-data must have a boundary", field="Content-Type")
 
     def feed(self, block: bytes) -> list[str | bytes]:
-        """What the block holds, in order: the name of each file (str), then its bytes.
+        """The content of the block, in order: the name of each file (str), then its bytes.
 
         Raises InvalidArgument for a damaged body and for a part that is no file.
         """
