@@ -1,4 +1,4 @@
-"""Frames: what they are asked with, and what comes."""
+"""Frames, from the settings of a request to the arrays of its answer."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Extrapolation:
 
 @dataclass(frozen=True)
 class Picture:
-    """Where pixels lie in the image plane of the probe.
+    """The places of pixels in the image plane of the probe.
 
     Columns are mm along x (`column_unit` "mm"), or scan lines of a fan at degrees from its axis ("deg"); rows are mm
     along z, or mm of range. The first values are those of the centre of pixel (0, 0), the steps lead to the next one.

@@ -51,7 +51,7 @@ class JobProgress:
 
 @dataclass(frozen=True)
 class JobError:
-    """Why a job failed."""
+    """The reason of a failed job."""
 
     reason: str  # stable
     detail: str  # one sentence

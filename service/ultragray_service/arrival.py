@@ -1,4 +1,4 @@
-"""What a client sends next, waited for with patience that ends."""
+"""Waiting for the next part of an upload, for a limited time."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ T = TypeVar("T")
 
 
 async def arrival(arriving: Awaitable[T], idle_timeout_s: float, stopping: asyncio.Future[Any]) -> T:
-    """What arrives next.
+    """The result of `arriving`.
 
-    Raises DeadlineExceeded where nothing does in time, Draining once `stopping` is done.
+    Raises DeadlineExceeded where it does not come in time, Draining once `stopping` is done.
     """
     work = asyncio.ensure_future(arriving)
     either: set[asyncio.Future[Any]] = {work, stopping}

@@ -87,7 +87,7 @@ class Refusal:
 
 @dataclass(frozen=True)
 class Statuses:
-    """How the doors tell an error. `retry_after_s`: when the same request may succeed; None: not by waiting."""
+    """The answer of the doors to an error. `retry_after_s`: when the same request may succeed; None: not by waiting."""
 
     http: int
     grpc: str
@@ -146,5 +146,5 @@ STATUSES = {  # by the reason of the error
 
 
 def statuses_of(error: UltragrayError | type[UltragrayError]) -> Statuses:
-    """How the doors tell an error."""
+    """The answer of the doors to an error."""
     return STATUSES[error.reason]

@@ -214,11 +214,11 @@ async def _start_igtl(server: IgtlServer, settings: Settings, sockets: contextli
 
 async def _mirror_health(service: Service, server: GrpcServer) -> None:
     """Keep the health of gRPC equal to the readiness of HTTP."""
-    told = False
+    serving = False
     while True:
-        if service.ready is not told:
-            told = service.ready
-            await server.tell_health(serving=told)
+        if service.ready is not serving:
+            serving = service.ready
+            await server.tell_health(serving=serving)
         await asyncio.sleep(_HEALTH_POLL_S)
 
 

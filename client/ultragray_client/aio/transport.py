@@ -1,4 +1,4 @@
-"""What asyncio does in its own way; `sync/transport.py` gives the same names to threads."""
+"""The channel and the stream of poses under asyncio; `sync/transport.py` gives the same names to threads."""
 
 from __future__ import annotations
 

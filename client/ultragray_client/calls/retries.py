@@ -1,4 +1,4 @@
-"""When to ask again, and when to give up."""
+"""The pauses between attempts, and the end of them."""
 
 from __future__ import annotations
 

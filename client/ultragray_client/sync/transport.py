@@ -1,4 +1,4 @@
-"""What threads do in their own way; `aio/transport.py` gives the same names to asyncio."""
+"""The channel and the stream of poses under threads; `aio/transport.py` gives the same names to asyncio."""
 
 from __future__ import annotations
 

@@ -39,7 +39,7 @@ _WAIT_S = 600.0
 
 @dataclass(frozen=True)
 class ClientsExtent:
-    """How much is measured."""
+    """The extent of the measurements."""
 
     loop_s: float = 60.0
     stream_s: float = 10.0

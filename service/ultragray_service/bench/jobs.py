@@ -43,7 +43,7 @@ _COPIED_AT_ONCE = 500
 
 @dataclass(frozen=True)
 class JobsExtent:
-    """How much is measured."""
+    """The extent of the measurements."""
 
     jobs: int = 10_000
     pages: int = 200

@@ -26,7 +26,7 @@ VoxelMm = Annotated[
 
 
 class Split(str, enum.Enum):
-    """Which frames of a dataset to measure on."""
+    """The frames of a dataset to measure on."""
 
     VAL = "val"
     TRAIN = "train"

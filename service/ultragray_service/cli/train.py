@@ -96,7 +96,7 @@ def train(
 
 @dataclass(frozen=True)
 class RunOptions:
-    """Where and how a run takes place; none of it changes the scene on one thread."""
+    """The place and the means of a run; none of it changes the scene on one thread."""
 
     output: Path
     folder: Path

@@ -42,7 +42,7 @@ _log = logging.getLogger("ultragray.igtl")
 
 
 class Frames(Protocol):
-    """What connections share: the newest frame, and a call that tells all of them about one."""
+    """The part of the server that connections share: the newest frame, and a call that tells all of them about one."""
 
     newest: Frame | None
 

@@ -1,4 +1,4 @@
-"""What a client asked to be sent of every frame: the newest that it has not seen, at most as often as it said."""
+"""Subscriptions of a client: the newest frame that it has not seen, at most as often as it asked for."""
 
 from __future__ import annotations
 

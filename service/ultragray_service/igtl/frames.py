@@ -21,7 +21,7 @@ _SLICE_MM = 1.0  # nominal thickness: an image of one slice has none
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """What was rendered for a pose."""
+    """The rendering of a pose."""
 
     posed: PoseMessage
     result: RenderResult

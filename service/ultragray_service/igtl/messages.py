@@ -1,4 +1,4 @@
-"""What frames an OpenIGTLink message: header, extended header, metadata. All numbers are big-endian."""
+"""The framing of OpenIGTLink messages: header, extended header, metadata. All numbers are big-endian."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which scene a device's poses are for, and what the image of a device is called."""
+"""From the name of a device to the scene of its poses and to the name of its images."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ class PoseMessage:
 
 @dataclass(eq=False)
 class Underway:
-    """What is asked of the render pool; while it waits there, a newer pose takes its turn."""
+    """A request to the render pool; while it waits there, a newer pose takes its turn."""
 
     posed: PoseMessage
     turn: Turn

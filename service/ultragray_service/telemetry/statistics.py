@@ -19,7 +19,7 @@ _SAMPLES = 500  # of a step and stage; more are sampled
 
 @dataclass(frozen=True)
 class StageTimes:
-    """Where the time of a request went, ms."""
+    """The parts of the time of a request, ms."""
 
     queue: float
     render: float
@@ -52,7 +52,7 @@ class _Step:
 
 @dataclass(frozen=True, kw_only=True)
 class StatisticsStep:
-    """What happened in one step."""
+    """The events of one step."""
 
     seconds_ago: int = described("0: it is going on; 5: it ended up to 5 s ago, and so on.")
     frames: int
