@@ -143,8 +143,9 @@ def _read_checkpoint(path: Path) -> tuple[int | None, dict[str, Tensor]]:
     tensors = {name: splats[name] for name in PARAMETERS}
     _check_tensors(path, tensors)
     step = document.get("step") if splats is not document else None
-    known_step = step if isinstance(step, int) and not isinstance(step, bool) else None
-    return known_step, {name: tensor.detach().to(torch.float32).contiguous() for name, tensor in tensors.items()}
+    return step if type(step) is int else None, {
+        name: tensor.detach().to(torch.float32).contiguous() for name, tensor in tensors.items()
+    }
 
 
 def _load_without_code(path: Path) -> Any:

@@ -135,7 +135,7 @@ def _splats(scene: GaussianScene, centre_mm: Vector, notes: list[str]) -> tuple[
 
 def _step(scene: GaussianScene) -> int:
     step = scene.info.training.get("step")
-    return step if isinstance(step, int) and not isinstance(step, bool) else 0
+    return step if type(step) is int else 0
 
 
 def _saved(document: Mapping[str, Any]) -> bytes:

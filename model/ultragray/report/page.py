@@ -172,8 +172,11 @@ def _counts_plot(content: ReportContent) -> str | None:
 
 def _pictures(content: ReportContent) -> list[dict[str, Any]]:
     """The chosen held-out frames, panel by panel."""
-    places = _telling_places(content) if content.spread is None else _spread_places(content, content.spread)
-    pixels = PANEL_PIXELS if content.spread is None else SMALL_PANEL_PIXELS
+    if content.spread is None:
+        places, pixels = _typical_places(content), PANEL_PIXELS
+    else:
+        spread = spread_places(len(content.dataset.val), content.spread)
+        places, pixels = dict.fromkeys(spread.tolist(), ""), SMALL_PANEL_PIXELS
     chosen = content.dataset.val.select(list(places))
     panels = side_by_side_panels(content.scene, chosen)
     if content.baselines:
@@ -190,14 +193,10 @@ def _pictures(content: ReportContent) -> list[dict[str, Any]]:
     ]
 
 
-def _telling_places(content: ReportContent) -> dict[int, str]:
+def _typical_places(content: ReportContent) -> dict[int, str]:
     """The held-out frames where the scene does worst, as usual, and best; perhaps fewer than three."""
     order = np.argsort([-frame.psnr_db for frame in content.evaluation.frames], kind="stable")
     return {int(order[-1]): ", worst", int(order[len(order) // 2]): ", typical", int(order[0]): ", best"}
-
-
-def _spread_places(content: ReportContent, most: int) -> dict[int, str]:
-    return dict.fromkeys(spread_places(len(content.dataset.val), most).tolist(), "")
 
 
 def _data_uri(picture: ByteArray) -> str:

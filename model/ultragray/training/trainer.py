@@ -155,9 +155,8 @@ class Trainer:
         self._dataset_sha256 = dataset.sha256
         forget_peak_memory(self._device)
         self._images = torch.tensor(dataset.train.images, device=self._device)  # [F, H, W] uint8
-        x, y, z = self._geometry.centre_mm.tolist()
         self._info = SceneInfo(
-            centre_mm=(x, y, z),
+            centre_mm=self._geometry.centre_mm.tolist(),
             probe=dataset.probe,
             image_height=dataset.train.height,
             image_width=dataset.train.width,

@@ -27,10 +27,9 @@ def draw_preview(folder: str, artifact_folder: str, dataset: str, checkpoint: st
     torch.set_num_threads(1)
     header, tensors = read_checkpoint(Path(checkpoint))
     sweeps = DatasetStore(Path(artifact_folder)).load(dataset)
-    x, y, z = sweeps.centre_mm.tolist()
     scene = GaussianScene.from_splats(
         {name: tensors[f"parameter.{name}"] for name in PARAMETERS},
-        info=SceneInfo(centre_mm=(x, y, z), probe=sweeps.probe, intensity=header.config.intensity),
+        info=SceneInfo(centre_mm=sweeps.centre_mm.tolist(), probe=sweeps.probe, intensity=header.config.intensity),
     )
     part = sweeps.val if len(sweeps.val) else sweeps.train
     frame = part.select(np.array([len(part) // 2]))
