@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from ultragray.errors import UltragrayError
+
+_NAMES_IN_MESSAGE = 5
 
 
 class SceneNotFound(UltragrayError):
@@ -150,3 +154,9 @@ class StartupFailed(UltragrayError):
 
     reason = "STARTUP_FAILED"
     title = "Service cannot start"
+
+
+def known_names(kind: str, names: Sequence[str]) -> str:
+    """The scenes or datasets that there are, the first few by name, for the message that another is not there."""
+    shown = ", ".join(names[:_NAMES_IN_MESSAGE]) + (", …" if len(names) > _NAMES_IN_MESSAGE else "")
+    return f"known {kind}s: {shown}" if names else f"there are no {kind}s yet"

@@ -13,11 +13,10 @@ from typing import Any
 from ultragray.errors import InvalidArgument, SceneFileInvalid
 from ultragray.scene_info import SceneHeader, SceneInfo, read_header, scene_file_invalid
 
-from .errors import SceneNotFound
+from .errors import SceneNotFound, known_names
 
 SUFFIX = ".ugr"
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
-_NAMES_IN_MESSAGE = 5
 
 # What the kernel prepares of a scene once (axes, activations, bounds) takes about 1.5 times the raw parameters.
 _RESIDENT_PER_RAW_BYTE = 2.5
@@ -162,10 +161,7 @@ class SceneStore:
         self._headers.drop(name)
 
     def _not_found(self, name: str) -> SceneNotFound:
-        known = self.names()
-        shown = ", ".join(known[:_NAMES_IN_MESSAGE]) + (", …" if len(known) > _NAMES_IN_MESSAGE else "")
-        hint = f"known scenes: {shown}" if known else "there are no scenes yet"
-        return SceneNotFound(f"there is no scene {name[:128]!r}; {hint}", field="scene")
+        return SceneNotFound(f"there is no scene {name[:128]!r}; {known_names('scene', self.names())}", field="scene")
 
 
 def check_scene_name(name: Any, field: str = "scene") -> None:

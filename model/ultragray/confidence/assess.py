@@ -76,15 +76,9 @@ class Assessor:
         if self._views is None:
             return [Extrapolation(None, None, None, share) for share in shares]
         measures = self._views.measure(checked, self._info.probe_or(probe))
-        confidences: list[Any] = [None] * len(checked)
-        if self._model is not None:
-            confidences = self._model.predict(measures).tolist()
-        return [
-            Extrapolation(*values)
-            for values in zip(
-                measures.nearest_mm.tolist(), measures.angle_deg.tolist(), confidences, shares, strict=True
-            )
-        ]
+        confidences = [None] * len(checked) if self._model is None else self._model.predict(measures).tolist()
+        figures = (measures.nearest_mm.tolist(), measures.angle_deg.tolist(), confidences, shares)
+        return [Extrapolation(*values) for values in zip(*figures, strict=True)]
 
 
 def supported(coverage: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:  # [C, H, W] -> [C, H, W]

@@ -93,9 +93,8 @@ class TrainingViews:
         distances = np.hypot(elevation, beside)  # [K, P]
         nearest = (distances + ANGLE_MM_PER_DEG * angles).argmin(axis=1)
         nearest_mm = distances[np.arange(len(points)), nearest]
-        along = elevation * np.sign(
-            self._axes[1][:, views].T @ pose[:3, 1]
-        )  # a probe turned round has its front at its back
+        facing = np.sign(self._axes[1][:, views].T @ pose[:3, 1])  # a probe turned round has its front at its back
+        along = elevation * facing
         sides = [np.where(side, distances, np.inf).min(axis=1) for side in (along >= 0.0, along <= 0.0)]
         front, back = (np.minimum(side, 1e3 * FAR_MM) for side in sides)
         between = front * back / np.maximum(front + back, 1e-9)

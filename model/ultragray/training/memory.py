@@ -144,4 +144,5 @@ def _missing(needed: int, config: TrainingConfig, free: int | None, place: str =
     limit = free if config.memory_gb is None else int(config.memory_gb * GIB)
     if limit is None or needed <= limit:
         return None
-    return f"{f'{place} has free' if config.memory_gb is None else 'memory_gb allows'} {limit / GIB:.1f} GiB"
+    bound = f"{place} has free" if config.memory_gb is None else "memory_gb allows"
+    return f"{bound} {limit / GIB:.1f} GiB"

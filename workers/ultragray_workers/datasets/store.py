@@ -18,7 +18,7 @@ from ultragray.files.atomic import sync, write_whole
 from ultragray.probe import Probe
 
 from ..claims import out_of_sight
-from ..errors import DatasetExists, DatasetInUse, DatasetNotFound
+from ..errors import DatasetExists, DatasetInUse, DatasetNotFound, known_names
 from .contents import find_source
 
 if TYPE_CHECKING:
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 FOLDER = "datasets"
 MANIFEST_NAME, FILES_NAME, CONTACT_SHEET_NAME = "dataset.json", "files", "contact_sheet.png"
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
-_NAMES_IN_MESSAGE = 5
 
 
 @dataclass(frozen=True)
@@ -149,10 +148,9 @@ class DatasetStore:
         return (self.folder / name / MANIFEST_NAME).is_file()
 
     def _not_found(self, name: str) -> DatasetNotFound:
-        known = self.names()
-        shown = ", ".join(known[:_NAMES_IN_MESSAGE]) + (", …" if len(known) > _NAMES_IN_MESSAGE else "")
-        hint = f"known datasets: {shown}" if known else "there are no datasets yet"
-        return DatasetNotFound(f"there is no dataset {name[:128]!r}; {hint}", field="dataset")
+        return DatasetNotFound(
+            f"there is no dataset {name[:128]!r}; {known_names('dataset', self.names())}", field="dataset"
+        )
 
 
 def check_dataset_name(name: str) -> None:

@@ -22,7 +22,7 @@ def read_meta_image(path: Path) -> StoredSequence:
         else:
             raise DatasetInvalid(f"{path}: not a MetaImage file, or truncated: its header has no ElementDataFile")
         offset = file.tell()
-    if entries.get("ElementType") != "MET_UCHAR" or _is_true(entries, "BinaryData", default=True) is False:
+    if entries.get("ElementType") != "MET_UCHAR" or entries.get("BinaryData", "True").lower() != "true":
         raise DatasetInvalid(
             f"{path}: pixels must be binary MET_UCHAR (8 bits), got ElementType {entries.get('ElementType', 'missing')}"
         )
@@ -37,10 +37,6 @@ def read_meta_image(path: Path) -> StoredSequence:
         None if local else entries["ElementDataFile"],
         offset if local else header_size,
         shape,
-        deflated=_is_true(entries, "CompressedData", default=False),
+        deflated=entries.get("CompressedData", "False").lower() == "true",
     )
     return StoredSequence(path, pixels, fields, frame_fields)
-
-
-def _is_true(entries: dict[str, str], key: str, *, default: bool) -> bool:
-    return entries[key].lower() == "true" if key in entries else default

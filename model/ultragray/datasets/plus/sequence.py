@@ -103,16 +103,13 @@ def read_payload(
             f"{header}: {' x '.join(map(str, shape))} bytes of pixels, the limit is {MAX_PIXEL_BYTES >> 30} GiB"
         )
     if not deflated:
-        found = max(0, path.stat().st_size - offset)
-        if found != expected:
-            raise DatasetInvalid(_wrong_size(path, header, found, expected))
+        _require_size(path, header, max(0, path.stat().st_size - offset), expected)
         return np.fromfile(path, np.uint8, expected, offset=offset).reshape(shape)
     with path.open("rb") as file:
         file.seek(offset)
         deflated_limit = expected + expected // 256 + (1 << 16)  # incompressible pixels grow by far less
         pixels = _inflate(file.read(deflated_limit), path, expected)
-    if len(pixels) != expected:
-        raise DatasetInvalid(_wrong_size(path, header, len(pixels), expected))
+    _require_size(path, header, len(pixels), expected)
     return np.frombuffer(pixels, np.uint8).reshape(shape)
 
 
@@ -127,10 +124,13 @@ def _inflate(data: bytes, path: Path, expected: int) -> bytes:
     return pixels
 
 
-def _wrong_size(path: Path, header: Path, found: int, expected: int) -> str:
+def _require_size(path: Path, header: Path, found: int, expected: int) -> None:
     if found < expected:
-        return f"{path}: truncated: {found} bytes of pixels, but the header of {header.name} needs {expected}"
-    return f"{path}: more pixels than the {expected} bytes that the header of {header.name} says"
+        raise DatasetInvalid(
+            f"{path}: truncated: {found} bytes of pixels, but the header of {header.name} needs {expected}"
+        )
+    if found > expected:
+        raise DatasetInvalid(f"{path}: more pixels than the {expected} bytes that the header of {header.name} says")
 
 
 def _beside(header: Path, file_name: str) -> Path:
