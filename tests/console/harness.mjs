@@ -20,12 +20,12 @@ const START_TIMEOUT_MS = 90_000;
 export const SCREENSHOTS = path.join(ROOT, "build/console-screenshots");
 export const TIMEOUT_MS = 30_000; // of what a page should show: the machine may be busy
 
-/** A free port: the service must come back on the same one. */
+/** A free port, below those that the system gives to connections: the service must come back on the same one. */
 function freePort() {
-  return new Promise((resolve, reject) => {
+  return new Promise((resolve) => {
     const server = createServer();
-    server.on("error", reject);
-    server.listen(0, "127.0.0.1", () => {
+    server.on("error", () => resolve(freePort()));
+    server.listen(20_000 + Math.floor(12_000 * Math.random()), "127.0.0.1", () => {
       const { port } = server.address();
       server.close(() => resolve(port));
     });

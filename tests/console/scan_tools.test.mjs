@@ -162,7 +162,7 @@ describe("the image", () => {
       assert.deepEqual(words.filter(({ fits }) => !fits), []);
       assert.match(words.map(({ text }) => text).join("\n"), /Simulated, not for diagnosis\.[^]*demo[^]*"quaternion"/);
       assert.equal(words.find(({ text }) => text === "U").left, side === "left");
-      await page.getByLabel("Flip left/right").check();
+      await page.getByLabel("Flip").check();
       await page.locator('[data-testid="orientation-marker"][data-side="right"]').waitFor();
     }
   });

@@ -72,7 +72,7 @@ describe("train", () => {
     await page.getByText("28 to train from, 5 held out").waitFor();
     await start(page, "long", { Steps: "100000", "Most Gaussians": "800" });
     const preview = page.getByRole("img", { name: "A held-out frame and its rendering" });
-    await preview.waitFor({ timeout: 60_000 });
+    await preview.waitFor({ timeout: 180_000 }); // a training and its picture take turns on a busy machine
     await picture(page, "train-running");
     const steps = page.getByText(/^Step [\d,]+ of 100,000$/);
     const stepNow = async () => Number((await steps.textContent()).split(" ")[1].replaceAll(",", ""));
