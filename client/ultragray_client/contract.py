@@ -147,7 +147,7 @@ class FrameSettings:
     probe: Probe | None = None
     """Instead of the scene's own."""
     min_confidence: float | None = None
-    """0 to 1; what is below is refused, or masked."""
+    """What is below is refused, or masked."""
     below_min_confidence: Below = Below.REFUSE
     """mask: pixels of such frames that Gaussians do not support are 0."""
     display: Display | None = None

@@ -66,7 +66,7 @@ class FrameSettings(Contract):
         "Scan lines. Default: as trained, else 512.", None, low=1, high=MAX_IMAGE_SIDE, error=InvalidImageSize
     )
     probe: Probe | None = described("Instead of the scene's own.", None, error=InvalidProbe)
-    min_confidence: float | None = described("0 to 1; what is below is refused, or masked.", None, low=0.0, high=1.0)
+    min_confidence: float | None = described("What is below is refused, or masked.", None, low=0.0, high=1.0)
     below_min_confidence: Below = described(
         "mask: pixels of such frames that Gaussians do not support are 0.", Below.REFUSE
     )
