@@ -3,8 +3,8 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-# A file of tests belongs to one process, which shares its services among them.
-PYTEST := $(BIN)/pytest --numprocesses auto --maxprocesses 4 --dist loadfile
+# A file of tests belongs to one process, which shares its services among them. Most of the time they wait for others: four fit two cores.
+PYTEST := $(BIN)/pytest --numprocesses 4 --dist loadfile
 KERNEL_SOURCES := $(wildcard model/kernels/*) CMakeLists.txt pyproject.toml
 GENERATED_TESTS := tests/proto tests/client/test_client_generated.py tests/interfaces/test_generated_tables.py tests/service/test_snapshots.py
 PYTHON_SOURCES := model service workers proto client tests benchmarks docs examples
@@ -14,9 +14,10 @@ CONSOLE_SOURCES := $(shell find web -type f -not -path 'web/node_modules/*' -not
 CONSOLE_IF_POSSIBLE = [ -z "$(NPM)" ] || $(MAKE) --no-print-directory console || echo "The console could not be built; all else works without it."
 DATA ?= ../shared/data
 ARGS ?=
+MINUTES ?= 30
 
 .DEFAULT_GOAL := help
-.PHONY: ALWAYS help serve console test test-fast test-long test-console test-faults check check-lint check-types check-generated check-web format bench bench-console bench-cuda results demo-scene generate clean
+.PHONY: ALWAYS help serve console test test-fast test-long test-console test-faults test-fuzz test-soak test-overload check check-lint check-types check-generated check-web format bench bench-console bench-cuda results demo-scene generate clean
 
 help:  ## say what there is
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
@@ -27,7 +28,7 @@ serve: $(VENV)/installed  ## set up, then serve the demo scene and every *.ugr i
 
 console: $(CONSOLE)  ## build the console, which the service serves at / (needs Node 20 or newer; serve does it where that is there)
 
-test: $(VENV)/installed-dev  ## set up, then run the tests (ARGS="-k probe" for some)
+test: $(VENV)/installed-dev  ## set up, then run the tests in random order (ARGS="-k probe" for some, ARGS="--randomly-seed=N" for an order again)
 	@$(CONSOLE_IF_POSSIBLE)
 	$(PYTEST) -m "not long" $(ARGS)
 
@@ -44,6 +45,16 @@ test-console: $(VENV)/installed-dev $(CONSOLE)  ## the console in Debian's Chrom
 test-faults: $(VENV)/installed-dev  ## processes killed at random: render workers under load, then everything while jobs run
 	ULTRAGRAY_FAULT_SECONDS=30 $(BIN)/pytest tests/workers/pool/test_faults.py -s $(ARGS)
 	ULTRAGRAY_FAULT_KILLS=32 $(BIN)/pytest tests/faults -s $(ARGS)
+
+test-fuzz: $(VENV)/installed-dev  ## 100,000 inputs that are nearly right, on every door and in every file format (ARGS="--seed N" for the same again)
+	ULTRAGRAY_FUZZ_INPUTS=100000 $(BIN)/pytest --numprocesses 2 --dist loadfile tests/fuzz $(ARGS)
+
+test-soak: $(VENV)/installed-dev  ## clients of all kinds for MINUTES (30) while processes are killed; the result goes to tests/soak-run.json
+	ULTRAGRAY_SOAK_SECONDS=$$(($(MINUTES) * 60)) ULTRAGRAY_SOAK_RECORD=tests/soak-run.json $(BIN)/pytest tests/soak $(ARGS)
+
+test-overload: $(VENV)/installed-dev  ## ten times the capacity for a minute at each door; the figures go to tests/overload-run.json
+	@rm -f tests/overload-run.json
+	ULTRAGRAY_OVERLOAD_SECONDS=60 ULTRAGRAY_OVERLOAD_RECORD=tests/overload-run.json $(BIN)/pytest tests/overload $(ARGS)
 
 check: $(VENV)/installed-dev  ## lint, types, formatting, and whether what is generated is current; all at the same time
 	@$(MAKE) --no-print-directory --keep-going --jobs --output-sync=target check-lint check-types check-generated check-web

@@ -58,6 +58,7 @@ NOT_OVER_GRPC = {  # reasons of other doors, and of jobs that failed
 }
 OWN_ERRORS = {  # of the client, by their reason: base, meaning
     "UNREACHABLE": ("Unavailable", "Nobody answers at the address, or the connection broke."),
+    "TLS_FAILED": ("ClientError", "The service shows no certificate to trust, or does not speak TLS."),
     "STREAM_ENDED": ("ClientError", "A stream of poses that is over was asked to go on."),
 }
 _ALSO = {"InvalidArgument": ["ValueError"], "DeadlineExceeded": ["TimeoutError"]}  # what they are beside
@@ -194,7 +195,7 @@ def _add(sources: dict[str, str], cls: Any, name: str) -> None:
             _add(sources, member, member.__name__)
         sources[name] = f"{name}: TypeAlias = {' | '.join(member.__name__ for member in cls.members.values())}"
     else:
-        bases = [base for base in cls.__bases__ if is_dataclass(base)]
+        bases = [base for base in cls.__bases__ if is_dataclass(base) and Family not in base.__bases__]
         for other in (*bases, *_classes_in(get_type_hints(cls).values())):
             _add(sources, other, other.__name__)
         sources[name] = _dataclass_source(cls, name, bases)
@@ -213,15 +214,17 @@ def _enum_source(cls: type[Enum]) -> str:
 
 
 def _dataclass_source(cls: Any, name: str, bases: list[Any]) -> str:
-    names = inspect.get_annotations(cls).keys() - LEFT_OUT
-    own = [item for item, _ in annotated_fields(cls) if item.name in names]
-    options = "frozen=True, kw_only=True" if all(item.kw_only for item in own) else "frozen=True"
+    families = [base for base in cls.__bases__ if Family in base.__bases__]  # their members have their fields
+    names = {name for one in (cls, *families) for name in inspect.get_annotations(one)} - LEFT_OUT
+    own = sorted((item for item, _ in annotated_fields(cls) if item.name in names), key=lambda item: item.kw_only)
+    is_kw_only = all(item.kw_only for item in own)
+    options = "frozen=True, kw_only=True" if is_kw_only else "frozen=True"
     head = f"class {name}" + (f"({', '.join(base.__name__ for base in bases)})" if bases else "")
-    body = "\n".join(map(_field_source, own))
+    body = "\n".join(_field_source(item, kw_only=item.kw_only and not is_kw_only) for item in own)
     return f"@dataclass({options})\n{head}:\n    {_docstring(cls)}\n\n{body}\n"
 
 
-def _field_source(item: Field[Any]) -> str:
+def _field_source(item: Field[Any], *, kw_only: bool) -> str:
     if str(item.type).startswith("Literal"):  # what tells a member of a family apart
         return f"    kind: Literal[{item.default!r}] = field(default={item.default!r}, repr=False, kw_only=True)"
     default = ""
@@ -229,6 +232,8 @@ def _field_source(item: Field[Any]) -> str:
         default = f" = {item.default if isinstance(item.default, Enum) else repr(item.default)}"
     elif item.default_factory is not MISSING:
         default = f" = field(default_factory={item.default_factory.__name__})"
+    if kw_only:
+        default = f" = field(default={item.default!r}, kw_only=True)"
     annotation = re.sub(r"\w+", lambda word: OWN_TYPES.get(word[0], word[0]), str(item.type))
     return f"    {item.name}: {annotation}{default}\n    {_quoted(_wrapped(item.metadata['description']))}"
 

@@ -13,6 +13,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
+import hypothesis.configuration
 import numpy as np
 import pytest
 import torch
@@ -25,23 +26,21 @@ from ultragray.probe import FloatArray
 from ultragray.scene import PARAMETERS
 
 from .postgres import postgres
+from .surroundings import ROOT, forget_the_users_environment, home_of_the_tests, working_folder
 
-__all__ = ["postgres"]
+__all__ = ["home_of_the_tests", "postgres", "working_folder"]
 
 if not torch.cuda.is_available():
     os.environ.setdefault("TRITON_INTERPRET", "1")  # before any kernel is imported: they run on the CPU then
 
-for name in list(os.environ):  # settings of whoever runs the tests are not theirs
-    if name.startswith("ULTRAGRAY_") and not name.startswith(
-        ("ULTRAGRAY_FAULT_", "ULTRAGRAY_TEST_", "ULTRAGRAY_UPDATE_")
-    ):
-        del os.environ[name]
+forget_the_users_environment()
+hypothesis.configuration.set_hypothesis_home_dir(ROOT / ".hypothesis")  # else it is in the working folder of a test
 
 RUN = f"PYTEST_RUN={os.getpid()}\0"  # in the environment of every process that these tests start
 os.environ["PYTEST_RUN"] = str(os.getpid())
 
 BEGAN = time.monotonic()
-SHARED = Path(__file__).resolve().parents[2] / "shared"
+SHARED = ROOT.parent / "shared"
 LARGEST_FLIP = 5e-3  # a threshold that flips moves a pixel by about 1/255
 
 
@@ -190,6 +189,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--record-in", type=Path, help="write when, at which commit and how this run ended to a JSON file")
+    parser.addoption("--seed", type=int, help="of what is drawn at random by tests/fuzz; another one in every run")
 
 
 @pytest.hookimpl(trylast=True)

@@ -19,6 +19,8 @@ import pytest
 from psycopg import sql
 from typing_extensions import LiteralString
 
+from .waiting import Deadline
+
 PASSWORD = "s3cret/with@signs"
 _START_TIMEOUT_S = 120.0
 _UNPRIVILEGED = "nobody"  # PostgreSQL refuses to run as root
@@ -71,14 +73,14 @@ class PostgresServer:
                 cwd=self._folder,
                 user=self._user,
             )
-        end = time.monotonic() + _START_TIMEOUT_S
+        end = Deadline(_START_TIMEOUT_S)
         while True:
             try:
                 self._connect().close()
                 return
             except psycopg.OperationalError:
                 assert self._process.poll() is None, self._log.read_text()
-                assert time.monotonic() < end, self._log.read_text()
+                assert not end.passed, self._log.read_text()
                 time.sleep(0.05)
 
     def stop(self) -> None:
@@ -106,6 +108,15 @@ class PostgresServer:
         """Runs one statement as the server's owner."""
         with self._connect() as connection:
             connection.execute(statement)
+
+    def set_read_only(self, url: str, value: bool) -> None:
+        """Lets the transactions of a database change nothing, as those of a standby, or change what they like again."""
+        name = url.rpartition("/")[2]
+        statement = sql.SQL("ALTER DATABASE {} SET default_transaction_read_only = {}")
+        with self._connect() as connection:
+            connection.execute(statement.format(sql.Identifier(name), sql.Literal(value)))
+            # Connections take it when they are made.
+            connection.execute("SELECT pg_terminate_backend(pid) FROM pg_stat_activity WHERE datname = %s", [name])
 
     def create_database(self) -> str:
         """The URL of a new database."""

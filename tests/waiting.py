@@ -5,21 +5,37 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import TypeVar
 
 Found = TypeVar("Found")
 
 
+class Deadline:
+    """So many seconds from now, of a machine that has nothing else to do; later as long as others keep it busy."""
+
+    def __init__(self, seconds: float) -> None:
+        self._began = time.monotonic()
+        self._seconds = seconds
+
+    @property
+    def passed(self) -> bool:
+        elapsed = time.monotonic() - self._began
+        return elapsed > self._seconds and elapsed > at_this_load(self._seconds)
+
+
 def wait_until(condition: Callable[[], Found], *, within_s: float = 60, every_s: float = 0.01) -> Found:
-    """The first true answer of `condition`; an AssertionError where none comes within `within_s`."""
-    end = time.monotonic() + within_s
+    """The first true answer of `condition`; an AssertionError where none comes before the Deadline of `within_s`."""
+    deadline = Deadline(within_s)
     while not (found := condition()):
-        assert time.monotonic() < end, f"not within {within_s:g} s: last was {found!r}"
+        assert not deadline.passed, f"not within {within_s:g} s: last was {found!r}"
         time.sleep(every_s)
     return found
 
 
 def at_this_load(seconds: float) -> float:
     """A limit of a machine that has nothing else to do, as it stands now: longer where others keep it busy."""
-    share = os.getloadavg()[0] / (os.cpu_count() or 1)  # of each core in the last minute
-    return seconds * max(1.0, 2.0 * share)
+    average, _, _, running, _ = Path("/proc/loadavg").read_text(encoding="ascii").split()  # the first: of a minute
+    now = int(running.partition("/")[0]) - 1  # without this process; the average lags behind
+    busy = max(float(average), now)
+    return seconds * max(1.0, 2.0 * busy / (os.cpu_count() or 1))

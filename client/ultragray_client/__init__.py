@@ -8,9 +8,11 @@ is told as one of `ultragray_client.errors`.
 from __future__ import annotations
 
 from . import contract, errors
+from .access import Me, Role
 from .aio.client import AsyncClient
 from .aio.stream import AsyncFrameStream
 from .calls.pose_exchange import StreamMode
+from .calls.tls import Tls
 from .contract import *  # noqa: F403
 from .errors import ClientError
 from .frames import Extrapolation, Frame, Picture, Timings
@@ -34,14 +36,17 @@ __all__ = [
     "JobEvent",
     "JobProgress",
     "JobState",
+    "Me",
     "Picture",
     "Placement",
     "PoseLike",
     "Quaternion",
+    "Role",
     "Scene",
     "SceneEntry",
     "StreamMode",
     "Timings",
+    "Tls",
     "errors",
 ]
 __all__ += contract.__all__

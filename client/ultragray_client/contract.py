@@ -220,6 +220,10 @@ class Dataset:
     """What looks wrong, for a person to decide."""
     options: dict[str, str]
     """How it was read: the query parameters of its upload."""
+    owner: str | None = None
+    """Who uploaded it; null: from before there were owners."""
+    private: bool = False
+    """Whether others may not see it."""
 
 
 @dataclass(frozen=True)
@@ -236,6 +240,8 @@ class EvaluateJob:
     baselines: bool = False
     """Also score compounding of the training frames: the classical way."""
     kind: Literal["evaluate"] = field(default="evaluate", repr=False, kw_only=True)
+    max_run_s: float | None = field(default=None, kw_only=True)
+    """Longest time that the job may run in all, s; then it fails, and a retry goes on. None: the service's longest."""
 
 
 @dataclass(frozen=True)
@@ -339,6 +345,8 @@ class RenderJob(FrameSettings):
     dtype: str | None = None
     """Default: the format's own."""
     kind: Literal["render"] = field(default="render", repr=False, kw_only=True)
+    max_run_s: float | None = field(default=None, kw_only=True)
+    """Longest time that the job may run in all, s; then it fails, and a retry goes on. None: the service's longest."""
 
 
 @dataclass(frozen=True)
@@ -356,6 +364,8 @@ class TrainJob:
     device: str = "auto"
     """auto, cpu, cuda or cuda:N."""
     kind: Literal["train"] = field(default="train", repr=False, kw_only=True)
+    max_run_s: float | None = field(default=None, kw_only=True)
+    """Longest time that the job may run in all, s; then it fails, and a retry goes on. None: the service's longest."""
 
 
 Specification: TypeAlias = EvaluateJob | RenderJob | TrainJob

@@ -18,9 +18,9 @@ _ARCHIVE_SUFFIXES = (".zip", ".tar", ".tar.gz", ".tgz")
 class Upload:
     """A folder with all below it, or one archive (.zip, .tar, .tar.gz, .tgz), on its way to the service."""
 
-    def __init__(self, name: str, path: str | Path, options: DatasetOptions) -> None:
+    def __init__(self, name: str, path: str | Path, options: DatasetOptions, private: bool) -> None:
         """Raises InvalidArgument for a path that is neither."""
-        self._name, self._path, self._options = name, Path(path), options
+        self._name, self._path, self._options, self._private = name, Path(path), options, private
         if not self._path.is_dir() and not (self._path.is_file() and self._path.name.endswith(_ARCHIVE_SUFFIXES)):
             expected = f"a folder or an archive ({', '.join(_ARCHIVE_SUFFIXES)})"
             raise InvalidArgument(f"path must be {expected} that exists, got {self._path}", field="path")
@@ -30,7 +30,8 @@ class Upload:
         request = datasets_pb2.UploadDatasetRequest
         options = message_of(self._options, datasets_pb2.DatasetOptions)
         archive = self._path.is_file()
-        yield request(header=datasets_pb2.UploadHeader(dataset=self._name, options=options, archive=archive))
+        header = datasets_pb2.UploadHeader(dataset=self._name, options=options, archive=archive, private=self._private)
+        yield request(header=header)
         for path in [self._path] if archive else sorted(self._path.rglob("*")):
             if not path.is_file():
                 continue

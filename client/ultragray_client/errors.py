@@ -8,14 +8,32 @@ ClientError
 │   ├── InvalidImageSize
 │   ├── UnknownOutput
 │   ├── LowConfidence
+│   ├── FrameTooCostly
 │   ├── TooManyPoses
+│   ├── HeadersTooLarge
+│   ├── TargetTooLong
+│   ├── RequestMalformed
 │   ├── DatasetInvalid
 │   └── UploadTooLarge
 ├── Unauthenticated
+├── Unavailable
+│   ├── IssuerUnavailable
+│   ├── TooManyConnections
+│   ├── DatabaseUnavailable
+│   ├── ArtifactFolderUnavailable
+│   ├── NotReady
+│   ├── Draining
+│   └── Unreachable
+├── PermissionDenied
+│   └── HostRefused
+├── DeadlineExceeded
+│   ├── RequestTooSlow
+│   └── JobTimeExceeded
 ├── NotFound
 │   ├── SceneNotFound
 │   ├── DatasetNotFound
 │   ├── JobNotFound
+│   ├── WorkerNotFound
 │   └── ArtifactNotFound
 ├── FailedPrecondition
 │   ├── SceneFileInvalid
@@ -33,16 +51,14 @@ ClientError
 │   ├── JobQueueFull
 │   ├── SceneTooLarge
 │   └── QueueFull
-├── Unavailable
-│   ├── DatabaseUnavailable
-│   ├── NotReady
-│   ├── Draining
-│   └── Unreachable
+├── JobStalled
 ├── Unimplemented
 │   ├── BackendUnavailable
 │   └── ExtraMissing
-├── DeadlineExceeded
+├── BackupInvalid
+├── RestoreRefused
 ├── RenderFailed
+├── TlsFailed
 └── StreamEnded
 
 A reason that this client does not know is told with the class of its gRPC status, or ClientError.
@@ -90,10 +106,34 @@ class LowConfidence(InvalidArgument):
     reason = "LOW_CONFIDENCE"
 
 
+class FrameTooCostly(InvalidArgument):
+    """A frame whose Gaussians cover more pixels than `ULTRAGRAY_MAX_FOOTPRINT_PIXELS` allows; ask for a smaller one."""
+
+    reason = "FRAME_TOO_COSTLY"
+
+
 class TooManyPoses(InvalidArgument):
     """More poses, or pixels, than one request may have; send several."""
 
     reason = "TOO_MANY_POSES"
+
+
+class HeadersTooLarge(InvalidArgument):
+    """The head of a request over `ULTRAGRAY_MAX_HEADER_BYTES`, or more headers than `ULTRAGRAY_MAX_HEADERS`."""
+
+    reason = "HEADERS_TOO_LARGE"
+
+
+class TargetTooLong(InvalidArgument):
+    """Path and query of a request over 16 KiB."""
+
+    reason = "TARGET_TOO_LONG"
+
+
+class RequestMalformed(InvalidArgument):
+    """Bytes that are no HTTP request, or too many requests at once on one connection."""
+
+    reason = "REQUEST_MALFORMED"
 
 
 class DatasetInvalid(InvalidArgument):
@@ -113,6 +153,87 @@ class Unauthenticated(ClientError):
 
     reason = "UNAUTHENTICATED"
     grpc_status = "UNAUTHENTICATED"
+
+
+class Unavailable(ClientError):
+    """Base of the errors whose gRPC status is UNAVAILABLE."""
+
+    reason = "UNAVAILABLE"
+    grpc_status = "UNAVAILABLE"
+
+
+class IssuerUnavailable(Unavailable):
+    """The issuer of a token does not answer, so that the token cannot be checked; API keys work all the same; retry."""
+
+    reason = "ISSUER_UNAVAILABLE"
+
+
+class TooManyConnections(Unavailable):
+    """Connections over `ULTRAGRAY_MAX_CONNECTIONS`, or of one address over the limit of those; retry."""
+
+    reason = "TOO_MANY_CONNECTIONS"
+
+
+class DatabaseUnavailable(Unavailable):
+    """The database of the jobs is away or takes no changes; scenes are rendered all the same; retry."""
+
+    reason = "DATABASE_UNAVAILABLE"
+
+
+class ArtifactFolderUnavailable(Unavailable):
+    """The artifact folder is gone, or not the one that the jobs belong to: its share is not mounted; retry."""
+
+    reason = "ARTIFACT_FOLDER_UNAVAILABLE"
+
+
+class NotReady(Unavailable):
+    """The service is starting, or cannot render at the moment; retry."""
+
+    reason = "NOT_READY"
+
+
+class Draining(Unavailable):
+    """The service is stopping; retry elsewhere."""
+
+    reason = "DRAINING"
+
+
+class Unreachable(Unavailable):
+    """Nobody answers at the address, or the connection broke."""
+
+    reason = "UNREACHABLE"
+
+
+class PermissionDenied(ClientError):
+    """A role that may not do what was asked, or something that belongs to somebody else."""
+
+    reason = "PERMISSION_DENIED"
+    grpc_status = "PERMISSION_DENIED"
+
+
+class HostRefused(PermissionDenied):
+    """A `Host` that the service is not known as, where it asks for no key."""
+
+    reason = "HOST_REFUSED"
+
+
+class DeadlineExceeded(ClientError, TimeoutError):
+    """The deadline passed first."""
+
+    reason = "DEADLINE_EXCEEDED"
+    grpc_status = "DEADLINE_EXCEEDED"
+
+
+class RequestTooSlow(DeadlineExceeded):
+    """A head that took longer than `ULTRAGRAY_HEADER_TIMEOUT_S`, or a body below `ULTRAGRAY_MIN_BYTES_PER_S`."""
+
+    reason = "REQUEST_TOO_SLOW"
+
+
+class JobTimeExceeded(DeadlineExceeded):
+    """A job ran longer than its `max_run_s`, or `ULTRAGRAY_JOB_MAX_RUN_S`, and was ended."""
+
+    reason = "JOB_TIME_EXCEEDED"
 
 
 class NotFound(ClientError):
@@ -138,6 +259,12 @@ class JobNotFound(NotFound):
     """No job of that id."""
 
     reason = "JOB_NOT_FOUND"
+
+
+class WorkerNotFound(NotFound):
+    """No worker of that name."""
+
+    reason = "WORKER_NOT_FOUND"
 
 
 class ArtifactNotFound(NotFound):
@@ -247,35 +374,10 @@ class QueueFull(ResourceExhausted):
     reason = "QUEUE_FULL"
 
 
-class Unavailable(ClientError):
-    """Base of the errors whose gRPC status is UNAVAILABLE."""
+class JobStalled(ClientError):
+    """The process of a job neither computed nor read nor wrote for `ULTRAGRAY_JOB_STALL_TIMEOUT_S`, and was ended."""
 
-    reason = "UNAVAILABLE"
-    grpc_status = "UNAVAILABLE"
-
-
-class DatabaseUnavailable(Unavailable):
-    """The database of the jobs does not answer; scenes are rendered all the same; retry."""
-
-    reason = "DATABASE_UNAVAILABLE"
-
-
-class NotReady(Unavailable):
-    """The service is starting; retry."""
-
-    reason = "NOT_READY"
-
-
-class Draining(Unavailable):
-    """The service is stopping; retry elsewhere."""
-
-    reason = "DRAINING"
-
-
-class Unreachable(Unavailable):
-    """Nobody answers at the address, or the connection broke."""
-
-    reason = "UNREACHABLE"
+    reason = "JOB_STALLED"
 
 
 class Unimplemented(ClientError):
@@ -299,17 +401,28 @@ class ExtraMissing(Unimplemented):
     reason = "EXTRA_MISSING"
 
 
-class DeadlineExceeded(ClientError, TimeoutError):
-    """The deadline passed first."""
+class BackupInvalid(ClientError):
+    """A backup that is not there, damaged, or made by a newer release (command line)."""
 
-    reason = "DEADLINE_EXCEEDED"
-    grpc_status = "DEADLINE_EXCEEDED"
+    reason = "BACKUP_INVALID"
+
+
+class RestoreRefused(ClientError):
+    """A backup or restore into a place that holds something else, or where somebody is at work (command line)."""
+
+    reason = "RESTORE_REFUSED"
 
 
 class RenderFailed(ClientError):
     """A worker could not render the frame."""
 
     reason = "RENDER_FAILED"
+
+
+class TlsFailed(ClientError):
+    """The service shows no certificate to trust, or does not speak TLS."""
+
+    reason = "TLS_FAILED"
 
 
 class StreamEnded(ClientError):
@@ -326,14 +439,32 @@ ERRORS = (
     InvalidImageSize,
     UnknownOutput,
     LowConfidence,
+    FrameTooCostly,
     TooManyPoses,
+    HeadersTooLarge,
+    TargetTooLong,
+    RequestMalformed,
     DatasetInvalid,
     UploadTooLarge,
     Unauthenticated,
+    Unavailable,
+    IssuerUnavailable,
+    TooManyConnections,
+    DatabaseUnavailable,
+    ArtifactFolderUnavailable,
+    NotReady,
+    Draining,
+    Unreachable,
+    PermissionDenied,
+    HostRefused,
+    DeadlineExceeded,
+    RequestTooSlow,
+    JobTimeExceeded,
     NotFound,
     SceneNotFound,
     DatasetNotFound,
     JobNotFound,
+    WorkerNotFound,
     ArtifactNotFound,
     FailedPrecondition,
     SceneFileInvalid,
@@ -351,15 +482,13 @@ ERRORS = (
     JobQueueFull,
     SceneTooLarge,
     QueueFull,
-    Unavailable,
-    DatabaseUnavailable,
-    NotReady,
-    Draining,
-    Unreachable,
+    JobStalled,
     Unimplemented,
     BackendUnavailable,
     ExtraMissing,
-    DeadlineExceeded,
+    BackupInvalid,
+    RestoreRefused,
     RenderFailed,
+    TlsFailed,
     StreamEnded,
 )

@@ -78,6 +78,8 @@ class Job:
     worker: str | None
     retry_of: str | None  # the job that this one goes on from
     attempts: int  # how often it was started
+    owner: str | None  # who submitted it
+    private: bool  # others do not see it
 
 
 @dataclass(frozen=True)
@@ -128,13 +130,15 @@ class Watch(Conversation[JobEvent]):
         return log
 
 
-def submission(specification: Specification, request_id: str | None, priority: int) -> jobs_pb2.SubmitJobRequest:
+def submission(
+    specification: Specification, request_id: str | None, priority: int, private: bool
+) -> jobs_pb2.SubmitJobRequest:
     """The request for a job. With an id of its own a submission that is sent again gives the same job.
 
     Raises InvalidPose, and InvalidArgument for a word that is none; the service checks the rest.
     """
     request_id = uuid.uuid4().hex if request_id is None else request_id
-    request = jobs_pb2.SubmitJobRequest(request_id=request_id, priority=priority)
+    request = jobs_pb2.SubmitJobRequest(request_id=request_id, priority=priority, private=private)
     job = getattr(request, specification.kind)
     poses = getattr(specification, "poses", None)
     others = {} if poses is None else {"poses": pose_messages(poses)}

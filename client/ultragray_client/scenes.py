@@ -25,6 +25,8 @@ class SceneEntry:
     image_width: int
     file_bytes: int
     error: str | None  # why the file cannot be read
+    owner: str | None  # None: nobody
+    private: bool  # others do not see it
 
 
 @dataclass(frozen=True)
@@ -60,6 +62,8 @@ class Scene:
     dataset_sha256: str
     label_names: Mapping[int, str]  # what the values of the output labels mean
     confidence: ConfidenceFit | None  # None: it cannot tell the confidence of its frames
+    owner: str | None  # None: nobody
+    private: bool  # others do not see it
 
 
 def entry_from_message(message: scenes_pb2.SceneEntry) -> SceneEntry:

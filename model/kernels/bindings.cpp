@@ -24,6 +24,8 @@ using FreeMatrix = nb::ndarray<float, nb::ndim<2>, nb::c_contig, nb::device::cpu
 using ImageBatch = nb::ndarray<const float, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
 using FreePlanes = nb::ndarray<float, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
 using OptionalPlanes = std::optional<FreePlanes>;
+using Flag = nb::ndarray<const int64_t, nb::shape<1>, nb::c_contig, nb::device::cpu>;
+using FreeCounts = nb::ndarray<int64_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 
 // B, E, T, coverage and S, each [C, H, W] or null.
 Outputs planes_of(const std::array<OptionalPlanes, 5>& arrays, size_t count, int height, int width) {
@@ -35,6 +37,14 @@ Outputs planes_of(const std::array<OptionalPlanes, 5>& arrays, size_t count, int
         planes[k] = arrays[k]->data();
     }
     return {planes[0], planes[1], planes[2], planes[3], planes[4]};
+}
+
+Limits limits_of(std::optional<int64_t> footprint_pixels, const std::optional<Flag>& flag, int64_t number) {
+    Limits limits;
+    if (footprint_pixels) limits.footprint_pixels = *footprint_pixels;
+    if (flag) limits.flag = flag->data();
+    limits.number = number;
+    return limits;
 }
 
 // The arguments that rendering and recording share.
@@ -49,6 +59,15 @@ Outputs planes_of(const std::array<OptionalPlanes, 5>& arrays, size_t count, int
 
 NB_MODULE(_cpu, m) {
     nb::set_leak_warnings(false);  // a scene that a script still holds when it ends is no leak
+    nb::exception<GivenUp>(m, "GivenUp");
+    static nb::handle too_costly = nb::exception<TooCostly>(m, "TooCostly");  // of two arguments: pose, footprint pixels
+    nb::register_exception_translator([](const std::exception_ptr& raised, void*) {
+        try {
+            std::rethrow_exception(raised);
+        } catch (const TooCostly& error) {
+            PyErr_SetObject(too_costly.ptr(), nb::make_tuple(error.pose, error.footprint_pixels).ptr());
+        }
+    });
     nb::class_<PreparedScene>(m, "PreparedScene")
         .def(
             "__init__",
@@ -83,14 +102,33 @@ NB_MODULE(_cpu, m) {
         [](const PreparedScene& scene, bool fanned, bool wrap, double start, double span, double near_cm, double far_cm,
            double cull_far_cm, Poses poses, int height, int width, int threads, const std::string& instruction_set,
            OptionalPlanes bmode, OptionalPlanes echo, OptionalPlanes transmittance, OptionalPlanes coverage,
-           OptionalPlanes weight_sum) {
+           OptionalPlanes weight_sum, std::optional<int64_t> footprint_pixels, std::optional<Flag> flag, int64_t number) {
             const Outputs outputs =
                 planes_of({bmode, echo, transmittance, coverage, weight_sum}, poses.shape(0), height, width);
             const ProbeGeometry probe{fanned, wrap, start, span, near_cm, far_cm, cull_far_cm};
+            const Limits limits = limits_of(footprint_pixels, flag, number);
             nb::gil_scoped_release release;
-            render(scene, probe, poses.data(), int(poses.shape(0)), height, width, threads, instruction_set, outputs);
+            render(scene, probe, poses.data(), int(poses.shape(0)), height, width, threads, instruction_set, outputs,
+                   limits);
         },
-        RENDER_ARGUMENTS, nb::arg("weight_sum").noconvert().none() = nb::none());
+        RENDER_ARGUMENTS, nb::arg("weight_sum").noconvert().none() = nb::none(), nb::arg("footprint_pixels") = nb::none(),
+        nb::arg("flag").noconvert().none() = nb::none(), nb::arg("number") = 0);
+
+    m.def(
+        "footprints",
+        [](const PreparedScene& scene, bool fanned, bool wrap, double start, double span, double near_cm, double far_cm,
+           double cull_far_cm, Poses poses, int height, int width, int threads, FreeCounts pixels, std::optional<Flag> flag,
+           int64_t number) {
+            if (pixels.shape(0) != poses.shape(0)) throw std::invalid_argument("there must be one count per pose");
+            const ProbeGeometry probe{fanned, wrap, start, span, near_cm, far_cm, cull_far_cm};
+            const Limits limits = limits_of({}, flag, number);
+            nb::gil_scoped_release release;
+            footprints(scene, probe, poses.data(), int(poses.shape(0)), height, width, threads, limits, pixels.data());
+        },
+        nb::arg("scene"), nb::arg("fanned"), nb::arg("wrap"), nb::arg("start"), nb::arg("span"), nb::arg("near_cm"),
+        nb::arg("far_cm"), nb::arg("cull_far_cm"), nb::arg("poses").noconvert(), nb::arg("height"), nb::arg("width"),
+        nb::arg("threads"), nb::arg("pixels").noconvert(), nb::arg("flag").noconvert().none() = nb::none(),
+        nb::arg("number") = 0);
 
     nb::class_<Recording>(m, "Recording")
         .def(

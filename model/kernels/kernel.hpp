@@ -78,6 +78,7 @@ class SliceList {
     void shrink_by(int n);
     const Slice* data() const { return data_; }
     int64_t size() const { return size_; }
+    int64_t lines = 0;  // scan lines that each slice may touch, added up
 
  private:
     Slice* data_ = nullptr;

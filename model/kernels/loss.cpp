@@ -24,8 +24,7 @@ double image_loss(const float* x, const float* y, int count, int height, int wid
                      losses[i] = kernels.image_loss(x + at, y + at, height, width, window, scratch.data(),
                                                     float(0.5 / pixels), float(-0.5 / windows), gradient + at);
                  }};
-    Phase nothing{0, {}};
-    run_phases(images, nothing, threads);
+    run_phases({&images}, threads);
     ImageLoss total{0, 0};
     for (const ImageLoss& loss : losses) total.l1 += loss.l1, total.ssim += loss.ssim;
     return 0.5 * total.l1 / pixels + 0.5 * (1.0 - total.ssim / windows);

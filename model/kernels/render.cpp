@@ -7,6 +7,7 @@
 #include <new>
 #include <stdexcept>
 
+#include "footprint.hpp"
 #include "threads.hpp"
 
 namespace ultragray {
@@ -14,7 +15,8 @@ namespace {
 
 constexpr int kStripLines = 64;  // four accumulators of 512 rows stay within a 1 MB cache
 constexpr int64_t kClustersPerTask = 128;
-constexpr int kPosesAtOnce = 8;  // bounds the memory that slices take
+constexpr int kPosesAtOnce = 8;                    // bounds the memory that slices take
+constexpr int64_t kPixelsBetweenChecks = 1 << 21;  // of the flag that ends a rendering: at most some 10 ms
 
 std::vector<const Kernels*> available_kernels() {
     std::vector<const Kernels*> found;
@@ -95,17 +97,28 @@ class Batch {
     Batch(const Batch&) = delete;
     Batch& operator=(const Batch&) = delete;
 
-    void render(const Outputs& outputs, const std::vector<SavedPlanes>& saved, int threads) {
-        Phase slicing{count() * parts(), [&](int task) {
-                          const int64_t begin = task % parts() * kClustersPerTask;
-                          const int64_t end = std::min(begin + kClustersPerTask, scene_.cluster_count);
-                          kernels_.slice(scene_, views_[task / parts()], begin, end, slices_[task]);
-                      }};
+    // `first` is the number of the first pose, for errors. Throws GivenUp, TooCostly.
+    void render(const Outputs& outputs, const std::vector<SavedPlanes>& saved, int threads, const Limits& limits = {},
+                int first = 0) {
+        Phase slicing{count() * parts(), [&](int task) { slice(task, limits); }};
+        Phase checking{count(), [&](int c) {
+                           const auto& most = limits.footprint_pixels;
+                           if (sum(c, footprint_bound) <= most) return;
+                           const int64_t pixels = sum(c, footprint_pixels);
+                           if (pixels > most) throw TooCostly(first + c, pixels);
+                       }};
         Phase drawing{count() * strips(), [&](int task) {
                           const int c = task / strips();
-                          draw(c, task % strips() * kStripLines, outputs, saved.empty() ? SavedPlanes{} : saved[c]);
+                          draw(c, task % strips() * kStripLines, outputs, saved.empty() ? SavedPlanes{} : saved[c], limits);
                       }};
-        run_phases(slicing, drawing, threads);
+        run_phases({&slicing, &checking, &drawing}, threads);
+    }
+
+    // The cost of each pose, without drawing.
+    void footprints(int64_t* pixels, int threads, const Limits& limits) {
+        Phase slicing{count() * parts(), [&](int task) { slice(task, limits); }};
+        Phase summing{count(), [&](int c) { pixels[c] = sum(c, footprint_pixels); }};
+        run_phases({&slicing, &summing}, threads);
     }
 
     // Gradients are added to; no two tasks share a Gaussian, and each adds in the order of the poses.
@@ -124,7 +137,7 @@ class Batch {
                                   kernels_.gather(scene_, views_[c], list.data(), list.size(), pixels[c], gaussians, sh);
                               }
                           }};
-        run_phases(by_pixel, by_gaussian, threads);
+        run_phases({&by_pixel, &by_gaussian}, threads);
     }
 
  private:
@@ -133,7 +146,20 @@ class Batch {
     int strips() const { return (views_[0].lines + kStripLines - 1) / kStripLines; }
     int64_t frame_size() const { return int64_t(views_[0].height) * views_[0].lines; }
 
-    void draw(int c, int first, const Outputs& outputs, const SavedPlanes& saved) const {
+    void slice(int task, const Limits& limits) {
+        limits.check_flag();
+        const int64_t begin = task % parts() * kClustersPerTask;
+        const int64_t end = std::min(begin + kClustersPerTask, scene_.cluster_count);
+        kernels_.slice(scene_, views_[task / parts()], begin, end, slices_[task]);
+    }
+
+    int64_t sum(int c, int64_t (*pixels)(const View&, const SliceList&)) const {
+        int64_t found = 0;
+        for (int part = 0; part < parts(); ++part) found += pixels(views_[c], slices_[int64_t(c) * parts() + part]);
+        return found;
+    }
+
+    void draw(int c, int first, const Outputs& outputs, const SavedPlanes& saved, const Limits& limits) const {
         const View& view = views_[c];
         thread_local std::unique_ptr<StripBuffer> buffer;
         thread_local int buffer_height = 0;
@@ -142,10 +168,14 @@ class Batch {
             buffer = std::make_unique<StripBuffer>(view.height, kStripLines);
             buffer_height = view.height;
         }
+        const int64_t at_once = std::max<int64_t>(1, kPixelsBetweenChecks / (int64_t(kStripLines) * view.height));
         const Strip strip = buffer->clear(first, std::min(kStripLines, view.lines - first));
         for (int part = 0; part < parts(); ++part) {
             const SliceList& list = slices_[int64_t(c) * parts() + part];
-            kernels_.draw(view, list.data(), list.size(), strip);
+            for (int64_t i = 0; i < list.size(); i += at_once) {
+                limits.check_flag();
+                kernels_.draw(view, list.data() + i, std::min(at_once, list.size() - i), strip);
+            }
         }
         kernels_.finish(view, strip, frame_of(outputs, c * frame_size()), saved);
     }
@@ -203,13 +233,23 @@ std::vector<std::string> instruction_sets() {
 }
 
 void render(const PreparedScene& scene, const ProbeGeometry& probe, const double* poses, int count, int height, int width,
-            int threads, const std::string& instruction_set, const Outputs& outputs) {
+            int threads, const std::string& instruction_set, const Outputs& outputs, const Limits& limits) {
     const Kernels& kernels = choose_kernels(instruction_set);
     const int64_t frame_size = int64_t(height) * width;
     for (int first = 0; first < count; first += kPosesAtOnce) {
         Batch batch(scene, probe, poses + 16 * first, std::min(kPosesAtOnce, count - first), height, width, kernels);
         const FramePointers from = frame_of(outputs, first * frame_size);
-        batch.render({from.bmode, from.echo, from.transmittance, from.coverage, from.weight_sum}, {}, threads);
+        batch.render({from.bmode, from.echo, from.transmittance, from.coverage, from.weight_sum}, {}, threads, limits,
+                     first);
+    }
+}
+
+void footprints(const PreparedScene& scene, const ProbeGeometry& probe, const double* poses, int count, int height,
+                int width, int threads, const Limits& limits, int64_t* pixels) {
+    const Kernels& kernels = choose_kernels("auto");
+    for (int first = 0; first < count; first += kPosesAtOnce) {
+        Batch batch(scene, probe, poses + 16 * first, std::min(kPosesAtOnce, count - first), height, width, kernels);
+        batch.footprints(pixels + first, threads, limits);
     }
 }
 

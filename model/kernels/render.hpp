@@ -5,6 +5,7 @@
 #include <string>
 #include <vector>
 
+#include "limits.hpp"
 #include "scene.hpp"
 
 namespace ultragray {
@@ -23,9 +24,13 @@ struct Outputs {
 
 // Renders C poses [4, 4] (row-major, cm, probe to scene; columns 0 and 2 may be those of a plane that is sheared such that
 // its parallel lines run along z). The result does not depend on the number of threads.
-// Throws std::bad_alloc, or std::invalid_argument for an instruction set that this processor lacks.
+// Throws GivenUp, TooCostly, std::bad_alloc, or std::invalid_argument for an instruction set that this processor lacks.
 void render(const PreparedScene& scene, const ProbeGeometry& probe, const double* poses, int count, int height, int width,
-            int threads, const std::string& instruction_set, const Outputs& outputs);
+            int threads, const std::string& instruction_set, const Outputs& outputs, const Limits& limits);
+
+// The cost of each pose [C] in footprint pixels (footprint.hpp), without drawing it. Throws GivenUp, std::bad_alloc.
+void footprints(const PreparedScene& scene, const ProbeGeometry& probe, const double* poses, int count, int height,
+                int width, int threads, const Limits& limits, int64_t* pixels);
 
 // Frames that remember what their gradients need. The scene must outlive the recording.
 class Recording {

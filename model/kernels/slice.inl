@@ -181,7 +181,11 @@ void slice_candidates(const SceneView& scene, const View& view, const Candidates
         s.absorb = scene.gaussians[c.ids[k]].absorb;
         s.gaussian = static_cast<int32_t>(c.ids[k]);
         ++written;
-        if (s.first <= s.last) continue;
+        if (s.first <= s.last) {
+            out.lines += s.last - s.first + 1;
+            continue;
+        }
+        out.lines += view.lines + s.last - s.first + 1;
         next[written] = s;  // on the seam: once for either side of it
         next[written].first = 0;
         s.last = view.lines - 1;

@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <exception>
+#include <iterator>
 #include <mutex>
 #include <system_error>
 #include <thread>
@@ -9,7 +10,7 @@
 
 namespace ultragray {
 
-void run_phases(Phase& first, Phase& second, int threads) {
+void run_phases(std::initializer_list<Phase*> phases, int threads) {
     std::exception_ptr failure;
     std::mutex failure_lock;
     std::atomic<bool> failed{false};
@@ -26,12 +27,16 @@ void run_phases(Phase& first, Phase& second, int threads) {
         }
     };
     const auto work = [&] {
-        take_all(first);
-        while (first.done < first.count) std::this_thread::yield();
-        take_all(second);
+        for (Phase* phase : phases) {
+            take_all(*phase);
+            if (phase == *std::prev(phases.end())) return;
+            while (phase->done < phase->count) std::this_thread::yield();
+        }
     };
+    int most = 0;
+    for (const Phase* phase : phases) most = std::max(most, phase->count);
     std::vector<std::thread> helpers;
-    const int wanted = std::min(threads, std::max(first.count, second.count)) - 1;
+    const int wanted = std::min(threads, most) - 1;
     helpers.reserve(std::max(0, wanted));
     try {
         for (int t = 0; t < wanted; ++t) helpers.emplace_back(work);
@@ -47,8 +52,7 @@ void run_ranges(int64_t count, const std::function<void(int64_t, int64_t)>& task
     constexpr int64_t kRange = 8192;
     Phase ranges{static_cast<int>((count + kRange - 1) / kRange),
                  [&](int i) { task(i * kRange, std::min((i + 1) * kRange, count)); }};
-    Phase nothing{0, {}};
-    run_phases(ranges, nothing, threads);
+    run_phases({&ranges}, threads);
 }
 
 }  // namespace ultragray

@@ -18,7 +18,7 @@ from dataclasses import MISSING, Field, field, fields, is_dataclass
 from enum import Enum
 from functools import cache, partial
 from operator import is_
-from pathlib import Path
+from pathlib import Path, PurePath
 from types import NoneType, UnionType
 from typing import Annotated, Any, ClassVar, Literal, NoReturn, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -28,6 +28,7 @@ from .errors import InvalidArgument, UltragrayError
 
 _T = TypeVar("_T")
 _SHOWN_CHARACTERS = 100
+_SHOWN_ELEMENTS = 50
 _BOOLEANS = {"true": True, "1": True, "yes": True, "on": True, "false": False, "0": False, "no": False, "off": False}
 
 
@@ -422,9 +423,31 @@ def _refuse(expected: str, given: Any) -> NoReturn:
 
 
 def shown(value: Any) -> str:
-    """A value in a message: as Python writes it, cut where it is long."""
-    text = repr(value)
+    """A value in a message, cut where it is long: as JSON writes it, but for the quotes of a text."""
+    text = _in_words(value)
     return text if len(text) <= _SHOWN_CHARACTERS else f"{text[:_SHOWN_CHARACTERS]}…"
+
+
+def _in_words(value: Any) -> str:
+    if isinstance(value, Enum):
+        return _in_words(value.value)
+    if isinstance(value, (list, tuple)):
+        if len(value) > _SHOWN_ELEMENTS:
+            return f"a list of {len(value)} values"
+        return f"[{', '.join(map(_in_words, value))}]"
+    if isinstance(value, Mapping):
+        if len(value) > _SHOWN_ELEMENTS:
+            return f"an object of {len(value)} entries"
+        return f"{{{', '.join(f'{_in_words(key)}: {_in_words(one)}' for key, one in value.items())}}}"
+    if value is None or isinstance(value, (bool, np.bool_)):
+        return {None: "null", True: "true", False: "false"}[value if value is None else bool(value)]
+    if isinstance(value, np.ndarray):
+        return f"an array {list(value.shape)}"
+    if isinstance(value, np.generic):
+        return repr(value.item())
+    if isinstance(value, (str, int, float)) or is_dataclass(value):
+        return repr(value)
+    return repr(str(value)) if isinstance(value, PurePath) else f"a value of type {type(value).__name__}"
 
 
 @contextmanager

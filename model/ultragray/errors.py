@@ -7,6 +7,7 @@ UltragrayError
 │   ├── InvalidImageSize
 │   ├── UnknownOutput
 │   ├── LowConfidence
+│   ├── FrameTooCostly
 │   └── TooManyPoses
 ├── SceneFileInvalid
 ├── CheckpointInvalid
@@ -38,6 +39,7 @@ class UltragrayError(Exception):
 
     reason: ClassVar[str] = "INTERNAL"
     title: ClassVar[str] = "Internal error"
+    retry_after_s: float | None = None  # when the same request may succeed, where the one who raises it knows
 
     def __init__(self, detail: str, *, field: str | None = None) -> None:
         super().__init__(detail)
@@ -99,6 +101,13 @@ class LowConfidence(InvalidArgument):
 
     reason = "LOW_CONFIDENCE"
     title = "The confidence is too low"
+
+
+class FrameTooCostly(InvalidArgument):
+    """A frame whose Gaussians cover more pixels than `ULTRAGRAY_MAX_FOOTPRINT_PIXELS` allows; ask for a smaller one."""
+
+    reason = "FRAME_TOO_COSTLY"
+    title = "The frame would take too long"
 
 
 class TooManyPoses(InvalidArgument):

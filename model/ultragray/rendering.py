@@ -10,13 +10,14 @@ from torch import Tensor
 from .backends import cpu, cuda, reference
 from .errors import BackendUnavailable
 from .image_size import check_image_size
+from .limits import UNLIMITED, Limits
 from .outputs import OUTPUTS, PLANES, check_available, check_outputs
 from .pose import check_poses
 from .probe import FloatArray, Probe
 from .scene import GaussianScene
 from .version import __version__
 
-Backend = Callable[[GaussianScene, Probe, FloatArray, int, int, Sequence[str]], dict[str, Tensor]]
+Backend = Callable[[GaussianScene, Probe, FloatArray, int, int, Sequence[str], Limits], dict[str, Tensor]]
 
 
 class Frames(Mapping[str, Tensor]):
@@ -51,17 +52,19 @@ class Frames(Mapping[str, Tensor]):
 class Drawing:
     """Views of a scene by one backend: the planes that outputs are derived from."""
 
-    def __init__(self, draw: Backend, scene: GaussianScene, view: tuple[Probe, FloatArray, int, int]) -> None:
+    def __init__(
+        self, draw: Backend, scene: GaussianScene, view: tuple[Probe, FloatArray, int, int], limits: Limits
+    ) -> None:
         """`view`: probe, poses [C, 4, 4] in cm about the scene's centre, height and width."""
         self.scene = scene
         self.shape = (len(view[1]), view[2], view[3])
-        self._draw, self._view = draw, view
+        self._draw, self._view, self._limits = draw, view, limits
         self._planes: dict[str, Tensor] = {}
 
     def draw(self, planes: Sequence[str]) -> None:
         """Draws planes of the whole scene at once."""
         if planes:
-            self._planes = self._draw(self.scene, *self._view, planes)
+            self._planes = self._draw(self.scene, *self._view, planes, self._limits)
 
     def plane(self, name: str) -> Tensor:  # [C, H, W]
         """One of the planes that were drawn."""
@@ -69,7 +72,7 @@ class Drawing:
 
     def plane_of(self, part: GaussianScene, name: str) -> Tensor:  # [C, H, W]
         """A plane of some of the scene's Gaussians alone."""
-        return self._draw(part, *self._view, (name,))[name]
+        return self._draw(part, *self._view, (name,), self._limits)[name]
 
 
 def render(
@@ -81,6 +84,7 @@ def render(
     width: int,
     outputs: Sequence[str] = PLANES,
     backend: str = "auto",
+    limits: Limits = UNLIMITED,
 ) -> Frames:
     """Frames [C, height, width] of a scene seen by `probe` (None: the probe the scene was trained with) from `poses`.
 
@@ -89,6 +93,8 @@ def render(
     threads as torch.get_num_threads(); `cuda` in float32 on the GPU that holds the scene (`scene.to("cuda")`). `auto`
     takes the fast one for where the scene is. All are differentiable with respect to the scene's tensors (`cpu` and
     `cuda` once), labels apart; the gradients are the true ones (docs/physics.md §4).
+    `limits` bound the cost of each frame and can end the rendering (`ultragray.limits`), but for frames with gradients:
+    FrameTooCostly, GivenUp.
     Raises InvalidPose, InvalidProbe, InvalidImageSize, UnknownOutput (also for labels of a scene that carries none),
     BackendUnavailable, and MemoryExceeded where the GPU's memory does not suffice.
     """
@@ -101,9 +107,27 @@ def render(
         int(height),
         int(width),
     )
-    drawing = Drawing(_BACKENDS[choose_backend(backend, scene)], scene, view)
+    drawing = Drawing(_BACKENDS[choose_backend(backend, scene)], scene, view, limits)
     drawing.draw(list(dict.fromkeys(plane for name in chosen for plane in OUTPUTS[name].planes)))
     return Frames({name: OUTPUTS[name].derive(drawing) for name in chosen})
+
+
+def footprint_pixels(
+    scene: GaussianScene,
+    probe: Probe | None,
+    poses: Any,  # [C, 4, 4] or [4, 4] mm, probe→scene
+    *,
+    height: int,
+    width: int,
+    limits: Limits = UNLIMITED,
+) -> list[int]:  # [C]
+    """The cost of each frame of a scene (`ultragray.limits`), without drawing it: by the CPU, wherever the scene is.
+
+    Raises InvalidPose, InvalidProbe, InvalidImageSize, and GivenUp.
+    """
+    check_image_size(height, width)
+    view = scene.info.probe_or(probe), scene.poses_to_scene_cm(check_poses(poses)), int(height), int(width)
+    return cpu.footprint_pixels(scene, *view, limits)
 
 
 _BACKENDS: dict[str, Backend] = {

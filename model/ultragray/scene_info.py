@@ -19,6 +19,7 @@ from safetensors import SafetensorError, safe_open
 from .confidence.assess import read_model
 from .contract import Contract, described, from_dict, to_dict
 from .errors import InvalidArgument, InvalidProbe, SceneFileInvalid
+from .files.format_version import require_version
 from .image_size import DEFAULT_IMAGE_SIDE
 from .pose import check_poses
 from .probe import FloatArray, Probe
@@ -104,9 +105,7 @@ def info_from_json(text: str) -> SceneInfo:
     document = json.loads(text)
     if not isinstance(document, dict):
         raise ValueError("its metadata is not a JSON object")
-    version = document.pop("format_version", None)
-    if version != FORMAT_VERSION:
-        raise ValueError(f"its format_version is {version!r}, this release reads {FORMAT_VERSION}")
+    require_version(document.pop("format_version", None), FORMAT_VERSION)
     unknown = set(document) - set(SceneInfo.__dataclass_fields__)
     if unknown:
         raise ValueError(f"its metadata has unknown keys {sorted(unknown)}")
@@ -201,7 +200,8 @@ def scene_file_invalid(path: str | Path, error: Exception) -> SceneFileInvalid:
         return SceneFileInvalid(f"{path}: no such file")
     if isinstance(error, RecursionError):
         return SceneFileInvalid(f"{path}: not a scene file: its metadata nests too deeply")
-    return SceneFileInvalid(f"{path}: not a scene file that can be read: {error}")
+    reason = error.strerror if isinstance(error, OSError) and error.strerror else error  # the whole would name the path
+    return SceneFileInvalid(f"{path}: not a scene file that can be read: {reason}")
 
 
 def with_summary(info: SceneInfo, means_cm: FloatArray, sh_degree: int) -> SceneInfo:  # means [N, 3]

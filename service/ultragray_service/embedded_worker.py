@@ -15,13 +15,14 @@ from .settings import ENVIRONMENT_PREFIX, Settings
 
 _FIRST_WAIT_S, _LONGEST_WAIT_S = 0.5, 30.0
 _STEADY_S = 60.0  # a worker that lived so long is started again after the first wait
-_STOP_WAIT_S = 20.0
+_STOP_WAIT_S = 20.0  # beside what a job has to end
 _PASSED_ON = (
     "data_folder",
     "artifact_folder",
     "database_url",
     "training_threads",
     "job_nice",
+    "job_drain_timeout_s",
     "job_retention_days",
     "log_level",
 )
@@ -52,7 +53,7 @@ class EmbeddedWorker:
         if self._task is None:
             return
         try:
-            await asyncio.wait({self._task}, timeout=_STOP_WAIT_S)
+            await asyncio.wait({self._task}, timeout=_STOP_WAIT_S + self._settings.job_drain_timeout_s)
         finally:  # also where the caller was cancelled
             if self._process is not None and self._process.poll() is None:
                 self._process.kill()

@@ -15,8 +15,29 @@ class Unauthenticated(UltragrayError):
     title = "Authentication required"
 
 
+class IssuerUnavailable(UltragrayError):
+    """The issuer of a token does not answer, so that the token cannot be checked; API keys work all the same; retry."""
+
+    reason = "ISSUER_UNAVAILABLE"
+    title = "The issuer of the token does not answer"
+
+
+class PermissionDenied(UltragrayError):
+    """A role that may not do what was asked, or something that belongs to somebody else."""
+
+    reason = "PERMISSION_DENIED"
+    title = "Not allowed to this key"
+
+
+class HostRefused(UltragrayError):
+    """A `Host` that the service is not known as, where it asks for no key."""
+
+    reason = "HOST_REFUSED"
+    title = "Unknown host name"
+
+
 class OriginRefused(UltragrayError):
-    """A page of another site opens a stream."""
+    """A page of another site opens a stream, or asks for anything where no key is asked for."""
 
     reason = "ORIGIN_REFUSED"
     title = "Pages of this origin are not allowed"
@@ -41,6 +62,41 @@ class UnsupportedMediaType(UltragrayError):
 
     reason = "UNSUPPORTED_MEDIA_TYPE"
     title = "Unsupported media type"
+
+
+class HeadersTooLarge(UltragrayError):
+    """The head of a request over `ULTRAGRAY_MAX_HEADER_BYTES`, or more headers than `ULTRAGRAY_MAX_HEADERS`."""
+
+    reason = "HEADERS_TOO_LARGE"
+    title = "Request headers too large"
+
+
+class TargetTooLong(UltragrayError):
+    """Path and query of a request over 16 KiB."""
+
+    reason = "TARGET_TOO_LONG"
+    title = "Request target too long"
+
+
+class RequestMalformed(UltragrayError):
+    """Bytes that are no HTTP request, or too many requests at once on one connection."""
+
+    reason = "REQUEST_MALFORMED"
+    title = "Not an HTTP request"
+
+
+class RequestTooSlow(UltragrayError):
+    """A head that took longer than `ULTRAGRAY_HEADER_TIMEOUT_S`, or a body below `ULTRAGRAY_MIN_BYTES_PER_S`."""
+
+    reason = "REQUEST_TOO_SLOW"
+    title = "The request came too slowly"
+
+
+class TooManyConnections(UltragrayError):
+    """Connections over `ULTRAGRAY_MAX_CONNECTIONS`, or of one address over the limit of those; retry."""
+
+    reason = "TOO_MANY_CONNECTIONS"
+    title = "Too many connections"
 
 
 class IgtlMessageInvalid(UltragrayError):
@@ -102,12 +158,21 @@ STATUSES = {  # by the reason of the error
     "INVALID_IMAGE_SIZE": Statuses(422, "INVALID_ARGUMENT"),
     "UNKNOWN_OUTPUT": Statuses(422, "INVALID_ARGUMENT"),
     "LOW_CONFIDENCE": Statuses(422, "INVALID_ARGUMENT"),
+    "FRAME_TOO_COSTLY": Statuses(422, "INVALID_ARGUMENT"),
     "TOO_MANY_POSES": Statuses(422, "INVALID_ARGUMENT"),
     "UNAUTHENTICATED": Statuses(401, "UNAUTHENTICATED"),
+    "ISSUER_UNAVAILABLE": Statuses(503, "UNAVAILABLE", retry_after_s=5),
+    "PERMISSION_DENIED": Statuses(403, "PERMISSION_DENIED"),
+    "HOST_REFUSED": Statuses(403, "PERMISSION_DENIED"),
     "ORIGIN_REFUSED": Statuses(403, "PERMISSION_DENIED"),
     "BODY_TOO_LARGE": Statuses(413, "INVALID_ARGUMENT"),
     "NOT_ACCEPTABLE": Statuses(406, "INVALID_ARGUMENT"),
     "UNSUPPORTED_MEDIA_TYPE": Statuses(415, "INVALID_ARGUMENT"),
+    "HEADERS_TOO_LARGE": Statuses(431, "INVALID_ARGUMENT"),
+    "TARGET_TOO_LONG": Statuses(414, "INVALID_ARGUMENT"),
+    "REQUEST_MALFORMED": Statuses(400, "INVALID_ARGUMENT"),
+    "REQUEST_TOO_SLOW": Statuses(408, "DEADLINE_EXCEEDED"),
+    "TOO_MANY_CONNECTIONS": Statuses(503, "UNAVAILABLE", retry_after_s=1),
     "IGTL_MESSAGE_INVALID": Statuses(400, "INVALID_ARGUMENT"),
     "ROUTE_NOT_FOUND": Statuses(404, "UNIMPLEMENTED"),
     "METHOD_NOT_ALLOWED": Statuses(405, "UNIMPLEMENTED"),
@@ -126,12 +191,16 @@ STATUSES = {  # by the reason of the error
     "SCENE_EXISTS": Statuses(409, "ALREADY_EXISTS"),
     "SCENE_READ_ONLY": Statuses(403, "PERMISSION_DENIED"),
     "DATABASE_UNAVAILABLE": Statuses(503, "UNAVAILABLE", retry_after_s=5),
+    "ARTIFACT_FOLDER_UNAVAILABLE": Statuses(503, "UNAVAILABLE", retry_after_s=5),
+    "JOB_STALLED": Statuses(500, "INTERNAL"),
+    "JOB_TIME_EXCEEDED": Statuses(504, "DEADLINE_EXCEEDED"),
     "JOB_NOT_FOUND": Statuses(404, "NOT_FOUND"),
     "REQUEST_ID_CONFLICT": Statuses(409, "ALREADY_EXISTS"),
     "JOB_FINISHED": Statuses(409, "FAILED_PRECONDITION"),
     "JOB_NOT_FINISHED": Statuses(409, "FAILED_PRECONDITION"),
     "JOB_IN_USE": Statuses(409, "FAILED_PRECONDITION"),
     "JOB_QUEUE_FULL": Statuses(429, "RESOURCE_EXHAUSTED", retry_after_s=10),
+    "WORKER_NOT_FOUND": Statuses(404, "NOT_FOUND"),
     "ARTIFACT_NOT_FOUND": Statuses(404, "NOT_FOUND"),
     "SCENE_TOO_LARGE": Statuses(507, "RESOURCE_EXHAUSTED"),
     "BACKEND_UNAVAILABLE": Statuses(501, "UNIMPLEMENTED"),
@@ -140,9 +209,16 @@ STATUSES = {  # by the reason of the error
     "DEADLINE_EXCEEDED": Statuses(504, "DEADLINE_EXCEEDED"),
     "NOT_READY": Statuses(503, "UNAVAILABLE", retry_after_s=1),
     "DRAINING": Statuses(503, "UNAVAILABLE", retry_after_s=1),
+    "BACKUP_INVALID": Statuses(500, "INTERNAL"),
+    "RESTORE_REFUSED": Statuses(500, "INTERNAL"),
     "STARTUP_FAILED": Statuses(500, "INTERNAL"),
     "RENDER_FAILED": Statuses(500, "INTERNAL"),
 }
+
+
+def retry_after_s(error: UltragrayError) -> float | None:
+    """When the same request may succeed; None: not by waiting."""
+    return statuses_of(error).retry_after_s if error.retry_after_s is None else error.retry_after_s
 
 
 def statuses_of(error: UltragrayError | type[UltragrayError]) -> Statuses:

@@ -10,7 +10,11 @@ from typing import Any
 from ultragray.contract import Contract, annotated_fields, described, from_text
 from ultragray.errors import InvalidArgument
 from ultragray.image_size import MAX_IMAGE_SIDE
+from ultragray_workers.jobs.kinds.base import MAX_RUN_S
 from ultragray_workers.pool.pool import MAX_BATCH_POSES
+
+from .access.addresses import parse_allowed
+from .access.oidc.claims import check_url, parse_roles
 
 ENVIRONMENT_PREFIX = "ULTRAGRAY_"
 LEAST_KEY_LENGTH = 16
@@ -22,13 +26,30 @@ _HOUR_S = 3600.0
 class Settings(Contract):
     """The settings of one service. Lists are written with commas: `ULTRAGRAY_PRELOAD=liver,spine`."""
 
-    host: str = described("Address that all servers listen on; 0.0.0.0 for all.", "127.0.0.1")
+    host: str = described(
+        "Address that all servers listen on; 0.0.0.0 for all. Others than this machine's own need API keys.",
+        "127.0.0.1",
+    )
     http_port: int = described("Port of HTTP; 0 takes a free one, which the log tells.", 8000, low=0, high=65535)
     grpc_port: int = described("Port of gRPC; 0 takes a free one.", 50051, low=0, high=65535)
     igtl_port: int | None = described(
         "Port of OpenIGTLink, usually 18944; 0 takes a free one; none: off.", None, low=0, high=65535
     )
     igtl_scene: str | None = described("Scene of OpenIGTLink devices whose names name none; none: the only one.", None)
+    igtl_allow: tuple[str, ...] = described(
+        "Other machines that may use OpenIGTLink, which has neither keys nor TLS: addresses or networks with a role, "
+        "such as 10.0.0.7=reader; none: this machine alone.",
+        (),
+    )
+    tls_certificate: Path | None = described(
+        "PEM file of the server's certificate, then those of intermediate authorities: HTTP and gRPC speak TLS, and "
+        "nothing else. None: no TLS.",
+        None,
+    )
+    tls_key: Path | None = described("PEM file of the certificate's key, not encrypted.", None)
+    tls_client_ca: Path | None = described(
+        "PEM file of authorities: a client must present a certificate that one of them signed (mutual TLS).", None
+    )
     data_folder: Path = described(
         "Existing folder of the scene files (*.ugr); `ultragray serve` makes the default one, and puts the demo scene "
         "where there is none.",
@@ -48,6 +69,19 @@ class Settings(Contract):
     queue_limit_frames: int = described(
         "Frames that may wait, interactive and batch frames each; beyond: QUEUE_FULL.", 256, low=1, high=100_000
     )
+    client_limit_frames: int = described(
+        "Of those, frames of one client: of one name where keys are asked for, else of one address.",
+        128,
+        low=1,
+        high=100_000,
+    )
+    max_queue_ms: float = described(
+        "How long frames of others may keep an interactive request waiting; one that would wait longer is refused at "
+        "once (QUEUE_FULL), and told when to try again.",
+        1000.0,
+        above=0.0,
+        high=3_600_000.0,
+    )
     max_batch_poses: int = described(
         "Waiting poses of one scene that are rendered together; fewer above 512x512 pixels.",
         16,
@@ -66,6 +100,13 @@ class Settings(Contract):
     max_request_pixels: int = described(
         "Pixels that one answer may hold: poses x height x width x outputs.", 2**26, low=1, high=2**28
     )
+    max_footprint_pixels: int = described(
+        "Cost of one frame: pixels in the footprints of the Gaussians that it cuts, about 3e7 of 500,000 usual ones at "
+        "512x512; beyond: FRAME_TOO_COSTLY.",
+        2**31,
+        low=1,
+        high=2**62,
+    )
     max_body_bytes: int = described("Largest HTTP request body.", 8 * 2**20, low=1024, high=2**30)
 
     artifact_folder: Path | None = described(
@@ -82,15 +123,63 @@ class Settings(Contract):
     )
     upload_idle_timeout_s: float = described("How long an upload may send nothing.", 60.0, above=0.0, high=_HOUR_S)
 
+    max_connections: int = described(
+        "Connections to each of HTTP, gRPC and OpenIGTLink; the process may open about three times as many files.",
+        2048,
+        low=1,
+        high=1_000_000,
+    )
+    max_connections_per_address: int = described(
+        "Those of one address; behind a proxy, whose connections all have its address, as many as in all.",
+        256,
+        low=1,
+        high=1_000_000,
+    )
+    max_header_bytes: int = described(
+        "Request line and headers of an HTTP request, or metadata of a call of gRPC.", 64 * 1024, low=8192, high=2**20
+    )
+    max_headers: int = described("Headers of an HTTP request.", 128, low=16, high=10_000)
+    header_timeout_s: float = described("How long the head of an HTTP request may take.", 10.0, above=0.0, high=_HOUR_S)
+    idle_timeout_s: float = described(
+        "How long a connection to HTTP or gRPC may stay open without a request.", 75.0, low=1.0, high=_HOUR_S
+    )
+    min_bytes_per_s: float = described(
+        "Least rate at which a client sends a body and takes an answer.", 1024.0, above=0.0, high=2.0**40
+    )
+    transfer_patience_s: float = described("How long it may do less before it is cut off.", 30.0, low=1.0, high=_HOUR_S)
+
     database_url: str | None = described(
         "PostgreSQL URL of the queue of jobs; none: a SQLite file in the artifact folder.", None, repr=False
     )
     job_queue_limit: int = described("Jobs that may wait; beyond: JOB_QUEUE_FULL.", 1000, low=1, high=100_000)
+    ready_without_jobs: bool = described(
+        "Whether the service is ready as soon as it renders, even where the jobs' database or the artifact folder is "
+        "away.",
+        False,
+    )
     embedded_worker: bool = described("Whether `ultragray serve` starts a worker for jobs as well.", True)
     training_threads: int = described(
         "Threads of a job's process; 0: all cores but one, at least one.", 0, low=0, high=1024
     )
     job_nice: int = described("Nice level of a job's process: frames go first.", 10, low=0, high=19)
+    job_stall_timeout_s: float = described(
+        "Time in which the process of a job must get on (compute, read or write), or it is ended: JOB_STALLED; 0: any.",
+        120.0,
+        low=0.0,
+        high=_HOUR_S,
+    )
+    job_max_run_s: float = described(
+        "Longest time that a job may run in all, whatever its max_run_s: JOB_TIME_EXCEEDED; 0: any.",
+        2 * 86_400.0,
+        low=0.0,
+        high=MAX_RUN_S,
+    )
+    job_drain_timeout_s: float = described(
+        "How long a worker that stops lets a job go on that would begin anew elsewhere; trainings go back at once.",
+        10.0,
+        low=0.0,
+        high=_HOUR_S,
+    )
     job_retention_days: float = described(
         "Days after which workers remove a finished job with its files (the scene that it trained stays); 0: never.",
         30.0,
@@ -99,6 +188,19 @@ class Settings(Contract):
     )
 
     default_timeout_s: float = described("Deadline of a request that names none.", 30.0, above=0.0, high=_HOUR_S)
+    worker_grace_s: float = described(
+        "How long a render process may leave a task untouched, or owe an answer past its deadline, before it is killed "
+        "and replaced, and its frames are rendered again.",
+        5.0,
+        above=0.0,
+        high=_HOUR_S,
+    )
+    worker_timeout_s: float = described(
+        "How long a render process may take to load a scene before it is killed and replaced.",
+        120.0,
+        above=0.0,
+        high=24 * _HOUR_S,
+    )
     drain_timeout_s: float = described("How long frames that wait may take at a stop.", 10.0, low=0.0, high=_HOUR_S)
 
     api_keys: tuple[str, ...] = described(
@@ -107,13 +209,51 @@ class Settings(Contract):
         (),
         repr=False,
     )
-    cors_origins: tuple[str, ...] = described("Origins whose pages may call HTTP; * for all.", ())
+    oidc_issuer: str | None = described(
+        "URL of an OpenID Connect issuer, as tokens name it: they are taken beside API keys; none: no tokens.",
+        None,
+    )
+    oidc_audience: str | None = described("Audience that tokens must be for, usually this service's client id.", None)
+    oidc_role_claim: str = described("Claim that gives roles; dots lead inwards: realm_access.roles.", "roles")
+    oidc_roles: tuple[str, ...] = described(
+        "Values of that claim with the role that each gives, such as ultragray-admin=admin,radiology=reader.", ()
+    )
+    oidc_name_claim: str = described(
+        "Claim that says whose a token is; its values must never go to somebody else.", "sub"
+    )
+    oidc_ca: Path | None = described(
+        "PEM file of authorities that sign the issuer's certificate; none: those that the system trusts.", None
+    )
+    insecure: bool = described(
+        "Whether other machines are served even without any API key: whoever reaches the address is an admin.",
+        False,
+    )
+    allowed_hosts: tuple[str, ...] = described(
+        "Names of this machine in URLs, beside localhost and its addresses: without API keys others are refused; * for "
+        "all.",
+        (),
+    )
+    cors_origins: tuple[str, ...] = described(
+        "Origins of other sites, such as https://app.example, whose pages may use the service; * for all.", ()
+    )
     log_level: str = described("Least level that is logged.", "info", choices=("debug", "info", "warning", "error"))
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.host:
             raise InvalidArgument("host must be an address, got none", field="host")
+        parse_allowed(self.igtl_allow)
+        if (self.tls_certificate is None) is not (self.tls_key is None):
+            missing = "tls_key" if self.tls_key is None else "tls_certificate"
+            raise InvalidArgument(f"{missing} must be given too: TLS needs a certificate and its key", field=missing)
+        if self.tls_client_ca is not None and self.tls_certificate is None:
+            raise InvalidArgument("tls_client_ca needs tls_certificate and tls_key", field="tls_client_ca")
+        parse_roles(self.oidc_roles)
+        if self.oidc_issuer is not None:
+            check_url(self.oidc_issuer, "oidc_issuer")
+            for name in ("oidc_audience", "oidc_roles"):
+                if not getattr(self, name):
+                    raise InvalidArgument(f"{name} must be given too, beside oidc_issuer", field=name)
         if any(len(key) < LEAST_KEY_LENGTH for key in self.api_keys):
             raise InvalidArgument(f"api_keys must have at least {LEAST_KEY_LENGTH} characters each", field="api_keys")
         if not all(key.isascii() for key in self.api_keys):

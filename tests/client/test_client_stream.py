@@ -14,6 +14,7 @@ from ultragray_client.calls.pose_exchange import PoseExchange
 from ultragray_client.frames import settings_message
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2, scenes_pb2
 
+from ..freshness import check_fresh
 from ..service.conftest import StartService
 from .test_client_render import moved
 
@@ -128,3 +129,33 @@ def test_what_was_dropped_before_an_error_is_told_with_the_next_frame() -> None:
     )
     assert exchange.frame(answer, dropped_here=4).dropped == 7
     assert exchange.frame(answer).dropped == 1
+
+
+class ClientDoor:
+    """A latest stream of either client."""
+
+    def __init__(self, stream: Any) -> None:
+        self._stream = stream
+
+    def send(self) -> None:
+        self._stream.send(moved(0.0))
+
+    def receive(self) -> float:
+        frame = self._stream.receive()
+        return time.monotonic() - float(frame.latency_ms) / 1000
+
+
+def test_a_latest_stream_gives_no_old_frame(client: Any) -> None:
+    with client.stream("demo", RenderSettings(height=128, width=128), mode="latest") as stream:
+        check_fresh(ClientDoor(stream))
+
+
+def test_a_latest_stream_may_be_read_before_anything_is_sent(client: Any) -> None:
+    with client.stream("demo", RenderSettings(height=8, width=8), mode="latest") as stream:
+        frames: list[Any] = []
+        reader = threading.Thread(target=lambda: frames.append(stream.receive()))
+        reader.start()
+        time.sleep(0.1)
+        stream.send(moved(0.0))
+        reader.join()
+        assert frames[0].sequence == 1

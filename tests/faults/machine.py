@@ -12,9 +12,11 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
+from ..waiting import Deadline
+
 CHECKPOINT_INTERVAL_S = 0.3
 DEAD_AFTER_S = 3.0
-_START_TIMEOUT_S = 60.0
+_START_TIMEOUT_S = 180.0
 _STOP_TIMEOUT_S = 30.0
 
 # Each process of ours imports this first: checkpoints and take-overs come as often as the kills do.
@@ -35,8 +37,9 @@ _WORK = [sys.executable, "-c", "from ultragray_service.cli.app import app; app()
 class Machine:
     """Its processes; `tend` must be called often."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, **settings: str) -> None:
         self.data, self.artifacts = folder / "data", folder / "data" / "artifacts"
+        self.database_url = settings.get("ULTRAGRAY_DATABASE_URL")
         self.http: str | None = None  # while the server listens
         self.grpc: str | None = None
         self._logs = folder / "logs"
@@ -55,6 +58,7 @@ class Machine:
             "ULTRAGRAY_THREADS_PER_PROCESS": "1",
             "ULTRAGRAY_TRAINING_THREADS": "1",
             "ULTRAGRAY_JOB_NICE": "0",
+            **settings,
         }
         self._servers: list[subprocess.Popen[bytes]] = []
         self._workers: list[subprocess.Popen[bytes]] = []
@@ -63,9 +67,9 @@ class Machine:
     def start_without_workers(self) -> None:
         """The server alone, listening when this returns."""
         self.tend()
-        end = time.monotonic() + _START_TIMEOUT_S
+        end = Deadline(_START_TIMEOUT_S)
         while self.http is None:
-            assert time.monotonic() < end, self.told()
+            assert not end.passed, self.told()
             time.sleep(0.05)
             self.tend()
 
@@ -102,6 +106,24 @@ class Machine:
         _kill(found if kind == "all" else found[:1])
         return True
 
+    def stop_for_a_while(self, kind: str, chance: random.Random, seconds: float) -> bool:
+        """SIGSTOP to one process of a kind, and SIGCONT later where it still is; False where there is none."""
+        if not (found := self._processes()[kind]):
+            return False
+        pid = chance.choice(found)
+        with suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGSTOP)
+            self.tend_for(seconds)
+            os.kill(pid, signal.SIGCONT)
+        return True
+
+    def tend_for(self, seconds: float) -> None:
+        """Tends it for a while."""
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            self.tend()
+            time.sleep(0.05)
+
     def _processes(self) -> dict[str, list[int]]:
         """The processes that live, by kind; embedded workers also of servers that died."""
         found: dict[str, list[int]] = {"job": [], "worker": [], "server": []}
@@ -118,6 +140,11 @@ class Machine:
             elif "worker.run_job" in line and str(self.artifacts) in line:
                 found["job"].append(int(path.parent.name))
         return found
+
+    def halt_jobs(self) -> None:
+        """The processes of jobs stand still from now on, alive."""
+        for pid in self._processes()["job"]:
+            os.kill(pid, signal.SIGSTOP)
 
     def stop(self) -> list[int]:
         """Ends the server and the worker as a service manager does; their exit codes."""

@@ -12,7 +12,7 @@ import random
 import tarfile
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -37,9 +37,9 @@ from .observer import Observer
 KILLS = int(os.environ.get("ULTRAGRAY_FAULT_KILLS", "3"))
 SEED = int(os.environ.get("ULTRAGRAY_FAULT_SEED", "1"))
 STEPS = 200 * KILLS  # of the shortest training
-TIME_LIMIT_S = 180.0 + 15.0 * KILLS  # ten times what it takes on a machine of its own
+TIME_LIMIT_S = 600.0 + 60.0 * KILLS  # forty times what it takes on a machine of its own: others may keep it busy
 SOONEST_S, SOON_S = 0.1, 4.0
-FRAMES, HEIGHT, WIDTH = 20 * KILLS, 48, 40  # of a rendering
+FRAMES, HEIGHT, WIDTH = 60 * KILLS, 96, 80  # of a rendering
 
 # scene, priority, seed, more steps than the shortest
 TRAININGS = [("a", 0, 1, 0), ("b", 5, 2, 40), ("c", 0, 3, 17), ("d", -2, 4, 3), ("e", 5, 5, 21)]
@@ -95,13 +95,15 @@ def submit(machine: Machine, body: dict[str, Any], over_grpc: bool) -> tuple[str
 
 
 class Killer:
-    """Decides when the next process dies: spread over all steps, soon after another, or while artifacts are written."""
+    """Decides when the next process dies: spread over all steps, soon after another, while artifacts are written, or
+    in the middle of a rendering.
+    """
 
     def __init__(self, machine: Machine, total_steps: int) -> None:
         self._machine, self._chance = machine, random.Random(SEED)
         chance = self._chance
         kinds = [("job", "worker", "server", "all")[number % 4] for number in range(KILLS)]
-        moments = [("steps", "soon", "finishing")[number % 3] for number in range(KILLS)]
+        moments = [("steps", "soon", "finishing", "rendering")[number % 4] for number in range(KILLS)]
         chance.shuffle(kinds)
         chance.shuffle(moments)
         moments[0] = "steps"
@@ -115,7 +117,7 @@ class Killer:
     def finished(self) -> bool:
         return len(self.done) == len(self._plan)
 
-    def tend(self, steps_done: int) -> None:
+    def tend(self, steps_done: int, jobs: Iterable[Job]) -> None:
         """Kills if it is time to."""
         if self.finished or time.monotonic() < self._due_at:
             return
@@ -123,6 +125,8 @@ class Killer:
         if moment == "steps" and steps_done < place:
             return
         if moment == "finishing" and not self._is_finishing() and steps_done < place + self._latest:
+            return
+        if moment == "rendering" and not any(map(is_rendering, jobs)) and steps_done < place + self._latest:
             return
         if self._machine.strike(kind, self._chance):
             self.done.append((kind, moment))
@@ -142,6 +146,12 @@ def machine(tmp_path: Path) -> Iterator[Machine]:
     store_dataset(machine.artifacts, "tiny")
     yield machine
     machine.kill_all()
+
+
+def is_rendering(job: Job) -> bool:
+    """Whether some frames are done, and others are not."""
+    done, frames = job.progress.frames_done or 0, job.progress.frames or 0
+    return job.kind == "render" and job.state is JobState.RUNNING and 0 < done < frames
 
 
 def steps_done(jobs: dict[str, Job]) -> int:
@@ -177,7 +187,7 @@ def test_every_job_ends_as_if_nothing_had_been_killed(machine: Machine) -> None:
             done = steps_done(observer.jobs)
             if done > 0.4 * total_steps and LATE["request_id"] not in ids:
                 ask(0, LATE)
-            killer.tend(done)
+            killer.tend(done, list(observer.jobs.values()))
             machine.tend()
             time.sleep(0.02)
         while machine.http is None:

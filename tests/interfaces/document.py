@@ -40,12 +40,12 @@ def numbers(cell: str) -> list[float]:
 
 
 def headers_read(package: ModuleType) -> set[str]:
-    """The names, in lower case, of the headers or metadata that the modules of a package look up, from their text."""
+    """The names, in lower case, of the headers or metadata that the modules of a package read, from their text."""
     found = set()
     for path in Path(package.__path__[0]).rglob("*.py"):
         text = path.read_text(encoding="utf-8")
         for literal, constant in re.findall(
-            r'eaders(?:\(scope=scope\))?(?:\.get\(|\[)(?:"([\w-]+)"|([A-Z_]+))(?!\] =)', text
+            r'(?:eaders(?:\(scope=scope\))?(?:\.get\(|\[)|Header\(alias=)(?:"([\w-]+)"|([A-Z_]+))(?!\] =)', text
         ):
             module = ".".join((package.__name__, *path.relative_to(package.__path__[0]).with_suffix("").parts))
             found.add((literal or getattr(import_module(module), constant)).lower())

@@ -7,19 +7,15 @@ import logging
 import math
 import sys
 
+import numpy as np
 import pytest
 import typer
+from opentelemetry import trace
 
-from ultragray import (
-    ConvexProbe,
-    errors,
-    image_size,
-    pose,
-    scene_info,
-)
+from ultragray import ConvexProbe, LinearProbe, errors, image_size, pose, scene_info
 from ultragray.probe import fan, probe
+from ultragray.settings import Resolved
 from ultragray.training import TrainingConfig
-from ultragray_service import server
 from ultragray_service.cli.app import USER_ERROR
 from ultragray_service.cli.app import app as command_line
 from ultragray_service.cli.jobs.watch import JOB_CANCELLED, JOB_FAILED
@@ -28,15 +24,20 @@ from ultragray_service.core import catalog, dataset_uploads
 from ultragray_service.core.state import Service
 from ultragray_service.core.streams import pose_stream
 from ultragray_service.errors import STATUSES
+from ultragray_service.listening import http_server
 from ultragray_service.rpc import server as grpc_server
 from ultragray_service.settings import LEAST_KEY_LENGTH, load_settings
 from ultragray_service.telemetry.logs import JsonFormatter, request_id
+from ultragray_service.tls.certificates import HANDSHAKE_TIMEOUT_S
 from ultragray_workers import scenes
 from ultragray_workers.datasets import store as dataset_store
 from ultragray_workers.datasets import unpack as dataset_unpack
 from ultragray_workers.errors import QueueFull
 from ultragray_workers.jobs.job import JobState
+from ultragray_workers.jobs.overview import JobsOverview
+from ultragray_workers.jobs.queue.attendance import WorkerState
 from ultragray_workers.pool.process import encoding as pixels
+from ultragray_workers.pool.types import RenderResult
 
 from .document import code, rows, table
 
@@ -68,10 +69,17 @@ def test_exit_codes() -> None:
     assert set(table("Exit codes")) == {"0", "1", *map(str, (USER_ERROR, JOB_FAILED, JOB_CANCELLED, INTERRUPTED))}
 
 
+def rendered() -> RenderResult:
+    settings = Resolved(LinearProbe(width_mm=40, near_mm=0, far_mm=40), 16, 16)
+    poses = np.eye(4)[None]
+    return RenderResult("demo", "0" * 64, "reference", settings, poses, b"", 1.0, 1.0, 1.0, (), 1)
+
+
 def test_metrics(service: Service) -> None:
     service.metrics.count_request("http", "/", "200", 0.1)
     service.metrics.count_frame_error(QueueFull("all places are taken"))
-    service.jobs.counts = {JobState.QUEUED: 1}
+    service.metrics.observe_result(rendered())
+    service.jobs.overview = JobsOverview({JobState.QUEUED: 1}, {WorkerState.IDLE: 1})
     found = {}
     for metric in service.metrics.registry.collect():
         if not metric.name.startswith("process_"):
@@ -83,11 +91,13 @@ def test_metrics(service: Service) -> None:
 
 def test_logs() -> None:
     token = request_id.set("one")
+    span = trace.NonRecordingSpan(trace.SpanContext(1, 1, is_remote=False))
     try:
         raise ValueError("no")
     except ValueError:
         record = logging.LogRecord("ultragray", logging.INFO, "", 0, "text", (), sys.exc_info())
-        assert list(table("Logs")) == list(json.loads(JsonFormatter().format(record)))
+        with trace.use_span(span):
+            assert list(table("Logs")) == list(json.loads(JsonFormatter().format(record)))
     finally:
         request_id.reset(token)
 
@@ -116,9 +126,11 @@ def test_fixed_limits() -> None:
         "Check of a dataset": dataset_uploads.CHECK_TIMEOUT_S,
         "Frames in flight in one ordered stream": pose_stream.MAX_FRAMES_IN_FLIGHT,
         "Bytes of these frames, if there are several": pose_stream.MAX_BYTES_IN_FLIGHT,
-        "Message to a WebSocket": server.MAX_STREAM_MESSAGE_BYTES,
+        "Frames in the window of a latest stream": pose_stream.MAX_WINDOW,
+        "Message to a WebSocket": http_server.MAX_STREAM_MESSAGE_BYTES,
         "gRPC message received": grpc_server.MAX_RECEIVE_BYTES,
         "Keepalive pings of a gRPC client, no more often than every": grpc_server.LEAST_PING_INTERVAL_MS,
+        "TLS handshake": HANDSHAKE_TIMEOUT_S,
         "JPEG quality": pixels.JPEG_QUALITY,
         "Retry after": STATUSES["QUEUE_FULL"].retry_after_s,
         "Shortest API key": LEAST_KEY_LENGTH,

@@ -48,7 +48,7 @@ class Drawing(Contract):
     ("values", "field", "message"),
     [
         ({"copies": 0}, "copies", "copies must be an integer from 1 to 9, got 0"),
-        ({"copies": True}, "copies", "copies must be an integer from 1 to 9, got True"),
+        ({"copies": True}, "copies", "copies must be an integer from 1 to 9, got true"),
         ({"copies": 1.5}, "copies", "copies must be an integer from 1 to 9, got 1.5"),
         ({"offsets_mm": (1.0, 6.0)}, "offsets_mm[1]", r"offsets_mm\[1\] must be a finite number from -5 to 5, got 6.0"),
         ({"offsets_mm": (0.0,) * 4}, "offsets_mm", "offsets_mm must be a list of at most 3 values, got 4"),
@@ -96,7 +96,7 @@ def test_json_and_back() -> None:
     [
         ({"size": 3}, "size", "size is not a known key: Drawing takes shape, colour"),
         ({"shape": {"kind": "line"}}, "shape.kind", "shape.kind must be one of square, circle, got 'line'"),
-        ({"shape": {}}, "shape.kind", "shape.kind must be one of square, circle, got None"),
+        ({"shape": {}}, "shape.kind", "shape.kind must be one of square, circle, got null"),
         ({"shape": {"kind": "circle"}}, "shape.radius_mm", "shape.radius_mm is required by kind circle"),
         ({"shape": {"kind": "circle", "radius_mm": -1}}, "shape.radius_mm", "shape.radius_mm must be a finite number"),
         ({"shape": 3}, "shape", "shape must be an object, got 3"),

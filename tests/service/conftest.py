@@ -22,6 +22,7 @@ import torch
 from ultragray import GaussianScene, LinearProbe, SceneInfo
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2, rendering_pb2_grpc, scenes_pb2_grpc
 
+from ..waiting import Deadline
 from ..warm import SOURCE_FOLDERS, WARM_TEMPLATES, WarmProcess, WarmServer, fork
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -47,6 +48,7 @@ class RunningService:
             "ULTRAGRAY_GRPC_PORT": "0",
             "ULTRAGRAY_THREADS_PER_PROCESS": "1",
             "ULTRAGRAY_EMBEDDED_WORKER": "false",
+            "ULTRAGRAY_DEFAULT_TIMEOUT_S": "120",  # others may keep the machine busy
             "PYTHONPATH": os.pathsep.join(str(ROOT / folder) for folder in SOURCE_FOLDERS),
         }
         whole = {**os.environ, **settings, **environment}
@@ -70,11 +72,11 @@ class RunningService:
 
     def log(self) -> list[dict[str, Any]]:
         whole = self.log_path.read_text().rpartition("\n")[0]  # the last line may be half written
-        return [json.loads(line) for line in whole.splitlines() if line.startswith("{")]
+        return [json.loads(line) for line in whole.split("\n") if line.startswith("{")]
 
     def wait_until_serving(self) -> None:
-        end = time.monotonic() + START_TIMEOUT_S
-        while time.monotonic() < end:
+        end = Deadline(START_TIMEOUT_S)
+        while not end.passed:
             for record in self.log():
                 if "grpc" in record:
                     self.http, self.grpc = record["http"], record["grpc"]
@@ -197,7 +199,7 @@ def service(start_shared_service: StartService) -> RunningService:
 
 @pytest.fixture(scope="session")
 def http(service: RunningService) -> Iterator[httpx.Client]:
-    with httpx.Client(base_url=service.http, timeout=30) as client:
+    with httpx.Client(base_url=service.http, timeout=120) as client:
         yield client
 
 

@@ -28,7 +28,7 @@ LARGE = rendering_pb2.RenderSettings(
 )  # 2.9 MB a frame
 CALM_BYTES = 64 * 2**20
 IDLE = 200
-TIMEOUT_S = 30.0
+TIMEOUT_S = 120.0
 
 
 def cpu_seconds(service: RunningService) -> float:

@@ -24,7 +24,7 @@ NAMES = {1: "bone", 200: "vessel"}
 PHASED = PhasedProbe(opening_angle_deg=80.0, far_mm=40.0)
 PHASED_BODY = {"kind": "phased", "opening_angle_deg": 80.0, "far_mm": 40.0}
 HEIGHT, WIDTH = 40, 30
-TIMEOUT_S = 30
+TIMEOUT_S = 120
 RAW = "application/octet-stream"
 
 Labels = npt.NDArray[np.uint8]

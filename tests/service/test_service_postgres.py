@@ -70,7 +70,7 @@ def test_scene_is_trained_and_served_and_an_outage_passes(
                 assert answer.headers["retry-after"] == "5"
             assert client.post(f"/v1/jobs/{long}:cancel").status_code == 503
             assert render() == 200
-            assert client.get("/v1/health/ready").status_code == 200
+            wait_until(lambda: client.get("/v1/health/ready").status_code == 503, every_s=0.1)
             time.sleep(1.0)
         finally:
             postgres.start()

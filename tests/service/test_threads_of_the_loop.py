@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from ultragray import GaussianScene
+from ultragray_service.access.principal import LOCAL, act_as
 from ultragray_service.core import catalog, scene_imports
 from ultragray_service.core.helper_processes import HelperProcesses
 from ultragray_service.core.state import Service
@@ -38,7 +39,7 @@ async def receive(service: Service) -> None:
 
 async def publish(service: Service) -> None:
     async with service.imports.receive("sent", body()) as received:
-        await service.imports.accept(received, "sent")
+        await service.imports.accept(received, "sent", private=False)
 
 
 async def points(service: Service) -> None:
@@ -72,11 +73,13 @@ def test_long_work_leaves_the_threads_of_the_loop(
     demo_scene.save(tmp_path / "demo.ugr")
 
     async def main() -> None:
+        act_as(LOCAL, address="127.0.0.1", connection="test")
         service = Service(load_settings(data_folder=tmp_path))
-        await service.jobs.start()
+        await service.jobs.open()
         asyncio.get_running_loop().set_default_executor(ThreadPoolExecutor(1))
         task = asyncio.ensure_future(begin(service))
         while not begun.is_set():
+            assert not task.done(), task
             await asyncio.sleep(0.01)
         await asyncio.wait_for(asyncio.to_thread(int), 10)
         assert not task.done()

@@ -8,6 +8,7 @@ from ultragray import LinearProbe
 from ultragray.probe import FloatArray
 from ultragray.settings import Resolved
 from ultragray_workers import Priority, RenderRequest
+from ultragray_workers.pool.fairness.turns import UNKNOWN_CALLER, Caller
 
 PROBE = LinearProbe(width_mm=30.0, near_mm=0.0, far_mm=40.0)
 HEIGHT, WIDTH = 24, 32
@@ -19,8 +20,9 @@ def asking(
     *,
     priority: Priority = Priority.INTERACTIVE,
     deadline: float | None = None,
+    caller: Caller = UNKNOWN_CALLER,
     **settings: Any,
 ) -> RenderRequest:
     """A request; what is not given is as the scenes were trained."""
     resolved = Resolved(**{"probe": PROBE, "height": HEIGHT, "width": WIDTH, **settings})
-    return RenderRequest(scene, resolved, poses, priority, deadline)
+    return RenderRequest(scene, resolved, poses, priority, deadline, caller=caller)

@@ -52,16 +52,16 @@ def test_unknown_and_impossible_names_are_not_found(scene_folder, name):
 
 def test_headers_are_read_again_only_when_the_file_changes(scene_folder):
     store = SceneStore(scene_folder)
-    assert store.cached_header("a") is None
+    assert store.cached_versioned_header("a") is None
     first = store.header("a")
     assert first.info.gaussian_count == 50
     assert store.header("a") is first
-    assert store.cached_header("a") is first
+    assert store.cached_versioned_header("a") == (store.version("a"), first)
     (scene_folder / "b.ugr").replace(scene_folder / "a.ugr")
-    assert store.cached_header("a") is None
+    assert store.cached_versioned_header("a") is None
     assert store.header("a") is not first
     (scene_folder / "a.ugr").unlink()
-    assert store.cached_header("a") is None
+    assert store.cached_versioned_header("a") is None
     with pytest.raises(SceneNotFound):
         store.header("a")
 
@@ -85,9 +85,9 @@ def test_only_the_headers_used_last_are_kept(scene_folder, monkeypatch):
         (scene_folder / f"{name}.ugr").write_bytes((scene_folder / "a.ugr").read_bytes())
     store.header("a")
     store.header("b")
-    assert store.cached_header("a") is not None  # used later than b
+    assert store.cached_versioned_header("a") is not None  # used later than b
     store.header("c")
-    assert [name for name in ("a", "b", "c") if store.cached_header(name)] == ["a", "c"]
+    assert [name for name in ("a", "b", "c") if store.cached_versioned_header(name)] == ["a", "c"]
 
 
 def test_headers_of_deleted_scenes_are_forgotten(scene_folder):
@@ -99,7 +99,7 @@ def test_headers_of_deleted_scenes_are_forgotten(scene_folder):
         assert kept() is not None
         path.unlink()
         if number % 2:
-            assert store.cached_header(path.stem) is None
+            assert store.cached_versioned_header(path.stem) is None
         else:
             store.forget(path.stem)
         assert kept() is None

@@ -59,10 +59,31 @@ class SceneExists(UltragrayError):
 
 
 class DatabaseUnavailable(UltragrayError):
-    """The database of the jobs does not answer; scenes are rendered all the same; retry."""
+    """The database of the jobs is away or takes no changes; scenes are rendered all the same; retry."""
 
     reason = "DATABASE_UNAVAILABLE"
-    title = "The database of the jobs does not answer"
+    title = "The database of the jobs cannot be used"
+
+
+class ArtifactFolderUnavailable(UltragrayError):
+    """The artifact folder is gone, or not the one that the jobs belong to: its share is not mounted; retry."""
+
+    reason = "ARTIFACT_FOLDER_UNAVAILABLE"
+    title = "The artifact folder is not there"
+
+
+class JobStalled(UltragrayError):
+    """The process of a job neither computed nor read nor wrote for `ULTRAGRAY_JOB_STALL_TIMEOUT_S`, and was ended."""
+
+    reason = "JOB_STALLED"
+    title = "The job got stuck"
+
+
+class JobTimeExceeded(UltragrayError):
+    """A job ran longer than its `max_run_s`, or `ULTRAGRAY_JOB_MAX_RUN_S`, and was ended."""
+
+    reason = "JOB_TIME_EXCEEDED"
+    title = "The job took too long"
 
 
 class JobNotFound(UltragrayError):
@@ -107,6 +128,13 @@ class JobQueueFull(UltragrayError):
     title = "Too many jobs are waiting"
 
 
+class WorkerNotFound(UltragrayError):
+    """No worker of that name."""
+
+    reason = "WORKER_NOT_FOUND"
+    title = "No such worker"
+
+
 class ArtifactNotFound(UltragrayError):
     """The job has no file of that name."""
 
@@ -127,6 +155,10 @@ class QueueFull(UltragrayError):
     reason = "QUEUE_FULL"
     title = "Too much is waiting"
 
+    def __init__(self, detail: str, *, field: str | None = None, retry_after_s: float | None = None) -> None:
+        super().__init__(detail, field=field)
+        self.retry_after_s = retry_after_s
+
 
 class DeadlineExceeded(UltragrayError):
     """The deadline passed first."""
@@ -136,10 +168,10 @@ class DeadlineExceeded(UltragrayError):
 
 
 class NotReady(UltragrayError):
-    """The service is starting; retry."""
+    """The service is starting, or cannot render at the moment; retry."""
 
     reason = "NOT_READY"
-    title = "Service is starting"
+    title = "Service is not ready"
 
 
 class Draining(UltragrayError):
@@ -149,11 +181,30 @@ class Draining(UltragrayError):
     title = "Service is stopping"
 
 
+class BackupInvalid(UltragrayError):
+    """A backup that is not there, damaged, or made by a newer release (command line)."""
+
+    reason = "BACKUP_INVALID"
+    title = "Backup cannot be used"
+
+
+class RestoreRefused(UltragrayError):
+    """A backup or restore into a place that holds something else, or where somebody is at work (command line)."""
+
+    reason = "RESTORE_REFUSED"
+    title = "Place of the backup or restore cannot be used"
+
+
 class StartupFailed(UltragrayError):
     """The service cannot start, such as on a port in use (command line)."""
 
     reason = "STARTUP_FAILED"
     title = "Service cannot start"
+
+
+def job_not_found(job_id: str) -> JobNotFound:
+    """The error at a job that is not there, or that the caller may not see."""
+    return JobNotFound(f"there is no job {job_id[:64]!r}", field="job")
 
 
 def known_names(kind: str, names: Sequence[str]) -> str:

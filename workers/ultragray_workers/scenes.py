@@ -6,6 +6,7 @@ import os
 import re
 import threading
 from collections import OrderedDict
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -50,7 +51,8 @@ class FileVersion:
         return f"{self.mtime_ns:x}-{self.size:x}-{self.inode:x}"
 
     @classmethod
-    def of(cls, path: str | Path) -> FileVersion:
+    def of(cls, path: str | Path | int) -> FileVersion:
+        """That of a file, by its path or descriptor. Raises OSError."""
         status = os.stat(path)
         return cls(mtime_ns=status.st_mtime_ns, size=status.st_size, inode=status.st_ino)
 
@@ -106,11 +108,16 @@ class SceneStore:
 
     def __init__(self, *folders: Path) -> None:
         self.folders = tuple(Path(folder) for folder in folders)
+        self.hides: Callable[[str], bool] = lambda name: False  # from whoever asks: what is hidden is not found
         self._headers = _KeptHeaders()
 
     def names(self) -> list[str]:
         """The names of all scenes, sorted; files whose name could not stand in a URL are left out."""
         return sorted({name for folder in self.folders for name in _names_in(folder)})
+
+    def shown_names(self) -> list[str]:
+        """As `names`, without those that are hidden."""
+        return [name for name in self.names() if not self.hides(name)]
 
     def names_of(self, folder: Path) -> set[str]:
         """The names of the scenes that are those of one of the folders: none before it has the name."""
@@ -119,7 +126,7 @@ class SceneStore:
 
     def path(self, name: str) -> Path:
         """The file of a scene. Raises SceneNotFound, also for a name that no scene can have."""
-        if _NAME.fullmatch(name) and (path := self.file(name)).is_file():
+        if _NAME.fullmatch(name) and not self.hides(name) and (path := self.file(name)).is_file():
             return path
         raise self._not_found(name)
 
@@ -130,13 +137,17 @@ class SceneStore:
 
     def header(self, name: str) -> SceneHeader:
         """A scene's description and training poses. Raises SceneNotFound, SceneFileInvalid."""
+        return self.versioned_header(name)[1]
+
+    def versioned_header(self, name: str) -> tuple[FileVersion, SceneHeader]:
+        """The same, with the version of the file that it is of."""
         version = self.version(name)  # before reading, so that a change meanwhile counts as newer
         cached = self._headers.get(name, version)
         if cached is not None:
-            return cached
+            return version, cached
         header = read_header(self.file(name))
         self._headers.keep(name, version, header)
-        return header
+        return version, header
 
     def version(self, name: str) -> FileVersion:
         """The version of a scene's file as it is now. Raises SceneNotFound, SceneFileInvalid."""
@@ -148,20 +159,26 @@ class SceneStore:
         except OSError as error:
             raise scene_file_invalid(path, error) from error
 
-    def cached_header(self, name: str) -> SceneHeader | None:
-        """The description if it was read before and the file is unchanged, at the cost of one stat."""
+    def cached_versioned_header(self, name: str) -> tuple[FileVersion, SceneHeader] | None:
+        """The versioned header if it was read before and the file is unchanged, at the cost of one stat."""
+        if self.hides(name):
+            return None
         try:
-            return self._headers.get(name, FileVersion.of(self.file(name)))
+            version = FileVersion.of(self.file(name))
         except (OSError, ValueError):  # ValueError: no file can have the name
             self._headers.drop(name)
             return None
+        header = self._headers.get(name, version)
+        return None if header is None else (version, header)
 
     def forget(self, name: str) -> None:
         """Drops what is kept of a scene that was deleted."""
         self._headers.drop(name)
 
     def _not_found(self, name: str) -> SceneNotFound:
-        return SceneNotFound(f"there is no scene {name[:128]!r}; {known_names('scene', self.names())}", field="scene")
+        return SceneNotFound(
+            f"there is no scene {name[:128]!r}; {known_names('scene', self.shown_names())}", field="scene"
+        )
 
 
 def check_scene_name(name: Any, field: str = "scene") -> None:

@@ -20,7 +20,8 @@ class AsyncJobs:
     """`client.jobs`. All raise ClientError; an id that does not exist is JobNotFound.
 
     A submission has a `request_id`, one of its own unless one is given: the same id with the same job gives the job
-    that is there, with another one RequestIdConflict. A `priority` is from -1000 to 1000, higher ones go first.
+    that is there, with another one RequestIdConflict. A `priority` is from -1000 to 1000, higher ones go first. Others
+    see neither a `private` job nor the scene that it makes.
     """
 
     def __init__(self, connection: AsyncConnection) -> None:
@@ -33,6 +34,7 @@ class AsyncJobs:
         *,
         request_id: str | None = None,
         priority: int = 0,
+        private: bool = False,
         timeout_s: float | None = None,
     ) -> Job:
         """Puts a job into the queue: `TrainJob(dataset="liver", scene="liver")` makes a scene that is served,
@@ -41,7 +43,7 @@ class AsyncJobs:
         Raises DatasetNotFound, SceneNotFound, SceneExists, JobQueueFull, ExtraMissing, StorageFull, LowConfidence and
         other kinds of InvalidArgument.
         """
-        request = submission(specification, request_id, priority)
+        request = submission(specification, request_id, priority, private)
         return job_from_message((await self._connection.answer(self._calls.SubmitJob, request, timeout_s)).job)
 
     async def list(

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any, Generic, TypeVar
+from collections.abc import Callable
+from typing import Any, Generic, TypeAlias, TypeVar
 
 from ..errors import ClientError, InvalidArgument
 from .retries import Retries
 
 T = TypeVar("T")
+ApiKey: TypeAlias = str | Callable[[], str]  # of which the function gives one that is valid when it is called
 
 DEFAULT_ADDRESS = "localhost:50051"
 DEFAULT_TIMEOUT_S = 30.0
 PAGE_SIZE = 1000  # the most that the service gives at once
-CHANNEL_OPTIONS = (
+CHANNEL_OPTIONS: tuple[tuple[str, str | int], ...] = (
     ("grpc.max_receive_message_length", -1),  # a frame of float32 outputs may be larger than the usual 4 MiB
     ("grpc.keepalive_time_ms", 30_000),  # only while calls are under way; a peer that vanished is noticed
     ("grpc.keepalive_timeout_ms", 10_000),

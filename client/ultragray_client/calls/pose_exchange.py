@@ -10,6 +10,7 @@ from ultragray_proto.v1 import rendering_pb2
 from ..errors import InvalidArgument
 from ..frames import Frame, frame_from_message
 from ..geometry import PoseLike, pose_message
+from .newest_answers import WINDOW
 from .statuses import error_of_frame
 
 TAKES_NO_MORE = "the stream takes no more poses: done_sending was called, or it is over"
@@ -39,7 +40,12 @@ class PoseExchange:
     def opening(self) -> rendering_pb2.RenderStreamRequest:
         """The first message: settings and mode, no pose. If they are refused, the first answer says so."""
         mode = f"STREAM_MODE_{self.mode.name}"
-        return rendering_pb2.RenderStreamRequest(settings=self._settings, mode=mode)
+        window = WINDOW if self.mode is StreamMode.LATEST else None
+        return rendering_pb2.RenderStreamRequest(settings=self._settings, mode=mode, window=window)
+
+    def acknowledgement(self, sequence: int) -> rendering_pb2.RenderStreamRequest:
+        """The message that the answer of that sequence was taken: a newer one may come."""
+        return rendering_pb2.RenderStreamRequest(acknowledged=sequence)
 
     def pose(
         self, pose: PoseLike, timeout_s: float | None, measured_ns: int | None

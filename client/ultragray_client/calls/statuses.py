@@ -14,9 +14,17 @@ from google.protobuf.unknown_fields import UnknownFieldSet
 
 from ultragray_proto.v1 import scenes_pb2
 
-from ..errors import ERRORS, ClientError, Unreachable
+from ..errors import ERRORS, ClientError, TlsFailed, Unreachable
 
 _DETAILS_KEY = "grpc-status-details-bin"
+_TLS_FAILURES = {  # by a part of what grpc says
+    "WRONG_VERSION_NUMBER": "does not speak TLS: leave out tls",
+    "CERTIFICATE_VERIFY_FAILED": "shows a certificate that is out of its time, or that no trusted authority signed: "
+    "give its authority as tls.root_certificates",
+    "Hostname Verification Check failed": "shows a certificate of another name: reach it by a name of its certificate, "
+    "or give one as tls.server_name",
+}
+_CUT_OFF = ("Socket closed", "Connection reset")  # all that grpc says where a server wanted TLS, or a certificate
 _BY_REASON = {error.reason: error for error in ERRORS}
 _BY_STATUS = {error.grpc_status: error for error in reversed(ERRORS)}  # of several, the root of the branch
 
@@ -35,9 +43,19 @@ def error_of_call(error: grpc.RpcError, address: str) -> ClientError:
     status, sentence = error.code().name, error.details() or ""
     reason, field, retry_after_s = _details(dict(error.trailing_metadata() or ()).get(_DETAILS_KEY, b""))
     if reason is None and status == "UNAVAILABLE":
-        return Unreachable(f"no service answers at {address} ({sentence})")
+        return _unreachable(sentence, address)
     cls = _BY_REASON.get(reason or status) or _BY_STATUS.get(status, ClientError)
     return cls(sentence, reason=reason or status, field=field, retry_after_s=retry_after_s)
+
+
+def _unreachable(sentence: str, address: str) -> ClientError:
+    for part, meaning in _TLS_FAILURES.items():
+        if part in sentence:
+            return TlsFailed(f"{address} {meaning} ({sentence})")
+    hint = ""
+    if any(part in sentence for part in _CUT_OFF):
+        hint = "; it may want TLS, or a client's certificate: see tls"
+    return Unreachable(f"no service answers at {address} ({sentence}){hint}")
 
 
 def error_of_frame(error: scenes_pb2.Error, sequence: int) -> ClientError:

@@ -5,11 +5,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 
-from ultragray_proto.v1 import rendering_pb2, rendering_pb2_grpc
+from ultragray_proto.codec import from_message
+from ultragray_proto.v1 import access_pb2, access_pb2_grpc, rendering_pb2, rendering_pb2_grpc
 
+from ..access import Me
 from ..calls.batch import Batch
-from ..calls.connection import DEFAULT_ADDRESS, DEFAULT_TIMEOUT_S
+from ..calls.connection import DEFAULT_ADDRESS, DEFAULT_TIMEOUT_S, ApiKey
 from ..calls.pose_exchange import PoseExchange, StreamMode
+from ..calls.tls import Tls
 from ..contract import RenderSettings
 from ..frames import Frame, frame_from_message, settings_message
 from ..geometry import PoseLike, pose_message
@@ -21,7 +24,10 @@ from .stream import FrameStream
 
 
 class Client:
-    """A service at `address` (HOST:PORT).
+    """A service at `address` (HOST:PORT), encrypted where `tls` is given.
+
+    `api_key` is a key or a token that the service knows, or a function that is called before each call and gives one
+    that is valid then, at once: a token that will soon expire is best renewed elsewhere.
 
     Threads may share a `Client`; each process needs one of its own, made after the fork. An `AsyncClient` is made and
     used within one event loop.
@@ -33,10 +39,16 @@ class Client:
     """
 
     def __init__(
-        self, address: str = DEFAULT_ADDRESS, *, api_key: str | None = None, timeout_s: float = DEFAULT_TIMEOUT_S
+        self,
+        address: str = DEFAULT_ADDRESS,
+        *,
+        api_key: ApiKey | None = None,
+        tls: Tls | None = None,
+        timeout_s: float = DEFAULT_TIMEOUT_S,
     ) -> None:
-        self._connection = Connection(address, api_key, timeout_s)
+        self._connection = Connection(address, api_key, tls, timeout_s)
         self._calls = rendering_pb2_grpc.RenderServiceStub(self._connection.channel)
+        self._access = access_pb2_grpc.AccessServiceStub(self._connection.channel)
         self.scenes = Scenes(self._connection)
         self.datasets = Datasets(self._connection)
         self.jobs = Jobs(self._connection)
@@ -84,6 +96,11 @@ class Client:
         exchange = PoseExchange(settings_message(scene, settings), mode)
         call = self._connection.pose_call(self._calls.RenderStream, exchange, timeout_s)
         return FrameStream(self._connection.address, exchange, call)
+
+    def who_am_i(self, *, timeout_s: float | None = None) -> Me:
+        """The name and the role that the key stands for."""
+        request = access_pb2.WhoAmIRequest()
+        return from_message(self._connection.answer(self._access.WhoAmI, request, timeout_s), Me)
 
     def close(self) -> None:
         """Ends all that is under way."""

@@ -9,10 +9,11 @@ from contextlib import contextmanager
 from functools import partial
 from typing import Any, TypeAlias, TypeVar
 
-from ..calls.connection import PAGE_SIZE, Conversation, check_timeout
+from ..calls.connection import PAGE_SIZE, ApiKey, Conversation, check_timeout
 from ..calls.pose_exchange import PoseExchange
 from ..calls.retries import Retries
 from ..calls.statuses import client_errors
+from ..calls.tls import Tls, check_address, warn_of_open_key
 from ..errors import ClientError, NotFound
 from .transport import PoseCall, open_channel
 
@@ -23,11 +24,13 @@ Call: TypeAlias = Callable[..., Any]  # a method of a stub
 class Connection:
     """A channel and what goes with every call. All raise ClientError."""
 
-    def __init__(self, address: str, api_key: str | None, timeout_s: float) -> None:
-        self.address = address
+    def __init__(self, address: str, api_key: ApiKey | None, tls: Tls | None, timeout_s: float) -> None:
+        self.address = check_address(address)
         self._timeout_s = check_timeout(timeout_s)
-        self._metadata = () if api_key is None else (("x-api-key", api_key),)
-        self.channel = open_channel(address)
+        self._api_key = api_key
+        if api_key is not None and tls is None:
+            warn_of_open_key(address)
+        self.channel = open_channel(address, tls)
 
     def close(self) -> None:
         self.channel.close()
@@ -79,7 +82,12 @@ class Connection:
     def pose_call(self, call: Call, exchange: PoseExchange, timeout_s: float | None) -> PoseCall:
         """The call of a stream, which ends after `timeout_s`; None: it may last."""
         timeout = None if timeout_s is None else check_timeout(timeout_s)
-        return PoseCall(partial(call, timeout=timeout, metadata=self._metadata), exchange)
+        return PoseCall(partial(call, timeout=timeout, metadata=self._metadata()), exchange)
+
+    def _metadata(self) -> tuple[tuple[str, str], ...]:
+        if self._api_key is None:
+            return ()
+        return (("x-api-key", self._api_key if isinstance(self._api_key, str) else self._api_key()),)
 
     def _retries(self, timeout_s: float | None) -> Retries:
         return Retries(None if timeout_s is None else check_timeout(timeout_s), self._timeout_s)
@@ -91,14 +99,14 @@ class Connection:
         while True:
             try:
                 with client_errors(self.address):
-                    return call(request(), timeout=retries.remaining_s(), metadata=self._metadata)
+                    return call(request(), timeout=retries.remaining_s(), metadata=self._metadata())
             except ClientError as error:
                 time.sleep(retries.pause_s(error))
 
     @contextmanager
     def _streamed(self, call: Call, request: Any, retries: Retries) -> Iterator[Any]:
         """The messages that a call streams; the call ends with the context."""
-        messages = call(request, timeout=retries.remaining_s(), metadata=self._metadata)
+        messages = call(request, timeout=retries.remaining_s(), metadata=self._metadata())
         try:
             with client_errors(self.address):
                 yield messages

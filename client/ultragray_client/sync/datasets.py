@@ -24,14 +24,21 @@ class Datasets:
         self._calls = datasets_pb2_grpc.DatasetServiceStub(connection.channel)
 
     def upload(
-        self, name: str, path: str | Path, *, options: DatasetOptions | None = None, timeout_s: float | None = None
+        self,
+        name: str,
+        path: str | Path,
+        *,
+        options: DatasetOptions | None = None,
+        private: bool = False,
+        timeout_s: float | None = None,
     ) -> Dataset:
         """Uploads a folder with all below it, or an archive (.zip, .tar, .tar.gz, .tgz), and waits until it is checked.
 
-        The same content and options again give the dataset that is there. Without `timeout_s` it takes as long as it
-        takes. Raises DatasetInvalid with the file and the frame, DatasetExists, UploadTooLarge, StorageFull.
+        Others do not see a `private` one. The same content and options again give the dataset that is there. Without
+        `timeout_s` it takes as long as it takes. Raises DatasetInvalid with the file and the frame, DatasetExists,
+        UploadTooLarge, StorageFull.
         """
-        messages = partial(_read, Upload(name, path, options or DatasetOptions()))
+        messages = partial(_read, Upload(name, path, options or DatasetOptions(), private))
         answer = self._connection.upload(self._calls.UploadDataset, messages, timeout_s)
         return from_message(answer.dataset, Dataset)
 

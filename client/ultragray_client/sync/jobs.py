@@ -21,7 +21,8 @@ class Jobs:
     """`client.jobs`. All raise ClientError; an id that does not exist is JobNotFound.
 
     A submission has a `request_id`, one of its own unless one is given: the same id with the same job gives the job
-    that is there, with another one RequestIdConflict. A `priority` is from -1000 to 1000, higher ones go first.
+    that is there, with another one RequestIdConflict. A `priority` is from -1000 to 1000, higher ones go first. Others
+    see neither a `private` job nor the scene that it makes.
     """
 
     def __init__(self, connection: Connection) -> None:
@@ -34,6 +35,7 @@ class Jobs:
         *,
         request_id: str | None = None,
         priority: int = 0,
+        private: bool = False,
         timeout_s: float | None = None,
     ) -> Job:
         """Puts a job into the queue: `TrainJob(dataset="liver", scene="liver")` makes a scene that is served,
@@ -42,7 +44,7 @@ class Jobs:
         Raises DatasetNotFound, SceneNotFound, SceneExists, JobQueueFull, ExtraMissing, StorageFull, LowConfidence and
         other kinds of InvalidArgument.
         """
-        request = submission(specification, request_id, priority)
+        request = submission(specification, request_id, priority, private)
         return job_from_message((self._connection.answer(self._calls.SubmitJob, request, timeout_s)).job)
 
     def list(

@@ -36,7 +36,7 @@ class FrameStream:
         self._call.done_sending()
 
     def receive(self) -> Frame:
-        """Waits for the next frame.
+        """Waits for the next frame; of a latest stream the newest: those it takes the place of are dropped.
 
         Raises the ClientError that is told in its place, with the `sequence` of its pose: the stream goes on. Raises
         StreamEnded after the last frame, and what ended the stream, such as Draining: open another one.

@@ -13,6 +13,7 @@ from torch.autograd.function import once_differentiable
 
 from .. import _cpu
 from ..errors import BackendUnavailable
+from ..limits import UNLIMITED, GivenUp, Limits
 from ..outputs import PLANES, WEIGHT_SUM
 from ..probe import FloatArray, Probe
 from ..scene import PARAMETERS, GaussianScene
@@ -33,34 +34,70 @@ def render_outputs(
     height: int,
     width: int,
     outputs: Sequence[str],
+    limits: Limits = UNLIMITED,
     *,
     instruction_set: str = "auto",
 ) -> dict[str, Tensor]:
     """The outputs by name, each [C, H, W] float32; differentiable once with respect to every parameter.
 
-    The scene is one that it supports. Raises BackendUnavailable for an unknown instruction set.
+    The scene is one that it supports; limits hold for frames without gradients.
+    Raises BackendUnavailable for an unknown instruction set, FrameTooCostly, GivenUp.
     """
     if instruction_set != "auto" and instruction_set not in INSTRUCTION_SETS:
         raise BackendUnavailable(
             f"instruction_set must be auto or one of {', '.join(INSTRUCTION_SETS)}, got {instruction_set!r}",
             field="instruction_set",
         )
-    view = _view_arguments(probe, poses_cm, height, width, instruction_set)
+    view = {**_view_arguments(probe, poses_cm, height, width), "instruction_set": instruction_set}
     if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in scene.splats.values()):
         frames = _Render.apply(  # type: ignore[no-untyped-call]
             scene.info.intensity, view, tuple(outputs), *scene.splats.values()
         )
         return dict(zip(outputs, frames, strict=True))
     planes = _empty_planes(view, outputs)
-    prepared = scene.prepared("cpu", lambda: _prepare(scene.splats, scene.info.intensity))
     weight_sum = planes[WEIGHT_SUM].numpy() if WEIGHT_SUM in planes else None
-    _cpu.render(prepared, **view, **_arrays(planes), weight_sum=weight_sum)
+    try:
+        _cpu.render(
+            _sorted(scene),
+            **view,
+            **_arrays(planes),
+            weight_sum=weight_sum,
+            footprint_pixels=limits.footprint_pixels,
+            flag=limits.flag,
+            number=limits.number,
+        )
+    except _cpu.GivenUp:
+        raise GivenUp from None
+    except _cpu.TooCostly as error:
+        raise limits.too_costly(*error.args) from None
     return planes
 
 
-def _view_arguments(
-    probe: Probe, poses_cm: FloatArray, height: int, width: int, instruction_set: str
-) -> dict[str, Any]:
+def footprint_pixels(
+    scene: GaussianScene,
+    probe: Probe,
+    poses_cm: FloatArray,  # [C, 4, 4] about the scene's centre
+    height: int,
+    width: int,
+    limits: Limits = UNLIMITED,
+) -> list[int]:  # [C]
+    """The cost of each pose (`ultragray.limits`), without drawing it. Raises GivenUp."""
+    view = _view_arguments(probe, poses_cm, height, width)
+    pixels = np.empty(len(poses_cm), np.int64)
+    try:
+        _cpu.footprints(_sorted(scene), **view, pixels=pixels, flag=limits.flag, number=limits.number)
+    except _cpu.GivenUp:
+        raise GivenUp from None
+    found: list[int] = pixels.tolist()
+    return found
+
+
+def _sorted(scene: GaussianScene) -> _cpu.PreparedScene:
+    """The scene as the kernel takes it for many frames."""
+    return scene.prepared("cpu", lambda: _prepare(scene.splats, scene.info.intensity))
+
+
+def _view_arguments(probe: Probe, poses_cm: FloatArray, height: int, width: int) -> dict[str, Any]:
     lines = KernelLines.of(probe)
     return {
         "fanned": lines.fanned,
@@ -74,7 +111,6 @@ def _view_arguments(
         "height": height,
         "width": width,
         "threads": torch.get_num_threads(),
-        "instruction_set": instruction_set,
     }
 
 
@@ -127,7 +163,7 @@ class _Render(torch.autograd.Function):
 
 
 def _prepare(splats: Mapping[str, Tensor], intensity: str, *, as_given: bool = False) -> _cpu.PreparedScene:
-    raw = {name: tensor.detach().contiguous() for name, tensor in splats.items()}
+    raw = {name: tensor.detach().to("cpu", torch.float32).contiguous() for name, tensor in splats.items()}
     return _cpu.PreparedScene(
         raw["means"].numpy(),
         raw["scales"].numpy(),

@@ -14,9 +14,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from ..limits import UNLIMITED, Limits
 from ..outputs import WEIGHT_SUM
 from ..probe import FloatArray, Probe
 from ..scene import GaussianScene
+from .cpu import footprint_pixels
 
 MIN_WEIGHT = 1.0 / 255.0  # the skip rule: a Gaussian is skipped where both w and α are below this
 MAX_WEIGHT = 0.999
@@ -41,9 +43,14 @@ def render_outputs(
     height: int,
     width: int,
     outputs: Sequence[str],
+    limits: Limits = UNLIMITED,
 ) -> dict[str, Tensor]:
-    """The outputs by name, each [C, H, W] in the dtype of the scene's tensors."""
-    views = [combine(_render_pose(scene, probe, scene.means.new_tensor(pose), height, width)) for pose in poses_cm]
+    """The outputs by name, each [C, H, W] in the dtype of the scene's tensors. Raises FrameTooCostly and GivenUp."""
+    if limits.footprint_pixels is not None:
+        limits.check_costs(footprint_pixels(scene, probe, poses_cm, height, width, limits))
+    views = [
+        combine(_render_pose(scene, probe, scene.means.new_tensor(pose), height, width, limits)) for pose in poses_cm
+    ]
     empty = scene.means.new_zeros((0, height, width))
     return {name: torch.stack([view[name] for view in views]) if views else empty for name in outputs}
 
@@ -61,7 +68,9 @@ def combine(fields: Fields) -> dict[str, Tensor]:
     }
 
 
-def _render_pose(scene: GaussianScene, probe: Probe, pose: Tensor, height: int, width: int) -> Fields:  # [H, W] each
+def _render_pose(
+    scene: GaussianScene, probe: Probe, pose: Tensor, height: int, width: int, limits: Limits
+) -> Fields:  # [H, W] each
     like = scene.means
     rotation, origin = pose[:3, :3], pose[:3, 3]
     means = (scene.means - origin) @ rotation  # [N, 3] probe frame
@@ -82,6 +91,7 @@ def _render_pose(scene: GaussianScene, probe: Probe, pose: Tensor, height: int, 
         near_enough = (rays.m2 <= -2.0 * math.log(MIN_WEIGHT)).any(dim=1)  # else w and α are below 1/255
         (touching,) = torch.nonzero(near_enough, as_tuple=True)
         for part in torch.split(touching, max(1, ELEMENTS_PER_CHUNK // (height * width))):
+            limits.check_flag()
             weight, alpha = _weight_and_alpha(Rays(*(r[part] for r in rays)), depths)  # [n, H, W]
             counted = (weight >= MIN_WEIGHT) | (alpha >= MIN_WEIGHT)
             weight = torch.where(counted, weight, 0.0)

@@ -104,7 +104,8 @@ def _read_header(path: Path) -> Any:
 
 
 def _value(path: Path, header: Any, name: str) -> Any:
-    value = header.get(name)
+    with _in_our_words(path):  # pydicom reads a value when it is first asked for
+        value = header.get(name)
     if value is None or value == "":
         raise DatasetInvalid(f"{path}: it lacks {name}")
     return value
@@ -120,7 +121,8 @@ def _shape(path: Path, header: Any) -> tuple[int, int, int]:  # frames, rows, co
     for name, (wanted, why) in expected.items():
         if (given := _value(path, header, name)) != wanted:
             raise DatasetInvalid(f"{path}: {why} ({name} {wanted}), got {str(given)[:40]}")
-    transducer = str(header.get("TransducerType", "LINEAR"))
+    with _in_our_words(path):
+        transducer = str(header.get("TransducerType", "LINEAR"))
     if transducer not in ("LINEAR", ""):
         raise DatasetInvalid(
             f"{path}: the probe must be linear, TransducerType is {transducer[:40]}: a fan on a screen"

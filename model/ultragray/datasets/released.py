@@ -47,9 +47,12 @@ def read_released(path: str | Path) -> Dataset:
 
 
 def require_files_below(config_path: Path, folder: Path) -> None:
-    """Raise DatasetInvalid where a conf.json from a stranger names files that are not below `folder`."""
+    """Raise DatasetInvalid where a conf.json from a stranger names files that are not below `folder`.
+
+    Nothing outside is looked for. What is found here is what `read_released` finds afterwards.
+    """
     try:
-        config = read_released_config(config_path)
+        config = read_released_config(config_path, within=folder)
     except CheckpointInvalid as error:
         raise DatasetInvalid(error.detail) from error
     for key, named in config.files.items():

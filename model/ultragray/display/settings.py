@@ -13,6 +13,7 @@ from ..contract import Contract, described
 from ..errors import InvalidImageSize
 from ..image_size import MAX_IMAGE_SIDE
 from ..probe import FloatArray, Picture, Probe
+from ..probe.probe import length_field
 
 FRAME_RANGE_DB = 60.0  # a B-mode frame is taken as compressed logarithmically over this range, 1 being 0 dB
 MAX_TGC_POINTS = 16
@@ -35,7 +36,7 @@ class Display(Contract):
         high=100.0,
         most=MAX_TGC_POINTS,
     )
-    depth_mm: float | None = described("Deeper rows, counted from the face, are cut off.", None, low=1e-3)
+    depth_mm: float | None = length_field("Deeper rows, counted from the face, are cut off.", default=None, low=1e-3)
     flip: bool = described("Left and right change places.", False)
     pixel_mm: float | None = described("Scan conversion to square pixels of this size.", None, low=1e-3, high=100.0)
     edge: float = described(
@@ -52,7 +53,7 @@ class Display(Contract):
         if self.depth_mm is None:
             return height
         share = (probe.face_depth_mm + self.depth_mm - probe.near_mm) / probe.scan_line_length_mm
-        return min(height, max(1, round(height * share)))
+        return max(1, round(height * min(share, 1.0)))
 
     def picture(self, probe: Probe, height: int, width: int) -> Picture:
         """Size and place of what frames of height x width are shown as. Raises InvalidImageSize for a huge one."""

@@ -13,6 +13,7 @@ from typing import Any, BinaryIO
 import numpy as np
 import numpy.typing as npt
 
+_DAMAGED = "its .npy header is damaged or truncated"
 _MAGIC, _ZIP_MAGIC = b"\x93NUMPY", b"PK\x03\x04"
 
 
@@ -27,7 +28,10 @@ def map_npy(path: Path) -> npt.NDArray[Any]:
         missing = file.tell() + math.prod(shape) * dtype.itemsize - path.stat().st_size
     if missing > 0:
         raise ValueError(f"it is truncated: {missing} bytes are missing")
-    return np.asarray(np.load(path, mmap_mode="r", allow_pickle=False))
+    try:
+        return np.asarray(np.load(path, mmap_mode="r", allow_pickle=False))
+    except OverflowError:
+        raise ValueError(_DAMAGED) from None  # sizes that no array has, one of them 0
 
 
 def _read_header(file: BinaryIO) -> tuple[tuple[int, ...], np.dtype[Any]]:
@@ -42,9 +46,9 @@ def _read_header(file: BinaryIO) -> tuple[tuple[int, ...], np.dtype[Any]]:
         read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
         shape, _, dtype = read(file)
     except (ValueError, TypeError, SyntaxError, TokenError, RecursionError):
-        raise ValueError("its .npy header is damaged or truncated") from None
+        raise ValueError(_DAMAGED) from None
     if dtype.hasobject:
         raise ValueError("it holds Python objects, where numbers are expected")
     if any(size < 0 for size in shape):
-        raise ValueError("its .npy header is damaged or truncated")
+        raise ValueError(_DAMAGED)
     return shape, dtype

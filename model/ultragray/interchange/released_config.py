@@ -8,6 +8,7 @@ images, and `probe_kind`, "phased" for a fan that begins at the face.
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,10 +49,12 @@ class ReleasedConfig:
     image_height: int | None  # H and W of the training images, where conf.json itself says so
     image_width: int | None
 
+    within: Path | None  # the only folder that is looked into; None: any
+
     def find(self, key: str) -> Path | None:
         """The file that a key names: as written, by its name beside conf.json, or from a folder above."""
         named = self.files.get(key)
-        return None if named is None else _find(self.path, named)
+        return None if named is None else _find(self.path, named, self.within)
 
     def probe(self, image_height: int) -> Probe:
         """The probe of ours for training images of `image_height` rows: the stretch of docs/physics.md §3."""
@@ -139,12 +142,15 @@ def released_centre_mm(released_probe: Probe, poses: FloatArray) -> FloatArray: 
     return centre
 
 
-def read_released_config(path: str | Path) -> ReleasedConfig:
-    """Read conf.json and the shape of its images file. Raises CheckpointInvalid, naming the file."""
+def read_released_config(path: str | Path, within: Path | None = None) -> ReleasedConfig:
+    """Read conf.json and the shape of its images file; of one from a stranger, only `within` a folder.
+
+    Raises CheckpointInvalid, naming the file.
+    """
     path = Path(path)
     document = _read_object(path)
     files = _named_files(path, document)
-    images, images_missing = _find_images(path, files)
+    images, images_missing = _find_images(path, files, within)
     return ReleasedConfig(
         path=path,
         released_probe=_read_probe(path, document),
@@ -154,6 +160,7 @@ def read_released_config(path: str | Path) -> ReleasedConfig:
         images_missing=images_missing,
         image_height=_count(path, document, "image_height", at_least=2),
         image_width=_count(path, document, "image_width", at_least=1),
+        within=within,
     )
 
 
@@ -202,25 +209,40 @@ def _dataset_name(path: Path, files: Mapping[str, str]) -> str | None:
     return Path(files.get("images_file_train", "")).parent.name or path.resolve().parent.name or None
 
 
-def _find_images(path: Path, files: Mapping[str, str]) -> tuple[TrainingImages | None, str]:
+def _find_images(path: Path, files: Mapping[str, str], within: Path | None) -> tuple[TrainingImages | None, str]:
     named = files.get("images_file_train")
     if named is None:
         return None, f"{path} names no images_file_train"
-    found = _find(path, named)
+    found = _find(path, named, within)
     return (None, f"the file {named[:200]!r} that {path} names was not found") if found is None else (_shape(found), "")
 
 
-def _find(path: Path, named: str) -> Path | None:
-    return next((candidate for candidate in _candidates(path, named) if _is_file(candidate)), None)
+def _find(path: Path, named: str, within: Path | None) -> Path | None:
+    """The first candidate that is a file. None at the first one outside `within`: whether it exists is not asked."""
+    for candidate in _candidates(path, named):
+        if within is not None and not candidate.is_relative_to(within):
+            return None
+        if _is_file(candidate):
+            return candidate
+    return None
 
 
 def _candidates(path: Path, named: str) -> Iterator[Path]:
-    """The path as written from conf.json's folder, then by name beside it, then as written from each folder above."""
+    """The path as written from conf.json's folder, then by name beside it, then as written from each folder above.
+
+    A path that leads out of the folder comes after the name beside conf.json: a copied dataset must not find its
+    original.
+    """
     folder = path.resolve().parent
-    yield folder / named
-    yield folder / Path(named).name  # before the folders above: a copied dataset must not find its original
+    as_written, beside = _joined(folder, named), folder / Path(named).name
+    yield from (as_written, beside) if as_written.is_relative_to(folder) else (beside, as_written)
     for base in folder.parents:
-        yield base / named
+        yield _joined(base, named)
+
+
+def _joined(folder: Path, named: str) -> Path:
+    """A path from a folder, without its `..`."""
+    return Path(os.path.normpath(folder / named))
 
 
 def _is_file(path: Path) -> bool:

@@ -11,6 +11,7 @@ from ..confidence import Extrapolation, is_confident
 from ..confidence.support import SupportWatch
 from ..display.frames import show
 from ..evaluation.scoring import frames_at_once
+from ..limits import UNLIMITED, Limits
 from ..probe import FloatArray
 from ..rendering import render, renderer_name
 from ..scene import GaussianScene
@@ -31,6 +32,7 @@ def render_to_file(
     scene_name: str,
     scene_sha256: str,
     backend: str = "auto",
+    limits: Limits = UNLIMITED,
     before_portion: Callable[[int], object] | None = None,
 ) -> list[Extrapolation]:  # [C]
     """Render frames into a file of a format (None: a folder of PNGs), which appears whole or not at all.
@@ -53,15 +55,23 @@ def render_to_file(
     limit = settings.min_confidence if settings.below_min_confidence is Below.MASK else None
     masked = [limit is not None and not is_confident(one, limit) for one in extrapolations]
     wanted = tuple(dict.fromkeys((*settings.outputs, "coverage")))
-    size = {"height": settings.height, "width": settings.width}
-    portion = frames_at_once(**size)
+    portion = frames_at_once(settings.height, settings.width)
     found: list[Extrapolation] = []
     with export_pngs(path, header) if format is None else export_to(path, format, header) as add, torch.no_grad():
         for first in range(0, len(poses), portion):
             if before_portion is not None:
                 before_portion(first)
             places = slice(first, first + portion)
-            frames = render(scene, settings.probe, poses[places], **size, outputs=wanted, backend=backend)
+            frames = render(
+                scene,
+                settings.probe,
+                poses[places],
+                height=settings.height,
+                width=settings.width,
+                outputs=wanted,
+                backend=backend,
+                limits=limits.after(first),
+            )
             assert frames.coverage is not None
             watch = SupportWatch(masked[places])
             blackened = watch.look(frames.coverage)

@@ -21,6 +21,7 @@ from torch import Tensor
 
 from ..errors import InvalidArgument, TrainingStateInvalid
 from ..files.atomic import write_whole
+from ..files.format_version import require_version
 from ..scene_info import expected_shapes
 from .config import TrainingConfig
 from .steps.optimizer import MOMENTS, is_trained
@@ -75,9 +76,7 @@ def _header(text: str) -> CheckpointHeader:
     document: Any = json.loads(text)
     if not isinstance(document, dict):
         raise ValueError("its metadata is not a JSON object")
-    version = document.pop("format_version", None)
-    if version != FORMAT_VERSION:
-        raise ValueError(f"its format_version is {version!r}, this release reads {FORMAT_VERSION}")
+    require_version(document.pop("format_version", None), FORMAT_VERSION)
     try:
         header = CheckpointHeader(**{**document, "config": TrainingConfig.from_dict(document["config"])})
     except InvalidArgument as error:

@@ -131,7 +131,7 @@ class TrainingConfig(Contract):
         "Whether a second, shorter training on a part of the frames fits the scene's confidence.", True
     )
     memory_gb: float | None = described(
-        "Memory that the training may take; none: what the machine has to give.", None, low=1e-3, high=1e6
+        "Memory that the training may take, of what the machine has to give; none: all of it.", None, low=1e-3, high=1e6
     )
 
     def __post_init__(self) -> None:

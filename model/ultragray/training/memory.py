@@ -140,9 +140,9 @@ def check_comparison_memory(dataset: Dataset, config: TrainingConfig) -> None:
 
 
 def _missing(needed: int, config: TrainingConfig, free: int | None, place: str = "this machine") -> str | None:
-    """The limits that are lower than what is needed, and who sets them."""
-    limit = free if config.memory_gb is None else int(config.memory_gb * GIB)
-    if limit is None or needed <= limit:
-        return None
-    bound = f"{place} has free" if config.memory_gb is None else "memory_gb allows"
-    return f"{bound} {limit / GIB:.1f} GiB"
+    """The lowest of the limits, where less than is needed, and who sets it: a setting allows no more than there is."""
+    limits = [] if free is None else [(free, f"{place} has free")]
+    if config.memory_gb is not None:
+        limits.append((int(config.memory_gb * GIB), "memory_gb allows"))
+    limit, bound = min(limits, default=(needed, ""))
+    return f"{bound} {limit / GIB:.1f} GiB" if needed > limit else None

@@ -18,14 +18,16 @@ class UploadDatasetRequest(_message.Message):
     def __init__(self, header: _Optional[_Union[UploadHeader, _Mapping]] = ..., file: _Optional[str] = ..., chunk: _Optional[bytes] = ...) -> None: ...
 
 class UploadHeader(_message.Message):
-    __slots__ = ("dataset", "options", "archive")
+    __slots__ = ("dataset", "options", "archive", "private")
     DATASET_FIELD_NUMBER: _ClassVar[int]
     OPTIONS_FIELD_NUMBER: _ClassVar[int]
     ARCHIVE_FIELD_NUMBER: _ClassVar[int]
+    PRIVATE_FIELD_NUMBER: _ClassVar[int]
     dataset: str
     options: DatasetOptions
     archive: bool
-    def __init__(self, dataset: _Optional[str] = ..., options: _Optional[_Union[DatasetOptions, _Mapping]] = ..., archive: _Optional[bool] = ...) -> None: ...
+    private: bool
+    def __init__(self, dataset: _Optional[str] = ..., options: _Optional[_Union[DatasetOptions, _Mapping]] = ..., archive: _Optional[bool] = ..., private: _Optional[bool] = ...) -> None: ...
 
 class DatasetOptions(_message.Message):
     __slots__ = ("crop", "image_size", "frames", "train_frames", "val_frames")
@@ -50,7 +52,7 @@ class UploadDatasetResponse(_message.Message):
     def __init__(self, dataset: _Optional[_Union[Dataset, _Mapping]] = ..., created: _Optional[bool] = ...) -> None: ...
 
 class Dataset(_message.Message):
-    __slots__ = ("name", "kind", "sha256", "bytes", "created_at", "train_frames", "val_frames", "height", "width", "probe", "warnings", "options")
+    __slots__ = ("name", "kind", "sha256", "bytes", "created_at", "train_frames", "val_frames", "height", "width", "probe", "warnings", "options", "owner", "private")
     NAME_FIELD_NUMBER: _ClassVar[int]
     KIND_FIELD_NUMBER: _ClassVar[int]
     SHA256_FIELD_NUMBER: _ClassVar[int]
@@ -63,6 +65,8 @@ class Dataset(_message.Message):
     PROBE_FIELD_NUMBER: _ClassVar[int]
     WARNINGS_FIELD_NUMBER: _ClassVar[int]
     OPTIONS_FIELD_NUMBER: _ClassVar[int]
+    OWNER_FIELD_NUMBER: _ClassVar[int]
+    PRIVATE_FIELD_NUMBER: _ClassVar[int]
     name: str
     kind: str
     sha256: str
@@ -75,7 +79,9 @@ class Dataset(_message.Message):
     probe: _geometry_pb2.Probe
     warnings: _containers.RepeatedScalarFieldContainer[str]
     options: DatasetOptions
-    def __init__(self, name: _Optional[str] = ..., kind: _Optional[str] = ..., sha256: _Optional[str] = ..., bytes: _Optional[int] = ..., created_at: _Optional[str] = ..., train_frames: _Optional[int] = ..., val_frames: _Optional[int] = ..., height: _Optional[int] = ..., width: _Optional[int] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., warnings: _Optional[_Iterable[str]] = ..., options: _Optional[_Union[DatasetOptions, _Mapping]] = ...) -> None: ...
+    owner: str
+    private: bool
+    def __init__(self, name: _Optional[str] = ..., kind: _Optional[str] = ..., sha256: _Optional[str] = ..., bytes: _Optional[int] = ..., created_at: _Optional[str] = ..., train_frames: _Optional[int] = ..., val_frames: _Optional[int] = ..., height: _Optional[int] = ..., width: _Optional[int] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., warnings: _Optional[_Iterable[str]] = ..., options: _Optional[_Union[DatasetOptions, _Mapping]] = ..., owner: _Optional[str] = ..., private: _Optional[bool] = ...) -> None: ...
 
 class ListDatasetsRequest(_message.Message):
     __slots__ = ("page_size", "page_token")

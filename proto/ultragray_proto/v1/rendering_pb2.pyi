@@ -140,20 +140,24 @@ class RenderBatchRequest(_message.Message):
     def __init__(self, settings: _Optional[_Union[RenderSettings, _Mapping]] = ..., poses: _Optional[_Iterable[_Union[_geometry_pb2.Pose, _Mapping]]] = ...) -> None: ...
 
 class RenderStreamRequest(_message.Message):
-    __slots__ = ("sequence", "settings", "pose", "mode", "timeout_ms", "client_time_ns")
+    __slots__ = ("sequence", "settings", "pose", "mode", "timeout_ms", "client_time_ns", "window", "acknowledged")
     SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     SETTINGS_FIELD_NUMBER: _ClassVar[int]
     POSE_FIELD_NUMBER: _ClassVar[int]
     MODE_FIELD_NUMBER: _ClassVar[int]
     TIMEOUT_MS_FIELD_NUMBER: _ClassVar[int]
     CLIENT_TIME_NS_FIELD_NUMBER: _ClassVar[int]
+    WINDOW_FIELD_NUMBER: _ClassVar[int]
+    ACKNOWLEDGED_FIELD_NUMBER: _ClassVar[int]
     sequence: int
     settings: RenderSettings
     pose: _geometry_pb2.Pose
     mode: StreamMode
     timeout_ms: float
     client_time_ns: int
-    def __init__(self, sequence: _Optional[int] = ..., settings: _Optional[_Union[RenderSettings, _Mapping]] = ..., pose: _Optional[_Union[_geometry_pb2.Pose, _Mapping]] = ..., mode: _Optional[_Union[StreamMode, str]] = ..., timeout_ms: _Optional[float] = ..., client_time_ns: _Optional[int] = ...) -> None: ...
+    window: int
+    acknowledged: int
+    def __init__(self, sequence: _Optional[int] = ..., settings: _Optional[_Union[RenderSettings, _Mapping]] = ..., pose: _Optional[_Union[_geometry_pb2.Pose, _Mapping]] = ..., mode: _Optional[_Union[StreamMode, str]] = ..., timeout_ms: _Optional[float] = ..., client_time_ns: _Optional[int] = ..., window: _Optional[int] = ..., acknowledged: _Optional[int] = ...) -> None: ...
 
 class Frame(_message.Message):
     __slots__ = ("sequence", "scene", "scene_sha256", "renderer", "pose", "probe", "height", "width", "outputs", "encoding", "data", "timings", "error", "dropped", "extrapolation", "display", "picture", "rendered_height", "rendered_width", "client_time_ns")

@@ -24,7 +24,7 @@ class ListScenesResponse(_message.Message):
     def __init__(self, scenes: _Optional[_Iterable[_Union[SceneEntry, _Mapping]]] = ..., next_page_token: _Optional[str] = ...) -> None: ...
 
 class SceneEntry(_message.Message):
-    __slots__ = ("name", "loaded", "gaussian_count", "image_height", "image_width", "file_bytes", "error")
+    __slots__ = ("name", "loaded", "gaussian_count", "image_height", "image_width", "file_bytes", "error", "owner", "private")
     NAME_FIELD_NUMBER: _ClassVar[int]
     LOADED_FIELD_NUMBER: _ClassVar[int]
     GAUSSIAN_COUNT_FIELD_NUMBER: _ClassVar[int]
@@ -32,6 +32,8 @@ class SceneEntry(_message.Message):
     IMAGE_WIDTH_FIELD_NUMBER: _ClassVar[int]
     FILE_BYTES_FIELD_NUMBER: _ClassVar[int]
     ERROR_FIELD_NUMBER: _ClassVar[int]
+    OWNER_FIELD_NUMBER: _ClassVar[int]
+    PRIVATE_FIELD_NUMBER: _ClassVar[int]
     name: str
     loaded: bool
     gaussian_count: int
@@ -39,7 +41,9 @@ class SceneEntry(_message.Message):
     image_width: int
     file_bytes: int
     error: Error
-    def __init__(self, name: _Optional[str] = ..., loaded: _Optional[bool] = ..., gaussian_count: _Optional[int] = ..., image_height: _Optional[int] = ..., image_width: _Optional[int] = ..., file_bytes: _Optional[int] = ..., error: _Optional[_Union[Error, _Mapping]] = ...) -> None: ...
+    owner: str
+    private: bool
+    def __init__(self, name: _Optional[str] = ..., loaded: _Optional[bool] = ..., gaussian_count: _Optional[int] = ..., image_height: _Optional[int] = ..., image_width: _Optional[int] = ..., file_bytes: _Optional[int] = ..., error: _Optional[_Union[Error, _Mapping]] = ..., owner: _Optional[str] = ..., private: _Optional[bool] = ...) -> None: ...
 
 class GetSceneRequest(_message.Message):
     __slots__ = ("scene",)
@@ -48,7 +52,7 @@ class GetSceneRequest(_message.Message):
     def __init__(self, scene: _Optional[str] = ...) -> None: ...
 
 class Scene(_message.Message):
-    __slots__ = ("name", "loaded", "loaded_processes", "file_bytes", "gaussian_count", "sh_degree", "intensity", "centre_mm", "bounds_min_mm", "bounds_max_mm", "probe", "image_height", "image_width", "training_poses", "metrics", "dataset_name", "dataset_sha256", "label_names", "confidence")
+    __slots__ = ("name", "loaded", "loaded_processes", "file_bytes", "gaussian_count", "sh_degree", "intensity", "centre_mm", "bounds_min_mm", "bounds_max_mm", "probe", "image_height", "image_width", "training_poses", "metrics", "dataset_name", "dataset_sha256", "label_names", "confidence", "owner", "private")
     class MetricsEntry(_message.Message):
         __slots__ = ("key", "value")
         KEY_FIELD_NUMBER: _ClassVar[int]
@@ -82,6 +86,8 @@ class Scene(_message.Message):
     DATASET_SHA256_FIELD_NUMBER: _ClassVar[int]
     LABEL_NAMES_FIELD_NUMBER: _ClassVar[int]
     CONFIDENCE_FIELD_NUMBER: _ClassVar[int]
+    OWNER_FIELD_NUMBER: _ClassVar[int]
+    PRIVATE_FIELD_NUMBER: _ClassVar[int]
     name: str
     loaded: bool
     loaded_processes: int
@@ -101,7 +107,9 @@ class Scene(_message.Message):
     dataset_sha256: str
     label_names: _containers.ScalarMap[int, str]
     confidence: ConfidenceFit
-    def __init__(self, name: _Optional[str] = ..., loaded: _Optional[bool] = ..., loaded_processes: _Optional[int] = ..., file_bytes: _Optional[int] = ..., gaussian_count: _Optional[int] = ..., sh_degree: _Optional[int] = ..., intensity: _Optional[str] = ..., centre_mm: _Optional[_Union[_geometry_pb2.Position, _Mapping]] = ..., bounds_min_mm: _Optional[_Union[_geometry_pb2.Position, _Mapping]] = ..., bounds_max_mm: _Optional[_Union[_geometry_pb2.Position, _Mapping]] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., image_height: _Optional[int] = ..., image_width: _Optional[int] = ..., training_poses: _Optional[_Union[TrainingPoses, _Mapping]] = ..., metrics: _Optional[_Mapping[str, float]] = ..., dataset_name: _Optional[str] = ..., dataset_sha256: _Optional[str] = ..., label_names: _Optional[_Mapping[int, str]] = ..., confidence: _Optional[_Union[ConfidenceFit, _Mapping]] = ...) -> None: ...
+    owner: str
+    private: bool
+    def __init__(self, name: _Optional[str] = ..., loaded: _Optional[bool] = ..., loaded_processes: _Optional[int] = ..., file_bytes: _Optional[int] = ..., gaussian_count: _Optional[int] = ..., sh_degree: _Optional[int] = ..., intensity: _Optional[str] = ..., centre_mm: _Optional[_Union[_geometry_pb2.Position, _Mapping]] = ..., bounds_min_mm: _Optional[_Union[_geometry_pb2.Position, _Mapping]] = ..., bounds_max_mm: _Optional[_Union[_geometry_pb2.Position, _Mapping]] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., image_height: _Optional[int] = ..., image_width: _Optional[int] = ..., training_poses: _Optional[_Union[TrainingPoses, _Mapping]] = ..., metrics: _Optional[_Mapping[str, float]] = ..., dataset_name: _Optional[str] = ..., dataset_sha256: _Optional[str] = ..., label_names: _Optional[_Mapping[int, str]] = ..., confidence: _Optional[_Union[ConfidenceFit, _Mapping]] = ..., owner: _Optional[str] = ..., private: _Optional[bool] = ...) -> None: ...
 
 class ConfidenceFit(_message.Message):
     __slots__ = ("error", "fitted_on")

@@ -19,7 +19,7 @@ from ultragray import GaussianScene
 from ultragray.backends import cuda
 from ultragray.backends.cuda.work import Work, count_work
 from ultragray.probe import FloatArray
-from ultragray_workers.pool.transfer import to_uint8
+from ultragray_workers.pool.process.transfer import to_uint8
 
 from .gpu import Limits, gpu_machine, measure_limits
 from .kernel import PROBE, BenchScene, bench_poses, bench_scenes, elapsed_ms, finish, mark

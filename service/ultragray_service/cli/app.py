@@ -25,6 +25,10 @@ from . import eval as cli_eval
 from . import report as cli_report
 from . import train as cli_train
 from . import worker as cli_worker
+from .administration import audit as cli_audit
+from .administration import backup as cli_backup
+from .administration import keys as cli_keys
+from .administration import workers as cli_workers
 from .jobs import commands as cli_jobs
 from .options import FieldsOf, with_options
 
@@ -79,14 +83,15 @@ def main(
 def serve(
     scenes: Annotated[
         list[Path] | None,
-        typer.Argument(help="Scene files to serve instead of a data folder.", show_default=False),
+        typer.Argument(help="Scene files to serve alone, without those of a data folder.", show_default=False),
     ] = None,
     *,
     options: Annotated[
         dict[str, Any],
         FieldsOf(
             Settings,
-            *("data_folder", "host", "http_port", "grpc_port", "igtl_port"),
+            *("data_folder", "artifact_folder", "host", "insecure", "http_port", "grpc_port", "igtl_port"),
+            *("tls_certificate", "tls_key", "tls_client_ca"),
             *("processes", "threads_per_process", "backend", "log_level"),
             environment=ENVIRONMENT_PREFIX,
         ),
@@ -145,6 +150,8 @@ def info(
 
 app.add_typer(cli_dataset.dataset_app, name="dataset")
 app.add_typer(cli_jobs.jobs_app, name="jobs")
+app.add_typer(cli_workers.workers_app, name="workers")
+app.add_typer(cli_keys.keys_app, name="keys")
 app.command()(cli_train.train)
 app.command("eval")(cli_eval.evaluate)
 app.command()(cli_eval.compound)
@@ -153,6 +160,9 @@ app.command()(cli_convert.export)
 app.command()(cli_convert.import_ply)
 app.command()(cli_convert.import_checkpoint)
 app.command()(cli_worker.worker)
+app.command()(cli_audit.audit)
+app.command()(cli_backup.backup)
+app.command()(cli_backup.restore)
 
 
 @app.command()

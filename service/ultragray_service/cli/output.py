@@ -1,13 +1,15 @@
-"""Checks of where a command writes, before the work starts."""
+"""Checks of where a command writes, before the work starts; tables on standard output."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from ultragray.errors import InvalidArgument
 
 SCENE_SUFFIX = ".ugr"  # the service lists no other files
+_PIPE_COLUMNS = 400  # where no terminal says how wide it is, nothing is cut
 
 
 def check_writable(path: Path, suffix: str | None = None) -> None:
@@ -29,3 +31,18 @@ def check_picture_folder(path: Path) -> None:
         raise InvalidArgument(f"output must be a folder for pictures, {path} is a file", field="output")
     if path.is_dir() and next(path.iterdir(), None) is not None:
         raise InvalidArgument(f"output must be a new or empty folder, {path} holds files", field="output")
+
+
+def print_table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+    """Print rows under their columns; the first column is never cut."""
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console()
+    if not console.is_terminal:
+        console.width = _PIPE_COLUMNS
+    table = Table(*columns, box=None, pad_edge=False)
+    table.columns[0].no_wrap = True
+    for row in rows:
+        table.add_row(*row)
+    console.print(table)

@@ -23,8 +23,9 @@ DEMO_NAME = "demo"
 def serve_scenes(scenes: Iterable[Path], options: Mapping[str, Any]) -> None:
     """Serve the given scene files, or the data folder of the settings, until the service has stopped.
 
-    Given files are served by their stem from a folder of links that lasts as long as the service. A data
-    folder without a scene gets the demo scene; the default one is made.
+    Given files are served by their stem from a folder of links. It lasts as long as the service, and so do its
+    datasets and jobs, unless the settings name an artifact folder. A data folder without a scene gets the demo
+    scene; the default one is made.
     Raises InvalidArgument, SceneFileInvalid, StartupFailed and OSError.
     """
     files = list(scenes)
@@ -37,10 +38,17 @@ def serve_scenes(scenes: Iterable[Path], options: Mapping[str, Any]) -> None:
         return
     if "data_folder" in options:
         raise InvalidArgument("scenes and --data-folder cannot be given together", field="data_folder")
-    with tempfile.TemporaryDirectory(prefix="ultragray-scenes-") as folder:
+    with tempfile.TemporaryDirectory(prefix="ultragray-scenes-", ignore_cleanup_errors=True) as folder:
         link_scenes(files, Path(folder))
-        artifacts = load_settings(**options).artifacts  # not in the folder of links, which does not last
-        run(load_settings(**{**options, "data_folder": Path(folder), "artifact_folder": artifacts}))
+        settings = load_settings(**{**options, "data_folder": Path(folder)})
+        if settings.artifact_folder is None:
+            if settings.database_url is not None:
+                raise InvalidArgument(
+                    "scenes served alone share no queue: add --artifact-folder, or unset ULTRAGRAY_DATABASE_URL",
+                    field="artifact_folder",
+                )
+            typer.echo("Datasets and jobs end with this service; --artifact-folder keeps them", err=True)
+        run(settings)
 
 
 def ensure_scenes(folder: Path) -> None:

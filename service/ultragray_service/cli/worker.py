@@ -14,6 +14,7 @@ import typer
 from ultragray.errors import UltragrayError
 from ultragray_workers.errors import StartupFailed
 
+from ..service_manager import ALIVE, READY, ServiceManager
 from ..settings import ENVIRONMENT_PREFIX, Settings, load_settings
 from .options import FieldsOf, with_options
 
@@ -45,9 +46,12 @@ def worker(
 
 def run_worker(overrides: dict[str, Any], *, name: str | None = None, device: str = "auto") -> None:
     """Do jobs until SIGTERM or SIGINT, then end the process. Raises StartupFailed, InvalidArgument."""
+    from opentelemetry import trace
+
     from ultragray_workers.jobs.worker.worker import work
 
     from ..telemetry.logs import configure_logging
+    from ..telemetry.tracing import start_tracing
 
     settings = load_settings(**overrides)
     configure_logging(settings.log_level)
@@ -55,6 +59,10 @@ def run_worker(overrides: dict[str, Any], *, name: str | None = None, device: st
         raise StartupFailed(
             f"artifact_folder must be an existing folder, got {str(settings.artifacts)!r}", field="artifact_folder"
         )
+    manager = ServiceManager()
+    tracing = start_tracing("worker")
+    if tracing is not None:
+        trace.set_tracer_provider(tracing.provider)
     stop = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda received, frame: stop.set())
@@ -67,7 +75,15 @@ def run_worker(overrides: dict[str, Any], *, name: str | None = None, device: st
         threads=settings.training_threads,
         nice=settings.job_nice,
         retention_days=settings.job_retention_days,
+        stall_timeout_s=settings.job_stall_timeout_s,
+        max_run_s=settings.job_max_run_s,
+        drain_timeout_s=settings.job_drain_timeout_s,
+        ready=lambda: manager.tell(READY),
+        alive_every_s=manager.alive_every_s,
+        tell_alive=lambda: manager.tell(ALIVE),
     )
+    if tracing is not None:
+        tracing.stop()
     sys.stderr.flush()
     os._exit(0)  # threads of the queue would be waited for
 

@@ -6,6 +6,7 @@ import asyncio
 import base64
 import binascii
 import math
+import re
 from bisect import bisect_right
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -20,6 +21,7 @@ from ultragray_workers.scenes import FileVersion, SceneStore
 from ..views.scene_points import point_message
 from .own_thread import in_own_thread
 
+_FOLDERS = re.compile(r"^/.*/(?=[^/]+\.ugr\b)", re.DOTALL)
 DEFAULT_PAGE_SIZE = 100
 MAX_PAGE_SIZE = 1000
 
@@ -42,9 +44,13 @@ class SceneCatalog:
 
     async def header(self, name: str) -> SceneHeader:
         """The header of a scene. Raises SceneNotFound, SceneFileInvalid; both name the field `scene`."""
+        return (await self.versioned_header(name))[1]
+
+    async def versioned_header(self, name: str) -> tuple[FileVersion, SceneHeader]:
+        """The same, with the version of the file that it is of."""
         with scene_to_blame():
-            cached = self._store.cached_header(name)
-            return cached if cached is not None else await asyncio.to_thread(self._store.header, name)
+            cached = self._store.cached_versioned_header(name)
+            return cached if cached is not None else await asyncio.to_thread(self._store.versioned_header, name)
 
     async def version(self, name: str) -> FileVersion:
         """The version of the content that the file of a scene has now. Raises SceneNotFound, SceneFileInvalid."""
@@ -60,8 +66,8 @@ class SceneCatalog:
                 return await in_own_thread(lambda: point_message(path, header.info, limit))
 
     async def names(self) -> list[str]:
-        """The names of all scenes, sorted."""
-        return await asyncio.to_thread(self._store.names)
+        """The names of the scenes that the caller may see, sorted."""
+        return await asyncio.to_thread(self._store.shown_names)
 
     async def page(self, page_size: int, page_token: str) -> tuple[list[CatalogEntry], str]:
         """One page of scenes by name and the token of the next (empty on the last).
@@ -97,11 +103,11 @@ def page_of_names(names: list[str], page_size: int, page_token: str) -> tuple[li
 
 @contextmanager
 def scene_to_blame() -> Iterator[None]:
-    """Errors about a scene name the field `scene`."""
+    """Errors about a scene name the field `scene`, and its file without the folders of the service."""
     try:
         yield
     except (SceneNotFound, SceneFileInvalid, SceneTooLarge) as error:
-        raise type(error)(error.detail, field=error.field or "scene") from error
+        raise type(error)(_FOLDERS.sub("", error.detail), field=error.field or "scene") from error
 
 
 def finite_metrics(header: SceneHeader) -> dict[str, float]:

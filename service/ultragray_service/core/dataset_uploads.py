@@ -15,7 +15,10 @@ from ultragray_workers.datasets.incoming import IncomingDataset, remove_stale
 from ultragray_workers.datasets.intake import take_in
 from ultragray_workers.datasets.store import DatasetRecord, DatasetStore, check_dataset_name
 from ultragray_workers.errors import Draining, QueueFull
+from ultragray_workers.jobs.queue.owners import Kind
 
+from ..access.audit import account
+from ..access.owners import Claim, Owners
 from ..arrival import arrival
 from ..settings import Settings
 from .helper_processes import HelperProcesses
@@ -33,21 +36,28 @@ class DatasetUploads:
     """The uploads under way. A few at a time are received, and wait for their turn in `checks`."""
 
     def __init__(
-        self, store: DatasetStore, settings: Settings, draining: asyncio.Event, checks: HelperProcesses
+        self,
+        store: DatasetStore,
+        settings: Settings,
+        draining: asyncio.Event,
+        checks: HelperProcesses,
+        owners: Owners,
     ) -> None:
         self._store = store
+        self._owners = owners
         self._settings = settings
         self._draining = draining
         self._checks = checks
         self._count = 0
 
     @asynccontextmanager
-    async def receive(self, name: str, options: dict[str, str]) -> AsyncIterator[DatasetUpload]:
+    async def receive(self, name: str, options: dict[str, str], *, private: bool) -> AsyncIterator[DatasetUpload]:
         """An upload; what has not become a dataset at the end is removed.
 
         Raises InvalidArgument for a bad name or option, QueueFull, Draining, StorageFull.
         """
         check_dataset_name(name)
+        account().target = name
         from_dict(SourceOptions, options)
         if self._draining.is_set():
             raise Draining("the service is stopping")
@@ -57,7 +67,8 @@ class DatasetUploads:
         stopping: asyncio.Future[Any] = asyncio.ensure_future(self._draining.wait())
         try:
             incoming = await asyncio.to_thread(IncomingDataset, self._store, self._settings.max_dataset_bytes)
-            upload = DatasetUpload(incoming, name, options, self._settings, stopping, self._checks)
+            claim = Claim(self._owners, Kind.DATASET, name, private=private)
+            upload = DatasetUpload(incoming, name, options, self._settings, stopping, self._checks, claim)
             try:
                 yield upload
             finally:
@@ -84,8 +95,10 @@ class DatasetUpload:
         settings: Settings,
         stopping: asyncio.Future[Any],
         checks: HelperProcesses,
+        claim: Claim,
     ) -> None:
         self._incoming = incoming
+        self._claim = claim
         self._name = name
         self._options = options
         self._settings = settings
@@ -136,10 +149,15 @@ class DatasetUpload:
                 "options": self._options,
                 "max_bytes": self._settings.max_dataset_bytes,
             }
-            await self._checks.run(
-                take_in, arguments, what="checking the dataset", timeout_s=CHECK_TIMEOUT_S, killed=DatasetInvalid
-            )
-            return await asyncio.to_thread(self._incoming.accept, self._name)
+            taken = await asyncio.to_thread(self._incoming.is_taken, self._name)
+            async with self._claim.making(taken=taken):
+                await self._checks.run(
+                    take_in, arguments, what="checking the dataset", timeout_s=CHECK_TIMEOUT_S, killed=DatasetInvalid
+                )
+                record, is_new = await asyncio.to_thread(self._incoming.accept, self._name)
+                if is_new:
+                    await self._claim.made()
+            return record, is_new
 
     async def ended(self) -> None:
         """Returns when a `finish` that was cancelled has ended its process."""

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import asyncio
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from ultragray.contract import described
 from ultragray.errors import DatasetInvalid
 from ultragray_workers.datasets.store import DatasetRecord, DatasetStore
 from ultragray_workers.errors import DatasetNotFound
+from ultragray_workers.jobs.queue.owners import Kind
 
 from .catalog import page_of_names
+from .state import Service
 
 
 @dataclass(frozen=True)
@@ -22,15 +24,28 @@ class DatasetPage:
     next_page_token: str = described("Empty on the last page.")
 
 
-async def dataset_page(store: DatasetStore, page_size: int, page_token: str) -> DatasetPage:
+def with_owner(service: Service, record: DatasetRecord) -> DatasetRecord:
+    """A dataset, told with whose it is."""
+    ownership = service.owners.known(Kind.DATASET, record.name)
+    return replace(record, owner=ownership.owner, private=ownership.private)
+
+
+async def dataset(service: Service, name: str) -> DatasetRecord:
+    """One dataset. Raises DatasetNotFound, DatasetInvalid."""
+    return with_owner(service, await asyncio.to_thread(service.datasets.get, name))
+
+
+async def dataset_page(service: Service, page_size: int, page_token: str) -> DatasetPage:
     """The datasets of one page; those whose manifest is damaged are left out. Raises InvalidArgument."""
 
+    store = service.datasets
+
     def read() -> DatasetPage:
-        names, next_page_token = page_of_names(store.names(), page_size, page_token)
+        names, next_page_token = page_of_names(store.shown_names(), page_size, page_token)
         records = []
         for name in names:
             with suppress(DatasetNotFound, DatasetInvalid):
-                records.append(store.get(name))
+                records.append(with_owner(service, store.get(name)))
         return DatasetPage(records, next_page_token)
 
     return await asyncio.to_thread(read)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import http.client
 import json
 import shutil
+import ssl
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
@@ -16,22 +17,26 @@ from ultragray.errors import InvalidArgument, UltragrayError
 from ultragray.files.atomic import atomic_path
 from ultragray_workers.errors import NotReady
 
+from ..tls.client import cut_off_hint, tls_problem
+
 _TIMEOUT_S = 60.0  # without a byte; event streams send a comment every 15 s
 
 
 class JobClient:
     """Asks the service at a URL. What it refuses is raised as UltragrayError with its sentence.
 
-    Raises NotReady where nobody answers, and where the service is starting or stopping.
+    Raises NotReady where nobody answers, and where the service is starting or stopping. `tls` None: the certificates
+    that the system trusts.
     """
 
-    def __init__(self, server: str, api_key: str | None) -> None:
+    def __init__(self, server: str, api_key: str | None, tls: ssl.SSLContext | None = None) -> None:
         parts = urlsplit(server)
         if parts.scheme not in ("http", "https") or not parts.netloc:
             raise InvalidArgument(
                 f"--server must be a URL such as http://127.0.0.1:8000, got {server!r}", field="server"
             )
         self._server = server.rstrip("/")
+        self._tls = tls
         self._headers = {} if api_key is None else {"X-API-Key": api_key}
 
     def submit(self, body: dict[str, Any]) -> tuple[dict[str, Any], bool]:
@@ -106,15 +111,17 @@ class JobClient:
         headers = self._headers | ({} if content is None else {"Content-Type": "application/json"})
         request = urllib.request.Request(self._server + route, content, headers, method=method)
         try:
-            answer: http.client.HTTPResponse = urllib.request.urlopen(request, timeout=_TIMEOUT_S)
+            answer: http.client.HTTPResponse = urllib.request.urlopen(request, timeout=_TIMEOUT_S, context=self._tls)
         except urllib.error.HTTPError as error:
             with error:
                 raise _refusal(error.code, error.read(), self._server) from None
         except (OSError, http.client.HTTPException) as error:
-            reason = getattr(error, "reason", None) or error
+            reason = error.reason if isinstance(error, urllib.error.URLError) else error
+            if (problem := tls_problem(self._server, reason)) is not None:
+                raise UltragrayError(problem) from error
             raise NotReady(
                 f"no service answers at {self._server} ({reason}); start one with `ultragray serve`, or name it with "
-                "--server"
+                f"--server{cut_off_hint(self._server, reason)}"
             ) from error
         return answer
 

@@ -1,16 +1,49 @@
-"""From what a caller asked for to what the pool renders: every check, once, for both front doors."""
+"""From what a caller asked for to what the pool renders: every check, once, for all front doors."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
+from contextlib import nullcontext
 from functools import lru_cache
 
 from ultragray.contract import under
 from ultragray.errors import InvalidImageSize, TooManyPoses
+from ultragray.scene_info import SceneInfo
 from ultragray.settings import Encoding, FrameSettings, Resolved
+from ultragray_workers.scenes import FileVersion
 
 from ..settings import Settings
 from .catalog import SceneCatalog
+
+
+class Plan:
+    """What a client wants of a scene: its settings, with nothing left open as the scene is now.
+
+    A frame is rendered for the version of the scene's file that they are for. Where the file has another by then, they
+    are resolved anew: what they left open is as the new scene has it.
+    """
+
+    settings: Resolved
+    version: FileVersion
+
+    def __init__(self, catalog: SceneCatalog, scene: str, resolve: Callable[[SceneInfo], Resolved], path: str) -> None:
+        """`path`: the place of the settings in the client's message, for errors. To be renewed before it is used."""
+        self.scene = scene
+        self._catalog = catalog
+        self._resolve = resolve
+        self._path = path
+
+    async def renew(self) -> None:
+        """Resolves the settings for the scene as it is now. Raises what RequestPlanner.plan raises."""
+        with under(self._path) if self._path else nullcontext():
+            version, header = await self._catalog.versioned_header(self.scene)
+            self.settings, self.version = self._resolve(header.info), version
+
+
+def as_resolved(settings: Resolved) -> Resolved:
+    """The settings as they are."""
+    return settings
 
 
 class RequestPlanner:
@@ -30,13 +63,26 @@ class RequestPlanner:
         """Poses that one answer may carry: they all wait in the queue at the same time."""
         return min(self._settings.max_poses_per_request, self._settings.queue_limit_frames)
 
-    async def resolve(self, scene: str, asked: FrameSettings, encoding: Encoding) -> Resolved:
-        """The settings for a scene, with nothing left open.
+    async def plan(
+        self,
+        scene: str,
+        asked: FrameSettings,
+        encoding: Encoding,
+        *,
+        path: str = "",
+        complete: Callable[[Resolved], Resolved] = as_resolved,
+    ) -> Plan:
+        """The settings for a scene, with nothing left open; `complete` checks or adds what only the door knows.
 
-        Raises SceneNotFound, SceneFileInvalid, InvalidProbe, InvalidImageSize, UnknownOutput, InvalidArgument.
+        Raises SceneNotFound, SceneFileInvalid, InvalidProbe, InvalidImageSize, UnknownOutput, InvalidArgument, and what
+        `complete` raises; `path` is the place of the settings in the client's message.
         """
-        header = await self._catalog.header(scene)
-        settings = _the_same(asked.resolved(header.info, encoding, max_image_side=self._settings.max_image_side))
+        plan = Plan(self._catalog, scene, lambda info: complete(self._resolved(info, asked, encoding)), path)
+        await plan.renew()
+        return plan
+
+    def _resolved(self, info: SceneInfo, asked: FrameSettings, encoding: Encoding) -> Resolved:
+        settings = _the_same(asked.resolved(info, encoding, max_image_side=self._settings.max_image_side))
         with under("display"):
             pixels = settings.pixels
         if pixels > self._settings.max_request_pixels:
@@ -46,8 +92,8 @@ class RequestPlanner:
             )
         return settings
 
-    def check_pixels(self, settings: Resolved, poses: int) -> None:
-        """Raises TooManyPoses for an answer of more pixels than one may have."""
+    def check_pixels(self, settings: Resolved, poses: int) -> Resolved:
+        """The settings. Raises TooManyPoses for an answer of more pixels than one may have."""
         pixels = poses * settings.pixels
         if pixels > self._settings.max_request_pixels:
             raise TooManyPoses(
@@ -55,6 +101,7 @@ class RequestPlanner:
                 f"pixels, got {pixels}; send the poses in several requests",
                 field="poses",
             )
+        return settings
 
     def deadline(self, timeout_s: float | None) -> float:
         """The time.monotonic() seconds by which a request must begin; None: the default timeout."""

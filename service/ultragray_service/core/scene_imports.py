@@ -14,8 +14,10 @@ from ultragray.scene_info import SceneHeader, read_header
 from ultragray_workers.claims import claimed_folder, remove_abandoned, storage_full
 from ultragray_workers.errors import QueueFull, SceneExists, SceneNotFound, UploadTooLarge
 from ultragray_workers.jobs.publication import SCENES_FOLDER
+from ultragray_workers.jobs.queue.owners import Kind
 from ultragray_workers.scenes import SUFFIX, SceneStore, check_scene_file, check_scene_name
 
+from ..access.owners import Claim, Owners
 from ..errors import SceneReadOnly
 from ..settings import Settings
 from .helper_processes import HelperProcesses
@@ -35,12 +37,14 @@ class SceneImports:
         settings: Settings,
         maker_of: Callable[[str], Awaitable[str | None]],
         checks: HelperProcesses,
+        owners: Owners,
     ) -> None:
         """`maker_of`: the job that makes a scene, in words; None where none does."""
         self._store = store
         self._settings = settings
         self._maker_of = maker_of
         self._checks = checks
+        self._owners = owners
         self._folder = settings.artifacts / SCENES_FOLDER
         self._count = 0
 
@@ -66,27 +70,31 @@ class SceneImports:
             self._count -= 1
             await to_its_end(claim.close)
 
-    async def accept(self, received: Path, name: str) -> SceneHeader:
+    async def accept(self, received: Path, name: str, *, private: bool) -> SceneHeader:
         """Checks a file that was received and serves it as the scene `name`.
 
         Cancelling it ends the check. Raises SceneFileInvalid, SceneExists, StorageFull, MemoryExceeded,
         DeadlineExceeded.
         """
-        await self._checks.run(
-            check_scene_file,
-            {"path": str(received)},
-            what="checking the scene",
-            timeout_s=CHECK_TIMEOUT_S,
-            killed=SceneFileInvalid,
-        )
-        header = await asyncio.to_thread(read_header, received)
-        await self._require_free(name)
-        await in_own_thread(lambda: self._publish(received, name))
+        claim = Claim(self._owners, Kind.SCENE, name, private=private)
+        async with claim.making(taken=False):
+            await self._checks.run(
+                check_scene_file,
+                {"path": str(received)},
+                what="checking the scene",
+                timeout_s=CHECK_TIMEOUT_S,
+                killed=SceneFileInvalid,
+            )
+            header = await asyncio.to_thread(read_header, received)
+            await self._require_free(name)
+            await in_own_thread(lambda: self._publish(received, name))
+            await claim.made()
         return header
 
     async def delete(self, name: str) -> None:
         """Removes the file of a scene. Raises SceneNotFound, and SceneReadOnly for one of the data folder."""
         await asyncio.to_thread(self._delete, name)
+        await self._owners.forget(Kind.SCENE, name)
 
     async def removable(self) -> set[str]:
         """The names of the scenes that `delete` removes."""

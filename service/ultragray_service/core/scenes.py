@@ -9,6 +9,7 @@ from ultragray.contract import described
 from ultragray.outputs import OUTPUTS
 from ultragray.probe import Probe
 from ultragray.scene_info import SceneHeader
+from ultragray_workers.jobs.queue.owners import Kind, Ownership
 
 from ..errors import Refusal
 from .catalog import CatalogEntry, finite_metrics
@@ -29,6 +30,8 @@ class SceneEntry:
     image_width: int | None = None
     file_bytes: int | None = None
     error: Refusal | None = None
+    owner: str | None = described("Who imported or trained it; null: nobody.", None)
+    private: bool = described("Whether others may not see it.", False)
 
 
 @dataclass(frozen=True)
@@ -106,6 +109,8 @@ class Scene:
     outputs: list[OutputName] = described("What can be rendered of it.")
     label_names: dict[int, str] = described("What the values of the output labels mean; empty: it has none.")
     confidence: ConfidenceFit | None = described("null: the scene cannot tell the confidence of its frames.")
+    owner: str | None = described("Who imported or trained it; null: nobody.")
+    private: bool = described("Whether others may not see it.")
 
     @property
     def bounds_min_mm(self) -> Position:
@@ -116,7 +121,7 @@ class Scene:
         return self.bounds.max_mm
 
     @classmethod
-    def of(cls, name: str, header: SceneHeader, loaded_processes: int) -> Scene:
+    def of(cls, name: str, header: SceneHeader, loaded_processes: int, ownership: Ownership) -> Scene:
         """The scene of a header, which so many render processes hold."""
         info, model = header.info, read_model(header.info.confidence, len(header.training_poses))
         return cls(
@@ -139,6 +144,8 @@ class Scene:
             outputs=[name for name, output in OUTPUTS.items() if output.lacks(info) is None],
             label_names=info.label_names,
             confidence=None if model is None else ConfidenceFit(model.error, model.fitted_on),
+            owner=ownership.owner,
+            private=ownership.private,
         )
 
 
@@ -158,19 +165,26 @@ class SceneLoaded:
 
 async def scene(service: Service, name: str) -> Scene:
     """Raises SceneNotFound, SceneFileInvalid."""
-    return Scene.of(name, await service.catalog.header(name), service.pool.loaded().get(name, 0))
+    header, loaded_processes = await service.catalog.header(name), service.pool.loaded().get(name, 0)
+    return Scene.of(name, header, loaded_processes, service.owners.known(Kind.SCENE, name))
 
 
 async def scene_page(service: Service, page_size: int, page_token: str) -> ScenePage:
     """One page of scenes by name. Raises InvalidArgument."""
     entries, next_page_token = await service.catalog.page(page_size, page_token)
     loaded, removable = service.pool.loaded(), await service.imports.removable()
-    return ScenePage([_entry(one, one.name in loaded, one.name in removable) for one in entries], next_page_token)
+    told = [
+        _entry(one, one.name in loaded, one.name in removable, service.owners.known(Kind.SCENE, one.name))
+        for one in entries
+    ]
+    return ScenePage(told, next_page_token)
 
 
-def _entry(entry: CatalogEntry, loaded: bool, removable: bool) -> SceneEntry:
+def _entry(entry: CatalogEntry, loaded: bool, removable: bool, ownership: Ownership) -> SceneEntry:
+    owner, private = ownership.owner, ownership.private
     if entry.error is not None:
-        return SceneEntry(entry.name, loaded, removable, error=Refusal.of(entry.error))
+        refusal = Refusal.of(entry.error)
+        return SceneEntry(entry.name, loaded, removable, error=refusal, owner=owner, private=private)
     assert entry.header is not None
     info = entry.header.info
     return SceneEntry(
@@ -181,4 +195,6 @@ def _entry(entry: CatalogEntry, loaded: bool, removable: bool) -> SceneEntry:
         info.image_height,
         info.image_width,
         entry.header.file_bytes,
+        owner=owner,
+        private=private,
     )

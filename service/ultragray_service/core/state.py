@@ -5,19 +5,32 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 from enum import Enum
+from functools import partial
 
-from ultragray.errors import UltragrayError
+from ultragray.errors import RenderFailed, UltragrayError
+from ultragray.probe import FloatArray
 from ultragray_workers.datasets.store import DatasetStore
-from ultragray_workers.errors import Draining, NotReady, StartupFailed
+from ultragray_workers.errors import Draining, NotReady, SceneNotFound, StartupFailed
+from ultragray_workers.jobs.queue.owners import Kind
 from ultragray_workers.jobs.store import SCENES_FOLDER, JobStore
-from ultragray_workers.pool.pool import PoolConfig, RenderPool
-from ultragray_workers.pool.types import RenderRequest, RenderResult
+from ultragray_workers.pool.pool import MAX_SCENE_CHANGES, PoolConfig, RenderPool
+from ultragray_workers.pool.types import Priority, RenderRequest, RenderResult, SceneChangedError
 from ultragray_workers.pool.waiting import Turn
 from ultragray_workers.scenes import SceneStore
 
-from ..auth import KeyGuard
+from ..access.addresses import is_loopback
+from ..access.audit import AuditLog, account
+from ..access.guard import Authenticator, EnvironmentKeys, Guard
+from ..access.keys import KnownKeys
+from ..access.oidc.tokens import OidcTokens
+from ..access.origins import Origins
+from ..access.owners import Owners
+from ..access.principal import caller
+from ..access.sessions import Sessions
+from ..access.snapshot import Snapshot
 from ..settings import Settings
 from ..telemetry.metrics import Metrics
+from ..telemetry.tracing import start_tracing
 from ..views.comparisons import Comparisons
 from ..views.datasets import DatasetViews
 from ..views.training import TrainingViews
@@ -25,7 +38,8 @@ from .catalog import SceneCatalog, scene_to_blame
 from .dataset_uploads import DatasetUploads
 from .helper_processes import HelperProcesses
 from .jobs.jobs import Jobs
-from .requests import RequestPlanner
+from .readiness.readiness import Readiness
+from .requests import Plan, RequestPlanner
 from .scene_imports import SceneImports
 
 
@@ -46,49 +60,74 @@ class Service:
                 f"data_folder must be an existing folder, got {str(settings.data_folder)!r}",
                 field="data_folder",
             )
-        store = SceneStore(settings.data_folder, settings.artifacts / SCENES_FOLDER)
+        folders = (settings.data_folder, settings.artifacts / SCENES_FOLDER)
+        store = SceneStore(*folders)
         self.settings = settings
         self.scenes = store
         self.catalog = SceneCatalog(store)
         self.planner = RequestPlanner(settings, self.catalog)
-        self.guard = KeyGuard(settings.api_keys)
+        self._keys = KnownKeys()
+        self.tokens = OidcTokens.of(settings)
+        sources: list[Authenticator] = [self._keys, EnvironmentKeys(settings.api_keys)]
+        self.guard = Guard(sources if self.tokens is None else [*sources, self.tokens])
+        self._following_issuer: asyncio.Task[None] | None = None
+        self.origins = Origins(settings)
+        self.sessions = Sessions(self.guard)
+        self.audit = AuditLog()
+        self._following_sessions: asyncio.Task[None] | None = None
+        self._snapshot: Snapshot | None = None
         self.pool = RenderPool(
-            store,
+            SceneStore(*folders),  # its own: nothing is hidden from the pool, which works for everybody at once
             PoolConfig(
                 processes=settings.processes,
                 threads_per_process=settings.threads_per_process,
                 queue_limit_frames=settings.queue_limit_frames,
+                client_limit_frames=settings.client_limit_frames,
+                max_queue_ms=settings.max_queue_ms,
                 max_batch_poses=settings.max_batch_poses,
                 memory_budget_bytes=settings.memory_budget_mb * 2**20,
+                max_footprint_pixels=settings.max_footprint_pixels,
+                worker_grace_s=settings.worker_grace_s,
+                worker_timeout_s=settings.worker_timeout_s,
                 backend=settings.backend,
             ),
         )
-        self.jobs = Jobs(settings, store)
-        self.metrics = Metrics(self.pool, lambda: self.jobs.counts)
-        self.pool.on_rendered = self.metrics.observe_result
+        self.datasets = DatasetStore(settings.artifacts)
+        self.jobs = Jobs(settings, store, self.datasets)
+        self.readiness = Readiness(
+            lambda: self.jobs.database,
+            require_serving=self.require_serving,
+            require_frames=self.require_frames,
+            without_jobs=settings.ready_without_jobs,
+        )
+        self.owners = Owners(
+            lambda job_id: self.jobs.do(JobStore.ownership, job_id),
+            {Kind.SCENE: store.path, Kind.DATASET: self.datasets.get},
+        )
+        store.hides = partial(self.owners.hides, Kind.SCENE)
+        self.datasets.hides = partial(self.owners.hides, Kind.DATASET)
+        self.metrics = Metrics(self.pool, lambda: self.jobs.overview)
+        self.tracing = start_tracing("service")
+        self.pool.on_rendered = self._observe
         self.phase = Phase.STARTING
         self.draining = asyncio.Event()
-        self.datasets = DatasetStore(settings.artifacts)
         # Each process may take all the memory that settings allow to one: one checks at a time, and one makes pictures.
         checks, pictures = (HelperProcesses(settings.dataset_memory_mb << 20) for _ in range(2))
-        self.uploads = DatasetUploads(self.datasets, settings, self.draining, checks)
+        self.uploads = DatasetUploads(self.datasets, settings, self.draining, checks, self.owners)
         self.datasets.in_use = self.jobs.uses_dataset
-        self.imports = SceneImports(store, settings, lambda name: self.jobs.do(JobStore.makes_scene, name), checks)
+        self.imports = SceneImports(
+            store, settings, lambda name: self.jobs.do(JobStore.makes_scene, name), checks, self.owners
+        )
         self.dataset_views = DatasetViews(self.datasets, settings, pictures)
         self.comparisons = Comparisons(store, self.catalog, self.datasets, settings, pictures)
         self.training_views = TrainingViews(self.jobs, self.datasets, settings, pictures)
         self._prepared = (self.dataset_views, self.comparisons, self.training_views)
 
-    @property
-    def ready(self) -> bool:
-        """Whether a frame asked for now would be rendered."""
-        return self.phase is Phase.SERVING and self.pool.ready
-
-    def require_ready(self) -> None:
+    def require_frames(self) -> None:
         """Raises NotReady or Draining, saying why no frame would be rendered now."""
         self.require_serving()
         if not self.pool.ready:
-            raise NotReady("no render process is alive at the moment")
+            raise NotReady("no render process is alive and gets on with its work at the moment")
 
     def require_serving(self) -> None:
         """Raises NotReady or Draining."""
@@ -97,8 +136,40 @@ class Service:
         if self.phase is Phase.DRAINING:
             raise Draining("the service is stopping")
 
+    async def open(self) -> None:
+        """Opens the jobs' database, and reads who may do what; before any door opens. Raises StartupFailed."""
+        await self.jobs.open()
+        self._snapshot = await asyncio.to_thread(Snapshot, self.jobs.database.engine, self._keys, self.owners)
+        self.owners.open(self.jobs.database.engine, self.jobs.threads)
+        self.audit.open(self.jobs.database.engine)
+        self._following_sessions = asyncio.create_task(self.sessions.follow())
+        if self.tokens is not None:
+            self._following_issuer = asyncio.create_task(self.tokens.issuer.follow())
+        settings = self.settings
+        if not (self.guard.asks or settings.insecure or is_loopback(settings.host)):
+            raise StartupFailed(
+                f"nobody is asked for an API key, and {settings.host} can be reached from other machines: make a key "
+                "with `ultragray keys create`, or set ULTRAGRAY_API_KEYS; ULTRAGRAY_INSECURE=true serves all the same, "
+                "and everybody is an admin then",
+                field="host",
+            )
+
+    async def close(self) -> None:
+        """Closes what `open` opened, and sends the last traces."""
+        if self._following_issuer is not None:
+            self._following_issuer.cancel()
+        if self._following_sessions is not None:
+            self._following_sessions.cancel()
+        if self._snapshot is not None:
+            await asyncio.to_thread(self._snapshot.close)
+        await asyncio.to_thread(self.audit.close)
+        self.readiness.close()
+        await self.jobs.close()
+        if self.tracing is not None:
+            await asyncio.to_thread(self.tracing.stop)
+
     async def start(self) -> None:
-        """Starts the pool, loads the scenes to preload, opens the jobs, clears what dead uploads left.
+        """Starts the pool, loads the scenes to preload, clears what dead uploads left.
 
         Raises StartupFailed.
         """
@@ -109,7 +180,9 @@ class Service:
         present = await asyncio.to_thread(self.datasets.names_by_content)
         await self._forget(lambda key: key.rpartition("-")[2] not in present)
         await self.training_views.forget(lambda key: True)  # a training that goes on has new ones
-        await asyncio.gather(self.pool.start(), self.jobs.start())
+        self.jobs.start()
+        await self.readiness.start()
+        await self.pool.start()
         for name in self.settings.preload:
             try:
                 await self.pool.load(name)
@@ -118,11 +191,36 @@ class Service:
         if self.phase is Phase.STARTING:
             self.phase = Phase.SERVING
 
-    async def render(self, request: RenderRequest, turn: Turn | None = None) -> RenderResult:
-        """Renders. Raises what RenderPool.render raises; cancelling drops a request that still waits."""
+    async def render(
+        self,
+        plan: Plan,
+        poses: FloatArray,  # [C, 4, 4] mm, exact
+        *,
+        deadline: float | None,  # time.monotonic() in seconds
+        priority: Priority = Priority.INTERACTIVE,
+        turn: Turn | None = None,
+    ) -> RenderResult:
+        """Renders, with the settings as they are for the scene that is there when it is rendered.
+
+        Raises what RenderPool.render and Plan.renew raise; cancelling drops a request that still waits.
+        """
         self.require_serving()
-        with scene_to_blame():
-            return await self.pool.render(request, turn)
+        mine = account()
+        mine.target = plan.scene
+        mine.frames += len(poses)
+        if self.owners.hides(Kind.SCENE, plan.scene):  # since a stream began, for example
+            raise SceneNotFound(f"there is no scene {plan.scene!r} any more", field="scene")
+        turn = turn or Turn()
+        for _ in range(MAX_SCENE_CHANGES):
+            asked = RenderRequest(plan.scene, plan.settings, poses, priority, deadline, plan.version, caller())
+            try:
+                with scene_to_blame():
+                    return await self.pool.render(asked, turn)
+            except SceneChangedError:
+                if turn.ticket is not None:  # perhaps with newer poses
+                    poses, deadline = turn.ticket.request.poses, turn.ticket.request.deadline
+                await plan.renew()
+        raise RenderFailed(f"scene {plan.scene!r} kept changing while it was being rendered", field="scene")
 
     async def load(self, scene: str) -> int:
         """Loads a scene into every process; how many hold it.
@@ -131,6 +229,7 @@ class Service:
         """
         self.require_serving()
         with scene_to_blame():
+            await asyncio.to_thread(self.scenes.path, scene)
             await self.pool.load(scene)
         return self.pool.loaded().get(scene, 0)
 
@@ -138,6 +237,7 @@ class Service:
         """Frees a scene; how many processes still hold it. Raises SceneNotFound."""
         self.require_serving()
         with scene_to_blame():
+            await asyncio.to_thread(self.scenes.path, scene)
             await self.pool.unload(scene)
         return self.pool.loaded().get(scene, 0)
 
@@ -145,6 +245,7 @@ class Service:
         """Deletes a dataset, and all that was made of it to be looked at. Raises DatasetNotFound, DatasetInUse."""
         deleted = (await asyncio.to_thread(self.datasets.get, name)).sha256
         await asyncio.to_thread(self.datasets.delete, name)
+        await self.owners.forget(Kind.DATASET, name)
         if deleted not in await asyncio.to_thread(self.datasets.names_by_content):
             await self._forget(lambda key: key.endswith(deleted))
 
@@ -152,6 +253,11 @@ class Service:
         """Deletes a finished job and its files. Raises JobNotFound, JobInUse, DatabaseUnavailable."""
         await self.jobs.do(JobStore.delete, job_id)
         await self.training_views.forget_job(job_id)
+
+    def _observe(self, result: RenderResult) -> None:
+        self.metrics.observe_result(result)
+        if self.tracing is not None:
+            self.tracing.observe_result(result)
 
     async def _forget(self, is_doomed: Callable[[str], bool]) -> None:
         for prepared in self._prepared:

@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 from fastapi import FastAPI
 from fastapi.exceptions import RequestValidationError
+from fastapi.telemetry import TelemetryConfig
 from pydantic import TypeAdapter
 from starlette.exceptions import HTTPException
 from starlette.middleware.cors import CORSMiddleware
+from starlette.routing import BaseRoute, Mount, Route, WebSocketRoute
 
 from ultragray import __version__
 from ultragray.errors import UltragrayError
 from ultragray.probe import Probe
 
+from ..access.rules import WEBSOCKET, HttpRules
 from ..core.state import Service
+from ..telemetry.tracing import Tracing
 from . import problems
 from .console import add_console
 from .docs import add_docs
-from .middleware import LimitBody, RequestContext, RequireKey
+from .middleware import QUIET_PATHS, Authorize, CheckOrigin, LimitBody, RequestContext
 from .reading.bodies import SPECIFICATIONS, JobBody, RenderBody, StreamMessage
 from .reading.json_body import adapter_of
 from .routes import (
@@ -26,7 +31,7 @@ from .routes import (
     datasets,
     health,
     jobs,
-    metrics,
+    me,
     probes,
     render,
     scene_files,
@@ -50,6 +55,22 @@ _SECURITY_SCHEMES = {
 }
 
 
+# render comes first: its route is the one that must be found fast
+_ROUTERS = (
+    render.router,
+    stream.router,
+    scenes.router,
+    scene_files.router,
+    probes.router,
+    datasets.router,
+    comparison.router,
+    jobs.router,
+    training.router,
+    statistics.router,
+    health.router,
+    me.router,
+)
+
 _READ: tuple[Any, ...] = (RenderBody, StreamMessage, JobBody, *SPECIFICATIONS, Probe)
 _WRITTEN: tuple[Any, ...] = (problems.Problem, FrameMessage, RefusalMessage)
 
@@ -63,31 +84,22 @@ def create_app(service: Service) -> FastAPI:
         docs_url=None,  # see add_docs
         redoc_url=None,
         redirect_slashes=False,
+        telemetry=_telemetry(service.tracing),
     )
     app.state.service = service
-    # render comes first: its route is the one that must be found fast
-    for module in (
-        render,
-        stream,
-        scenes,
-        scene_files,
-        probes,
-        datasets,
-        comparison,
-        jobs,
-        training,
-        statistics,
-        health,
-        metrics,
-    ):
-        app.include_router(module.router)
+    for router in _ROUTERS:
+        app.include_router(router)
     add_docs(app)
     add_console(app)
+    found = (*app.routes, *(route for router in _ROUTERS for route in router.routes))
+    app.state.routes = [route for route in found if isinstance(route, Route)]
+    rules = HttpRules()
+    rules.require_all(_asked_for(found))
     app.add_exception_handler(UltragrayError, problems.answer_ultragray_error)
     app.add_exception_handler(HTTPException, problems.answer_http_exception)
     app.add_exception_handler(RequestValidationError, problems.answer_validation_error)
     app.add_middleware(LimitBody, limit_bytes=service.settings.max_body_bytes)
-    app.add_middleware(RequireKey, guard=service.guard)
+    app.add_middleware(Authorize, service=service, rules=rules)
     if service.settings.cors_origins:
         app.add_middleware(
             CORSMiddleware,
@@ -96,8 +108,31 @@ def create_app(service: Service) -> FastAPI:
             allow_headers=["*"],
             expose_headers=["Retry-After", *render.RENDER_HEADERS],
         )
+    app.add_middleware(CheckOrigin, guard=service.guard, origins=service.origins)
     app.add_middleware(RequestContext, metrics=service.metrics)
     return app
+
+
+def _asked_for(routes: Iterable[BaseRoute]) -> Iterator[tuple[str, str]]:
+    """The method and path of every route."""
+    for route in routes:
+        match route:
+            case WebSocketRoute():
+                yield WEBSOCKET, route.path
+            case Mount():
+                yield "GET", f"{route.path}/{{path:path}}"
+            case Route():
+                yield from ((method, route.path) for method in route.methods or ())
+
+
+def _telemetry(tracing: Tracing | None) -> TelemetryConfig:
+    """A span for each request and stream of a service that is traced; Prometheus has the metrics."""
+    config = TelemetryConfig(tracing=False, metrics=False, logs=False, operation_spans=False, auto_configure=False)
+    if tracing is not None:
+        config["tracing"] = True
+        config["tracer_provider"] = tracing.provider
+        config["exclude"] = lambda scope: scope["path"].startswith(QUIET_PATHS)
+    return config
 
 
 class _Application(FastAPI):
@@ -116,7 +151,7 @@ class _Application(FastAPI):
             schemas.update(extra["$defs"])
             for unused in ("HTTPValidationError", "ValidationError"):
                 schemas.pop(unused, None)
-            if self.state.service.settings.api_keys:
+            if self.state.service.guard.asks:
                 document["components"]["securitySchemes"] = _SECURITY_SCHEMES
                 document["security"] = [{name: []} for name in _SECURITY_SCHEMES]
             self.openapi_schema = document

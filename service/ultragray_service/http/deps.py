@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Annotated, Any
 
 from fastapi import Depends, Path
@@ -18,20 +19,26 @@ async def _service(connection: HTTPConnection) -> Service:  # async: FastAPI run
 
 
 ServiceDep = Annotated[Service, Depends(_service)]
+_REFERENCE = "#/components/schemas/{}"
 _NAME_MEANS = "Name of the scene: its file name without .ugr."
 SceneName = Annotated[str, Path(description=_NAME_MEANS, examples=["demo"])]
 SCENE_NAME = {"description": _NAME_MEANS, "schema": {"type": "string", "title": "Scene", "examples": ["demo"]}}
 
 
-def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    """The documentation of error answers, for `responses=`."""
-    content = {PROBLEM_TYPE: {"schema": {"$ref": f"#/components/schemas/{Problem.__name__}"}}}
+def problems(*statuses: int, members: Mapping[str, type] | None = None) -> dict[int | str, dict[str, Any]]:
+    """The documentation of error answers, for `responses=`; `members`: of the document, beside those of Problem."""
+    schema: dict[str, Any] = {"$ref": _REFERENCE.format(Problem.__name__)}
+    if members:
+        more = {name: {"$ref": _REFERENCE.format(kind.__name__)} for name, kind in members.items()}
+        schema = {"allOf": [schema, {"type": "object", "properties": more, "required": list(more)}]}
+    content = {PROBLEM_TYPE: {"schema": schema}}
     return {status: {"description": _MEANINGS[status], "content": content} for status in statuses}
 
 
 _MEANINGS = {
     401: "No API key, or an unknown one (UNAUTHENTICATED), where the service asks for one.",
-    403: "The scene lies in the data folder, which is not the service's (SCENE_READ_ONLY).",
+    403: "The role of the key does not allow it, or it is somebody else's (PERMISSION_DENIED); the scene lies in the "
+    "data folder, which is not the service's (SCENE_READ_ONLY).",
     404: "No such scene, dataset, job or artifact (SCENE_NOT_FOUND, DATASET_NOT_FOUND, JOB_NOT_FOUND, "
     "ARTIFACT_NOT_FOUND).",
     406: "The Accept header allows no type that can hold the request (NOT_ACCEPTABLE).",
@@ -40,7 +47,7 @@ _MEANINGS = {
     413: "The body is over the limit (BODY_TOO_LARGE, UPLOAD_TOO_LARGE).",
     415: "The body is of another type than the route takes (UNSUPPORTED_MEDIA_TYPE).",
     422: "A value cannot be used: INVALID_ARGUMENT, INVALID_POSE, INVALID_PROBE, INVALID_IMAGE_SIZE, "
-    "UNKNOWN_OUTPUT, TOO_MANY_POSES, SCENE_FILE_INVALID, DATASET_INVALID. `field` names it.",
+    "UNKNOWN_OUTPUT, TOO_MANY_POSES, FRAME_TOO_COSTLY, SCENE_FILE_INVALID, DATASET_INVALID. `field` names it.",
     429: "Too many frames, uploads or jobs wait (QUEUE_FULL, JOB_QUEUE_FULL); retry after the seconds of Retry-After.",
     500: "Rendering failed (RENDER_FAILED, INTERNAL).",
     501: "The format needs an optional package that the service lacks (EXTRA_MISSING).",

@@ -5,24 +5,32 @@ from __future__ import annotations
 import logging
 import time
 
+from opentelemetry import trace
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from ultragray.errors import UltragrayError
 
-from ..auth import KeyGuard, key_of_subprotocols
-from ..errors import BodyTooLarge, Unauthenticated
+from ..access.audit import NOBODY, Entry
+from ..access.credentials import credential_of_subprotocols, offered_credential
+from ..access.guard import Guard
+from ..access.origins import Origins
+from ..access.permissions import require
+from ..access.principal import act_as
+from ..access.rules import UNKNOWN, WEBSOCKET, HttpRules, Operation
+from ..core.state import Service
+from ..errors import BodyTooLarge, HostRefused, OriginRefused
 from ..telemetry.logs import choose_request_id, request_id
 from ..telemetry.metrics import Metrics
-from .console import ASSETS_PATH, CONSOLE_PATHS
+from ..telemetry.tracing import REQUEST_ID_ATTRIBUTE
 from .problems import problem_response
 
 REQUEST_ID_HEADER = "X-Request-Id"
-_OPEN_PATHS = ("/v1/health/", "/docs", "/openapi.json", f"{ASSETS_PATH}/")
-_QUIET_PATHS = ("/v1/health/", "/metrics")
+QUIET_PATHS = ("/v1/health/", "/metrics")
 _UPLOAD_PATHS = ("/v1/datasets/", "/v1/scenes/")
 _CLIENT_GONE = 499
+_POLICY_VIOLATION = 1008  # of RFC 6455
 
 _log = logging.getLogger("ultragray.http")
 
@@ -45,6 +53,7 @@ class RequestContext:
         started = time.perf_counter()
         current = choose_request_id(Headers(scope=scope).get(REQUEST_ID_HEADER))
         token = request_id.set(current)
+        trace.get_current_span().set_attribute(REQUEST_ID_ATTRIBUTE, current)
         status = 0
 
         async def send_with_id(message: Message) -> None:
@@ -67,7 +76,7 @@ class RequestContext:
             seconds = time.perf_counter() - started
             route = getattr(scope.get("route"), "path", "unmatched")
             self._metrics.count_request("http", route, str(status), seconds)
-            level = logging.DEBUG if scope["path"].startswith(_QUIET_PATHS) else logging.INFO
+            level = logging.DEBUG if scope["path"].startswith(QUIET_PATHS) else logging.INFO
             if _log.isEnabledFor(level):
                 fields = {
                     "method": scope["method"],
@@ -79,23 +88,80 @@ class RequestContext:
             request_id.reset(token)
 
 
-class RequireKey:
-    """Lets through who has an API key, and everyone to health, the documentation and the files of the console."""
+class CheckOrigin:
+    """Keeps pages of other sites away: from everything where no key is asked for, else from WebSockets."""
 
-    def __init__(self, app: ASGIApp, guard: KeyGuard) -> None:
+    def __init__(self, app: ASGIApp, guard: Guard, origins: Origins) -> None:
         self._app = app
         self._guard = guard
+        self._origins = origins
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["path"] not in CONSOLE_PATHS and not scope["path"].startswith(_OPEN_PATHS):
+        try:
             headers = Headers(scope=scope)
-            key = headers.get("x-api-key") or key_of_subprotocols(scope.get("subprotocols", ()))
-            try:
-                self._guard.check(headers.get("authorization"), key)
-            except Unauthenticated as error:
+            if not self._guard.asks:
+                for host in headers.getlist("host"):
+                    self._origins.require_host(host)
+            if scope["type"] == "websocket" or not self._guard.asks:
+                self._origins.require_page(
+                    origin=headers.get("origin"),
+                    host=headers.get("host"),
+                    fetch_site=headers.get("sec-fetch-site"),
+                    fetch_mode=headers.get("sec-fetch-mode"),
+                )
+        except (HostRefused, OriginRefused) as error:
+            await problem_response(error)(scope, receive, send)
+        else:
+            await self._app(scope, receive, send)
+
+
+class Authorize:
+    """Finds out who asks, and whether they may; keeps account of it; ends what goes on when its key counts no more."""
+
+    def __init__(self, app: ASGIApp, service: Service, rules: HttpRules) -> None:
+        self._app = app
+        self._service = service
+        self._rules = rules
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        method = WEBSOCKET if scope["type"] == "websocket" else scope["method"]
+        operation, target = self._rules.find(method, scope["path"]) or (UNKNOWN, "")
+        if operation.role is None and operation is not UNKNOWN:
+            await self._app(scope, receive, send)
+            return
+        started = False
+
+        async def send_noted(message: Message) -> None:
+            nonlocal started
+            started = True
+            await send(message)
+
+        try:
+            await self._permitted(operation, target, scope, receive, send_noted)
+        except UltragrayError as error:
+            if not started:
                 await problem_response(error)(scope, receive, send)
-                return
-        await self._app(scope, receive, send)
+            elif scope["type"] == "websocket":
+                await send({"type": "websocket.close", "code": _POLICY_VIOLATION, "reason": error.reason})
+
+    async def _permitted(self, operation: Operation, target: str, scope: Scope, receive: Receive, send: Send) -> None:
+        """Raises Unauthenticated, PermissionDenied, JobNotFound."""
+        service, headers = self._service, Headers(scope=scope)
+        address, port = scope.get("client") or ("", 0)
+        key = headers.get("x-api-key") or credential_of_subprotocols(scope.get("subprotocols", ()))
+        credential = offered_credential(headers.get("authorization"), key)
+        try:
+            principal = service.guard.authenticate(credential)
+        except UltragrayError as error:
+            service.audit.count(Entry(NOBODY, address, operation.name, target, error.reason))
+            raise
+        act_as(principal, address=address, connection=f"{address}:{port}")
+        with (
+            service.audit.request(principal.name, address, operation, target),
+            service.sessions.held(principal, credential),
+        ):
+            await require(principal, operation, target, service.owners)
+            await self._app(scope, receive, send)
 
 
 class LimitBody:

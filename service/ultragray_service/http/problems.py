@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -11,16 +12,18 @@ from pydantic import BaseModel, Field
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import Response
+from starlette.routing import Match
 
-from ultragray.contract import blamed, error_under, join
+from ultragray.contract import blamed, error_under, join, shown
 from ultragray.errors import InvalidArgument, UltragrayError
 
-from ..errors import MethodNotAllowed, RouteNotFound, statuses_of
+from ..access.audit import account
+from ..errors import MethodNotAllowed, RouteNotFound, retry_after_s, statuses_of
 from ..telemetry.logs import request_id
 
 PROBLEM_TYPE = "application/problem+json"
 
-_SHOWN_INPUT = 60
+_SHOWN_PATH = 200
 
 
 class Problem(BaseModel):
@@ -35,9 +38,12 @@ class Problem(BaseModel):
     request_id: str
 
 
-def problem_response(error: UltragrayError, headers: Mapping[str, str] | None = None) -> Response:
-    """The answer that tells a client about `error`."""
+def problem_response(
+    error: UltragrayError, headers: Mapping[str, str] | None = None, members: Mapping[str, Any] | None = None
+) -> Response:
+    """The answer that tells a client about `error`; `members`: more of the document, beside those of Problem."""
     statuses = statuses_of(error)
+    account().result = error.reason
     document = Problem(
         type=f"urn:ultragray:problem:{error.reason.lower().replace('_', '-')}",
         title=error.title,
@@ -48,11 +54,11 @@ def problem_response(error: UltragrayError, headers: Mapping[str, str] | None = 
         request_id=request_id.get(),
     )
     all_headers = dict(headers or {})
-    if statuses.retry_after_s is not None:
-        all_headers["Retry-After"] = str(statuses.retry_after_s)
+    if (delay_s := retry_after_s(error)) is not None:
+        all_headers["Retry-After"] = str(math.ceil(delay_s))
     if statuses.http == 401:
         all_headers["WWW-Authenticate"] = "Bearer"
-    content = json.dumps(document.model_dump(), ensure_ascii=False)
+    content = json.dumps({**document.model_dump(), **(members or {})}, ensure_ascii=False)
     return Response(content.encode("utf-8", "replace"), statuses.http, all_headers, PROBLEM_TYPE)
 
 
@@ -66,11 +72,22 @@ async def answer_http_exception(request: Request, error: Exception) -> Response:
     """Exception handler of what the framework raises: unknown routes and methods."""
     assert isinstance(error, HTTPException)
     if error.status_code == 405:
-        detail = f"{request.url.path} does not answer {request.method}"
-        return problem_response(MethodNotAllowed(detail), error.headers)
+        allowed = ", ".join(_methods_of_path(request))
+        detail = f"{request.url.path[:_SHOWN_PATH]} answers {allowed}, not {request.method}"
+        return problem_response(MethodNotAllowed(detail), {"Allow": allowed})
     if error.status_code == 404:
-        return problem_response(RouteNotFound(f"there is no route {request.url.path}"))
+        return problem_response(RouteNotFound(f"there is no route {request.url.path[:_SHOWN_PATH]}"))
     return problem_response(InvalidArgument(str(error.detail)))
+
+
+def _methods_of_path(request: Request) -> list[str]:
+    """The methods of all routes of the path; the framework knows those of the first one."""
+    methods: set[str] = set()
+    for route in request.app.state.routes:
+        match, _ = route.matches(request.scope)
+        if match is not Match.NONE:
+            methods |= route.methods
+    return sorted(methods)
 
 
 async def answer_validation_error(request: Request, error: Exception) -> Response:
@@ -95,13 +112,8 @@ def invalid_argument(first: Mapping[str, Any], cls: Any = None) -> UltragrayErro
         case "union_tag_not_found" | "union_tag_invalid":
             kinds = ", ".join(kind_of_value.members)
             path = join(path, "kind")
-            return error(f"{path} must be one of {kinds}, got {_shown(first['input'].get('kind'))}", field=path)
+            return error(f"{path} must be one of {kinds}, got {shown(first['input'].get('kind'))}", field=path)
     message = str(first["msg"])
     _, verb, expected = message.partition(" should ")
     detail = f"{path or 'the body'} must {expected}" if verb else f"{path}: {message}"
-    return error(f"{detail}, got {_shown(first.get('input'))}", field=path or None)
-
-
-def _shown(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= _SHOWN_INPUT else text[:_SHOWN_INPUT] + "…"
+    return error(f"{detail}, got {shown(first.get('input'))}", field=path or None)

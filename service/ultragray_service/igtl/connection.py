@@ -11,6 +11,8 @@ from typing import Protocol
 from ultragray.errors import UltragrayError
 
 from ..core.state import Service
+from ..core.streams.buffers import hold_little
+from ..core.streams.unread import Unread
 from ..errors import IgtlMessageInvalid
 from .contents import (
     Status,
@@ -34,7 +36,6 @@ MAX_SKIPPED_BYTES = 64 * 2**20  # of a message that is not
 MESSAGE_TIMEOUT_S = 10.0  # from the first byte of a message to its last
 SEND_TIMEOUT_S = 30.0
 _SKIP_BYTES = 64 * 1024
-_SENT_AHEAD_BYTES = 64 * 1024
 
 _ACCEPTED, _REFUSED = b"\0", b"\1"
 
@@ -69,7 +70,8 @@ class Connection:
         self._writer = writer
         self._sending = asyncio.Lock()
         self._poses = WaitingPoses()
-        writer.transport.set_write_buffer_limits(high=_SENT_AHEAD_BYTES)
+        hold_little(writer.transport)
+        self._unread = Unread(writer.transport)
 
     async def run(self) -> None:
         """Until the client goes, sends what is no message, or takes too long."""
@@ -152,7 +154,7 @@ class Connection:
         elif message.type_name == "GET_CAPABIL":
             await self._send(_reply("CAPABILITY", message, pack_capability(CAPABILITY)))
         elif message.type_name == "GET_STATUS":
-            self._service.require_ready()
+            self._service.require_frames()
             await self._send(_reply("STATUS", message, pack_status(Status(OK, 0, "OK", "ready"))))
         elif prefix == "GET_":
             await self._send(self._newest(KINDS[suffix], message))
@@ -186,6 +188,7 @@ class Connection:
 
     async def _render(self) -> None:
         while True:
+            await self._unread.none()  # an older image: the newest pose then is the one to render
             underway = await self._poses.next()
             try:
                 frame = await self._maker.render(underway)
@@ -213,7 +216,7 @@ class Connection:
     async def _send(self, message: Message) -> None:
         """Raises ConnectionError where the client has gone, or takes nothing for too long."""
         async with self._sending:
-            self._writer.write(pack_message(message))
+            self._unread.write(pack_message(message))
             stalled = asyncio.get_running_loop().call_later(SEND_TIMEOUT_S, self.abort)
             try:
                 await self._writer.drain()

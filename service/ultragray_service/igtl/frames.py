@@ -7,8 +7,8 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 
 from ultragray.display.settings import true_to_scale
-from ultragray.settings import Encoding, FrameSettings
-from ultragray_workers.pool.types import RenderRequest, RenderResult
+from ultragray.settings import Encoding, FrameSettings, Resolved
+from ultragray_workers.pool.types import RenderResult
 
 from ..core.state import Service
 from .contents import Image, Tool, pack_image, pack_position, pack_tools, pack_transform
@@ -68,18 +68,20 @@ class FrameMaker:
     async def render(self, underway: Underway) -> Frame:
         """The frame of a pose, or of one that took its turn; probe and size are those the scene was trained with.
 
-        Raises SceneNotFound, and what RequestPlanner.resolve and Service.render raise.
+        Raises SceneNotFound, and what RequestPlanner.plan and Service.render raise.
         """
         self._service.require_serving()
         scene = await self._scenes.choose(underway.posed.message.device_name)
         planner = self._service.planner
-        settings = await planner.resolve(scene, FrameSettings(), Encoding.UINT8)
-        display = true_to_scale(settings.probe, settings.height, self._service.settings.max_image_side)
-        asked = RenderRequest(
-            scene, replace(settings, display=display), underway.posed.pose[None], deadline=planner.deadline(None)
+        plan = await planner.plan(scene, FrameSettings(), Encoding.UINT8, complete=self._true_to_scale)
+        result = await self._service.render(
+            plan, underway.posed.pose[None], deadline=planner.deadline(None), turn=underway.turn
         )
-        result = await self._service.render(asked, underway.turn)
         return Frame(underway.posed, result, image_of(result))
+
+    def _true_to_scale(self, settings: Resolved) -> Resolved:
+        side = self._service.settings.max_image_side
+        return replace(settings, display=true_to_scale(settings.probe, settings.height, side))
 
 
 def image_of(result: RenderResult) -> Image:

@@ -8,14 +8,18 @@ import logging
 import socket
 import time
 
-from ultragray_workers.errors import Draining, QueueFull
+from ultragray_workers.errors import Draining
 
+from ..access.addresses import AddressRoles
+from ..access.audit import NOBODY, Entry
+from ..access.principal import act_as
+from ..access.rules import IGTL
 from ..core.state import Service
+from ..errors import PermissionDenied, TooManyConnections
+from ..listening.connections import Connections
 from .connection import SEND_TIMEOUT_S, Connection
 from .frames import Frame
 from .routes import SceneChooser
-
-MAX_CONNECTIONS = 512
 
 _log = logging.getLogger("ultragray.igtl")
 
@@ -26,9 +30,16 @@ class IgtlServer:
     def __init__(self, service: Service) -> None:
         self.newest: Frame | None = None
         self._service = service
+        self._roles = AddressRoles(service.settings.igtl_allow)
         self._scenes = SceneChooser(service.catalog, service.settings.igtl_scene)
+        self._places = Connections(service.settings.max_connections, service.settings.max_connections_per_address)
         self._connections: dict[Connection, asyncio.Task[None]] = {}
         self._server: asyncio.Server | None = None
+
+    @property
+    def is_local(self) -> bool:
+        """Whether no other machine may connect."""
+        return self._roles.is_local
 
     async def start(self, listener: socket.socket) -> None:
         """Begins to answer on a bound socket."""
@@ -60,8 +71,17 @@ class IgtlServer:
 
     async def _connected(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         connection = Connection(self._service, self._scenes, self, reader, writer)
-        if len(self._connections) >= MAX_CONNECTIONS:
-            connection.dismiss(QueueFull(f"at most {MAX_CONNECTIONS} clients may be connected"))
+        host, port, *_ = writer.get_extra_info("peername") or ("::", 0)  # none of a peer that has gone already
+        principal = self._roles.principal_of(host, asks=self._service.guard.asks)
+        if principal is None:
+            self._service.audit.count(Entry(NOBODY, host, IGTL.name, "", PermissionDenied.reason))
+            connection.dismiss(PermissionDenied(f"{host} may not connect: ULTRAGRAY_IGTL_ALLOW does not name it"))
+            return
+        act_as(principal, address=host, connection=f"{host}:{port}")
+        try:
+            place = self._places.enter(host)
+        except TooManyConnections as error:
+            connection.dismiss(error)
             return
         if (endpoint := writer.get_extra_info("socket")) is not None:
             endpoint.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)  # to notice a peer that has vanished
@@ -70,7 +90,8 @@ class IgtlServer:
         task = asyncio.ensure_future(connection.run())
         self._connections[connection] = task
         try:
-            await task
+            with self._service.audit.request(principal.name, host, IGTL, ""):
+                await task
         except Exception:
             _log.exception("unexpected error", extra={"fields": {"client": client}})
         finally:
@@ -79,5 +100,6 @@ class IgtlServer:
                 await writer.wait_closed()
             stalled.cancel()
             del self._connections[connection]
+            place.leave()
             fields = {"client": client, "duration_ms": round(1000 * (time.monotonic() - started), 3)}
             _log.info("client gone", extra={"fields": fields})

@@ -5,15 +5,17 @@ from __future__ import annotations
 from ultragray.errors import BackendUnavailable, InvalidArgument, MemoryExceeded, SceneFileInvalid, UltragrayError
 from ultragray_workers.errors import DeadlineExceeded, Draining, NotReady, QueueFull, SceneNotFound, SceneTooLarge
 
-from ..errors import IgtlMessageInvalid, statuses_of
+from ..errors import IgtlMessageInvalid, PermissionDenied, TooManyConnections, statuses_of
 from .contents import Status
 
-OK, UNKNOWN_ERROR, NOT_FOUND, BUSY, TIMED_OUT = 1, 2, 4, 6, 7
+OK, UNKNOWN_ERROR, NOT_FOUND, ACCESS_DENIED, BUSY, TIMED_OUT = 1, 2, 4, 5, 6, 7
 CHECKSUM_ERROR, CONFIGURATION_ERROR, NO_RESOURCES, UNKNOWN_INSTRUCTION, NOT_READY, SHUTTING_DOWN = 9, 10, 11, 12, 13, 19
 
 _CODES: dict[type[UltragrayError], int] = {
     SceneNotFound: NOT_FOUND,
+    PermissionDenied: ACCESS_DENIED,
     QueueFull: BUSY,
+    TooManyConnections: BUSY,
     DeadlineExceeded: TIMED_OUT,
     InvalidArgument: CONFIGURATION_ERROR,
     SceneFileInvalid: CONFIGURATION_ERROR,

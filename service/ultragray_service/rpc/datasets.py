@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
-
 import grpc
 
 from ultragray.datasets.source import UPLOAD_OPTIONS
@@ -13,7 +11,7 @@ from ultragray_proto.v1 import datasets_pb2
 
 from ..core.catalog import DEFAULT_PAGE_SIZE
 from ..core.dataset_uploads import DatasetUpload
-from ..core.datasets import contact_sheet, dataset_page
+from ..core.datasets import contact_sheet, dataset, dataset_page, with_owner
 from ..core.state import Service
 
 
@@ -32,25 +30,25 @@ class DatasetService:
             raise InvalidArgument("the first message must hold the header", field="header")
         header = first.header
         options = {name: value for name in UPLOAD_OPTIONS if (value := getattr(header.options, name))}
-        async with self._service.uploads.receive(header.dataset, options) as upload:
+        async with self._service.uploads.receive(header.dataset, options, private=header.private) as upload:
             if header.archive:
                 await upload.begin_archive()
             await _receive(context, upload, archive=header.archive)
             record, is_new = await upload.finish()
-        return datasets_pb2.UploadDatasetResponse(dataset=to_message(record, datasets_pb2.Dataset), created=is_new)
+        told = to_message(with_owner(self._service, record), datasets_pb2.Dataset)
+        return datasets_pb2.UploadDatasetResponse(dataset=told, created=is_new)
 
     async def ListDatasets(  # noqa: N802
         self, request: datasets_pb2.ListDatasetsRequest, context: grpc.aio.ServicerContext
     ) -> datasets_pb2.ListDatasetsResponse:
         page_size = request.page_size or DEFAULT_PAGE_SIZE
-        page = await dataset_page(self._service.datasets, page_size, request.page_token)
+        page = await dataset_page(self._service, page_size, request.page_token)
         return to_message(page, datasets_pb2.ListDatasetsResponse)
 
     async def GetDataset(  # noqa: N802
         self, request: datasets_pb2.GetDatasetRequest, context: grpc.aio.ServicerContext
     ) -> datasets_pb2.Dataset:
-        record = await asyncio.to_thread(self._service.datasets.get, request.dataset)
-        return to_message(record, datasets_pb2.Dataset)
+        return to_message(await dataset(self._service, request.dataset), datasets_pb2.Dataset)
 
     async def GetContactSheet(  # noqa: N802
         self, request: datasets_pb2.GetContactSheetRequest, context: grpc.aio.ServicerContext

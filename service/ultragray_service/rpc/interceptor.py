@@ -12,40 +12,82 @@ import grpc
 
 from ultragray.errors import UltragrayError
 
-from ..auth import KeyGuard
-from ..errors import Unauthenticated, statuses_of
+from ..access.audit import NOBODY, Entry
+from ..access.credentials import offered_credential
+from ..access.permissions import require
+from ..access.principal import Principal, act_as
+from ..access.rules import GRPC_OPERATIONS, REFLECTION, Operation
+from ..core.state import Service
+from ..errors import statuses_of
 from ..telemetry.logs import choose_request_id, request_id
-from ..telemetry.metrics import Metrics
+from .handlers import Method, method_of, refusing_what_is_no_message, with_method
 from .status import REQUEST_ID_KEY, abort
 
 _OPEN_PREFIX = "/grpc.health.v1."
-_OWN_PREFIX = "/ultragray."
+OWN_PREFIX = "/ultragray."
 
 _log = logging.getLogger("ultragray.grpc")
-
-Method = Callable[[Any, Any], Awaitable[Any]]
 
 
 class CallContext(grpc.aio.ServerInterceptor):  # type: ignore[misc]
     """Wraps each call of our own services; keeps all but health from callers without a key."""
 
-    def __init__(self, guard: KeyGuard, metrics: Metrics) -> None:
-        self._guard = guard
-        self._metrics = metrics
+    def __init__(self, service: Service) -> None:
+        self._service = service
+        self._guard = service.guard
+        self._origins = service.origins
+        self._metrics = service.metrics
 
     async def intercept_service(self, continuation: Callable[[Any], Awaitable[Any]], details: Any) -> Any:
         handler = await continuation(details)
         if handler is None:
             return None
         headers = {key: value for key, value in details.invocation_metadata or () if isinstance(value, str)}
-        if not details.method.startswith(_OPEN_PREFIX):
-            try:
-                self._guard.check(headers.get("authorization"), headers.get("x-api-key"))
-            except Unauthenticated as error:
-                return _with_method(handler, self._wrap(details.method, _refusing(error), headers))
-        if not details.method.startswith(_OWN_PREFIX):
+        if details.method.startswith(_OPEN_PREFIX):
             return handler
-        return _with_method(handler, self._wrap(details.method, _method_of(handler), headers))
+        is_own = details.method.startswith(OWN_PREFIX)
+        operation = GRPC_OPERATIONS[details.method] if is_own else REFLECTION
+        try:
+            if not self._guard.asks:
+                # of a proxy that speaks gRPC for pages
+                self._origins.require_page(origin=headers.get("origin"), host=None)
+            credential = offered_credential(headers.get("authorization"), headers.get("x-api-key"))
+            principal = self._guard.authenticate(credential)
+        except UltragrayError as error:
+            method = self._refusing(operation, error)
+        else:
+            if not is_own:
+                return handler
+            method = self._permitted(principal, credential, operation, method_of(handler))
+        handler = with_method(handler, method)
+        if is_own:
+            handler = refusing_what_is_no_message(handler)
+        return with_method(handler, self._wrap(details.method, method_of(handler), headers))
+
+    def _permitted(self, principal: Principal, credential: str | None, operation: Operation, method: Method) -> Method:
+        """The method, for who may; it ends when the credential counts no more."""
+        service = self._service
+
+        async def call(request: Any, context: Any) -> Any:
+            peer, target = context.peer(), name_in(request, operation)
+            address = address_of(peer)
+            act_as(principal, address=address, connection=peer)
+            with (
+                service.audit.request(principal.name, address, operation, target),
+                service.sessions.held(principal, credential),
+            ):
+                await require(principal, operation, target, service.owners)
+                return await method(request, context)
+
+        return call
+
+    def _refusing(self, operation: Operation, error: UltragrayError) -> Method:
+        async def refuse(request: Any, context: Any) -> Any:
+            entry = Entry(NOBODY, address_of(context.peer()), operation.name, name_in(request, operation), error.reason)
+            self._service.audit.count(entry)
+            raise error
+
+        return refuse
 
     def _wrap(self, name: str, method: Method, headers: dict[str, str]) -> Method:
         async def call(request: Any, context: grpc.aio.ServicerContext) -> Any:
@@ -78,26 +120,14 @@ class CallContext(grpc.aio.ServerInterceptor):  # type: ignore[misc]
         return call
 
 
-def _refusing(error: UltragrayError) -> Method:
-    async def refuse(request: Any, context: Any) -> Any:
-        raise error
-
-    return refuse
+def address_of(peer: str) -> str:
+    """The address of a peer as gRPC writes it: `ipv4:127.0.0.1:50000`."""
+    return peer.partition(":")[2].rpartition(":")[0]
 
 
-def _method_of(handler: Any) -> Method:
-    for method in (handler.unary_unary, handler.unary_stream, handler.stream_unary, handler.stream_stream):
-        if method is not None:
-            return method  # type: ignore[no-any-return]
-    raise AssertionError("a handler has one method")
-
-
-def _with_method(handler: Any, method: Method) -> Any:
-    """The same handler, its method replaced."""
-    wrap = {
-        (False, False): grpc.unary_unary_rpc_method_handler,
-        (False, True): grpc.unary_stream_rpc_method_handler,
-        (True, False): grpc.stream_unary_rpc_method_handler,
-        (True, True): grpc.stream_stream_rpc_method_handler,
-    }[handler.request_streaming, handler.response_streaming]
-    return wrap(method, handler.request_deserializer, handler.response_serializer)
+def name_in(request: Any, operation: Operation) -> str:
+    """The name of what a request is about; empty where its first message has still to come."""
+    if operation.about is None:
+        return ""
+    holder = getattr(request, "settings", request)
+    return str(getattr(holder, operation.about.value, ""))

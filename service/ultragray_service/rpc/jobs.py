@@ -15,8 +15,7 @@ from ultragray_workers.jobs.store import JobStore
 from ..core.catalog import DEFAULT_PAGE_SIZE
 from ..core.jobs.log import DEFAULT_LOG_BYTES, MAX_LOG_BYTES
 from ..core.state import Service
-from .job_messages import job_message, read_specification
-from .messages import read_word
+from .messages import job_message, read_specification, read_word
 
 _CHUNK_BYTES = 2**20
 _LOOK_AROUND_S = 15.0  # how long a watch waits for news at a time
@@ -34,7 +33,11 @@ class JobService:
         self._service.require_serving()
         specification, field = await asyncio.to_thread(read_specification, request)  # of many poses
         job, is_new = await self._service.jobs.submit(
-            specification, field=field, request_id=request.request_id or None, priority=request.priority
+            specification,
+            field=field,
+            request_id=request.request_id or None,
+            priority=request.priority,
+            private=request.private,
         )
         return jobs_pb2.SubmitJobResponse(job=job_message(job), created=is_new)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
@@ -15,7 +16,9 @@ from ultragray.pose import check_poses, pose_from_position_quaternion
 from ultragray.probe import FloatArray
 from ultragray.settings import RenderSettings, Resolved
 from ultragray_proto.codec import MessageInvalid, from_message, to_message, words
-from ultragray_proto.v1 import geometry_pb2, rendering_pb2
+from ultragray_proto.v1 import geometry_pb2, jobs_pb2, rendering_pb2, scenes_pb2
+from ultragray_workers.jobs.job import Job
+from ultragray_workers.jobs.kinds import KINDS, Specification
 from ultragray_workers.pool.types import RenderResult
 
 from ..core.frames import FrameFacts, settings_used
@@ -96,3 +99,25 @@ def frame_message(result: RenderResult, sequence: int, **others: Any) -> renderi
 def _settings_message(settings: Resolved) -> rendering_pb2.Frame:
     """The part of a frame that is the same for all frames of a stream."""
     return to_message(settings_used(settings), rendering_pb2.Frame)
+
+
+def read_specification(message: jobs_pb2.SubmitJobRequest) -> tuple[Specification, str]:
+    """The checked specification, and the field that holds it.
+
+    Raises InvalidArgument, InvalidPose, UnknownOutput; their field is a path.
+    """
+    kind = message.WhichOneof("specification")
+    if kind is None:
+        raise InvalidArgument(f"specification must hold one of {', '.join(KINDS)}", field="specification")
+    asked = getattr(message, kind)
+    with under(kind):
+        given = {"poses": read_poses(asked.poses, "poses") if asked.poses else None} if hasattr(asked, "poses") else {}
+        specification: Specification = read(asked, Specification.member(kind), **given)
+    return specification, kind
+
+
+def job_message(job: Job) -> jobs_pb2.Job:
+    """The message of a job."""
+    error = None if job.reason is None else scenes_pb2.Error(reason=job.error or "", detail=job.reason)
+    shown = replace(job, specification={"kind": job.kind, **job.specification}, error=None)
+    return to_message(shown, jobs_pb2.Job, error=error)

@@ -8,14 +8,14 @@ from collections import deque
 
 import grpc
 
-from ultragray.contract import under
-from ultragray.errors import InvalidArgument, LowConfidence
-from ultragray.settings import Resolved
+from ultragray.errors import FrameTooCostly, InvalidArgument, LowConfidence
+from ultragray.probe import FloatArray
 from ultragray_proto.v1 import rendering_pb2
 from ultragray_workers.errors import QueueFull
-from ultragray_workers.pool.types import Priority, RenderRequest, RenderResult
+from ultragray_workers.pool.types import Priority, RenderResult
 
 from ..core.poses import check_pose_count, exact_poses
+from ..core.requests import Plan
 from ..core.state import Service
 from ..core.streams.stream import FrameStream
 from .messages import frame_message, read_pose, read_settings
@@ -34,19 +34,18 @@ class RenderService:
         self, request: rendering_pb2.RenderRequest, context: grpc.aio.ServicerContext
     ) -> rendering_pb2.Frame:
         deadline = self._service.planner.deadline(context.time_remaining())
-        scene, settings = await self._resolved(request)
+        plan = await self._plan(request)
         if not request.HasField("pose"):
             raise InvalidArgument("pose is required", field="pose")
         pose = read_pose(request.pose, "pose")
-        asked = RenderRequest(scene, settings, pose[None], deadline=deadline)
-        return frame_message(await self._service.render(asked), 0)
+        return frame_message(await self._service.render(plan, pose[None], deadline=deadline), 0)
 
     async def RenderBatch(  # noqa: N802
         self, request: rendering_pb2.RenderBatchRequest, context: grpc.aio.ServicerContext
     ) -> None:
         planner = self._service.planner
         check_pose_count(len(request.poses), planner.max_poses)
-        scene, settings = await self._resolved(request)
+        plan = await self._plan(request)
         poses = await exact_poses(len(request.poses), lambda index: read_pose(request.poses[index], f"poses[{index}]"))
         window = min(2 * self._service.settings.max_batch_poses, self._service.settings.queue_limit_frames)
         in_flight: deque[asyncio.Task[RenderResult]] = deque()
@@ -56,15 +55,14 @@ class RenderService:
                 while started < len(poses) and len(in_flight) < window:
                     deadline = planner.deadline(context.time_remaining())
                     some = poses[started : started + 1]
-                    asked = RenderRequest(scene, settings, some, Priority.BATCH, deadline)
-                    render = self._service.render(asked) if started == 0 else self._render_when_room(asked)
-                    in_flight.append(asyncio.ensure_future(render))
+                    render = self._render if started == 0 else self._render_when_room
+                    in_flight.append(asyncio.ensure_future(render(plan, some, deadline)))
                     started += 1
                 try:
                     result = await in_flight[0]
-                except LowConfidence as error:
+                except (LowConfidence, FrameTooCostly) as error:
                     field = f"poses[{sequence}]"
-                    raise LowConfidence(error.detail.replace("pose", field, 1), field=field) from None
+                    raise type(error)(error.detail.replace("pose", field, 1), field=field) from None
                 in_flight.popleft()
                 await context.write(frame_message(result, sequence))
         finally:
@@ -77,20 +75,21 @@ class RenderService:
     ) -> None:
         await FrameStream(self._service, CallTransport(context)).run()
 
-    async def _resolved(
-        self, request: rendering_pb2.RenderRequest | rendering_pb2.RenderBatchRequest
-    ) -> tuple[str, Resolved]:
-        """The scene and the settings of a request. Raises what RequestPlanner.resolve raises; the field is a path."""
+    async def _plan(self, request: rendering_pb2.RenderRequest | rendering_pb2.RenderBatchRequest) -> Plan:
+        """The plan of a request. Raises what RequestPlanner.plan raises; the field is a path."""
         scene, asked = read_settings(request)
-        with under("settings"):
-            return scene, await self._service.planner.resolve(scene, asked, asked.encoding)
+        return await self._service.planner.plan(scene, asked, asked.encoding, path="settings")
 
-    async def _render_when_room(self, request: RenderRequest) -> RenderResult:
+    async def _render(self, plan: Plan, pose: FloatArray, deadline: float) -> RenderResult:
+        """Renders a frame of a batch."""
+        return await self._service.render(plan, pose, priority=Priority.BATCH, deadline=deadline)
+
+    async def _render_when_room(self, plan: Plan, pose: FloatArray, deadline: float) -> RenderResult:
         """Renders a frame of a batch that was let in already: a full queue delays it."""
         while True:
             try:
-                return await self._service.render(request)
+                return await self._render(plan, pose, deadline)
             except QueueFull:
-                if request.deadline is not None and time.monotonic() + _RETRY_S >= request.deadline:
+                if time.monotonic() + _RETRY_S >= deadline:
                     raise
             await asyncio.sleep(_RETRY_S)

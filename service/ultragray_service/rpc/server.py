@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import grpc
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
 from ultragray_proto.v1 import (
+    access_pb2,
+    access_pb2_grpc,
     datasets_pb2,
     datasets_pb2_grpc,
     jobs_pb2,
@@ -17,66 +21,138 @@ from ultragray_proto.v1 import (
     scenes_pb2_grpc,
 )
 
+from ..access.rules import require_all_methods
+from ..core.readiness.readiness import Readiness
 from ..core.state import Service
+from ..settings import Settings
+from ..tls.certificates import HANDSHAKE_TIMEOUT_S, Certificates
+from ..tls.watch import CertificateWatch
+from .access import AccessService
 from .datasets import DatasetService
 from .interceptor import CallContext
 from .jobs import JobService
 from .rendering import RenderService
 from .scenes import SceneService
+from .traced import TracedCalls
 
 MAX_RECEIVE_BYTES = 16 * 2**20
 LEAST_PING_INTERVAL_MS = 10_000
+MAX_CALLS_PER_CONNECTION = 1024
 _UNLIMITED = -1
 
-SERVICE_NAMES = (
-    scenes_pb2.DESCRIPTOR.services_by_name["SceneService"].full_name,
-    rendering_pb2.DESCRIPTOR.services_by_name["RenderService"].full_name,
-    datasets_pb2.DESCRIPTOR.services_by_name["DatasetService"].full_name,
-    jobs_pb2.DESCRIPTOR.services_by_name["JobService"].full_name,
-)
+_SCENES = scenes_pb2.DESCRIPTOR.services_by_name["SceneService"].full_name
+_RENDERING = rendering_pb2.DESCRIPTOR.services_by_name["RenderService"].full_name
+_DATASETS = datasets_pb2.DESCRIPTOR.services_by_name["DatasetService"].full_name
+_JOBS = jobs_pb2.DESCRIPTOR.services_by_name["JobService"].full_name
+_ACCESS = access_pb2.DESCRIPTOR.services_by_name["AccessService"].full_name
+SERVICE_NAMES = (_SCENES, _RENDERING, _DATASETS, _JOBS, _ACCESS)
+
+
+def _methods() -> Iterator[str]:
+    """Every method of our services, as calls name them."""
+    for file in (scenes_pb2, rendering_pb2, datasets_pb2, jobs_pb2, access_pb2):
+        for service in file.DESCRIPTOR.services_by_name.values():
+            yield from (f"/{service.full_name}/{method.name}" for method in service.methods)
 
 
 class GrpcServer:
     """A server that listens once started, and tells its health."""
 
     def __init__(self, service: Service) -> None:
+        require_all_methods(_methods())
         self._server = grpc.aio.server(
-            interceptors=[CallContext(service.guard, service.metrics)],
+            interceptors=[
+                CallContext(service),
+                *([] if service.tracing is None else [TracedCalls(service.tracing)]),
+            ],
             options=[
                 ("grpc.max_receive_message_length", MAX_RECEIVE_BYTES),
                 ("grpc.max_send_message_length", _UNLIMITED),
                 # A client may ask this often whether the service is still there, as in a quiet WatchJob; without it, a
                 # client that asks more than twice within five minutes is cut off.
                 ("grpc.http2.min_ping_interval_without_data_ms", LEAST_PING_INTERVAL_MS),
+                ("grpc.server_handshake_timeout_ms", round(1000 * HANDSHAKE_TIMEOUT_S)),
                 ("grpc.so_reuseport", 0),  # else a second service would share the port unnoticed
+                *_connection_options(service.settings),
             ],
         )
         self._health = health.aio.HealthServicer()
+        self._told = dict.fromkeys(("", *SERVICE_NAMES), False)
         rendering_pb2_grpc.add_RenderServiceServicer_to_server(RenderService(service), self._server)
         scenes_pb2_grpc.add_SceneServiceServicer_to_server(SceneService(service), self._server)
         datasets_pb2_grpc.add_DatasetServiceServicer_to_server(DatasetService(service), self._server)
         jobs_pb2_grpc.add_JobServiceServicer_to_server(JobService(service), self._server)
+        access_pb2_grpc.add_AccessServiceServicer_to_server(AccessService(service), self._server)
         health_pb2_grpc.add_HealthServicer_to_server(self._health, self._server)
         reflection.enable_server_reflection(
             (*SERVICE_NAMES, health.SERVICE_NAME, reflection.SERVICE_NAME), self._server
         )
 
-    def bind(self, host: str, port: int) -> int:
-        """Takes the port (0: a free one) and returns it. Raises RuntimeError where it is in use."""
+    def bind(self, host: str, port: int, certificates: CertificateWatch | None) -> int:
+        """Takes the port (0: a free one) and returns it; None: without TLS. Raises RuntimeError where it is in use."""
         address = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
-        return int(self._server.add_insecure_port(address))
+        if certificates is None:
+            return int(self._server.add_insecure_port(address))
+        return int(self._server.add_secure_port(address, _credentials(certificates)))
 
     async def start(self) -> None:
         """Begins to answer; health says NOT_SERVING until told otherwise."""
-        await self.tell_health(serving=False)
+        for name in self._told:
+            await self._health.set(name, health_pb2.HealthCheckResponse.NOT_SERVING)
         await self._server.start()
 
-    async def tell_health(self, *, serving: bool) -> None:
-        """Sets the answer of grpc.health.v1 from now on."""
-        code = health_pb2.HealthCheckResponse.SERVING if serving else health_pb2.HealthCheckResponse.NOT_SERVING
-        for name in ("", *SERVICE_NAMES):
-            await self._health.set(name, code)
+    async def tell_health(self, readiness: Readiness) -> None:
+        """Sets the answers of grpc.health.v1 from now on: that of the server as a whole, and of each service."""
+        parts = readiness.components
+        serving = {
+            "": readiness.problem is None,
+            _RENDERING: parts.frames.ready,
+            _SCENES: parts.frames.ready,
+            _DATASETS: parts.artifacts.ready,
+            _JOBS: parts.jobs.ready and parts.artifacts.ready,
+            _ACCESS: True,
+        }
+        for name, is_serving in serving.items():
+            if self._told[name] is not is_serving:
+                self._told[name] = is_serving
+                code = health_pb2.HealthCheckResponse
+                await self._health.set(name, code.SERVING if is_serving else code.NOT_SERVING)
 
     async def stop(self, grace_s: float) -> None:
         """Refuses new calls and gives those that run `grace_s` seconds."""
         await self._server.stop(grace_s)
+
+
+def _credentials(certificates: CertificateWatch) -> grpc.ServerCredentials:
+    """Credentials that are those of `certificates` at the time of each handshake."""
+    offered = certificates.current
+
+    def fetch() -> grpc.ServerCertificateConfiguration | None:
+        nonlocal offered
+        if certificates.current is offered:
+            return None  # grpc keeps what it has
+        offered = certificates.current
+        return _configuration(offered)
+
+    return grpc.dynamic_ssl_server_credentials(
+        _configuration(offered), fetch, require_client_authentication=offered.content.client_authorities is not None
+    )
+
+
+def _configuration(certificates: Certificates) -> grpc.ServerCertificateConfiguration:
+    content = certificates.content
+    return grpc.ssl_server_certificate_configuration([(content.key, content.chain)], content.client_authorities)
+
+
+def _connection_options(settings: Settings) -> list[tuple[str, int]]:
+    """The bounds of connections as gRPC calls them; those of one address are OpenSockets' to keep."""
+    return [
+        ("grpc.max_allowed_incoming_connections", settings.max_connections),
+        ("grpc.max_concurrent_streams", MAX_CALLS_PER_CONNECTION),
+        ("grpc.max_metadata_size", settings.max_header_bytes),
+        ("grpc.absolute_max_metadata_size", settings.max_header_bytes),
+        ("grpc.max_connection_idle_ms", round(1000 * settings.idle_timeout_s)),
+        # Pings find clients that vanished, and those that read nothing any more.
+        ("grpc.keepalive_time_ms", round(1000 * settings.idle_timeout_s)),
+        ("grpc.keepalive_timeout_ms", round(1000 * settings.transfer_patience_s)),
+    ]

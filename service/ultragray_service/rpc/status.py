@@ -12,7 +12,7 @@ from google.rpc.status_pb2 import Status
 
 from ultragray.errors import InvalidArgument, UltragrayError
 
-from ..errors import statuses_of
+from ..errors import retry_after_s, statuses_of
 from ..telemetry.logs import request_id
 
 ERROR_DOMAIN = "ultragray"
@@ -29,8 +29,8 @@ def status_of(error: UltragrayError) -> Status:
     if error.field and isinstance(error, InvalidArgument):
         violation = BadRequest.FieldViolation(field=error.field, description=error.detail)
         details.append(BadRequest(field_violations=[violation]))
-    if statuses.retry_after_s is not None:
-        details.append(RetryInfo(retry_delay=Duration(seconds=statuses.retry_after_s)))
+    if (delay_s := retry_after_s(error)) is not None:
+        details.append(RetryInfo(retry_delay=Duration(nanos=int(delay_s % 1 * 1e9), seconds=int(delay_s))))
     status = Status(code=code.value[0], message=error.detail)
     for detail in details:
         packed = AnyMessage()

@@ -11,7 +11,7 @@ from ultragray.probe import FloatArray
 from ultragray_proto.codec import to_message
 from ultragray_proto.v1 import rendering_pb2, scenes_pb2
 
-from ..core.streams.pose_stream import Answered, StreamMode
+from ..core.streams.pose_stream import MAX_WINDOW, Answered, StreamMode
 from ..core.streams.stream import SceneSettings, checked_timeout_s
 from ..errors import Refusal
 from .messages import frame_message, read_pose, read_settings, read_word
@@ -24,14 +24,24 @@ class _Message:
         self.message = message
         self.sequence: int = message.sequence
         self.client_time: int | None = message.client_time_ns if message.HasField("client_time_ns") else None
+        self.acknowledged: int | None = message.acknowledged if message.HasField("acknowledged") else None
         self._left_s = left_s  # until the deadline of the call
+
+    @property
+    def window(self) -> int | None:
+        """Raises InvalidArgument for one beyond the limit."""
+        if self.message.window > MAX_WINDOW:
+            raise InvalidArgument(
+                f"window must be at most {MAX_WINDOW}, 0 for none, got {self.message.window}", field="window"
+            )
+        return self.message.window or None
 
     def settings(self) -> SceneSettings | None:
         return read_settings(self.message) if self.message.HasField("settings") else None
 
     @property
     def asks(self) -> bool:
-        return self.message.HasField("pose") or not self.message.HasField("settings")
+        return self.message.HasField("pose") or not (self.message.HasField("settings") or self.acknowledged is not None)
 
     def pose(self) -> FloatArray:  # [4, 4] mm
         if not self.message.HasField("pose"):
@@ -45,18 +55,43 @@ class _Message:
         return timeout_s if self._left_s is None else min(self._left_s, timeout_s)
 
 
+class _Unreadable:
+    """Bytes that are no RenderStreamRequest; they raise why where their contents are asked for."""
+
+    sequence = 0
+    client_time = window = acknowledged = None
+    asks = True
+
+    def __init__(self, error: InvalidArgument) -> None:
+        self._error = error
+
+    def settings(self) -> SceneSettings | None:
+        return None
+
+    def pose(self) -> FloatArray:
+        raise self._error
+
+    def timeout_s(self) -> float | None:
+        return None
+
+
 class CallTransport:
-    """One call of RenderStream."""
+    """One call of RenderStream. Its mode is read from the first message that can be read."""
 
     def __init__(self, context: grpc.aio.ServicerContext) -> None:
         self._context = context
 
-    async def receive(self) -> _Message | None:
-        message = await self._context.read()
+    async def receive(self) -> _Message | _Unreadable | None:
+        try:
+            message = await self._context.read()
+        except InvalidArgument as error:
+            return _Unreadable(error)
         return None if message is grpc.aio.EOF else _Message(message, self._context.time_remaining())
 
-    def mode(self, message: Any) -> StreamMode:
+    def mode(self, message: Any) -> StreamMode | None:
         """Raises InvalidArgument for a mode that does not exist."""
+        if isinstance(message, _Unreadable):
+            return None
         return StreamMode(read_word(message.message, "mode") or StreamMode.ORDERED)
 
     async def send(self, answered: Answered) -> None:

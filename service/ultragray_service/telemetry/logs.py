@@ -10,6 +10,8 @@ import uuid
 from contextvars import ContextVar
 from datetime import datetime, timezone
 
+from opentelemetry import trace
+
 request_id: ContextVar[str] = ContextVar("request_id", default="")
 
 _ACCEPTED_REQUEST_ID = re.compile(r"[A-Za-z0-9._:/+=-]{1,128}")
@@ -34,6 +36,8 @@ class JsonFormatter(logging.Formatter):
         }
         if current := request_id.get():
             document["request_id"] = current
+        if (span := trace.get_current_span().get_span_context()).is_valid:
+            document["trace_id"] = trace.format_trace_id(span.trace_id)
         document.update(getattr(record, "fields", {}))
         if record.exc_info:
             document["exception"] = self.formatException(record.exc_info)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from functools import partial
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, ProcessCollector, generate_latest
@@ -10,10 +10,11 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metri
 from prometheus_client.registry import Collector
 
 from ultragray.errors import UltragrayError
-from ultragray_workers.jobs.job import JobState
+from ultragray_workers.jobs.overview import JobsOverview
 from ultragray_workers.pool.pool import RenderPool
 from ultragray_workers.pool.types import RenderResult
 
+from ..access.principal import acting
 from ..errors import statuses_of
 from .statistics import Statistics
 
@@ -21,6 +22,8 @@ _MILLISECONDS = (0.5, 1, 2, 4, 6, 8, 12, 16, 24, 32, 64, 125, 250, 500, 1000, 20
 _SECONDS = tuple(ms / 1000 for ms in _MILLISECONDS)
 _OVERLOADED = ("429", "RESOURCE_EXHAUSTED", "UNAVAILABLE", "DEADLINE_EXCEEDED", "INTERNAL")
 _HEALTH_ROUTES = "/v1/health/"  # not ready is what they are asked for
+MAX_SCENE_LABELS = 1000
+OTHER_SCENES = ":other"  # no scene can have this name
 _POSES = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1024)
 
 
@@ -42,26 +45,45 @@ class _PoolCollector(Collector):
         yield GaugeMetricFamily("ultragray_processes_alive", "Render processes alive.", now.processes_alive)
         restarts = "Render processes replaced after they died."
         yield CounterMetricFamily("ultragray_process_restarts", restarts, now.restarts_total)
+        kills = "Render processes that hung, were killed and replaced."
+        yield CounterMetricFamily("ultragray_watchdog_kills", kills, now.kills_total)
+        stuck = "Render processes that have told nothing of their work for some seconds."
+        yield GaugeMetricFamily("ultragray_stuck_processes", stuck, now.stuck)
         yield GaugeMetricFamily("ultragray_loaded_scenes", "Scenes that a process holds.", len(self._pool.loaded()))
 
 
 class _JobsCollector(Collector):
     """Tells what was counted last: a scrape asks no database."""
 
-    def __init__(self, counts: Callable[[], Mapping[JobState, int]]) -> None:
-        self._counts = counts
+    def __init__(self, overview: Callable[[], JobsOverview]) -> None:
+        self._overview = overview
 
     def collect(self) -> Iterator[Metric]:
+        now = self._overview()
         family = GaugeMetricFamily("ultragray_jobs", "Jobs, counted every 10 s.", labels=["state"])
-        for state, count in self._counts().items():
+        for state, count in now.counts.items():
             family.add_metric([state.value], count)
         yield family
+        family = GaugeMetricFamily("ultragray_workers", "Workers of the jobs, likewise.", labels=["state"])
+        for worker_state, count in now.workers.items():
+            family.add_metric([worker_state.value], count)
+        yield family
+        oldest = "Time that the job has waited that waits longest; 0 where none waits."
+        yield GaugeMetricFamily("ultragray_oldest_waiting_job_seconds", oldest, now.oldest_waiting_s)
+
+
+def _role() -> str:
+    """The role of who asks."""
+    try:
+        return acting().role.value
+    except LookupError:  # a door that knows nobody
+        return "none"
 
 
 class Metrics:
-    """One registry per service. `jobs`: how many there are in each state; empty where that is not known."""
+    """One registry per service. `jobs`: the jobs in numbers, as they were counted last."""
 
-    def __init__(self, pool: RenderPool, jobs: Callable[[], Mapping[JobState, int]]) -> None:
+    def __init__(self, pool: RenderPool, jobs: Callable[[], JobsOverview]) -> None:
         self.registry = CollectorRegistry()
         self.statistics = Statistics()
         counter = partial(Counter, registry=self.registry)
@@ -84,7 +106,10 @@ class Metrics:
         self._dropped = counter(
             "ultragray_stream_dropped_poses", "Poses of streams that newer ones replaced before they were rendered."
         )
-        self._frames = counter("ultragray_frames", "Frames rendered.")
+        self._frames = counter(
+            "ultragray_frames", "Frames rendered, by the role of who asked for them.", ["scene", "role"]
+        )
+        self._scenes: set[str] = set()  # that have a label of their own
         self._queue = seconds("ultragray_queue_seconds", "Waiting time of a request before it was rendered.")
         self._render = seconds("ultragray_render_seconds", "Render time of the batch that a request was in.")
         self._encode = seconds("ultragray_encode_seconds", "Encoding time of a request's frames.")
@@ -116,12 +141,20 @@ class Metrics:
 
     def observe_result(self, result: RenderResult) -> None:
         """One rendered request of the pool."""
-        self._frames.inc(len(result.poses))
+        self._frames.labels(self._label_of(result.scene), _role()).inc(len(result.poses))
         self._queue.observe(result.queue_ms / 1000)
         self._render.observe(result.render_ms / 1000)
         self._encode.observe(result.encode_ms / 1000)
         self._batch.observe(result.batch_size)
         self.statistics.observe(len(result.poses), result.queue_ms, result.render_ms, result.encode_ms)
+
+    def _label_of(self, scene: str) -> str:
+        """The name of a scene; OTHER_SCENES once so many had a label that more would fill the memory."""
+        if scene not in self._scenes:
+            if len(self._scenes) == MAX_SCENE_LABELS:
+                return OTHER_SCENES
+            self._scenes.add(scene)
+        return scene
 
     def exposition(self) -> bytes:
         """The text that Prometheus scrapes."""

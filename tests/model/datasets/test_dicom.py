@@ -126,6 +126,16 @@ def test_files_that_are_no_dicom(tmp_path: Path, write: Write) -> None:
         load_dataset(tmp_path / "sweep.dcm")
 
 
+def test_a_value_of_a_kind_that_does_not_exist(write: Write, tmp_path: Path) -> None:
+    whole = write().read_bytes()
+    photometric_interpretation = b"\x28\x00\x04\x00"
+    (tmp_path / "sweep.dcm").write_bytes(
+        whole.replace(photometric_interpretation + b"CS", photometric_interpretation + b"BS")
+    )
+    with pytest.raises(DatasetInvalid, match=r"sweep\.dcm: it cannot be read as DICOM"):
+        load_dataset(tmp_path / "sweep.dcm")
+
+
 def test_options_of_other_formats_are_refused(write: Write, tmp_path: Path) -> None:
     with pytest.raises(InvalidArgument, match=r"device_set is for PLUS sequences, sweep\.dcm is none"):
         load_dataset(write(), SourceOptions(device_set=tmp_path / "set.xml"))

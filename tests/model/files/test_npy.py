@@ -43,6 +43,7 @@ def test_what_is_wrong_is_named(tmp_path: Path) -> None:
         (numbers.replace(b"(6,),", b"(-6,)"), "header is damaged or truncated"),
         (numbers.replace(b"(6,)", b"[{}:"), "header is damaged or truncated"),
         (numbers.replace(b"{", b"("), "header is damaged or truncated"),
+        (numbers.replace(b"(6,), }                 ", b"(0, 9223372036854775808)}"), "header is damaged or truncated"),
         (npy(path, np.array([[1], None], dtype=object)), "holds Python objects"),
     ]:
         path.write_bytes(content)

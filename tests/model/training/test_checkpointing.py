@@ -85,3 +85,10 @@ def test_refuses_another_run() -> None:
         check_same_run(path, HEADER, HEADER.config, "cd" * 32)
     with pytest.raises(TrainingStateInvalid, match="other settings: steps is 9 there, 10 here"):
         check_same_run(path, HEADER, replace(HEADER.config, steps=10), HEADER.dataset_sha256)
+
+
+def test_checkpoint_of_a_newer_release_says_what_to_do(tmp_path: Path) -> None:
+    path = tmp_path / "checkpoint.safetensors"
+    save_file({"a": torch.ones(1)}, path, metadata={METADATA_KEY: '{"format_version": 2}'})
+    with pytest.raises(TrainingStateInvalid, match="a newer release wrote it, use that one or a newer one to read it"):
+        read_checkpoint_header(path)

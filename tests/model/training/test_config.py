@@ -83,8 +83,8 @@ def test_survives_json() -> None:
     [
         ({"steps": 0}, "steps must be an integer from 1 to 10000000, got 0"),
         ({"steps": 2.5}, "steps must be an integer from 1 to 10000000, got 2.5"),
-        ({"steps": True}, "steps must be an integer from 1 to 10000000, got True"),
-        ({"batch_size": None}, "batch_size must be an integer from 1 to 1024, got None"),
+        ({"steps": True}, "steps must be an integer from 1 to 10000000, got true"),
+        ({"batch_size": None}, "batch_size must be an integer from 1 to 1024, got null"),
         ({"means_rate": float("nan")}, "means_rate must be a finite number from 0 to 1, got nan"),
         ({"out_of_plane_mm": "wide"}, "out_of_plane_mm must be a finite number from 0 to 100, got 'wide'"),
         ({"transmittance": 0}, "transmittance must be true or false, got 0"),

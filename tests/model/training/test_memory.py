@@ -49,6 +49,8 @@ def test_a_gpu_is_asked_for_its_own_memory(
         MemoryExceeded, match=r"1,000 Gaussians .* cuda:1 has free 0\.3 GiB: lower max_gaussians or batch"
     ):
         memory.check_memory(dataset, config, device)
+    with pytest.raises(MemoryExceeded, match=r"cuda:1 has free"):  # a setting allows no more than there is
+        memory.check_memory(dataset, TrainingConfig(max_gaussians=1000, memory_gb=64.0), device)
     with pytest.raises(MemoryExceeded, match=r"memory_gb allows 0\.1 GiB"):
         memory.check_memory(dataset, TrainingConfig(max_gaussians=1000, memory_gb=0.1), device)
 

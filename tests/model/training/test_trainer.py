@@ -33,6 +33,8 @@ from ultragray.errors import (
 from ultragray.training import Progress, TrainingConfig, train, trainer
 from ultragray.training.data.geometry import Geometry
 
+from ...waiting import Deadline
+
 Datasets = Callable[..., Dataset]
 Configs = Callable[..., TrainingConfig]
 
@@ -123,10 +125,10 @@ def test_killed_run_that_is_resumed_ends_in_the_same_scene(
     process = subprocess.Popen([sys.executable, "-c", program], env={**os.environ, "OMP_NUM_THREADS": "1"})
     journal, lines_before = tmp_path / "metrics.jsonl", random.randint(2, 18)
     try:
-        deadline = time.monotonic() + 60
+        deadline = Deadline(60)
         while not journal.exists() or journal.read_bytes().count(b"\n") < lines_before:
             assert process.poll() is None, "the training ended before it could be killed"
-            assert time.monotonic() < deadline
+            assert not deadline.passed
             time.sleep(0.002)
     finally:
         process.kill()

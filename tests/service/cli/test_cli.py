@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import re
+import shutil
 import signal
 import subprocess
 import time
 import urllib.request
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +26,7 @@ from ultragray.files.atomic import file_sha256
 from ultragray_service.cli.app import app
 from ultragray_service.cli.serve import ensure_scenes, link_scenes
 from ultragray_service.settings import Settings
+from ultragray_workers.jobs.store import SCENES_FOLDER
 
 from ...waiting import at_this_load
 from .command_line import python, refused, run
@@ -190,27 +193,56 @@ def test_mistakes_of_serve_are_named(scene_file: Path, tmp_path: Path) -> None:
     assert "backend" in refused("serve", scene_file, "--backend", "gpu")
 
 
-@pytest.mark.slow
-def test_serve_serves_the_given_file_until_sigterm(scene_file: Path, tmp_path: Path) -> None:
-    arguments = ("serve", scene_file, "--http-port", 0, "--grpc-port", 0, "--threads", 1)
+def test_a_shared_queue_needs_a_shared_artifact_folder(scene_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ULTRAGRAY_DATABASE_URL", "postgresql://localhost/jobs")
+    assert "--artifact-folder" in refused("serve", scene_file)
+
+
+@contextlib.contextmanager
+def served(folder: Path, *arguments: object) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """`ultragray serve` on free ports, started in `folder`, and the address of its HTTP."""
     program = "from ultragray_service.cli.app import app; app()"
-    with subprocess.Popen(
-        python(program, *arguments),
-        stderr=subprocess.STDOUT,
-        stdout=subprocess.PIPE,
-        text=True,
-        cwd=tmp_path,  # away from the scenes of ./data
-    ) as service:
+    command = python(program, "serve", *arguments, "--http-port", 0, "--grpc-port", 0, "--threads", 1)
+    with subprocess.Popen(command, stderr=subprocess.STDOUT, stdout=subprocess.PIPE, text=True, cwd=folder) as service:
         try:
             assert service.stdout is not None
-            address = next(m[0] for line in service.stdout if (m := re.search(r"http://127\.0\.0\.1:\d+", line)))
-            with urllib.request.urlopen(f"{address}/v1/scenes", timeout=60) as answer:
-                assert [scene["name"] for scene in json.load(answer)["scenes"]] == ["scene"]
-            service.send_signal(signal.SIGTERM)
-            started = time.monotonic()
-            service.stdout.read()
-            assert service.wait(timeout=60) == 0
-            assert time.monotonic() - started < at_this_load(15)
+            yield service, next(m[0] for line in service.stdout if (m := re.search(r"http://127\.0\.0\.1:\d+", line)))
         finally:
             service.kill()
+
+
+def names_of_scenes(address: str) -> list[str]:
+    with urllib.request.urlopen(f"{address}/v1/scenes", timeout=60) as answer:
+        return [scene["name"] for scene in json.load(answer)["scenes"]]
+
+
+@pytest.fixture
+def used_folder(tmp_path: Path, scene_file: Path) -> Path:
+    """A folder in which somebody has served ./data and trained scenes, one of them under the name of `scene_file`."""
+    folder = tmp_path / "used"
+    trained = folder / "data" / "artifacts" / SCENES_FOLDER
+    trained.mkdir(parents=True)
+    for path in (folder / "data" / "demo.ugr", trained / "liver.ugr", trained / "scene.ugr"):
+        shutil.copy(scene_file, path)
+    return folder
+
+
+@pytest.mark.slow
+def test_serve_serves_the_given_file_alone_until_sigterm(scene_file: Path, used_folder: Path) -> None:
+    before = sorted(used_folder.rglob("*"))
+    with served(used_folder, scene_file) as (service, address):
+        assert names_of_scenes(address) == ["scene"]
+        service.send_signal(signal.SIGTERM)
+        started = time.monotonic()
+        said, _ = service.communicate(timeout=60)
+        assert service.returncode == 0
+        assert time.monotonic() - started < at_this_load(15)
+    assert "Traceback" not in said
     assert scene_file.exists()
+    assert sorted(used_folder.rglob("*")) == before
+
+
+@pytest.mark.slow
+def test_serve_serves_the_scenes_of_a_named_artifact_folder_too(scene_file: Path, used_folder: Path) -> None:
+    with served(used_folder, scene_file, "--artifact-folder", "data/artifacts") as (_, address):
+        assert names_of_scenes(address) == ["liver", "scene"]

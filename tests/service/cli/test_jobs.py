@@ -26,7 +26,7 @@ from ultragray_service.cli.jobs.watch import JOB_CANCELLED, JOB_FAILED
 
 from ..conftest import ROOT, SOURCE_FOLDERS, RunningService, StartService
 
-WAIT_S = 30.0
+WAIT_S = 120.0
 KEY = "0123456789abcdef-jobs"
 
 

@@ -23,6 +23,8 @@ from ultragray.training import TrainingConfig, trainer
 from ultragray.training.data.geometry import Geometry
 from ultragray_service.cli.app import app
 
+from ...waiting import Deadline
+
 SMALL = ("--steps", 24, "--max-gaussians", 60, "--threads", 1)
 
 
@@ -158,10 +160,10 @@ def start(*arguments: object) -> subprocess.Popen[str]:
 
 
 def wait_for_lines(path: Path, count: int, process: subprocess.Popen[str]) -> None:
-    deadline = time.monotonic() + 60
+    deadline = Deadline(60)
     while not path.exists() or path.read_bytes().count(b"\n") < count:
         assert process.poll() is None, "the training ended early"
-        assert time.monotonic() < deadline
+        assert not deadline.passed
         time.sleep(0.002)
 
 

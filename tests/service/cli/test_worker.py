@@ -20,7 +20,7 @@ from ultragray_workers.jobs.kinds import RenderJob
 from ultragray_workers.jobs.store import Job, JobState, JobStore
 from ultragray_workers.scenes import SceneStore
 
-from ...waiting import wait_until
+from ...waiting import Deadline, wait_until
 from ..conftest import RunningService
 
 StartService = Callable[..., RunningService]
@@ -29,9 +29,9 @@ WORKER = [sys.executable, "-c", "from ultragray_service.cli.app import app; app(
 
 
 def until_final(store: JobStore, job: Job) -> Job:
-    end = time.monotonic() + 60
+    end = Deadline(60)
     while job.state in (JobState.QUEUED, JobState.RUNNING):
-        assert time.monotonic() < end, store.log_tail(job.id)
+        assert not end.passed, store.log_tail(job.id)
         time.sleep(0.05)
         job = store.get(job.id)
     return job

@@ -15,7 +15,7 @@ from ultragray_workers.errors import JobNotFound
 from ultragray_workers.jobs.store import Job, JobState, Progress
 
 INTERVAL_S = 0.02
-WAIT_S = 5.0
+WAIT_S = 60.0
 
 
 @pytest.fixture(autouse=True)
@@ -48,6 +48,8 @@ class OneJob:
             worker=None,
             retry_of=None,
             attempts=1,
+            owner=None,
+            private=False,
         )
         self.hub = JobHub(self.get, lambda job_id: self.log_path)
 
@@ -118,7 +120,7 @@ def test_a_watch_ends_after_the_final_state_and_the_last_line(one: OneJob) -> No
     async def work() -> None:
         one.log_path.write_text("begin\n")
         watch = await one.hub.watch("one")
-        assert await change(watch) == JobChange(one.job, "begin\n")
+        assert await change(watch) == JobChange(one.job, "begin\n", 6)
         assert not watch.finished
         one.log_path.write_text("begin\nend\n")
         one.move(state=JobState.SUCCEEDED)
@@ -130,7 +132,7 @@ def test_a_watch_ends_after_the_final_state_and_the_last_line(one: OneJob) -> No
         assert watch.finished
         assert await watch.next(WAIT_S) is None
         late = await one.hub.watch("one")
-        assert await change(late) == JobChange(one.job, "begin\nend\n")
+        assert await change(late) == JobChange(one.job, "begin\nend\n", 10)
         assert await late.next(WAIT_S) is None
         for each in (watch, late):
             each.close()
@@ -148,7 +150,7 @@ def test_a_watcher_who_reads_slowly_gets_the_newest_state(one: OneJob) -> None:
         found = await change(watch)
         assert found.job is not None
         assert found.job.progress.step == 4
-        assert await watch.next(2 * INTERVAL_S) == JobChange(None, "")
+        assert await watch.next(2 * INTERVAL_S) == JobChange(None, "", 0)
         watch.close()
 
     run(work())
@@ -197,15 +199,46 @@ def test_a_log_is_told_in_whole_lines(tmp_path: Path) -> None:
     assert log.read() == "anew\n"
 
 
-def test_a_long_log_is_told_from_its_end(tmp_path: Path) -> None:
+def test_a_long_log_is_told_from_its_end_and_then_whole(tmp_path: Path) -> None:
     path = tmp_path / "log.txt"
     lines = [f"line {number:06d}" for number in range(20_000)]
     path.write_text("\n".join(lines) + "\n")
     log = GrowingLog(path)
     told = log.read()
-    assert len(told) <= TAIL_BYTES
+    assert 0 < len(told) <= TAIL_BYTES
     assert told.splitlines() == lines[-len(told.splitlines()) :]
+    assert (log.read(), log.has_more) == ("", False)
     with path.open("a") as file:
         file.write("\n".join(lines) + "\n")
+    assert read_whole(log).splitlines() == lines
+    assert log.offset == path.stat().st_size
+
+
+def test_a_log_is_told_from_a_given_byte_and_a_line_without_end_in_pieces(tmp_path: Path) -> None:
+    path = tmp_path / "log.txt"
+    path.write_text("told before\n" + "x" * 200_000 + "\nafter\n")
+    log = GrowingLog(path, len("told before\n"))
+    assert read_whole(log) == "x" * 200_000 + "\nafter\n"
+
+
+def test_the_final_state_comes_with_the_last_lines_of_a_long_log(one: OneJob) -> None:
+    async def work() -> None:
+        lines = "".join(f"line {number:06d}\n" for number in range(20_000))
+        one.log_path.write_text(lines)
+        one.move(state=JobState.SUCCEEDED)
+        watch = await one.hub.watch("one", 0)
+        told = []
+        while (found := await watch.next(WAIT_S)) is not None:
+            told.append(found)
+        assert "".join(part.log for part in told) == lines
+        assert [part.job for part in told] == [None] * (len(told) - 1) + [one.job]
+        watch.close()
+
+    run(work())
+
+
+def read_whole(log: GrowingLog) -> str:
     told = log.read()
-    assert told.splitlines() == lines[-len(told.splitlines()) :]
+    while log.has_more:
+        told += log.read()
+    return told

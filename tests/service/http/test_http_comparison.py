@@ -23,7 +23,7 @@ from ultragray_proto.v1 import datasets_pb2, datasets_pb2_grpc
 from ultragray_workers.helpers.comparison import PICTURES
 from ultragray_workers.helpers.helper import PROGRESS_NAME
 
-from ...waiting import wait_until
+from ...waiting import Deadline, wait_until
 from ..conftest import RunningService, StartService, make_scene
 from .test_http_datasets import helper_process, zipped
 
@@ -77,8 +77,8 @@ def http(service: RunningService, tmp_path_factory: pytest.TempPathFactory) -> I
 
 
 def finished(http: httpx.Client, scene: str) -> dict[str, Any]:
-    end = time.monotonic() + WAIT_S
-    while time.monotonic() < end:
+    end = Deadline(WAIT_S)
+    while not end.passed:
         found: dict[str, Any] = http.get(f"/v1/scenes/{scene}/comparison").json()
         if found["state"] != "running":
             return found

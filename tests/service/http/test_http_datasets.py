@@ -32,7 +32,7 @@ KEY_HEADER = {"X-API-Key": KEY}
 LIMIT_BYTES = 200_000
 IDLE_TIMEOUT_S = 2.0
 ZIP = "application/zip"
-WAIT_S = 10.0
+WAIT_S = 120.0
 
 
 def sweep(count: int, offset_mm: float, seed: int = 0) -> Sweep:

@@ -199,7 +199,7 @@ def test_unknown_route_and_method(http: httpx.Client) -> None:
     assert_problem(http.get("/v1/nothing"), 404, "ROUTE_NOT_FOUND", None)
     answer = http.patch("/v1/scenes/demo")
     assert_problem(answer, 405, "METHOD_NOT_ALLOWED", None)
-    assert answer.headers["allow"] == "GET"
+    assert answer.headers["allow"] == "DELETE, GET, PUT"
     assert_problem(http.get("/v1/scenes/demo/render"), 405, "METHOD_NOT_ALLOWED", None)
 
 

@@ -25,7 +25,7 @@ from ultragray_service.http.stream_messages import FrameMessage, RefusalMessage
 from ...waiting import wait_until
 from ..conftest import HEIGHT, WIDTH, RunningService
 
-TIMEOUT_S = 20.0
+TIMEOUT_S = 120.0
 KEY = "a-key-of-twenty-chars"
 
 

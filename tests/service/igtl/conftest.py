@@ -27,9 +27,11 @@ FAN = ConvexProbe(opening_angle_deg=60.0, near_mm=20.0, far_mm=60.0)
 class Peer:
     """One connection, blocking."""
 
-    def __init__(self, address: str, **options: Any) -> None:
+    def __init__(self, address: str, *, source: str = "", **options: Any) -> None:
         host, port = address.rsplit(":", 1)
         self.socket = socket.socket()
+        if source:
+            self.socket.bind((source, 0))
         for option, value in options.items():
             self.socket.setsockopt(socket.SOL_SOCKET, getattr(socket, option), value)
         self.socket.settimeout(TIMEOUT_S)
@@ -80,13 +82,14 @@ Connect = Callable[..., Peer]
 
 @pytest.fixture(scope="session")
 def igtl_folder(data_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The linear scenes `demo`, `second` and `large` (its images 512x512), and `fan` of a convex probe."""
+    """Linear scenes (images of `medium` are 128x128, of `large` 512x512), and `fan` of a convex probe."""
     folder = tmp_path_factory.mktemp("igtl")
     for name in ("demo", "second"):
         (folder / f"{name}.ugr").write_bytes((data_folder / f"{name}.ugr").read_bytes())
     demo = make_scene(probe=DEMO_PROBE)
-    large = replace(demo.info, image_height=512, image_width=512)
-    GaussianScene.from_splats(demo.splats, info=large).save(folder / "large.ugr")
+    for name, side in (("medium", 128), ("large", 512)):
+        info = replace(demo.info, image_height=side, image_width=side)
+        GaussianScene.from_splats(demo.splats, info=info).save(folder / f"{name}.ugr")
     make_scene(seed=2, probe=FAN).save(folder / "fan.ugr")  # type: ignore[arg-type]
     return folder
 

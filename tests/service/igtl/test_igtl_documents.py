@@ -6,7 +6,7 @@ import re
 import subprocess
 import sys
 
-from ultragray_service.igtl import connection, server, waiting
+from ultragray_service.igtl import connection, waiting
 from ultragray_service.igtl.kinds import CAPABILITY
 from ultragray_service.igtl.messages import Message
 
@@ -28,7 +28,6 @@ def test_messages() -> None:
 
 def test_limits() -> None:
     assert [float(words[0]) for words in first_cells("OpenIGTLink limits")] == [
-        server.MAX_CONNECTIONS,
         waiting.MAX_WAITING_DEVICES,
         connection.MAX_BODY_BYTES,
         connection.MAX_SKIPPED_BYTES,

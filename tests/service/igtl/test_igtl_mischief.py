@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import socket
 import struct
@@ -14,10 +15,9 @@ import pytest
 from ultragray_service.igtl.connection import MAX_SKIPPED_BYTES, MESSAGE_TIMEOUT_S, SEND_TIMEOUT_S
 from ultragray_service.igtl.contents import unpack_status
 from ultragray_service.igtl.messages import HEADER_BYTES, Message, pack_message
-from ultragray_service.igtl.server import MAX_CONNECTIONS
 
 from ...waiting import wait_until
-from ..conftest import RunningService
+from ..conftest import RunningService, StartService
 from .conftest import Connect, Peer, moved
 
 MEBIBYTE = 2**20
@@ -176,19 +176,30 @@ def test_a_reader_that_stops_for_long_is_cut_off(connect: Connect, igtl_service:
     wait_until(lambda: not held(igtl_service, peers), within_s=SEND_TIMEOUT_S + 20, every_s=0.5)
 
 
-def test_more_connections_than_allowed_are_told_so(connect: Connect) -> None:
-    still_serves(connect())
-    peers = [connect() for _ in range(MAX_CONNECTIONS - 1)]
-    surplus = connect()
-    assert surplus.status().code == 6
-    assert surplus.is_closed()
-    still_serves(peers[-1])
-    for peer in peers:
-        peer.socket.close()
+def test_more_connections_than_allowed_are_told_so(start_service: StartService) -> None:
+    service = start_service(igtl_port=0, max_connections=30, max_connections_per_address=20)
+    address = next(record["igtl"] for record in service.log() if "igtl" in record)
+    with contextlib.ExitStack() as opened:
 
-    def is_let_in() -> bool:
-        late = connect()
-        late.send("GET_STATUS")
-        return late.status().code == 1
+        def connect(source: str) -> Peer:
+            peer = Peer(address, source=source)
+            opened.enter_context(peer.socket)
+            return peer
 
-    wait_until(is_let_in)
+        peers = [connect("127.0.0.2") for _ in range(20)]
+        still_serves(peers[-1])
+        surplus = connect("127.0.0.2")
+        assert surplus.status().code == 6
+        assert surplus.is_closed()
+        others = [connect("127.0.0.3") for _ in range(10)]
+        still_serves(others[-1])
+        assert connect("127.0.0.4").status().code == 6
+        for peer in peers:
+            peer.socket.close()
+
+        def is_let_in() -> bool:
+            late = connect("127.0.0.2")
+            late.send("GET_STATUS")
+            return late.status().code == 1
+
+        wait_until(is_let_in)

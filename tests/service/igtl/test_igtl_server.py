@@ -24,6 +24,7 @@ from ultragray_service.igtl.contents import (
     unpack_transform,
 )
 
+from ...freshness import check_fresh
 from ..conftest import DEMO_PROBE, HEIGHT, WIDTH, RunningService, StartService
 from ..rpc.test_grpc_render import matrix_pose
 from .conftest import FAN, Connect, Peer, address_of, moved, pyigtl_client, random_pose
@@ -258,10 +259,27 @@ def test_without_a_port_it_is_off(service: RunningService) -> None:
     assert not any("igtl" in record for record in service.log())
 
 
-def test_a_port_in_use_and_keys_stop_the_start(start_service: StartService, igtl_service: RunningService) -> None:
-    port = address_of(igtl_service).rpartition(":")[2]
-    taken = start_service(wait=False, igtl_port=port)
-    keys = start_service(wait=False, igtl_port=0, api_keys="0123456789abcdef")
-    for service, words in ((taken, "ULTRAGRAY_IGTL_PORT to another port"), (keys, "cannot ask for an API key")):
-        assert service.process.wait(60) != 0
-        assert words in service.log_path.read_text()
+def test_a_port_in_use_stops_the_start(start_service: StartService, igtl_service: RunningService) -> None:
+    service = start_service(wait=False, igtl_port=address_of(igtl_service).rpartition(":")[2])
+    assert service.process.wait(60) != 0
+    assert "ULTRAGRAY_IGTL_PORT to another port" in service.log_path.read_text()
+
+
+class SlowPeer:
+    """A client that acknowledges nothing; timestamps tell when its poses were sent."""
+
+    def __init__(self, peer: Peer, device_name: str) -> None:
+        self._peer, self._device_name = peer, device_name
+
+    def send(self) -> None:
+        self._peer.send_pose(moved(0.0), self._device_name, timestamp=int(time.monotonic() * 2**32))
+
+    def receive(self) -> float:
+        message = self._peer.receive()
+        assert message.type_name == "IMAGE", unpack_status(message.content)
+        return message.timestamp / 2**32
+
+
+@pytest.mark.parametrize("scene", ["demo", "medium", "large"])
+def test_a_slow_reader_gets_no_old_image(peer: Peer, scene: str) -> None:
+    check_fresh(SlowPeer(peer, scene))

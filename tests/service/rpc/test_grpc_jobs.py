@@ -15,12 +15,12 @@ from google.rpc.error_details_pb2 import ErrorInfo
 from google.rpc.status_pb2 import Status
 
 from ultragray_proto.v1 import geometry_pb2, jobs_pb2, jobs_pb2_grpc, rendering_pb2
-from ultragray_service.rpc.job_messages import read_specification
+from ultragray_service.rpc.messages import read_specification
 from ultragray_workers.jobs.kinds import TrainJob
 
 from ..conftest import RunningService, StartService
 
-WAIT_S = 20.0
+WAIT_S = 120.0
 
 
 @pytest.fixture(scope="module")

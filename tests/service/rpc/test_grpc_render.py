@@ -18,7 +18,7 @@ from ultragray_proto.v1 import geometry_pb2, rendering_pb2, rendering_pb2_grpc
 from ..conftest import HEIGHT, WIDTH
 
 Stub = rendering_pb2_grpc.RenderServiceStub
-TIMEOUT_S = 30
+TIMEOUT_S = 120
 
 
 def error_info(error: grpc.RpcError) -> tuple[ErrorInfo, BadRequest | None]:
@@ -216,6 +216,29 @@ def test_bad_messages_do_not_end_a_stream(conversation: Conversation, settings_m
     frame = conversation.ask(8, pose=moved(0))
     assert frame.data
     assert frame.scene == "demo"
+
+
+def test_bytes_that_are_no_message_do_not_end_a_stream(channel: grpc.Channel, settings_message: Any) -> None:
+    whole = rendering_pb2.RenderStreamRequest(
+        sequence=7, settings=settings_message, pose=moved(1.0)
+    ).SerializeToString()
+    call = channel.stream_stream("/ultragray.v1.RenderService/RenderStream")(
+        iter([b"\x0a\x05ab", *[whole, b"\x0a\x05ab"] * 20]), timeout=TIMEOUT_S
+    )
+    frames = [rendering_pb2.Frame.FromString(answer) for answer in call]
+    assert [frame.error.reason for frame in frames] == ["INVALID_ARGUMENT", *["", "INVALID_ARGUMENT"] * 20]
+    assert {frame.sequence for frame in frames if frame.data} == {7}
+
+
+def test_a_stream_that_cannot_go_on_ends_after_the_answers_under_way(channel: grpc.Channel) -> None:
+    unknown_mode = rendering_pb2.RenderStreamRequest(mode=99).SerializeToString()  # type: ignore[arg-type]
+    for _ in range(20):  # whether an answer is just being written is a matter of chance
+        call = channel.stream_stream("/ultragray.v1.RenderService/RenderStream")(
+            iter([*[b"\x0a\x05ab"] * 5, unknown_mode]), timeout=TIMEOUT_S
+        )
+        with pytest.raises(grpc.RpcError) as caught:
+            list(call)
+        assert caught.value.code() == grpc.StatusCode.INVALID_ARGUMENT
 
 
 def test_a_client_that_leaves_frees_the_service(renders: Stub, settings_message: Any) -> None:

@@ -9,7 +9,7 @@ from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
 
 from ultragray_proto.v1 import scenes_pb2, scenes_pb2_grpc
 
-from ..conftest import HEIGHT
+from ..conftest import HEIGHT, RunningService
 from .test_grpc_render import error_info
 
 Stub = scenes_pb2_grpc.SceneServiceStub
@@ -90,3 +90,24 @@ def test_request_id_is_echoed(scenes: Stub) -> None:
         1
     ]
     assert dict(call.trailing_metadata())["x-request-id"] == "robot-1"
+
+
+@pytest.mark.parametrize(
+    ("kind", "method"),
+    [
+        ("unary_unary", "SceneService/GetScene"),
+        ("unary_stream", "RenderService/RenderBatch"),
+        ("stream_unary", "DatasetService/UploadDataset"),
+    ],
+)
+def test_bytes_that_are_no_message_are_refused_in_our_words(
+    service: RunningService, channel: grpc.Channel, kind: str, method: str
+) -> None:
+    garbage = b"\x0a\x05ab"  # a text of five bytes, of which two are there
+    call = getattr(channel, kind)(f"/ultragray.v1.{method}")
+    with pytest.raises(grpc.RpcError) as caught:
+        list(call(iter([garbage]) if kind.startswith("stream") else garbage, timeout=30))
+    assert caught.value.code() == grpc.StatusCode.INVALID_ARGUMENT
+    assert error_info(caught.value)[0].reason == "INVALID_ARGUMENT"
+    assert "DecodeError" not in str(caught.value.details())
+    assert "DecodeError" not in service.log_path.read_text()

@@ -11,12 +11,11 @@ import grpc
 import pytest
 from google.protobuf.empty_pb2 import Empty
 
-from ultragray_service.auth import KeyGuard
+from ultragray_service.core.state import Service
 from ultragray_service.rpc.interceptor import CallContext
-from ultragray_service.telemetry.metrics import Metrics
-from ultragray_workers import PoolConfig, RenderPool, SceneStore
+from ultragray_service.settings import load_settings
 
-METHOD = "/ultragray.v1.TestService/Stream"
+METHOD = "/ultragray.v1.JobService/WatchJob"
 
 
 class Streaming(grpc.GenericRpcHandler):  # type: ignore[misc]
@@ -38,8 +37,7 @@ class Streaming(grpc.GenericRpcHandler):  # type: ignore[misc]
 
 
 async def vanish(folder: Path) -> None:
-    metrics = Metrics(RenderPool(SceneStore(folder), PoolConfig()), dict)
-    server = grpc.aio.server(interceptors=[CallContext(KeyGuard(()), metrics)])
+    server = grpc.aio.server(interceptors=[CallContext(Service(load_settings(data_folder=folder)))])
     streaming = Streaming()
     server.add_generic_rpc_handlers([streaming])
     port = server.add_insecure_port("127.0.0.1:0")

@@ -164,6 +164,30 @@ def test_conf_json_reads_no_file_but_those_of_the_upload(
             take_in(**arguments(incoming))
 
 
+def test_conf_json_does_not_tell_which_files_there_are_outside_the_upload(
+    store: DatasetStore, receive: Receive, files: dict[str, bytes], tmp_path: Path
+) -> None:
+    (tmp_path / "there.npy").write_bytes(b"no array")
+    for folder in (f"{tmp_path}/", "../../../../../", "x/../../../../../../"):
+        refusals = set()
+        for name in ("there.npy", "gone.npy"):
+            incoming = receive(changed_config(files, images_file_train=f"{folder}{name}"))
+            with pytest.raises(DatasetInvalid) as caught:
+                take_in(**arguments(incoming))
+            refusals.add(caught.value.detail.replace(name, "NAME"))
+        assert len(refusals) == 1
+
+
+def test_a_path_of_another_machine_is_found_by_its_name_in_the_upload(
+    store: DatasetStore, receive: Receive, files: dict[str, bytes], tmp_path: Path
+) -> None:
+    other = tmp_path / "images_train.npy"
+    other.write_bytes(npy(tmp_path, sweep(3, 0.0).images))
+    incoming = receive(changed_config(files, images_file_train=str(other)))
+    take_in(**arguments(incoming))
+    assert incoming.accept("tiny")[0].train_frames == 8
+
+
 def test_options_are_named_as_requests_write_them(
     store: DatasetStore, receive: Receive, files: dict[str, bytes]
 ) -> None:
@@ -223,7 +247,7 @@ def test_a_manifest_of_an_unknown_format_is_damaged(
     add(store, receive, files, "tiny")
     manifest = store.folder / "tiny" / "dataset.json"
     manifest.write_text(manifest.read_text().replace('"released"', '"nifti"'))
-    with pytest.raises(DatasetInvalid, match=r"'tiny' is damaged: .*kind must be one of released, .*'nifti'"):
+    with pytest.raises(DatasetInvalid, match=r"'tiny' cannot be used: .*kind must be one of released, .*'nifti'"):
         store.load("tiny")
 
 

@@ -133,6 +133,13 @@ def test_damaged_archives(make: Callable[..., Path], tmp_path: Path, target: Pat
         unpack(tmp_path / "archive", target, LIMIT_BYTES)
 
 
+def test_a_zip_whose_directory_points_before_its_beginning(tmp_path: Path, target: Path) -> None:
+    whole = zip_of(tmp_path / "archive", {"a": b"content"}).read_bytes()
+    (tmp_path / "archive").write_bytes(whole[1:])
+    with pytest.raises(DatasetInvalid, match="damaged"):
+        unpack(tmp_path / "archive", target, LIMIT_BYTES)
+
+
 @pytest.mark.parametrize("content", [b"", b"hello", b"\x89PNG", b"\x1f\x8b"])
 def test_what_is_no_archive(content: bytes, tmp_path: Path, target: Path) -> None:
     (tmp_path / "archive").write_bytes(content)

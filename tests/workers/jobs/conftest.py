@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -21,17 +22,23 @@ from ultragray_workers.datasets.store import FILES_NAME, DatasetRecord, write_ma
 from ultragray_workers.jobs.kinds import TrainJob
 from ultragray_workers.jobs.store import Job, JobState, JobStore
 
+from ...waiting import Deadline
+
 FINAL = (JobState.SUCCEEDED, JobState.FAILED, JobState.CANCELLED)
 PROBE = LinearProbe(width_mm=20.0, near_mm=0.0, far_mm=25.0)
 PROGRAM = """
-import os, signal, sys, threading
+import json, os, signal, socket, sys, threading
 from pathlib import Path
 from ultragray_workers.jobs.queue import heartbeat
 from ultragray_workers.jobs.worker.worker import work
 heartbeat.DEAD_AFTER_S = 3.0
 stop = threading.Event()
 signal.signal(signal.SIGTERM, lambda number, frame: stop.set())
-work(Path(sys.argv[1]), os.environ.get("DATABASE_URL"), stop, name=sys.argv[2], device="cpu", threads=1, nice=0)
+options = json.loads(sys.argv[3])
+host = options.pop("host", socket.gethostname())
+socket.gethostname = lambda: host
+settings = {"device": "cpu", "threads": 1, "nice": 0, **options}
+work(Path(sys.argv[1]), os.environ.get("DATABASE_URL"), stop, name=sys.argv[2], **settings)
 os._exit(0)
 """
 
@@ -76,18 +83,22 @@ def store_dataset(artifact_folder: Path, name: str) -> Path:
     return folder
 
 
-def train_job(scene: str, *, dataset: str = "tiny", steps: int = 20, **settings: Any) -> TrainJob:
+def train_job(
+    scene: str, *, dataset: str = "tiny", steps: int = 20, max_run_s: float | None = None, **settings: Any
+) -> TrainJob:
     values = {"steps": steps, "max_gaussians": 40, "batch_size": 2, **settings}
-    return TrainJob(dataset=dataset, scene=scene, settings=values, device="cpu")
+    return TrainJob(dataset=dataset, scene=scene, settings=values, device="cpu", max_run_s=max_run_s)
 
 
 class RunningWorker:
-    """A worker in a process of its own."""
+    """A worker in a process of its own. `options` are those of `work`, and `host`: the name that its host has."""
 
-    def __init__(self, artifact_folder: Path, database_url: str | None, name: str, log: Path) -> None:
+    def __init__(
+        self, artifact_folder: Path, database_url: str | None, name: str, log: Path, options: dict[str, Any]
+    ) -> None:
         with log.open("ab") as file:
             self.process = subprocess.Popen(
-                [sys.executable, "-c", PROGRAM, str(artifact_folder), name],
+                [sys.executable, "-c", PROGRAM, str(artifact_folder), name, json.dumps(options)],
                 env={
                     **os.environ,
                     "PYTHONPATH": os.pathsep.join(path for path in sys.path if path),
@@ -142,8 +153,8 @@ def start_worker(
 ) -> Iterator[Callable[..., RunningWorker]]:
     started: list[RunningWorker] = []
 
-    def start(name: str = "one") -> RunningWorker:
-        started.append(RunningWorker(artifact_folder, database_url, name, tmp_path / f"{name}.log"))
+    def start(name: str = "one", *, folder: Path = artifact_folder, **options: Any) -> RunningWorker:
+        started.append(RunningWorker(folder, database_url, name, tmp_path / f"{name}.log", options))
         return started[-1]
 
     yield start
@@ -155,10 +166,10 @@ def start_worker(
 def until(store: JobStore) -> Callable[..., Job]:
     """Waits for a job to be final, or whatever is asked for."""
 
-    def wait(job: Job, reached: Callable[[Job], bool] = lambda job: job.state in FINAL, timeout_s: float = 60) -> Job:
-        end = time.monotonic() + timeout_s
+    def wait(job: Job, reached: Callable[[Job], bool] = lambda job: job.state in FINAL, timeout_s: float = 240) -> Job:
+        end = Deadline(timeout_s)
         while not reached(job):
-            assert time.monotonic() < end, (job, store.log_tail(job.id))
+            assert not end.passed, (job, store.log_tail(job.id))
             time.sleep(0.05)
             job = store.get(job.id)
         return job

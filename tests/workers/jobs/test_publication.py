@@ -9,7 +9,7 @@ import pytest
 
 from ultragray_workers.errors import SceneExists
 from ultragray_workers.jobs.folder import JobFolder
-from ultragray_workers.jobs.publication import publish_scene, withdraw_scene
+from ultragray_workers.jobs.publication import publish_scene
 
 
 @pytest.fixture(params=["links", "no links"])
@@ -43,14 +43,3 @@ def test_another_scene_of_that_name_stays(folder: JobFolder) -> None:
         publish_scene(folder, "new")
     assert served.read_bytes() == b"another"
     assert [path.name for path in served.parent.iterdir()] == ["new.ugr"]
-
-
-def test_withdrawn_is_only_what_was_published(folder: JobFolder) -> None:
-    served = folder.artifact_folder / "scenes" / "new.ugr"
-    withdraw_scene(folder, "new")
-    publish_scene(folder, "new")
-    withdraw_scene(folder, "new")
-    assert not served.exists()
-    served.write_bytes(b"another")
-    withdraw_scene(folder, "new")
-    assert served.read_bytes() == b"another"

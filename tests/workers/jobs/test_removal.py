@@ -130,7 +130,7 @@ def test_jobs_are_counted_by_state(store: JobStore, finished: Finished) -> None:
     finished("one")
     finished("two")
     store.submit(train_job("three"))
-    assert store.counts() == {
+    assert store.overview().counts == {
         JobState.QUEUED: 1,
         JobState.RUNNING: 0,
         JobState.SUCCEEDED: 0,
@@ -196,5 +196,5 @@ def test_a_deletion_and_a_submission_at_once_never_both_succeed(
     monkeypatch.setattr(JobDatabase, "enqueue", delete_in_between)
     with pytest.raises(DatasetNotFound):
         store.submit(train_job("two"), request_id="mine")
-    assert store.counts()[JobState.QUEUED] == 0
+    assert store.overview().counts[JobState.QUEUED] == 0
     assert {job.id for job in store.list()[0]} == {submitted[0].id}

@@ -69,6 +69,14 @@ def test_same_request_id_gives_the_same_job(store: JobStore) -> None:
         store.submit(train_job("one"), request_id="x" * 129)
 
 
+@pytest.mark.parametrize("request_id", ["a\0b", "\0", "half a character: \ud800"])
+def test_request_id_that_no_database_keeps_is_refused(store: JobStore, request_id: str) -> None:
+    with pytest.raises(InvalidArgument, match="NUL") as caught:
+        store.submit(train_job("one"), request_id=request_id)
+    assert caught.value.field == "request_id"
+    assert store.list() == ([], None)
+
+
 def test_submitted_by_two_services_at_once(store: JobStore, artifact_folder: Path, database_url: str | None) -> None:
     other = JobStore(artifact_folder, database_url)
     with ThreadPoolExecutor(8) as threads:

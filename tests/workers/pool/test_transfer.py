@@ -8,7 +8,7 @@ import torch
 
 from ultragray.settings import Encoding
 from ultragray_workers.pool.process import encoding
-from ultragray_workers.pool.transfer import CHUNK_POSES, render_to_host, to_uint8
+from ultragray_workers.pool.process.transfer import CHUNK_POSES, render_to_host, to_uint8
 
 UINT8, FLOAT32 = np.dtype("u1"), np.dtype("<f4")
 POSES = 2 * CHUNK_POSES + 3

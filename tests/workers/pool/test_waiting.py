@@ -79,6 +79,21 @@ def test_batches_get_a_part_rendered_now_and_then(make_ticket, monkeypatch):
     assert taken(queue) == [(interactive[1], 0, 1)]
 
 
+def test_slow_batches_let_interactive_requests_pass_between_their_parts(make_ticket, monkeypatch):
+    queue = WaitingQueue(limit_frames=100, max_batch_poses=4)
+    batch = make_ticket(3, priority=Priority.BATCH)
+    interactive = [make_ticket(scene=name) for name in "ab"]
+    queue.add(batch)
+    for ticket in interactive:
+        queue.add(ticket)
+    now = time.monotonic()
+    order = []
+    for second in range(2, 12, 2):  # each part takes two
+        monkeypatch.setattr(waiting.time, "monotonic", lambda second=second: now + second)
+        order += [part.ticket for part in queue.take_batch()]
+    assert order == [batch, interactive[0], batch, interactive[1], batch]
+
+
 def test_large_images_make_smaller_batches(make_ticket):
     queue = WaitingQueue(limit_frames=100, max_batch_poses=4)
     ticket = make_ticket(4, height=512 * 8 * 2)  # 64 wide: twice the pixels of 512x512
@@ -103,7 +118,7 @@ def test_lost_work_comes_first_and_suspects_go_alone(make_ticket):
     (part,) = queue.take_batch()
     for ticket in others:
         queue.add(ticket)
-    for again in reversed(part.for_retry()):
+    for again in reversed(part.for_retry(hung=False)):
         queue.put_first(again)
     assert taken(queue) == [(lost, 0, 2), (others[0], 0, 1), (others[1], 0, 1)]
     assert taken(queue) == [(lost, 2, 4)]

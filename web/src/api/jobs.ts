@@ -48,13 +48,17 @@ export function artifactPath(job: string, name: string): string {
   return address("/v1/jobs/{job}/artifacts/{name}", { job, name });
 }
 
-/** Tells of the job until its final state. Ends early where the stream breaks; then it can be asked for again. */
-export async function followJob(
-  job: string,
-  told: { job: (job: Job) => void; log: (lines: string) => void },
-  signal: AbortSignal,
-): Promise<void> {
-  const response = await request(address("/v1/jobs/{job}/events", { job }), { signal });
+/** Who is told of a job; `event`: the id of the last event, from which a later stream can go on. */
+export interface JobListener {
+  job: (job: Job) => void;
+  log: (lines: string) => void;
+  event: (id: string) => void;
+}
+
+/** Tells of the job until its final state. Ends early where the stream breaks; then it can be asked for what follows `last`. */
+export async function followJob(job: string, last: string | null, told: JobListener, signal: AbortSignal): Promise<void> {
+  const headers: Record<string, string> = last === null ? {} : { "Last-Event-ID": last };
+  const response = await request(address("/v1/jobs/{job}/events", { job }), { signal, headers });
   const reader = response.body!.pipeThrough(new TextDecoderStream()).getReader();
   let text = "";
   for (;;) {
@@ -66,9 +70,11 @@ export async function followJob(
   }
 }
 
-function tell(event: string, told: { job: (job: Job) => void; log: (lines: string) => void }): void {
+function tell(event: string, told: JobListener): void {
   const lines = event.split("\n");
   const data = lines.filter((line) => line.startsWith("data: ")).map((line) => line.slice(6)).join("\n");
   if (lines.includes("event: progress")) told.job(JSON.parse(data) as Job);
   if (lines.includes("event: log")) told.log(data + "\n");
+  const id = lines.find((line) => line.startsWith("id: "));
+  if (id !== undefined) told.event(id.slice(4));
 }

@@ -27,6 +27,7 @@ export interface StreamEvents {
 }
 
 const MAX_UNANSWERED = 4; // more would only wait: the newest pose is kept here until there is room
+const WINDOW = 2; // frames that may come before the page has taken one: a page that stalls finds no more old ones
 const LEAST_BETWEEN_MS = 24; // 40 frames a second look smooth; more would only warm the room
 const RECONNECT_MS = { first: 300, most: 3000 };
 const TIMEOUT_MS = 8000; // of waiting: then the service refuses a frame that is not being rendered yet
@@ -153,6 +154,7 @@ export class FrameStream {
     const message: Partial<Schemas["StreamMessage"]> = {
       sequence: this.#sequence,
       mode: "latest",
+      window: WINDOW,
       timeout_ms: TIMEOUT_MS,
       client_time_ms: performance.now(),
       pose: { matrix: [0, 4, 8, 12].map((start) => pose.slice(start, start + 4)), position_mm: null, quaternion: null },
@@ -170,11 +172,13 @@ export class FrameStream {
     if (typeof data === "string") {
       const { sequence, error } = JSON.parse(data) as Schemas["RefusalMessage"];
       this.#takenSettings = "";
+      this.#acknowledge(sequence);
       this.#settle(sequence);
       this.events.refused(error);
       if (PASSING.includes(error.reason)) this.#askAgain();
     } else {
       const frame = decodeFrame(data);
+      this.#acknowledge(frame.header.sequence);
       if (frame.header.sequence < this.#answered) return; // a newer pose was refused
       this.#silent_ms = Math.max(SILENT_MS.first, 2 * frame.roundTrip_ms);
       this.#takenSettings = this.#asked.get(frame.header.sequence) ?? "";
@@ -182,6 +186,12 @@ export class FrameStream {
       this.events.frame(frame);
     }
     this.#send();
+  }
+
+  /** Tells the service that an answer was taken: it makes no more frames than the page can show. */
+  #acknowledge(sequence: number): void {
+    const message: Partial<Schemas["StreamMessage"]> = { acknowledged: sequence };
+    if (this.#socket?.readyState === WebSocket.OPEN) this.#socket.send(JSON.stringify(message));
   }
 
   /** The messages up to this one need no answer any more. */

@@ -14,6 +14,7 @@ export class FollowedJob {
   /** Why nothing is told at the moment. */
   problem = $state<string | null>(null);
   missing = $state(false);
+  #last: string | null = null;
   #ending = new AbortController();
   #thinning = false;
 
@@ -29,11 +30,15 @@ export class FollowedJob {
     const { signal } = this.#ending;
     while (!signal.aborted) {
       try {
-        this.log = "";
         this.curve = await trainingCurve(this.id, signal);
         await followJob(
           this.id,
-          { job: (job) => this.#take(job), log: (lines) => (this.log = (this.log + lines).slice(-LOG_KEPT)) },
+          this.#last,
+          {
+            job: (job) => this.#take(job),
+            log: (lines) => (this.log = (this.log + lines).slice(-LOG_KEPT)),
+            event: (id) => (this.#last = id),
+          },
           signal,
         );
         this.problem = null;

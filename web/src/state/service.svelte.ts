@@ -18,7 +18,7 @@ class ServiceState {
   async poll(): Promise<void> {
     clearTimeout(this.#timer);
     try {
-      await getJson("/v1/health/ready", {});
+      await requireFrames();
       this.#take(await listScenes());
       this.status = "ready";
     } catch (error) {
@@ -32,6 +32,15 @@ class ServiceState {
     const names = new Set(scenes.map((scene) => scene.name));
     for (const { name } of this.scenes) if (!names.has(name)) forgetSession(name);
     this.scenes = scenes;
+  }
+}
+
+/** Throws where no frame would be rendered; jobs may be away. */
+async function requireFrames(): Promise<void> {
+  try {
+    await getJson("/v1/health/ready", {});
+  } catch (error) {
+    if (!(error instanceof ServiceError && error.problem.components?.frames.ready)) throw error;
   }
 }
 

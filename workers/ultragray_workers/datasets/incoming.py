@@ -66,6 +66,10 @@ class IncomingDataset:
         with self._open():
             self._finish_file()
 
+    def is_taken(self, name: str) -> bool:
+        """Whether there is a dataset of that name already."""
+        return self._store.is_taken(name)
+
     def accept(self, name: str) -> tuple[DatasetRecord, bool]:
         """Make the checked dataset one of the store, as `DatasetStore.add`."""
         with self._open():

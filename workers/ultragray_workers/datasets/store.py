@@ -15,6 +15,7 @@ from ultragray.contract import Contract, described, from_dict, to_dict
 from ultragray.datasets.source import UPLOADED_FORMATS
 from ultragray.errors import DatasetInvalid, InvalidArgument, UltragrayError
 from ultragray.files.atomic import sync, write_whole
+from ultragray.files.format_version import require_version
 from ultragray.probe import Probe
 
 from ..claims import out_of_sight
@@ -25,7 +26,9 @@ if TYPE_CHECKING:
     from ultragray.datasets import Dataset
 
 FOLDER = "datasets"
+FORMAT_VERSION = 1  # of the manifest
 MANIFEST_NAME, FILES_NAME, CONTACT_SHEET_NAME = "dataset.json", "files", "contact_sheet.png"
+_NOT_KEPT = ("owner", "private")  # in the manifest: they are the database's
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
 
 
@@ -48,12 +51,15 @@ class DatasetRecord(Contract):
     probe: Probe | None = described("The probe that recorded it.")
     warnings: tuple[str, ...] = described("What looks wrong, for a person to decide.")
     options: dict[str, str] = described("How it was read: the query parameters of its upload.")
+    owner: str | None = described("Who uploaded it; null: from before there were owners.", None)
+    private: bool = described("Whether others may not see it.", False)
 
     @classmethod
     def from_json(cls, text: str) -> DatasetRecord:
         """The record of a manifest. Raises ValueError, KeyError or TypeError for anything else."""
         document: dict[str, Any] = json.loads(text)
-        return from_dict(cls, {one.name: document[one.name] for one in fields(cls)})
+        require_version(document.get("format_version", FORMAT_VERSION), FORMAT_VERSION)  # early ones have none
+        return from_dict(cls, {one.name: document[one.name] for one in fields(cls) if one.name not in _NOT_KEPT})
 
 
 class DatasetStore:
@@ -61,6 +67,7 @@ class DatasetStore:
 
     def __init__(self, artifact_folder: Path) -> None:
         self.folder = Path(artifact_folder) / FOLDER
+        self.hides: Callable[[str], bool] = lambda name: False  # from whoever asks: what is hidden is not found
         self.in_use: Callable[[str], str | None] = lambda name: None  # who needs a dataset, in words
 
     def names(self) -> list[str]:
@@ -69,17 +76,25 @@ class DatasetStore:
             entries = list(self.folder.iterdir())
         except (FileNotFoundError, NotADirectoryError):
             return []
-        return sorted(entry.name for entry in entries if _NAME.fullmatch(entry.name) and self._exists(entry.name))
+        return sorted(entry.name for entry in entries if _NAME.fullmatch(entry.name) and self.is_taken(entry.name))
+
+    def shown_names(self) -> list[str]:
+        """As `names`, without those that are hidden."""
+        return [name for name in self.names() if not self.hides(name)]
 
     def get(self, name: str) -> DatasetRecord:
         """Raises DatasetNotFound, also for a name that no dataset can have; DatasetInvalid for a damaged manifest."""
-        path = self._existing(name) / MANIFEST_NAME
+        return self._read(name, self._existing(name))
+
+    def _read(self, name: str, folder: Path) -> DatasetRecord:
+        path = folder / MANIFEST_NAME
         try:
             return DatasetRecord.from_json(path.read_text(encoding="utf-8"))
         except FileNotFoundError:
             raise self._not_found(name) from None
         except (ValueError, KeyError, TypeError) as error:
-            raise DatasetInvalid(f"the manifest of the dataset {name!r} is damaged: {error!r}") from error
+            reason = f"it has no {error}" if isinstance(error, KeyError) else error
+            raise DatasetInvalid(f"the manifest of the dataset {name!r} cannot be used: {reason}") from error
 
     def names_by_content(self) -> dict[str, str]:
         """The name of a dataset by its SHA-256; those whose manifest is damaged are left out."""
@@ -110,8 +125,9 @@ class DatasetStore:
         except OSError as error:
             if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
                 raise
-            present = self.get(name)
-            if (present.sha256, present.options) == (record.sha256, record.options):
+            present = self._read(name, self.folder / name)
+            is_same = (present.sha256, present.options) == (record.sha256, record.options)
+            if is_same and not self.hides(name):
                 return present, False
             raise DatasetExists(
                 f"there is already a dataset {name!r} with another content or other options: delete it first, or "
@@ -140,16 +156,17 @@ class DatasetStore:
             raise DatasetInUse(f"the dataset {name!r} is needed by {user}", field="dataset")
 
     def _existing(self, name: str) -> Path:
-        if _NAME.fullmatch(name) and self._exists(name):
+        if _NAME.fullmatch(name) and self.is_taken(name) and not self.hides(name):
             return self.folder / name
         raise self._not_found(name)
 
-    def _exists(self, name: str) -> bool:
+    def is_taken(self, name: str) -> bool:
+        """Whether there is a dataset of that name, hidden or not."""
         return (self.folder / name / MANIFEST_NAME).is_file()
 
     def _not_found(self, name: str) -> DatasetNotFound:
         return DatasetNotFound(
-            f"there is no dataset {name[:128]!r}; {known_names('dataset', self.names())}", field="dataset"
+            f"there is no dataset {name[:128]!r}; {known_names('dataset', self.shown_names())}", field="dataset"
         )
 
 
@@ -164,4 +181,6 @@ def check_dataset_name(name: str) -> None:
 
 def write_manifest(record: DatasetRecord, folder: Path) -> None:
     """Writes the manifest of a dataset whose other files are complete."""
-    write_whole(folder / MANIFEST_NAME, json.dumps(to_dict(record), indent=1) + "\n")
+    kept = {name: value for name, value in to_dict(record).items() if name not in _NOT_KEPT}
+    document = {"format_version": FORMAT_VERSION, **kept}
+    write_whole(folder / MANIFEST_NAME, json.dumps(document, indent=1) + "\n")

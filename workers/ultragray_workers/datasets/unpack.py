@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import gzip
 import stat
 import tarfile
@@ -102,7 +103,11 @@ def unpack(archive: Path, folder: Path, max_bytes: int) -> None:
         NotImplementedError,
         UnicodeError,
     ) as error:
-        raise DatasetInvalid(f"the archive is damaged, or of a kind that cannot be read: {error}") from error
+        raise _damaged(error) from error
+    except OSError as error:
+        if error.errno != errno.EINVAL:  # of a seek to where the archive's directory says that a file begins
+            raise
+        raise _damaged(error) from error
 
 
 def _unpack_zip(archive: Path, folder: Path, budget: FileBudget) -> None:
@@ -143,6 +148,10 @@ def _copy(name: str, content: AbstractContextManager[IO[bytes]], folder: Path, b
             budget.take_bytes(len(block))
             target.write(block)
     sync(Path(target.name))
+
+
+def _damaged(error: Exception) -> DatasetInvalid:
+    return DatasetInvalid(f"the archive is damaged, or of a kind that cannot be read: {error}")
 
 
 def _not_plain(name: str) -> DatasetInvalid:

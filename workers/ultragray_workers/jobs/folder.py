@@ -1,7 +1,7 @@
 """The folder of one job, which its worker and its training process write and the service reads.
 
 job.json        what is asked for: written by the worker before its process starts
-lock            held by the one process that works in the folder
+lock            held by the one process that works in the folder, whose number it says
 NAME.ugr        the scene that the job needs, as it was when the job was submitted
 run/            the trainer's folder: checkpoint, journal, configuration
 progress.json   how far it is
@@ -42,7 +42,7 @@ class Progress:
     frames: int | None = None
     rate_per_s: float | None = described("Steps or frames.", None)
     seconds_left: float | None = None
-    waits_for: str | None = described("The device, while another job of the same host is at work on it.", None)
+    waits_for: str | None = described("Of a job that waits: what else it needs than its turn.", None)
 
     @classmethod
     def from_dict(cls, document: Mapping[str, Any]) -> Progress:
@@ -80,7 +80,8 @@ class Request:
 
     specification: dict[str, Any]
     retry_of: str | None
-    device: str  # the worker's: auto, cpu, cuda or cuda:N
+    submission: str | None  # tells this submission of a request_id from an earlier one, whose database is lost
+    device: str  # cpu, cuda or cuda:N
     threads: int
     nice: int
 
@@ -104,6 +105,25 @@ class JobFolder:
     def request(self) -> Request:
         """The worker's instructions. Raises OSError, ValueError."""
         return Request(**json.loads(self._request.read_text(encoding="utf-8")))
+
+    def begin(self, submission: str | None, needed: str | None) -> None:
+        """Makes the folder; empties that of another submission, but for the file that this one needs.
+
+        A job's id follows from its request_id: after its database was lost, another job of that id may have been here.
+        Raises OSError.
+        """
+        self.path.mkdir(parents=True, exist_ok=True)
+        before = _read(self._request)
+        if before is None or before.get("submission") == submission:
+            return
+        for path in self.path.iterdir():
+            if path == self._request or path.name in (self.lock.name, needed):
+                continue
+            if path.is_dir():
+                shutil.rmtree(path)
+            else:
+                path.unlink()
+        self._request.unlink()  # last: until then the folder is the other one's
 
     def was_begun(self) -> bool:
         """True where a worker has started a process in the folder."""

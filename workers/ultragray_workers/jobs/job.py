@@ -15,6 +15,7 @@ from ultragray.contract import described
 from .folder import JobFolder, Outcome, Progress
 from .kinds import KINDS
 from .queue import database
+from .queue.owners import Ownership
 
 MAX_PRIORITY = 1000
 PRIORITY_ZERO = MAX_PRIORITY + 1  # DBOS takes the lowest number first, from 1
@@ -66,12 +67,14 @@ class Job:
     worker: str | None
     retry_of: str | None = described("The job that this one goes on from.")
     attempts: int = described("How often it was started.")
+    owner: str | None = described("Who submitted it; null: from before there were owners.")
+    private: bool = described("Whether others may not see it, nor the scene that it makes.")
 
 
 def job_of_row(row: WorkflowStatus, artifact_folder: Path) -> Job:
     """The job of a row of the queue; the folder of an unfinished one says how far it is."""
     state = _STATE_OF[row.status]
-    outcome = _outcome(row)
+    outcome, ownership = _outcome(row), ownership_of(row)
     started = state is not JobState.QUEUED or bool(row.recovery_attempts)
     if outcome is None:
         progress = JobFolder(artifact_folder, row.workflow_id).progress() if started else Progress()
@@ -89,13 +92,28 @@ def job_of_row(row: WorkflowStatus, artifact_folder: Path) -> Job:
         finished_at=_iso_not_before(max(row.created_at, row.dequeued_at or 0), row.completed_at),
         reason=outcome.reason,
         error=outcome.error,
-        progress=outcome.progress if state is JobState.RUNNING else replace(outcome.progress, waits_for=None),
+        progress=replace(outcome.progress, waits_for=_waits_for(row) if state is JobState.QUEUED else None),
         artifacts=outcome.artifacts,
         metrics=outcome.metrics,
         worker=row.executor_id if started else None,
         retry_of=attribute(row, "retry_of"),
         attempts=outcome.attempts,
+        owner=ownership.owner,
+        private=ownership.private,
     )
+
+
+def ownership_of(row: WorkflowStatus) -> Ownership:
+    """Whose a job is."""
+    return Ownership(row.authenticated_user, bool(attribute(row, "private")))
+
+
+def _waits_for(row: WorkflowStatus) -> str | None:
+    """The need of a job that no worker of this release can do."""
+    version = row.app_version
+    if version in (database.VERSION, *database.OLDER_VERSIONS, None):
+        return None
+    return f"a worker of another release: the job has version {version}, those of this release do {database.VERSION}"
 
 
 def _outcome(row: WorkflowStatus) -> Outcome | None:

@@ -12,13 +12,6 @@ from .folder import JobFolder
 SCENES_FOLDER = "scenes"  # of the artifact folder: scenes that jobs made
 
 
-def withdraw_scene(folder: JobFolder, scene: str) -> None:
-    """Undoes `publish_scene`; another scene of that name stays. Raises OSError."""
-    target = folder.artifact_folder / SCENES_FOLDER / f"{scene}{SUFFIX}"
-    if target.exists() and file_sha256(target) == file_sha256(folder.artifacts / target.name):
-        target.unlink()
-
-
 def publish_scene(folder: JobFolder, scene: str) -> None:
     """Serves the scene among the job's artifacts; nothing where it is served already.
 

@@ -10,17 +10,11 @@ from collections.abc import Iterator
 from ..claims import out_of_sight
 from ..errors import JobInUse
 from .folder import JobFolder
-from .job import attribute
+from .queue import runs
 from .queue.database import JobDatabase
 
 _LOCK_WAIT_S = 2.0  # for the process of a job that was cancelled a moment ago
 _LOCK_POLL_S = 0.05
-
-
-def sources_in_use(jobs: JobDatabase) -> dict[str, str]:
-    """Jobs that waiting or running jobs go on from: the id of each, and the id of one such job."""
-    pairs = ((attribute(row, "retry_of"), row.workflow_id) for row in jobs.unfinished())
-    return {source: job_id for source, job_id in pairs if source is not None}
 
 
 def remove_job(jobs: JobDatabase, folder: JobFolder) -> None:
@@ -33,6 +27,8 @@ def remove_job(jobs: JobDatabase, folder: JobFolder) -> None:
             stack.enter_context(_locked(folder))
         stack.enter_context(out_of_sight(folder.path))
         jobs.client.delete_workflows([folder.job_id])
+        with jobs.engine.begin() as connection:
+            runs.forget(connection, folder.job_id)
 
 
 @contextlib.contextmanager

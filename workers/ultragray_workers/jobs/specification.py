@@ -49,6 +49,11 @@ def value_in(document: Mapping[str, Any], role: str) -> str | None:
     return None if field is None else document[field]
 
 
+def has_checkpoints(document: Mapping[str, Any]) -> bool:
+    """Whether a job's JSON asks for work that, interrupted, goes on from where it was."""
+    return Specification.member(document["kind"]).has_checkpoints
+
+
 def _without_poses(specification: Specification) -> tuple[dict[str, Any], FloatArray | None]:
     names = [
         item.name for item, _ in contract.annotated_fields(type(specification)) if item.name not in ("kind", _POSES)

@@ -7,8 +7,11 @@ import os
 import re
 import threading
 import uuid
+from collections.abc import Callable
+from datetime import datetime
 from pathlib import Path
 
+import sqlalchemy as sa
 from dbos import EnqueueOptions, WorkflowSerializationFormat, WorkflowStatus
 from dbos import error as dbos_error
 
@@ -23,27 +26,34 @@ from ..errors import (
     JobFinished,
     JobInUse,
     JobNotFinished,
-    JobNotFound,
     JobQueueFull,
     SceneExists,
+    job_not_found,
 )
 from ..scenes import SceneStore
+from ..store import OpenStore
 from .folder import JobFolder, Progress
-from .job import MAX_PRIORITY, PRIORITY_ZERO, STATUSES, Job, JobState, attribute, job_of_row
+from .job import MAX_PRIORITY, PRIORITY_ZERO, STATUSES, Job, JobState, job_of_row, ownership_of
 from .kinds import Specification
+from .overview import JobsOverview, overview
 from .publication import SCENES_FOLDER
-from .queue import database
+from .queue import attendance, database, runs, unfinished
+from .queue.attendance import Worker
 from .queue.database import JobDatabase
-from .queue.listing import count_by_status, page_of_rows
-from .removal import remove_job, sources_in_use
+from .queue.listing import page_of_rows
+from .queue.owners import Kind, Ownership, set_owner
+from .queue.wishes import Wanted
+from .removal import remove_job
 from .requirements import Requirements
 from .specification import from_dict, in_short, to_dict, value_in
+from .tracing import TRACE, current_trace
 
 __all__ = ["SCENES_FOLDER", "Job", "JobState", "JobStore", "Progress"]
 
 
 MAX_REQUEST_ID_CHARACTERS = 128
 _JOB_ID = re.compile(r"[0-9a-f]{24}")
+_STORABLE = re.compile(r"[^\0\ud800-\udfff]*")  # PostgreSQL takes no NUL, and UTF-8 no surrogates
 _TAIL_BYTES = 8192
 
 
@@ -57,17 +67,25 @@ class JobStore:
         queue_limit: int = 1000,
         *,
         scenes: SceneStore | None = None,
+        datasets: DatasetStore | None = None,
         max_image_side: int = MAX_IMAGE_SIDE,
     ) -> None:
         """`scenes`: those that jobs may need, and whose names they may not make. None: those that jobs made.
 
+        `datasets`: those that jobs may need. None: those of the artifact folder.
+
         `max_image_side`: of frames, pixels. Raises StartupFailed where the database cannot be reached.
         """
         self._artifact_folder = Path(artifact_folder)
-        self._database = JobDatabase(self._artifact_folder, database_url)
+        self._open = OpenStore(self._artifact_folder)
+        try:
+            self.database = JobDatabase(self._artifact_folder, database_url)
+        except BaseException:
+            self._open.close()
+            raise
         self._queue_limit = queue_limit
         self._requirements = Requirements(
-            datasets=DatasetStore(self._artifact_folder),
+            datasets=datasets or DatasetStore(self._artifact_folder),
             scenes=scenes or SceneStore(self._artifact_folder / SCENES_FOLDER),
             artifact_folder=self._artifact_folder,
             max_image_side=max_image_side,
@@ -80,29 +98,39 @@ class JobStore:
         *,
         request_id: str | None = None,
         priority: int = 0,
+        owner: str | None = None,
+        private: bool = False,
     ) -> tuple[Job, bool]:
         """The job, and whether it is new: the same `request_id` gives the same job, whatever became of it.
 
-        Raises JobConflict where that one asked for something else, JobQueueFull, and what `Requirements.provide`
-        raises.
+        Raises JobConflict where that one asked for something else, JobQueueFull, ArtifactFolderUnavailable, and what
+        `Requirements.provide` raises.
         """
         if abs(priority) > MAX_PRIORITY:
             raise InvalidArgument(
                 f"priority must be an integer from {-MAX_PRIORITY} to {MAX_PRIORITY}, got {priority}", field="priority"
             )
         job_id = uuid.uuid4().hex[:24] if request_id is None else _id_of_request(request_id)
-        return self._submit(job_id, specification, request_id, priority, None)
+        return self._submit(job_id, specification, priority, owner, private, request_id=request_id)
 
     def _submit(
-        self, job_id: str, specification: Specification, request_id: str | None, priority: int, retry_of: str | None
+        self,
+        job_id: str,
+        specification: Specification,
+        priority: int,
+        owner: str | None,
+        private: bool,
+        *,
+        request_id: str | None = None,
+        retry_of: str | None = None,
     ) -> tuple[Job, bool]:
-        short = in_short(specification)
+        short, ownership = in_short(specification), Ownership(owner, private)
         made = value_in(short, "makes_scene")
+        self.database.folder.check()
         with self._submitting:
-            if self._database.workflow(job_id) is not None:
-                return self._same(job_id, specification, priority), False
-            waiting = self._database.unfinished()
-            if sum(row.status in database.QUEUED for row in waiting) >= self._queue_limit:
+            if self.database.workflow(job_id) is not None:
+                return self._same(job_id, specification, priority, ownership), False
+            if unfinished.count_waiting(self.database) >= self._queue_limit:
                 raise JobQueueFull(f"{self._queue_limit} jobs wait already: try again later, or cancel some")
             before = None if retry_of is None else self._folder(retry_of)
             self._requirements.provide(specification, self._folder(job_id), before)
@@ -113,15 +141,32 @@ class JobStore:
                 "workflow_id_reuse_policy": "reject",
                 "app_version": database.VERSION,
                 "priority": PRIORITY_ZERO - priority,
-                "attributes": {"request_id": request_id, "retry_of": retry_of, "specification": short},
+                "attributes": {
+                    "request_id": request_id,
+                    "retry_of": retry_of,
+                    "specification": short,
+                    "private": private,
+                    TRACE: current_trace(),
+                },
                 "serialization_type": WorkflowSerializationFormat.PORTABLE,
             }
             if made is not None:
                 options["deduplication_id"] = f"scene {made}"
+            if ownership.owner is not None:
+                options["authenticated_user"] = ownership.owner
+
+            def claim_scene(connection: sa.Connection) -> None:
+                if made is not None and ownership.owner is not None:
+                    set_owner(connection, Kind.SCENE, made, ownership)
+
             try:
-                self._database.enqueue(options, {"specification": to_dict(specification), "retry_of": retry_of})
+                self.database.enqueue(
+                    options,
+                    {"specification": to_dict(specification), "retry_of": retry_of, "submission": uuid.uuid4().hex},
+                    also=claim_scene,
+                )
             except dbos_error.DBOSWorkflowIDInUseError:  # another service was quicker
-                return self._same(job_id, specification, priority), False
+                return self._same(job_id, specification, priority, ownership), False
             except dbos_error.DBOSQueueDeduplicatedError:
                 raise SceneExists(
                     f"another job that waits or runs makes the scene {made!r}: choose another name",
@@ -130,15 +175,17 @@ class JobStore:
             try:  # again, now that a deletion of the dataset would see the job: one that came in between has won
                 self._requirements.require_dataset(specification)
             except DatasetNotFound:
-                self._database.client.cancel_workflow(job_id)
-                self._database.client.delete_workflows([job_id])
+                self.database.client.cancel_workflow(job_id)
+                self.database.client.delete_workflows([job_id])
                 raise
         return self.get(job_id), True
 
-    def _same(self, job_id: str, specification: Specification, priority: int) -> Job:
-        """The job that is there already. Raises JobConflict where it is asked for something else."""
+    def _same(self, job_id: str, specification: Specification, priority: int, ownership: Ownership) -> Job:
+        """The job that is there already. Raises JobConflict where it asks for something else, or is somebody else's."""
         row = self._row(job_id, with_input=True)
         job = self._seen(row)
+        if job.owner is not None and job.owner != ownership.owner:
+            raise JobConflict(f"the request_id {job.request_id!r} was used already: choose another", field="request_id")
         if priority != job.priority or to_dict(_specification_of(row)) != to_dict(specification):
             raise JobConflict(
                 f"the request_id {job.request_id!r} was used for the job {job.id}, which asks for something else",
@@ -155,6 +202,7 @@ class JobStore:
         *,
         state: JobState | None = None,
         kind: str | None = None,
+        shown: Callable[[Ownership], bool] = lambda ownership: True,
         page_size: int = 50,
         page_token: str | None = None,
     ) -> tuple[list[Job], str | None]:
@@ -164,9 +212,18 @@ class JobStore:
         """
         statuses = None if state is None else STATUSES[state]
         rows, token = page_of_rows(
-            self._database, kind=kind, statuses=statuses, page_size=page_size, page_token=page_token
+            self.database,
+            kind=kind,
+            statuses=statuses,
+            shown=lambda row: shown(ownership_of(row)),
+            page_size=page_size,
+            page_token=page_token,
         )
         return [self._seen(row) for row in rows], token
+
+    def ownership(self, job_id: str) -> Ownership:
+        """Whose a job is. Raises JobNotFound."""
+        return ownership_of(self._row(job_id))
 
     def cancel(self, job_id: str) -> Job:
         """Ends a job that waits or runs, its process within a second; nothing where it is cancelled already.
@@ -175,7 +232,9 @@ class JobStore:
         """
         job = self.get(job_id)
         if not job.state.is_final:
-            self._database.client.cancel_workflow(job_id)
+            if not runs.decide(self.database.engine, job_id, runs.CANCELLED):
+                raise JobFinished(f"the scene of the job {job_id} is being served: it is as good as done", field="job")
+            self.database.client.cancel_workflow(job_id)
             job = self.get(job_id)
         if job.state is not JobState.CANCELLED:
             raise JobFinished(f"the job {job_id} has {job.state.value} already", field="job")
@@ -193,7 +252,9 @@ class JobStore:
             raise JobNotFinished(
                 f"only a failed or cancelled job can be retried, the job {job_id} is {job.state.value}", field="job"
             )
-        return self._submit(_hashed(f"retry {job_id}"), _specification_of(row), None, job.priority, job_id)
+        return self._submit(
+            _hashed(f"retry {job_id}"), _specification_of(row), job.priority, job.owner, job.private, retry_of=job_id
+        )
 
     def delete(self, job_id: str) -> None:
         """Removes a finished job and its files; the scene that it made stays.
@@ -203,14 +264,21 @@ class JobStore:
         job = self.get(job_id)
         if not job.state.is_final:
             raise JobInUse(f"the job {job_id} is {job.state.value}: cancel it first", field="job")
-        if (successor := sources_in_use(self._database).get(job_id)) is not None:
+        if (successor := unfinished.successor(self.database, job_id)) is not None:
             raise JobInUse(f"the job {successor} goes on from the job {job_id}", field="job")
-        remove_job(self._database, self._folder(job_id))
+        remove_job(self.database, self._folder(job_id))
 
-    def counts(self) -> dict[JobState, int]:
-        """The number of jobs in each state."""
-        found = count_by_status(self._database)
-        return {state: sum(found.get(status, 0) for status in statuses) for state, statuses in STATUSES.items()}
+    def overview(self) -> JobsOverview:
+        """The jobs in numbers."""
+        return overview(self.database)
+
+    def unfinished_of(self, owner: str) -> int:
+        """The number of an owner's jobs that wait or run."""
+        return unfinished.count_of_owner(self.database, owner)
+
+    def usage_s(self, owner: str | None, since: datetime) -> dict[str, float]:
+        """How long the jobs of an owner ran since the day of `since` (UTC), s, by device: cpu, gpu."""
+        return runs.usage_s(self.database.engine, owner, since)
 
     def log_tail(self, job_id: str, bytes: int = _TAIL_BYTES) -> str:
         """The end of the log of a job's process; empty where there is none yet. Raises JobNotFound."""
@@ -231,6 +299,14 @@ class JobStore:
             raise ArtifactNotFound(f"the job {job_id} has no artifact {name[:128]!r}; it has {known}", field="name")
         return path
 
+    def workers(self) -> tuple[Worker, ...]:
+        """The workers of the queue, by name."""
+        return tuple(attendance.list_workers(self.database))
+
+    def want(self, worker: str, wanted: Wanted) -> Worker:
+        """The worker, which is told what is wanted of it. Raises WorkerNotFound."""
+        return attendance.want(self.database, worker, wanted)
+
     def uses_dataset(self, name: str) -> str | None:
         """The job that needs a dataset, in words; None where no job that waits or runs does."""
         return self._unfinished("needs_dataset", name)
@@ -240,21 +316,20 @@ class JobStore:
         return self._unfinished("makes_scene", name)
 
     def close(self) -> None:
-        """Ends the connections to the database."""
-        self._database.close()
+        """Ends the connections to the database; the folder may be restored."""
+        self.database.close()
+        self._open.close()
 
     def _unfinished(self, role: str, name: str) -> str | None:
-        for row in self._database.unfinished():
-            if value_in(attribute(row, "specification"), role) == name:
-                return f"the job {row.workflow_id}"
-        return None
+        job_id = unfinished.naming(self.database, role, name)
+        return None if job_id is None else f"the job {job_id}"
 
     def _row(self, job_id: str, *, with_input: bool = False) -> WorkflowStatus:
         row = None
         if _JOB_ID.fullmatch(job_id):
-            row = self._database.workflow(job_id, with_input=with_input, with_output=True)
+            row = self.database.workflow(job_id, with_input=with_input, with_output=True)
         if row is None:
-            raise JobNotFound(f"there is no job {job_id[:64]!r}", field="job")
+            raise job_not_found(job_id)
         return row
 
     def _seen(self, row: WorkflowStatus) -> Job:
@@ -269,6 +344,10 @@ def _id_of_request(request_id: str) -> str:
         raise InvalidArgument(
             f"request_id must have 1 to {MAX_REQUEST_ID_CHARACTERS} characters, got {len(request_id)}",
             field="request_id",
+        )
+    if not _STORABLE.fullmatch(request_id):
+        raise InvalidArgument(
+            "request_id must be text without NUL and without halves of characters", field="request_id"
         )
     return _hashed(f"request {request_id}")
 

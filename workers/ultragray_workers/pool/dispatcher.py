@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import time
 from collections.abc import Awaitable, Iterable
 from dataclasses import replace
 
@@ -12,24 +13,26 @@ from ultragray.errors import RenderFailed, UltragrayError
 
 from .launcher import Launcher
 from .memory import MemoryPool
-from .messages import Answer, ForkWorker, LoadTask, PackTask, Rendered, RenderPart, RenderTask, UnloadTask
+from .messages import Answer, ForkWorker, LoadTask, Outdated, PackTask, Rendered, RenderPart, RenderTask, UnloadTask
 from .slot import Assignment, Command, Slot
+from .types import SceneChangedError
 from .waiting import Packing, Part, Step, Ticket, WaitingQueue
+from .watchdog import Patience
 
 _MAX_DEATHS = 5
-
-
-class SceneChangedError(Exception):
-    """The parts of one request were rendered from two contents of a scene file: to be rendered anew."""
+_MAX_KILLS = 2
+_WATCH_INTERVAL_S = 0.25
 
 
 class Dispatcher:
     """The worker processes and the queue before them, in the event loop's thread."""
 
-    def __init__(self, launcher: Launcher, settings: ForkWorker, waiting: WaitingQueue) -> None:
+    def __init__(self, launcher: Launcher, settings: ForkWorker, patience: Patience, waiting: WaitingQueue) -> None:
         self.slots: list[Slot] = []
         self._launcher = launcher
         self._settings = settings
+        self._patience = patience
+        self._watching: asyncio.TimerHandle | None = None
         self._waiting = waiting
         self._memories = MemoryPool()
 
@@ -39,12 +42,13 @@ class Dispatcher:
         The first one tells how many GPUs there are, and leaves compiled kernels where the others find them.
         """
         first = self._add_slot()
+        self._watch()
         await first.start()
         processes = self._settings.processes or max(1, first.gpus)
         await _all([self._add_slot().start() for _ in range(1, processes)])
 
     def _add_slot(self) -> Slot:
-        slot = Slot(self._launcher, replace(self._settings, number=len(self.slots)), self)
+        slot = Slot(self._launcher, replace(self._settings, number=len(self.slots)), self._patience, self)
         self.slots.append(slot)
         return slot
 
@@ -56,6 +60,9 @@ class Dispatcher:
     def discard(self, ticket: Ticket) -> None:
         """Forgets a ticket, rendered or not: drops what still waits and takes its memory back."""
         self._waiting.remove(ticket)
+        if ticket.in_flight:
+            for slot in self.slots:
+                slot.give_up_abandoned()
         for memory in (ticket.memory, ticket.archive):
             if memory is None:
                 continue
@@ -66,8 +73,15 @@ class Dispatcher:
 
     async def close(self) -> None:
         """Returns when all worker processes are gone. Fail the tickets first."""
+        if self._watching is not None:
+            self._watching.cancel()
         await asyncio.gather(*(slot.close() for slot in self.slots))
         self._memories.close()
+
+    def _watch(self) -> None:
+        for slot in self.slots:
+            slot.kill_if_hung()
+        self._watching = asyncio.get_running_loop().call_later(_WATCH_INTERVAL_S, self._watch)
 
     async def command_all(self, task: LoadTask | UnloadTask) -> None:
         """Has every process do a task. Raises what the first of them reports, after all have reported."""
@@ -80,6 +94,7 @@ class Dispatcher:
 
     def _dispatch(self) -> None:
         """Gives every idle worker something to do: commands first, then what waits."""
+        self._waiting.workers = max(1, sum(slot.alive for slot in self.slots))
         for slot in self.slots:
             while slot.idle and slot.commands:
                 command = slot.commands.popleft()
@@ -99,7 +114,7 @@ class Dispatcher:
             step.ticket.batch_size = max(step.ticket.batch_size, sum(part.frames for part in parts))
             if step.ticket.memory is None:
                 step.ticket.memory = self._memories.acquire()
-        assignment = Assignment(steps=dict(enumerate(batch)))
+        assignment = Assignment(steps=dict(enumerate(batch)), batch=tuple(batch))
         ticket = batch[0].ticket
         if parts:
             slot.assign(_render_task(ticket, parts), assignment, _descriptors(part.ticket.memory for part in parts))
@@ -121,6 +136,9 @@ class Dispatcher:
             elif not command.done.done():
                 command.done.set_result(None)
             return
+        if answer.last:
+            typical = not assignment.loaded and not assignment.given_up
+            self._waiting.settle(assignment.batch, time.monotonic() - assignment.begun, typical=typical)
         step = assignment.steps.pop(answer.part)
         ticket = step.ticket
         ticket.in_flight -= 1
@@ -128,15 +146,17 @@ class Dispatcher:
             return
         if isinstance(outcome, Rendered):
             self._advance(ticket, step, outcome)
+        elif isinstance(outcome, Outdated):
+            self._fail_ticket(ticket, SceneChangedError())
         else:
             self._fail_ticket(ticket, outcome or RenderFailed("a worker answered nothing"))
 
-    def on_death(self, slot: Slot, assignment: Assignment) -> None:
-        """Has done again what a dead worker had not answered, unless that has killed too many workers."""
-        failure = RenderFailed(f"the worker process died {_MAX_DEATHS} times while it was rendering this")
+    def on_death(self, slot: Slot, assignment: Assignment, *, hung: bool) -> None:
+        """Has done again what a dead worker had not answered, unless that has taken too many workers with it."""
         if (command := assignment.command) is not None and not command.done.done():
             command.attempts += 1
-            if command.attempts >= _MAX_DEATHS:
+            command.kills += hung
+            if (failure := _failure(command.attempts, command.kills)) is not None:
                 command.fail(failure)
             else:
                 slot.commands.appendleft(command)
@@ -144,10 +164,10 @@ class Dispatcher:
             step.ticket.in_flight -= 1
             if step.ticket.done.done():
                 continue
-            if step.attempts + 1 >= _MAX_DEATHS:
+            if (failure := _failure(step.attempts + 1, step.kills + hung)) is not None:
                 self._fail_ticket(step.ticket, failure)
                 continue
-            for again in reversed(step.for_retry()):
+            for again in reversed(step.for_retry(hung=hung)):
                 self._waiting.put_first(again)
         self._dispatch()
 
@@ -180,6 +200,15 @@ async def _all(outcomes: Iterable[Awaitable[None]]) -> None:
             raise outcome
 
 
+def _failure(attempts: int, kills: int) -> RenderFailed | None:
+    """The end of what so many workers died with, of which so many hung; None where another one may try."""
+    if kills >= _MAX_KILLS:
+        return RenderFailed(f"{kills} worker processes hung while they were rendering this, and were killed")
+    if attempts >= _MAX_DEATHS:
+        return RenderFailed(f"the worker process died {attempts} times while it was rendering this")
+    return None
+
+
 def _summary(steps: list[Rendered]) -> Rendered:
     """The steps of one request as one; the last step knows the size of the reply."""
     return Rendered(
@@ -202,12 +231,14 @@ def _render_task(ticket: Ticket, parts: list[Part]) -> RenderTask:
     return RenderTask(
         scene=ticket.request.scene,
         path=ticket.path,
+        version=ticket.request.version,
         parts=tuple(
             RenderPart(
                 settings=part.ticket.request.settings,
                 poses=part.ticket.request.poses[part.first : part.stop],
                 first=part.first,
                 total=len(part.ticket.request.poses),
+                deadline=part.ticket.request.deadline,
             )
             for part in parts
         ),

@@ -10,7 +10,7 @@ import asyncio
 import os
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -49,8 +49,9 @@ class Launcher:
         request: ForkWorker | ForkTemplate,
         on_message: Callable[[Any], None],
         on_gone: Callable[[], None],
+        descriptors: Sequence[int] = (),
     ) -> Peer:
-        """Has a template fork a process; the first message of the new peer is its Hello.
+        """Has a template fork a process, which gets the descriptors; the first message of the new peer is its Hello.
 
         Returns at once. Where no template is ready yet the request waits for one; where that dies before it
         forked, the new peer is gone.
@@ -59,7 +60,7 @@ class Launcher:
         if template is None:
             template = self._templates[0] if self._templates else self._spawn_template()
         near, far = Channel.pair()
-        template.peer.send(request, [far.fileno()])
+        template.peer.send(request, [far.fileno(), *descriptors])
         far.close()
         return Peer(near, on_message, on_gone)
 

@@ -9,6 +9,8 @@ from ultragray.errors import UltragrayError
 from ultragray.probe import FloatArray
 from ultragray.settings import Resolved
 
+from ..scenes import FileVersion
+
 
 @dataclass(frozen=True)
 class ForkWorker:
@@ -19,6 +21,7 @@ class ForkWorker:
     processes: int  # in the pool; 0: one per GPU, or one
     threads: int  # 0: the cores this process may use, divided by the number of processes
     memory_budget_bytes: int
+    max_footprint_pixels: int  # of a frame
 
 
 @dataclass(frozen=True)
@@ -43,6 +46,11 @@ class RenderPart:
     poses: FloatArray  # [C, 4, 4] mm
     first: int
     total: int
+    deadline: float | None  # time.monotonic() in seconds, as in all processes; past it nobody takes its frames
+
+    def name_pose(self, index: int) -> str:
+        """One of its poses as the caller names it."""
+        return "pose" if self.total == 1 else f"poses[{self.first + index}]"
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +61,7 @@ class RenderTask:
 
     scene: str
     path: str
+    version: FileVersion | None  # that the scene's file must have; None: any
     parts: tuple[RenderPart, ...]
 
     @property
@@ -94,7 +103,7 @@ class Rendered:
     size: int  # bytes of the reply so far: all of `data` when this was the request's only part
     scene_sha256: str
     renderer: str
-    started: float  # time.monotonic() in seconds, the same clock in all processes
+    started: float  # time.monotonic() in seconds
     render_ms: float
     encode_ms: float
     first: int = 0  # pose of the request that the part begins with
@@ -102,10 +111,22 @@ class Rendered:
 
 
 @dataclass(frozen=True)
+class Loading:
+    """A worker's word that its task takes longer: it loads a scene from its file, or has done so."""
+
+    begins: bool
+
+
+@dataclass(frozen=True)
+class Outdated:
+    """A worker's report that it did not render: the scene's file is of another version."""
+
+
+@dataclass(frozen=True)
 class Answer:
     """The outcome of part `part` of a task (0 where it has none); after the `last` one the worker is idle."""
 
     part: int
-    outcome: Rendered | UltragrayError | None
+    outcome: Rendered | Outdated | UltragrayError | None
     last: bool
     resident: tuple[str, ...]  # scenes the worker holds now

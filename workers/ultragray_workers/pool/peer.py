@@ -41,6 +41,13 @@ class Peer:
         with contextlib.suppress(OSError):
             self._channel.send(message, descriptors)
 
+    def kill(self) -> None:
+        """Ends the process, even a stopped one; `on_gone` follows, also where the kernel does not let go of it."""
+        if self.pid is not None:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(self.pid, signal.SIGKILL)
+        self._loop.call_later(_STOP_TIMEOUT_S, self._end)
+
     async def stop(self) -> None:
         """Has the process exit, kills it where it does not, and returns when it is gone."""
         if self.alive:
@@ -68,6 +75,8 @@ class Peer:
         self._on_message(message)
 
     def _end(self) -> None:
+        if not self.alive:
+            return
         self._loop.remove_reader(self._channel.fileno())
         self._channel.close()
         self._ended.set()

@@ -1,8 +1,8 @@
 """RenderPool: poses in, encoded frames out, rendered by worker processes. Free of torch.
 
 A request becomes a ticket, its poses become parts. Idle workers take parts from the queue, as many as fit one
-batch, and write the pixels into the request's memory. A worker that dies loses nothing: rendering is pure, so
-that the parts it had not answered are rendered again by its replacement.
+batch, and write the pixels into the request's memory. A worker that dies, or hangs and is killed, loses nothing:
+rendering is pure, so that the parts it had not answered are rendered again by its replacement.
 """
 
 from __future__ import annotations
@@ -20,18 +20,19 @@ from ultragray.errors import InvalidArgument, RenderFailed
 from ..errors import Draining, NotReady
 from ..scenes import SceneStore
 from .channel import MAX_DESCRIPTORS
-from .dispatcher import Dispatcher, SceneChangedError
+from .dispatcher import Dispatcher
 from .launcher import Launcher
 from .memory import read_start
 from .messages import ForkWorker, LoadTask, UnloadTask
-from .types import RenderRequest, RenderResult
+from .types import RenderRequest, RenderResult, SceneChangedError
 from .waiting import Expiry, Ticket, Turn, WaitingQueue
+from .watchdog import Patience
 
 logger = logging.getLogger(__name__)
 
 MAX_BATCH_POSES = MAX_DESCRIPTORS  # the memory of each part goes along with the task
 MAX_REPLY_BYTES = 2**31 - 2**20
-_MAX_SCENE_CHANGES = 3
+MAX_SCENE_CHANGES = 3
 _READ_IN_THREAD_BYTES = 2**20
 
 
@@ -44,11 +45,31 @@ class PoolConfig(Contract):
         "0: the cores this process may use, divided by the number of processes.", 0, low=0, high=1024
     )
     queue_limit_frames: int = described("Poses that may wait, for each priority.", 256, low=1, high=2**31)
+    client_limit_frames: int = described("Of one client, for each priority.", 256, low=1, high=2**31)
+    max_queue_ms: float = described(
+        "How long others may keep an interactive request waiting; one that would wait longer is refused at once.",
+        1000.0,
+        above=0.0,
+        high=3_600_000.0,
+    )
     max_batch_poses: int = described(
         "Poses rendered together; fewer for images of more than 512x512 pixels.", 16, low=1, high=MAX_BATCH_POSES
     )
     memory_budget_bytes: int = described(
         "Of loaded scenes, per process, where they are rendered.", 4 * 2**30, low=1, high=2**63
+    )
+    max_footprint_pixels: int = described("Cost of a frame, see ultragray.limits.", 2**31, low=1, high=2**63 - 1)
+    worker_grace_s: float = described(
+        "How long a process may leave a task untouched, or owe its answer after the deadline.",
+        5.0,
+        above=0.0,
+        high=3600.0,
+    )
+    worker_timeout_s: float = described(
+        "How long a process may take for what has no deadline, such as loading a scene.",
+        120.0,
+        above=0.0,
+        high=86_400.0,
     )
     backend: str = "auto"
 
@@ -59,6 +80,8 @@ class PoolStatistics:
     busy: int  # processes at work
     processes_alive: int
     restarts_total: int  # workers that died and were replaced
+    kills_total: int  # workers that hung, were killed and replaced
+    stuck: int  # processes that have told nothing of their work for some seconds
     pids: tuple[int, ...]  # of the processes that are alive
 
 
@@ -68,7 +91,12 @@ class RenderPool:
     def __init__(self, store: SceneStore, config: PoolConfig) -> None:
         self.on_rendered: Callable[[RenderResult], None] | None = None
         self._store = store
-        self._waiting = WaitingQueue(config.queue_limit_frames, config.max_batch_poses)
+        self._waiting = WaitingQueue(
+            config.queue_limit_frames,
+            config.max_batch_poses,
+            config.client_limit_frames,
+            config.max_queue_ms / 1000.0,
+        )
         self._launcher = Launcher()
         self._dispatcher = Dispatcher(
             self._launcher,
@@ -78,7 +106,9 @@ class RenderPool:
                 processes=config.processes,
                 threads=config.threads_per_process,
                 memory_budget_bytes=config.memory_budget_bytes,
+                max_footprint_pixels=config.max_footprint_pixels,
             ),
+            Patience(config.worker_grace_s, config.worker_timeout_s),
             self._waiting,
         )
         self._open: set[Ticket] = set()
@@ -90,7 +120,9 @@ class RenderPool:
 
     @property
     def ready(self) -> bool:
-        return self._started and not self._draining and any(slot.alive for slot in self._dispatcher.slots)
+        """Whether a frame asked for now would be rendered: a process is alive that is free or gets on with its task."""
+        able = any(slot.alive and not slot.stuck for slot in self._dispatcher.slots)
+        return self._started and not self._draining and able
 
     async def start(self) -> None:
         """Returns when every process has rendered its first frame.
@@ -105,20 +137,23 @@ class RenderPool:
         self._started = True
 
     async def render(self, request: RenderRequest, turn: Turn | None = None) -> RenderResult:
-        """Renders the request as soon as its turn comes; cancelling the caller drops what has not begun.
+        """Renders the request as soon as its turn comes; cancelling the caller, and its deadline, end the rendering.
 
         With `turn` its poses can be replaced by newer ones as long as they wait. Raises NotReady, Draining, QueueFull,
-        DeadlineExceeded, InvalidArgument, SceneNotFound, SceneFileInvalid, SceneTooLarge, MemoryExceeded, RenderFailed.
+        DeadlineExceeded, InvalidArgument, FrameTooCostly, SceneNotFound, SceneFileInvalid, SceneTooLarge,
+        MemoryExceeded, RenderFailed; SceneChangedError where the request is for another version of the scene's file.
         """
         self._check_accepting()
         self._active += 1
         self._all_answered.clear()
         turn = turn or Turn()
         try:
-            for _ in range(_MAX_SCENE_CHANGES):
+            for _ in range(MAX_SCENE_CHANGES):
                 try:
                     result = await self._render(request, turn)
                 except SceneChangedError:
+                    if request.version is not None:
+                        raise
                     assert turn.ticket is not None
                     request = turn.ticket.request  # perhaps with newer poses
                     continue
@@ -157,6 +192,8 @@ class RenderPool:
             waiting_frames=self._waiting.frames,
             busy=sum(slot.busy for slot in self._dispatcher.slots),
             processes_alive=sum(slot.alive for slot in self._dispatcher.slots),
+            kills_total=sum(slot.kills for slot in self._dispatcher.slots),
+            stuck=sum(slot.stuck for slot in self._dispatcher.slots),
             restarts_total=sum(slot.replacements for slot in self._dispatcher.slots),
             pids=tuple(slot.pid for slot in self._dispatcher.slots if slot.pid is not None),
         )

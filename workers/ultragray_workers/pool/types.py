@@ -9,6 +9,9 @@ from ultragray.confidence import Extrapolation
 from ultragray.probe import FloatArray
 from ultragray.settings import Resolved
 
+from ..scenes import FileVersion
+from .fairness.turns import UNKNOWN_CALLER, Caller
+
 
 class Priority(IntEnum):
     """Waiting requests of a lower value are rendered first."""
@@ -25,7 +28,13 @@ class RenderRequest:
     settings: Resolved
     poses: FloatArray  # [C, 4, 4] mm, probe→scene, exact (check_poses was applied)
     priority: Priority = Priority.INTERACTIVE
-    deadline: float | None = None  # time.monotonic() in seconds; past it the request is dropped
+    deadline: float | None = None  # time.monotonic() in seconds; past it the request is given up
+    version: FileVersion | None = None  # of the scene's file that the settings are for; None: any
+    caller: Caller = UNKNOWN_CALLER
+
+
+class SceneChangedError(Exception):
+    """The file of a scene is not of the version that the settings of a request are for."""
 
 
 @dataclass(frozen=True, eq=False)

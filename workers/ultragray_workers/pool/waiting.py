@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import time
 from collections import OrderedDict, deque
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -12,6 +14,8 @@ from ultragray.probe import FloatArray
 from ultragray.settings import Encoding
 
 from ..errors import DeadlineExceeded, QueueFull
+from .fairness.forecast import Forecast
+from .fairness.turns import Turns
 from .messages import Rendered
 from .types import Priority, RenderRequest
 
@@ -19,6 +23,8 @@ _FULL_BATCH_PIXELS_PER_POSE = 512 * 512
 _ATTEMPTS_IN_COMPANY = 2
 _BATCH_PRIORITY_SHARE = 4  # an interactive request may have to wait for a part of a batch: a smaller one
 _BATCH_PATIENCE_S = 1.0
+_LONGEST_BATCH_S = 1.0  # that others may have to wait for, where that is known
+_LEAST_RETRY_S = 0.1
 
 
 @dataclass(eq=False)
@@ -40,7 +46,7 @@ class Ticket:
     @property
     def batch_key(self) -> tuple[Any, ...]:
         """Requests that agree in this can be rendered together."""
-        return (self.request.scene, *self.request.settings.view)
+        return (self.request.scene, self.request.version, *self.request.settings.view)
 
     @property
     def expired(self) -> bool:
@@ -96,16 +102,24 @@ class Part:
     first: int
     stop: int
     attempts: int = 0  # workers that died with it
+    kills: int = 0  # of those, the ones that hung and were killed
+    work_s: float = 0.0  # that it will take, by forecast
 
     @property
     def frames(self) -> int:
         return self.stop - self.first
 
-    def for_retry(self) -> list[Step]:
+    @property
+    def suspect(self) -> bool:
+        """Whether it may be what kills the workers: it goes alone."""
+        return self.attempts >= _ATTEMPTS_IN_COMPANY or self.kills > 0
+
+    def for_retry(self, *, hung: bool) -> list[Step]:
         """Itself in halves, so that even slow frames get done between one death and the next."""
         middle = (self.first + self.stop + 1) // 2
         bounds = [(self.first, middle), (middle, self.stop)]
-        return [Part(self.ticket, first, stop, self.attempts + 1) for first, stop in bounds if first < stop]
+        counts = self.attempts + 1, self.kills + hung
+        return [Part(self.ticket, first, stop, *counts) for first, stop in bounds if first < stop]
 
 
 @dataclass(eq=False)
@@ -114,136 +128,245 @@ class Packing:
 
     ticket: Ticket
     attempts: int = 0
+    kills: int = 0
     frames: int = 0
+    work_s: float = 0.0
 
-    def for_retry(self) -> list[Step]:
-        return [Packing(self.ticket, self.attempts + 1)]
+    def for_retry(self, *, hung: bool) -> list[Step]:
+        return [Packing(self.ticket, self.attempts + 1, self.kills + hung)]
 
 
 Step = Part | Packing
 
 
 class WaitingQueue:
-    """Tickets with steps that wait: by priority, then in turn, one part of a ticket at a time.
+    """Tickets with steps that wait: by priority, then in turns between clients, one part of a ticket at a time.
 
-    Batches wait for as long as interactive requests do, but get one part rendered per second at the least.
-
-    The limit holds for each priority on its own, so that a flood of batch frames leaves room for others.
+    Batches wait for as long as interactive requests do, but get one part rendered per second at the least, or every
+    other one where parts take longer. The limits hold for each priority on its own, so that a flood of batch frames
+    leaves room for others. Where there is no room, what came last of whoever waits for the most gives way to who waits
+    for less.
     """
 
-    def __init__(self, limit_frames: int, max_batch_poses: int) -> None:
+    def __init__(
+        self,
+        limit_frames: int,
+        max_batch_poses: int,
+        client_limit_frames: int | None = None,
+        max_queue_s: float = math.inf,
+    ) -> None:
+        """`max_queue_s`: an interactive request that others would keep waiting for longer is refused at once."""
+        self.workers = 1  # that take from it
         self._limit_frames = limit_frames
+        self._client_limit_frames = limit_frames if client_limit_frames is None else client_limit_frames
         self._max_batch_poses = max_batch_poses
-        self._tickets: dict[Priority, OrderedDict[Ticket, None]] = {priority: OrderedDict() for priority in Priority}
-        self._frames = dict.fromkeys(Priority, 0)
+        self._max_queue_s = max_queue_s
+        self._forecast = Forecast()
+        self._turns: dict[Priority, Turns[Ticket]] = {priority: Turns() for priority in Priority}
+        self._again: dict[Priority, OrderedDict[Ticket, None]] = {priority: OrderedDict() for priority in Priority}
         self._last_batch_turn = time.monotonic()  # or since when a batch waits
+        self._last_priority = Priority.INTERACTIVE  # of what was taken last
 
     @property
     def frames(self) -> int:
         """Poses that wait."""
-        return sum(self._frames.values())
+        again = (step.frames for tickets in self._again.values() for ticket in tickets for step in ticket.waiting)
+        return sum(turns.frames for turns in self._turns.values()) + sum(again)
 
     def add(self, ticket: Ticket) -> None:
-        """Raises QueueFull; a request larger than the limit is taken only while nothing else waits."""
-        count, waiting = len(ticket.request.poses), self._frames[ticket.request.priority]
-        if waiting and waiting + count > self._limit_frames:
-            raise QueueFull(
-                f"{waiting} frames wait already and {count} more would exceed the limit of "
-                f"{self._limit_frames}; try again shortly"
-            )
-        if not self._tickets[Priority.BATCH] and ticket.request.priority is Priority.BATCH:
+        """Raises QueueFull where there is no room, or where the ticket would not begin in time.
+
+        A request larger than a limit is taken only while nothing else waits.
+        """
+        request = ticket.request
+        turns = self._turns[request.priority]
+        self._require_time(ticket, turns)
+        self._make_room(ticket, turns)
+        if request.priority is Priority.BATCH and not turns.frames:
             self._last_batch_turn = time.monotonic()
-        size = self._poses_together(ticket)
+        count, size = len(request.poses), self._poses_together(ticket)
+        frame_s = self._forecast.frame_s(ticket.batch_key)
         for first in range(0, count, size):
-            self._append(Part(ticket, first, min(first + size, count)))
+            stop = min(first + size, count)
+            ticket.waiting.append(Part(ticket, first, stop, work_s=(stop - first) * frame_s))
+        turns.enter(request.caller, ticket, count, count * frame_s)
 
     def put_first(self, step: Step) -> None:
         """Puts a step that was begun and lost ahead of all that waits."""
         ticket = step.ticket
+        self._leave(ticket)
         ticket.waiting.appendleft(step)
-        self._frames[ticket.request.priority] += step.frames
-        tickets = self._tickets[ticket.request.priority]
-        tickets[ticket] = None
-        tickets.move_to_end(ticket, last=False)
+        again = self._again[ticket.request.priority]
+        again[ticket] = None
+        again.move_to_end(ticket, last=False)
 
     def remove(self, ticket: Ticket) -> None:
         """Drops all of a ticket that waits."""
-        priority = ticket.request.priority
-        self._frames[priority] -= sum(step.frames for step in ticket.waiting)
+        self._leave(ticket)
         ticket.waiting.clear()
-        self._tickets[priority].pop(ticket, None)
 
     def take_batch(self) -> list[Step]:
         """The steps to be done next, together; empty when nothing waits. Drops tickets past their deadline."""
         priorities = list(Priority)
-        if time.monotonic() - self._last_batch_turn >= _BATCH_PATIENCE_S:
+        patient_s = time.monotonic() - self._last_batch_turn
+        if patient_s >= _BATCH_PATIENCE_S and self._last_priority is not Priority.BATCH:
             priorities.reverse()
         for priority in priorities:
-            tickets = self._tickets[priority]
-            while tickets:
-                ticket = next(iter(tickets))
+            while (ticket := next(self._in_turn(priority), None)) is not None:
                 if ticket.expired:
                     self.expire(ticket)
                     continue
                 step = self._take(ticket)
-                return [step, *self._take_company(step)] if isinstance(step, Part) else [step]
+                batch: list[Step] = [step]
+                if isinstance(step, Part):
+                    batch += self._take_company(step)
+                self._shed_overtaken()
+                return batch
         return []
 
+    def settle(self, steps: Sequence[Step], seconds: float, *, typical: bool) -> None:
+        """Takes note of what a worker took for steps together; `typical`: such frames will take as long again."""
+        frames = sum(step.frames for step in steps)
+        kind = steps[0].ticket.batch_key
+        if frames and (typical or seconds / frames > self._forecast.frame_s(kind)):
+            self._forecast.learn(kind, frames, seconds)
+        for step in steps:
+            request, share = step.ticket.request, step.frames / frames if frames else 1.0
+            self._turns[request.priority].charge(request.caller, share * seconds - step.work_s)
+
     def expire(self, ticket: Ticket) -> None:
-        """Drops a ticket that is past its deadline, if any of it still waits."""
-        if ticket.waiting and ticket.expired:
+        """Fails a ticket that is past its deadline, and drops what still waits of it."""
+        if ticket.expired:
             self.remove(ticket)
             waited_ms = (time.monotonic() - ticket.submitted) * 1000.0
             ticket.fail(DeadlineExceeded(f"the deadline passed before the frames were rendered ({waited_ms:.0f} ms)"))
 
+    def _require_time(self, ticket: Ticket, turns: Turns[Ticket]) -> None:
+        """Raises QueueFull for a ticket that would begin after its deadline, or too late because of others."""
+        request = ticket.request
+        left_s = math.inf if request.deadline is None else request.deadline - time.monotonic()
+        patience_s = self._max_queue_s if request.priority is Priority.INTERACTIVE else math.inf
+        if left_s <= 0.0 or turns.work_s <= min(left_s, patience_s) * self.workers:
+            return
+        wait_s = turns.wait_s(request.caller, own=True) / self.workers
+        if wait_s > left_s:
+            limit = f"its deadline is in {left_s:.1f} s"
+        elif (wait_s := turns.wait_s(request.caller, own=False) / self.workers) > patience_s:
+            limit = f"one is to wait for others for at most {patience_s:g} s"
+        else:
+            return
+        raise self._refusal(f"the request would begin after {wait_s:.1f} s, {limit}", turns)
+
+    def _shed_overtaken(self) -> None:
+        """Refuses what waits longer for others than it was to, as others came that had had less, and went before it.
+
+        So much of it, what waits longest first, that the rest can be rendered in time.
+        """
+        turns = self._turns[Priority.INTERACTIVE]
+        if turns.work_s <= self._max_queue_s * self.workers:
+            return
+        latest = time.monotonic() - self._max_queue_s
+        heads = ((max(since, ticket.submitted), ticket) for since, ticket in turns.heads())
+        overdue = [(since, ticket) for since, ticket in heads if since < latest and ticket.untouched]
+        for _, ticket in sorted(overdue, key=lambda one: one[0]):
+            if turns.work_s <= self._max_queue_s * self.workers:
+                break
+            self.remove(ticket)
+            ticket.fail(self._refusal(f"others went before for more than {self._max_queue_s:g} s", turns))
+
+    def _make_room(self, ticket: Ticket, turns: Turns[Ticket]) -> None:
+        """Fails what came last of whoever waits for the most, where that is more than what the ticket's caller will.
+
+        Raises QueueFull where there is no such one.
+        """
+        caller, count = ticket.request.caller, len(ticket.request.poses)
+        while (waiting := turns.frames_of(caller.client)) and waiting + count > self._client_limit_frames:
+            self._push_out(
+                turns.greediest(caller, count, own=True),
+                self._refusal(_no_room("of this client", waiting, count, self._client_limit_frames), turns),
+            )
+        while (waiting := turns.frames) and waiting + count > self._limit_frames:
+            self._push_out(
+                turns.greediest(caller, count, own=False),
+                self._refusal(_no_room("already", waiting, count, self._limit_frames), turns),
+            )
+
+    def _push_out(self, last: Ticket | None, refusal: QueueFull) -> None:
+        if last is None or not last.untouched:
+            raise refusal
+        self.remove(last)
+        last.fail(refusal)
+
+    def _refusal(self, detail: str, turns: Turns[Ticket]) -> QueueFull:
+        """The error that tells when all that waits now will be rendered."""
+        return QueueFull(detail, retry_after_s=max(_LEAST_RETRY_S, turns.work_s / self.workers))
+
+    def _in_turn(self, priority: Priority) -> Iterator[Ticket]:
+        yield from list(self._again[priority])
+        yield from self._turns[priority]
+
+    def _leave(self, ticket: Ticket) -> None:
+        request = ticket.request
+        if self._again[request.priority].pop(ticket, ticket) is not None and ticket.waiting:
+            frames, work_s = _sum_of(ticket.waiting)
+            self._turns[request.priority].leave(request.caller, ticket, frames, work_s)
+
     def _take_company(self, first: Part) -> list[Part]:
-        if first.attempts >= _ATTEMPTS_IN_COMPANY:
-            return []  # it may be what kills the workers
+        if first.suspect:
+            return []
         room = self._poses_together(first.ticket) - first.frames
         company: list[Part] = []
-        for ticket in list(self._tickets[first.ticket.request.priority]):
-            if room <= 0:
-                break
+        for ticket in list(self._in_turn(first.ticket.request.priority)) if room > 0 else ():
             if ticket.batch_key != first.ticket.batch_key or ticket.expired:
                 continue
-            while ticket.waiting:
+            while ticket.waiting and room > 0:
                 step = ticket.waiting[0]
-                if not isinstance(step, Part) or step.frames > room or step.attempts >= _ATTEMPTS_IN_COMPANY:
+                if not isinstance(step, Part) or step.frames > room or step.suspect:
                     break
                 self._take(ticket)
                 company.append(step)
                 room -= step.frames
+            if room <= 0:
+                break
         return company
 
-    def _append(self, part: Part) -> None:
-        priority = part.ticket.request.priority
-        part.ticket.waiting.append(part)
-        self._frames[priority] += part.frames
-        self._tickets[priority].setdefault(part.ticket)
-
     def _take(self, ticket: Ticket) -> Step:
-        priority = ticket.request.priority
-        if priority is Priority.BATCH:
+        request = ticket.request
+        self._last_priority = request.priority
+        if request.priority is Priority.BATCH:
             self._last_batch_turn = time.monotonic()
         step = ticket.waiting.popleft()
-        self._frames[priority] -= step.frames
-        if ticket.waiting:
-            self._tickets[priority].move_to_end(ticket)  # others get their turn before its next part
+        turns = self._turns[request.priority]
+        if self._again[request.priority].pop(ticket, ticket) is None:
+            if ticket.waiting:  # others get their turn before its next part
+                turns.enter(request.caller, ticket, *_sum_of(ticket.waiting))
         else:
-            del self._tickets[priority][ticket]
+            turns.serve(request.caller, ticket, step.frames, step.work_s, more=bool(ticket.waiting))
         return step
 
     def _poses_together(self, ticket: Ticket) -> int:
-        """The number of poses in a full batch: fewer for images of more than 512x512 pixels."""
+        """The number of poses in a full batch: fewer for images of more than 512x512 pixels, and for slow ones."""
         share = _BATCH_PRIORITY_SHARE if ticket.request.priority is Priority.BATCH else 1
         settings = ticket.request.settings
         pixels = settings.height * settings.width * len(settings.outputs)
         fitting = self._max_batch_poses * _FULL_BATCH_PIXELS_PER_POSE // pixels
+        if (frame_s := self._forecast.frame_s(ticket.batch_key)) > 0.0:
+            fitting = min(fitting, int(_LONGEST_BATCH_S / frame_s))
         return max(1, min(self._max_batch_poses, fitting) // share)
 
 
+def _sum_of(steps: Iterable[Step]) -> tuple[int, float]:
+    """Their frames, and the work of these."""
+    steps = list(steps)
+    return sum(step.frames for step in steps), sum(step.work_s for step in steps)
+
+
+def _no_room(whose: str, waiting: int, count: int, limit: int) -> str:
+    return f"{waiting} frames wait {whose} and {count} more would exceed the limit of {limit}; try again shortly"
+
+
 class Expiry:
-    """Drops a ticket in time, should it still wait at its deadline."""
+    """Fails a ticket at its deadline, should its frames not be ready by then."""
 
     def __init__(self, ticket: Ticket, queue: WaitingQueue) -> None:
         self._ticket, self._queue = ticket, queue

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 
 from torch import Tensor
 
+from ...limits import UNLIMITED, Limits
 from ...probe import FloatArray, Probe
 from ...scene import GaussianScene
 from .device import available, device, device_count, interpreted, renderer, require, supports, upload
@@ -33,12 +34,14 @@ def render_outputs(
     height: int,
     width: int,
     outputs: Sequence[str],
+    limits: Limits = UNLIMITED,
 ) -> dict[str, Tensor]:
     """The outputs by name, each [C, H, W] float32 on the scene's device; differentiable once by every parameter.
 
-    The scene is one that the backend supports. Nothing here waits for the device.
-    Raises MemoryExceeded where the device's memory does not suffice.
+    The scene is one that the backend supports. Nothing here waits for the device, but where the cost of frames has a
+    limit; limits hold for frames without gradients.
+    Raises MemoryExceeded where the device's memory does not suffice, FrameTooCostly and GivenUp.
     """
     from .frames import render_frames
 
-    return render_frames(scene, probe, poses_cm, height, width, outputs)
+    return render_frames(scene, probe, poses_cm, height, width, outputs, limits)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator, Sequence
+from dataclasses import fields
 from typing import Any
 
 import torch
@@ -11,6 +12,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from ...errors import MemoryExceeded, TooManyPoses
+from ...limits import Limits
 from ...probe import FloatArray, Probe
 from ...scene import PARAMETERS, GaussianScene
 from ..spatial_order import spatial_order
@@ -30,6 +32,7 @@ from .launch import (
     view_table,
 )
 
+_SLICES = len(fields(Slices))
 WORKSPACE_BYTES = 1 << 30  # of slices and planes; poses beyond it are rendered in a further round
 
 
@@ -40,13 +43,14 @@ def render_frames(
     height: int,
     width: int,
     outputs: Sequence[str],
+    limits: Limits,
 ) -> dict[str, Tensor]:  # [C, H, W] each
     """See `ultragray.backends.cuda.render_outputs`."""
     geometry, device = Geometry.of(probe, height, width), scene.means.device
     with _on_device(device, f"{len(poses_cm)} frames of {height}x{width} pixels from {len(scene.means):,} Gaussians"):
         views = upload(torch.from_numpy(view_table(probe, poses_cm, height)), device)
         if not torch.is_grad_enabled() or not any(tensor.requires_grad for tensor in scene.splats.values()):
-            return _render(sorted_gaussians(scene), geometry, views, outputs)
+            return _render(sorted_gaussians(scene), geometry, views, outputs, limits)
         if len(views) > MAX_POSES:
             raise TooManyPoses(
                 f"at most {MAX_POSES:,} poses can be differentiated together, got {len(views):,}", field="poses"
@@ -70,12 +74,19 @@ def _on_device(device: torch.device, what: str) -> Iterator[None]:
         ) from error
 
 
-def _render(gaussians: Gaussians, geometry: Geometry, views: Tensor, outputs: Sequence[str]) -> dict[str, Tensor]:
+def _render(
+    gaussians: Gaussians, geometry: Geometry, views: Tensor, outputs: Sequence[str], limits: Limits
+) -> dict[str, Tensor]:
+    """Waits for the device only where the cost of frames has a limit."""
     frames = empty_frames(outputs, len(views), geometry, views.device)
     at_once = min(MAX_POSES, max(1, WORKSPACE_BYTES // bytes_per_pose(len(gaussians.means), geometry)))
     for first in range(0, len(views), at_once):
+        limits.check_flag()
         some = slice(first, first + at_once)
         slices = cut(gaussians, views[some], geometry, record=False)
+        if limits.footprint_pixels is not None:
+            limits.check_costs(slices.footprints.sum(dim=1).tolist(), first)
+            limits.check_flag()
         draw(slices, geometry, {name: frame[some] for name, frame in frames.items()}, keep=False)
     return frames
 
@@ -107,7 +118,7 @@ class _Render(torch.autograd.Function):
         }
         saved = list(ctx.saved_tensors)
         splats, (views, *rest) = saved[: len(PARAMETERS)], saved[len(PARAMETERS) :]
-        slices, planes = Slices(*rest[:5]), Planes(*rest[5:])
+        slices, planes = Slices(*rest[:_SLICES]), Planes(*rest[_SLICES:])
         with _on_device(views.device, f"the gradient of {len(views)} frames"):
             gaussians = Gaussians.of(dict(zip(PARAMETERS, splats, strict=True)), ctx.intensity)
             found = differentiate(gaussians, views, ctx.geometry, slices, planes, given)

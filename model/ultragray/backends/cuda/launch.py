@@ -144,6 +144,7 @@ class Slices:
     rectangles: Tensor  # [C, B, BLOCK, RECTANGLE] int32
     bounds: Tensor  # [C, B, 4] int32
     counts: Tensor  # [C, B] int32
+    footprints: Tensor  # [C, B] int64, footprint pixels
     places: Tensor  # [C, B, BLOCK] int32, empty where it is not recorded
 
 
@@ -178,6 +179,7 @@ def cut(gaussians: Gaussians, views: Tensor, geometry: Geometry, *, record: bool
         rectangles=torch.empty((places, constants.RECTANGLE.value), dtype=torch.int32, device=device),
         bounds=torch.empty((poses * blocks, 4), dtype=torch.int32, device=device),
         counts=torch.empty((poses, blocks), dtype=torch.int32, device=device),
+        footprints=torch.empty((poses, blocks), dtype=torch.int64, device=device),
         places=torch.empty(places if record else 0, dtype=torch.int32, device=device),
     )
     if places:

@@ -28,17 +28,30 @@ jobs_app.add_typer(submit_app, name="submit")
 JobArgument = Annotated[str, typer.Argument(help="Id of the job.", show_default=False)]
 _SERVER = typer.Option(help="URL of the service.", envvar="ULTRAGRAY_SERVER")
 _API_KEY = typer.Option(help="Where the service asks for one.", envvar="ULTRAGRAY_API_KEY", show_default=False)
+_CA = typer.Option(
+    help="Authorities (PEM) that sign the service's certificate.",
+    envvar="ULTRAGRAY_CA",
+    show_default="the system's",
+)
+_CERTIFICATE = typer.Option(
+    help="Certificate (PEM) of the client, where the service asks for one.",
+    envvar="ULTRAGRAY_CLIENT_CERTIFICATE",
+    show_default=False,
+)
+_KEY = typer.Option(help="Its key (PEM), not encrypted.", envvar="ULTRAGRAY_CLIENT_KEY", show_default=False)
 _CONNECTION = [
     keyword("server", Annotated[str, _SERVER], "http://127.0.0.1:8000"),
     keyword("api_key", Annotated[str | None, _API_KEY], None),
+    keyword("ca", Annotated[Path | None, _CA], None),
+    keyword("client_certificate", Annotated[Path | None, _CERTIFICATE], None),
+    keyword("client_key", Annotated[Path | None, _KEY], None),
 ]
 
 _COLUMNS = ("id", "kind", "state", "scene", "progress", "created", "reason")
-_PIPE_COLUMNS = 400  # where no terminal says how wide it is, nothing is cut
 
 
 def _with_client(command: Callable[..., None]) -> Callable[..., None]:
-    """Make a command of a function that takes a `client` first: with the options --server and --api-key."""
+    """Make a command of a function that takes a `client` first: with the options of its connection."""
     hints = get_type_hints(command, localns={"JobClient": Any}, include_extras=True)  # imported when a command runs
     own = [
         parameter.replace(annotation=hints[name], kind=parameter.KEYWORD_ONLY)
@@ -47,10 +60,26 @@ def _with_client(command: Callable[..., None]) -> Callable[..., None]:
     ]
 
     @wraps(command)
-    def run(*, server: str, api_key: str | None, **given: Any) -> None:
+    def run(
+        *,
+        server: str,
+        api_key: str | None,
+        ca: Path | None,
+        client_certificate: Path | None,
+        client_key: Path | None,
+        **given: Any,
+    ) -> None:
         from ...core.job_client import JobClient
+        from ...tls.client import client_context, exposes_key
 
-        command(JobClient(server, api_key), **given)
+        tls = client_context(ca, client_certificate, client_key)
+        if api_key is not None and exposes_key(server):
+            typer.secho(
+                f"warning: the API key travels unencrypted to {server}, and whoever is on the way can read it",
+                fg=typer.colors.YELLOW,
+                err=True,
+            )
+        command(JobClient(server, api_key, tls), **given)
 
     return with_parameters(run, [*own, *_CONNECTION])
 
@@ -187,18 +216,13 @@ for _kind, _class in Specification.members.items():
 
 
 def _print_jobs(jobs: list[dict[str, Any]]) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
+    from ..output import print_table
     from .watch import amount
 
-    console = Console()
-    if not console.is_terminal:
-        console.width = _PIPE_COLUMNS
-    table = Table(*_COLUMNS, box=None, pad_edge=False)
-    table.columns[0].no_wrap = True
-    for job in jobs:
-        created = str(job["created_at"])[:19].replace("T", " ")
-        scene = str(job["specification"].get("scene", ""))
-        table.add_row(job["id"], job["kind"], job["state"], scene, amount(job), created, job["reason"] or "")
-    console.print(table)
+    print_table(_COLUMNS, [_row(job, amount(job)) for job in jobs])
+
+
+def _row(job: dict[str, Any], progress: str) -> tuple[str, ...]:
+    created = str(job["created_at"])[:19].replace("T", " ")
+    scene = str(job["specification"].get("scene", ""))
+    return (job["id"], job["kind"], job["state"], scene, progress, created, job["reason"] or "")

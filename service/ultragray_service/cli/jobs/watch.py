@@ -109,7 +109,7 @@ def figures(job: dict[str, Any]) -> str:
     progress = job["progress"]
     parts = []
     if progress["waits_for"] is not None:
-        parts.append(f"waits for {progress['waits_for']}, where another job is at work")
+        parts.append(f"waits for {progress['waits_for']}")
     if progress["loss"] is not None:
         parts.append(f"loss {progress['loss']:.4f}")
     if progress["gaussians"] is not None:

@@ -12,10 +12,9 @@ from pathlib import Path
 from ultragray_workers.errors import DatabaseUnavailable
 from ultragray_workers.jobs.store import Job
 
-from .log import TAIL_BYTES, GrowingLog
+from .log import GrowingLog
 
 READ_INTERVAL_S = 0.5
-_WAITING_LOG_CHARACTERS = 65536  # of a watcher that reads slowly; the oldest go
 
 
 @dataclass(frozen=True)
@@ -24,16 +23,16 @@ class JobChange:
 
     job: Job | None
     log: str
+    log_offset: int  # the byte of the log after these lines
 
 
 class JobWatch:
-    """One watcher's part. A watcher that reads slowly gets the newest state and loses old log lines, never both."""
+    """One watcher's part. A watcher that reads slowly gets the newest state and every line of the log."""
 
-    def __init__(self, leave: Callable[[JobWatch], None]) -> None:
-        self._leave = leave
+    def __init__(self, log: GrowingLog, threads: Executor | None, leave: Callable[[JobWatch], None]) -> None:
+        self._log, self._threads, self._leave = log, threads, leave
         self._job: Job | None = None
-        self._log = ""
-        self.finished = False  # whether the final state was given
+        self.finished = False  # whether the final state was told
         self._ended = False
         self._error: Exception | None = None
         self._news = asyncio.Event()
@@ -41,28 +40,42 @@ class JobWatch:
     async def next(self, timeout_s: float) -> JobChange | None:
         """The changes since the last call, after at most `timeout_s` seconds (none: an empty change).
 
-        None after the job's final state was given, or when the service stops. Raises what reading the job raises.
+        The final state comes with the last lines or after them; then None, as when the service stops. Raises what
+        reading the job raises.
         """
-        if not self._news.is_set() and not self._ended:
-            try:
-                await asyncio.wait_for(self._news.wait(), timeout_s)
-            except asyncio.TimeoutError:
-                return JobChange(None, "")
-        self._news.clear()
-        if self._job is not None or self._log:
-            change = JobChange(self._job, self._log)
-            self._job, self._log = None, ""
-            return change
-        if self._error is not None:
-            raise self._error
-        return None
+        loop = asyncio.get_running_loop()
+        end = loop.time() + timeout_s
+        while True:
+            if self._news.is_set():
+                change = await self._take()
+                if change.job is not None or change.log:
+                    return change
+            elif self._ended:
+                if self._error is not None:
+                    raise self._error
+                return None
+            else:
+                try:
+                    await asyncio.wait_for(self._news.wait(), max(0.0, end - loop.time()))
+                except asyncio.TimeoutError:
+                    return JobChange(None, "", self._log.offset)
 
-    def tell(self, job: Job | None, log: str) -> None:
-        """Adds to what the watcher has not read yet."""
+    async def _take(self) -> JobChange:
+        self._news.clear()
+        job, self._job = self._job, None
+        # After the state was read, so that the log of a finished job is whole.
+        lines = await asyncio.get_running_loop().run_in_executor(self._threads, self._log.read)
+        if self._log.has_more:
+            self._news.set()
+            if job is not None and job.state.is_final:
+                job, self._job = None, job
+        return JobChange(job, lines, self._log.offset)
+
+    def tell(self, job: Job | None) -> None:
+        """The job's newest state where it changed, or else that its log grew."""
         if job is not None:
             self._job = job
             self.finished = job.state.is_final
-        self._log = (self._log + log)[-_WAITING_LOG_CHARACTERS:]
         self._news.set()
 
     def end(self, error: Exception | None = None) -> None:
@@ -82,17 +95,17 @@ class _Reader:
     def __init__(self, read: Callable[[], Job], log_path: Path, threads: Executor | None) -> None:
         self._read = read
         self._threads = threads
-        self._log = GrowingLog(log_path)
-        self._tail = ""  # for those who come later
+        self._log_path = log_path
+        self._log_bytes = 0
         self._job: Job | None = None
         self.watches: set[JobWatch] = set()
         self.task = asyncio.ensure_future(self._run())
 
     def add(self, watch: JobWatch) -> None:
-        """Adds a watcher, whose first news are the job as it is known and the last lines of its log."""
+        """Adds a watcher, whose first news are the job as it is known and its log."""
         self.watches.add(watch)
         if self._job is not None:
-            watch.tell(self._job, self._tail)
+            watch.tell(self._job)
 
     async def _run(self) -> None:
         error: Exception | None = None
@@ -101,26 +114,29 @@ class _Reader:
                 if self._job is not None:
                     await asyncio.sleep(READ_INTERVAL_S)
                 try:
-                    job, log = await asyncio.get_running_loop().run_in_executor(self._threads, self._look)
+                    job, log_bytes = await asyncio.get_running_loop().run_in_executor(self._threads, self._look)
                 except DatabaseUnavailable:
                     if self._job is None:
                         raise
                     continue  # it comes back, and the watchers have nothing else to do
                 changed = job if job != self._job else None
-                self._job = job
-                self._tail = (self._tail + log)[-TAIL_BYTES:]
-                if changed is not None or log:
+                has_grown = log_bytes != self._log_bytes
+                self._job, self._log_bytes = job, log_bytes
+                if changed is not None or has_grown:
                     for watch in self.watches:
-                        watch.tell(changed, log)
+                        watch.tell(changed)
         except Exception as raised:
             error = raised
         finally:
             for watch in self.watches:
                 watch.end(error)
 
-    def _look(self) -> tuple[Job, str]:
+    def _look(self) -> tuple[Job, int]:
         job = self._read()  # first, so that the log of a finished job is whole
-        return job, self._log.read()
+        try:
+            return job, self._log_path.stat().st_size
+        except FileNotFoundError:
+            return job, 0
 
 
 class JobHub:
@@ -141,20 +157,24 @@ class JobHub:
         """The number of jobs that are being read."""
         return len(self._readers)
 
-    async def watch(self, job_id: str) -> JobWatch:
-        """A watcher of a job; its first change tells all. It must be closed. Raises JobNotFound."""
+    async def watch(self, job_id: str, log_offset: int | None = None) -> JobWatch:
+        """A watcher of a job, whose first change tells the job, and of its log what follows `log_offset`.
+
+        None: the last lines. It must be closed. Raises JobNotFound.
+        """
         reader = self._readers.get(job_id)
         if reader is None or reader.task.done():
             await asyncio.get_running_loop().run_in_executor(self._threads, self._get, job_id)
             reader = self._readers.get(job_id)  # another watcher may have come in the meantime
+        log = GrowingLog(self._log_path(job_id), log_offset)
         if self._closed:
-            over = JobWatch(lambda leaving: None)
+            over = JobWatch(log, self._threads, lambda leaving: None)
             over.end()
             return over
         if reader is None or reader.task.done():
             reader = _Reader(partial(self._get, job_id), self._log_path(job_id), self._threads)
             self._readers[job_id] = reader
-        watch = JobWatch(partial(self._remove, job_id, reader))
+        watch = JobWatch(log, self._threads, partial(self._remove, job_id, reader))
         reader.add(watch)
         return watch
 

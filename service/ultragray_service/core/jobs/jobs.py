@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import contextmanager
+from contextvars import copy_context
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -15,12 +16,18 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from ultragray.contract import described, under
 from ultragray.errors import DatasetInvalid, InvalidArgument, SceneFileInvalid, UltragrayError
+from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import DatabaseUnavailable, DatasetNotFound, NotReady, SceneExists, SceneNotFound
 from ultragray_workers.jobs.folder import JobFolder
 from ultragray_workers.jobs.kinds import Specification
+from ultragray_workers.jobs.overview import JobsOverview
+from ultragray_workers.jobs.queue.database import JobDatabase
 from ultragray_workers.jobs.store import Job, JobState, JobStore
 from ultragray_workers.scenes import SceneStore
 
+from ...access.audit import account
+from ...access.owners import may_see
+from ...access.principal import acting
 from ...settings import Settings
 from ..catalog import MAX_PAGE_SIZE, scene_to_blame
 from .hub import JobHub
@@ -45,14 +52,15 @@ class JobPage:
 class Jobs:
     """The jobs of one service."""
 
-    def __init__(self, settings: Settings, scenes: SceneStore) -> None:
+    def __init__(self, settings: Settings, scenes: SceneStore, datasets: DatasetStore) -> None:
         self._settings = settings
         self._scenes = scenes
+        self._datasets = datasets
         self._opened: JobStore | None = None
         # Of their own, so that a database that does not answer keeps nobody else waiting.
         self._threads = ThreadPoolExecutor(_THREADS, "jobs")
         self.hub = JobHub(lambda job_id: self._store.get(job_id), self._log_path, self._threads)
-        self.counts: dict[JobState, int] = {}  # as it was up to COUNT_INTERVAL_S ago; empty: not known
+        self.overview = JobsOverview()  # as it was up to COUNT_INTERVAL_S ago
         self._counting: asyncio.Task[None] | None = None
 
     @property
@@ -61,7 +69,7 @@ class Jobs:
             raise NotReady("the service is starting")
         return self._opened
 
-    async def start(self) -> None:
+    async def open(self) -> None:
         """Opens the store. Raises StartupFailed where its database cannot be reached."""
         settings = self._settings
         self._opened = await asyncio.to_thread(
@@ -70,8 +78,22 @@ class Jobs:
             settings.database_url,
             settings.job_queue_limit,
             scenes=self._scenes,
+            datasets=self._datasets,
             max_image_side=settings.max_image_side,
         )
+
+    @property
+    def threads(self) -> Executor:
+        """The threads in which the database is asked."""
+        return self._threads
+
+    @property
+    def database(self) -> JobDatabase:
+        """The opened database. Raises NotReady before `open`."""
+        return self._store.database
+
+    def start(self) -> None:
+        """Begins to count the jobs."""
         self._counting = asyncio.create_task(self._count())
 
     async def do(self, method: Callable[Concatenate[JobStore, P], T], *arguments: P.args, **options: P.kwargs) -> T:
@@ -79,7 +101,8 @@ class Jobs:
 
         Raises what the method raises, NotReady before the start, DatabaseUnavailable where the database is silent.
         """
-        call = partial(method, self._store, *arguments, **options)
+        # In the context of the caller: what others have and keep to themselves is not found.
+        call = partial(copy_context().run, method, self._store, *arguments, **options)
         answer = asyncio.get_running_loop().run_in_executor(self._threads, call)
         try:
             return await asyncio.wait_for(answer, _PATIENCE_S)
@@ -89,7 +112,7 @@ class Jobs:
             ) from None
 
     async def submit(
-        self, specification: Specification, *, field: str, request_id: str | None, priority: int
+        self, specification: Specification, *, field: str, request_id: str | None, priority: int, private: bool
     ) -> tuple[Job, bool]:
         """The job, and whether it is new. `field` is where the caller wrote the specification.
 
@@ -97,7 +120,16 @@ class Jobs:
         SceneFileInvalid, SceneExists.
         """
         with _specification_to_blame(field):
-            return await self.do(JobStore.submit, specification, request_id=request_id, priority=priority)
+            job, is_new = await self.do(
+                JobStore.submit,
+                specification,
+                request_id=request_id,
+                priority=priority,
+                owner=acting().name,
+                private=private,
+            )
+        account().target = job.id
+        return job, is_new
 
     async def page(self, *, state: str, kind: str, page_size: int, page_token: str) -> JobPage:
         """One page of jobs; empty filters pass all.
@@ -112,6 +144,7 @@ class Jobs:
             JobStore.list,
             state=JobState(state) if state else None,
             kind=kind or None,
+            shown=partial(may_see, acting()),
             page_size=page_size,
             page_token=page_token or None,
         )
@@ -131,9 +164,9 @@ class Jobs:
     async def _count(self) -> None:
         while True:
             try:
-                self.counts = await self.do(JobStore.counts)
+                self.overview = await self.do(JobStore.overview)
             except (UltragrayError, SQLAlchemyError):
-                self.counts = {}
+                self.overview = JobsOverview()
             await asyncio.sleep(COUNT_INTERVAL_S)
 
     def _log_path(self, job_id: str) -> Path:

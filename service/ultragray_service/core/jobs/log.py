@@ -6,40 +6,48 @@ import os
 from pathlib import Path
 
 DEFAULT_LOG_BYTES, MAX_LOG_BYTES = 65536, 2**20  # of the log's end, given at once
-TAIL_BYTES = 8192  # of the log, for a watcher who comes late
-_STEP_BYTES = 65536  # of a log that grows faster, only the end is given
+TAIL_BYTES = 8192  # of the log, for a watcher who names no place
+_STEP_BYTES = 65536  # at most, of one read
 
 
 class GrowingLog:
-    """Reads what was added to a log file since the last time; a file that does not exist yet is empty."""
+    """Reads a log file step by step; a file that does not exist yet is empty."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, offset: int | None = None) -> None:
+        """`offset`: the byte of the file to go on from; None: the last lines that are there at the first read."""
         self._path = path
-        self._offset: int | None = None  # None: nothing was read yet
+        self._offset = offset
+        self.has_more = False  # whether there may be more to read at once
+
+    @property
+    def offset(self) -> int:
+        """The byte of the file up to which it was read."""
+        return self._offset or 0
 
     def read(self) -> str:
-        """The lines that are new and whole, at first the last ones of the file.
+        """The next lines that are whole; a line longer than a step comes in pieces.
 
-        Where more was added than is read at a time, the oldest of it is left out. A file that became shorter was begun
-        again, and is read from its start.
+        A file that became shorter was begun again, and is read from its start.
         """
+        self.has_more = False
         try:
             with self._path.open("rb") as file:
-                size = os.fstat(file.fileno()).st_size
-                begin = 0 if self._offset is None or self._offset > size else self._offset
-                limit = TAIL_BYTES if self._offset is None else _STEP_BYTES
-                left_out = size - begin > limit
-                begin = max(begin, size - limit)
-                file.seek(begin)
-                added = file.read(size - begin)
+                self._offset = self._begin(file.fileno())
+                file.seek(self._offset)
+                added = file.read(_STEP_BYTES)
         except FileNotFoundError:
+            self._offset = 0
             return ""
+        self.has_more = len(added) == _STEP_BYTES
         end = added.rfind(b"\n") + 1
-        if not end and not left_out:
-            self._offset = begin
-            return ""
-        whole = added[:end]
-        self._offset = begin + end
-        if left_out:  # from the first line that is whole
-            whole = whole[whole.find(b"\n") + 1 :]
-        return whole.decode("utf-8", "replace")
+        if not end and self.has_more:
+            end = len(added)
+        self._offset += end
+        return added[:end].decode("utf-8", "replace")
+
+    def _begin(self, file: int) -> int:
+        size = os.fstat(file).st_size
+        if self._offset is not None:
+            return self._offset if self._offset <= size else 0
+        begin = max(0, size - TAIL_BYTES)
+        return begin and begin + os.pread(file, TAIL_BYTES, begin).find(b"\n") + 1

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from collections import deque
 from collections.abc import Awaitable, Callable, Coroutine
 from dataclasses import dataclass, replace
 from enum import Enum
@@ -12,16 +13,16 @@ from typing import Any
 
 from ultragray.errors import UltragrayError
 from ultragray.probe import FloatArray
-from ultragray.settings import Resolved
 from ultragray_workers.errors import Draining
-from ultragray_workers.pool.types import RenderRequest, RenderResult
+from ultragray_workers.pool.types import RenderResult
 from ultragray_workers.pool.waiting import Turn
 
+from ..requests import Plan
 from ..state import Service
 
 MAX_FRAMES_IN_FLIGHT = 8  # of an ordered stream; then it stops reading
 MAX_BYTES_IN_FLIGHT = 32 * 2**20  # of their frames, if there is more than one
-_MAX_LATEST_UNSENT = 2  # one on its way to the client, one being rendered
+MAX_WINDOW = 16  # answers of a latest stream that its client may have yet to acknowledge
 
 _log = logging.getLogger("ultragray.stream")
 
@@ -39,8 +40,7 @@ class Asked:
 
     sequence: int
     client_time: float | None  # any number (an int for gRPC): the client gets it back
-    scene: str
-    settings: Resolved  # the same object for as long as nothing changes
+    plan: Plan  # the same object until the client sends other settings
     pose: FloatArray  # [4, 4] mm, exact
     deadline: float  # time.monotonic() in seconds
 
@@ -83,6 +83,42 @@ class _Room:
         self._left.set()
 
 
+class _Window:
+    """The answers of a latest stream that are between the service and the hands of its client.
+
+    A pose is rendered only once there is room, so that it is the newest one then. A client that acknowledges has
+    opened a window of several answers, which leave it when they are acknowledged; of one that does not, one answer at
+    a time is on its way, until the transport has taken the whole of it: what lies in the buffers behind is unknown.
+    """
+
+    def __init__(self) -> None:
+        self._size: int | None = None  # None: the client acknowledges nothing
+        self._entered: deque[int] = deque()  # sequences, in the order of the answers
+
+    def open(self, size: int) -> None:
+        """The client acknowledges from now on."""
+        self._size = size
+
+    @property
+    def has_room(self) -> bool:
+        return len(self._entered) < (1 if self._size is None else self._size)
+
+    def enter(self, sequence: int) -> None:
+        """An answer is ready to be sent."""
+        self._entered.append(sequence)
+
+    def sent(self) -> None:
+        """The transport has taken the whole of the oldest answer that it had not."""
+        if self._size is None:
+            self._entered.popleft()
+
+    def acknowledge(self, sequence: int) -> None:
+        """The client has taken the answer of that sequence, and those before it are of no use any more."""
+        if self._size is not None and sequence in self._entered:
+            while self._entered.popleft() != sequence:
+                pass
+
+
 class PoseStream:
     """One stream of one client."""
 
@@ -98,7 +134,7 @@ class PoseStream:
         self._current: Asked | None = None
         self._turn = Turn()
         self._next: Asked | None = None
-        self._unsent = 0
+        self._window = _Window()
 
     async def run(self, read: Callable[[], Awaitable[None]], write: Callable[[Answered], Awaitable[None]]) -> None:
         """Until the client has sent its last pose and got its last frame.
@@ -114,6 +150,8 @@ class PoseStream:
         try:
             await asyncio.wait({reader, writer}, return_when=asyncio.FIRST_EXCEPTION)
             if reader.done() and not reader.cancelled():
+                if isinstance(reader.exception(), UltragrayError):
+                    await asyncio.wait({writer})  # gRPC cannot end a call while an answer is being written
                 reader.result()
             if writer.done() and not writer.cancelled():
                 writer.result()
@@ -121,18 +159,19 @@ class PoseStream:
                 raise Draining("the service is stopping; the frames in flight have been answered")
         finally:
             self._service.metrics.count_stream(-1)
-            left = [task for task in (reader, writer, stopping, *self._started) if not task.done()]
-            for task in left:
+            tasks = [reader, writer, stopping, *self._started]
+            for task in tasks:
                 task.cancel()
             self._answers = asyncio.Queue()  # with the frames that nobody takes any more
-            await asyncio.gather(*left, return_exceptions=True)
-            left.clear()
+            await asyncio.gather(*tasks, return_exceptions=True)  # those that have failed already, too
+            tasks.clear()
             del reader, writer  # what they raised holds on to this call, and that to frames that nobody takes any more
 
     async def ask(self, asked: Asked) -> None:
         """Takes a pose. An ordered stream waits while too many frames are in flight."""
         if self.mode is StreamMode.ORDERED:
-            size = asked.settings.pixels * asked.settings.encoding.pixel_type.itemsize
+            settings = asked.plan.settings
+            size = settings.pixels * settings.encoding.pixel_type.itemsize
             await self._room.enter(size)
             self._start(self._answer(asked), sent=partial(self._room.leave, size))
             return
@@ -142,6 +181,15 @@ class PoseStream:
         if self._next is not None:
             self._count_dropped()
         self._next = asked
+        self._advance()
+
+    def open_window(self, size: int) -> None:
+        """The client of a latest stream acknowledges answers, and wants so many of them ahead."""
+        self._window.open(size)
+
+    def acknowledge(self, sequence: int) -> None:
+        """The client has taken the answer of that sequence."""
+        self._window.acknowledge(sequence)
         self._advance()
 
     async def refuse(self, sequence: int, client_time: float | None, error: UltragrayError) -> None:
@@ -179,20 +227,18 @@ class PoseStream:
 
     async def _outcome(self, asked: Asked, turn: Turn) -> RenderResult | UltragrayError:
         try:
-            request = RenderRequest(asked.scene, asked.settings, asked.pose[None], deadline=asked.deadline)
-            return await self._service.render(request, turn)
+            return await self._service.render(asked.plan, asked.pose[None], deadline=asked.deadline, turn=turn)
         except UltragrayError as error:
             outcome = error
-        except Exception:
-            _log.exception("unexpected error in a stream")
-            outcome = UltragrayError("an unexpected error, see the log")
+        except Exception as error:
+            outcome = unexpected(error)
         self._service.metrics.count_frame_error(outcome)
         return outcome
 
     def _take_over(self, asked: Asked) -> bool:
         """Puts a pose into the place of the one that the pool has not begun."""
         current = self._current
-        if current is None or current.settings is not asked.settings:
+        if current is None or current.plan is not asked.plan:
             return False
         if not self._turn.give_to(asked.pose[None], asked.deadline):
             return False
@@ -201,9 +247,9 @@ class PoseStream:
 
     def _advance(self) -> None:
         """Asks the pool for what comes next, once it may; ends the answers after the last one."""
-        if self._next is not None and self._current is None and self._unsent < _MAX_LATEST_UNSENT:
+        has_room = self._window.has_room or self._ended  # a client that has ended cannot acknowledge any more
+        if self._next is not None and self._current is None and has_room:
             self._current, self._next, self._turn = self._next, None, Turn()
-            self._unsent += 1
             self._start(self._answer_latest(), sent=self._sent_latest)
         if self._ended and self._next is None:
             self._answers.put_nowait(None)
@@ -212,16 +258,23 @@ class PoseStream:
         assert self._current is not None
         outcome = await self._outcome(self._current, self._turn)
         asked, self._current = self._current, None  # perhaps a later one than at the start
+        self._window.enter(asked.sequence)
         self._advance()
         return Answered(asked.sequence, asked.client_time, outcome)
 
     def _sent_latest(self) -> None:
-        self._unsent -= 1
+        self._window.sent()
         self._advance()
 
     def _count_dropped(self) -> None:
         self._dropped += 1
         self._service.metrics.count_dropped()
+
+
+def unexpected(error: Exception) -> UltragrayError:
+    """The refusal of a message that a fault of the service kept from its frame; the log has the fault."""
+    _log.error("unexpected error in a stream", exc_info=error)
+    return UltragrayError("an unexpected error, see the log")
 
 
 def _cancel(task: asyncio.Task[None], _: asyncio.Future[bool]) -> None:

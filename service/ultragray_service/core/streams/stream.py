@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from ultragray.contract import under
 from ultragray.errors import InvalidArgument, UltragrayError
 from ultragray.probe import FloatArray
-from ultragray.settings import RenderSettings, Resolved
+from ultragray.settings import RenderSettings
 
+from ..requests import Plan
 from ..state import Service
-from .pose_stream import Answered, Asked, PoseStream, StreamMode
+from .pose_stream import Answered, Asked, PoseStream, StreamMode, unexpected
 
 MAX_TIMEOUT_MS = 3_600_000.0
 
@@ -25,6 +25,14 @@ class Message(Protocol):
 
     @property
     def client_time(self) -> float | None: ...
+
+    @property
+    def window(self) -> int | None:
+        """Answers of a latest stream that may wait to be acknowledged; of the first message. None: none ever is."""
+
+    @property
+    def acknowledged(self) -> int | None:
+        """The sequence of the newest answer that the client has taken; None: no news."""
 
     def settings(self) -> SceneSettings | None:
         """The scene and what to render of it from now on; None: as before."""
@@ -63,7 +71,7 @@ class FrameStream:
         self._service = service
         self._transport = transport
         self._unset = unset
-        self._resolved: tuple[str, Resolved] | None = None
+        self._plan: Plan | None = None
         self._poses = PoseStream(service)
 
     async def run(self) -> None:
@@ -78,6 +86,10 @@ class FrameStream:
         while (message := await self._transport.receive()) is not None:
             if mode is None and (mode := self._transport.mode(message)) is not None:
                 self._poses.mode = mode
+                if message.window is not None:
+                    self._poses.open_window(message.window)
+            if message.acknowledged is not None:
+                self._poses.acknowledge(message.acknowledged)
             await self._take(message)
 
     async def _take(self, message: Message) -> None:
@@ -85,6 +97,8 @@ class FrameStream:
             asked = await self._asked(message)
         except UltragrayError as error:
             await self._poses.refuse(message.sequence, message.client_time, error)
+        except Exception as error:
+            await self._poses.refuse(message.sequence, message.client_time, unexpected(error))
         else:
             if asked is not None:
                 await self._poses.ask(asked)
@@ -93,13 +107,12 @@ class FrameStream:
         await self._change_settings(message)
         if not message.asks:
             return None
-        if self._resolved is None:
+        if self._plan is None:
             if self._unset is None:
                 raise InvalidArgument("settings must be given, and accepted, before the first pose", field="settings")
-            self._resolved = await self._resolve(self._unset)
-        scene, settings = self._resolved
+            self._plan = await self._resolve(self._unset)
         pose, deadline = message.pose(), self._service.planner.deadline(message.timeout_s())
-        return Asked(message.sequence, message.client_time, scene, settings, pose, deadline)
+        return Asked(message.sequence, message.client_time, self._plan, pose, deadline)
 
     async def _change_settings(self, message: Message) -> None:
         unset, self._unset = self._unset, None  # as long as the message's own are not known to be none
@@ -107,12 +120,11 @@ class FrameStream:
         if settings is None:
             self._unset = unset
         else:
-            self._resolved = await self._resolve(settings)
+            self._plan = await self._resolve(settings)
 
-    async def _resolve(self, settings: SceneSettings) -> tuple[str, Resolved]:
-        with under("settings"):
-            scene, asked = settings
-            return scene, await self._service.planner.resolve(scene, asked, asked.encoding)
+    async def _resolve(self, settings: SceneSettings) -> Plan:
+        scene, asked = settings
+        return await self._service.planner.plan(scene, asked, asked.encoding, path="settings")
 
 
 def checked_timeout_s(timeout_ms: float) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import Field, dataclass, field, make_dataclass
 from typing import Any, Literal, get_args
@@ -15,8 +16,11 @@ from ultragray_workers.jobs.job import MAX_PRIORITY
 from ultragray_workers.jobs.kinds import KINDS, Specification
 
 from ...core.poses import Pose, check_pose_count
-from ...core.streams.pose_stream import StreamMode
+from ...core.streams.pose_stream import MAX_WINDOW, StreamMode
 from ...core.streams.stream import MAX_TIMEOUT_MS
+from .large_json import INLINE_BYTES, Apart
+
+_POSE_BYTES = 1024  # with room for indentation
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,8 +33,21 @@ class RenderBody(FrameSettings):
         "Of application/octet-stream; a dtype in the Accept header goes first. Default: uint8.", None
     )
     timeout_ms: float | None = described(
-        "A frame that still waits after this time is dropped (504).", None, above=0, high=MAX_TIMEOUT_MS
+        "A frame that is not ready after this time is given up (504).", None, above=0, high=MAX_TIMEOUT_MS
     )
+
+    @classmethod
+    def many_poses(cls, limit: int) -> Apart:
+        """The part of a body that may be large."""
+        return Apart(
+            "poses",
+            list,
+            Pose,
+            InvalidPose,
+            lambda count: check_pose_count(count, limit),
+            max_bytes=INLINE_BYTES + limit * _POSE_BYTES,
+            max_values=math.inf,
+        )
 
     def poses_by_path(self, limit: int) -> Sequence[tuple[str, Pose]]:
         """The poses, each with its path in the body. Raises InvalidArgument, TooManyPoses."""
@@ -53,6 +70,19 @@ class StreamMessage(Contract):
     mode: StreamMode | None = described("Of the stream; read from its first message. Default: ordered.", None)
     timeout_ms: float | None = described("Later this pose is not rendered.", None, above=0, high=MAX_TIMEOUT_MS)
     client_time_ms: float | None = described("Any number; the answer carries it.", None)
+    window: int | None = described(
+        "Of a latest stream, read from its first message: answers that may wait to be acknowledged. Default: the "
+        "client acknowledges none.",
+        None,
+        low=1,
+        high=MAX_WINDOW,
+    )
+    acknowledged: int | None = described(
+        "Sequence of the newest answer that the client has taken; it and those before it leave room for others.",
+        None,
+        low=0,
+        high=2**64 - 1,
+    )
 
 
 def _body_of(kind: str) -> type[Any]:
@@ -81,6 +111,7 @@ def _without_arrays(annotation: Any) -> Any:
     return first
 
 
+SPECIFICATION = Apart("specification", dict)  # of a job: there may be many poses in it
 SPECIFICATIONS = tuple(map(_body_of, KINDS))
 
 
@@ -91,7 +122,8 @@ class JobBody(Contract):
     kind: str = described("What is to be done.", choices=KINDS)
     specification: dict[str, Any] = field(
         metadata={
-            "description": f"{' or '.join(one.__name__ for one in SPECIFICATIONS)}, by kind.",
+            "description": f"{' or '.join(one.__name__ for one in SPECIFICATIONS)}, by kind. Poses may also be "
+            "one text: float64, row by row, the low byte first, in base64.",
             "json_schema_extra": {
                 "anyOf": [{"$ref": f"#/components/schemas/{one.__name__}"} for one in SPECIFICATIONS]
             },
@@ -101,3 +133,4 @@ class JobBody(Contract):
         "Chosen by the client, 1 to 128 characters: sent again, it gives the same job.", None
     )
     priority: int = described("Higher ones go first.", 0, low=-MAX_PRIORITY, high=MAX_PRIORITY)
+    private: bool = described("Whether others may not see it, nor the scene that it makes.", False)

@@ -10,6 +10,7 @@ from starlette.requests import Request
 
 from ...errors import UnsupportedMediaType
 from ..problems import invalid_argument
+from .large_json import INLINE_BYTES, Apart, read_large
 
 T = TypeVar("T")
 
@@ -28,15 +29,19 @@ def body_schema(cls: Any, examples: dict[str, Any] | None = None) -> dict[str, A
     return {"requestBody": {"required": True, "content": {"application/json": content}}}
 
 
-async def read_json_body(request: Request, cls: type[T]) -> T:
-    """The body, checked. Raises UnsupportedMediaType, BodyTooLarge, InvalidArgument and what the class raises."""
+async def read_json_body(request: Request, cls: type[T], apart: Apart | None = None) -> T:
+    """The body, checked; `apart` says which part of it may be large.
+
+    Raises UnsupportedMediaType, BodyTooLarge, InvalidArgument and what the class raises.
+    """
     content_type = request.headers.get("content-type", "application/json")
     media_type = content_type.partition(";")[0].strip().lower()
     if media_type != "application/json" and not media_type.endswith("+json"):
         raise UnsupportedMediaType(f"Content-Type must be application/json, got {content_type!r}", field="Content-Type")
     if request.headers.get("content-encoding", "identity").lower() != "identity":
         raise UnsupportedMediaType("the body must not be compressed", field="Content-Encoding")
-    return read_json(await request.body(), cls)
+    body = await request.body()
+    return read_json(body, cls) if len(body) <= INLINE_BYTES else await read_large(body, cls, apart, read_json)
 
 
 def read_json(text: str | bytes, cls: type[T]) -> T:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import time
 from collections.abc import AsyncIterator
 from inspect import Parameter, Signature
@@ -16,9 +15,10 @@ from ultragray.datasets.source import UPLOAD_OPTIONS, UPLOADED_FORMATS
 from ultragray_workers.datasets.store import DatasetRecord
 from ultragray_workers.errors import UploadTooLarge
 
+from ...core import datasets
 from ...core.catalog import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE
 from ...core.dataset_uploads import DatasetUpload
-from ...core.datasets import DatasetPage, contact_sheet, dataset_page
+from ...core.datasets import DatasetPage, contact_sheet, dataset_page, with_owner
 from ...core.helper_processes import PATIENCE_S
 from ...errors import UnsupportedMediaType
 from ..deps import ServiceDep, problems
@@ -41,6 +41,9 @@ ARCHIVES = (
 DatasetName = Annotated[str, Path(description="Name of the dataset.", examples=["liver"])]
 PageSize = Annotated[int, Query(ge=1, le=MAX_PAGE_SIZE, description="Datasets on one page.")]
 PageToken = Annotated[str, Query(description="next_page_token of the page before.")]
+
+
+Private = Annotated[bool, Query(description="Whether others may not see it.")]
 
 
 def _given_options(**given: str) -> dict[str, str]:
@@ -82,7 +85,7 @@ _PICTURE: _Answers = {200: {"description": "The image planes in space and some f
     "/{dataset}",
     status_code=201,
     openapi_extra=_UPLOAD,
-    responses=_PRESENT | problems(401, 409, 413, 415, 422, 429, 500, 501, 503, 504, 507),
+    responses=_PRESENT | problems(401, 403, 409, 413, 415, 422, 429, 500, 501, 503, 504, 507),
 )
 async def put_dataset(
     request: Request,
@@ -90,6 +93,7 @@ async def put_dataset(
     service: ServiceDep,
     dataset: DatasetName,
     options: GivenOptions,
+    private: Private = False,
 ) -> DatasetRecord:
     """Uploads a dataset, checks it as `ultragray dataset check` does, and keeps it. Empty options: as it is stored."""
     service.require_serving()
@@ -100,7 +104,7 @@ async def put_dataset(
             f"a dataset may have at most {service.settings.max_dataset_bytes} bytes, {announced} were announced",
             field="body",
         )
-    async with service.uploads.receive(dataset, options) as upload:
+    async with service.uploads.receive(dataset, options, private=private) as upload:
         if media_type == MULTIPART:
             await _receive_files(request, upload)
         else:
@@ -108,7 +112,7 @@ async def put_dataset(
         deadline = time.monotonic() + PATIENCE_S
         record, is_new = await finish_or_abandon(upload.finish(), request.receive, deadline)
     response.status_code = 201 if is_new else 200
-    return record
+    return with_owner(service, record)
 
 
 @router.get("", responses=problems(401, 422))
@@ -116,13 +120,13 @@ async def list_datasets(
     service: ServiceDep, page_size: PageSize = DEFAULT_PAGE_SIZE, page_token: PageToken = ""
 ) -> DatasetPage:
     """The datasets by name."""
-    return await dataset_page(service.datasets, page_size, page_token)
+    return await dataset_page(service, page_size, page_token)
 
 
 @router.get("/{dataset}", responses=problems(401, 404, 422))
 async def get_dataset(service: ServiceDep, dataset: DatasetName) -> DatasetRecord:
     """Size, probe, split, and what the check warned of."""
-    return await asyncio.to_thread(service.datasets.get, dataset)
+    return await datasets.dataset(service, dataset)
 
 
 @router.get(
@@ -135,7 +139,7 @@ async def get_contact_sheet(service: ServiceDep, dataset: DatasetName) -> Respon
     return Response(await contact_sheet(service.datasets, dataset), media_type=PNG)
 
 
-@router.delete("/{dataset}", status_code=204, responses=problems(401, 404, 409, 422))
+@router.delete("/{dataset}", status_code=204, responses=problems(401, 403, 404, 409, 422))
 async def delete_dataset(service: ServiceDep, dataset: DatasetName) -> None:
     """Deletes a dataset that no job needs, with the pictures and comparisons that were made of it."""
     await service.delete_dataset(dataset)

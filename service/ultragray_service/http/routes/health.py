@@ -1,13 +1,18 @@
-"""Is the process alive; would it render."""
+"""Is the process alive; would it render and take jobs."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Literal
 
 from fastapi import APIRouter
+from starlette.responses import Response
 
+from ultragray.contract import described
+
+from ...core.readiness.readiness import Components
 from ..deps import ServiceDep, problems
+from ..problems import problem_response
 
 
 @dataclass(frozen=True)
@@ -19,9 +24,13 @@ class Live:
 
 @dataclass(frozen=True)
 class Ready:
-    """Frames are rendered."""
+    """Frames are rendered, and jobs are taken unless `ready_without_jobs` is set."""
 
+    components: Components
     status: Literal["ready"] = "ready"
+    identity_provider: Literal["available", "unavailable"] | None = described(
+        "Whether the issuer of tokens answers; null where no tokens are taken.", None
+    )
 
 
 router = APIRouter(prefix="/v1/health", tags=["health"])
@@ -34,9 +43,20 @@ async def live() -> Live:
     return Live()
 
 
-@router.head("/ready", include_in_schema=False)
-@router.get("/ready", responses=problems(503))
-async def ready(service: ServiceDep) -> Ready:
-    """200 while frames are rendered; 503 while the service starts (NOT_READY) or stops (DRAINING)."""
-    service.require_ready()
-    return Ready()
+@router.head("/ready", include_in_schema=False, response_model=Ready)
+@router.get("/ready", response_model=Ready, responses=problems(503, members={"components": Components}))
+async def ready(service: ServiceDep) -> Ready | Response:
+    """200 while frames are rendered and jobs are taken.
+
+    503 while the service starts (NOT_READY) or stops (DRAINING), no frame would be rendered (NOT_READY), or the jobs'
+    database (DATABASE_UNAVAILABLE) or the artifact folder (ARTIFACT_FOLDER_UNAVAILABLE) is away: `components` tells of
+    every part, in both answers. With ULTRAGRAY_READY_WITHOUT_JOBS the last two are told and do not count.
+    """
+    readiness = service.readiness
+    components = readiness.components
+    if readiness.problem is not None:
+        return problem_response(readiness.problem, members={"components": asdict(components)})
+    if service.tokens is None:
+        return Ready(components)
+    is_available = service.tokens.issuer.problem is None
+    return Ready(components, identity_provider="available" if is_available else "unavailable")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from typing import Annotated, Any, Literal
 
-from fastapi import APIRouter, Path, Query
+from fastapi import APIRouter, Header, Path, Query
 from starlette.requests import Request
 from starlette.responses import FileResponse, PlainTextResponse, Response, StreamingResponse
 
@@ -21,9 +21,9 @@ from ...core.jobs.jobs import JobPage
 from ...core.jobs.log import DEFAULT_LOG_BYTES, MAX_LOG_BYTES
 from ..deps import ServiceDep, problems
 from ..examples import JOB_EXAMPLES
-from ..job_events import EVENTS_TYPE, JobEvents
+from ..job_events import EVENTS_TYPE, JobEvents, LastEvent
 from ..reading.accept import NPZ, PNG
-from ..reading.bodies import JobBody
+from ..reading.bodies import SPECIFICATION, JobBody
 from ..reading.json_body import body_schema, read_json_body
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
@@ -39,7 +39,6 @@ MEDIA_TYPES = {
     ".tar": "application/x-tar",
     ".zip": "application/zip",
 }
-_SPECIFICATION = "specification"  # the key of the body
 _ANY_FILE = "application/octet-stream"
 
 JobId = Annotated[str, Path(description="Id of the job.")]
@@ -50,6 +49,7 @@ KindFilter = Annotated[_AnyKind, Query(description="Only jobs of this kind; empt
 PageSize = Annotated[int, Query(ge=1, le=MAX_PAGE_SIZE, description="Jobs on one page.")]
 PageToken = Annotated[str, Query(description="next_page_token of the page before.")]
 LogBytes = Annotated[int, Query(ge=1, le=MAX_LOG_BYTES, description="How much of the log's end is given.")]
+LastEventId = Annotated[str, Header(alias="Last-Event-ID", description="Id of the last event of an earlier stream.")]
 
 _SUBMIT = body_schema(JobBody, JOB_EXAMPLES)
 _Answers = dict[int | str, dict[str, Any]]
@@ -79,19 +79,23 @@ _EVENTS: _Answers = {
     status_code=201,
     response_model=Job,
     openapi_extra=_SUBMIT,
-    responses=_SAME_JOB | problems(401, 404, 409, 413, 415, 422, 429, 503, 507),
+    responses=_SAME_JOB | problems(401, 403, 404, 409, 413, 415, 422, 429, 503, 507),
 )
 async def submit_job(request: Request, response: Response, service: ServiceDep) -> Job:
     """Puts a job into the queue. The same request_id with the same body gives the same job, whatever its state."""
     service.require_serving()
-    body = await read_json_body(request, JobBody)
-    with under(_SPECIFICATION):
+    body = await read_json_body(request, JobBody, SPECIFICATION)
+    with under(SPECIFICATION.key):
         if "kind" in body.specification:
             raise InvalidArgument("kind stands beside the specification, not in it", field="kind")
         # in a thread: there may be many poses
         specification = await asyncio.to_thread(from_dict, {"kind": body.kind, **body.specification})
     job, is_new = await service.jobs.submit(
-        specification, field=_SPECIFICATION, request_id=body.request_id, priority=body.priority
+        specification,
+        field=SPECIFICATION.key,
+        request_id=body.request_id,
+        priority=body.priority,
+        private=body.private,
     )
     response.status_code = 201 if is_new else 200
     return job
@@ -115,7 +119,7 @@ async def get_job(service: ServiceDep, job: JobId) -> Job:
     return await service.jobs.do(JobStore.get, job)
 
 
-@router.post("/{job}:cancel", responses=problems(401, 404, 409, 422, 503))
+@router.post("/{job}:cancel", responses=problems(401, 403, 404, 409, 422, 503))
 async def cancel_job(service: ServiceDep, job: JobId) -> Job:
     """Stops a job within a second; no error where it is cancelled already."""
     return await service.jobs.do(JobStore.cancel, job)
@@ -125,7 +129,7 @@ async def cancel_job(service: ServiceDep, job: JobId) -> Job:
     "/{job}:retry",
     status_code=201,
     response_model=Job,
-    responses=_SAME_RETRY | problems(401, 404, 409, 422, 429, 503, 507),
+    responses=_SAME_RETRY | problems(401, 403, 404, 409, 422, 429, 503, 507),
 )
 async def retry_job(response: Response, service: ServiceDep, job: JobId) -> Job:
     """A new job in place of a failed or cancelled one; a training goes on from its last checkpoint."""
@@ -135,7 +139,7 @@ async def retry_job(response: Response, service: ServiceDep, job: JobId) -> Job:
     return successor
 
 
-@router.delete("/{job}", status_code=204, responses=problems(401, 404, 409, 422, 503))
+@router.delete("/{job}", status_code=204, responses=problems(401, 403, 404, 409, 422, 503))
 async def delete_job(service: ServiceDep, job: JobId) -> None:
     """Removes a finished job and its files. The scene that it trained stays."""
     await service.delete_job(job)
@@ -169,7 +173,8 @@ async def get_artifact(
     response_class=StreamingResponse,
     responses=_EVENTS | problems(401, 404, 422, 503),
 )
-async def watch_job(service: ServiceDep, job: JobId) -> JobEvents:
-    """Follows a job. A stream that ends before the final state (the service stopped) can be asked for again."""
+async def watch_job(service: ServiceDep, job: JobId, last_event_id: LastEventId = "") -> JobEvents:
+    """Follows a job. A stream that ends before the final state goes on where it ended: say the id of its last event."""
     service.require_serving()
-    return JobEvents(await service.jobs.hub.watch(job))
+    last = LastEvent.read(last_event_id)
+    return JobEvents(await service.jobs.hub.watch(job, last.log_offset), last)

@@ -14,7 +14,7 @@ from starlette.responses import Response
 from ultragray.contract import to_dict
 from ultragray.outputs import OUTPUTS
 from ultragray.settings import Resolved
-from ultragray_workers.pool.types import Priority, RenderRequest, RenderResult
+from ultragray_workers.pool.types import Priority, RenderResult
 
 from ...core.frames import settings_used
 from ...core.poses import exact_poses
@@ -77,8 +77,8 @@ async def render(request: Request) -> Response:
     # Taken from the request here, because FastAPI needs 0.07 ms to hand them over.
     service: Service = request.app.state.service
     scene: str = request.path_params["scene"]
-    body = await read_json_body(request, RenderBody)
     planner = service.planner
+    body = await read_json_body(request, RenderBody, RenderBody.many_poses(planner.max_poses_at_once))
     deadline = planner.deadline(None if body.timeout_ms is None else body.timeout_ms / 1000)
     poses = body.poses_by_path(planner.max_poses_at_once)
     choice = choose(
@@ -88,12 +88,13 @@ async def render(request: Request) -> Response:
         dtype=body.dtype,
         lossless=any(OUTPUTS[name].is_numbers for name in body.outputs),
     )
-    settings = await planner.resolve(scene, body, choice.encoding)
-    planner.check_pixels(settings, len(poses))
+    plan = await planner.plan(
+        scene, body, choice.encoding, complete=lambda settings: planner.check_pixels(settings, len(poses))
+    )
     exact = await exact_poses(len(poses), lambda index: poses[index][1].exact(poses[index][0]))
     priority = Priority.INTERACTIVE if body.poses is None else Priority.BATCH
-    asked = RenderRequest(scene, settings, exact, priority, deadline)
-    result = await finish_or_abandon(service.render(asked), request.receive, deadline)
+    rendering = service.render(plan, exact, priority=priority, deadline=deadline)
+    result = await finish_or_abandon(rendering, request.receive, deadline)
     return Response(result.data, 200, render_headers(result), choice.media_type)
 
 

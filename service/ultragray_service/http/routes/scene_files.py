@@ -16,6 +16,7 @@ from starlette.responses import FileResponse, Response
 from ultragray.contract import described
 from ultragray.probe import FloatArray
 from ultragray_workers.errors import UploadTooLarge
+from ultragray_workers.jobs.queue.owners import Kind
 from ultragray_workers.scenes import SUFFIX
 
 from ...arrival import arrival
@@ -27,6 +28,7 @@ from ..deps import SceneName, ServiceDep, problems
 from ..disconnect import finish_or_abandon
 from ..reading.accept import RAW
 from ..revalidation import NOT_MODIFIED, revalidated
+from .datasets import Private
 
 
 @dataclass(frozen=True)
@@ -90,9 +92,9 @@ async def download_scene(service: ServiceDep, scene: SceneName) -> FileResponse:
     "/{scene}",
     status_code=201,
     openapi_extra=_IMPORT,
-    responses=problems(401, 409, 413, 415, 422, 429, 500, 503, 504, 507),
+    responses=problems(401, 403, 409, 413, 415, 422, 429, 500, 503, 504, 507),
 )
-async def import_scene(request: Request, service: ServiceDep, scene: SceneName) -> Scene:
+async def import_scene(request: Request, service: ServiceDep, scene: SceneName, private: Private = False) -> Scene:
     """Takes a scene file in and serves it. It is checked first, and appears whole or not at all."""
     service.require_serving()
     if request.headers.get("content-encoding", "identity").lower() != "identity":
@@ -103,8 +105,10 @@ async def import_scene(request: Request, service: ServiceDep, scene: SceneName) 
         raise UploadTooLarge(f"a scene file may have at most {limit} bytes, {announced} were announced", field="body")
     async with service.imports.receive(scene, _blocks(request, service)) as received:
         deadline = time.monotonic() + PATIENCE_S
-        header = await finish_or_abandon(service.imports.accept(received, scene), request.receive, deadline)
-    return Scene.of(scene, header, 0)
+        header = await finish_or_abandon(
+            service.imports.accept(received, scene, private=private), request.receive, deadline
+        )
+    return Scene.of(scene, header, 0, service.owners.known(Kind.SCENE, scene))
 
 
 @router.delete("/{scene}", status_code=204, responses=problems(401, 403, 404, 422, 503))

@@ -31,13 +31,13 @@ async def get_scene(service: ServiceDep, scene: SceneName) -> Scene:
     return await scenes.scene(service, scene)
 
 
-@router.post("/{scene}:load", responses=problems(401, 404, 422, 503, 507))
+@router.post("/{scene}:load", responses=problems(401, 403, 404, 422, 503, 507))
 async def load_scene(service: ServiceDep, scene: SceneName) -> SceneLoaded:
     """Loads the scene into every worker ahead of its first frame (rendering also loads on demand)."""
     return SceneLoaded.of(scene, await service.load(scene))
 
 
-@router.post("/{scene}:unload", responses=problems(401, 404, 422, 503))
+@router.post("/{scene}:unload", responses=problems(401, 403, 404, 422, 503))
 async def unload_scene(service: ServiceDep, scene: SceneName) -> SceneLoaded:
     """Frees the scene's memory; no error where it is not loaded."""
     return SceneLoaded.of(scene, await service.unload(scene))

@@ -1,18 +1,32 @@
-"""The last minutes of the service."""
+"""The service at work: its frames, the workers that do its jobs, and Prometheus."""
 
 from __future__ import annotations
 
 import asyncio
+from dataclasses import dataclass
 
 from fastapi import APIRouter
+from prometheus_client import CONTENT_TYPE_LATEST
+from starlette.responses import Response
+
+from ultragray.contract import described
+from ultragray_workers.jobs.queue.attendance import Worker
+from ultragray_workers.jobs.store import JobStore
 
 from ...telemetry.statistics import ServiceStatistics, memory_bytes
 from ..deps import ServiceDep, problems
 
-router = APIRouter(prefix="/v1/statistics", tags=["statistics"])
+router = APIRouter()
 
 
-@router.get("", responses=problems(401))
+@dataclass(frozen=True)
+class WorkerList:
+    """The workers of the queue."""
+
+    workers: tuple[Worker, ...] = described("By name; also those that were lost within a day.")
+
+
+@router.get("/v1/statistics", tags=["statistics"], responses=problems(401))
 async def get_statistics(service: ServiceDep) -> ServiceStatistics:
     """Frames, times and errors of the last ten minutes in steps of 5 s, and what waits and runs now."""
     pool = service.pool.statistics()
@@ -24,5 +38,22 @@ async def get_statistics(service: ServiceDep) -> ServiceStatistics:
         process_restarts=pool.restarts_total,
         memory_bytes=await asyncio.to_thread(memory_bytes, pool.pids),
         loaded_scenes=len(service.pool.loaded()),
-        jobs={state.value: count for state, count in service.jobs.counts.items()},
+        jobs={state.value: count for state, count in service.jobs.overview.counts.items()},
     )
+
+
+@router.get("/v1/workers", tags=["statistics"], responses=problems(401, 503))
+async def list_workers(service: ServiceDep) -> WorkerList:
+    """Who does the jobs, and what is at hand; `ultragray workers` pauses and resumes them."""
+    return WorkerList(await service.jobs.do(JobStore.workers))
+
+
+@router.get(
+    "/metrics",
+    tags=["metrics"],
+    response_class=Response,
+    responses={200: {"description": "The Prometheus text format.", "content": {"text/plain": {}}}},
+)
+async def metrics(service: ServiceDep) -> Response:
+    """Requests, frames, queue, render and encode times, and the state of the render pool."""
+    return Response(service.metrics.exposition(), media_type=CONTENT_TYPE_LATEST)

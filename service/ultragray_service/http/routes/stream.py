@@ -6,7 +6,6 @@ import asyncio
 import time
 from dataclasses import dataclass
 from typing import Annotated
-from urllib.parse import urlsplit
 
 from fastapi import APIRouter, WebSocket, WebSocketDisconnect
 from pydantic import Field, FiniteFloat, TypeAdapter
@@ -16,11 +15,11 @@ from ultragray.probe import FloatArray
 from ultragray.settings import RenderSettings
 from ultragray_workers.errors import Draining
 
-from ...auth import STREAM_PROTOCOL
+from ...access.credentials import STREAM_PROTOCOL
 from ...core.state import Service
 from ...core.streams.pose_stream import Answered, StreamMode
 from ...core.streams.stream import FrameStream, Message, SceneSettings
-from ...errors import OriginRefused, statuses_of
+from ...errors import statuses_of
 from ..deps import SceneName
 from ..problems import problem_response
 from ..reading.bodies import StreamMessage
@@ -39,7 +38,6 @@ async def stream(websocket: WebSocket, scene: SceneName) -> None:
     service: Service = websocket.app.state.service
     started = time.perf_counter()
     try:
-        _check_origin(websocket, service.settings.cors_origins)
         _check_subprotocols(websocket.scope["subprotocols"])
         service.require_serving()
         await service.catalog.header(scene)
@@ -60,21 +58,6 @@ async def stream(websocket: WebSocket, scene: SceneName) -> None:
         service.metrics.count_request("websocket", _ROUTE, status, time.perf_counter() - started)
 
 
-def _check_origin(websocket: WebSocket, allowed: tuple[str, ...]) -> None:
-    """Raises OriginRefused for a page of another site: browsers let any page open a WebSocket to anywhere."""
-    origin = websocket.headers.get("origin")
-    if origin is None or "*" in allowed or origin in allowed:
-        return
-    try:
-        host = urlsplit(origin).netloc
-    except ValueError:
-        host = None
-    if host != websocket.headers.get("host"):
-        raise OriginRefused(
-            f"pages of {origin} may not open streams; allow them with ULTRAGRAY_CORS_ORIGINS", field="Origin"
-        )
-
-
 def _check_subprotocols(offered: list[str]) -> None:
     """Raises InvalidArgument for an offer without the one that is spoken: browsers hang up without it."""
     if offered and STREAM_PROTOCOL not in offered:
@@ -90,6 +73,8 @@ class _Message:
         self.sequence = message.sequence
         self.client_time = message.client_time_ms
         self.mode = message.mode
+        self.window = message.window
+        self.acknowledged = message.acknowledged
         self._message = message
         self._scene = scene
 
@@ -125,6 +110,7 @@ class _Unreadable:
         return None
 
     asks = True
+    window = acknowledged = None
 
     def pose(self) -> FloatArray:
         raise self._error

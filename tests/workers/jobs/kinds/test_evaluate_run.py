@@ -38,7 +38,7 @@ def job_run(artifact_folder: Path, random_scene: Callable[..., GaussianScene]) -
         folder = JobFolder(artifact_folder, "job")
         folder.path.mkdir(parents=True)
         random_scene(60, info={"probe": probe}).save(folder.path / "one.ugr")
-        return JobRun(folder, Request(to_dict(job), None, "cpu", 1, 0), should_stop)
+        return JobRun(folder, Request(to_dict(job), None, None, "cpu", 1, 0), should_stop)
 
     return make
 

@@ -49,7 +49,7 @@ def work(tmp_path: Path, random_scene: Callable[..., GaussianScene]) -> Callable
         made = random_scene(60, info=info | changes)
         scene = GaussianScene.from_splats(made.splats, info=made.info, training_poses=TRAINING)
         scene.save(folder.path / f"{job.scene}.ugr")
-        return JobRun(folder, Request(to_dict(job), None, "cpu", 1, 0), should_stop)
+        return JobRun(folder, Request(to_dict(job), None, None, "cpu", 1, 0), should_stop)
 
     return make
 

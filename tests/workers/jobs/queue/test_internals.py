@@ -46,7 +46,7 @@ def test_the_time_of_submission_can_be_set_and_orders_the_queue(jobs: JobDatabas
     with jobs.engine.begin() as connection:
         moved = sa.update(WORKFLOWS).where(WORKFLOWS.c.workflow_uuid == first.id)
         connection.execute(moved.values(created_at=int(time.time() * 1000) + 60_000))
-    assert [row.workflow_id for row in jobs.unfinished()] == [second.id, first.id]
+    assert [row.workflow_id for row in jobs.client.list_workflows()] == [second.id, first.id]
 
 
 def test_only_a_running_job_of_that_worker_is_put_back(jobs: JobDatabase, store: JobStore) -> None:

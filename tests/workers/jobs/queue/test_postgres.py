@@ -23,7 +23,7 @@ from ultragray_workers.jobs.queue.database import JobDatabase, checked_url
 from ultragray_workers.jobs.store import Job, JobState, JobStore
 
 from ....postgres import PASSWORD, PostgresServer
-from ....waiting import at_this_load
+from ....waiting import Deadline, at_this_load
 from ..conftest import RunningWorker, train_job
 
 StartWorker = Callable[..., RunningWorker]
@@ -62,10 +62,10 @@ def hosts(artifact_folder: Path, database_url: str, tmp_path: Path) -> Iterator[
                 stderr=log,
                 cwd=tmp_path / name,
             )
-    end = time.monotonic() + 30
+    end = Deadline(30)
     for name in running:
         while "takes jobs" not in (told := (tmp_path / f"{name}.log").read_text()):
-            assert time.monotonic() < end, told
+            assert not end.passed, told
             time.sleep(0.05)
     yield running
     for process in running.values():

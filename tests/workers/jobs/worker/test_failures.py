@@ -21,7 +21,7 @@ from ultragray_workers.jobs.kinds import RenderJob
 from ultragray_workers.jobs.kinds.render import Poses
 from ultragray_workers.jobs.store import Job, JobState, JobStore
 
-from ....waiting import at_this_load
+from ....waiting import Deadline, at_this_load
 from ..conftest import RunningWorker, store_dataset, train_job
 
 StartWorker = Callable[..., RunningWorker]
@@ -51,9 +51,9 @@ def is_training(job: Job) -> bool:
 
 def process_of(worker: RunningWorker, *, not_: int | None = None, timeout_s: float = 60.0) -> int:
     """The process of the worker's job, once there is one."""
-    end = time.monotonic() + timeout_s
+    end = Deadline(timeout_s)
     while (process := worker.job_process()) in (None, not_):
-        assert time.monotonic() < end, "no process of a job was started"
+        assert not end.passed, "no process of a job was started"
         time.sleep(0.005)
     assert process is not None
     return process
@@ -142,7 +142,7 @@ def test_full_disk(small_disk: Path, tmp_path: Path, start_worker: StartWorker) 
     def until(job: Job, reached: Callable[[Job], bool] = lambda job: job.state in FINAL) -> Job:
         end = time.monotonic() + 60
         while not reached(job):
-            assert time.monotonic() < end, (job, store.log_tail(job.id), (tmp_path / "one.log").read_text())
+            assert not end.passed, (job, store.log_tail(job.id), (tmp_path / "one.log").read_text())
             time.sleep(0.05)
             job = store.get(job.id)
         return job

@@ -7,10 +7,12 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from ultragray.contract import Family
+from ultragray.contract import Family, described
 from ultragray.scene_info import SceneHeader
 
 from ...scenes import check_scene_name
+
+MAX_RUN_S = 31_536_000.0
 
 if TYPE_CHECKING:
     from ..folder import Outcome
@@ -26,6 +28,7 @@ class Surroundings:
     max_image_side: int  # pixels
 
 
+@dataclass(frozen=True)
 class Specification(Family):
     """The task of a job, a member of this family for each kind of job, with all that is particular to the kind.
 
@@ -33,9 +36,17 @@ class Specification(Family):
     """
 
     kind: str
+    max_run_s: float | None = described(
+        "Longest time that the job may run in all, s; then it fails, and a retry goes on. None: the service's longest.",
+        None,
+        above=0.0,
+        high=MAX_RUN_S,
+        kw_only=True,
+    )
     run_module: ClassVar[str]  # of this folder: its `run(job_run, specification)` does the work
     needs_dataset: ClassVar[str | None] = None  # field: the dataset stays while the job waits or runs
     needs_scene: ClassVar[str | None] = None  # field: the scene is kept for the job as it is at the submission
+    has_checkpoints: ClassVar[bool] = False  # interrupted, it goes on from where it was; others begin anew
     makes_scene: ClassVar[str | None] = None  # field: the scene among the artifacts is served when the job succeeds
 
     def __post_init__(self) -> None:

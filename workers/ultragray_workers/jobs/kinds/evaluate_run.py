@@ -7,7 +7,6 @@ import sys
 import time
 
 import numpy as np
-import torch
 
 from ultragray.datasets.sweep import Sweep
 from ultragray.evaluation.baselines import evaluate_baselines
@@ -22,7 +21,6 @@ from ultragray.training.device import training_device
 from ...datasets.store import DatasetStore
 from ...scenes import SUFFIX
 from ..folder import Outcome, Progress
-from ..worker.device import device_for
 from ..worker.job_run import JobRun, Stopped
 from .evaluate import EvaluateJob
 
@@ -36,11 +34,7 @@ def run(job_run: JobRun, job: EvaluateJob) -> Outcome:
     Raises Stopped, DatasetNotFound, DatasetInvalid also for a dataset without held-out frames or of another kind of
     probe, SceneFileInvalid, InvalidImageSize.
     """
-    with device_for(job_run) as device:
-        return _evaluate_on(training_device(device, "auto"), job_run, job)
-
-
-def _evaluate_on(device: torch.device, job_run: JobRun, job: EvaluateJob) -> Outcome:
+    device = training_device(job_run.request.device, "auto")
     path = job_run.folder.path / f"{job.scene}{SUFFIX}"
     dataset = DatasetStore(job_run.folder.artifact_folder).load(job.dataset)
     require_frames(dataset.val)

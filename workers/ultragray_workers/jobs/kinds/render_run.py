@@ -5,8 +5,6 @@ from __future__ import annotations
 import sys
 import time
 
-import torch
-
 from ultragray.confidence import Assessor, Extrapolation
 from ultragray.files.atomic import file_sha256
 from ultragray.interchange.exports import FORMATS
@@ -20,7 +18,6 @@ from ultragray.training.device import training_device
 
 from ...scenes import SUFFIX
 from ..folder import Outcome, Progress
-from ..worker.device import device_for
 from ..worker.job_run import JobRun, Stopped
 from .render import RenderJob
 
@@ -32,11 +29,7 @@ def run(job_run: JobRun, job: RenderJob) -> Outcome:
 
     Raises Stopped, InvalidArgument, LowConfidence, InvalidProbe, SceneFileInvalid, ExtraMissing.
     """
-    with device_for(job_run) as device:
-        return _render_on(training_device(device, "auto"), job_run, job)
-
-
-def _render_on(device: torch.device, job_run: JobRun, job: RenderJob) -> Outcome:
+    device = training_device(job_run.request.device, "auto")
     path = job_run.folder.path / f"{job.scene}{SUFFIX}"
     described = read_header(path)
     settings = job.resolved(described.info, Encoding.FLOAT32)

@@ -31,6 +31,7 @@ class TrainJob(Specification):
     kind: Literal["train"] = kind_field("train")
 
     run_module = "train_run"
+    has_checkpoints = True
     needs_dataset = "dataset"
     makes_scene = "scene"
 

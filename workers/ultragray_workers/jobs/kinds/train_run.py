@@ -28,7 +28,6 @@ from ultragray.training.trainer import CHECKPOINT_FILE, CONFIG_FILE, JOURNAL_FIL
 from ...datasets.store import DatasetStore
 from ...scenes import SUFFIX
 from ..folder import JobFolder, Outcome, Progress
-from ..worker.device import device_for
 from ..worker.job_run import JobRun, Stopped
 from .curve import draw_training_curve
 from .train import TrainJob
@@ -43,11 +42,7 @@ def run(job_run: JobRun, job: TrainJob) -> Outcome:
 
     Raises Stopped, DatasetNotFound, DatasetInvalid, InvalidArgument, and what `ultragray.training.train` raises.
     """
-    with device_for(job_run, job.device) as device:
-        return _train_on(device, job_run, job)
-
-
-def _train_on(device: str, job_run: JobRun, job: TrainJob) -> Outcome:
+    device = job_run.request.device
     config = TrainingConfig.preset(job.preset, **job.settings)
     dataset = DatasetStore(job_run.folder.artifact_folder).load(job.dataset)
     _take_over_run(job_run)

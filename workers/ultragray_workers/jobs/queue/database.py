@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +14,15 @@ from sqlalchemy.engine import ExceptionContext
 from sqlalchemy.exc import SQLAlchemyError
 
 from ...errors import DatabaseUnavailable, StartupFailed, StorageFull
-from .internals import SCHEMA, SQLITE_ISOLATION, SQLITE_SETTINGS, WORKFLOWS, put_back
+from . import runs, tables
+from .folder_identity import FolderIdentity, identify
+from .internals import SCHEMA, SQLITE_ISOLATION, SQLITE_SETTINGS, WORKFLOWS, put_back, take_back
+from .writable import WriteProbe
 
 APPLICATION = "ultragray"
-VERSION = "1"  # of the workflow's inputs and steps: workers take the jobs of their own version only
+# Of the workflow's inputs and steps: workers take the jobs of their own version only, and make jobs of older ones that
+# they can do as well their own.
+VERSION, OLDER_VERSIONS = "2", ("1",)
 QUEUE = "ultragray-jobs"
 SQLITE_FILE = "jobs.sqlite"
 _POSTGRES_SCHEMES = ("postgresql", "postgres", "postgresql+psycopg")
@@ -30,8 +36,18 @@ _CONNECTIONS = 5
 # SQLSTATE: the connection is gone, the server lacks the means, a statement took too long, the server stops or starts.
 _AWAY = ("08", "53", "57014", "57P")
 _DEADLOCK = "40P01"
+_TAKES_NO_CHANGES = "the database of the jobs takes no changes: it is read-only"
+_IS_LOST = "the database of the jobs is not there any more, or has lost its tables"
+_REFUSALS = {  # by SQLSTATE, or by words of SQLite
+    "25006": _TAKES_NO_CHANGES,
+    "readonly database": _TAKES_NO_CHANGES,
+    "42P01": _IS_LOST,
+    "no such table": _IS_LOST,
+    "unable to open database file": _IS_LOST,
+    "disk I/O error": "the disk of the jobs' database fails",
+}
 
-QUEUED = ("ENQUEUED", "DELAYED")
+QUEUED = ("ENQUEUED",)  # no job is delayed
 RUNNING = ("PENDING",)
 SUCCEEDED = ("SUCCESS",)
 FAILED = ("ERROR", "MAX_RECOVERY_ATTEMPTS_EXCEEDED")
@@ -77,13 +93,6 @@ def checked_url(database_url: str | None, artifact_folder: Path) -> str:
     return ours.render_as_string(hide_password=False)
 
 
-def _connect_once(url: str) -> None:
-    """DBOS would make a PostgreSQL database that is not there: a misspelt name would be a queue of its own."""
-    engine = sa.create_engine(url, poolclass=sa.NullPool)
-    with engine.connect():
-        pass
-
-
 def _raise_as_ours(context: ExceptionContext) -> None:
     if context.is_pre_ping:  # a connection that was lost while nobody used it is replaced
         return
@@ -93,6 +102,9 @@ def _raise_as_ours(context: ExceptionContext) -> None:
     state = getattr(error, "sqlstate", None) or ""
     if context.connection is None or context.is_disconnect or state.startswith(_AWAY):
         raise DatabaseUnavailable("the database of the jobs does not answer: try again in a few seconds") from error
+    for sign, meaning in _REFUSALS.items():
+        if sign == state or (not state and sign in str(error)):
+            raise DatabaseUnavailable(meaning) from error
 
 
 class JobDatabase:
@@ -101,16 +113,25 @@ class JobDatabase:
     def __init__(self, artifact_folder: Path, database_url: str | None) -> None:
         """Raises StartupFailed where the database cannot be used.
 
-        While a database that was there is away, every use raises DatabaseUnavailable; StorageFull where a SQLite file
-        cannot grow.
+        While a database that was there is away or read-only, every use that needs it raises DatabaseUnavailable;
+        StorageFull where a SQLite file cannot grow.
         """
         quiet_dbos()
         try:
             artifact_folder.mkdir(parents=True, exist_ok=True)
             self.url = checked_url(database_url, artifact_folder)
-            _connect_once(self.url)
-            DBOS.migrate(self.url)
             engine = _engine(self.url)
+            # Also for tables of our own beside those of the queue.
+            self.engine = engine.execution_options(
+                schema_translate_map={SCHEMA: None if engine.dialect.name == "sqlite" else SCHEMA}
+            )
+            # The lock connects first: DBOS would make a PostgreSQL database that is not there, and a misspelt name
+            # would be a queue of its own.
+            with tables.one_at_a_time(engine.url):
+                DBOS.migrate(self.url)
+                tables.migrate(self.engine)
+                self.folder = self._identify(artifact_folder)
+            self._probe = WriteProbe(self.engine)
             self.client = DBOSClient(
                 system_database_engine=engine,
                 application_name=APPLICATION,
@@ -125,29 +146,41 @@ class JobDatabase:
                 field="database_url",
             ) from error
         sa.event.listen(engine, "handle_error", _raise_as_ours)
-        # Also for tables of our own beside those of the queue.
-        self.engine = engine.execution_options(
-            schema_translate_map={SCHEMA: None if engine.dialect.name == "sqlite" else SCHEMA}
-        )
 
-    def enqueue(self, options: EnqueueOptions, *arguments: Any) -> None:
-        """Puts a workflow into the queue behind all others of its priority.
+    def _identify(self, artifact_folder: Path) -> FolderIdentity:
+        holds_database = self.engine.url.database == str(artifact_folder.resolve() / SQLITE_FILE)
+        try:
+            with self.engine.begin() as connection:
+                return identify(connection, artifact_folder, holds_database=holds_database)
+        except StartupFailed:
+            self.engine.dispose()
+            raise
+
+    def check(self) -> None:
+        """Raises DatabaseUnavailable or StorageFull unless a row could be written now."""
+        self._probe.check()
+
+    def enqueue(
+        self, options: EnqueueOptions, *arguments: Any, also: Callable[[sa.Connection], None] = lambda connection: None
+    ) -> None:
+        """Puts a workflow into the queue behind all others of its priority, and does `also` in the same transaction.
 
         DBOS orders by the time of submission, which on SQLite it may know to the second only: here it is set to the
         millisecond, and after that of every other job.
         """
         while True:
             try:
-                return self._enqueue(options, *arguments)
+                return self._enqueue(also, options, *arguments)
             except SQLAlchemyError as error:
                 # Two submissions of one job at once: PostgreSQL ends one of them, which then finds the other's.
                 if getattr(getattr(error, "orig", None), "sqlstate", None) != _DEADLOCK:
                     raise
 
-    def _enqueue(self, options: EnqueueOptions, *arguments: Any) -> None:
+    def _enqueue(self, also: Callable[[sa.Connection], None], options: EnqueueOptions, *arguments: Any) -> None:
         rows = WORKFLOWS
         with self.engine.begin() as connection:
             self.client.enqueue_in_transaction(connection, options, *arguments)
+            runs.begin(connection, options["workflow_id"])
             last_ms = sa.select(sa.func.coalesce(sa.func.max(rows.c.created_at), 0)).where(
                 rows.c.workflow_uuid != options["workflow_id"]
             )
@@ -155,21 +188,20 @@ class JobDatabase:
             connection.execute(
                 sa.update(rows).where(rows.c.workflow_uuid == options["workflow_id"]).values(created_at=submitted_ms)
             )
+            also(connection)
 
     def workflow(self, job_id: str, *, with_input: bool = False, with_output: bool = False) -> WorkflowStatus | None:
         """The queue's row of a job; None where there is no such job."""
         rows = self.client.list_workflows(workflow_ids=[job_id], load_input=with_input, load_output=with_output)
         return rows[0] if rows else None
 
-    def unfinished(self) -> list[WorkflowStatus]:
-        """The rows of all jobs that wait or run, oldest first."""
-        return self.client.list_workflows(
-            status=[*QUEUED, *RUNNING], queue_name=QUEUE, load_input=False, load_output=False
-        )
-
     def put_back(self, job_id: str, executor: str) -> bool:
         """Puts a job that `executor` runs back into the queue; False where it does not run it (any more)."""
         return put_back(self.client, job_id, executor, QUEUE)
+
+    def take_back(self, job_id: str, executor: str) -> bool:
+        """As `put_back`, of a job that was taken and not begun."""
+        return take_back(self.engine, self.client, job_id, executor, QUEUE)
 
     def close(self) -> None:
         """Ends the connections."""

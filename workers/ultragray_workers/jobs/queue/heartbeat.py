@@ -8,6 +8,8 @@ does not run: DBOS forgets a job whose end it cannot write, such as on a full di
 from __future__ import annotations
 
 import logging
+import os
+import socket
 import threading
 import time
 from collections.abc import Callable
@@ -16,10 +18,13 @@ from contextlib import suppress
 import sqlalchemy as sa
 from sqlalchemy.exc import SQLAlchemyError
 
+import ultragray
 from ultragray.errors import UltragrayError
 
-from . import database
+from . import unfinished
 from .database import JobDatabase
+from .tables import WORKERS
+from .wishes import Wanted, wanted_of
 
 BEAT_INTERVAL_S = 1.0
 DEAD_AFTER_S = 10.0
@@ -28,51 +33,65 @@ _FORGET_AFTER_S = 86_400.0
 
 _log = logging.getLogger("ultragray.jobs")
 
-_workers = sa.Table(
-    "ultragray_workers",
-    sa.MetaData(),
-    sa.Column("executor", sa.Text, primary_key=True),
-    sa.Column("seen_at_s", sa.Double, nullable=False),
-)
-
 
 class Heartbeat:
     """The life sign of one worker, and its watch over the others."""
 
-    def __init__(self, jobs: JobDatabase, executor: str, job_at_hand: Callable[[], str | None]) -> None:
-        """The first beat is done when this returns."""
-        self._database, self._executor, self._job_at_hand = jobs, executor, job_at_hand
+    def __init__(
+        self,
+        jobs: JobDatabase,
+        executor: str,
+        job_at_hand: Callable[[], str | None],
+        is_stuck: Callable[[], bool] = lambda: False,
+        *,
+        device: str = "",
+        obey: Callable[[Wanted], None] = lambda wanted: None,
+    ) -> None:
+        """The first beat is done when this returns. While the worker `is_stuck`, there are none.
+
+        `obey` is called after each beat with what administrators want of the worker.
+        """
+        self._database, self._executor = jobs, executor
+        self._job_at_hand, self._is_stuck, self._obey = job_at_hand, is_stuck, obey
+        self._facts = {
+            "host": socket.gethostname(),
+            "pid": os.getpid(),
+            "device": device,
+            "version": ultragray.__version__,
+            "started_at_s": time.time(),
+        }
         self._forgotten: set[str] = set()  # own jobs that were not running at the last look
         self._look_at_s = float("-inf")
         self._stop = threading.Event()
-        with jobs.engine.begin() as connection:
-            connection.execute(sa.schema.CreateTable(_workers, if_not_exists=True))
         self.beat()
         self._thread = threading.Thread(target=self._run, name="heartbeat", daemon=True)
         self._thread.start()
 
     def beat(self) -> None:
         """Writes that the worker is alive."""
-        now_s = self._now_s()
         with self._database.engine.begin() as connection:
-            mine = _workers.c.executor == self._executor
-            if not connection.execute(sa.update(_workers).where(mine).values(seen_at_s=now_s)).rowcount:
-                connection.execute(sa.insert(_workers).values(executor=self._executor, seen_at_s=now_s))
+            mine = WORKERS.c.executor == self._executor
+            facts = {**self._facts, "seen_at_s": now_s(self._database), "job_id": self._job_at_hand()}
+            if not connection.execute(sa.update(WORKERS).where(mine).values(facts)).rowcount:
+                connection.execute(sa.insert(WORKERS).values(executor=self._executor, **facts))
+            wanted = connection.execute(sa.select(WORKERS.c.wanted).where(mine)).scalar()
+        self._obey(wanted_of(wanted))
 
     def take_over(self) -> list[str]:
         """Puts the jobs that no living worker runs back into the queue, and returns their ids."""
-        running = [row for row in self._database.unfinished() if row.status in database.RUNNING]
-        mine = {row.workflow_id for row in running if row.executor_id == self._executor} - {self._job_at_hand()}
+        running = unfinished.running(self._database)
+        mine = {job_id for job_id, executor in running if executor == self._executor} - {self._job_at_hand()}
         twice, self._forgotten = mine & self._forgotten, mine
         if not running:
             return []
-        alive = self._alive() | {self._executor}
+        living = alive(self._database) | {self._executor}
         taken = [
-            row.workflow_id
-            for row in running
-            if (row.executor_id not in alive or row.workflow_id in twice)
-            and self._database.put_back(row.workflow_id, row.executor_id or "")
+            job_id
+            for job_id, executor in running
+            if (executor not in living or job_id in twice) and self._database.put_back(job_id, executor)
         ]
+        if taken:
+            unfinished.adopt_older(self._database)
         for job_id in taken:
             _log.warning(f"no worker is at the job {job_id} any more: it waits again")
         return taken
@@ -82,23 +101,19 @@ class Heartbeat:
         self._stop.set()
         self._thread.join()
         with suppress(UltragrayError, SQLAlchemyError), self._database.engine.begin() as connection:
-            connection.execute(sa.delete(_workers).where(_workers.c.executor == self._executor))
-
-    def _alive(self) -> set[str]:
-        with self._database.engine.begin() as connection:
-            connection.execute(sa.delete(_workers).where(_workers.c.seen_at_s < self._now_s() - _FORGET_AFTER_S))
-            fresh = sa.select(_workers.c.executor).where(_workers.c.seen_at_s > self._now_s() - DEAD_AFTER_S)
-            return set(connection.execute(fresh).scalars())
-
-    def _now_s(self) -> sa.ColumnElement[float]:
-        if self._database.engine.dialect.name == "sqlite":  # days since noon of a day long ago
-            return (sa.func.julianday("now", type_=sa.Double) - 2440587.5) * 86400.0
-        return sa.cast(sa.func.extract("epoch", sa.func.clock_timestamp()), sa.Double)
+            mine = WORKERS.c.executor == self._executor
+            connection.execute(sa.update(WORKERS).where(mine).values(seen_at_s=0.0, job_id=None))
+            connection.execute(sa.delete(WORKERS).where(mine, WORKERS.c.wanted.is_(None)))  # else it holds at a restart
 
     def _run(self) -> None:
         beats = 0
         is_away = False
         while not self._stop.wait(BEAT_INTERVAL_S):
+            if self._is_stuck():
+                if not is_away:
+                    _log.error(f"the job {self._job_at_hand()} is stuck, and so is its worker: others may take it over")
+                is_away = True
+                continue
             try:
                 self.beat()
                 beats += 1
@@ -112,3 +127,19 @@ class Heartbeat:
                     _log.warning(f"no heartbeat for now: {str(error).splitlines()[0]}")
                 is_away = True
                 self._look_at_s = time.monotonic() + DEAD_AFTER_S  # others may need longer to come back
+
+
+def alive(jobs: JobDatabase) -> set[str]:
+    """The workers that have beaten lately; those of long ago are forgotten."""
+    with jobs.engine.begin() as connection:
+        long_ago = WORKERS.c.seen_at_s < now_s(jobs) - _FORGET_AFTER_S
+        connection.execute(sa.delete(WORKERS).where(long_ago, WORKERS.c.wanted.is_(None)))
+        fresh = sa.select(WORKERS.c.executor).where(WORKERS.c.seen_at_s > now_s(jobs) - DEAD_AFTER_S)
+        return set(connection.execute(fresh).scalars())
+
+
+def now_s(jobs: JobDatabase) -> sa.ColumnElement[float]:
+    """The time by the clock of the database, which all hosts share."""
+    if jobs.engine.dialect.name == "sqlite":  # days since noon of a day long ago
+        return (sa.func.julianday("now", type_=sa.Double) - 2440587.5) * 86400.0
+    return sa.cast(sa.func.extract("epoch", sa.func.clock_timestamp()), sa.Double)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import base64
 import binascii
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from datetime import datetime, timezone
 
 import sqlalchemy as sa
@@ -30,32 +30,59 @@ def count_by_status(jobs: JobDatabase) -> dict[str, int]:
 
 
 def page_of_rows(
-    jobs: JobDatabase, *, kind: str | None, statuses: Sequence[str] | None, page_size: int, page_token: str | None
+    jobs: JobDatabase,
+    *,
+    kind: str | None,
+    statuses: Sequence[str] | None,
+    shown: Callable[[WorkflowStatus], bool],
+    page_size: int,
+    page_token: str | None,
 ) -> tuple[list[WorkflowStatus], str | None]:
-    """The rows of one page, and the token of the next; None on the last.
+    """The rows of one page, of those that are `shown`, and the token of the next; None on the last.
 
     Raises InvalidArgument for a token that no page gave.
     """
-    before_ms, seen = (None, []) if page_token is None else read_token(page_token)
-    rows = [
-        row
-        for row in jobs.client.list_workflows(
-            name=kind,
-            status=None if statuses is None else list(statuses),
-            end_time=None if before_ms is None else _iso_after(before_ms),
-            sort_desc=True,
-            limit=page_size + len(seen) + 1,  # one more than the page tells whether there is another
-            load_input=False,
-        )
-        if row.workflow_id not in seen
-    ]
-    page, more = rows[:page_size], len(rows) > page_size
-    if not more:
-        return page, None
-    last_ms = page[-1].created_at
+    place: _Place = (None, []) if page_token is None else read_token(page_token)
+    found: list[WorkflowStatus] = []
+    reading, some = place, page_size + 1  # one more than the page tells whether there is another
+    while True:
+        rows = _rows_after(jobs, kind, statuses, reading, some)
+        found += [row for row in rows if shown(row)]
+        if len(found) > page_size or len(rows) < some:
+            break
+        reading = _after(rows, reading)
+    page = found[:page_size]
+    return page, write_token(*_after(page, place)) if len(found) > page_size else None
+
+
+_Place = tuple[
+    int | None, list[str]
+]  # the time of a job, in ms, and the jobs of that very millisecond before the place
+
+
+def _rows_after(
+    jobs: JobDatabase, kind: str | None, statuses: Sequence[str] | None, place: _Place, limit: int
+) -> list[WorkflowStatus]:
+    before_ms, seen = place
+    rows = jobs.client.list_workflows(
+        name=kind,
+        status=None if statuses is None else list(statuses),
+        end_time=None if before_ms is None else _iso_after(before_ms),
+        sort_desc=True,
+        limit=limit + len(seen),
+        load_input=False,
+    )
+    return [row for row in rows if row.workflow_id not in seen][:limit]
+
+
+def _after(rows: Sequence[WorkflowStatus], place: _Place) -> tuple[int, list[str]]:
+    """The place after the last of some rows, which begin at `place`."""
+    last_ms = rows[-1].created_at
     assert last_ms is not None
-    at_last = [row.workflow_id for row in page if row.created_at == last_ms]
-    return page, write_token(last_ms, at_last + (seen if before_ms == last_ms else []))
+    before_ms, seen = place
+    return last_ms, [row.workflow_id for row in rows if row.created_at == last_ms] + (
+        seen if before_ms == last_ms else []
+    )
 
 
 def _iso_after(epoch_ms: int) -> str:

@@ -1,82 +1,103 @@
-"""The device of a job: which one, and one job at a time on it, whichever workers of a host share an artifact folder."""
+"""The devices of a host: which one a worker uses, and one job at a time on it, whichever workers share the folder.
+
+A worker holds its device before it takes a job: those that wait for a device leave the jobs to other hosts. Free of
+torch, which a process of its own asks about GPUs.
+"""
 
 from __future__ import annotations
 
 import fcntl
+import json
+import os
 import re
 import socket
+import subprocess
 import sys
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import replace
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
-
-import torch
-
-from .job_run import JobRun, Stopped
+from typing import IO
 
 LOCK_FOLDER = "workers"  # of the artifact folder, which several hosts may share
-_POLL_INTERVAL_S = 0.2
+_DRIVERS = (Path("/dev/nvidiactl"), Path("/dev/dxg"))
+_ANSWER_TIMEOUT_S = 120.0
+_ASK_TORCH = """
+import json, sys, torch
+asked = sys.argv[1]
+found = torch.cuda.device_count() if torch.cuda.is_available() else 0
+index = int(asked.partition(":")[2] or 0)
+device = "cpu" if asked == "auto" and not found else "cuda" if asked == "auto" else asked
+known = device != "cpu" and index < found
+print(json.dumps([device, str(torch.cuda.get_device_properties(index).uuid) if known else None]))
+"""
 
 
-@contextmanager
-def device_for(job_run: JobRun, asked: str = "auto") -> Iterator[str]:
-    """The device of a job, held alone: its own wish, else its worker's, else a GPU where there is one.
+@dataclass(frozen=True)
+class Device:
+    """A device as torch calls it on this host, and the name of its lock: the same by whatever number it is known."""
 
-    Also sets the number of torch's threads. Raises Stopped where the job is to stop meanwhile.
-    """
-    torch.set_num_threads(job_run.request.threads)
-    device = job_run.request.device if asked == "auto" else asked
-    if device == "auto":
-        device = "cuda" if torch.cuda.is_available() else "cpu"
-    with device_alone(job_run, device):
-        yield device
+    name: str  # cpu, cuda or cuda:N
+    lock_name: str
 
 
-@contextmanager
-def device_alone(job_run: JobRun, device: str) -> Iterator[None]:
-    """Holds `device` (cpu, cuda or cuda:N) as soon as no other job of this host does; until then the job waits for it.
-
-    Raises Stopped where the job is to stop meanwhile.
-    """
-    path = lock_path(job_run.folder.artifact_folder, device)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("a") as file:
-        is_announced = False
-        while not _is_locked(file.fileno()):
-            if not is_announced:
-                sys.stderr.write(f"waits for {device}: another job of this host is at work on it\n")
-                sys.stderr.flush()
-                job_run.report(replace(job_run.progress, waits_for=device))
-                is_announced = True
-            if job_run.should_stop():
-                raise Stopped
-            time.sleep(_POLL_INTERVAL_S)
-        if is_announced:
-            job_run.report(replace(job_run.progress, waits_for=None))
-        job_run.progress = replace(job_run.progress, waits_for=None)  # a process that was killed may have left it
-        yield
+@cache
+def device_of(asked: str) -> Device:
+    """The device that auto, cpu, cuda or cuda:N means here; auto: a GPU where there is one."""
+    if asked == "cpu" or (asked == "auto" and not any(driver.exists() for driver in _DRIVERS)):
+        return Device("cpu", "cpu")
+    told = subprocess.run(
+        [sys.executable, "-c", _ASK_TORCH, asked],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)},
+        stdout=subprocess.PIPE,
+        timeout=_ANSWER_TIMEOUT_S,
+        check=True,
+    ).stdout
+    name, gpu = json.loads(told)
+    if name == "cpu":
+        return Device("cpu", "cpu")
+    return Device(name, f"cuda-{name.partition(':')[2] or 0}" if gpu is None else f"gpu-{gpu}")  # None: the job fails
 
 
-def lock_path(artifact_folder: Path, device: str) -> Path:
-    """The file that is locked: of this host and of the device itself, by whatever number a process knows it."""
+def lock_path(artifact_folder: Path, device: Device) -> Path:
+    """The file that is locked: of this host and of the device."""
     host = re.sub(r"[^A-Za-z0-9.-]", "-", socket.gethostname()) or "host"
-    return artifact_folder / LOCK_FOLDER / f"{host}.{_device_name(device)}.device"
+    return artifact_folder / LOCK_FOLDER / f"{host}.{device.lock_name}.device"
 
 
-def _device_name(device: str) -> str:
-    if device == "cpu":
-        return device
-    index = int(device.partition(":")[2] or 0)
-    if not torch.cuda.is_available() or index >= torch.cuda.device_count():
-        return f"cuda-{index}"  # the work itself refuses it
-    return f"gpu-{torch.cuda.get_device_properties(index).uuid}"
+class DeviceLock:
+    """The lock of one device, which the process of a job shares with its worker: held until both have let go."""
 
+    def __init__(self, artifact_folder: Path, device: Device, worker: str) -> None:
+        self.device, self.path = device, lock_path(artifact_folder, device)
+        self._worker = worker
+        self._file: IO[str] | None = None
 
-def _is_locked(descriptor: int) -> bool:
-    try:
-        fcntl.lockf(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    return True
+    def take(self) -> bool:
+        """Whether the device is held now. Raises OSError."""
+        if self._file is not None:
+            return True
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        file = self.path.open("a+")
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            file.close()
+            return False
+        file.truncate(0)
+        file.write(f"{os.getpid()} {self._worker}\n")
+        file.flush()
+        self._file = file
+        return True
+
+    def fileno(self) -> int:
+        """The descriptor for the process of the job, which inherits the lock by it."""
+        assert self._file is not None
+        return self._file.fileno()
+
+    def release(self) -> None:
+        """Lets other workers have the device; nothing where it is not held."""
+        if self._file is not None:
+            with suppress(OSError):
+                self._file.close()
+            self._file = None

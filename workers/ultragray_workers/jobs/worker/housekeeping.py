@@ -24,9 +24,9 @@ from ...claims import DELETED_PREFIX, remove_whole
 from ...errors import JobInUse
 from ..folder import FOLDER, JobFolder
 from ..kinds import KINDS
-from ..queue import database
+from ..queue import database, unfinished
 from ..queue.database import JobDatabase
-from ..removal import remove_job, sources_in_use
+from ..removal import remove_job
 
 INTERVAL_S = 3600.0
 STEP_PAUSE_S = 1.0
@@ -59,7 +59,7 @@ class Housekeeper:
         """One round: how many jobs and folders were removed. Raises UltragrayError where the database is away."""
         removed = 0
         kept: set[str] = set()
-        while not self._stop.is_set() and (old := self._finished_long_ago(kept | set(sources_in_use(self._database)))):
+        while not self._stop.is_set() and (old := self._finished_long_ago(kept | unfinished.sources(self._database))):
             for job_id in old:
                 try:
                     remove_job(self._database, JobFolder(self._artifact_folder, job_id))

@@ -1,7 +1,8 @@
 """`python -m ultragray_workers.jobs.worker.run_job JOB_FOLDER WORKER_PID`: the process that does the work of one job.
 
 It dies with its worker, works alone in the folder, and as its last act says in outcome.json how the job ended. A job
-that fails is a process that ends well; SIGTERM ends it with exit code STOPPED and a checkpoint to go on from.
+that fails is a process that ends well; SIGTERM ends it with exit code STOPPED and a checkpoint to go on from, and files
+that cannot be used (a share that has gone) with FOLDER_LOST: it may be started again.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import fcntl
 import os
 import signal
 import sys
+import time
 import traceback
 from contextlib import suppress
 from dataclasses import replace
@@ -18,13 +20,14 @@ from pathlib import Path
 
 from ultragray.errors import InvalidArgument, MemoryExceeded, UltragrayError
 
-from ...claims import storage_full
+from ...claims import is_no_room, storage_full
 from ..folder import JobFolder, Outcome
 from ..specification import from_dict
 from .job_run import JobRun, Stopped
 
-STOPPED, STORAGE_FULL = 75, 73
+STOPPED, STORAGE_FULL, FOLDER_LOST = 75, 73, 74
 _PR_SET_PDEATHSIG = 1
+_LOCK_POLL_S = 0.2
 _OOM_SCORE_ADJ = "500"  # of 1000: where memory runs out, jobs go before the service and its workers
 
 
@@ -39,7 +42,13 @@ def main(folder_path: str, worker_pid: str) -> int:
     path = Path(folder_path)
     folder = JobFolder(path.parent.parent, path.name)
     with folder.lock.open("a") as lock:
-        fcntl.lockf(lock, fcntl.LOCK_EX)  # another worker's process may still be at it, or have finished
+        while not _is_locked(lock.fileno()):  # another worker's process may still be at it, or have finished
+            if received:
+                return STOPPED
+            time.sleep(_LOCK_POLL_S)
+        lock.truncate(0)
+        lock.write(str(os.getpid()))
+        lock.flush()
         if folder.outcome() is not None:
             return 0
         request = folder.request()
@@ -48,22 +57,35 @@ def main(folder_path: str, worker_pid: str) -> int:
         job_run = JobRun(folder, request, lambda: bool(received))
         try:
             outcome = _outcome_of(job_run)
-        except Stopped:
-            return STOPPED
-        try:
             folder.write_progress(outcome.progress)
             folder.write_outcome(outcome)
-        except OSError:
-            return STORAGE_FULL
+        except Stopped:
+            return STOPPED
+        except OSError as error:
+            if is_no_room(error):
+                return STORAGE_FULL
+            traceback.print_exc()
+            return FOLDER_LOST
     return 0
 
 
+def _is_locked(descriptor: int) -> bool:
+    try:
+        fcntl.lockf(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
+
+
 def _outcome_of(job_run: JobRun) -> Outcome:
+    import torch  # not before the folder is this process's own
+
+    torch.set_num_threads(job_run.request.threads)
     try:
         with storage_full("what this job writes"):
             outcome = from_dict(job_run.request.specification).run(job_run)
         return replace(outcome, progress=job_run.progress)
-    except Stopped:
+    except (Stopped, OSError):  # files that cannot be read or written are no fault of the job
         raise
     except UltragrayError as error:
         field = error.field if isinstance(error, InvalidArgument) else None

@@ -5,38 +5,53 @@ from __future__ import annotations
 import logging
 import os
 import signal
-import subprocess
-import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TypeVar
 
 from dbos import WorkflowStatus
+from opentelemetry.trace import Status, StatusCode
 
 from ultragray.errors import MemoryExceeded
 
 from ...claims import is_no_room
-from ...errors import DatabaseUnavailable, SceneExists, StorageFull
+from ...errors import (
+    ArtifactFolderUnavailable,
+    DatabaseUnavailable,
+    JobStalled,
+    JobTimeExceeded,
+    SceneExists,
+    StorageFull,
+)
+from ...scenes import SUFFIX
 from ..folder import JobFolder, Outcome, Request
-from ..publication import publish_scene, withdraw_scene
-from ..queue import database
+from ..publication import publish_scene
+from ..queue import database, runs
 from ..queue.database import JobDatabase
-from ..specification import value_in
+from ..specification import has_checkpoints, value_in
+from ..tracing import job_span
+from .device import DeviceLock, device_of
+from .gate import Gate
+from .job_process import STOP_WAIT_S, end_process_of_another_worker, end_with_checkpoint, job_process
 from .run_job import STOPPED, STORAGE_FULL
+from .run_time import RunTime
+from .watchdog import Watchdog
 
 WATCH_INTERVAL_S = 0.25
+STUCK_AFTER_S = 60.0  # in which the supervision itself has not moved, such as on a share that does not answer
 _POLL_INTERVAL_S = 0.05
-_STOP_WAIT_S = 10.0  # for the checkpoint of a training that is to stop
+_PAUSE_S = 5.0  # before the next look for a job, after one that could not be begun or went on
 # A job fails after so many deaths of its process without progress in between. Kills from outside are hardly the job's
 # fault, so more of them are allowed.
 MAX_CRASHES, MAX_KILLS = 3, 20
 _RESERVE_BYTES = 2**19
 
 _log = logging.getLogger("ultragray.jobs")
+_T = TypeVar("_T")
 
 
 @dataclass(frozen=True)
@@ -48,6 +63,8 @@ class WorkerConfig:
     device: str = "auto"
     threads: int = 1
     nice: int = 10
+    stall_timeout_s: float = 0.0  # 0: no limit; likewise the next
+    max_run_s: float = 0.0
 
 
 class Interrupted(Exception):
@@ -57,20 +74,31 @@ class Interrupted(Exception):
 class Supervisor:
     """Does the jobs of a worker, one at a time."""
 
-    def __init__(self, config: WorkerConfig, jobs: JobDatabase) -> None:
-        self._config, self._database = config, jobs
+    def __init__(self, config: WorkerConfig, jobs: JobDatabase, gate: Gate) -> None:
+        self._config, self._database, self._gate = config, jobs, gate
         self._stop = threading.Event()
         self._idle = threading.Event()
         self._idle.set()
+        self._moved_at_s = time.monotonic()
+        self._stop_by_s = float("-inf")
+        self._goes_on_elsewhere = False  # the job at hand, from its checkpoint
+        self.is_draining = False  # an administrator wants the job at hand to go to another worker
         self.job_at_hand: str | None = None
 
-    def stop(self) -> None:
+    @property
+    def is_stuck(self) -> bool:
+        """Whether there is a job at hand that nobody watches: then this worker should count as dead."""
+        return self.job_at_hand is not None and time.monotonic() - self._moved_at_s > STUCK_AFTER_S
+
+    def stop(self, drain_timeout_s: float = 0.0) -> None:
         """Ends the process at hand, which writes a checkpoint, and puts its job back into the queue.
 
-        Jobs that DBOS starts from now on are put back too.
+        A job that would begin anew has `drain_timeout_s` to end first. Jobs that DBOS starts from now on are put back
+        too.
         """
+        self._stop_by_s = time.monotonic() + drain_timeout_s
         self._stop.set()
-        self._idle.wait(_STOP_WAIT_S + 5.0)
+        self._idle.wait(drain_timeout_s + STOP_WAIT_S + 5.0)
 
     def supervise(self, job_id: str, request: dict[str, Any]) -> Outcome:
         """Does a job, from where an earlier process left it; returns also where the job fails.
@@ -78,52 +106,113 @@ class Supervisor:
         Raises Interrupted.
         """
         self._idle.clear()
+        self._moved_at_s = time.monotonic()
+        self._goes_on_elsewhere = has_checkpoints(request["specification"])
         self.job_at_hand = job_id
         try:
             row = self._require_ours(job_id)
             if self._stop.is_set():
                 self._give_back(job_id)
-            folder = JobFolder(self._config.artifact_folder, job_id)
-            try:
-                folder.path.mkdir(parents=True, exist_ok=True)
-                attempt = row.recovery_attempts or 1
-                kept = folder.outcome()  # of a process that finished as its worker died
-                outcome = self._work(folder, request, attempt) if kept is None else replace(kept, attempts=attempt)
-                made = value_in(request["specification"], "makes_scene")
-                if outcome.error is None and made is not None:
-                    self._require_ours(job_id)
-                    self._publish(folder, made)
-                    folder.remove_checkpoints()
-            except SceneExists as error:
-                outcome = replace(outcome, error=error.reason, reason=error.detail)  # the scene can be downloaded
-            except OSError as error:
-                outcome = _failure_of_storage(error)
-            folder.remove_leftovers()
+            with (
+                self._device_for(job_id, request["specification"]) as device,
+                job_span(row, self._config.executor) as span,
+            ):
+                outcome = self._outcome_of(row, request, device)
+                if outcome.error is not None:
+                    span.set_status(Status(StatusCode.ERROR, outcome.error))
+            if outcome.error is not None:
+                self._require_folder(job_id)
             _log.info(f"job {job_id} {'succeeded' if outcome.error is None else f'failed: {outcome.reason}'}")
             return outcome
         finally:
+            self._gate.close()
             self.job_at_hand = None
             self._idle.set()
 
-    def _work(self, folder: JobFolder, request: dict[str, Any], attempt: int) -> Outcome:
-        config = self._config
+    def _outcome_of(self, row: WorkflowStatus, request: dict[str, Any], device: DeviceLock) -> Outcome:
+        job_id, specification, attempt = row.workflow_id, request["specification"], row.recovery_attempts or 1
+        folder = JobFolder(self._config.artifact_folder, job_id)
+        needed, made = (value_in(specification, role) for role in ("needs_scene", "makes_scene"))
+        try:
+            end_process_of_another_worker(folder)
+            folder.begin(request.get("submission"), needed and f"{needed}{SUFFIX}")
+            kept = folder.outcome()  # of a process that finished as its worker died
+            outcome = self._work(folder, row, request, device) if kept is None else replace(kept, attempts=attempt)
+            if outcome.error is None and made is not None:
+                self._publish(folder, made)
+                folder.remove_checkpoints()
+        except SceneExists as error:
+            outcome = replace(outcome, error=error.reason, reason=error.detail)  # the scene can be downloaded
+        except (JobStalled, JobTimeExceeded) as error:
+            outcome = Outcome(error.reason, error.detail, progress=folder.progress(), attempts=attempt)
+        except OSError as error:
+            if not is_no_room(error) and attempt < MAX_KILLS:  # such as a share that has gone, and may be back by now
+                self._put_back(job_id, f"its folder could not be used: {error.strerror}")
+            outcome = _failure_of_storage(error)
+        folder.remove_leftovers()
+        return outcome
+
+    @contextmanager
+    def _device_for(self, job_id: str, specification: dict[str, Any]) -> Iterator[DeviceLock]:
+        """The device of a job: its own wish, else the worker's. Raises Interrupted where another job has it."""
+        asked = specification.get("device", "auto")
+        device, lock = device_of(self._config.device if asked == "auto" else asked), self._gate.device
+        if device.lock_name != lock.device.lock_name:
+            lock.release()
+            lock = DeviceLock(self._config.artifact_folder, device, self._config.executor)
+        try:
+            is_ours = lock.take()
+        except OSError:
+            self._require_folder(job_id)
+            is_ours = False
+        if not is_ours:
+            self._gate.close(for_s=_PAUSE_S)
+            self._until_the_database_answers(job_id, lambda: self._database.take_back(job_id, self._config.executor))
+            raise Interrupted
+        try:
+            yield lock
+        finally:
+            lock.release()
+
+    def _work(self, folder: JobFolder, row: WorkflowStatus, request: dict[str, Any], device: DeviceLock) -> Outcome:
+        config, specification = self._config, request["specification"]
+        run_time = self._until_the_database_answers(
+            folder.job_id,
+            lambda: RunTime(
+                self._database,
+                folder.job_id,
+                row.authenticated_user,
+                device.device.name,
+                [specification.get("max_run_s") or 0.0, config.max_run_s],
+            ),
+        )
         folder.write_request(
             Request(
-                specification=request["specification"],
+                specification=specification,
                 retry_of=request["retry_of"],
-                device=config.device,
+                submission=request.get("submission"),
+                device=device.device.name,
                 threads=config.threads,
                 nice=config.nice,
             )
         )
+        attempt = row.recovery_attempts or 1
         crashes = kills = 0
         furthest = _furthest(folder)
         while True:
             memory_kills = _memory_kills()
+            self._require_ours(folder.job_id)
+            end_process_of_another_worker(folder)
             with _room_for_the_end(folder):
-                code = self._run_process(folder)
+                code = self._run_process(folder, device, run_time)
             if (outcome := folder.outcome()) is not None:
                 return replace(outcome, attempts=attempt)
+            if run_time.is_over:
+                raise JobTimeExceeded(
+                    f"the job ran for {run_time.limit_s:g} s, the longest that it may (its max_run_s, or "
+                    "ULTRAGRAY_JOB_MAX_RUN_S); a retry goes on from its checkpoint"
+                )
+            self._require_folder(folder.job_id)
             if code == STORAGE_FULL:
                 return replace(_storage_full(), progress=folder.progress(), attempts=attempt)
             if _furthest(folder) > furthest:
@@ -137,64 +226,87 @@ class Supervisor:
                 return replace(failed, progress=folder.progress(), attempts=attempt)
             attempt += 1
 
-    def _run_process(self, folder: JobFolder) -> int:
-        """Runs the job's process to its end; its exit code. Raises Interrupted."""
-        threads = str(self._config.threads)
-        with folder.log.open("ab") as log:
-            process = subprocess.Popen(
-                [sys.executable, "-m", "ultragray_workers.jobs.worker.run_job", str(folder.path), str(os.getpid())],
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=log,
-                env={
-                    **os.environ,
-                    "PYTHONPATH": os.pathsep.join(path for path in sys.path if path),
-                    "OMP_NUM_THREADS": threads,
-                    "OPENBLAS_NUM_THREADS": threads,
-                },
-                start_new_session=True,
-            )
-        try:
-            watched_at = float("-inf")
-            while (code := process.poll()) is None:
-                if self._stop.is_set():
-                    process.terminate()
-                    with suppress(subprocess.TimeoutExpired):
-                        process.wait(_STOP_WAIT_S)
-                    self._give_back(folder.job_id)
-                if time.monotonic() - watched_at >= WATCH_INTERVAL_S:
-                    with suppress(DatabaseUnavailable):  # the work goes on meanwhile
-                        self._raise_unless_ours(folder.job_id)
-                    watched_at = time.monotonic()
-                time.sleep(_POLL_INTERVAL_S)
-            return code
-        finally:
-            with suppress(ProcessLookupError):
-                os.killpg(process.pid, signal.SIGKILL)
-            process.wait()
+    def _run_process(self, folder: JobFolder, device: DeviceLock, run_time: RunTime) -> int:
+        """Runs the job's process to its end, or to that of its time; its exit code. Raises Interrupted, JobStalled."""
+        with job_process(folder, device, self._config.threads) as process:
+            watchdog = Watchdog(process.pid, self._config.stall_timeout_s)
+            watched_at_s = float("-inf")
+            try:
+                while process.poll() is None:
+                    if self._stop.is_set() and (self._goes_on_elsewhere or time.monotonic() > self._stop_by_s):
+                        end_with_checkpoint(process)
+                        self._give_back(folder.job_id)
+                    if self.is_draining and self._goes_on_elsewhere:
+                        end_with_checkpoint(process)
+                        self._leave_to_others(folder.job_id)
+                    if time.monotonic() - watched_at_s >= WATCH_INTERVAL_S:
+                        run_time.add(watchdog.look())
+                        if watchdog.is_stalled:
+                            raise JobStalled(
+                                f"the process of the job neither computed nor read nor wrote for "
+                                f"{self._config.stall_timeout_s:g} s and was ended; a retry goes on from its checkpoint"
+                            )
+                        if run_time.is_over:
+                            end_with_checkpoint(process)
+                            break
+                        with suppress(DatabaseUnavailable):  # the work goes on meanwhile
+                            self._raise_unless_ours(folder.job_id)
+                        watched_at_s = time.monotonic()
+                    self._moved_at_s = time.monotonic()
+                    time.sleep(_POLL_INTERVAL_S)
+            finally:
+                run_time.save()
+        return process.returncode
 
     def _publish(self, folder: JobFolder, scene: str) -> None:
+        """Serves the scene, unless the job was cancelled first: from here on it cannot be. Raises Interrupted."""
+
+        def decide() -> bool:
+            self._raise_unless_ours(folder.job_id)
+            return runs.decide(self._database.engine, folder.job_id, runs.PUBLISHED)
+
+        if not self._until_the_database_answers(folder.job_id, decide):
+            cancel = self._database.client.cancel_workflow  # again: whoever decided it may have died before
+            self._until_the_database_answers(folder.job_id, lambda: cancel(folder.job_id))
+            raise Interrupted
         publish_scene(folder, scene)
+
+    def _require_folder(self, job_id: str) -> None:
+        """Puts a job back that failed because its folder is gone. Raises Interrupted."""
         try:
-            self._require_ours(folder.job_id)
-        except Interrupted:
-            row = self._database.workflow(folder.job_id)
-            if row is None or row.status in database.CANCELLED:  # a moment before; else it is another worker's
-                withdraw_scene(folder, scene)
-            raise
+            self._gate.folder.check()
+        except ArtifactFolderUnavailable as error:
+            self._put_back(job_id, error.detail)
+
+    def _put_back(self, job_id: str, why: str) -> NoReturn:
+        _log.error(f"the job {job_id} waits again: {why}")
+        self._gate.close(for_s=_PAUSE_S)
+        self._until_the_database_answers(job_id, lambda: self._database.put_back(job_id, self._config.executor))
+        raise Interrupted
+
+    def _leave_to_others(self, job_id: str) -> NoReturn:
+        """Puts the job at hand back into the queue. Raises Interrupted."""
+        _log.info(f"the job {job_id} waits again: this worker is to rest")
+        self._until_the_database_answers(job_id, lambda: self._database.put_back(job_id, self._config.executor))
+        raise Interrupted
 
     def _give_back(self, job_id: str) -> NoReturn:
         with suppress(DatabaseUnavailable, StorageFull):  # then the heartbeat of any worker puts it back
             self._database.put_back(job_id, self._config.executor)
         self._idle.set()
         while True:  # until this worker's process ends: a return would let DBOS take the job again
-            time.sleep(_STOP_WAIT_S)
+            time.sleep(STOP_WAIT_S)
 
     def _require_ours(self, job_id: str) -> WorkflowStatus:
         """As `_raise_unless_ours`, but waits for a database that is away."""
+        return self._until_the_database_answers(job_id, lambda: self._raise_unless_ours(job_id))
+
+    def _until_the_database_answers(self, job_id: str, ask: Callable[[], _T]) -> _T:
+        """The answer of a database that may be away for a while; a worker that is to stop does not wait for it."""
         while True:
+            self._moved_at_s = time.monotonic()
             try:
-                return self._raise_unless_ours(job_id)
+                return ask()
             except DatabaseUnavailable:
                 if self._stop.wait(WATCH_INTERVAL_S):
                     self._give_back(job_id)

@@ -10,18 +10,22 @@ import os
 import re
 import socket
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 from dbos import DBOS, PortableWorkflowError, WorkflowSerializationFormat
 
 from ...errors import StartupFailed
+from ...store import OpenStore
 from ..kinds import KINDS
-from ..queue import database
+from ..queue import database, unfinished
 from ..queue.database import JobDatabase, dbos_config, quiet_dbos
 from ..queue.heartbeat import Heartbeat
-from ..queue.internals import NotMine
+from ..queue.internals import NotMine, take_only_through
+from ..queue.wishes import Wanted
+from .device import DeviceLock, device_of
+from .gate import Gate
 from .housekeeping import Housekeeper
 from .supervision import Interrupted, Supervisor, WorkerConfig
 
@@ -42,38 +46,70 @@ def work(
     threads: int = 0,
     nice: int = 10,
     retention_days: float = 0.0,
+    stall_timeout_s: float = 0.0,
+    max_run_s: float = 0.0,
+    drain_timeout_s: float = 0.0,
+    ready: Callable[[], None] = lambda: None,
+    alive_every_s: float | None = None,
+    tell_alive: Callable[[], None] = lambda: None,
 ) -> None:
     """Does jobs until `stop` is set; then the one at hand is put back into the queue with a checkpoint.
 
+    One that has no checkpoints gets `drain_timeout_s` to end first. `ready` is called when jobs are taken, and
+    `tell_alive` every `alive_every_s` while the worker is not stuck.
+
     No other worker may have the `name` (None: that of the host, numbered); a worker that is started again under its
     name goes on with its jobs at once. `threads` 0: all cores but one. Finished jobs are removed after
-    `retention_days`; 0: never. Threads of DBOS are left behind: end the process by os._exit. Raises StartupFailed.
+    `retention_days`; a job fails whose process does not get on for `stall_timeout_s`, or that runs for `max_run_s` in
+    all; 0: never. Threads of DBOS are left behind: end the process by os._exit. Raises StartupFailed.
     """
-    jobs = JobDatabase(artifact_folder, database_url)
-    with claim_name(artifact_folder, name) as executor:
+    with contextlib.closing(OpenStore(artifact_folder)), claim_name(artifact_folder, name) as executor:
+        jobs = JobDatabase(artifact_folder, database_url)
         config = WorkerConfig(
             artifact_folder=artifact_folder.resolve(),
             executor=executor,
             device=device,
             threads=threads or max(1, (os.cpu_count() or 1) - 1),
             nice=nice,
+            stall_timeout_s=stall_timeout_s,
+            max_run_s=max_run_s,
         )
-        supervisor = Supervisor(config, jobs)
-        heartbeat = Heartbeat(jobs, executor, lambda: supervisor.job_at_hand)
-        _launch(jobs.url, config, supervisor)
+        device_lock = DeviceLock(config.artifact_folder, device_of(device), executor)
+        gate = Gate(jobs.folder, device_lock)
+        supervisor = Supervisor(config, jobs, gate)
+
+        def obey(wanted: Wanted) -> None:
+            if gate.is_resting is not (wanted is not Wanted.WORK):
+                _log.info(f"worker {executor} is to {wanted.value}")
+            gate.is_resting = wanted is not Wanted.WORK
+            supervisor.is_draining = wanted is Wanted.DRAIN
+
+        heartbeat = Heartbeat(
+            jobs,
+            executor,
+            job_at_hand=lambda: supervisor.job_at_hand,
+            is_stuck=lambda: supervisor.is_stuck,
+            device=device,
+            obey=obey,
+        )
+        unfinished.adopt_older(jobs)
+        _launch(jobs.url, config, supervisor, gate)
         housekeeper = Housekeeper(jobs, config.artifact_folder, retention_days)
         if retention_days:
             housekeeper.start()
         fields = {"worker": executor, "threads": config.threads, "device": device}
         _log.info(f"worker {executor} takes jobs", extra={"fields": fields})
-        stop.wait()
+        ready()
+        while not stop.wait(alive_every_s):
+            if not supervisor.is_stuck:
+                tell_alive()
         housekeeper.stop()
-        supervisor.stop()
+        supervisor.stop(drain_timeout_s)
         heartbeat.stop()
         _log.info(f"worker {executor} stopped")
 
 
-def _launch(url: str, config: WorkerConfig, supervisor: Supervisor) -> None:
+def _launch(url: str, config: WorkerConfig, supervisor: Supervisor, gate: Gate) -> None:
     def run(request: dict[str, Any]) -> dict[str, Any]:
         job_id = DBOS.workflow_id
         assert job_id is not None
@@ -85,7 +121,7 @@ def _launch(url: str, config: WorkerConfig, supervisor: Supervisor) -> None:
             raise PortableWorkflowError(outcome.reason or outcome.error, outcome.error, data=outcome.to_dict())
         return outcome.to_dict()
 
-    DBOS(config=dbos_config(url, config.executor))
+    dbos = DBOS(config=dbos_config(url, config.executor))
     for kind in KINDS:
         # However often its worker dies, a job does not fail for it.
         DBOS.workflow(name=kind, max_recovery_attempts=None, serialization_type=WorkflowSerializationFormat.PORTABLE)(
@@ -94,6 +130,7 @@ def _launch(url: str, config: WorkerConfig, supervisor: Supervisor) -> None:
     quiet_dbos()
     DBOS.listen_queues([database.QUEUE])
     DBOS.launch()
+    take_only_through(dbos, database.QUEUE, gate.opens, gate.close)
     DBOS.register_queue(database.QUEUE, worker_concurrency=1, polling_interval_sec=POLLING_INTERVAL_S)
 
 

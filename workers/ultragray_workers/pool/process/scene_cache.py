@@ -48,6 +48,14 @@ class SceneCache:
 
     def get(self, name: str, path: str) -> LoadedScene:
         """The scene of a file as it is now. Raises SceneFileInvalid, SceneTooLarge, MemoryExceeded."""
+        if (held := self.held(name, path)) is not None:
+            return held
+        self._make_room(name, path)
+        self._scenes[name] = loaded = self._load(name, path)
+        return loaded
+
+    def held(self, name: str, path: str) -> LoadedScene | None:
+        """The scene where it need not be loaded: it is here, and its file is the same. Raises SceneFileInvalid."""
         try:
             version = _version(path)
         except SceneFileInvalid:
@@ -58,10 +66,7 @@ class SceneCache:
             self._scenes.move_to_end(name)
             return held
         self.drop(name)
-        self._make_room(name, path)
-        loaded = self._load(name, path)
-        self._scenes[name] = loaded
-        return loaded
+        return None
 
     def drop(self, name: str) -> None:
         self._scenes.pop(name, None)

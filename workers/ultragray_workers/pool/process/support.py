@@ -24,6 +24,5 @@ def refusal(task: RenderTask, extrapolations: Sequence[Extrapolation]) -> LowCon
         return None
     for index, one in enumerate(extrapolations):
         if not is_confident(one, limit):
-            part = task.parts[0]
-            return low_confidence(one, limit, "pose" if part.total == 1 else f"poses[{part.first + index}]")
+            return low_confidence(one, limit, task.parts[0].name_pose(index))
     return None

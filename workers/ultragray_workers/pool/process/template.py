@@ -46,11 +46,11 @@ def main(channel_descriptor: int) -> NoReturn:
                 os.close(descriptor)
             continue
         channel.close()
-        channel = Channel.from_descriptor(descriptors[0])
+        channel = Channel.from_descriptor(descriptors[0])  # the others are the worker's board
         if isinstance(request, ForkWorker):
             _name_process("ug-worker")
             try:
-                run_worker(channel, request)
+                run_worker(channel, request, *descriptors[1:])
             except BaseException:
                 traceback.print_exc()
                 os._exit(1)

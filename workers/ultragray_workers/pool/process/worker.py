@@ -26,31 +26,49 @@ from ultragray.display.frames import show
 from ultragray.display.pixels import ByteArray, to_uint8
 from ultragray.display.settings import AS_RENDERED
 from ultragray.errors import MemoryExceeded, RenderFailed, UltragrayError
+from ultragray.limits import UNLIMITED, GivenUp, Limits
 from ultragray.probe import FloatArray
 from ultragray.rendering import renderer_name
 from ultragray.settings import Encoding, Resolved
 
+from ...errors import DeadlineExceeded
+from ..board import Board
 from ..channel import Channel
 from ..memory import write_at
-from ..messages import Answer, ForkWorker, Hello, LoadTask, PackTask, Rendered, RenderPart, RenderTask, Task, UnloadTask
-from ..transfer import CHUNK_POSES, Arriving, Wanted, render_to_host
+from ..messages import (
+    Answer,
+    ForkWorker,
+    Hello,
+    Loading,
+    LoadTask,
+    Outdated,
+    PackTask,
+    Rendered,
+    RenderPart,
+    RenderTask,
+    Task,
+    UnloadTask,
+)
 from .encoding import encode_image, encode_pixels, write_npz
 from .placement import render_device
-from .scene_cache import SceneCache
+from .scene_cache import LoadedScene, SceneCache
 from .support import below_limit, refusal
+from .transfer import CHUNK_POSES, Arriving, Wanted, render_to_host
 
 MAX_DETAIL_LENGTH = 2000
 
 logger = logging.getLogger(__name__)
 
 
-def run_worker(channel: Channel, settings: ForkWorker) -> None:
+def run_worker(channel: Channel, settings: ForkWorker, board_memory: int) -> None:
     """Serves the channel until the service hangs up or dies."""
+    board = Board(board_memory)
+    os.close(board_memory)
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     threading.Thread(target=_exit_with_service, args=(channel.fileno(),), daemon=True).start()
     torch.set_grad_enabled(False)
     try:
-        worker = _Worker(channel, settings)
+        worker = _Worker(channel, settings, board)
         worker.warm_up()
     except Exception as error:
         channel.send(Hello(os.getpid(), error=_as_reported(error)))
@@ -73,8 +91,11 @@ def _exit_with_service(channel_descriptor: int) -> None:
 
 
 class _Worker:
-    def __init__(self, channel: Channel, settings: ForkWorker) -> None:
+    def __init__(self, channel: Channel, settings: ForkWorker, board: Board) -> None:
         self._channel = channel
+        self._board = board
+        self._tasks = 0  # taken up
+        self._max_footprint_pixels = settings.max_footprint_pixels
         self._backend = settings.backend
         self._device = render_device(settings.backend, settings.number)
         self.gpus = cuda.device_count() if self._device.type == "cuda" else 0
@@ -94,6 +115,8 @@ class _Worker:
 
     def do(self, task: Task, descriptors: list[int]) -> None:
         """Does one task and answers it, whatever happens."""
+        self._tasks += 1
+        self._board.taken[0] = self._tasks
         try:
             if isinstance(task, RenderTask):
                 for index, outcome in enumerate(self._render_parts(task, descriptors)):
@@ -104,7 +127,7 @@ class _Worker:
             for descriptor in descriptors:
                 os.close(descriptor)
 
-    def _answer(self, part: int, outcome: Rendered | UltragrayError | None, *, last: bool) -> None:
+    def _answer(self, part: int, outcome: Rendered | Outdated | UltragrayError | None, *, last: bool) -> None:
         self._channel.send(Answer(part=part, outcome=outcome, last=last, resident=self._scenes.names()))
 
     def _do_other(
@@ -114,17 +137,34 @@ class _Worker:
             if isinstance(task, PackTask):
                 return _pack(task, *descriptors)
             if isinstance(task, LoadTask):
-                self._render_small(self._scenes.get(task.scene, task.path).scene)  # lets the kernels prepare it
+                self._loaded(task.scene, task.path)
             else:
                 self._scenes.drop(task.scene)
         except Exception as error:
             return _as_reported(error)
         return None
 
-    def _render_parts(self, task: RenderTask, memories: Sequence[int]) -> Iterator[Rendered | UltragrayError]:
+    def _loaded(self, name: str, path: str) -> LoadedScene:
+        """A scene, ready for its first frame. Raises SceneFileInvalid, SceneTooLarge, MemoryExceeded."""
+        if (held := self._scenes.held(name, path)) is not None:
+            return held
+        self._channel.send(Loading(begins=True))
+        try:
+            loaded = self._scenes.get(name, path)
+            self._render_small(loaded.scene)  # lets the kernels prepare it
+        finally:
+            self._channel.send(Loading(begins=False))
+        return loaded
+
+    def _render_parts(
+        self, task: RenderTask, memories: Sequence[int]
+    ) -> Iterator[Rendered | Outdated | UltragrayError]:
         """One outcome per part, each as soon as its frames are written."""
         try:
-            loaded = self._scenes.get(task.scene, task.path)
+            loaded = self._loaded(task.scene, task.path)
+            if task.version not in (None, loaded.version):
+                yield from [Outdated()] * len(task.parts)
+                return
             poses = np.concatenate([part.poses for part in task.parts])  # [C, 4, 4]
             extrapolations = loaded.assessor.assess(poses, task.view.probe)
         except Exception as error:
@@ -140,10 +180,16 @@ class _Worker:
                 wanted.setdefault(name, set()).add(part.settings.encoding.pixel_type)
         started = time.monotonic()
         support = SupportWatch(below_limit(task, extrapolations))
+        limits = Limits(self._max_footprint_pixels, self._board.given_up, self._tasks, task.parts[0].name_pose)
         frames = None
         try:
             if refused is None:
-                frames = self._render(loaded.scene, task.view, poses, wanted, support)
+                frames = self._render(loaded.scene, task.view, poses, wanted, support, limits)
+        except GivenUp:
+            yield from [RenderFailed("the service gave up this rendering: nobody waited for it any more")] * len(
+                task.parts
+            )
+            return
         except Exception as error:
             if len(task.parts) == 1:
                 yield _as_reported(error)
@@ -164,7 +210,10 @@ class _Worker:
         for part, memory in zip(task.parts, memories, strict=True):
             end = begin + len(part.poses)
             assessed = partial(support.with_shares, extrapolations[begin:end], begin)
-            yield _write_part(task.scene, part, frames, begin, memory, rendered, assessed)
+            if part.deadline is not None and time.monotonic() >= part.deadline:
+                yield DeadlineExceeded("the deadline passed before the frames were written")
+            else:
+                yield _write_part(task.scene, part, frames, begin, memory, rendered, assessed)
             begin = end
 
     def _render(
@@ -174,11 +223,23 @@ class _Worker:
         poses: FloatArray,  # [C, 4, 4] mm
         wanted: Wanted,
         support: SupportWatch,
+        limits: Limits,
     ) -> Arriving:
+        shot = 0
+
         def shoot(some: FloatArray) -> dict[str, Tensor]:  # [C, 4, 4] -> each [C, H, W] of the picture
+            nonlocal shot
             frames = render(
-                scene, view.probe, some, height=view.height, width=view.width, outputs=needed, backend=self._backend
+                scene,
+                view.probe,
+                some,
+                height=view.height,
+                width=view.width,
+                outputs=needed,
+                backend=self._backend,
+                limits=limits.after(shot),
             )
+            shot += len(some)
             assert frames.coverage is not None
             blackened = support.look(frames.coverage)
             rendered = {name: frames[name] for name in outputs}
@@ -201,7 +262,9 @@ class _Worker:
         pixel_type, small = Encoding.UINT8.pixel_type, []
         for probe in example_probes():
             view = Resolved(probe, 16, 16)
-            frames = self._render(scene, view, np.eye(4)[None], {"bmode": {pixel_type}}, SupportWatch([False]))
+            frames = self._render(
+                scene, view, np.eye(4)[None], {"bmode": {pixel_type}}, SupportWatch([False]), UNLIMITED
+            )
             small.append(to_uint8(frames.take("bmode", pixel_type, 0, 1)[0]))
         return small
 

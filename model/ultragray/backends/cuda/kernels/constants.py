@@ -18,4 +18,7 @@ VIEW = tl.constexpr(17)  # of a pose: axes 9, origin 3, near, cull_far, row_cm, 
 FIELDS = tl.constexpr(12)  # of a slice: t, row offset, r, m2, tt, tr, rr, det, intensity, 1 - tau; to whole 16 bytes
 RECTANGLE = tl.constexpr(8)  # of a slice: first and last column and row, own column and row, clipped; likewise
 GRADIENTS = tl.constexpr(9)  # by a slice's t, r, tt, tr, rr, m2, intensity, 1 - tau, det
+SPARE_LINES = tl.constexpr(15)  # what a footprint costs beside its pixels, as on the CPU (model/kernels/footprint.cpp)
+SPARE_ROWS = tl.constexpr(16)
+CLIPPED_COST = tl.constexpr(8)
 NOTHING = tl.constexpr(1 << 30)  # larger than every block, row and column

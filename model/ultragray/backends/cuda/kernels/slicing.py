@@ -11,6 +11,7 @@ import triton
 import triton.language as tl
 
 from .constants import (
+    CLIPPED_COST,
     EARLY_SIGMA_CM,
     FIELDS,
     FULL_PROFILE,
@@ -19,6 +20,8 @@ from .constants import (
     MIN_PSI,
     NEGLIGIBLE,
     RECTANGLE,
+    SPARE_LINES,
+    SPARE_ROWS,
     VIEW,
 )
 from .harmonics import activate, harmonics
@@ -152,6 +155,7 @@ def slice_gaussians(
     rectangles,  # [C, B, BLOCK, RECTANGLE] out, int32
     bounds,  # [C, B, 4] out, int32: of all rectangles of the block
     counts,  # [C, B] out, int32
+    footprints,  # [C, B] out, int64: the cost of its slices in footprint pixels
     places,  # [C, B, BLOCK] out, int32: which slice of its block a Gaussian became, -1: none; only where RECORD
     count,
     shn_stride,
@@ -174,6 +178,7 @@ def slice_gaussians(
     found = tl.max(candidate.to(tl.int32), 0)
     if found == 0:
         tl.store(counts + group, 0)
+        tl.store(footprints + group, tl.full([], 0, tl.int64))
         for side in tl.static_range(4):
             tl.store(bounds + group * 4 + side, -1)
         if RECORD:
@@ -297,6 +302,9 @@ def slice_gaussians(
         tl.store(to + 6, clipped.to(tl.int32), kept)
 
         tl.store(counts + group, tl.sum(kept.to(tl.int32), 0))
+        rows = (last_row - first_row + 1) * tl.where(clipped, CLIPPED_COST, 1) + SPARE_ROWS
+        pixels = (last_column - first_column + 1 + SPARE_LINES).to(tl.int64) * rows
+        tl.store(footprints + group, tl.sum(tl.where(kept, pixels, 0), 0))
         to = bounds + group * 4
         tl.store(to, tl.min(tl.where(kept, first_column, width), 0))
         tl.store(to + 1, tl.max(tl.where(kept, last_column, -1), 0))

@@ -7,8 +7,8 @@ from grpc_health.v1 import health_pb2, health_pb2_grpc
 
 from ultragray_proto.v1 import scenes_pb2, scenes_pb2_grpc
 
-from .conftest import RunningService, StartService
-from .rpc.test_grpc_render import error_info
+from ..conftest import RunningService, StartService
+from ..rpc.test_grpc_render import error_info
 
 KEY, OTHER_KEY = "0123456789abcdef-first", "0123456789abcdef-second"
 

@@ -1,0 +1,1 @@
+"""Who calls, and what they may do: one answer for every front door."""

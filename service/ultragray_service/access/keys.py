@@ -1,0 +1,162 @@
+"""Named API keys in the jobs' database: made, listed, revoked; and a copy in memory to check requests with."""
+
+from __future__ import annotations
+
+import re
+import secrets
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import sqlalchemy as sa
+
+from ultragray.contract import described
+from ultragray.errors import InvalidArgument
+from ultragray_workers.jobs.queue.owners import tell_change
+from ultragray_workers.jobs.queue.tables import KEYS
+
+from ..errors import Unauthenticated
+from .guard import digest_of
+from .principal import Principal, Role
+
+_PREFIX = "ultragray_"  # so that people, and those who search files for secrets, know one when they see it
+_RANDOM_BYTES = 32
+_ID_BYTES = 4
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._@-]{0,63}")  # no colon: see Principal
+_DAY_S = 86_400.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Key:
+    """An API key as its row has it; times are time.time() in seconds."""
+
+    id: str
+    name: str = described("Whose it is.")
+    role: Role
+    created_at_s: float
+    expires_at_s: float | None = None
+    revoked_at_s: float | None = None
+    last_used_at_s: float | None = described("To the minute or so.", None)
+
+    def is_valid(self, now_s: float) -> bool:
+        """Whether it opens the doors."""
+        return self.revoked_at_s is None and (self.expires_at_s is None or now_s < self.expires_at_s)
+
+
+class KeyStore:
+    """The keys of a database. Its methods block."""
+
+    def __init__(self, engine: sa.Engine) -> None:
+        self._engine = engine
+
+    def create(self, name: str, role: Role, expires_days: float | None) -> tuple[Key, str]:
+        """A new key and its secret, which nobody can read again. Raises InvalidArgument for a name that none may have.
+
+        One name may have several keys: the new one while the old one is replaced.
+        """
+        if not NAME.fullmatch(name):
+            raise InvalidArgument(
+                f"name must be 1 to 64 letters, digits, '.', '_', '@', '-', the first a letter or digit, got {name!r}",
+                field="name",
+            )
+        now_s = time.time()
+        secret = _PREFIX + secrets.token_urlsafe(_RANDOM_BYTES)
+        expires_at_s = None if expires_days is None else now_s + expires_days * _DAY_S
+        key = Key(id=secrets.token_hex(_ID_BYTES), name=name, role=role, created_at_s=now_s, expires_at_s=expires_at_s)
+        with self._engine.begin() as connection:
+            connection.execute(
+                sa.insert(KEYS).values(
+                    id=key.id,
+                    digest=digest_of(secret).hex(),
+                    name=name,
+                    role=role.value,
+                    created_at_s=now_s,
+                    expires_at_s=expires_at_s,
+                )
+            )
+            tell_change(connection)
+        return key, secret
+
+    def revoke(self, name_or_id: str) -> list[Key]:
+        """Revokes the key of an id, or all keys of a name; the keys that opened doors until now.
+
+        Raises InvalidArgument where there is none of that name.
+        """
+        now_s = time.time()
+        found = [key for key in self.keys().values() if name_or_id in (key.id, key.name)]
+        if not found:
+            raise InvalidArgument(f"there is no key of the name or id {name_or_id!r}", field="name")
+        revoked = [key for key in found if key.revoked_at_s is None]
+        with self._engine.begin() as connection:
+            chosen = KEYS.c.id.in_([key.id for key in revoked])
+            connection.execute(sa.update(KEYS).where(chosen).values(revoked_at_s=now_s))
+            tell_change(connection)
+        return [key for key in revoked if key.is_valid(now_s)]
+
+    def keys(self) -> dict[bytes, Key]:
+        """All keys by their digests, also those that are revoked or expired; oldest first."""
+        with self._engine.connect() as connection:
+            return read_keys(connection)
+
+    def note_uses(self, last_used_at_s: Mapping[str, float]) -> None:
+        """Writes when keys were used last, by their ids."""
+        if last_used_at_s:
+            with self._engine.begin() as connection:
+                connection.execute(
+                    sa.update(KEYS).where(KEYS.c.id == sa.bindparam("key_id")),
+                    [{"key_id": id, "last_used_at_s": at_s} for id, at_s in last_used_at_s.items()],
+                )
+
+
+def read_keys(connection: sa.Connection) -> dict[bytes, Key]:
+    """As KeyStore.keys."""
+    columns = KEYS.c
+    rows = connection.execute(sa.select(KEYS).order_by(columns.created_at_s, columns.id))
+    return {
+        bytes.fromhex(row.digest): Key(
+            id=row.id,
+            name=row.name,
+            role=Role(row.role),
+            created_at_s=row.created_at_s,
+            expires_at_s=row.expires_at_s,
+            revoked_at_s=row.revoked_at_s,
+            last_used_at_s=row.last_used_at_s,
+        )
+        for row in rows
+    }
+
+
+class KnownKeys:
+    """An Authenticator: the keys as they were read last."""
+
+    def __init__(self) -> None:
+        self._keys: Mapping[bytes, Key] = {}
+        self._principals: Mapping[bytes, Principal] = {}
+        self._used_at_s: dict[str, float] = {}
+
+    @property
+    def is_used(self) -> bool:
+        return bool(self._keys)
+
+    def replace(self, keys: Mapping[bytes, Key]) -> None:
+        """From now on these are the keys. May be called from any thread."""
+        self._principals = {
+            digest: Principal(key.name, key.role, key.id, key.expires_at_s)
+            for digest, key in keys.items()
+            if key.revoked_at_s is None
+        }
+        self._keys = keys
+
+    def authenticate(self, credential: str) -> Principal | None:
+        digest = digest_of(credential)
+        principal = self._principals.get(digest)
+        if principal is not None:
+            self._used_at_s[principal.source] = time.time()
+        elif digest in self._keys:
+            raise Unauthenticated("the API key was revoked", field="Authorization")
+        return principal
+
+    def take_uses(self) -> dict[str, float]:
+        """When keys were used last, by their ids, since the last call."""
+        taken, self._used_at_s = self._used_at_s, {}
+        return dict(taken)  # a request may still be writing into the other one

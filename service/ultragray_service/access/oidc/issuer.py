@@ -1,0 +1,161 @@
+"""The public keys of an OpenID Connect issuer, fetched in the background and kept while it is away."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import logging
+import ssl
+import time
+import urllib.request
+from collections.abc import Mapping
+from dataclasses import dataclass
+from http.client import HTTPException
+from pathlib import Path
+from typing import Any
+
+import jwt
+
+from ultragray.errors import InvalidArgument
+
+from ...errors import IssuerUnavailable, Unauthenticated
+from .claims import check_url
+
+DISCOVERY_PATH = "/.well-known/openid-configuration"
+REFRESH_S = 300.0
+LEAST_INTERVAL_S = 5.0  # between two fetches, however many tokens name keys that are not known
+RETRY_S = 15.0  # while the issuer does not answer
+_CONNECT_TIMEOUT_S = 5.0
+_ANSWER_TIMEOUT_S = 15.0
+_LARGEST_ANSWER_BYTES = 2**19
+_LEAST_RSA_BITS = 2048
+_MAX_ASKED = 100
+_SIGNATURES = {  # that a key of a kind can make, by the class that JSON Web Keys know it as; nothing symmetric
+    "RSA": ("RS256", "RS384", "RS512", "PS256", "PS384", "PS512"),
+    "P-256": ("ES256",),
+    "P-384": ("ES384",),
+    "P-521": ("ES512",),
+    "Ed25519": ("EdDSA",),
+}
+
+_log = logging.getLogger("ultragray.access")
+
+
+@dataclass(frozen=True)
+class SigningKey:
+    """A public key, and the algorithms that a token may name with it."""
+
+    key: Any
+    algorithms: tuple[str, ...]
+
+
+class Issuer:
+    """An issuer and its keys as they were fetched last."""
+
+    def __init__(self, url: str, ca: Path | None) -> None:
+        """`ca` None: the authorities that the system trusts. Raises InvalidArgument where the file holds none."""
+        self.url = url
+        try:
+            tls = ssl.create_default_context(cafile=ca)
+        except OSError as error:
+            raise InvalidArgument(
+                f"oidc_ca: {ca} holds no certificates ({error.strerror or error})", field="oidc_ca"
+            ) from None
+        self._opener = urllib.request.build_opener(urllib.request.HTTPSHandler(context=tls), _NoRedirects)
+        self._published: list[Any] = []
+        # Keys that tokens named and that are not known: to be fetched, being fetched, and not found by the last fetch.
+        self._asked: set[str | None] = set()
+        self._fetching: set[str | None] = set()
+        self._absent: set[str | None] = set()
+        self._wanted = asyncio.Event()
+        self.keys: Mapping[str | None, SigningKey] = {}  # by their ids; another object when they change
+        self.problem: str | None = "its keys were not fetched yet"  # for the log alone: it may name addresses
+
+    def key(self, key_id: str | None) -> SigningKey:
+        """The key of an id; None: the only one there is.
+
+        Raises Unauthenticated where the issuer has none of that id, IssuerUnavailable where that is not known yet.
+        """
+        found = self.keys.get(key_id)
+        if found is not None:
+            return found
+        if self.problem is not None:
+            raise IssuerUnavailable("the token cannot be checked: its issuer does not answer", field="Authorization")
+        if key_id in self._absent or len(self._asked) >= _MAX_ASKED:
+            raise Unauthenticated("the token is signed with a key that its issuer does not have", field="Authorization")
+        if key_id not in self._fetching:
+            self._asked.add(key_id)
+            self._wanted.set()
+        raise IssuerUnavailable(
+            "the token names a new key of its issuer, and the keys are being fetched", field="Authorization"
+        )
+
+    async def follow(self) -> None:
+        """Fetches the keys, again after a while and when tokens name others, for ever."""
+        while True:
+            self._wanted.clear()
+            self._fetching, self._asked = self._asked, set()
+            problem = await asyncio.to_thread(self._fetch)
+            self._absent, self._fetching = self._fetching - self.keys.keys(), set()
+            if problem != self.problem:
+                self.problem = problem
+                if problem is None:
+                    _log.info("the keys of %s are known: %d", self.url, len(self.keys))
+                else:
+                    _log.error("tokens of %s cannot be checked: %s", self.url, problem)
+            await asyncio.sleep(LEAST_INTERVAL_S)
+            with contextlib.suppress(asyncio.TimeoutError):
+                await asyncio.wait_for(
+                    self._wanted.wait(), (REFRESH_S if problem is None else RETRY_S) - LEAST_INTERVAL_S
+                )
+
+    def _fetch(self) -> str | None:
+        """Takes over the keys that the issuer publishes. Why it could not, if so: the ones before stay."""
+        try:
+            discovered = self._get(self.url.rstrip("/") + DISCOVERY_PATH)
+            if discovered["issuer"] != self.url:
+                return f"the issuer calls itself {discovered['issuer']!r}"
+            published = self._get(check_url(discovered["jwks_uri"], "jwks_uri"))["keys"]
+            if published != self._published:
+                keys = dict(found for one in published if (found := _usable(one)) is not None)
+                if len(keys) == 1:
+                    keys[None] = next(iter(keys.values()))
+                self.keys, self._published = keys, published
+        except (OSError, HTTPException, ValueError, LookupError, TypeError, RecursionError) as error:
+            return f"the issuer does not answer as expected ({error})"
+        return None
+
+    def _get(self, url: str) -> Any:
+        end = time.monotonic() + _ANSWER_TIMEOUT_S
+        content = b""
+        with self._opener.open(url, timeout=_CONNECT_TIMEOUT_S) as answer:
+            while chunk := answer.read1(2**16):
+                content += chunk
+                if len(content) > _LARGEST_ANSWER_BYTES or time.monotonic() > end:
+                    raise ValueError(f"{url} answers too slowly, or with more than {_LARGEST_ANSWER_BYTES} bytes")
+        return json.loads(content)
+
+
+class _NoRedirects(urllib.request.HTTPRedirectHandler):
+    """Takes a redirection as the refusal that it is: it might lead to where nothing is encrypted."""
+
+    def redirect_request(self, *_: Any) -> None:
+        return None
+
+
+def _usable(published: Any) -> tuple[str | None, SigningKey] | None:
+    """Id and key of a JSON Web Key that tokens may be signed with; None: it is for something else."""
+    kind = published["kty"] if published["kty"] == "RSA" else published.get("crv")
+    algorithms = _SIGNATURES.get(kind, ())
+    if (named := published.get("alg")) is not None:
+        algorithms = tuple(one for one in algorithms if one == named)
+    if not algorithms or published.get("use", "sig") != "sig":
+        return None
+    try:
+        key = jwt.PyJWK(published, algorithms[0]).key
+    except jwt.PyJWTError:
+        return None
+    if kind == "RSA" and key.key_size < _LEAST_RSA_BITS:
+        return None
+    return published.get("kid"), SigningKey(key, algorithms)

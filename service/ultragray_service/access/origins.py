@@ -1,0 +1,76 @@
+"""Which pages may reach a service that asks for no key, and which WebSockets any service opens.
+
+A browser lets every page send requests to this machine. Two headers that no page can change tell them apart: `Origin`,
+the site of the page, and `Host`, the name that it used for this machine, which is a foreign one where somebody's DNS
+was made to point here (rebinding).
+"""
+
+from __future__ import annotations
+
+import ipaddress
+from functools import lru_cache
+from urllib.parse import urlsplit
+
+from ..errors import HostRefused, OriginRefused
+from ..settings import Settings
+from .addresses import is_loopback
+
+_ANY = "*"
+
+
+class Origins:
+    """Checks the headers of requests that browsers sent; those of other programs have no Origin."""
+
+    def __init__(self, settings: Settings) -> None:
+        self._pages = frozenset(settings.cors_origins)
+        self._hosts = frozenset(name.lower() for name in (settings.host, *settings.allowed_hosts))
+        # An address is not a name that anybody could point here. It is checked all the same where only this machine is
+        # served, which no other address can be the right one of.
+        self._any_address = not is_loopback(settings.host)
+        self._is_allowed_host = lru_cache(maxsize=256)(self._allows_host)
+
+    def require_host(self, host: str | None) -> None:
+        """Raises HostRefused for a name that is not known as one of this service."""
+        if host is not None and not self._is_allowed_host(host):
+            raise HostRefused(
+                f"this service is not known as {host[:128]!r}: allow the name with ULTRAGRAY_ALLOWED_HOSTS, or give the"
+                " service API keys",
+                field="Host",
+            )
+
+    def require_page(
+        self, *, origin: str | None, host: str | None, fetch_site: str | None = None, fetch_mode: str | None = None
+    ) -> None:
+        """Raises OriginRefused for a request of another site's page, by the headers that browsers send."""
+        if origin is not None:
+            self._require_origin(origin, host)
+        elif fetch_site == "cross-site" and fetch_mode != "navigate":
+            raise OriginRefused("pages of other sites may not load this; a link to it may be followed", field="Origin")
+
+    def _require_origin(self, origin: str, host: str | None) -> None:
+        if origin in self._pages or _ANY in self._pages:
+            return
+        try:
+            parts = urlsplit(origin)
+        except ValueError:
+            parts = urlsplit("")
+        if parts.scheme not in ("http", "https") or host is None or parts.netloc.lower() != host.lower():
+            raise OriginRefused(
+                f"pages of {origin[:128]} may not use this service; allow them with ULTRAGRAY_CORS_ORIGINS",
+                field="Origin",
+            )
+
+    def _allows_host(self, host: str) -> bool:
+        if _ANY in self._hosts:
+            return True
+        try:
+            name = (urlsplit(f"//{host}").hostname or "").lower()
+        except ValueError:
+            return False
+        if name in self._hosts or is_loopback(name):
+            return True
+        try:
+            ipaddress.ip_address(name)
+        except ValueError:
+            return False
+        return self._any_address

@@ -1,0 +1,189 @@
+"""Who may do what: the one table of all operations, with the role that each needs, for every door.
+
+A route or method without a row stops the service at its start.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+from starlette.routing import compile_path
+
+from ultragray_workers.jobs.queue.owners import Kind
+
+from .principal import Role
+
+STREAM = "stream"  # the operation of poses in, frames out
+WEBSOCKET = "WEBSOCKET"  # in place of the method, of a route that is one
+
+
+@dataclass(frozen=True)
+class Operation:
+    """Something that a client may ask for.
+
+    `role` None: anybody may, also without a key. `about`: what kind of thing it names. `owned`: it must be the
+    caller's own, but for admins. `changes`: it leaves something behind, and stands in the audit log one by one.
+    """
+
+    name: str
+    role: Role | None
+    http: tuple[str, ...] = ()  # "METHOD /path"
+    grpc: tuple[str, ...] = ()  # "Service/Method" of ultragray.v1
+    about: Kind | None = None
+    owned: bool = False
+
+    @property
+    def lasts(self) -> bool:
+        """Whether its begin and its end stand in the audit log."""
+        return self.name == STREAM
+
+    @property
+    def changes(self) -> bool:
+        return self.role in (Role.OPERATOR, Role.ADMIN)
+
+
+_READER, _OPERATOR = Role.READER, Role.OPERATOR
+_SCENE, _DATASET, _JOB = Kind.SCENE, Kind.DATASET, Kind.JOB
+
+OPERATIONS = (
+    # Frames come first: their route is the one that must be found fast.
+    Operation("render", _READER, ("POST /v1/scenes/{scene}/render",), ("RenderService/Render",), _SCENE),
+    Operation("render.batch", _READER, (), ("RenderService/RenderBatch",), _SCENE),
+    Operation(STREAM, _READER, (f"{WEBSOCKET} /v1/scenes/{{scene}}/stream",), ("RenderService/RenderStream",), _SCENE),
+    Operation("probe.plane", _READER, ("POST /v1/probes:plane",)),
+    Operation("scene.list", _READER, ("GET /v1/scenes",), ("SceneService/ListScenes",)),
+    Operation(
+        "scene.get",
+        _READER,
+        (
+            "GET /v1/scenes/{scene}",
+            "GET /v1/scenes/{scene}/gaussians",
+            "GET /v1/scenes/{scene}/training-poses",
+            "GET /v1/scenes/{scene}/comparison",
+            "GET /v1/scenes/{scene}/comparison/{index}/{what}.png",
+        ),
+        ("SceneService/GetScene",),
+        _SCENE,
+    ),
+    Operation("scene.download", _READER, ("GET /v1/scenes/{scene}/file",), (), _SCENE),
+    Operation("scene.load", _OPERATOR, ("POST /v1/scenes/{scene}:load",), ("SceneService/LoadScene",), _SCENE),
+    Operation("scene.unload", _OPERATOR, ("POST /v1/scenes/{scene}:unload",), ("SceneService/UnloadScene",), _SCENE),
+    Operation("scene.import", _OPERATOR, ("PUT /v1/scenes/{scene}",), (), _SCENE),
+    Operation("scene.delete", _OPERATOR, ("DELETE /v1/scenes/{scene}",), (), _SCENE, owned=True),
+    Operation("dataset.list", _READER, ("GET /v1/datasets",), ("DatasetService/ListDatasets",)),
+    Operation(
+        "dataset.get",
+        _READER,
+        (
+            "GET /v1/datasets/{dataset}",
+            "GET /v1/datasets/{dataset}/contact-sheet",
+            "GET /v1/datasets/{dataset}/poses",
+            "GET /v1/datasets/{dataset}/frames/{part}/{index}",
+        ),
+        ("DatasetService/GetDataset", "DatasetService/GetContactSheet"),
+        _DATASET,
+    ),
+    Operation(
+        "dataset.upload", _OPERATOR, ("PUT /v1/datasets/{dataset}",), ("DatasetService/UploadDataset",), _DATASET
+    ),
+    Operation(
+        "dataset.delete",
+        _OPERATOR,
+        ("DELETE /v1/datasets/{dataset}",),
+        ("DatasetService/DeleteDataset",),
+        _DATASET,
+        owned=True,
+    ),
+    Operation("job.list", _READER, ("GET /v1/jobs",), ("JobService/ListJobs",)),
+    Operation(
+        "job.get",
+        _READER,
+        (
+            "GET /v1/jobs/{job}",
+            "GET /v1/jobs/{job}/log",
+            "GET /v1/jobs/{job}/curve",
+            "GET /v1/jobs/{job}/preview",
+            "GET /v1/jobs/{job}/events",
+        ),
+        ("JobService/GetJob", "JobService/GetJobLog", "JobService/WatchJob"),
+        _JOB,
+    ),
+    Operation(
+        "job.download", _READER, ("GET /v1/jobs/{job}/artifacts/{name}",), ("JobService/DownloadArtifact",), _JOB
+    ),
+    Operation("job.submit", _OPERATOR, ("POST /v1/jobs",), ("JobService/SubmitJob",)),
+    Operation("job.cancel", _OPERATOR, ("POST /v1/jobs/{job}:cancel",), ("JobService/CancelJob",), _JOB, owned=True),
+    Operation("job.retry", _OPERATOR, ("POST /v1/jobs/{job}:retry",), ("JobService/RetryJob",), _JOB, owned=True),
+    Operation("job.delete", _OPERATOR, ("DELETE /v1/jobs/{job}",), ("JobService/DeleteJob",), _JOB, owned=True),
+    Operation("service.watch", _READER, ("GET /v1/statistics", "GET /v1/workers", "GET /metrics")),
+    Operation("me", _READER, ("GET /v1/me",), ("AccessService/WhoAmI",)),
+    Operation(
+        "public",
+        None,
+        (
+            "GET /v1/health/live",
+            "GET /v1/health/ready",
+            "GET /docs",
+            "GET /docs/static/{path:path}",
+            "GET /openapi.json",
+            "GET /",
+            "GET /favicon.svg",
+            "GET /licences.txt",
+            "GET /assets/{path:path}",
+        ),
+    ),
+)
+
+
+class HttpRules:
+    """The operation of a request."""
+
+    def __init__(self, operations: Iterable[Operation] = OPERATIONS) -> None:
+        self._routes: dict[str, list[tuple[str, Operation]]] = {}
+        for operation in operations:
+            for route in operation.http:
+                method, _, path = route.partition(" ")
+                self._routes.setdefault(method, []).append((path, operation))
+        self._compiled = {
+            method: [(compile_path(path)[0], operation) for path, operation in found]
+            for method, found in self._routes.items()
+        }
+
+    def find(self, method: str, path: str) -> tuple[Operation, str] | None:
+        """The operation, and the name of what it is about; None where no route is known.
+
+        A path goes to the first route that it matches, as in the application.
+        """
+        for pattern, operation in self._compiled.get("GET" if method == "HEAD" else method, ()):
+            if (match := pattern.match(path)) is not None:
+                return operation, "" if operation.about is None else match[operation.about.value]
+        return None
+
+    def require_all(self, routes: Iterable[tuple[str, str]]) -> None:
+        """Raises LookupError for a method and path that no rule names."""
+        known = {(method, path) for method, found in self._routes.items() for path, _ in found}
+        missing = sorted({(method, path) for method, path in routes if method not in ("HEAD", "OPTIONS")} - known)
+        if missing:
+            raise LookupError(f"access/rules.py does not say who may ask for {missing}")
+
+    def routes(self) -> Iterator[tuple[str, str, Operation]]:
+        """Each method and path that there is a rule for."""
+        for method, found in self._routes.items():
+            for path, operation in found:
+                yield method, path, operation
+
+
+PACKAGE = "ultragray.v1"
+GRPC_OPERATIONS = {f"/{PACKAGE}.{method}": operation for operation in OPERATIONS for method in operation.grpc}
+
+
+UNKNOWN = Operation("unknown", None)  # a route that is not there
+REFLECTION = Operation("reflection", _READER)
+IGTL = Operation(STREAM, _READER)
+
+
+def require_all_methods(methods: Iterable[str]) -> None:
+    """Raises LookupError for a method of gRPC ("/package.Service/Method") that no rule names."""
+    if missing := sorted(set(methods) - GRPC_OPERATIONS.keys()):
+        raise LookupError(f"access/rules.py does not say who may call {missing}")

@@ -1,0 +1,68 @@
+"""The copy in memory of what the jobs' database knows of keys and owners, at most a second or two old.
+
+Requests are checked against the copy: no frame waits for the database. While the database is away the last copy holds,
+and so do the times at which keys expire.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+
+import sqlalchemy as sa
+from sqlalchemy.exc import SQLAlchemyError
+
+from ultragray.errors import UltragrayError
+from ultragray_workers.jobs.queue.tables import CHANGES
+
+from .keys import KeyStore, KnownKeys, read_keys
+from .owners import Owners
+
+INTERVAL_S = 1.0
+_USES_EVERY = 30  # intervals
+
+_log = logging.getLogger("ultragray.access")
+
+
+class Snapshot:
+    """Reads keys and owners again whenever they changed, in a thread of its own."""
+
+    def __init__(self, engine: sa.Engine, keys: KnownKeys, owners: Owners) -> None:
+        """Fills `keys` and `owners`: the first copy is there when this returns. Raises DatabaseUnavailable."""
+        self._engine, self._keys, self._owners = engine, keys, owners
+        self._number: int | None = None
+        self._stop = threading.Event()
+        self.refresh()
+        self._thread = threading.Thread(target=self._run, name="access", daemon=True)
+        self._thread.start()
+
+    def refresh(self) -> None:
+        """Reads what changed since the last call. Raises DatabaseUnavailable."""
+        with self._engine.connect() as connection:
+            number = connection.execute(sa.select(CHANGES.c.number)).scalar()  # first: what follows is as new or newer
+            if number != self._number:
+                self._keys.replace(read_keys(connection))
+                self._owners.read(connection)
+                self._number = number
+
+    def close(self) -> None:
+        """Ends the thread."""
+        self._stop.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        is_away, round_number = False, 0
+        while not self._stop.wait(INTERVAL_S):
+            round_number += 1
+            try:
+                self.refresh()
+                if round_number % _USES_EVERY == 0:
+                    KeyStore(self._engine).note_uses(self._keys.take_uses())
+            except (UltragrayError, SQLAlchemyError) as error:
+                if not is_away:
+                    _log.warning(f"keys and owners stay as they are for now: {str(error).splitlines()[0]}")
+                is_away = True
+            else:
+                if is_away:
+                    _log.warning("keys and owners are read again")
+                is_away = False

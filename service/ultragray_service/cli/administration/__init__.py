@@ -1,0 +1,1 @@
+"""Commands of who looks after a service: keys, workers, backups and the like."""

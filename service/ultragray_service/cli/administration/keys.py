@@ -1,0 +1,126 @@
+"""`ultragray keys …`: the named API keys of a service, in the database of its jobs."""
+
+from __future__ import annotations
+
+import json as json_text
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
+from datetime import datetime, timezone
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from ...access.principal import Role
+from ...settings import ENVIRONMENT_PREFIX, Settings, load_settings
+from ..options import FieldsOf, with_options
+from ..output import print_table
+
+if TYPE_CHECKING:
+    from ...access.keys import Key, KeyStore
+
+keys_app = typer.Typer(
+    no_args_is_help=True, help="API keys: who may use the service, and as what. Changes count within two seconds."
+)
+
+Where = Annotated[
+    dict[str, Any],
+    FieldsOf(Settings, "data_folder", "artifact_folder", "database_url", environment=ENVIRONMENT_PREFIX),
+]
+_COLUMNS = ("id", "name", "role", "state", "created", "expires", "last used")
+
+
+@keys_app.command()
+@with_options
+def create(
+    name: Annotated[str, typer.Argument(help="Whose it is: a person, a machine or a program.", show_default=False)],
+    *,
+    role: Annotated[
+        Role,
+        typer.Option(
+            help="reader: sees, renders, streams; operator: and has jobs, datasets and scenes; admin: everything."
+        ),
+    ],
+    expires_days: Annotated[
+        float | None, typer.Option(min=0.0, max=36_500.0, help="Days that it counts.", show_default="for ever")
+    ] = None,
+    where: Where,
+) -> None:
+    """Make a key, and print it: alone on standard output, and never again."""
+    with _key_store(where) as store:
+        others = [key for key in store.keys().values() if key.name == name and key.is_valid(time.time())]
+        key, secret = store.create(name, role, expires_days)
+    typer.echo(f"key {key.id} of {key.name}, {key.role.value}, expires: {_time(key.expires_at_s, 'never')}", err=True)
+    for other in others:
+        typer.echo(f"{name} still has the key {other.id}, {other.role.value}, too", err=True)
+    typer.echo("Keep it now: it is shown only once.", err=True)
+    typer.echo(secret)
+
+
+@keys_app.command("list")
+@with_options
+def list_keys(
+    *,
+    json: Annotated[bool, typer.Option("--json", help="A JSON list, for scripts.")] = False,
+    where: Where,
+) -> None:
+    """List the keys, oldest first, also those that count no more; no secrets."""
+    with _key_store(where) as store:
+        keys = list(store.keys().values())
+    if json:
+        typer.echo(json_text.dumps([{**asdict(key), "state": _state(key)} for key in keys], indent=2))
+        return
+    print_table(_COLUMNS, [_row(key) for key in keys])
+
+
+@keys_app.command()
+@with_options
+def revoke(
+    name: Annotated[str, typer.Argument(help="Name, or id of one key.", show_default=False)], *, where: Where
+) -> None:
+    """Revoke all keys of a name, or the one of an id. What runs on them is cut within two seconds."""
+    with _key_store(where) as store:
+        revoked = store.revoke(name)
+    for key in revoked:
+        typer.echo(f"revoked {key.id} of {key.name}, {key.role.value}")
+    if not revoked:
+        typer.echo(f"no key of {name} opened any door", err=True)
+
+
+@contextmanager
+def _key_store(where: dict[str, Any]) -> Iterator[KeyStore]:
+    from ultragray_workers.jobs.queue.database import JobDatabase
+
+    from ...access.keys import KeyStore
+
+    settings = load_settings(**where)
+    database = JobDatabase(settings.artifacts, settings.database_url)
+    try:
+        yield KeyStore(database.engine)
+    finally:
+        database.close()
+
+
+def _row(key: Key) -> tuple[str, ...]:
+    return (
+        key.id,
+        key.name,
+        key.role.value,
+        _state(key),
+        _time(key.created_at_s, ""),
+        _time(key.expires_at_s, "never"),
+        _time(key.last_used_at_s, "never"),
+    )
+
+
+def _state(key: Key) -> str:
+    if key.revoked_at_s is not None:
+        return "revoked"
+    return "valid" if key.is_valid(time.time()) else "expired"
+
+
+def _time(at_s: float | None, otherwise: str) -> str:
+    if at_s is None:
+        return otherwise
+    return datetime.fromtimestamp(at_s, timezone.utc).isoformat(sep=" ", timespec="minutes")

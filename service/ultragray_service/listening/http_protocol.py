@@ -1,0 +1,242 @@
+"""HTTP connections with bounds: on what is read before it is parsed, on time, and on requests that pile up."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol
+
+from ultragray.errors import UltragrayError
+
+from ..errors import HeadersTooLarge, RequestMalformed, RequestTooSlow, TargetTooLong
+from ..http.problems import problem_response
+from ..http.prompt_websocket import PromptWebSocket
+from ..telemetry.logs import choose_request_id, request_id
+from .connections import Place
+from .patience import Patience
+
+MAX_PIPELINED = 32
+MAX_TARGET_BYTES = 16 * 1024
+_MAX_UNWANTED_BYTES = 2**20  # of a body whose request was answered already
+_LINGER_S = 1.0  # in which a refused client can read why
+
+
+@dataclass(frozen=True)
+class HttpLimits:
+    """The bounds of each connection. `on_refused` is told of each refusal."""
+
+    max_header_bytes: int
+    max_headers: int
+    header_timeout_s: float
+    min_bytes_per_s: float
+    transfer_patience_s: float
+    on_refused: Callable[[UltragrayError], None]
+
+
+class BoundedHttp(HttpToolsProtocol):
+    """One connection. `look` must be called every second or so.
+
+    A head is counted while it comes, and nothing beyond the limit reaches the parser. The same count bounds trailers,
+    and whatever else brings neither a head to its end nor a body on.
+    """
+
+    def __init__(self, *arguments: Any, limits: HttpLimits, place: Place, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self.ws_protocol_class: Any = partial(_BoundedWebSocket, limits=limits, place=place)
+        self._limits = limits
+        self._place = place
+        self._in_head = True
+        self._head_since: float | None = self.loop.time()
+        self._looked_at = self.loop.time()
+        self._idle_bytes = 0  # since the request came on
+        self._body_bytes = 0  # since the last look
+        self._unwanted_bytes = 0
+        self._refused_for: UltragrayError | None = None
+        self._is_refused = False
+        self._receiving = Patience(limits.min_bytes_per_s, limits.transfer_patience_s)
+        self._sending = _Sending(limits)
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        super().connection_made(_Closing(transport))  # type: ignore[arg-type]  # it has all that a transport has
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._place.leave()
+        super().connection_lost(exc)
+
+    def data_received(self, data: bytes) -> None:
+        if self._in_head:
+            if self._head_since is None:
+                self._head_since = self.loop.time()
+            room = self._limits.max_header_bytes - self._idle_bytes
+            if len(data) > room:
+                self._take(data[:room])
+                if self._in_head and not self._is_refused:
+                    self._refuse(self._head_too_large())
+                data = data[room:]
+        self._take(data)
+
+    def _take(self, data: bytes) -> None:
+        if self._is_refused or self.transport.is_closing():
+            return
+        self._idle_bytes += len(data)
+        super().data_received(data)
+        if self._idle_bytes > self._limits.max_header_bytes and not self._is_refused:
+            self._refuse(self._head_too_large())
+
+    def on_message_begin(self) -> None:
+        if self._head_since is None:  # it came with the end of the request before
+            self._head_since = self.loop.time()
+        super().on_message_begin()
+
+    def on_url(self, url: bytes) -> None:
+        super().on_url(url)
+        if len(self.url) > MAX_TARGET_BYTES:
+            self._stop_parsing(TargetTooLong(f"the target of a request may have at most {MAX_TARGET_BYTES} bytes"))
+
+    def on_headers_complete(self) -> None:
+        if len(self.headers) > self._limits.max_headers:
+            self._stop_parsing(self._head_too_large())
+        self._in_head = False
+        self._head_since = None
+        self._idle_bytes = self._unwanted_bytes = 0
+        self._receiving.renew()
+        super().on_headers_complete()
+        if len(self.pipeline) > MAX_PIPELINED:
+            self._stop_parsing(RequestMalformed(f"at most {MAX_PIPELINED} requests may wait for their turn"))
+
+    def on_body(self, body: bytes) -> None:
+        self._idle_bytes = 0
+        self._body_bytes += len(body)
+        super().on_body(body)
+        if self.cycle.response_complete:
+            self._unwanted_bytes += len(body)
+            if self._unwanted_bytes > _MAX_UNWANTED_BYTES:
+                self._stop_parsing(RequestMalformed("the request was answered before its body had come"))
+
+    def on_message_complete(self) -> None:
+        self._in_head = True
+        self._idle_bytes = 0
+        super().on_message_complete()
+
+    def _stop_parsing(self, error: UltragrayError) -> None:
+        self._refused_for = error
+        raise ValueError  # the parser hands over to `send_400_response`
+
+    def send_400_response(self, msg: str) -> None:
+        """Answers where the parser stopped."""
+        self._refuse(self._refused_for or RequestMalformed("this is no HTTP request that can be read"))
+
+    def look(self, now: float) -> None:
+        """Cuts the connection where the client has been too slow."""
+        elapsed_s, self._looked_at = now - self._looked_at, now
+        body_bytes, self._body_bytes = self._body_bytes, 0
+        limits = self._limits
+        if self._sending.is_stalled(self.transport, elapsed_s):
+            self.transport.abort()
+        elif self._is_refused:
+            pass
+        elif self._in_head:
+            if self._head_since is not None and now - self._head_since > limits.header_timeout_s:
+                self._refuse(RequestTooSlow(f"the head of a request must come within {limits.header_timeout_s:g} s"))
+        elif not self.flow.read_paused and self._receiving.is_over(body_bytes, elapsed_s):
+            self._refuse(RequestTooSlow(f"a body must come at {limits.min_bytes_per_s:g} bytes a second or faster"))
+
+    def _head_too_large(self) -> HeadersTooLarge:
+        limits = self._limits
+        return HeadersTooLarge(
+            f"the head of a request may have at most {limits.max_header_bytes} bytes and {limits.max_headers} headers"
+        )
+
+    def _refuse(self, error: UltragrayError) -> None:
+        """Says why, where no other answer is due, and closes. What still comes is thrown away."""
+        self._is_refused = True
+        self._unset_keepalive_if_required()
+        cycle = self.cycle
+        is_due = cycle is not None and not cycle.response_complete
+        if self._in_head:
+            has_begun = self.scope is not None or self._idle_bytes > 0
+            can_answer = has_begun and not is_due
+        else:
+            can_answer = is_due and cycle.more_body and not cycle.response_started
+        if is_due:
+            cycle.disconnected = True
+            cycle.message_event.set()
+        self.pipeline.clear()
+        self.flow.resume_reading()
+        if can_answer:
+            self._limits.on_refused(error)
+            self.transport.write(refusal_bytes(error, self.server_state.default_headers))
+        if self.transport.can_write_eof() and not self.transport.is_closing():
+            self.transport.write_eof()
+        self.loop.call_later(_LINGER_S, self.transport.abort)
+
+
+class _Closing:
+    """A transport that drops what is written once it closes: the answers under way hear of that a moment later."""
+
+    def __init__(self, transport: Any) -> None:
+        self._transport = transport
+        self._has_ended = False
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._transport, name)
+
+    def write(self, data: bytes) -> None:
+        if not self._has_ended and not self._transport.is_closing():
+            self._transport.write(data)
+
+    def write_eof(self) -> None:
+        self._has_ended = True
+        self._transport.write_eof()
+
+
+class _BoundedWebSocket(PromptWebSocket):
+    """What a connection becomes by an upgrade."""
+
+    def __init__(self, *arguments: Any, limits: HttpLimits, place: Place, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self._place = place
+        self._looked_at = self.loop.time()
+        self._sending = _Sending(limits)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._place.leave()
+        super().connection_lost(exc)
+
+    def look(self, now: float) -> None:
+        """Cuts the connection where the client does not take what is sent."""
+        elapsed_s, self._looked_at = now - self._looked_at, now
+        if self._sending.is_stalled(self.transport, elapsed_s):
+            self.transport.abort()
+
+
+class _Sending:
+    """Whether a client takes what is sent."""
+
+    def __init__(self, limits: HttpLimits) -> None:
+        self._patience = Patience(limits.min_bytes_per_s, limits.transfer_patience_s)
+        self._waiting_bytes = 0
+
+    def is_stalled(self, transport: asyncio.Transport, elapsed_s: float) -> bool:
+        """Whether it has been too slow, `elapsed_s` after the last question."""
+        before, self._waiting_bytes = self._waiting_bytes, transport.get_write_buffer_size()
+        if not before or not self._waiting_bytes or self._waiting_bytes > before:  # more comes when there is room only
+            self._patience.renew()
+            return False
+        return self._patience.is_over(before - self._waiting_bytes, elapsed_s)
+
+
+def refusal_bytes(error: UltragrayError, default_headers: list[tuple[bytes, bytes]]) -> bytes:
+    """The answer to a request that never reached the application."""
+    token = request_id.set(choose_request_id(None))
+    try:
+        response = problem_response(error, {"Connection": "close", "X-Request-Id": request_id.get()})
+    finally:
+        request_id.reset(token)
+    headers = [*default_headers, *response.raw_headers]
+    lines = [STATUS_LINE[response.status_code], *(b"%s: %s\r\n" % header for header in headers), b"\r\n"]
+    return b"".join([*lines, bytes(response.body)])

@@ -1,0 +1,128 @@
+"""A server's certificate, its key, and the authorities of its clients, checked as a whole before any door uses them."""
+
+from __future__ import annotations
+
+import ssl
+from dataclasses import dataclass, field
+from datetime import datetime, timezone
+from pathlib import Path
+
+from cryptography import x509
+from cryptography.hazmat.primitives.asymmetric.types import PrivateKeyTypes
+from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat, load_pem_private_key
+from cryptography.x509.oid import NameOID
+
+from ultragray_workers.errors import StartupFailed
+
+HANDSHAKE_TIMEOUT_S = 10.0  # of a client that connects and then says nothing, or not enough
+_LARGEST_FILE_BYTES = 2**20
+
+
+@dataclass(frozen=True)
+class CertificateFiles:
+    """The PEM files of the settings. `client_ca` None: clients need no certificate."""
+
+    certificate: Path
+    key: Path
+    client_ca: Path | None
+
+    def read(self) -> CertificateBytes:
+        """The contents as they are now. Raises StartupFailed where a file cannot be read."""
+        return CertificateBytes(
+            _read(self.certificate, "tls_certificate"),
+            _read(self.key, "tls_key"),
+            None if self.client_ca is None else _read(self.client_ca, "tls_client_ca"),
+        )
+
+    def load(self, read: CertificateBytes) -> Certificates:
+        """Certificates that a client can accept now. Raises StartupFailed, with a sentence that names the setting."""
+        chain = self._chain(read.chain)
+        own = chain[0]
+        if self._private_key(read.key).public_key().public_bytes(
+            Encoding.DER, PublicFormat.SubjectPublicKeyInfo
+        ) != own.public_key().public_bytes(Encoding.DER, PublicFormat.SubjectPublicKeyInfo):
+            raise _unusable("tls_key", f"{self.key} is not the key of the certificate in {self.certificate}")
+        now = datetime.now(timezone.utc)
+        if now < own.not_valid_before_utc:
+            raise _unusable("tls_certificate", f"{self.certificate} is not valid before {own.not_valid_before_utc}")
+        if now > own.not_valid_after_utc:
+            raise _unusable("tls_certificate", f"{self.certificate} expired at {own.not_valid_after_utc}")
+        return Certificates(read, _names(own), own.not_valid_before_utc, own.not_valid_after_utc, self._context(read))
+
+    def _chain(self, content: bytes) -> list[x509.Certificate]:
+        try:
+            return x509.load_pem_x509_certificates(content)
+        except ValueError:
+            raise _unusable("tls_certificate", f"{self.certificate} holds no certificate in PEM format") from None
+
+    def _private_key(self, content: bytes) -> PrivateKeyTypes:
+        try:
+            return load_pem_private_key(content, password=None)
+        except TypeError:  # cryptography's answer to a missing password
+            raise _unusable(
+                "tls_key", f"{self.key} is encrypted; decrypt it: openssl pkey -in ENCRYPTED -out DECRYPTED"
+            ) from None
+        except ValueError:
+            raise _unusable("tls_key", f"{self.key} holds no private key in PEM format") from None
+
+    def _context(self, read: CertificateBytes) -> ssl.SSLContext:
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+        context.minimum_version = ssl.TLSVersion.TLSv1_2
+        context.set_alpn_protocols(["http/1.1"])
+        try:
+            context.load_cert_chain(self.certificate, self.key, password="")
+        except ssl.SSLError as error:
+            raise _unusable("tls_certificate", f"OpenSSL refuses {self.certificate}: {error.reason or error}") from None
+        if read.client_authorities is not None:
+            try:
+                context.load_verify_locations(cadata=read.client_authorities.decode("ascii"))
+            except (ssl.SSLError, ValueError):
+                raise _unusable("tls_client_ca", f"{self.client_ca} holds no certificate in PEM format") from None
+            context.verify_mode = ssl.CERT_REQUIRED
+        if self.read() != read:  # OpenSSL takes files, not bytes
+            raise _unusable("tls_certificate", f"{self.certificate} changed while it was read")
+        return context
+
+
+@dataclass(frozen=True)
+class CertificateBytes:
+    """The contents of the files at one moment, PEM."""
+
+    chain: bytes
+    key: bytes = field(repr=False)
+    client_authorities: bytes | None
+
+
+@dataclass(frozen=True)
+class Certificates:
+    """Certificates that the doors may use: key and certificate belong together and are valid."""
+
+    content: CertificateBytes
+    names: str
+    not_before: datetime
+    not_after: datetime
+    http_context: ssl.SSLContext = field(repr=False)
+
+
+def _read(path: Path, setting: str) -> bytes:
+    try:
+        with path.open("rb") as file:
+            content = file.read(_LARGEST_FILE_BYTES + 1)
+    except OSError as error:
+        raise _unusable(setting, f"{path} cannot be read: {error.strerror}") from None
+    if len(content) > _LARGEST_FILE_BYTES:
+        raise _unusable(setting, f"{path} is larger than {_LARGEST_FILE_BYTES} bytes, which no PEM file of keys is")
+    return content
+
+
+def _names(certificate: x509.Certificate) -> str:
+    """Who the certificate says the server is, for the log."""
+    try:
+        names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    except x509.ExtensionNotFound:
+        return ", ".join(str(one.value) for one in certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME))
+    return ", ".join(str(name.value) for name in names)
+
+
+def _unusable(setting: str, reason: str) -> StartupFailed:
+    return StartupFailed(f"{setting} cannot be used: {reason}", field=setting)

@@ -1,0 +1,282 @@
+"""HTTP: requests made from the OpenAPI document, bodies and paths nearly right, bytes that are no requests, uploads."""
+
+from __future__ import annotations
+
+import contextlib
+import http.client
+import io
+import json
+import socket
+import zipfile
+from collections.abc import Iterator
+from typing import Any
+from urllib.parse import quote
+
+import pytest
+import requests
+import schemathesis
+from hypothesis import strategies as st
+from schemathesis.checks import load_all_checks
+from schemathesis.core.failures import FailureGroup
+from schemathesis.specs.openapi.checks import (
+    content_type_conformance,
+    response_headers_conformance,
+    response_schema_conformance,
+    status_code_conformance,
+)
+
+from ultragray import GaussianScene
+from ultragray.datasets import Dataset
+from ultragray.datasets.released import write_released
+
+from ..model.datasets.conftest import make_sweep
+from ..waiting import at_this_load
+from .conftest import EnterDoor
+from .fuzzed import EXPECTED_5XX, FuzzedService
+from .mutations import TEXTS, Strategy, as_json, mutated_bytes, mutated_json
+from .test_fuzz_files import mutated_bundle, mutated_released, packed
+from .test_fuzz_websocket import MATRIX, POSE, SETTINGS
+
+__all__ = ["make_sweep"]
+
+pytestmark = pytest.mark.long
+
+TIMEOUT_S = 60.0
+ENDLESS = "/events"  # of a job that waits
+RENDER = "/v1/scenes/demo/render"
+BODIES: tuple[tuple[str, Any], ...] = (
+    (RENDER, {"pose": POSE, **SETTINGS, "timeout_ms": 5000.0}),
+    (
+        RENDER,
+        {"poses": [POSE, MATRIX], "height": 16, "width": 12, "outputs": ["bmode", "coverage"], "dtype": "float32"},
+    ),
+    ("/v1/probes:plane", {"probe": {"kind": "convex", "opening_angle_deg": 60.0, "near_mm": 10.0, "far_mm": 60.0}}),
+    ("/v1/probes:plane", {"probe": {"kind": "radial", "near_mm": 1.0, "far_mm": 60.0}, "width": 16, "height": 16}),
+    ("/v1/jobs", {"kind": "train", "dataset": "absent", "scene": "new", "settings": {"steps": 10}, "request_id": "a"}),
+    ("/v1/jobs", {"kind": "evaluate", "dataset": "absent", "scene": "demo", "priority": 3}),
+    (
+        "/v1/jobs",
+        {"kind": "render", "scene": "demo", "sampler": {"kind": "around", "count": 2}, "height": 16, "width": 12},
+    ),
+)
+TYPES = (
+    "application/json",
+    "image/png",
+    "application/octet-stream",
+    "application/x-npz",
+    "application/*;q=0.1",
+    "*/*",
+    "x",
+)
+
+
+CHECKS = [
+    status_code_conformance,
+    content_type_conformance,
+    response_headers_conformance,
+    response_schema_conformance,
+]
+
+
+def unreadable(operation: Any) -> list[Any]:
+    """The checks that Schemathesis cannot make: it takes `prefixItems` of OpenAPI 3.1 for `items` (in 4.32)."""
+    return [response_schema_conformance] if operation.path == "/v1/probes:plane" else []
+
+
+def is_expected(status: int) -> bool:
+    return status < 500 or status in EXPECTED_5XX
+
+
+class Connection:
+    """One that is kept alive, opened again where the service has closed it."""
+
+    def __init__(self, fuzzed: FuzzedService) -> None:
+        self._fuzzed = fuzzed
+        self._opened: http.client.HTTPConnection | None = None
+
+    def ask(self, method: str, path: str, body: bytes | None, headers: dict[str, str]) -> tuple[int, bytes]:
+        """Status and body; asked again over a new connection where the old one was closed meanwhile."""
+        self._fuzzed.require_alive()
+        for is_last in (False, True):
+            if self._opened is None:
+                self._opened = http.client.HTTPConnection(*self._fuzzed.address, timeout=at_this_load(TIMEOUT_S))
+            try:
+                self._opened.request(method, path, body, headers)
+                with self._opened.getresponse() as answer:
+                    return answer.status, answer.read()
+            except (ConnectionError, http.client.BadStatusLine):
+                self.close()
+                if is_last:
+                    raise
+        raise AssertionError("unreachable")
+
+    def close(self) -> None:
+        if self._opened is not None:
+            self._opened.close()
+            self._opened = None
+
+
+@pytest.fixture
+def connection(well: FuzzedService) -> Iterator[Connection]:
+    opened = Connection(well)
+    yield opened
+    opened.close()
+
+
+def test_what_the_document_allows_and_what_it_does_not(door: EnterDoor, well: FuzzedService) -> None:
+    load_all_checks()
+    schema = schemathesis.openapi.from_url(f"{well.running.http}/openapi.json")
+    operations = [found.ok() for found in schema.get_all_operations()]
+    operations = [operation for operation in operations if not operation.path.endswith(ENDLESS)]
+    with requests.Session() as session:
+
+        def attempt(case: Any) -> None:
+            well.require_alive()
+            answer = case.call(base_url=well.running.http, session=session, timeout=TIMEOUT_S)
+            assert is_expected(answer.status_code), (
+                f"{case.as_curl_command()}: {answer.status_code} {answer.text[:500]}"
+            )
+            try:
+                case.validate_response(answer, checks=CHECKS, excluded_checks=unreadable(case.operation))
+            except FailureGroup as failures:
+                raise AssertionError("; ".join(str(one) for one in failures.exceptions)) from None
+
+        inputs = []
+        for operation in operations:
+            inputs += [operation.as_strategy(generation_mode=mode) for mode in schemathesis.GenerationMode]
+            if "{scene}" in operation.path and operation.method in ("get", "post"):
+                inputs.append(operation.as_strategy(path_parameters={"scene": "demo"}))
+        door("http documented").enter(st.one_of(inputs), attempt)
+
+
+def test_bodies(door: EnterDoor, connection: Connection) -> None:
+    by_path = {path: [body for at, body in BODIES if at == path] for path, _ in BODIES}
+    raw = {path: mutated_bytes([json.dumps(body).encode() for body in bodies]) for path, bodies in by_path.items()}
+
+    def of(path: str) -> Strategy:
+        body = st.one_of(mutated_json(by_path[path]).map(as_json), mutated_json(by_path[path]).map(as_json), raw[path])
+        return st.tuples(st.just(path), body, st.sampled_from(TYPES))
+
+    def attempt(asked: tuple[str, bytes, str]) -> None:
+        path, body, accepted = asked
+        headers = {"Content-Type": "application/json", "Accept": accepted}
+        status, answer = connection.ask("POST", path, body, headers)
+        assert is_expected(status), (status, answer[:500])
+        if status >= 400:
+            problem = json.loads(answer)
+            assert problem["reason"]
+            assert problem["status"] == status
+
+    door("http bodies").enter(st.sampled_from(sorted(by_path)).flatmap(of), attempt)
+
+
+PATHS = (
+    "/v1/scenes",
+    "/v1/scenes/demo",
+    "/v1/scenes/demo/gaussians",
+    "/v1/scenes/demo/training-poses",
+    "/v1/scenes/demo/file",
+    "/v1/scenes/demo/comparison",
+    "/v1/scenes/demo/comparison/0/truth.png",
+    "/v1/datasets",
+    "/v1/datasets/absent",
+    "/v1/datasets/absent/contact-sheet",
+    "/v1/datasets/absent/poses",
+    "/v1/datasets/absent/frames/train/0",
+    "/v1/jobs",
+    "/v1/jobs/absent",
+    "/v1/jobs/absent/log",
+    "/v1/jobs/absent/artifacts/scene.ugr",
+    "/v1/jobs/absent/curve",
+    "/v1/jobs/absent/preview",
+    "/v1/statistics",
+    "/v1/health/ready",
+    "/metrics",
+    "/openapi.json",
+    "/docs",
+    "/",
+)
+QUERIES = ("page_size", "page_token", "state", "kind", "max_points", "dataset", "step", "format", "x")
+
+
+def test_paths_and_queries(door: EnterDoor, connection: Connection) -> None:
+    values = st.one_of(st.sampled_from(TEXTS), st.integers().map(str), st.text(max_size=12))
+    parts = st.lists(st.tuples(st.integers(0, 8), values), max_size=1)
+    query = st.lists(st.tuples(st.sampled_from(QUERIES), values), max_size=3)
+    methods = st.sampled_from(["GET", "GET", "GET", "HEAD", "OPTIONS", "POST", "DELETE", "PATCH", "TRACE", "GETX"])
+    headers = st.dictionaries(
+        st.sampled_from(
+            ["Range", "If-None-Match", "Accept", "Accept-Encoding", "Last-Event-ID", "X-Request-ID", "Origin"]
+        ),
+        st.one_of(values, st.sampled_from(["bytes=0-", "bytes=5-2", "bytes=-0", 'W/"x"', "*", "gzip;q=nan", "null"])),
+        max_size=2,
+    )
+
+    def attempt(asked: tuple[str, str, Any, Any, dict[str, str]]) -> None:
+        method, path, changed, queried, told = asked
+        pieces = path.split("/")
+        for index, value in changed:
+            pieces[index % len(pieces)] = quote(value, safe="", errors="surrogatepass")
+        whole = "/" + "/".join(pieces).lstrip("/")
+        whole += "?" + "&".join(f"{name}={quote(value, safe='', errors='surrogatepass')}" for name, value in queried)
+        encoded = {name: quote(value, safe=' =-*"/;,', errors="surrogatepass") for name, value in told.items()}
+        status, answer = connection.ask(method, whole, None, encoded)
+        assert is_expected(status), (status, answer[:500])
+
+    door("http paths").enter(st.tuples(methods, st.sampled_from(PATHS), parts, query, headers), attempt)
+
+
+def test_bytes(door: EnterDoor, well: FuzzedService) -> None:
+    body = json.dumps(BODIES[0][1]).encode()
+    head = b"POST %s HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\nContent-Length: %d\r\n\r\n"
+    chunked = b"POST %s HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\n\r\n%x\r\n%s\r\n0\r\n\r\n"
+    upgrade = (
+        b"GET /v1/scenes/demo/stream HTTP/1.1\r\nHost: localhost\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+        b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: MDEyMzQ1Njc4OWFiY2RlZg==\r\n\r\n\x81\x82\0\0\0\0{}"
+    )
+    upload = (
+        b"PUT /v1/datasets/new HTTP/1.1\r\nHost: localhost\r\nContent-Type: multipart/form-data; boundary=b\r\n"
+        b'Content-Length: 82\r\n\r\n--b\r\nContent-Disposition: form-data; name="f"; filename="conf.json"\r\n\r\n'
+        b"{}\r\n--b--\r\n"
+    )
+    whole = [
+        b"GET /v1/scenes HTTP/1.1\r\nHost: localhost\r\nAccept: */*\r\n\r\n" * 2,
+        head % (RENDER.encode(), len(body)) + body,
+        chunked % (RENDER.encode(), len(body), body),
+        upgrade,
+        upload,
+    ]
+
+    def attempt(data: bytes) -> None:
+        well.require_alive()
+        with socket.create_connection(well.address, timeout=TIMEOUT_S) as peer, contextlib.suppress(ConnectionError):
+            peer.sendall(data)
+            peer.shutdown(socket.SHUT_WR)
+            answer = b""
+            while block := peer.recv(65536):
+                answer += block
+            if answer.startswith(b"HTTP/1.1 "):
+                assert is_expected(int(answer[9:12])), answer[:1000]
+
+    door("http bytes").enter(mutated_bytes(whole), attempt)
+
+
+def test_uploads(
+    door: EnterDoor, connection: Connection, demo_scene: GaussianScene, make_sweep: Any, tmp_path: Any
+) -> None:
+    demo_scene.save(tmp_path / "whole.ugr")
+    write_released(Dataset("tiny", make_sweep(8), make_sweep(2)), tmp_path / "released")
+    files = {path.name: path.read_bytes() for path in (tmp_path / "released").iterdir()}
+    scenes = mutated_bundle((tmp_path / "whole.ugr").read_bytes()).map(lambda data: ("/v1/scenes/new", data))
+    archives = mutated_released(files).map(lambda changed: packed(list(changed.items()), "zip"))
+    datasets = archives.map(lambda data: ("/v1/datasets/new", data))
+
+    def attempt(asked: tuple[str, bytes]) -> None:
+        path, data = asked
+        kind = "application/zip" if zipfile.is_zipfile(io.BytesIO(data)) else "application/octet-stream"
+        status, answer = connection.ask("PUT", path, data, {"Content-Type": kind})
+        assert is_expected(status), (status, answer[:500])
+        if status in (200, 201):
+            connection.ask("DELETE", path, None, {})
+
+    door("uploads").enter(st.one_of(scenes, datasets), attempt)

@@ -1,0 +1,153 @@
+"""The audit log of a service at work, and streams that end with their key."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import grpc
+import httpx
+import pytest
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
+
+from ultragray_proto.v1 import geometry_pb2, jobs_pb2, jobs_pb2_grpc, rendering_pb2, rendering_pb2_grpc
+from ultragray_service.access import audit
+from ultragray_service.access.audit import MAX_WAITING, AuditLog, Entry, read_audit
+from ultragray_service.access.keys import KeyStore
+from ultragray_service.access.principal import Role
+from ultragray_workers.jobs.queue.database import JobDatabase
+
+from ...postgres import PostgresServer
+from ...waiting import wait_until
+from ..cli.command_line import run
+from ..conftest import StartService
+from .conftest import MATRIX, POSE
+
+
+@pytest.fixture
+def database(tmp_path: Path) -> Iterator[JobDatabase]:
+    opened = JobDatabase(tmp_path, None)
+    yield opened
+    opened.close()
+
+
+def entries(folder: Path, *options: object) -> list[dict[str, object]]:
+    lines = run("audit", "--json", "--artifact-folder", folder, *options).stdout.splitlines()
+    return [json.loads(line) for line in lines]
+
+
+def test_a_service_writes_who_did_what(
+    start_service: StartService, tmp_path: Path, database: JobDatabase, scene_bytes: bytes
+) -> None:
+    store = KeyStore(database.engine)
+    _, alice = store.create("alice", Role.OPERATOR, None)
+    _, reader = store.create("reader", Role.READER, None)
+    service = start_service(artifact_folder=tmp_path)
+
+    def ask(key: str, method: str, path: str, **options: object) -> httpx.Response:
+        return httpx.request(method, f"{service.http}{path}", headers={"X-API-Key": key}, timeout=60, **options)
+
+    ask(alice, "PUT", "/v1/scenes/mine", content=scene_bytes)
+    specification = {"scene": "demo", "poses": [MATRIX]}
+    job = ask(alice, "POST", "/v1/jobs", json={"kind": "render", "specification": specification}).json()["id"]
+    ask(reader, "DELETE", "/v1/scenes/mine")
+    ask(reader, "DELETE", "/v1/scenes/mine")
+    ask("wrong", "GET", "/v1/scenes")
+    for _ in range(3):
+        assert ask(reader, "POST", "/v1/scenes/demo/render", json={"pose": POSE}).status_code == 200
+    ask(alice, "DELETE", "/v1/scenes/absent")
+    pose = geometry_pb2.Pose(
+        placement=geometry_pb2.Placement(position_mm=geometry_pb2.Position(), quaternion=geometry_pb2.Quaternion(w=1.0))
+    )
+    settings = rendering_pb2.RenderSettings(scene="demo")
+    asked = [rendering_pb2.RenderStreamRequest(settings=settings, pose=pose) for _ in range(2)]
+    with service.channel() as channel:
+        stub = rendering_pb2_grpc.RenderServiceStub(channel)
+        assert len(list(stub.RenderStream(iter(asked), metadata=(("x-api-key", reader),)))) == 2
+    assert service.terminate() == 0  # which writes what is left
+
+    found = [(one["who"], one["address"], one["what"], one["target"], one["result"]) for one in entries(tmp_path)]
+    here = "127.0.0.1"
+    for expected in (
+        ("alice", here, "scene.import", "mine", "OK"),
+        ("alice", here, "job.submit", job, "OK"),
+        ("reader", here, "scene.delete", "mine", "PERMISSION_DENIED"),
+        ("-", here, "scene.list", "", "UNAUTHENTICATED"),
+        ("alice", here, "scene.delete", "absent", "SCENE_NOT_FOUND"),
+        ("reader", here, "stream", "", "OPENED"),
+        ("reader", here, "stream", "demo", "OK"),
+        ("reader", here, "render", "demo", "OK"),
+    ):
+        assert expected in found
+    counts = {
+        (one["what"], one["result"]): one["facts"] for one in entries(tmp_path, "--who", "reader") if one["facts"]
+    }
+    assert counts["render", "OK"] == {"count": 3}
+    assert counts["scene.delete", "PERMISSION_DENIED"] == {"count": 1}  # after the first
+    assert dict(counts["stream", "OK"])["frames"] == 2  # type: ignore[call-overload]
+    assert {one["what"] for one in entries(tmp_path, "--what", "scene")} == {
+        "scene.import",
+        "scene.delete",
+        "scene.list",
+    }
+    assert "scene.import" in run("audit", "--artifact-folder", tmp_path).stdout
+
+
+def test_entries_wait_for_the_database_and_what_is_lost_is_counted(tmp_path: Path, postgres: PostgresServer) -> None:
+    database = JobDatabase(tmp_path, postgres.create_database())
+    log = AuditLog()
+    log.open(database.engine)
+    postgres.stop()
+    try:
+        for number in range(MAX_WAITING + 7):
+            log.tell(Entry("alice", "::1", "scene.load", str(number), "OK"))
+    finally:
+        postgres.start()
+
+    def lost() -> list[Entry]:
+        return read_audit(database.engine, since_s=0, what="audit", limit=10)
+
+    (entry,) = wait_until(lost)
+    assert entry.facts == {"count": 7}
+    kept = read_audit(database.engine, since_s=0, what="scene", limit=MAX_WAITING + 10)
+    assert [one.target for one in kept] == [str(number) for number in range(MAX_WAITING)]
+    log.close()
+    database.close()
+
+
+def test_an_attacker_fills_no_log(database: JobDatabase, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(audit, "WRITE_INTERVAL_S", 0.01)
+    log = AuditLog()
+    for number in range(5000):
+        log.count(Entry("-", f"10.0.{number // 250}.{number % 250}", "scene.get", "x\0", "UNAUTHENTICATED"))
+    log.open(database.engine)
+    log.close()
+    assert len(read_audit(database.engine, since_s=time.time() - 60, limit=10_000)) <= 1010
+
+
+def test_streams_and_watches_end_with_their_key(
+    start_service: StartService, tmp_path: Path, database: JobDatabase
+) -> None:
+    store = KeyStore(database.engine)
+    _, key = store.create("alice", Role.OPERATOR, None)
+    service = start_service(artifact_folder=tmp_path)
+    body = {"kind": "render", "specification": {"scene": "demo", "poses": [MATRIX]}}
+    job = httpx.post(f"{service.http}/v1/jobs", headers={"X-API-Key": key}, json=body, timeout=60).json()["id"]
+    address = f"{service.http.replace('http', 'ws')}/v1/scenes/demo/stream"
+    with service.channel() as channel, connect(address, additional_headers={"X-API-Key": key}) as socket:
+        stub = jobs_pb2_grpc.JobServiceStub(channel)
+        watch = stub.WatchJob(jobs_pb2.WatchJobRequest(job=job), metadata=(("x-api-key", key),))
+        next(watch)
+        store.revoke("alice")
+        revoked_s = time.monotonic()
+        with pytest.raises(grpc.RpcError) as refused:
+            list(watch)
+        assert refused.value.code() is grpc.StatusCode.UNAUTHENTICATED
+        with pytest.raises(ConnectionClosed) as closed:
+            socket.recv(timeout=60)
+        assert closed.value.rcvd is not None
+        assert (closed.value.rcvd.code, closed.value.rcvd.reason) == (1008, "UNAUTHENTICATED")
+        assert time.monotonic() - revoked_s < 10

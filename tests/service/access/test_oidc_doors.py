@@ -1,0 +1,95 @@
+"""Tokens of an OpenID Connect issuer at the doors of a real service, beside API keys."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import grpc
+import httpx
+import pytest
+
+from ultragray_client import Client
+from ultragray_proto.v1 import scenes_pb2, scenes_pb2_grpc
+
+from ...waiting import wait_until
+from ..conftest import RunningService, StartService
+from ..rpc.test_grpc_render import error_info
+from .identity_provider import IdentityProvider
+
+KEY = "0123456789abcdef-environment"
+
+
+@pytest.fixture(scope="module")
+def provider() -> Iterator[IdentityProvider]:
+    found = IdentityProvider()
+    found.add_key("one")
+    yield found
+    found.close()
+
+
+@pytest.fixture(scope="module")
+def guarded(start_service: StartService, provider: IdentityProvider) -> RunningService:
+    service = start_service(**provider.settings(), api_keys=KEY)
+    wait_until(lambda: identity_provider(service) == "available")
+    return service
+
+
+def identity_provider(service: RunningService) -> str:
+    told: str = httpx.get(f"{service.http}/v1/health/ready", timeout=60).json()["identity_provider"]
+    return told
+
+
+def ask(service: RunningService, credential: str) -> httpx.Response:
+    return httpx.get(f"{service.http}/v1/scenes", headers={"Authorization": f"Bearer {credential}"}, timeout=60)
+
+
+def test_a_token_opens_both_doors(guarded: RunningService, provider: IdentityProvider) -> None:
+    assert ask(guarded, provider.token()).status_code == 200
+    given = iter([provider.token(), provider.token(exp=1)])
+    with Client(guarded.grpc, api_key=lambda: next(given), timeout_s=60.0) as client:
+        assert client.scenes.list()
+        with pytest.raises(Exception, match="UNAUTHENTICATED: the token has expired"):
+            client.scenes.list()
+
+
+def test_tokens_that_are_refused_say_why_at_the_doors(guarded: RunningService, provider: IdentityProvider) -> None:
+    for token, status, reason in (
+        (provider.token(aud="another"), 401, "UNAUTHENTICATED"),
+        (provider.token(realm_access=None), 403, "PERMISSION_DENIED"),
+    ):
+        answer = ask(guarded, token)
+        assert (answer.status_code, answer.json()["reason"]) == (status, reason)
+        metadata = (("authorization", f"Bearer {token}"),)
+        with guarded.channel() as channel:
+            stub = scenes_pb2_grpc.SceneServiceStub(channel)
+            with pytest.raises(grpc.RpcError) as caught:
+                stub.ListScenes(scenes_pb2.ListScenesRequest(), metadata=metadata)
+        assert error_info(caught.value)[0].reason == reason
+    assert "eyJ" not in guarded.log_path.read_text(), "a token was logged"
+
+
+def test_an_issuer_that_is_away_shuts_out_only_its_tokens(start_service: StartService) -> None:
+    provider = IdentityProvider()
+    provider.add_key("one")
+    provider.up = False
+    try:
+        service = start_service(**provider.settings(), api_keys=KEY)
+        assert ask(service, KEY).status_code == 200
+        refused = ask(service, provider.token())
+        assert (refused.status_code, refused.json()["reason"]) == (503, "ISSUER_UNAVAILABLE")
+        assert int(refused.headers["retry-after"]) >= 1
+        assert identity_provider(service) == "unavailable"
+        wait_until(lambda: any("cannot be checked" in record["message"] for record in service.log()))
+        provider.up = True
+        wait_until(lambda: ask(service, provider.token()).status_code == 200)
+        assert identity_provider(service) == "available"
+    finally:
+        provider.close()
+
+
+def test_with_an_issuer_alone_nobody_passes_without_a_token(
+    start_service: StartService, provider: IdentityProvider
+) -> None:
+    service = start_service(**provider.settings(), host="127.0.0.1")
+    assert httpx.get(f"{service.http}/v1/scenes", timeout=60).status_code == 401
+    wait_until(lambda: ask(service, provider.token()).status_code == 200)

@@ -1,0 +1,218 @@
+"""What is private is not there for others, at any door; what is not can be read by all, and changed by its owner."""
+
+from __future__ import annotations
+
+import grpc
+import pytest
+
+from ultragray_proto.v1 import (
+    access_pb2,
+    access_pb2_grpc,
+    datasets_pb2,
+    datasets_pb2_grpc,
+    geometry_pb2,
+    jobs_pb2,
+    jobs_pb2_grpc,
+    rendering_pb2,
+    rendering_pb2_grpc,
+    scenes_pb2,
+    scenes_pb2_grpc,
+)
+
+from ...waiting import wait_until
+from .conftest import MATRIX, POSE, Keyed
+
+
+@pytest.fixture(scope="module")
+def private(keyed: Keyed, scene_bytes: bytes, dataset_bytes: bytes) -> str:
+    """The id of a private job of alice's; her scene and dataset are called secret."""
+    answer = keyed.http("alice", "PUT", "/v1/scenes/secret?private=true", content=scene_bytes)
+    assert (answer.status_code, answer.json()["owner"], answer.json()["private"]) == (201, "alice", True)
+    answer = keyed.http("alice", "PUT", "/v1/datasets/secret?private=true", content=dataset_bytes)
+    assert (answer.status_code, answer.json()["owner"], answer.json()["private"]) == (201, "alice", True)
+    answer = keyed.submit("alice", private=True, scene="secret")
+    assert (answer.status_code, answer.json()["owner"], answer.json()["private"]) == (201, "alice", True)
+    return str(answer.json()["id"])
+
+
+def names(keyed: Keyed, who: str, what: str) -> set[str]:
+    found = keyed.http(who, "GET", f"/v1/{what}").json()[what]
+    return {one.get("name", one.get("id")) for one in found}
+
+
+def test_lists_leave_out_what_others_keep_to_themselves(keyed: Keyed, private: str) -> None:
+    for what, name in {"scenes": "secret", "datasets": "secret", "jobs": private}.items():
+        seen = {who: name in names(keyed, who, what) for who in ("alice", "admin", "bob", "reader")}
+        assert seen == {"alice": True, "admin": True, "bob": False, "reader": False}, what
+
+
+def test_a_page_of_jobs_is_full_though_others_are_left_out(keyed: Keyed) -> None:
+    mine = [keyed.submit("bob").json()["id"] for _ in range(2)]
+    for _ in range(3):
+        keyed.submit("alice", private=True)
+    page = keyed.http("bob", "GET", "/v1/jobs?page_size=2").json()
+    assert {job["id"] for job in page["jobs"]} == set(mine)
+    everything, token = [], ""
+    while True:
+        page = keyed.http("bob", "GET", f"/v1/jobs?page_size=1&page_token={token}").json()
+        everything += [job["id"] for job in page["jobs"]]
+        if not (token := page["next_page_token"]):
+            break
+    assert everything == [job["id"] for job in keyed.http("bob", "GET", "/v1/jobs").json()["jobs"]]
+
+
+ROUTES = [
+    ("GET", "/v1/scenes/{name}", None),
+    ("GET", "/v1/scenes/{name}/file", None),
+    ("GET", "/v1/scenes/{name}/gaussians", None),
+    ("GET", "/v1/scenes/{name}/training-poses", None),
+    ("GET", "/v1/scenes/{name}/comparison", None),
+    ("POST", "/v1/scenes/{name}/render", {"pose": POSE}),
+    ("POST", "/v1/scenes/{name}:load", None),
+    ("POST", "/v1/scenes/{name}:unload", None),
+    ("DELETE", "/v1/scenes/{name}", None),
+    ("GET", "/v1/datasets/{name}", None),
+    ("GET", "/v1/datasets/{name}/contact-sheet", None),
+    ("GET", "/v1/datasets/{name}/poses", None),
+    ("GET", "/v1/datasets/{name}/frames/train/0", None),
+    ("DELETE", "/v1/datasets/{name}", None),
+    ("POST", "/v1/jobs", {"kind": "train", "specification": {"dataset": "{name}", "scene": "mine"}}),
+    ("POST", "/v1/jobs", {"kind": "render", "specification": {"scene": "{name}", "poses": [MATRIX]}}),
+]
+
+
+@pytest.mark.parametrize(("method", "path", "body"), ROUTES)
+def test_private_things_answer_as_if_they_were_not_there(
+    keyed: Keyed, private: str, method: str, path: str, body: object
+) -> None:
+    def ask(name: str) -> tuple[int, str]:
+        filled = None if body is None else filled_in(body, name)
+        answer = keyed.http("bob", method, path.format(name=name), json=filled)
+        document = {**answer.json(), "request_id": ""}
+        return answer.status_code, str(document).replace(name, "NAME")
+
+    status, text = ask("secret")
+    assert status == 404
+    assert (status, text) == ask("absent")
+
+
+def filled_in(value: object, name: str) -> object:
+    if isinstance(value, dict):
+        return {key: filled_in(one, name) for key, one in value.items()}
+    if isinstance(value, list):
+        return [filled_in(one, name) for one in value]
+    return value.replace("{name}", name) if isinstance(value, str) else value
+
+
+JOB_ROUTES = [
+    ("GET", ""),
+    ("GET", "/log"),
+    ("GET", "/events"),
+    ("GET", "/curve"),
+    ("GET", "/preview"),
+    ("GET", "/artifacts/x"),
+    ("POST", ":cancel"),
+    ("POST", ":retry"),
+    ("DELETE", ""),
+]
+
+
+@pytest.mark.parametrize(("method", "suffix"), JOB_ROUTES)
+def test_private_jobs_answer_as_if_they_were_not_there(keyed: Keyed, private: str, method: str, suffix: str) -> None:
+    def ask(job: str) -> tuple[int, str]:
+        answer = keyed.http("bob", method, f"/v1/jobs/{job}{suffix}")
+        return answer.status_code, str({**answer.json(), "request_id": ""}).replace(job, "JOB")
+
+    assert ask(private) == ask("0" * 24)
+    assert ask(private)[0] == 404
+
+
+def test_names_of_private_things_are_taken_all_the_same(
+    keyed: Keyed, private: str, scene_bytes: bytes, dataset_bytes: bytes
+) -> None:
+    for answer, reason in (
+        (keyed.http("bob", "PUT", "/v1/scenes/secret", content=scene_bytes), "SCENE_EXISTS"),
+        (keyed.http("bob", "PUT", "/v1/datasets/secret", content=dataset_bytes), "DATASET_EXISTS"),
+    ):
+        assert (answer.status_code, answer.json()["reason"]) == (409, reason)
+    assert keyed.http("alice", "GET", "/v1/scenes/secret").json()["owner"] == "alice"
+    assert keyed.http("alice", "GET", "/v1/datasets/secret").json()["owner"] == "alice"
+
+
+def test_the_request_id_of_somebody_else_gives_no_job(keyed: Keyed) -> None:
+    assert keyed.submit("alice", request_id="same", private=True).status_code == 201
+    answer = keyed.submit("bob", request_id="same")
+    assert (answer.status_code, answer.json()["reason"]) == (409, "REQUEST_ID_CONFLICT")
+    assert keyed.submit("alice", request_id="same", private=True).status_code == 200
+
+
+def test_the_owner_and_admins_see_and_render(keyed: Keyed, private: str) -> None:
+    for who in ("alice", "admin"):
+        assert keyed.http(who, "POST", "/v1/scenes/secret/render", json={"pose": POSE}).status_code == 200
+        assert keyed.http(who, "GET", "/v1/datasets/secret").json()["private"] is True
+        assert keyed.http(who, "GET", f"/v1/jobs/{private}").json()["owner"] == "alice"
+
+
+def test_over_grpc_too(keyed: Keyed, private: str) -> None:
+    def metadata(who: str) -> tuple[tuple[str, str], ...]:
+        return tuple(keyed.headers(who).items())
+
+    settings = rendering_pb2.RenderSettings(scene="secret")
+    pose = geometry_pb2.Pose(
+        placement=geometry_pb2.Placement(position_mm=geometry_pb2.Position(), quaternion=geometry_pb2.Quaternion(w=1.0))
+    )
+    with keyed.service.channel() as channel:
+        scenes = scenes_pb2_grpc.SceneServiceStub(channel)
+        renders = rendering_pb2_grpc.RenderServiceStub(channel)
+        datasets = datasets_pb2_grpc.DatasetServiceStub(channel)
+        jobs = jobs_pb2_grpc.JobServiceStub(channel)
+        calls = (
+            lambda who: scenes.GetScene(scenes_pb2.GetSceneRequest(scene="secret"), metadata=metadata(who)),
+            lambda who: renders.Render(
+                rendering_pb2.RenderRequest(settings=settings, pose=pose), metadata=metadata(who)
+            ),
+            lambda who: datasets.GetDataset(datasets_pb2.GetDatasetRequest(dataset="secret"), metadata=metadata(who)),
+            lambda who: jobs.GetJob(jobs_pb2.GetJobRequest(job=private), metadata=metadata(who)),
+        )
+        for call in calls:
+            call("alice")
+            with pytest.raises(grpc.RpcError) as caught:
+                call("bob")
+            assert caught.value.code() is grpc.StatusCode.NOT_FOUND
+        asked = rendering_pb2.RenderStreamRequest(settings=settings, pose=pose)
+        (frame,) = renders.RenderStream(iter([asked]), metadata=metadata("bob"))
+        assert frame.error.reason == "SCENE_NOT_FOUND"
+        (frame,) = renders.RenderStream(iter([asked]), metadata=metadata("alice"))
+        assert frame.data
+        me = access_pb2_grpc.AccessServiceStub(channel).WhoAmI(access_pb2.WhoAmIRequest(), metadata=metadata("bob"))
+        assert (me.name, me.role, me.key_required) == ("bob", access_pb2.ROLE_OPERATOR, True)
+
+
+def test_a_key_tells_whose_it_is(keyed: Keyed) -> None:
+    answer = keyed.http("reader", "GET", "/v1/me").json()
+    assert (answer["name"], answer["role"], answer["key_required"]) == ("reader", "reader", True)
+    assert answer["expires_at"].startswith("20")
+
+
+def test_others_things_can_be_read_and_not_changed(keyed: Keyed, scene_bytes: bytes) -> None:
+    assert keyed.http("alice", "PUT", "/v1/scenes/shared", content=scene_bytes).status_code == 201
+    assert keyed.http("reader", "POST", "/v1/scenes/shared/render", json={"pose": POSE}).status_code == 200
+    refused = keyed.http("bob", "DELETE", "/v1/scenes/shared")
+    assert (refused.status_code, refused.json()["reason"]) == (403, "PERMISSION_DENIED")
+    assert "the scene 'shared' is alice's" in refused.json()["detail"]
+    assert keyed.http("alice", "DELETE", "/v1/scenes/shared").status_code == 204
+    assert keyed.http("bob", "PUT", "/v1/scenes/shared", content=scene_bytes).json()["owner"] == "bob"
+
+
+def test_a_scene_that_a_job_makes_is_its_owners(keyed: Keyed, private: str) -> None:
+    specification = {"dataset": "secret", "scene": "trained"}
+    body = {"kind": "train", "specification": specification, "private": True}
+    assert keyed.http("alice", "POST", "/v1/jobs", json=body).status_code == 201
+    folder = keyed.service.data_folder
+    published = folder / "trained.ugr"  # as a worker would, in the folder of scenes
+    published.write_bytes((folder / "demo.ugr").read_bytes())
+    try:
+        wait_until(lambda: keyed.http("alice", "GET", "/v1/scenes/trained").json()["owner"] == "alice")
+        assert keyed.http("bob", "GET", "/v1/scenes/trained").status_code == 404
+    finally:
+        published.unlink()

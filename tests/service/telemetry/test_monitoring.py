@@ -1,0 +1,106 @@
+"""The dashboard and the alerts in docker/monitoring ask for metrics that a service has, with labels that these have."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+from typing import Any
+
+import httpx
+import pytest
+import yaml
+from prometheus_client.parser import text_string_to_metric_families
+
+from ultragray.contract import annotated_fields
+from ultragray_service.settings import ENVIRONMENT_PREFIX, Settings
+
+from ..conftest import ROOT, RunningService
+
+MONITORING = ROOT / "docker" / "monitoring"
+METRIC = re.compile(r"\b(?:ultragray|process)_[a-z_]+")
+BY = re.compile(r"\bby \(([a-z, ]+)\)")
+OF_PROMETHEUS = {"instance", "job", "le"}
+
+
+def expressions() -> dict[str, str]:
+    """Every query of the dashboard and of the alerts, by its place."""
+    dashboard = json.loads((MONITORING / "dashboard.json").read_text())
+    queries = {
+        f"panel {panel['title']}, {target['refId']}": target["expr"]
+        for panel in dashboard["panels"]
+        for target in panel.get("targets", ())
+    }
+    for group in yaml.safe_load((MONITORING / "alerts.yaml").read_text())["groups"]:
+        queries |= {f"alert {rule['alert']}": rule["expr"] for rule in group["rules"]}
+    return queries
+
+
+@pytest.fixture(scope="module")
+def labels_of(service: RunningService, module_pose: dict[str, Any]) -> dict[str, set[str]]:
+    """The labels of each sample that a service has told once it rendered, answered and refused."""
+    render = f"{service.http}/v1/scenes/demo/render"
+    assert httpx.post(render, json={"pose": module_pose}, timeout=60).status_code == 200
+    text = httpx.get(f"{service.http}/metrics", timeout=60).text
+    found: dict[str, set[str]] = {}
+    for family in text_string_to_metric_families(text):
+        found.setdefault(family.name, set())
+        if family.type == "counter":
+            found.setdefault(f"{family.name}_total", set())
+        for sample in family.samples:
+            found.setdefault(sample.name, set()).update(sample.labels)
+    return found
+
+
+@pytest.fixture(scope="module")
+def module_pose() -> dict[str, Any]:
+    return {"position_mm": {"x": 0, "y": 0, "z": 0}, "quaternion": {"w": 1, "x": 0, "y": 0, "z": 0}}
+
+
+@pytest.mark.parametrize("place", expressions())
+def test_queries_ask_for_metrics_that_there_are(labels_of: dict[str, set[str]], place: str) -> None:
+    query = expressions()[place]
+    metrics = set(METRIC.findall(query))
+    assert metrics <= set(labels_of), place
+    known = OF_PROMETHEUS.union(*(labels_of[metric] for metric in metrics))
+    grouped = {label.strip() for labels in BY.findall(query) for label in labels.split(",")}
+    if all(labels_of[metric] for metric in metrics):  # a counter without a sample yet does not tell its labels
+        assert grouped <= known, place
+
+
+@pytest.mark.skipif(shutil.which("promtool") is None, reason="promtool, of Debian's package prometheus, is not there")
+@pytest.mark.parametrize(
+    "check", [["check", "rules", "alerts.yaml"], ["check", "config", "--syntax-only", "prometheus.yaml"]]
+)
+def test_prometheus_takes_its_files(check: list[str]) -> None:
+    *command, name = check
+    done = subprocess.run(["promtool", *command, str(MONITORING / name)], capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_files_of_grafana_name_one_another() -> None:
+    def read(name: str) -> Any:
+        return yaml.safe_load((MONITORING / name).read_text())
+
+    used = {
+        panel["datasource"]["uid"]
+        for panel in json.loads((MONITORING / "dashboard.json").read_text())["panels"]
+        if "datasource" in panel
+    }
+    assert used == {source["uid"] for source in read("grafana-datasource.yaml")["datasources"]}
+
+
+@pytest.mark.parametrize("name", ["compose.yaml", "compose.operation.yaml"])
+def test_containers_are_given_settings_that_there_are(name: str) -> None:
+    services = yaml.safe_load((ROOT / "docker" / name).read_text())["services"].values()
+    given = {
+        key for service in services for key in service.get("environment", {}) if key.startswith(ENVIRONMENT_PREFIX)
+    }
+    assert given <= {ENVIRONMENT_PREFIX + item.name.upper() for item, _ in annotated_fields(Settings)}
+
+
+def test_containers_find_the_files_that_they_are_given() -> None:
+    services = yaml.safe_load((ROOT / "docker" / "compose.operation.yaml").read_text())["services"].values()
+    files = [volume.split(":")[0] for service in services for volume in service.get("volumes", ())]
+    assert all((ROOT / "docker" / file).is_file() for file in files if file.startswith("./"))

@@ -1,0 +1,180 @@
+"""Numbers at the edge of what a float or an integer can be, in every field of the contract, through every door."""
+
+from __future__ import annotations
+
+import json
+import queue
+from collections.abc import Iterator
+from dataclasses import MISSING
+from typing import Any, get_args, get_origin
+
+import httpx
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
+from websockets.sync.client import ClientConnection, connect
+
+from ultragray.contract import Contract, Family, annotated_fields, optional_of
+from ultragray.settings import RenderSettings
+from ultragray_proto.v1 import geometry_pb2, rendering_pb2
+
+from .conftest import RunningService
+
+TIMEOUT_S = 60.0
+MANY = settings(deadline=None, max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
+EDGES = (
+    0.0,
+    5e-324,
+    2.2e-308,
+    1e-300,
+    1e-45,
+    1e-38,
+    1e-30,
+    1e-9,
+    1.0,
+    1e9,
+    3.4e38,
+    1e39,
+    1e300,
+    1.7976931348623157e308,
+)
+HUGE = (2**31 - 1, 2**31, 2**53 + 1, 2**63, 2**64, 10**400)
+POSE = {"matrix": np.eye(4).tolist()}
+
+
+def numbers(item: Any) -> st.SearchStrategy[Any]:
+    """What a field takes, from one limit to the other; the limits and their neighbours; and what no field takes."""
+    limits = [item.metadata[name] for name in ("low", "high", "above") if name in item.metadata]
+    near = [float(np.nextafter(limit, toward)) for limit in limits for toward in (-np.inf, np.inf)]
+    low, high = min(limits, default=None), max(limits, default=None)
+    within = st.floats(low, high if high != low else None, allow_nan=False, allow_infinity=False)
+    return within | st.sampled_from([*limits, *near, *EDGES, *(-edge for edge in EDGES)])
+
+
+def values(annotation: Any, item: Any) -> st.SearchStrategy[Any]:
+    kind, optional = optional_of(annotation)
+    if kind is float:
+        found = numbers(item)
+    elif kind is int:
+        found = st.sampled_from([0, 1, 2, 33, 512, 600, 601]) | st.sampled_from([*HUGE, *(-one for one in HUGE)])
+    elif kind is bool:
+        found = st.booleans()
+    elif get_origin(kind) is tuple and get_args(kind)[0] is float:
+        found = st.lists(numbers(item), max_size=4)
+    elif isinstance(kind, type) and issubclass(kind, Family) and Family in kind.__bases__:
+        found = st.one_of([documents(member) for member in kind.members.values()])
+    elif isinstance(kind, type) and issubclass(kind, Contract):
+        found = documents(kind)
+    else:
+        return st.nothing()
+    return st.none() | found if optional else found
+
+
+def documents(cls: Any) -> st.SearchStrategy[dict[str, Any]]:
+    """JSON of a class of the contract: fields without a default always, each of the others now and then."""
+    fields = {item.name: (item, values(annotation, item)) for item, annotation in annotated_fields(cls)}
+    given = {name: found for name, (_, found) in fields.items() if not found.is_empty}
+    required = {name for name, (item, _) in fields.items() if name in given and not _has_default(item)}
+    if "kind" in fields:
+        given["kind"] = st.just(cls.kind)
+        required.add("kind")
+    return st.fixed_dictionaries(
+        {name: found for name, found in given.items() if name in required},
+        optional={name: found for name, found in given.items() if name not in required},
+    )
+
+
+def _has_default(item: Any) -> bool:
+    return item.default is not MISSING or item.default_factory is not MISSING
+
+
+POSES = st.one_of(
+    st.fixed_dictionaries(
+        {
+            "position_mm": st.fixed_dictionaries({axis: st.sampled_from(EDGES) for axis in "xyz"}),
+            "quaternion": st.fixed_dictionaries({axis: st.sampled_from(EDGES) for axis in "wxyz"}),
+        }
+    ),
+    st.fixed_dictionaries(
+        {"matrix": st.lists(st.lists(st.sampled_from(EDGES), min_size=4, max_size=4), min_size=4, max_size=4)}
+    ),
+    st.just(POSE),
+)
+DEEP = {"height": 512, "display": {"depth_mm": 1e308}}
+EXTREME = given(asked=documents(RenderSettings), pose=st.just(POSE) | POSES)
+
+
+@EXTREME
+@example(asked=DEEP, pose=POSE)
+@MANY
+def test_http(http: httpx.Client, asked: dict[str, Any], pose: dict[str, Any]) -> None:
+    answer = http.post("/v1/scenes/demo/render", content=json.dumps({**asked, "pose": pose}), timeout=TIMEOUT_S)
+    assert answer.status_code in (200, 422), answer.text
+    assert answer.status_code == 200 or answer.json()["field"], answer.text
+
+
+@pytest.fixture(scope="module")
+def websocket(service: RunningService) -> Iterator[ClientConnection]:
+    address = f"{service.http.replace('http', 'ws', 1)}/v1/scenes/demo/stream"
+    with connect(address, compression=None, max_size=None, close_timeout=0.2) as connection:
+        yield connection
+
+
+@EXTREME
+@example(asked=DEEP, pose=POSE)
+@MANY
+def test_websocket(websocket: ClientConnection, asked: dict[str, Any], pose: dict[str, Any]) -> None:
+    websocket.send(json.dumps({"settings": asked, "pose": pose}))
+    answer = websocket.recv(timeout=TIMEOUT_S)
+    if isinstance(answer, str):
+        error = json.loads(answer)["error"]
+        assert error["field"], error
+
+
+class Stream:
+    """A stream that must outlive all that is asked of it."""
+
+    def __init__(self, renders: Any) -> None:
+        self._messages: queue.Queue[Any] = queue.Queue()
+        self._frames = renders.RenderStream(iter(self._messages.get, None))
+
+    def ask(self, message: rendering_pb2.RenderStreamRequest) -> rendering_pb2.Frame:
+        self._messages.put(message)
+        return next(self._frames)
+
+    def end(self) -> None:
+        self._messages.put(None)
+
+
+@pytest.fixture(scope="module")
+def grpc_stream(renders: Any) -> Iterator[Stream]:
+    stream = Stream(renders)
+    yield stream
+    stream.end()
+
+
+@EXTREME
+@example(asked=DEEP, pose=POSE)
+@MANY
+def test_grpc_stream(grpc_stream: Stream, asked: dict[str, Any], pose: dict[str, Any]) -> None:
+    try:
+        message = rendering_pb2.RenderStreamRequest(settings=settings_message(asked), pose=pose_message(pose))
+    except (ValueError, OverflowError):  # an integer that the message has no room for
+        return
+    error = grpc_stream.ask(message).error
+    assert not error.reason or error.field, error
+
+
+def settings_message(asked: dict[str, Any]) -> rendering_pb2.RenderSettings:
+    given = dict(asked)
+    if (probe := given.pop("probe", None)) is not None:
+        inner = {name: value for name, value in probe.items() if name != "kind"}
+        given["probe"] = geometry_pb2.Probe(**{probe["kind"]: inner})
+    return rendering_pb2.RenderSettings(scene="demo", **given)
+
+
+def pose_message(pose: dict[str, Any]) -> geometry_pb2.Pose:
+    if "matrix" in pose:
+        return geometry_pb2.Pose(matrix=geometry_pb2.Matrix(values=np.ravel(pose["matrix"])))
+    return geometry_pb2.Pose(placement=geometry_pb2.Placement(**pose))

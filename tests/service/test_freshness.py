@@ -1,0 +1,127 @@
+"""A reader of a latest stream that acknowledges gets no old frame, through any door and whatever it does."""
+
+from __future__ import annotations
+
+import json
+import queue
+import struct
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import grpc
+import numpy as np
+import pytest
+from websockets.sync.client import ClientConnection, connect
+
+from ultragray_proto.v1 import geometry_pb2, rendering_pb2
+
+from ..freshness import check_fresh
+from .conftest import RunningService
+
+IDENTITY = geometry_pb2.Pose(matrix=geometry_pb2.Matrix(values=np.eye(4).ravel().tolist()))
+SMALL = {"height": 128, "width": 128, "encoding": "jpeg"}  # some KB: buffers hold hundreds of them
+LARGE = {"height": 512, "width": 512, "encoding": "float32"}  # 1 MB
+LATEST = rendering_pb2.STREAM_MODE_LATEST
+
+
+class GrpcDoor:
+    """A client that acknowledges each frame as it takes it."""
+
+    def __init__(self, renders: Any, settings: dict[str, Any], window: int = 1) -> None:
+        self._messages: queue.Queue[Any] = queue.Queue()
+        self._sequence = 0
+        self.frames = renders.RenderStream(iter(self._messages.get, None))
+        asked = {**settings, "encoding": f"ENCODING_{settings['encoding'].upper()}"}
+        self.put(settings=rendering_pb2.RenderSettings(scene="demo", **asked), mode=LATEST, window=window)
+
+    def put(self, **fields: Any) -> None:
+        self._messages.put(rendering_pb2.RenderStreamRequest(**fields))
+
+    def send(self) -> None:
+        self._sequence += 1
+        self.put(sequence=self._sequence, pose=IDENTITY, client_time_ns=time.monotonic_ns())
+
+    def take(self) -> rendering_pb2.Frame:
+        frame = next(self.frames)
+        assert not frame.HasField("error"), frame.error
+        return frame
+
+    def receive(self) -> float:
+        frame = self.take()
+        self.put(acknowledged=frame.sequence)
+        return float(frame.client_time_ns / 1e9)
+
+    def close(self) -> None:
+        self._messages.put(None)
+        self.frames.cancel()
+
+
+class WebSocketDoor:
+    """The same over a WebSocket."""
+
+    def __init__(self, connection: ClientConnection, settings: dict[str, Any]) -> None:
+        self._connection = connection
+        self._sequence = 0
+        connection.send(json.dumps({"mode": "latest", "window": 1, "settings": settings}))
+
+    def send(self) -> None:
+        self._sequence += 1
+        pose = {"matrix": np.eye(4).tolist()}
+        message = {"sequence": self._sequence, "pose": pose, "client_time_ms": 1000 * time.monotonic()}
+        self._connection.send(json.dumps(message))
+
+    def receive(self) -> float:
+        message = self._connection.recv(timeout=60)
+        assert isinstance(message, bytes), message
+        (length,) = struct.unpack_from("<I", message)
+        about = json.loads(message[4 : 4 + length])
+        self._connection.send(json.dumps({"acknowledged": about["sequence"]}))
+        return float(about["client_time_ms"] / 1000)
+
+
+@pytest.fixture
+def open_grpc(renders: Any) -> Iterator[Any]:
+    doors: list[GrpcDoor] = []
+
+    def open_one(settings: dict[str, Any], window: int = 1) -> GrpcDoor:
+        doors.append(GrpcDoor(renders, settings, window))
+        return doors[-1]
+
+    yield open_one
+    for door in doors:
+        door.close()
+
+
+@pytest.mark.parametrize("settings", [SMALL, LARGE], ids=["small", "large"])
+def test_grpc(open_grpc: Any, settings: dict[str, Any]) -> None:
+    check_fresh(open_grpc(settings))
+
+
+@pytest.mark.parametrize("settings", [SMALL, LARGE], ids=["small", "large"])
+def test_websocket(service: RunningService, settings: dict[str, Any]) -> None:
+    address = f"{service.http.replace('http', 'ws', 1)}/v1/scenes/demo/stream"
+    with connect(address, compression=None, max_size=None, close_timeout=0.2) as connection:
+        check_fresh(WebSocketDoor(connection, settings))
+
+
+def test_no_more_answers_come_than_the_window_has_room_for(open_grpc: Any, service: RunningService) -> None:
+    door = open_grpc(SMALL, window=3)
+    for _ in range(3):
+        door.send()
+        door.take()
+    frames = service.metric("ultragray_frames_total")
+    for _ in range(20):
+        door.send()
+    door.put()  # neither pose nor settings: its refusal comes after all that was to come
+    refusal = next(door.frames)
+    assert (refusal.error.field, refusal.dropped) == ("pose", 19)
+    assert service.metric("ultragray_frames_total") == frames
+    door.put(acknowledged=12345)  # of no answer
+    door.put(acknowledged=2)
+    assert door.take().sequence == 23
+
+
+def test_a_window_beyond_the_limit_ends_the_stream(open_grpc: Any) -> None:
+    with pytest.raises(grpc.RpcError, match="window must be at most 16"):
+        open_grpc(SMALL, window=17).take()

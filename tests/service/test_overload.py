@@ -1,0 +1,144 @@
+"""More asked for than can be rendered, and scenes that would take for ever: answers of a real service."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import grpc
+import httpx
+import numpy as np
+import pytest
+import torch
+
+from ultragray import GaussianScene, SceneInfo
+from ultragray_proto.v1 import rendering_pb2, rendering_pb2_grpc
+
+from ..waiting import at_this_load
+from .conftest import DEMO_PROBE, RunningService, StartService, make_scene
+from .rpc.test_grpc_render import error_info, moved
+
+IDENTITY = {"position_mm": {"x": 0, "y": 0, "z": 0}, "quaternion": {"w": 1, "x": 0, "y": 0, "z": 0}}
+LARGE = {"height": 512, "width": 512}
+GREEDY = 40
+OVERLOAD_S = 6.0
+
+
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """`demo`, and scenes of 20,000 Gaussians of 148 cm and of e^88 cm before the probe."""
+    folder = tmp_path_factory.mktemp("scenes")
+    make_scene(probe=DEMO_PROBE).save(folder / "demo.ugr")
+    for name, log_scale in (("wide", 5.0), ("endless", 88.0)):
+        random = torch.Generator().manual_seed(0)
+        splats = {
+            "means": torch.rand(20_000, 3, generator=random) + torch.tensor([0.0, 0.0, 1.0]),
+            "scales": torch.full((20_000, 3), log_scale),
+            "quats": torch.ones(20_000, 4),
+            "transmittances": torch.zeros(20_000),
+            "sh0": torch.zeros(20_000, 1, 1),
+        }
+        GaussianScene.from_splats(splats, info=SceneInfo(probe=DEMO_PROBE)).save(folder / f"{name}.ugr")
+    return folder
+
+
+def render(client: httpx.Client, scene: str, **body: Any) -> httpx.Response:
+    return client.post(f"/v1/scenes/{scene}/render", json={"pose": IDENTITY, **body}, timeout=60)
+
+
+@pytest.fixture(scope="module")
+def strict(start_service: StartService, scenes: Path) -> RunningService:
+    return start_service(data_folder=scenes)
+
+
+@pytest.mark.parametrize("scene", ["wide", "endless"])
+def test_a_scene_that_would_take_minutes_is_refused_by_both_doors(strict: RunningService, scene: str) -> None:
+    with httpx.Client(base_url=strict.http) as client, strict.channel() as channel:
+        refused = render(client, scene, **LARGE)
+        assert (refused.status_code, refused.json()["reason"], refused.json()["field"]) == (
+            422,
+            "FRAME_TOO_COSTLY",
+            "pose",
+        )
+        assert "may cost 2,147 million footprint pixels" in refused.json()["detail"]
+        stub = rendering_pb2_grpc.RenderServiceStub(channel)
+        settings = rendering_pb2.RenderSettings(scene=scene, **LARGE)
+        with pytest.raises(grpc.RpcError) as caught:
+            stub.Render(rendering_pb2.RenderRequest(settings=settings, pose=moved(0)), timeout=60)
+        assert caught.value.code() is grpc.StatusCode.INVALID_ARGUMENT
+        assert error_info(caught.value)[0].reason == "FRAME_TOO_COSTLY"
+        with pytest.raises(grpc.RpcError) as caught:
+            list(stub.RenderBatch(rendering_pb2.RenderBatchRequest(settings=settings, poses=[moved(0)]), timeout=60))
+        assert error_info(caught.value)[0].metadata["field"] == "poses[0]"
+        assert render(client, "demo").status_code == 200
+    assert strict.metric("ultragray_process_restarts_total") == strict.metric("ultragray_watchdog_kills_total") == 0
+
+
+def test_a_frame_past_its_deadline_frees_the_worker(start_service: StartService, scenes: Path) -> None:
+    service = start_service(data_folder=scenes, max_footprint_pixels=2**62)
+    with httpx.Client(base_url=service.http) as client:
+        assert render(client, "wide", height=16, width=16).status_code == 200
+        began = time.monotonic()
+        late = render(client, "wide", timeout_ms=500, **LARGE)
+        assert (late.status_code, late.json()["reason"]) == (504, "DEADLINE_EXCEEDED")
+        assert render(client, "demo").status_code == 200
+        assert time.monotonic() - began < at_this_load(5.0)  # without it: minutes
+        assert client.get("/v1/health/ready").status_code == 200
+    assert service.metric("ultragray_watchdog_kills_total") == 0
+
+
+@pytest.fixture
+def slow(start_service: StartService, scenes: Path) -> RunningService:
+    """A service of some ten frames a second: capacity is soon exceeded."""
+    return start_service(data_folder=scenes, backend="reference", max_batch_poses=1, max_queue_ms=500.0)
+
+
+def test_overload_is_refused_early_and_whoever_asks_little_is_served(slow: RunningService) -> None:
+    body = {"height": 80, "width": 80}
+    statuses: Counter[int] = Counter()
+    accepted_s: list[float] = []
+    retry_after_s: list[int] = []
+    stop = threading.Event()
+    lock = threading.Lock()
+
+    def hammer() -> None:
+        with httpx.Client(base_url=slow.http, timeout=60) as client:
+            while not stop.is_set():
+                began = time.monotonic()
+                answer = render(client, "demo", **body)
+                with lock:
+                    statuses[answer.status_code] += 1
+                    if answer.status_code == 200:
+                        accepted_s.append(time.monotonic() - began)
+                    else:
+                        assert answer.json()["reason"] == "QUEUE_FULL"
+                        retry_after_s.append(int(answer.headers["Retry-After"]))
+                if answer.status_code == 429:
+                    time.sleep(0.05)  # far sooner than it was told
+
+    with httpx.Client(base_url=slow.http, timeout=60) as client:
+        alone_s = []
+        for _ in range(10):
+            began = time.monotonic()
+            assert render(client, "demo", **body).status_code == 200
+            alone_s.append(time.monotonic() - began)
+        threads = [threading.Thread(target=hammer) for _ in range(GREEDY)]
+        for thread in threads:
+            thread.start()
+        time.sleep(OVERLOAD_S)
+        stop.set()
+        for thread in threads:
+            thread.join(60)
+        began = time.monotonic()
+        assert render(client, "demo", **body).status_code == 200  # recovered
+        recovery_s = time.monotonic() - began
+    frame_s = float(np.median(alone_s))
+    assert set(statuses) == {200, 429}, statuses
+    assert statuses[429] > 0
+    assert min(retry_after_s) >= 1
+    assert np.percentile(accepted_s, 99) < at_this_load(2.0)
+    assert recovery_s < at_this_load(2.0)
+    assert statuses[200] > 0.3 * OVERLOAD_S / frame_s  # goodput, with the clients on the same cores

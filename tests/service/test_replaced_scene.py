@@ -1,0 +1,198 @@
+"""A scene whose file is replaced while frames of it are asked for: no frame mixes the old one with the new one."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import struct
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+from websockets.sync.client import connect
+
+from ultragray import LinearProbe
+from ultragray_proto.v1 import geometry_pb2, rendering_pb2, rendering_pb2_grpc
+from ultragray_service.igtl.contents import unpack_image
+
+from .conftest import RunningService, StartService, make_scene
+from .igtl.conftest import Peer, address_of
+
+IDENTITY = geometry_pb2.Pose(matrix=geometry_pb2.Matrix(values=np.eye(4).ravel().tolist()))
+SETTINGS = rendering_pb2.RenderSettings(scene="changing")
+SWAPS = 8
+BETWEEN_SWAPS_S = 0.25
+
+Seen = tuple[str, float]  # SHA-256 of the scene, far_mm of the probe of a frame
+Ask = Callable[[], Iterator[Seen]]
+
+
+class Changing:
+    """A scene that is replaced by one with another probe, and back."""
+
+    def __init__(self, folder: Path) -> None:
+        self.path = folder / "changing.ugr"
+        self._contents = []
+        self.known: set[Seen] = set()
+        for far_mm, gaussians in ((40.0, 400), (60.0, 500)):
+            make_scene(gaussians, probe=LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=far_mm)).save(self.path)
+            self._contents.append(self.path.read_bytes())
+            self.known.add((hashlib.sha256(self._contents[-1]).hexdigest(), far_mm))
+
+    def swap(self) -> None:
+        self._contents.reverse()
+        other = self.path.with_suffix(".new")
+        other.write_bytes(self._contents[0])
+        os.replace(other, self.path)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("changing")
+
+
+@pytest.fixture(scope="module")
+def changing(folder: Path) -> Changing:
+    return Changing(folder)
+
+
+@pytest.fixture(scope="module")
+def service(start_service: StartService, changing: Changing, folder: Path) -> RunningService:
+    return start_service(data_folder=folder, igtl_port=0, igtl_scene="changing")
+
+
+def check(changing: Changing, ask: Ask) -> None:
+    """Both contents are seen while they are swapped, each with its own probe only."""
+    seen: set[Seen] = set()
+    done = threading.Event()
+
+    def swap() -> None:
+        for _ in range(SWAPS):
+            time.sleep(BETWEEN_SWAPS_S)
+            changing.swap()
+        done.set()
+
+    swapping = threading.Thread(target=swap)
+    swapping.start()
+    try:
+        while not done.is_set() or seen != changing.known:
+            seen.update(ask())
+            assert seen <= changing.known
+            if done.is_set():
+                changing.swap()
+    finally:
+        swapping.join()
+
+
+def of_frame(frame: rendering_pb2.Frame) -> Seen:
+    assert not frame.HasField("error"), frame.error
+    return frame.scene_sha256, frame.probe.linear.far_mm
+
+
+def test_http(service: RunningService, changing: Changing) -> None:
+    body = {"poses": [{"matrix": np.eye(4).tolist()}] * 3, "dtype": "uint8"}
+
+    def ask() -> Iterator[Seen]:
+        answer = client.post("/v1/scenes/changing/render", json=body, headers={"Accept": "application/octet-stream"})
+        assert answer.status_code == 200, answer.text
+        probe = json.loads(answer.headers["X-Ultragray-Probe"])
+        yield answer.headers["X-Ultragray-Scene-Sha256"], probe["far_mm"]
+
+    with httpx.Client(base_url=service.http, timeout=60) as client:
+        check(changing, ask)
+
+
+def test_grpc(service: RunningService, changing: Changing) -> None:
+    with service.channel() as channel:
+        renders = rendering_pb2_grpc.RenderServiceStub(channel)
+        one = rendering_pb2.RenderRequest(settings=SETTINGS, pose=IDENTITY)
+        many = rendering_pb2.RenderBatchRequest(settings=SETTINGS, poses=[IDENTITY] * 20)
+
+        def ask() -> Iterator[Seen]:
+            yield of_frame(renders.Render(one, timeout=60))
+            yield from map(of_frame, renders.RenderBatch(many, timeout=60))
+
+        check(changing, ask)
+
+
+@pytest.mark.parametrize("mode", [rendering_pb2.STREAM_MODE_ORDERED, rendering_pb2.STREAM_MODE_LATEST])
+def test_grpc_stream(service: RunningService, changing: Changing, mode: Any) -> None:
+    poses = threading.Semaphore(0)
+    over = threading.Event()
+
+    def messages() -> Iterator[rendering_pb2.RenderStreamRequest]:
+        yield rendering_pb2.RenderStreamRequest(settings=SETTINGS, mode=mode)
+        while poses.acquire() and not over.is_set():
+            yield rendering_pb2.RenderStreamRequest(pose=IDENTITY)
+
+    with service.channel() as channel:
+        frames = rendering_pb2_grpc.RenderServiceStub(channel).RenderStream(messages())
+        poses.release(3)
+
+        def ask() -> Iterator[Seen]:
+            poses.release()
+            yield of_frame(next(frames))
+            if mode == rendering_pb2.STREAM_MODE_LATEST:
+                poses.release()  # some get no frame
+
+        check(changing, ask)
+        over.set()
+        poses.release()
+
+
+def test_websocket(service: RunningService, changing: Changing) -> None:
+    message = json.dumps({"pose": {"matrix": np.eye(4).tolist()}})
+
+    def ask() -> Iterator[Seen]:
+        connection.send(message)
+        answer = connection.recv(timeout=60)
+        assert isinstance(answer, bytes), answer
+        (length,) = struct.unpack_from("<I", answer)
+        about = json.loads(answer[4 : 4 + length])
+        yield about["scene_sha256"], about["probe"]["far_mm"]
+
+    address = f"{service.http.replace('http', 'ws', 1)}/v1/scenes/changing/stream"
+    with connect(address, compression=None, max_size=None, close_timeout=0.2) as connection:
+        check(changing, ask)
+
+
+def test_openigtlink(service: RunningService, changing: Changing) -> None:
+    peer = Peer(address_of(service))
+
+    def ask() -> Iterator[Seen]:
+        peer.send_pose(np.eye(4), "changing", version=2)
+        message = peer.receive()
+        assert message.type_name == "IMAGE", message
+        image = unpack_image(message.content)
+        far_mm = np.linalg.norm(image.matrix[:3, 1]) * image.pixels.shape[0]
+        yield message.metadata["scene_sha256"], round(float(far_mm), 3)
+
+    check(changing, ask)
+    peer.socket.close()
+
+
+def test_what_the_new_scene_cannot_give_is_told_and_the_stream_goes_on(
+    service: RunningService, changing: Changing
+) -> None:
+    """A scene without a probe of its own takes the place of one with a probe, under a stream that names none."""
+    message = json.dumps({"pose": {"matrix": np.eye(4).tolist()}})
+    address = f"{service.http.replace('http', 'ws', 1)}/v1/scenes/changing/stream"
+    with connect(address, compression=None, max_size=None, close_timeout=0.2) as connection:
+        connection.send(message)
+        assert isinstance(connection.recv(timeout=60), bytes)
+        make_scene(20).save(changing.path)
+        for _ in range(2):
+            connection.send(message)
+            refusal = connection.recv(timeout=60)
+            assert isinstance(refusal, str)
+            assert json.loads(refusal)["error"]["reason"] == "INVALID_PROBE"
+            assert json.loads(refusal)["error"]["field"] == "settings.probe"
+        changing.swap()
+        connection.send(message)
+        assert isinstance(connection.recv(timeout=60), bytes)

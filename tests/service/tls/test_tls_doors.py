@@ -1,0 +1,201 @@
+"""TLS on both doors of a real service, while its certificate files are replaced."""
+
+from __future__ import annotations
+
+import base64
+import socket
+import ssl
+import time
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import grpc
+import httpx
+import pytest
+import trustme
+from cryptography import x509
+from grpc_health.v1 import health_pb2, health_pb2_grpc
+from websockets.sync.client import connect
+
+from ultragray_proto.v1 import geometry_pb2, rendering_pb2, rendering_pb2_grpc
+from ultragray_service.tls.certificates import HANDSHAKE_TIMEOUT_S
+
+from ...certificates import KEY, SERVER, Mounted
+from ...waiting import at_this_load, wait_until
+from ..conftest import RunningService, StartService
+
+LIVE = "/v1/health/live"
+
+
+@pytest.fixture
+def mounted(tmp_path: Path) -> Mounted:
+    found = Mounted(tmp_path / "tls")
+    found.put(found.issue())
+    return found
+
+
+@pytest.fixture
+def serving(start_service: StartService, mounted: Mounted) -> RunningService:
+    return start_service(**mounted.settings())
+
+
+def address_of(url: str) -> tuple[str, int]:
+    host, _, port = url.rpartition("/")[2].partition(":")
+    return host, int(port)
+
+
+def serial_offered(address: tuple[str, int], context: ssl.SSLContext) -> int:
+    """The number of the certificate that a door shows to a client that gives no server name."""
+    with (
+        socket.create_connection(address, timeout=60) as plain,
+        context.wrap_socket(plain, server_hostname=address[0]) as connection,
+    ):
+        shown = connection.getpeercert(binary_form=True)
+        assert shown is not None
+        return x509.load_der_x509_certificate(shown).serial_number
+
+
+def shows(address: tuple[str, int], context: ssl.SSLContext, leaf: trustme.LeafCert) -> bool:
+    expected = x509.load_pem_x509_certificate(leaf.cert_chain_pems[0].bytes())
+    return serial_offered(address, context) == expected.serial_number
+
+
+def check_health(service: RunningService, credentials: grpc.ChannelCredentials) -> None:
+    """Raises grpc.RpcError. Each call has a connection of its own."""
+    options = [("grpc.use_local_subchannel_pool", 1)]
+    with grpc.secure_channel(service.grpc, credentials, options=options) as channel:
+        health_pb2_grpc.HealthStub(channel).Check(health_pb2.HealthCheckRequest(), timeout=30)
+
+
+def errors_in(service: RunningService) -> list[str]:
+    return [record["message"] for record in service.log() if record["level"] == "error"]
+
+
+def test_both_doors_speak_tls_and_nothing_else(
+    serving: RunningService, mounted: Mounted, pose_body: dict[str, Any], pose_message: geometry_pb2.Pose
+) -> None:
+    assert serving.http.startswith("https://")
+    with httpx.Client(base_url=serving.http, verify=mounted.context(), timeout=60) as client:
+        assert client.post("/v1/scenes/demo/render", json={"pose": pose_body}).status_code == 200
+        assert client.get("/v1/scenes").json()["scenes"]
+    stream = f"{serving.http.replace('https', 'wss')}/v1/scenes/demo/stream"
+    with connect(stream, ssl=mounted.context(), max_size=None) as connection:
+        connection.send('{"sequence": 7, "pose": {"matrix": [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}}')
+        assert '"sequence":7' in str(connection.recv(timeout=60)).replace(" ", "")
+    with grpc.secure_channel(serving.grpc, mounted.credentials()) as channel:
+        request = rendering_pb2.RenderRequest(settings=rendering_pb2.RenderSettings(scene="demo"), pose=pose_message)
+        assert rendering_pb2_grpc.RenderServiceStub(channel).Render(request, timeout=60).data
+    with pytest.raises(httpx.TransportError):
+        httpx.get(serving.http.replace("https", "http") + LIVE, timeout=60)
+    with serving.channel() as plain, pytest.raises(grpc.RpcError):
+        health_pb2_grpc.HealthStub(plain).Check(health_pb2.HealthCheckRequest(), timeout=60)
+
+
+def test_versions_before_1_2_are_refused(serving: RunningService, mounted: Mounted) -> None:
+    for address in (address_of(serving.http), address_of(serving.grpc)):
+        assert serial_offered(address, mounted.context())
+        old = mounted.context()
+        old.set_ciphers("DEFAULT:@SECLEVEL=0")
+        with pytest.warns(DeprecationWarning, match="TLSv1"):
+            old.minimum_version, old.maximum_version = ssl.TLSVersion.TLSv1, ssl.TLSVersion.TLSv1_1
+        with pytest.raises(OSError, match=r"PROTOCOL_VERSION|reset by peer|EOF"):
+            serial_offered(address, old)
+
+
+def test_mutual_tls_lets_in_only_clients_of_the_authority(start_service: StartService, mounted: Mounted) -> None:
+    serving = start_service(**mounted.settings(mutual=True))
+    client = mounted.authority.issue_cert("robot@hospital.example")
+    stranger = trustme.CA().issue_cert("robot@hospital.example")
+    assert httpx.get(serving.http + LIVE, verify=mounted.context(client), timeout=60).status_code == 200
+    check_health(serving, mounted.credentials(client))
+    for other in (None, stranger):
+        with pytest.raises(httpx.TransportError):
+            httpx.get(serving.http + LIVE, verify=mounted.context(other), timeout=60)
+        with pytest.raises(grpc.RpcError) as caught:
+            check_health(serving, mounted.credentials(other))
+        assert caught.value.code() is grpc.StatusCode.UNAVAILABLE
+
+
+def test_replaced_files_are_used_by_new_connections(serving: RunningService, mounted: Mounted) -> None:
+    doors = (address_of(serving.http), address_of(serving.grpc))
+    with httpx.Client(base_url=serving.http, verify=mounted.context(), timeout=60) as open_before:
+        assert open_before.get(LIVE).status_code == 200
+        for _ in range(3):
+            new = mounted.put(mounted.issue())
+            for door in doors:
+                wait_until(partial(shows, door, mounted.context(), new), within_s=at_this_load(3))
+            assert open_before.get(LIVE).status_code == 200
+    check_health(serving, mounted.credentials())
+
+
+def test_files_that_cannot_be_used_leave_the_old_ones(serving: RunningService, mounted: Mounted) -> None:
+    doors = (address_of(serving.http), address_of(serving.grpc))
+    good = serial_offered(doors[0], mounted.context())
+
+    def stays(complaint: str) -> None:
+        wait_until(lambda: any(complaint in message for message in errors_in(serving)))
+        for door in doors:
+            assert serial_offered(door, mounted.context()) == good
+
+    mounted.put(mounted.issue(), key=mounted.issue().private_key_pem.bytes())
+    stays("is not the key of the certificate")
+    (mounted.folder / KEY).write_bytes(b"")
+    stays("holds no private key in PEM format")
+    mounted.put(mounted.issue(days=-1))
+    stays("expired at")
+    (mounted.folder / SERVER).unlink()
+    stays("cannot be read: No such file or directory")
+    assert len(errors_in(serving)) == 4, "each is told once"
+    (mounted.folder / SERVER).symlink_to(Path("..data", SERVER))
+    new = mounted.put(mounted.issue())
+    for door in doors:
+        wait_until(partial(shows, door, mounted.context(), new))
+
+
+def test_another_authority_shuts_out_the_clients_of_the_one_before(
+    start_service: StartService, mounted: Mounted
+) -> None:
+    serving = start_service(**mounted.settings(mutual=True))
+    before = mounted.authority.issue_cert("robot@hospital.example")
+    after_authority = trustme.CA()
+    after = after_authority.issue_cert("robot@hospital.example")
+    assert httpx.get(serving.http + LIVE, verify=mounted.context(before), timeout=60).status_code == 200
+    new = mounted.put(mounted.issue(), clients=after_authority)
+    for door in (address_of(serving.http), address_of(serving.grpc)):
+        wait_until(partial(shows, door, mounted.context(after), new))
+    assert httpx.get(serving.http + LIVE, verify=mounted.context(after), timeout=60).status_code == 200
+    check_health(serving, mounted.credentials(after))
+    with pytest.raises(httpx.TransportError):
+        httpx.get(serving.http + LIVE, verify=mounted.context(before), timeout=60)
+    with pytest.raises(grpc.RpcError):
+        check_health(serving, mounted.credentials(before))
+
+
+def test_a_client_that_stalls_in_its_handshake_is_cut_off_and_holds_up_nobody(
+    serving: RunningService, mounted: Mounted
+) -> None:
+    def seconds_until_cut_off(address: tuple[str, int]) -> float:
+        with socket.create_connection(address, timeout=4 * HANDSHAKE_TIMEOUT_S) as stalled:
+            began = time.monotonic()
+            stalled.sendall(base64.b16decode("16030102"))  # the begin of a ClientHello
+            assert stalled.recv(4096) == b""
+            return time.monotonic() - began
+
+    with ThreadPoolExecutor(8) as threads:
+        doors = (address_of(serving.http), address_of(serving.grpc))
+        waiting = [threads.submit(seconds_until_cut_off, door) for door in doors for _ in range(4)]
+        assert httpx.get(serving.http + LIVE, verify=mounted.context(), timeout=60).status_code == 200
+        check_health(serving, mounted.credentials())
+        assert not any(one.done() for one in waiting)
+        assert all(one.result() < at_this_load(HANDSHAKE_TIMEOUT_S + 3) for one in waiting)
+
+
+def test_files_that_cannot_be_used_stop_the_start(start_service: StartService, mounted: Mounted) -> None:
+    mounted.put(mounted.issue(), key=b"nothing")
+    service = start_service(wait=False, **mounted.settings())
+    assert service.process.wait(60) == 1
+    said = service.log_path.read_text()
+    assert f"tls_key cannot be used: {mounted.folder / KEY} holds no private key" in said.splitlines()[-1]
+    assert "Traceback" not in said

@@ -1,0 +1,234 @@
+"""What a backup holds, what it copies again, and what becomes of it when it is damaged."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import sqlalchemy as sa
+
+from ultragray.samplers import AroundSampler
+from ultragray_workers.backup import backing_up, manifest
+from ultragray_workers.backup.backing_up import back_up, verify
+from ultragray_workers.backup.contents import Folders
+from ultragray_workers.backup.database_copy import Database
+from ultragray_workers.backup.objects import Objects
+from ultragray_workers.backup.restoring import restore
+from ultragray_workers.errors import BackupInvalid, RestoreRefused
+from ultragray_workers.jobs.folder import JobFolder, Outcome
+from ultragray_workers.jobs.kinds import RenderJob
+from ultragray_workers.jobs.queue.database import JobDatabase
+from ultragray_workers.jobs.queue.internals import WORKFLOWS
+from ultragray_workers.jobs.store import Job, JobState, JobStore
+from ultragray_workers.scenes import SceneStore
+
+NewDatabase = Callable[[], str | None]
+ODD = "tab\there, line\nbreak, back\\slash, \\N, ünï©ode 🩻, 'quotes' \"both\""
+
+
+def submit(store: JobStore, name: str) -> Job:
+    return store.submit(RenderJob(scene="demo", sampler=AroundSampler(2), height=16, width=16), request_id=name)[0]
+
+
+def set_row(database: JobDatabase, job: Job, **values: Any) -> None:
+    """As the queue would."""
+    rows = sa.Table(WORKFLOWS.name, sa.MetaData(), *[sa.Column(name) for name in ("workflow_uuid", *values)])
+    rows.schema = WORKFLOWS.schema
+    with database.engine.begin() as connection:
+        connection.execute(sa.update(rows).where(rows.c.workflow_uuid == job.id).values(**values))
+
+
+def restored(backups: Path, elsewhere: Folders, url: str | None) -> JobStore:
+    restore(backups, elsewhere, url)
+    return JobStore(elsewhere.artifacts, url, scenes=SceneStore(elsewhere.data))
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def test_everything_comes_back_and_what_ran_waits_again(
+    store: JobStore,
+    database: JobDatabase,
+    folders: Folders,
+    backups: Path,
+    elsewhere: Folders,
+    database_url: str | None,
+    new_database: NewDatabase,
+) -> None:
+    waiting, running, done, odd = (submit(store, name) for name in ("waiting", "running", "done", ODD))
+    set_row(database, running, status="PENDING", executor_id="gone", recovery_attempts=1)
+    set_row(database, done, status="CANCELLED")
+    folder = JobFolder(folders.artifacts, running.id)
+    folder.run.mkdir(parents=True)
+    (folder.run / "checkpoint.safetensors").write_bytes(b"far")
+    (folder.run / "metrics.jsonl").write_text("{}\n")
+    folder.lock.touch()
+    folder.reserve.write_bytes(bytes(100))
+    (folder.path / "artifacts.partial").mkdir()
+    (folder.path / "artifacts.partial" / "half").write_text("half")
+    before, _ = store.list()
+
+    report = back_up(folders, database_url, backups)
+    assert report.manifest.counts == {"scenes": 1, "datasets": 1, "jobs": 4, "unfinished jobs": 3}
+    other_url = new_database()
+    other = restored(backups, elsewhere, other_url)
+    after, _ = other.list()
+
+    assert {job.id: job.state for job in after} == {
+        waiting.id: JobState.QUEUED,
+        running.id: JobState.QUEUED,
+        done.id: JobState.CANCELLED,
+        odd.id: JobState.QUEUED,
+    }
+    assert [job for job in after if job.id != running.id] == [job for job in before if job.id != running.id]
+    assert next(job for job in after if job.id == odd.id).request_id == ODD
+    assert contents(elsewhere.artifacts / "datasets") == contents(folders.artifacts / "datasets")
+    assert (elsewhere.data / "demo.ugr").read_bytes() == (folders.data / "demo.ugr").read_bytes()
+    there = contents(JobFolder(elsewhere.artifacts, running.id).path)
+    assert there == {
+        "demo.ugr": (folders.data / "demo.ugr").read_bytes(),
+        "run/checkpoint.safetensors": b"far",
+        "run/metrics.jsonl": b"{}\n",
+    }
+    newer = submit(other, "newer")
+    assert other.list()[0][0].id == newer.id
+    other.close()
+
+
+def test_second_backup_copies_only_what_is_new_and_old_ones_go(
+    store: JobStore, folders: Folders, backups: Path, database_url: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    submit(store, "one")
+    first = back_up(folders, database_url, backups)
+    assert first.new_files > 0
+    gone = folders.artifacts / "scenes" / "gone.ugr"
+    gone.parent.mkdir()
+    gone.write_bytes(b"of the second backup alone")
+    read: list[Path] = []
+    add = Objects.add
+
+    def noted(self: Objects, source: Path, **options: Any) -> Any:
+        read.append(source)
+        return add(self, source, **options)
+
+    monkeypatch.setattr(Objects, "add", noted)
+    second = back_up(folders, database_url, backups)
+    assert [path for path in read if path.is_relative_to(folders.data)] == [gone]
+    assert second.new_files <= 2  # the scene, and a SQLite file that may have other bytes
+    sha256 = next(entry.sha256 for entry in second.manifest.files if entry.path == "scenes/gone.ugr")
+    gone.unlink()
+    third = back_up(folders, database_url, backups, keep=1)
+    assert manifest.names(backups) == [third.manifest.name]
+    assert third.removed_backups == 2
+    assert third.removed_bytes >= len(b"of the second backup alone")
+    assert not Objects(backups).has(sha256)
+    assert [bad for _, bad in verify(backups)] == [[]]
+
+
+def test_damage_is_found_and_nothing_is_changed_by_its_restore(
+    store: JobStore, folders: Folders, backups: Path, elsewhere: Folders, database_url: str | None
+) -> None:
+    submit(store, "one")
+    made = back_up(folders, database_url, backups).manifest
+    scene = next(entry for entry in made.files if entry.path == "demo.ugr")
+    path = Objects(backups).path(scene.sha256)
+    damaged = bytearray(path.read_bytes())
+    damaged[1000] ^= 1
+    path.write_bytes(damaged)
+    assert [bad for _, bad in verify(backups)] == [[scene.sha256]]
+    with pytest.raises(BackupInvalid, match=r"missing or damaged, such as that of jobs/\w+/demo\.ugr"):
+        restore(backups, elsewhere, database_url)
+    assert not elsewhere.data.exists()
+    path.unlink()
+    with pytest.raises(BackupInvalid, match="missing or damaged"):
+        restore(backups, elsewhere, database_url)
+    text = (backups / "manifests" / f"{made.name}.json").read_text()
+    (backups / "manifests" / f"{made.name}.json").write_text(text.replace("demo.ugr", "dome.ugr", 1))
+    with pytest.raises(BackupInvalid, match="damaged: it does not have its own hash"):
+        restore(backups, elsewhere, database_url)
+
+
+def test_jobs_that_go_while_files_are_copied_are_gone_after_the_restore(
+    store: JobStore,
+    database: JobDatabase,
+    folders: Folders,
+    backups: Path,
+    elsewhere: Folders,
+    database_url: str | None,
+    new_database: NewDatabase,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    stays, goes, ends = (submit(store, name) for name in ("stays", "goes", "ends"))
+    set_row(database, goes, status="SUCCESS")
+    folder = JobFolder(folders.artifacts, goes.id)
+    folder.write_outcome(Outcome())
+    late: list[Job] = []
+    snapshot = Database.snapshot
+
+    def then_they_go(self: Database, objects: Objects, work: Path) -> Any:
+        taken = snapshot(self, objects, work)
+        if not late:
+            store.delete(goes.id)
+            store.cancel(ends.id)
+            late.append(submit(store, "late"))
+        return taken
+
+    monkeypatch.setattr(Database, "snapshot", then_they_go)
+    made = back_up(folders, database_url, backups).manifest
+    assert (made.deleted_jobs, made.cancelled_jobs) == ((goes.id,), (ends.id,))
+    other = restored(backups, elsewhere, new_database())
+    states = {job.id: job.state for job in other.list()[0]}
+    assert states == {stays.id: JobState.QUEUED, ends.id: JobState.CANCELLED}
+    assert not JobFolder(elsewhere.artifacts, late[0].id).path.exists()
+    assert not JobFolder(elsewhere.artifacts, goes.id).path.exists()
+    other.close()
+
+
+def test_backup_of_a_newer_release_is_refused(
+    store: JobStore, folders: Folders, backups: Path, elsewhere: Folders, database_url: str | None
+) -> None:
+    submit(store, "one")
+    made = back_up(folders, database_url, backups).manifest
+    assert made.database is not None
+    document = json.loads((backups / "manifests" / f"{made.name}.json").read_text())
+    for change, told in (
+        ({"format_version": 2}, "has version 2 of the format of backups.*restore it with release"),
+        ({"database": {**document["database"], "tables_version": 99}}, "holds version 99 of our own tables"),
+        ({"database": {**document["database"], "queue_version": 999}}, "holds version 999 of the queue's tables"),
+    ):
+        changed = {name: value for name, value in (document | change).items() if name != "sha256"}
+        changed["sha256"] = manifest._sha256(changed)
+        (backups / "manifests" / f"{made.name}.json").write_text(json.dumps(changed))
+        with pytest.raises(BackupInvalid, match=told):
+            restore(backups, elsewhere, database_url)
+
+
+def test_place_that_cannot_be(folders: Folders, backups: Path, tmp_path: Path) -> None:
+    with pytest.raises(RestoreRefused, match="lies within"):
+        back_up(folders, None, folders.artifacts / "backups")
+    with pytest.raises(RestoreRefused, match="must be an existing folder"):
+        back_up(Folders(tmp_path / "mistyped", folders.artifacts), None, backups)
+    with pytest.raises(BackupInvalid, match="holds no backup"):
+        restore(backups, folders, None)
+    backups.mkdir()
+    with (backups / "lock").open("a") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        with pytest.raises(RestoreRefused, match="another backup or restore is at work"):
+            back_up(folders, None, backups)
+
+
+def test_manifest_that_points_outside_is_refused(folders: Folders, backups: Path, elsewhere: Folders) -> None:
+    made = back_up(folders, None, backups).manifest
+    path = backups / "manifests" / f"{made.name}.json"
+    document = json.loads(path.read_text())
+    document["files"][0]["path"] = "../outside"
+    document.pop("sha256")
+    path.write_text(json.dumps({**document, "sha256": manifest._sha256(document)}))
+    with pytest.raises(BackupInvalid, match="names the file"):
+        restore(backups, elsewhere, None)
+    assert backing_up.verify(backups) is not None

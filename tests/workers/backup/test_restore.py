@@ -1,0 +1,139 @@
+"""A restore: over nothing unasked, under nobody's feet, and to its end however often it is interrupted."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import sqlalchemy as sa
+
+from ultragray_workers.backup import restoring
+from ultragray_workers.backup.backing_up import back_up
+from ultragray_workers.backup.contents import Folders
+from ultragray_workers.backup.restoring import restore
+from ultragray_workers.errors import RestoreRefused, StartupFailed
+from ultragray_workers.jobs.queue import tables
+from ultragray_workers.jobs.queue.database import JobDatabase
+from ultragray_workers.jobs.store import JobStore
+
+from .test_backup import contents, submit
+
+NewDatabase = Callable[[], str | None]
+
+
+def test_nothing_is_overwritten_unasked(
+    store: JobStore, folders: Folders, backups: Path, database_url: str | None, new_database: NewDatabase
+) -> None:
+    kept = submit(store, "kept")
+    back_up(folders, database_url, backups)
+    submit(store, "later")
+    (folders.data / "later.ugr").write_bytes(b"no scene")
+    with pytest.raises(RestoreRefused, match="a service or a worker is at work"):
+        restore(backups, folders, database_url, overwrite=True)
+    store.close()
+    with pytest.raises(RestoreRefused, match=r"holds something already, such as datasets/tiny/.*--overwrite"):
+        restore(backups, folders, database_url)
+    restore(backups, folders, database_url, overwrite=True)
+    again = JobStore(folders.artifacts, database_url)
+    assert [job.id for job in again.list()[0]] == [kept.id]
+    again.close()
+    assert not (folders.data / "later.ugr").exists()
+
+
+def test_database_with_jobs_is_not_overwritten_by_another_folder(
+    store: JobStore, folders: Folders, backups: Path, elsewhere: Folders, database_url: str | None
+) -> None:
+    submit(store, "one")
+    back_up(folders, database_url, backups)
+    if database_url is None:  # each folder has a file of its own
+        database_url = f"sqlite:///{folders.artifacts / 'jobs.sqlite'}"
+    with pytest.raises(RestoreRefused, match="the database holds jobs already"):
+        restore(backups, elsewhere, database_url)
+
+
+@pytest.mark.parametrize("step", ["_write_files", "_load_database", "_let_jobs_go_on"])
+def test_interrupted_restore_goes_on_and_is_seen_by_nobody_before(
+    step: str,
+    store: JobStore,
+    folders: Folders,
+    backups: Path,
+    elsewhere: Folders,
+    database_url: str | None,
+    new_database: NewDatabase,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    jobs = {submit(store, name).id for name in ("one", "two")}
+    back_up(folders, database_url, backups)
+    url = new_database()
+    whole = getattr(restoring, step)
+
+    def interrupted(*arguments: Any) -> None:
+        whole(*arguments)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(restoring, step, interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        restore(backups, elsewhere, url)
+    monkeypatch.setattr(restoring, step, whole)
+    written = (elsewhere.data / "demo.ugr").stat().st_ino
+    with pytest.raises(StartupFailed, match="is being restored from a backup"):
+        JobStore(elsewhere.artifacts, url)
+    restore(backups, elsewhere, url)
+    again = JobStore(elsewhere.artifacts, url)
+    assert {job.id for job in again.list()[0]} == jobs
+    again.close()
+    assert (elsewhere.data / "demo.ugr").stat().st_ino == written
+    assert contents(elsewhere.artifacts / "datasets") == contents(folders.artifacts / "datasets")
+
+
+def test_backup_with_older_tables_is_migrated(
+    store: JobStore,
+    database: JobDatabase,
+    folders: Folders,
+    backups: Path,
+    elsewhere: Folders,
+    database_url: str | None,
+    new_database: NewDatabase,
+) -> None:
+    job = submit(store, "one")
+    with database.engine.begin() as connection:  # as a release before the first version left them
+        for table in reversed(tables.TABLES.sorted_tables):
+            connection.execute(sa.schema.DropTable(table))
+    made = back_up(folders, database_url, backups).manifest
+    assert made.database is not None
+    assert made.database.tables_version == 0
+    url = new_database()
+    restore(backups, elsewhere, url)
+    opened = JobDatabase(elsewhere.artifacts, url)
+    with opened.engine.begin() as connection:
+        assert tables.version(connection) == tables.VERSION
+    assert opened.workflow(job.id) is not None
+    opened.close()
+
+
+def test_restore_of_an_older_backup_brings_back_a_database_of_a_newer_release(
+    store: JobStore, database: JobDatabase, folders: Folders, backups: Path, database_url: str | None
+) -> None:
+    job = submit(store, "one")
+    back_up(folders, database_url, backups)
+    with database.engine.begin() as connection:
+        connection.execute(sa.update(tables.SCHEMA_VERSION).values(version=99))
+    store.close()
+    database.close()
+    with pytest.raises(StartupFailed, match="restore a backup made before it"):
+        JobStore(folders.artifacts, database_url)
+    restore(backups, folders, database_url, overwrite=True)
+    again = JobStore(folders.artifacts, database_url)
+    assert [one.id for one in again.list()[0]] == [job.id]
+    again.close()
+
+
+def test_backup_of_the_other_kind_of_database_is_refused(
+    store: JobStore, folders: Folders, backups: Path, elsewhere: Folders, database_url: str | None
+) -> None:
+    back_up(folders, database_url, backups)
+    other = "postgresql://nobody@127.0.0.1:1/none" if database_url is None else None
+    with pytest.raises(RestoreRefused, match="the backup holds a database of the kind"):
+        restore(backups, elsewhere, other)

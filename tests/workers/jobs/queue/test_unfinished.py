@@ -1,0 +1,82 @@
+"""Questions about the jobs that wait or run: their answers, and that they do not read the whole table."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import sqlalchemy as sa
+
+from ultragray_workers.jobs.queue import unfinished
+from ultragray_workers.jobs.queue.database import JobDatabase
+from ultragray_workers.jobs.queue.internals import WORKFLOWS
+from ultragray_workers.jobs.store import JobStore
+
+from ....postgres import PostgresServer
+from ..conftest import train_job
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def database_url(request: pytest.FixtureRequest) -> str | None:
+    if request.param == "sqlite":
+        return None
+    server: PostgresServer = request.getfixturevalue("postgres")
+    return server.create_database()
+
+
+@pytest.fixture
+def jobs(artifact_folder: Path, database_url: str | None) -> Iterator[JobDatabase]:
+    jobs = JobDatabase(artifact_folder, database_url)
+    yield jobs
+    jobs.close()
+
+
+def test_answers(jobs: JobDatabase, store: JobStore) -> None:
+    waiting, running, over = (store.submit(train_job(scene))[0] for scene in ("waiting", "running", "over"))
+    store.cancel(over.id)
+    assert unfinished.successor(jobs, over.id) is None
+    after, _ = store.retry(over.id)
+    with jobs.engine.begin() as connection:
+        of_running = sa.update(WORKFLOWS).where(WORKFLOWS.c.workflow_uuid == running.id)
+        connection.execute(of_running.values(status="PENDING", executor_id="me"))
+    assert unfinished.running(jobs) == [(running.id, "me")]
+    assert unfinished.count_waiting(jobs) == 2
+    assert unfinished.naming(jobs, "makes_scene", "running") == running.id
+    assert unfinished.naming(jobs, "makes_scene", "over") == after.id
+    assert unfinished.naming(jobs, "needs_dataset", "tiny") in {waiting.id, running.id, after.id}
+    assert unfinished.naming(jobs, "needs_scene", "running") is None
+    assert unfinished.successor(jobs, over.id) == after.id
+    assert unfinished.sources(jobs) == {over.id}
+    store.cancel(after.id)
+    assert unfinished.sources(jobs) == set()
+
+
+@pytest.mark.parametrize(
+    "ask",
+    [
+        unfinished.running,
+        unfinished.count_waiting,
+        unfinished.sources,
+        lambda jobs: unfinished.count_of_owner(jobs, "me"),
+        lambda jobs: unfinished.naming(jobs, "needs_dataset", "tiny"),
+        lambda jobs: unfinished.successor(jobs, "0" * 24),
+    ],
+)
+def test_no_question_reads_all_rows(jobs: JobDatabase, ask: Callable[[JobDatabase], Any]) -> None:
+    asked: list[tuple[str, Any]] = []
+
+    def listen(connection: Any, cursor: Any, statement: str, parameters: Any, *_: Any) -> None:
+        asked.append((statement, parameters))
+
+    sa.event.listen(jobs.engine, "before_cursor_execute", listen)
+    ask(jobs)
+    (statement, parameters) = asked[-1]
+    is_sqlite = jobs.engine.dialect.name == "sqlite"
+    with jobs.engine.begin() as connection:
+        if not is_sqlite:  # of a table so small it reads all, if it may
+            connection.exec_driver_sql("SET LOCAL enable_seqscan = off")
+        explain = "EXPLAIN QUERY PLAN" if is_sqlite else "EXPLAIN"
+        plan = "\n".join(map(str, connection.exec_driver_sql(f"{explain} {statement}", parameters)))
+    assert "idx_workflow_status_" in plan, plan

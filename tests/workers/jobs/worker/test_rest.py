@@ -1,0 +1,131 @@
+"""Workers that are to rest: paused, drained, resumed, and stopped by a service manager."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ultragray.demo import copy_demo_scene
+from ultragray_workers.errors import WorkerNotFound
+from ultragray_workers.jobs.kinds import RenderJob
+from ultragray_workers.jobs.queue.attendance import Worker, WorkerState
+from ultragray_workers.jobs.queue.wishes import Wanted
+from ultragray_workers.jobs.store import Job, JobState, JobStore
+
+from ....waiting import wait_until
+from ..conftest import RunningWorker, train_job
+
+StartWorker = Callable[..., RunningWorker]
+Until = Callable[..., Job]
+COMMAND = [sys.executable, "-c", "from ultragray_service.cli.app import app; app()", "workers"]
+
+
+def worker_of(store: JobStore, name: str) -> Worker | None:
+    return next((worker for worker in store.workers() if worker.name == name), None)
+
+
+def reaches(store: JobStore, name: str, state: WorkerState) -> None:
+    wait_until(lambda: (worker := worker_of(store, name)) is not None and worker.state is state)
+
+
+def is_under_way(job: Job) -> bool:
+    return (job.progress.step or 0) > 0
+
+
+def render_job(frames: int) -> RenderJob:
+    return RenderJob(scene="demo", poses=np.tile(np.eye(4), (frames, 1, 1)), height=64, width=64)
+
+
+def test_worker_tells_who_it_is_and_what_it_does(store: JobStore, start_worker: StartWorker, until: Until) -> None:
+    running = start_worker()
+    reaches(store, "one", WorkerState.IDLE)
+    job = until(store.submit(train_job("made", steps=1_000_000))[0], is_under_way)
+    reaches(store, "one", WorkerState.WORKING)
+    worker = worker_of(store, "one")
+    assert worker is not None
+    assert (worker.pid, worker.device, worker.job) == (running.process.pid, "cpu", job.id)
+    assert worker.version
+    assert worker.started_at
+    assert worker.seconds_since_beat is not None
+    running.kill()
+    reaches(store, "one", WorkerState.LOST)
+    with pytest.raises(WorkerNotFound, match="there is no worker 'two'; known workers: one"):
+        store.want("two", Wanted.PAUSE)
+
+
+def test_paused_worker_ends_its_job_and_takes_no_other_until_it_is_resumed(
+    store: JobStore, start_worker: StartWorker, until: Until
+) -> None:
+    running = start_worker()
+    first = until(store.submit(train_job("first", steps=150))[0], is_under_way)
+    assert store.want("one", Wanted.PAUSE).state is WorkerState.PAUSING
+    second, _ = store.submit(train_job("second"))
+    assert until(first).state is JobState.SUCCEEDED
+    reaches(store, "one", WorkerState.PAUSED)
+    assert running.terminate() == 0
+    start_worker()  # a restart does not end the pause
+    reaches(store, "one", WorkerState.PAUSED)
+    assert store.get(second.id).state is JobState.QUEUED
+    assert store.get(second.id).attempts == 0
+    store.want("one", Wanted.WORK)
+    assert until(second).state is JobState.SUCCEEDED
+
+
+def test_training_of_a_drained_worker_goes_on_at_another(
+    store: JobStore, start_worker: StartWorker, until: Until
+) -> None:
+    start_worker()
+    job = until(store.submit(train_job("made", steps=1_500))[0], is_under_way)
+    store.want("one", Wanted.DRAIN)
+    reaches(store, "one", WorkerState.DRAINED)
+    assert store.get(job.id).state is JobState.QUEUED
+    start_worker("two")
+    job = until(job)
+    assert (job.state, job.worker) == (JobState.SUCCEEDED, "two"), job
+    assert "going on from a checkpoint" in store.log_tail(job.id)
+
+
+@pytest.mark.parametrize(("drain_timeout_s", "state"), [(120.0, JobState.SUCCEEDED), (0.0, JobState.QUEUED)])
+def test_job_without_checkpoints_has_its_time_when_the_worker_is_stopped(
+    drain_timeout_s: float,
+    state: JobState,
+    store: JobStore,
+    artifact_folder: Path,
+    start_worker: StartWorker,
+    until: Until,
+) -> None:
+    (artifact_folder / "scenes").mkdir()
+    copy_demo_scene(artifact_folder / "scenes" / "demo.ugr")
+    running = start_worker(drain_timeout_s=drain_timeout_s)
+    job = until(store.submit(render_job(400))[0], lambda job: (job.progress.frames or 0) > 0)
+    assert running.terminate() == 0
+    assert store.get(job.id).state is state
+
+
+def test_commands_list_pause_and_resume(store: JobStore, artifact_folder: Path, start_worker: StartWorker) -> None:
+    start_worker()
+    reaches(store, "one", WorkerState.IDLE)
+
+    def run(*arguments: str) -> Any:
+        done = subprocess.run(
+            [*COMMAND, *arguments, "--artifact-folder", str(artifact_folder)],
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+            capture_output=True,
+            text=True,
+        )
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    assert run("pause", "one") == "one paused\n"
+    (told,) = json.loads(run("list", "--json"))
+    assert (told["name"], told["state"]) == ("one", "paused")
+    assert run("resume", "one") == "one idle\n"
+    assert run("list").splitlines()[0].split()[:3] == ["name", "state", "job"]

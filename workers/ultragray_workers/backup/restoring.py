@@ -1,0 +1,161 @@
+"""The way back from a backup: every hash is checked first, nothing is overwritten unasked, and a restore can go on.
+
+From its first change to its last the artifact folder says that a restore is under way: no service and no worker opens
+it, and `ultragray restore` of the same backup goes on where an earlier one was interrupted.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import sqlalchemy as sa
+
+from ultragray.files.atomic import atomic_path, file_sha256, sync
+from ultragray.files.link import link_or_copy
+
+from ..errors import BackupInvalid, RestoreRefused
+from ..jobs.queue import unfinished
+from ..jobs.queue.database import JobDatabase
+from ..jobs.queue.tables import WORKERS
+from ..scenes import SUFFIX
+from ..store import closed_store, remove_restore_marker, restore_under_way, write_restore_marker
+from . import manifest as manifests
+from .backing_up import alone_in
+from .contents import ARTIFACTS, Folders, files_of
+from .database_copy import Database
+from .manifest import FileEntry, Manifest
+from .objects import Objects
+
+
+def restore(
+    backup_folder: Path,
+    folders: Folders,
+    database_url: str | None,
+    *,
+    name: str | None = None,
+    overwrite: bool = False,
+    say: Callable[[str], None] = lambda sentence: None,
+) -> Manifest:
+    """Makes an installation what it was at a backup (None: the newest); jobs that ran then wait again.
+
+    `overwrite`: what the folders and the database hold now is removed where the backup does not have it. Raises
+    BackupInvalid before anything is changed, RestoreRefused where there is something already or somebody at work,
+    StartupFailed and OSError.
+    """
+    manifest = manifests.read(backup_folder, name)
+    database = Database(folders.artifacts, database_url)
+    if manifest.database is not None:
+        database.check_loadable(manifest.database)
+    say(f"checking {len(manifest.objects()):,} contents of the backup {manifest.name}")
+    objects = Objects(backup_folder)
+    _check_objects(manifest, objects)
+    for folder in (folders.data, folders.artifacts):
+        folder.mkdir(parents=True, exist_ok=True)
+    with closed_store(folders.artifacts), alone_in(backup_folder):
+        if at_work := database.workers_at_work():
+            raise RestoreRefused(
+                f"workers are at work in the database: {', '.join(at_work)}; stop them first", field="database_url"
+            )
+        if restore_under_way(folders.artifacts) != manifest.name:
+            if not overwrite:
+                _require_empty(folders, database)
+            write_restore_marker(folders.artifacts, manifest.name)
+        say(f"writing {len(manifest.files):,} files")
+        _remove_others(manifest, folders, database)
+        _write_files(manifest, folders, objects)
+        if manifest.database is not None:
+            say("loading the database")
+            _load_database(manifest, database, objects)
+            _let_jobs_go_on(manifest, folders.artifacts, database_url)
+        remove_restore_marker(folders.artifacts)
+    return manifest
+
+
+def _check_objects(manifest: Manifest, objects: Objects) -> None:
+    damaged = [sha256 for sha256 in manifest.objects() if not objects.is_whole(sha256)]
+    if damaged:
+        names = [entry.path for entry in manifest.files if entry.sha256 in damaged] or ["the database"]
+        raise BackupInvalid(
+            f"{len(damaged)} contents of the backup {manifest.name} are missing or damaged, such as that of "
+            f"{names[0]}; nothing was restored. --backup names another backup of the folder"
+        )
+
+
+def _require_empty(folders: Folders, database: Database) -> None:
+    for file in files_of(folders, database.sqlite):
+        if "/" in str(file.path) or file.path.suffix == SUFFIX:
+            raise RestoreRefused(
+                f"{folders.root(file.root)} holds something already, such as {file.path}: name empty folders, or give "
+                "--overwrite to replace all that is there"
+            )
+    if database.holds_jobs():
+        raise RestoreRefused(
+            "the database holds jobs already: name an empty one, or give --overwrite to replace all that is there",
+            field="database_url",
+        )
+
+
+def _remove_others(manifest: Manifest, folders: Folders, database: Database) -> None:
+    kept = {(entry.root, entry.path) for entry in manifest.files}
+    for file in list(files_of(folders, database.sqlite)):
+        if (file.root, str(file.path)) not in kept:
+            file.source.unlink(missing_ok=True)
+
+
+def _write_files(manifest: Manifest, folders: Folders, objects: Objects) -> None:
+    scenes: dict[str, Path] = {}  # by their content: those that never change are one file under several names
+    written: set[Path] = set()
+    for entry in manifest.files:
+        target = folders.root(entry.root) / entry.path
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if not _is_there(target, entry):
+            target.unlink(missing_ok=True)
+            if entry.sha256 in scenes and entry.root == ARTIFACTS:
+                link_or_copy(scenes[entry.sha256], target)
+            else:
+                with atomic_path(target) as temporary:
+                    shutil.copyfile(objects.path(entry.sha256), temporary)
+                os.utime(target, ns=(entry.mtime_ns, entry.mtime_ns))
+        if target.suffix == SUFFIX and entry.root == ARTIFACTS:
+            scenes.setdefault(entry.sha256, target)
+        written.add(target.parent)
+    for folder in written:
+        sync(folder)
+
+
+def _is_there(target: Path, entry: FileEntry) -> bool:
+    with contextlib.suppress(OSError):
+        return target.stat().st_size == entry.bytes and file_sha256(target) == entry.sha256
+    return False
+
+
+def _load_database(manifest: Manifest, database: Database, objects: Objects) -> None:
+    assert manifest.database is not None
+    if database.sqlite is None:
+        database.load(manifest.database, objects)
+        return
+    assert manifest.database.sha256 is not None
+    for companion in ("-wal", "-shm", "-journal"):  # of the file that goes
+        Path(f"{database.sqlite}{companion}").unlink(missing_ok=True)
+    with atomic_path(database.sqlite) as temporary:
+        shutil.copyfile(objects.path(manifest.database.sha256), temporary)
+
+
+def _let_jobs_go_on(manifest: Manifest, artifact_folder: Path, database_url: str | None) -> None:
+    """Brings the tables to this release's version; what ran waits again, and what was taken away goes."""
+    jobs = JobDatabase(artifact_folder, database_url)
+    try:
+        with jobs.engine.begin() as connection:
+            connection.execute(sa.delete(WORKERS))  # of the processes of then
+        if manifest.cancelled_jobs:
+            jobs.client.cancel_workflows(list(manifest.cancelled_jobs))
+        if manifest.deleted_jobs:
+            jobs.client.delete_workflows(list(manifest.deleted_jobs))
+        for job_id, executor in unfinished.running(jobs):
+            jobs.put_back(job_id, executor)
+    finally:
+        jobs.close()

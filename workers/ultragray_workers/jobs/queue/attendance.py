@@ -1,0 +1,95 @@
+"""The workers as administrators see them, and what they want of them, by the table into which the workers beat."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from enum import Enum
+
+import sqlalchemy as sa
+
+from ultragray.contract import described
+
+from ...errors import WorkerNotFound, known_names
+from .database import JobDatabase
+from .heartbeat import DEAD_AFTER_S, now_s
+from .tables import WORKERS
+from .wishes import Wanted, wanted_of
+
+
+class WorkerState(str, Enum):
+    """The state of a worker."""
+
+    IDLE = "idle"
+    WORKING = "working"
+    PAUSING = "pausing"
+    PAUSED = "paused"
+    DRAINING = "draining"
+    DRAINED = "drained"
+    LOST = "lost"
+
+
+_STATES = {  # by what is wanted, and whether there is a job at hand
+    (Wanted.WORK, False): WorkerState.IDLE,
+    (Wanted.WORK, True): WorkerState.WORKING,
+    (Wanted.PAUSE, False): WorkerState.PAUSED,
+    (Wanted.PAUSE, True): WorkerState.PAUSING,
+    (Wanted.DRAIN, False): WorkerState.DRAINED,
+    (Wanted.DRAIN, True): WorkerState.DRAINING,
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Worker:
+    """A worker of the queue."""
+
+    name: str
+    state: WorkerState = described("lost: it has given no sign of life for 10 s, or was stopped while paused.")
+    host: str
+    pid: int
+    device: str = described("auto, cpu, cuda or cuda:N.")
+    version: str = described("Of its release.")
+    started_at: str | None = described("ISO 8601, UTC.")
+    seconds_since_beat: float | None = described("Since its last sign of life; null: it was stopped.")
+    job: str | None = described("The job at hand.")
+
+
+def list_workers(jobs: JobDatabase) -> list[Worker]:
+    """The workers that live, are wanted to rest, or were lost within a day, by name."""
+    age_s = now_s(jobs) - WORKERS.c.seen_at_s
+    with jobs.engine.begin() as connection:
+        rows = connection.execute(sa.select(WORKERS, age_s.label("age_s")).order_by(WORKERS.c.executor)).all()
+    return [_worker_of(row) for row in rows]
+
+
+def want(jobs: JobDatabase, name: str, wanted: Wanted) -> Worker:
+    """Tells a worker what is wanted of it, which it does within a second or two. Raises WorkerNotFound."""
+    kept = None if wanted is Wanted.WORK else wanted.value
+    with jobs.engine.begin() as connection:
+        connection.execute(sa.update(WORKERS).where(WORKERS.c.executor == name).values(wanted=kept))
+    workers = {worker.name: worker for worker in list_workers(jobs)}
+    if name not in workers:
+        known = known_names("worker", list(workers))
+        raise WorkerNotFound(f"there is no worker {name[:128]!r}; {known}", field="worker")
+    return workers[name]
+
+
+def _worker_of(row: sa.Row[tuple[object, ...]]) -> Worker:
+    facts = row._mapping
+    is_lost = facts["age_s"] > DEAD_AFTER_S
+    state = _STATES[wanted_of(facts["wanted"]), facts["job_id"] is not None]
+    return Worker(
+        name=facts["executor"],
+        state=WorkerState.LOST if is_lost else state,
+        host=facts["host"] or "",
+        pid=facts["pid"] or 0,
+        device=facts["device"] or "",
+        version=facts["version"] or "",
+        started_at=_iso(facts["started_at_s"]),
+        seconds_since_beat=max(0.0, round(facts["age_s"], 1)) if facts["seen_at_s"] else None,
+        job=None if is_lost else facts["job_id"],
+    )
+
+
+def _iso(epoch_s: float | None) -> str | None:
+    return None if epoch_s is None else datetime.fromtimestamp(epoch_s, timezone.utc).isoformat(timespec="seconds")

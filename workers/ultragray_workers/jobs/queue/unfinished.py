@@ -1,0 +1,97 @@
+"""The jobs that wait or run, asked for by what is needed of them only: there may be tens of thousands.
+
+Each query goes by an index of DBOS, which SQLite takes only where the statuses stand in the query itself.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import sqlalchemy as sa
+
+from ..kinds import KINDS, Specification
+from . import database
+from .database import JobDatabase
+from .internals import WORKFLOWS
+
+_ROWS = WORKFLOWS.c
+
+
+def running(jobs: JobDatabase) -> list[tuple[str, str]]:
+    """Each job that runs, with the worker that it is the job of."""
+    found = sa.select(_ROWS.workflow_uuid, _ROWS.executor_id).where(_has_status(*database.RUNNING))
+    with jobs.engine.connect() as connection:
+        return [(row[0], row[1] or "") for row in connection.execute(found)]
+
+
+def count_waiting(jobs: JobDatabase) -> int:
+    """The number of jobs that wait."""
+    counted = sa.select(sa.func.count()).select_from(WORKFLOWS).where(_has_status(*database.QUEUED))
+    with jobs.engine.connect() as connection:
+        return connection.execute(counted).scalar_one()
+
+
+def oldest_waiting_ms(jobs: JobDatabase) -> int | None:
+    """The time of submission, ms since 1970, of the job that has waited longest; None where none waits."""
+    oldest = sa.select(sa.func.min(_ROWS.created_at)).where(_has_status(*database.QUEUED))
+    with jobs.engine.connect() as connection:
+        return connection.execute(oldest).scalar()
+
+
+def count_of_owner(jobs: JobDatabase, owner: str) -> int:
+    """The number of an owner's jobs that wait or run."""
+    of_owner = sa.and_(_is_unfinished(), _ROWS.authenticated_user == owner)
+    with jobs.engine.connect() as connection:
+        return connection.execute(sa.select(sa.func.count()).select_from(WORKFLOWS).where(of_owner)).scalar_one()
+
+
+def naming(jobs: JobDatabase, role: str, name: str) -> str | None:
+    """A job that names a dataset or scene in a role, such as needs_dataset; None where there is none."""
+    fields = {kind: getattr(Specification.member(kind), role) for kind in KINDS}
+    names = [
+        sa.and_(_ROWS.name == kind, _ROWS.attributes["specification"][field].as_string() == name)
+        for kind, field in fields.items()
+        if field is not None
+    ]
+    found = sa.select(_ROWS.workflow_uuid).where(_is_unfinished(), sa.or_(*names)).limit(1)
+    with jobs.engine.connect() as connection:
+        return connection.execute(found).scalar()
+
+
+def successor(jobs: JobDatabase, job_id: str) -> str | None:
+    """A job that goes on from this one; None where there is none."""
+    found = sa.select(_ROWS.workflow_uuid).where(_is_unfinished(), _source() == job_id).limit(1)
+    with jobs.engine.connect() as connection:
+        return connection.execute(found).scalar()
+
+
+def sources(jobs: JobDatabase) -> set[str]:
+    """The jobs that others go on from."""
+    found = sa.select(_source()).where(_is_unfinished(), _source().is_not(None)).distinct()
+    with jobs.engine.connect() as connection:
+        return set(connection.execute(found).scalars())
+
+
+def adopt_older(jobs: JobDatabase) -> None:
+    """Makes jobs that wait for a worker of an older release those of this one, which can do them too."""
+    older = sa.and_(_has_status(*database.QUEUED), _ROWS.application_version.in_(database.OLDER_VERSIONS))
+    with jobs.engine.begin() as connection:
+        connection.execute(sa.update(WORKFLOWS).where(older).values(application_version=database.VERSION))
+
+
+def _source() -> sa.ColumnElement[Any]:
+    source: sa.ColumnElement[Any] = _ROWS.attributes["retry_of"].as_string()
+    return source
+
+
+def _is_unfinished() -> sa.ColumnElement[bool]:
+    either = [_written(status) for status in (*database.QUEUED, *database.RUNNING)]
+    return sa.and_(_ROWS.queue_name == database.QUEUE, _ROWS.status.in_(either))
+
+
+def _has_status(status: str) -> sa.ColumnElement[bool]:
+    return sa.and_(_ROWS.queue_name == database.QUEUE, _ROWS.status == _written(status), _is_unfinished())
+
+
+def _written(status: str) -> sa.ColumnElement[str]:
+    return sa.literal_column(f"'{status}'")
