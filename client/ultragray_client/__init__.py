@@ -21,6 +21,7 @@ from .jobs import Job, JobError, JobEvent, JobProgress, JobState
 from .scenes import ConfidenceFit, Scene, SceneEntry
 from .sync.client import Client
 from .sync.stream import FrameStream
+from .workers import Worker, WorkerState
 
 __all__ = [
     "AsyncClient",
@@ -47,6 +48,8 @@ __all__ = [
     "StreamMode",
     "Timings",
     "Tls",
+    "Worker",
+    "WorkerState",
     "errors",
 ]
 __all__ += contract.__all__

@@ -25,10 +25,12 @@ from ultragray_client import (
     SplineSampler,
     TrainingSampler,
     TrainJob,
+    WorkerState,
     errors,
 )
 
 from ..service.http.test_http_datasets import poisoned_files, released_files
+from ..waiting import wait_until
 
 SETTINGS = {"steps": 20, "max_gaussians": 40, "batch_size": 2}
 
@@ -185,3 +187,17 @@ def test_cancel_and_retry(client: Any) -> None:
         client.jobs.delete(again.id)
     client.jobs.cancel(again.id)
     client.jobs.wait(again.id)
+
+
+def test_workers_rest_and_resume(client: Any) -> None:
+    wait_until(lambda: client.workers.list())
+    (worker,) = client.workers.list()
+    assert (worker.job, worker.pid > 0, worker.device) == (None, True, "auto")
+    try:
+        assert client.workers.drain(worker.name).state is WorkerState.DRAINED
+        assert client.workers.pause(worker.name).state is WorkerState.PAUSED
+        assert client.workers.list()[0].state is WorkerState.PAUSED
+    finally:
+        assert client.workers.resume(worker.name).state is WorkerState.IDLE
+    with pytest.raises(errors.WorkerNotFound, match="there is no worker 'gone'"):
+        client.workers.pause("gone")

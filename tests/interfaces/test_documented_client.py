@@ -8,6 +8,7 @@ import ultragray_client
 from ultragray_client.sync import datasets as client_datasets
 from ultragray_client.sync import jobs as client_jobs
 from ultragray_client.sync import scenes as client_scenes
+from ultragray_client.sync import workers as client_workers
 
 from .document import call_of, table
 
@@ -29,6 +30,7 @@ def test_client_methods() -> None:
         "scenes.": client_scenes.Scenes,
         "datasets.": client_datasets.Datasets,
         "jobs.": client_jobs.Jobs,
+        "workers.": client_workers.Workers,
         "stream.": ultragray_client.FrameStream,
     }
     found = [

@@ -5,13 +5,13 @@ from __future__ import annotations
 from google.protobuf.descriptor_pb2 import DescriptorProto, FieldDescriptorProto
 
 from ultragray.errors import error_classes
-from ultragray_proto.v1 import access_pb2, datasets_pb2, geometry_pb2, jobs_pb2, rendering_pb2, scenes_pb2
+from ultragray_proto.v1 import access_pb2, datasets_pb2, geometry_pb2, jobs_pb2, rendering_pb2, scenes_pb2, workers_pb2
 from ultragray_service import rpc
 from ultragray_service.rpc import status
 
 from .document import code, headers_read, table
 
-PROTO_MODULES = (geometry_pb2, rendering_pb2, scenes_pb2, access_pb2, datasets_pb2, jobs_pb2)
+PROTO_MODULES = (geometry_pb2, rendering_pb2, scenes_pb2, access_pb2, datasets_pb2, jobs_pb2, workers_pb2)
 
 
 def declarations(message: DescriptorProto) -> list[str]:

@@ -12,7 +12,7 @@ from google.protobuf.descriptor_pb2 import DescriptorProto, FileDescriptorProto,
 from google.protobuf.descriptor_pool import DescriptorPool
 from grpc_tools import protoc
 
-from ultragray_proto.v1 import access_pb2, datasets_pb2, geometry_pb2, jobs_pb2, rendering_pb2, scenes_pb2
+from ultragray_proto.v1 import access_pb2, datasets_pb2, geometry_pb2, jobs_pb2, rendering_pb2, scenes_pb2, workers_pb2
 
 PROTO = Path(__file__).resolve().parents[2] / "proto"
 COMMITTED = PROTO / "ultragray_proto" / "v1"
@@ -58,7 +58,7 @@ def test_descriptors_are_current(tmp_path: Path) -> None:
     pool = DescriptorPool()
     for file in FileDescriptorSet.FromString(output.read_bytes()).file:  # dependencies come first
         pool.AddSerializedFile(file.SerializeToString())
-    modules = (geometry_pb2, scenes_pb2, rendering_pb2, access_pb2, datasets_pb2, jobs_pb2)
+    modules = (geometry_pb2, scenes_pb2, rendering_pb2, access_pb2, datasets_pb2, jobs_pb2, workers_pb2)
     assert len(modules) == len(sources)
     for module in modules:
         committed, expected = FileDescriptorProto(), FileDescriptorProto()

@@ -14,7 +14,7 @@ import httpx
 from google.protobuf.descriptor import Descriptor, FileDescriptor
 from pydantic import TypeAdapter
 
-from ultragray_proto.v1 import access_pb2, datasets_pb2, geometry_pb2, jobs_pb2, rendering_pb2, scenes_pb2
+from ultragray_proto.v1 import access_pb2, datasets_pb2, geometry_pb2, jobs_pb2, rendering_pb2, scenes_pb2, workers_pb2
 from ultragray_service.errors import STATUSES
 from ultragray_service.settings import Settings
 
@@ -74,7 +74,7 @@ def contract(file: FileDescriptor) -> dict[str, Any]:
 
 
 def test_grpc() -> None:
-    files = (geometry_pb2, scenes_pb2, rendering_pb2, access_pb2, datasets_pb2, jobs_pb2)
+    files = (geometry_pb2, scenes_pb2, rendering_pb2, access_pb2, datasets_pb2, jobs_pb2, workers_pb2)
     check(FOLDER / "proto.json", {module.DESCRIPTOR.name: contract(module.DESCRIPTOR) for module in files})
 
 

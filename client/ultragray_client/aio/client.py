@@ -20,6 +20,7 @@ from .datasets import AsyncDatasets
 from .jobs import AsyncJobs
 from .scenes import AsyncScenes
 from .stream import AsyncFrameStream
+from .workers import AsyncWorkers
 
 
 class AsyncClient:
@@ -51,6 +52,7 @@ class AsyncClient:
         self.scenes = AsyncScenes(self._connection)
         self.datasets = AsyncDatasets(self._connection)
         self.jobs = AsyncJobs(self._connection)
+        self.workers = AsyncWorkers(self._connection)
 
     async def render(
         self, scene: str, pose: PoseLike, settings: RenderSettings | None = None, *, timeout_s: float | None = None

@@ -21,6 +21,7 @@ from .datasets import Datasets
 from .jobs import Jobs
 from .scenes import Scenes
 from .stream import FrameStream
+from .workers import Workers
 
 
 class Client:
@@ -52,6 +53,7 @@ class Client:
         self.scenes = Scenes(self._connection)
         self.datasets = Datasets(self._connection)
         self.jobs = Jobs(self._connection)
+        self.workers = Workers(self._connection)
 
     def render(
         self, scene: str, pose: PoseLike, settings: RenderSettings | None = None, *, timeout_s: float | None = None

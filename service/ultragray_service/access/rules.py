@@ -43,8 +43,8 @@ class Operation:
         return self.role in (Role.OPERATOR, Role.ADMIN)
 
 
-_READER, _OPERATOR = Role.READER, Role.OPERATOR
-_SCENE, _DATASET, _JOB = Kind.SCENE, Kind.DATASET, Kind.JOB
+_READER, _OPERATOR, _ADMIN = Role.READER, Role.OPERATOR, Role.ADMIN
+_SCENE, _DATASET, _JOB, _WORKER = Kind.SCENE, Kind.DATASET, Kind.JOB, Kind.WORKER
 
 OPERATIONS = (
     # Frames come first: their route is the one that must be found fast.
@@ -116,7 +116,11 @@ OPERATIONS = (
     Operation("job.cancel", _OPERATOR, ("POST /v1/jobs/{job}:cancel",), ("JobService/CancelJob",), _JOB, owned=True),
     Operation("job.retry", _OPERATOR, ("POST /v1/jobs/{job}:retry",), ("JobService/RetryJob",), _JOB, owned=True),
     Operation("job.delete", _OPERATOR, ("DELETE /v1/jobs/{job}",), ("JobService/DeleteJob",), _JOB, owned=True),
-    Operation("service.watch", _READER, ("GET /v1/statistics", "GET /v1/workers", "GET /metrics")),
+    Operation("worker.list", _READER, ("GET /v1/workers",), ("WorkerService/ListWorkers",)),
+    Operation("worker.pause", _ADMIN, ("POST /v1/workers/{worker}:pause",), ("WorkerService/PauseWorker",), _WORKER),
+    Operation("worker.drain", _ADMIN, ("POST /v1/workers/{worker}:drain",), ("WorkerService/DrainWorker",), _WORKER),
+    Operation("worker.resume", _ADMIN, ("POST /v1/workers/{worker}:resume",), ("WorkerService/ResumeWorker",), _WORKER),
+    Operation("service.watch", _READER, ("GET /v1/statistics", "GET /metrics")),
     Operation("me", _READER, ("GET /v1/me",), ("AccessService/WhoAmI",)),
     Operation(
         "public",

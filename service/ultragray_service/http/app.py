@@ -30,7 +30,6 @@ from .routes import (
     comparison,
     datasets,
     health,
-    jobs,
     me,
     probes,
     render,
@@ -38,8 +37,8 @@ from .routes import (
     scenes,
     statistics,
     stream,
-    training,
 )
+from .routes.jobs import jobs, training, workers
 from .stream_messages import FrameMessage, RefusalMessage
 
 _DESCRIPTION = """B-mode frames from trained 3D-Gaussian ultrasound scenes.
@@ -66,6 +65,7 @@ _ROUTERS = (
     comparison.router,
     jobs.router,
     training.router,
+    workers.router,
     statistics.router,
     health.router,
     me.router,

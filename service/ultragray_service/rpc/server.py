@@ -19,6 +19,8 @@ from ultragray_proto.v1 import (
     rendering_pb2_grpc,
     scenes_pb2,
     scenes_pb2_grpc,
+    workers_pb2,
+    workers_pb2_grpc,
 )
 
 from ..access.rules import require_all_methods
@@ -27,12 +29,13 @@ from ..core.state import Service
 from ..settings import Settings
 from ..tls.certificates import HANDSHAKE_TIMEOUT_S, Certificates
 from ..tls.watch import CertificateWatch
-from .access import AccessService
-from .datasets import DatasetService
 from .interceptor import CallContext
-from .jobs import JobService
-from .rendering import RenderService
-from .scenes import SceneService
+from .services.access import AccessService
+from .services.datasets import DatasetService
+from .services.jobs import JobService
+from .services.rendering import RenderService
+from .services.scenes import SceneService
+from .services.workers import WorkerService
 from .traced import TracedCalls
 
 MAX_RECEIVE_BYTES = 16 * 2**20
@@ -45,12 +48,13 @@ _RENDERING = rendering_pb2.DESCRIPTOR.services_by_name["RenderService"].full_nam
 _DATASETS = datasets_pb2.DESCRIPTOR.services_by_name["DatasetService"].full_name
 _JOBS = jobs_pb2.DESCRIPTOR.services_by_name["JobService"].full_name
 _ACCESS = access_pb2.DESCRIPTOR.services_by_name["AccessService"].full_name
-SERVICE_NAMES = (_SCENES, _RENDERING, _DATASETS, _JOBS, _ACCESS)
+_WORKERS = workers_pb2.DESCRIPTOR.services_by_name["WorkerService"].full_name
+SERVICE_NAMES = (_SCENES, _RENDERING, _DATASETS, _JOBS, _ACCESS, _WORKERS)
 
 
 def _methods() -> Iterator[str]:
     """Every method of our services, as calls name them."""
-    for file in (scenes_pb2, rendering_pb2, datasets_pb2, jobs_pb2, access_pb2):
+    for file in (scenes_pb2, rendering_pb2, datasets_pb2, jobs_pb2, access_pb2, workers_pb2):
         for service in file.DESCRIPTOR.services_by_name.values():
             yield from (f"/{service.full_name}/{method.name}" for method in service.methods)
 
@@ -83,6 +87,7 @@ class GrpcServer:
         datasets_pb2_grpc.add_DatasetServiceServicer_to_server(DatasetService(service), self._server)
         jobs_pb2_grpc.add_JobServiceServicer_to_server(JobService(service), self._server)
         access_pb2_grpc.add_AccessServiceServicer_to_server(AccessService(service), self._server)
+        workers_pb2_grpc.add_WorkerServiceServicer_to_server(WorkerService(service), self._server)
         health_pb2_grpc.add_HealthServicer_to_server(self._health, self._server)
         reflection.enable_server_reflection(
             (*SERVICE_NAMES, health.SERVICE_NAME, reflection.SERVICE_NAME), self._server
@@ -110,6 +115,7 @@ class GrpcServer:
             _SCENES: parts.frames.ready,
             _DATASETS: parts.artifacts.ready,
             _JOBS: parts.jobs.ready and parts.artifacts.ready,
+            _WORKERS: parts.jobs.ready,
             _ACCESS: True,
         }
         for name, is_serving in serving.items():

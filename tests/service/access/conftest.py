@@ -32,6 +32,7 @@ class Keyed:
     service: RunningService
     keys: Mapping[str, str | None]
     client: httpx.Client  # without a key
+    artifact_folder: Path
 
     def headers(self, who: str) -> dict[str, str]:
         key = self.keys[who]
@@ -59,7 +60,7 @@ def keyed(start_service: StartService, tmp_path_factory: pytest.TempPathFactory)
     database.close()
     service = start_service(artifact_folder=folder)
     with httpx.Client(base_url=service.http, timeout=60) as client:
-        yield Keyed(service, keys, client)
+        yield Keyed(service, keys, client, folder)
 
 
 @pytest.fixture(scope="session")

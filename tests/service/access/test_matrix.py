@@ -14,7 +14,7 @@ from google.protobuf.message_factory import GetMessageClass
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
-from ultragray_proto.v1 import access_pb2, datasets_pb2, jobs_pb2, rendering_pb2, scenes_pb2
+from ultragray_proto.v1 import access_pb2, datasets_pb2, jobs_pb2, rendering_pb2, scenes_pb2, workers_pb2
 from ultragray_service.access.principal import Role
 from ultragray_service.access.rules import GRPC_OPERATIONS, WEBSOCKET, HttpRules, Operation, require_all_methods
 from ultragray_service.core.state import Service
@@ -28,7 +28,7 @@ from .conftest import ROLES, Keyed
 STRANGERS = ("nobody", "wrong", "expired", "revoked")
 METHODS: dict[str, MethodDescriptor] = {
     f"/{service.full_name}/{method.name}": method
-    for module in (scenes_pb2, rendering_pb2, datasets_pb2, jobs_pb2, access_pb2)
+    for module in (scenes_pb2, rendering_pb2, datasets_pb2, jobs_pb2, access_pb2, workers_pb2)
     for service in module.DESCRIPTOR.services_by_name.values()
     for method in service.methods
 }
@@ -57,7 +57,7 @@ def things(keyed: Keyed, scene_bytes: bytes, dataset_bytes: bytes) -> dict[str, 
     assert job.status_code == 201, job.text
     assert keyed.http("alice", "PUT", "/v1/scenes/hers", content=scene_bytes).status_code in (201, 409)
     assert keyed.http("alice", "PUT", "/v1/datasets/hers", content=dataset_bytes).status_code in (200, 201)
-    return {"scene": "hers", "dataset": "hers", "job": job.json()["id"]}
+    return {"scene": "hers", "dataset": "hers", "job": job.json()["id"], "worker": "absent"}
 
 
 def ask(keyed: Keyed, who: str, method: str, path: str) -> tuple[int, str | None]:

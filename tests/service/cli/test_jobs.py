@@ -104,7 +104,7 @@ def test_a_scene_is_trained_watched_and_served(server: RunningService, client: h
     events = client.get(f"/v1/jobs/{job}/events").text
     log = done(server, "logs", job)
     assert log
-    assert events.startswith("event: log\ndata: " + log.splitlines()[0])
+    assert events.partition("\ndata: ")[2].startswith(log.splitlines()[0])
     assert json.loads(events.rpartition("event: progress\ndata: ")[2])["state"] == "succeeded"
 
 
@@ -123,6 +123,12 @@ def test_poses_of_a_file_become_an_archive(server: RunningService, client: httpx
     listed = json.loads(done(server, "list", "--kind", "render", "--json"))
     assert [entry["id"] for entry in listed] == [job]
     assert job in done(server, "list", "--state", "succeeded")
+
+
+def test_a_job_is_private_where_that_is_said(server: RunningService, client: httpx.Client) -> None:
+    for options, private in (((), False), (("--private",), True)):
+        job = done(server, "submit", "render", "demo", "--height", "24", "--width", "16", *options).strip()
+        assert client.get(f"/v1/jobs/{job}").json()["private"] is private
 
 
 def test_a_job_that_fails_says_why_by_its_exit_code(server: RunningService, client: httpx.Client) -> None:

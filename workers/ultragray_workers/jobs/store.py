@@ -8,6 +8,7 @@ import re
 import threading
 import uuid
 from collections.abc import Callable
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 
@@ -299,9 +300,14 @@ class JobStore:
             raise ArtifactNotFound(f"the job {job_id} has no artifact {name[:128]!r}; it has {known}", field="name")
         return path
 
-    def workers(self) -> tuple[Worker, ...]:
-        """The workers of the queue, by name."""
-        return tuple(attendance.list_workers(self.database))
+    def workers(self, shown: Callable[[Ownership], bool] = lambda ownership: True) -> tuple[Worker, ...]:
+        """The workers of the queue, by name; a job at hand that is not `shown`, or gone again, is left out."""
+
+        def told(worker: Worker) -> Worker:
+            row = None if worker.job is None else self.database.workflow(worker.job)
+            return worker if row is not None and shown(ownership_of(row)) else replace(worker, job=None)
+
+        return tuple(map(told, attendance.list_workers(self.database)))
 
     def want(self, worker: str, wanted: Wanted) -> Worker:
         """The worker, which is told what is wanted of it. Raises WorkerNotFound."""

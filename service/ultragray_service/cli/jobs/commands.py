@@ -175,12 +175,15 @@ def _submit(
         typer.Option(help="A name of your own: given again, it gives the same job.", show_default=False),
     ] = None,
     priority: Annotated[int, typer.Option(min=-1000, max=1000, help="Higher ones go first.")] = 0,
+    private: Annotated[
+        bool, typer.Option("--private", help="Others see neither the job nor the scene that it makes.")
+    ] = False,
     wait: Annotated[bool, typer.Option("--wait", help="Follow the job to its end, as `jobs watch` does.")] = False,
 ) -> None:
     from .watch import follow
 
-    body = {"kind": kind, "specification": specification, "request_id": request_id, "priority": priority}
-    job, _ = client.submit(body)
+    beside = {"request_id": request_id, "priority": priority, "private": private}
+    job, _ = client.submit({"kind": kind, "specification": specification, **beside})
     typer.echo(job["id"])
     if wait:
         follow(client, job["id"])

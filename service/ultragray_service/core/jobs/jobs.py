@@ -21,6 +21,7 @@ from ultragray_workers.errors import DatabaseUnavailable, DatasetNotFound, NotRe
 from ultragray_workers.jobs.folder import JobFolder
 from ultragray_workers.jobs.kinds import Specification
 from ultragray_workers.jobs.overview import JobsOverview
+from ultragray_workers.jobs.queue.attendance import Worker
 from ultragray_workers.jobs.queue.database import JobDatabase
 from ultragray_workers.jobs.store import Job, JobState, JobStore
 from ultragray_workers.scenes import SceneStore
@@ -47,6 +48,13 @@ class JobPage:
 
     jobs: list[Job]
     next_page_token: str = described("Empty on the last page.")
+
+
+@dataclass(frozen=True)
+class WorkerList:
+    """The workers of the queue."""
+
+    workers: tuple[Worker, ...] = described("By name; also those that were lost within a day.")
 
 
 class Jobs:
@@ -149,6 +157,10 @@ class Jobs:
             page_token=page_token or None,
         )
         return JobPage(jobs, token or "")
+
+    async def workers(self) -> WorkerList:
+        """The workers, without the jobs that others keep to themselves."""
+        return WorkerList(await self.do(JobStore.workers, partial(may_see, acting())))
 
     def uses_dataset(self, name: str) -> str | None:
         """The waiting or running job that needs a dataset; blocks. Raises NotReady before the start."""

@@ -1,29 +1,17 @@
-"""The service at work: its frames, the workers that do its jobs, and Prometheus."""
+"""The service at work: its frames and its jobs in numbers, and Prometheus."""
 
 from __future__ import annotations
 
 import asyncio
-from dataclasses import dataclass
 
 from fastapi import APIRouter
 from prometheus_client import CONTENT_TYPE_LATEST
 from starlette.responses import Response
 
-from ultragray.contract import described
-from ultragray_workers.jobs.queue.attendance import Worker
-from ultragray_workers.jobs.store import JobStore
-
 from ...telemetry.statistics import ServiceStatistics, memory_bytes
 from ..deps import ServiceDep, problems
 
 router = APIRouter()
-
-
-@dataclass(frozen=True)
-class WorkerList:
-    """The workers of the queue."""
-
-    workers: tuple[Worker, ...] = described("By name; also those that were lost within a day.")
 
 
 @router.get("/v1/statistics", tags=["statistics"], responses=problems(401))
@@ -40,12 +28,6 @@ async def get_statistics(service: ServiceDep) -> ServiceStatistics:
         loaded_scenes=len(service.pool.loaded()),
         jobs={state.value: count for state, count in service.jobs.overview.counts.items()},
     )
-
-
-@router.get("/v1/workers", tags=["statistics"], responses=problems(401, 503))
-async def list_workers(service: ServiceDep) -> WorkerList:
-    """Who does the jobs, and what is at hand; `ultragray workers` pauses and resumes them."""
-    return WorkerList(await service.jobs.do(JobStore.workers))
 
 
 @router.get(

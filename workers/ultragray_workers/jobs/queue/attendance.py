@@ -51,7 +51,7 @@ class Worker:
     version: str = described("Of its release.")
     started_at: str | None = described("ISO 8601, UTC.")
     seconds_since_beat: float | None = described("Since its last sign of life; null: it was stopped.")
-    job: str | None = described("The job at hand.")
+    job: str | None = described("The job at hand; null: none, or one that is private to somebody else.")
 
 
 def list_workers(jobs: JobDatabase) -> list[Worker]:

@@ -12,11 +12,12 @@ from .tables import CHANGES, OWNERS
 
 
 class Kind(str, Enum):
-    """Things that have an owner."""
+    """Things that requests name. All but workers have an owner."""
 
     SCENE = "scene"
     DATASET = "dataset"
     JOB = "job"
+    WORKER = "worker"
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,9 @@ from typing import Any
 from fastapi import APIRouter
 from starlette.responses import Response
 
-from ...views.training import TrainingCurve
-from ..deps import ServiceDep, problems
-from ..reading.accept import PNG
+from ....views.training import TrainingCurve
+from ...deps import ServiceDep, problems
+from ...reading.accept import PNG
 from .jobs import JobId
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])

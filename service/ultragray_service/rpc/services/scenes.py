@@ -7,10 +7,10 @@ import grpc
 from ultragray_proto.codec import to_message
 from ultragray_proto.v1 import scenes_pb2
 
-from ..core import scenes
-from ..core.catalog import DEFAULT_PAGE_SIZE
-from ..core.scenes import SceneLoaded
-from ..core.state import Service
+from ...core import scenes
+from ...core.catalog import DEFAULT_PAGE_SIZE
+from ...core.scenes import SceneLoaded
+from ...core.state import Service
 
 
 class SceneService:

@@ -7,8 +7,8 @@ import grpc
 from ultragray_proto.codec import to_message
 from ultragray_proto.v1 import access_pb2
 
-from ..access.principal import me
-from ..core.state import Service
+from ...access.principal import me
+from ...core.state import Service
 
 
 class AccessService:

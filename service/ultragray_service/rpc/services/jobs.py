@@ -12,10 +12,10 @@ from ultragray_proto.v1 import jobs_pb2
 from ultragray_workers.errors import Draining
 from ultragray_workers.jobs.store import JobStore
 
-from ..core.catalog import DEFAULT_PAGE_SIZE
-from ..core.jobs.log import DEFAULT_LOG_BYTES, MAX_LOG_BYTES
-from ..core.state import Service
-from .messages import job_message, read_specification, read_word
+from ...core.catalog import DEFAULT_PAGE_SIZE
+from ...core.jobs.log import DEFAULT_LOG_BYTES, MAX_LOG_BYTES
+from ...core.state import Service
+from ..messages import job_message, read_specification, read_word
 
 _CHUNK_BYTES = 2**20
 _LOOK_AROUND_S = 15.0  # how long a watch waits for news at a time

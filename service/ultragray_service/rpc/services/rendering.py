@@ -14,12 +14,12 @@ from ultragray_proto.v1 import rendering_pb2
 from ultragray_workers.errors import QueueFull
 from ultragray_workers.pool.types import Priority, RenderResult
 
-from ..core.poses import check_pose_count, exact_poses
-from ..core.requests import Plan
-from ..core.state import Service
-from ..core.streams.stream import FrameStream
-from .messages import frame_message, read_pose, read_settings
-from .stream import CallTransport
+from ...core.poses import check_pose_count, exact_poses
+from ...core.requests import Plan
+from ...core.state import Service
+from ...core.streams.stream import FrameStream
+from ..messages import frame_message, read_pose, read_settings
+from ..stream import CallTransport
 
 _RETRY_S = 0.02
 

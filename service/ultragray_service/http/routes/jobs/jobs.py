@@ -16,15 +16,15 @@ from ultragray_workers.jobs.kinds import KINDS
 from ultragray_workers.jobs.specification import from_dict
 from ultragray_workers.jobs.store import JobStore
 
-from ...core.catalog import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE
-from ...core.jobs.jobs import JobPage
-from ...core.jobs.log import DEFAULT_LOG_BYTES, MAX_LOG_BYTES
-from ..deps import ServiceDep, problems
-from ..examples import JOB_EXAMPLES
-from ..job_events import EVENTS_TYPE, JobEvents, LastEvent
-from ..reading.accept import NPZ, PNG
-from ..reading.bodies import SPECIFICATION, JobBody
-from ..reading.json_body import body_schema, read_json_body
+from ....core.catalog import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE
+from ....core.jobs.jobs import JobPage
+from ....core.jobs.log import DEFAULT_LOG_BYTES, MAX_LOG_BYTES
+from ...deps import ServiceDep, problems
+from ...examples import JOB_EXAMPLES
+from ...job_events import EVENTS_TYPE, JobEvents, LastEvent
+from ...reading.accept import NPZ, PNG
+from ...reading.bodies import SPECIFICATION, JobBody
+from ...reading.json_body import body_schema, read_json_body
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 

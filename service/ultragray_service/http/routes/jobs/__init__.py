@@ -1,0 +1,1 @@
+"""Jobs, trainings, and the workers that do them."""

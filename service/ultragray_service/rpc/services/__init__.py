@@ -1,0 +1,1 @@
+"""The services of ultragray.v1, one module each."""
