@@ -20,6 +20,7 @@ def test_no_setting_and_no_folder_of_the_user_is_seen(working_folder: Path, home
     assert Path.home() == home_of_the_tests
 
 
+@pytest.mark.long
 def test_strange_settings_in_the_environment_do_not_matter() -> None:
     strange = {
         "ULTRAGRAY_DATA_FOLDER": "/nowhere",

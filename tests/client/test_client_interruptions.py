@@ -181,7 +181,7 @@ def test_a_deletion_that_had_worked_is_no_error(failures: list[str], is_refused:
             raise FailedCall(getattr(grpc.StatusCode, left.pop(0)), "no")
         return request
 
-    left, connection = list(failures), Connection("127.0.0.1:1", None, 60.0)
+    left, connection = list(failures), Connection("127.0.0.1:1", None, None, 60.0)
     with pytest.raises(errors.ClientError) if is_refused else nullcontext():
         connection.delete(call, "job", None)
     assert not left

@@ -96,6 +96,7 @@ def slow(start_service: StartService, scenes: Path) -> RunningService:
     return start_service(data_folder=scenes, backend="reference", max_batch_poses=1, max_queue_ms=500.0)
 
 
+@pytest.mark.long
 def test_overload_is_refused_early_and_whoever_asks_little_is_served(slow: RunningService) -> None:
     body = {"height": 80, "width": 80}
     statuses: Counter[int] = Counter()

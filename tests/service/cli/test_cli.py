@@ -79,7 +79,8 @@ def test_the_defaults_that_serve_names_are_those_of_the_settings() -> None:
         field = "threads_per_process" if name == "threads" else name
         if hasattr(Settings, field):
             default = getattr(Settings, field)
-            assert option.show_default == (False if default is None else str(default))
+            says_none = default is None or default is False  # a flag
+            assert option.show_default == (False if says_none else str(default))
             assert f"ULTRAGRAY_{field.upper()}" in option.help
 
 

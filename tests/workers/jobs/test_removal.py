@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import sqlalchemy as sa
@@ -188,10 +189,10 @@ def test_a_deletion_and_a_submission_at_once_never_both_succeed(
 
     enqueue = JobDatabase.enqueue
 
-    def delete_in_between(self: JobDatabase, *arguments: object) -> None:
+    def delete_in_between(self: JobDatabase, *arguments: Any, **options: Any) -> None:
         """The dataset was there when it was looked for, and is gone before a deletion could see the job."""
         datasets.delete("tiny")
-        enqueue(self, *arguments)  # type: ignore[arg-type]
+        enqueue(self, *arguments, **options)
 
     monkeypatch.setattr(JobDatabase, "enqueue", delete_in_between)
     with pytest.raises(DatasetNotFound):

@@ -132,7 +132,7 @@ def test_given_poses_are_assessed_where_that_is_quick(
 def test_submission_sent_again_after_a_failure_takes_the_scene_of_now(
     save: Callable[..., bytes], rendering_store: JobStore, artifact_folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def away(*arguments: Any) -> None:
+    def away(*arguments: Any, **options: Any) -> None:
         raise DatabaseUnavailable("away")
 
     save("one", seed=1)

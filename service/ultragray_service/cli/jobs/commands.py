@@ -72,14 +72,14 @@ def _with_client(command: Callable[..., None]) -> Callable[..., None]:
         from ...core.job_client import JobClient
         from ...tls.client import client_context, exposes_key
 
-        tls = client_context(ca, client_certificate, client_key)
+        client = JobClient(server, api_key, client_context(ca, client_certificate, client_key))
         if api_key is not None and exposes_key(server):
             typer.secho(
                 f"warning: the API key travels unencrypted to {server}, and whoever is on the way can read it",
                 fg=typer.colors.YELLOW,
                 err=True,
             )
-        command(JobClient(server, api_key, tls), **given)
+        command(client, **given)
 
     return with_parameters(run, [*own, *_CONNECTION])
 

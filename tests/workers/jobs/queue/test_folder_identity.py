@@ -53,6 +53,7 @@ def test_a_database_within_the_folder_is_at_home_there(store: JobStore, artifact
     assert (artifact_folder / FILE).read_text() == before
 
 
+@pytest.mark.long
 def test_a_share_that_vanishes_costs_no_job(
     store: JobStore,
     artifact_folder: Path,

@@ -109,6 +109,7 @@ def test_hosts_share_one_queue_and_one_takes_over_from_the_other(
         assert PASSWORD not in (tmp_path / f"{name}.log").read_text()
 
 
+@pytest.mark.long
 def test_training_goes_on_while_the_database_is_away(
     store: JobStore, postgres: PostgresServer, tmp_path: Path, start_worker: StartWorker, until: Until
 ) -> None:

@@ -59,6 +59,7 @@ def test_every_device_has_a_lock_of_its_own(tmp_path: Path) -> None:
     assert len({lock_path(tmp_path, device) for device in devices}) == 3
 
 
+@pytest.mark.long
 def test_who_waits_for_a_device_takes_no_job_and_another_host_does(
     store: JobStore, start_worker: StartWorker, until: Until
 ) -> None:
@@ -107,9 +108,10 @@ def test_a_stopped_worker_loses_its_job_and_its_device(
     job = until(job)
     assert (job.state, job.worker, job.attempts) == (JobState.SUCCEEDED, "two", 2), job
     assert one.process.wait(30) == -signal.SIGKILL
-    assert not Path(f"/proc/{process}").exists()
+    wait_until(lambda: not Path(f"/proc/{process}").exists())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("database_url", ["postgresql"], indirect=True)
 def test_a_worker_that_comes_back_after_its_job_was_taken_over_leaves_it_alone(
     store: JobStore, start_worker: StartWorker, until: Until

@@ -67,6 +67,7 @@ def assert_failed(job: Job, error: str, *told: str) -> None:
         assert part in job.reason
 
 
+@pytest.mark.long
 def test_poisoned_datasets_and_diverging_trainings(
     store: JobStore,
     artifact_folder: Path,

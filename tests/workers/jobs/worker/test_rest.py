@@ -79,6 +79,7 @@ def test_paused_worker_ends_its_job_and_takes_no_other_until_it_is_resumed(
     assert until(second).state is JobState.SUCCEEDED
 
 
+@pytest.mark.long
 def test_training_of_a_drained_worker_goes_on_at_another(
     store: JobStore, start_worker: StartWorker, until: Until
 ) -> None:
@@ -93,6 +94,7 @@ def test_training_of_a_drained_worker_goes_on_at_another(
     assert "going on from a checkpoint" in store.log_tail(job.id)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("drain_timeout_s", "state"), [(120.0, JobState.SUCCEEDED), (0.0, JobState.QUEUED)])
 def test_job_without_checkpoints_has_its_time_when_the_worker_is_stopped(
     drain_timeout_s: float,

@@ -231,11 +231,13 @@ class Supervisor:
         with job_process(folder, device, self._config.threads) as process:
             watchdog = Watchdog(process.pid, self._config.stall_timeout_s)
             watched_at_s = float("-inf")
+            is_given_back = False
             try:
                 while process.poll() is None:
                     if self._stop.is_set() and (self._goes_on_elsewhere or time.monotonic() > self._stop_by_s):
                         end_with_checkpoint(process)
-                        self._give_back(folder.job_id)
+                        is_given_back = True
+                        break
                     if self.is_draining and self._goes_on_elsewhere:
                         end_with_checkpoint(process)
                         self._leave_to_others(folder.job_id)
@@ -255,7 +257,10 @@ class Supervisor:
                     self._moved_at_s = time.monotonic()
                     time.sleep(_POLL_INTERVAL_S)
             finally:
+                run_time.add(watchdog.look())
                 run_time.save()
+            if is_given_back:
+                self._give_back(folder.job_id)
         return process.returncode
 
     def _publish(self, folder: JobFolder, scene: str) -> None:
