@@ -7,6 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from ultragray_service.settings import Settings, load_settings
 
 from .surroundings import ROOT

@@ -59,7 +59,7 @@ def cut_off_hint(server: str, error: object) -> str:
 def exposes_key(server: str) -> bool:
     """Whether others on the way to the URL can read a key that is sent there."""
     parts = urlsplit(server)
-    if parts.scheme != "http" or parts.hostname == "localhost":
+    if parts.scheme == "https" or parts.hostname == "localhost":
         return False
     try:
         return not ipaddress.ip_address(parts.hostname or "").is_loopback

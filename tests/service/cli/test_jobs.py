@@ -105,7 +105,7 @@ def test_a_scene_is_trained_watched_and_served(server: RunningService, client: h
     log = done(server, "logs", job)
     assert log
     assert events.partition("\ndata: ")[2].startswith(log.splitlines()[0])
-    assert json.loads(events.rpartition("event: progress\ndata: ")[2])["state"] == "succeeded"
+    assert json.loads(events.rpartition("\ndata: ")[2])["state"] == "succeeded"
 
 
 def test_poses_of_a_file_become_an_archive(server: RunningService, client: httpx.Client, tmp_path: Path) -> None:
@@ -121,7 +121,7 @@ def test_poses_of_a_file_become_an_archive(server: RunningService, client: httpx
     assert pictures == [f"{number:06d}.bmode.png" for number in range(3)]
     assert client.get(f"/v1/jobs/{job}/artifacts/{name}").headers["content-type"] == "application/x-tar"
     listed = json.loads(done(server, "list", "--kind", "render", "--json"))
-    assert [entry["id"] for entry in listed] == [job]
+    assert job in {entry["id"] for entry in listed}
     assert job in done(server, "list", "--state", "succeeded")
 
 
