@@ -25,10 +25,10 @@ from ultragray.outputs import PLANES
 from ultragray.probe import FloatArray
 from ultragray.scene import PARAMETERS
 
-from .postgres import postgres
+from .postgres import new_database, postgres
 from .surroundings import ROOT, forget_the_users_environment, home_of_the_tests, working_folder
 
-__all__ = ["home_of_the_tests", "postgres", "working_folder"]
+__all__ = ["home_of_the_tests", "new_database", "postgres", "working_folder"]
 
 if not torch.cuda.is_available():
     os.environ.setdefault("TRITON_INTERPRET", "1")  # before any kernel is imported: they run on the CPU then

@@ -10,7 +10,7 @@ import socket
 import subprocess
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from urllib.parse import quote
 
@@ -20,6 +20,8 @@ from psycopg import sql
 from typing_extensions import LiteralString
 
 from .waiting import Deadline
+
+NewDatabase = Callable[[], str | None]
 
 PASSWORD = "s3cret/with@signs"
 _START_TIMEOUT_S = 120.0
@@ -153,6 +155,15 @@ def postgres() -> Iterator[PostgresServer]:
     server = PostgresServer()
     yield server
     server.remove()
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def new_database(request: pytest.FixtureRequest) -> NewDatabase:
+    """Makes the URL of an empty database; None: a SQLite file in the artifact folder."""
+    if request.param == "sqlite":
+        return lambda: None
+    server: PostgresServer = request.getfixturevalue("postgres")
+    return server.create_database
 
 
 def _program_folder() -> Path:

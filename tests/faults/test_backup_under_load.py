@@ -22,7 +22,7 @@ from ultragray.demo import copy_demo_scene
 from ultragray_workers.backup.contents import Folders
 from ultragray_workers.jobs.folder import JobFolder
 
-from ..postgres import PostgresServer
+from ..postgres import NewDatabase
 from ..waiting import wait_until
 from ..workers.jobs.conftest import store_dataset
 from .machine import Machine
@@ -128,14 +128,6 @@ class Load:
         client.delete(f"/v1/scenes/{name}")
 
 
-@pytest.fixture(params=["sqlite", "postgresql"])
-def new_database(request: pytest.FixtureRequest) -> Callable[[], str | None]:
-    if request.param == "sqlite":
-        return lambda: None
-    server: PostgresServer = request.getfixturevalue("postgres")
-    return server.create_database
-
-
 @pytest.fixture
 def machines(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -156,7 +148,7 @@ def machines(
 @pytest.mark.long
 def test_service_that_was_lost_at_work_goes_on_elsewhere(
     machines: Callable[[str, str | None], tuple[Machine, Folders]],
-    new_database: Callable[[], str | None],
+    new_database: NewDatabase,
     tmp_path: Path,
 ) -> None:
     url = new_database()

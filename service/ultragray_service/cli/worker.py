@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import os
 import signal
 import sys
@@ -13,12 +12,11 @@ import typer
 
 from ultragray.errors import UltragrayError
 from ultragray_workers.errors import StartupFailed
+from ultragray_workers.parent import end_with_parent
 
 from ..service_manager import ALIVE, READY, ServiceManager
 from ..settings import ENVIRONMENT_PREFIX, Settings, load_settings
 from .options import FieldsOf, with_options
-
-_PR_SET_PDEATHSIG = 1
 
 
 @with_options
@@ -90,7 +88,7 @@ def run_worker(overrides: dict[str, Any], *, name: str | None = None, device: st
 
 def main(service_pid: str) -> int:
     """The worker within `ultragray serve`, which it does not outlive."""
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+    end_with_parent(signal.SIGTERM)
     if os.getppid() != int(service_pid):
         return 1
     try:

@@ -23,18 +23,15 @@ from ultragray_workers.jobs.queue import tables
 from ultragray_workers.jobs.queue.database import JobDatabase
 from ultragray_workers.jobs.queue.owners import Ownership
 
-from ...postgres import PostgresServer
+from ...postgres import NewDatabase, PostgresServer
 from ...waiting import wait_until
 from ..cli.command_line import run
 from ..conftest import StartService
 
 
-@pytest.fixture(params=["sqlite", "postgresql"])
-def database_url(request: pytest.FixtureRequest) -> str | None:
-    if request.param == "sqlite":
-        return None
-    server: PostgresServer = request.getfixturevalue("postgres")
-    return server.create_database()
+@pytest.fixture
+def database_url(new_database: NewDatabase) -> str | None:
+    return new_database()
 
 
 @pytest.fixture

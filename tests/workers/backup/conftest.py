@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -13,20 +13,12 @@ from ultragray_workers.jobs.queue.database import JobDatabase
 from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.scenes import SceneStore
 
+from ...postgres import NewDatabase
 from ..jobs.conftest import store_dataset
 
 
-@pytest.fixture(params=["sqlite", "postgresql"])
-def new_database(request: pytest.FixtureRequest) -> Callable[[], str | None]:
-    """The URL of an empty database; None: a SQLite file in the artifact folder."""
-    if request.param == "sqlite":
-        return lambda: None
-    create: Callable[[], str] = request.getfixturevalue("postgres").create_database
-    return create
-
-
 @pytest.fixture
-def database_url(new_database: Callable[[], str | None]) -> str | None:
+def database_url(new_database: NewDatabase) -> str | None:
     return new_database()
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import fcntl
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +25,8 @@ from ultragray_workers.jobs.queue.internals import WORKFLOWS
 from ultragray_workers.jobs.store import Job, JobState, JobStore
 from ultragray_workers.scenes import SceneStore
 
-NewDatabase = Callable[[], str | None]
+from ...postgres import NewDatabase
+
 ODD = "tab\there, line\nbreak, back\\slash, \\N, ünï©ode 🩻, 'quotes' \"both\""
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +17,8 @@ from ultragray_workers.jobs.queue import tables
 from ultragray_workers.jobs.queue.database import JobDatabase
 from ultragray_workers.jobs.store import JobStore
 
+from ...postgres import NewDatabase
 from .test_backup import contents, submit
-
-NewDatabase = Callable[[], str | None]
 
 
 def test_nothing_is_overwritten_unasked(

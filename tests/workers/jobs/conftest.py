@@ -20,6 +20,7 @@ from ultragray.datasets.released import write_released
 from ultragray.datasets.sweep import Dataset, Sweep
 from ultragray_workers.datasets.store import FILES_NAME, DatasetRecord, write_manifest
 from ultragray_workers.jobs.kinds import TrainJob
+from ultragray_workers.jobs.queue.database import JobDatabase
 from ultragray_workers.jobs.store import Job, JobState, JobStore
 
 from ...waiting import Deadline
@@ -138,6 +139,13 @@ def artifact_folder(tmp_path: Path) -> Path:
 def database_url() -> str | None:
     """None: a SQLite file."""
     return None
+
+
+@pytest.fixture
+def jobs(artifact_folder: Path, database_url: str | None) -> Iterator[JobDatabase]:
+    jobs = JobDatabase(artifact_folder, database_url)
+    yield jobs
+    jobs.close()
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -23,23 +23,13 @@ from ultragray_workers.jobs.store import Job, JobState, JobStore
 from ultragray_workers.jobs.worker import housekeeping
 from ultragray_workers.jobs.worker.housekeeping import DAY_S, Housekeeper
 
-from ...postgres import PostgresServer
+from ...postgres import NewDatabase
 from .conftest import train_job
 
 
-@pytest.fixture(params=["sqlite", "postgresql"])
-def database_url(request: pytest.FixtureRequest) -> str | None:
-    if request.param == "sqlite":
-        return None
-    server: PostgresServer = request.getfixturevalue("postgres")
-    return server.create_database()
-
-
 @pytest.fixture
-def jobs(artifact_folder: Path, database_url: str | None) -> Iterator[JobDatabase]:
-    jobs = JobDatabase(artifact_folder, database_url)
-    yield jobs
-    jobs.close()
+def database_url(new_database: NewDatabase) -> str | None:
+    return new_database()
 
 
 @pytest.fixture

@@ -30,18 +30,15 @@ from ultragray_workers.jobs.queue.database import checked_url
 from ultragray_workers.jobs.store import JobState, JobStore
 from ultragray_workers.scenes import SceneStore
 
-from ...postgres import PostgresServer
+from ...postgres import NewDatabase
 from .conftest import train_job
 
 TRAINING_POSES = TrainingSampler()
 
 
-@pytest.fixture(params=["sqlite", "postgresql"])
-def database_url(request: pytest.FixtureRequest) -> str | None:
-    if request.param == "sqlite":
-        return None
-    server: PostgresServer = request.getfixturevalue("postgres")
-    return server.create_database()
+@pytest.fixture
+def database_url(new_database: NewDatabase) -> str | None:
+    return new_database()
 
 
 def test_submitted_job_waits(store: JobStore) -> None:

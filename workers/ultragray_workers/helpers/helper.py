@@ -7,7 +7,6 @@ must be until the work begins.
 
 from __future__ import annotations
 
-import ctypes
 import json
 import os
 import resource
@@ -19,15 +18,15 @@ from pathlib import Path
 from ultragray.errors import MemoryExceeded, UltragrayError
 
 from ..claims import storage_full
+from ..parent import end_with_parent
 
 PROGRESS_NAME = "progress"  # in the folder that a process fills
 NICE_LEVEL = 10
-_PR_SET_PDEATHSIG = 1
 
 
 def answer_request(work: Callable[..., None]) -> None:
     """Do the work with the arguments on stdin. The process ends with its parent."""
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    end_with_parent(signal.SIGKILL)
     os.nice(NICE_LEVEL)
     request = json.loads(sys.stdin.buffer.read())
     memory_bytes, what = request["memory_bytes"], request["what"]

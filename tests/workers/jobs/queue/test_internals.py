@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -15,23 +14,13 @@ from ultragray_workers.jobs.queue.database import QUEUE, SERIALIZER, JobDatabase
 from ultragray_workers.jobs.queue.internals import SQLITE_ISOLATION, SQLITE_SETTINGS, WORKFLOWS, put_back
 from ultragray_workers.jobs.store import JobState, JobStore
 
-from ....postgres import PostgresServer
+from ....postgres import NewDatabase
 from ..conftest import RunningWorker, train_job
 
 
-@pytest.fixture(params=["sqlite", "postgresql"])
-def database_url(request: pytest.FixtureRequest) -> str | None:
-    if request.param == "sqlite":
-        return None
-    server: PostgresServer = request.getfixturevalue("postgres")
-    return server.create_database()
-
-
 @pytest.fixture
-def jobs(artifact_folder: Path, database_url: str | None) -> Iterator[JobDatabase]:
-    jobs = JobDatabase(artifact_folder, database_url)
-    yield jobs
-    jobs.close()
+def database_url(new_database: NewDatabase) -> str | None:
+    return new_database()
 
 
 def test_the_columns_are_those_of_the_table(jobs: JobDatabase) -> None:
@@ -66,7 +55,7 @@ def test_only_a_running_job_of_that_worker_is_put_back(jobs: JobDatabase, store:
     assert store.get(job.id).state is JobState.CANCELLED
 
 
-@pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)
+@pytest.mark.parametrize("new_database", ["sqlite"], indirect=True)
 def test_our_engine_is_set_up_like_the_one_that_dbos_makes(jobs: JobDatabase) -> None:
     theirs = DBOSClient(system_database_url=jobs.url, serializer=SERIALIZER)
     for engine in (jobs.engine, theirs._sys_db.engine):
@@ -77,7 +66,7 @@ def test_our_engine_is_set_up_like_the_one_that_dbos_makes(jobs: JobDatabase) ->
     theirs.destroy()
 
 
-@pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)
+@pytest.mark.parametrize("new_database", ["sqlite"], indirect=True)
 def test_an_interrupted_execution_is_no_end_of_its_job(
     store: JobStore, start_worker: Callable[..., RunningWorker], until: Callable[..., Any]
 ) -> None:

@@ -14,7 +14,7 @@ from ultragray_workers.jobs.queue import tables
 from ultragray_workers.jobs.queue.database import JobDatabase
 from ultragray_workers.jobs.queue.internals import SCHEMA
 
-from ....postgres import PostgresServer
+from ....postgres import NewDatabase
 
 STARTS = 4
 OPEN = """
@@ -27,12 +27,9 @@ JobDatabase(Path(sys.argv[1]), sys.argv[2] or None).close()
 """
 
 
-@pytest.fixture(params=["sqlite", "postgresql"])
-def database_url(request: pytest.FixtureRequest) -> str | None:
-    if request.param == "sqlite":
-        return None
-    server: PostgresServer = request.getfixturevalue("postgres")
-    return server.create_database()
+@pytest.fixture
+def database_url(new_database: NewDatabase) -> str | None:
+    return new_database()
 
 
 def test_processes_that_open_a_new_database_at_once_all_find_its_tables(

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -14,23 +13,13 @@ from ultragray_workers.jobs.queue.database import JobDatabase
 from ultragray_workers.jobs.queue.internals import WORKFLOWS
 from ultragray_workers.jobs.store import JobStore
 
-from ....postgres import PostgresServer
+from ....postgres import NewDatabase
 from ..conftest import train_job
 
 
-@pytest.fixture(params=["sqlite", "postgresql"])
-def database_url(request: pytest.FixtureRequest) -> str | None:
-    if request.param == "sqlite":
-        return None
-    server: PostgresServer = request.getfixturevalue("postgres")
-    return server.create_database()
-
-
 @pytest.fixture
-def jobs(artifact_folder: Path, database_url: str | None) -> Iterator[JobDatabase]:
-    jobs = JobDatabase(artifact_folder, database_url)
-    yield jobs
-    jobs.close()
+def database_url(new_database: NewDatabase) -> str | None:
+    return new_database()
 
 
 def test_answers(jobs: JobDatabase, store: JobStore) -> None:

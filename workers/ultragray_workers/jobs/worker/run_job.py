@@ -7,7 +7,6 @@ that cannot be used (a share that has gone) with FOLDER_LOST: it may be started 
 
 from __future__ import annotations
 
-import ctypes
 import fcntl
 import os
 import signal
@@ -21,19 +20,19 @@ from pathlib import Path
 from ultragray.errors import InvalidArgument, MemoryExceeded, UltragrayError
 
 from ...claims import is_no_room, storage_full
+from ...parent import end_with_parent
 from ..folder import JobFolder, Outcome
 from ..specification import from_dict
 from .job_run import JobRun, Stopped
 
 STOPPED, STORAGE_FULL, FOLDER_LOST = 75, 73, 74
-_PR_SET_PDEATHSIG = 1
 _LOCK_POLL_S = 0.2
 _OOM_SCORE_ADJ = "500"  # of 1000: where memory runs out, jobs go before the service and its workers
 
 
 def main(folder_path: str, worker_pid: str) -> int:
     """The exit code: 0 where outcome.json says how the job ended."""
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    end_with_parent(signal.SIGKILL)
     if os.getppid() != int(worker_pid):  # it died before the line above
         return STOPPED
     received: list[int] = []
