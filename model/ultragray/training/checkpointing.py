@@ -81,6 +81,8 @@ def _header(text: str) -> CheckpointHeader:
         header = CheckpointHeader(**{**document, "config": TrainingConfig.from_dict(document["config"])})
     except InvalidArgument as error:
         raise ValueError(error.detail) from error
+    if header.config.max_gaussians is None:
+        raise ValueError("its max_gaussians is null, expected a number")
     if type(header.step) is not int or not 1 <= header.step <= (header.config.steps or 0):
         raise ValueError(f"its step is {header.step!r}, expected 1 to {header.config.steps}")
     if not isinstance(header.elapsed_s, (int, float)) or not 0.0 <= header.elapsed_s < math.inf:

@@ -22,7 +22,9 @@ from ultragray.training.checkpointing import (
     write_checkpoint,
 )
 
-HEADER = CheckpointHeader(step=7, elapsed_s=1.5, dataset_sha256="ab" * 32, config=TrainingConfig(steps=9))
+HEADER = CheckpointHeader(
+    step=7, elapsed_s=1.5, dataset_sha256="ab" * 32, config=TrainingConfig(steps=9, max_gaussians=40)
+)
 
 
 def test_round_trip(tmp_path: Path) -> None:
@@ -60,8 +62,9 @@ def test_refuses_what_is_no_checkpoint(tmp_path: Path) -> None:
         ({"elapsed_s": math.nan}, "its elapsed_s is nan, expected seconds"),
         ({"elapsed_s": "1"}, "its elapsed_s is '1', expected seconds"),
         ({"dataset_sha256": 5}, "its dataset_sha256 is 5, expected text"),
-        ({"config": {"steps": 9, "colour": 1}}, "a training has no setting colour"),
+        ({"config": {"steps": 9, "max_gaussians": 40, "colour": 1}}, "a training has no setting colour"),
         ({"config": 3}, "int"),
+        ({"config": {"steps": 9}}, "its max_gaussians is null, expected a number"),
     ],
 )
 def test_refuses_a_header_that_no_run_wrote(tmp_path: Path, changes: dict[str, object], reason: str) -> None:
