@@ -50,7 +50,9 @@ ClientError
 │   ├── MemoryExceeded
 │   ├── JobQueueFull
 │   ├── SceneTooLarge
-│   └── QueueFull
+│   ├── QueueFull
+│   ├── RateLimited
+│   └── LimitReached
 ├── JobStalled
 ├── Unimplemented
 │   ├── BackendUnavailable
@@ -374,6 +376,18 @@ class QueueFull(ResourceExhausted):
     reason = "QUEUE_FULL"
 
 
+class RateLimited(ResourceExhausted):
+    """More requests or frames in a second than the key may have; retry."""
+
+    reason = "RATE_LIMITED"
+
+
+class LimitReached(ResourceExhausted):
+    """As many streams, jobs, minutes of compute or bytes as the key may have; end or delete some, or wait."""
+
+    reason = "LIMIT_REACHED"
+
+
 class JobStalled(ClientError):
     """The process of a job neither computed nor read nor wrote for `ULTRAGRAY_JOB_STALL_TIMEOUT_S`, and was ended."""
 
@@ -482,6 +496,8 @@ ERRORS = (
     JobQueueFull,
     SceneTooLarge,
     QueueFull,
+    RateLimited,
+    LimitReached,
     JobStalled,
     Unimplemented,
     BackendUnavailable,

@@ -39,19 +39,20 @@ class UltragrayError(Exception):
 
     reason: ClassVar[str] = "INTERNAL"
     title: ClassVar[str] = "Internal error"
-    retry_after_s: float | None = None  # when the same request may succeed, where the one who raises it knows
 
-    def __init__(self, detail: str, *, field: str | None = None) -> None:
+    def __init__(self, detail: str, *, field: str | None = None, retry_after_s: float | None = None) -> None:
+        """`retry_after_s`: when the same request may succeed, where the one who raises it knows."""
         super().__init__(detail)
         self.detail = detail
         self.field = field
+        self.retry_after_s = retry_after_s
 
     def __reduce__(self) -> tuple[object, ...]:  # crosses the pipe from a worker unchanged
-        return _rebuild, (type(self), self.detail, self.field)
+        return _rebuild, (type(self), self.detail, self.field, self.retry_after_s)
 
 
-def _rebuild(cls: type[UltragrayError], detail: str, field: str | None) -> UltragrayError:
-    return cls(detail, field=field)
+def _rebuild(cls: type[UltragrayError], detail: str, field: str | None, retry_after_s: float | None) -> UltragrayError:
+    return cls(detail, field=field, retry_after_s=retry_after_s)
 
 
 def error_classes(base: type[UltragrayError] = UltragrayError) -> Iterator[type[UltragrayError]]:

@@ -29,6 +29,20 @@ class PermissionDenied(UltragrayError):
     title = "Not allowed to this key"
 
 
+class RateLimited(UltragrayError):
+    """More requests or frames in a second than the key may have; retry."""
+
+    reason = "RATE_LIMITED"
+    title = "Too many in a second for this key"
+
+
+class LimitReached(UltragrayError):
+    """As many streams, jobs, minutes of compute or bytes as the key may have; end or delete some, or wait."""
+
+    reason = "LIMIT_REACHED"
+    title = "This key has as much as it may"
+
+
 class HostRefused(UltragrayError):
     """A `Host` that the service is not known as, where it asks for no key."""
 
@@ -206,6 +220,8 @@ STATUSES = {  # by the reason of the error
     "BACKEND_UNAVAILABLE": Statuses(501, "UNIMPLEMENTED"),
     "EXTRA_MISSING": Statuses(501, "UNIMPLEMENTED"),
     "QUEUE_FULL": Statuses(429, "RESOURCE_EXHAUSTED", retry_after_s=1),
+    "RATE_LIMITED": Statuses(429, "RESOURCE_EXHAUSTED", retry_after_s=1),
+    "LIMIT_REACHED": Statuses(429, "RESOURCE_EXHAUSTED"),
     "DEADLINE_EXCEEDED": Statuses(504, "DEADLINE_EXCEEDED"),
     "NOT_READY": Statuses(503, "UNAVAILABLE", retry_after_s=1),
     "DRAINING": Statuses(503, "UNAVAILABLE", retry_after_s=1),

@@ -14,6 +14,7 @@ from ultragray_workers.jobs.kinds.base import MAX_RUN_S
 from ultragray_workers.pool.pool import MAX_BATCH_POSES
 
 from .access.addresses import parse_allowed
+from .access.limits.allowance import NAMES, Allowance, of_key
 from .access.oidc.claims import check_url, parse_roles
 
 ENVIRONMENT_PREFIX = "ULTRAGRAY_"
@@ -224,6 +225,12 @@ class Settings(Contract):
     oidc_ca: Path | None = described(
         "PEM file of authorities that sign the issuer's certificate; none: those that the system trusts.", None
     )
+    key_requests_per_s: int | None = of_key("requests_per_s")
+    key_frames_per_s: int | None = of_key("frames_per_s")
+    key_streams: int | None = of_key("streams")
+    key_unfinished_jobs: int | None = of_key("unfinished_jobs")
+    key_compute_minutes_per_day: float | None = of_key("compute_minutes_per_day")
+    key_stored_gb: float | None = of_key("stored_gb")
     insecure: bool = described(
         "Whether other machines are served even without any API key: whoever reaches the address is an admin.",
         False,
@@ -258,6 +265,11 @@ class Settings(Contract):
             raise InvalidArgument(f"api_keys must have at least {LEAST_KEY_LENGTH} characters each", field="api_keys")
         if not all(key.isascii() for key in self.api_keys):
             raise InvalidArgument("api_keys must be of ASCII characters, as gRPC carries no others", field="api_keys")
+
+    @property
+    def allowance(self) -> Allowance:
+        """How much a key may take that has no limits of its own."""
+        return Allowance(**{name: getattr(self, f"key_{name}") for name in NAMES})
 
     @property
     def artifacts(self) -> Path:

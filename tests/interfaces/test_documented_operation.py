@@ -79,6 +79,7 @@ def test_metrics(service: Service) -> None:
     service.metrics.count_request("http", "/", "200", 0.1)
     service.metrics.count_frame_error(QueueFull("all places are taken"))
     service.metrics.observe_result(rendered())
+    service.metrics.count_limited("streams")
     service.jobs.overview = JobsOverview({JobState.QUEUED: 1}, {WorkerState.IDLE: 1})
     found = {}
     for metric in service.metrics.registry.collect():

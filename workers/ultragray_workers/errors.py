@@ -155,10 +155,6 @@ class QueueFull(UltragrayError):
     reason = "QUEUE_FULL"
     title = "Too much is waiting"
 
-    def __init__(self, detail: str, *, field: str | None = None, retry_after_s: float | None = None) -> None:
-        super().__init__(detail, field=field)
-        self.retry_after_s = retry_after_s
-
 
 class DeadlineExceeded(UltragrayError):
     """The deadline passed first."""

@@ -25,7 +25,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from ultragray.errors import UltragrayError
 from ultragray_workers.jobs.queue.tables import AUDIT
 
-from ..errors import PermissionDenied, Unauthenticated
+from ..errors import LimitReached, PermissionDenied, RateLimited, Unauthenticated
 from .rules import Operation
 
 OK = "OK"
@@ -37,6 +37,7 @@ TALLY_INTERVAL_S = 60.0
 MAX_WAITING = 10_000  # entries, while the database is away
 _MAX_TALLIES = 1000  # of one interval; more are told as one
 _BATCH = 500
+_COUNTED = {error.reason for error in (PermissionDenied, Unauthenticated, RateLimited, LimitReached)}
 _LONGEST = 256  # characters of what clients name
 
 _log = logging.getLogger("ultragray.audit")
@@ -114,6 +115,15 @@ class AuditLog:
             self._tallies[entry] = (seen or 0) + 1
 
     @contextmanager
+    def refusals(self, who: str, address: str, operation: Operation, target: str) -> Iterator[None]:
+        """Counts what the body refuses, before there is anything to tell of."""
+        try:
+            yield
+        except UltragrayError as error:
+            self.count(Entry(who, address, operation.name, target, error.reason))
+            raise
+
+    @contextmanager
     def request(self, who: str, address: str, operation: Operation, target: str) -> Iterator[Account]:
         """Tells of what the body does, or counts it. The body says in its account what became of it."""
         mine, began_s = Account(target), time.monotonic()
@@ -135,7 +145,7 @@ class AuditLog:
                 self.tell(
                     replace(entry, facts={"frames": mine.frames, "seconds": round(time.monotonic() - began_s, 1)})
                 )
-            elif operation.changes and mine.result not in (PermissionDenied.reason, Unauthenticated.reason):
+            elif operation.changes and mine.result not in _COUNTED:
                 self.tell(entry)
             else:
                 self.count(entry)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import re
 import secrets
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import sqlalchemy as sa
 
@@ -17,12 +19,14 @@ from ultragray_workers.jobs.queue.tables import KEYS
 
 from ..errors import Unauthenticated
 from .guard import digest_of
+from .limits.allowance import Number
 from .principal import Principal, Role
 
 _PREFIX = "ultragray_"  # so that people, and those who search files for secrets, know one when they see it
 _RANDOM_BYTES = 32
 _ID_BYTES = 4
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._@-]{0,63}")  # no colon: see Principal
+NO_LIMITS: Mapping[str, Number | None] = MappingProxyType({})
 _DAY_S = 86_400.0
 
 
@@ -37,6 +41,7 @@ class Key:
     expires_at_s: float | None = None
     revoked_at_s: float | None = None
     last_used_at_s: float | None = described("To the minute or so.", None)
+    limits: Mapping[str, Number | None] = described("Its own, in place of those of all keys.", factory=dict)
 
     def is_valid(self, now_s: float) -> bool:
         """Whether it opens the doors."""
@@ -49,7 +54,9 @@ class KeyStore:
     def __init__(self, engine: sa.Engine) -> None:
         self._engine = engine
 
-    def create(self, name: str, role: Role, expires_days: float | None) -> tuple[Key, str]:
+    def create(
+        self, name: str, role: Role, expires_days: float | None, limits: Mapping[str, Number | None] = NO_LIMITS
+    ) -> tuple[Key, str]:
         """A new key and its secret, which nobody can read again. Raises InvalidArgument for a name that none may have.
 
         One name may have several keys: the new one while the old one is replaced.
@@ -62,7 +69,14 @@ class KeyStore:
         now_s = time.time()
         secret = _PREFIX + secrets.token_urlsafe(_RANDOM_BYTES)
         expires_at_s = None if expires_days is None else now_s + expires_days * _DAY_S
-        key = Key(id=secrets.token_hex(_ID_BYTES), name=name, role=role, created_at_s=now_s, expires_at_s=expires_at_s)
+        key = Key(
+            id=secrets.token_hex(_ID_BYTES),
+            name=name,
+            role=role,
+            created_at_s=now_s,
+            expires_at_s=expires_at_s,
+            limits=dict(limits),
+        )
         with self._engine.begin() as connection:
             connection.execute(
                 sa.insert(KEYS).values(
@@ -72,6 +86,7 @@ class KeyStore:
                     role=role.value,
                     created_at_s=now_s,
                     expires_at_s=expires_at_s,
+                    limits=json.dumps(key.limits) if limits else None,
                 )
             )
             tell_change(connection)
@@ -121,6 +136,7 @@ def read_keys(connection: sa.Connection) -> dict[bytes, Key]:
             expires_at_s=row.expires_at_s,
             revoked_at_s=row.revoked_at_s,
             last_used_at_s=row.last_used_at_s,
+            limits=json.loads(row.limits or "{}"),
         )
         for row in rows
     }
@@ -141,7 +157,7 @@ class KnownKeys:
     def replace(self, keys: Mapping[bytes, Key]) -> None:
         """From now on these are the keys. May be called from any thread."""
         self._principals = {
-            digest: Principal(key.name, key.role, key.id, key.expires_at_s)
+            digest: Principal(key.name, key.role, key.id, key.expires_at_s, tuple(key.limits.items()))
             for digest, key in keys.items()
             if key.revoked_at_s is None
         }

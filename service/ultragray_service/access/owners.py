@@ -48,6 +48,11 @@ class Owners:
         """Whose a dataset or scene is."""
         return self._known.get((kind, name), NOBODYS)
 
+    def owned(self, kind: Kind, owner: str) -> list[str]:
+        """The datasets or scenes of an owner. May be called from any thread."""
+        with self._changing:
+            return [name for (one, name), whose in self._known.items() if one is kind and whose.owner == owner]
+
     async def of(self, kind: Kind, name: str) -> Ownership:
         """Whose something is. Raises JobNotFound."""
         return await self._of_job(name) if kind is Kind.JOB else self.known(kind, name)

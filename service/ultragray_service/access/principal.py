@@ -10,6 +10,8 @@ from enum import Enum
 from ultragray.contract import described
 from ultragray_workers.pool.fairness.turns import Caller
 
+from .limits.allowance import Number
+
 
 class Role(str, Enum):
     """The roles, least first: each may do all that those before it may."""
@@ -38,6 +40,7 @@ class Principal:
     role: Role
     source: str  # what vouches for it: the id of a key, or the kind of source
     expires_at_s: float | None = None  # time.time() in seconds, from which on it counts no more; None: never
+    limits: tuple[tuple[str, Number | None], ...] = ()  # its own, by the names of an Allowance
 
 
 LOCAL = Principal("local:", Role.ADMIN, "open")  # everybody, where no keys are asked for

@@ -18,6 +18,7 @@ from ultragray_workers.errors import Draining, QueueFull
 from ultragray_workers.jobs.queue.owners import Kind
 
 from ..access.audit import account
+from ..access.limits.holdings import Holdings
 from ..access.owners import Claim, Owners
 from ..arrival import arrival
 from ..settings import Settings
@@ -42,8 +43,10 @@ class DatasetUploads:
         draining: asyncio.Event,
         checks: HelperProcesses,
         owners: Owners,
+        holdings: Holdings,
     ) -> None:
         self._store = store
+        self._holdings = holdings
         self._owners = owners
         self._settings = settings
         self._draining = draining
@@ -54,7 +57,7 @@ class DatasetUploads:
     async def receive(self, name: str, options: dict[str, str], *, private: bool) -> AsyncIterator[DatasetUpload]:
         """An upload; what has not become a dataset at the end is removed.
 
-        Raises InvalidArgument for a bad name or option, QueueFull, Draining, StorageFull.
+        Raises InvalidArgument for a bad name or option, QueueFull, LimitReached, Draining, StorageFull.
         """
         check_dataset_name(name)
         account().target = name
@@ -66,11 +69,15 @@ class DatasetUploads:
         self._count += 1
         stopping: asyncio.Future[Any] = asyncio.ensure_future(self._draining.wait())
         try:
-            incoming = await asyncio.to_thread(IncomingDataset, self._store, self._settings.max_dataset_bytes)
+            room, most = await self._holdings.room(), self._settings.max_dataset_bytes
+            incoming = await asyncio.to_thread(IncomingDataset, self._store, room.at_most(most))
             claim = Claim(self._owners, Kind.DATASET, name, private=private)
-            upload = DatasetUpload(incoming, name, options, self._settings, stopping, self._checks, claim)
+            upload = DatasetUpload(
+                incoming, name, options, self._settings, stopping, self._checks, claim, room.at_most(most)
+            )
             try:
-                yield upload
+                with room.to_blame(most):
+                    yield upload
             finally:
                 await upload.ended()
                 await asyncio.shield(asyncio.to_thread(incoming.discard))
@@ -96,7 +103,9 @@ class DatasetUpload:
         stopping: asyncio.Future[Any],
         checks: HelperProcesses,
         claim: Claim,
+        max_bytes: int,
     ) -> None:
+        self._max_bytes = max_bytes
         self._incoming = incoming
         self._claim = claim
         self._name = name
@@ -147,7 +156,7 @@ class DatasetUpload:
                 "folder": str(self._incoming.folder),
                 "name": self._name,
                 "options": self._options,
-                "max_bytes": self._settings.max_dataset_bytes,
+                "max_bytes": self._max_bytes,
             }
             taken = await asyncio.to_thread(self._incoming.is_taken, self._name)
             async with self._claim.making(taken=taken):

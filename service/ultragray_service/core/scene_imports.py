@@ -17,6 +17,7 @@ from ultragray_workers.jobs.publication import SCENES_FOLDER
 from ultragray_workers.jobs.queue.owners import Kind
 from ultragray_workers.scenes import SUFFIX, SceneStore, check_scene_file, check_scene_name
 
+from ..access.limits.holdings import Holdings
 from ..access.owners import Claim, Owners
 from ..errors import SceneReadOnly
 from ..settings import Settings
@@ -38,6 +39,7 @@ class SceneImports:
         maker_of: Callable[[str], Awaitable[str | None]],
         checks: HelperProcesses,
         owners: Owners,
+        holdings: Holdings,
     ) -> None:
         """`maker_of`: the job that makes a scene, in words; None where none does."""
         self._store = store
@@ -45,6 +47,7 @@ class SceneImports:
         self._maker_of = maker_of
         self._checks = checks
         self._owners = owners
+        self._holdings = holdings
         self._folder = settings.artifacts / SCENES_FOLDER
         self._count = 0
 
@@ -52,7 +55,8 @@ class SceneImports:
     async def receive(self, name: str, blocks: AsyncIterator[bytes]) -> AsyncIterator[Path]:
         """Writes what arrives into a file, to be given to `accept` within this context; it is removed at the end.
 
-        Raises InvalidArgument for a name that no scene can have, SceneExists, UploadTooLarge, QueueFull, StorageFull.
+        Raises InvalidArgument for a name that no scene can have, SceneExists, UploadTooLarge, QueueFull, LimitReached,
+        StorageFull.
         """
         check_scene_name(name)
         await self._require_free(name)
@@ -61,10 +65,11 @@ class SceneImports:
         self._count += 1
         claim = contextlib.ExitStack()
         try:
-            with storage_full("the scene"):
+            room, most = await self._holdings.room(), self._settings.max_dataset_bytes
+            with storage_full("the scene"), room.to_blame(most):
                 folder = await to_its_end(lambda: claim.enter_context(claimed_folder(self._folder, _PREFIX)))
                 received = folder / f"{name}{SUFFIX}"
-                await self._write(received, blocks)
+                await self._write(received, blocks, room.at_most(most))
                 yield received
         finally:
             self._count -= 1
@@ -105,15 +110,13 @@ class SceneImports:
 
         await asyncio.to_thread(remove_abandoned, self._folder, _PREFIX)
 
-    async def _write(self, path: Path, blocks: AsyncIterator[bytes]) -> None:
+    async def _write(self, path: Path, blocks: AsyncIterator[bytes], max_bytes: int) -> None:
         received = 0
         with path.open("xb") as file:
             async for block in blocks:
                 received += len(block)
-                if received > self._settings.max_dataset_bytes:
-                    raise UploadTooLarge(
-                        f"a scene file may have at most {self._settings.max_dataset_bytes} bytes", field="body"
-                    )
+                if received > max_bytes:
+                    raise UploadTooLarge(f"a scene file may have at most {max_bytes} bytes", field="body")
                 await asyncio.to_thread(file.write, block)
             await asyncio.to_thread(file.flush)
         await in_own_thread(lambda: sync(path))

@@ -22,6 +22,8 @@ from ..access.addresses import is_loopback
 from ..access.audit import AuditLog, account
 from ..access.guard import Authenticator, EnvironmentKeys, Guard
 from ..access.keys import KnownKeys
+from ..access.limits.holdings import Holdings
+from ..access.limits.limits import Limits
 from ..access.oidc.tokens import OidcTokens
 from ..access.origins import Origins
 from ..access.owners import Owners
@@ -107,16 +109,19 @@ class Service:
         store.hides = partial(self.owners.hides, Kind.SCENE)
         self.datasets.hides = partial(self.owners.hides, Kind.DATASET)
         self.metrics = Metrics(self.pool, lambda: self.jobs.overview)
+        self.limits = Limits(settings.allowance, self.metrics.count_limited)
+        holdings = Holdings(self.limits, self.owners, self.datasets, store, self.jobs)
+        self.jobs.admit = holdings.admit_job
         self.tracing = start_tracing("service")
         self.pool.on_rendered = self._observe
         self.phase = Phase.STARTING
         self.draining = asyncio.Event()
         # Each process may take all the memory that settings allow to one: one checks at a time, and one makes pictures.
         checks, pictures = (HelperProcesses(settings.dataset_memory_mb << 20) for _ in range(2))
-        self.uploads = DatasetUploads(self.datasets, settings, self.draining, checks, self.owners)
+        self.uploads = DatasetUploads(self.datasets, settings, self.draining, checks, self.owners, holdings)
         self.datasets.in_use = self.jobs.uses_dataset
         self.imports = SceneImports(
-            store, settings, lambda name: self.jobs.do(JobStore.makes_scene, name), checks, self.owners
+            store, settings, lambda name: self.jobs.do(JobStore.makes_scene, name), checks, self.owners, holdings
         )
         self.dataset_views = DatasetViews(self.datasets, settings, pictures)
         self.comparisons = Comparisons(store, self.catalog, self.datasets, settings, pictures)
@@ -199,6 +204,7 @@ class Service:
         deadline: float | None,  # time.monotonic() in seconds
         priority: Priority = Priority.INTERACTIVE,
         turn: Turn | None = None,
+        begin_by: float | None = None,  # time.monotonic() in seconds; else it is refused
     ) -> RenderResult:
         """Renders, with the settings as they are for the scene that is there when it is rendered.
 
@@ -212,7 +218,9 @@ class Service:
             raise SceneNotFound(f"there is no scene {plan.scene!r} any more", field="scene")
         turn = turn or Turn()
         for _ in range(MAX_SCENE_CHANGES):
-            asked = RenderRequest(plan.scene, plan.settings, poses, priority, deadline, plan.version, caller())
+            asked = RenderRequest(
+                plan.scene, plan.settings, poses, priority, deadline, plan.version, caller(), begin_by
+            )
             try:
                 with scene_to_blame():
                     return await self.pool.render(asked, turn)

@@ -26,7 +26,11 @@ SCENE_NAME = {"description": _NAME_MEANS, "schema": {"type": "string", "title": 
 
 
 def problems(*statuses: int, members: Mapping[str, type] | None = None) -> dict[int | str, dict[str, Any]]:
-    """The documentation of error answers, for `responses=`; `members`: of the document, beside those of Problem."""
+    """The documentation of error answers, for `responses=`; `members`: of the document, beside those of Problem.
+
+    Whoever needs a key (401) has limits (429).
+    """
+    statuses = tuple(sorted({*statuses, 429})) if 401 in statuses else statuses
     schema: dict[str, Any] = {"$ref": _REFERENCE.format(Problem.__name__)}
     if members:
         more = {name: {"$ref": _REFERENCE.format(kind.__name__)} for name, kind in members.items()}
@@ -48,7 +52,8 @@ _MEANINGS = {
     415: "The body is of another type than the route takes (UNSUPPORTED_MEDIA_TYPE).",
     422: "A value cannot be used: INVALID_ARGUMENT, INVALID_POSE, INVALID_PROBE, INVALID_IMAGE_SIZE, "
     "UNKNOWN_OUTPUT, TOO_MANY_POSES, FRAME_TOO_COSTLY, SCENE_FILE_INVALID, DATASET_INVALID. `field` names it.",
-    429: "Too many frames, uploads or jobs wait (QUEUE_FULL, JOB_QUEUE_FULL); retry after the seconds of Retry-After.",
+    429: "Too many frames, uploads or jobs wait (QUEUE_FULL, JOB_QUEUE_FULL), or the key asks for more in a second "
+    "than it may (RATE_LIMITED): retry after the seconds of Retry-After. Or it has all that it may (LIMIT_REACHED).",
     500: "Rendering failed (RENDER_FAILED, INTERNAL).",
     501: "The format needs an optional package that the service lacks (EXTRA_MISSING).",
     503: "The service is starting or stopping (NOT_READY, DRAINING); retry after the seconds of Retry-After.",

@@ -12,7 +12,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from ultragray.errors import UltragrayError
 
-from ..access.audit import NOBODY, Entry
+from ..access.audit import NOBODY
 from ..access.credentials import credential_of_subprotocols, offered_credential
 from ..access.guard import Guard
 from ..access.origins import Origins
@@ -116,7 +116,10 @@ class CheckOrigin:
 
 
 class Authorize:
-    """Finds out who asks, and whether they may; keeps account of it; ends what goes on when its key counts no more."""
+    """Finds out who asks, and whether they may, and not too often; keeps account of it.
+
+    Ends what goes on when its key counts no more.
+    """
 
     def __init__(self, app: ASGIApp, service: Service, rules: HttpRules) -> None:
         self._app = app
@@ -145,17 +148,16 @@ class Authorize:
                 await send({"type": "websocket.close", "code": _POLICY_VIOLATION, "reason": error.reason})
 
     async def _permitted(self, operation: Operation, target: str, scope: Scope, receive: Receive, send: Send) -> None:
-        """Raises Unauthenticated, PermissionDenied, JobNotFound."""
+        """Raises Unauthenticated, RateLimited, PermissionDenied, JobNotFound."""
         service, headers = self._service, Headers(scope=scope)
         address, port = scope.get("client") or ("", 0)
         key = headers.get("x-api-key") or credential_of_subprotocols(scope.get("subprotocols", ()))
         credential = offered_credential(headers.get("authorization"), key)
-        try:
+        with service.audit.refusals(NOBODY, address, operation, target):
             principal = service.guard.authenticate(credential)
-        except UltragrayError as error:
-            service.audit.count(Entry(NOBODY, address, operation.name, target, error.reason))
-            raise
         act_as(principal, address=address, connection=f"{address}:{port}")
+        with service.audit.refusals(principal.name, address, operation, target):
+            service.limits.take_request()
         with (
             service.audit.request(principal.name, address, operation, target),
             service.sessions.held(principal, credential),

@@ -189,7 +189,9 @@ class Connection:
     async def _render(self) -> None:
         while True:
             await self._unread.none()  # an older image: the newest pose then is the one to render
-            underway = await self._poses.next()
+            await self._poses.come()
+            await self._service.limits.frame_turn(None)  # meanwhile newer poses replace those that wait
+            underway = self._poses.take()
             try:
                 frame = await self._maker.render(underway)
             except UltragrayError as error:

@@ -12,10 +12,10 @@ from ultragray_workers.errors import Draining
 
 from ..access.addresses import AddressRoles
 from ..access.audit import NOBODY, Entry
-from ..access.principal import act_as
+from ..access.principal import Principal, act_as
 from ..access.rules import IGTL
 from ..core.state import Service
-from ..errors import PermissionDenied, TooManyConnections
+from ..errors import LimitReached, PermissionDenied, RateLimited, TooManyConnections
 from ..listening.connections import Connections
 from .connection import SEND_TIMEOUT_S, Connection
 from .frames import Frame
@@ -78,11 +78,20 @@ class IgtlServer:
             connection.dismiss(PermissionDenied(f"{host} may not connect: ULTRAGRAY_IGTL_ALLOW does not name it"))
             return
         act_as(principal, address=host, connection=f"{host}:{port}")
-        try:
-            place = self._places.enter(host)
-        except TooManyConnections as error:
-            connection.dismiss(error)
-            return
+        with contextlib.ExitStack() as places:
+            try:
+                self._service.limits.take_request()
+                places.callback(self._places.enter(host).leave)
+                places.enter_context(self._service.limits.stream())
+            except (TooManyConnections, RateLimited, LimitReached) as error:
+                self._service.audit.count(Entry(principal.name, host, IGTL.name, "", error.reason))
+                connection.dismiss(error)
+                return
+            await self._serve(connection, writer, principal, host)
+
+    async def _serve(
+        self, connection: Connection, writer: asyncio.StreamWriter, principal: Principal, host: str
+    ) -> None:
         if (endpoint := writer.get_extra_info("socket")) is not None:
             endpoint.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)  # to notice a peer that has vanished
         started = time.monotonic()
@@ -100,6 +109,5 @@ class IgtlServer:
                 await writer.wait_closed()
             stalled.cancel()
             del self._connections[connection]
-            place.leave()
             fields = {"client": client, "duration_ms": round(1000 * (time.monotonic() - started), 3)}
             _log.info("client gone", extra={"fields": fields})

@@ -5,7 +5,14 @@ from __future__ import annotations
 from ultragray.errors import BackendUnavailable, InvalidArgument, MemoryExceeded, SceneFileInvalid, UltragrayError
 from ultragray_workers.errors import DeadlineExceeded, Draining, NotReady, QueueFull, SceneNotFound, SceneTooLarge
 
-from ..errors import IgtlMessageInvalid, PermissionDenied, TooManyConnections, statuses_of
+from ..errors import (
+    IgtlMessageInvalid,
+    LimitReached,
+    PermissionDenied,
+    RateLimited,
+    TooManyConnections,
+    statuses_of,
+)
 from .contents import Status
 
 OK, UNKNOWN_ERROR, NOT_FOUND, ACCESS_DENIED, BUSY, TIMED_OUT = 1, 2, 4, 5, 6, 7
@@ -16,6 +23,8 @@ _CODES: dict[type[UltragrayError], int] = {
     PermissionDenied: ACCESS_DENIED,
     QueueFull: BUSY,
     TooManyConnections: BUSY,
+    RateLimited: BUSY,
+    LimitReached: BUSY,
     DeadlineExceeded: TIMED_OUT,
     InvalidArgument: CONFIGURATION_ERROR,
     SceneFileInvalid: CONFIGURATION_ERROR,

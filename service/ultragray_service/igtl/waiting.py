@@ -60,13 +60,16 @@ class WaitingPoses:
         self._settled.clear()
         return older is not None
 
-    async def next(self) -> Underway:
-        """Waits for a pose and takes it out. What was given out before has its answer by now."""
+    async def come(self) -> None:
+        """Waits for a pose. What was given out before has its answer by now."""
         self._underway = None
         if not self._poses:
             self._settled.set()
             self._come.clear()
             await self._come.wait()
+
+    def take(self) -> Underway:
+        """Takes a pose out, of which there is one."""
         self._underway = Underway(self._poses.pop(next(iter(self._poses))), Turn())
         return self._underway
 

@@ -72,6 +72,8 @@ class CallContext(grpc.aio.ServerInterceptor):  # type: ignore[misc]
             peer, target = context.peer(), name_in(request, operation)
             address = address_of(peer)
             act_as(principal, address=address, connection=peer)
+            with service.audit.refusals(principal.name, address, operation, target):
+                service.limits.take_request()
             with (
                 service.audit.request(principal.name, address, operation, target),
                 service.sessions.held(principal, credential),

@@ -109,6 +109,11 @@ class Metrics:
         self._frames = counter(
             "ultragray_frames", "Frames rendered, by the role of who asked for them.", ["scene", "role"]
         )
+        self._limited = counter(
+            "ultragray_limited",
+            "Requests, frames, streams, jobs and uploads that a limit of their key refused, by the name of the limit.",
+            ["limit", "role"],
+        )
         self._scenes: set[str] = set()  # that have a label of their own
         self._queue = seconds("ultragray_queue_seconds", "Waiting time of a request before it was rendered.")
         self._render = seconds("ultragray_render_seconds", "Render time of the batch that a request was in.")
@@ -138,6 +143,10 @@ class Metrics:
     def count_dropped(self) -> None:
         """One pose of a stream that a newer one replaced."""
         self._dropped.inc()
+
+    def count_limited(self, limit: str) -> None:
+        """One refusal by a limit of a key."""
+        self._limited.labels(limit, _role()).inc()
 
     def observe_result(self, result: RenderResult) -> None:
         """One rendered request of the pool."""

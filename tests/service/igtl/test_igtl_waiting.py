@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ultragray_service.igtl.messages import Message
-from ultragray_service.igtl.waiting import MAX_WAITING_DEVICES, PoseMessage, WaitingPoses
+from ultragray_service.igtl.waiting import MAX_WAITING_DEVICES, PoseMessage, Underway, WaitingPoses
 from ultragray_workers.errors import QueueFull
 
 
@@ -30,6 +30,11 @@ def posed(device_name: str, x_mm: float = 0.0) -> PoseMessage:
     return PoseMessage(Message("TRANSFORM", device_name), pose, 0.0)
 
 
+async def taken(waiting: WaitingPoses) -> Underway:
+    await waiting.come()
+    return waiting.take()
+
+
 def run(work: Callable[[WaitingPoses], Awaitable[None]]) -> None:
     async def main() -> None:
         await work(WaitingPoses())
@@ -41,7 +46,7 @@ def test_each_device_has_its_turn_with_its_newest_pose() -> None:
     async def work(waiting: WaitingPoses) -> None:
         replaced = [waiting.put(posed(name, x_mm), 0.0) for name, x_mm in (("a", 1), ("b", 2), ("a", 3), ("a", 4))]
         assert replaced == [False, False, True, True]
-        first, second = (await waiting.next()).posed, (await waiting.next()).posed
+        first, second = (await taken(waiting)).posed, (await taken(waiting)).posed
         assert (first.message.device_name, first.pose[0, 3], first.replaced) == ("a", 4, 2)
         assert (second.message.device_name, second.pose[0, 3], second.replaced) == ("b", 2, 0)
 
@@ -51,12 +56,12 @@ def test_each_device_has_its_turn_with_its_newest_pose() -> None:
 def test_a_newer_pose_takes_the_turn_of_one_that_waits_in_the_pool() -> None:
     async def work(waiting: WaitingPoses) -> None:
         waiting.put(posed("a", 1), 0.0)
-        underway = await waiting.next()
+        underway = await taken(waiting)
         assert not waiting.put(posed("a", 2), 0.0)  # it is being rendered
         underway.turn = turn = FakeTurn()  # type: ignore[assignment]
         assert waiting.put(posed("a", 3), 0.0)  # of the two that wait here, the older one
         assert turn.poses is None
-        underway = await waiting.next()
+        underway = await taken(waiting)
         assert underway.posed.pose[0, 3] == 3
         underway.turn = turn = FakeTurn()  # type: ignore[assignment]
         assert not waiting.put(posed("b", 4), 0.0)
@@ -82,11 +87,11 @@ def test_settled_is_when_nothing_waits_and_nothing_is_under_way() -> None:
     async def work(waiting: WaitingPoses) -> None:
         await waiting.settled()
         waiting.put(posed("a"), 0.0)
-        await waiting.next()
+        await taken(waiting)
         settled = asyncio.ensure_future(waiting.settled())
         await asyncio.sleep(0)
         assert not settled.done()
-        more = asyncio.ensure_future(waiting.next())
+        more = asyncio.ensure_future(taken(waiting))
         await asyncio.wait_for(settled, 5)
         more.cancel()
 

@@ -35,7 +35,7 @@ const CONNECT_MS = 10_000;
 // After so long without the answer that is due, the connection is taken for dead. A scene that is loaded, or a slow
 // processor, may take longer: it is given more time after each loss.
 const SILENT_MS = { first: 10_000, most: 160_000 };
-const PASSING = ["QUEUE_FULL", "DEADLINE_EXCEEDED", "NOT_READY"];
+const PASSING = ["QUEUE_FULL", "RATE_LIMITED", "DEADLINE_EXCEEDED", "NOT_READY"];
 const AGAIN_MS = 1000; // after a refusal that may pass
 
 /** A stream that stays open, over restarts of the service, until it is closed. */

@@ -7,7 +7,8 @@ import os
 import re
 import threading
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
@@ -41,7 +42,7 @@ from .publication import SCENES_FOLDER
 from .queue import attendance, database, runs, unfinished
 from .queue.attendance import Worker
 from .queue.database import JobDatabase
-from .queue.listing import page_of_rows
+from .queue.listing import ids_of_owner, page_of_rows
 from .queue.owners import Kind, Ownership, set_owner
 from .queue.wishes import Wanted
 from .removal import remove_job
@@ -56,6 +57,13 @@ MAX_REQUEST_ID_CHARACTERS = 128
 _JOB_ID = re.compile(r"[0-9a-f]{24}")
 _STORABLE = re.compile(r"[^\0\ud800-\udfff]*")  # PostgreSQL takes no NUL, and UTF-8 no surrogates
 _TAIL_BYTES = 8192
+
+
+Admit = Callable[["JobStore"], None]
+
+
+def _admit_any(jobs: JobStore) -> None:
+    """Keeps no job out."""
 
 
 class JobStore:
@@ -101,8 +109,11 @@ class JobStore:
         priority: int = 0,
         owner: str | None = None,
         private: bool = False,
+        admit: Admit = _admit_any,
     ) -> tuple[Job, bool]:
         """The job, and whether it is new: the same `request_id` gives the same job, whatever became of it.
+
+        `admit` is called before a new one is made, one at a time, and raises what keeps it out.
 
         Raises JobConflict where that one asked for something else, JobQueueFull, ArtifactFolderUnavailable, and what
         `Requirements.provide` raises.
@@ -112,7 +123,7 @@ class JobStore:
                 f"priority must be an integer from {-MAX_PRIORITY} to {MAX_PRIORITY}, got {priority}", field="priority"
             )
         job_id = uuid.uuid4().hex[:24] if request_id is None else _id_of_request(request_id)
-        return self._submit(job_id, specification, priority, owner, private, request_id=request_id)
+        return self._submit(job_id, specification, priority, owner, private, admit, request_id=request_id)
 
     def _submit(
         self,
@@ -121,6 +132,7 @@ class JobStore:
         priority: int,
         owner: str | None,
         private: bool,
+        admit: Admit,
         *,
         request_id: str | None = None,
         retry_of: str | None = None,
@@ -133,6 +145,7 @@ class JobStore:
                 return self._same(job_id, specification, priority, ownership), False
             if unfinished.count_waiting(self.database) >= self._queue_limit:
                 raise JobQueueFull(f"{self._queue_limit} jobs wait already: try again later, or cancel some")
+            admit(self)
             before = None if retry_of is None else self._folder(retry_of)
             self._requirements.provide(specification, self._folder(job_id), before)
             options: EnqueueOptions = {
@@ -241,7 +254,7 @@ class JobStore:
             raise JobFinished(f"the job {job_id} has {job.state.value} already", field="job")
         return job
 
-    def retry(self, job_id: str) -> tuple[Job, bool]:
+    def retry(self, job_id: str, *, admit: Admit = _admit_any) -> tuple[Job, bool]:
         """The job in place of a failed or cancelled one, and whether it is new: a job has one such successor.
 
         A training goes on from the last checkpoint of its predecessor. Raises JobNotFound, JobNotFinished, and what
@@ -254,7 +267,13 @@ class JobStore:
                 f"only a failed or cancelled job can be retried, the job {job_id} is {job.state.value}", field="job"
             )
         return self._submit(
-            _hashed(f"retry {job_id}"), _specification_of(row), job.priority, job.owner, job.private, retry_of=job_id
+            _hashed(f"retry {job_id}"),
+            _specification_of(row),
+            job.priority,
+            job.owner,
+            job.private,
+            admit,
+            retry_of=job_id,
         )
 
     def delete(self, job_id: str) -> None:
@@ -280,6 +299,12 @@ class JobStore:
     def usage_s(self, owner: str | None, since: datetime) -> dict[str, float]:
         """How long the jobs of an owner ran since the day of `since` (UTC), s, by device: cpu, gpu."""
         return runs.usage_s(self.database.engine, owner, since)
+
+    def artifact_files_of(self, owner: str) -> Iterator[Path]:
+        """The files that can be downloaded of an owner's jobs."""
+        for job_id in ids_of_owner(self.database, owner):
+            with suppress(FileNotFoundError):
+                yield from self._folder(job_id).artifacts.iterdir()
 
     def log_tail(self, job_id: str, bytes: int = _TAIL_BYTES) -> str:
         """The end of the log of a job's process; empty where there is none yet. Raises JobNotFound."""

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from ...access.limits.allowance import NAMES, read_limits
 from ...access.principal import Role
 from ...settings import ENVIRONMENT_PREFIX, Settings, load_settings
 from ..options import FieldsOf, with_options
@@ -28,7 +29,7 @@ Where = Annotated[
     dict[str, Any],
     FieldsOf(Settings, "data_folder", "artifact_folder", "database_url", environment=ENVIRONMENT_PREFIX),
 ]
-_COLUMNS = ("id", "name", "role", "state", "created", "expires", "last used")
+_COLUMNS = ("id", "name", "role", "state", "created", "expires", "last used", "limits")
 
 
 @keys_app.command()
@@ -45,12 +46,21 @@ def create(
     expires_days: Annotated[
         float | None, typer.Option(min=0.0, max=36_500.0, help="Days that it counts.", show_default="for ever")
     ] = None,
+    limit: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=NUMBER",
+            help=f"A limit of its own, NAME=none: no limit; may be repeated. Names: {', '.join(NAMES)}.",
+            show_default="the settings key_NAME of the service",
+        ),
+    ] = None,
     where: Where,
 ) -> None:
     """Make a key, and print it: alone on standard output, and never again."""
+    limits = read_limits(limit or ())
     with _key_store(where) as store:
         others = [key for key in store.keys().values() if key.name == name and key.is_valid(time.time())]
-        key, secret = store.create(name, role, expires_days)
+        key, secret = store.create(name, role, expires_days, limits)
     typer.echo(f"key {key.id} of {key.name}, {key.role.value}, expires: {_time(key.expires_at_s, 'never')}", err=True)
     for other in others:
         typer.echo(f"{name} still has the key {other.id}, {other.role.value}, too", err=True)
@@ -111,6 +121,7 @@ def _row(key: Key) -> tuple[str, ...]:
         _time(key.created_at_s, ""),
         _time(key.expires_at_s, "never"),
         _time(key.last_used_at_s, "never"),
+        " ".join(f"{name}={'none' if value is None else f'{value:g}'}" for name, value in key.limits.items()),
     )
 
 

@@ -68,6 +68,7 @@ class Jobs:
         # Of their own, so that a database that does not answer keeps nobody else waiting.
         self._threads = ThreadPoolExecutor(_THREADS, "jobs")
         self.hub = JobHub(lambda job_id: self._store.get(job_id), self._log_path, self._threads)
+        self.admit: Callable[[JobStore], None] = lambda jobs: None  # raises what keeps a new job of the caller out
         self.overview = JobsOverview()  # as it was up to COUNT_INTERVAL_S ago
         self._counting: asyncio.Task[None] | None = None
 
@@ -125,7 +126,7 @@ class Jobs:
         """The job, and whether it is new. `field` is where the caller wrote the specification.
 
         Raises InvalidArgument, JobConflict, JobQueueFull, DatasetNotFound, DatasetInvalid, SceneNotFound,
-        SceneFileInvalid, SceneExists.
+        SceneFileInvalid, SceneExists, LimitReached.
         """
         with _specification_to_blame(field):
             job, is_new = await self.do(
@@ -135,9 +136,14 @@ class Jobs:
                 priority=priority,
                 owner=acting().name,
                 private=private,
+                admit=self.admit,
             )
         account().target = job.id
         return job, is_new
+
+    async def retry(self, job_id: str) -> tuple[Job, bool]:
+        """As JobStore.retry. Raises LimitReached."""
+        return await self.do(JobStore.retry, job_id, admit=self.admit)
 
     async def page(self, *, state: str, kind: str, page_size: int, page_token: str) -> JobPage:
         """One page of jobs; empty filters pass all.

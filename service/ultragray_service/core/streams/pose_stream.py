@@ -132,6 +132,7 @@ class PoseStream:
         self._dropped = 0
         # Of a latest stream: what is asked of the pool, its place in the queue, and what comes after it.
         self._current: Asked | None = None
+        self._is_waiting = False  # for the limits of its key to allow it
         self._turn = Turn()
         self._next: Asked | None = None
         self._window = _Window()
@@ -223,11 +224,18 @@ class PoseStream:
         self._answers.put_nowait(_Underway(task, sent))
 
     async def _answer(self, asked: Asked) -> Answered:
-        return Answered(asked.sequence, asked.client_time, await self._outcome(asked, Turn()))
+        return Answered(asked.sequence, asked.client_time, await self._outcome(self._rendered(asked)))
 
-    async def _outcome(self, asked: Asked, turn: Turn) -> RenderResult | UltragrayError:
+    async def _rendered(self, asked: Asked) -> RenderResult:
+        await self._service.limits.frame_turn(asked.deadline)
+        return await self._render(asked, Turn())
+
+    async def _render(self, asked: Asked, turn: Turn) -> RenderResult:
+        return await self._service.render(asked.plan, asked.pose[None], deadline=asked.deadline, turn=turn)
+
+    async def _outcome(self, rendering: Awaitable[RenderResult]) -> RenderResult | UltragrayError:
         try:
-            return await self._service.render(asked.plan, asked.pose[None], deadline=asked.deadline, turn=turn)
+            return await rendering
         except UltragrayError as error:
             outcome = error
         except Exception as error:
@@ -236,8 +244,11 @@ class PoseStream:
         return outcome
 
     def _take_over(self, asked: Asked) -> bool:
-        """Puts a pose into the place of the one that the pool has not begun."""
+        """Puts a pose into the place of the one that is not begun: it waits for its key's limits, or in the pool."""
         current = self._current
+        if self._is_waiting:
+            self._current = asked
+            return True
         if current is None or current.plan is not asked.plan:
             return False
         if not self._turn.give_to(asked.pose[None], asked.deadline):
@@ -255,12 +266,21 @@ class PoseStream:
             self._answers.put_nowait(None)
 
     async def _answer_latest(self) -> Answered:
+        outcome = await self._outcome(self._rendered_latest())
         assert self._current is not None
-        outcome = await self._outcome(self._current, self._turn)
         asked, self._current = self._current, None  # perhaps a later one than at the start
         self._window.enter(asked.sequence)
         self._advance()
         return Answered(asked.sequence, asked.client_time, outcome)
+
+    async def _rendered_latest(self) -> RenderResult:
+        self._is_waiting = True
+        try:
+            await self._service.limits.frame_turn(None)  # meanwhile newer poses, with later deadlines, may come
+        finally:
+            self._is_waiting = False
+        assert self._current is not None
+        return await self._render(self._current, self._turn)
 
     def _sent_latest(self) -> None:
         self._window.sent()

@@ -80,6 +80,7 @@ async def render(request: Request) -> Response:
     planner = service.planner
     body = await read_json_body(request, RenderBody, RenderBody.many_poses(planner.max_poses_at_once))
     deadline = planner.deadline(None if body.timeout_ms is None else body.timeout_ms / 1000)
+    begin_by = None if body.max_queue_ms is None else planner.deadline(body.max_queue_ms / 1000)
     poses = body.poses_by_path(planner.max_poses_at_once)
     choice = choose(
         request.headers.get("accept", ""),
@@ -93,8 +94,12 @@ async def render(request: Request) -> Response:
     )
     exact = await exact_poses(len(poses), lambda index: poses[index][1].exact(poses[index][0]))
     priority = Priority.INTERACTIVE if body.poses is None else Priority.BATCH
-    rendering = service.render(plan, exact, priority=priority, deadline=deadline)
-    result = await finish_or_abandon(rendering, request.receive, deadline)
+
+    async def rendered() -> RenderResult:
+        await service.limits.take_frames(len(exact), deadline)
+        return await service.render(plan, exact, priority=priority, deadline=deadline, begin_by=begin_by)
+
+    result = await finish_or_abandon(rendered(), request.receive, deadline)
     return Response(result.data, 200, render_headers(result), choice.media_type)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
+from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -37,18 +38,21 @@ async def stream(websocket: WebSocket, scene: SceneName) -> None:
     """Poses in, frames out, in the order of the poses."""
     service: Service = websocket.app.state.service
     started = time.perf_counter()
+    place = ExitStack()
     try:
         _check_subprotocols(websocket.scope["subprotocols"])
         service.require_serving()
         await service.catalog.header(scene)
+        place.enter_context(service.limits.stream())
     except UltragrayError as error:
         await websocket.send_denial_response(problem_response(error))
         service.metrics.count_request("websocket", _ROUTE, str(statuses_of(error).http), time.perf_counter() - started)
         return
-    await websocket.accept(STREAM_PROTOCOL if STREAM_PROTOCOL in websocket.scope["subprotocols"] else None)
     status = "closed"
     try:
-        await FrameStream(service, _WebSocketTransport(websocket, scene), (scene, RenderSettings())).run()
+        with place:
+            await websocket.accept(STREAM_PROTOCOL if STREAM_PROTOCOL in websocket.scope["subprotocols"] else None)
+            await FrameStream(service, _WebSocketTransport(websocket, scene), (scene, RenderSettings())).run()
     except WebSocketDisconnect:
         pass
     except Draining as error:

@@ -67,7 +67,7 @@ class JobService:
         self, request: jobs_pb2.RetryJobRequest, context: grpc.aio.ServicerContext
     ) -> jobs_pb2.Job:
         self._service.require_serving()
-        job, _ = await self._service.jobs.do(JobStore.retry, request.job)
+        job, _ = await self._service.jobs.retry(request.job)
         return job_message(job)
 
     async def DeleteJob(  # noqa: N802

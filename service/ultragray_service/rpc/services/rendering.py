@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import time
 from collections import deque
+from collections.abc import Awaitable, Callable
 
 import grpc
 
@@ -17,7 +18,7 @@ from ultragray_workers.pool.types import Priority, RenderResult
 from ...core.poses import check_pose_count, exact_poses
 from ...core.requests import Plan
 from ...core.state import Service
-from ...core.streams.stream import FrameStream
+from ...core.streams.stream import FrameStream, checked_s
 from ..messages import frame_message, read_pose, read_settings
 from ..stream import CallTransport
 
@@ -34,11 +35,16 @@ class RenderService:
         self, request: rendering_pb2.RenderRequest, context: grpc.aio.ServicerContext
     ) -> rendering_pb2.Frame:
         deadline = self._service.planner.deadline(context.time_remaining())
+        begin_by = None
+        if request.HasField("max_queue_ms"):
+            begin_by = self._service.planner.deadline(checked_s("max_queue_ms", request.max_queue_ms))
         plan = await self._plan(request)
         if not request.HasField("pose"):
             raise InvalidArgument("pose is required", field="pose")
         pose = read_pose(request.pose, "pose")
-        return frame_message(await self._service.render(plan, pose[None], deadline=deadline), 0)
+        await self._service.limits.take_frames(1, deadline)
+        result = await self._service.render(plan, pose[None], deadline=deadline, begin_by=begin_by)
+        return frame_message(result, 0)
 
     async def RenderBatch(  # noqa: N802
         self, request: rendering_pb2.RenderBatchRequest, context: grpc.aio.ServicerContext
@@ -53,10 +59,9 @@ class RenderService:
         try:
             for sequence in range(len(poses)):
                 while started < len(poses) and len(in_flight) < window:
-                    deadline = planner.deadline(context.time_remaining())
                     some = poses[started : started + 1]
                     render = self._render if started == 0 else self._render_when_room
-                    in_flight.append(asyncio.ensure_future(render(plan, some, deadline)))
+                    in_flight.append(asyncio.ensure_future(self._in_turn(render, plan, some, context)))
                     started += 1
                 try:
                     result = await in_flight[0]
@@ -73,12 +78,25 @@ class RenderService:
     async def RenderStream(  # noqa: N802
         self, messages: object, context: grpc.aio.ServicerContext
     ) -> None:
-        await FrameStream(self._service, CallTransport(context)).run()
+        with self._service.limits.stream():
+            await FrameStream(self._service, CallTransport(context)).run()
 
     async def _plan(self, request: rendering_pb2.RenderRequest | rendering_pb2.RenderBatchRequest) -> Plan:
         """The plan of a request. Raises what RequestPlanner.plan raises; the field is a path."""
         scene, asked = read_settings(request)
         return await self._service.planner.plan(scene, asked, asked.encoding, path="settings")
+
+    async def _in_turn(
+        self,
+        render: Callable[[Plan, FloatArray, float], Awaitable[RenderResult]],
+        plan: Plan,
+        pose: FloatArray,
+        context: grpc.aio.ServicerContext,
+    ) -> RenderResult:
+        """Renders a frame of a batch once the caller may have one more."""
+        left_s = context.time_remaining()
+        await self._service.limits.frame_turn(None if left_s is None else time.monotonic() + left_s)
+        return await render(plan, pose, self._service.planner.deadline(context.time_remaining()))
 
     async def _render(self, plan: Plan, pose: FloatArray, deadline: float) -> RenderResult:
         """Renders a frame of a batch."""

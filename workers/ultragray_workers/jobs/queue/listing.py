@@ -29,6 +29,14 @@ def count_by_status(jobs: JobDatabase) -> dict[str, int]:
         return {row[0]: row[1] for row in connection.execute(counted)}
 
 
+def ids_of_owner(jobs: JobDatabase, owner: str) -> list[str]:
+    """The jobs of an owner, whatever became of them."""
+    rows = WORKFLOWS.c
+    found = sa.select(rows.workflow_uuid).where(rows.name.in_(KINDS), rows.authenticated_user == owner)
+    with jobs.engine.connect() as connection:
+        return list(connection.execute(found).scalars())
+
+
 def page_of_rows(
     jobs: JobDatabase,
     *,

@@ -40,6 +40,7 @@ KEYS = sa.Table(  # API keys: rows stay when a key is revoked or has expired
     sa.Column("expires_at_s", sa.Double),
     sa.Column("revoked_at_s", sa.Double),
     sa.Column("last_used_at_s", sa.Double),
+    sa.Column("limits", sa.Text),  # JSON of those that are its own; NULL: none
 )
 OWNERS = sa.Table(  # of datasets and scenes; jobs keep theirs with their row
     "ultragray_owners",
@@ -164,14 +165,29 @@ def _to_version_4(connection: sa.Connection) -> None:
     """Facts about workers, and what is wanted of them."""
     types = {"host": "TEXT", "pid": "INTEGER", "device": "TEXT", "version": "TEXT"}
     types |= {"started_at_s": "DOUBLE PRECISION", "job_id": "TEXT", "wanted": "TEXT"}
-    table = "ultragray_workers" if connection.dialect.name == "sqlite" else f"{SCHEMA}.ultragray_workers"
+    _add_columns(connection, "ultragray_workers", types)
+
+
+def _to_version_5(connection: sa.Connection) -> None:
+    """The limits of a key."""
+    _add_columns(connection, "ultragray_keys", {"limits": "TEXT"})
+
+
+def _add_columns(connection: sa.Connection, table: str, types: dict[str, str]) -> None:
+    place = table if connection.dialect.name == "sqlite" else f"{SCHEMA}.{table}"
     for name, kind in types.items():
-        connection.execute(sa.text(f"ALTER TABLE {table} ADD COLUMN {name} {kind}"))
+        connection.execute(sa.text(f"ALTER TABLE {place} ADD COLUMN {name} {kind}"))
 
 
 # Each takes the tables from one version to the next. A step that has been released never changes: it says what it makes
 # in full, and takes nothing from the tables above, which go on changing.
-STEPS: tuple[Callable[[sa.Connection], None], ...] = (_to_version_1, _to_version_2, _to_version_3, _to_version_4)
+STEPS: tuple[Callable[[sa.Connection], None], ...] = (
+    _to_version_1,
+    _to_version_2,
+    _to_version_3,
+    _to_version_4,
+    _to_version_5,
+)
 VERSION = len(STEPS)
 
 

@@ -134,7 +134,7 @@ async def cancel_job(service: ServiceDep, job: JobId) -> Job:
 async def retry_job(response: Response, service: ServiceDep, job: JobId) -> Job:
     """A new job in place of a failed or cancelled one; a training goes on from its last checkpoint."""
     service.require_serving()
-    successor, is_new = await service.jobs.do(JobStore.retry, job)
+    successor, is_new = await service.jobs.retry(job)
     response.status_code = 201 if is_new else 200
     return successor
 

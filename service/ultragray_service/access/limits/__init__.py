@@ -1,0 +1,1 @@
+"""Limits of each key: rates, streams, jobs, minutes of compute, bytes."""
