@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 from collections import Counter
@@ -17,7 +18,7 @@ import torch
 from ultragray import GaussianScene, SceneInfo
 from ultragray_proto.v1 import rendering_pb2, rendering_pb2_grpc
 
-from ..waiting import at_this_load
+from ..waiting import at_this_load, wait_until
 from .conftest import DEMO_PROBE, RunningService, StartService, make_scene
 from .rpc.test_grpc_render import error_info, moved
 
@@ -97,6 +98,31 @@ def slow(start_service: StartService, scenes: Path) -> RunningService:
 
 
 @pytest.mark.long
+def test_a_request_names_how_long_it_waits_to_begin(start_service: StartService, scenes: Path) -> None:
+    service = start_service(data_folder=scenes, backend="reference", max_batch_poses=1, max_queue_ms=600_000)
+    poses, size = [IDENTITY] * 256, {"height": 64, "width": 64}
+
+    def fill() -> None:
+        with contextlib.suppress(httpx.HTTPError):  # the service stops before it is done
+            httpx.post(f"{service.http}/v1/scenes/demo/render", json={"poses": poses, **size}, timeout=600)
+
+    with httpx.Client(base_url=service.http) as client, service.channel() as channel:
+        assert render(client, "demo", max_queue_ms=60_000, **size).status_code == 200
+        threading.Thread(target=fill, daemon=True).start()
+        wait_until(lambda: service.metric("ultragray_waiting_frames") > 0)
+        refused = render(client, "demo", poses=poses[:2], pose=None, max_queue_ms=20, **size)
+        assert (refused.status_code, refused.json()["reason"]) == (429, "QUEUE_FULL")
+        assert int(refused.headers["Retry-After"]) >= 1
+        request = rendering_pb2.RenderRequest(
+            settings=rendering_pb2.RenderSettings(scene="demo"), pose=moved(0), max_queue_ms=0.0
+        )
+        with pytest.raises(grpc.RpcError) as caught:
+            rendering_pb2_grpc.RenderServiceStub(channel).Render(request, timeout=60)
+        assert error_info(caught.value)[0].metadata["field"] == "max_queue_ms"
+        request.max_queue_ms = 60_000
+        assert rendering_pb2_grpc.RenderServiceStub(channel).Render(request, timeout=60).data
+
+
 def test_overload_is_refused_early_and_whoever_asks_little_is_served(slow: RunningService) -> None:
     body = {"height": 80, "width": 80}
     statuses: Counter[int] = Counter()

@@ -21,8 +21,9 @@ def asking(
     priority: Priority = Priority.INTERACTIVE,
     deadline: float | None = None,
     caller: Caller = UNKNOWN_CALLER,
+    begin_by: float | None = None,
     **settings: Any,
 ) -> RenderRequest:
     """A request; what is not given is as the scenes were trained."""
     resolved = Resolved(**{"probe": PROBE, "height": HEIGHT, "width": WIDTH, **settings})
-    return RenderRequest(scene, resolved, poses, priority, deadline, caller=caller)
+    return RenderRequest(scene, resolved, poses, priority, deadline, caller=caller, begin_by=begin_by)

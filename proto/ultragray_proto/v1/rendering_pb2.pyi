@@ -124,12 +124,14 @@ class Picture(_message.Message):
     def __init__(self, column_unit: _Optional[str] = ..., first_column: _Optional[float] = ..., first_row_mm: _Optional[float] = ..., column_step: _Optional[float] = ..., row_step_mm: _Optional[float] = ...) -> None: ...
 
 class RenderRequest(_message.Message):
-    __slots__ = ("settings", "pose")
+    __slots__ = ("settings", "pose", "max_queue_ms")
     SETTINGS_FIELD_NUMBER: _ClassVar[int]
     POSE_FIELD_NUMBER: _ClassVar[int]
+    MAX_QUEUE_MS_FIELD_NUMBER: _ClassVar[int]
     settings: RenderSettings
     pose: _geometry_pb2.Pose
-    def __init__(self, settings: _Optional[_Union[RenderSettings, _Mapping]] = ..., pose: _Optional[_Union[_geometry_pb2.Pose, _Mapping]] = ...) -> None: ...
+    max_queue_ms: float
+    def __init__(self, settings: _Optional[_Union[RenderSettings, _Mapping]] = ..., pose: _Optional[_Union[_geometry_pb2.Pose, _Mapping]] = ..., max_queue_ms: _Optional[float] = ...) -> None: ...
 
 class RenderBatchRequest(_message.Message):
     __slots__ = ("settings", "poses")

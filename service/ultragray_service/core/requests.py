@@ -104,7 +104,7 @@ class RequestPlanner:
         return settings
 
     def deadline(self, timeout_s: float | None) -> float:
-        """The time.monotonic() seconds by which a request must begin; None: the default timeout."""
+        """The time.monotonic() seconds after a time; None: after the default timeout."""
         return time.monotonic() + (self._settings.default_timeout_s if timeout_s is None else timeout_s)
 
 

@@ -12,7 +12,7 @@ from ultragray_proto.codec import to_message
 from ultragray_proto.v1 import rendering_pb2, scenes_pb2
 
 from ..core.streams.pose_stream import MAX_WINDOW, Answered, StreamMode
-from ..core.streams.stream import SceneSettings, checked_timeout_s
+from ..core.streams.stream import SceneSettings, checked_s
 from ..errors import Refusal
 from .messages import frame_message, read_pose, read_settings, read_word
 
@@ -51,7 +51,7 @@ class _Message:
     def timeout_s(self) -> float | None:
         if not self.message.HasField("timeout_ms"):
             return self._left_s
-        timeout_s = checked_timeout_s(self.message.timeout_ms)
+        timeout_s = checked_s("timeout_ms", self.message.timeout_ms)
         return timeout_s if self._left_s is None else min(self._left_s, timeout_s)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -184,3 +185,33 @@ def test_a_deadline_that_was_put_off_expires_later(make_ticket):
         assert isinstance(ticket.done.exception(), DeadlineExceeded)
 
     asyncio.run(wait())
+
+
+def test_what_cannot_begin_in_time_is_refused_at_once_and_told_when_it_could(make_ticket):
+    queue = WaitingQueue(limit_frames=100, max_batch_poses=1)
+    queue.settle([Part(make_ticket(), 0, 1)], 10.0, typical=True)
+    queue.add(make_ticket())
+    with pytest.raises(QueueFull, match=r"would begin after 10\.0 s, its deadline to begin is in 5\.0 s") as caught:
+        queue.add(make_ticket(begin_by=time.monotonic() + 5.0, deadline=time.monotonic() + 60.0))
+    assert caught.value.retry_after_s == pytest.approx(10.0)
+    queue.add(make_ticket(begin_by=time.monotonic() + 15.0))
+
+
+def test_what_has_not_begun_in_time_is_refused_and_what_has_goes_on(make_ticket):
+    async def main():
+        queue = WaitingQueue(limit_frames=100, max_batch_poses=1)
+        begun, waits = make_ticket(2), make_ticket()
+        for ticket in (begun, waits):
+            ticket.request = replace(ticket.request, begin_by=time.monotonic() + 0.2)
+            ticket.done = asyncio.get_running_loop().create_future()
+            queue.add(ticket)
+        expiries = [Expiry(ticket, queue) for ticket in (begun, waits)]
+        begun.memory = 0  # a worker has the first part of it
+        with pytest.raises(QueueFull, match="max_queue_ms"):
+            await asyncio.wait_for(waits.done, 60)
+        assert not begun.done.done()
+        assert queue.frames == 2
+        for expiry in expiries:
+            expiry.cancel()
+
+    asyncio.run(main())

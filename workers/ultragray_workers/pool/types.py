@@ -31,6 +31,7 @@ class RenderRequest:
     deadline: float | None = None  # time.monotonic() in seconds; past it the request is given up
     version: FileVersion | None = None  # of the scene's file that the settings are for; None: any
     caller: Caller = UNKNOWN_CALLER
+    begin_by: float | None = None  # time.monotonic() in seconds; it is given up where none of it has begun by then
 
 
 class SceneChangedError(Exception):

@@ -49,8 +49,14 @@ class Ticket:
         return (self.request.scene, self.request.version, *self.request.settings.view)
 
     @property
+    def give_up_at(self) -> float:
+        """time.monotonic() from which on it is given up, s: its deadline, or sooner while none of it has begun."""
+        begin_by = self.request.begin_by if self.memory is None else None
+        return min((at for at in (self.request.deadline, begin_by) if at is not None), default=math.inf)
+
+    @property
     def expired(self) -> bool:
-        return self.request.deadline is not None and time.monotonic() >= self.request.deadline
+        return time.monotonic() >= self.give_up_at
 
     @property
     def untouched(self) -> bool:
@@ -235,22 +241,27 @@ class WaitingQueue:
             self._turns[request.priority].charge(request.caller, share * seconds - step.work_s)
 
     def expire(self, ticket: Ticket) -> None:
-        """Fails a ticket that is past its deadline, and drops what still waits of it."""
+        """Fails a ticket that is to be given up, and drops what still waits of it."""
         if ticket.expired:
             self.remove(ticket)
             waited_ms = (time.monotonic() - ticket.submitted) * 1000.0
-            ticket.fail(DeadlineExceeded(f"the deadline passed before the frames were rendered ({waited_ms:.0f} ms)"))
+            if ticket.give_up_at == ticket.request.deadline:
+                detail = f"the deadline passed before the frames were rendered ({waited_ms:.0f} ms)"
+                ticket.fail(DeadlineExceeded(detail))
+            else:
+                turns = self._turns[ticket.request.priority]
+                ticket.fail(self._refusal(f"the request had not begun after {waited_ms:.0f} ms (max_queue_ms)", turns))
 
     def _require_time(self, ticket: Ticket, turns: Turns[Ticket]) -> None:
         """Raises QueueFull for a ticket that would begin after its deadline, or too late because of others."""
         request = ticket.request
-        left_s = math.inf if request.deadline is None else request.deadline - time.monotonic()
+        left_s = ticket.give_up_at - time.monotonic()
         patience_s = self._max_queue_s if request.priority is Priority.INTERACTIVE else math.inf
         if left_s <= 0.0 or turns.work_s <= min(left_s, patience_s) * self.workers:
             return
         wait_s = turns.wait_s(request.caller, own=True) / self.workers
         if wait_s > left_s:
-            limit = f"its deadline is in {left_s:.1f} s"
+            limit = f"its deadline{'' if ticket.give_up_at == request.deadline else ' to begin'} is in {left_s:.1f} s"
         elif (wait_s := turns.wait_s(request.caller, own=False) / self.workers) > patience_s:
             limit = f"one is to wait for others for at most {patience_s:g} s"
         else:
@@ -366,7 +377,7 @@ def _no_room(whose: str, waiting: int, count: int, limit: int) -> str:
 
 
 class Expiry:
-    """Fails a ticket at its deadline, should its frames not be ready by then."""
+    """Fails a ticket at its deadline, should its frames not be ready, or not begun, by then."""
 
     def __init__(self, ticket: Ticket, queue: WaitingQueue) -> None:
         self._ticket, self._queue = ticket, queue
@@ -374,17 +385,17 @@ class Expiry:
         self.watch()
 
     def watch(self) -> None:
-        """Looks at the deadline, which may have changed."""
+        """Looks at the deadlines, which may have changed."""
         self.cancel()
-        deadline = self._ticket.request.deadline
-        if deadline is not None:
-            delay_s = max(0.0, deadline - time.monotonic())
+        give_up_at = self._ticket.give_up_at
+        if give_up_at < math.inf:
+            delay_s = max(0.0, give_up_at - time.monotonic())
             self._timer = asyncio.get_running_loop().call_later(delay_s, self._look)
 
     def _look(self) -> None:
         if self._ticket.expired:
             self._queue.expire(self._ticket)
-        else:  # the timer was a little early
+        else:  # it has begun, or the timer was a little early
             self.watch()
 
     def cancel(self) -> None:

@@ -127,10 +127,10 @@ class FrameStream:
         return await self._service.planner.plan(scene, asked, asked.encoding, path="settings")
 
 
-def checked_timeout_s(timeout_ms: float) -> float:
-    """The seconds of a timeout that a client gave. Raises InvalidArgument."""
-    if not 0.0 < timeout_ms <= MAX_TIMEOUT_MS:
+def checked_s(name: str, milliseconds: float) -> float:
+    """The seconds of a time that a client gave as the field `name`. Raises InvalidArgument."""
+    if not 0.0 < milliseconds <= MAX_TIMEOUT_MS:
         raise InvalidArgument(
-            f"timeout_ms must be above 0 and at most {MAX_TIMEOUT_MS:g}, got {timeout_ms:g}", field="timeout_ms"
+            f"{name} must be above 0 and at most {MAX_TIMEOUT_MS:g}, got {milliseconds:g}", field=name
         )
-    return timeout_ms / 1000.0
+    return milliseconds / 1000.0

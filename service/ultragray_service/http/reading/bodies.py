@@ -35,6 +35,13 @@ class RenderBody(FrameSettings):
     timeout_ms: float | None = described(
         "A frame that is not ready after this time is given up (504).", None, above=0, high=MAX_TIMEOUT_MS
     )
+    max_queue_ms: float | None = described(
+        "A request that cannot begin within this time is refused at once (429, QUEUE_FULL); null: see "
+        "ULTRAGRAY_MAX_QUEUE_MS, which holds all the same.",
+        None,
+        above=0,
+        high=MAX_TIMEOUT_MS,
+    )
 
     @classmethod
     def many_poses(cls, limit: int) -> Apart:
