@@ -40,6 +40,15 @@ function jobKinds({ kind, specification }) {
   return Object.fromEntries(kind.enum.map((one, index) => [one, described(specification.anyOf[index])]));
 }
 
+/** What each operation of the service needs: "POST /v1/jobs" → its role, and whether what it names must be one's own. */
+function operations(paths) {
+  const all = Object.entries(paths).flatMap(([path, methods]) =>
+    Object.entries(methods).map(([method, told]) => [`${method.toUpperCase()} ${path}`, told]),
+  );
+  const ruled = all.filter(([, told]) => told["x-role"] !== undefined);
+  return Object.fromEntries(ruled.map(([name, told]) => [name, { role: told["x-role"], owned: told["x-owned"] }]));
+}
+
 const texts = {
   "schema.d.ts": astToString(await openapiTS(structuredClone(document))),
   "contract.ts": `import type { Described } from "../described";
@@ -48,6 +57,8 @@ export const jobs: Record<string, Described> = ${JSON.stringify(jobKinds(schemas
 export const uploadOptions: Record<string, Described> = ${JSON.stringify(queryOf(document.paths["/v1/datasets/{dataset}"].put), null, 1)};
 export const settings: Described = ${JSON.stringify(described(schemas.RenderSettings), null, 1)};
 export const scene: Described = ${JSON.stringify(described(schemas.Scene), null, 1)};
+export const roles = ${JSON.stringify(schemas.Role.enum)} as const;
+export const operations = ${JSON.stringify(operations(document.paths), null, 1)} as const;
 `,
 };
 mkdirSync(FOLDER, { recursive: true });

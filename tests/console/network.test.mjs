@@ -141,15 +141,41 @@ describe("a slow service", () => {
   });
 });
 
+describe("a service that is asked too often", () => {
+  it("is asked again when it says, and stays ready meanwhile", async () => {
+    const page = await openPage(at, "#/scenes");
+    await page.getByText("Service ready").waitFor();
+    let refused = 0;
+    let full = true;
+    const refuse = async (route) => {
+      if (!full) return route.continue();
+      refused += 1;
+      const problem = { type: "about:blank", status: 429, detail: "too many requests", reason: "RATE_LIMITED" };
+      await route.fulfill({ status: 429, headers: { "Retry-After": "60" }, json: problem });
+    };
+    await page.clock.install();
+    await page.route(/\/v1\/(scenes|statistics)\b/, refuse);
+    await page.clock.runFor(5000);
+    await page.getByText("too many requests Trying again.").waitFor();
+    await until(() => refused, (count) => count === 2, "both are not asked");
+    await page.clock.runFor(50_000);
+    await page.getByText("Service ready").waitFor();
+    assert.equal(refused, 2, "it was asked before it wanted to be");
+    full = false;
+    await page.clock.runFor(11_000);
+    await page.getByText("too many requests").waitFor({ state: "detached" });
+  });
+});
+
 describe("a refused pose", () => {
-  it("is asked for again where the refusal may pass", async () => {
+  for (const reason of ["QUEUE_FULL", "RATE_LIMITED"]) it(`is asked for again where the refusal may pass: ${reason}`, async () => {
     const page = await openPage(at, "#/scenes");
     let full = false;
     await page.routeWebSocket(/\/stream$/, (socket) => {
       const there = socket.connectToServer();
       socket.onMessage((message) => {
         const { sequence } = JSON.parse(message);
-        const error = { reason: "QUEUE_FULL", detail: "too many frames wait", field: null };
+        const error = { reason, detail: "too many frames wait", field: null };
         if (full) socket.send(JSON.stringify({ sequence, client_time_ms: null, dropped: 0, error }));
         else there.send(message);
       });

@@ -111,7 +111,7 @@ describe("a job of any kind", () => {
     await page.getByRole("button", { name: "Start the job" }).click();
     await page.getByText("It waits for its turn.").waitFor();
     const [job] = (await (await fetch(`${at.service.url}/v1/jobs?kind=evaluate`)).json()).jobs;
-    assert.deepEqual(job.specification, { dataset: "sweep", scene: "demo", baselines: true });
+    assert.deepEqual(job.specification, { dataset: "sweep", scene: "demo", baselines: true, max_run_s: null });
     assert.deepEqual(page.faults, []);
   });
 });

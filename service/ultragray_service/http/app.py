@@ -48,6 +48,10 @@ the frame of the sweep that the scene was trained from. Errors are `application/
 `reason`.
 """
 
+# What the OpenAPI document says of each operation beside what is standard.
+ROLE = "x-role"  # that it needs
+OWNED = "x-owned"  # whether what it names must be the caller's own, but for admins
+
 _SECURITY_SCHEMES = {
     "Bearer": {"type": "http", "scheme": "bearer"},
     "ApiKey": {"type": "apiKey", "in": "header", "name": "X-API-Key"},
@@ -149,6 +153,11 @@ class _Application(FastAPI):
             schemas = document.setdefault("components", {}).setdefault("schemas", {})
             schemas.update({cls.__name__: schema for (cls, _), schema in found.items() if "$ref" not in schema})
             schemas.update(extra["$defs"])
+            for method, path, operation in HttpRules().routes():
+                told = document["paths"].get(path, {}).get(method.lower())
+                if told is not None and operation.role is not None:
+                    told[ROLE] = operation.role.value
+                    told[OWNED] = operation.owned
             for unused in ("HTTPValidationError", "ValidationError"):
                 schemas.pop(unused, None)
             if self.state.service.guard.asks:

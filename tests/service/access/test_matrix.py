@@ -19,7 +19,7 @@ from ultragray_service.access.principal import Role
 from ultragray_service.access.rules import GRPC_OPERATIONS, WEBSOCKET, HttpRules, Operation, require_all_methods
 from ultragray_service.core.state import Service
 from ultragray_service.http import app as http_app
-from ultragray_service.http.app import create_app
+from ultragray_service.http.app import OWNED, ROLE, create_app
 from ultragray_service.settings import Settings
 
 from ..rpc.test_grpc_render import error_info
@@ -137,6 +137,21 @@ def test_unauthenticated_answers_say_how_to_authenticate(keyed: Keyed) -> None:
 def test_rules_and_routes_are_the_same(tmp_path: Path) -> None:
     create_app(Service(Settings(data_folder=tmp_path)))  # which has a rule for each of its routes
     assert set(METHODS) == set(GRPC_OPERATIONS)
+
+
+def test_the_openapi_document_tells_the_rules(tmp_path: Path) -> None:
+    paths = create_app(Service(Settings(data_folder=tmp_path))).openapi()["paths"]
+    told = {
+        (path, method.upper()): (operation.get(ROLE), operation.get(OWNED))
+        for path, operations in paths.items()
+        for method, operation in operations.items()
+    }
+    assert told["/v1/health/live", "GET"] == (None, None)
+    assert told["/v1/jobs", "POST"] == ("operator", False)
+    assert told["/v1/jobs/{job}", "DELETE"] == ("operator", True)
+    assert told["/v1/workers/{worker}:pause", "POST"] == ("admin", False)
+    rules = {(path, method): operation for method, path, operation in HttpRules().routes()}
+    assert all(role == (rules[one].role and rules[one].role.value) for one, (role, _) in told.items())
 
 
 def test_a_route_without_a_rule_stops_the_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

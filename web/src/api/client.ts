@@ -24,7 +24,11 @@ export type Problem = Pick<Schemas["Problem"], "status" | "detail" | "reason"> &
 
 /** The service refused. */
 export class ServiceError extends Error {
-  constructor(readonly problem: Problem) {
+  constructor(
+    readonly problem: Problem,
+    /** When asking again may help; 0: the service does not say. */
+    readonly retryAfter_s = 0,
+  ) {
     super(problem.detail);
     this.name = "ServiceError";
   }
@@ -55,6 +59,10 @@ export function setApiKey(key: string): void {
   sessionStorage.setItem(KEY_STORAGE, key);
 }
 
+export function forgetApiKey(): void {
+  sessionStorage.removeItem(KEY_STORAGE);
+}
+
 /** The headers that every request needs. */
 export function keyHeaders(): Record<string, string> {
   const key = apiKey();
@@ -72,13 +80,23 @@ export async function request(path: string, init: RequestInit = {}): Promise<Res
     if (init.signal?.aborted) throw error;
     throw new Unreachable();
   }
-  if (!response.ok) throw new ServiceError(await problemOf(response));
+  if (!response.ok) throw await refusalOf(response);
   return response;
 }
 
 /** Whether asking again may help: the service is down, full or starting. */
 export function mayPass(error: unknown): boolean {
   return !(error instanceof ServiceError) || PASSING.includes(error.problem.status);
+}
+
+/** Whether the service answers, and only wants to be asked less often. */
+export function isTooOften(error: unknown): boolean {
+  return error instanceof ServiceError && error.problem.status === 429;
+}
+
+/** How long to wait before asking again: as the service says, `least_ms` at least. */
+export function pauseAfter(error: unknown, least_ms: number): number {
+  return Math.max(least_ms, error instanceof ServiceError ? 1000 * error.retryAfter_s : 0);
 }
 
 /**
@@ -91,13 +109,15 @@ export async function untilAnswered<T>(
   signal: AbortSignal,
 ): Promise<T> {
   for (;;) {
+    let pause_ms: number;
     try {
       return await ask();
     } catch (error) {
       if (signal.aborted || !mayPass(error)) throw error;
       told(error);
+      pause_ms = pauseAfter(error, RETRY_MS);
     }
-    await new Promise((resolve) => setTimeout(resolve, RETRY_MS));
+    await new Promise((resolve) => setTimeout(resolve, pause_ms));
   }
 }
 
@@ -134,8 +154,13 @@ export async function remove<P extends Path>(path: P, places: Places<P>): Promis
   await request(address(path, places), { method: "DELETE" });
 }
 
+/** The refusal that an answer tells. */
+export async function refusalOf(response: Response): Promise<ServiceError> {
+  return new ServiceError(await problemOf(response), Number(response.headers.get("Retry-After")) || 0);
+}
+
 /** Reads a problem out of an answer; what is no problem document becomes one. */
-export async function problemOf(response: Response): Promise<Problem> {
+async function problemOf(response: Response): Promise<Problem> {
   const text = await response.text();
   try {
     const document = JSON.parse(text) as Partial<Problem>;

@@ -15,15 +15,17 @@ export async function listDatasets(): Promise<Dataset[]> {
   return (await getJson("/v1/datasets", {}, { query: { page_size: "1000" } })).datasets;
 }
 
-/** One archive is sent as it is, files as a form. Throws what `putFile` throws. */
+/** One archive is sent as it is, files as a form; others do not see a private dataset. Throws what `putFile` throws. */
 export function uploadDataset(
   dataset: string,
   files: File[],
   options: DatasetOptions,
+  isPrivate: boolean,
   told: Told,
   signal: AbortSignal,
 ): Promise<Dataset> {
   const given = new URLSearchParams(Object.entries(options).filter(([, value]) => value !== ""));
+  if (isPrivate) given.set("private", "true");
   const path = `${address("/v1/datasets/{dataset}", { dataset })}?${given}`;
   const [first] = files;
   if (files.length === 1 && first && ARCHIVES.some((suffix) => first.name.toLowerCase().endsWith(suffix)))

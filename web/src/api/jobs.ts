@@ -23,8 +23,9 @@ export async function listJobs(count: number): Promise<Job[]> {
   return (await getJson("/v1/jobs", {}, { query: { page_size: String(count) } })).jobs as Job[];
 }
 
-export function startJob(kind: string, specification: Record<string, unknown>): Promise<Job> {
-  return postJson("/v1/jobs", {}, { kind, specification }) as Promise<Job>;
+/** Others see neither a private job nor the scene that it makes. */
+export function startJob(kind: string, specification: Record<string, unknown>, isPrivate: boolean): Promise<Job> {
+  return postJson("/v1/jobs", {}, { kind, specification, private: isPrivate }) as Promise<Job>;
 }
 
 export function cancelJob(job: string): Promise<unknown> {

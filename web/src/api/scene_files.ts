@@ -14,8 +14,16 @@ export async function unloadScene(scene: string): Promise<void> {
   await postJson("/v1/scenes/{scene}:unload", { scene });
 }
 
-export function importScene(scene: string, file: File, told: Told, signal: AbortSignal): Promise<SceneDescription> {
-  return putFile(address("/v1/scenes/{scene}", { scene }), new Blob([file]), told, signal);
+/** Others do not see a private scene. */
+export function importScene(
+  scene: string,
+  file: File,
+  isPrivate: boolean,
+  told: Told,
+  signal: AbortSignal,
+): Promise<SceneDescription> {
+  const path = address("/v1/scenes/{scene}", { scene }) + (isPrivate ? "?private=true" : "");
+  return putFile(path, new Blob([file]), told, signal);
 }
 
 export function deleteScene(scene: string): Promise<void> {

@@ -1,6 +1,6 @@
 /** Sending files, told how far it is: fetch cannot say. */
 
-import { keyHeaders, problemOf, ServiceError, Unreachable } from "./client";
+import { keyHeaders, refusalOf, Unreachable } from "./client";
 
 /** Shares of the body that were sent, 0 to 1; 1 while the service checks what it got. */
 export type Told = (share: number) => void;
@@ -19,7 +19,7 @@ export function putFile<T>(path: string, body: Blob | FormData, told: Told, sign
     sending.onload = () => {
       if (sending.status < 400) return resolve(JSON.parse(sending.responseText) as T);
       const answer = new Response(sending.responseText, { status: sending.status, statusText: sending.statusText });
-      void problemOf(answer).then((problem) => reject(new ServiceError(problem)));
+      void refusalOf(answer).then(reject);
     };
     signal.addEventListener("abort", () => sending.abort());
     sending.send(body);

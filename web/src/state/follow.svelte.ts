@@ -1,6 +1,6 @@
 /** One job, followed until its end: what it says, its curve, its log. */
 
-import { explain, ServiceError, Unreachable } from "../api/client";
+import { explain, pauseAfter, ServiceError, Unreachable } from "../api/client";
 import { followJob, isFinal, trainingCurve, type CurvePoint, type Job } from "../api/jobs";
 
 const RETRY_MS = 1000;
@@ -29,6 +29,7 @@ export class FollowedJob {
   async #follow(): Promise<void> {
     const { signal } = this.#ending;
     while (!signal.aborted) {
+      let pause_ms = RETRY_MS;
       try {
         this.curve = await trainingCurve(this.id, signal);
         await followJob(
@@ -51,8 +52,9 @@ export class FollowedJob {
         this.missing = error instanceof ServiceError && error.reason === "JOB_NOT_FOUND";
         this.problem = error instanceof TypeError ? new Unreachable().message : explain(error);
         if (this.missing) return;
+        pause_ms = pauseAfter(error, RETRY_MS);
       }
-      await new Promise((resolve) => setTimeout(resolve, RETRY_MS));
+      await new Promise((resolve) => setTimeout(resolve, pause_ms));
     }
   }
 

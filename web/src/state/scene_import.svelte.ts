@@ -9,18 +9,20 @@ import { service } from "./service.svelte";
 class SceneImport extends Sending {
   file = $state.raw<File | null>(null);
   name = $state("");
+  isPrivate = $state(false);
 
   choose(file: File | null): void {
     this.file = file;
     this.problem = null;
+    this.isPrivate = false;
     if (file) this.name = nameOfFile(file.name) || "scene";
   }
 
   /** Sends the file; the scene that it becomes is pointed out. */
   async send(file: File): Promise<void> {
-    const scene = await this.transfer((told, signal) => importScene(this.name, file, told, signal));
+    const scene = await this.transfer((told, signal) => importScene(this.name, file, this.isPrivate, told, signal));
     if (scene === null) return;
-    this.file = null;
+    this.choose(null);
     await service.poll();
     if (router.route.view === "scenes") location.hash = href("scenes", scene.name);
   }

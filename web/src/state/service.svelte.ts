@@ -1,6 +1,7 @@
-/** Whether the service answers, and whether it wants a key. */
+/** Whether the service answers, whether it wants a key, and whose that is. */
 
-import { getJson, ServiceError } from "../api/client";
+import { barredFor, whoAmI, type Me, type Operation } from "../api/access";
+import { forgetApiKey, getJson, isTooOften, pauseAfter, ServiceError } from "../api/client";
 import { listScenes, type SceneEntry } from "../api/scenes";
 import { forgetSession } from "./session.svelte";
 
@@ -12,20 +13,38 @@ export type ServiceStatus = "asking" | "ready" | "starting" | "down" | "locked";
 class ServiceState {
   status = $state<ServiceStatus>("asking");
   scenes = $state.raw<SceneEntry[]>([]);
+  /** Whom the key stands for; null: not known yet. */
+  me = $state.raw<Me | null>(null);
   #timer: ReturnType<typeof setTimeout> | undefined;
 
   /** Asks now, and from now on. */
   async poll(): Promise<void> {
     clearTimeout(this.#timer);
+    let refusal: unknown = null;
     try {
       await requireFrames();
+      if (this.status !== "ready") this.me = await whoAmI();
       this.#take(await listScenes());
       this.status = "ready";
     } catch (error) {
-      this.status = statusOf(error);
+      refusal = error;
+      if (!isTooOften(error)) this.status = statusOf(error);
+      else if (this.status !== "ready") this.status = "asking";
     }
     clearTimeout(this.#timer);
-    this.#timer = setTimeout(() => void this.poll(), this.status === "ready" ? POLL_MS : POLL_DOWN_MS);
+    const least_ms = this.status === "ready" ? POLL_MS : POLL_DOWN_MS;
+    this.#timer = setTimeout(() => void this.poll(), pauseAfter(refusal, least_ms));
+  }
+
+  /** Who may do an operation in place of who looks at the page, in words; null: they may. `owner`: of what it is about. */
+  barred(operation: Operation, owner: string | null = null): string | null {
+    return this.me && barredFor(this.me, operation, owner);
+  }
+
+  /** Lets go of the key and of all that was seen with it. */
+  leave(): void {
+    forgetApiKey();
+    location.reload();
   }
 
   #take(scenes: SceneEntry[]): void {

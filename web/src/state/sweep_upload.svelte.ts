@@ -8,6 +8,7 @@ import { training } from "./training.svelte";
 class SweepUpload extends Sending {
   files = $state.raw<File[]>([]);
   name = $state("");
+  isPrivate = $state(false);
   options = $state<DatasetOptions>({});
 
   choose(files: File[]): void {
@@ -21,12 +22,13 @@ class SweepUpload extends Sending {
   discard(): void {
     this.files = [];
     this.options = {};
+    this.isPrivate = false;
   }
 
   /** Sends the files; what comes of them is the dataset that is looked at. */
   async send(): Promise<void> {
     const dataset = await this.transfer((told, signal) =>
-      uploadDataset(this.name, this.files, { ...this.options }, told, signal),
+      uploadDataset(this.name, this.files, { ...this.options }, this.isPrivate, told, signal),
     );
     if (dataset === null) return;
     this.discard();

@@ -3,6 +3,7 @@
 import { explain } from "../api/client";
 import { listDatasets, type Dataset } from "../api/datasets";
 import { listJobs, type Job } from "../api/jobs";
+import { polled } from "./polled";
 
 const POLL_MS = 4000;
 const JOBS_LISTED = 20;
@@ -19,6 +20,10 @@ class TrainingState {
   #taken = 0;
 
   async refresh(): Promise<void> {
+    await this.#ask().catch(() => undefined); // it is told as the problem
+  }
+
+  async #ask(): Promise<void> {
     const asked = ++this.#asked;
     try {
       const [datasets, jobs] = await Promise.all([listDatasets(), listJobs(JOBS_LISTED)]);
@@ -32,6 +37,7 @@ class TrainingState {
       if (asked < this.#taken) return;
       this.#taken = asked;
       this.problem = explain(error);
+      throw error;
     }
   }
 
@@ -43,9 +49,8 @@ class TrainingState {
 
   /** Asks now and from now on; the answer ends it. */
   poll(): () => void {
-    void this.refresh();
-    const timer = setInterval(() => void this.refresh(), POLL_MS);
-    return () => clearInterval(timer);
+    const nothing = (): void => undefined;
+    return polled(() => this.#ask(), POLL_MS, nothing, nothing);
   }
 }
 
