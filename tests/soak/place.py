@@ -17,7 +17,7 @@ from ultragray import GaussianScene, render
 from ..service.conftest import DEMO_PROBE, HEIGHT, WIDTH, RunningService, make_scene
 
 POSES = np.tile(np.eye(4), (12, 1, 1))
-POSES[:, 0, 3] = np.linspace(-3.0, 3.0, len(POSES))
+POSES[:, 0, 3] = np.arange(-2.75, 3.0, 0.5)  # mm, exact in float32, too, which OpenIGTLink sends
 STEADY, CHANGING = "steady", "changing"
 
 Pixels = npt.NDArray[np.uint8]
