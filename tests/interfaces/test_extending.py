@@ -23,11 +23,6 @@ CLASSES = (Contract, Family, DatasetFormat, Display, Exporter, Format, Probe, Tr
 NAMED = {cls.__name__: cls for cls in CLASSES} | {"described": described, "PRESETS": PRESETS, "STATUSES": STATUSES}
 
 
-@pytest.mark.parametrize("link", sorted(set(re.findall(r"\]\(([^)#]+)\)", TEXT))))
-def test_every_link_leads_to_a_file_or_folder(link: str) -> None:
-    assert (PAGE.parent / link).exists()
-
-
 @pytest.mark.parametrize("name", NAMED)
 def test_names_of_the_code_are_those_of_the_page(name: str) -> None:
     assert re.search(rf"`{name}\b", TEXT), "the page does not name it"
