@@ -1,4 +1,4 @@
-"""A reader of a latest stream that acknowledges gets no old frame, through any door and whatever it does."""
+"""A reader of a latest stream gets no old frame, whatever it does: over gRPC one that acknowledges, else any."""
 
 from __future__ import annotations
 
@@ -58,12 +58,13 @@ class GrpcDoor:
 
 
 class WebSocketDoor:
-    """The same over a WebSocket."""
+    """A client that reads a WebSocket, and acknowledges its frames or not."""
 
-    def __init__(self, connection: ClientConnection, settings: dict[str, Any]) -> None:
+    def __init__(self, connection: ClientConnection, settings: dict[str, Any], window: int | None) -> None:
         self._connection = connection
         self._sequence = 0
-        connection.send(json.dumps({"mode": "latest", "window": 1, "settings": settings}))
+        self._acknowledges = window is not None
+        connection.send(json.dumps({"mode": "latest", "window": window, "settings": settings}))
 
     def send(self) -> None:
         self._sequence += 1
@@ -76,7 +77,8 @@ class WebSocketDoor:
         assert isinstance(message, bytes), message
         (length,) = struct.unpack_from("<I", message)
         about = json.loads(message[4 : 4 + length])
-        self._connection.send(json.dumps({"acknowledged": about["sequence"]}))
+        if self._acknowledges:
+            self._connection.send(json.dumps({"acknowledged": about["sequence"]}))
         return float(about["client_time_ms"] / 1000)
 
 
@@ -98,11 +100,12 @@ def test_grpc(open_grpc: Any, settings: dict[str, Any]) -> None:
     check_fresh(open_grpc(settings))
 
 
+@pytest.mark.parametrize("window", [1, None], ids=["acknowledged", "unacknowledged"])
 @pytest.mark.parametrize("settings", [SMALL, LARGE], ids=["small", "large"])
-def test_websocket(service: RunningService, settings: dict[str, Any]) -> None:
+def test_websocket(service: RunningService, settings: dict[str, Any], window: int | None) -> None:
     address = f"{service.http.replace('http', 'ws', 1)}/v1/scenes/demo/stream"
     with connect(address, compression=None, max_size=None, close_timeout=0.2) as connection:
-        check_fresh(WebSocketDoor(connection, settings))
+        check_fresh(WebSocketDoor(connection, settings, window))
 
 
 def test_no_more_answers_come_than_the_window_has_room_for(open_grpc: Any, service: RunningService) -> None:

@@ -1,22 +1,83 @@
-"""The WebSocket as streams need it: a message that was sent has left the service."""
+"""The WebSocket as streams need it: a message that was sent has left the service, or is in the hands of the client."""
 
 from __future__ import annotations
 
 import asyncio
 from typing import Any
 
+from uvicorn.protocols.utils import ClientDisconnected
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
+from websockets.exceptions import InvalidState
+from websockets.frames import Frame
 
 from ..core.streams.buffers import hold_little
 
+HAND_OVER = "ultragray.hand_over"  # of an ASGI message that is sent: to return once the client has taken it
+_FRAGMENTS = 32  # of a message that is handed over
+_PINGS = 2
+
 
 class PromptWebSocket(WebSocketsSansIOProtocol):
-    """A WebSocket that buffers next to nothing: whoever sends waits until the kernel has taken the whole message."""
+    """A WebSocket that buffers next to nothing: whoever sends waits until the kernel has taken the whole message.
+
+    A message that is handed over waits longer, for pongs. Some libraries answer pings when the caller reads, which
+    suffices; others read ahead until so many fragments (Python's websockets: 16) wait for the caller, which every
+    message therefore has more than. Such a library may still read a ping that comes together with the message; it has
+    stopped when the next one comes.
+    """
+
+    _pong: asyncio.Future[None] | None = None
+    _ping = 0  # the number of the last one, which it carries
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         super().connection_made(transport)
         hold_little(transport)
 
+    def connection_lost(self, exc: Exception | None) -> None:
+        super().connection_lost(exc)
+        self._answered()
+
+    def handle_pong(self, event: Frame) -> None:
+        if bytes(event.data) == self._ping_payload:
+            self._answered()
+        else:
+            super().handle_pong(event)
+
     async def send(self, message: Any) -> None:
-        await super().send(message)
-        await self.writable.wait()
+        is_handed_over = message.get(HAND_OVER, False)
+        try:
+            if is_handed_over and "bytes" in message:
+                self._send_fragments(message["bytes"])
+            else:
+                await super().send(message)
+            await self.writable.wait()
+            for _ in range(_PINGS if is_handed_over else 0):
+                await self._be_answered()
+        except InvalidState:
+            raise ClientDisconnected from None
+
+    def _send_fragments(self, data: bytes) -> None:
+        step = -(-len(data) // _FRAGMENTS)
+        self.conn.send_binary(data[:step], fin=False)
+        for start in range(step, len(data), step):
+            self.conn.send_continuation(data[start : start + step], fin=start + step >= len(data))
+        self._write()
+
+    async def _be_answered(self) -> None:
+        """Waits for the pong of a new ping, or for the end of the connection."""
+        self._pong = self.loop.create_future()
+        self._ping += 1
+        self.conn.send_ping(self._ping_payload)
+        self._write()
+        await self._pong
+
+    @property
+    def _ping_payload(self) -> bytes:
+        return b"taken %d" % self._ping
+
+    def _answered(self) -> None:
+        if self._pong is not None and not self._pong.done():
+            self._pong.set_result(None)
+
+    def _write(self) -> None:
+        self.transport.write(b"".join(self.conn.data_to_send()))

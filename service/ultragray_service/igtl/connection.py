@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from dataclasses import replace
 from typing import Protocol
 
@@ -29,7 +31,7 @@ from .kinds import CAPABILITY, HEARD, KINDS, POSE_TYPES, UNDERSTOOD
 from .messages import HEADER_BYTES, Header, Message, pack_message, unpack_header, unpack_message
 from .routes import SceneChooser
 from .states import OK, state_of
-from .waiting import PoseMessage, WaitingPoses
+from .waiting import PoseMessage, Underway, WaitingPoses
 
 MAX_BODY_BYTES = 64 * 1024  # of a message that is read
 MAX_SKIPPED_BYTES = 64 * 2**20  # of a message that is not
@@ -61,7 +63,7 @@ class Connection:
         reader: asyncio.StreamReader,
         writer: asyncio.StreamWriter,
     ) -> None:
-        self.feed = Feed(self._send)
+        self.feed = Feed(self._turn, self._send)
         self._service = service
         self._scenes = scenes
         self._frames = frames
@@ -69,6 +71,7 @@ class Connection:
         self._reader = reader
         self._writer = writer
         self._sending = asyncio.Lock()
+        self._showing = asyncio.Lock()
         self._poses = WaitingPoses()
         hold_little(writer.transport)
         self._unread = Unread(writer.transport)
@@ -186,25 +189,35 @@ class Connection:
             if self._poses.put(posed, self._service.planner.deadline(None)):
                 self._service.metrics.count_dropped()
 
+    @asynccontextmanager
+    async def _turn(self) -> AsyncIterator[None]:
+        """The turn of a subscription to tell its newest frame: at most the one before is unread."""
+        async with self._showing:
+            await self._unread.all_but_one()
+            yield
+
     async def _render(self) -> None:
         while True:
-            await self._unread.none()  # an older image: the newest pose then is the one to render
             await self._poses.come()
             await self._service.limits.frame_turn(None)  # meanwhile newer poses replace those that wait
-            underway = self._poses.take()
-            try:
-                frame = await self._maker.render(underway)
-            except UltragrayError as error:
-                await self._refuse(underway.posed.message, error, underway.posed.arrived)
-            except Exception:
-                _log.exception("unexpected error at a pose")
-                unexpected = UltragrayError("an unexpected error, see the log")
-                await self._refuse(underway.posed.message, unexpected, underway.posed.arrived)
-            else:
-                self._frames.publish(frame, self)
-                asked = frame.posed.message
-                await self._send(frame.message("IMAGE", asked.version, asked.message_id))
-                self._count(asked.type_name, "OK", frame.posed.arrived)
+            async with self._showing:
+                await self._unread.none()
+                await self._show(self._poses.take())
+
+    async def _show(self, underway: Underway) -> None:
+        try:
+            frame = await self._maker.render(underway)
+        except UltragrayError as error:
+            await self._refuse(underway.posed.message, error, underway.posed.arrived)
+        except Exception:
+            _log.exception("unexpected error at a pose")
+            unexpected = UltragrayError("an unexpected error, see the log")
+            await self._refuse(underway.posed.message, unexpected, underway.posed.arrived)
+        else:
+            self._frames.publish(frame, self)
+            asked = frame.posed.message
+            await self._send(frame.message("IMAGE", asked.version, asked.message_id))
+            self._count(asked.type_name, "OK", frame.posed.arrived)
 
     async def _refuse(self, about: Message, error: UltragrayError, arrived: float) -> None:
         self._service.metrics.count_frame_error(error)

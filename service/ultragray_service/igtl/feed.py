@@ -6,10 +6,13 @@ import asyncio
 import contextlib
 import time
 from collections.abc import Awaitable, Callable
+from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass
 
 from .frames import Frame
 from .messages import Message
+
+Turn = Callable[[], AbstractAsyncContextManager[None]]
 
 
 @dataclass
@@ -23,7 +26,9 @@ class _Subscription:
 class Feed:
     """The subscriptions of one client, by kind of message. Holds one frame for each at most."""
 
-    def __init__(self, send: Callable[[Message], Awaitable[None]]) -> None:
+    def __init__(self, turn: Turn, send: Callable[[Message], Awaitable[None]]) -> None:
+        """`turn` is entered for each message, and waits until the client has read what came before."""
+        self._turn = turn
         self._send = send
         self._subscriptions: dict[str, _Subscription] = {}
         self._fresh: dict[str, Frame] = {}
@@ -52,10 +57,11 @@ class Feed:
             await self._wait(self._next_due())
             now = time.monotonic()
             for kind in [kind for kind in self._fresh if self._subscriptions[kind].due <= now]:
-                if (frame := self._fresh.pop(kind, None)) is not None:  # may have been stopped meanwhile
-                    subscription = self._subscriptions[kind]
-                    subscription.due = time.monotonic() + subscription.interval_s
-                    await self._send(frame.message(kind, subscription.version))
+                async with self._turn():
+                    if (frame := self._fresh.pop(kind, None)) is not None:  # may have been stopped meanwhile
+                        subscription = self._subscriptions[kind]
+                        subscription.due = time.monotonic() + subscription.interval_s
+                        await self._send(frame.message(kind, subscription.version))
 
     def _next_due(self) -> float | None:
         return min((self._subscriptions[kind].due for kind in self._fresh), default=None)

@@ -103,3 +103,5 @@ class CallTransport:
             await self._context.write(rendering_pb2.Frame(sequence=answered.sequence, error=error, **about))
         else:
             await self._context.write(frame_message(answered.outcome, answered.sequence, **about))
+
+    hand_over = send  # flow control tells the client's library what was taken, not the service

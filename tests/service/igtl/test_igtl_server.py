@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import struct
+import threading
 import time
 from pathlib import Path
 
@@ -283,3 +285,28 @@ class SlowPeer:
 @pytest.mark.parametrize("scene", ["demo", "medium", "large"])
 def test_a_slow_reader_gets_no_old_image(peer: Peer, scene: str) -> None:
     check_fresh(SlowPeer(peer, scene))
+
+
+class SlowViewer:
+    """A subscriber of what a robot sees, who sends nothing."""
+
+    def __init__(self, robot: Peer, viewer: Peer, scene: str) -> None:
+        self._robot, self._viewer, self._scene = robot, viewer, scene
+        assert viewer.ask("STT_IMAGE", "").content == b"\0"
+        threading.Thread(target=self._take_images, daemon=True).start()
+
+    def _take_images(self) -> None:
+        with contextlib.suppress(OSError):
+            while True:
+                self._robot.image()
+
+    def send(self) -> None:
+        self._robot.send_pose(np.eye(4), self._scene, timestamp=int(time.monotonic() * 2**32))
+
+    def receive(self) -> float:
+        return self._viewer.receive().timestamp / 2**32
+
+
+@pytest.mark.parametrize("scene", ["medium", "large"])
+def test_a_slow_subscriber_gets_no_image_from_before_its_last_two_readings(connect: Connect, scene: str) -> None:
+    check_fresh(SlowViewer(connect(), connect(), scene), pauses=3)

@@ -55,6 +55,9 @@ class Answered:
     dropped: int = 0  # poses that were replaced since the answer before
 
 
+Write = Callable[[Answered], Awaitable[None]]
+
+
 @dataclass(frozen=True, eq=False)
 class _Underway:
     work: asyncio.Task[Answered]
@@ -88,7 +91,7 @@ class _Window:
 
     A pose is rendered only once there is room, so that it is the newest one then. A client that acknowledges has
     opened a window of several answers, which leave it when they are acknowledged; of one that does not, one answer at
-    a time is on its way, until the transport has taken the whole of it: what lies in the buffers behind is unknown.
+    a time is on its way, until the transport has handed it over.
     """
 
     def __init__(self) -> None:
@@ -100,6 +103,10 @@ class _Window:
         self._size = size
 
     @property
+    def is_open(self) -> bool:
+        return self._size is not None
+
+    @property
     def has_room(self) -> bool:
         return len(self._entered) < (1 if self._size is None else self._size)
 
@@ -108,7 +115,7 @@ class _Window:
         self._entered.append(sequence)
 
     def sent(self) -> None:
-        """The transport has taken the whole of the oldest answer that it had not."""
+        """The transport has done with the oldest answer."""
         if self._size is None:
             self._entered.popleft()
 
@@ -137,14 +144,15 @@ class PoseStream:
         self._next: Asked | None = None
         self._window = _Window()
 
-    async def run(self, read: Callable[[], Awaitable[None]], write: Callable[[Answered], Awaitable[None]]) -> None:
+    async def run(self, read: Callable[[], Awaitable[None]], send: Write, hand_over: Write) -> None:
         """Until the client has sent its last pose and got its last frame.
 
-        `read` takes messages to `ask` and `refuse` until there are no more. Raises Draining when the service stops,
-        after the frames in flight, and what `read` and `write` raise.
+        `read` takes messages to `ask` and `refuse` until there are no more. `hand_over` sends the answers of a latest
+        stream whose client acknowledges none, `send` all others. Raises Draining when the service stops, after the
+        frames in flight, and what the three raise.
         """
         reader = asyncio.ensure_future(self._read(read))
-        writer = asyncio.ensure_future(self._write(write))
+        writer = asyncio.ensure_future(self._write(send, hand_over))
         stopping = asyncio.ensure_future(self._service.draining.wait())
         stopping.add_done_callback(partial(_cancel, reader))
         self._service.metrics.count_stream(+1)
@@ -210,10 +218,11 @@ class PoseStream:
             self._ended = True
             self._advance()
 
-    async def _write(self, write: Callable[[Answered], Awaitable[None]]) -> None:
+    async def _write(self, send: Write, hand_over: Write) -> None:
         while (underway := await self._answers.get()) is not None:
             answered = await underway.work
             dropped, self._dropped = self._dropped, 0
+            write = send if self.mode is StreamMode.ORDERED or self._window.is_open else hand_over
             await write(replace(answered, dropped=dropped))
             underway.sent()
 

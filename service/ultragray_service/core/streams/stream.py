@@ -60,6 +60,9 @@ class Transport(Protocol):
     async def send(self, answered: Answered) -> None:
         """Sends a frame, or why there is none."""
 
+    async def hand_over(self, answered: Answered) -> None:
+        """Sends, and waits until the client has taken the answer, as far as the transport can tell."""
+
 
 class FrameStream:
     """Poses in, frames out. Refused settings change nothing: those before them stay, `unset` at the beginning.
@@ -79,7 +82,7 @@ class FrameStream:
 
         Raises Draining when the service stops, and what the transport raises.
         """
-        await self._poses.run(self._read, self._transport.send)
+        await self._poses.run(self._read, self._transport.send, self._transport.hand_over)
 
     async def _read(self) -> None:
         mode = None

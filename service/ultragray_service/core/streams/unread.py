@@ -13,6 +13,7 @@ _POLL_S = 0.004
 _QUIET_S = 0.25  # a client that sends nothing tells nothing about its window
 _LONGEST_S = 5.0  # for a client whose window shrank for good
 _FIRST_BYTES = 256
+_KEEPALIVE = {"TCP_KEEPIDLE": 1, "TCP_KEEPINTVL": 1, "TCP_KEEPCNT": 100}  # s, s, probes without an answer
 
 # <linux/sockios.h> and struct tcp_info of <linux/tcp.h>
 _SIOCOUTQ = 0x5411
@@ -37,6 +38,9 @@ class Unread:
     wide as it was before the message. Linux advertises less than its room, by as much as the queue held when the last
     segment came: a whole message would fit there unseen. Hence the first bytes of a message go ahead in a segment of
     their own, which finds the queue empty and has the kernel advertise all of its room.
+
+    A client that sends nothing, as one that subscribed, tells that it has read when its kernel acknowledges the next
+    message, or a keepalive probe, which comes every second.
     """
 
     def __init__(self, transport: asyncio.WriteTransport) -> None:
@@ -45,6 +49,9 @@ class Unread:
         self._window_bytes = 0  # the widest since it last shrank for good
         self._message_bytes = 0
         self._is_ahead = False  # a message was sent after one that may be unread
+        if sys.platform == "linux" and self._socket is not None:
+            for option, value in _KEEPALIVE.items():
+                self._socket.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), value)
 
     def write(self, message: bytes) -> None:
         """Gives a message to the transport, which must not gather what it is given."""
@@ -66,6 +73,19 @@ class Unread:
                     return
                 if state.quiet_s > _QUIET_S and not self._is_ahead:
                     self._is_ahead = True
+                    return
+                if loop.time() > latest:
+                    self._window_bytes = state.window_bytes
+                    return
+            await asyncio.sleep(_POLL_S)
+
+    async def all_but_one(self) -> None:
+        """Waits until the client has read all messages before the last one, as `none` does."""
+        loop = asyncio.get_running_loop()
+        latest = loop.time() + _LONGEST_S
+        while (state := self._state()) is not None and not self._transport.is_closing():
+            if state.unacknowledged_bytes == 0:
+                if state.window_bytes >= self._window_bytes - self._message_bytes * 3 // 2:
                     return
                 if loop.time() > latest:
                     self._window_bytes = state.window_bytes

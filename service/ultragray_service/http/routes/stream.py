@@ -6,7 +6,7 @@ import asyncio
 import time
 from contextlib import ExitStack
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Any
 
 from fastapi import APIRouter, WebSocket, WebSocketDisconnect
 from pydantic import Field, FiniteFloat, TypeAdapter
@@ -23,6 +23,7 @@ from ...core.streams.stream import FrameStream, Message, SceneSettings
 from ...errors import statuses_of
 from ..deps import SceneName
 from ..problems import problem_response
+from ..prompt_websocket import HAND_OVER
 from ..reading.bodies import StreamMessage
 from ..reading.json_body import read_json
 from ..stream_messages import frame_bytes, refusal_text
@@ -157,7 +158,13 @@ class _WebSocketTransport:
         return (message.mode or StreamMode.ORDERED) if isinstance(message, _Message) else None
 
     async def send(self, answered: Answered) -> None:
-        if isinstance(answered.outcome, UltragrayError):
-            await self._websocket.send_text(refusal_text(answered))
-        else:
-            await self._websocket.send_bytes(frame_bytes(answered))
+        await self._websocket.send({"type": "websocket.send", **_contents(answered)})
+
+    async def hand_over(self, answered: Answered) -> None:
+        await self._websocket.send({"type": "websocket.send", HAND_OVER: True, **_contents(answered)})
+
+
+def _contents(answered: Answered) -> dict[str, Any]:
+    if isinstance(answered.outcome, UltragrayError):
+        return {"text": refusal_text(answered)}
+    return {"bytes": frame_bytes(answered)}
