@@ -1,9 +1,16 @@
-"""The processor that figures were measured on, as a table names it."""
+"""Facts about the machine that this process runs on."""
 
 from __future__ import annotations
 
+import os
 import platform
+from contextlib import suppress
 from pathlib import Path
+
+_GROUP_LIMITS = (  # of the control group that a container is
+    Path("/sys/fs/cgroup/memory.max"),
+    Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"),
+)
 
 
 def processor_name() -> str:
@@ -14,3 +21,12 @@ def processor_name() -> str:
             if line.startswith("model name"):
                 return line.partition(":")[2].strip()
     return platform.processor() or platform.machine()
+
+
+def memory_bytes() -> int:
+    """The memory of the machine, or of the container where that may have less."""
+    found = [os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")]
+    for limit in _GROUP_LIMITS:
+        with suppress(OSError, ValueError):  # another layout, or "max": no limit
+            found.append(int(limit.read_text(encoding="ascii")))
+    return min(found)

@@ -1,4 +1,4 @@
-"""The name of the processor."""
+"""The name of the processor, and how much memory there is."""
 
 from __future__ import annotations
 
@@ -21,3 +21,13 @@ def test_else_the_architecture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(machine, "Path", lambda _: tmp_path / "none")
     monkeypatch.setattr(platform, "processor", lambda: "")
     assert machine.processor_name() == platform.machine()
+
+
+def test_a_container_may_have_less_memory_than_the_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    limits = (tmp_path / "memory.max", tmp_path / "none")
+    monkeypatch.setattr(machine, "_GROUP_LIMITS", limits)
+    limits[0].write_text("max\n")
+    whole = machine.memory_bytes()
+    assert whole >= 2**28
+    limits[0].write_text("268435456\n")
+    assert machine.memory_bytes() == 2**28

@@ -32,6 +32,7 @@ LIMITS = {  # by the name of the key
     "ordered": "frames_per_s=4",
     "latest": "frames_per_s=2",
     "rpc-latest": "frames_per_s=2",
+    "client": "frames_per_s=2",
     "streams": "streams=1",
     "greedy": "requests_per_s=5",
     "polite": "requests_per_s=none",

@@ -17,6 +17,7 @@ import pytest
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
+from ultragray_client import Client, RenderSettings
 from ultragray_proto.v1 import access_pb2, access_pb2_grpc, rendering_pb2
 
 from ....waiting import wait_until
@@ -196,6 +197,15 @@ def _works(open_stream: Callable[[], object]) -> bool:
     except (InvalidStatus, grpc.RpcError):
         return False
     return True
+
+
+def test_the_python_client_waits_as_long_as_it_is_told(limited: Limited) -> None:
+    with Client(limited.service.grpc, api_key=limited.keys["client"], timeout_s=120.0) as client:
+        began = time.monotonic()
+        for _ in range(5):
+            client.render("demo", np.eye(4), RenderSettings(**SMALL))
+        assert time.monotonic() - began >= 2.0
+    assert limited.refusals("frames_per_s") >= 1
 
 
 def test_a_greedy_client_costs_a_polite_one_nothing(limited: Limited) -> None:

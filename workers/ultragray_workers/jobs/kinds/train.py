@@ -8,11 +8,13 @@ from typing import Any, Literal
 
 from ultragray.contract import described, kind_field, shown
 from ultragray.errors import InvalidArgument
+from ultragray.machine import memory_bytes
 from ultragray.training.config import PRESETS, TrainingConfig
 
-from .base import Specification
+from .base import Specification, Surroundings
 
 _MAX_SETTINGS, _MAX_SETTING_CHARACTERS = 100, 100
+_GIB = 1 << 30
 _DEVICE = re.compile(r"auto|cpu|cuda(:\d{1,3})?")
 
 
@@ -51,6 +53,17 @@ class TrainJob(Specification):
             TrainingConfig.preset(self.preset, **self.settings)
         except InvalidArgument as error:
             raise InvalidArgument(error.detail, field=f"settings.{error.field}") from None
+
+    def check(self, surroundings: Surroundings) -> None:
+        """Raises InvalidArgument for more memory than this machine has, unless it is to be a GPU's.
+
+        The worker allows no more than its own machine has left, either, see `ultragray.training.memory`.
+        """
+        memory_gb = TrainingConfig.preset(self.preset, **self.settings).memory_gb
+        if memory_gb is None or self.device.startswith("cuda"):
+            return
+        most_gb = memory_bytes() / _GIB
+        _require(memory_gb <= most_gb, "settings.memory_gb", f"at most the {most_gb:.1f} GiB of the host", memory_gb)
 
 
 def _require(holds: bool, field: str, expected: str, given: Any) -> None:

@@ -1,0 +1,28 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from ultragray.errors import InvalidArgument
+from ultragray_workers.jobs.kinds import TrainJob, train
+from ultragray_workers.jobs.kinds.base import Surroundings
+
+
+def test_a_training_may_not_have_more_memory_than_the_host(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(train, "memory_bytes", lambda: 8 << 30)
+
+    def check(device: str, memory_gb: float | None) -> None:
+        TrainJob("liver", "new", settings={"memory_gb": memory_gb}, device=device).check(
+            Surroundings(None, tmp_path, 512)
+        )
+
+    for device in ("cpu", "auto"):
+        with pytest.raises(
+            InvalidArgument, match=r"memory_gb must be at most the 8\.0 GiB of the host, got 8\.5"
+        ) as told:
+            check(device, 8.5)
+        assert told.value.field == "settings.memory_gb"
+        check(device, 8.0)
+        check(device, None)
+    check("cuda:0", 80.0)  # of the GPU, which the worker knows
