@@ -9,7 +9,7 @@ import { askAs, giveKeys, pageOf } from "./people.mjs";
 import { tested } from "./tested.mjs";
 
 const at = tested({
-  environment: { ULTRAGRAY_EMBEDDED_WORKER: "true", ULTRAGRAY_TRAINING_THREADS: "1" },
+  environment: { ULTRAGRAY_EMBEDDED_WORKER: "true", ULTRAGRAY_TRAINING_THREADS: "1", ULTRAGRAY_KEY_STREAMS: "1" },
   sweep: true,
   prepare: async (at) => {
     at.keys = await giveKeys(at.service);
@@ -68,6 +68,19 @@ describe("a reader", () => {
     assert.deepEqual(await seriousFindings(page), []);
     await picture(page, "scenes-reader");
     assert.deepEqual(page.faults, []);
+  });
+});
+
+describe("a key that has as many streams as it may", () => {
+  it("is told of it, and goes on when another one ends", async () => {
+    const image = '[aria-label="Live image"]';
+    const first = await pageOf(at, "rita", "#/scan/demo");
+    await until(() => canvasState(first, image), ({ mean }) => mean > 5, "no frame came");
+    const second = await pageOf(at, "rita", "#/scan/demo");
+    await second.getByTestId("stream-barred").getByText("as many streams open as it may").waitFor();
+    await first.close();
+    await until(() => canvasState(second, image), ({ mean }) => mean > 5, "it does not go on");
+    await second.getByTestId("stream-barred").waitFor({ state: "detached" });
   });
 });
 

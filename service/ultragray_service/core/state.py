@@ -120,9 +120,7 @@ class Service:
         checks, pictures = (HelperProcesses(settings.dataset_memory_mb << 20) for _ in range(2))
         self.uploads = DatasetUploads(self.datasets, settings, self.draining, checks, self.owners, holdings)
         self.datasets.in_use = self.jobs.uses_dataset
-        self.imports = SceneImports(
-            store, settings, lambda name: self.jobs.do(JobStore.makes_scene, name), checks, self.owners, holdings
-        )
+        self.imports = SceneImports(store, settings, self.jobs.makes_scene, checks, self.owners, holdings)
         self.dataset_views = DatasetViews(self.datasets, settings, pictures)
         self.comparisons = Comparisons(store, self.catalog, self.datasets, settings, pictures)
         self.training_views = TrainingViews(self.jobs, self.datasets, settings, pictures)

@@ -139,6 +139,21 @@ def test_names_of_private_things_are_taken_all_the_same(
     assert keyed.http("alice", "GET", "/v1/datasets/secret").json()["owner"] == "alice"
 
 
+def test_a_private_job_that_is_in_the_way_is_not_named(keyed: Keyed, scene_bytes: bytes, dataset_bytes: bytes) -> None:
+    assert keyed.http("bob", "PUT", "/v1/datasets/lent", content=dataset_bytes).status_code == 201
+    for private, scene in ((True, "hush"), (False, "told")):
+        body = {"kind": "train", "specification": {"dataset": "lent", "scene": scene}, "private": private}
+        job = keyed.http("alice", "POST", "/v1/jobs", json=body).json()["id"]
+        for method, path, content, reason in (
+            ("DELETE", "/v1/datasets/lent", None, "DATASET_IN_USE"),
+            ("PUT", f"/v1/scenes/{scene}", scene_bytes, "SCENE_EXISTS"),
+        ):
+            answer = keyed.http("bob", method, path, content=content)
+            assert (answer.status_code, answer.json()["reason"]) == (409, reason)
+            assert (job in answer.json()["detail"]) is not private, answer.json()
+        assert keyed.http("alice", "POST", f"/v1/jobs/{job}:cancel").status_code == 200
+
+
 def test_the_request_id_of_somebody_else_gives_no_job(keyed: Keyed) -> None:
     assert keyed.submit("alice", request_id="same", private=True).status_code == 201
     answer = keyed.submit("bob", request_id="same")

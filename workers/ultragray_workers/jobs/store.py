@@ -66,6 +66,13 @@ def _admit_any(jobs: JobStore) -> None:
     """Keeps no job out."""
 
 
+Shown = Callable[[Ownership], bool]  # whether whoever asks may know of a job
+
+
+def _all_are_shown(_: Ownership) -> bool:
+    return True
+
+
 class JobStore:
     """The jobs of an artifact folder. Its methods block; they may be called from any thread."""
 
@@ -216,7 +223,7 @@ class JobStore:
         *,
         state: JobState | None = None,
         kind: str | None = None,
-        shown: Callable[[Ownership], bool] = lambda ownership: True,
+        shown: Shown = _all_are_shown,
         page_size: int = 50,
         page_token: str | None = None,
     ) -> tuple[list[Job], str | None]:
@@ -325,7 +332,7 @@ class JobStore:
             raise ArtifactNotFound(f"the job {job_id} has no artifact {name[:128]!r}; it has {known}", field="name")
         return path
 
-    def workers(self, shown: Callable[[Ownership], bool] = lambda ownership: True) -> tuple[Worker, ...]:
+    def workers(self, shown: Shown = _all_are_shown) -> tuple[Worker, ...]:
         """The workers of the queue, by name; a job at hand that is not `shown`, or gone again, is left out."""
 
         def told(worker: Worker) -> Worker:
@@ -338,22 +345,25 @@ class JobStore:
         """The worker, which is told what is wanted of it. Raises WorkerNotFound."""
         return attendance.want(self.database, worker, wanted)
 
-    def uses_dataset(self, name: str) -> str | None:
+    def uses_dataset(self, name: str, shown: Shown = _all_are_shown) -> str | None:
         """The job that needs a dataset, in words; None where no job that waits or runs does."""
-        return self._unfinished("needs_dataset", name)
+        return self._unfinished("needs_dataset", name, shown)
 
-    def makes_scene(self, name: str) -> str | None:
+    def makes_scene(self, name: str, shown: Shown = _all_are_shown) -> str | None:
         """The job that will serve a scene of that name, in words; None where no job that waits or runs does."""
-        return self._unfinished("makes_scene", name)
+        return self._unfinished("makes_scene", name, shown)
 
     def close(self) -> None:
         """Ends the connections to the database; the folder may be restored."""
         self.database.close()
         self._open.close()
 
-    def _unfinished(self, role: str, name: str) -> str | None:
+    def _unfinished(self, role: str, name: str, shown: Shown) -> str | None:
         job_id = unfinished.naming(self.database, role, name)
-        return None if job_id is None else f"the job {job_id}"
+        if job_id is None:
+            return None
+        row = self.database.workflow(job_id)
+        return f"the job {job_id}" if row is not None and shown(ownership_of(row)) else "a private job of somebody else"
 
     def _row(self, job_id: str, *, with_input: bool = False) -> WorkflowStatus:
         row = None

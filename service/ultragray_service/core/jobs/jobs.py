@@ -169,8 +169,12 @@ class Jobs:
         return WorkerList(await self.do(JobStore.workers, partial(may_see, acting())))
 
     def uses_dataset(self, name: str) -> str | None:
-        """The waiting or running job that needs a dataset; blocks. Raises NotReady before the start."""
-        return self._store.uses_dataset(name)
+        """The waiting or running job that needs a dataset, in words; blocks. Raises NotReady before the start."""
+        return self._store.uses_dataset(name, partial(may_see, acting()))
+
+    async def makes_scene(self, name: str) -> str | None:
+        """The waiting or running job that will serve a scene of that name, in words."""
+        return await self.do(JobStore.makes_scene, name, partial(may_see, acting()))
 
     async def close(self) -> None:
         """Closes the store."""
