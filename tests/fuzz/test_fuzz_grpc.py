@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import pkgutil
 from collections.abc import Iterator
 from dataclasses import dataclass
+from importlib import import_module
 from typing import Any
 
 import grpc
@@ -12,7 +14,8 @@ from google.protobuf.message import Message
 from google.protobuf.message_factory import GetMessageClass
 from hypothesis import strategies as st
 
-from ultragray_proto.v1 import datasets_pb2, geometry_pb2, jobs_pb2, rendering_pb2, scenes_pb2
+from ultragray_proto import v1
+from ultragray_proto.v1 import datasets_pb2, geometry_pb2, jobs_pb2, rendering_pb2, scenes_pb2, workers_pb2
 
 from .conftest import EnterDoor
 from .fuzzed import EXPECTED_CODES, UNEXPECTED_REASONS, FuzzedService
@@ -56,6 +59,7 @@ VALID: tuple[Message, ...] = (
     ),
     jobs_pb2.SubmitJobRequest(train=jobs_pb2.TrainJob(dataset="absent", scene="new", preset="fast")),
     jobs_pb2.SubmitJobRequest(evaluate=jobs_pb2.EvaluateJob(dataset="absent", scene="demo")),
+    workers_pb2.PauseWorkerRequest(worker="absent-0"),
     datasets_pb2.UploadDatasetRequest(header=datasets_pb2.UploadHeader(dataset="new", archive=True)),
 )
 
@@ -80,10 +84,11 @@ class Method:
 
 
 def all_methods() -> list[Method]:
+    modules = [name for _, name, _ in pkgutil.iter_modules(v1.__path__) if name.endswith("_pb2")]
     services = (
         service
-        for module in (scenes_pb2, rendering_pb2, datasets_pb2, jobs_pb2)
-        for service in module.DESCRIPTOR.services_by_name.values()
+        for module in modules
+        for service in import_module(f"{v1.__name__}.{module}").DESCRIPTOR.services_by_name.values()
     )
     return [
         Method(
