@@ -22,6 +22,7 @@ _PASSED_ON = (
     "database_url",
     "training_threads",
     "job_nice",
+    "max_footprint_pixels",
     "job_drain_timeout_s",
     "job_retention_days",
     "log_level",

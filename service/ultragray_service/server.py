@@ -61,6 +61,8 @@ async def serve(settings: Settings) -> None:
     manager = ServiceManager()
     certificates = CertificateWatch.of(settings)
     service = Service(settings)
+    if certificates is not None:
+        service.metrics.tell_certificate_expiry(lambda: certificates.current.not_after)
     await service.open()
     grpc_server = GrpcServer(service)
     grpc_port = _bind_grpc(grpc_server, settings, certificates)

@@ -108,7 +108,12 @@ class Settings(Contract):
         low=1,
         high=2**62,
     )
-    max_body_bytes: int = described("Largest HTTP request body.", 8 * 2**20, low=1024, high=2**30)
+    max_body_bytes: int = described(
+        "Largest HTTP request body and gRPC message; of gRPC at least 2 MiB, for the chunks of uploads.",
+        8 * 2**20,
+        low=1024,
+        high=2**30,
+    )
 
     artifact_folder: Path | None = described(
         "Folder of datasets and jobs, which all services and workers share; none: artifacts in the data folder.", None

@@ -6,6 +6,7 @@ import json
 import logging
 import math
 import sys
+from datetime import datetime, timezone
 
 import numpy as np
 import pytest
@@ -80,6 +81,7 @@ def test_metrics(service: Service) -> None:
     service.metrics.count_frame_error(QueueFull("all places are taken"))
     service.metrics.observe_result(rendered())
     service.metrics.count_limited("streams")
+    service.metrics.tell_certificate_expiry(lambda: datetime(2030, 1, 1, tzinfo=timezone.utc))
     service.jobs.overview = JobsOverview({JobState.QUEUED: 1}, {WorkerState.IDLE: 1})
     found = {}
     for metric in service.metrics.registry.collect():
@@ -129,7 +131,7 @@ def test_fixed_limits() -> None:
         "Bytes of these frames, if there are several": pose_stream.MAX_BYTES_IN_FLIGHT,
         "Frames in the window of a latest stream": pose_stream.MAX_WINDOW,
         "Message to a WebSocket": http_server.MAX_STREAM_MESSAGE_BYTES,
-        "gRPC message received": grpc_server.MAX_RECEIVE_BYTES,
+        "gRPC message received, where `ULTRAGRAY_MAX_BODY_BYTES` is less": grpc_server.LEAST_MAX_MESSAGE_BYTES,
         "Keepalive pings of a gRPC client, no more often than every": grpc_server.LEAST_PING_INTERVAL_MS,
         "TLS handshake": HANDSHAKE_TIMEOUT_S,
         "JPEG quality": pixels.JPEG_QUALITY,

@@ -43,7 +43,10 @@ def worker(
 
 
 def run_worker(overrides: dict[str, Any], *, name: str | None = None, device: str = "auto") -> None:
-    """Do jobs until SIGTERM or SIGINT, then end the process. Raises StartupFailed, InvalidArgument."""
+    """Do jobs until SIGTERM or SIGINT, then end the process; a second signal ends the drain at once.
+
+    Raises StartupFailed, InvalidArgument.
+    """
     from opentelemetry import trace
 
     from ultragray_workers.jobs.worker.worker import work
@@ -61,17 +64,19 @@ def run_worker(overrides: dict[str, Any], *, name: str | None = None, device: st
     tracing = start_tracing("worker")
     if tracing is not None:
         trace.set_tracer_provider(tracing.provider)
-    stop = threading.Event()
+    stop, hurry = threading.Event(), threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda received, frame: stop.set())
+        signal.signal(number, lambda received, frame: (hurry if stop.is_set() else stop).set())
     work(
         settings.artifacts,
         settings.database_url,
         stop,
+        hurry=hurry,
         name=name,
         device=device,
         threads=settings.training_threads,
         nice=settings.job_nice,
+        max_footprint_pixels=settings.max_footprint_pixels,
         retention_days=settings.job_retention_days,
         stall_timeout_s=settings.job_stall_timeout_s,
         max_run_s=settings.job_max_run_s,

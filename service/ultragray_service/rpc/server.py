@@ -38,7 +38,7 @@ from .services.scenes import SceneService
 from .services.workers import WorkerService
 from .traced import TracedCalls
 
-MAX_RECEIVE_BYTES = 16 * 2**20
+LEAST_MAX_MESSAGE_BYTES = 2 * 2**20  # room for a chunk of an upload
 LEAST_PING_INTERVAL_MS = 10_000
 MAX_CALLS_PER_CONNECTION = 1024
 _UNLIMITED = -1
@@ -70,7 +70,7 @@ class GrpcServer:
                 *([] if service.tracing is None else [TracedCalls(service.tracing)]),
             ],
             options=[
-                ("grpc.max_receive_message_length", MAX_RECEIVE_BYTES),
+                ("grpc.max_receive_message_length", max(service.settings.max_body_bytes, LEAST_MAX_MESSAGE_BYTES)),
                 ("grpc.max_send_message_length", _UNLIMITED),
                 # A client may ask this often whether the service is still there, as in a quiet WatchJob; without it, a
                 # client that asks more than twice within five minutes is cut off.

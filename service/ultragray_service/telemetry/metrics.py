@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from datetime import datetime
 from functools import partial
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, ProcessCollector, generate_latest
@@ -122,6 +123,15 @@ class Metrics:
         self.registry.register(_PoolCollector(pool))
         self.registry.register(_JobsCollector(jobs))
         ProcessCollector(registry=self.registry)
+
+    def tell_certificate_expiry(self, not_after: Callable[[], datetime]) -> None:
+        """The end of the certificate in use, which is asked for at each scrape."""
+        expiry = Gauge(
+            "ultragray_certificate_expires_timestamp_seconds",
+            "Unix time at which the TLS certificate in use expires.",
+            registry=self.registry,
+        )
+        expiry.set_function(lambda: not_after().timestamp())
 
     def count_request(self, door: str, route: str, status: str, seconds: float) -> None:
         """One answered request of `door` http, websocket, grpc or igtl, whose errors are also frame errors."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import re
 import socket
 import ssl
 import time
@@ -80,6 +81,11 @@ def test_both_doors_speak_tls_and_nothing_else(
     with httpx.Client(base_url=serving.http, verify=mounted.context(), timeout=60) as client:
         assert client.post("/v1/scenes/demo/render", json={"pose": pose_body}).status_code == 200
         assert client.get("/v1/scenes").json()["scenes"]
+        certificate = x509.load_pem_x509_certificate((mounted.folder / SERVER).read_bytes())
+        (told,) = re.findall(
+            r"^ultragray_certificate_expires_timestamp_seconds (.*)$", client.get("/metrics").text, re.M
+        )
+        assert float(told) == certificate.not_valid_after_utc.timestamp()
     stream = f"{serving.http.replace('https', 'wss')}/v1/scenes/demo/stream"
     with connect(stream, ssl=mounted.context(), max_size=None) as connection:
         connection.send('{"sequence": 7, "pose": {"matrix": [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}}')

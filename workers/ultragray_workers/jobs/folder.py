@@ -84,6 +84,7 @@ class Request:
     device: str  # cpu, cuda or cuda:N
     threads: int
     nice: int
+    max_footprint_pixels: int | None = None  # of a frame, see ultragray.limits; None: no limit
 
 
 class JobFolder:

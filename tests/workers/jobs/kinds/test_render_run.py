@@ -18,7 +18,7 @@ from ultragray.contract import to_dict as to_json
 from ultragray.datasets.plus import read_plus_sweep
 from ultragray.display import Display
 from ultragray.display.frames import show
-from ultragray.errors import ExtraMissing, InvalidArgument, InvalidProbe, LowConfidence
+from ultragray.errors import ExtraMissing, FrameTooCostly, InvalidArgument, InvalidProbe, LowConfidence
 from ultragray.interchange import rendering
 from ultragray.samplers import AroundSampler, CoveredSampler, FanSampler, SplineSampler, TrainingSampler
 from ultragray.settings import Below
@@ -43,13 +43,19 @@ def work(tmp_path: Path, random_scene: Callable[..., GaussianScene]) -> Callable
     """The work of a job whose folder holds its scene."""
     info = {"probe": PROBE, "image_height": 24, "image_width": 20}
 
-    def make(job: RenderJob, *, should_stop: Callable[[], bool] = lambda: False, **changes: object) -> JobRun:
+    def make(
+        job: RenderJob,
+        *,
+        should_stop: Callable[[], bool] = lambda: False,
+        max_footprint_pixels: int | None = None,
+        **changes: object,
+    ) -> JobRun:
         folder = JobFolder(tmp_path, "job")
         folder.path.mkdir(parents=True)
         made = random_scene(60, info=info | changes)
         scene = GaussianScene.from_splats(made.splats, info=made.info, training_poses=TRAINING)
         scene.save(folder.path / f"{job.scene}.ugr")
-        return JobRun(folder, Request(to_dict(job), None, None, "cpu", 1, 0), should_stop)
+        return JobRun(folder, Request(to_dict(job), None, None, "cpu", 1, 0, max_footprint_pixels), should_stop)
 
     return make
 
@@ -186,3 +192,12 @@ def test_frames_below_the_limit_are_masked_instead_of_refused(work: Callable[...
     with np.load(asked.folder.artifacts / "frames.npz") as archive:
         assert archive["bmode"].shape[0] == len(far)
         assert (archive["bmode"][4] > 0).sum() < (archive["bmode"][0] > 0).sum()
+
+
+def test_a_frame_that_costs_more_than_the_limit_fails_the_job_and_is_named(work: Callable[..., JobRun]) -> None:
+    job = RenderJob(scene="one", poses=TRAINING[:2].tolist(), height=16, width=12)
+    asked = work(job, max_footprint_pixels=1)
+    with pytest.raises(FrameTooCostly, match="ask for fewer pixels") as refused:
+        render_run.run(asked, job)
+    assert refused.value.field == "poses[0]"
+    assert asked.folder.artifact_names() == ()

@@ -12,7 +12,7 @@ import sqlalchemy as sa
 from ultragray_workers.errors import StartupFailed
 from ultragray_workers.jobs.queue import tables
 from ultragray_workers.jobs.queue.database import JobDatabase
-from ultragray_workers.jobs.queue.internals import SCHEMA
+from ultragray_workers.jobs.queue.internals import QUEUE_VERSION, SCHEMA, latest_queue_version
 
 from ....postgres import NewDatabase
 
@@ -68,6 +68,16 @@ def test_tables_of_a_newer_release_are_refused_in_words(tmp_path: Path, database
         connection.execute(sa.update(tables.SCHEMA_VERSION).values(version=tables.VERSION + 1))
     jobs.close()
     with pytest.raises(StartupFailed, match=f"tables of version {tables.VERSION + 1}.*up to version {tables.VERSION}"):
+        JobDatabase(tmp_path, database_url)
+
+
+def test_tables_of_a_newer_queue_are_refused_in_words(tmp_path: Path, database_url: str | None) -> None:
+    jobs = JobDatabase(tmp_path, database_url)
+    known = latest_queue_version(jobs.engine.dialect.name)
+    with jobs.engine.begin() as connection:
+        connection.execute(sa.update(QUEUE_VERSION).values(version=known + 1))
+    jobs.close()
+    with pytest.raises(StartupFailed, match=f"tables of the queue of version {known + 1}.*up to version {known}"):
         JobDatabase(tmp_path, database_url)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -110,6 +111,34 @@ def test_job_without_checkpoints_has_its_time_when_the_worker_is_stopped(
     job = until(store.submit(render_job(400))[0], lambda job: (job.progress.frames or 0) > 0)
     assert running.terminate() == 0
     assert store.get(job.id).state is state
+
+
+@pytest.mark.long
+def test_a_second_signal_ends_the_drain_of_a_worker_at_once(
+    store: JobStore, artifact_folder: Path, tmp_path: Path, until: Until
+) -> None:
+    (artifact_folder / "scenes").mkdir()
+    copy_demo_scene(artifact_folder / "scenes" / "demo.ugr")
+    environment = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join(filter(None, sys.path)),
+        "ULTRAGRAY_JOB_DRAIN_TIMEOUT_S": "3600",
+    }
+    command = [sys.executable, "-c", "from ultragray_service.cli.app import app; app()", "worker", "--device", "cpu"]
+    with (tmp_path / "log").open("wb") as log:
+        worker = subprocess.Popen(
+            [*command, "--artifact-folder", str(artifact_folder)], env=environment, stdout=log, stderr=log
+        )
+    try:
+        job = until(store.submit(render_job(100_000))[0], lambda job: (job.progress.frames_done or 0) > 0)
+        worker.send_signal(signal.SIGTERM)
+        with pytest.raises(subprocess.TimeoutExpired):
+            worker.wait(1)  # the job has an hour to end
+        worker.send_signal(signal.SIGINT)
+        assert worker.wait(60) == 0
+        assert store.get(job.id).state is JobState.QUEUED
+    finally:
+        worker.kill()
 
 
 def test_commands_list_pause_and_resume(store: JobStore, artifact_folder: Path, start_worker: StartWorker) -> None:

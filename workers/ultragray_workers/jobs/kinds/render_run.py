@@ -9,6 +9,7 @@ from ultragray.confidence import Assessor, Extrapolation
 from ultragray.files.atomic import file_sha256
 from ultragray.interchange.exports import FORMATS
 from ultragray.interchange.rendering import render_to_file
+from ultragray.limits import Limits
 from ultragray.probe import FloatArray, Probe
 from ultragray.samplers import Assess
 from ultragray.scene import GaussianScene
@@ -27,7 +28,8 @@ ASSESSED_AT_ONCE = 100_000  # poses times training poses, of about a tenth of a 
 def run(job_run: JobRun, job: RenderJob) -> Outcome:
     """Renders all poses into `frames` with the suffix of the format.
 
-    Raises Stopped, InvalidArgument, LowConfidence, InvalidProbe, SceneFileInvalid, ExtraMissing.
+    Raises Stopped, InvalidArgument, LowConfidence, InvalidProbe, FrameTooCostly, SceneFileInvalid,
+    ExtraMissing.
     """
     device = training_device(job_run.request.device, "auto")
     path = job_run.folder.path / f"{job.scene}{SUFFIX}"
@@ -59,6 +61,7 @@ def run(job_run: JobRun, job: RenderJob) -> Outcome:
             dtype=job.dtype,
             scene_name=job.scene,
             scene_sha256=file_sha256(path),
+            limits=Limits(job_run.request.max_footprint_pixels),
             before_portion=before_portion,
         )
     return Outcome(artifacts=job_run.folder.artifact_names())

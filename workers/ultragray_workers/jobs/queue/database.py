@@ -128,6 +128,7 @@ class JobDatabase:
             # The lock connects first: DBOS would make a PostgreSQL database that is not there, and a misspelt name
             # would be a queue of its own.
             with tables.one_at_a_time(engine.url):
+                tables.require_known_queue(self.engine)
                 DBOS.migrate(self.url)
                 tables.migrate(self.engine)
                 self.folder = self._identify(artifact_folder)

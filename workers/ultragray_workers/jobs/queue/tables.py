@@ -13,7 +13,7 @@ from contextlib import contextmanager
 import sqlalchemy as sa
 
 from ...errors import StartupFailed
-from .internals import SCHEMA
+from .internals import QUEUE_VERSION, SCHEMA, latest_queue_version
 
 TABLES = sa.MetaData(schema=SCHEMA)
 WORKERS = sa.Table(
@@ -200,11 +200,25 @@ def migrate(engine: sa.Engine) -> None:
         found = version(connection)
         if found <= VERSION:
             migrate_to(connection, VERSION)
-    if found > VERSION:
+    _require_known(engine, "tables", found, VERSION)
+
+
+def require_known_queue(engine: sa.Engine) -> None:
+    """Raises StartupFailed where a newer release has migrated the queue's own tables."""
+    with engine.connect() as connection:
+        schema = None if engine.dialect.name == "sqlite" else SCHEMA
+        if not sa.inspect(connection).has_table(QUEUE_VERSION.name, schema=schema):
+            return
+        found = connection.execute(sa.select(QUEUE_VERSION.c.version)).scalar() or 0
+    _require_known(engine, "tables of the queue", found, latest_queue_version(engine.dialect.name))
+
+
+def _require_known(engine: sa.Engine, what: str, found: int, known: int) -> None:
+    if found > known:
         engine.dispose()
         raise StartupFailed(
-            f"the database of the jobs has tables of version {found}, and this release knows them up to version "
-            f"{VERSION}: a newer release has used it; start that one, or restore a backup made before it",
+            f"the database of the jobs has {what} of version {found}, and this release knows them up to version "
+            f"{known}: a newer release has used it; start that one, or restore a backup made before it",
             field="database_url",
         )
 

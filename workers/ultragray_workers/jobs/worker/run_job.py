@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import fcntl
 import os
+import re
 import signal
 import sys
 import time
@@ -27,6 +28,7 @@ from .job_run import JobRun, Stopped
 
 STOPPED, STORAGE_FULL, FOLDER_LOST = 75, 73, 74
 _LOCK_POLL_S = 0.2
+_FOLDERS = re.compile(r"(?<![\w./:])/(?:[^\s/:,;'\"()]+/)+")  # of an absolute path
 _OOM_SCORE_ADJ = "500"  # of 1000: where memory runs out, jobs go before the service and its workers
 
 
@@ -63,7 +65,7 @@ def main(folder_path: str, worker_pid: str) -> int:
         except OSError as error:
             if is_no_room(error):
                 return STORAGE_FULL
-            traceback.print_exc()
+            _tell_traceback()
             return FOLDER_LOST
     return 0
 
@@ -93,15 +95,24 @@ def _outcome_of(job_run: JobRun) -> Outcome:
     except Exception as error:
         if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and "allocate memory" in str(error)):
             return _failed(job_run, MemoryExceeded.reason, "the memory of the machine did not suffice for this job")
-        traceback.print_exc()
+        _tell_traceback()
         message = " ".join(str(error).split()) or "no message"
         return _failed(
             job_run, "INTERNAL", f"the process of the job failed, see its log: {type(error).__name__}: {message}"
         )
 
 
+def _tell_traceback() -> None:
+    sys.stderr.write(_without_folders(traceback.format_exc()))
+
+
+def _without_folders(text: str) -> str:
+    """A text with absolute paths cut to their last part: callers learn no folders of the service."""
+    return _FOLDERS.sub("", text)
+
+
 def _failed(job_run: JobRun, error: str, reason: str) -> Outcome:
-    shown = reason.replace(f"{job_run.folder.artifact_folder}{os.sep}", "")  # callers learn no paths of the service
+    shown = _without_folders(reason.replace(f"{job_run.folder.artifact_folder}{os.sep}", ""))
     with suppress(OSError):
         sys.stderr.write(f"failed: {shown}\n")
     return Outcome(error=error, reason=shown, progress=job_run.progress)

@@ -63,6 +63,7 @@ class WorkerConfig:
     device: str = "auto"
     threads: int = 1
     nice: int = 10
+    max_footprint_pixels: int | None = None  # of a frame of a render job; None: no limit
     stall_timeout_s: float = 0.0  # 0: no limit; likewise the next
     max_run_s: float = 0.0
 
@@ -90,15 +91,19 @@ class Supervisor:
         """Whether there is a job at hand that nobody watches: then this worker should count as dead."""
         return self.job_at_hand is not None and time.monotonic() - self._moved_at_s > STUCK_AFTER_S
 
-    def stop(self, drain_timeout_s: float = 0.0) -> None:
+    def stop(self, drain_timeout_s: float, hurry: threading.Event) -> None:
         """Ends the process at hand, which writes a checkpoint, and puts its job back into the queue.
 
-        A job that would begin anew has `drain_timeout_s` to end first. Jobs that DBOS starts from now on are put back
-        too.
+        A job that would begin anew has `drain_timeout_s` to end first, or until `hurry` is set. Jobs that DBOS starts
+        from now on are put back too.
         """
         self._stop_by_s = time.monotonic() + drain_timeout_s
         self._stop.set()
-        self._idle.wait(drain_timeout_s + STOP_WAIT_S + 5.0)
+        while time.monotonic() < self._stop_by_s and not hurry.is_set():
+            if self._idle.wait(_POLL_INTERVAL_S):
+                return
+        self._stop_by_s = float("-inf")
+        self._idle.wait(STOP_WAIT_S + 5.0)
 
     def supervise(self, job_id: str, request: dict[str, Any]) -> Outcome:
         """Does a job, from where an earlier process left it; returns also where the job fails.
@@ -194,6 +199,7 @@ class Supervisor:
                 device=device.device.name,
                 threads=config.threads,
                 nice=config.nice,
+                max_footprint_pixels=config.max_footprint_pixels,
             )
         )
         attempt = row.recovery_attempts or 1

@@ -41,10 +41,12 @@ def work(
     database_url: str | None,
     stop: threading.Event,
     *,
+    hurry: threading.Event | None = None,
     name: str | None = None,
     device: str = "auto",
     threads: int = 0,
     nice: int = 10,
+    max_footprint_pixels: int | None = None,
     retention_days: float = 0.0,
     stall_timeout_s: float = 0.0,
     max_run_s: float = 0.0,
@@ -55,13 +57,14 @@ def work(
 ) -> None:
     """Does jobs until `stop` is set; then the one at hand is put back into the queue with a checkpoint.
 
-    One that has no checkpoints gets `drain_timeout_s` to end first. `ready` is called when jobs are taken, and
-    `tell_alive` every `alive_every_s` while the worker is not stuck.
+    One that has no checkpoints gets `drain_timeout_s` to end first, or until `hurry` is set. `ready` is called when
+    jobs are taken, and `tell_alive` every `alive_every_s` while the worker is not stuck.
 
     No other worker may have the `name` (None: that of the host, numbered); a worker that is started again under its
-    name goes on with its jobs at once. `threads` 0: all cores but one. Finished jobs are removed after
-    `retention_days`; a job fails whose process does not get on for `stall_timeout_s`, or that runs for `max_run_s` in
-    all; 0: never. Threads of DBOS are left behind: end the process by os._exit. Raises StartupFailed.
+    name goes on with its jobs at once. `threads` 0: all cores but one. A render job fails at a frame that costs more
+    than `max_footprint_pixels`, see ultragray.limits. Finished jobs are removed after `retention_days`; a job fails
+    whose process does not get on for `stall_timeout_s`, or that runs for `max_run_s` in all; 0: never. Threads of
+    DBOS are left behind: end the process by os._exit. Raises StartupFailed.
     """
     with contextlib.closing(OpenStore(artifact_folder)), claim_name(artifact_folder, name) as executor:
         jobs = JobDatabase(artifact_folder, database_url)
@@ -71,6 +74,7 @@ def work(
             device=device,
             threads=threads or max(1, (os.cpu_count() or 1) - 1),
             nice=nice,
+            max_footprint_pixels=max_footprint_pixels,
             stall_timeout_s=stall_timeout_s,
             max_run_s=max_run_s,
         )
@@ -104,7 +108,7 @@ def work(
             if not supervisor.is_stuck:
                 tell_alive()
         housekeeper.stop()
-        supervisor.stop(drain_timeout_s)
+        supervisor.stop(drain_timeout_s, hurry or threading.Event())
         heartbeat.stop()
         _log.info(f"worker {executor} stopped")
 
