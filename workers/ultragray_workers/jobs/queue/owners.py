@@ -36,7 +36,9 @@ def set_owner(connection: sa.Connection, kind: Kind, name: str, ownership: Owner
     insert = (sqlite if connection.dialect.name == "sqlite" else postgresql).insert(OWNERS)
     values = {"owner": ownership.owner, "private": ownership.private}
     key = [OWNERS.c.kind, OWNERS.c.name]
-    connection.execute(insert.values(kind=kind.value, name=name, **values).on_conflict_do_update(key, set_=values))
+    connection.execute(
+        insert.values(kind=kind.value, name=name, **values).on_conflict_do_update(index_elements=key, set_=values)
+    )
     tell_change(connection)
 
 
