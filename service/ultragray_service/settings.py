@@ -234,6 +234,7 @@ class Settings(Contract):
     key_frames_per_s: int | None = of_key("frames_per_s")
     key_streams: int | None = of_key("streams")
     key_unfinished_jobs: int | None = of_key("unfinished_jobs")
+    key_running_jobs: int | None = of_key("running_jobs")
     key_compute_minutes_per_day: float | None = of_key("compute_minutes_per_day")
     key_stored_gb: float | None = of_key("stored_gb")
     insecure: bool = described(

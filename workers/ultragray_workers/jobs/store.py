@@ -42,6 +42,7 @@ from .publication import SCENES_FOLDER
 from .queue import attendance, database, runs, unfinished
 from .queue.attendance import Worker
 from .queue.database import JobDatabase
+from .queue.internals import MOST_RUNNING
 from .queue.listing import ids_of_owner, page_of_rows
 from .queue.owners import Kind, Ownership, set_owner
 from .queue.wishes import Wanted
@@ -59,11 +60,12 @@ _STORABLE = re.compile(r"[^\0\ud800-\udfff]*")  # PostgreSQL takes no NUL, and U
 _TAIL_BYTES = 8192
 
 
-Admit = Callable[["JobStore"], None]
+Admit = Callable[["JobStore"], int | None]  # raises what keeps a new job out, else: how many may run at once
 
 
-def _admit_any(jobs: JobStore) -> None:
-    """Keeps no job out."""
+def _admit_any(jobs: JobStore) -> int | None:
+    """Keeps no job out, and has any number of them run."""
+    return None
 
 
 Shown = Callable[[Ownership], bool]  # whether whoever asks may know of a job
@@ -120,7 +122,8 @@ class JobStore:
     ) -> tuple[Job, bool]:
         """The job, and whether it is new: the same `request_id` gives the same job, whatever became of it.
 
-        `admit` is called before a new one is made, one at a time, and raises what keeps it out.
+        `admit` is called before a new one is made, one at a time: it raises what keeps it out, or tells how many jobs
+        of the owner may run at once; None: any number.
 
         Raises JobConflict where that one asked for something else, JobQueueFull, ArtifactFolderUnavailable, and what
         `Requirements.provide` raises.
@@ -152,7 +155,7 @@ class JobStore:
                 return self._same(job_id, specification, priority, ownership), False
             if unfinished.count_waiting(self.database) >= self._queue_limit:
                 raise JobQueueFull(f"{self._queue_limit} jobs wait already: try again later, or cancel some")
-            admit(self)
+            most_running = admit(self)
             before = None if retry_of is None else self._folder(retry_of)
             self._requirements.provide(specification, self._folder(job_id), before)
             options: EnqueueOptions = {
@@ -167,6 +170,7 @@ class JobStore:
                     "retry_of": retry_of,
                     "specification": short,
                     "private": private,
+                    MOST_RUNNING: most_running,
                     TRACE: current_trace(),
                 },
                 "serialization_type": WorkflowSerializationFormat.PORTABLE,

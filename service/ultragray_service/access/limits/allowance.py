@@ -40,6 +40,12 @@ class Allowance(Contract):
     unfinished_jobs: int | None = described(
         "Jobs of one key that wait or run at once; none: any number.", None, low=0, high=100_000
     )
+    running_jobs: int | None = described(
+        "Jobs of one key that run at once; more wait, and jobs of others go first; none: any number.",
+        None,
+        low=1,
+        high=100_000,
+    )
     compute_minutes_per_day: float | None = described(
         "Minutes that the jobs of one key may have run since midnight (UTC), on CPU and GPU together; then it submits "
         "no more that day; none: any number.",

@@ -51,8 +51,8 @@ class Holdings:
         self._limits, self._owners = limits, owners
         self._datasets, self._scenes, self._jobs = datasets, scenes, jobs
 
-    def admit_job(self, jobs: JobStore) -> None:
-        """Raises LimitReached where there may not be one more job. Blocks."""
+    def admit_job(self, jobs: JobStore) -> int | None:
+        """How many jobs may run at once; None: any number. Blocks. Raises LimitReached where there may be no more."""
         mine, owner = self._limits.mine, acting().name
         if mine.unfinished_jobs is not None and jobs.unfinished_of(owner) >= mine.unfinished_jobs:
             raise self._limits.refused(
@@ -74,6 +74,7 @@ class Holdings:
                     ),
                 )
         self._left_bytes(jobs)
+        return mine.running_jobs
 
     async def room(self) -> Room:
         """The room for an upload. Raises LimitReached where there is none."""

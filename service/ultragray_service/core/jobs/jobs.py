@@ -23,7 +23,7 @@ from ultragray_workers.jobs.kinds import Specification
 from ultragray_workers.jobs.overview import JobsOverview
 from ultragray_workers.jobs.queue.attendance import Worker
 from ultragray_workers.jobs.queue.database import JobDatabase
-from ultragray_workers.jobs.store import Job, JobState, JobStore
+from ultragray_workers.jobs.store import Admit, Job, JobState, JobStore
 from ultragray_workers.scenes import SceneStore
 
 from ...access.audit import account
@@ -68,7 +68,7 @@ class Jobs:
         # Of their own, so that a database that does not answer keeps nobody else waiting.
         self._threads = ThreadPoolExecutor(_THREADS, "jobs")
         self.hub = JobHub(lambda job_id: self._store.get(job_id), self._log_path, self._threads)
-        self.admit: Callable[[JobStore], None] = lambda jobs: None  # raises what keeps a new job of the caller out
+        self.admit: Admit = lambda jobs: None
         self.overview = JobsOverview()  # as it was up to COUNT_INTERVAL_S ago
         self._counting: asyncio.Task[None] | None = None
 

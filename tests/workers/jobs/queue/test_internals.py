@@ -12,7 +12,7 @@ from dbos import DBOSClient
 
 from ultragray_workers.jobs.queue.database import QUEUE, SERIALIZER, JobDatabase
 from ultragray_workers.jobs.queue.internals import SQLITE_ISOLATION, SQLITE_SETTINGS, WORKFLOWS, put_back
-from ultragray_workers.jobs.store import JobState, JobStore
+from ultragray_workers.jobs.store import Job, JobState, JobStore
 
 from ....postgres import NewDatabase
 from ..conftest import RunningWorker, train_job
@@ -53,6 +53,25 @@ def test_only_a_running_job_of_that_worker_is_put_back(jobs: JobDatabase, store:
     set_row(status="CANCELLED", executor_id="dead")
     assert not put_back(jobs.client, job.id, "dead", QUEUE)
     assert store.get(job.id).state is JobState.CANCELLED
+
+
+def test_an_owner_with_enough_running_jobs_waits_while_others_go_first(
+    store: JobStore, start_worker: Callable[..., RunningWorker], until: Callable[..., Any]
+) -> None:
+    def submit(scene: str, owner: str, most: int | None) -> Job:
+        return store.submit(train_job(scene, steps=4000), owner=owner, admit=lambda jobs: most)[0]
+
+    first, second = submit("one", "alice", 1), submit("two", "alice", 1)
+    start_worker("one", host="first")
+    until(first, lambda job: job.state is JobState.RUNNING)
+    start_worker("two", host="second")
+    third = submit("three", "bob", 1)
+    until(third, lambda job: job.state is not JobState.QUEUED)
+    assert store.get(second.id).state is JobState.QUEUED
+    store.cancel(first.id)
+    until(second, lambda job: job.state is not JobState.QUEUED)
+    for job in (second, third):
+        store.cancel(job.id)
 
 
 @pytest.mark.parametrize("new_database", ["sqlite"], indirect=True)

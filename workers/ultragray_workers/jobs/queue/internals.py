@@ -7,6 +7,7 @@
   the worker that has just taken it over. DBOS's own recovery calls the same method as `put_back`.
 - `take_back`: the same, and the attempt is not counted.
 - `take_only_through`: DBOS takes whatever a queue holds; which worker can do a job is known to us alone.
+- `leave_others_room`: DBOS bounds the running jobs of a queue, or of a part of it by one number for all parts.
 - `NotMine`: an execution that raises it ends without an entry in the queue. Any other error is kept as the job's end,
   even while another worker is at the job.
 - `QUEUE_VERSION`, `latest_queue_version`: DBOS opens tables of a newer DBOS without a word.
@@ -27,6 +28,7 @@ from sqlalchemy.dialects.postgresql import JSONB
 
 NotMine = dbos_error.DBOSWorkflowConflictIDError
 
+MOST_RUNNING = "most_running"  # attribute of a job: how many of its owner may run at once
 SCHEMA = "dbos"  # on PostgreSQL; none on SQLite
 SQLITE_SETTINGS = {"busy_timeout": 30_000, "foreign_keys": 1}
 SQLITE_ISOLATION = "IMMEDIATE"
@@ -89,3 +91,22 @@ def take_only_through(dbos: DBOS, queue: str, opens: Callable[[], bool], close: 
                 close()
 
     vars(dbos._sys_db)["start_queued_workflows"] = take_if_open
+
+
+def leave_others_room(dbos: DBOS, queue: str) -> None:
+    """Lets a worker take only jobs whose owner has fewer running than MOST_RUNNING among their attributes.
+
+    Two workers that look in the same instant may start one more.
+    """
+    rows = dbos._sys_db.tables.workflow_status
+    running = rows.alias("running")
+    count = (
+        sa.select(sa.func.count())
+        .where(running.c.queue_name == queue, running.c.status == "PENDING")
+        .where(running.c.authenticated_user == rows.c.authenticated_user)
+        .correlate(rows)
+        .scalar_subquery()
+    )
+    most: Any = rows.c.attributes[MOST_RUNNING].as_integer()
+    has_room = sa.or_(most.is_(None), count < most)
+    vars(dbos._sys_db)["_claim_gate"] = lambda name, partition: [has_room] if name == queue else []

@@ -22,7 +22,7 @@ from ..kinds import KINDS
 from ..queue import database, unfinished
 from ..queue.database import JobDatabase, dbos_config, quiet_dbos
 from ..queue.heartbeat import Heartbeat
-from ..queue.internals import NotMine, take_only_through
+from ..queue.internals import NotMine, leave_others_room, take_only_through
 from ..queue.wishes import Wanted
 from .device import DeviceLock, device_of
 from .gate import Gate
@@ -134,6 +134,7 @@ def _launch(url: str, config: WorkerConfig, supervisor: Supervisor, gate: Gate) 
     quiet_dbos()
     DBOS.listen_queues([database.QUEUE])
     DBOS.launch()
+    leave_others_room(dbos, database.QUEUE)
     take_only_through(dbos, database.QUEUE, gate.opens, gate.close)
     DBOS.register_queue(database.QUEUE, worker_concurrency=1, polling_interval_sec=POLLING_INTERVAL_S)
 
