@@ -203,3 +203,19 @@ def test_more_connections_than_allowed_are_told_so(start_service: StartService) 
             return late.status().code == 1
 
         wait_until(is_let_in)
+
+
+NUMBERS = (np.nan, np.inf, -np.inf, -0.0, 1e-45, -1e-38, 1e38, 3.4e38, -3.4e38)
+
+
+@pytest.mark.parametrize("number", NUMBERS)
+def test_numbers_at_the_edge_of_float32_are_answered_and_the_connection_goes_on(peer: Peer, number: float) -> None:
+    plain = np.eye(3, 4, dtype=">f4")
+    for place in np.ndindex(3, 4):
+        values = plain.copy()
+        values[place] = number
+        peer.send("TRANSFORM", "demo", values.T.tobytes())
+        peer.send("GET_STATUS")
+        while (answer := peer.receive()).type_name != "STATUS" or unpack_status(answer.content).code != 1:
+            if answer.type_name == "STATUS":
+                assert unpack_status(answer.content).name in ("INVALID_POSE", "INVALID_ARGUMENT"), (place, number)
