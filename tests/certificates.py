@@ -12,6 +12,17 @@ import grpc
 import trustme
 
 SERVER, KEY, AUTHORITY = "server.pem", "server.key", "clients.pem"
+RARE_CURVE = b"""\
+-----BEGIN CERTIFICATE-----
+MIIBSjCCAQigAwIBAgIUPlwjUR1kL5xGnGPIHZGw13Ikc6cwCgYIKoZIzj0EAwIw
+FDESMBAGA1UEAwwJbG9jYWxob3N0MB4XDTI2MTEyMjExNDAwNVoXDTI2MTEyNTEx
+NDAwNVowFDESMBAGA1UEAwwJbG9jYWxob3N0MD4wEAYHKoZIzj0CAQYFK4EEAAkD
+KgAEwe6P6LZeflimoI3h9b1apiuN+x3e66l4YooZopqkB3TkUiHZi7aHsKNTMFEw
+HQYDVR0OBBYEFE/Sfs0kzyRW5xXowPbtFSYwyKtFMB8GA1UdIwQYMBaAFE/Sfs0k
+zyRW5xXowPbtFSYwyKtFMA8GA1UdEwEB/wQFMAMBAf8wCgYIKoZIzj0EAwIDMAAw
+LQIVAKMoXPqjTHvxPmWHfkWJVlucbOyjAhR7oqmNSf6pshXh1rzS5BiqDIiA5Q==
+-----END CERTIFICATE-----
+"""  # of the curve secp160k1, which the library of certificates does not know
 _number = count()
 
 

@@ -11,6 +11,8 @@ import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 
+from ultragray_workers.rounds import Rounds
+
 from .settings import ENVIRONMENT_PREFIX, Settings
 
 _FIRST_WAIT_S, _LONGEST_WAIT_S = 0.5, 30.0
@@ -62,15 +64,17 @@ class EmbeddedWorker:
 
     async def _keep_alive(self) -> None:
         wait_s = _FIRST_WAIT_S
+        rounds = Rounds("the watch over the worker for jobs", _log)
         while not self._stop.is_set():
             started = time.monotonic()
-            self._process = self._spawn()
-            code = await asyncio.get_running_loop().run_in_executor(self._thread, self._process.wait)
-            if self._stop.is_set():
-                return
-            if time.monotonic() - started > _STEADY_S:
-                wait_s = _FIRST_WAIT_S
-            _log.warning(f"the worker for jobs ended with {code}; the next one starts in {wait_s:g} s")
+            with rounds.round():  # a process that cannot be started, for want of memory or files, can be later
+                self._process = self._spawn()
+                code = await asyncio.get_running_loop().run_in_executor(self._thread, self._process.wait)
+                if self._stop.is_set():
+                    return
+                if time.monotonic() - started > _STEADY_S:
+                    wait_s = _FIRST_WAIT_S
+                _log.warning(f"the worker for jobs ended with {code}; the next one starts in {wait_s:g} s")
             with contextlib.suppress(asyncio.TimeoutError):
                 await asyncio.wait_for(self._stop.wait(), wait_s)
             wait_s = min(2.0 * wait_s, _LONGEST_WAIT_S)

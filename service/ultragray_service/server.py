@@ -14,6 +14,7 @@ from typing import Any
 import uvloop
 
 from ultragray_workers.errors import StartupFailed
+from ultragray_workers.rounds import Rounds
 
 from .access.addresses import is_loopback
 from .core.state import Service
@@ -196,6 +197,8 @@ async def _start_igtl(server: IgtlServer, settings: Settings, sockets: contextli
 
 async def _mirror_health(service: Service, server: GrpcServer) -> None:
     """Keep the health of gRPC equal to the readiness of HTTP."""
+    rounds = Rounds("the health of gRPC", _log)
     while True:
-        await server.tell_health(service.readiness)
+        with rounds.round():
+            await server.tell_health(service.readiness)
         await asyncio.sleep(_HEALTH_POLL_S)

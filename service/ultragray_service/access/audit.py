@@ -24,6 +24,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from ultragray.errors import UltragrayError
 from ultragray_workers.jobs.queue.tables import AUDIT
+from ultragray_workers.rounds import Rounds
 
 from ..errors import LimitReached, PermissionDenied, RateLimited, Unauthenticated
 from .rules import Operation
@@ -80,6 +81,7 @@ class AuditLog:
         self._waiting: deque[Entry] = deque()
         self._tallies: dict[Entry, int] = {}
         self._lost = 0
+        self._is_away = False
         self._engine: sa.Engine | None = None
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="audit", daemon=True)
@@ -151,22 +153,28 @@ class AuditLog:
                 self.count(entry)
 
     def _run(self) -> None:
-        tallied_s, is_away = time.monotonic(), False
+        tallied_s = time.monotonic()
+        rounds = Rounds("the audit log", _log)
         stopping = False
         while not stopping:
             stopping = self._stop.wait(WRITE_INTERVAL_S)
-            if stopping or time.monotonic() - tallied_s >= TALLY_INTERVAL_S:
-                tallied_s = time.monotonic()
-                self._tell_tallies()
-            try:
-                self._write()
-                if is_away:
-                    _log.warning("the audit log is written again")
-                is_away = False
-            except (UltragrayError, SQLAlchemyError) as error:
-                if not is_away:
-                    _log.warning(f"the audit log waits in memory: {str(error).splitlines()[0]}")
-                is_away = True
+            with rounds.round():
+                if stopping or time.monotonic() - tallied_s >= TALLY_INTERVAL_S:
+                    tallied_s = time.monotonic()
+                    self._tell_tallies()
+                self._try_to_write()
+
+    def _try_to_write(self) -> None:
+        try:
+            self._write()
+        except (UltragrayError, SQLAlchemyError) as error:
+            if not self._is_away:
+                _log.warning(f"the audit log waits in memory: {str(error).splitlines()[0]}")
+            self._is_away = True
+        else:
+            if self._is_away:
+                _log.warning("the audit log is written again")
+            self._is_away = False
 
     def _tell_tallies(self) -> None:
         tallies, self._tallies = self._tallies, {}

@@ -3,23 +3,32 @@
 from __future__ import annotations
 
 import asyncio
+import logging
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
-from ..errors import Unauthenticated
+from ultragray.errors import UltragrayError
+from ultragray_workers.rounds import Rounds
+
+from ..errors import IssuerUnavailable
 from .guard import Guard
 from .principal import LOCAL, Principal
 
 LOOK_INTERVAL_S = 1.0
 
+_log = logging.getLogger("ultragray.access")
+
 
 @dataclass(eq=False)
 class _Session:
     credential: str | None
+    expires_at_s: float | None  # time.time() in seconds; None: never
     task: asyncio.Task[Any]
-    error: Unauthenticated | None = None
+    error: UltragrayError | None = None
+    looks: Rounds = field(default_factory=lambda: Rounds("the watch over an open session", _log))
 
 
 class Sessions:
@@ -31,10 +40,10 @@ class Sessions:
 
     @contextmanager
     def held(self, principal: Principal, credential: str | None) -> Iterator[None]:
-        """Cancels the body, and raises Unauthenticated, when the credential counts no more."""
+        """Cancels the body, and raises why, when the credential counts no more."""
         task = asyncio.current_task()
         assert task is not None
-        session = _Session(None if principal is LOCAL else credential, task)
+        session = _Session(None if principal is LOCAL else credential, principal.expires_at_s, task)
         self._open.add(session)
         try:
             yield
@@ -50,9 +59,16 @@ class Sessions:
         while True:
             await asyncio.sleep(LOOK_INTERVAL_S)
             for session in list(self._open):
-                try:
-                    self._guard.authenticate(session.credential)
-                except Unauthenticated as error:
-                    if session.error is None:
-                        session.error = error
-                        session.task.cancel()
+                with session.looks.round():
+                    self._look(session)
+
+    def _look(self, session: _Session) -> None:
+        try:
+            self._guard.authenticate(session.credential)
+        except UltragrayError as error:
+            is_expired = session.expires_at_s is not None and session.expires_at_s <= time.time()
+            if isinstance(error, IssuerUnavailable) and not is_expired:
+                return  # the issuer changed its keys, or is away: the next round may know more
+            if session.error is None:
+                session.error = error
+                session.task.cancel()

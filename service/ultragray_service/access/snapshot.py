@@ -14,6 +14,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from ultragray.errors import UltragrayError
 from ultragray_workers.jobs.queue.tables import CHANGES
+from ultragray_workers.rounds import Rounds
 
 from .keys import KeyStore, KnownKeys, read_keys
 from .owners import Owners
@@ -31,6 +32,7 @@ class Snapshot:
         """Fills `keys` and `owners`: the first copy is there when this returns. Raises DatabaseUnavailable."""
         self._engine, self._keys, self._owners = engine, keys, owners
         self._number: int | None = None
+        self._is_away = False
         self._stop = threading.Event()
         self.refresh()
         self._thread = threading.Thread(target=self._run, name="access", daemon=True)
@@ -51,18 +53,22 @@ class Snapshot:
         self._thread.join()
 
     def _run(self) -> None:
-        is_away, round_number = False, 0
+        rounds, round_number = Rounds("the watch over keys and owners", _log), 0
         while not self._stop.wait(INTERVAL_S):
             round_number += 1
-            try:
-                self.refresh()
-                if round_number % _USES_EVERY == 0:
-                    KeyStore(self._engine).note_uses(self._keys.take_uses())
-            except (UltragrayError, SQLAlchemyError) as error:
-                if not is_away:
-                    _log.warning(f"keys and owners stay as they are for now: {str(error).splitlines()[0]}")
-                is_away = True
-            else:
-                if is_away:
-                    _log.warning("keys and owners are read again")
-                is_away = False
+            with rounds.round():
+                self._look(notes_uses=round_number % _USES_EVERY == 0)
+
+    def _look(self, *, notes_uses: bool) -> None:
+        try:
+            self.refresh()
+            if notes_uses:
+                KeyStore(self._engine).note_uses(self._keys.take_uses())
+        except (UltragrayError, SQLAlchemyError) as error:
+            if not self._is_away:
+                _log.warning(f"keys and owners stay as they are for now: {str(error).splitlines()[0]}")
+            self._is_away = True
+        else:
+            if self._is_away:
+                _log.warning("keys and owners are read again")
+            self._is_away = False

@@ -9,6 +9,8 @@ import socket
 import ssl
 from collections.abc import Callable
 
+from ultragray_workers.rounds import Rounds
+
 from ..errors import TooManyConnections
 from ..tls.certificates import HANDSHAKE_TIMEOUT_S
 from .connections import Connections, Place
@@ -54,22 +56,26 @@ class Acceptor:
         await asyncio.wait({self._task})
 
     async def _accept(self) -> None:
-        loop = asyncio.get_running_loop()
+        rounds = Rounds("accepting connections", _log)
         while True:
-            try:
-                connection, peer = await loop.sock_accept(self._listener)
-            except OSError as error:  # too many open files, or a peer that has gone already
-                _log.warning(f"a connection could not be accepted: {error.strerror}")
-                await asyncio.sleep(_RETRY_S)
-                continue
-            try:
-                place = self._connections.enter(peer[0])
-            except TooManyConnections as error:
-                self._refuse(connection, error)
-                continue
-            task = asyncio.ensure_future(self._serve(connection, place))
-            self._serving.add(task)
-            task.add_done_callback(self._serving.discard)
+            with rounds.round():
+                await self._accept_one()
+
+    async def _accept_one(self) -> None:
+        try:
+            connection, peer = await asyncio.get_running_loop().sock_accept(self._listener)
+        except OSError as error:  # too many open files, or a peer that has gone already
+            _log.warning(f"a connection could not be accepted: {error.strerror}")
+            await asyncio.sleep(_RETRY_S)
+            return
+        try:
+            place = self._connections.enter(peer[0])
+        except TooManyConnections as error:
+            self._refuse(connection, error)
+            return
+        task = asyncio.ensure_future(self._serve(connection, place))
+        self._serving.add(task)
+        task.add_done_callback(self._serving.discard)
 
     def _refuse(self, connection: socket.socket, error: TooManyConnections) -> None:
         with connection, contextlib.suppress(OSError):  # before TLS no answer can be read

@@ -13,6 +13,8 @@ import os
 import socket
 import stat
 
+from ultragray_workers.rounds import Rounds
+
 from ..errors import TooManyConnections
 from .connections import Connections, Place
 
@@ -33,9 +35,11 @@ class OpenSockets:
 
     async def run(self) -> None:
         """Look again and again, until cancelled."""
+        rounds = Rounds(f"the watch over connections to port {self._port}", _log)
         while True:
-            if refused := await asyncio.to_thread(self.look):
-                _log.warning(f"closed {refused} connections to port {self._port}: too many of one address")
+            with rounds.round():
+                if refused := await asyncio.to_thread(self.look):
+                    _log.warning(f"closed {refused} connections to port {self._port}: too many of one address")
             await asyncio.sleep(INTERVAL_S)
 
     def look(self) -> int:

@@ -8,6 +8,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 
 from cryptography import x509
+from cryptography.exceptions import UnsupportedAlgorithm
 from cryptography.hazmat.primitives.asymmetric.types import PrivateKeyTypes
 from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat, load_pem_private_key
 from cryptography.x509.oid import NameOID
@@ -36,6 +37,14 @@ class CertificateFiles:
 
     def load(self, read: CertificateBytes) -> Certificates:
         """Certificates that a client can accept now. Raises StartupFailed, with a sentence that names the setting."""
+        try:
+            return self._load(read)
+        except (UnsupportedAlgorithm, x509.DuplicateExtension, ValueError) as error:
+            raise _unusable("tls_certificate", f"{self.certificate} and {self.key}: {error}") from None
+        except OSError as error:  # a file that went after it was read
+            raise _unusable("tls_certificate", f"{self.certificate} and {self.key}: {error.strerror}") from None
+
+    def _load(self, read: CertificateBytes) -> Certificates:
         chain = self._chain(read.chain)
         own = chain[0]
         if self._private_key(read.key).public_key().public_bytes(

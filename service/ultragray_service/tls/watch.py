@@ -8,6 +8,7 @@ import time
 from datetime import datetime, timezone
 
 from ultragray_workers.errors import StartupFailed
+from ultragray_workers.rounds import Rounds
 
 from ..settings import Settings
 from .certificates import CertificateFiles, Certificates
@@ -38,13 +39,15 @@ class CertificateWatch:
 
     async def follow(self) -> None:
         """Looks at the files for ever; tells in the log what is in use and what is wrong."""
+        rounds = Rounds("the watch over TLS certificates", _log)
         while True:
             await asyncio.sleep(_POLL_S)
-            before = self.current
-            problem = await asyncio.to_thread(self._update)  # a disk may be slow
-            if self.current is not before:
-                _tell_in_use(self.current)
-            self._tell_problem(problem or _lateness(self.current))
+            with rounds.round():
+                before = self.current
+                problem = await asyncio.to_thread(self._update)  # a disk may be slow
+                if self.current is not before:
+                    _tell_in_use(self.current)
+                self._tell_problem(problem or _lateness(self.current))
 
     def _update(self) -> str | None:
         """Takes over files that changed. What is wrong with them, if anything is."""

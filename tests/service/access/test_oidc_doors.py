@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import grpc
 import httpx
@@ -10,10 +12,14 @@ import pytest
 
 from ultragray_client import Client
 from ultragray_proto.v1 import scenes_pb2, scenes_pb2_grpc
+from ultragray_service.access.keys import KeyStore
+from ultragray_service.access.principal import Role
+from ultragray_workers.jobs.queue.database import JobDatabase
 
 from ...waiting import wait_until
 from ..conftest import RunningService, StartService
 from ..rpc.test_grpc_render import error_info
+from .conftest import MATRIX
 from .identity_provider import IdentityProvider
 
 KEY = "0123456789abcdef-environment"
@@ -93,3 +99,41 @@ def test_with_an_issuer_alone_nobody_passes_without_a_token(
     service = start_service(**provider.settings(), host="127.0.0.1")
     assert httpx.get(f"{service.http}/v1/scenes", timeout=60).status_code == 401
     wait_until(lambda: ask(service, provider.token()).status_code == 200)
+
+
+def test_a_rotation_of_keys_leaves_sessions_and_their_revocation_alone(
+    start_service: StartService, tmp_path: Path
+) -> None:
+    provider = IdentityProvider()
+    provider.add_key("one")
+    database = JobDatabase(tmp_path, None)
+    store = KeyStore(database.engine)
+    _, bob = store.create("bob", Role.OPERATOR, None)
+    try:
+        service = start_service(**provider.settings(), artifact_folder=tmp_path)
+        wait_until(lambda: identity_provider(service) == "available")
+        with ThreadPoolExecutor() as threads, httpx.Client(base_url=service.http, timeout=None) as client:
+            body = {"kind": "render", "specification": {"scene": "demo", "poses": [MATRIX]}}
+            job = client.post("/v1/jobs", json=body, headers={"X-API-Key": bob}).json()["id"]  # no worker takes it
+            opened: list[str] = []
+
+            def watch(credential: str) -> None:
+                headers = {"Authorization": f"Bearer {credential}"}
+                with client.stream("GET", f"/v1/jobs/{job}/events", headers=headers) as events:
+                    opened.append(credential)
+                    with pytest.raises(httpx.RemoteProtocolError):  # cut
+                        events.read()
+
+            of_token = threads.submit(watch, provider.token("one"))
+            of_key = threads.submit(watch, bob)
+            wait_until(lambda: len(opened) == 2)
+            provider.add_key("two")
+            provider.remove_key("one")
+            wait_until(lambda: ask(service, provider.token("two")).status_code == 200)
+            assert not of_key.done()
+            store.revoke("bob")
+            of_key.result(60)
+            of_token.result(60)  # its key is gone for good
+    finally:
+        database.close()
+        provider.close()

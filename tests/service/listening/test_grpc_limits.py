@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import resource
 import socket
 import time
 
@@ -93,3 +94,21 @@ def test_long_metadata_is_refused(limited: RunningService, size: int) -> None:
 def test_clients_that_come_and_go_leave_no_place_taken(limited: RunningService) -> None:
     for _ in range(3 * PER_ADDRESS):
         wait_until(lambda: answers(limited), within_s=TIMEOUT_S)
+
+
+def test_a_want_of_open_files_does_not_end_the_watch_over_connections(start_service: StartService) -> None:
+    service = start_service(max_connections=TOTAL, max_connections_per_address=PER_ADDRESS)
+    limits = resource.prlimit(service.process.pid, resource.RLIMIT_NOFILE)
+    resource.prlimit(service.process.pid, resource.RLIMIT_NOFILE, (3, limits[1]))
+    try:
+        wait_until(lambda: logged(service, "connections to port", "failed, and goes on"))
+    finally:
+        resource.prlimit(service.process.pid, resource.RLIMIT_NOFILE, limits)
+    wait_until(lambda: logged(service, "connections to port", "is in order again"))
+    with contextlib.ExitStack() as opened:
+        sockets = [opened.enter_context(open_socket(service, "127.0.0.2")) for _ in range(PER_ADDRESS + 3)]
+        wait_until(lambda: sum(map(is_open, sockets)) == PER_ADDRESS)
+
+
+def logged(service: RunningService, *words: str) -> bool:
+    return any(all(word in record["message"] for word in words) for record in service.log())

@@ -15,7 +15,7 @@ from ultragray_service.tls.certificates import CertificateFiles
 from ultragray_service.tls.watch import CertificateWatch
 from ultragray_workers.errors import StartupFailed
 
-from ...certificates import AUTHORITY, KEY, SERVER, Mounted
+from ...certificates import AUTHORITY, KEY, RARE_CURVE, SERVER, Mounted
 
 
 @pytest.fixture
@@ -57,6 +57,7 @@ def test_good_files_are_loaded(mounted: Mounted) -> None:
         (KEY, encrypted_key(), "tls_key cannot be used: .*server.key is encrypted; decrypt it: openssl pkey"),
         (AUTHORITY, b"\xff", "tls_client_ca cannot be used: .*clients.pem holds no certificate"),
         (AUTHORITY, b"", "tls_client_ca cannot be used: .*clients.pem holds no certificate"),
+        (SERVER, RARE_CURVE, "tls_certificate cannot be used: .*server.pem.*Curve 1.3.132.0.9 is not supported"),
         (KEY, b"x" * (2**20 + 1), "tls_key cannot be used: .*server.key is larger than"),
     ],
 )
@@ -68,6 +69,14 @@ def test_bad_files_are_one_clear_sentence(mounted: Mounted, name: str, content: 
     with pytest.raises(StartupFailed, match=expected) as caught:
         load(mounted)
     assert caught.value.field in str(caught.value)
+
+
+def test_a_key_that_goes_after_it_was_read(mounted: Mounted) -> None:
+    files = CertificateFiles(mounted.folder / SERVER, mounted.folder / KEY, None)
+    content = files.read()
+    (mounted.folder / KEY).unlink()
+    with pytest.raises(StartupFailed, match=r"server.key: No such file or directory"):
+        files.load(content)
 
 
 def test_a_key_of_another_certificate(mounted: Mounted) -> None:

@@ -23,7 +23,7 @@ from websockets.sync.client import connect
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2, rendering_pb2_grpc
 from ultragray_service.tls.certificates import HANDSHAKE_TIMEOUT_S
 
-from ...certificates import KEY, SERVER, Mounted
+from ...certificates import KEY, RARE_CURVE, SERVER, Mounted
 from ...waiting import at_this_load, wait_until
 from ..conftest import RunningService, StartService
 
@@ -153,8 +153,10 @@ def test_files_that_cannot_be_used_leave_the_old_ones(serving: RunningService, m
     stays("expired at")
     (mounted.folder / SERVER).unlink()
     stays("cannot be read: No such file or directory")
-    assert len(errors_in(serving)) == 4, "each is told once"
     (mounted.folder / SERVER).symlink_to(Path("..data", SERVER))
+    (mounted.folder / SERVER).write_bytes(RARE_CURVE)
+    stays("Curve 1.3.132.0.9 is not supported")
+    assert len(errors_in(serving)) == 5, "each is told once"
     new = mounted.put(mounted.issue())
     for door in doors:
         wait_until(partial(shows, door, mounted.context(), new))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import os
 import time
 from collections.abc import Awaitable, Iterable
@@ -11,6 +12,7 @@ from dataclasses import replace
 from ultragray.confidence import Extrapolation
 from ultragray.errors import RenderFailed, UltragrayError
 
+from ..rounds import Rounds
 from .launcher import Launcher
 from .memory import MemoryPool
 from .messages import Answer, ForkWorker, LoadTask, Outdated, PackTask, Rendered, RenderPart, RenderTask, UnloadTask
@@ -23,6 +25,8 @@ _MAX_DEATHS = 5
 _MAX_KILLS = 2
 _WATCH_INTERVAL_S = 0.25
 
+logger = logging.getLogger(__name__)
+
 
 class Dispatcher:
     """The worker processes and the queue before them, in the event loop's thread."""
@@ -33,6 +37,7 @@ class Dispatcher:
         self._settings = settings
         self._patience = patience
         self._watching: asyncio.TimerHandle | None = None
+        self._looks = Rounds("the watch over render processes", logger)
         self._waiting = waiting
         self._memories = MemoryPool()
 
@@ -80,7 +85,8 @@ class Dispatcher:
 
     def _watch(self) -> None:
         for slot in self.slots:
-            slot.kill_if_hung()
+            with self._looks.round():
+                slot.kill_if_hung()
         self._watching = asyncio.get_running_loop().call_later(_WATCH_INTERVAL_S, self._watch)
 
     async def command_all(self, task: LoadTask | UnloadTask) -> None:

@@ -18,6 +18,7 @@ from typing import Any
 import jwt
 
 from ultragray.errors import InvalidArgument
+from ultragray_workers.rounds import Rounds
 
 from ...errors import IssuerUnavailable, Unauthenticated
 from .claims import check_url
@@ -93,22 +94,27 @@ class Issuer:
 
     async def follow(self) -> None:
         """Fetches the keys, again after a while and when tokens name others, for ever."""
+        rounds = Rounds("the watch over the issuer's keys", _log)
         while True:
-            self._wanted.clear()
-            self._fetching, self._asked = self._asked, set()
-            problem = await asyncio.to_thread(self._fetch)
-            self._absent, self._fetching = self._fetching - self.keys.keys(), set()
-            if problem != self.problem:
-                self.problem = problem
-                if problem is None:
-                    _log.info("the keys of %s are known: %d", self.url, len(self.keys))
-                else:
-                    _log.error("tokens of %s cannot be checked: %s", self.url, problem)
+            with rounds.round():
+                await self._look()
             await asyncio.sleep(LEAST_INTERVAL_S)
             with contextlib.suppress(asyncio.TimeoutError):
                 await asyncio.wait_for(
-                    self._wanted.wait(), (REFRESH_S if problem is None else RETRY_S) - LEAST_INTERVAL_S
+                    self._wanted.wait(), (REFRESH_S if self.problem is None else RETRY_S) - LEAST_INTERVAL_S
                 )
+
+    async def _look(self) -> None:
+        self._wanted.clear()
+        self._fetching, self._asked = self._asked, set()
+        problem = await asyncio.to_thread(self._fetch)
+        self._absent, self._fetching = self._fetching - self.keys.keys(), set()
+        if problem != self.problem:
+            self.problem = problem
+            if problem is None:
+                _log.info("the keys of %s are known: %d", self.url, len(self.keys))
+            else:
+                _log.error("tokens of %s cannot be checked: %s", self.url, problem)
 
     def _fetch(self) -> str | None:
         """Takes over the keys that the issuer publishes. Why it could not, if so: the ones before stay."""

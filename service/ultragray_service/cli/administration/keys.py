@@ -61,9 +61,9 @@ def create(
     with _key_store(where) as store:
         others = [key for key in store.keys().values() if key.name == name and key.is_valid(time.time())]
         key, secret = store.create(name, role, expires_days, limits)
-    typer.echo(f"key {key.id} of {key.name}, {key.role.value}, expires: {_time(key.expires_at_s, 'never')}", err=True)
+    typer.echo(f"key {key.id} of {key.name}, {_role(key)}, expires: {_time(key.expires_at_s, 'never')}", err=True)
     for other in others:
-        typer.echo(f"{name} still has the key {other.id}, {other.role.value}, too", err=True)
+        typer.echo(f"{name} still has the key {other.id}, {_role(other)}, too", err=True)
     typer.echo("Keep it now: it is shown only once.", err=True)
     typer.echo(secret)
 
@@ -93,7 +93,7 @@ def revoke(
     with _key_store(where) as store:
         revoked = store.revoke(name)
     for key in revoked:
-        typer.echo(f"revoked {key.id} of {key.name}, {key.role.value}")
+        typer.echo(f"revoked {key.id} of {key.name}, {_role(key)}")
     if not revoked:
         typer.echo(f"no key of {name} opened any door", err=True)
 
@@ -116,13 +116,17 @@ def _row(key: Key) -> tuple[str, ...]:
     return (
         key.id,
         key.name,
-        key.role.value,
+        _role(key),
         _state(key),
         _time(key.created_at_s, ""),
         _time(key.expires_at_s, "never"),
         _time(key.last_used_at_s, "never"),
         " ".join(f"{name}={'none' if value is None else f'{value:g}'}" for name, value in key.limits.items()),
     )
+
+
+def _role(key: Key) -> str:
+    return "unknown" if key.role is None else key.role.value
 
 
 def _state(key: Key) -> str:

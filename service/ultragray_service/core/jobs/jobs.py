@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import contextmanager
@@ -24,6 +25,7 @@ from ultragray_workers.jobs.overview import JobsOverview
 from ultragray_workers.jobs.queue.attendance import Worker
 from ultragray_workers.jobs.queue.database import JobDatabase
 from ultragray_workers.jobs.store import Admit, Job, JobState, JobStore
+from ultragray_workers.rounds import Rounds
 from ultragray_workers.scenes import SceneStore
 
 from ...access.audit import account
@@ -37,6 +39,8 @@ COUNT_INTERVAL_S = 10.0
 _BESIDE_SPECIFICATION = ("request_id", "priority")
 _THREADS = 4
 _PATIENCE_S = 10.0  # with a database that is there and says nothing
+
+_log = logging.getLogger("ultragray.service")
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -184,11 +188,13 @@ class Jobs:
             await asyncio.to_thread(self._opened.close)
 
     async def _count(self) -> None:
+        rounds = Rounds("the count of the jobs", _log)
         while True:
-            try:
-                self.overview = await self.do(JobStore.overview)
-            except (UltragrayError, SQLAlchemyError):
-                self.overview = JobsOverview()
+            with rounds.round():
+                try:
+                    self.overview = await self.do(JobStore.overview)
+                except (UltragrayError, SQLAlchemyError):
+                    self.overview = JobsOverview()
             await asyncio.sleep(COUNT_INTERVAL_S)
 
     def _log_path(self, job_id: str) -> Path:

@@ -8,6 +8,7 @@ from collections.abc import Callable
 
 from ultragray.errors import UltragrayError
 from ultragray_workers.errors import NotReady
+from ultragray_workers.rounds import Rounds
 
 from ..own_thread import in_own_thread
 
@@ -29,8 +30,10 @@ class WatchedPart:
 
     async def run(self) -> None:
         """Checks until it is cancelled."""
+        rounds = Rounds(f"the watch over {self._name}", _log)
         while True:
-            await self.look()
+            with rounds.round():
+                await self.look()
             await asyncio.sleep(CHECK_INTERVAL_S)
 
     async def look(self) -> None:

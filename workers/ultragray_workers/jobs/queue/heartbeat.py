@@ -21,6 +21,7 @@ from sqlalchemy.exc import SQLAlchemyError
 import ultragray
 from ultragray.errors import UltragrayError
 
+from ...rounds import Rounds
 from . import unfinished
 from .database import JobDatabase
 from .tables import WORKERS
@@ -62,6 +63,8 @@ class Heartbeat:
         }
         self._forgotten: set[str] = set()  # own jobs that were not running at the last look
         self._look_at_s = float("-inf")
+        self._beats = 0
+        self._is_away = False
         self._stop = threading.Event()
         self.beat()
         self._thread = threading.Thread(target=self._run, name="heartbeat", daemon=True)
@@ -106,27 +109,30 @@ class Heartbeat:
             connection.execute(sa.delete(WORKERS).where(mine, WORKERS.c.wanted.is_(None)))  # else it holds at a restart
 
     def _run(self) -> None:
-        beats = 0
-        is_away = False
+        rounds = Rounds("the heartbeat", _log)
         while not self._stop.wait(BEAT_INTERVAL_S):
-            if self._is_stuck():
-                if not is_away:
-                    _log.error(f"the job {self._job_at_hand()} is stuck, and so is its worker: others may take it over")
-                is_away = True
-                continue
-            try:
-                self.beat()
-                beats += 1
-                if is_away:
-                    _log.warning("the heartbeat is back")
-                    is_away = False
-                if beats % _LOOK_EVERY_BEATS == 0 and time.monotonic() > self._look_at_s:
-                    self.take_over()
-            except (UltragrayError, SQLAlchemyError) as error:
-                if not is_away:
-                    _log.warning(f"no heartbeat for now: {str(error).splitlines()[0]}")
-                is_away = True
-                self._look_at_s = time.monotonic() + DEAD_AFTER_S  # others may need longer to come back
+            with rounds.round():
+                self._beat_and_look()
+
+    def _beat_and_look(self) -> None:
+        if self._is_stuck():
+            if not self._is_away:
+                _log.error(f"the job {self._job_at_hand()} is stuck, and so is its worker: others may take it over")
+            self._is_away = True
+            return
+        try:
+            self.beat()
+            self._beats += 1
+            if self._is_away:
+                _log.warning("the heartbeat is back")
+                self._is_away = False
+            if self._beats % _LOOK_EVERY_BEATS == 0 and time.monotonic() > self._look_at_s:
+                self.take_over()
+        except (UltragrayError, SQLAlchemyError) as error:
+            if not self._is_away:
+                _log.warning(f"no heartbeat for now: {str(error).splitlines()[0]}")
+            self._is_away = True
+            self._look_at_s = time.monotonic() + DEAD_AFTER_S  # others may need longer to come back
 
 
 def alive(jobs: JobDatabase) -> set[str]:

@@ -22,6 +22,7 @@ from ultragray.errors import UltragrayError
 
 from ...claims import DELETED_PREFIX, remove_whole
 from ...errors import JobInUse
+from ...rounds import Rounds
 from ..folder import FOLDER, JobFolder
 from ..kinds import KINDS
 from ..queue import database, unfinished
@@ -104,12 +105,14 @@ class Housekeeper:
         return [path for path in folders if path.name not in known]
 
     def _run(self) -> None:
+        rounds = Rounds("the removal of old jobs", _log)
         while not self._stop.is_set():
-            try:
-                if removed := self.keep_house():
-                    _log.info(f"removed {removed} old jobs")
-            except (UltragrayError, SQLAlchemyError, OSError) as error:
-                _log.warning(f"old jobs are kept for now: {str(error).splitlines()[0]}")
+            with rounds.round():
+                try:
+                    if removed := self.keep_house():
+                        _log.info(f"removed {removed} old jobs")
+                except (UltragrayError, SQLAlchemyError, OSError) as error:
+                    _log.warning(f"old jobs are kept for now: {str(error).splitlines()[0]}")
             self._stop.wait(INTERVAL_S)
 
 
