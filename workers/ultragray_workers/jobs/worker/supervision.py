@@ -48,6 +48,7 @@ _PAUSE_S = 5.0  # before the next look for a job, after one that could not be be
 # A job fails after so many deaths of its process without progress in between. Kills from outside are hardly the job's
 # fault, so more of them are allowed.
 MAX_CRASHES, MAX_KILLS = 3, 20
+_ROW_WAIT_S = 5.0
 _RESERVE_BYTES = 2**19
 
 _log = logging.getLogger("ultragray.jobs")
@@ -97,13 +98,24 @@ class Supervisor:
         A job that would begin anew has `drain_timeout_s` to end first, or until `hurry` is set. Jobs that DBOS starts
         from now on are put back too.
         """
+        job_id = self.job_at_hand
         self._stop_by_s = time.monotonic() + drain_timeout_s
         self._stop.set()
-        while time.monotonic() < self._stop_by_s and not hurry.is_set():
-            if self._idle.wait(_POLL_INTERVAL_S):
-                return
+        while time.monotonic() < self._stop_by_s and not hurry.is_set() and not self._idle.wait(_POLL_INTERVAL_S):
+            pass
         self._stop_by_s = float("-inf")
-        self._idle.wait(STOP_WAIT_S + 5.0)
+        if self._idle.wait(STOP_WAIT_S + 5.0) and job_id is not None:
+            self._wait_for_the_row(job_id)
+
+    def _wait_for_the_row(self, job_id: str) -> None:
+        """Waits until the queue has the end of a job, which DBOS writes after `supervise` has returned it."""
+        end_s = time.monotonic() + _ROW_WAIT_S
+        while time.monotonic() < end_s:
+            with suppress(DatabaseUnavailable):
+                row = self._database.workflow(job_id)
+                if row is None or row.status not in database.RUNNING or row.executor_id != self._config.executor:
+                    return
+            time.sleep(_POLL_INTERVAL_S)
 
     def supervise(self, job_id: str, request: dict[str, Any]) -> Outcome:
         """Does a job, from where an earlier process left it; returns also where the job fails.
