@@ -45,11 +45,13 @@ _log = logging.getLogger("ultragray.igtl")
 
 
 class Frames(Protocol):
-    """The part of the server that connections share: the newest frame, and a call that tells all of them about one."""
+    """The part of the server that connections share."""
 
-    newest: Frame | None
+    def newest(self) -> Frame | None:
+        """The newest frame of a scene that the caller may see."""
 
-    def publish(self, frame: Frame, source: Connection) -> None: ...
+    def publish(self, frame: Frame, source: Connection) -> None:
+        """Tells all connections that may see its scene about a frame."""
 
 
 class Connection:
@@ -170,7 +172,7 @@ class Connection:
 
     def _newest(self, kind: str, query: Message) -> Message:
         """The newest frame as the query wants it; without content where there is none of that name."""
-        frame = self._frames.newest
+        frame = self._frames.newest()
         if frame is None or not frame.goes_by(query.device_name):
             return _reply(kind, query, b"")
         return frame.message(kind, query.version, query.message_id, query.device_name)

@@ -8,6 +8,7 @@ import numpy as np
 
 from ultragray.display.settings import true_to_scale
 from ultragray.settings import Encoding, FrameSettings, Resolved
+from ultragray_workers.jobs.queue.owners import Kind, Ownership
 from ultragray_workers.pool.types import RenderResult
 
 from ..core.state import Service
@@ -26,6 +27,7 @@ class Frame:
     posed: PoseMessage
     result: RenderResult
     image: Image
+    ownership: Ownership  # of its scene when it was rendered
 
     def goes_by(self, name: str) -> bool:
         """Whether a query for `name` means this frame; a query without a name means any."""
@@ -72,12 +74,13 @@ class FrameMaker:
         """
         self._service.require_serving()
         scene = await self._scenes.choose(underway.posed.message.device_name)
+        ownership = self._service.owners.known(Kind.SCENE, scene)
         planner = self._service.planner
         plan = await planner.plan(scene, FrameSettings(), Encoding.UINT8, complete=self._true_to_scale)
         result = await self._service.render(
             plan, underway.posed.pose[None], deadline=planner.deadline(None), turn=underway.turn
         )
-        return Frame(underway.posed, result, image_of(result))
+        return Frame(underway.posed, result, image_of(result), ownership)
 
     def _true_to_scale(self, settings: Resolved) -> Resolved:
         side = self._service.settings.max_image_side

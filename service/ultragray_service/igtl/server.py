@@ -8,14 +8,17 @@ import logging
 import socket
 import time
 
+from ultragray.errors import UltragrayError
 from ultragray_workers.errors import Draining
+from ultragray_workers.jobs.queue.owners import Kind
 
 from ..access.addresses import AddressRoles
 from ..access.audit import NOBODY, Entry
-from ..access.principal import Principal, act_as
+from ..access.owners import may_see
+from ..access.principal import LOCAL, Principal, act_as, acting
 from ..access.rules import IGTL
 from ..core.state import Service
-from ..errors import LimitReached, PermissionDenied, RateLimited, TooManyConnections
+from ..errors import LimitReached, PermissionDenied, RateLimited, TooManyConnections, Unauthenticated
 from ..listening.connections import Connections
 from .connection import SEND_TIMEOUT_S, Connection
 from .frames import Frame
@@ -28,12 +31,13 @@ class IgtlServer:
     """A server that listens once started. Keeps the newest frame of all clients, for those who ask for it."""
 
     def __init__(self, service: Service) -> None:
-        self.newest: Frame | None = None
+        # The newest frames last, by whom their scenes are private to; None: they are not.
+        self._frames: dict[str | None, Frame] = {}
         self._service = service
         self._roles = AddressRoles(service.settings.igtl_allow)
-        self._scenes = SceneChooser(service.catalog, service.settings.igtl_scene)
         self._places = Connections(service.settings.max_connections, service.settings.max_connections_per_address)
         self._connections: dict[Connection, asyncio.Task[None]] = {}
+        self._principals: dict[Connection, Principal] = {}
         self._server: asyncio.Server | None = None
 
     @property
@@ -63,14 +67,27 @@ class IgtlServer:
         for connection in self._connections:
             connection.abort()
 
+    def newest(self) -> Frame | None:
+        """The newest frame of a scene that the caller may see."""
+        return next((frame for frame in reversed(self._frames.values()) if self._may_see(acting(), frame)), None)
+
     def publish(self, frame: Frame, source: Connection) -> None:
-        """Tells every client about a frame that was rendered for `source`."""
-        self.newest = frame
-        for connection in self._connections:
-            connection.feed.offer(frame, is_own=connection is source)
+        """Tells every client that may see its scene about a frame that was rendered for `source`."""
+        kept_for = frame.ownership.owner if frame.ownership.private else None
+        self._frames.pop(kept_for, None)
+        self._frames[kept_for] = frame
+        for connection, principal in self._principals.items():
+            if self._may_see(principal, frame):
+                connection.feed.offer(frame, is_own=connection is source)
+
+    def _may_see(self, principal: Principal, frame: Frame) -> bool:
+        now = self._service.owners.known(Kind.SCENE, frame.result.scene)
+        return may_see(principal, frame.ownership) and may_see(principal, now)
 
     async def _connected(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        connection = Connection(self._service, self._scenes, self, reader, writer)
+        # Its own: a client knows the scenes that it may see.
+        scenes = SceneChooser(self._service.catalog, self._service.settings.igtl_scene)
+        connection = Connection(self._service, scenes, self, reader, writer)
         host, port, *_ = writer.get_extra_info("peername") or ("::", 0)  # none of a peer that has gone already
         principal = self._roles.principal_of(host, asks=self._service.guard.asks)
         if principal is None:
@@ -89,6 +106,18 @@ class IgtlServer:
                 return
             await self._serve(connection, writer, principal, host)
 
+    async def _run(self, connection: Connection, task: asyncio.Task[None], principal: Principal) -> None:
+        """Waits for the end of a connection. Raises Unauthenticated where everybody's rights end with the first key."""
+        held = self._service.sessions.held(LOCAL, None) if principal is LOCAL else contextlib.nullcontext()
+        try:
+            with held:
+                await asyncio.shield(task)
+        except UltragrayError as error:
+            connection.dismiss(error)
+            raise
+        finally:
+            task.cancel()
+
     async def _serve(
         self, connection: Connection, writer: asyncio.StreamWriter, principal: Principal, host: str
     ) -> None:
@@ -98,9 +127,12 @@ class IgtlServer:
         client = str(writer.get_extra_info("peername"))
         task = asyncio.ensure_future(connection.run())
         self._connections[connection] = task
+        self._principals[connection] = principal
         try:
             with self._service.audit.request(principal.name, host, IGTL, ""):
-                await task
+                await self._run(connection, task, principal)
+        except Unauthenticated:
+            pass  # the client was told
         except Exception:
             _log.exception("unexpected error", extra={"fields": {"client": client}})
         finally:
@@ -108,6 +140,6 @@ class IgtlServer:
             with contextlib.suppress(ConnectionError):
                 await writer.wait_closed()
             stalled.cancel()
-            del self._connections[connection]
+            del self._connections[connection], self._principals[connection]
             fields = {"client": client, "duration_ms": round(1000 * (time.monotonic() - started), 3)}
             _log.info("client gone", extra={"fields": fields})

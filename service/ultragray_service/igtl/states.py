@@ -11,6 +11,7 @@ from ..errors import (
     PermissionDenied,
     RateLimited,
     TooManyConnections,
+    Unauthenticated,
     statuses_of,
 )
 from .contents import Status
@@ -21,6 +22,7 @@ CHECKSUM_ERROR, CONFIGURATION_ERROR, NO_RESOURCES, UNKNOWN_INSTRUCTION, NOT_READ
 _CODES: dict[type[UltragrayError], int] = {
     SceneNotFound: NOT_FOUND,
     PermissionDenied: ACCESS_DENIED,
+    Unauthenticated: ACCESS_DENIED,
     QueueFull: BUSY,
     TooManyConnections: BUSY,
     RateLimited: BUSY,
