@@ -4,17 +4,30 @@ from __future__ import annotations
 
 import asyncio
 import threading
+import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from concurrent.futures import Executor
 from contextlib import asynccontextmanager
+from typing import TypeVar
 
 import sqlalchemy as sa
 
-from ultragray_workers.jobs.queue.owners import NOBODYS, Kind, Ownership, forget_owner, read_owners, set_owner
+from ultragray_workers.jobs.queue.owners import (
+    NOBODYS,
+    Kind,
+    Ownership,
+    add_owner,
+    forget_owner,
+    read_owner,
+    read_owners,
+)
 
 from .principal import Principal, Role, acting
 
+SPREAD_S = 2.0  # in which every service has read who owns what again, see `snapshot`
 _KEPT_JOBS = 10_000
+
+T = TypeVar("T")
 
 
 class Owners:
@@ -81,60 +94,89 @@ class Owners:
         except LookupError:  # the service itself
             return False
 
-    async def set(self, kind: Kind, name: str, ownership: Ownership) -> None:
-        """Makes a dataset or scene somebody's. Raises DatabaseUnavailable."""
+    async def claim(
+        self, kind: Kind, name: str, ownership: Ownership, is_there: Callable[[str | None], Awaitable[bool]]
+    ) -> bool:
+        """Whether a dataset or scene is to be this owner's: somebody else has the name otherwise.
+
+        `is_there`: whether what an earlier claim of the name is to is there, or is being made. If not, whoever claimed
+        it died. Raises DatabaseUnavailable.
+        """
+
+        def add(connection: sa.Connection) -> Ownership:
+            if not add_owner(connection, kind, name, ownership):
+                return read_owner(connection, kind, name)
+            self._known[kind, name] = ownership
+            return ownership
+
+        while (holder := await self._write(add)) != ownership:
+            if holder != NOBODYS and await is_there(holder.claim):
+                return False
+            await self.forget(kind, name, holder)
+        return True
+
+    async def forget(self, kind: Kind, name: str, ownership: Ownership) -> None:
+        """Forgets whose a dataset or scene was, unless the name is another's now. Raises DatabaseUnavailable."""
 
         def change(connection: sa.Connection) -> None:
-            set_owner(connection, kind, name, ownership)
-            self._known[kind, name] = ownership
+            forget_owner(connection, kind, name, ownership)
+            if self._known.get((kind, name)) == ownership:
+                del self._known[kind, name]
 
         await self._write(change)
 
-    async def forget(self, kind: Kind, name: str) -> None:
-        """Forgets whose a dataset or scene was that is gone. Raises DatabaseUnavailable."""
+    @asynccontextmanager
+    async def removing(self, kind: Kind, name: str) -> AsyncIterator[None]:
+        """Forgets whose the dataset or scene was that the body removes. Raises DatabaseUnavailable."""
+        ownership = await self._write(lambda connection: read_owner(connection, kind, name))
+        yield
+        await self.forget(kind, name, ownership)
 
-        def change(connection: sa.Connection) -> None:
-            forget_owner(connection, kind, name)
-            self._known.pop((kind, name), None)
-
-        if (kind, name) in self._known:
-            await self._write(change)
-
-    async def _write(self, change: Callable[[sa.Connection], None]) -> None:
+    async def _write(self, change: Callable[[sa.Connection], T]) -> T:
+        """A cancelled caller waits for the end of the transaction all the same."""
         assert self._engine is not None
         engine = self._engine
 
-        def write() -> None:
+        def write() -> T:
             with self._changing, engine.begin() as connection:
-                change(connection)
+                return change(connection)
 
-        await asyncio.get_running_loop().run_in_executor(self._threads, write)
+        writing = asyncio.get_running_loop().run_in_executor(self._threads, write)
+        try:
+            return await asyncio.shield(writing)
+        finally:
+            await asyncio.wait({writing})
 
 
 class Claim:
     """A dataset or scene that the caller is about to make."""
 
-    def __init__(self, owners: Owners, kind: Kind, name: str, *, private: bool) -> None:
+    def __init__(self, owners: Owners, kind: Kind, name: str, token: str, *, private: bool) -> None:
+        """`token`: no other claim has it."""
         self._owners, self._kind, self._name = owners, kind, name
-        self._ownership = Ownership(acting().name, private)
+        self._ownership = Ownership(acting().name, private, token)
+        self._taken_at_s: float | None = None
+        self.is_made = False  # told by who makes it, from any thread
+
+    async def take(self, is_there: Callable[[str | None], Awaitable[bool]]) -> bool:
+        """As `Owners.claim`; what is to be private is hidden from here on."""
+        if self._taken_at_s is None:
+            self._taken_at_s = time.monotonic()
+        return await self._owners.claim(self._kind, self._name, self._ownership, is_there)
+
+    async def spread(self) -> None:
+        """Returns when other services know the claim, if what it is to is to be hidden."""
+        if self._ownership.private and self._taken_at_s is not None:
+            await asyncio.sleep(self._taken_at_s + SPREAD_S - time.monotonic())
 
     @asynccontextmanager
-    async def making(self, *, taken: bool) -> AsyncIterator[None]:
-        """Hides what is to be private before the body makes it, also on other services, unless the name is `taken`."""
-        if taken or not self._ownership.private:
-            yield
-            return
-        await self._owners.set(self._kind, self._name, self._ownership)
+    async def held(self) -> AsyncIterator[None]:
+        """Gives the name back at the end of the body, unless what it names was made."""
         try:
             yield
-        except BaseException:
-            if self._owners.known(self._kind, self._name) is self._ownership:  # nobody was quicker
-                await self._owners.forget(self._kind, self._name)
-            raise
-
-    async def made(self) -> None:
-        """Says whose it is, now that it is there: whoever made it, where two tried at once."""
-        await self._owners.set(self._kind, self._name, self._ownership)
+        finally:
+            if self._taken_at_s is not None and not self.is_made:
+                await self._owners.forget(self._kind, self._name, self._ownership)
 
 
 def may_see(principal: Principal, ownership: Ownership) -> bool:

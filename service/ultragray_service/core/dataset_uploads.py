@@ -6,6 +6,8 @@ import asyncio
 import logging
 from collections.abc import AsyncIterator, Awaitable
 from contextlib import asynccontextmanager
+from contextvars import copy_context
+from functools import partial
 from typing import Any, TypeVar
 
 from ultragray.contract import from_dict
@@ -23,10 +25,12 @@ from ..access.owners import Claim, Owners
 from ..arrival import arrival
 from ..settings import Settings
 from .helper_processes import HelperProcesses
+from .own_thread import to_its_end
 
 MAX_UPLOADS = 8
 CHECK_TIMEOUT_S = 1800.0
 _BLOCK_BYTES = 1 << 20
+_POLL_INTERVAL_S = 0.25
 
 _log = logging.getLogger("ultragray.service")
 
@@ -71,7 +75,7 @@ class DatasetUploads:
         try:
             room, most = await self._holdings.room(), self._settings.max_dataset_bytes
             incoming = await asyncio.to_thread(IncomingDataset, self._store, room.at_most(most))
-            claim = Claim(self._owners, Kind.DATASET, name, private=private)
+            claim = Claim(self._owners, Kind.DATASET, name, incoming.folder.name, private=private)
             upload = DatasetUpload(
                 incoming, name, options, self._settings, stopping, self._checks, claim, room.at_most(most)
             )
@@ -149,7 +153,7 @@ class DatasetUpload:
         Raises DatasetInvalid with the file and the frame, InvalidArgument for an option, DatasetExists, UploadTooLarge,
         MemoryExceeded, StorageFull, DeadlineExceeded.
         """
-        async with self._finishing:
+        async with self._finishing, self._claim.held():
             await self._flush()
             await asyncio.to_thread(self._incoming.finish)
             arguments = {
@@ -158,15 +162,26 @@ class DatasetUpload:
                 "options": self._options,
                 "max_bytes": self._max_bytes,
             }
-            taken = await asyncio.to_thread(self._incoming.is_taken, self._name)
-            async with self._claim.making(taken=taken):
-                await self._checks.run(
-                    take_in, arguments, what="checking the dataset", timeout_s=CHECK_TIMEOUT_S, killed=DatasetInvalid
-                )
-                record, is_new = await asyncio.to_thread(self._incoming.accept, self._name)
-                if is_new:
-                    await self._claim.made()
-            return record, is_new
+            await self._take_name()
+            await self._checks.run(
+                take_in, arguments, what="checking the dataset", timeout_s=CHECK_TIMEOUT_S, killed=DatasetInvalid
+            )
+            while not await self._take_name():
+                if await asyncio.to_thread(self._incoming.is_taken, self._name):
+                    return await asyncio.to_thread(self._incoming.present, self._name), False
+                await asyncio.sleep(_POLL_INTERVAL_S)  # another upload of the name is being checked
+            await self._claim.spread()
+            return await to_its_end(partial(copy_context().run, self._accept))
+
+    async def _take_name(self) -> bool:
+        """Whether the name is now this upload's; it is not where there is a dataset, whoever has it."""
+        if await asyncio.to_thread(self._incoming.is_taken, self._name):
+            return False
+        return await self._claim.take(lambda claim: asyncio.to_thread(self._incoming.is_there, self._name, claim))
+
+    def _accept(self) -> tuple[DatasetRecord, bool]:
+        record, self._claim.is_made = self._incoming.accept(self._name)
+        return record, self._claim.is_made
 
     async def ended(self) -> None:
         """Returns when a `finish` that was cancelled has ended its process."""

@@ -5,13 +5,14 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from collections.abc import AsyncIterator, Awaitable, Callable
+from functools import partial
 from pathlib import Path
 
 from ultragray.errors import SceneFileInvalid
 from ultragray.files.atomic import file_sha256, sync
 from ultragray.files.link import link_or_copy
 from ultragray.scene_info import SceneHeader, read_header
-from ultragray_workers.claims import claimed_folder, remove_abandoned, storage_full
+from ultragray_workers.claims import claimed_folder, is_claimed, remove_abandoned, storage_full
 from ultragray_workers.errors import QueueFull, SceneExists, SceneNotFound, UploadTooLarge
 from ultragray_workers.jobs.publication import SCENES_FOLDER
 from ultragray_workers.jobs.queue.owners import Kind
@@ -81,8 +82,12 @@ class SceneImports:
         Cancelling it ends the check. Raises SceneFileInvalid, SceneExists, StorageFull, MemoryExceeded,
         DeadlineExceeded.
         """
-        claim = Claim(self._owners, Kind.SCENE, name, private=private)
-        async with claim.making(taken=False):
+        await self._require_free(name)
+        claim = Claim(self._owners, Kind.SCENE, name, received.parent.name, private=private)
+        async with claim.held():
+            if not await claim.take(partial(self._is_there, name)):
+                await self._require_free(name)
+                raise SceneExists(f"another import makes a scene {name!r}: choose another name", field="scene")
             await self._checks.run(
                 check_scene_file,
                 {"path": str(received)},
@@ -92,14 +97,14 @@ class SceneImports:
             )
             header = await asyncio.to_thread(read_header, received)
             await self._require_free(name)
-            await in_own_thread(lambda: self._publish(received, name))
-            await claim.made()
+            await claim.spread()
+            await to_its_end(lambda: self._publish(received, name, claim))
         return header
 
     async def delete(self, name: str) -> None:
         """Removes the file of a scene. Raises SceneNotFound, and SceneReadOnly for one of the data folder."""
-        await asyncio.to_thread(self._delete, name)
-        await self._owners.forget(Kind.SCENE, name)
+        async with self._owners.removing(Kind.SCENE, name):
+            await asyncio.to_thread(self._delete, name)
 
     async def removable(self) -> set[str]:
         """The names of the scenes that `delete` removes."""
@@ -121,11 +126,20 @@ class SceneImports:
             await asyncio.to_thread(file.flush)
         await in_own_thread(lambda: sync(path))
 
-    def _publish(self, received: Path, name: str) -> None:
+    def _publish(self, received: Path, name: str, claim: Claim) -> None:
         target = self._folder / f"{name}{SUFFIX}"
         link_or_copy(received, target)
         if not target.samefile(received) and file_sha256(target) != file_sha256(received):  # another one was quicker
             raise self._exists(name)
+        claim.is_made = True
+
+    async def _is_there(self, name: str, claim: str | None) -> bool:
+        """Whether the scene of a claim is there, or is being made: in this order it is not missed."""
+        if claim is not None and await asyncio.to_thread(is_claimed, self._folder / claim):
+            return True
+        if await self._maker_of(name) is not None:
+            return True
+        return name in await asyncio.to_thread(self._store.names)
 
     async def _require_free(self, name: str) -> None:
         if name in await asyncio.to_thread(self._store.names):

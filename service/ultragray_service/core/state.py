@@ -250,8 +250,8 @@ class Service:
     async def delete_dataset(self, name: str) -> None:
         """Deletes a dataset, and all that was made of it to be looked at. Raises DatasetNotFound, DatasetInUse."""
         deleted = (await asyncio.to_thread(self.datasets.get, name)).sha256
-        await asyncio.to_thread(self.datasets.delete, name)
-        await self.owners.forget(Kind.DATASET, name)
+        async with self.owners.removing(Kind.DATASET, name):
+            await asyncio.to_thread(self.datasets.delete, name)
         if deleted not in await asyncio.to_thread(self.datasets.names_by_content):
             await self._forget(lambda key: key.endswith(deleted))
 

@@ -9,7 +9,12 @@ import pytest
 
 from ultragray_workers.errors import SceneExists
 from ultragray_workers.jobs.folder import JobFolder
-from ultragray_workers.jobs.publication import publish_scene
+from ultragray_workers.jobs.publication import give_name_back, publish_scene
+from ultragray_workers.jobs.queue.database import JobDatabase
+from ultragray_workers.jobs.queue.owners import Kind, read_owner
+from ultragray_workers.jobs.store import JobStore
+
+from .conftest import train_job
 
 
 @pytest.fixture(params=["links", "no links"])
@@ -43,3 +48,24 @@ def test_another_scene_of_that_name_stays(folder: JobFolder) -> None:
         publish_scene(folder, "new")
     assert served.read_bytes() == b"another"
     assert [path.name for path in served.parent.iterdir()] == ["new.ugr"]
+
+
+@pytest.mark.parametrize("is_served", [False, True])
+def test_a_job_that_ends_without_its_scene_gives_the_name_back(
+    jobs: JobDatabase, store: JobStore, artifact_folder: Path, is_served: bool
+) -> None:
+    def owner() -> str | None:
+        with jobs.engine.connect() as connection:
+            return read_owner(connection, Kind.SCENE, "made").owner
+
+    job, _ = store.submit(train_job("made"), owner="alice")
+    folder = JobFolder(artifact_folder, job.id)
+    folder.artifacts.mkdir(parents=True)
+    (folder.artifacts / "made.ugr").write_bytes(b"made")
+    assert owner() == "alice"
+    if is_served:
+        publish_scene(folder, "made")
+    give_name_back(jobs, folder, "made", "bob")
+    assert owner() == "alice"
+    give_name_back(jobs, folder, "made", "alice")
+    assert owner() == ("alice" if is_served else None)

@@ -11,7 +11,7 @@ from typing import IO
 from ultragray.errors import DatasetInvalid
 from ultragray.files.atomic import sync
 
-from ..claims import DELETED_PREFIX, claimed_folder, remove_abandoned, storage_full
+from ..claims import DELETED_PREFIX, claimed_folder, is_claimed, remove_abandoned, storage_full
 from .store import FILES_NAME, DatasetRecord, DatasetStore
 from .unpack import FileBudget, create_below
 
@@ -69,6 +69,18 @@ class IncomingDataset:
     def is_taken(self, name: str) -> bool:
         """Whether there is a dataset of that name already."""
         return self._store.is_taken(name)
+
+    def is_there(self, name: str, claim: str | None) -> bool:
+        """Whether there is a dataset of that name, or the upload of a claim is about to make it.
+
+        In the other order a dataset that appears in between would be missed.
+        """
+        return (claim is not None and is_claimed(self._store.folder / claim)) or self._store.is_taken(name)
+
+    def present(self, name: str) -> DatasetRecord:
+        """As `DatasetStore.present`."""
+        with self._open():
+            return self._store.present(self.folder / DATASET_NAME, name)
 
     def accept(self, name: str) -> tuple[DatasetRecord, bool]:
         """Make the checked dataset one of the store, as `DatasetStore.add`."""

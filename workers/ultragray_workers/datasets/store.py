@@ -125,17 +125,21 @@ class DatasetStore:
         except OSError as error:
             if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
                 raise
-            present = self._read(name, self.folder / name)
-            is_same = (present.sha256, present.options) == (record.sha256, record.options)
-            if is_same and not self.hides(name):
-                return present, False
-            raise DatasetExists(
-                f"there is already a dataset {name!r} with another content or other options: delete it first, or "
-                "choose another name",
-                field="dataset",
-            ) from None
+            return self.present(folder, name), False
         sync(self.folder)
         return record, True
+
+    def present(self, folder: Path, name: str) -> DatasetRecord:
+        """The dataset `name`, where it is the one in a complete folder. Raises DatasetExists for another."""
+        record = DatasetRecord.from_json((folder / MANIFEST_NAME).read_text(encoding="utf-8"))
+        present = self._read(name, self.folder / name)
+        if (present.sha256, present.options) == (record.sha256, record.options) and not self.hides(name):
+            return present
+        raise DatasetExists(
+            f"there is already a dataset {name!r} with another content or other options: delete it first, or choose "
+            "another name",
+            field="dataset",
+        )
 
     def delete(self, name: str) -> None:
         """Raises DatasetNotFound, and DatasetInUse where `in_use` names who needs it.

@@ -20,6 +20,7 @@ from dbos import error as dbos_error
 from ultragray.errors import InvalidArgument
 from ultragray.image_size import MAX_IMAGE_SIDE
 
+from ..claims import is_claimed
 from ..datasets.store import DatasetStore
 from ..errors import (
     ArtifactNotFound,
@@ -38,13 +39,13 @@ from .folder import JobFolder, Progress
 from .job import MAX_PRIORITY, PRIORITY_ZERO, STATUSES, Job, JobState, job_of_row, ownership_of
 from .kinds import Specification
 from .overview import JobsOverview, overview
-from .publication import SCENES_FOLDER
+from .publication import SCENES_FOLDER, give_name_back
 from .queue import attendance, database, runs, unfinished
 from .queue.attendance import Worker
 from .queue.database import JobDatabase
 from .queue.internals import MOST_RUNNING
 from .queue.listing import ids_of_owner, page_of_rows
-from .queue.owners import Kind, Ownership, set_owner
+from .queue.owners import NOBODYS, Kind, Ownership, add_owner, claim_of_job, forget_owner, read_owner
 from .queue.wishes import Wanted
 from .removal import remove_job
 from .requirements import Requirements
@@ -181,9 +182,15 @@ class JobStore:
                 options["authenticated_user"] = ownership.owner
 
             def claim_scene(connection: sa.Connection) -> None:
-                if made is not None and ownership.owner is not None:
-                    set_owner(connection, Kind.SCENE, made, ownership)
+                if made is None or owner is None:
+                    return
+                if not add_owner(connection, Kind.SCENE, made, Ownership(owner, private, claim_of_job(job_id))):
+                    raise SceneExists(
+                        f"a scene {made!r} is being imported: choose another name", field=specification.makes_scene
+                    )
 
+            if made is not None:
+                self._forget_dead_claim(made)
             try:
                 self.database.enqueue(
                     options,
@@ -202,6 +209,8 @@ class JobStore:
             except DatasetNotFound:
                 self.database.client.cancel_workflow(job_id)
                 self.database.client.delete_workflows([job_id])
+                if made is not None:
+                    give_name_back(self.database, self._folder(job_id), made, owner)
                 raise
         return self.get(job_id), True
 
@@ -263,6 +272,9 @@ class JobStore:
             job = self.get(job_id)
         if job.state is not JobState.CANCELLED:
             raise JobFinished(f"the job {job_id} has {job.state.value} already", field="job")
+        made = value_in({**job.specification, "kind": job.kind}, "makes_scene")
+        if made is not None:
+            give_name_back(self.database, self._folder(job_id), made, job.owner)
         return job
 
     def retry(self, job_id: str, *, admit: Admit = _admit_any) -> tuple[Job, bool]:
@@ -361,6 +373,16 @@ class JobStore:
         """Ends the connections to the database; the folder may be restored."""
         self.database.close()
         self._open.close()
+
+    def _forget_dead_claim(self, scene: str) -> None:
+        """Forgets whose a scene was to be that nobody makes any more, such as an import of a service that died."""
+        with self.database.engine.begin() as connection:
+            holder = read_owner(connection, Kind.SCENE, scene)
+        if holder == NOBODYS or is_claimed(self._artifact_folder / SCENES_FOLDER / str(holder.claim)):
+            return
+        if self.makes_scene(scene) is None and scene not in self._requirements.scenes.names():
+            with self.database.engine.begin() as connection:
+                forget_owner(connection, Kind.SCENE, scene, holder)
 
     def _unfinished(self, role: str, name: str, shown: Shown) -> str | None:
         job_id = unfinished.naming(self.database, role, name)

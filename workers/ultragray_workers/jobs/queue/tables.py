@@ -49,6 +49,7 @@ OWNERS = sa.Table(  # of datasets and scenes; jobs keep theirs with their row
     sa.Column("name", sa.Text, primary_key=True),
     sa.Column("owner", sa.Text, nullable=False),
     sa.Column("private", sa.Boolean, nullable=False),
+    sa.Column("claim", sa.Text),  # what made the row, see `owners`; NULL: it is from before there were claims
 )
 CHANGES = sa.Table(  # one row: counts the changes of keys and owners, so that who keeps a copy sees when it is old
     "ultragray_changes", TABLES, sa.Column("number", sa.BigInteger, nullable=False)
@@ -173,6 +174,11 @@ def _to_version_5(connection: sa.Connection) -> None:
     _add_columns(connection, "ultragray_keys", {"limits": "TEXT"})
 
 
+def _to_version_6(connection: sa.Connection) -> None:
+    """The claims that rows of owners are from."""
+    _add_columns(connection, "ultragray_owners", {"claim": "TEXT"})
+
+
 def _add_columns(connection: sa.Connection, table: str, types: dict[str, str]) -> None:
     place = table if connection.dialect.name == "sqlite" else f"{SCHEMA}.{table}"
     for name, kind in types.items():
@@ -187,6 +193,7 @@ STEPS: tuple[Callable[[sa.Connection], None], ...] = (
     _to_version_3,
     _to_version_4,
     _to_version_5,
+    _to_version_6,
 )
 VERSION = len(STEPS)
 

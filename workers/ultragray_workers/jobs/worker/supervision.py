@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
@@ -29,7 +30,7 @@ from ...errors import (
 )
 from ...scenes import SUFFIX
 from ..folder import JobFolder, Outcome, Request
-from ..publication import publish_scene
+from ..publication import give_name_back, publish_scene
 from ..queue import database, runs
 from ..queue.database import JobDatabase
 from ..specification import has_checkpoints, value_in
@@ -139,6 +140,7 @@ class Supervisor:
                     span.set_status(Status(StatusCode.ERROR, outcome.error))
             if outcome.error is not None:
                 self._require_folder(job_id)
+                self._give_name_back(row, request["specification"])
             _log.info(f"job {job_id} {'succeeded' if outcome.error is None else f'failed: {outcome.reason}'}")
             return outcome
         finally:
@@ -293,6 +295,13 @@ class Supervisor:
             self._until_the_database_answers(folder.job_id, lambda: cancel(folder.job_id))
             raise Interrupted
         publish_scene(folder, scene)
+
+    def _give_name_back(self, row: WorkflowStatus, specification: dict[str, Any]) -> None:
+        """Lets others have the name of the scene that a job was to make and did not."""
+        if (scene := value_in(specification, "makes_scene")) is not None:
+            folder = JobFolder(self._config.artifact_folder, row.workflow_id)
+            give = partial(give_name_back, self._database, folder, scene, row.authenticated_user)
+            self._until_the_database_answers(row.workflow_id, give)
 
     def _require_folder(self, job_id: str) -> None:
         """Puts a job back that failed because its folder is gone. Raises Interrupted."""
