@@ -40,8 +40,8 @@ class HttpLimits:
 class BoundedHttp(HttpToolsProtocol):
     """One connection. `look` must be called every second or so.
 
-    A head is counted while it comes, and nothing beyond the limit reaches the parser. The same count bounds trailers,
-    and whatever else brings neither a head to its end nor a body on.
+    A head is counted while it comes, and nothing beyond the limit reaches the parser. The same count bounds whatever
+    else brings neither a head to its end nor a body on. Trailers are bounded like a head, and thrown away.
     """
 
     def __init__(self, *arguments: Any, limits: HttpLimits, place: Place, **options: Any) -> None:
@@ -55,6 +55,7 @@ class BoundedHttp(HttpToolsProtocol):
         self._idle_bytes = 0  # since the request came on
         self._body_bytes = 0  # since the last look
         self._unwanted_bytes = 0
+        self._trailers = self._trailer_bytes = 0
         self._refused_for: UltragrayError | None = None
         self._is_refused = False
         self._receiving = Patience(limits.min_bytes_per_s, limits.transfer_patience_s)
@@ -97,12 +98,21 @@ class BoundedHttp(HttpToolsProtocol):
         if len(self.url) > MAX_TARGET_BYTES:
             self._stop_parsing(TargetTooLong(f"the target of a request may have at most {MAX_TARGET_BYTES} bytes"))
 
+    def on_header(self, name: bytes, value: bytes) -> None:
+        if self._in_head:
+            super().on_header(name, value)
+            return
+        self._trailers += 1
+        self._trailer_bytes += len(name) + len(value)
+        if self._trailers > self._limits.max_headers or self._trailer_bytes > self._limits.max_header_bytes:
+            self._stop_parsing(self._head_too_large())
+
     def on_headers_complete(self) -> None:
         if len(self.headers) > self._limits.max_headers:
             self._stop_parsing(self._head_too_large())
         self._in_head = False
         self._head_since = None
-        self._idle_bytes = self._unwanted_bytes = 0
+        self._idle_bytes = self._unwanted_bytes = self._trailers = self._trailer_bytes = 0
         self._receiving.renew()
         super().on_headers_complete()
         if len(self.pipeline) > MAX_PIPELINED:

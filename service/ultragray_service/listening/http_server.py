@@ -45,6 +45,7 @@ class HttpServer(uvicorn.Server):
                 log_config=None,
                 access_log=False,
                 server_header=False,
+                proxy_headers=False,  # anybody on this machine could write another's address there
                 timeout_keep_alive=int(settings.idle_timeout_s),
                 timeout_graceful_shutdown=int(flush_s),
             )

@@ -22,6 +22,7 @@ MEBIBYTE = 2**20
 HEADER_BYTES = 64 * 1024
 TOTAL, PER_ADDRESS = 40, 12
 REQUEST = b"GET /v1/health/live HTTP/1.1\r\nHost: localhost\r\n"
+CHUNKED = b"POST /v1/probes:plane HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\n"
 KEY = "a-key-of-these-tests"
 TIMEOUT_S = 20.0
 
@@ -147,6 +148,21 @@ def test_more_headers_than_allowed_are_refused(limited: RunningService) -> None:
         problem = problem_of(answer(opened))
         assert (problem["status"], problem["reason"]) == (431, "HEADERS_TOO_LARGE")
         assert is_closed(opened)
+
+
+@pytest.mark.parametrize("trailers", [b"X-A: " + b"b" * 150_000 + b"\r\n", b"X-A: b\r\n" * 20_000])
+def test_trailers_are_bounded_like_headers(limited: RunningService, trailers: bytes) -> None:
+    with open_socket(limited) as opened:
+        opened.sendall(CHUNKED + f"X-API-Key: {KEY}\r\n\r\n0\r\n".encode() + trailers + b"\r\n")
+        assert status_of(answer(opened)) == 431
+
+
+def test_trailers_are_no_headers(limited: RunningService) -> None:
+    with open_socket(limited) as opened:
+        opened.sendall(CHUNKED + f"\r\n0\r\nX-API-Key: {KEY}\r\n\r\n".encode())
+        assert status_of(answer(opened)) == 401
+        opened.sendall(REQUEST + b"\r\n")
+        assert status_of(answer(opened)) == 200
 
 
 def test_trailers_without_end_are_refused(limited: RunningService) -> None:
