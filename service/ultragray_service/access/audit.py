@@ -12,7 +12,7 @@ import json
 import logging
 import threading
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -36,7 +36,7 @@ NOBODY = "-"  # who has shown no key that is known
 WRITE_INTERVAL_S = 1.0
 TALLY_INTERVAL_S = 60.0
 MAX_WAITING = 10_000  # entries, while the database is away
-_MAX_TALLIES = 1000  # of one interval; more are told as one
+_MAX_TALLIES = 1000  # of one caller in one interval, or of all without a name; more are told as one
 _BATCH = 500
 _COUNTED = {error.reason for error in (PermissionDenied, Unauthenticated, RateLimited, LimitReached)}
 _LONGEST = 256  # characters of what clients name
@@ -80,6 +80,7 @@ class AuditLog:
     def __init__(self) -> None:
         self._waiting: deque[Entry] = deque()
         self._tallies: dict[Entry, int] = {}
+        self._different: Counter[str] = Counter()  # tallies by callers
         self._lost = 0
         self._is_away = False
         self._engine: sa.Engine | None = None
@@ -105,11 +106,18 @@ class AuditLog:
             self._waiting.append(entry)
 
     def count(self, entry: Entry) -> None:
-        """Counts something that happens often; a refusal is told the first time."""
+        """Counts something that happens often; a refusal is told the first time.
+
+        What a caller without a name asked for is left out: each could be told once.
+        """
+        if entry.who == NOBODY:
+            entry = replace(entry, target="")
         seen = self._tallies.get(entry)
-        if seen is None and len(self._tallies) >= _MAX_TALLIES:
-            entry = Entry("*", "*", "*", "", entry.result)
-            seen = self._tallies.get(entry)
+        if seen is None:
+            if self._different[entry.who] >= _MAX_TALLIES:
+                entry = Entry(entry.who, "*", "*", "", entry.result)
+                seen = self._tallies.get(entry)
+            self._different[entry.who] += seen is None
         if seen is None and entry.result != OK:
             self.tell(entry)
             self._tallies[entry] = 0
@@ -178,6 +186,7 @@ class AuditLog:
 
     def _tell_tallies(self) -> None:
         tallies, self._tallies = self._tallies, {}
+        self._different = Counter()
         for entry, count in list(tallies.items()):
             if count:
                 self.tell(Entry(entry.who, entry.address, entry.what, entry.target, entry.result, {"count": count}))

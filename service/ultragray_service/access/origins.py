@@ -39,12 +39,15 @@ class Origins:
             )
 
     def require_page(
-        self, *, origin: str | None, host: str | None, fetch_site: str | None = None, fetch_mode: str | None = None
+        self, *, origin: str | None, host: str | None, fetch_site: str | None = None, is_link: bool = False
     ) -> None:
-        """Raises OriginRefused for a request of another site's page, by the headers that browsers send."""
+        """Raises OriginRefused for a request of another site's page, by the headers that browsers send.
+
+        `is_link`: whether it fetches a whole page, as whoever follows a link does.
+        """
         if origin is not None:
             self._require_origin(origin, host)
-        elif fetch_site == "cross-site" and fetch_mode != "navigate":
+        elif fetch_site == "cross-site" and not is_link:
             raise OriginRefused("pages of other sites may not load this; a link to it may be followed", field="Origin")
 
     def _require_origin(self, origin: str, host: str | None) -> None:

@@ -17,6 +17,7 @@ from starlette.types import Scope
 from ultragray_workers.scenes import FileVersion
 
 from ..errors import RouteNotFound
+from .docs import NOT_FRAMED
 from .revalidation import revalidated
 
 CONSOLE_FOLDER = Path(__file__).resolve().parents[1] / "console"
@@ -31,7 +32,7 @@ _POLICY = (
     "object-src 'none'",
     "base-uri 'none'",
     "form-action 'none'",
-    "frame-ancestors 'none'",
+    NOT_FRAMED["Content-Security-Policy"],
 )
 _PAGE_HEADERS = {
     "Cross-Origin-Opener-Policy": "same-origin",
@@ -94,7 +95,7 @@ def _headers(request: Request) -> Mapping[str, str]:
     host = request.headers.get("host", "")
     sockets = f" ws://{host} wss://{host}" if _HOST.fullmatch(host) else ""
     policy = "; ".join((*_POLICY, f"connect-src 'self'{sockets}"))
-    return {**_PAGE_HEADERS, "Content-Security-Policy": policy}
+    return {**NOT_FRAMED, **_PAGE_HEADERS, "Content-Security-Policy": policy}
 
 
 class _Assets(StaticFiles):

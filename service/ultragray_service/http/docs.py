@@ -8,6 +8,8 @@ from starlette.responses import HTMLResponse
 from starlette.staticfiles import StaticFiles
 
 DOCS_PATH = "/docs"
+# No page of another site shows this one within itself, where its visitors would click on what they do not see.
+NOT_FRAMED = {"Content-Security-Policy": "frame-ancestors 'none'", "X-Frame-Options": "DENY"}
 _STATIC_PATH = f"{DOCS_PATH}/static"
 
 
@@ -21,6 +23,8 @@ def add_docs(app: FastAPI) -> None:
         swagger_css_url=f"{_STATIC_PATH}/swagger-ui.css",
         swagger_favicon_url=f"{_STATIC_PATH}/favicon.png",
     )
+
+    page.headers.update(NOT_FRAMED)
 
     @app.get(DOCS_PATH, include_in_schema=False)
     async def docs() -> HTMLResponse:

@@ -107,7 +107,9 @@ class CheckOrigin:
                     origin=headers.get("origin"),
                     host=headers.get("host"),
                     fetch_site=headers.get("sec-fetch-site"),
-                    fetch_mode=headers.get("sec-fetch-mode"),
+                    is_link=scope.get("method") in ("GET", "HEAD")
+                    and headers.get("sec-fetch-mode") == "navigate"
+                    and headers.get("sec-fetch-dest") == "document",
                 )
         except (HostRefused, OriginRefused) as error:
             await problem_response(error)(scope, receive, send)

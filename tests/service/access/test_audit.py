@@ -48,7 +48,8 @@ def test_a_service_writes_who_did_what(
     service = start_service(artifact_folder=tmp_path)
 
     def ask(key: str, method: str, path: str, **options: object) -> httpx.Response:
-        return httpx.request(method, f"{service.http}{path}", headers={"X-API-Key": key}, timeout=60, **options)
+        headers = {"X-API-Key": key, "X-Forwarded-For": "203.0.113.7"}  # which says nothing
+        return httpx.request(method, f"{service.http}{path}", headers=headers, timeout=60, **options)
 
     ask(alice, "PUT", "/v1/scenes/mine", content=scene_bytes)
     specification = {"scene": "demo", "poses": [MATRIX]}
@@ -126,6 +127,36 @@ def test_an_attacker_fills_no_log(database: JobDatabase, monkeypatch: pytest.Mon
     log.open(database.engine)
     log.close()
     assert len(read_audit(database.engine, since_s=time.time() - 60, limit=10_000)) <= 1010
+
+
+def test_callers_without_a_key_hide_nobodys_refusals(
+    start_service: StartService, tmp_path: Path, database: JobDatabase
+) -> None:
+    _, reader = KeyStore(database.engine).create("reader", Role.READER, None)
+    service = start_service(artifact_folder=tmp_path)
+    with httpx.Client(base_url=service.http, timeout=60) as client:
+        for number in range(1100):
+            assert client.get(f"/v1/scenes/guess{number}").status_code == 401
+        assert client.delete("/v1/scenes/demo", headers={"X-API-Key": reader}).status_code == 403
+    assert service.terminate() == 0
+    found = [(one["who"], one["what"], one["target"], one["facts"]) for one in entries(tmp_path)]
+    assert ("reader", "scene.delete", "demo", {}) in found
+    of_nobody = [one for one in found if one[0] == "-"]
+    assert {one[:3] for one in of_nobody} == {("-", "scene.get", "")}
+    assert len(of_nobody) <= 10
+    assert sum(dict(one[3]).get("count", 1) for one in of_nobody) == 1100  # type: ignore[call-overload]
+
+
+def test_each_name_has_room_of_its_own(database: JobDatabase) -> None:
+    log = AuditLog()
+    for number in range(2000):
+        log.count(Entry("alice", "::1", "scene.get", str(number), "RATE_LIMITED"))
+    log.count(Entry("bob", "::1", "scene.delete", "demo", "PERMISSION_DENIED"))
+    log.open(database.engine)
+    log.close()
+    found = read_audit(database.engine, since_s=0, limit=10_000)
+    assert [one.target for one in found if one.who == "bob"] == ["demo"]
+    assert sum(one.facts.get("count", 1) for one in found if one.who == "alice") == 2000
 
 
 def test_streams_and_watches_end_with_their_key(

@@ -59,7 +59,16 @@ def test_pictures_and_scripts_of_other_sites_are_refused_and_links_are_not(http:
     assert http.get("/v1/scenes", headers=fetched).json()["reason"] == "ORIGIN_REFUSED"
     followed = {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "navigate", "Sec-Fetch-Dest": "document"}
     assert http.get("/", headers=followed).status_code == 200
+    assert http.post("/v1/scenes/demo:unload", headers=followed).json()["reason"] == "ORIGIN_REFUSED"
+    assert http.get("/docs", headers={**followed, "Sec-Fetch-Dest": "iframe"}).json()["reason"] == "ORIGIN_REFUSED"
     assert http.get("/v1/scenes", headers={"Sec-Fetch-Site": "same-origin"}).status_code == 200
+
+
+@pytest.mark.parametrize("path", ["/", "/docs"])
+def test_no_page_shows_ours_within_itself(http: httpx.Client, path: str) -> None:
+    headers = http.get(path).headers
+    assert "frame-ancestors 'none'" in headers["content-security-policy"]
+    assert headers["x-frame-options"] == "DENY"
 
 
 def test_this_machine_is_let_in_under_each_of_its_names(http: httpx.Client, service: RunningService) -> None:
