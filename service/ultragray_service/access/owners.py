@@ -25,23 +25,21 @@ from ultragray_workers.jobs.queue.owners import (
 from .principal import Principal, Role, acting
 
 SPREAD_S = 2.0  # in which every service has read who owns what again, see `snapshot`
-_KEPT_JOBS = 10_000
 
 T = TypeVar("T")
 
 
 class Owners:
-    """Knows owners without asking the database, but for those of jobs that nobody asked for before."""
+    """Knows whose datasets and scenes are without asking the database; those of jobs stand with their rows."""
 
     def __init__(
         self, job_ownership: Callable[[str], Awaitable[Ownership]], find: Mapping[Kind, Callable[[str], object]]
     ) -> None:
-        """`job_ownership`: reads the owner of a job, which never changes. Raises JobNotFound.
+        """`job_ownership`: reads the owner of a job. Raises JobNotFound.
 
         `find`: raises DatasetNotFound or SceneNotFound where there is no such thing; it blocks.
         """
         self._known: dict[tuple[Kind, str], Ownership] = {}
-        self._jobs: dict[str, Ownership] = {}
         self._job_ownership = job_ownership
         self._find = find
         self._changing = threading.Lock()  # of the table and its copy, so that no older copy follows a newer one
@@ -68,21 +66,12 @@ class Owners:
 
     async def of(self, kind: Kind, name: str) -> Ownership:
         """Whose something is. Raises JobNotFound."""
-        return await self._of_job(name) if kind is Kind.JOB else self.known(kind, name)
+        return await self._job_ownership(name) if kind is Kind.JOB else self.known(kind, name)
 
     async def require_existing(self, kind: Kind, name: str) -> None:
         """Raises DatasetNotFound or SceneNotFound, also for what is hidden."""
         if kind in self._find:
             await asyncio.to_thread(self._find[kind], name)
-
-    async def _of_job(self, job_id: str) -> Ownership:
-        found = self._jobs.get(job_id)
-        if found is None:
-            found = await self._job_ownership(job_id)
-            if len(self._jobs) >= _KEPT_JOBS:
-                self._jobs.clear()
-            self._jobs[job_id] = found
-        return found
 
     def hides(self, kind: Kind, name: str) -> bool:
         """Whether a dataset or scene is private to somebody else than who the running code works for."""

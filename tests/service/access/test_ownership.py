@@ -154,11 +154,13 @@ def test_a_private_job_that_is_in_the_way_is_not_named(keyed: Keyed, scene_bytes
         assert keyed.http("alice", "POST", f"/v1/jobs/{job}:cancel").status_code == 200
 
 
-def test_the_request_id_of_somebody_else_gives_no_job(keyed: Keyed) -> None:
-    assert keyed.submit("alice", request_id="same", private=True).status_code == 201
-    answer = keyed.submit("bob", request_id="same")
-    assert (answer.status_code, answer.json()["reason"]) == (409, "REQUEST_ID_CONFLICT")
-    assert keyed.submit("alice", request_id="same", private=True).status_code == 200
+def test_the_request_ids_of_two_owners_are_two(keyed: Keyed) -> None:
+    mine = keyed.submit("alice", request_id="same", private=True)
+    others = keyed.submit("bob", request_id="same")
+    assert (mine.status_code, others.status_code) == (201, 201)
+    assert mine.json()["id"] != others.json()["id"]
+    again = keyed.submit("alice", request_id="same", private=True)
+    assert (again.status_code, again.json()["id"]) == (200, mine.json()["id"])
 
 
 def test_the_owner_and_admins_see_and_render(keyed: Keyed, private: str) -> None:
@@ -231,3 +233,55 @@ def test_a_scene_that_a_job_makes_is_its_owners(keyed: Keyed, private: str) -> N
         assert keyed.http("bob", "GET", "/v1/scenes/trained").status_code == 404
     finally:
         published.unlink()
+
+
+def test_a_request_id_of_a_deleted_job_shows_nobody_the_private_job_of_another(keyed: Keyed) -> None:
+    first = keyed.submit("bob", request_id="run-1").json()["id"]
+    assert keyed.http("bob", "GET", f"/v1/jobs/{first}").status_code == 200
+    assert keyed.http("bob", "POST", f"/v1/jobs/{first}:cancel").status_code == 200
+    assert keyed.http("bob", "DELETE", f"/v1/jobs/{first}").status_code == 204
+    second = keyed.submit("alice", request_id="run-1", private=True).json()["id"]
+    for who in ("bob", "reader"):
+        assert keyed.http(who, "GET", f"/v1/jobs/{second}").status_code == 404
+    assert keyed.http("alice", "POST", f"/v1/jobs/{second}:cancel").status_code == 200
+
+
+def test_a_request_id_that_is_used_again_may_be_private_this_time(keyed: Keyed) -> None:
+    first = keyed.submit("alice", request_id="twice").json()["id"]
+    assert keyed.http("bob", "GET", f"/v1/jobs/{first}").status_code == 200
+    assert keyed.http("alice", "POST", f"/v1/jobs/{first}:cancel").status_code == 200
+    assert keyed.http("alice", "DELETE", f"/v1/jobs/{first}").status_code == 204
+    second = keyed.submit("alice", request_id="twice", private=True).json()["id"]
+    assert keyed.http("bob", "GET", f"/v1/jobs/{second}").status_code == 404
+
+
+def test_a_request_id_with_another_private_asks_for_something_else(keyed: Keyed) -> None:
+    for first in (False, True):
+        assert keyed.submit("alice", request_id=f"changes {first}", private=first).status_code == 201
+        answer = keyed.submit("alice", request_id=f"changes {first}", private=not first)
+        assert (answer.status_code, answer.json()["reason"]) == (409, "REQUEST_ID_CONFLICT")
+
+
+def test_a_job_on_something_private_is_private(keyed: Keyed, private: str) -> None:
+    by_scene = keyed.submit("alice", scene="secret", request_id="on secret")
+    body = {"kind": "train", "specification": {"dataset": "secret", "scene": "of-secret"}}
+    for answer in (by_scene, keyed.http("alice", "POST", "/v1/jobs", json=body)):
+        assert (answer.status_code, answer.json()["private"]) == (201, True)
+        assert keyed.http("bob", "GET", f"/v1/jobs/{answer.json()['id']}").status_code == 404
+    assert keyed.submit("alice", scene="secret", request_id="on secret").status_code == 200
+
+
+def test_a_retry_uses_nothing_that_the_owner_of_the_job_may_not_see(keyed: Keyed, dataset_bytes: bytes) -> None:
+    assert keyed.http("bob", "PUT", "/v1/datasets/swap", content=dataset_bytes).status_code == 201
+    body = {"kind": "train", "specification": {"dataset": "swap", "scene": "swapped"}}
+    job = keyed.http("bob", "POST", "/v1/jobs", json=body).json()["id"]
+    assert keyed.http("bob", "POST", f"/v1/jobs/{job}:cancel").status_code == 200
+    assert keyed.http("bob", "DELETE", "/v1/datasets/swap").status_code == 204
+    assert keyed.http("alice", "PUT", "/v1/datasets/swap?private=true", content=dataset_bytes).status_code == 201
+    for who in ("bob", "admin"):
+        answer = keyed.http(who, "POST", f"/v1/jobs/{job}:retry")
+        assert (answer.status_code, answer.json()["reason"]) == (404, "DATASET_NOT_FOUND")
+    assert keyed.http("alice", "DELETE", "/v1/datasets/swap").status_code == 204
+    assert keyed.http("bob", "PUT", "/v1/datasets/swap", content=dataset_bytes).status_code == 201
+    retried = keyed.http("admin", "POST", f"/v1/jobs/{job}:retry")
+    assert (retried.status_code, retried.json()["owner"]) == (201, "bob")

@@ -17,6 +17,7 @@ from ..scenes import SUFFIX, SceneStore
 from .folder import JobFolder
 from .kinds import Specification
 from .kinds.base import Surroundings
+from .queue.owners import Kind
 
 
 @dataclass(frozen=True)
@@ -45,14 +46,21 @@ class Requirements:
         if name is None:
             specification.check(self._surroundings(None))
             return
-        old = None if before is None else before.path / f"{name}{SUFFIX}"
-        if old is not None and old.is_file():
+        if (old := _kept(name, before)) is not None:
             path, header = old, read_header(old)
         else:
             path, header = self.scenes.path(name), self.scenes.header(name)
         with storage_full("the scene of the job"):
             specification.check(self._surroundings(header))
             self._keep(path, name, folder)
+
+    def taken(self, specification: Specification, before: JobFolder | None) -> list[tuple[Kind, str]]:
+        """The dataset and the scene that `provide` takes; not a scene that the job replaced has kept."""
+        dataset, scene = (
+            _named(specification, one) for one in (specification.needs_dataset, specification.needs_scene)
+        )
+        found = [] if dataset is None else [(Kind.DATASET, dataset)]
+        return found if scene is None or _kept(scene, before) is not None else [*found, (Kind.SCENE, scene)]
 
     def require_dataset(self, specification: Specification) -> None:
         """Raises DatasetNotFound, DatasetInvalid where the job's dataset is not there."""
@@ -80,3 +88,9 @@ class Requirements:
 
 def _named(specification: Specification, field: str | None) -> Any:
     return None if field is None else getattr(specification, field)
+
+
+def _kept(scene: str, before: JobFolder | None) -> Path | None:
+    """The file of a scene in the folder of the job that is replaced; None where it is not there."""
+    kept = None if before is None else before.path / f"{scene}{SUFFIX}"
+    return kept if kept is not None and kept.is_file() else None

@@ -31,12 +31,13 @@ from ..errors import (
     JobNotFinished,
     JobQueueFull,
     SceneExists,
+    SceneNotFound,
     job_not_found,
 )
 from ..scenes import SceneStore
 from ..store import OpenStore
 from .folder import JobFolder, Progress
-from .job import MAX_PRIORITY, PRIORITY_ZERO, STATUSES, Job, JobState, job_of_row, ownership_of
+from .job import MAX_PRIORITY, PRIORITY_ZERO, STATUSES, Job, JobState, attribute, job_of_row, ownership_of
 from .kinds import Specification
 from .overview import JobsOverview, overview
 from .publication import SCENES_FOLDER, give_name_back
@@ -59,6 +60,7 @@ MAX_REQUEST_ID_CHARACTERS = 128
 _JOB_ID = re.compile(r"[0-9a-f]{24}")
 _STORABLE = re.compile(r"[^\0\ud800-\udfff]*")  # PostgreSQL takes no NUL, and UTF-8 no surrogates
 _TAIL_BYTES = 8192
+_ASKED_PRIVATE = "asked_private"  # attribute of a job, which is also private where it takes something private
 
 
 Admit = Callable[["JobStore"], int | None]  # raises what keeps a new job out, else: how many may run at once
@@ -133,7 +135,11 @@ class JobStore:
             raise InvalidArgument(
                 f"priority must be an integer from {-MAX_PRIORITY} to {MAX_PRIORITY}, got {priority}", field="priority"
             )
-        job_id = uuid.uuid4().hex[:24] if request_id is None else _id_of_request(request_id)
+        if request_id is None:
+            job_id = uuid.uuid4().hex[:24]
+        else:
+            _check_request_id(request_id)
+            job_id = self._id_for(f"request {request_id}", owner)
         return self._submit(job_id, specification, priority, owner, private, admit, request_id=request_id)
 
     def _submit(
@@ -147,18 +153,21 @@ class JobStore:
         *,
         request_id: str | None = None,
         retry_of: str | None = None,
+        by: str | None = None,
     ) -> tuple[Job, bool]:
-        short, ownership = in_short(specification), Ownership(owner, private)
+        short, asked = in_short(specification), Ownership(owner, private)
         made = value_in(short, "makes_scene")
         self.database.folder.check()
         with self._submitting:
             if self.database.workflow(job_id) is not None:
-                return self._same(job_id, specification, priority, ownership), False
+                return self._same(job_id, specification, priority, asked), False
             if unfinished.count_waiting(self.database) >= self._queue_limit:
                 raise JobQueueFull(f"{self._queue_limit} jobs wait already: try again later, or cancel some")
             most_running = admit(self)
             before = None if retry_of is None else self._folder(retry_of)
             self._requirements.provide(specification, self._folder(job_id), before)
+            used = self._requirements.taken(specification, before)
+            private |= self._are_private(used, owner, by)
             options: EnqueueOptions = {
                 "workflow_name": specification.kind,
                 "queue_name": database.QUEUE,
@@ -171,6 +180,7 @@ class JobStore:
                     "retry_of": retry_of,
                     "specification": short,
                     "private": private,
+                    _ASKED_PRIVATE: asked.private,
                     MOST_RUNNING: most_running,
                     TRACE: current_trace(),
                 },
@@ -178,8 +188,8 @@ class JobStore:
             }
             if made is not None:
                 options["deduplication_id"] = f"scene {made}"
-            if ownership.owner is not None:
-                options["authenticated_user"] = ownership.owner
+            if owner is not None:
+                options["authenticated_user"] = owner
 
             def claim_scene(connection: sa.Connection) -> None:
                 if made is None or owner is None:
@@ -198,7 +208,7 @@ class JobStore:
                     also=claim_scene,
                 )
             except dbos_error.DBOSWorkflowIDInUseError:  # another service was quicker
-                return self._same(job_id, specification, priority, ownership), False
+                return self._same(job_id, specification, priority, asked), False
             except dbos_error.DBOSQueueDeduplicatedError:
                 raise SceneExists(
                     f"another job that waits or runs makes the scene {made!r}: choose another name",
@@ -206,7 +216,8 @@ class JobStore:
                 ) from None
             try:  # again, now that a deletion of the dataset would see the job: one that came in between has won
                 self._requirements.require_dataset(specification)
-            except DatasetNotFound:
+                self._are_private(used, owner, by)
+            except (DatasetNotFound, SceneNotFound):
                 self.database.client.cancel_workflow(job_id)
                 self.database.client.delete_workflows([job_id])
                 if made is not None:
@@ -214,13 +225,30 @@ class JobStore:
                 raise
         return self.get(job_id), True
 
-    def _same(self, job_id: str, specification: Specification, priority: int, ownership: Ownership) -> Job:
+    def _are_private(self, used: list[tuple[Kind, str]], owner: str | None, by: str | None) -> bool:
+        """Whether any of the datasets and scenes that a job takes is private.
+
+        Raises DatasetNotFound, SceneNotFound where somebody else asks for the job whose owner may not see one.
+        """
+        with self.database.engine.connect() as connection:
+            whose = [(kind, name, read_owner(connection, kind, name)) for kind, name in used]
+        for kind, name, holder in whose:
+            if by not in (None, owner) and holder.private and holder.owner != owner:
+                not_found = DatasetNotFound if kind is Kind.DATASET else SceneNotFound
+                raise not_found(
+                    f"the owner of the job may not see the {kind.value} {name!r}: it is private", field=kind.value
+                )
+        return any(holder.private for _, _, holder in whose)
+
+    def _same(self, job_id: str, specification: Specification, priority: int, asked: Ownership) -> Job:
         """The job that is there already. Raises JobConflict where it asks for something else, or is somebody else's."""
         row = self._row(job_id, with_input=True)
         job = self._seen(row)
-        if job.owner is not None and job.owner != ownership.owner:
+        if job.owner is not None and job.owner != asked.owner:
             raise JobConflict(f"the request_id {job.request_id!r} was used already: choose another", field="request_id")
-        if priority != job.priority or to_dict(_specification_of(row)) != to_dict(specification):
+        before = attribute(row, _ASKED_PRIVATE)
+        is_same = (priority, asked.private) == (job.priority, job.private if before is None else before)
+        if not is_same or to_dict(_specification_of(row)) != to_dict(specification):
             raise JobConflict(
                 f"the request_id {job.request_id!r} was used for the job {job.id}, which asks for something else",
                 field="request_id",
@@ -257,7 +285,7 @@ class JobStore:
 
     def ownership(self, job_id: str) -> Ownership:
         """Whose a job is. Raises JobNotFound."""
-        return ownership_of(self._row(job_id))
+        return ownership_of(self._row(job_id, with_output=False))
 
     def cancel(self, job_id: str) -> Job:
         """Ends a job that waits or runs, its process within a second; nothing where it is cancelled already.
@@ -277,10 +305,11 @@ class JobStore:
             give_name_back(self.database, self._folder(job_id), made, job.owner)
         return job
 
-    def retry(self, job_id: str, *, admit: Admit = _admit_any) -> tuple[Job, bool]:
+    def retry(self, job_id: str, *, by: str | None = None, admit: Admit = _admit_any) -> tuple[Job, bool]:
         """The job in place of a failed or cancelled one, and whether it is new: a job has one such successor.
 
-        A training goes on from the last checkpoint of its predecessor. Raises JobNotFound, JobNotFinished, and what
+        `by`: who asks for it; None: the owner of the job. A training goes on from the last checkpoint of its
+        predecessor. Raises JobNotFound, JobNotFinished, and what
         `submit` raises.
         """
         row = self._row(job_id, with_input=True)
@@ -290,13 +319,14 @@ class JobStore:
                 f"only a failed or cancelled job can be retried, the job {job_id} is {job.state.value}", field="job"
             )
         return self._submit(
-            _hashed(f"retry {job_id}"),
+            self._id_for(f"retry {job_id}", job.owner),
             _specification_of(row),
             job.priority,
             job.owner,
             job.private,
             admit,
             retry_of=job_id,
+            by=by,
         )
 
     def delete(self, job_id: str) -> None:
@@ -391,10 +421,19 @@ class JobStore:
         row = self.database.workflow(job_id)
         return f"the job {job_id}" if row is not None and shown(ownership_of(row)) else "a private job of somebody else"
 
-    def _row(self, job_id: str, *, with_input: bool = False) -> WorkflowStatus:
+    def _id_for(self, text: str, owner: str | None) -> str:
+        """The id of the one job of an owner that a text without NUL stands for."""
+        ownerless = _hashed(text)  # also that of the jobs of releases whose ids did not tell owners apart
+        if owner is None:
+            return ownerless
+        row = self.database.workflow(ownerless)
+        is_mine = row is not None and row.authenticated_user in (None, owner)
+        return ownerless if is_mine else _hashed(f"{text}\0{owner}")
+
+    def _row(self, job_id: str, *, with_input: bool = False, with_output: bool = True) -> WorkflowStatus:
         row = None
         if _JOB_ID.fullmatch(job_id):
-            row = self.database.workflow(job_id, with_input=with_input, with_output=True)
+            row = self.database.workflow(job_id, with_input=with_input, with_output=with_output)
         if row is None:
             raise job_not_found(job_id)
         return row
@@ -406,7 +445,7 @@ class JobStore:
         return JobFolder(self._artifact_folder, job_id)
 
 
-def _id_of_request(request_id: str) -> str:
+def _check_request_id(request_id: str) -> None:
     if not 1 <= len(request_id) <= MAX_REQUEST_ID_CHARACTERS:
         raise InvalidArgument(
             f"request_id must have 1 to {MAX_REQUEST_ID_CHARACTERS} characters, got {len(request_id)}",
@@ -416,7 +455,6 @@ def _id_of_request(request_id: str) -> str:
         raise InvalidArgument(
             "request_id must be text without NUL and without halves of characters", field="request_id"
         )
-    return _hashed(f"request {request_id}")
 
 
 def _hashed(text: str) -> str:

@@ -147,7 +147,7 @@ class Jobs:
 
     async def retry(self, job_id: str) -> tuple[Job, bool]:
         """As JobStore.retry. Raises LimitReached."""
-        return await self.do(JobStore.retry, job_id, admit=self.admit)
+        return await self.do(JobStore.retry, job_id, by=acting().name, admit=self.admit)
 
     async def page(self, *, state: str, kind: str, page_size: int, page_token: str) -> JobPage:
         """One page of jobs; empty filters pass all.
