@@ -21,6 +21,7 @@ from .errors import RestoreRefused, StartupFailed
 
 FORMAT_VERSION = 1  # 0: folders of releases that wrote no version, which are laid out as those of version 1
 _VERSION_FILE, _LOCK_FILE, MARKER = "store.json", "store.lock", "restoring.json"
+PRIVATE_FOLDER, PRIVATE_FILE = 0o700, 0o600  # modes of what is made here: keys' hashes, and what people own
 _READ_ONLY = (errno.EACCES, errno.EPERM, errno.EROFS)
 
 
@@ -31,7 +32,7 @@ class OpenStore:
         """Raises StartupFailed for a folder of a newer release, and during a restore; OSError."""
         self._lock: IO[str] | None = None
         try:
-            folder.mkdir(parents=True, exist_ok=True)
+            folder.mkdir(mode=PRIVATE_FOLDER, parents=True, exist_ok=True)
             self._lock = (folder / _LOCK_FILE).open("a")
             fcntl.flock(self._lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
         except OSError as error:

@@ -8,6 +8,7 @@ was made to point here (rebinding).
 from __future__ import annotations
 
 import ipaddress
+import re
 from functools import lru_cache
 from urllib.parse import urlsplit
 
@@ -16,6 +17,7 @@ from ..settings import Settings
 from .addresses import is_loopback
 
 _ANY = "*"
+_HOST = re.compile(r"(\[(?P<address>[0-9A-Fa-f:.]+)\]|(?P<name>[A-Za-z0-9._-]+))(:[0-9]{0,5})?", re.ASCII)
 
 
 class Origins:
@@ -66,10 +68,10 @@ class Origins:
     def _allows_host(self, host: str) -> bool:
         if _ANY in self._hosts:
             return True
-        try:
-            name = (urlsplit(f"//{host}").hostname or "").lower()
-        except ValueError:
+        match = _HOST.fullmatch(host)
+        if match is None:
             return False
+        name = (match["address"] or match["name"]).lower()
         if name in self._hosts or is_loopback(name):
             return True
         try:

@@ -13,7 +13,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from ultragray.errors import UltragrayError
 
 from ..access.audit import NOBODY
-from ..access.credentials import credential_of_subprotocols, offered_credential
+from ..access.credentials import credentials_of_subprotocols, offered_credential
 from ..access.guard import Guard
 from ..access.origins import Origins
 from ..access.permissions import require
@@ -153,9 +153,9 @@ class Authorize:
         """Raises Unauthenticated, RateLimited, PermissionDenied, JobNotFound."""
         service, headers = self._service, Headers(scope=scope)
         address, port = scope.get("client") or ("", 0)
-        key = headers.get("x-api-key") or credential_of_subprotocols(scope.get("subprotocols", ()))
-        credential = offered_credential(headers.get("authorization"), key)
+        keys = [*headers.getlist("x-api-key"), *credentials_of_subprotocols(scope.get("subprotocols", ()))]
         with service.audit.refusals(NOBODY, address, operation, target):
+            credential = offered_credential(headers.getlist("authorization"), keys)
             principal = service.guard.authenticate(credential)
         act_as(principal, address=address, connection=f"{address}:{port}")
         with service.audit.refusals(principal.name, address, operation, target):

@@ -9,6 +9,8 @@ from functools import partial
 from typing import Any
 
 from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol
+from websockets.exceptions import InvalidHandshake
+from websockets.http11 import Request
 
 from ultragray.errors import UltragrayError
 
@@ -210,12 +212,25 @@ class _BoundedWebSocket(PromptWebSocket):
     def __init__(self, *arguments: Any, limits: HttpLimits, place: Place, **options: Any) -> None:
         super().__init__(*arguments, **options)
         self._place = place
+        self._limits = limits
         self._looked_at = self.loop.time()
         self._sending = _Sending(limits)
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._place.leave()
         super().connection_lost(exc)
+
+    def handle_connect(self, event: Request) -> None:
+        try:
+            self.conn.process_request(event)
+        except InvalidHandshake:
+            error = RequestMalformed("the headers are no handshake of a WebSocket of version 13 (RFC 6455)")
+            self.handshake_initiated = self.handshake_complete = self.close_sent = True
+            self._limits.on_refused(error)
+            self.transport.write(refusal_bytes(error, self.default_headers))
+            self.transport.close()
+        else:
+            super().handle_connect(event)
 
     def look(self, now: float) -> None:
         """Cuts the connection where the client does not take what is sent."""

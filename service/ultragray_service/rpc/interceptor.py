@@ -42,16 +42,21 @@ class CallContext(grpc.aio.ServerInterceptor):  # type: ignore[misc]
         handler = await continuation(details)
         if handler is None:
             return None
-        headers = {key: value for key, value in details.invocation_metadata or () if isinstance(value, str)}
+        texts = [(key, value) for key, value in details.invocation_metadata or () if isinstance(value, str)]
+        headers = dict(texts)
         if details.method.startswith(_OPEN_PREFIX):
-            return handler
+            handler = refusing_what_is_no_message(handler)
+            return with_method(handler, _telling_errors(method_of(handler)))
         is_own = details.method.startswith(OWN_PREFIX)
         operation = GRPC_OPERATIONS[details.method] if is_own else REFLECTION
         try:
             if not self._guard.asks:
                 # of a proxy that speaks gRPC for pages
                 self._origins.require_page(origin=headers.get("origin"), host=None)
-            credential = offered_credential(headers.get("authorization"), headers.get("x-api-key"))
+            credential = offered_credential(
+                [value for key, value in texts if key == "authorization"],
+                [value for key, value in texts if key == "x-api-key"],
+            )
             principal = self._guard.authenticate(credential)
         except UltragrayError as error:
             method = self._refusing(operation, error)
@@ -120,6 +125,16 @@ class CallContext(grpc.aio.ServerInterceptor):  # type: ignore[misc]
             return answer
 
         return call
+
+
+def _telling_errors(method: Method) -> Method:
+    async def call(request: Any, context: grpc.aio.ServicerContext) -> Any:
+        try:
+            return await method(request, context)
+        except UltragrayError as error:
+            await abort(context, error)
+
+    return call
 
 
 def address_of(peer: str) -> str:

@@ -29,6 +29,7 @@ from ..core.state import Service
 from ..settings import Settings
 from ..tls.certificates import HANDSHAKE_TIMEOUT_S, Certificates
 from ..tls.watch import CertificateWatch
+from .health import Health
 from .interceptor import CallContext
 from .services.access import AccessService
 from .services.datasets import DatasetService
@@ -80,7 +81,7 @@ class GrpcServer:
                 *_connection_options(service.settings),
             ],
         )
-        self._health = health.aio.HealthServicer()
+        self._health = Health()
         self._told = dict.fromkeys(("", *SERVICE_NAMES), False)
         rendering_pb2_grpc.add_RenderServiceServicer_to_server(RenderService(service), self._server)
         scenes_pb2_grpc.add_SceneServiceServicer_to_server(SceneService(service), self._server)

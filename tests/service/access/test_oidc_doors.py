@@ -58,6 +58,12 @@ def test_a_token_opens_both_doors(guarded: RunningService, provider: IdentityPro
             client.scenes.list()
 
 
+def test_a_token_for_ever_is_one_until_the_last_date(guarded: RunningService, provider: IdentityProvider) -> None:
+    headers = {"Authorization": f"Bearer {provider.token(exp=1e300)}"}
+    answer = httpx.get(f"{guarded.http}/v1/me", headers=headers, timeout=60)
+    assert (answer.status_code, answer.json()["expires_at"][:4]) == (200, "9999")
+
+
 def test_tokens_that_are_refused_say_why_at_the_doors(guarded: RunningService, provider: IdentityProvider) -> None:
     for token, status, reason in (
         (provider.token(aud="another"), 401, "UNAUTHENTICATED"),

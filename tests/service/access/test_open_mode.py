@@ -47,6 +47,12 @@ def test_a_name_that_was_pointed_here_reaches_no_route(http: httpx.Client, metho
         "localhost.elsewhere.example",
         "10.0.0.7:8000",
         "[::",
+        "localhost#.evil",
+        "localhost/.evil",
+        "localhost?.evil",
+        "a@localhost",
+        "localhost:80:80",
+        "[::1].evil",
         "",
     ):
         headers = {"Host": host, "Origin": f"http://{host}"}

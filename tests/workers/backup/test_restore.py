@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +15,7 @@ from ultragray_workers.backup import restoring
 from ultragray_workers.backup.backing_up import back_up
 from ultragray_workers.backup.contents import Folders
 from ultragray_workers.backup.restoring import restore
-from ultragray_workers.errors import RestoreRefused, StartupFailed
+from ultragray_workers.errors import BackupInvalid, RestoreRefused, StartupFailed
 from ultragray_workers.jobs.queue import tables
 from ultragray_workers.jobs.queue.database import JobDatabase
 from ultragray_workers.jobs.store import JobStore
@@ -38,6 +41,64 @@ def test_nothing_is_overwritten_unasked(
     assert [job.id for job in again.list()[0]] == [kept.id]
     again.close()
     assert not (folders.data / "later.ugr").exists()
+
+
+@pytest.mark.parametrize("kind", ["file", "link", "folder"])
+def test_what_stands_in_the_way_is_named_before_anything_changes(
+    kind: str, store: JobStore, folders: Folders, backups: Path, elsewhere: Folders, database_url: str | None
+) -> None:
+    back_up(folders, database_url, backups)
+    elsewhere.artifacts.mkdir(parents=True)
+    outside = elsewhere.data.parent / "outside"
+    outside.mkdir()
+    place = elsewhere.artifacts / "datasets"
+    if kind == "file":
+        place.write_bytes(b"")
+    elif kind == "link":
+        place.symlink_to(outside)
+    else:
+        (elsewhere.data / "demo.ugr").mkdir(parents=True)
+    with pytest.raises(RestoreRefused, match="remove it first"):
+        restore(backups, elsewhere, database_url, overwrite=True)
+    assert not list(outside.iterdir())
+
+
+def forged(backups: Path, change: Callable[[dict[str, Any]], None]) -> None:
+    """Changes the only list of a folder of backups, and its hash."""
+    (path,) = (backups / "manifests").glob("*.json")
+    document = json.loads(path.read_text())
+    del document["sha256"]
+    change(document)
+    sha256 = hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()
+    path.write_text(json.dumps({**document, "sha256": sha256}))
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        (lambda document: document["files"][0].update(path="a\0b"), "names the file"),
+        (lambda document: document.update(name="20200101T000000.000Z"), "calls itself '20200101T000000.000Z'"),
+        (
+            lambda document: document["files"].append(
+                {**document["files"][0], "path": document["files"][0]["path"] + "/x"}
+            ),
+            "below another file",
+        ),
+    ],
+)
+def test_lists_that_no_backup_has_are_damaged(
+    change: Callable[[dict[str, Any]], None],
+    expected: str,
+    store: JobStore,
+    folders: Folders,
+    backups: Path,
+    elsewhere: Folders,
+    database_url: str | None,
+) -> None:
+    back_up(folders, database_url, backups)
+    forged(backups, change)
+    with pytest.raises(BackupInvalid, match=expected):
+        restore(backups, elsewhere, database_url)
 
 
 def test_database_with_jobs_is_not_overwritten_by_another_folder(

@@ -124,6 +124,8 @@ def read(backup_folder: Path, name: str | None) -> Manifest:
             )
         if told != _sha256(document):
             raise ValueError("it does not have its own hash")
+        if document["name"] != path.stem:
+            raise ValueError(f"it calls itself {document['name']!r}")
         return _manifest_of(document)
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise BackupInvalid(f"{path} is damaged: {error}") from error
@@ -135,7 +137,11 @@ def _manifest_of(document: dict[str, Any]) -> Manifest:
     if database is not None:
         tables = tuple(TableEntry(**{**one, "columns": tuple(one["columns"])}) for one in database["tables"])
         values["database"] = DatabaseEntry(**{**database, "tables": tables})
-    values["files"] = tuple(map(_file_entry, values["files"]))
+    values["files"] = files = tuple(map(_file_entry, values["files"]))
+    paths = {(entry.root, PurePosixPath(entry.path)) for entry in files}
+    for root, path in paths:
+        if any((root, parent) in paths for parent in path.parents):
+            raise ValueError(f"it names the file {root} {str(path)!r} below another file")
     made = Manifest(**values)
     return replace(made, deleted_jobs=tuple(made.deleted_jobs), cancelled_jobs=tuple(made.cancelled_jobs))
 
@@ -143,7 +149,7 @@ def _manifest_of(document: dict[str, Any]) -> Manifest:
 def _file_entry(document: dict[str, Any]) -> FileEntry:
     entry = FileEntry(**document)
     path = PurePosixPath(entry.path)
-    if entry.root not in ROOTS or path.is_absolute() or ".." in path.parts or not path.parts:
+    if entry.root not in ROOTS or path.is_absolute() or ".." in path.parts or not path.parts or "\0" in entry.path:
         raise ValueError(f"it names the file {entry.root} {entry.path!r}")
     if not _HASH.fullmatch(entry.sha256):
         raise ValueError(f"it names the hash {entry.sha256!r}")

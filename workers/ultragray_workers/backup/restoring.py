@@ -22,7 +22,14 @@ from ..jobs.queue import unfinished
 from ..jobs.queue.database import JobDatabase
 from ..jobs.queue.tables import WORKERS
 from ..scenes import SUFFIX
-from ..store import closed_store, remove_restore_marker, restore_under_way, write_restore_marker
+from ..store import (
+    PRIVATE_FILE,
+    PRIVATE_FOLDER,
+    closed_store,
+    remove_restore_marker,
+    restore_under_way,
+    write_restore_marker,
+)
 from . import manifest as manifests
 from .backing_up import alone_in
 from .contents import ARTIFACTS, Folders, files_of
@@ -54,7 +61,8 @@ def restore(
     objects = Objects(backup_folder)
     _check_objects(manifest, objects)
     for folder in (folders.data, folders.artifacts):
-        folder.mkdir(parents=True, exist_ok=True)
+        folder.mkdir(mode=PRIVATE_FOLDER, parents=True, exist_ok=True)
+    _require_room(manifest, folders)
     with closed_store(folders.artifacts), alone_in(backup_folder):
         if at_work := database.workers_at_work():
             raise RestoreRefused(
@@ -83,6 +91,20 @@ def _check_objects(manifest: Manifest, objects: Objects) -> None:
             f"{len(damaged)} contents of the backup {manifest.name} are missing or damaged, such as that of "
             f"{names[0]}; nothing was restored. --backup names another backup of the folder"
         )
+
+
+def _require_room(manifest: Manifest, folders: Folders) -> None:
+    """Raises RestoreRefused for a file or a link where the backup has a folder, and a folder where it has a file."""
+    for entry in manifest.files:
+        root = folders.root(entry.root)
+        target = root / entry.path
+        for folder in target.parents:
+            if folder == root:
+                break
+            if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
+                raise RestoreRefused(f"{folder} must be a folder, and no link to one: remove it first")
+        if target.is_dir() and not target.is_symlink():
+            raise RestoreRefused(f"{target} is a folder, and a file in the backup: remove it first")
 
 
 def _require_empty(folders: Folders, database: Database) -> None:
@@ -143,6 +165,7 @@ def _load_database(manifest: Manifest, database: Database, objects: Objects) -> 
         Path(f"{database.sqlite}{companion}").unlink(missing_ok=True)
     with atomic_path(database.sqlite) as temporary:
         shutil.copyfile(objects.path(manifest.database.sha256), temporary)
+        temporary.chmod(PRIVATE_FILE)
 
 
 def _let_jobs_go_on(manifest: Manifest, artifact_folder: Path, database_url: str | None) -> None:

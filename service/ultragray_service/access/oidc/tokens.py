@@ -19,7 +19,7 @@ MAX_TOKEN_BYTES = 16_384
 LEEWAY_S = 30.0  # by which clocks may differ
 _MAX_VERIFIED = 4096
 _LONGEST_NAME = 200
-_LATEST_S = 2.0**53
+_LATEST_S = 253_402_300_000.0  # in the year 9999, the last that dates have
 _TOKEN = re.compile(r"[\w-]+\.[\w-]+\.[\w-]*", flags=re.ASCII)
 _REFUSALS = {  # by what PyJWT found
     jwt.ExpiredSignatureError: "the token has expired",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from sqlalchemy.engine import ExceptionContext
 from sqlalchemy.exc import SQLAlchemyError
 
 from ...errors import DatabaseUnavailable, StartupFailed, StorageFull
+from ...store import PRIVATE_FILE, PRIVATE_FOLDER
 from . import runs, tables
 from .folder_identity import FolderIdentity, identify
 from .internals import SCHEMA, SQLITE_ISOLATION, SQLITE_SETTINGS, WORKFLOWS, put_back, take_back
@@ -118,9 +120,12 @@ class JobDatabase:
         """
         quiet_dbos()
         try:
-            artifact_folder.mkdir(parents=True, exist_ok=True)
+            artifact_folder.mkdir(mode=PRIVATE_FOLDER, parents=True, exist_ok=True)
             self.url = checked_url(database_url, artifact_folder)
             engine = _engine(self.url)
+            if engine.dialect.name == "sqlite" and engine.url.database:
+                with suppress(FileExistsError):
+                    Path(engine.url.database).touch(PRIVATE_FILE, exist_ok=False)  # its companions get the same mode
             # Also for tables of our own beside those of the queue.
             self.engine = engine.execution_options(
                 schema_translate_map={SCHEMA: None if engine.dialect.name == "sqlite" else SCHEMA}
