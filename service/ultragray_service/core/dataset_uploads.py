@@ -16,11 +16,12 @@ from ultragray.errors import DatasetInvalid
 from ultragray_workers.datasets.incoming import IncomingDataset, remove_stale
 from ultragray_workers.datasets.intake import take_in
 from ultragray_workers.datasets.store import DatasetRecord, DatasetStore, check_dataset_name
-from ultragray_workers.errors import Draining, QueueFull
+from ultragray_workers.errors import Draining
 from ultragray_workers.jobs.queue.owners import Kind
 
 from ..access.audit import account
 from ..access.limits.holdings import Holdings
+from ..access.limits.slots import Slots
 from ..access.owners import Claim, Owners
 from ..arrival import arrival
 from ..settings import Settings
@@ -55,7 +56,7 @@ class DatasetUploads:
         self._settings = settings
         self._draining = draining
         self._checks = checks
-        self._count = 0
+        self._slots = Slots(MAX_UPLOADS, "uploads of datasets")
 
     @asynccontextmanager
     async def receive(self, name: str, options: dict[str, str], *, private: bool) -> AsyncIterator[DatasetUpload]:
@@ -68,26 +69,23 @@ class DatasetUploads:
         from_dict(SourceOptions, options)
         if self._draining.is_set():
             raise Draining("the service is stopping")
-        if self._count >= MAX_UPLOADS:
-            raise QueueFull(f"{MAX_UPLOADS} uploads are under way already")
-        self._count += 1
-        stopping: asyncio.Future[Any] = asyncio.ensure_future(self._draining.wait())
-        try:
-            room, most = await self._holdings.room(), self._settings.max_dataset_bytes
-            incoming = await asyncio.to_thread(IncomingDataset, self._store, room.at_most(most))
-            claim = Claim(self._owners, Kind.DATASET, name, incoming.folder.name, private=private)
-            upload = DatasetUpload(
-                incoming, name, options, self._settings, stopping, self._checks, claim, room.at_most(most)
-            )
+        with self._slots.one():
+            stopping: asyncio.Future[Any] = asyncio.ensure_future(self._draining.wait())
             try:
-                with room.to_blame(most):
-                    yield upload
+                room, most = await self._holdings.room(), self._settings.max_dataset_bytes
+                incoming = await asyncio.to_thread(IncomingDataset, self._store, room.at_most(most))
+                claim = Claim(self._owners, Kind.DATASET, name, incoming.folder.name, private=private)
+                upload = DatasetUpload(
+                    incoming, name, options, self._settings, stopping, self._checks, claim, room.at_most(most)
+                )
+                try:
+                    with room.to_blame(most):
+                        yield upload
+                finally:
+                    await upload.ended()
+                    await asyncio.shield(asyncio.to_thread(incoming.discard))
             finally:
-                await upload.ended()
-                await asyncio.shield(asyncio.to_thread(incoming.discard))
-        finally:
-            stopping.cancel()
-            self._count -= 1
+                stopping.cancel()
 
     async def remove_stale(self) -> None:
         """Removes what uploads of dead services left."""

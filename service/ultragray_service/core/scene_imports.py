@@ -13,12 +13,13 @@ from ultragray.files.atomic import file_sha256, sync
 from ultragray.files.link import link_or_copy
 from ultragray.scene_info import SceneHeader, read_header
 from ultragray_workers.claims import claimed_folder, is_claimed, remove_abandoned, storage_full
-from ultragray_workers.errors import QueueFull, SceneExists, SceneNotFound, UploadTooLarge
+from ultragray_workers.errors import SceneExists, SceneNotFound, UploadTooLarge
 from ultragray_workers.jobs.publication import SCENES_FOLDER
 from ultragray_workers.jobs.queue.owners import Kind
 from ultragray_workers.scenes import SUFFIX, SceneStore, check_scene_file, check_scene_name
 
 from ..access.limits.holdings import Holdings
+from ..access.limits.slots import Slots
 from ..access.owners import Claim, Owners
 from ..errors import SceneReadOnly
 from ..settings import Settings
@@ -50,7 +51,7 @@ class SceneImports:
         self._owners = owners
         self._holdings = holdings
         self._folder = settings.artifacts / SCENES_FOLDER
-        self._count = 0
+        self._slots = Slots(MAX_IMPORTS, "imports of scenes")
 
     @contextlib.asynccontextmanager
     async def receive(self, name: str, blocks: AsyncIterator[bytes]) -> AsyncIterator[Path]:
@@ -61,20 +62,17 @@ class SceneImports:
         """
         check_scene_name(name)
         await self._require_free(name)
-        if self._count >= MAX_IMPORTS:
-            raise QueueFull(f"{MAX_IMPORTS} scenes are being imported already")
-        self._count += 1
-        claim = contextlib.ExitStack()
-        try:
-            room, most = await self._holdings.room(), self._settings.max_dataset_bytes
-            with storage_full("the scene"), room.to_blame(most):
-                folder = await to_its_end(lambda: claim.enter_context(claimed_folder(self._folder, _PREFIX)))
-                received = folder / f"{name}{SUFFIX}"
-                await self._write(received, blocks, room.at_most(most))
-                yield received
-        finally:
-            self._count -= 1
-            await to_its_end(claim.close)
+        with self._slots.one():
+            claim = contextlib.ExitStack()
+            try:
+                room, most = await self._holdings.room(), self._settings.max_dataset_bytes
+                with storage_full("the scene"), room.to_blame(most):
+                    folder = await to_its_end(lambda: claim.enter_context(claimed_folder(self._folder, _PREFIX)))
+                    received = folder / f"{name}{SUFFIX}"
+                    await self._write(received, blocks, room.at_most(most))
+                    yield received
+            finally:
+                await to_its_end(claim.close)
 
     async def accept(self, received: Path, name: str, *, private: bool) -> SceneHeader:
         """Checks a file that was received and serves it as the scene `name`.

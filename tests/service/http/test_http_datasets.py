@@ -28,6 +28,7 @@ from ...waiting import wait_until
 from ..conftest import RunningService, StartService
 
 KEY = "0123456789abcdef-datasets"
+OTHER_KEYS = (f"{KEY}-2", f"{KEY}-3")
 KEY_HEADER = {"X-API-Key": KEY}
 LIMIT_BYTES = 200_000
 IDLE_TIMEOUT_S = 2.0
@@ -128,12 +129,12 @@ def helper_process(service: RunningService, work: str) -> int | None:
 class HalfUpload:
     """A PUT of which only the beginning has been sent."""
 
-    def __init__(self, service: RunningService, name: str) -> None:
+    def __init__(self, service: RunningService, name: str, key: str = KEY) -> None:
         address = httpx.URL(service.http)
         assert address.port is not None
         self.socket = socket.create_connection((address.host, address.port), timeout=WAIT_S)
         head = (
-            f"PUT /v1/datasets/{name} HTTP/1.1\r\nHost: test\r\nX-API-Key: {KEY}\r\n"
+            f"PUT /v1/datasets/{name} HTTP/1.1\r\nHost: test\r\nX-API-Key: {key}\r\n"
             f"Content-Type: {ZIP}\r\nContent-Length: 100000\r\n\r\n"
         )
         self.socket.sendall(head.encode() + b"PK" * 100)
@@ -162,7 +163,7 @@ def service(start_service: StartService, artifacts: Path) -> RunningService:
         max_dataset_bytes=LIMIT_BYTES,
         max_body_bytes=1024,
         upload_idle_timeout_s=IDLE_TIMEOUT_S,
-        api_keys=KEY,
+        api_keys=", ".join((KEY, *OTHER_KEYS)),
     )
 
 
@@ -347,9 +348,11 @@ def test_a_client_that_goes_away(service: RunningService, artifacts: Path) -> No
 
 
 def test_too_many_uploads_at_once(service: RunningService) -> None:
-    uploads = [HalfUpload(service, f"upload-{number}") for number in range(MAX_UPLOADS + 1)]
+    asked = [KEY] * (MAX_UPLOADS // 2 + 1) + [OTHER_KEYS[0]] * (MAX_UPLOADS // 2) + [OTHER_KEYS[1]]
+    uploads = [HalfUpload(service, f"upload-{number}", key) for number, key in enumerate(asked)]
     answers = [upload.answer() for upload in uploads]
-    assert sum("QUEUE_FULL" in answer for answer in answers) == 1
+    assert sum("QUEUE_FULL" in answer for answer in answers) == 2
+    assert sum("of this client" in answer for answer in answers[: MAX_UPLOADS // 2 + 1]) == 1
     assert sum("DEADLINE_EXCEEDED" in answer for answer in answers) == MAX_UPLOADS
     for upload in uploads:
         upload.close()
