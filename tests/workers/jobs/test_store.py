@@ -27,6 +27,7 @@ from ultragray_workers.errors import (
 )
 from ultragray_workers.jobs.kinds import RenderJob
 from ultragray_workers.jobs.queue.database import checked_url
+from ultragray_workers.jobs.queue.internals import WORKFLOWS
 from ultragray_workers.jobs.store import JobState, JobStore
 from ultragray_workers.scenes import SceneStore
 
@@ -64,6 +65,22 @@ def test_same_request_id_gives_the_same_job(store: JobStore) -> None:
         store.submit(train_job("one"), request_id="mine", priority=1)
     with pytest.raises(InvalidArgument, match="128"):
         store.submit(train_job("one"), request_id="x" * 129)
+
+
+def test_a_request_id_is_its_owners_also_after_an_upgrade(store: JobStore) -> None:
+    store.submit(train_job("one"), request_id="mine")  # its id is that of a job of a release that told no owners apart
+    with store.database.engine.begin() as connection:
+        connection.execute(sa.update(WORKFLOWS).values(authenticated_user="alice"))
+    (old,), _ = store.list()
+    assert store.submit(train_job("one"), request_id="mine", owner="alice") == (old, False)
+    others, is_new = store.submit(train_job("two"), request_id="mine", owner="bob")
+    assert is_new
+    assert store.submit(train_job("two"), request_id="mine", owner="bob") == (others, False)
+    store.cancel(old.id)
+    store.delete(old.id)
+    anew, is_new = store.submit(train_job("one"), request_id="mine", owner="alice")
+    assert is_new
+    assert len({old.id, others.id, anew.id}) == 3
 
 
 @pytest.mark.parametrize("request_id", ["a\0b", "\0", "half a character: \ud800"])
