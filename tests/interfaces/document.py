@@ -45,7 +45,8 @@ def headers_read(package: ModuleType) -> set[str]:
     for path in Path(package.__path__[0]).rglob("*.py"):
         text = path.read_text(encoding="utf-8")
         for literal, constant in re.findall(
-            r'(?:eaders(?:\(scope=scope\))?(?:\.get\(|\[)|Header\(alias=)(?:"([\w-]+)"|([A-Z_]+))(?!\] =)', text
+            r'(?:eaders(?:\(scope=scope\))?(?:\.get(?:list)?\(|\[)|Header\(alias=)(?:"([\w-]+)"|([A-Z_]+))(?!\] =)',
+            text,
         ):
             module = ".".join((package.__name__, *path.relative_to(package.__path__[0]).with_suffix("").parts))
             found.add((literal or getattr(import_module(module), constant)).lower())

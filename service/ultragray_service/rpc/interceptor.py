@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
+from collections import defaultdict
 from collections.abc import Awaitable, Callable
 from typing import Any
 
@@ -44,6 +45,9 @@ class CallContext(grpc.aio.ServerInterceptor):  # type: ignore[misc]
             return None
         texts = [(key, value) for key, value in details.invocation_metadata or () if isinstance(value, str)]
         headers = dict(texts)
+        all_headers = defaultdict[str, list[str]](list)
+        for key, value in texts:
+            all_headers[key].append(value)
         if details.method.startswith(_OPEN_PREFIX):
             handler = refusing_what_is_no_message(handler)
             return with_method(handler, _telling_errors(method_of(handler)))
@@ -53,10 +57,7 @@ class CallContext(grpc.aio.ServerInterceptor):  # type: ignore[misc]
             if not self._guard.asks:
                 # of a proxy that speaks gRPC for pages
                 self._origins.require_page(origin=headers.get("origin"), host=None)
-            credential = offered_credential(
-                [value for key, value in texts if key == "authorization"],
-                [value for key, value in texts if key == "x-api-key"],
-            )
+            credential = offered_credential(all_headers["authorization"], all_headers["x-api-key"])
             principal = self._guard.authenticate(credential)
         except UltragrayError as error:
             method = self._refusing(operation, error)
