@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import socket
+from functools import partial
 from urllib.parse import urlsplit
 
 import grpc
@@ -13,6 +14,7 @@ from grpc_health.v1 import health_pb2, health_pb2_grpc
 
 from ultragray_proto.v1 import access_pb2, access_pb2_grpc
 
+from ...waiting import wait_until
 from ..conftest import RunningService, StartService
 
 KEY, OTHER = "0123456789abcdef-one", "0123456789abcdef-two"
@@ -77,9 +79,13 @@ def test_subprotocols_that_are_none_are_refused_with_a_problem(
 def test_health_lists_every_service_without_a_key(guarded: RunningService) -> None:
     with guarded.channel() as channel:
         stub = health_pb2_grpc.HealthStub(channel)
-        statuses = stub.List(health_pb2.HealthListRequest(), timeout=60).statuses
-        assert statuses["ultragray.v1.RenderService"].status == health_pb2.HealthCheckResponse.SERVING
-        assert "" in statuses
+
+        def is_serving(name: str) -> bool:
+            statuses = stub.List(health_pb2.HealthListRequest(), timeout=60).statuses
+            return bool(statuses[name].status == health_pb2.HealthCheckResponse.SERVING)
+
+        for name in ("", "ultragray.v1.RenderService"):
+            wait_until(partial(is_serving, name))  # it follows the service a moment later
         check = channel.unary_unary("/grpc.health.v1.Health/Check")
         with pytest.raises(grpc.RpcError) as caught:
             check(b"\xff\xff", timeout=60)
