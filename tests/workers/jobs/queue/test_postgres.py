@@ -81,13 +81,13 @@ def test_hosts_share_one_queue_and_one_takes_over_from_the_other(
     hosts: dict[str, subprocess.Popen[bytes]],
     until: Until,
 ) -> None:
-    made = [until(job) for job in [store.submit(train_job(f"scene-{number}"))[0] for number in range(3)]]
+    made = [until(job) for job in [store.submit(train_job(f"scene-{number}"))[0] for number in range(6)]]
     assert {job.state for job in made} == {JobState.SUCCEEDED}, made
     assert {job.worker for job in made} == set(hosts)
     for name in hosts:
         spans = sorted((job.started_at or "", job.finished_at or "") for job in made if job.worker == name)
         assert all(before[1] <= after[0] for before, after in pairwise(spans)), spans
-    assert [(job.attempts, store.log_tail(job.id).count("training scene")) for job in made] == [(1, 1)] * 3
+    assert [(job.attempts, store.log_tail(job.id).count("training scene")) for job in made] == [(1, 1)] * 6
 
     asked = train_job("long", steps=500)
     job, _ = store.submit(asked)

@@ -22,7 +22,7 @@ from ultragray_workers.jobs.kinds.render import Poses
 from ultragray_workers.jobs.store import Job, JobState, JobStore
 
 from ....waiting import Deadline, at_this_load
-from ..conftest import RunningWorker, store_dataset, train_job
+from ..conftest import FINAL, RunningWorker, store_dataset, train_job
 
 StartWorker = Callable[..., RunningWorker]
 Until = Callable[..., Job]
@@ -136,12 +136,10 @@ def small_disk(artifact_folder: Path) -> Iterator[Path]:
 
 @pytest.mark.long
 def test_full_disk(small_disk: Path, tmp_path: Path, start_worker: StartWorker) -> None:
-    from ..conftest import FINAL
-
     store = JobStore(small_disk, None)
 
     def until(job: Job, reached: Callable[[Job], bool] = lambda job: job.state in FINAL) -> Job:
-        end = time.monotonic() + 60
+        end = Deadline(60)
         while not reached(job):
             assert not end.passed, (job, store.log_tail(job.id), (tmp_path / "one.log").read_text())
             time.sleep(0.05)
