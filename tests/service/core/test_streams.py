@@ -44,7 +44,7 @@ def test_a_connection_that_breaks_fails_reading_and_writing_at_once_and_neither_
 
         asyncio.get_running_loop().call_later(0.05, broken.set)
         with pytest.raises(ConnectionResetError):
-            await stream.run(read, write)
+            await stream.run(read, write, write)
         gc.collect()
         await asyncio.sleep(0)
 
@@ -69,7 +69,7 @@ def test_a_stream_that_is_refused_as_a_whole_is_not_ended_in_the_middle_of_an_an
             written.append(answered)
 
         with pytest.raises(InvalidArgument):
-            await stream.run(read, write)
+            await stream.run(read, write, write)
 
     asyncio.run(main())
     assert len(written) == 1
@@ -100,6 +100,8 @@ class FaultyTransport:
 
     async def send(self, answered: Answered) -> None:
         self.answers.append(answered)
+
+    hand_over = send
 
 
 def test_a_fault_at_one_message_is_told_and_the_stream_goes_on(service: Service) -> None:

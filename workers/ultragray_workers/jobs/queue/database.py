@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
@@ -120,30 +120,33 @@ class JobDatabase:
         """
         quiet_dbos()
         try:
-            artifact_folder.mkdir(mode=PRIVATE_FOLDER, parents=True, exist_ok=True)
-            self.url = checked_url(database_url, artifact_folder)
-            engine = _engine(self.url)
-            if engine.dialect.name == "sqlite" and engine.url.database:
-                with suppress(FileExistsError):
-                    Path(engine.url.database).touch(PRIVATE_FILE, exist_ok=False)  # its companions get the same mode
-            # Also for tables of our own beside those of the queue.
-            self.engine = engine.execution_options(
-                schema_translate_map={SCHEMA: None if engine.dialect.name == "sqlite" else SCHEMA}
-            )
-            # The lock connects first: DBOS would make a PostgreSQL database that is not there, and a misspelt name
-            # would be a queue of its own.
-            with tables.one_at_a_time(engine.url):
-                tables.require_known_queue(self.engine)
-                DBOS.migrate(self.url)
-                tables.migrate(self.engine)
-                self.folder = self._identify(artifact_folder)
-            self._probe = WriteProbe(self.engine)
-            self.client = DBOSClient(
-                system_database_engine=engine,
-                application_name=APPLICATION,
-                serializer=SERIALIZER,
-                retry_connection_errors=False,
-            )
+            with ExitStack() as undo:
+                artifact_folder.mkdir(mode=PRIVATE_FOLDER, parents=True, exist_ok=True)
+                self.url = checked_url(database_url, artifact_folder)
+                engine = _engine(self.url)
+                undo.callback(engine.dispose)
+                if engine.dialect.name == "sqlite" and engine.url.database:
+                    with suppress(FileExistsError):
+                        Path(engine.url.database).touch(PRIVATE_FILE, exist_ok=False)  # its companions get its mode
+                # Also for tables of our own beside those of the queue.
+                self.engine = engine.execution_options(
+                    schema_translate_map={SCHEMA: None if engine.dialect.name == "sqlite" else SCHEMA}
+                )
+                # The lock connects first: DBOS would make a PostgreSQL database that is not there, and a misspelt name
+                # would be a queue of its own.
+                with tables.one_at_a_time(engine.url):
+                    tables.require_known_queue(self.engine)
+                    DBOS.migrate(self.url)
+                    tables.migrate(self.engine)
+                    self.folder = self._identify(artifact_folder)
+                self._probe = WriteProbe(self.engine)
+                self.client = DBOSClient(
+                    system_database_engine=engine,
+                    application_name=APPLICATION,
+                    serializer=SERIALIZER,
+                    retry_connection_errors=False,
+                )
+                undo.pop_all()
         except (SQLAlchemyError, OSError) as error:
             cause = getattr(error, "orig", None) or error
             raise StartupFailed(
@@ -155,12 +158,8 @@ class JobDatabase:
 
     def _identify(self, artifact_folder: Path) -> FolderIdentity:
         holds_database = self.engine.url.database == str(artifact_folder.resolve() / SQLITE_FILE)
-        try:
-            with self.engine.begin() as connection:
-                return identify(connection, artifact_folder, holds_database=holds_database)
-        except StartupFailed:
-            self.engine.dispose()
-            raise
+        with self.engine.begin() as connection:
+            return identify(connection, artifact_folder, holds_database=holds_database)
 
     def check(self) -> None:
         """Raises DatabaseUnavailable or StorageFull unless a row could be written now."""
