@@ -52,6 +52,14 @@ def until_calm(service: RunningService) -> float:
     raise AssertionError("frames are rendered without end")
 
 
+@pytest.fixture
+def renders(service: RunningService) -> Iterator[rendering_pb2_grpc.RenderServiceStub]:
+    """Over a connection whose window stays as it is: gRPC lets that of a busy machine grow to 100 MB and more."""
+    options = [("grpc.http2.bdp_probe", 0), ("grpc.max_receive_message_length", -1)]
+    with grpc.insecure_channel(service.grpc, options=options) as channel:
+        yield rendering_pb2_grpc.RenderServiceStub(channel)
+
+
 def test_a_batch_whose_reader_stops_waits_for_him(service: RunningService, renders: Any) -> None:
     before, frames_before = service.resident_bytes(), rendered(service)
     call = renders.RenderBatch(rendering_pb2.RenderBatchRequest(settings=LARGE, poses=[IDENTITY] * 40))

@@ -116,7 +116,11 @@ class Owners:
 
     @asynccontextmanager
     async def removing(self, kind: Kind, name: str) -> AsyncIterator[None]:
-        """Forgets whose the dataset or scene was that the body removes. Raises DatabaseUnavailable."""
+        """Forgets whose the dataset or scene was that the body removes.
+
+        Raises DatasetNotFound, SceneNotFound, and DatabaseUnavailable.
+        """
+        await self.require_existing(kind, name)
         ownership = await self._write(lambda connection: read_owner(connection, kind, name))
         yield
         await self.forget(kind, name, ownership)
