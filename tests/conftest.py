@@ -5,11 +5,9 @@ from __future__ import annotations
 import json
 import math
 import os
-import subprocess
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +24,7 @@ from ultragray.probe import FloatArray
 from ultragray.scene import PARAMETERS
 
 from .postgres import new_database, postgres
+from .records import origin
 from .surroundings import ROOT, forget_the_users_environment, home_of_the_tests, working_folder
 
 __all__ = ["home_of_the_tests", "new_database", "postgres", "working_folder"]
@@ -198,13 +197,10 @@ def pytest_terminal_summary(terminalreporter: Any, exitstatus: int, config: pyte
     path: Path | None = config.getoption("--record-in")
     if path is None:
         return
-    commit = ["git", "describe", "--always", "--dirty", "--exclude=*", "--abbrev=12"]
     counts = {kind: len(terminalreporter.stats.get(kind, ())) for kind in ("passed", "failed", "error", "skipped")}
     record = {
-        "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
-        "commit": subprocess.run(commit, cwd=Path(__file__).parent, capture_output=True, text=True).stdout.strip(),
+        **origin(),
         "seconds": round(time.monotonic() - BEGAN),
-        "cpus": os.cpu_count(),
         "exit_status": int(exitstatus),
         **counts,
         "not_passed": sorted(

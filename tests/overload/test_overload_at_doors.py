@@ -16,6 +16,7 @@ import pytest
 
 from ultragray import GaussianScene
 
+from ..records import origin
 from ..service.conftest import DEMO_PROBE, RunningService, StartService, make_scene, service_starter
 from ..surroundings import ROOT
 from ..waiting import at_this_load
@@ -119,4 +120,4 @@ def test_ten_times_the_capacity(service: RunningService, door: str) -> None:
 def keep(path: Path, door: str, measured: dict[str, Any]) -> None:
     """Adds the figures of a door to the file of the run."""
     document = json.loads(path.read_text()) if path.exists() else {}
-    path.write_text(json.dumps({**document, door: measured}, indent=2) + "\n")
+    path.write_text(json.dumps({**document, door: {**origin(), **measured}}, indent=2) + "\n")

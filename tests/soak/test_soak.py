@@ -11,12 +11,10 @@ import json
 import os
 import random
 import signal
-import subprocess
 import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
-from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
@@ -25,10 +23,10 @@ import pytest
 from ultragray.datasets import Dataset
 from ultragray.datasets.released import write_released
 from ultragray.files.atomic import file_sha256
-from ultragray.machine import processor_name
 
 from ..model.training.conftest import make_tiny_dataset
 from ..processes import Growth, Taken, by_role, family
+from ..records import origin
 from ..service.conftest import RunningService, service_starter
 from ..service.igtl.conftest import address_of
 from ..surroundings import ROOT
@@ -133,11 +131,10 @@ def place(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[
 
 def test_all_kinds_of_clients_for_a_long_time(place: Place) -> None:
     soak = Soak(place)
-    began = datetime.now(timezone.utc)
     soak.run(SECONDS)
     growth = soak.growth()
     if RECORD:
-        (ROOT / RECORD).write_text(json.dumps(record_of(soak, growth, began), indent=2) + "\n")
+        (ROOT / RECORD).write_text(json.dumps(record_of(soak, growth), indent=2) + "\n")
     assert not soak.errors, soak.errors[:10]
     assert all(soak.visits[name] for name in VISITORS), soak.visits
     assert_log_is_clean(place.service)
@@ -152,14 +149,10 @@ def assert_log_is_clean(service: RunningService) -> None:
     assert "Traceback" not in said, said[max(0, said.index("Traceback") - 1000) :][:4000]
 
 
-def record_of(soak: Soak, growth: dict[str, dict[str, Growth]], began: datetime) -> dict[str, Any]:
+def record_of(soak: Soak, growth: dict[str, dict[str, Growth]]) -> dict[str, Any]:
     """What the file of the run says."""
-    commit = ["git", "describe", "--always", "--dirty", "--exclude=*", "--abbrev=12"]
     return {
-        "date": began.isoformat(timespec="seconds"),
-        "commit": subprocess.run(commit, cwd=ROOT, capture_output=True, text=True).stdout.strip(),
-        "machine": processor_name(),
-        "cpus": os.cpu_count(),
+        **origin(),
         "seconds": round(SECONDS),
         "visits": dict(sorted(soak.visits.items())),
         "kills": dict(soak.kills),
