@@ -141,6 +141,20 @@ def test_many_idle_connections_cost_nothing(service: RunningService) -> None:
         assert service.resident_bytes() - before < IDLE * 200_000
 
 
+def test_many_mistakes_at_once_do_not_stop_a_stream(service: RunningService) -> None:
+    """More refusals wait than may be under way, while the client has yet to say that it has the first frame."""
+    address = f"{service.http.replace('http', 'ws', 1)}/v1/scenes/demo/stream"
+    pose = {"mode": "latest", "settings": {}, "pose": {"matrix": np.eye(4).tolist()}}
+    with connect(address, compression=None, max_size=None, close_timeout=0.2) as connection:
+        for sequence in range(3):
+            connection.send(json.dumps({**pose, "sequence": sequence}))
+            for _ in range(30):
+                connection.send('{"settings": 3}')
+        connection.send(json.dumps({**pose, "sequence": 99}))
+        while isinstance(answer := connection.recv(TIMEOUT_S), str) or b'"sequence":99' not in answer:
+            pass
+
+
 def test_a_flood_of_messages_leaves_others_their_turn(service: RunningService) -> None:
     """Settings and poses of a latest stream are never answered one by one: nothing slows the sender down."""
     address = f"{service.http.replace('http', 'ws', 1)}/v1/scenes/demo/stream"

@@ -12,9 +12,10 @@ from websockets.frames import Frame
 
 from ..core.streams.buffers import hold_little
 
-HAND_OVER = "ultragray.hand_over"  # of an ASGI message that is sent: to return once the client has taken it
+HAND_OVER = "ultragray.hand_over"  # of an ASGI message with bytes: to return once the client has taken it
 _FRAGMENTS = 32  # of a message that is handed over
 _PINGS = 2
+_LOOK_EVERY_S = 0.25
 
 
 class PromptWebSocket(WebSocketsSansIOProtocol):
@@ -46,12 +47,13 @@ class PromptWebSocket(WebSocketsSansIOProtocol):
     async def send(self, message: Any) -> None:
         is_handed_over = message.get(HAND_OVER, False)
         try:
-            if is_handed_over and "bytes" in message:
-                self._send_fragments(message["bytes"])
-            else:
+            if not is_handed_over or "bytes" not in message:
                 await super().send(message)
+                await self.writable.wait()
+                return
+            self._send_fragments(message["bytes"])
             await self.writable.wait()
-            for _ in range(_PINGS if is_handed_over else 0):
+            for _ in range(_PINGS):
                 await self._be_answered()
         except InvalidState:
             raise ClientDisconnected from None
@@ -64,12 +66,19 @@ class PromptWebSocket(WebSocketsSansIOProtocol):
         self._write()
 
     async def _be_answered(self) -> None:
-        """Waits for the pong of a new ping, or for the end of the connection."""
+        """Waits for the pong of a new ping, or for the end of the connection.
+
+        Not while nobody reads on, such as a stream with too many refusals to send: the pong is behind what is unread.
+        """
         self._pong = self.loop.create_future()
         self._ping += 1
         self.conn.send_ping(self._ping_payload)
         self._write()
-        await self._pong
+        while not self._pong.done():
+            was_paused = self.read_paused
+            await asyncio.wait({self._pong}, timeout=_LOOK_EVERY_S)
+            if was_paused and self.read_paused:
+                return
 
     @property
     def _ping_payload(self) -> bytes:
