@@ -309,8 +309,7 @@ class JobStore:
         """The job in place of a failed or cancelled one, and whether it is new: a job has one such successor.
 
         `by`: who asks for it; None: the owner of the job. A training goes on from the last checkpoint of its
-        predecessor. Raises JobNotFound, JobNotFinished, and what
-        `submit` raises.
+        predecessor. Raises JobNotFound, JobNotFinished, and what `submit` raises.
         """
         row = self._row(job_id, with_input=True)
         job = self._seen(row)
