@@ -27,7 +27,7 @@ from ultragray.datasets import Dataset, Sweep, checks, dicom, phantom, pictures,
 from ultragray.display import frames as display_frames
 from ultragray.display import scan_conversion
 from ultragray.display import settings as display
-from ultragray.evaluation import baselines, compounding, metrics, side_by_side
+from ultragray.evaluation import baselines, compounding, metrics, side_by_side, speckle
 from ultragray.evaluation import scoring as evaluation
 from ultragray.files import atomic as files
 from ultragray.files import poses as pose_file
@@ -51,7 +51,7 @@ LIBRARY_MODULES = (
     rendering,
     scan_conversion,
 )
-MEASURING_MODULES = (baselines, compounding, evaluation, metrics, side_by_side, png_folder)
+MEASURING_MODULES = (baselines, compounding, evaluation, metrics, side_by_side, speckle, png_folder)
 MEMBERS_OF = (GaussianScene, Probe, errors.UltragrayError)
 
 

@@ -16,6 +16,7 @@ from ..rendering import render
 from ..scene import GaussianScene
 from ..scene_info import SceneInfo
 from .metrics import FrameMetrics, frame_metrics, mean_metrics, ms_ssim_scales, std_metrics
+from .speckle import FrameSpeckle, SpeckleSummary, compare_speckle, summarize
 
 CHUNK_PIXELS = 1 << 20  # rendered and measured at once: measuring takes about 200 bytes of each
 CHUNK_FRAMES = 32  # of a frame, rendering takes room for each Gaussian too
@@ -28,6 +29,7 @@ class Evaluation:
     frames: list[FrameMetrics]
     frame_numbers: IntArray  # [F] as the sweep numbers them
     ms_ssim_scales: int
+    frame_speckle: list[FrameSpeckle]
 
     @property
     def mean(self) -> FrameMetrics:
@@ -39,12 +41,18 @@ class Evaluation:
         """Standard deviation over the frames."""
         return std_metrics(self.frames)
 
+    @property
+    def speckle(self) -> SpeckleSummary:
+        """Means over the frames."""
+        return summarize(self.frame_speckle)
+
     def to_dict(self) -> dict[str, Any]:
-        """A JSON object: `mean`, `std`, `ms_ssim_scales` and the `frames` with their numbers."""
+        """A JSON object: `mean`, `std`, `ms_ssim_scales`, `speckle` and the `frames` with their numbers."""
         return {
             "mean": self.mean.to_dict(),
             "std": self.std.to_dict(),
             "ms_ssim_scales": self.ms_ssim_scales,
+            "speckle": self.speckle.to_dict(),
             "frames": [
                 {"frame": int(number), **metrics.to_dict()}
                 for number, metrics in zip(self.frame_numbers, self.frames, strict=True)
@@ -76,10 +84,12 @@ def _measured(predictions: Iterable[npt.NDArray[np.float32]], sweep: Sweep) -> E
     require_frames(sweep)
     scales = ms_ssim_scales(sweep.height, sweep.width)
     measured: list[FrameMetrics] = []
+    speckle: list[FrameSpeckle] = []
     for predicted, places in zip(predictions, _chunks(sweep), strict=True):
         truth = torch.from_numpy(sweep.images[places]).float().div_(255.0)
         measured += frame_metrics(torch.from_numpy(predicted), truth)
-    return Evaluation(frames=measured, frame_numbers=sweep.frame_numbers, ms_ssim_scales=scales)
+        speckle += compare_speckle(predicted, truth.numpy(), sweep.probe)
+    return Evaluation(measured, sweep.frame_numbers, scales, speckle)
 
 
 def frames_at_once(height: int, width: int) -> int:

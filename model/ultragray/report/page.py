@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,7 @@ from ..evaluation.compounding import VOXEL_MM
 from ..evaluation.metrics import FrameMetrics
 from ..evaluation.scoring import Evaluation
 from ..evaluation.side_by_side import as_picture, side_by_side_panels
+from ..evaluation.speckle import Speckle
 from ..scene import GaussianScene
 from ..version import __version__
 from .plots import LABELS, plot_counts, plot_frames, plot_tilt, plot_training
@@ -74,16 +75,16 @@ def render_page(content: ReportContent) -> str:
     )
     evaluations = {"scene": content.evaluation, **content.baselines}
     shown = {name: evaluations[name] for name in ("scene", *PLOTTED_BASELINES) if name in evaluations}
+    compared = {"this scene": content.evaluation}
+    compared |= {BASELINE_NAMES[name]: evaluation for name, evaluation in content.baselines.items()}
     tilt = content.tilt if isinstance(content.tilt, TiltStudy) else None
     return environment.get_template("page.html").render(
         version=__version__,
         content=content,
         facts=_facts(content),
         metric_names=list(LABELS.values()),
-        comparison=metric_rows(
-            {"this scene": content.evaluation}
-            | {BASELINE_NAMES[name]: evaluation for name, evaluation in content.baselines.items()}
-        ),
+        comparison=metric_rows(compared),
+        speckle=speckle_rows(compared),
         frames_plot=plot_frames(shown),
         training_plot=None if content.trained is None else plot_training(content.trained),
         pictures=_pictures(content),
@@ -121,6 +122,20 @@ def metric_rows(evaluations: Mapping[str, Evaluation], notes: Mapping[str, list[
         )
         for name in evaluations
     ]
+
+
+def speckle_rows(evaluations: Mapping[str, Evaluation]) -> list[tuple[str, list[str]]]:
+    """The statistics of speckle: the true frames, then one row a method, as texts."""
+    summaries = {name: evaluation.speckle for name, evaluation in evaluations.items()}
+    true = next(iter(summaries.values())).true
+    return [
+        ("true frames", [*_speckle_texts(true), ""]),
+        *((name, [*_speckle_texts(one.rendered), f"{one.histogram_distance:.4f}"]) for name, one in summaries.items()),
+    ]
+
+
+def _speckle_texts(speckle: Speckle | None) -> list[str]:
+    return ["–"] * 3 if speckle is None else [f"{value:.3f}" for value in astuple(speckle)]
 
 
 def _text(metric: str, value: float) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import enum
 from collections.abc import Mapping
+from dataclasses import astuple
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -62,7 +63,7 @@ def evaluate(
     *,
     source: SourceOptions,
 ) -> None:
-    """Measure a scene on the held-out frames of a dataset: PSNR, MS-SSIM, GMS, GMSD."""
+    """Measure a scene on the held-out frames of a dataset: PSNR, MS-SSIM, GMS, GMSD, and the statistics of speckle."""
     from ultragray.evaluation.scoring import evaluate as evaluate_scene
     from ultragray.evaluation.scoring import require_frames
     from ultragray.scene import GaussianScene
@@ -80,6 +81,7 @@ def evaluate(
         _print_json({"scene": str(scene), "dataset": read.name, "split": split.value, **evaluation.to_dict()})
     else:
         print_metrics(f"{read.name}, {len(sweep)} {split.value} frames", {scene.stem: evaluation})
+        print_speckle({scene.stem: evaluation})
     if output is not None:
         from ultragray.evaluation.side_by_side import write_side_by_side
 
@@ -112,6 +114,7 @@ def compound(
         _print_json({"dataset": read.name, "voxel_mm": voxel_mm, "methods": found})
     else:
         print_metrics(f"{read.name}, {len(read.val)} val frames, voxels of {voxel_mm:g} mm", evaluations)
+        print_speckle(evaluations)
 
 
 def print_metrics(title: str, evaluations: Mapping[str, Evaluation]) -> None:
@@ -135,6 +138,26 @@ def print_metrics(title: str, evaluations: Mapping[str, Evaluation]) -> None:
     scales = next(iter(evaluations.values())).ms_ssim_scales
     if scales < 5:
         console.print(f"MS-SSIM over {scales} of its 5 scales, which is what the image holds", style="dim")
+
+
+def print_speckle(evaluations: Mapping[str, Evaluation]) -> None:
+    """A table of the statistics of speckle, means over the frames: the true frames, then one row a name."""
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(box=None, pad_edge=False)
+    for place, head in enumerate(("speckle", "contrast", "axial, mm", "lateral, mm", "histogram distance")):
+        table.add_column(head, justify="right" if place else "left", no_wrap=True)
+    summaries = {name: evaluation.speckle for name, evaluation in evaluations.items()}
+    true = next(iter(summaries.values())).true
+    rows = {
+        "true frames": (true, ""),
+        **{n: (one.rendered, f"{one.histogram_distance:.4f}") for n, one in summaries.items()},
+    }
+    for name, (speckle, distance) in rows.items():
+        figures = ("–",) * 3 if speckle is None else [f"{value:.3f}" for value in astuple(speckle)]
+        table.add_row(name, *figures, distance)
+    Console().print(table)
 
 
 def _print_json(document: Mapping[str, Any]) -> None:

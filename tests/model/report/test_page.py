@@ -85,6 +85,13 @@ def test_the_page_is_whole_and_needs_nothing_else(content: ReportContent) -> Non
         "maximum compounding",
         "linear interpolation between frames",
         "nearest training frame",
+        "true frames",
+        "this scene",
+        "median compounding",
+        "mean compounding",
+        "maximum compounding",
+        "linear interpolation between frames",
+        "nearest training frame",
         "full model",
         *content.ablations,
         "scene",
@@ -108,7 +115,7 @@ def test_a_scene_alone_with_frames_from_end_to_end(content: ReportContent) -> No
     assert Checked(text).open_tags == []
     assert re.findall(r"<h2>(.*?)</h2>", text) == ["Held-out frames", "Pictures", "Training"]
     assert "<dt>Scene</dt><dd>ball &amp; &lt;noise&gt;</dd>" in text
-    assert re.findall(r'<th scope="row">(.*?)</th>', text) == ["this scene"]
+    assert re.findall(r'<th scope="row">(.*?)</th>', text) == ["this scene", "true frames", "this scene"]
     first, last = content.dataset.val.frame_numbers[[0, -1]]
     captions = re.findall(r"<figcaption>Frame (\d+): [\d.]+ dB</figcaption>", text)
     assert captions == [str(first), str(last)]
@@ -124,7 +131,7 @@ def test_a_study_that_failed_says_why_in_place_of_its_figures(content: ReportCon
     assert Checked(text).open_tags == []
     assert f'<th scope="row">{name}</th><td class="failure" colspan="6">it needs 9 GB &amp; more</td></tr>' in text
     rows = re.findall(r'<th scope="row">(.*?)</th>', text)
-    assert rows[6:] == ["full model", *content.ablations]
+    assert rows[13:] == ["full model", *content.ablations]
     assert "This study could not be finished: &lt;diverged&gt;" in text
     assert "hardly turns" not in text
     everything = render_page(replace(content, trained=None, ablations=dict.fromkeys(content.ablations, failed)))
@@ -163,7 +170,7 @@ def test_what_the_data_decides_is_told_as_it_was_decided(turning_dataset: Datase
 
 def test_one_held_out_frame_is_shown_once(content: ReportContent) -> None:
     val = content.dataset.val.select([0])
-    alone = Evaluation(content.evaluation.frames[:1], val.frame_numbers, 1)
+    alone = Evaluation(content.evaluation.frames[:1], val.frame_numbers, 1, content.evaluation.frame_speckle[:1])
     dataset = replace(content.dataset, val=val)
     text = render_page(
         replace(content, dataset=dataset, evaluation=alone, baselines=evaluate_baselines(dataset), ablations={})
@@ -173,7 +180,7 @@ def test_one_held_out_frame_is_shown_once(content: ReportContent) -> None:
 
 def test_the_best_of_each_column_is_marked_as_numbers_not_as_words() -> None:
     def of(psnr_db: float, gmsd: float) -> Evaluation:
-        return Evaluation([FrameMetrics(psnr_db, 0.5, 0.5, gmsd)], np.arange(1), 5)
+        return Evaluation([FrameMetrics(psnr_db, 0.5, 0.5, gmsd)], np.arange(1), 5, [])
 
     rows = metric_rows({"a": of(9.5, 0.2), "b": of(10.5, 0.1)})
     assert [[best for _, best in row.cells] for row in rows] == [[False, True, True, False], [True, True, True, True]]

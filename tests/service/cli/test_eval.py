@@ -61,6 +61,8 @@ def test_eval_prints_what_the_library_measures(dataset: Path, scene: Path) -> No
     assert f"{mean.psnr_db:.2f} ± {std.psnr_db:.2f}" in result.stdout
     assert f"{mean.gmsd:.3f} ± {std.gmsd:.3f}" in result.stdout
     assert "1 of its 5 scales" in result.stdout
+    assert f"{expected.speckle.histogram_distance:.4f}" in result.stdout
+    assert "true frames" in result.stdout
 
 
 def test_eval_of_the_training_frames_and_of_others(dataset: Path, scene: Path) -> None:

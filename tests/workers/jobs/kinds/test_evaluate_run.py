@@ -49,7 +49,7 @@ def test_scores_are_those_of_the_library(job_run: Callable[..., JobRun], monkeyp
     outcome = from_dict(asked.request.specification).run(asked)
     held_out = DatasetStore(asked.folder.artifact_folder).load("tiny").val
     expected = evaluate(GaussianScene.load(asked.folder.path / "one.ugr"), held_out)
-    assert outcome.metrics == pytest.approx(expected.mean.to_dict())
+    assert outcome.metrics == pytest.approx(expected.mean.to_dict() | expected.speckle.figures())
     assert (asked.progress.frames_done, asked.progress.frames) == (len(held_out), len(held_out))
     document = json.loads((asked.folder.artifacts / "evaluation.json").read_text())
     assert [one["frame"] for one in document["frames"]] == held_out.frame_numbers.tolist()

@@ -14,6 +14,7 @@ from ultragray.evaluation.compounding import affordable_voxel_mm
 from ultragray.evaluation.metrics import FrameMetrics
 from ultragray.evaluation.scoring import Evaluation, check_same_origin, evaluate, frames_at_once, require_frames
 from ultragray.evaluation.side_by_side import write_spread
+from ultragray.evaluation.speckle import FrameSpeckle
 from ultragray.files.atomic import file_sha256
 from ultragray.scene import GaussianScene
 from ultragray.training.device import training_device
@@ -56,7 +57,7 @@ def run(job_run: JobRun, job: EvaluateJob) -> Outcome:
         "baselines": {method: found.to_dict() for method, found in baselines.items()},
         "voxel_mm": voxel_mm if baselines else None,
     }
-    metrics = evaluation.mean.to_dict()
+    metrics = evaluation.mean.to_dict() | evaluation.speckle.figures()
     for method, found in baselines.items():
         metrics |= {f"{method}_{name}": value for name, value in found.mean.to_dict().items()}
     with job_run.folder.new_artifacts() as folder:
@@ -69,13 +70,15 @@ def _scored(job_run: JobRun, scene: GaussianScene, sweep: Sweep) -> Evaluation:
     """The scores of the frames, portion by portion."""
     started, portion = time.monotonic(), frames_at_once(sweep.height, sweep.width)
     frames: list[FrameMetrics] = []
+    speckle: list[FrameSpeckle] = []
     scales = 0
     while len(frames) < len(sweep):
         if job_run.should_stop():
             raise Stopped
         scored = evaluate(scene, sweep.select(np.arange(len(frames), min(len(frames) + portion, len(sweep)))))
         frames, scales = frames + scored.frames, scored.ms_ssim_scales
+        speckle += scored.frame_speckle
         rate = len(frames) / (time.monotonic() - started)
         left_s = (len(sweep) - len(frames)) / rate
         job_run.report(Progress(frames_done=len(frames), frames=len(sweep), rate_per_s=rate, seconds_left=left_s))
-    return Evaluation(frames=frames, frame_numbers=sweep.frame_numbers, ms_ssim_scales=scales)
+    return Evaluation(frames, sweep.frame_numbers, scales, speckle)
