@@ -22,6 +22,7 @@ using Poses = nb::ndarray<const double, nb::shape<-1, 4, 4>, nb::c_contig, nb::d
 using FreeVector = nb::ndarray<float, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 using FreeMatrix = nb::ndarray<float, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 using ImageBatch = nb::ndarray<const float, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
+using FreeViews = nb::ndarray<double, nb::shape<-1, 2, 3>, nb::c_contig, nb::device::cpu>;
 using FreePlanes = nb::ndarray<float, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
 using OptionalPlanes = std::optional<FreePlanes>;
 using Flag = nb::ndarray<const int64_t, nb::shape<1>, nb::c_contig, nb::device::cpu>;
@@ -148,22 +149,27 @@ NB_MODULE(_cpu, m) {
             "differentiate",
             [](const Recording& self, int threads, OptionalPlanes bmode, OptionalPlanes echo, OptionalPlanes transmittance,
                OptionalPlanes coverage, FreeMatrix means, FreeMatrix scales, FreeMatrix quats, FreeVector transmittances,
-               FreeVector sh0, FreeMatrix shn) {
+               FreeVector sh0, FreeMatrix shn, std::optional<FreeViews> views) {
                 const Outputs gradients =
                     planes_of({bmode, echo, transmittance, coverage, {}}, self.count(), self.height(), self.width());
                 const size_t n = self.gaussian_count(), rest = self.harmonics() - 1;
                 if (means.size() != 3 * n || scales.size() != 3 * n || quats.size() != 4 * n || transmittances.size() != n ||
                     sh0.size() != n || shn.size() != rest * n)
                     throw std::invalid_argument("the gradients' shapes are not those of the parameters");
+                if (views && views->shape(0) != size_t(self.count()))
+                    throw std::invalid_argument("there must be one gradient per view");
+                static_assert(sizeof(ViewGradient) == 6 * sizeof(double), "a shift and a turn, nothing between");
+                ViewGradient* by_views = views ? reinterpret_cast<ViewGradient*>(views->data()) : nullptr;
                 const RawGradients out{means.data(),          scales.data(), quats.data(),
                                        transmittances.data(), sh0.data(),    shn.data()};
                 nb::gil_scoped_release release;
-                self.differentiate(gradients, out, threads);
+                self.differentiate(gradients, out, by_views, threads);
             },
             nb::arg("threads"), nb::arg("bmode").noconvert().none(), nb::arg("echo").noconvert().none(),
             nb::arg("transmittance").noconvert().none(), nb::arg("coverage").noconvert().none(),
             nb::arg("means").noconvert(), nb::arg("scales").noconvert(), nb::arg("quats").noconvert(),
-            nb::arg("transmittances").noconvert(), nb::arg("sh0").noconvert(), nb::arg("shn").noconvert());
+            nb::arg("transmittances").noconvert(), nb::arg("sh0").noconvert(), nb::arg("shn").noconvert(),
+            nb::arg("views").noconvert().none());
 
     m.def(
         "image_loss",

@@ -314,7 +314,7 @@ inline HarmonicsGradient differentiate_harmonics(const SceneView& scene, const H
 
 // From kLanes slices to their Gaussians: `place` and the conditioning on the plane, backwards.
 inline void differentiate_slices(const SceneView& scene, const View& view, const Candidates& c, const SliceGradients& by,
-                                 GaussianGradient* gradients, float* sh_gradients) {
+                                 GaussianGradient* gradients, float* sh_gradients, ViewGradient* by_view) {
     const auto widen = [](const float* p) { return __builtin_convertvector(load<Floats>(p), Doubles); };
     const Placed p = place(scene, view, c);
     const Doubles mean_x = widen(by.mean_x), mean_z = widen(by.mean_z), m2 = widen(by.m2_plane);
@@ -347,10 +347,11 @@ inline void differentiate_slices(const SceneView& scene, const View& view, const
     };
     const HarmonicsGradient harmonics =
         differentiate_harmonics(scene, load_harmonics(scene, c), direction_of(p.offset), load<Floats>(by.intensity));
-    Doubles by_mean[3];
-    for (int d = 0; d < 3; ++d)
-        by_mean[d] = view.axes[0][d] * by_mu[0] + view.axes[1][d] * by_mu[1] + view.axes[2][d] * by_mu[2] +
-                     __builtin_convertvector(harmonics.mean[d], Doubles);
+    Doubles by_place[3], by_mean[3];  // by the mean as the probe sees it, and in all
+    for (int d = 0; d < 3; ++d) {
+        by_place[d] = view.axes[0][d] * by_mu[0] + view.axes[1][d] * by_mu[1] + view.axes[2][d] * by_mu[2];
+        by_mean[d] = by_place[d] + __builtin_convertvector(harmonics.mean[d], Doubles);
+    }
 
     const int terms = (scene.sh_degree + 1) * (scene.sh_degree + 1);
     for (int k = 0; k < c.count; ++k) {
@@ -361,10 +362,20 @@ inline void differentiate_slices(const SceneView& scene, const View& view, const
         float* sh = sh_gradients + c.ids[k] * terms;
         for (int t = 0; t < terms; ++t) sh[t] += harmonics.coefficients[t][k];
     }
+    if (by_view == nullptr) return;
+    // To move the probe is to move all Gaussians the other way; but a turn about its own origin changes no intensity, which
+    // depends on the direction of view in the scene's axes.
+    for (int d = 0; d < 3; ++d) {
+        const int e = (d + 1) % 3, f = (d + 2) % 3;
+        const Doubles turn = p.offset[e] * by_place[f] - p.offset[f] * by_place[e] +
+                             0.5 * (w * by_quat[d + 1] - p.quat[d + 1] * by_quat[0] + p.quat[e + 1] * by_quat[f + 1] -
+                                    p.quat[f + 1] * by_quat[e + 1]);
+        for (int k = 0; k < c.count; ++k) by_view->shift[d] -= by_mean[d][k], by_view->turn[d] -= turn[k];
+    }
 }
 
 void gather(const SceneView& scene, const View& view, const Slice* slices, int64_t count, const PixelGradients& pixels,
-            GaussianGradient* gradients, float* sh_gradients) {
+            GaussianGradient* gradients, float* sh_gradients, ViewGradient* by_view) {
     for (int64_t first = 0; first < count; first += kLanes) {
         Candidates c;
         SliceGradients by{};
@@ -373,7 +384,7 @@ void gather(const SceneView& scene, const View& view, const Slice* slices, int64
             gather_slice(view, s, pixels, by, c.count);
             c.ids[c.count] = s.gaussian;
         }
-        differentiate_slices(scene, view, c, by, gradients, sh_gradients);
+        differentiate_slices(scene, view, c, by, gradients, sh_gradients, by_view);
     }
 }
 

@@ -112,6 +112,12 @@ struct GaussianGradient {
     float absorb;
 };
 
+// The gradient with respect to a rigid motion of the view, in the scene's axes: a shift in cm, and a turn in radians about
+// the view's origin.
+struct ViewGradient {
+    double shift[3], turn[3];
+};
+
 // Accumulators of a strip of scan lines, rows of `stride` floats.
 struct Strip {
     float *weight, *intensity, *local, *below;  // S, sum of I*w, T inside footprints, T steps at the rows below them
@@ -136,11 +142,12 @@ struct Kernels {
     void (*slice)(const SceneView&, const View&, int64_t first_cluster, int64_t last_cluster, SliceList&);
     void (*draw)(const View&, const Slice*, int64_t count, const Strip&);
     void (*finish)(const View&, const Strip&, const FramePointers&, const SavedPlanes&);
-    // The backward pass: pixels of `lines` scan lines from `first` on, then slices; [N] and sh [N, K] are added to.
+    // The backward pass: pixels of `lines` scan lines from `first` on, then slices; [N], sh [N, K] and, where it is not
+    // null, the gradient by the view are added to.
     void (*differentiate)(const View&, int first, int lines, const SavedPlanes&, const FramePointers& gradients,
                           const PixelGradients&);
     void (*gather)(const SceneView&, const View&, const Slice*, int64_t count, const PixelGradients&, GaussianGradient*,
-                   float* sh);
+                   float* sh, ViewGradient*);
     // Writes `by_l1` times the gradient of sum |x - y| plus `by_ssim` times that of the sum of SSIM; `window` sums to 1.
     ImageLoss (*image_loss)(const float* x, const float* y, int height, int width, const float* window, float* scratch,
                             float by_l1, float by_ssim, float* gradient);

@@ -121,10 +121,12 @@ class Batch {
         run_phases({&slicing, &summing}, threads);
     }
 
-    // Gradients are added to; no two tasks share a Gaussian, and each adds in the order of the poses.
+    // Gradients are added to; no two tasks share a Gaussian, and each adds in the order of the poses. Views add up their
+    // parts in order.
     void differentiate(const std::vector<SavedPlanes>& saved, const Outputs& gradients,
                        const std::vector<PixelGradients>& pixels, GaussianGradient* gaussians, float* sh,
-                       int threads) const {
+                       ViewGradient* views, int threads) const {
+        std::vector<ViewGradient> by_part(views ? slices_.size() : 0);
         Phase by_pixel{count() * strips(), [&](int task) {
                            const int c = task / strips(), first = task % strips() * kStripLines;
                            const View& view = views_[c];
@@ -133,11 +135,20 @@ class Batch {
                        }};
         Phase by_gaussian{parts(), [&](int part) {
                               for (int c = 0; c < count(); ++c) {
-                                  const SliceList& list = slices_[int64_t(c) * parts() + part];
-                                  kernels_.gather(scene_, views_[c], list.data(), list.size(), pixels[c], gaussians, sh);
+                                  const int64_t place = int64_t(c) * parts() + part;
+                                  const SliceList& list = slices_[place];
+                                  kernels_.gather(scene_, views_[c], list.data(), list.size(), pixels[c], gaussians, sh,
+                                                  views ? &by_part[place] : nullptr);
                               }
                           }};
         run_phases({&by_pixel, &by_gaussian}, threads);
+        for (size_t place = 0; place < by_part.size(); ++place) {
+            ViewGradient& sum = views[place / parts()];
+            for (int d = 0; d < 3; ++d) {
+                sum.shift[d] += by_part[place].shift[d];
+                sum.turn[d] += by_part[place].turn[d];
+            }
+        }
     }
 
  private:
@@ -282,7 +293,8 @@ int Recording::harmonics() const {
     return (degree + 1) * (degree + 1);
 }
 
-void Recording::differentiate(const Outputs& gradients, const RawGradients& out, int threads) const {
+void Recording::differentiate(const Outputs& gradients, const RawGradients& out, ViewGradient* views, int threads) const {
+    if (views) std::fill_n(views, count_, ViewGradient{});
     const SceneView scene = scene_.view();
     std::vector<GaussianGradient> gaussians(scene.count);
     std::vector<float> sh(scene.count * harmonics());
@@ -291,7 +303,7 @@ void Recording::differentiate(const Outputs& gradients, const RawGradients& out,
         std::vector<PixelGradients> pixels;
         for (int c = 0; c < count_; ++c)
             pixels.push_back({planes.at(c, 0), planes.at(c, 1), planes.at(c, 2), planes.at(c, 3), state_->stride});
-        state_->batch.differentiate(state_->saved, gradients, pixels, gaussians.data(), sh.data(), threads);
+        state_->batch.differentiate(state_->saved, gradients, pixels, gaussians.data(), sh.data(), views, threads);
     }
     scene_.to_raw(gaussians.data(), sh.data(), out, threads);
 }

@@ -41,8 +41,9 @@ class Recording {
     ~Recording();
 
     // From the gradients of a loss with respect to the outputs (null: zero) to those with respect to the raw parameters,
-    // which are overwritten. The result does not depend on the number of threads.
-    void differentiate(const Outputs& gradients, const RawGradients& out, int threads) const;
+    // which are overwritten, and by the views [C] where they are wanted (not null). The result does not depend on the
+    // number of threads.
+    void differentiate(const Outputs& gradients, const RawGradients& out, ViewGradient* views, int threads) const;
 
     int count() const { return count_; }
     int height() const { return height_; }

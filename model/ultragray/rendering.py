@@ -8,16 +8,16 @@ from typing import Any
 from torch import Tensor
 
 from .backends import cpu, cuda, reference
+from .backends.poses import ScenePoses, as_array, scene_poses
 from .errors import BackendUnavailable
 from .image_size import check_image_size
 from .limits import UNLIMITED, Limits
 from .outputs import OUTPUTS, PLANES, check_available, check_outputs
-from .pose import check_poses
-from .probe import FloatArray, Probe
+from .probe import Probe
 from .scene import GaussianScene
 from .version import __version__
 
-Backend = Callable[[GaussianScene, Probe, FloatArray, int, int, Sequence[str], Limits], dict[str, Tensor]]
+Backend = Callable[[GaussianScene, Probe, ScenePoses, int, int, Sequence[str], Limits], dict[str, Tensor]]
 
 
 class Frames(Mapping[str, Tensor]):
@@ -53,7 +53,7 @@ class Drawing:
     """Views of a scene by one backend: the planes that outputs are derived from."""
 
     def __init__(
-        self, draw: Backend, scene: GaussianScene, view: tuple[Probe, FloatArray, int, int], limits: Limits
+        self, draw: Backend, scene: GaussianScene, view: tuple[Probe, ScenePoses, int, int], limits: Limits
     ) -> None:
         """`view`: probe, poses [C, 4, 4] in cm about the scene's centre, height and width."""
         self.scene = scene
@@ -91,8 +91,8 @@ def render(
     Poses are rigid probe→scene transforms in mm, in the frame of the sweep that the scene was trained from.
     Backends: `reference` computes in the dtype of the scene's tensors, where they are; `cpu` in float32 on as many
     threads as torch.get_num_threads(); `cuda` in float32 on the GPU that holds the scene (`scene.to("cuda")`). `auto`
-    takes the fast one for where the scene is. All are differentiable with respect to the scene's tensors (`cpu` and
-    `cuda` once), labels apart; the gradients are the true ones (docs/physics.md §4).
+    takes the fast one for where the scene is. All are differentiable with respect to the scene's tensors, and to poses
+    that are a torch tensor (`cpu` and `cuda` once), labels apart; the gradients are the true ones (docs/physics.md §4).
     `limits` bound the cost of each frame and can end the rendering (`ultragray.limits`), but for frames with gradients:
     FrameTooCostly, GivenUp.
     Raises InvalidPose, InvalidProbe, InvalidImageSize, UnknownOutput (also for labels of a scene that carries none),
@@ -103,7 +103,7 @@ def render(
     check_image_size(height, width)
     view = (
         scene.info.probe_or(probe),
-        scene.poses_to_scene_cm(check_poses(poses)),
+        scene_poses(scene, poses),
         int(height),
         int(width),
     )
@@ -126,7 +126,7 @@ def footprint_pixels(
     Raises InvalidPose, InvalidProbe, InvalidImageSize, and GivenUp.
     """
     check_image_size(height, width)
-    view = scene.info.probe_or(probe), scene.poses_to_scene_cm(check_poses(poses)), int(height), int(width)
+    view = scene.info.probe_or(probe), as_array(scene_poses(scene, poses)), int(height), int(width)
     return cpu.footprint_pixels(scene, *view, limits)
 
 

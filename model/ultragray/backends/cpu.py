@@ -17,6 +17,7 @@ from ..limits import UNLIMITED, GivenUp, Limits
 from ..outputs import PLANES, WEIGHT_SUM
 from ..probe import FloatArray, Probe
 from ..scene import PARAMETERS, GaussianScene
+from .poses import ScenePoses, as_array, gradient_by_poses, want_gradient
 from .scan_lines import KernelLines
 
 INSTRUCTION_SETS: tuple[str, ...] = tuple(_cpu.instruction_sets())  # what this processor can run, best first
@@ -30,7 +31,7 @@ def supports(scene: GaussianScene) -> bool:
 def render_outputs(
     scene: GaussianScene,
     probe: Probe,
-    poses_cm: FloatArray,  # [C, 4, 4] about the scene's centre
+    poses_cm: ScenePoses,  # [C, 4, 4] about the scene's centre
     height: int,
     width: int,
     outputs: Sequence[str],
@@ -38,7 +39,7 @@ def render_outputs(
     *,
     instruction_set: str = "auto",
 ) -> dict[str, Tensor]:
-    """The outputs by name, each [C, H, W] float32; differentiable once with respect to every parameter.
+    """The outputs by name, each [C, H, W] float32; differentiable once by every parameter and by poses.
 
     The scene is one that it supports; limits hold for frames without gradients.
     Raises BackendUnavailable for an unknown instruction set, FrameTooCostly, GivenUp.
@@ -48,10 +49,16 @@ def render_outputs(
             f"instruction_set must be auto or one of {', '.join(INSTRUCTION_SETS)}, got {instruction_set!r}",
             field="instruction_set",
         )
-    view = {**_view_arguments(probe, poses_cm, height, width), "instruction_set": instruction_set}
-    if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in scene.splats.values()):
+    view = {**_view_arguments(probe, as_array(poses_cm), height, width), "instruction_set": instruction_set}
+    if want_gradient(poses_cm) or (
+        torch.is_grad_enabled() and any(tensor.requires_grad for tensor in scene.splats.values())
+    ):
         frames = _Render.apply(  # type: ignore[no-untyped-call]
-            scene.info.intensity, view, tuple(outputs), *scene.splats.values()
+            scene.info.intensity,
+            view,
+            tuple(outputs),
+            poses_cm,
+            *scene.splats.values(),
         )
         return dict(zip(outputs, frames, strict=True))
     planes = _empty_planes(view, outputs)
@@ -128,12 +135,17 @@ class _Render(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, intensity: str, view: dict[str, Any], names: tuple[str, ...], *splats: Tensor
+        ctx: Any,
+        intensity: str,
+        view: dict[str, Any],
+        names: tuple[str, ...],
+        poses: ScenePoses,
+        *splats: Tensor,
     ) -> tuple[Tensor, ...]:
         planes = _empty_planes(view, names)
         scene = _prepare(dict(zip(PARAMETERS, splats, strict=True)), intensity, as_given=True)
         ctx.recording = _cpu.Recording(scene, **view, **_arrays(planes))
-        ctx.names = names
+        ctx.names, ctx.poses = names, poses
         ctx.shapes = [tensor.shape for tensor in splats]
         ctx.set_materialize_grads(False)
         return tuple(planes.values())
@@ -149,6 +161,7 @@ class _Render(torch.autograd.Function):
         means, scales, quats, transmittances, sh0, shn = (
             torch.empty(shape, dtype=torch.float32, device="cpu") for shape in ctx.shapes
         )
+        views = torch.empty((len(ctx.poses), 2, 3), dtype=torch.float64) if ctx.needs_input_grad[3] else None
         ctx.recording.differentiate(
             threads=torch.get_num_threads(),
             **_arrays(wanted),
@@ -158,8 +171,10 @@ class _Render(torch.autograd.Function):
             transmittances=transmittances.numpy(),
             sh0=sh0.view(-1).numpy(),
             shn=shn.squeeze(-1).numpy(),
+            views=None if views is None else views.numpy(),
         )
-        return (None, None, None, means, scales, quats, transmittances, sh0, shn)
+        by_poses = None if views is None else gradient_by_poses(ctx.poses.detach(), views)
+        return (None, None, None, by_poses, means, scales, quats, transmittances, sh0, shn)
 
 
 def _prepare(splats: Mapping[str, Tensor], intensity: str, *, as_given: bool = False) -> _cpu.PreparedScene:

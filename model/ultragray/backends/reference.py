@@ -16,9 +16,10 @@ from torch import Tensor
 
 from ..limits import UNLIMITED, Limits
 from ..outputs import WEIGHT_SUM
-from ..probe import FloatArray, Probe
+from ..probe import Probe
 from ..scene import GaussianScene
 from .cpu import footprint_pixels
+from .poses import ScenePoses, as_array
 
 MIN_WEIGHT = 1.0 / 255.0  # the skip rule: a Gaussian is skipped where both w and α are below this
 MAX_WEIGHT = 0.999
@@ -39,7 +40,7 @@ class Fields(NamedTuple):
 def render_outputs(
     scene: GaussianScene,
     probe: Probe,
-    poses_cm: FloatArray,  # [C, 4, 4] about the scene's centre
+    poses_cm: ScenePoses,  # [C, 4, 4] about the scene's centre
     height: int,
     width: int,
     outputs: Sequence[str],
@@ -47,10 +48,9 @@ def render_outputs(
 ) -> dict[str, Tensor]:
     """The outputs by name, each [C, H, W] in the dtype of the scene's tensors. Raises FrameTooCostly and GivenUp."""
     if limits.footprint_pixels is not None:
-        limits.check_costs(footprint_pixels(scene, probe, poses_cm, height, width, limits))
-    views = [
-        combine(_render_pose(scene, probe, scene.means.new_tensor(pose), height, width, limits)) for pose in poses_cm
-    ]
+        limits.check_costs(footprint_pixels(scene, probe, as_array(poses_cm), height, width, limits))
+    poses = torch.as_tensor(poses_cm).to(scene.means)
+    views = [combine(_render_pose(scene, probe, pose, height, width, limits)) for pose in poses]
     empty = scene.means.new_zeros((0, height, width))
     return {name: torch.stack([view[name] for view in views]) if views else empty for name in outputs}
 

@@ -41,6 +41,7 @@ RARELY_TELL_MORE = {
         "degree 3",
     },
     "test_each_output_alone": {"linear", "shadows"},
+    "test_poses_of_every_kind": {"phased", "off centre", "shadows", "needles", "degree 0", "degree 2"},
     "test_the_label_that_weighs_most_is_shown": {"linear", "phased"},
     "test_extreme_parameters_stay_exact": {"-60.0", "0.0001", "-50.0"},
     "test_golden_gradient": {"cuda"},

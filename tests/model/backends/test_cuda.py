@@ -241,6 +241,8 @@ for degree, probe in ((degree, probes[degree]) for degree in map(int, sys.argv[3
         tensor.requires_grad_()
     scene = GaussianScene.from_splats(splats)
     cuda.render_outputs(scene, probe, np.eye(4)[None], 33, 47, ("bmode", "coverage"))["coverage"].sum().backward()
+    pose = torch.eye(4, dtype=torch.float64)[None].requires_grad_()
+    cuda.render_outputs(scene, probe, pose, 33, 47, ("bmode",))["bmode"].sum().backward()
 
 cubin, tool = Path(sys.argv[2], "kernel.cubin"), Path(triton.__file__).parent / "backends/nvidia/bin/cuobjdump"
 for name, code in compiled.values():

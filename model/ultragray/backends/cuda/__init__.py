@@ -10,8 +10,9 @@ from collections.abc import Sequence
 from torch import Tensor
 
 from ...limits import UNLIMITED, Limits
-from ...probe import FloatArray, Probe
+from ...probe import Probe
 from ...scene import GaussianScene
+from ..poses import ScenePoses
 from .device import available, device, device_count, interpreted, renderer, require, supports, upload
 
 __all__ = [
@@ -30,13 +31,14 @@ __all__ = [
 def render_outputs(
     scene: GaussianScene,
     probe: Probe,
-    poses_cm: FloatArray,  # [C, 4, 4] about the scene's centre
+    poses_cm: ScenePoses,  # [C, 4, 4] about the scene's centre
     height: int,
     width: int,
     outputs: Sequence[str],
     limits: Limits = UNLIMITED,
 ) -> dict[str, Tensor]:
-    """The outputs by name, each [C, H, W] float32 on the scene's device; differentiable once by every parameter.
+    """The outputs by name, each [C, H, W] float32 on the scene's device; differentiable once by every parameter and
+    by poses.
 
     The scene is one that the backend supports. Nothing here waits for the device, but where the cost of frames has a
     limit; limits hold for frames without gradients.

@@ -13,8 +13,9 @@ from torch.autograd.function import once_differentiable
 
 from ...errors import MemoryExceeded, TooManyPoses
 from ...limits import Limits
-from ...probe import FloatArray, Probe
+from ...probe import Probe
 from ...scene import PARAMETERS, GaussianScene
+from ..poses import ScenePoses, as_array, gradient_by_poses, want_gradient
 from ..spatial_order import spatial_order
 from .device import upload
 from .launch import (
@@ -39,7 +40,7 @@ WORKSPACE_BYTES = 1 << 30  # of slices and planes; poses beyond it are rendered 
 def render_frames(
     scene: GaussianScene,
     probe: Probe,
-    poses_cm: FloatArray,  # [C, 4, 4]
+    poses_cm: ScenePoses,  # [C, 4, 4]
     height: int,
     width: int,
     outputs: Sequence[str],
@@ -48,15 +49,21 @@ def render_frames(
     """See `ultragray.backends.cuda.render_outputs`."""
     geometry, device = Geometry.of(probe, height, width), scene.means.device
     with _on_device(device, f"{len(poses_cm)} frames of {height}x{width} pixels from {len(scene.means):,} Gaussians"):
-        views = upload(torch.from_numpy(view_table(probe, poses_cm, height)), device)
-        if not torch.is_grad_enabled() or not any(tensor.requires_grad for tensor in scene.splats.values()):
+        views = upload(torch.from_numpy(view_table(probe, as_array(poses_cm), height)), device)
+        by_scene = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in scene.splats.values())
+        if not by_scene and not want_gradient(poses_cm):
             return _render(sorted_gaussians(scene), geometry, views, outputs, limits)
         if len(views) > MAX_POSES:
             raise TooManyPoses(
                 f"at most {MAX_POSES:,} poses can be differentiated together, got {len(views):,}", field="poses"
             )
         frames = _Render.apply(  # type: ignore[no-untyped-call]
-            scene.info.intensity, geometry, views, tuple(outputs), *scene.splats.values()
+            scene.info.intensity,
+            geometry,
+            views,
+            tuple(outputs),
+            poses_cm,
+            *scene.splats.values(),
         )
         return dict(zip(outputs, frames, strict=True))
 
@@ -96,7 +103,13 @@ class _Render(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, intensity: str, geometry: Geometry, views: Tensor, names: tuple[str, ...], *splats: Tensor
+        ctx: Any,
+        intensity: str,
+        geometry: Geometry,
+        views: Tensor,
+        names: tuple[str, ...],
+        poses: ScenePoses,
+        *splats: Tensor,
     ) -> tuple[Tensor, ...]:
         gaussians = Gaussians.of(dict(zip(PARAMETERS, splats, strict=True)), intensity)
         slices = cut(gaussians, views, geometry, record=True)
@@ -104,7 +117,7 @@ class _Render(torch.autograd.Function):
         planes = draw(slices, geometry, frames, keep=True)
         # Saved by torch: a parameter that changes before the backward pass is noticed, and all is freed after it.
         ctx.save_for_backward(*splats, views, *vars(slices).values(), *vars(planes).values())
-        ctx.intensity, ctx.geometry, ctx.names = intensity, geometry, names
+        ctx.intensity, ctx.geometry, ctx.names, ctx.poses = intensity, geometry, names, poses
         ctx.set_materialize_grads(False)
         return tuple(frames.values())
 
@@ -121,8 +134,16 @@ class _Render(torch.autograd.Function):
         slices, planes = Slices(*rest[:_SLICES]), Planes(*rest[_SLICES:])
         with _on_device(views.device, f"the gradient of {len(views)} frames"):
             gaussians = Gaussians.of(dict(zip(PARAMETERS, splats, strict=True)), ctx.intensity)
-            found = differentiate(gaussians, views, ctx.geometry, slices, planes, given)
-        return (None, None, None, None, *found.values())
+            by_views = _room_for_views(slices) if ctx.needs_input_grad[4] else None
+            found = differentiate(gaussians, views, ctx.geometry, slices, planes, given, by_views)
+        by_poses = None
+        if by_views is not None:
+            by_poses = gradient_by_poses(ctx.poses.detach(), by_views.sum(dim=1).cpu())
+        return (None, None, None, None, by_poses, *found.values())
+
+
+def _room_for_views(slices: Slices) -> Tensor:  # [C, B, 2, 3]
+    return slices.slices.new_zeros((*slices.counts.shape, 2, 3), dtype=torch.float64)
 
 
 def sorted_gaussians(scene: GaussianScene) -> Gaussians:

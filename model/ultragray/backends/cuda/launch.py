@@ -266,8 +266,12 @@ def differentiate(
     slices: Slices,
     planes: Planes,
     gradients: Mapping[str, Tensor],  # of the loss by each output, [C, H, W] contiguous
+    by_views: Tensor | None,  # [C, B, 2, 3] float64, zero
 ) -> dict[str, Tensor]:
-    """The gradient of the loss by every raw parameter, in its shape."""
+    """The gradient of the loss by every raw parameter, in its shape.
+
+    Where there is room for it, also by a shift and a turn of each view, block by block.
+    """
     how, device = shapes(), gaussians.means.device
     height, width = geometry.height, geometry.width
     poses, blocks = slices.counts.shape
@@ -320,6 +324,7 @@ def differentiate(
         slices.places,
         by_slice,
         *found.values(),
+        views if by_views is None else by_views,
         poses,
         count,
         gaussians.shn.stride(0),
@@ -328,6 +333,7 @@ def differentiate(
         SIGMOID=gaussians.sigmoid,
         DEGREE=gaussians.degree,
         TERMS=max(2, triton.next_power_of_2(terms)),
+        BY_VIEW=by_views is not None,
         BLOCK=how.block,
         num_warps=4,
     )

@@ -28,6 +28,14 @@ def spoke_gradient(spoke, on_xx, on_xy, on_xz, on_yy, on_yz, on_zz):
 
 
 @triton.jit
+def store_sums(to, x, y, z):
+    """A vector, over all Gaussians, negative: to move the probe is to move them the other way."""
+    tl.store(to, -tl.sum(x, 0))
+    tl.store(to + 1, -tl.sum(y, 0))
+    tl.store(to + 2, -tl.sum(z, 0))
+
+
+@triton.jit
 def store3(to, index, mask, x, y, z):
     tl.store(to + index * 3, x.to(tl.float32), mask)
     tl.store(to + index * 3 + 1, y.to(tl.float32), mask)
@@ -53,6 +61,7 @@ def place_gradients(
     by_transmittances,
     by_sh0,
     by_shn,  # [N, K - 1] contiguous
+    by_views,  # [C, B, 2, 3] float64 out: by a shift and a turn of the view; only where BY_VIEW
     poses,
     count,
     shn_stride,
@@ -61,6 +70,7 @@ def place_gradients(
     SIGMOID: tl.constexpr,
     DEGREE: tl.constexpr,
     TERMS: tl.constexpr,  # coefficients, to the next power of two
+    BY_VIEW: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
     block, blocks = tl.program_id(0), tl.num_programs(0)
@@ -150,10 +160,21 @@ def place_gradients(
                 vx, vy, vz, sh0, shn, shn_stride, index, cut, on_intensity, DEGREE, SIGMOID, TERMS
             )
             sum_sh += on_sh
-            sum_mx += tl.where(cut, towards_scene(view, on_x, on_y, on_z, 0), 0.0).to(tl.float32) + hx
-            sum_my += tl.where(cut, towards_scene(view, on_x, on_y, on_z, 1), 0.0).to(tl.float32) + hy
-            sum_mz += tl.where(cut, towards_scene(view, on_x, on_y, on_z, 2), 0.0).to(tl.float32) + hz
+            on_mx = tl.where(cut, towards_scene(view, on_x, on_y, on_z, 0), 0.0)
+            on_my = tl.where(cut, towards_scene(view, on_x, on_y, on_z, 1), 0.0)
+            on_mz = tl.where(cut, towards_scene(view, on_x, on_y, on_z, 2), 0.0)
+            sum_mx += on_mx.to(tl.float32) + hx
+            sum_my += on_my.to(tl.float32) + hy
+            sum_mz += on_mz.to(tl.float32) + hz
             sum_absorb += tl.load(g + 7, cut, 0.0)
+            if BY_VIEW:
+                # A turn of the probe about its origin changes no intensity.
+                tx = offset[1] * on_mz - offset[2] * on_my + 0.5 * (w * gx - x * gw + y * gz - z * gy)
+                ty = offset[2] * on_mx - offset[0] * on_mz + 0.5 * (w * gy - y * gw + z * gx - x * gz)
+                tz = offset[0] * on_my - offset[1] * on_mx + 0.5 * (w * gz - z * gw + x * gy - y * gx)
+                to = by_views + group * 6
+                store_sums(to, on_mx + hx, on_my + hy, on_mz + hz)
+                store_sums(to + 3, tl.where(cut, tx, 0.0), tl.where(cut, ty, 0.0), tl.where(cut, tz, 0.0))
 
     store3(by_means, index, mask, sum_mx, sum_my, sum_mz)
     store3(by_scales, index, mask, sum_s0, sum_s1, sum_s2)
