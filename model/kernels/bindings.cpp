@@ -1,6 +1,7 @@
 // The extension module ultragray._cpu. Arrays come in contiguous and typed: nothing is copied or converted silently.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
+#include <nanobind/stl/array.h>
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>
@@ -26,6 +27,8 @@ using FreeViews = nb::ndarray<double, nb::shape<-1, 2, 3>, nb::c_contig, nb::dev
 using FreePlanes = nb::ndarray<float, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
 using OptionalPlanes = std::optional<FreePlanes>;
 using Flag = nb::ndarray<const int64_t, nb::shape<1>, nb::c_contig, nb::device::cpu>;
+using BeamNumbers = std::array<double, 4>;  // of a Beam
+using FreeBeam = nb::ndarray<double, nb::shape<3>, nb::c_contig, nb::device::cpu>;
 using FreeCounts = nb::ndarray<int64_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 
 // B, E, T, coverage and S, each [C, H, W] or null.
@@ -40,6 +43,8 @@ Outputs planes_of(const std::array<OptionalPlanes, 5>& arrays, size_t count, int
     return {planes[0], planes[1], planes[2], planes[3], planes[4]};
 }
 
+Beam beam_of(const BeamNumbers& numbers) { return {numbers[0], numbers[1], numbers[2], numbers[3]}; }
+
 Limits limits_of(std::optional<int64_t> footprint_pixels, const std::optional<Flag>& flag, int64_t number) {
     Limits limits;
     if (footprint_pixels) limits.footprint_pixels = *footprint_pixels;
@@ -49,11 +54,11 @@ Limits limits_of(std::optional<int64_t> footprint_pixels, const std::optional<Fl
 }
 
 // The arguments that rendering and recording share.
-#define RENDER_ARGUMENTS                                                                                              \
-    nb::arg("scene"), nb::arg("fanned"), nb::arg("wrap"), nb::arg("start"), nb::arg("span"), nb::arg("near_cm"),      \
-        nb::arg("far_cm"), nb::arg("cull_far_cm"), nb::arg("poses").noconvert(), nb::arg("height"), nb::arg("width"), \
-        nb::arg("threads"), nb::arg("instruction_set"), nb::arg("bmode").noconvert().none(),                          \
-        nb::arg("echo").noconvert().none(), nb::arg("transmittance").noconvert().none(),                              \
+#define RENDER_ARGUMENTS                                                                                             \
+    nb::arg("scene"), nb::arg("fanned"), nb::arg("wrap"), nb::arg("start"), nb::arg("span"), nb::arg("near_cm"),     \
+        nb::arg("far_cm"), nb::arg("cull_far_cm"), nb::arg("beam"), nb::arg("poses").noconvert(), nb::arg("height"), \
+        nb::arg("width"), nb::arg("threads"), nb::arg("instruction_set"), nb::arg("bmode").noconvert().none(),       \
+        nb::arg("echo").noconvert().none(), nb::arg("transmittance").noconvert().none(),                             \
         nb::arg("coverage").noconvert().none()
 
 }  // namespace
@@ -101,12 +106,13 @@ NB_MODULE(_cpu, m) {
     m.def(
         "render",
         [](const PreparedScene& scene, bool fanned, bool wrap, double start, double span, double near_cm, double far_cm,
-           double cull_far_cm, Poses poses, int height, int width, int threads, const std::string& instruction_set,
-           OptionalPlanes bmode, OptionalPlanes echo, OptionalPlanes transmittance, OptionalPlanes coverage,
-           OptionalPlanes weight_sum, std::optional<int64_t> footprint_pixels, std::optional<Flag> flag, int64_t number) {
+           double cull_far_cm, BeamNumbers beam, Poses poses, int height, int width, int threads,
+           const std::string& instruction_set, OptionalPlanes bmode, OptionalPlanes echo, OptionalPlanes transmittance,
+           OptionalPlanes coverage, OptionalPlanes weight_sum, std::optional<int64_t> footprint_pixels,
+           std::optional<Flag> flag, int64_t number) {
             const Outputs outputs =
                 planes_of({bmode, echo, transmittance, coverage, weight_sum}, poses.shape(0), height, width);
-            const ProbeGeometry probe{fanned, wrap, start, span, near_cm, far_cm, cull_far_cm};
+            const ProbeGeometry probe{fanned, wrap, start, span, near_cm, far_cm, cull_far_cm, beam_of(beam)};
             const Limits limits = limits_of(footprint_pixels, flag, number);
             nb::gil_scoped_release release;
             render(scene, probe, poses.data(), int(poses.shape(0)), height, width, threads, instruction_set, outputs,
@@ -118,28 +124,28 @@ NB_MODULE(_cpu, m) {
     m.def(
         "footprints",
         [](const PreparedScene& scene, bool fanned, bool wrap, double start, double span, double near_cm, double far_cm,
-           double cull_far_cm, Poses poses, int height, int width, int threads, FreeCounts pixels, std::optional<Flag> flag,
-           int64_t number) {
+           double cull_far_cm, BeamNumbers beam, Poses poses, int height, int width, int threads, FreeCounts pixels,
+           std::optional<Flag> flag, int64_t number) {
             if (pixels.shape(0) != poses.shape(0)) throw std::invalid_argument("there must be one count per pose");
-            const ProbeGeometry probe{fanned, wrap, start, span, near_cm, far_cm, cull_far_cm};
+            const ProbeGeometry probe{fanned, wrap, start, span, near_cm, far_cm, cull_far_cm, beam_of(beam)};
             const Limits limits = limits_of({}, flag, number);
             nb::gil_scoped_release release;
             footprints(scene, probe, poses.data(), int(poses.shape(0)), height, width, threads, limits, pixels.data());
         },
         nb::arg("scene"), nb::arg("fanned"), nb::arg("wrap"), nb::arg("start"), nb::arg("span"), nb::arg("near_cm"),
-        nb::arg("far_cm"), nb::arg("cull_far_cm"), nb::arg("poses").noconvert(), nb::arg("height"), nb::arg("width"),
-        nb::arg("threads"), nb::arg("pixels").noconvert(), nb::arg("flag").noconvert().none() = nb::none(),
+        nb::arg("far_cm"), nb::arg("cull_far_cm"), nb::arg("beam"), nb::arg("poses").noconvert(), nb::arg("height"),
+        nb::arg("width"), nb::arg("threads"), nb::arg("pixels").noconvert(), nb::arg("flag").noconvert().none() = nb::none(),
         nb::arg("number") = 0);
 
     nb::class_<Recording>(m, "Recording")
         .def(
             "__init__",
             [](Recording* self, const PreparedScene& scene, bool fanned, bool wrap, double start, double span,
-               double near_cm, double far_cm, double cull_far_cm, Poses poses, int height, int width, int threads,
-               const std::string& instruction_set, OptionalPlanes bmode, OptionalPlanes echo, OptionalPlanes transmittance,
-               OptionalPlanes coverage) {
+               double near_cm, double far_cm, double cull_far_cm, BeamNumbers beam, Poses poses, int height, int width,
+               int threads, const std::string& instruction_set, OptionalPlanes bmode, OptionalPlanes echo,
+               OptionalPlanes transmittance, OptionalPlanes coverage) {
                 const Outputs outputs = planes_of({bmode, echo, transmittance, coverage, {}}, poses.shape(0), height, width);
-                const ProbeGeometry probe{fanned, wrap, start, span, near_cm, far_cm, cull_far_cm};
+                const ProbeGeometry probe{fanned, wrap, start, span, near_cm, far_cm, cull_far_cm, beam_of(beam)};
                 nb::gil_scoped_release release;
                 new (self) Recording(scene, probe, poses.data(), int(poses.shape(0)), height, width, threads,
                                      instruction_set, outputs);
@@ -149,7 +155,7 @@ NB_MODULE(_cpu, m) {
             "differentiate",
             [](const Recording& self, int threads, OptionalPlanes bmode, OptionalPlanes echo, OptionalPlanes transmittance,
                OptionalPlanes coverage, FreeMatrix means, FreeMatrix scales, FreeMatrix quats, FreeVector transmittances,
-               FreeVector sh0, FreeMatrix shn, std::optional<FreeViews> views) {
+               FreeVector sh0, FreeMatrix shn, std::optional<FreeViews> views, FreeBeam beam) {
                 const Outputs gradients =
                     planes_of({bmode, echo, transmittance, coverage, {}}, self.count(), self.height(), self.width());
                 const size_t n = self.gaussian_count(), rest = self.harmonics() - 1;
@@ -163,13 +169,14 @@ NB_MODULE(_cpu, m) {
                 const RawGradients out{means.data(),          scales.data(), quats.data(),
                                        transmittances.data(), sh0.data(),    shn.data()};
                 nb::gil_scoped_release release;
-                self.differentiate(gradients, out, by_views, threads);
+                const BeamMoments moments = self.differentiate(gradients, out, by_views, threads);
+                beam.data()[0] = moments.zeroth, beam.data()[1] = moments.first, beam.data()[2] = moments.second;
             },
             nb::arg("threads"), nb::arg("bmode").noconvert().none(), nb::arg("echo").noconvert().none(),
             nb::arg("transmittance").noconvert().none(), nb::arg("coverage").noconvert().none(),
             nb::arg("means").noconvert(), nb::arg("scales").noconvert(), nb::arg("quats").noconvert(),
             nb::arg("transmittances").noconvert(), nb::arg("sh0").noconvert(), nb::arg("shn").noconvert(),
-            nb::arg("views").noconvert().none());
+            nb::arg("views").noconvert().none(), nb::arg("beam").noconvert());
 
     m.def(
         "image_loss",

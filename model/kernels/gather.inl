@@ -313,26 +313,52 @@ inline HarmonicsGradient differentiate_harmonics(const SceneView& scene, const H
 }
 
 // From kLanes slices to their Gaussians: `place` and the conditioning on the plane, backwards.
+template <bool thick>
 inline void differentiate_slices(const SceneView& scene, const View& view, const Candidates& c, const SliceGradients& by,
-                                 GaussianGradient* gradients, float* sh_gradients, ViewGradient* by_view) {
+                                 GaussianGradient* gradients, float* sh_gradients, BeamMoments& moments,
+                                 ViewGradient* by_view) {
     const auto widen = [](const float* p) { return __builtin_convertvector(load<Floats>(p), Doubles); };
-    const Placed p = place(scene, view, c);
+    Placed p = place(scene, view, c);
+    Spread spread;
+    if (thick) spread = spread_along_elevation(view, p);
     const Doubles mean_x = widen(by.mean_x), mean_z = widen(by.mean_z), m2 = widen(by.m2_plane);
     const Doubles cov_xx = widen(by.cov_xx), cov_xz = widen(by.cov_xz), cov_zz = widen(by.cov_zz);
     const Doubles inverse = 1.0 / p.yy, height = p.mu[1] * inverse, tilt_x = p.xy * inverse, tilt_z = p.yz * inverse;
-    const Doubles by_mu[3] = {mean_x, 2.0 * height * m2 - tilt_x * mean_x - tilt_z * mean_z, mean_z};
+    Doubles by_mu[3] = {mean_x, 2.0 * height * m2 - tilt_x * mean_x - tilt_z * mean_z, mean_z};
     const Doubles by_xy = -2.0 * tilt_x * cov_xx - tilt_z * cov_xz - height * mean_x;
     const Doubles by_yz = -2.0 * tilt_z * cov_zz - tilt_x * cov_xz - height * mean_z;
     const Doubles by_yy = tilt_x * tilt_x * cov_xx + tilt_x * tilt_z * cov_xz + tilt_z * tilt_z * cov_zz -
                           height * height * m2 + height * (tilt_x * mean_x + tilt_z * mean_z);
 
+    Doubles by_precision{};
+    if (thick) {
+        by_precision = m2 * spread.variance / spread.ratio;
+        const Doubles by_variance = by_yy + m2 * spread.precision / spread.ratio;
+        const Doubles by_depth = 2.0 * view.beam.slope2 * by_variance * spread.offset,
+                      depth = spread.offset + view.beam.focus;
+        if (view.fanned)
+            by_mu[0] += by_depth * p.mu[0] / depth, by_mu[2] += by_depth * p.mu[2] / depth;
+        else
+            by_mu[2] += by_depth;
+        for (int k = 0; k < c.count; ++k) {
+            const double offset = spread.offset[k];
+            moments.zeroth += by_variance[k], moments.first += by_variance[k] * offset;
+            moments.second += by_variance[k] * offset * offset;
+        }
+    }
+
     Doubles by_axes[3][3], by_log_scale[3];  // by_axes[d][k]: axis k along d, in the scene's axes
     for (int k = 0; k < 3; ++k) {
         const Doubles* s = p.spoke[k];
-        const Doubles by_spoke[3] = {2.0 * s[0] * cov_xx + s[1] * by_xy + s[2] * cov_xz,
-                                     2.0 * s[1] * by_yy + s[0] * by_xy + s[2] * by_yz,
-                                     2.0 * s[2] * cov_zz + s[0] * cov_xz + s[1] * by_yz};
+        Doubles by_spoke[3] = {2.0 * s[0] * cov_xx + s[1] * by_xy + s[2] * cov_xz,
+                               2.0 * s[1] * by_yy + s[0] * by_xy + s[2] * by_yz,
+                               2.0 * s[2] * cov_zz + s[0] * cov_xz + s[1] * by_yz};
         by_log_scale[k] = by_spoke[0] * s[0] + by_spoke[1] * s[1] + by_spoke[2] * s[2];
+        if (thick) {  // the precision is the sum of (spoke / scale^2)^2 along elevation
+            const Doubles pull = 2.0 * by_precision * s[1] / (p.scale[k] * p.scale[k] * p.scale[k] * p.scale[k]);
+            by_spoke[1] += pull;
+            by_log_scale[k] -= pull * s[1];
+        }
         for (int d = 0; d < 3; ++d)
             by_axes[d][k] =
                 p.scale[k] * (view.axes[0][d] * by_spoke[0] + view.axes[1][d] * by_spoke[1] + view.axes[2][d] * by_spoke[2]);
@@ -375,7 +401,7 @@ inline void differentiate_slices(const SceneView& scene, const View& view, const
 }
 
 void gather(const SceneView& scene, const View& view, const Slice* slices, int64_t count, const PixelGradients& pixels,
-            GaussianGradient* gradients, float* sh_gradients, ViewGradient* by_view) {
+            GaussianGradient* gradients, float* sh_gradients, BeamMoments& moments, ViewGradient* by_view) {
     for (int64_t first = 0; first < count; first += kLanes) {
         Candidates c;
         SliceGradients by{};
@@ -384,7 +410,10 @@ void gather(const SceneView& scene, const View& view, const Slice* slices, int64
             gather_slice(view, s, pixels, by, c.count);
             c.ids[c.count] = s.gaussian;
         }
-        differentiate_slices(scene, view, c, by, gradients, sh_gradients, by_view);
+        if (view.beam.is_thick())
+            differentiate_slices<true>(scene, view, c, by, gradients, sh_gradients, moments, by_view);
+        else
+            differentiate_slices<false>(scene, view, c, by, gradients, sh_gradients, moments, by_view);
     }
 }
 

@@ -41,6 +41,17 @@ struct SceneView {
     Intensity intensity;
 };
 
+// The variance of the slice along elevation by depth s: at_focus + slope2 (s - focus)^2, and the most of it that is seen.
+struct Beam {
+    double at_focus, focus, slope2, most;  // cm2, cm, 1, cm2
+    bool is_thick() const { return at_focus > 0; }
+};
+
+// The gradient with respect to that variance, summed over slices, times powers of s - focus.
+struct BeamMoments {
+    double zeroth, first, second;
+};
+
 // One pose and the probe's scan lines.
 struct View {
     double axes[3][3];  // rows: the probe's lateral, elevation and axial axes in the scene's frame
@@ -53,6 +64,7 @@ struct View {
     bool wrap;                        // fanned all the way round: the first line follows the last
     bool fanned;                      // the lines run from an apex at the origin, else side by side along z
     int height, lines;
+    Beam beam;
 };
 
 // A Gaussian cut by the image plane: a 2D Gaussian there, and what it adds.
@@ -142,12 +154,12 @@ struct Kernels {
     void (*slice)(const SceneView&, const View&, int64_t first_cluster, int64_t last_cluster, SliceList&);
     void (*draw)(const View&, const Slice*, int64_t count, const Strip&);
     void (*finish)(const View&, const Strip&, const FramePointers&, const SavedPlanes&);
-    // The backward pass: pixels of `lines` scan lines from `first` on, then slices; [N], sh [N, K] and, where it is not
-    // null, the gradient by the view are added to.
+    // The backward pass: pixels of `lines` scan lines from `first` on, then slices; [N], sh [N, K], the beam's moments and,
+    // where it is not null, the gradient by the view are added to.
     void (*differentiate)(const View&, int first, int lines, const SavedPlanes&, const FramePointers& gradients,
                           const PixelGradients&);
     void (*gather)(const SceneView&, const View&, const Slice*, int64_t count, const PixelGradients&, GaussianGradient*,
-                   float* sh, ViewGradient*);
+                   float* sh, BeamMoments&, ViewGradient*);
     // Writes `by_l1` times the gradient of sum |x - y| plus `by_ssim` times that of the sum of SSIM; `window` sums to 1.
     ImageLoss (*image_loss)(const float* x, const float* y, int height, int width, const float* window, float* scratch,
                             float by_l1, float by_ssim, float* gradient);

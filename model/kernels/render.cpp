@@ -55,6 +55,7 @@ View make_view(const ProbeGeometry& probe, const ScanLines& lines, const double*
     view.row_step = (probe.far - probe.near) / height;
     view.start = probe.start, view.span = probe.span, view.fanned = probe.fanned, view.wrap = probe.wrap;
     view.height = height, view.lines = width;
+    view.beam = probe.beam;
     return view;
 }
 
@@ -122,10 +123,10 @@ class Batch {
     }
 
     // Gradients are added to; no two tasks share a Gaussian, and each adds in the order of the poses. Views add up their
-    // parts in order.
-    void differentiate(const std::vector<SavedPlanes>& saved, const Outputs& gradients,
-                       const std::vector<PixelGradients>& pixels, GaussianGradient* gaussians, float* sh,
-                       ViewGradient* views, int threads) const {
+    // parts in order, and so does the beam.
+    BeamMoments differentiate(const std::vector<SavedPlanes>& saved, const Outputs& gradients,
+                              const std::vector<PixelGradients>& pixels, GaussianGradient* gaussians, float* sh,
+                              ViewGradient* views, int threads) const {
         std::vector<ViewGradient> by_part(views ? slices_.size() : 0);
         Phase by_pixel{count() * strips(), [&](int task) {
                            const int c = task / strips(), first = task % strips() * kStripLines;
@@ -133,12 +134,13 @@ class Batch {
                            kernels_.differentiate(view, first, std::min(kStripLines, view.lines - first), saved[c],
                                                   frame_of(gradients, c * frame_size()), pixels[c]);
                        }};
+        std::vector<BeamMoments> moments(parts());
         Phase by_gaussian{parts(), [&](int part) {
                               for (int c = 0; c < count(); ++c) {
                                   const int64_t place = int64_t(c) * parts() + part;
                                   const SliceList& list = slices_[place];
                                   kernels_.gather(scene_, views_[c], list.data(), list.size(), pixels[c], gaussians, sh,
-                                                  views ? &by_part[place] : nullptr);
+                                                  moments[part], views ? &by_part[place] : nullptr);
                               }
                           }};
         run_phases({&by_pixel, &by_gaussian}, threads);
@@ -149,6 +151,10 @@ class Batch {
                 sum.turn[d] += by_part[place].turn[d];
             }
         }
+        BeamMoments sum{};
+        for (const BeamMoments& part : moments)
+            sum.zeroth += part.zeroth, sum.first += part.first, sum.second += part.second;
+        return sum;
     }
 
  private:
@@ -293,19 +299,22 @@ int Recording::harmonics() const {
     return (degree + 1) * (degree + 1);
 }
 
-void Recording::differentiate(const Outputs& gradients, const RawGradients& out, ViewGradient* views, int threads) const {
+BeamMoments Recording::differentiate(const Outputs& gradients, const RawGradients& out, ViewGradient* views,
+                                     int threads) const {
     if (views) std::fill_n(views, count_, ViewGradient{});
     const SceneView scene = scene_.view();
     std::vector<GaussianGradient> gaussians(scene.count);
     std::vector<float> sh(scene.count * harmonics());
+    BeamMoments moments{};
     if (state_) {
         const Planes planes(count_, 4, height_, state_->stride);
         std::vector<PixelGradients> pixels;
         for (int c = 0; c < count_; ++c)
             pixels.push_back({planes.at(c, 0), planes.at(c, 1), planes.at(c, 2), planes.at(c, 3), state_->stride});
-        state_->batch.differentiate(state_->saved, gradients, pixels, gaussians.data(), sh.data(), views, threads);
+        moments = state_->batch.differentiate(state_->saved, gradients, pixels, gaussians.data(), sh.data(), views, threads);
     }
     scene_.to_raw(gaussians.data(), sh.data(), out, threads);
+    return moments;
 }
 
 }  // namespace ultragray

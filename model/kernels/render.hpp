@@ -15,6 +15,7 @@ struct ProbeGeometry {
     bool fanned, wrap;
     double start, span;  // of the scan lines, as in View
     double near, far, cull_far;
+    Beam beam;
 };
 
 // Planes of many poses, each [C, H, W] or null. S, the sum of w, has no gradient.
@@ -41,9 +42,9 @@ class Recording {
     ~Recording();
 
     // From the gradients of a loss with respect to the outputs (null: zero) to those with respect to the raw parameters,
-    // which are overwritten, and by the views [C] where they are wanted (not null). The result does not depend on the
-    // number of threads.
-    void differentiate(const Outputs& gradients, const RawGradients& out, ViewGradient* views, int threads) const;
+    // which are overwritten, and by the views [C] where they are wanted (not null); returns those with respect to the
+    // beam. The result does not depend on the number of threads.
+    BeamMoments differentiate(const Outputs& gradients, const RawGradients& out, ViewGradient* views, int threads) const;
 
     int count() const { return count_; }
     int height() const { return height_; }

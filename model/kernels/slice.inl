@@ -139,6 +139,30 @@ inline Placed place(const SceneView& scene, const View& view, const Candidates& 
     return p;
 }
 
+// The beam's spread along elevation (docs/physics.md §3): S' = S + variance e eT.
+struct Spread {
+    Doubles offset;     // of the mean's depth from the focus
+    Doubles variance;   // there
+    Doubles precision;  // eT S^-1 e
+    Doubles ratio;      // |S'| / |S|
+};
+
+inline Spread spread_along_elevation(const View& view, Placed& p) {
+    Spread t{};
+    t.offset = p.mu[2];
+    if (view.fanned)
+        for (int k = 0; k < kLanes; ++k) t.offset[k] = __builtin_sqrt(p.mu[0][k] * p.mu[0][k] + p.mu[2][k] * p.mu[2][k]);
+    t.offset -= view.beam.focus;
+    t.variance = view.beam.at_focus + view.beam.slope2 * t.offset * t.offset;
+    for (int k = 0; k < 3; ++k) {
+        const Doubles along = p.spoke[k][1] / (p.scale[k] * p.scale[k]);
+        t.precision += along * along;
+    }
+    t.ratio = 1.0 + t.variance * t.precision;
+    p.yy += t.variance;
+    return t;
+}
+
 // The direction of view, 0 at the probe's own origin.
 struct Direction {
     Floats x, y, z, inverse_length;
@@ -150,10 +174,17 @@ inline Direction direction_of(const Doubles offset[3]) {
     return {x * inverse_length, y * inverse_length, z * inverse_length, inverse_length};
 }
 
+// Apart for a slice without thickness, so that it costs nothing there.
+template <bool thick>
 void slice_candidates(const SceneView& scene, const View& view, const Candidates& c, SliceList& out) {
-    const Placed p = place(scene, view, c);
+    Placed p = place(scene, view, c);
+    Doubles lost{};  // what m2 grows by, as the beam's weight spreads
+    if (thick) {
+        const Spread spread = spread_along_elevation(view, p);
+        for (int k = 0; k < c.count; ++k) lost[k] = __builtin_log(spread.ratio[k]);
+    }
     const Doubles inverse_yy = 1.0 / p.yy, shift = -p.mu[1] * inverse_yy;  // condition on the plane, y = 0
-    const Doubles m2 = p.mu[1] * p.mu[1] * inverse_yy;
+    const Doubles m2 = p.mu[1] * p.mu[1] * inverse_yy + lost;
     const Doubles mean_x = p.mu[0] + p.xy * shift, mean_z = p.mu[2] + p.yz * shift;
     const Doubles cov_xx = p.xx - p.xy * p.xy * inverse_yy, cov_xz = p.xz - p.xy * p.yz * inverse_yy;
     const Doubles cov_zz = p.zz - p.yz * p.yz * inverse_yy;
@@ -194,16 +225,22 @@ void slice_candidates(const SceneView& scene, const View& view, const Candidates
     out.shrink_by(room - written);
 }
 
-void slice_clusters(const SceneView& scene, const View& view, int64_t first, int64_t last, SliceList& out) {
+template <bool thick>
+void slice_clusters_of(const SceneView& scene, const View& view, int64_t first, int64_t last, SliceList& out) {
     const float ny[3] = {float(view.axes[1][0]), float(view.axes[1][1]), float(view.axes[1][2])};
     const float o[3] = {float(view.origin[0]), float(view.origin[1]), float(view.origin[2])};
     // The culls here only save work; they are widened by what float32 may be off.
     const float far = view.cull_far < 1e6 ? float(view.cull_far) : 1e6f;  // infinite for one row
     const float slack = 1e-6f * (1.0f + far + __builtin_fabsf(o[0]) + __builtin_fabsf(o[1]) + __builtin_fabsf(o[2]));
+    // A reach of 3.33 standard deviations; variances add up.
+    const float beam_reach2 = float(kMaxM2 * (1 + 1e-5) * view.beam.most);
+    const auto reach_of = [beam_reach2](float reach) {
+        return thick ? __builtin_sqrtf(reach * reach + beam_reach2) : reach;
+    };
     Candidates found;
     for (int64_t i = first; i < last; ++i) {
         const Cluster& cluster = scene.clusters[i];
-        float distance = 0, extent = slack + cluster.reach;
+        float distance = 0, extent = slack + reach_of(cluster.reach);
         for (int d = 0; d < 3; ++d) {
             distance += ny[d] * (cluster.centre[d] - o[d]);
             extent += __builtin_fabsf(ny[d]) * cluster.half[d];
@@ -216,14 +253,21 @@ void slice_clusters(const SceneView& scene, const View& view, int64_t first, int
             float height = 0;
             for (int d = 0; d < 3; ++d) height += ny[d] * (gaussian.mean[d] - o[d]);
             found.ids[found.count] = g;
-            found.count += __builtin_fabsf(height) <= gaussian.reach + slack;
+            found.count += __builtin_fabsf(height) <= reach_of(gaussian.reach) + slack;
             if (found.count == kLanes) {
-                slice_candidates(scene, view, found, out);
+                slice_candidates<thick>(scene, view, found, out);
                 found.count = 0;
             }
         }
     }
-    if (found.count > 0) slice_candidates(scene, view, found, out);
+    if (found.count > 0) slice_candidates<thick>(scene, view, found, out);
+}
+
+void slice_clusters(const SceneView& scene, const View& view, int64_t first, int64_t last, SliceList& out) {
+    if (view.beam.is_thick())
+        slice_clusters_of<true>(scene, view, first, last, out);
+    else
+        slice_clusters_of<false>(scene, view, first, last, out);
 }
 
 }  // namespace

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from .errors import UltragrayError
 from .pose import check_poses, pose_from_position_quaternion, quaternion_from_pose
-from .probe import ConvexProbe, LinearProbe, PhasedProbe, Probe, RadialProbe, SteeredProbe
+from .probe import ConvexProbe, ElevationBeam, LinearProbe, PhasedProbe, Probe, RadialProbe, SteeredProbe
 from .scene_info import SceneHeader, SceneInfo, read_header
 from .version import __version__ as __version__
 
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "ConvexProbe",
+    "ElevationBeam",
     "Frames",
     "GaussianScene",
     "LinearProbe",

@@ -8,16 +8,19 @@ from typing import Any
 from torch import Tensor
 
 from .backends import cpu, cuda, reference
+from .backends.beam import beam_cm
 from .backends.poses import ScenePoses, as_array, scene_poses
 from .errors import BackendUnavailable
 from .image_size import check_image_size
 from .limits import UNLIMITED, Limits
 from .outputs import OUTPUTS, PLANES, check_available, check_outputs
-from .probe import Probe
+from .probe import ElevationBeam, Probe
 from .scene import GaussianScene
 from .version import __version__
 
-Backend = Callable[[GaussianScene, Probe, ScenePoses, int, int, Sequence[str], Limits], dict[str, Tensor]]
+Backend = Callable[
+    [GaussianScene, Probe, ScenePoses, int, int, Sequence[str], Limits, Tensor | None], dict[str, Tensor]
+]
 
 
 class Frames(Mapping[str, Tensor]):
@@ -53,18 +56,23 @@ class Drawing:
     """Views of a scene by one backend: the planes that outputs are derived from."""
 
     def __init__(
-        self, draw: Backend, scene: GaussianScene, view: tuple[Probe, ScenePoses, int, int], limits: Limits
+        self,
+        draw: Backend,
+        scene: GaussianScene,
+        view: tuple[Probe, ScenePoses, int, int],
+        limits: Limits,
+        beam: Tensor | None,
     ) -> None:
-        """`view`: probe, poses [C, 4, 4] in cm about the scene's centre, height and width."""
+        """`view`: probe, poses [C, 4, 4] in cm about the scene's centre, height and width; `beam`: [3] in cm."""
         self.scene = scene
         self.shape = (len(view[1]), view[2], view[3])
-        self._draw, self._view, self._limits = draw, view, limits
+        self._draw, self._view, self._limits, self._beam = draw, view, limits, beam
         self._planes: dict[str, Tensor] = {}
 
     def draw(self, planes: Sequence[str]) -> None:
         """Draws planes of the whole scene at once."""
         if planes:
-            self._planes = self._draw(self.scene, *self._view, planes, self._limits)
+            self._planes = self._draw(self.scene, *self._view, planes, self._limits, self._beam)
 
     def plane(self, name: str) -> Tensor:  # [C, H, W]
         """One of the planes that were drawn."""
@@ -72,7 +80,7 @@ class Drawing:
 
     def plane_of(self, part: GaussianScene, name: str) -> Tensor:  # [C, H, W]
         """A plane of some of the scene's Gaussians alone."""
-        return self._draw(part, *self._view, (name,), self._limits)[name]
+        return self._draw(part, *self._view, (name,), self._limits, self._beam)[name]
 
 
 def render(
@@ -85,6 +93,7 @@ def render(
     outputs: Sequence[str] = PLANES,
     backend: str = "auto",
     limits: Limits = UNLIMITED,
+    beam: ElevationBeam | Tensor | None = None,
 ) -> Frames:
     """Frames [C, height, width] of a scene seen by `probe` (None: the probe the scene was trained with) from `poses`.
 
@@ -93,6 +102,8 @@ def render(
     threads as torch.get_num_threads(); `cuda` in float32 on the GPU that holds the scene (`scene.to("cuda")`). `auto`
     takes the fast one for where the scene is. All are differentiable with respect to the scene's tensors, and to poses
     that are a torch tensor (`cpu` and `cuda` once), labels apart; the gradients are the true ones (docs/physics.md §4).
+    `beam` is how thick a slice the frames show, instead of the scene's own (None); a thickness of 0 mm is an infinitely
+    thin one. A tensor [3] of its thickness, focus and depth of field in mm is differentiable too.
     `limits` bound the cost of each frame and can end the rendering (`ultragray.limits`), but for frames with gradients:
     FrameTooCostly, GivenUp.
     Raises InvalidPose, InvalidProbe, InvalidImageSize, UnknownOutput (also for labels of a scene that carries none),
@@ -107,7 +118,8 @@ def render(
         int(height),
         int(width),
     )
-    drawing = Drawing(_BACKENDS[choose_backend(backend, scene)], scene, view, limits)
+    draw = _BACKENDS[choose_backend(backend, scene)]
+    drawing = Drawing(draw, scene, view, limits, beam_cm(scene.info.beam if beam is None else beam, view[0]))
     drawing.draw(list(dict.fromkeys(plane for name in chosen for plane in OUTPUTS[name].planes)))
     return Frames({name: OUTPUTS[name].derive(drawing) for name in chosen})
 
@@ -120,6 +132,7 @@ def footprint_pixels(
     height: int,
     width: int,
     limits: Limits = UNLIMITED,
+    beam: ElevationBeam | None = None,
 ) -> list[int]:  # [C]
     """The cost of each frame of a scene (`ultragray.limits`), without drawing it: by the CPU, wherever the scene is.
 
@@ -127,7 +140,7 @@ def footprint_pixels(
     """
     check_image_size(height, width)
     view = scene.info.probe_or(probe), as_array(scene_poses(scene, poses)), int(height), int(width)
-    return cpu.footprint_pixels(scene, *view, limits)
+    return cpu.footprint_pixels(scene, *view, limits, beam_cm(beam or scene.info.beam, view[0]))
 
 
 _BACKENDS: dict[str, Backend] = {

@@ -22,7 +22,7 @@ from .errors import InvalidArgument, InvalidProbe, SceneFileInvalid
 from .files.format_version import require_version
 from .image_size import DEFAULT_IMAGE_SIDE
 from .pose import check_poses
-from .probe import FloatArray, Probe
+from .probe import ElevationBeam, FloatArray, Probe
 
 FORMAT_VERSION = 1
 METADATA_KEY = "ultragray"
@@ -57,6 +57,7 @@ class SceneInfo(Contract):
     training: dict[str, Any] = described("The configuration the scene was made with.", factory=dict)
     confidence: dict[str, Any] = described("Of ultragray.confidence.ConfidenceModel; empty: none.", factory=dict)
     label_names: dict[int, str] = described("By label, 1 to 255; empty: the scene carries none.", factory=dict)
+    beam: ElevationBeam | None = described("Of the frames it was trained on; none: as thick as its Gaussians.", None)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "label_names", _label_names(self.label_names))
@@ -95,8 +96,9 @@ def _label_names(names: Any) -> dict[int, str]:
 def info_to_json(info: SceneInfo) -> str:
     """The metadata entry of a scene file."""
     document = {"format_version": FORMAT_VERSION, **to_dict(info)}
-    if not info.label_names:
-        del document["label_names"]  # a scene without labels keeps its bytes, and its hash
+    for name in ("label_names", "beam"):
+        if not document[name]:
+            del document[name]  # a scene without them keeps its bytes, and its hash
     return json.dumps(document, allow_nan=False, sort_keys=True)
 
 
@@ -111,6 +113,8 @@ def info_from_json(text: str) -> SceneInfo:
         raise ValueError(f"its metadata has unknown keys {sorted(unknown)}")
     if document.get("probe") is not None:
         document["probe"] = from_dict(Probe, document["probe"])
+    if document.get("beam") is not None:
+        document["beam"] = from_dict(ElevationBeam, document["beam"])
     return SceneInfo(**document)
 
 

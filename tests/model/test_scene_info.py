@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from safetensors.numpy import save_file
 
-from ultragray import ConvexProbe, GaussianScene, LinearProbe, PhasedProbe, SceneInfo, read_header
+from ultragray import ConvexProbe, ElevationBeam, GaussianScene, LinearProbe, PhasedProbe, SceneInfo, read_header
 from ultragray.errors import InvalidArgument, SceneFileInvalid
 from ultragray.scene_info import (
     MAX_HEADER_BYTES,
@@ -47,6 +47,7 @@ OTHERS = (
     SceneInfo(probe=LinearProbe(40.0, 0.0, 50.0)),
     SceneInfo(probe=PhasedProbe(90.0, 120.0)),
     SceneInfo(label_names={1: "bone", 10: "vessel", 2: "muscle"}),
+    SceneInfo(beam=ElevationBeam(thickness_mm=2.5, focus_mm=30.0, depth_of_field_mm=20.0)),
 )
 
 
@@ -71,6 +72,8 @@ def test_json_round_trip(info: SceneInfo) -> None:
         ({"training": None}, "training must be an object"),
         ({"label_names": {"0": "nothing"}}, "label_names must give labels from 1 to 255 a name each"),
         ({"label_names": ["bone"]}, "label_names must give"),
+        ({"beam": {"thickness_mm": -1.0}}, "thickness_mm must be a finite number from 0"),
+        ({"beam": {"thickness_mm": 1.0, "focus_mm": 9.0}}, "depth_of_field_mm must be given"),
         ({"probe": {"kind": "linear"}}, "width_mm is required by kind linear"),
     ],
 )
@@ -84,6 +87,10 @@ def test_a_wrong_entry_is_named(change: dict[str, Any], message: str) -> None:
 def test_other_text_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match=r"."):
         info_from_json(text)
+
+
+def test_a_scene_without_a_beam_keeps_its_bytes() -> None:
+    assert "beam" not in json.loads(info_to_json(SceneInfo()))
 
 
 def test_nan_cannot_be_written() -> None:

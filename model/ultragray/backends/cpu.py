@@ -17,6 +17,7 @@ from ..limits import UNLIMITED, GivenUp, Limits
 from ..outputs import PLANES, WEIGHT_SUM
 from ..probe import FloatArray, Probe
 from ..scene import PARAMETERS, GaussianScene
+from .beam import THIN, BeamVariance, Moments
 from .poses import ScenePoses, as_array, gradient_by_poses, want_gradient
 from .scan_lines import KernelLines
 
@@ -36,10 +37,11 @@ def render_outputs(
     width: int,
     outputs: Sequence[str],
     limits: Limits = UNLIMITED,
+    beam: Tensor | None = None,  # [3] cm, see `beam.beam_cm`
     *,
     instruction_set: str = "auto",
 ) -> dict[str, Tensor]:
-    """The outputs by name, each [C, H, W] float32; differentiable once by every parameter and by poses.
+    """The outputs by name, each [C, H, W] float32; differentiable once by every parameter, by poses and by the beam.
 
     The scene is one that it supports; limits hold for frames without gradients.
     Raises BackendUnavailable for an unknown instruction set, FrameTooCostly, GivenUp.
@@ -49,15 +51,15 @@ def render_outputs(
             f"instruction_set must be auto or one of {', '.join(INSTRUCTION_SETS)}, got {instruction_set!r}",
             field="instruction_set",
         )
-    view = {**_view_arguments(probe, as_array(poses_cm), height, width), "instruction_set": instruction_set}
-    if want_gradient(poses_cm) or (
-        torch.is_grad_enabled() and any(tensor.requires_grad for tensor in scene.splats.values())
-    ):
+    view = {**_view_arguments(probe, as_array(poses_cm), height, width, beam), "instruction_set": instruction_set}
+    varied = [*scene.splats.values(), *([] if beam is None else [beam])]
+    if want_gradient(poses_cm) or (torch.is_grad_enabled() and any(tensor.requires_grad for tensor in varied)):
         frames = _Render.apply(  # type: ignore[no-untyped-call]
             scene.info.intensity,
             view,
             tuple(outputs),
             poses_cm,
+            beam,
             *scene.splats.values(),
         )
         return dict(zip(outputs, frames, strict=True))
@@ -87,9 +89,10 @@ def footprint_pixels(
     height: int,
     width: int,
     limits: Limits = UNLIMITED,
+    beam: Tensor | None = None,  # [3] cm
 ) -> list[int]:  # [C]
     """The cost of each pose (`ultragray.limits`), without drawing it. Raises GivenUp."""
-    view = _view_arguments(probe, poses_cm, height, width)
+    view = _view_arguments(probe, poses_cm, height, width, beam)
     pixels = np.empty(len(poses_cm), np.int64)
     try:
         _cpu.footprints(_sorted(scene), **view, pixels=pixels, flag=limits.flag, number=limits.number)
@@ -104,7 +107,7 @@ def _sorted(scene: GaussianScene) -> _cpu.PreparedScene:
     return scene.prepared("cpu", lambda: _prepare(scene.splats, scene.info.intensity))
 
 
-def _view_arguments(probe: Probe, poses_cm: FloatArray, height: int, width: int) -> dict[str, Any]:
+def _view_arguments(probe: Probe, poses_cm: FloatArray, height: int, width: int, beam: Tensor | None) -> dict[str, Any]:
     lines = KernelLines.of(probe)
     return {
         "fanned": lines.fanned,
@@ -114,6 +117,7 @@ def _view_arguments(probe: Probe, poses_cm: FloatArray, height: int, width: int)
         "near_cm": probe.near_mm / 10.0,
         "far_cm": probe.far_mm / 10.0,
         "cull_far_cm": probe.cull_far_mm(height) / 10.0,
+        "beam": THIN if beam is None else BeamVariance.of(beam, probe.near_mm / 10.0, probe.far_mm / 10.0),
         "poses": np.ascontiguousarray(lines.view_axes(poses_cm)),
         "height": height,
         "width": width,
@@ -140,6 +144,7 @@ class _Render(torch.autograd.Function):
         view: dict[str, Any],
         names: tuple[str, ...],
         poses: ScenePoses,
+        beam: Tensor | None,
         *splats: Tensor,
     ) -> tuple[Tensor, ...]:
         planes = _empty_planes(view, names)
@@ -147,6 +152,7 @@ class _Render(torch.autograd.Function):
         ctx.recording = _cpu.Recording(scene, **view, **_arrays(planes))
         ctx.names, ctx.poses = names, poses
         ctx.shapes = [tensor.shape for tensor in splats]
+        ctx.beam = beam.detach() if beam is not None and beam.requires_grad else None
         ctx.set_materialize_grads(False)
         return tuple(planes.values())
 
@@ -162,6 +168,7 @@ class _Render(torch.autograd.Function):
             torch.empty(shape, dtype=torch.float32, device="cpu") for shape in ctx.shapes
         )
         views = torch.empty((len(ctx.poses), 2, 3), dtype=torch.float64) if ctx.needs_input_grad[3] else None
+        moments = np.empty(3)
         ctx.recording.differentiate(
             threads=torch.get_num_threads(),
             **_arrays(wanted),
@@ -172,9 +179,11 @@ class _Render(torch.autograd.Function):
             sh0=sh0.view(-1).numpy(),
             shn=shn.squeeze(-1).numpy(),
             views=None if views is None else views.numpy(),
+            beam=moments,
         )
         by_poses = None if views is None else gradient_by_poses(ctx.poses.detach(), views)
-        return (None, None, None, by_poses, means, scales, quats, transmittances, sh0, shn)
+        by_beam = None if ctx.beam is None else Moments(*moments.tolist()).gradient(ctx.beam)
+        return (None, None, None, by_poses, by_beam, means, scales, quats, transmittances, sh0, shn)
 
 
 def _prepare(splats: Mapping[str, Tensor], intensity: str, *, as_given: bool = False) -> _cpu.PreparedScene:

@@ -20,6 +20,7 @@ from ..probe import Probe
 from ..scene import GaussianScene
 from .cpu import footprint_pixels
 from .poses import ScenePoses, as_array
+from .scan_lines import KernelLines
 
 MIN_WEIGHT = 1.0 / 255.0  # the skip rule: a Gaussian is skipped where both w and α are below this
 MAX_WEIGHT = 0.999
@@ -45,12 +46,13 @@ def render_outputs(
     width: int,
     outputs: Sequence[str],
     limits: Limits = UNLIMITED,
+    beam: Tensor | None = None,  # [3] cm, see `beam.beam_cm`
 ) -> dict[str, Tensor]:
     """The outputs by name, each [C, H, W] in the dtype of the scene's tensors. Raises FrameTooCostly and GivenUp."""
     if limits.footprint_pixels is not None:
-        limits.check_costs(footprint_pixels(scene, probe, as_array(poses_cm), height, width, limits))
+        limits.check_costs(footprint_pixels(scene, probe, as_array(poses_cm), height, width, limits, beam))
     poses = torch.as_tensor(poses_cm).to(scene.means)
-    views = [combine(_render_pose(scene, probe, pose, height, width, limits)) for pose in poses]
+    views = [combine(_render_pose(scene, probe, pose, height, width, limits, beam)) for pose in poses]
     empty = scene.means.new_zeros((0, height, width))
     return {name: torch.stack([view[name] for view in views]) if views else empty for name in outputs}
 
@@ -69,12 +71,15 @@ def combine(fields: Fields) -> dict[str, Tensor]:
 
 
 def _render_pose(
-    scene: GaussianScene, probe: Probe, pose: Tensor, height: int, width: int, limits: Limits
+    scene: GaussianScene, probe: Probe, pose: Tensor, height: int, width: int, limits: Limits, beam: Tensor | None
 ) -> Fields:  # [H, W] each
     like = scene.means
     rotation, origin = pose[:3, :3], pose[:3, 3]
     means = (scene.means - origin) @ rotation  # [N, 3] probe frame
     inverse_root = _inverse_root_covariance(scene, rotation)  # [N, 3, 3]
+    spread = None  # [N] ln(|Σ'|/|Σ|)
+    if beam is not None:
+        inverse_root, spread = _spread_along_elevation(inverse_root, _beam_variance(beam.to(like), probe, means))
     intensities = intensity(scene, origin)  # [N]
     tau = torch.sigmoid(scene.transmittances)  # [N]
     origins, directions = (like.new_tensor(v) for v in probe.scan_lines(width))  # [W, 3] mm, [W, 3]
@@ -88,6 +93,8 @@ def _render_pose(
     (kept,) = torch.nonzero(torch.from_numpy(probe.cull(x_mm, z_mm, height)).to(like.device), as_tuple=True)
     for ids in torch.split(kept, max(1, ELEMENTS_PER_CHUNK // (9 * width))):
         rays = _intersect(means[ids], inverse_root[ids], origins, directions)  # [n, W]
+        if spread is not None:
+            rays = rays._replace(m2=rays.m2 + spread[ids][:, None])
         near_enough = (rays.m2 <= -2.0 * math.log(MIN_WEIGHT)).any(dim=1)  # else w and α are below 1/255
         (touching,) = torch.nonzero(near_enough, as_tuple=True)
         for part in torch.split(touching, max(1, ELEMENTS_PER_CHUNK // (height * width))):
@@ -116,6 +123,25 @@ def _inverse_root_covariance(scene: GaussianScene, rotation: Tensor) -> Tensor: 
         dim=-1,
     ).reshape(-1, 3, 3)
     return axes.transpose(1, 2) @ rotation * torch.exp(-scene.scales)[:, :, None]
+
+
+def _beam_variance(beam: Tensor, probe: Probe, means: Tensor) -> Tensor:  # [3] cm, [N, 3] -> [N] cm²
+    """σ_y² at the depth of each mean along its scan line."""
+    x, _, z = means.unbind(-1)
+    lines = KernelLines.of(probe)
+    squared = x.square() + z.square()
+    depth = squared.clamp(min=torch.finfo(squared.dtype).tiny).sqrt() if lines.fanned else z * lines.axes[2, 2]
+    sigma, focus, rayleigh = beam.unbind()
+    return sigma.square() * (1.0 + ((depth - focus) / rayleigh).square())
+
+
+def _spread_along_elevation(inverse_root: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
+    """L' [N, 3, 3] of Σ' = Σ + σ_y²·e eᵀ, and ln(|Σ'|/|Σ|) [N]: with n = L·e, L' = L − β·n nᵀL."""
+    across = inverse_root[:, :, 1]  # n
+    ratio = 1.0 + variance * across.square().sum(dim=-1)  # |Σ'|/|Σ| = 1 + σ_y²·eᵀAe
+    beta = variance / (ratio.sqrt() * (1.0 + ratio.sqrt()))
+    projected = torch.einsum("ni,nij->nj", across, inverse_root)
+    return inverse_root - beta[:, None, None] * across[:, :, None] * projected[:, None, :], ratio.log()
 
 
 class Rays(NamedTuple):

@@ -10,6 +10,7 @@ A kind of probe is one class in one file (`linear.py`): its numbers, and the bun
 """
 
 from .convex import ConvexProbe
+from .elevation import ElevationBeam
 from .linear import LinearProbe
 from .phased import PhasedProbe
 from .picture import Picture
@@ -20,6 +21,7 @@ from .steered import SteeredProbe
 
 __all__ = [
     "ConvexProbe",
+    "ElevationBeam",
     "FloatArray",
     "LinearProbe",
     "PhasedProbe",

@@ -36,14 +36,15 @@ def render_outputs(
     width: int,
     outputs: Sequence[str],
     limits: Limits = UNLIMITED,
+    beam: Tensor | None = None,  # [3] cm, see `beam.beam_cm`
 ) -> dict[str, Tensor]:
     """The outputs by name, each [C, H, W] float32 on the scene's device; differentiable once by every parameter and
-    by poses.
+    by poses and the beam.
 
     The scene is one that the backend supports. Nothing here waits for the device, but where the cost of frames has a
-    limit; limits hold for frames without gradients.
+    limit, and the gradient by a beam; limits hold for frames without gradients.
     Raises MemoryExceeded where the device's memory does not suffice, FrameTooCostly and GivenUp.
     """
     from .frames import render_frames
 
-    return render_frames(scene, probe, poses_cm, height, width, outputs, limits)
+    return render_frames(scene, probe, poses_cm, height, width, outputs, limits, beam)

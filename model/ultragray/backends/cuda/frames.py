@@ -15,6 +15,7 @@ from ...errors import MemoryExceeded, TooManyPoses
 from ...limits import Limits
 from ...probe import Probe
 from ...scene import PARAMETERS, GaussianScene
+from ..beam import Moments
 from ..poses import ScenePoses, as_array, gradient_by_poses, want_gradient
 from ..spatial_order import spatial_order
 from .device import upload
@@ -45,12 +46,14 @@ def render_frames(
     width: int,
     outputs: Sequence[str],
     limits: Limits,
+    beam: Tensor | None,  # [3] cm
 ) -> dict[str, Tensor]:  # [C, H, W] each
     """See `ultragray.backends.cuda.render_outputs`."""
-    geometry, device = Geometry.of(probe, height, width), scene.means.device
+    geometry, device = Geometry.of(probe, height, width, beam), scene.means.device
     with _on_device(device, f"{len(poses_cm)} frames of {height}x{width} pixels from {len(scene.means):,} Gaussians"):
-        views = upload(torch.from_numpy(view_table(probe, as_array(poses_cm), height)), device)
-        by_scene = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in scene.splats.values())
+        views = upload(torch.from_numpy(view_table(probe, as_array(poses_cm), height, beam)), device)
+        varied = [*scene.splats.values(), *([] if beam is None else [beam])]
+        by_scene = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in varied)
         if not by_scene and not want_gradient(poses_cm):
             return _render(sorted_gaussians(scene), geometry, views, outputs, limits)
         if len(views) > MAX_POSES:
@@ -63,6 +66,7 @@ def render_frames(
             views,
             tuple(outputs),
             poses_cm,
+            beam,
             *scene.splats.values(),
         )
         return dict(zip(outputs, frames, strict=True))
@@ -109,6 +113,7 @@ class _Render(torch.autograd.Function):
         views: Tensor,
         names: tuple[str, ...],
         poses: ScenePoses,
+        beam: Tensor | None,
         *splats: Tensor,
     ) -> tuple[Tensor, ...]:
         gaussians = Gaussians.of(dict(zip(PARAMETERS, splats, strict=True)), intensity)
@@ -118,6 +123,7 @@ class _Render(torch.autograd.Function):
         # Saved by torch: a parameter that changes before the backward pass is noticed, and all is freed after it.
         ctx.save_for_backward(*splats, views, *vars(slices).values(), *vars(planes).values())
         ctx.intensity, ctx.geometry, ctx.names, ctx.poses = intensity, geometry, names, poses
+        ctx.beam = beam.detach() if beam is not None and beam.requires_grad else None
         ctx.set_materialize_grads(False)
         return tuple(frames.values())
 
@@ -135,11 +141,12 @@ class _Render(torch.autograd.Function):
         with _on_device(views.device, f"the gradient of {len(views)} frames"):
             gaussians = Gaussians.of(dict(zip(PARAMETERS, splats, strict=True)), ctx.intensity)
             by_views = _room_for_views(slices) if ctx.needs_input_grad[4] else None
-            found = differentiate(gaussians, views, ctx.geometry, slices, planes, given, by_views)
+            found, moments = differentiate(gaussians, views, ctx.geometry, slices, planes, given, by_views)
+            by_beam = None if ctx.beam is None else Moments(*moments.tolist()).gradient(ctx.beam)
         by_poses = None
         if by_views is not None:
             by_poses = gradient_by_poses(ctx.poses.detach(), by_views.sum(dim=1).cpu())
-        return (None, None, None, None, by_poses, *found.values())
+        return (None, None, None, None, by_poses, by_beam, *found.values())
 
 
 def _room_for_views(slices: Slices) -> Tensor:  # [C, B, 2, 3]

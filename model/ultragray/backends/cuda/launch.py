@@ -19,6 +19,7 @@ from torch import Tensor
 from ...outputs import PLANES, WEIGHT_SUM
 from ...probe import FloatArray, Probe
 from ...scene_info import expected_shapes
+from ..beam import THIN, BeamVariance
 from ..scan_lines import KernelLines
 from .device import interpreted
 from .kernels import constants
@@ -82,25 +83,32 @@ class Geometry(NamedTuple):
     width: int
     pitch: float  # between scan lines: cm, or radians for a fan
     row_cm: float
+    thick: bool  # whether the slice has a thickness
 
     @classmethod
-    def of(cls, probe: Probe, height: int, width: int) -> Geometry:
-        lines = KernelLines.of(probe)
-        return cls(lines.fanned, lines.wrap, height, width, lines.span / width, _row_cm(probe, height))
+    def of(cls, probe: Probe, height: int, width: int, beam: Tensor | None = None) -> Geometry:
+        lines, thick = KernelLines.of(probe), beam is not None
+        return cls(lines.fanned, lines.wrap, height, width, lines.span / width, _row_cm(probe, height), thick)
 
 
 def _row_cm(probe: Probe, height: int) -> float:
     return (probe.far_mm - probe.near_mm) / 10.0 / height
 
 
-def view_table(probe: Probe, poses_cm: FloatArray, height: int) -> FloatArray:  # [C, 4, 4] -> [C, VIEW]
-    """Each pose as the kernels want it: the probe's axes and origin, and the probe."""
+def view_table(
+    probe: Probe,
+    poses_cm: FloatArray,  # [C, 4, 4]
+    height: int,
+    beam: Tensor | None = None,  # [3] cm
+) -> FloatArray:  # [C, VIEW]
+    """Each pose as the kernels want it: the probe's axes and origin, the probe, and its beam."""
     lines = KernelLines.of(probe)
     table = np.empty((len(poses_cm), constants.VIEW.value))
     table[:, :9] = lines.view_axes(poses_cm)[:, :3, :3].transpose(0, 2, 1).reshape(-1, 9)
     table[:, 9:12] = poses_cm[:, :3, 3]
     depths_cm = probe.near_mm / 10.0, probe.cull_far_mm(height) / 10.0, _row_cm(probe, height)
-    table[:, 12:] = *depths_cm, lines.start, lines.span
+    thickness = THIN if beam is None else BeamVariance.of(beam, probe.near_mm / 10.0, probe.far_mm / 10.0)
+    table[:, 12:] = *depths_cm, lines.start, lines.span, *thickness
     return table
 
 
@@ -195,6 +203,7 @@ def cut(gaussians: Gaussians, views: Tensor, geometry: Geometry, *, record: bool
             WRAP=geometry.wrap,
             SIGMOID=gaussians.sigmoid,
             DEGREE=gaussians.degree,
+            THICK=geometry.thick,
             RECORD=record,
             BLOCK=how.block,
             num_warps=4,
@@ -267,8 +276,8 @@ def differentiate(
     planes: Planes,
     gradients: Mapping[str, Tensor],  # of the loss by each output, [C, H, W] contiguous
     by_views: Tensor | None,  # [C, B, 2, 3] float64, zero
-) -> dict[str, Tensor]:
-    """The gradient of the loss by every raw parameter, in its shape.
+) -> tuple[dict[str, Tensor], Tensor]:
+    """The gradient of the loss by every raw parameter, in its shape, and the moments of that by the beam [3].
 
     Where there is room for it, also by a shift and a turn of each view, block by block.
     """
@@ -278,8 +287,9 @@ def differentiate(
     count, terms = len(gaussians.means), (gaussians.degree + 1) ** 2
     shapes_by_name = expected_shapes(count, gaussians.degree)  # in the order in which the kernel takes them
     found = {name: torch.empty(shape, device=device) for name, shape in shapes_by_name.items()}
+    by_beam = torch.zeros((blocks if geometry.thick else 0, 3), dtype=torch.float64, device=device)
     if not count:
-        return found
+        return found, by_beam.sum(dim=0)
     by_pixel = [torch.empty_like(planes.weight) for _ in range(4)]
     by_slice = torch.empty((poses * blocks * how.block, constants.GRADIENTS.value), device=device)
     given = [gradients.get(name) for name in PLANES]
@@ -325,6 +335,7 @@ def differentiate(
         by_slice,
         *found.values(),
         views if by_views is None else by_views,
+        by_beam,
         poses,
         count,
         gaussians.shn.stride(0),
@@ -332,9 +343,10 @@ def differentiate(
         FANNED=geometry.fanned,
         SIGMOID=gaussians.sigmoid,
         DEGREE=gaussians.degree,
+        THICK=geometry.thick,
         TERMS=max(2, triton.next_power_of_2(terms)),
         BY_VIEW=by_views is not None,
         BLOCK=how.block,
         num_warps=4,
     )
-    return found
+    return found, by_beam.sum(dim=0)

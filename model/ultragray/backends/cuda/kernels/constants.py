@@ -14,7 +14,9 @@ LOG2_E = tl.constexpr(1.4426950408889634)  # the hardware's exponential has base
 HALF_LOG2_E = tl.constexpr(0.7213475204444817)  # exp(-x2 / 2) is exp2(-HALF_LOG2_E x2)
 NODE = tl.constexpr(0.7745966692414834)  # Gauss-Legendre: nodes 0, +-sqrt(0.6)
 
-VIEW = tl.constexpr(17)  # of a pose: axes 9, origin 3, near, cull_far, row_cm, start and span of the scan lines
+# Of a pose: axes 9, origin 3, near, cull_far, row_cm, start and span of the scan lines, and the beam's variance by
+# depth: at the focus, the focus, the square of its slope, the most.
+VIEW = tl.constexpr(21)
 FIELDS = tl.constexpr(12)  # of a slice: t, row offset, r, m2, tt, tr, rr, det, intensity, 1 - tau; to whole 16 bytes
 RECTANGLE = tl.constexpr(8)  # of a slice: first and last column and row, own column and row, clipped; likewise
 GRADIENTS = tl.constexpr(9)  # by a slice's t, r, tt, tr, rr, m2, intensity, 1 - tau, det

@@ -8,7 +8,7 @@ import triton.language as tl
 
 from .constants import GRADIENTS, RECTANGLE, VIEW
 from .harmonics import harmonics_gradient
-from .slicing import place
+from .slicing import place, spread_along_elevation
 
 
 @triton.jit
@@ -62,6 +62,7 @@ def place_gradients(
     by_sh0,
     by_shn,  # [N, K - 1] contiguous
     by_views,  # [C, B, 2, 3] float64 out: by a shift and a turn of the view; only where BY_VIEW
+    by_beam,  # [B, 3] float64 out: by the beam's variance, times powers of the depth's offset from the focus
     poses,
     count,
     shn_stride,
@@ -69,6 +70,7 @@ def place_gradients(
     FANNED: tl.constexpr,
     SIGMOID: tl.constexpr,
     DEGREE: tl.constexpr,
+    THICK: tl.constexpr,
     TERMS: tl.constexpr,  # coefficients, to the next power of two
     BY_VIEW: tl.constexpr,
     BLOCK: tl.constexpr,
@@ -83,6 +85,7 @@ def place_gradients(
     sum_qw, sum_qx, sum_qy, sum_qz = zero, zero, zero, zero
     sum_absorb = zero
     sum_sh = tl.zeros([BLOCK, TERMS], tl.float32)
+    zeroth, first, second = tl.zeros([BLOCK], tl.float64), tl.zeros([BLOCK], tl.float64), tl.zeros([BLOCK], tl.float64)
     for pose in range(0, poses):
         group = pose * blocks + block.to(tl.int64)
         if tl.load(counts + group) > 0:
@@ -113,6 +116,9 @@ def place_gradients(
             yy = a[1] * a[1] + b[1] * b[1] + c[1] * c[1]
             yz = a[1] * a[2] + b[1] * b[2] + c[1] * c[2]
             zz = a[2] * a[2] + b[2] * b[2] + c[2] * c[2]
+            if THICK:
+                depth_offset, variance, precision, ratio = spread_along_elevation(view, mean, a, b, c, s, FANNED)
+                yy += variance
             # The conditioning on the plane, backwards.
             inverse = 1.0 / yy
             rise, tilt_x, tilt_z = mean[1] * inverse, xy * inverse, yz * inverse
@@ -126,9 +132,34 @@ def place_gradients(
             on_yy = tilt_x * tilt_x * on_xx + tilt_x * tilt_z * on_xz + tilt_z * tilt_z * on_zz
             on_yy += rise * (tilt_x * on_x + tilt_z * on_z) - rise * rise * on_m2
 
+            on_px, on_pz = on_x, on_z
+            if THICK:
+                on_variance = tl.where(cut, on_yy + on_m2 * precision / ratio, 0.0)
+                zeroth += on_variance
+                first += on_variance * depth_offset
+                second += on_variance * depth_offset * depth_offset
+                on_depth = 2.0 * tl.load(view + 19) * on_variance * depth_offset
+                if FANNED:
+                    depth = depth_offset + tl.load(view + 18)
+                    on_px += on_depth * mean[0] / depth
+                    on_pz += on_depth * mean[2] / depth
+                else:
+                    on_pz += on_depth
+
             ga = spoke_gradient(a, on_xx, on_xy, on_xz, on_yy, on_yz, on_zz)
             gb = spoke_gradient(b, on_xx, on_xy, on_xz, on_yy, on_yz, on_zz)
             gc = spoke_gradient(c, on_xx, on_xy, on_xz, on_yy, on_yz, on_zz)
+            if THICK:  # eᵀΣ⁻¹e is the sum of (spoke / s²)² along elevation
+                on_precision = on_m2 * variance / ratio
+                pa = 2.0 * on_precision * a[1] / (s[0] * s[0] * s[0] * s[0])
+                pb = 2.0 * on_precision * b[1] / (s[1] * s[1] * s[1] * s[1])
+                pc = 2.0 * on_precision * c[1] / (s[2] * s[2] * s[2] * s[2])
+                sum_s0 -= tl.where(cut, 2.0 * pa * a[1], 0.0).to(tl.float32)
+                sum_s1 -= tl.where(cut, 2.0 * pb * b[1], 0.0).to(tl.float32)
+                sum_s2 -= tl.where(cut, 2.0 * pc * c[1], 0.0).to(tl.float32)
+                ga = (ga[0], ga[1] + pa, ga[2])
+                gb = (gb[0], gb[1] + pb, gb[2])
+                gc = (gc[0], gc[1] + pc, gc[2])
             sum_s0 += tl.where(cut, ga[0] * a[0] + ga[1] * a[1] + ga[2] * a[2], 0.0).to(tl.float32)
             sum_s1 += tl.where(cut, gb[0] * b[0] + gb[1] * b[1] + gb[2] * b[2], 0.0).to(tl.float32)
             sum_s2 += tl.where(cut, gc[0] * c[0] + gc[1] * c[1] + gc[2] * c[2], 0.0).to(tl.float32)
@@ -160,9 +191,9 @@ def place_gradients(
                 vx, vy, vz, sh0, shn, shn_stride, index, cut, on_intensity, DEGREE, SIGMOID, TERMS
             )
             sum_sh += on_sh
-            on_mx = tl.where(cut, towards_scene(view, on_x, on_y, on_z, 0), 0.0)
-            on_my = tl.where(cut, towards_scene(view, on_x, on_y, on_z, 1), 0.0)
-            on_mz = tl.where(cut, towards_scene(view, on_x, on_y, on_z, 2), 0.0)
+            on_mx = tl.where(cut, towards_scene(view, on_px, on_y, on_pz, 0), 0.0)
+            on_my = tl.where(cut, towards_scene(view, on_px, on_y, on_pz, 1), 0.0)
+            on_mz = tl.where(cut, towards_scene(view, on_px, on_y, on_pz, 2), 0.0)
             sum_mx += on_mx.to(tl.float32) + hx
             sum_my += on_my.to(tl.float32) + hy
             sum_mz += on_mz.to(tl.float32) + hz
@@ -176,6 +207,10 @@ def place_gradients(
                 store_sums(to, on_mx + hx, on_my + hy, on_mz + hz)
                 store_sums(to + 3, tl.where(cut, tx, 0.0), tl.where(cut, ty, 0.0), tl.where(cut, tz, 0.0))
 
+    if THICK:
+        tl.store(by_beam + block * 3, tl.sum(zeroth, 0))
+        tl.store(by_beam + block * 3 + 1, tl.sum(first, 0))
+        tl.store(by_beam + block * 3 + 2, tl.sum(second, 0))
     store3(by_means, index, mask, sum_mx, sum_my, sum_mz)
     store3(by_scales, index, mask, sum_s0, sum_s1, sum_s2)
     to = by_quats + index * 4

@@ -120,6 +120,18 @@ def place(view, means, scales, quats, index, mask):
 
 
 @triton.jit
+def spread_along_elevation(view, mean, a, b, c, s, FANNED: tl.constexpr):
+    """The beam's spread Σ' = Σ + variance·e eᵀ: the offset of the mean's depth from the focus, the variance there,
+    eᵀΣ⁻¹e and |Σ'|/|Σ|."""
+    depth = tl.sqrt(mean[0] * mean[0] + mean[2] * mean[2]) if FANNED else mean[2]
+    offset = depth - tl.load(view + 18)
+    variance = tl.load(view + 17) + tl.load(view + 19) * offset * offset
+    along_a, along_b, along_c = a[1] / (s[0] * s[0]), b[1] / (s[1] * s[1]), c[1] / (s[2] * s[2])
+    precision = along_a * along_a + along_b * along_b + along_c * along_c
+    return offset, variance, precision, 1.0 + variance * precision
+
+
+@triton.jit
 def near_plane(view, means, scales, quats, index, mask):
     """Whether a Gaussian may come within MAX_M2 of the image plane; widened by what float32 may be off."""
     mx, my, mz = load3(means, index, 3, mask)
@@ -137,7 +149,7 @@ def near_plane(view, means, scales, quats, index, mask):
     a = s0 * (nx * ax + ny * ay + nz * az)
     b = s1 * (nx * bx + ny * by + nz * bz)
     c = s2 * (nx * cx + ny * cy + nz * cz)
-    reach = 3.33 * tl.sqrt(a * a + b * b + c * c)
+    reach = 3.33 * tl.sqrt(a * a + b * b + c * c + tl.load(view + 20).to(tl.float32))
     slack = 1.0 + tl.abs(ox) + tl.abs(oy) + tl.abs(oz) + tl.abs(mx) + tl.abs(my) + tl.abs(mz) + s0 + s1 + s2
     return mask & (tl.abs(height) <= reach + 1e-6 * slack)
 
@@ -165,6 +177,7 @@ def slice_gaussians(
     WRAP: tl.constexpr,
     SIGMOID: tl.constexpr,
     DEGREE: tl.constexpr,
+    THICK: tl.constexpr,
     RECORD: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
@@ -184,17 +197,22 @@ def slice_gaussians(
         if RECORD:
             tl.store(places + group * BLOCK + lanes, tl.full([BLOCK], -1, tl.int32))
     else:
-        offset, mean, a, b, c, _, _, _ = place(view, means, scales, quats, index, candidate)
+        offset, mean, a, b, c, _, _, s = place(view, means, scales, quats, index, candidate)
         xx = a[0] * a[0] + b[0] * b[0] + c[0] * c[0]
         xy = a[0] * a[1] + b[0] * b[1] + c[0] * c[1]
         xz = a[0] * a[2] + b[0] * b[2] + c[0] * c[2]
         yy = a[1] * a[1] + b[1] * b[1] + c[1] * c[1]
         yz = a[1] * a[2] + b[1] * b[2] + c[1] * c[2]
         zz = a[2] * a[2] + b[2] * b[2] + c[2] * c[2]
+        lost = 0.0 * yy  # what m2 grows by, as the beam's weight spreads
+        if THICK:
+            _, variance, _, ratio = spread_along_elevation(view, mean, a, b, c, s, FANNED)
+            yy += variance
+            lost = tl.log(ratio)
         # Condition on the plane, y = 0.
         inverse = 1.0 / yy
         shift = -mean[1] * inverse
-        m2 = mean[1] * mean[1] * inverse
+        m2 = mean[1] * mean[1] * inverse + lost
         x, z = mean[0] + xy * shift, mean[2] + yz * shift
         xx, xz, zz = xx - xy * xy * inverse, xz - xy * yz * inverse, zz - yz * yz * inverse
         det = xx * zz - xz * xz
