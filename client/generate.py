@@ -24,6 +24,7 @@ import unasync
 from ultragray.contract import Contract, Family, annotated_fields
 from ultragray.datasets.source import SourceOptions
 from ultragray.errors import error_classes
+from ultragray.probe import ElevationBeam
 from ultragray.settings import RenderSettings
 from ultragray_service.errors import STATUSES
 from ultragray_workers.datasets.store import DatasetRecord
@@ -35,6 +36,7 @@ MODULES = ("client", "connection", "datasets", "jobs", "scenes", "stream", "work
 # The classes that callers fill in or get, each with all that it is made of, and the names that the client gives them.
 ROOTS = {
     "RenderSettings": RenderSettings,
+    "ElevationBeam": ElevationBeam,
     "DatasetOptions": SourceOptions,
     "Dataset": DatasetRecord,
     "Specification": Specification,

@@ -18,6 +18,7 @@ __all__ = [
     "Dataset",
     "DatasetOptions",
     "Display",
+    "ElevationBeam",
     "Encoding",
     "EvaluateJob",
     "FanSampler",
@@ -150,6 +151,8 @@ class FrameSettings:
     """What is below is refused, or masked."""
     below_min_confidence: Below = Below.REFUSE
     """mask: pixels of such frames that Gaussians do not support are 0."""
+    slice_thickness_mm: float | None = None
+    """Full width at half maximum along elevation, at the focus of the scene's beam; 0: a plane. Default: as trained."""
     display: Display | None = None
     """Gain, depth, scan conversion ...; default: as rendered."""
     outputs: tuple[str, ...] = ("bmode",)
@@ -172,6 +175,22 @@ class RenderSettings(FrameSettings):
 
     encoding: Encoding = Encoding.UINT8
     """Form of the pixels."""
+
+
+@dataclass(frozen=True)
+class ElevationBeam:
+    """A Gaussian beam across the image plane, with a focus (docs/physics.md §3).
+
+    Its thickness at a depth s is thickness_mm·√(1 + ((s − focus_mm)/z_R)²), its Rayleigh range z_R half the depth of
+    field. With neither focus nor depth of field it is as thick at every depth.
+    """
+
+    thickness_mm: float
+    """Thickness at the focus: full width at half maximum along elevation."""
+    focus_mm: float | None = None
+    """Depth of the focus below the probe's face; none: the same thickness at every depth."""
+    depth_of_field_mm: float | None = None
+    """Depth over which it is at most √2 times as thick as at the focus: twice the Rayleigh range."""
 
 
 @dataclass(frozen=True)

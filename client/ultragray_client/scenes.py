@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from ultragray_proto.codec import from_message
 from ultragray_proto.v1 import scenes_pb2
 
-from .contract import Probe
+from .contract import ElevationBeam, Probe
 from .geometry import FloatArray
 
 Point = tuple[float, float, float]  # x, y, z in the scene's frame, mm
@@ -61,6 +61,7 @@ class Scene:
     dataset_name: str
     dataset_sha256: str
     label_names: Mapping[int, str]  # what the values of the output labels mean
+    beam: ElevationBeam | None  # of the frames it was trained on; None: they are taken for planes
     confidence: ConfidenceFit | None  # None: it cannot tell the confidence of its frames
     owner: str | None  # None: nobody
     private: bool  # others do not see it

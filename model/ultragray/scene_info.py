@@ -23,6 +23,7 @@ from .files.format_version import require_version
 from .image_size import DEFAULT_IMAGE_SIDE
 from .pose import check_poses
 from .probe import ElevationBeam, FloatArray, Probe
+from .probe.elevation import PLANE
 
 FORMAT_VERSION = 1
 METADATA_KEY = "ultragray"
@@ -71,6 +72,12 @@ class SceneInfo(Contract):
                 "probe must be given: the scene does not know the one it was trained with", field="probe"
             )
         return probe
+
+    def beam_or(self, thickness_mm: float | None) -> ElevationBeam:
+        """The beam of the scene, as thick as asked for (None: as it is); where it has none, one without a focus."""
+        if self.beam is None:
+            return PLANE if thickness_mm is None else ElevationBeam(thickness_mm)
+        return self.beam if thickness_mm is None else self.beam.as_thick_as(thickness_mm)
 
     def image_size_or(self, height: int | None, width: int | None) -> tuple[int, int]:
         """Height and width as asked for, else those of the training images, else 512."""

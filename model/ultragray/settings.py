@@ -17,7 +17,8 @@ from .display import AS_RENDERED, Display
 from .errors import InvalidArgument, InvalidImageSize, InvalidProbe, UnknownOutput
 from .image_size import MAX_IMAGE_SIDE, check_image_size
 from .outputs import OUTPUTS, check_available, check_outputs
-from .probe import Picture, Probe
+from .probe import ElevationBeam, Picture, Probe
+from .probe.elevation import MAX_THICKNESS_MM, PLANE
 from .scene_info import SceneInfo
 
 
@@ -70,6 +71,12 @@ class FrameSettings(Contract):
     below_min_confidence: Below = described(
         "mask: pixels of such frames that Gaussians do not support are 0.", Below.REFUSE
     )
+    slice_thickness_mm: float | None = described(
+        "Full width at half maximum along elevation, at the focus of the scene's beam; 0: a plane. Default: as trained.",
+        None,
+        low=0.0,
+        high=MAX_THICKNESS_MM,
+    )
     display: Display | None = described("Gain, depth, scan conversion ...; default: as rendered.", None)
     outputs: tuple[str, ...] = described(f"Some of {', '.join(OUTPUTS)}.", ("bmode",), error=UnknownOutput)
 
@@ -100,6 +107,7 @@ class FrameSettings(Contract):
             )
         return Resolved(
             probe=info.probe_or(self.probe),
+            beam=info.beam_or(self.slice_thickness_mm),
             height=height,
             width=width,
             outputs=self.outputs,
@@ -132,6 +140,7 @@ class Resolved:
     height: int  # depth samples that are rendered
     width: int  # scan lines
     outputs: tuple[str, ...] = ("bmode",)
+    beam: ElevationBeam = PLANE
     encoding: Encoding = Encoding.UINT8
     display: Display = AS_RENDERED
     min_confidence: float | None = None
@@ -145,7 +154,8 @@ class Resolved:
     @cached_property
     def view(self) -> tuple[Any, ...]:
         """All but outputs and encoding: frames that agree in this can be rendered together."""
-        return (self.probe, self.height, self.width, self.display, self.min_confidence, self.below_min_confidence)
+        asked = (self.display, self.min_confidence, self.below_min_confidence)
+        return (self.probe, self.beam, self.height, self.width, *asked)
 
     @property
     def pixels(self) -> int:

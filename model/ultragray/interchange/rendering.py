@@ -71,6 +71,7 @@ def render_to_file(
                 outputs=wanted,
                 backend=backend,
                 limits=limits.after(first),
+                beam=settings.beam,
             )
             assert frames.coverage is not None
             watch = SupportWatch(masked[places])

@@ -56,6 +56,15 @@ class ElevationBeam(Contract):
         thickness, focus, depth_of_field = self.numbers
         return thickness * math.hypot(1.0, 2.0 * (depth_mm - focus) / depth_of_field)
 
+    @property
+    def is_thin(self) -> bool:
+        """Whether it is a plane."""
+        return self.thickness_mm == 0.0
+
     def as_thick_as(self, thickness_mm: float) -> ElevationBeam:
         """A beam of the same shape with another thickness."""
         return replace(self, thickness_mm=thickness_mm)
+
+
+PLANE = ElevationBeam(thickness_mm=0.0)
+"""No beam: an infinitely thin slice."""

@@ -98,6 +98,16 @@ class SteeredProbe(_message.Message):
     far_mm: float
     def __init__(self, width_mm: _Optional[float] = ..., steering_deg: _Optional[float] = ..., near_mm: _Optional[float] = ..., far_mm: _Optional[float] = ...) -> None: ...
 
+class ElevationBeam(_message.Message):
+    __slots__ = ("thickness_mm", "focus_mm", "depth_of_field_mm")
+    THICKNESS_MM_FIELD_NUMBER: _ClassVar[int]
+    FOCUS_MM_FIELD_NUMBER: _ClassVar[int]
+    DEPTH_OF_FIELD_MM_FIELD_NUMBER: _ClassVar[int]
+    thickness_mm: float
+    focus_mm: float
+    depth_of_field_mm: float
+    def __init__(self, thickness_mm: _Optional[float] = ..., focus_mm: _Optional[float] = ..., depth_of_field_mm: _Optional[float] = ...) -> None: ...
+
 class Probe(_message.Message):
     __slots__ = ("linear", "convex", "phased", "radial", "steered")
     LINEAR_FIELD_NUMBER: _ClassVar[int]

@@ -71,6 +71,7 @@ class SettingsUsed:
     """The settings of a frame, as used: the same for all frames of a stream."""
 
     probe: Probe = described("As used.")
+    slice_thickness_mm: float = described("As used: at the focus of the scene's beam; 0: a plane.")
     rendered_height: int = described("Depth samples, before the display settings were applied.")
     rendered_width: int = described("Scan lines, likewise.")
     display: Display = described("As used.", AS_RENDERED)
@@ -125,6 +126,7 @@ def settings_used(settings: Resolved) -> SettingsUsed:
     """The settings of a request, as frames tell them."""
     return SettingsUsed(
         probe=settings.probe,
+        slice_thickness_mm=settings.beam.thickness_mm,
         rendered_height=settings.height,
         rendered_width=settings.width,
         display=settings.display,

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from ultragray.confidence.assess import read_model
 from ultragray.contract import described
 from ultragray.outputs import OUTPUTS
-from ultragray.probe import Probe
+from ultragray.probe import ElevationBeam, Probe
 from ultragray.scene_info import SceneHeader
 from ultragray_workers.jobs.queue.owners import Kind, Ownership
 
@@ -108,6 +108,7 @@ class Scene:
     dataset_sha256: str | None
     outputs: list[OutputName] = described("What can be rendered of it.")
     label_names: dict[int, str] = described("What the values of the output labels mean; empty: it has none.")
+    beam: ElevationBeam | None = described("Of the frames it was trained on; null: they are taken for planes.")
     confidence: ConfidenceFit | None = described("null: the scene cannot tell the confidence of its frames.")
     owner: str | None = described("Who imported or trained it; null: nobody.")
     private: bool = described("Whether others may not see it.")
@@ -143,6 +144,7 @@ class Scene:
             dataset_sha256=None if info.dataset_sha256 is None else str(info.dataset_sha256),
             outputs=[name for name, output in OUTPUTS.items() if output.lacks(info) is None],
             label_names=info.label_names,
+            beam=info.beam,
             confidence=None if model is None else ConfidenceFit(model.error, model.fitted_on),
             owner=ownership.owner,
             private=ownership.private,

@@ -53,6 +53,7 @@ class Frame:
             "scene": result.scene,
             "scene_sha256": result.scene_sha256,
             "renderer": result.renderer,
+            "slice_thickness_mm": repr(result.settings.beam.thickness_mm),
             "replaced_poses": str(self.posed.replaced),
             **{name: f"{value:.3f}" for name, value in asdict(result.extrapolations[0]).items() if value is not None},
             "queue_ms": f"{result.queue_ms:.3f}",

@@ -29,7 +29,7 @@ from .command_line import refused, run
 LINEAR = LinearProbe(width_mm=30.0, near_mm=0.0, far_mm=40.0)
 CONVEX = ConvexProbe(opening_angle_deg=60.0, near_mm=10.0, far_mm=50.0)
 PHASED = PhasedProbe(opening_angle_deg=90.0, far_mm=50.0)
-ORIGIN = ("scene", "scene_sha256", "renderer", "probe", "display", "picture")
+ORIGIN = ("scene", "scene_sha256", "renderer", "probe", "slice_thickness_mm", "display", "picture")
 CONVEX_JSON = '{"kind": "convex", "opening_angle_deg": 60, "near_mm": 10, "far_mm": 50}'
 
 

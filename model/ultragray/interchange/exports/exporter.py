@@ -53,6 +53,7 @@ class ExportHeader:
             "scene_sha256": self.scene_sha256,
             "renderer": self.renderer,
             "probe": to_dict(self.settings.probe),
+            "slice_thickness_mm": self.settings.beam.thickness_mm,
             "display": to_dict(self.settings.display),
             "picture": to_dict(self.settings.picture),
         }

@@ -72,6 +72,7 @@ class PlusExporter(Exporter):
             "UltraGRaySceneSha256": header.scene_sha256,
             "UltraGRayRenderer": header.renderer,
             "UltraGRayProbe": json.dumps(origin["probe"]),
+            "UltraGRaySliceThicknessMm": json.dumps(origin["slice_thickness_mm"]),
             "UltraGRayDisplay": json.dumps(origin["display"]),
         }
 

@@ -38,6 +38,7 @@ RENDER_HEADERS = {
     "X-Ultragray-Outputs": "Outputs in the order of the data, with commas.",
     "X-Ultragray-Pose": "One pose only: the 4x4 matrix that was used, JSON. Of many, npz holds `poses`.",
     "X-Ultragray-Probe": "The probe that was used, JSON.",
+    "X-Ultragray-Slice-Thickness-Mm": "As used: at the focus of the scene's beam; 0: a plane.",
     "X-Ultragray-Confidence": "Of each pose, with commas; empty where the scene cannot tell.",
     "X-Ultragray-Extrapolation": "One pose only: distance_mm, angle_deg, confidence, supported_share, JSON. "
     "Of many, npz holds them.",
@@ -132,5 +133,6 @@ def _settings_headers(settings: Resolved) -> dict[str, str]:
         "X-Ultragray-Dtype": settings.encoding.pixel_type.name,
         "X-Ultragray-Outputs": ",".join(settings.outputs),
         "X-Ultragray-Probe": json.dumps(to_dict(used.probe)),
+        "X-Ultragray-Slice-Thickness-Mm": repr(used.slice_thickness_mm),
         "X-Ultragray-Picture": json.dumps(to_dict(used.picture)),
     }

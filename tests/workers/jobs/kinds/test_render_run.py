@@ -12,7 +12,7 @@ import pydicom
 import pytest
 import torch
 
-from ultragray import ConvexProbe, GaussianScene, LinearProbe, render
+from ultragray import ConvexProbe, ElevationBeam, GaussianScene, LinearProbe, render
 from ultragray.confidence import Assessor, ConfidenceModel, figure_arrays
 from ultragray.contract import to_dict as to_json
 from ultragray.datasets.plus import read_plus_sweep
@@ -179,6 +179,17 @@ def test_frames_are_shown_as_asked_and_the_archive_says_where_their_pixels_lie(w
         scene = GaussianScene.load(asked.folder.path / "one.ugr")
         rendered = {"bmode": render(scene, probe, TRAINING, height=24, width=20)["bmode"]}
         np.testing.assert_allclose(archive["bmode"], show(rendered, probe, display)["bmode"].numpy(), atol=1e-6)
+
+
+def test_frames_are_as_thick_as_asked_and_the_archive_says_so(work: Callable[..., JobRun]) -> None:
+    job = RenderJob(scene="one", sampler=TrainingSampler(), slice_thickness_mm=5.0)
+    asked = work(job)
+    render_run.run(asked, job)
+    scene = GaussianScene.load(asked.folder.path / "one.ugr")
+    expected = render(scene, None, TRAINING, height=24, width=20, beam=ElevationBeam(5.0))["bmode"]
+    with np.load(asked.folder.artifacts / "frames.npz") as archive:
+        np.testing.assert_allclose(archive["bmode"], expected.numpy(), atol=1e-6)
+        assert float(archive["slice_thickness_mm"]) == 5.0
 
 
 def test_frames_below_the_limit_are_masked_instead_of_refused(work: Callable[..., JobRun]) -> None:

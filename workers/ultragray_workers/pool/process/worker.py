@@ -238,6 +238,7 @@ class _Worker:
                 outputs=needed,
                 backend=self._backend,
                 limits=limits.after(shot),
+                beam=view.beam,
             )
             shot += len(some)
             assert frames.coverage is not None
