@@ -152,7 +152,7 @@ class FrameSettings:
     below_min_confidence: Below = Below.REFUSE
     """mask: pixels of such frames that Gaussians do not support are 0."""
     slice_thickness_mm: float | None = None
-    """Full width at half maximum along elevation, at the focus of the scene's beam; 0: a plane. Default: as trained."""
+    """Full width at half maximum along elevation at the focus of the scene's beam; 0: a plane. Default: as trained."""
     display: Display | None = None
     """Gain, depth, scan conversion ...; default: as rendered."""
     outputs: tuple[str, ...] = ("bmode",)

@@ -72,7 +72,7 @@ class FrameSettings(Contract):
         "mask: pixels of such frames that Gaussians do not support are 0.", Below.REFUSE
     )
     slice_thickness_mm: float | None = described(
-        "Full width at half maximum along elevation, at the focus of the scene's beam; 0: a plane. Default: as trained.",
+        "Full width at half maximum along elevation at the focus of the scene's beam; 0: a plane. Default: as trained.",
         None,
         low=0.0,
         high=MAX_THICKNESS_MM,

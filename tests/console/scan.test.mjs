@@ -57,6 +57,10 @@ describe("scan", () => {
     await page.getByLabel("Depth", { exact: true }).fill("30");
     await until(() => canvasState(page, IMAGE), ({ height }) => height === 128, "the depth is not half of it");
     await page.getByRole("button", { name: "Reset" }).click();
+    await until(() => canvasState(page, IMAGE), ({ print }) => print === first.print, "the depth stayed");
+    await page.getByLabel("Slice thickness", { exact: true }).fill("8");
+    await changed(page, first.print);
+    await page.getByRole("button", { name: "Reset" }).click();
     await page.getByLabel("Flip").check();
     await page.locator('[data-testid="orientation-marker"][data-side="right"]').waitFor();
     await page.getByRole("combobox", { name: "Samples" }).selectOption("512");

@@ -61,6 +61,8 @@ export class Session {
   scanConverted = $state(true);
   /** Depth samples and scan lines; null: as trained. */
   samples = $state<number | null>(null);
+  /** Thickness along elevation, at the focus of the scene's beam; 0: a plane; null: as trained. */
+  sliceThickness_mm = $state<number | null>(null);
   /** Whether what no Gaussians support is black. */
   hidesUnsupported = $state(false);
 
@@ -132,6 +134,7 @@ export class Session {
         pixel_mm: this.scanConverted ? squarePixel_mm(this.plane) : null,
       },
       outputs,
+      slice_thickness_mm: this.sliceThickness_mm,
       min_confidence: this.hidesUnsupported && this.description?.confidence ? 1 : null,
       below_min_confidence: "mask",
     };
@@ -211,12 +214,13 @@ export class Session {
 
   resetDisplay(): void {
     this.display = AS_RENDERED;
+    this.sliceThickness_mm = null;
   }
 
   /** What was chosen for another scene of that name does not fit this one. */
   #beginAnew(): void {
     this.#choices += 1;
-    this.#chosen = this.trajectory = this.samples = null;
+    this.#chosen = this.trajectory = this.samples = this.sliceThickness_mm = null;
     this.display = { ...this.display, depth_mm: null };
     this.goHome();
   }
