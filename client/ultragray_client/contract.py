@@ -156,7 +156,7 @@ class FrameSettings:
     display: Display | None = None
     """Gain, depth, scan conversion ...; default: as rendered."""
     outputs: tuple[str, ...] = ("bmode",)
-    """Some of bmode, echo, transmittance, coverage, attenuation, labels."""
+    """Some of bmode, echo, transmittance, coverage, attenuation, labels, uncertainty."""
 
 
 class Encoding(str, Enum):

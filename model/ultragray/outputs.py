@@ -17,6 +17,7 @@ from .errors import UnknownOutput
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from .probe import FloatArray, Probe
     from .scene import GaussianScene
     from .scene_info import SceneInfo
 
@@ -34,6 +35,12 @@ class Drawing(Protocol):
     @property
     def shape(self) -> tuple[int, int, int]:
         """C, H, W."""
+
+    @property
+    def probe(self) -> Probe: ...
+    @property
+    def poses_mm(self) -> FloatArray:
+        """[C, 4, 4] mm, in the frame of the sweep that the scene was trained from."""
 
     def plane(self, name: str) -> Tensor:  # [C, H, W]
         """One of the planes that the output names."""
@@ -90,6 +97,17 @@ def _attenuation(drawing: Drawing) -> Tensor:
     return (1.0 - transmittance / above.clamp(min=SPENT_BEAM)).clamp(0.0, 1.0) * (above >= SPENT_BEAM)
 
 
+def _uncertainty(drawing: Drawing) -> Tensor:
+    from .confidence.deviation import deviations  # needs torch
+
+    planes = tuple(drawing.plane(name) for name in UNCERTAINTY.planes)
+    return deviations(drawing.scene, planes, drawing.poses_mm, drawing.probe)
+
+
+def _lacks_uncertainty(info: SceneInfo) -> str | None:
+    return None if info.confidence.get("uncertainty") else "whose training fitted its uncertainty; this one has none"
+
+
 def _lacks_labels(info: SceneInfo) -> str | None:
     return None if info.label_names else "whose Gaussians carry labels; this one's carry none"
 
@@ -111,6 +129,14 @@ LABELS = _register(
     derive=_labels,
     dtype=_NUMBERS,
     lacks=_lacks_labels,
+)
+UNCERTAINTY = _register(
+    "uncertainty",
+    "standard deviation that the error of bmode is expected to have; of a scene whose training fitted it",
+    planes=("bmode", "coverage", "transmittance"),
+    derive=_uncertainty,
+    tells_support=True,
+    lacks=_lacks_uncertainty,
 )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
+import numpy as np
 from torch import Tensor
 
 from .backends import cpu, cuda, reference
@@ -14,7 +15,7 @@ from .errors import BackendUnavailable
 from .image_size import check_image_size
 from .limits import UNLIMITED, Limits
 from .outputs import OUTPUTS, PLANES, check_available, check_outputs
-from .probe import ElevationBeam, Probe
+from .probe import ElevationBeam, FloatArray, Probe
 from .scene import GaussianScene
 from .version import __version__
 
@@ -68,6 +69,17 @@ class Drawing:
         self.shape = (len(view[1]), view[2], view[3])
         self._draw, self._view, self._limits, self._beam = draw, view, limits, beam
         self._planes: dict[str, Tensor] = {}
+
+    @property
+    def probe(self) -> Probe:
+        return self._view[0]
+
+    @property
+    def poses_mm(self) -> FloatArray:
+        """[C, 4, 4] mm, in the frame of the sweep that the scene was trained from."""
+        poses = as_array(self._view[1]).copy()
+        poses[:, :3, 3] = 10.0 * poses[:, :3, 3] + np.asarray(self.scene.info.centre_mm)
+        return poses
 
     def draw(self, planes: Sequence[str]) -> None:
         """Draws planes of the whole scene at once."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -68,17 +68,32 @@ class Assessor:
         InvalidProbe where no probe is known.
         """
         checked = check_poses(poses)
-        shares = [None] * len(checked) if coverage is None else supported(coverage).mean(axis=(1, 2)).tolist()
-        if len(shares) != len(checked):
+        shares = [] if coverage is None else supported(coverage).mean(axis=(1, 2)).tolist()
+        if coverage is not None and len(shares) != len(checked):
             raise InvalidArgument(
                 f"coverage must have one image for each of {len(checked)} poses, got {len(shares)}", field="coverage"
             )
         if self._views is None:
-            return [Extrapolation(None, None, None, share) for share in shares]
+            unknown = [Extrapolation(None, None, None, None)] * len(checked)
+            return unknown if coverage is None else self.with_support(unknown, shares)
         measures = self._views.measure(checked, self._info.probe_or(probe))
         confidences = [None] * len(checked) if self._model is None else self._model.predict(measures).tolist()
-        figures = (measures.nearest_mm.tolist(), measures.angle_deg.tolist(), confidences, shares)
-        return [Extrapolation(*values) for values in zip(*figures, strict=True)]
+        away = (measures.nearest_mm.mean(axis=1).tolist(), measures.angle_deg.mean(axis=1).tolist())
+        found = [Extrapolation(*values, None) for values in zip(*away, confidences, strict=True)]
+        return found if coverage is None else self.with_support(found, shares)
+
+    def with_support(self, extrapolations: Sequence[Extrapolation], shares: Sequence[float]) -> list[Extrapolation]:
+        """Those of frames that have been rendered, with the share of each one's pixels that has support."""
+        return [
+            replace(
+                one,
+                supported_share=share,
+                confidence=None
+                if one.confidence is None or self._model is None
+                else self._model.limited(one.confidence, share),
+            )
+            for one, share in zip(extrapolations, shares, strict=True)
+        ]
 
 
 def supported(coverage: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:  # [C, H, W] -> [C, H, W]

@@ -1,10 +1,16 @@
-"""The model behind the figure `confidence`: a logistic curve over how a pose lies to the training views.
+"""The model behind the figure `confidence`: logistic curves over how points of a frame lie to the training views.
 
-    c = b + (1 − b)·σ(w₀ − w₁·log(1 + i/0.3 mm) − w₂·d/5 mm − w₃·φ/10° − w₄·h)
+    c = b + (1 − b)·mean over points of σ(w₀ − w₁·log(1 + i/0.3 mm) − w₂·d/5 mm − w₃·φ/10° − w₄·h)
 
 d, i and φ are the distance, the interpolation distance and the angle of `ViewMeasures`; h is how hard the place is: the
 `hardness` of the training views around the pose, by their weights. b is what a black frame reaches. w₁ … w₄ are not
-negative: a pose farther away never earns more confidence. Needs no torch.
+negative: a pose farther away never earns more confidence. Beyond the farthest point and the largest angle that the
+weights were fitted on, d and φ count twice: nothing there says that the curve goes on.
+
+Of a rendered frame more is known, the share s of its pixels that Gaussians support: c ≤ b + (1 − b)·g·s, the gain g
+being what frames with little support reached.
+
+Version 1, of older scenes, takes the curve of the means over the points, and knows neither limit. Needs no torch.
 """
 
 from __future__ import annotations
@@ -18,13 +24,16 @@ import numpy as np
 
 from ..errors import InvalidArgument
 from ..probe import FloatArray
+from .uncertainty import Uncertainty
 from .views import ViewMeasures
 
-VERSION = 1
+VERSION = 2
 NEAR_MM, DISTANCE_MM, ANGLE_DEG = 0.3, 5.0, 10.0  # units of the terms
 TERMS = 4  # beside the constant
-PRIOR_WEIGHTS = (3.4, 1.1, 1.4, 0.05, 0.6)  # of fourteen in-silico scenes; what the views cannot tell stays near it
-PRIOR_STRENGTH = 1.0  # squared error that a weight costs which is 1 away from its prior
+PRIOR_WEIGHTS = (3.6, 1.1, 1.5, 0.2, 0.6)  # about those of ten scenes; what the views cannot tell stays near it
+PRIOR_STRENGTH = 0.02  # squared error that a weight costs which is 1 away from its prior
+GAIN_QUANTILE = 0.9  # of the frames that the gain is fitted on keep to the limit by their support
+LEAST_SHARE = 0.02  # less support than that tells nothing of the gain
 FIT_STEPS = 100
 HARDNESS_DIGITS = 3
 
@@ -41,6 +50,10 @@ class ConfidenceModel:
     hardness: tuple[float, ...]  # [P]
     fitted_on: int  # held-out views
     error: float  # mean absolute error on those views
+    support_gain: float | None = None  # g; None: support sets no limit
+    fitted_to: tuple[float, ...] | None = None  # mm, degrees: the farthest point, the largest angle; None: any
+    uncertainty: Uncertainty | None = None  # of pixels; None: not known
+    version: int = VERSION
 
     def __post_init__(self) -> None:
         weights = _numbers("weights", self.weights)
@@ -56,22 +69,40 @@ class ConfidenceModel:
             )
         if type(self.fitted_on) is not int or self.fitted_on < 1:
             raise InvalidArgument(f"fitted_on must be a positive integer, got {self.fitted_on!r}", field="fitted_on")
+        if self.support_gain is not None and _numbers("support_gain", [self.support_gain])[0] <= 0.0:
+            raise InvalidArgument(f"support_gain must be positive, got {self.support_gain:g}", field="support_gain")
+        if self.fitted_to is not None:
+            fitted_to = _numbers("fitted_to", self.fitted_to)
+            if len(fitted_to) != 2 or min(fitted_to) < 0.0:
+                raise InvalidArgument(f"fitted_to must be 2 numbers, at least 0, got {fitted_to}", field="fitted_to")
+            object.__setattr__(self, "fitted_to", fitted_to)
         object.__setattr__(self, "weights", weights)
         object.__setattr__(self, "hardness", _numbers("hardness", self.hardness))
 
     def predict(self, measures: ViewMeasures) -> FloatArray:  # [C]
         """The MS-SSIM expected at each pose, in [0, 1]."""
-        terms = terms_of(measures, np.array(self.hardness))
+        if self.version == 1:
+            measures = measures.averaged()
+        terms = terms_of(measures, np.array(self.hardness), self.fitted_to)
         return predicted(np.array(self.weights), terms, self.black_ms_ssim)
+
+    def limited(self, confidence: float, supported_share: float) -> float:
+        """The confidence of a pose once it is known which share of its pixels has support."""
+        if self.support_gain is None:
+            return confidence
+        most = self.black_ms_ssim + (1.0 - self.black_ms_ssim) * min(1.0, self.support_gain * supported_share)
+        return min(confidence, most)
 
     def to_dict(self) -> dict[str, Any]:
         """A JSON object, as a scene's metadata holds it."""
-        return {
-            "version": VERSION,
+        document = {
             **asdict(self),
             "weights": list(self.weights),
             "hardness": [round(value, HARDNESS_DIGITS) for value in self.hardness],
+            "fitted_to": None if self.fitted_to is None else list(self.fitted_to),
+            "uncertainty": None if self.uncertainty is None else self.uncertainty.to_dict(),
         }
+        return {key: document[key] for key in _KEYS[self.version]}
 
     @classmethod
     def from_dict(cls, document: Mapping[str, Any]) -> ConfidenceModel:
@@ -79,37 +110,64 @@ class ConfidenceModel:
 
         Raises InvalidArgument for another version, a missing or a surplus key, and values that cannot be.
         """
-        expected = {"version", *cls.__dataclass_fields__}
-        if not isinstance(document, Mapping) or set(document) != expected:
-            found = sorted(document) if isinstance(document, Mapping) else document
+        version = document.get("version") if isinstance(document, Mapping) else None
+        if type(version) is not int or version not in _KEYS:
+            known = " or ".join(map(str, _KEYS))
             raise InvalidArgument(
-                f"confidence must be an object with the keys {sorted(expected)}, got {found!r}", field="confidence"
+                f"confidence must be an object of version {known}, got {version!r}", field="confidence"
             )
-        if document["version"] != VERSION:
+        if set(document) != set(_KEYS[version]):
             raise InvalidArgument(
-                f"confidence must be of version {VERSION}, got {document['version']!r}", field="confidence"
+                f"confidence of version {version} must have the keys {sorted(_KEYS[version])}, got {sorted(document)}",
+                field="confidence",
             )
-        return cls(**{key: value for key, value in document.items() if key != "version"})
+        uncertainty = document.get("uncertainty")
+        return cls(**{**document, "uncertainty": None if uncertainty is None else Uncertainty.from_dict(uncertainty)})
 
 
-def terms_of(measures: ViewMeasures, hardness: FloatArray) -> FloatArray:  # [P] -> [C, 1 + TERMS]
-    """The factors of the weights: 1 and the negative terms of the formula."""
+_KEYS_1 = ("version", "weights", "black_ms_ssim", "hardness", "fitted_on", "error")
+_KEYS = {1: _KEYS_1, 2: (*_KEYS_1, "support_gain", "fitted_to", "uncertainty")}
+
+
+def terms_of(
+    measures: ViewMeasures,
+    hardness: FloatArray,  # [P]
+    fitted_to: tuple[float, ...] | None = None,
+) -> FloatArray:  # [C, K, 1 + TERMS]
+    """The factors of the weights at each point: 1 and the negative terms of the formula."""
+    distance_mm, angle_deg = measures.distance_mm, measures.angle_deg
+    if fitted_to is not None:
+        distance_mm, angle_deg = (
+            values + np.maximum(values - most, 0.0)
+            for values, most in zip((distance_mm, angle_deg), fitted_to, strict=True)
+        )
     columns = (
-        np.full(len(measures.distance_mm), -1.0),
+        np.full_like(distance_mm, -1.0),
         np.log1p(measures.interpolation_mm / NEAR_MM),
-        measures.distance_mm / DISTANCE_MM,
-        measures.angle_deg / ANGLE_DEG,
-        measures.weights @ hardness,
+        distance_mm / DISTANCE_MM,
+        angle_deg / ANGLE_DEG,
+        np.broadcast_to((measures.weights @ hardness)[:, None], distance_mm.shape),
     )
-    return -np.stack(columns, axis=1)
+    return -np.stack(columns, axis=-1)
 
 
 def predicted(weights: FloatArray, terms: FloatArray, black_ms_ssim: float) -> FloatArray:  # [C]
     """The formula."""
-    return black_ms_ssim + (1.0 - black_ms_ssim) * _logistic(terms @ weights)
+    shares: FloatArray = _logistic(terms @ weights).mean(axis=1)
+    return black_ms_ssim + (1.0 - black_ms_ssim) * shares
 
 
-def fit_weights(terms: FloatArray, ms_ssim: FloatArray, black_ms_ssim: float) -> FloatArray:  # [C, 1 + TERMS], [C]
+def fit_support_gain(shares: FloatArray, ms_ssim: FloatArray, black_ms_ssim: float) -> float:  # [C], [C]
+    """The gain that holds for GAIN_QUANTILE of the frames, at least 1."""
+    reached = (ms_ssim - black_ms_ssim) / ((1.0 - black_ms_ssim) * np.maximum(shares, LEAST_SHARE))
+    return max(1.0, float(np.quantile(reached, GAIN_QUANTILE)))
+
+
+def fit_weights(
+    terms: FloatArray,  # [C, K, 1 + TERMS]
+    ms_ssim: FloatArray,  # [C]
+    black_ms_ssim: float,
+) -> FloatArray:  # [1 + TERMS]
     """The weights with the least squared error of the figure, and little away from PRIOR_WEIGHTS; only w₀ may be < 0.
 
     Levenberg-Marquardt steps; a weight that would turn negative is held at 0.
@@ -123,7 +181,7 @@ def fit_weights(terms: FloatArray, ms_ssim: FloatArray, black_ms_ssim: float) ->
 
     for _ in range(FIT_STEPS):
         share = _logistic(terms @ weights)
-        slope = ((1.0 - black_ms_ssim) * share * (1.0 - share))[:, None] * terms
+        slope = (1.0 - black_ms_ssim) * ((share * (1.0 - share))[..., None] * terms).mean(axis=1)
         misses = predicted(weights, terms, black_ms_ssim) - ms_ssim
         gradient = slope.T @ misses + PRIOR_STRENGTH * (weights - prior)
         free = (weights > 0.0) | (gradient < 0.0)

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from .assess import SUPPORT_COVERAGE, Extrapolation
+from .assess import SUPPORT_COVERAGE
 
 
 class SupportWatch:
@@ -30,10 +29,10 @@ class SupportWatch:
             return None
         return torch.tensor(masked, device=coverage.device)[:, None, None] & (coverage < SUPPORT_COVERAGE)
 
-    def with_shares(self, extrapolations: Sequence[Extrapolation], first: int = 0) -> tuple[Extrapolation, ...]:
-        """The extrapolations of the poses from `first` on, with their shares; waits for a GPU to have rendered them."""
-        shares = torch.cat(self._shares)[first : first + len(extrapolations)].tolist()
-        return tuple(replace(one, supported_share=share) for one, share in zip(extrapolations, shares, strict=True))
+    def shares(self, first: int, count: int) -> list[float]:
+        """The share of each of `count` frames that has support, from `first` on; waits for a GPU to have rendered."""
+        shares: list[float] = torch.cat(self._shares)[first : first + count].tolist()
+        return shares
 
 
 def _supported_shares(coverage: Tensor) -> Tensor:  # [C, H, W] -> [C]

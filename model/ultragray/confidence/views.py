@@ -19,18 +19,28 @@ NEIGHBOURHOOD_MM = 3.0  # views this near tell how hard a place is, and where al
 
 @dataclass(frozen=True, eq=False)
 class ViewMeasures:
-    """Of C poses, each a mean over the points of its image, and the weights of the P training views around it.
+    """Of K points of the images of C poses, row by row, and the weights of the P training views around each pose.
 
     distance: to the nearest training image. interpolation: a·b/(a + b) of the distances a, b to the nearest images on
-    either side: half of either midway between two, all of it where there is one side only. Both count as at most FAR_MM
-    at a point; `nearest_mm` is the distance without that limit. angle: the rotation to the view of the nearest image.
+    either side: half of either midway between two, all of it where there is one side only. Both count as at most
+    FAR_MM; `nearest_mm` is the distance without that limit. angle: the rotation to the view of the nearest image.
     """
 
-    nearest_mm: FloatArray  # [C]
-    distance_mm: FloatArray  # [C]
-    interpolation_mm: FloatArray  # [C]
-    angle_deg: FloatArray  # [C]
+    nearest_mm: FloatArray  # [C, K]
+    distance_mm: FloatArray  # [C, K]
+    interpolation_mm: FloatArray  # [C, K]
+    angle_deg: FloatArray  # [C, K]
     weights: FloatArray  # [C, P], each row sums to 1
+
+    def averaged(self) -> ViewMeasures:
+        """The same with the mean over the points as the only one."""
+        return ViewMeasures(
+            nearest_mm=self.nearest_mm.mean(axis=1, keepdims=True),
+            distance_mm=self.distance_mm.mean(axis=1, keepdims=True),
+            interpolation_mm=self.interpolation_mm.mean(axis=1, keepdims=True),
+            angle_deg=self.angle_deg.mean(axis=1, keepdims=True),
+            weights=self.weights,
+        )
 
 
 class TrainingViews:
@@ -41,16 +51,18 @@ class TrainingViews:
         self._axes = np.ascontiguousarray(poses[:, :3, :3].transpose(2, 1, 0))  # [axis, xyz, P]
         self._offsets = np.einsum("axp,px->ap", self._axes, poses[:, :3, 3])  # [axis, P]
         self._rotations = poses[:, :3, :3].reshape(len(poses), 9)
-        self._middles = poses[:, :3, :3] @ _image_points(probe).mean(axis=0) + poses[:, :3, 3]  # [P, 3] mm
+        self._middles = (
+            poses[:, :3, :3] @ _image_points(probe, POINTS_PER_SIDE).mean(axis=0) + poses[:, :3, 3]
+        )  # [P, 3] mm
 
     def __len__(self) -> int:
         return len(self._rotations)
 
-    def measure(self, poses: FloatArray, probe: Probe) -> ViewMeasures:
+    def measure(self, poses: FloatArray, probe: Probe, points_per_side: int = POINTS_PER_SIDE) -> ViewMeasures:
         """Measures poses [C, 4, 4] (mm) of a probe, which need not be the views' own. Raises InvalidPose."""
-        points = _image_points(probe)
+        points = _image_points(probe, points_per_side)
         count = len(poses)
-        measures = np.zeros((4, count))
+        measures = np.zeros((4, count, len(points)))
         weights = np.zeros((count, len(self)))
         for place, pose in enumerate(check_poses(poses) if count else poses):
             seen = points @ pose[:3, :3].T + pose[:3, 3]
@@ -61,7 +73,7 @@ class TrainingViews:
 
     def mean_distances_mm(self, poses: FloatArray, probe: Probe) -> FloatArray:  # [C, P]
         """Root of the mean square distance of the points of each image to each view."""
-        points = _image_points(probe)
+        points = _image_points(probe, POINTS_PER_SIDE)
         distances = np.zeros((len(poses), len(self)))
         for place, pose in enumerate(poses):
             elevation, beside = self._offsets_mm(points @ pose[:3, :3].T + pose[:3, 3], slice(None))
@@ -87,7 +99,7 @@ class TrainingViews:
 
     def _measure(
         self, points: FloatArray, pose: FloatArray, views: slice | npt.NDArray[np.intp]
-    ) -> tuple[FloatArray, FloatArray]:  # [4], [V]
+    ) -> tuple[FloatArray, FloatArray]:  # [4, K], [V]
         elevation, beside = self._offsets_mm(points, views)
         angles = self._angles_deg(pose)[views]
         distances = np.hypot(elevation, beside)  # [K, P]
@@ -98,12 +110,12 @@ class TrainingViews:
         sides = [np.where(side, distances, np.inf).min(axis=1) for side in (along >= 0.0, along <= 0.0)]
         front, back = (np.minimum(side, 1e3 * FAR_MM) for side in sides)
         between = front * back / np.maximum(front + back, 1e-9)
-        capped = [np.minimum(value, FAR_MM).mean() for value in (nearest_mm, between)]
+        capped = [np.minimum(value, FAR_MM) for value in (nearest_mm, between)]
         around = _root_mean_square(np.minimum(distances, 1e3 * FAR_MM))
         least = around.min()
         reach = max(NEIGHBOURHOOD_MM, 1.3 * least)
         weights = np.exp((least / reach) ** 2 - (around / reach) ** 2)
-        return np.array([nearest_mm.mean(), *capped, angles[nearest].mean()]), weights / weights.sum()
+        return np.stack([nearest_mm, *capped, angles[nearest]]), weights / weights.sum()
 
     def _angles_deg(self, pose: FloatArray) -> FloatArray:  # [P]
         """Angle of the rotation from the pose to each view."""
@@ -111,9 +123,9 @@ class TrainingViews:
         return np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
 
 
-def _image_points(probe: Probe) -> FloatArray:  # [K, 3] mm, probe frame
-    origins, directions = probe.scan_lines(POINTS_PER_SIDE)
-    points = origins + probe.depths_mm(POINTS_PER_SIDE)[:, None, None] * directions
+def _image_points(probe: Probe, per_side: int) -> FloatArray:  # [K, 3] mm, probe frame
+    origins, directions = probe.scan_lines(per_side)
+    points = origins + probe.depths_mm(per_side)[:, None, None] * directions
     return points.reshape(-1, 3)
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 
-from ..confidence import Extrapolation, is_confident
+from ..confidence import Assessor, Extrapolation, is_confident
 from ..confidence.support import SupportWatch
 from ..display.frames import show
 from ..evaluation.scoring import frames_at_once
@@ -38,8 +38,8 @@ def render_to_file(
     """Render frames into a file of a format (None: a folder of PNGs), which appears whole or not at all.
 
     `scene` lies where the backend renders; `poses` and `extrapolations` are those of `assessed_poses`. `before_portion`
-    is told how many frames are done, at last all of them; to stop, it raises. Returns the extrapolations with the share
-    of each frame that has support. Raises what `render` raises, InvalidArgument, ExtraMissing and OSError.
+    is told how many frames are done, at last all of them; to stop, it raises. Returns the extrapolations with what the
+    support of each frame tells. Raises what `render` raises, InvalidArgument, ExtraMissing and OSError.
     """
     if format is not None:
         dtype = check_format(format, settings.outputs, dtype)
@@ -56,6 +56,7 @@ def render_to_file(
     masked = [limit is not None and not is_confident(one, limit) for one in extrapolations]
     wanted = tuple(dict.fromkeys((*settings.outputs, "coverage")))
     portion = frames_at_once(settings.height, settings.width)
+    assessor = Assessor(scene.info, scene.training_poses)
     found: list[Extrapolation] = []
     with export_pngs(path, header) if format is None else export_to(path, format, header) as add, torch.no_grad():
         for first in range(0, len(poses), portion):
@@ -78,7 +79,8 @@ def render_to_file(
             blackened = watch.look(frames.coverage)
             asked = {name: getattr(frames, name) for name in settings.outputs}
             shown = show(asked, settings.probe, settings.display, blackened)
-            found.extend(watch.with_shares(extrapolations[places]))
+            shares = watch.shares(0, len(frames.coverage))
+            found.extend(assessor.with_support(extrapolations[places], shares))
             add({name: pixels.cpu().numpy() for name, pixels in shown.items()}, found[first:])
         if before_portion is not None:
             before_portion(len(poses))

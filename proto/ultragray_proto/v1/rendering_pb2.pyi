@@ -18,6 +18,7 @@ class Output(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     OUTPUT_COVERAGE: _ClassVar[Output]
     OUTPUT_LABELS: _ClassVar[Output]
     OUTPUT_ATTENUATION: _ClassVar[Output]
+    OUTPUT_UNCERTAINTY: _ClassVar[Output]
 
 class Encoding(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
@@ -45,6 +46,7 @@ OUTPUT_TRANSMITTANCE: Output
 OUTPUT_COVERAGE: Output
 OUTPUT_LABELS: Output
 OUTPUT_ATTENUATION: Output
+OUTPUT_UNCERTAINTY: Output
 ENCODING_UNSPECIFIED: Encoding
 ENCODING_UINT8: Encoding
 ENCODING_FLOAT32: Encoding

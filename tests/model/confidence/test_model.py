@@ -3,26 +3,34 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from ultragray.confidence import ConfidenceModel
-from ultragray.confidence.model import PRIOR_WEIGHTS, fit_weights, predicted
+from ultragray.confidence.model import PRIOR_WEIGHTS, fit_support_gain, fit_weights, predicted
 from ultragray.confidence.views import ViewMeasures
 from ultragray.errors import InvalidArgument
 
 MODEL = ConfidenceModel(
-    weights=(3.5, 1.2, 0.8, 0.1, 0.6), black_ms_ssim=0.06, hardness=(0.0, 1.0), fitted_on=20, error=0.04
+    weights=(3.5, 1.2, 0.8, 0.1, 0.6),
+    black_ms_ssim=0.06,
+    hardness=(0.0, 1.0),
+    fitted_on=20,
+    error=0.04,
+    support_gain=1.5,
+    fitted_to=(2.0, 5.0),
 )
+OLD = replace(MODEL, version=1, support_gain=None, fitted_to=None)
 
 
 def measures(
     distance_mm: float = 0.0, interpolation_mm: float = 0.0, angle_deg: float = 0.0, weight: float = 0.0
 ) -> ViewMeasures:
     """`weight`: of the harder of two views."""
-    values = (np.array([value]) for value in (distance_mm, distance_mm, interpolation_mm, angle_deg))
+    values = (np.array([[value]]) for value in (distance_mm, distance_mm, interpolation_mm, angle_deg))
     return ViewMeasures(*values, weights=np.array([[1.0 - weight, weight]]))
 
 
@@ -32,6 +40,40 @@ def test_the_formula() -> None:
     away = 3.5 - 1.2 * np.log(1.0 + 0.9 / 0.3) - 0.8 * 2.0 / 5.0 - 0.1 * 5.0 / 10.0 - 0.6 * 0.25
     expected = 0.06 + 0.94 / (1.0 + np.exp(-away))
     assert MODEL.predict(measures(2.0, 0.9, 5.0, 0.25)) == pytest.approx([expected])
+
+
+def test_each_point_has_its_own_curve_but_in_old_scenes_the_means_have_one() -> None:
+    half_known = ViewMeasures(
+        *(np.array([[0.0, far]]) for far in (20.0, 20.0, 20.0, 0.0)), weights=np.array([[1.0, 0.0]])
+    )
+    known, unknown = MODEL.predict(measures())[0], MODEL.predict(measures(20.0, 20.0))[0]
+    assert MODEL.predict(half_known) == pytest.approx([0.5 * (known + unknown)])
+    assert OLD.predict(half_known) == pytest.approx(OLD.predict(measures(10.0, 10.0)))
+
+
+@pytest.mark.parametrize(
+    ("beyond", "as_far"), [({"distance_mm": 3.0}, {"distance_mm": 4.0}), ({"angle_deg": 8.0}, {"angle_deg": 11.0})]
+)
+def test_beyond_what_it_was_fitted_on_distance_and_angle_count_twice(
+    beyond: dict[str, float], as_far: dict[str, float]
+) -> None:
+    endless = replace(MODEL, fitted_to=None)
+    assert MODEL.predict(measures(**beyond)) == pytest.approx(endless.predict(measures(**as_far)))
+    assert MODEL.predict(measures(2.0, 0.0, 5.0)) == pytest.approx(endless.predict(measures(2.0, 0.0, 5.0)))
+
+
+def test_little_support_limits_the_confidence() -> None:
+    assert MODEL.limited(0.8, 0.2) == pytest.approx(0.06 + 0.94 * 1.5 * 0.2)
+    assert MODEL.limited(0.2, 0.2) == 0.2
+    assert MODEL.limited(0.99, 0.7) == 0.99
+    assert OLD.limited(0.8, 0.0) == 0.8
+
+
+def test_the_gain_of_support_is_what_nine_of_ten_frames_keep_to() -> None:
+    shares = np.linspace(0.1, 0.5, 100)
+    gains = np.linspace(1.0, 2.0, 100)
+    assert fit_support_gain(shares, 0.1 + 0.9 * gains * shares, 0.1) == pytest.approx(1.9, abs=0.02)
+    assert fit_support_gain(np.ones(5), np.full(5, 0.6), 0.1) == 1.0
 
 
 @pytest.mark.parametrize("name", ["distance_mm", "interpolation_mm", "angle_deg", "weight"])
@@ -48,7 +90,7 @@ def test_far_away_it_is_what_a_black_frame_reaches() -> None:
 
 def test_views_decide_the_weights() -> None:
     rng = np.random.default_rng(0)
-    terms = np.column_stack([np.ones(4000), -rng.uniform(0.0, 2.0, (4000, 4))])
+    terms = np.concatenate([np.ones((400, 5, 1)), -rng.uniform(0.0, 2.0, (400, 5, 4))], axis=2)
     truth = np.array([2.5, 0.4, 2.0, 0.8, 0.0])
     fitted = fit_weights(terms, predicted(truth, terms, 0.1), 0.1)
     assert np.abs(predicted(fitted, terms, 0.1) - predicted(truth, terms, 0.1)).mean() < 0.02
@@ -57,29 +99,35 @@ def test_views_decide_the_weights() -> None:
 
 def test_no_weight_turns_negative_though_the_views_say_so() -> None:
     distances = np.linspace(0.0, 2.0, 500)
-    terms = np.column_stack([np.ones(500), -distances, *np.zeros((3, 500))])
+    terms = np.column_stack([np.ones(500), -distances, *np.zeros((3, 500))])[:, None]
     fitted = fit_weights(terms, 0.3 + 0.3 * distances, 0.05)
     assert fitted[1] == 0.0
     assert predicted(fitted, terms, 0.05).std() < 1e-12
 
 
 def test_what_the_views_cannot_tell_stays_as_it_was() -> None:
-    terms = np.column_stack([np.ones(30), -np.linspace(0, 2, 30), *np.zeros((3, 30))])
+    terms = np.column_stack([np.ones(30), -np.linspace(0, 2, 30), *np.zeros((3, 30))])[:, None]
     fitted = fit_weights(terms, predicted(np.array([3.0, 2.0, 0, 0, 0]), terms, 0.05), 0.05)
     assert fitted[2:] == pytest.approx(PRIOR_WEIGHTS[2:])
     assert fitted[1] > PRIOR_WEIGHTS[1]
 
 
 def test_json_and_back() -> None:
-    document = json.loads(json.dumps(MODEL.to_dict(), allow_nan=False))
-    assert document["version"] == 1
-    assert ConfidenceModel.from_dict(document) == MODEL
+    for model, version in ((MODEL, 2), (OLD, 1)):
+        document = json.loads(json.dumps(model.to_dict(), allow_nan=False))
+        assert document["version"] == version
+        assert ConfidenceModel.from_dict(document) == model
+    assert set(OLD.to_dict()) == {"version", "weights", "black_ms_ssim", "hardness", "fitted_on", "error"}
 
 
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"version": 2}, "version 1, got 2"),
+        ({"version": 3}, "version 1 or 2, got 3"),
+        ({"version": 1}, "version 1 must have the keys"),
+        ({"support_gain": 0.0}, "support_gain must be positive"),
+        ({"support_gain": "much"}, "support_gain must be numbers"),
+        ({"fitted_to": [1.0]}, "fitted_to must be 2 numbers"),
         ({"weights": [1.0, 2.0]}, "weights must be 5 numbers"),
         ({"weights": [1.0, -2.0, 0, 0, 0]}, "at least 0"),
         ({"weights": ["a"] * 5}, "weights must be numbers"),
@@ -89,7 +137,7 @@ def test_json_and_back() -> None:
         ({"black_ms_ssim": 1.5}, r"in \[0, 1\], got 1.5"),
         ({"error": "much"}, "must be numbers"),
         ({"fitted_on": 0}, "fitted_on must be a positive integer"),
-        ({"more": 1}, "with the keys"),
+        ({"more": 1}, "must have the keys"),
     ],
 )
 def test_damage_is_refused(change: dict[str, Any], said: str) -> None:

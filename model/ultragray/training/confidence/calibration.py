@@ -9,14 +9,17 @@ from typing import TypeAlias
 
 import numpy as np
 
-from ...confidence.model import ConfidenceModel, fit_weights, predicted, terms_of
+from ...confidence.assess import supported
+from ...confidence.model import ConfidenceModel, fit_support_gain, fit_weights, predicted, terms_of
 from ...confidence.views import TrainingViews
 from ...datasets.sweep import Dataset, Sweep, spread_places
-from ...evaluation.scoring import evaluate, evaluate_frames
+from ...evaluation.scoring import evaluate, evaluate_frames, render_sweep
+from ...probe import FloatArray
 from ...scene import GaussianScene
 from ..config import TrainingConfig
 from .hardness import hardness_of_views
 from .held_out import held_out_frames
+from .residuals import fit_uncertainty
 
 SHORTER, ENOUGH_STEPS = 0.5, 250  # of the steps, but not fewer where the run has them: they leave shadows unlearned
 LEAST_HELD_OUT = 3
@@ -53,14 +56,13 @@ def fit_confidence(dataset: Dataset, train_shorter: TrainShorter, *, backend: st
     scene = train_shorter(part)
     if scene is None:
         return None
-    seen = sweep.select(kept[spread_places(len(kept), MEASURED_FRAMES // 3)])
-    unseen = sweep.select(held_out[spread_places(len(held_out), MEASURED_FRAMES)])
-    ms_ssim = np.array(
-        [frame.ms_ssim for some in (unseen, seen) for frame in evaluate(scene, some, backend=backend).frames]
-    )
-    poses = np.concatenate([unseen.poses, seen.poses])
+    seen = kept[spread_places(len(kept), MEASURED_FRAMES // 3)]
+    unseen = held_out[spread_places(len(held_out), MEASURED_FRAMES)]
+    both = sweep.select(np.concatenate([unseen, seen]))
+    ms_ssim, shares = _measured(scene, both, backend)
     views = TrainingViews(part.train.poses, sweep.probe)
-    terms = terms_of(views.measure(poses, sweep.probe), hardness_of_views(part.train))
+    measures = views.measure(both.poses, sweep.probe)
+    terms = terms_of(measures, hardness_of_views(part.train))
     black = _black_ms_ssim(sweep)
     weights = fit_weights(terms, ms_ssim, black)
     misses = np.abs(predicted(weights, terms, black) - ms_ssim)[: len(unseen)]
@@ -70,7 +72,17 @@ def fit_confidence(dataset: Dataset, train_shorter: TrainShorter, *, backend: st
         hardness=tuple(hardness_of_views(sweep).tolist()),
         fitted_on=len(unseen),
         error=float(misses.mean()),
+        support_gain=fit_support_gain(shares, ms_ssim, black),
+        fitted_to=(float(measures.distance_mm.max()), float(measures.angle_deg.max())),
+        uncertainty=fit_uncertainty(scene, views, both, backend=backend),
     )
+
+
+def _measured(scene: GaussianScene, sweep: Sweep, backend: str) -> tuple[FloatArray, FloatArray]:  # [F], [F]
+    """MS-SSIM and the share of supported pixels of each frame."""
+    ms_ssim = [frame.ms_ssim for frame in evaluate(scene, sweep, backend=backend).frames]
+    coverage = render_sweep(scene, sweep, output="coverage", backend=backend)
+    return np.array(ms_ssim), supported(coverage).mean(axis=(1, 2))
 
 
 def _black_ms_ssim(sweep: Sweep) -> float:

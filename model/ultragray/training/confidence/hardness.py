@@ -48,7 +48,7 @@ def hardness_of_views(sweep: Sweep) -> FloatArray:  # [F]
             truth = torch.from_numpy(small.images[target : target + 1]).float().div_(255.0)
             measured.append(frame_metrics(torch.from_numpy(picture), truth)[0].ms_ssim)
             measures = TrainingViews(sweep.poses[helpers], sweep.probe).measure(pose, sweep.probe)
-            near, between = measures.distance_mm[0], measures.interpolation_mm[0]
+            near, between = measures.distance_mm[0].mean(), measures.interpolation_mm[0].mean()
             found.append((row, 1.0, np.log(between + NEAR_MM), near, np.log(near + NEAR_MM)))
     if not found:
         return np.zeros(len(sweep))

@@ -10,10 +10,11 @@ import pytest
 
 from ultragray import GaussianScene
 from ultragray.confidence import Assessor, ConfidenceModel
+from ultragray.confidence.uncertainty import TERMS
 from ultragray.datasets.phantom import PHANTOM_PROBE, freehand_poses, simulate
 from ultragray.datasets.sweep import Dataset, Sweep
 from ultragray.errors import TrainingDiverged
-from ultragray.evaluation.scoring import evaluate
+from ultragray.evaluation.scoring import evaluate, render_sweep
 from ultragray.probe import FloatArray
 from ultragray.training import TrainingConfig, train, trainer
 from ultragray.training.confidence.calibration import fit_confidence, shorter
@@ -102,7 +103,8 @@ def test_it_can_be_left_out(tiny_dataset: Datasets, tiny_config: Configs) -> Non
     without = train(dataset, tiny_config(confidence=False))
     assert without.info.confidence == {}
     having = train(dataset, tiny_config())
-    assert having.info.confidence["version"] == 1
+    assert having.info.confidence["version"] == 2
+    assert len(having.info.confidence["uncertainty"]["variances"]) == len(TERMS)
     assert having.means.equal(without.means)
 
 
@@ -140,3 +142,14 @@ def test_a_calibration_that_diverges_costs_no_scene(
     scene = train(tiny_dataset(frames=40), tiny_config())
     assert scene.info.confidence == {}
     assert "the scene gets no confidence: training diverged in step 3" in caplog.text
+
+
+@pytest.mark.long
+def test_it_tells_the_errors_of_pixels() -> None:
+    scene, (_, val) = trained(), phantom()
+    bmode, uncertainty = (render_sweep(scene, val, output=output) for output in ("bmode", "uncertainty"))
+    errors = np.abs(val.images / 255.0 - bmode)
+    assert 0.5 < np.sqrt((uncertainty**2).mean()) / np.sqrt((errors**2).mean()) < 2.0
+    sure, unsure = (errors[chosen].mean() for chosen in (uncertainty < 0.1, uncertainty > 0.2))
+    assert unsure > 2.0 * sure
+    assert 0.85 < (errors <= 2.0 * uncertainty).mean() < 0.995

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from ultragray import GaussianScene, Probe, render
 from ultragray.backends import cuda
-from ultragray.confidence import Extrapolation
+from ultragray.confidence import Assessor, Extrapolation
 from ultragray.confidence.support import SupportWatch
 from ultragray.display.frames import show
 from ultragray.display.pixels import ByteArray, to_uint8
@@ -209,7 +209,7 @@ class _Worker:
         begin = 0
         for part, memory in zip(task.parts, memories, strict=True):
             end = begin + len(part.poses)
-            assessed = partial(support.with_shares, extrapolations[begin:end], begin)
+            assessed = partial(_supported, loaded.assessor, extrapolations[begin:end], support, begin)
             if part.deadline is not None and time.monotonic() >= part.deadline:
                 yield DeadlineExceeded("the deadline passed before the frames were written")
             else:
@@ -274,6 +274,13 @@ def example_probes() -> tuple[Probe, ...]:
     """One probe for each bundle of scan lines that probes have."""
     examples: list[Probe] = [member(**member.example()) for member in Probe.members.values()]
     return tuple({type(probe.lines): probe for probe in examples}.values())
+
+
+def _supported(
+    assessor: Assessor, extrapolations: Sequence[Extrapolation], support: SupportWatch, first: int
+) -> tuple[Extrapolation, ...]:
+    """The extrapolations of the frames from `first` on, with what was seen of their support."""
+    return tuple(assessor.with_support(extrapolations, support.shares(first, len(extrapolations))))
 
 
 def _write_part(

@@ -1,0 +1,59 @@
+"""The model behind the output `uncertainty`: which variances add up to that of a pixel's error. Needs no torch.
+
+    σ² = Σ cₖ·vₖ,  cₖ ≥ 0
+
+The terms vₖ are those of `ultragray.confidence.deviation`. Away from the training views they tend to V = spread +
+(level − B̄)²: the squared error of a pixel that shows B̄ where any pixel of the training images at that depth could be.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from ..errors import InvalidArgument
+
+TERMS = ("floor", "level", "level²", "texture", "gap 0.3 mm", "gap 1 mm", "gap 3 mm", "beyond", "thin", "shadow")
+DEPTHS = 8  # bands of depth of the training images, each with its level and spread
+DIGITS = 6  # in a scene's metadata
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """Fitted cₖ, and mean and variance of the training images' grey values in bands of depth, in [0, 1].
+
+    Raises InvalidArgument for numbers that cannot be.
+    """
+
+    variances: tuple[float, ...]  # [TERMS]
+    level: tuple[float, ...]  # [DEPTHS]
+    spread: tuple[float, ...]  # [DEPTHS]
+
+    def __post_init__(self) -> None:
+        for name, count in (("variances", len(TERMS)), ("level", DEPTHS), ("spread", DEPTHS)):
+            values = getattr(self, name)
+            field = f"uncertainty.{name}"
+            try:
+                numbers = tuple(float(value) for value in values)
+            except (TypeError, ValueError, OverflowError):
+                raise InvalidArgument(f"{field} must be numbers, got {values!r}", field=field) from None
+            if len(numbers) != count or not all(math.isfinite(value) and value >= 0.0 for value in numbers):
+                raise InvalidArgument(f"{field} must be {count} numbers, at least 0, got {values!r}", field=field)
+            object.__setattr__(self, name, numbers)
+
+    def to_dict(self) -> dict[str, Any]:
+        """A JSON object, as a scene's metadata holds it."""
+        return {name: [round(value, DIGITS) for value in values] for name, values in asdict(self).items()}
+
+    @classmethod
+    def from_dict(cls, document: Any) -> Uncertainty:
+        """Inverse of `to_dict`, but for the digits. Raises InvalidArgument for keys or values that cannot be."""
+        expected = set(cls.__dataclass_fields__)
+        if not isinstance(document, Mapping) or set(document) != expected:
+            found = sorted(document) if isinstance(document, Mapping) else document
+            raise InvalidArgument(
+                f"uncertainty must be an object with the keys {sorted(expected)}, got {found!r}", field="uncertainty"
+            )
+        return cls(**document)
