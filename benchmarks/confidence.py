@@ -1,39 +1,67 @@
-"""The truth of a scene's confidence: in-silico sweeps that mix causes, predicted against actual MS-SSIM.
+"""The truth of confidence and uncertainty: what scenes tell of frames that they have not seen, against what comes out.
 
-    python benchmarks/confidence.py [--only NAME ...]
-    python benchmarks/confidence.py --recorded FOLDER
+    python benchmarks/confidence.py [--only NAME ...] [--data FOLDER] [--steps N]
 
-Each scene is trained from sweeps with gaps, at some tilts, that stop short of one end; it is then asked for frames of
-new sweeps: tilted by −10° … 10°, within the gaps, and off the end. Writes docs/images/confidence_reliability.png and
-prints the table of docs/confidence.md. With --recorded it trains from a data set and tells of its
-held-out frames.
+Each scene is trained from in-silico sweeps that leave something out, or with --data from sets of that folder; it is
+then asked for what was left out, cause by cause. Each scene's figures go into benchmarks/confidence.json as soon as
+they are known, with commit and machine; from the JSON the tables of docs/confidence.md are written, and
+docs/images/confidence_reliability.png and docs/images/uncertainty_reliability.png are drawn.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
+import subprocess
 import sys
 import time
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from ultragray import LinearProbe, Probe
 from ultragray.confidence import Assessor
 from ultragray.datasets.phantom import PHANTOM_PROBE, freehand_poses, simulate
 from ultragray.datasets.source import load_dataset
 from ultragray.datasets.sweep import Dataset, Sweep
-from ultragray.evaluation.scoring import evaluate
+from ultragray.evaluation.metrics import frame_metrics
+from ultragray.evaluation.reliability import compare_deviations
+from ultragray.evaluation.scoring import render_sweep
+from ultragray.machine import processor_name
 from ultragray.probe import FloatArray
 from ultragray.training import TrainingConfig, train
 
-PICTURE = Path(__file__).parents[1] / "docs" / "images" / "confidence_reliability.png"
-COLOURS = {"tilt": "#0b6e99", "gap": "#d97706", "end": "#6d8f3c"}
-TILTS_DEG = np.linspace(-10.0, 10.0, 9)
+FOLDER = Path(__file__).resolve().parent
+FIGURES = FOLDER / "confidence.json"
+DOCUMENT = FOLDER.parent / "docs" / "confidence.md"
+IMAGES = FOLDER.parent / "docs" / "images"
+SIDE = 128
 FIRST_MM = -36.0  # where the sweeps begin
+TELLING_STD = 0.05  # of actual values; where they vary less, ranks mean little
+COLOURS = {
+    "tilt": "#0b6e99",
+    "steep": "#7c3aed",
+    "gap": "#d97706",
+    "end": "#6d8f3c",
+    "band": "#c2410c",
+    "random": "#475569",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Asked:
+    """What a scene is trained from, and frames that it has not seen with the cause that each is asked for."""
+
+    training: Sweep
+    unseen: Sweep
+    causes: np.ndarray  # [F] of COLOURS
 
 
 @dataclass(frozen=True)
@@ -47,33 +75,38 @@ class Mixture:
     end_mm: float
     over_mm: float = 10.0  # how far beyond frames are asked for
     first_mm: float = FIRST_MM
-    side: int = 128
 
-    def poses(self) -> tuple[FloatArray, FloatArray, np.ndarray]:  # [F, 4, 4], [C, 4, 4], [C]
-        """Training poses, poses to ask for, and the cause that each of those is there for."""
+    def asked(self) -> Asked:
+        """Frames of new sweeps: tilts of −10° … 10° and ±18°, within the gaps, and off the end."""
         generator = np.random.default_rng(self.seed)
 
         def sweep(count: int, tilt_deg: float) -> FloatArray:
             offset_mm, unrest = generator.uniform(-2.0, 2.0), generator.uniform(0.0, 6.0)
             return freehand_poses(count, tilt_deg=tilt_deg, offset_mm=offset_mm, unrest=unrest)
 
+        def some(poses: FloatArray, chosen: np.ndarray, count: int) -> FloatArray:
+            return poses[generator.choice(np.flatnonzero(chosen), count, replace=False)]
+
         trained, asked, causes = [], [], []
         for tilt in self.tilts:
             poses = sweep(self.count, tilt)
             trained.append(poses[self._is_trained(poses)])
-        for tilt in TILTS_DEG:
+        for tilt in np.linspace(-10.0, 10.0, 9):
             poses = sweep(300, float(tilt))
-            asked.append(poses[generator.choice(np.flatnonzero(self._is_trained(poses)), 5, replace=False)])
+            asked.append(some(poses, self._is_trained(poses), 5))
             causes += ["tilt"] * 5
         for cause, sweeps in (("gap", 6), ("end", 5)):
             for _ in range(sweeps):
                 poses = sweep(600, float(generator.choice(self.tilts)))
                 along = poses[:, 1, 3]
                 beyond = (along > self.end_mm) & (along < self.end_mm + self.over_mm)
-                chosen = self._in_gap(along) if cause == "gap" else beyond
-                asked.append(poses[generator.choice(np.flatnonzero(chosen), 6, replace=False)])
+                asked.append(some(poses, self._in_gap(along) if cause == "gap" else beyond, 6))
                 causes += [cause] * 6
-        return np.concatenate(trained), np.concatenate(asked), np.array(causes)
+        for tilt in (-18.0, 18.0):
+            poses = sweep(300, tilt)
+            asked.append(some(poses, self._is_trained(poses), 10))
+            causes += ["steep"] * 10
+        return simulated(np.concatenate(trained), np.concatenate(asked), np.array(causes))
 
     def _is_trained(self, poses: FloatArray) -> np.ndarray:
         along = poses[:, 1, 3]
@@ -83,38 +116,126 @@ class Mixture:
         return np.any([(along > low) & (along < high) for low, high in self.gaps], axis=0)
 
 
-MIXTURES = {
-    "two tilts": Mixture(101, (-3.0, 3.0), 41, ((-22.0, -15.0), (2.0, 7.0)), 22.0, over_mm=12.0),
-    "one sweep": Mixture(102, (0.0,), 46, ((-26.0, -20.0), (-8.0, -4.0), (10.0, 15.0)), 27.0),
-    "three tilts": Mixture(103, (-6.0, 0.0, 6.0), 30, ((-10.0, -2.0), (6.0, 10.0)), 18.0, first_mm=-30.0),
-    "one side": Mixture(104, (0.0, 4.0), 36, ((-28.0, -24.0), (-16.0, -9.0), (4.0, 7.0)), 25.0, side=160),
-}
-
-
-def measure(mixture: Mixture) -> tuple[FloatArray, FloatArray, np.ndarray, int]:
-    """Predicted and actual MS-SSIM of the frames asked for, their causes, and the number of training frames."""
-    trained, asked, causes = mixture.poses()
+def simulated(trained: FloatArray, asked: FloatArray, causes: np.ndarray, probe: Probe = PHANTOM_PROBE) -> Asked:
+    """Frames of the phantom at both."""
     poses = np.concatenate([trained, asked])
-    images = simulate(poses, probe=PHANTOM_PROBE, height=mixture.side, width=mixture.side)
-    sweep = Sweep(images, poses, PHANTOM_PROBE, np.arange(len(poses)), "phantom")
-    training, unseen = sweep.select(np.arange(len(trained))), sweep.select(np.arange(len(trained), len(poses)))
-    scene = train(Dataset("phantom", training, unseen.select([])), TrainingConfig.preset("fast"))
-    actual = np.array([frame.ms_ssim for frame in evaluate(scene, unseen).frames])
-    told = Assessor(scene.info, scene.training_poses).assess(unseen.poses)
-    return np.array([frame.confidence for frame in told], dtype=np.float64), actual, causes, len(training)
+    images = simulate(poses, probe=probe, height=SIDE, width=SIDE)
+    sweep = Sweep(images, poses, probe, np.arange(len(poses)), "phantom")
+    count = len(trained)
+    return Asked(sweep.select(np.arange(count)), sweep.select(np.arange(count, len(poses))), causes)
 
 
-def tell_recorded(dataset: Dataset) -> str:
-    """The confidence of held-out frames against their MS-SSIM, in words."""
-    scene = train(dataset, TrainingConfig.preset("fast"))
-    actual = np.array([frame.ms_ssim for frame in evaluate(scene, dataset.val).frames])
-    told = Assessor(scene.info, scene.training_poses).assess(dataset.val.poses)
-    predicted = np.array([frame.confidence for frame in told], dtype=np.float64)
-    return (
-        f"{dataset.name}: {len(dataset.train)} training frames, {len(actual)} held out: "
-        f"confidence {predicted.mean():.3f}, actual {actual.mean():.3f}, "
-        f"mean absolute error {np.abs(predicted - actual).mean():.3f}"
-    )
+def fourth_tilt(trained: tuple[float, ...], asked: float) -> Asked:
+    """Three sweeps at three tilts, and a fourth at another."""
+    sweeps = [
+        freehand_poses(36, tilt_deg=tilt, offset_mm=0.7 * place, unrest=place) for place, tilt in enumerate(trained)
+    ]
+    others = freehand_poses(24, tilt_deg=asked, offset_mm=1.5, unrest=3.3)
+    return simulated(np.concatenate(sweeps), others, np.array(["steep"] * len(others)))
+
+
+def robot(middle_mm: float) -> Asked:
+    """120 parallel frames 0.35 mm apart, of which every fifth and a band of 3.5 mm are held out."""
+    numbers = np.arange(120)
+    poses = np.tile(np.eye(4), (120, 1, 1))
+    poses[:, 1, 3] = middle_mm + 0.35 * (numbers - 59.5)
+    band = (numbers >= 66) & (numbers < 76)
+    held_out = band | (numbers % 5 == 2)
+    causes = np.where(band, "band", "random")[held_out]
+    return simulated(poses[~held_out], poses[held_out], causes, LinearProbe(40.0, 0.0, 40.0))
+
+
+def recorded(folder: Path, name: str) -> Asked:
+    """A recorded set: its held-out frames, and where it has more than 40 training frames a band and an end of these."""
+    dataset = load_dataset(folder / name)
+    train, count = dataset.train, len(dataset.train)
+    if count <= 40:
+        return Asked(train, dataset.val, np.array(["random"] * len(dataset.val)))
+    numbers = np.arange(count)
+    gap = (numbers >= 0.4 * count) & (numbers < 0.5 * count)
+    end = numbers >= 0.9 * count
+    random = (numbers % 7 == 3) & ~gap & ~end
+    left_out = gap | end | random
+    causes = np.where(gap, "gap", np.where(end, "end", "random"))[left_out]
+    return Asked(train.select(numbers[~left_out]), train.select(numbers[left_out]), causes)
+
+
+IN_SILICO: dict[str, Callable[[], Asked]] = {
+    "two tilts": Mixture(101, (-3.0, 3.0), 41, ((-22.0, -15.0), (2.0, 7.0)), 22.0, over_mm=12.0).asked,
+    "one sweep": Mixture(102, (0.0,), 46, ((-26.0, -20.0), (-8.0, -4.0), (10.0, 15.0)), 27.0).asked,
+    "three tilts": Mixture(103, (-6.0, 0.0, 6.0), 30, ((-10.0, -2.0), (6.0, 10.0)), 18.0, first_mm=-30.0).asked,
+    "one side": Mixture(104, (0.0, 4.0), 36, ((-28.0, -24.0), (-16.0, -9.0), (4.0, 7.0)), 25.0).asked,
+    "fourth tilt +6°": partial(fourth_tilt, (-18.0, -6.0, 18.0), 6.0),
+    "fourth tilt +18°": partial(fourth_tilt, (-18.0, -6.0, 6.0), 18.0),
+    "robot": partial(robot, 0.0),
+    "robot, elsewhere": partial(robot, -22.0),
+}
+RECORDED = ("spine_phantom", "liver_convex")
+
+
+def measure(asked: Asked, config: TrainingConfig) -> dict[str, Any]:
+    """Trains a scene, renders what it has not seen and measures each frame and its pixels."""
+    started = time.monotonic()
+    unseen, causes = asked.unseen, asked.causes
+    scene = train(Dataset("asked", asked.training, unseen.select([])), config)
+    seconds = time.monotonic() - started
+    frames = {name: render_sweep(scene, unseen, output=name) for name in ("bmode", "coverage", "uncertainty")}
+    truth = (unseen.images / 255.0).astype(np.float32)
+    metrics = frame_metrics(torch.from_numpy(frames["bmode"]), torch.from_numpy(truth))
+    assessor = Assessor(scene.info, scene.training_poses)
+    told = assessor.assess(unseen.poses, coverage=frames["coverage"])
+    of_poses = assessor.assess(unseen.poses)
+    errors = truth - frames["bmode"]
+    figures: dict[str, Any] = {
+        "commit": _commit(),
+        "machine": f"{processor_name()}, {torch.get_num_threads()} threads",
+        "training_frames": len(asked.training),
+        "seconds": round(seconds, 1),
+        "causes": {},
+    }
+    for cause in dict.fromkeys(causes.tolist()):
+        chosen = causes == cause
+        figures["causes"][cause] = {
+            "actual": [round(frame.ms_ssim, 4) for frame, one in zip(metrics, chosen, strict=True) if one],
+            "told": _rounded([one.confidence for one, is_one in zip(told, chosen, strict=True) if is_one]),
+            "of_pose": _rounded([one.confidence for one, is_one in zip(of_poses, chosen, strict=True) if is_one]),
+            "supported_share": _rounded([o.supported_share for o, is_one in zip(told, chosen, strict=True) if is_one]),
+            "uncertainty": asdict(compare_deviations(errors[chosen], frames["uncertainty"][chosen])),
+        }
+    return figures
+
+
+def tables(figures: dict[str, Any]) -> str:
+    """The Markdown of what was measured."""
+    return "\n".join(_lines(figures))
+
+
+def _lines(figures: dict[str, Any]) -> Iterator[str]:
+    yield "| scene | frames | cause | actual | of the frame | of the pose alone |"
+    yield "|---|---|---|---|---|---|"
+    for name, cause, found in _cells(figures):
+        actual = np.array(found["actual"])
+        cells = [_agreement(np.array(found[key]), actual) for key in ("told", "of_pose")]
+        spread = f"{actual.mean():.2f} ± {actual.std():.2f}"
+        count = figures[name]["training_frames"]
+        yield f"| {name} | {count} | {cause} ({len(actual)}) | {spread} | {' | '.join(cells)} |"
+    yield ""
+    yield "| scene | cause | expected | actual | within 1σ | within 2σ |"
+    yield "|---|---|---|---|---|---|"
+    for name, cause, found in _cells(figures):
+        pixels = found["uncertainty"]
+        numbers = [f"{pixels[key]:.3f}" for key in ("expected", "actual")]
+        shares = [f"{pixels[key]:.0%}" for key in ("within_1", "within_2")]
+        yield f"| {name} | {cause} | {' | '.join(numbers + shares)} |"
+    yield ""
+    commits = sorted({one["commit"] for one in figures.values()})
+    machines = sorted({one["machine"] for one in figures.values()})
+    yield f"Measured at {', '.join(commits)} on {', '.join(machines)}."
+
+
+def _agreement(told: FloatArray, actual: FloatArray) -> str:
+    error = f"{np.abs(told - actual).mean():.3f}"
+    return f"{error} / {rank_correlation(told, actual):.2f}" if actual.std() > TELLING_STD else f"{error} / –"
 
 
 def rank_correlation(first: FloatArray, second: FloatArray) -> float:
@@ -123,41 +244,72 @@ def rank_correlation(first: FloatArray, second: FloatArray) -> float:
     return float(np.corrcoef(*ranks)[0, 1])
 
 
+def draw(figures: dict[str, Any]) -> None:
+    """The two pictures of docs/confidence.md."""
+    names = list(figures)
+    rows, columns = -(-len(names) // 3), min(3, len(names))
+    for key, picture in (("told", "confidence_reliability.png"), ("uncertainty", "uncertainty_reliability.png")):
+        figure = Figure(figsize=(3.6 * columns, 3.4 * rows), layout="constrained")
+        axes = figure.subplots(rows, columns, squeeze=False).ravel()
+        for axis, name in zip(axes, names, strict=False):
+            most = 1.0 if key == "told" else 0.45
+            axis.plot([0, most], [0, most], color="#9aa5b1", linewidth=1.0)
+            for cause, found in figures[name]["causes"].items():
+                if key == "told":
+                    axis.plot(found["told"], found["actual"], ".", color=COLOURS[cause], label=cause, alpha=0.7)
+                else:
+                    bins = found["uncertainty"]["bins"]
+                    expected, actual = ([one[side] for one in bins] for side in ("expected", "actual"))
+                    axis.plot(expected, actual, ".-", color=COLOURS[cause], label=cause)
+            axis.set(xlim=(0, most), ylim=(0, most), title=name, aspect="equal")
+            axis.set(xlabel="confidence" if key == "told" else "expected deviation")
+            axis.set(ylabel="actual MS-SSIM" if key == "told" else "actual deviation")
+            axis.spines[["top", "right"]].set_visible(False)
+            axis.legend(frameon=False, fontsize="small")
+        for axis in axes[len(names) :]:
+            axis.set_visible(False)
+        FigureCanvasAgg(figure)
+        figure.savefig(IMAGES / picture, dpi=70)
+
+
+def _cells(figures: dict[str, Any]) -> Iterator[tuple[str, str, dict[str, Any]]]:
+    for name, one in figures.items():
+        for cause, found in one["causes"].items():
+            yield name, cause, found
+
+
+def _rounded(values: list[float | None]) -> list[float]:
+    return [round(float(value), 4) for value in values if value is not None]
+
+
+def _commit() -> str:
+    command = ["git", "-C", str(FOLDER), "describe", "--always", "--dirty"]
+    return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
+
+
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--only", nargs="*", choices=list(MIXTURES), default=list(MIXTURES))
-    parser.add_argument("--recorded", metavar="FOLDER", help="of a data set, instead of the in-silico scenes")
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--only", nargs="*", choices=[*IN_SILICO, *RECORDED], help="leave out the others")
+    parser.add_argument("--data", type=Path, metavar="FOLDER", help="of the recorded sets; without, they are left out")
+    parser.add_argument("--steps", type=int, help="of each training, instead of what the frames ask for")
     given = parser.parse_args()
     torch.set_num_threads(1)
-    if given.recorded is not None:
-        sys.stdout.write(tell_recorded(load_dataset(given.recorded)) + "\n")
-        return
-    names = given.only
-    figure = Figure(figsize=(4.2 * min(2, len(names)), 4.0 * -(-len(names) // 2)), layout="constrained")
-    axes = figure.subplots(-(-len(names) // 2), min(2, len(names)), squeeze=False).ravel()
-    out = sys.stdout
-    out.write("| scene | frames | all | tilt | gap | end |\n|---|---|---|---|---|---|\n")
-    for axis, name in zip(axes, names, strict=False):
-        started = time.monotonic()
-        predicted, actual, causes, count = measure(MIXTURES[name])
-        cells = []
-        for chosen in (np.ones(len(causes), bool), *(causes == cause for cause in COLOURS)):
-            error = np.abs(predicted - actual)[chosen].mean()
-            cells.append(
-                f"{error:.3f} / {rank_correlation(predicted[chosen], actual[chosen]):.2f} ({actual[chosen].std():.2f})"
-            )
-        out.write(f"| {name} | {count} | {' | '.join(cells)} |\n")
-        sys.stderr.write(f"{name}: {time.monotonic() - started:.0f} s\n")
-        axis.plot([0, 1], [0, 1], color="#9aa5b1", linewidth=1.0)
-        for cause, colour in COLOURS.items():
-            axis.plot(predicted[causes == cause], actual[causes == cause], ".", color=colour, label=cause, alpha=0.7)
-        axis.set(xlabel="confidence", ylabel="actual MS-SSIM", xlim=(0, 1), ylim=(0, 1), title=name, aspect="equal")
-        axis.spines[["top", "right"]].set_visible(False)
-    axes[0].legend(frameon=False)
-    for axis in axes[len(names) :]:
-        axis.set_visible(False)
-    FigureCanvasAgg(figure)
-    figure.savefig(PICTURE, dpi=80)
+    config = TrainingConfig.preset("fast", **({} if given.steps is None else {"steps": given.steps}))
+    runs = dict(IN_SILICO)
+    if given.data is not None:
+        runs |= {name: partial(recorded, given.data, name) for name in RECORDED}
+    known = json.loads(FIGURES.read_text()) if FIGURES.exists() else {}
+    for name, ask in runs.items():
+        if given.only is None or name in given.only:
+            known[name] = measure(ask(), config)
+            sys.stderr.write(f"{name}: {known[name]['seconds']:.0f} s\n")
+            FIGURES.write_text(json.dumps(known, indent=1) + "\n")
+    figures = {name: known[name] for name in (*IN_SILICO, *RECORDED) if name in known}
+    draw(figures)
+    begin, end = "<!-- measured: benchmarks/confidence.py -->\n", "<!-- end -->"
+    before, _, rest = DOCUMENT.read_text(encoding="utf-8").partition(begin)
+    after = rest.partition(end)[2]
+    DOCUMENT.write_text(f"{before}{begin}{tables(figures)}\n{end}{after}", encoding="utf-8")
 
 
 if __name__ == "__main__":

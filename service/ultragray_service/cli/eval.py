@@ -17,6 +17,7 @@ from .options import with_options
 from .output import check_picture_folder
 
 if TYPE_CHECKING:
+    from ultragray.evaluation.reliability import Reliability
     from ultragray.evaluation.scoring import Evaluation
 
 
@@ -53,7 +54,8 @@ def evaluate(
         typer.Option(
             "--output",
             "-o",
-            help="New folder for one picture a frame: truth, rendering, difference, echo, transmittance.",
+            help="New folder for one picture a frame: truth, rendering, difference, echo, transmittance; and one plot "
+            "of the uncertainty.",
             show_default="no pictures",
         ),
     ] = None,
@@ -63,7 +65,8 @@ def evaluate(
     *,
     source: SourceOptions,
 ) -> None:
-    """Measure a scene on the held-out frames of a dataset: PSNR, MS-SSIM, GMS, GMSD, and the statistics of speckle."""
+    """Measure a scene on the held-out frames of a dataset: PSNR, MS-SSIM, GMS, GMSD, speckle, uncertainty."""
+    from ultragray.evaluation.reliability import measure_reliability, plot_reliability
     from ultragray.evaluation.scoring import evaluate as evaluate_scene
     from ultragray.evaluation.scoring import require_frames
     from ultragray.scene import GaussianScene
@@ -77,15 +80,22 @@ def evaluate(
     require_frames(sweep)
     check_scene_fits(loaded.info, read)
     evaluation = evaluate_scene(loaded, sweep, backend=backend)
+    reliability = measure_reliability(loaded, sweep, backend=backend)
     if json:
-        _print_json({"scene": str(scene), "dataset": read.name, "split": split.value, **evaluation.to_dict()})
+        figures = evaluation.to_dict() | {"uncertainty": None if reliability is None else reliability.to_dict()}
+        _print_json({"scene": str(scene), "dataset": read.name, "split": split.value, **figures})
     else:
         print_metrics(f"{read.name}, {len(sweep)} {split.value} frames", {scene.stem: evaluation})
         print_speckle({scene.stem: evaluation})
+        if reliability is not None:
+            typer.echo(_in_words(reliability))
     if output is not None:
         from ultragray.evaluation.side_by_side import write_side_by_side
 
         paths = write_side_by_side(loaded, sweep, evaluation.frames, output, backend=backend)
+        if reliability is not None:
+            paths.append(output / "uncertainty.png")
+            plot_reliability({scene.stem: reliability}, paths[-1])
         typer.echo(f"wrote {len(paths)} pictures into {output}", err=json)
 
 
@@ -158,6 +168,13 @@ def print_speckle(evaluations: Mapping[str, Evaluation]) -> None:
         figures = ("–",) * 3 if speckle is None else [f"{value:.3f}" for value in astuple(speckle)]
         table.add_row(name, *figures, distance)
     Console().print(table)
+
+
+def _in_words(reliability: Reliability) -> str:
+    return (
+        f"uncertainty: pixels are off by {reliability.expected:.3f} as expected, {reliability.actual:.3f} in truth; "
+        f"{reliability.within_1:.0%} of the errors are within 1, {reliability.within_2:.0%} within 2 deviations"
+    )
 
 
 def _print_json(document: Mapping[str, Any]) -> None:

@@ -17,6 +17,7 @@ from ultragray.datasets import Dataset, Sweep
 from ultragray.datasets.released import read_released, write_released
 from ultragray.errors import MemoryExceeded, TrainingDiverged
 from ultragray.evaluation.baselines import evaluate_baselines
+from ultragray.evaluation.reliability import measure_reliability
 from ultragray.evaluation.scoring import evaluate
 from ultragray.report import study
 from ultragray.training import TrainingConfig, train
@@ -53,8 +54,11 @@ def printed_json(*arguments: object) -> Any:
 
 def test_eval_prints_what_the_library_measures(dataset: Path, scene: Path) -> None:
     expected = evaluate(GaussianScene.load(scene), read_released(dataset).val)
+    reliability = measure_reliability(GaussianScene.load(scene), read_released(dataset).val)
+    assert reliability is not None
     document = printed_json("eval", scene, dataset, "--json")
-    assert document == {"scene": str(scene), "dataset": "ball", "split": "val", **expected.to_dict()}
+    figures = {**expected.to_dict(), "uncertainty": json.loads(json.dumps(reliability.to_dict()))}
+    assert document == {"scene": str(scene), "dataset": "ball", "split": "val", **figures}
     result = run("eval", scene, dataset)
     assert result.exit_code == 0
     mean, std = expected.mean, expected.std
@@ -63,6 +67,7 @@ def test_eval_prints_what_the_library_measures(dataset: Path, scene: Path) -> No
     assert "1 of its 5 scales" in result.stdout
     assert f"{expected.speckle.histogram_distance:.4f}" in result.stdout
     assert "true frames" in result.stdout
+    assert f"{reliability.within_2:.0%} within 2 deviations" in " ".join(result.stdout.split())
 
 
 def test_eval_of_the_training_frames_and_of_others(dataset: Path, scene: Path) -> None:
@@ -77,6 +82,7 @@ def test_eval_writes_pictures(dataset: Path, scene: Path, tmp_path: Path) -> Non
     assert result.exit_code == 0
     assert len(json.loads(result.stdout)["frames"]) == 2
     assert len(list((tmp_path / "pictures").glob("frame_*.png"))) == 2
+    assert (tmp_path / "pictures" / "uncertainty.png").exists()
 
 
 def test_compound_prints_what_the_library_measures(dataset: Path) -> None:

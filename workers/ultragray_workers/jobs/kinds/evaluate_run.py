@@ -12,6 +12,7 @@ from ultragray.datasets.sweep import Sweep
 from ultragray.evaluation.baselines import evaluate_baselines
 from ultragray.evaluation.compounding import affordable_voxel_mm
 from ultragray.evaluation.metrics import FrameMetrics
+from ultragray.evaluation.reliability import measure_reliability
 from ultragray.evaluation.scoring import Evaluation, check_same_origin, evaluate, frames_at_once, require_frames
 from ultragray.evaluation.side_by_side import write_spread
 from ultragray.evaluation.speckle import FrameSpeckle
@@ -45,6 +46,7 @@ def run(job_run: JobRun, job: EvaluateJob) -> Outcome:
         sys.stderr.write(f"warning: {warning}\n")
     sys.stderr.write(f"scoring {job.scene} on {len(dataset.val):,} frames of {job.dataset} on {device}\n")
     evaluation = _scored(job_run, scene, dataset.val)
+    reliability = measure_reliability(scene, dataset.val)
     voxel_mm = affordable_voxel_mm(dataset.train)
     baselines = evaluate_baselines(dataset, voxel_mm=voxel_mm) if job.baselines else {}
     document = {
@@ -54,10 +56,12 @@ def run(job_run: JobRun, job: EvaluateJob) -> Outcome:
         "dataset_sha256": dataset.sha256,
         "warnings": warnings,
         **evaluation.to_dict(),
+        "uncertainty": None if reliability is None else reliability.to_dict(),
         "baselines": {method: found.to_dict() for method, found in baselines.items()},
         "voxel_mm": voxel_mm if baselines else None,
     }
     metrics = evaluation.mean.to_dict() | evaluation.speckle.figures()
+    metrics |= {} if reliability is None else reliability.figures()
     for method, found in baselines.items():
         metrics |= {f"{method}_{name}": value for name, value in found.mean.to_dict().items()}
     with job_run.folder.new_artifacts() as folder:
