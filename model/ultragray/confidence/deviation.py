@@ -1,7 +1,8 @@
-"""The standard deviation that a pixel's error is expected to have, from what is rendered there and how far views are.
+"""The standard deviation that a pixel's error is expected to have, from what is rendered around and how far views are.
 
-B̄ is B averaged over BLUR of the image's sides, i and d are `interpolation_mm` and `distance_mm` of `ViewMeasures`, on
-a grid of POINTS_PER_SIDE² points, and reach(x, r) = 1 − exp(−x/r). The terms vₖ:
+All is computed in CELLS² cells of the image, over which B̄, γ and T are means, and then interpolated. i and d are
+`interpolation_mm` and `distance_mm` of `ViewMeasures`, on a grid of POINTS_PER_SIDE² points, interpolated too, and
+reach(x, r) = 1 − exp(−x/r). The terms vₖ:
 
     floor      0.001                 level      B̄/10           level²   B̄²       texture   mean of B² less B̄²
     gap r      reach(i, r)·V         beyond     reach(d, 5 mm)·V
@@ -10,9 +11,8 @@ a grid of POINTS_PER_SIDE² points, and reach(x, r) = 1 − exp(−x/r). The ter
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional
@@ -20,10 +20,10 @@ from torch.nn import functional
 from ..probe import FloatArray, Probe
 from ..scene import GaussianScene
 from .assess import read_model
-from .uncertainty import DEPTHS, Uncertainty
+from .uncertainty import Uncertainty
 from .views import TrainingViews
 
-BLUR = 0.05  # of the height and of the width
+CELLS = 32  # a side; no more than pixels
 POINTS_PER_SIDE = 12
 GAPS_MM = (0.3, 1.0, 3.0)
 BEYOND_MM = 5.0
@@ -41,10 +41,9 @@ def deviations(
     assert model.uncertainty is not None
     views = TrainingViews(scene.training_poses, scene.info.probe_or(None))
     terms = variance_terms(planes, view_distances(views, poses, probe), model.uncertainty)
-    variance = torch.zeros_like(planes[0])
-    for weight, term in zip(model.uncertainty.variances, terms, strict=True):
-        variance = variance + weight * term
-    return variance.clamp(0.0, 1.0).sqrt()
+    weighted = [weight * term for weight, term in zip(model.uncertainty.variances, terms, strict=True)]
+    deviation = torch.stack(weighted).sum(dim=0).clamp(0.0, 1.0).sqrt()
+    return _interpolated(deviation, planes[0].shape[1:])
 
 
 def view_distances(
@@ -60,23 +59,22 @@ def variance_terms(
     planes: tuple[Tensor, ...],  # bmode, coverage, transmittance, each [C, H, W]
     distances_mm: tuple[FloatArray, FloatArray],  # of `view_distances`
     images: Uncertainty,
-) -> Iterator[Tensor]:  # each [C, H, W]
-    """The vₖ, in the order of `uncertainty.TERMS`; of `images`, level and spread are looked at."""
-    bmode, coverage, transmittance = planes
-    height, width = bmode.shape[1:]
+) -> Iterator[Tensor]:  # each [C, h, w]
+    """The vₖ in each cell, in the order of `uncertainty.TERMS`; of `images`, level and spread are looked at."""
+    mean, coverage, transmittance = map(in_cells, planes)
+    cells = mean.shape[1:]
     interpolation, distance = (
-        functional.interpolate(
-            torch.as_tensor(values, dtype=bmode.dtype, device=bmode.device)[:, None], (height, width), mode="bilinear"
-        )[:, 0]
-        for values in distances_mm
+        _interpolated(torch.as_tensor(values, dtype=mean.dtype, device=mean.device), cells) for values in distances_mm
     )
-    level, spread = (_by_row(values, height, bmode) for values in (images.level, images.spread))
-    mean = _blurred(bmode)
+    level, spread = (
+        _interpolated(torch.tensor(values, dtype=mean.dtype, device=mean.device)[None, :, None], (cells[0], 1))
+        for values in (images.level, images.spread)
+    )
     unknown = spread + (level - mean).square()
-    yield torch.full_like(bmode, 1e-3)
+    yield torch.full_like(mean, 1e-3)
     yield 0.1 * mean
     yield mean.square()
-    yield (_blurred(bmode.square()) - mean.square()).clamp_min(0.0)
+    yield (in_cells(planes[0].square()) - mean.square()).clamp_min(0.0)
     for reach in GAPS_MM:
         yield -torch.expm1(-interpolation / reach) * unknown
     yield -torch.expm1(-distance / BEYOND_MM) * unknown
@@ -84,15 +82,11 @@ def variance_terms(
     yield 0.1 * (1.0 - transmittance) * mean
 
 
-def _by_row(bands: tuple[float, ...], height: int, like: Tensor) -> Tensor:  # [DEPTHS] -> [H, 1]
-    rows = np.interp((np.arange(height) + 0.5) / height * DEPTHS - 0.5, np.arange(DEPTHS), bands)
-    return torch.as_tensor(rows, dtype=like.dtype, device=like.device)[:, None]
+def in_cells(frames: Tensor) -> Tensor:  # [C, H, W] -> [C, h, w]
+    """Means over the cells."""
+    height, width = frames.shape[1:]
+    return functional.adaptive_avg_pool2d(frames, (min(CELLS, height), min(CELLS, width)))
 
 
-def _blurred(frames: Tensor) -> Tensor:  # [C, H, W] -> [C, H, W]
-    """Means over a window of BLUR of the sides; at the edges over what of it lies in the image."""
-    rows, columns = (2 * round(0.5 * BLUR * side) + 1 for side in frames.shape[1:])
-    for window in ((rows, 1), (1, columns)):
-        padding = (window[0] // 2, window[1] // 2)
-        frames = functional.avg_pool2d(frames[:, None], window, 1, padding, count_include_pad=False)[:, 0]
-    return frames
+def _interpolated(maps: Tensor, size: Sequence[int]) -> Tensor:  # [C, h, w] -> [C, *size]
+    return functional.interpolate(maps[:, None], tuple(size), mode="bilinear", align_corners=False)[:, 0]

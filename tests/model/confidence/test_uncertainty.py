@@ -13,7 +13,7 @@ import torch
 
 from ultragray import GaussianScene, LinearProbe, SceneInfo, render
 from ultragray.confidence import ConfidenceModel
-from ultragray.confidence.deviation import variance_terms
+from ultragray.confidence.deviation import CELLS, variance_terms
 from ultragray.confidence.uncertainty import DEPTHS, TERMS, Uncertainty
 from ultragray.errors import InvalidArgument, UnknownOutput
 from ultragray.probe import FloatArray
@@ -85,6 +85,8 @@ def test_terms_are_as_many_as_named_and_never_negative() -> None:
     terms = list(variance_terms(planes, distances, MODEL))
     assert len(terms) == len(TERMS)
     assert all(term.shape == (2, 24, 20) and bool((term >= 0.0).all()) for term in terms)
+    large = tuple(torch.rand(1, 100, 300) for _ in range(3))
+    assert {term.shape for term in variance_terms(large, (np.ones((1, 12, 12)),) * 2, MODEL)} == {(1, CELLS, CELLS)}
 
 
 def test_json_and_back() -> None:

@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 import torch
 
-from ...confidence.deviation import POINTS_PER_SIDE, variance_terms, view_distances
+from ...confidence.deviation import CELLS, POINTS_PER_SIDE, in_cells, variance_terms, view_distances
 from ...confidence.uncertainty import DEPTHS, TERMS, Uncertainty
 from ...confidence.views import FAR_MM, TrainingViews
 from ...datasets.sweep import ByteArray, Sweep
@@ -16,7 +16,7 @@ from ...probe import FloatArray
 from ...rendering import render
 from ...scene import GaussianScene
 
-PIXELS = 40_000  # looked at, over all frames
+LOOKED_AT = 40_000  # cells, over all frames
 FAR_SHARE = 0.05  # of as many again, where nothing is known and no frame can tell
 ITERATIONS = 300
 
@@ -29,7 +29,7 @@ def fit_uncertainty(scene: GaussianScene, views: TrainingViews, sweep: Sweep, *,
     """
     level, spread = _bands(sweep.images)
     images = Uncertainty((0.0,) * len(TERMS), level, spread)
-    stride = max(1, sweep.images.size // PIXELS)
+    stride = max(1, len(sweep) * CELLS**2 // LOOKED_AT)
     terms, squares = [], []
     portion = frames_at_once(sweep.height, sweep.width)
     with torch.no_grad():
@@ -41,7 +41,7 @@ def fit_uncertainty(scene: GaussianScene, views: TrainingViews, sweep: Sweep, *,
             columns = [term.flatten()[::stride] for term in variance_terms(planes, distances, images)]
             terms.append(torch.stack(columns, dim=1).double().numpy())
             errors = torch.from_numpy(some.images).float().div_(255.0) - planes[0]
-            squares.append(errors.flatten()[::stride].square().double().numpy())
+            squares.append(in_cells(errors.square()).flatten()[::stride].double().numpy())
     far_terms, far_squares = _far_away(images)
     weight = FAR_SHARE * sum(map(len, squares)) / len(far_squares)
     variances = likeliest_variances(
