@@ -283,8 +283,12 @@ def _rounded(values: list[float | None]) -> list[float]:
 
 
 def _commit() -> str:
-    command = ["git", "-C", str(FOLDER), "describe", "--always", "--dirty"]
-    return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
+    """The last commit that changed the model, and whether it is changed since."""
+    commit, changed = (
+        subprocess.run(["git", "-C", str(FOLDER), *words, "--", "../model"], check=True, capture_output=True, text=True)
+        for words in (("log", "-1", "--format=%h"), ("status", "--porcelain"))
+    )
+    return commit.stdout.strip() + ("-dirty" if changed.stdout else "")
 
 
 def main() -> None:

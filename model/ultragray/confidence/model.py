@@ -4,8 +4,8 @@
 
 d, i and φ are the distance, the interpolation distance and the angle of `ViewMeasures`; h is how hard the place is: the
 `hardness` of the training views around the pose, by their weights. b is what a black frame reaches. w₁ … w₄ are not
-negative: a pose farther away never earns more confidence. Beyond the farthest point and the largest angle that the
-weights were fitted on, d and φ count twice: nothing there says that the curve goes on.
+negative: a pose farther away never earns more confidence. What d is beyond the farthest point that the weights were
+fitted on counts twice: nothing there says that the curve goes on.
 
 Of a rendered frame more is known, the share s of its pixels that Gaussians support: c ≤ b + (1 − b)·g·s, the gain g
 being what frames with little support reached.
@@ -30,7 +30,7 @@ from .views import ViewMeasures
 VERSION = 2
 NEAR_MM, DISTANCE_MM, ANGLE_DEG = 0.3, 5.0, 10.0  # units of the terms
 TERMS = 4  # beside the constant
-PRIOR_WEIGHTS = (3.6, 1.1, 1.5, 0.2, 0.6)  # about those of ten scenes; what the views cannot tell stays near it
+PRIOR_WEIGHTS = (3.6, 1.1, 1.5, 0.3, 0.6)  # about those of ten scenes; what the views cannot tell stays near it
 PRIOR_STRENGTH = 0.02  # squared error that a weight costs which is 1 away from its prior
 GAIN_QUANTILE = 0.9  # of the frames that the gain is fitted on keep to the limit by their support
 LEAST_SHARE = 0.02  # less support than that tells nothing of the gain
@@ -51,7 +51,7 @@ class ConfidenceModel:
     fitted_on: int  # held-out views
     error: float  # mean absolute error on those views
     support_gain: float | None = None  # g; None: support sets no limit
-    fitted_to: tuple[float, ...] | None = None  # mm, degrees: the farthest point, the largest angle; None: any
+    fitted_to_mm: float | None = None  # the farthest point of those views; None: any
     uncertainty: Uncertainty | None = None  # of pixels; None: not known
     version: int = VERSION
 
@@ -71,11 +71,8 @@ class ConfidenceModel:
             raise InvalidArgument(f"fitted_on must be a positive integer, got {self.fitted_on!r}", field="fitted_on")
         if self.support_gain is not None and _numbers("support_gain", [self.support_gain])[0] <= 0.0:
             raise InvalidArgument(f"support_gain must be positive, got {self.support_gain:g}", field="support_gain")
-        if self.fitted_to is not None:
-            fitted_to = _numbers("fitted_to", self.fitted_to)
-            if len(fitted_to) != 2 or min(fitted_to) < 0.0:
-                raise InvalidArgument(f"fitted_to must be 2 numbers, at least 0, got {fitted_to}", field="fitted_to")
-            object.__setattr__(self, "fitted_to", fitted_to)
+        if self.fitted_to_mm is not None and _numbers("fitted_to_mm", [self.fitted_to_mm])[0] < 0.0:
+            raise InvalidArgument(f"fitted_to_mm must be at least 0, got {self.fitted_to_mm:g}", field="fitted_to_mm")
         object.__setattr__(self, "weights", weights)
         object.__setattr__(self, "hardness", _numbers("hardness", self.hardness))
 
@@ -83,7 +80,7 @@ class ConfidenceModel:
         """The MS-SSIM expected at each pose, in [0, 1]."""
         if self.version == 1:
             measures = measures.averaged()
-        terms = terms_of(measures, np.array(self.hardness), self.fitted_to)
+        terms = terms_of(measures, np.array(self.hardness), self.fitted_to_mm)
         return predicted(np.array(self.weights), terms, self.black_ms_ssim)
 
     def limited(self, confidence: float, supported_share: float) -> float:
@@ -99,7 +96,6 @@ class ConfidenceModel:
             **asdict(self),
             "weights": list(self.weights),
             "hardness": [round(value, HARDNESS_DIGITS) for value in self.hardness],
-            "fitted_to": None if self.fitted_to is None else list(self.fitted_to),
             "uncertainty": None if self.uncertainty is None else self.uncertainty.to_dict(),
         }
         return {key: document[key] for key in _KEYS[self.version]}
@@ -126,26 +122,23 @@ class ConfidenceModel:
 
 
 _KEYS_1 = ("version", "weights", "black_ms_ssim", "hardness", "fitted_on", "error")
-_KEYS = {1: _KEYS_1, 2: (*_KEYS_1, "support_gain", "fitted_to", "uncertainty")}
+_KEYS = {1: _KEYS_1, 2: (*_KEYS_1, "support_gain", "fitted_to_mm", "uncertainty")}
 
 
 def terms_of(
     measures: ViewMeasures,
     hardness: FloatArray,  # [P]
-    fitted_to: tuple[float, ...] | None = None,
+    fitted_to_mm: float | None = None,
 ) -> FloatArray:  # [C, K, 1 + TERMS]
     """The factors of the weights at each point: 1 and the negative terms of the formula."""
-    distance_mm, angle_deg = measures.distance_mm, measures.angle_deg
-    if fitted_to is not None:
-        distance_mm, angle_deg = (
-            values + np.maximum(values - most, 0.0)
-            for values, most in zip((distance_mm, angle_deg), fitted_to, strict=True)
-        )
+    distance_mm = measures.distance_mm
+    if fitted_to_mm is not None:
+        distance_mm = distance_mm + np.maximum(distance_mm - fitted_to_mm, 0.0)
     columns = (
         np.full_like(distance_mm, -1.0),
         np.log1p(measures.interpolation_mm / NEAR_MM),
         distance_mm / DISTANCE_MM,
-        angle_deg / ANGLE_DEG,
+        measures.angle_deg / ANGLE_DEG,
         np.broadcast_to((measures.weights @ hardness)[:, None], distance_mm.shape),
     )
     return -np.stack(columns, axis=-1)

@@ -21,9 +21,9 @@ MODEL = ConfidenceModel(
     fitted_on=20,
     error=0.04,
     support_gain=1.5,
-    fitted_to=(2.0, 5.0),
+    fitted_to_mm=2.0,
 )
-OLD = replace(MODEL, version=1, support_gain=None, fitted_to=None)
+OLD = replace(MODEL, version=1, support_gain=None, fitted_to_mm=None)
 
 
 def measures(
@@ -51,15 +51,10 @@ def test_each_point_has_its_own_curve_but_in_old_scenes_the_means_have_one() -> 
     assert OLD.predict(half_known) == pytest.approx(OLD.predict(measures(10.0, 10.0)))
 
 
-@pytest.mark.parametrize(
-    ("beyond", "as_far"), [({"distance_mm": 3.0}, {"distance_mm": 4.0}), ({"angle_deg": 8.0}, {"angle_deg": 11.0})]
-)
-def test_beyond_what_it_was_fitted_on_distance_and_angle_count_twice(
-    beyond: dict[str, float], as_far: dict[str, float]
-) -> None:
-    endless = replace(MODEL, fitted_to=None)
-    assert MODEL.predict(measures(**beyond)) == pytest.approx(endless.predict(measures(**as_far)))
-    assert MODEL.predict(measures(2.0, 0.0, 5.0)) == pytest.approx(endless.predict(measures(2.0, 0.0, 5.0)))
+def test_distance_beyond_what_it_was_fitted_on_counts_twice() -> None:
+    endless = replace(MODEL, fitted_to_mm=None)
+    assert MODEL.predict(measures(3.0)) == pytest.approx(endless.predict(measures(4.0)))
+    assert MODEL.predict(measures(2.0)) == pytest.approx(endless.predict(measures(2.0)))
 
 
 def test_little_support_limits_the_confidence() -> None:
@@ -127,7 +122,7 @@ def test_json_and_back() -> None:
         ({"version": 1}, "version 1 must have the keys"),
         ({"support_gain": 0.0}, "support_gain must be positive"),
         ({"support_gain": "much"}, "support_gain must be numbers"),
-        ({"fitted_to": [1.0]}, "fitted_to must be 2 numbers"),
+        ({"fitted_to_mm": -1.0}, "fitted_to_mm must be at least 0"),
         ({"weights": [1.0, 2.0]}, "weights must be 5 numbers"),
         ({"weights": [1.0, -2.0, 0, 0, 0]}, "at least 0"),
         ({"weights": ["a"] * 5}, "weights must be numbers"),

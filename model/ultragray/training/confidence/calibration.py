@@ -73,7 +73,7 @@ def fit_confidence(dataset: Dataset, train_shorter: TrainShorter, *, backend: st
         fitted_on=len(unseen),
         error=float(misses.mean()),
         support_gain=fit_support_gain(shares, ms_ssim, black),
-        fitted_to=(float(measures.distance_mm.max()), float(measures.angle_deg.max())),
+        fitted_to_mm=float(measures.distance_mm.max()),
         uncertainty=fit_uncertainty(scene, views, both, backend=backend),
     )
 
