@@ -7,6 +7,7 @@ export const LABELS: Record<Metric, { title: string; unit: string; digits: numbe
   ms_ssim: { title: "MS-SSIM", unit: "", digits: 3, better: "higher is better" },
   gms: { title: "GMS", unit: "", digits: 3, better: "higher is better" },
   gmsd: { title: "GMSD", unit: "", digits: 3, better: "lower is better" },
+  histogram_distance: { title: "Histogram distance", unit: "", digits: 4, better: "lower is better" },
 };
 export const METRICS = Object.keys(LABELS) as Metric[];
 

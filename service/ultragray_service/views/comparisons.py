@@ -21,6 +21,8 @@ from ..core.own_thread import in_own_thread
 from ..settings import Settings
 from .prepared import Preparation, Prepared
 
+_FORMAT = 2  # of what is kept of a comparison
+
 
 @dataclass(frozen=True, kw_only=True)
 class ComparedFrame:
@@ -32,10 +34,12 @@ class ComparedFrame:
     ms_ssim: float
     gms: float
     gmsd: float
+    histogram_distance: float = described("Between the grey values of both frames, in [0, 1].")
     median_psnr_db: float
     median_ms_ssim: float
     median_gms: float
     median_gmsd: float
+    median_histogram_distance: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,7 +124,7 @@ class Comparisons(Prepared):
             )
         path = self._scenes.path(scene)
         scene_sha256 = await in_own_thread(lambda: self._sha256(scene, path))
-        return f"{scene_sha256}-{wanted}", present[wanted], path
+        return f"{_FORMAT}-{scene_sha256}-{wanted}", present[wanted], path
 
     def _sha256(self, scene: str, path: Path) -> str:
         version = FileVersion.of(path)

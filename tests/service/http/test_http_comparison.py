@@ -129,6 +129,8 @@ def test_a_scene_is_compared_with_the_frames_held_out_from_it(http: httpx.Client
     error = np.mean((pictures["truth"] - pictures["rendering"]) ** 2) / 255.0**2
     assert abs(-10 * np.log10(error) - found["frames"][1]["psnr_db"]) < 3.0
     assert found["frames"][1]["median_psnr_db"] != found["frames"][1]["psnr_db"]
+    shown, true = (np.sort(pictures[what], axis=None) / 255.0 for what in ("rendering", "truth"))
+    assert abs(np.abs(shown - true).mean() - found["frames"][1]["histogram_distance"]) < 0.02
     (kept,) = (artifacts / "comparisons").iterdir()
     assert kept.name.endswith(DATASET.sha256)
     assert (kept / PROGRESS_NAME).read_text() == "0.9"  # it never falls back

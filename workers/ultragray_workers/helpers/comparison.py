@@ -51,10 +51,19 @@ def compare(folder: str, artifact_folder: str, dataset: str, scene_path: str) ->
             "index": index,
             "frame_number": int(number),
             **{name: getattr(own, name) for name in _COMPARED},
+            "histogram_distance": own_speckle.histogram_distance,
             **{f"median_{name}": getattr(other, name) for name in _COMPARED},
+            "median_histogram_distance": other_speckle.histogram_distance,
         }
-        for index, (number, own, other) in enumerate(
-            zip(measured.frame_numbers, measured.frames, of_median.frames, strict=True)
+        for index, (number, own, own_speckle, other, other_speckle) in enumerate(
+            zip(
+                measured.frame_numbers,
+                measured.frames,
+                measured.frame_speckle,
+                of_median.frames,
+                of_median.frame_speckle,
+                strict=True,
+            )
         )
     ]
     (filled / FRAMES_NAME).write_text(json.dumps(frames), encoding="utf-8")
