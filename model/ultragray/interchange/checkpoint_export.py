@@ -71,6 +71,11 @@ def export_checkpoint(scene: GaussianScene, checkpoint: str | Path) -> Checkpoin
             notes.append(f"no {POSES_NAME}: the scene has no training poses; poses are relative to its centre, {at}")
     if scene.labels is not None:
         notes.append("its labels are left out: the released format has none")
+    if scene.info.beam is not None:
+        notes.append(
+            "its beam is left out: the released code cuts a plane, and shows slices of 0 mm where ours are "
+            f"{scene.info.beam.thickness_mm:.3g} mm thick or more"
+        )
     splats, largest_error = _splats(scene, centre_mm, notes)
     folder = checkpoint.absolute().parent
     _check_not_replaced(folder, beside)

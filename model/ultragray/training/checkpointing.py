@@ -24,6 +24,7 @@ from ..files.atomic import write_whole
 from ..files.format_version import require_version
 from ..scene_info import expected_shapes
 from .config import TrainingConfig
+from .steps.beam import expected_beam_tensors
 from .steps.optimizer import MOMENTS, is_trained
 
 FORMAT_VERSION = 1
@@ -130,6 +131,7 @@ def _expected_tensors(
         **{name: (torch.float32, shape) for name, shape in shapes.items()},
         "waiting": (torch.int64, (waiting_count,)),
         "generator": (generator.dtype, tuple(generator.shape)),
+        **{f"beam.{name}": expected for name, expected in expected_beam_tensors(config).items()},
     }
 
 

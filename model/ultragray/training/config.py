@@ -17,6 +17,9 @@ from typing import Any
 
 from ..contract import Contract, described
 from ..errors import InvalidArgument
+from ..probe import ElevationBeam
+from ..probe.elevation import MAX_THICKNESS_MM, MIN_DEPTH_OF_FIELD_MM
+from ..probe.probe import MAX_LENGTH_MM
 from ..scene_info import INTENSITIES, MAX_SH_DEGREE
 
 if typing.TYPE_CHECKING:
@@ -91,6 +94,25 @@ class TrainingConfig(Contract):
         low=0.0,
         high=MAX_RANGE_MM,
     )
+    slice_thickness_mm: float | None = described(
+        "Thickness of the frames along elevation (full width at half maximum, at the focus); none: planes, or learned.",
+        None,
+        above=0.0,
+        high=MAX_THICKNESS_MM,
+    )
+    slice_focus_mm: float | None = described(
+        "Depth of its focus below the face; none: the same thickness at every depth.", None, low=0.0, high=MAX_LENGTH_MM
+    )
+    slice_depth_of_field_mm: float | None = described(
+        "Depth over which it is at most √2 times as thick as at the focus.",
+        None,
+        low=MIN_DEPTH_OF_FIELD_MM,
+        high=MAX_LENGTH_MM,
+    )
+    learn_beam: bool = described(
+        "Whether thickness, focus and depth of field are learned, from given ones on: for sweeps that cross or tilt.",
+        False,
+    )
     means_rate: float = described("Learning rate of the means, times the scene's scale in cm.", 2e-4, low=0.0, high=1.0)
     scales_rate: float = described("Learning rate of the scales.", 1e-2, low=0.0, high=1.0)
     quats_rate: float = described("Learning rate of the quaternions.", 1e-2, low=0.0, high=1.0)
@@ -141,6 +163,24 @@ class TrainingConfig(Contract):
                 f"initial_gaussians must be at most max_gaussians ({self.max_gaussians}), got {self.initial_gaussians}",
                 field="initial_gaussians",
             )
+        shape = self.slice_focus_mm, self.slice_depth_of_field_mm
+        if shape.count(None) == 1 or (self.slice_thickness_mm is None and shape != (None, None)):
+            raise InvalidArgument(
+                "slice_focus_mm and slice_depth_of_field_mm must be given together, and with slice_thickness_mm",
+                field="slice_focus_mm",
+            )
+
+    @property
+    def given_beam(self) -> ElevationBeam | None:
+        """The beam that the settings describe."""
+        if self.slice_thickness_mm is None:
+            return None
+        return ElevationBeam(self.slice_thickness_mm, self.slice_focus_mm, self.slice_depth_of_field_mm)
+
+    @property
+    def has_beam(self) -> bool:
+        """Whether the scene gets a beam, given or learned."""
+        return self.learn_beam or self.slice_thickness_mm is not None
 
     @classmethod
     def preset(cls, name: str, **overrides: Any) -> TrainingConfig:
@@ -159,14 +199,17 @@ class TrainingConfig(Contract):
         """The same with everything that was left to the data filled in."""
         steps = self.steps or geometry.steps
         limit = self.max_gaussians or max(geometry.gaussian_count, self.initial_gaussians or 0)
-        out_of_plane_mm = _given_or(self.out_of_plane_mm, min(geometry.out_of_plane_mm, MAX_RANGE_MM))
+        by_shifts = 0.0 if self.has_beam else min(geometry.out_of_plane_mm, MAX_RANGE_MM)  # the beam takes their part
+        out_of_plane_mm = _given_or(self.out_of_plane_mm, by_shifts)
+        initial_scale_mm = self.initial_scale_mm or geometry.initial_scale_mm
+        thick_mm = initial_scale_mm if self.has_beam else geometry.initial_elevation_mm(out_of_plane_mm)
         return replace(
             self,
             steps=steps,
             max_gaussians=limit,
             initial_gaussians=self.initial_gaussians or (limit if not self.refinements else (limit + 1) // 2),
-            initial_scale_mm=self.initial_scale_mm or geometry.initial_scale_mm,
-            initial_elevation_mm=self.initial_elevation_mm or geometry.initial_elevation_mm(out_of_plane_mm),
+            initial_scale_mm=initial_scale_mm,
+            initial_elevation_mm=self.initial_elevation_mm or thick_mm,
             intensity_floor=_given_or(self.intensity_floor, min(geometry.brightness, MAX_FLOOR)),
             out_of_plane_mm=out_of_plane_mm,
             transmittance_rate=_given_or(self.transmittance_rate, scaled_transmittance_rate(steps)),

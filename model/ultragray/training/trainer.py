@@ -40,6 +40,7 @@ from .data.sampling import BatchSampler, out_of_plane_shift_mm, shift_out_of_pla
 from .device import forget_peak_memory, peak_memory_mb, training_device
 from .memory import check_comparison_memory, check_memory
 from .progress import Journal, Progress, StepTimer
+from .steps.beam import TrainedBeam
 from .steps.intensity import project_sh0
 from .steps.losses import SSIM_WINDOW, image_loss
 from .steps.optimizer import Optimizer, is_trained
@@ -169,6 +170,7 @@ class Trainer:
         self._schedule = Schedule(
             config, scene_scale_cm=self._geometry.scene_scale_cm, batch_size=self._sampler.batch_size
         )
+        self._beam = TrainedBeam(config, dataset.probe)
         self.step = 0  # steps done
         self._timer = StepTimer()
         self._val_psnr_db: float | None = None
@@ -298,6 +300,7 @@ class Trainer:
             assert means_gradient is not None
             self._pull.add(means_gradient)
             self._optimizer.step(self._schedule.rates(self.step))
+            self._beam.step(self.step / self._schedule.steps)
             self._project(self.parameters["sh0"])
             image_part, scale_part = parts.tolist()  # the one wait of a step for a GPU: all its work is queued by now
         loss: float = image_part + scale_part
@@ -322,6 +325,7 @@ class Trainer:
             width=sweep.width,
             outputs=("bmode",),
             backend=self._backend,
+            beam=self._beam.numbers,
         )
         assert frames.bmode is not None
         return frames.bmode
@@ -395,6 +399,7 @@ class Trainer:
             "pull.seen": self._pull.seen,
             "waiting": self._sampler.waiting,
             "generator": self._generator.get_state(),
+            **{f"beam.{name}": tensor for name, tensor in self._beam.tensors().items()},
         }
         header = CheckpointHeader(self.step, self._timer.elapsed_s, self._dataset_sha256, self.config)
         write_checkpoint(self._checkpoint, header, tensors)
@@ -413,6 +418,7 @@ class Trainer:
         self._begin_with({name: tensors[f"parameter.{name}"] for name in PARAMETERS})
         prefix = "adam."
         self._optimizer.load({k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)})
+        self._beam.load({k.removeprefix("beam."): v for k, v in tensors.items() if k.startswith("beam.")})
         self._pull = PullStatistics(tensors["pull.total"].to(self._device), tensors["pull.seen"].to(self._device))
         self._sampler.waiting = tensors["waiting"]
         self.step = header.step
@@ -421,7 +427,7 @@ class Trainer:
     def scene(self) -> GaussianScene:
         """The scene as it is; a finished run's is measured on the held-out frames."""
         splats = {name: tensor.detach().cpu() for name, tensor in self.parameters.items()}
-        info = replace(self._info, training={**self.config.to_dict(), "step": self.step})
+        info = replace(self._info, beam=self._beam.found(), training={**self.config.to_dict(), "step": self.step})
         scene = GaussianScene.from_splats(splats, info=info, training_poses=self.dataset.train.poses)
         if len(self.dataset.val) and self.is_finished:
             measured = evaluate(scene.to(self._device), self.dataset.val, backend=self._backend)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections import OrderedDict
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 
-from ultragray import ConvexProbe, GaussianScene, LinearProbe, PhasedProbe, Probe, SceneInfo, render
+from ultragray import ConvexProbe, ElevationBeam, GaussianScene, LinearProbe, PhasedProbe, Probe, SceneInfo, render
 from ultragray.errors import InvalidArgument
 from ultragray.interchange.checkpoint import import_checkpoint
 from ultragray.interchange.checkpoint_export import export_checkpoint
@@ -155,6 +156,13 @@ def test_a_scene_that_does_not_know_its_probe(tmp_path: Path, make_scene: SceneM
 def test_a_convex_probe_is_told_to_be_too_much_for_the_released_trainer(tmp_path: Path, make_scene: SceneMaker) -> None:
     assert any("linear probes only" in note for note in export_checkpoint(make_scene(CONVEX), tmp_path / "a.pt").notes)
     assert "ultrasound_opening_width" not in json.loads((tmp_path / "conf.json").read_text())
+
+
+def test_a_scene_with_a_beam_is_told_to_be_cut_by_a_plane(tmp_path: Path, make_scene: SceneMaker) -> None:
+    scene = make_scene()
+    assert not any("beam" in note for note in export_checkpoint(scene, tmp_path / "a" / "ckpt.pt").notes)
+    thick = replace(scene, info=replace(scene.info, beam=ElevationBeam(2.5)))
+    assert any("2.5 mm thick" in note for note in export_checkpoint(thick, tmp_path / "b" / "ckpt.pt").notes)
 
 
 def test_a_sigmoid_scene_is_fitted_and_says_how_well(tmp_path: Path, make_scene: SceneMaker) -> None:

@@ -7,6 +7,7 @@ import os
 import re
 import struct
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from ultragray import ConvexProbe, GaussianScene, LinearProbe
+from ultragray import ConvexProbe, ElevationBeam, GaussianScene, LinearProbe
 from ultragray.errors import SceneFileInvalid
 from ultragray.interchange import ply
 from ultragray.interchange.ply import read_ply, write_ply
@@ -71,6 +72,7 @@ def test_a_scene_comes_back_to_the_bit(
     tmp_path: Path, make_scene: Callable[..., GaussianScene], sh_degree: int, intensity: str
 ) -> None:
     scene = make_scene(sh_degree=sh_degree, intensity=intensity)
+    scene = replace(scene, info=replace(scene.info, beam=ElevationBeam(2.5, 30.0, 20.0)))
     write_ply(scene, tmp_path / "a.ply")
     back = read_ply(tmp_path / "a.ply")
     assert back.info == scene.info

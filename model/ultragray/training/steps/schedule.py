@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from ..config import TrainingConfig
 
+BEAM_INTENSITY_RATE = 3.0  # a beam dims what it spreads: intensities have further to go than from the frames' own
+
 
 class Schedule:
     """The schedules of one run. Steps count from 0; `step` of n completed steps is the next one."""
@@ -18,7 +20,7 @@ class Schedule:
             "scales": config.scales_rate * root,
             "quats": config.quats_rate * root,
             "transmittances": config.transmittance_rate * root,
-            "sh0": config.sh0_rate * root,
+            "sh0": config.sh0_rate * root * (BEAM_INTENSITY_RATE if config.has_beam else 1.0),
             "shN": config.shn_rate * root,
         }
         last = config.refinement_end * self.steps
