@@ -84,16 +84,13 @@ class Assessor:
 
     def with_support(self, extrapolations: Sequence[Extrapolation], shares: Sequence[float]) -> list[Extrapolation]:
         """Those of frames that have been rendered, with the share of each one's pixels that has support."""
-        return [
-            replace(
-                one,
-                supported_share=share,
-                confidence=None
-                if one.confidence is None or self._model is None
-                else self._model.limited(one.confidence, share),
-            )
-            for one, share in zip(extrapolations, shares, strict=True)
-        ]
+        model, found = self._model, []
+        for one, share in zip(extrapolations, shares, strict=True):
+            confidence = one.confidence
+            if confidence is not None and model is not None:
+                confidence = float(model.limited(np.array(confidence), np.array(share)))
+            found.append(replace(one, supported_share=share, confidence=confidence))
+        return found
 
 
 def supported(coverage: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:  # [C, H, W] -> [C, H, W]

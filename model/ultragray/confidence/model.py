@@ -7,8 +7,8 @@ d, i and φ are the distance, the interpolation distance and the angle of `ViewM
 negative: a pose farther away never earns more confidence. What d is beyond the farthest point that the weights were
 fitted on counts twice: nothing there says that the curve goes on.
 
-Of a rendered frame more is known, the share s of its pixels that Gaussians support: c ≤ b + (1 − b)·g·s, the gain g
-being what frames with little support reached.
+Where Gaussians support only the share s of a frame's pixels, c ≤ b + (1 − b)·g·s, the gain g being what frames with
+little support reached. A pose alone is taken to have s₀·mean over points of exp(−d²/r²); of a rendered frame s is seen.
 
 Version 1, of older scenes, takes the curve of the means over the points, and knows neither limit. Needs no torch.
 """
@@ -32,10 +32,32 @@ NEAR_MM, DISTANCE_MM, ANGLE_DEG = 0.3, 5.0, 10.0  # units of the terms
 TERMS = 4  # beside the constant
 PRIOR_WEIGHTS = (3.6, 1.1, 1.5, 0.3, 0.6)  # about those of ten scenes; what the views cannot tell stays near it
 PRIOR_STRENGTH = 0.02  # squared error that a weight costs which is 1 away from its prior
-GAIN_QUANTILE = 0.9  # of the frames that the gain is fitted on keep to the limit by their support
+GAIN_QUANTILE = 0.8  # of the frames that the gain is fitted on keep to the limit by their support
 LEAST_SHARE = 0.02  # less support than that tells nothing of the gain
+REACHES_MM = np.geomspace(0.2, 30.0, 60)  # that are tried for r
 FIT_STEPS = 100
 HARDNESS_DIGITS = 3
+
+
+@dataclass(frozen=True)
+class Support:
+    """The limit that the share of supported pixels sets, and what that share is expected to be at a pose.
+
+    Raises InvalidArgument for numbers that are not finite or not positive.
+    """
+
+    gain: float  # g
+    share: float  # s₀, at the views
+    reach_mm: float  # r
+
+    def __post_init__(self) -> None:
+        numbers = _numbers("support", (self.gain, self.share, self.reach_mm))
+        if min(numbers) <= 0.0:
+            raise InvalidArgument(f"support must be positive numbers, got {list(numbers)}", field="support")
+
+    def expected_shares(self, measures: ViewMeasures) -> FloatArray:  # [C]
+        """The share of supported pixels that frames at these poses are taken to have."""
+        return self.share * _within(measures.distance_mm, self.reach_mm)
 
 
 @dataclass(frozen=True)
@@ -50,7 +72,7 @@ class ConfidenceModel:
     hardness: tuple[float, ...]  # [P]
     fitted_on: int  # held-out views
     error: float  # mean absolute error on those views
-    support_gain: float | None = None  # g; None: support sets no limit
+    support: Support | None = None  # None: it sets no limit
     fitted_to_mm: float | None = None  # the farthest point of those views; None: any
     uncertainty: Uncertainty | None = None  # of pixels; None: not known
     version: int = VERSION
@@ -69,8 +91,6 @@ class ConfidenceModel:
             )
         if type(self.fitted_on) is not int or self.fitted_on < 1:
             raise InvalidArgument(f"fitted_on must be a positive integer, got {self.fitted_on!r}", field="fitted_on")
-        if self.support_gain is not None and _numbers("support_gain", [self.support_gain])[0] <= 0.0:
-            raise InvalidArgument(f"support_gain must be positive, got {self.support_gain:g}", field="support_gain")
         if self.fitted_to_mm is not None and _numbers("fitted_to_mm", [self.fitted_to_mm])[0] < 0.0:
             raise InvalidArgument(f"fitted_to_mm must be at least 0, got {self.fitted_to_mm:g}", field="fitted_to_mm")
         object.__setattr__(self, "weights", weights)
@@ -81,14 +101,16 @@ class ConfidenceModel:
         if self.version == 1:
             measures = measures.averaged()
         terms = terms_of(measures, np.array(self.hardness), self.fitted_to_mm)
-        return predicted(np.array(self.weights), terms, self.black_ms_ssim)
+        told = predicted(np.array(self.weights), terms, self.black_ms_ssim)
+        return told if self.support is None else self.limited(told, self.support.expected_shares(measures))
 
-    def limited(self, confidence: float, supported_share: float) -> float:
-        """The confidence of a pose once it is known which share of its pixels has support."""
-        if self.support_gain is None:
-            return confidence
-        most = self.black_ms_ssim + (1.0 - self.black_ms_ssim) * min(1.0, self.support_gain * supported_share)
-        return min(confidence, most)
+    def limited(self, confidences: FloatArray, supported_shares: FloatArray) -> FloatArray:  # [C] both
+        """The confidences of poses once it is known which share of their pixels has support."""
+        if self.support is None:
+            return confidences
+        shares = np.minimum(1.0, self.support.gain * supported_shares)
+        most: FloatArray = self.black_ms_ssim + (1.0 - self.black_ms_ssim) * shares
+        return np.minimum(confidences, most)
 
     def to_dict(self) -> dict[str, Any]:
         """A JSON object, as a scene's metadata holds it."""
@@ -117,12 +139,16 @@ class ConfidenceModel:
                 f"confidence of version {version} must have the keys {sorted(_KEYS[version])}, got {sorted(document)}",
                 field="confidence",
             )
-        uncertainty = document.get("uncertainty")
-        return cls(**{**document, "uncertainty": None if uncertainty is None else Uncertainty.from_dict(uncertainty)})
+        support, uncertainty = document.get("support"), document.get("uncertainty")
+        parts = {
+            "support": None if support is None else _support_of(support),
+            "uncertainty": None if uncertainty is None else Uncertainty.from_dict(uncertainty),
+        }
+        return cls(**{**document, **parts})
 
 
 _KEYS_1 = ("version", "weights", "black_ms_ssim", "hardness", "fitted_on", "error")
-_KEYS = {1: _KEYS_1, 2: (*_KEYS_1, "support_gain", "fitted_to_mm", "uncertainty")}
+_KEYS = {1: _KEYS_1, 2: (*_KEYS_1, "support", "fitted_to_mm", "uncertainty")}
 
 
 def terms_of(
@@ -150,10 +176,21 @@ def predicted(weights: FloatArray, terms: FloatArray, black_ms_ssim: float) -> F
     return black_ms_ssim + (1.0 - black_ms_ssim) * shares
 
 
-def fit_support_gain(shares: FloatArray, ms_ssim: FloatArray, black_ms_ssim: float) -> float:  # [C], [C]
-    """The gain that holds for GAIN_QUANTILE of the frames, at least 1."""
+def fit_support(
+    measures: ViewMeasures,
+    shares: FloatArray,  # [C] of supported pixels
+    ms_ssim: FloatArray,  # [C]
+    black_ms_ssim: float,
+) -> Support:
+    """The gain, at least 1, that holds for GAIN_QUANTILE of the frames; share and reach of the least squared error."""
     reached = (ms_ssim - black_ms_ssim) / ((1.0 - black_ms_ssim) * np.maximum(shares, LEAST_SHARE))
-    return max(1.0, float(np.quantile(reached, GAIN_QUANTILE)))
+    found = []
+    for reach_mm in REACHES_MM:
+        within = _within(measures.distance_mm, reach_mm)
+        share = min(1.0, max(LEAST_SHARE, float(within @ shares) / max(float(within @ within), 1e-9)))
+        found.append((float(np.square(share * within - shares).sum()), share, float(reach_mm)))
+    _, share, reach_mm = min(found)
+    return Support(max(1.0, float(np.quantile(reached, GAIN_QUANTILE))), share, reach_mm)
 
 
 def fit_weights(
@@ -189,6 +226,21 @@ def fit_weights(
         else:
             damping = min(4.0 * damping, 1e6)
     return weights
+
+
+def _within(distance_mm: FloatArray, reach_mm: float) -> FloatArray:  # [C, K] -> [C]
+    shares: FloatArray = np.exp(-np.square(distance_mm / reach_mm)).mean(axis=1)
+    return shares
+
+
+def _support_of(document: Any) -> Support:
+    expected = set(Support.__dataclass_fields__)
+    if not isinstance(document, Mapping) or set(document) != expected:
+        found = sorted(document) if isinstance(document, Mapping) else document
+        raise InvalidArgument(
+            f"support must be an object with the keys {sorted(expected)}, got {found!r}", field="support"
+        )
+    return Support(**document)
 
 
 def _logistic(values: FloatArray) -> FloatArray:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from ultragray.confidence import ConfidenceModel
-from ultragray.confidence.model import PRIOR_WEIGHTS, fit_support_gain, fit_weights, predicted
+from ultragray.confidence.model import PRIOR_WEIGHTS, Support, fit_support, fit_weights, predicted
 from ultragray.confidence.views import ViewMeasures
 from ultragray.errors import InvalidArgument
 
@@ -20,10 +20,10 @@ MODEL = ConfidenceModel(
     hardness=(0.0, 1.0),
     fitted_on=20,
     error=0.04,
-    support_gain=1.5,
+    support=Support(1.5, 0.9, 4.0),
     fitted_to_mm=2.0,
 )
-OLD = replace(MODEL, version=1, support_gain=None, fitted_to_mm=None)
+OLD = replace(MODEL, version=1, support=None, fitted_to_mm=None)
 
 
 def measures(
@@ -46,29 +46,40 @@ def test_each_point_has_its_own_curve_but_in_old_scenes_the_means_have_one() -> 
     half_known = ViewMeasures(
         *(np.array([[0.0, far]]) for far in (20.0, 20.0, 20.0, 0.0)), weights=np.array([[1.0, 0.0]])
     )
-    known, unknown = MODEL.predict(measures())[0], MODEL.predict(measures(20.0, 20.0))[0]
-    assert MODEL.predict(half_known) == pytest.approx([0.5 * (known + unknown)])
+    model = replace(MODEL, support=None)
+    known, unknown = model.predict(measures())[0], model.predict(measures(20.0, 20.0))[0]
+    assert model.predict(half_known) == pytest.approx([0.5 * (known + unknown)])
     assert OLD.predict(half_known) == pytest.approx(OLD.predict(measures(10.0, 10.0)))
 
 
 def test_distance_beyond_what_it_was_fitted_on_counts_twice() -> None:
-    endless = replace(MODEL, fitted_to_mm=None)
-    assert MODEL.predict(measures(3.0)) == pytest.approx(endless.predict(measures(4.0)))
-    assert MODEL.predict(measures(2.0)) == pytest.approx(endless.predict(measures(2.0)))
+    ending = replace(MODEL, support=None)
+    endless = replace(ending, fitted_to_mm=None)
+    assert ending.predict(measures(3.0)) == pytest.approx(endless.predict(measures(4.0)))
+    assert ending.predict(measures(2.0)) == pytest.approx(endless.predict(measures(2.0)))
 
 
 def test_little_support_limits_the_confidence() -> None:
-    assert MODEL.limited(0.8, 0.2) == pytest.approx(0.06 + 0.94 * 1.5 * 0.2)
-    assert MODEL.limited(0.2, 0.2) == 0.2
-    assert MODEL.limited(0.99, 0.7) == 0.99
-    assert OLD.limited(0.8, 0.0) == 0.8
+    told = MODEL.limited(np.array([0.8, 0.2, 0.99]), np.array([0.2, 0.2, 0.7]))
+    assert told == pytest.approx([0.06 + 0.94 * 1.5 * 0.2, 0.2, 0.99])
+    assert OLD.limited(np.array([0.8]), np.array([0.0])) == [0.8]
 
 
-def test_the_gain_of_support_is_what_nine_of_ten_frames_keep_to() -> None:
-    shares = np.linspace(0.1, 0.5, 100)
-    gains = np.linspace(1.0, 2.0, 100)
-    assert fit_support_gain(shares, 0.1 + 0.9 * gains * shares, 0.1) == pytest.approx(1.9, abs=0.02)
-    assert fit_support_gain(np.ones(5), np.full(5, 0.6), 0.1) == 1.0
+def test_a_pose_alone_is_taken_to_have_the_support_of_its_distance() -> None:
+    least = replace(MODEL, weights=(9.0, 0.0, 0.0, 0.0, 0.0))  # that would be sure of everything
+    assert least.predict(measures(0.0)) == pytest.approx([0.06 + 0.94 / (1.0 + np.exp(-9.0))])
+    assert least.predict(measures(6.0)) == pytest.approx([0.06 + 0.94 * 1.5 * 0.9 * np.exp(-((6.0 / 4.0) ** 2))])
+
+
+def test_support_is_fitted_so_that_four_of_five_frames_keep_to_it() -> None:
+    distances = np.linspace(0.0, 6.0, 100)
+    away = ViewMeasures(*(distances[:, None],) * 3, np.zeros((100, 1)), np.ones((100, 1)))
+    shares = 0.8 * np.exp(-np.square(distances / 3.0))
+    gains = np.random.default_rng(0).permutation(np.linspace(1.0, 2.0, 100))
+    found = fit_support(away, shares, 0.1 + 0.9 * gains * np.maximum(shares, 0.02), 0.1)
+    assert found.gain == pytest.approx(1.8, abs=0.02)
+    assert (found.share, found.reach_mm) == pytest.approx((0.8, 3.0), rel=0.05)
+    assert fit_support(away, np.ones(100), np.full(100, 0.6), 0.1).gain == 1.0
 
 
 @pytest.mark.parametrize("name", ["distance_mm", "interpolation_mm", "angle_deg", "weight"])
@@ -120,8 +131,9 @@ def test_json_and_back() -> None:
     [
         ({"version": 3}, "version 1 or 2, got 3"),
         ({"version": 1}, "version 1 must have the keys"),
-        ({"support_gain": 0.0}, "support_gain must be positive"),
-        ({"support_gain": "much"}, "support_gain must be numbers"),
+        ({"support": {"gain": 0.0, "share": 0.5, "reach_mm": 1.0}}, "support must be positive"),
+        ({"support": {"gain": "much", "share": 0.5, "reach_mm": 1.0}}, "support must be numbers"),
+        ({"support": 1.5}, "support must be an object"),
         ({"fitted_to_mm": -1.0}, "fitted_to_mm must be at least 0"),
         ({"weights": [1.0, 2.0]}, "weights must be 5 numbers"),
         ({"weights": [1.0, -2.0, 0, 0, 0]}, "at least 0"),

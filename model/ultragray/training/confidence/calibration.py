@@ -10,7 +10,7 @@ from typing import TypeAlias
 import numpy as np
 
 from ...confidence.assess import supported
-from ...confidence.model import ConfidenceModel, fit_support_gain, fit_weights, predicted, terms_of
+from ...confidence.model import ConfidenceModel, fit_support, fit_weights, predicted, terms_of
 from ...confidence.views import TrainingViews
 from ...datasets.sweep import Dataset, Sweep, spread_places
 from ...evaluation.scoring import evaluate, evaluate_frames, render_sweep
@@ -72,7 +72,7 @@ def fit_confidence(dataset: Dataset, train_shorter: TrainShorter, *, backend: st
         hardness=tuple(hardness_of_views(sweep).tolist()),
         fitted_on=len(unseen),
         error=float(misses.mean()),
-        support_gain=fit_support_gain(shares, ms_ssim, black),
+        support=fit_support(measures, shares, ms_ssim, black),
         fitted_to_mm=float(measures.distance_mm.max()),
         uncertainty=fit_uncertainty(scene, views, both, backend=backend),
     )
