@@ -30,6 +30,7 @@ SETTINGS: dict[str, Any] = {
     "encoding": "uint8",
     "probe": {"kind": "linear", "width_mm": 40.0, "near_mm": 0.0, "far_mm": 40.0},
     "display": {"gain_db": 3.0, "dynamic_range_db": 50.0, "tgc_db": [0.0, 3.0], "depth_mm": 30.0, "flip": True},
+    "slice_thickness_mm": 2.0,
     "min_confidence": 0.0,
     "below_min_confidence": "mask",
 }

@@ -55,15 +55,16 @@ class BeamVariance(NamedTuple):
     at_focus: float
     focus: float
     slope2: float
-    most: float  # from the near plane to the far one
+    most: float  # at the depths where means are not culled
 
     @classmethod
-    def of(cls, beam: Tensor, near_cm: float, far_cm: float) -> BeamVariance:
-        """Of the numbers of `beam_cm`."""
+    def of(cls, beam: Tensor, probe: Probe, height: int) -> BeamVariance:
+        """Of the numbers of `beam_cm`, for frames of a height."""
         sigma, focus, rayleigh = beam.tolist()
         slope2 = (sigma / rayleigh) ** 2
-        furthest = max(abs(near_cm - focus), abs(far_cm - focus))
-        return cls(sigma**2, focus, slope2, sigma**2 + slope2 * furthest**2)
+        ends = probe.near_mm / 10.0, probe.cull_far_mm(height) / 10.0
+        offset = max(abs(end - focus) for end in ends) if slope2 else 0.0
+        return cls(sigma**2, focus, slope2, sigma**2 + slope2 * offset**2)
 
 
 THIN = BeamVariance(0.0, 0.0, 0.0, 0.0)

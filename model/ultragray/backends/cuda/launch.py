@@ -107,7 +107,7 @@ def view_table(
     table[:, :9] = lines.view_axes(poses_cm)[:, :3, :3].transpose(0, 2, 1).reshape(-1, 9)
     table[:, 9:12] = poses_cm[:, :3, 3]
     depths_cm = probe.near_mm / 10.0, probe.cull_far_mm(height) / 10.0, _row_cm(probe, height)
-    thickness = THIN if beam is None else BeamVariance.of(beam, probe.near_mm / 10.0, probe.far_mm / 10.0)
+    thickness = THIN if beam is None else BeamVariance.of(beam, probe, height)
     table[:, 12:] = *depths_cm, lines.start, lines.span, *thickness
     return table
 
