@@ -22,9 +22,11 @@ from .files.atomic import write_whole
 from .pose import check_poses
 from .probe import FloatArray
 from .scene_info import (
+    CORRECTIONS_TENSOR,
     LABELS_TENSOR,
     METADATA_KEY,
     SceneInfo,
+    check_corrections,
     check_header_size,
     check_training_pose_count,
     expected_shapes,
@@ -67,6 +69,7 @@ class GaussianScene:
     info: SceneInfo = field(default_factory=SceneInfo)
     training_poses: FloatArray = field(default_factory=lambda: np.zeros((0, 4, 4)))  # [P, 4, 4] mm
     labels: Tensor | None = None  # [N] uint8
+    pose_corrections: FloatArray | None = None  # [P, 4, 4] mm: training poses = corrections · poses of the tracker
     _prepared: dict[str, _Kept] = field(default_factory=dict, init=False, repr=False)
 
     @classmethod
@@ -77,6 +80,7 @@ class GaussianScene:
         info: SceneInfo | None = None,
         training_poses: Any = None,  # [P, 4, 4] mm
         labels: Tensor | None = None,  # [N] uint8
+        pose_corrections: Any = None,  # [P, 4, 4] mm
     ) -> GaussianScene:
         """A scene of raw released parameters, lengths in cm; the graph of the tensors is kept.
 
@@ -128,7 +132,14 @@ class GaussianScene:
         check_training_pose_count(len(poses))
         summary = with_summary(info or SceneInfo(), means.detach().cpu().double().numpy(), degree)
         names = _names_of_labels(labels, means, summary.label_names)
-        return cls(**tensors, info=replace(summary, label_names=names), training_poses=poses, labels=labels)
+        corrections = None if pose_corrections is None else check_corrections(pose_corrections, len(poses))
+        return cls(
+            **tensors,
+            info=replace(summary, label_names=names),
+            training_poses=poses,
+            labels=labels,
+            pose_corrections=corrections,
+        )
 
     @property
     def gaussian_count(self) -> int:
@@ -147,7 +158,13 @@ class GaussianScene:
         """The same scene with its tensors in another dtype or on another device."""
         moved: dict[str, Any] = {name: tensor.to(target) for name, tensor in self.splats.items()}
         labels = None if self.labels is None else self.labels.to(moved["means"].device)
-        return GaussianScene(**moved, info=self.info, training_poses=self.training_poses, labels=labels)
+        return GaussianScene(
+            **moved,
+            info=self.info,
+            training_poses=self.training_poses,
+            labels=labels,
+            pose_corrections=self.pose_corrections,
+        )
 
     def prepared(self, name: str, make: Callable[[], Prepared]) -> Prepared:
         """A backend's preparation of the scene, kept by name until one of the tensors, or the activation, changes.
@@ -185,6 +202,8 @@ class GaussianScene:
         if self.labels is not None:
             tensors[LABELS_TENSOR] = self.labels.cpu().contiguous()
         tensors["training_poses"] = torch.from_numpy(np.ascontiguousarray(self.training_poses))
+        if self.pose_corrections is not None:
+            tensors[CORRECTIONS_TENSOR] = torch.from_numpy(np.ascontiguousarray(self.pose_corrections))
         data: bytes = save(tensors, metadata={METADATA_KEY: info_to_json(self.info)})
         check_header_size(data)
         return data
@@ -201,7 +220,13 @@ class GaussianScene:
             with safe_open(path, framework="pt") as bundle:
                 splats = {name: bundle.get_tensor(name) for name in PARAMETERS}
                 labels = bundle.get_tensor(LABELS_TENSOR) if header.info.label_names else None
-            return cls.from_splats(splats, info=header.info, training_poses=header.training_poses, labels=labels)
+            return cls.from_splats(
+                splats,
+                info=header.info,
+                training_poses=header.training_poses,
+                labels=labels,
+                pose_corrections=header.pose_corrections,
+            )
         except (OSError, SafetensorError, ValueError) as error:
             raise scene_file_invalid(path, error) from error
 

@@ -34,6 +34,7 @@ MAX_HEADER_BYTES = 4 * 2**20  # of the bundle: names and shapes of tensors, and 
 MAX_TRAINING_POSES = 100_000
 MAX_METRICS = 1000
 LABELS_TENSOR = "labels"
+CORRECTIONS_TENSOR = "pose_corrections"
 _LENGTH_BYTES = 8  # a safetensors bundle starts with the length of its header, little endian
 
 Vector = tuple[float, float, float]
@@ -144,6 +145,7 @@ class SceneHeader:
     info: SceneInfo
     training_poses: FloatArray  # [P, 4, 4] mm, probe→scene
     file_bytes: int
+    pose_corrections: FloatArray | None = None  # [P, 4, 4] mm: training poses = corrections · poses of the tracker
 
 
 def read_header(path: str | Path) -> SceneHeader:
@@ -163,10 +165,24 @@ def read_header(path: str | Path) -> SceneHeader:
             info = info_from_json(metadata[METADATA_KEY])
             _check_tensors(bundle, info)
             poses = check_poses(bundle.get_tensor("training_poses"), field="training_poses")
+            corrections = None
+            if CORRECTIONS_TENSOR in bundle.keys():  # noqa: SIM118
+                corrections = check_corrections(bundle.get_tensor(CORRECTIONS_TENSOR), len(poses))
             read_model(info.confidence, len(poses))
     except (OSError, SafetensorError, ValueError, TypeError, RecursionError) as error:
         raise scene_file_invalid(path, error) from error
-    return SceneHeader(info=info, training_poses=poses, file_bytes=size)
+    return SceneHeader(info=info, training_poses=poses, file_bytes=size, pose_corrections=corrections)
+
+
+def check_corrections(corrections: Any, count: int) -> FloatArray:  # [P, 4, 4] mm
+    """Rigid motions, one for each of `count` training poses. Raises InvalidPose and InvalidArgument."""
+    exact = check_poses(corrections, field=CORRECTIONS_TENSOR)
+    if len(exact) != count:
+        raise InvalidArgument(
+            f"{CORRECTIONS_TENSOR} must be {count}, one for each training pose, got {len(exact)}",
+            field=CORRECTIONS_TENSOR,
+        )
+    return exact
 
 
 def check_header_size(start: bytes) -> None:
@@ -189,7 +205,7 @@ def _check_tensors(bundle: Any, info: SceneInfo) -> None:
     shapes = expected_shapes(info.gaussian_count, info.sh_degree)
     if info.label_names:
         shapes[LABELS_TENSOR] = (info.gaussian_count,)
-    if names != {*shapes, "training_poses"}:
+    if names - {CORRECTIONS_TENSOR} != {*shapes, "training_poses"}:
         raise ValueError(f"its tensors are {sorted(names)}, expected {sorted([*shapes, 'training_poses'])}")
     for name, shape in shapes.items():
         part, dtype = bundle.get_slice(name), "U8" if name == LABELS_TENSOR else "F32"
@@ -197,12 +213,13 @@ def _check_tensors(bundle: Any, info: SceneInfo) -> None:
             raise ValueError(
                 f"its tensor {name} is {part.get_dtype()} {list(part.get_shape())}, expected {dtype} {list(shape)}"
             )
-    poses = bundle.get_slice("training_poses")
-    if poses.get_dtype() != "F64" or len(poses.get_shape()) != 3:
-        raise ValueError(
-            f"its tensor training_poses is {poses.get_dtype()} {list(poses.get_shape())}, expected F64 [P, 4, 4]"
-        )
-    check_training_pose_count(poses.get_shape()[0])
+    for name in sorted(names - set(shapes)):
+        poses = bundle.get_slice(name)
+        if poses.get_dtype() != "F64" or len(poses.get_shape()) != 3:
+            raise ValueError(
+                f"its tensor {name} is {poses.get_dtype()} {list(poses.get_shape())}, expected F64 [P, 4, 4]"
+            )
+        check_training_pose_count(poses.get_shape()[0])
 
 
 def scene_file_invalid(path: str | Path, error: Exception) -> SceneFileInvalid:

@@ -36,7 +36,8 @@ def test_scene_file(tmp_path: Path) -> None:
     shapes = scene_info.expected_shapes(5, 1)
     splats = {name: torch.ones(shape) for name, shape in shapes.items()}
     poses = np.tile(np.eye(4), (2, 1, 1))
-    GaussianScene.from_splats(splats, training_poses=poses, labels=LABELS).save(tmp_path / "scene.ugr")
+    scene = GaussianScene.from_splats(splats, training_poses=poses, labels=LABELS, pose_corrections=poses)
+    scene.save(tmp_path / "scene.ugr")
     with safe_open(tmp_path / "scene.ugr", framework="numpy") as bundle:
         parts = {name: bundle.get_slice(name) for name in bundle.keys()}  # noqa: SIM118 (no mapping)
         found = {name: (part.get_dtype(), list(part.get_shape())) for name, part in parts.items()}

@@ -13,6 +13,7 @@ from matplotlib.ticker import MaxNLocator
 
 from ..evaluation.metrics import FrameMetrics
 from ..evaluation.scoring import Evaluation
+from ..probe import FloatArray
 from .study import TiltStudy, Trained
 
 COLOURS = {"scene": "#0b6e99", "median": "#d97706", "nearest": "#7c8a97", "linear": "#6d8f3c"}
@@ -40,6 +41,15 @@ def plot_frames(evaluations: Mapping[str, Evaluation]) -> str:
             )
         axis.set(xlabel="frame", ylabel=label)
     axes[0].legend(frameon=False, ncols=len(evaluations), loc="lower left", bbox_to_anchor=(0.0, 1.0))
+    return _svg(figure)
+
+
+def plot_corrections(shift_mm: FloatArray, turn_deg: FloatArray) -> str:  # [P] both
+    """How far each training frame's pose was corrected."""
+    figure, axes = _figure(2, (11.0, 2.6), columns=2)
+    for axis, values, label in zip(axes, (shift_mm, turn_deg), ("shift, mm", "turn, degrees"), strict=True):
+        axis.plot(values, linewidth=1.2, color=COLOURS["scene"])
+        axis.set(xlabel="training frame", ylabel=label)
     return _svg(figure)
 
 

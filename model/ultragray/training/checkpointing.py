@@ -1,8 +1,9 @@
 """Checkpoints of a running training: one safetensors file that a killed run continues from, bit for bit.
 
 Tensors: `parameter.*` (the raw parameters), `adam.*` (moments and step counts), `pull.total` and `pull.seen` (the
-statistics of the next refinement), `waiting` (frames of this round that were not seen yet) and `generator` (the state
-of the run's random numbers). Metadata: one JSON object with the fields of `CheckpointHeader`. Nothing is pickled.
+statistics of the next refinement), `pose.*` (corrections of poses that are trained, and their moments), `waiting`
+(frames of this round that were not seen yet) and `generator` (the state of the run's random numbers). Metadata: one
+JSON object with the fields of `CheckpointHeader`. Nothing is pickled.
 """
 
 from __future__ import annotations
@@ -93,14 +94,19 @@ def _header(text: str) -> CheckpointHeader:
     return header
 
 
-def check_tensors(path: Path, header: CheckpointHeader, tensors: Mapping[str, Tensor], frame_count: int) -> None:
-    """Raises TrainingStateInvalid unless these are the tensors of such a run on so many training frames."""
+def check_tensors(
+    path: Path, header: CheckpointHeader, tensors: Mapping[str, Tensor], frame_count: int, pose_count: int
+) -> None:
+    """Raises TrainingStateInvalid unless these are the tensors of such a run on so many training frames.
+
+    `pose_count` is the number of pose corrections that the run trains.
+    """
     config, means, waiting = header.config, tensors.get("parameter.means"), tensors.get("waiting")
     assert config.max_gaussians is not None
     count, waiting_count = (len(t) if t is not None and t.ndim else 0 for t in (means, waiting))
     if not 1 <= count <= config.max_gaussians:
         raise TrainingStateInvalid(f"{path}: it holds {count} Gaussians, expected 1 to {config.max_gaussians}")
-    expected = _expected_tensors(config, count, waiting_count)
+    expected = _expected_tensors(config, count, waiting_count, pose_count)
     if different := set(tensors) ^ set(expected):
         raise TrainingStateInvalid(f"{path}: missing or unexpected tensors: {', '.join(sorted(different))}")
     for name, (dtype, shape) in expected.items():
@@ -119,7 +125,7 @@ def check_tensors(path: Path, header: CheckpointHeader, tensors: Mapping[str, Te
 
 
 def _expected_tensors(
-    config: TrainingConfig, gaussian_count: int, waiting_count: int
+    config: TrainingConfig, gaussian_count: int, waiting_count: int, pose_count: int
 ) -> dict[str, tuple[torch.dtype, tuple[int, ...]]]:
     shapes: dict[str, tuple[int, ...]] = {"pull.total": (gaussian_count,), "pull.seen": (gaussian_count,)}
     for name, shape in expected_shapes(gaussian_count, config.sh_degree).items():
@@ -127,7 +133,9 @@ def _expected_tensors(
         if is_trained(name, shape, config):
             shapes |= {f"adam.{name}.{moment}": shape for moment in MOMENTS} | {f"adam.{name}.step": ()}
     generator = torch.Generator().get_state()
+    poses = {f"pose.{name}": (torch.float64, (pose_count, 6)) for name in ("twists", *MOMENTS)}
     return {
+        **({**poses, "pose.step": (torch.float32, ())} if pose_count else {}),
         **{name: (torch.float32, shape) for name, shape in shapes.items()},
         "waiting": (torch.int64, (waiting_count,)),
         "generator": (generator.dtype, tuple(generator.shape)),

@@ -36,6 +36,7 @@ MAX_FLOOR = 0.9
 MAX_RANGE_MM = 100.0  # frames further apart have nothing to say about what lies between
 STARTS = ("informed", "random")
 GROWTHS = ("even", "threshold")
+REFINEMENTS = ("none", "sweeps", "frames")
 
 
 @dataclass(frozen=True)
@@ -112,6 +113,12 @@ class TrainingConfig(Contract):
     learn_beam: bool = described(
         "Whether thickness, focus and depth of field are learned, from given ones on: for sweeps that cross or tilt.",
         False,
+    )
+    refine_poses: str = described(
+        "Correction of the training poses (docs/poses.md): none; sweeps: each sweep as a whole; frames: each frame "
+        "too. Good poses are left alone.",
+        "none",
+        choices=REFINEMENTS,
     )
     means_rate: float = described("Learning rate of the means, times the scene's scale in cm.", 2e-4, low=0.0, high=1.0)
     scales_rate: float = described("Learning rate of the scales.", 1e-2, low=0.0, high=1.0)

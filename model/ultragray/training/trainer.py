@@ -39,6 +39,7 @@ from .data.initial import initial_parameters
 from .data.sampling import BatchSampler, out_of_plane_shift_mm, shift_out_of_plane
 from .device import forget_peak_memory, peak_memory_mb, training_device
 from .memory import check_comparison_memory, check_memory
+from .poses.refinement import PoseRefinement
 from .progress import Journal, Progress, StepTimer
 from .steps.beam import TrainedBeam
 from .steps.intensity import project_sh0
@@ -100,7 +101,9 @@ def train(
         scene, is_finished, resolved = trainer.scene(), trainer.is_finished, trainer.config
     if resolved.confidence and is_finished:
         del trainer  # what it takes of the memory is free for the second training
-        scene.info.confidence.update(_fitted_confidence(dataset, resolved, should_stop, device, backend))
+        refined = replace(dataset, train=replace(dataset.train, poses=scene.training_poses))
+        settled = replace(resolved, refine_poses="none")
+        scene.info.confidence.update(_fitted_confidence(refined, settled, should_stop, device, backend))
     return scene
 
 
@@ -148,12 +151,14 @@ class Trainer:
             )
         check_training_pose_count(len(dataset.train))
         check_comparison_memory(dataset, config)
+        self._dataset_sha256 = dataset.sha256
+        self.refinement = PoseRefinement(dataset, config.refine_poses)
+        dataset = self.refinement.dataset
         self._geometry = Geometry.of(dataset)
         config = config.resolved(self._geometry)
         check_memory(dataset, config, self._device)
         self.dataset, self.config, self.folder = dataset, config, folder
         self._checkpoint = None if folder is None else folder / CHECKPOINT_FILE
-        self._dataset_sha256 = dataset.sha256
         forget_peak_memory(self._device)
         self._images = torch.tensor(dataset.train.images, device=self._device)  # [F, H, W] uint8
         self._info = SceneInfo(
@@ -292,8 +297,11 @@ class Trainer:
         if self.config.out_of_plane_mm:
             poses = shift_out_of_plane(poses, out_of_plane_shift_mm(self.config.out_of_plane_mm, self._generator))
         truth = self._images[cuda.upload(batch, self._device)].float().div_(255.0)
-        image = image_loss(self._rendered(poses, self._schedule.sh_degree(self.step)), truth)
+        image = image_loss(
+            self._rendered(self.refinement.corrected(batch, poses), self._schedule.sh_degree(self.step)), truth
+        )
         image.backward()  # type: ignore[no-untyped-call]
+        self.refinement.step(self.step / self._schedule.steps)
         with torch.no_grad():
             parts = torch.stack([image.detach(), self._add_scale_penalty()])
             means_gradient = self.parameters["means"].grad
@@ -395,6 +403,7 @@ class Trainer:
         tensors = {
             **{f"parameter.{name}": tensor for name, tensor in self.parameters.items()},
             **{f"adam.{name}": tensor for name, tensor in self._optimizer.tensors().items()},
+            **{f"pose.{name}": tensor for name, tensor in self.refinement.tensors().items()},
             "pull.total": self._pull.total,
             "pull.seen": self._pull.seen,
             "waiting": self._sampler.waiting,
@@ -410,7 +419,7 @@ class Trainer:
             raise TrainingStateInvalid("a run without a folder cannot be resumed")
         header, tensors = read_checkpoint(path)
         check_same_run(path, header, self.config, self._dataset_sha256)
-        check_tensors(path, header, tensors, len(self.dataset.train))
+        check_tensors(path, header, tensors, len(self.dataset.train), self.refinement.group_count)
         try:
             self._generator.set_state(tensors["generator"])
         except RuntimeError as error:
@@ -421,6 +430,7 @@ class Trainer:
         self._beam.load({k.removeprefix("beam."): v for k, v in tensors.items() if k.startswith("beam.")})
         self._pull = PullStatistics(tensors["pull.total"].to(self._device), tensors["pull.seen"].to(self._device))
         self._sampler.waiting = tensors["waiting"]
+        self.refinement.load({k.removeprefix("pose."): v for k, v in tensors.items() if k.startswith("pose.")})
         self.step = header.step
         self._timer = StepTimer(header.elapsed_s)
 
@@ -428,7 +438,12 @@ class Trainer:
         """The scene as it is; a finished run's is measured on the held-out frames."""
         splats = {name: tensor.detach().cpu() for name, tensor in self.parameters.items()}
         info = replace(self._info, beam=self._beam.found(), training={**self.config.to_dict(), "step": self.step})
-        scene = GaussianScene.from_splats(splats, info=info, training_poses=self.dataset.train.poses)
+        scene = GaussianScene.from_splats(
+            splats,
+            info=info,
+            training_poses=self.refinement.poses(),
+            pose_corrections=self.refinement.corrections(),
+        )
         if len(self.dataset.val) and self.is_finished:
             measured = evaluate(scene.to(self._device), self.dataset.val, backend=self._backend)
             scene.info.metrics.update(measured.mean.to_dict())

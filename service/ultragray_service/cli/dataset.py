@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from ultragray.datasets.source import FORMATS, PHANTOM, SourceOptions, load_dataset
+from ultragray.errors import InvalidArgument
 
 from .options import with_options
 
@@ -82,6 +84,10 @@ def convert(
     output: Annotated[
         Path, typer.Option("--output", "-o", help="Folder for conf.json and the .npy files.", show_default=False)
     ],
+    poses_of: Annotated[
+        Path | None,
+        typer.Option(metavar="SCENE", help="A scene trained from it: its corrected training poses are written."),
+    ] = None,
     *,
     source: SourceOptions,
 ) -> None:
@@ -89,11 +95,27 @@ def convert(
     from ultragray.datasets.released import write_released
 
     read = read_dataset(dataset, source)
+    if poses_of is not None:
+        read = _with_poses_of(poses_of, read)
     write_released(read, output)
     typer.echo(
         f"wrote {output}: {len(read.train)} training and {len(read.val)} held-out frames of "
         f"{read.train.width}x{read.train.height}, {read.probe}"
     )
+
+
+def _with_poses_of(path: Path, dataset: Dataset) -> Dataset:
+    """The dataset with a scene's corrected training poses."""
+    from ultragray.scene_info import read_header
+
+    header = read_header(path)
+    if header.info.dataset_sha256 != dataset.sha256:
+        raise InvalidArgument(
+            f"{path} was trained from {header.info.dataset_name or 'other data'}, not from {dataset.name} split as "
+            "here: give the dataset and the options that it was trained with",
+            field="poses_of",
+        )
+    return replace(dataset, train=replace(dataset.train, poses=header.training_poses))
 
 
 @dataset_app.command()

@@ -17,8 +17,10 @@ from .options import with_options
 from .output import check_picture_folder
 
 if TYPE_CHECKING:
+    from ultragray.datasets.sweep import Sweep
     from ultragray.evaluation.reliability import Reliability
     from ultragray.evaluation.scoring import Evaluation
+    from ultragray.scene import GaussianScene
 
 
 VoxelMm = Annotated[
@@ -55,13 +57,16 @@ def evaluate(
             "--output",
             "-o",
             help="New folder for one picture a frame: truth, rendering, difference, echo, transmittance; and one plot "
-            "of the uncertainty.",
+            "of the uncertainty, one of the corrected poses.",
             show_default="no pictures",
         ),
     ] = None,
     split: Annotated[Split, typer.Option(help="Frames to measure on.")] = Split.VAL,
     json: Annotated[bool, typer.Option("--json", help="One JSON object, with every frame.")] = False,
     backend: Annotated[str, typer.Option(help="auto, cpu, cuda or reference.")] = "auto",
+    register: Annotated[
+        bool, typer.Option("--register", help="Also move each frame by one half of it, and score the other half.")
+    ] = False,
     *,
     source: SourceOptions,
 ) -> None:
@@ -81,14 +86,18 @@ def evaluate(
     check_scene_fits(loaded.info, read)
     evaluation = evaluate_scene(loaded, sweep, backend=backend)
     reliability = measure_reliability(loaded, sweep, backend=backend)
+    poses = _pose_figures(loaded, sweep if register else None, backend)
     if json:
         figures = evaluation.to_dict() | {"uncertainty": None if reliability is None else reliability.to_dict()}
+        figures |= {name: value.to_dict() for name, value in poses.items()}
         _print_json({"scene": str(scene), "dataset": read.name, "split": split.value, **figures})
     else:
         print_metrics(f"{read.name}, {len(sweep)} {split.value} frames", {scene.stem: evaluation})
         print_speckle({scene.stem: evaluation})
         if reliability is not None:
             typer.echo(_in_words(reliability))
+        for value in poses.values():
+            typer.echo(str(value))
     if output is not None:
         from ultragray.evaluation.side_by_side import write_side_by_side
 
@@ -96,7 +105,23 @@ def evaluate(
         if reliability is not None:
             paths.append(output / "uncertainty.png")
             plot_reliability({scene.stem: reliability}, paths[-1])
+        if (corrections := poses.get("pose_corrections")) is not None:
+            paths.append(output / "pose_corrections.svg")
+            corrections.write_plot(paths[-1])
         typer.echo(f"wrote {len(paths)} pictures into {output}", err=json)
+
+
+def _pose_figures(scene: GaussianScene, registered: Sweep | None, backend: str) -> dict[str, Any]:
+    """How far a scene's training poses were corrected, and the scores of registered frames, by their key in JSON."""
+    from ultragray.training.poses.held_out import score_halves
+    from ultragray.training.poses.sizes import CorrectionSizes
+
+    found: dict[str, Any] = {}
+    if scene.pose_corrections is not None:
+        found["pose_corrections"] = CorrectionSizes.of(scene.pose_corrections, scene.training_poses)
+    if registered is not None:
+        found["halves"] = score_halves(scene, registered, backend=backend)
+    return found
 
 
 @with_options
