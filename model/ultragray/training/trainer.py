@@ -437,6 +437,11 @@ class Trainer:
     def scene(self) -> GaussianScene:
         """The scene as it is; a finished run's is measured on the held-out frames."""
         splats = {name: tensor.detach().cpu() for name, tensor in self.parameters.items()}
+        if self.is_finished and self._beam.is_doubtful(self._geometry.frame_spacing_mm):
+            logging.getLogger(__name__).warning(
+                "the frames do not tell how thick they are: what was learned is thinner than the gaps between them; "
+                "give slice_thickness_mm, or leave learn_beam off"
+            )
         info = replace(self._info, beam=self._beam.found(), training={**self.config.to_dict(), "step": self.step})
         scene = GaussianScene.from_splats(
             splats,

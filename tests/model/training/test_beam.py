@@ -152,6 +152,15 @@ def test_without_a_beam_a_scene_has_none_and_keeps_its_file() -> None:
     assert TrainedBeam(TrainingConfig(), PROBE).numbers is None
 
 
+def test_a_beam_thinner_than_the_gaps_is_doubtful() -> None:
+    thin, given = (
+        TrainedBeam(TrainingConfig(slice_thickness_mm=0.4, learn_beam=learned), PROBE) for learned in (True, False)
+    )
+    assert thin.is_doubtful(frame_spacing_mm=1.0)
+    assert not thin.is_doubtful(frame_spacing_mm=0.5)
+    assert not given.is_doubtful(frame_spacing_mm=1.0)
+
+
 @pytest.mark.parametrize(
     "shape", [{"slice_focus_mm": 9.0}, {"slice_thickness_mm": 2.0, "slice_depth_of_field_mm": 9.0}]
 )

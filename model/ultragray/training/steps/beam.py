@@ -67,6 +67,11 @@ class TrainedBeam:
         thickness, focus, depth_of_field = self._raw.tolist()
         return ElevationBeam(math.exp(thickness), focus * self._length_mm, math.exp(depth_of_field))
 
+    def is_doubtful(self, frame_spacing_mm: float) -> bool:
+        """Whether what was learned is so thin that frames have nothing in common: then they do not tell it."""
+        found = self.found()
+        return self._config.learn_beam and found is not None and found.thickness_mm < 0.5 * frame_spacing_mm
+
     def tensors(self) -> dict[str, Tensor]:
         """The state of what is learned, as `load` takes it; empty where nothing is."""
         if not self._config.learn_beam:
