@@ -84,8 +84,22 @@ def test_an_even_selection(count: int, limit: int) -> None:
 
 
 def test_training_poses(http: httpx.Client, demo_scene: GaussianScene) -> None:
-    poses = np.array(http.get("/v1/scenes/demo/training-poses").json()["poses"])
-    np.testing.assert_array_equal(poses.reshape(-1, 4, 4), demo_scene.training_poses)
+    told = http.get("/v1/scenes/demo/training-poses").json()
+    np.testing.assert_array_equal(np.array(told["poses"]).reshape(-1, 4, 4), demo_scene.training_poses)
+    assert told["shift_mm"] is told["turn_deg"] is None
+
+
+def test_corrected_training_poses(http: httpx.Client) -> None:
+    plain = make_scene(probe=DEMO_PROBE, seed=6)
+    corrections = np.tile(np.eye(4), (2, 1, 1))
+    corrections[1, 0, 3] = 2.0
+    scene = GaussianScene.from_splats(
+        plain.splats, info=plain.info, training_poses=np.tile(np.eye(4), (2, 1, 1)), pose_corrections=corrections
+    )
+    assert http.put("/v1/scenes/corrected", content=scene.to_bytes(), headers=RAW).status_code == 201
+    told = http.get("/v1/scenes/corrected/training-poses").json()
+    assert (told["shift_mm"], told["turn_deg"]) == ([0.0, 2.0], [0.0, 0.0])
+    http.delete("/v1/scenes/corrected")
 
 
 def test_the_life_of_an_imported_scene(http: httpx.Client, artifacts: Path) -> None:

@@ -36,7 +36,9 @@ export async function sceneGaussians(scene: string, limit: number): Promise<Gaus
   return { count, values: new Float32Array(buffer, 4 + length, count * 6) };
 }
 
-/** The poses that the scene was trained from, each 16 numbers row by row. */
-export async function trainingPoses(scene: string): Promise<number[][]> {
-  return (await getJson("/v1/scenes/{scene}/training-poses", { scene })).poses;
+export type TrainingPoses = Schemas["ScenePoses"];
+
+/** The poses that the scene was trained from, each 16 numbers row by row, and how far each was corrected. */
+export async function trainingPoses(scene: string): Promise<TrainingPoses> {
+  return await getJson("/v1/scenes/{scene}/training-poses", { scene });
 }

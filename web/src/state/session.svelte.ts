@@ -5,7 +5,7 @@ import { defaultsOf } from "../api/described";
 import { settings } from "../api/generated/contract";
 import type { Output } from "../api/outputs";
 import { exampleProbe, PROBE_KINDS, type Probe } from "../api/probes";
-import { describeScene, trainingPoses, type SceneDescription } from "../api/scenes";
+import { describeScene, trainingPoses, type SceneDescription, type TrainingPoses } from "../api/scenes";
 import type { Display, StreamSettings } from "../api/stream";
 import { areUpright, boxOf, type ImagePlane } from "../geometry/plane";
 import {
@@ -51,6 +51,8 @@ export class Session {
   missing = $state(false);
   /** The views that the scene was trained from. */
   views = $state.raw<Pose[]>([]);
+  /** How far each was corrected in the training; null: none was. */
+  corrections = $state.raw<Pick<TrainingPoses, "shift_mm" | "turn_deg"> | null>(null);
   pose = $state.raw<Pose>(IDENTITY);
   /** What is played in place of the training sweep. */
   trajectory = $state.raw<Trajectory | null>(null);
@@ -100,7 +102,9 @@ export class Session {
       if (!sameScene(this.description, description)) {
         const probe = description.probe ?? SUBSTITUTE;
         const plane = await planes.get(probe);
-        this.views = description.training_poses.count > 0 ? await viewsOf(this.name) : [];
+        const known = description.training_poses.count > 0 ? await viewsOf(this.name) : null;
+        this.views = known?.poses ?? [];
+        this.corrections = known?.shift_mm ? known : null;
         this.description = description;
         this.#own = { probe, plane };
         this.#beginAnew();
@@ -232,12 +236,12 @@ function sameScene(before: SceneDescription | null, now: SceneDescription): bool
   return before !== null && lasting(before) === lasting(now);
 }
 
-async function viewsOf(scene: string): Promise<Pose[]> {
+async function viewsOf(scene: string): Promise<TrainingPoses | null> {
   try {
     return await trainingPoses(scene);
   } catch (error) {
     if (mayPass(error)) throw error;
-    return [];
+    return null;
   }
 }
 

@@ -1,7 +1,8 @@
-"""How far corrections moved the frames of a scene: numbers, and a plot over the frames."""
+"""How far corrections moved the frames of a scene: numbers, and a plot over the frames. Free of torch."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,6 @@ import numpy as np
 
 from ...files.atomic import write_whole
 from ...probe import FloatArray
-from .motion import turn_vectors_deg
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,7 +25,8 @@ class CorrectionSizes:
         """Of corrections that were left-multiplied to the tracker's poses, which gave the training poses."""
         given = np.linalg.inv(corrections) @ training_poses
         shifts = np.linalg.norm(training_poses[:, :3, 3] - given[:, :3, 3], axis=1)
-        return cls(shifts, np.linalg.norm(turn_vectors_deg(corrections[:, :3, :3]), axis=1))
+        half_chords = np.linalg.norm(corrections[:, :3, :3] - np.eye(3), axis=(1, 2)) / math.sqrt(8.0)
+        return cls(shifts, np.degrees(2.0 * np.arcsin(np.clip(half_chords, 0.0, 1.0))))
 
     def to_dict(self) -> dict[str, Any]:
         """A JSON object."""

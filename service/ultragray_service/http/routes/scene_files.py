@@ -14,7 +14,8 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import FileResponse, Response
 
 from ultragray.contract import described
-from ultragray.probe import FloatArray
+from ultragray.scene_info import SceneHeader
+from ultragray.training.poses.sizes import CorrectionSizes
 from ultragray_workers.errors import UploadTooLarge
 from ultragray_workers.jobs.queue.owners import Kind
 from ultragray_workers.scenes import SUFFIX
@@ -36,6 +37,8 @@ class ScenePoses:
     """Training poses of a scene, evenly taken."""
 
     poses: list[list[float]] = described("16 numbers each, row by row, mm.")
+    shift_mm: list[float] | None = described("How far each was corrected in the training; null: none was.", None)
+    turn_deg: list[float] | None = described("And turned.", None)
 
 
 router = APIRouter(prefix="/v1/scenes", tags=["scenes"])
@@ -76,7 +79,7 @@ async def get_training_poses(request: Request, service: ServiceDep, scene: Scene
 
     async def poses() -> Response:
         header = await service.catalog.header(scene)
-        return Response(await asyncio.to_thread(_poses_json, header.training_poses), media_type="application/json")
+        return Response(await asyncio.to_thread(_poses_json, header), media_type="application/json")
 
     return await revalidated(request, (await service.catalog.version(scene)).tag, poses)
 
@@ -119,9 +122,13 @@ async def delete_scene(service: ServiceDep, scene: SceneName) -> None:
     await service.pool.forget(scene)
 
 
-def _poses_json(poses: FloatArray) -> bytes:  # [P, 4, 4]
-    chosen = poses[even_selection(len(poses), MAX_POSES)]
-    return json.dumps({"poses": chosen.reshape(-1, 16).tolist()}).encode()
+def _poses_json(header: SceneHeader) -> bytes:
+    poses, corrections = header.training_poses, header.pose_corrections
+    chosen = even_selection(len(poses), MAX_POSES)
+    sizes: dict[str, Any] = {"shift_mm": None, "turn_deg": None}
+    if corrections is not None:
+        sizes = CorrectionSizes.of(corrections[chosen], poses[chosen]).to_dict()
+    return json.dumps({"poses": poses[chosen].reshape(-1, 16).tolist(), **sizes}).encode()
 
 
 async def _blocks(request: Request, service: ServiceDep) -> AsyncIterator[bytes]:
