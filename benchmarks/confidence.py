@@ -44,6 +44,7 @@ DOCUMENT = FOLDER.parent / "docs" / "confidence.md"
 IMAGES = FOLDER.parent / "docs" / "images"
 SIDE = 128
 FIRST_MM = -36.0  # where the sweeps begin
+ERROR, RANK = 0.07, 0.8  # that are aimed at
 TELLING_STD = 0.05  # of actual values; where they vary less, ranks mean little
 COLOURS = {
     "tilt": "#0b6e99",
@@ -215,11 +216,19 @@ def _lines(figures: dict[str, Any]) -> Iterator[str]:
     yield "|---|---|---|---|---|---|"
     for name, cause, found in _cells(figures):
         actual = np.array(found["actual"])
-        cells = [_agreement(np.array(found[key]), actual) for key in ("told", "of_pose")]
+        agreements = [_agreement(np.array(found[key]), actual) for key in ("told", "of_pose")]
         spread = f"{actual.mean():.2f} ± {actual.std():.2f}"
         count = figures[name]["training_frames"]
-        yield f"| {name} | {count} | {cause} ({len(actual)}) | {spread} | {' | '.join(cells)} |"
+        yield f"| {name} | {count} | {cause} ({len(actual)}) | {spread} | {' | '.join(agreements)} |"
     yield ""
+    cells = list(_cells(figures))
+    telling = sum(np.std(found["actual"]) > TELLING_STD for _, _, found in cells)
+    for key, of_what in (("told", "Of rendered frames"), ("of_pose", "Of poses alone")):
+        errors = [f"{cause} of {name}" for name, cause, found in cells if _error(found, key) > ERROR]
+        ranks = [f"{cause} of {name}" for name, cause, found in cells if _rank(found, key) < RANK]
+        yield f"{of_what}, {len(errors)} of {len(cells)} errors are above {ERROR:g}: {_listed(errors)}."
+        yield f"{len(ranks)} of {telling} rank correlations are below {RANK:g}: {_listed(ranks)}."
+        yield ""
     yield "| scene | cause | expected | actual | within 1σ | within 2σ |"
     yield "|---|---|---|---|---|---|"
     for name, cause, found in _cells(figures):
@@ -231,6 +240,20 @@ def _lines(figures: dict[str, Any]) -> Iterator[str]:
     commits = sorted({one["commit"] for one in figures.values()})
     machines = sorted({one["machine"] for one in figures.values()})
     yield f"Measured at {', '.join(commits)} on {', '.join(machines)}."
+
+
+def _error(found: dict[str, Any], key: str) -> float:
+    return float(np.abs(np.array(found[key]) - np.array(found["actual"])).mean())
+
+
+def _rank(found: dict[str, Any], key: str) -> float:
+    """1 where ranks mean little."""
+    told, actual = np.array(found[key]), np.array(found["actual"])
+    return rank_correlation(told, actual) if actual.std() > TELLING_STD else 1.0
+
+
+def _listed(names: list[str]) -> str:
+    return ", ".join(names) or "none"
 
 
 def _agreement(told: FloatArray, actual: FloatArray) -> str:
