@@ -129,7 +129,7 @@ def simulated(trained: FloatArray, asked: FloatArray, causes: np.ndarray, probe:
 def fourth_tilt(trained: tuple[float, ...], asked: float) -> Asked:
     """Three sweeps at three tilts, and a fourth at another."""
     sweeps = [
-        freehand_poses(36, tilt_deg=tilt, offset_mm=0.7 * place, unrest=place) for place, tilt in enumerate(trained)
+        freehand_poses(20, tilt_deg=tilt, offset_mm=0.7 * place, unrest=place) for place, tilt in enumerate(trained)
     ]
     others = freehand_poses(24, tilt_deg=asked, offset_mm=1.5, unrest=3.3)
     return simulated(np.concatenate(sweeps), others, np.array(["steep"] * len(others)))
