@@ -1,9 +1,10 @@
 """Checkpoints of a running training: one safetensors file that a killed run continues from, bit for bit.
 
 Tensors: `parameter.*` (the raw parameters), `adam.*` (moments and step counts), `pull.total` and `pull.seen` (the
-statistics of the next refinement), `pose.*` (corrections of poses that are trained, and their moments), `waiting`
-(frames of this round that were not seen yet) and `generator` (the state of the run's random numbers). Metadata: one
-JSON object with the fields of `CheckpointHeader`. Nothing is pickled.
+statistics of the next refinement), `floor` (the least intensity of each Gaussian), `beam.*` (a learned beam), `pose.*`
+(corrections of poses that are trained, and their moments), `waiting` (frames of this round that were not seen yet) and
+`generator` (the state of the run's random numbers). Metadata: one JSON object with the fields of `CheckpointHeader`.
+Nothing is pickled.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from .config import TrainingConfig
 from .steps.beam import expected_beam_tensors
 from .steps.optimizer import MOMENTS, is_trained
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 METADATA_KEY = "ultragray-training"
 
 
@@ -127,7 +128,7 @@ def check_tensors(
 def _expected_tensors(
     config: TrainingConfig, gaussian_count: int, waiting_count: int, pose_count: int
 ) -> dict[str, tuple[torch.dtype, tuple[int, ...]]]:
-    shapes: dict[str, tuple[int, ...]] = {"pull.total": (gaussian_count,), "pull.seen": (gaussian_count,)}
+    shapes: dict[str, tuple[int, ...]] = dict.fromkeys(("pull.total", "pull.seen", "floor"), (gaussian_count,))
     for name, shape in expected_shapes(gaussian_count, config.sh_degree).items():
         shapes[f"parameter.{name}"] = shape
         if is_trained(name, shape, config):

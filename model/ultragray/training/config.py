@@ -32,7 +32,6 @@ else:
 
 RELEASED_STEPS = 30_000  # the length of run that the released rates are tuned for
 RELEASED_TRANSMITTANCE_RATE, MAX_SCALED_RATE = 5e-4, 2e-2
-MAX_FLOOR = 0.9
 MAX_RANGE_MM = 100.0  # frames further apart have nothing to say about what lies between
 STARTS = ("informed", "random")
 GROWTHS = ("even", "threshold")
@@ -48,7 +47,10 @@ class TrainingConfig(Contract):
     """
 
     steps: int | None = described("Steps of the run; none: from the number of frames.", None, low=1, high=10_000_000)
-    batch_size: int = described("Frames of one step; fewer where the dataset has fewer.", 8, low=1, high=1_024)
+    batch_size: int = described("Views of one step; fewer where the dataset has few frames.", 8, low=1, high=1_024)
+    views_between: float = described(
+        "Share of them that lies between neighbouring frames or beyond the ends of the sweep.", 0.75, low=0.0, high=1.0
+    )
     seed: int = described("Of every random choice.", 0, low=0, high=2**63 - 1)
     initial_gaussians: int | None = described(
         "Gaussians at the start; none: max_gaussians, or half of them where refinements add to them.",
@@ -74,11 +76,11 @@ class TrainingConfig(Contract):
         "sigmoid",
         choices=INTENSITIES,
     )
-    shadow_start: float = described(
-        "Up to this share of the run only the transmittances are trained.", 0.1, low=0.0, high=1.0
-    )
-    intensity_floor: float | None = described(
-        "Least intensity, up to floor_end; none: the frames' mean brightness.", None, low=0.0, high=MAX_FLOOR
+    intensity_floor: float = described(
+        "Least intensity of what lies in a shadow, up to floor_end, as a share of what the whole beam would show.",
+        0.9,
+        low=0.0,
+        high=1.0,
     )
     floor_end: float = described("Where the floor ends, as a share of the run.", 0.3, low=0.0, high=1.0)
     sh_degree: int = described("Degree of the spherical harmonics.", 1, low=0, high=MAX_SH_DEGREE)
@@ -217,7 +219,6 @@ class TrainingConfig(Contract):
             initial_gaussians=self.initial_gaussians or (limit if not self.refinements else (limit + 1) // 2),
             initial_scale_mm=initial_scale_mm,
             initial_elevation_mm=self.initial_elevation_mm or thick_mm,
-            intensity_floor=_given_or(self.intensity_floor, min(geometry.brightness, MAX_FLOOR)),
             out_of_plane_mm=out_of_plane_mm,
             transmittance_rate=_given_or(self.transmittance_rate, scaled_transmittance_rate(steps)),
         )
@@ -241,12 +242,12 @@ PRESETS: dict[str, dict[str, Any]] = {
     "fast": {},
     "paper": {
         "steps": RELEASED_STEPS,
+        "views_between": 0.0,
         "initial_gaussians": 500_000,
         "max_gaussians": 500_000,
         "start": "random",
         "initial_scale_mm": 0.5,
         "intensity": "released",
-        "shadow_start": 0.0,
         "intensity_floor": 0.0,
         "out_of_plane_mm": 2.0,
         "means_rate": 1e-4,

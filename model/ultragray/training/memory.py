@@ -18,6 +18,7 @@ from ..evaluation.scoring import CHUNK_PIXELS, frames_at_once
 from ..scene_info import expected_shapes
 from .config import TrainingConfig
 from .data.sampling import PREDICTED_PIXELS
+from .data.shadows import LOOKED_AT_FRAMES
 
 BASE_BYTES = 440 << 20  # the process with torch loaded, and the scratch memory of its kernels
 COPIES = 16  # parameters, gradients, moments; what refinements, checkpoints and the kernel copy (measured: 14)
@@ -28,6 +29,7 @@ LIST_GAUSSIANS = 4096  # a step lists those that an image plane touches, so many
 LIST_BYTES = 72 * 4160  # of a full list: it begins with room for 1040 slices of 72 bytes and doubles twice
 MEASURED_BYTES = 288  # of a pixel of the held-out frames that are measured at once (measured: 234 to 259)
 COMPARED_BYTES = 8 * 2 * PREDICTED_PIXELS + 32_768  # of a frame beside its distances, when frames are compared
+SHADOW_BYTES = 4 * 5  # of a pixel of the frames that shadows are looked for in: copies as they are compared
 CUDA_BASE_BYTES = 256 << 20  # what torch's allocator rounds up and leaves unused
 CUDA_SLICE_BYTES = 4 * (20 + 1 + 9)  # of a Gaussian in a pose: the slice, its place and its gradient
 CUDA_PLANES = 10  # of a pose, as large as a frame: the frame, what it is made of, and their gradients
@@ -39,15 +41,17 @@ CONTROL_GROUPS = Path("/sys/fs/cgroup")
 def required_bytes(dataset: Dataset, config: TrainingConfig) -> int:
     """An upper bound of the process's memory, dataset included."""
     assert config.max_gaussians is not None
-    frames = min(config.batch_size, len(dataset.train))
+    frames = config.batch_size  # views between them are drawn however few there are
     height, width = dataset.train.height, dataset.train.width
     stepping = 4 * PIXEL_FLOATS * frames * height * (width + PADDING)
     measured = max(len(dataset.val), len(dataset.train) if config.confidence else 0)
     measuring = MEASURED_BYTES * min(measured * height * width, max(CHUNK_PIXELS, height * width))
+    shadows = SHADOW_BYTES * min(len(dataset.train), LOOKED_AT_FRAMES) * height * width
+    beginning = max(comparison_bytes(dataset), shadows)
     slices = frames * -(-config.max_gaussians // LIST_GAUSSIANS) * LIST_BYTES  # as if all touched all planes
     copies = 3 if config.confidence else 2  # the dataset's, the trainer's and that of the frames it calibrates with
     images = copies * dataset.train.images.nbytes + dataset.val.images.nbytes
-    return BASE_BYTES + _gaussian_bytes(config) + slices + max(stepping, measuring, comparison_bytes(dataset)) + images
+    return BASE_BYTES + _gaussian_bytes(config) + slices + max(stepping, measuring, beginning) + images
 
 
 def required_device_bytes(dataset: Dataset, config: TrainingConfig) -> int:
@@ -55,8 +59,7 @@ def required_device_bytes(dataset: Dataset, config: TrainingConfig) -> int:
     assert config.max_gaussians is not None
     height, width = dataset.train.height, dataset.train.width
     per_frame = config.max_gaussians * CUDA_SLICE_BYTES + 4 * CUDA_PLANES * height * width
-    frames = min(config.batch_size, len(dataset.train))
-    stepping = frames * (per_frame + 4 * CUDA_LOSS_FLOATS * height * width)
+    stepping = config.batch_size * (per_frame + 4 * CUDA_LOSS_FLOATS * height * width)
     measuring = min(len(dataset.val), frames_at_once(height, width)) * per_frame
     return CUDA_BASE_BYTES + _gaussian_bytes(config) + max(stepping, measuring) + dataset.train.images.nbytes
 

@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -34,8 +35,10 @@ from .checkpointing import (
 )
 from .confidence.calibration import fit_confidence, shorter
 from .config import TrainingConfig
+from .data.between import ViewsBetween
 from .data.geometry import Geometry
 from .data.initial import initial_parameters
+from .data.neighbours import neighbours_of
 from .data.sampling import BatchSampler, out_of_plane_shift_mm, shift_out_of_plane
 from .device import forget_peak_memory, peak_memory_mb, training_device
 from .memory import check_comparison_memory, check_memory
@@ -171,22 +174,26 @@ class Trainer:
             dataset_sha256=self._dataset_sha256,
         )
         self._generator = torch.Generator().manual_seed(config.seed)
-        self._sampler = BatchSampler(len(dataset.train), config.batch_size, self._generator)
-        self._schedule = Schedule(
-            config, scene_scale_cm=self._geometry.scene_scale_cm, batch_size=self._sampler.batch_size
-        )
+        neighbours = neighbours_of(dataset.train)
+        self._views_between = ViewsBetween(dataset.train, neighbours, self._images)
+        self._between_count = min(round(config.views_between * config.batch_size), config.batch_size - 1)
+        self._sampler = BatchSampler(len(dataset.train), config.batch_size - self._between_count, self._generator)
+        self._batch_size = self._sampler.batch_size + self._between_count
+        self._schedule = Schedule(config, scene_scale_cm=self._geometry.scene_scale_cm, batch_size=self._batch_size)
         self._beam = TrainedBeam(config, dataset.probe)
         self.step = 0  # steps done
         self._timer = StepTimer()
         self._val_psnr_db: float | None = None
         self._val_step: int | None = None
         self._peak_memory_mb: float | None = None
-        self._begin_with(initial_parameters(dataset, self._geometry, config, self._generator))
+        start = initial_parameters(dataset, neighbours, self._geometry, config, self._generator)
+        self._begin_with(start.parameters, start.floor)
         self._backend = choose_backend(backend, self._view(sh_degree=0))
 
-    def _begin_with(self, parameters: dict[str, Tensor]) -> None:
+    def _begin_with(self, parameters: dict[str, Tensor], floor: Tensor) -> None:  # [N]
         self.parameters = self._trainable(parameters)
-        self._optimizer = Optimizer(self.parameters, batch_size=self._sampler.batch_size)
+        self._floor = floor.to(self._device)
+        self._optimizer = Optimizer(self.parameters, batch_size=self._batch_size)
         self._pull = PullStatistics.empty(len(parameters["means"]), self._device)
 
     def _trainable(self, parameters: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -231,7 +238,7 @@ class Trainer:
         except (torch.OutOfMemoryError, MemoryExceeded) as error:
             raise MemoryExceeded(
                 f"the memory of {self._device} did not suffice after step {self.step:,} with {self.gaussian_count:,} "
-                f"Gaussians and batches of {self._sampler.batch_size} frames of {self.dataset.train.height}x"
+                f"Gaussians and batches of {self._batch_size} frames of {self.dataset.train.height}x"
                 f"{self.dataset.train.width}: lower max_gaussians or batch_size{self._kept()}",
                 field="max_gaussians",
             ) from error
@@ -294,9 +301,13 @@ class Trainer:
         """One batch, one update, and the refinement that is due after it; returns the loss."""
         batch = self._sampler.next_batch()
         poses = self.dataset.train.poses[batch.numpy()]
+        truth = self._images[cuda.upload(batch, self._device)].float().div_(255.0)
+        if self._between_count:
+            between = self._views_between.draw(self._between_count, self._generator)
+            batch, poses = torch.cat([batch, between.nearer]), np.concatenate([poses, between.poses])
+            truth = torch.cat([truth, between.images])
         if self.config.out_of_plane_mm:
             poses = shift_out_of_plane(poses, out_of_plane_shift_mm(self.config.out_of_plane_mm, self._generator))
-        truth = self._images[cuda.upload(batch, self._device)].float().div_(255.0)
         image = image_loss(
             self._rendered(self.refinement.corrected(batch, poses), self._schedule.sh_degree(self.step)), truth
         )
@@ -346,7 +357,7 @@ class Trainer:
         return GaussianScene(**tensors, info=info)
 
     def _project(self, sh0: Tensor) -> None:
-        project_sh0(sh0, self.config.intensity, self._schedule.intensity_floor(self.step))
+        project_sh0(sh0, self.config.intensity, self._floor if self._schedule.has_floor(self.step) else None)
 
     def _add_scale_penalty(self) -> Tensor:
         """λ·mean(exp(scales)), a scalar; its gradient is added to that of the scales."""
@@ -368,6 +379,7 @@ class Trainer:
             )
             if not len(refined.parameters["means"]):
                 raise self._diverged(self.step, "refinement pruned every Gaussian")
+            self._floor = torch.where(refined.origin < 0, 0.0, self._floor[refined.origin.clamp(min=0)])
             self._project(refined.parameters["sh0"])
         self.parameters = self._trainable(refined.parameters)
         self._optimizer.replace(self.parameters, refined.origin)
@@ -406,6 +418,7 @@ class Trainer:
             **{f"pose.{name}": tensor for name, tensor in self.refinement.tensors().items()},
             "pull.total": self._pull.total,
             "pull.seen": self._pull.seen,
+            "floor": self._floor,
             "waiting": self._sampler.waiting,
             "generator": self._generator.get_state(),
             **{f"beam.{name}": tensor for name, tensor in self._beam.tensors().items()},
@@ -424,7 +437,7 @@ class Trainer:
             self._generator.set_state(tensors["generator"])
         except RuntimeError as error:
             raise TrainingStateInvalid(f"{path}: its tensor generator is no generator's state: {error}") from error
-        self._begin_with({name: tensors[f"parameter.{name}"] for name in PARAMETERS})
+        self._begin_with({name: tensors[f"parameter.{name}"] for name in PARAMETERS}, tensors["floor"])
         prefix = "adam."
         self._optimizer.load({k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)})
         self._beam.load({k.removeprefix("beam."): v for k, v in tensors.items() if k.startswith("beam.")})

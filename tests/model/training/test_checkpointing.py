@@ -14,6 +14,7 @@ from safetensors.torch import save_file
 from ultragray.errors import TrainingStateInvalid
 from ultragray.training import TrainingConfig
 from ultragray.training.checkpointing import (
+    FORMAT_VERSION,
     METADATA_KEY,
     CheckpointHeader,
     check_same_run,
@@ -44,7 +45,7 @@ def test_refuses_what_is_no_checkpoint(tmp_path: Path) -> None:
     with pytest.raises(TrainingStateInvalid, match="c: not a checkpoint of a training"):
         read_checkpoint(path)
     save_file({"a": torch.ones(1)}, path, metadata={METADATA_KEY: '{"format_version": 99}'})
-    with pytest.raises(TrainingStateInvalid, match="its format_version is 99, this release reads 1"):
+    with pytest.raises(TrainingStateInvalid, match="its format_version is 99, this release reads 2"):
         read_checkpoint(path)
     write_checkpoint(path, HEADER, {"a": torch.ones(100)})
     path.write_bytes(path.read_bytes()[:-7])
@@ -68,7 +69,7 @@ def test_refuses_what_is_no_checkpoint(tmp_path: Path) -> None:
     ],
 )
 def test_refuses_a_header_that_no_run_wrote(tmp_path: Path, changes: dict[str, object], reason: str) -> None:
-    document = {"format_version": 1, **asdict(HEADER), **changes}
+    document = {"format_version": FORMAT_VERSION, **asdict(HEADER), **changes}
     save_file({"a": torch.ones(1)}, tmp_path / "c", metadata={METADATA_KEY: json.dumps(document)})
     with pytest.raises(TrainingStateInvalid, match=f"c: not a checkpoint that can be read: .*{reason}"):
         read_checkpoint_header(tmp_path / "c")
@@ -92,6 +93,6 @@ def test_refuses_another_run() -> None:
 
 def test_checkpoint_of_a_newer_release_says_what_to_do(tmp_path: Path) -> None:
     path = tmp_path / "checkpoint.safetensors"
-    save_file({"a": torch.ones(1)}, path, metadata={METADATA_KEY: '{"format_version": 2}'})
+    save_file({"a": torch.ones(1)}, path, metadata={METADATA_KEY: '{"format_version": 3}'})
     with pytest.raises(TrainingStateInvalid, match="a newer release wrote it, use that one or a newer one to read it"):
         read_checkpoint_header(path)

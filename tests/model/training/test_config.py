@@ -48,11 +48,10 @@ def test_what_is_left_open_follows_from_the_data(tiny_dataset: Callable[..., Dat
     assert config.initial_scale_mm == geometry.initial_scale_mm
     assert config.initial_elevation_mm == geometry.initial_elevation_mm(geometry.out_of_plane_mm)
     assert config.out_of_plane_mm == geometry.out_of_plane_mm
-    assert config.intensity_floor == geometry.brightness
-    given = TrainingConfig(max_gaussians=9, out_of_plane_mm=0.0, intensity_floor=0.0, initial_scale_mm=2.0)
+    given = TrainingConfig(max_gaussians=9, out_of_plane_mm=0.0, initial_scale_mm=2.0)
     resolved = given.resolved(geometry)
     assert (resolved.max_gaussians, resolved.initial_gaussians, resolved.initial_scale_mm) == (9, 9, 2.0)
-    assert (resolved.out_of_plane_mm, resolved.intensity_floor) == (0.0, 0.0)
+    assert resolved.out_of_plane_mm == 0.0
     assert resolved.resolved(geometry) == resolved
 
 

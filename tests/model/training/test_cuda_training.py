@@ -28,7 +28,7 @@ def dataset(tiny_dataset: Datasets) -> Dataset:
 def config(tiny_config: Configs) -> TrainingConfig:
     if not cuda.available():
         pytest.skip("there is no GPU, and Triton is not installed, which could interpret the kernels")
-    return tiny_config(steps=6, max_gaussians=30, batch_size=2, refinements=1, shadow_start=0.0)
+    return tiny_config(steps=6, max_gaussians=30, batch_size=2, refinements=1)
 
 
 def learned(

@@ -21,7 +21,7 @@ from .hardness import hardness_of_views
 from .held_out import held_out_frames
 from .residuals import fit_uncertainty
 
-SHORTER, ENOUGH_STEPS = 0.5, 250  # of the steps, but not fewer where the run has them: they leave shadows unlearned
+SHORTER, ENOUGH_STEPS = 0.5, 500  # of the steps, but not fewer where the run has them: they leave shadows unlearned
 LEAST_HELD_OUT = 3
 MEASURED_FRAMES = 96  # of those held out; of those trained from a third as many
 BLACK_FRAMES = 32

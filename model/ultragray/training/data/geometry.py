@@ -1,4 +1,4 @@
-"""Facts of a dataset that a training needs: its size, the spacing of its frames and pixels, its brightness."""
+"""Facts of a dataset that a training needs: its size, the spacing of its frames and pixels."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from .sampling import out_of_plane_range_mm
 
 SCALE_MARGIN = 1.1  # of the released recipe
 FRAMES_AT_ONCE = 64
-PIXELS_PER_GAUSSIAN = 25  # of the training frames
-STEPS_PER_FRAME = 15  # a frame that is seen more often is learned with its noise
-MIN_STEPS, MAX_STEPS = 250, 1_500  # fewer leave shadows unlearned
+PIXELS_PER_GAUSSIAN = 12  # of the training frames; those between them are learned too
+STEPS_PER_FRAME = 30  # half of them for what lies between
+MIN_STEPS, MAX_STEPS = 500, 1_500  # fewer leave shadows unlearned
 MIN_GAUSSIANS, MAX_GAUSSIANS = 2_000, 150_000  # fewer hold no anatomy, more take longer than they are worth
 
 
@@ -32,7 +32,6 @@ class Geometry:
     out_of_plane_mm: float  # full range of the shift of a batch along elevation
     gaussian_count: int
     steps: int
-    brightness: float  # mean of the training frames, in [0, 1]
 
     @classmethod
     def of(cls, dataset: Dataset) -> Geometry:
@@ -48,7 +47,6 @@ class Geometry:
             out_of_plane_mm=out_of_plane_range_mm(sweep, spacing),
             gaussian_count=min(max(sweep.images.size // PIXELS_PER_GAUSSIAN, MIN_GAUSSIANS), MAX_GAUSSIANS),
             steps=min(max(STEPS_PER_FRAME * len(sweep), MIN_STEPS), MAX_STEPS),
-            brightness=float(sweep.images.mean(dtype=np.float64)) / 255.0,
         )
 
     @property

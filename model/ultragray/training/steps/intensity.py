@@ -6,8 +6,8 @@ is the true one and leads back inside as soon as the images ask for it, which is
 clamp aims at, with no gradient that `render()` does not give. Harmonics above degree 0 may still cross an end in some
 views; in the others the Gaussian keeps its gradient.
 
-`sigmoid` has no floor, so that a shadow can be learned as tissue without echo, which is wrong from any other angle. A
-training that keeps a floor for its first part learns what absorbs, and dark tissue afterwards.
+`sigmoid` has no floor, so that a shadow can be learned as tissue without echo, which is wrong from any other angle. So
+what lies in a shadow keeps a floor of its own for the first part of a training: what is above it learns to absorb.
 """
 
 from __future__ import annotations
@@ -31,10 +31,11 @@ def sh0_of_intensity(brightness: Tensor, intensity: str) -> Tensor:  # [N] in [0
     return value / SH_C0
 
 
-def project_sh0(sh0: Tensor, intensity: str, floor: float) -> None:  # [N, 1, 1]
-    """Puts sh0 back, in place, to where the activation has a gradient and its intensity is at least `floor`."""
+def project_sh0(sh0: Tensor, intensity: str, floor: Tensor | None) -> None:  # [N, 1, 1], [N]
+    """Puts sh0 back, in place, to where the activation has a gradient and its intensity is at least the floor."""
     if intensity == "released":
         low, high = RELEASED_RANGE
-        sh0.clamp_((max(floor, low) - 1.0) / SH_C0, (high - 1.0) / SH_C0)
-    elif floor > 0.0:
-        sh0.clamp_(min=math.log(floor / (1.0 - floor)) / (4.0 * SH_C0))
+        sh0.clamp_((low - 1.0) / SH_C0, (high - 1.0) / SH_C0)
+    if floor is not None:
+        (least,) = torch.nonzero(floor > 0.0, as_tuple=True)
+        sh0[least] = sh0[least].maximum(sh0_of_intensity(floor[least], intensity).reshape(-1, 1, 1))

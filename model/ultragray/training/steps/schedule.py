@@ -29,14 +29,10 @@ class Schedule:
         self._refinements = {min(done, self.steps - 1): place for place, done in enumerate(after)}
 
     def rates(self, step: int) -> dict[str, float]:
-        """Adam's rate for each parameter: exponential decay from the first to the last step, 0 before it is trained."""
+        """Adam's rate for each parameter: exponential decay from the first to the last step."""
         config = self._config
         decay = config.final_rate ** (step / self.steps)
-        shadows_only = config.transmittance and step < config.shadow_start * self.steps
-        return {
-            name: 0.0 if shadows_only and name != "transmittances" else rate * decay
-            for name, rate in self._first_rates.items()
-        }
+        return {name: rate * decay for name, rate in self._first_rates.items()}
 
     def sh_degree(self, step: int) -> int:
         """The degree of the harmonics in use: one more at each multiple of sh_start."""
@@ -44,10 +40,9 @@ class Schedule:
         reached = self._config.sh_degree if first == 0 else int(step / first)
         return min(reached, self._config.sh_degree)
 
-    def intensity_floor(self, step: int) -> float:
-        """The least intensity of degree 0 that a Gaussian may have."""
-        assert self._config.intensity_floor is not None
-        return self._config.intensity_floor if step < self._config.floor_end * self.steps else 0.0
+    def has_floor(self, step: int) -> bool:
+        """Whether intensities are kept above their floors."""
+        return step < self._config.floor_end * self.steps
 
     def refinement(self, done: int) -> int | None:
         """The number, from 0, of the refinement that is due after `done` steps; None where none is due."""

@@ -22,14 +22,6 @@ def test_released_rates() -> None:
     assert schedule_of().rates(15_000)["sh0"] == pytest.approx(first["sh0"] * 0.1**0.5)
 
 
-def test_only_the_transmittances_are_trained_at_first() -> None:
-    schedule = schedule_of(steps=10, shadow_start=0.2)
-    trained = [{name for name, rate in schedule.rates(step).items() if rate} for step in (0, 1, 2)]
-    assert trained[:2] == [{"transmittances"}] * 2
-    assert len(trained[2]) == 6
-    assert all(schedule_of(steps=10, shadow_start=0.2, transmittance=False).rates(0).values())
-
-
 def test_released_refinements() -> None:
     schedule = schedule_of()
     found = [done for done in range(30_001) if schedule.refinement(done) is not None]
@@ -76,6 +68,6 @@ def test_even_growth_ends_at_the_limit_however_refinements_fall(settings: dict[s
     assert schedule.gaussian_limit(places[-1]) == 170
 
 
-def test_the_intensity_floor_holds_for_the_first_part() -> None:
-    schedule = schedule_of(steps=10, intensity_floor=0.4, floor_end=0.3)
-    assert [schedule.intensity_floor(step) for step in (0, 2, 3, 9)] == [0.4, 0.4, 0.0, 0.0]
+def test_floors_hold_for_the_first_part() -> None:
+    schedule = schedule_of(steps=10, floor_end=0.3)
+    assert [schedule.has_floor(step) for step in (0, 2, 3, 9)] == [True, True, False, False]

@@ -1,0 +1,128 @@
+"""Views between the frames of a sweep, and beyond its ends: what the frames on either side say that a plane shows.
+
+What a training sees of a gap are only its edges; it may put anything between them. So it is also shown planes between
+neighbouring frames, at a place drawn anew each time, with the two frames blended by their distances. Which frames are
+neighbours, and how they blend, the sweep itself decides: each frame is predicted from those on either side of it.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ...datasets.sweep import IntArray, Sweep, spread_places
+from ...evaluation.baselines import interpolate_planes
+from ...probe import FloatArray
+from ...samplers.rotations import blended
+from .neighbours import Neighbours
+
+EXACT = 1e-9  # a squared error that counts as none
+PREDICTED_FRAMES = 32  # enough to tell which blend is better
+
+
+@dataclass(frozen=True, eq=False)
+class Places:
+    """V places between two frames each, or beyond one of them: there both are the same."""
+
+    frames: IntArray  # [V, 2]
+    shares: FloatArray  # [V] of the way from the first frame to the second
+    beyond_mm: FloatArray  # [V] along the elevation axis of the first; 0 between frames
+
+    @property
+    def nearer(self) -> IntArray:  # [V]
+        """The frame that lies nearer."""
+        return np.where(self.shares > 0.5, self.frames[:, 1], self.frames[:, 0])
+
+    def poses(self, sweep: Sweep) -> FloatArray:  # [V, 4, 4] mm
+        """The middles of the images on a straight line, the rotations on the shortest way."""
+        first, second = sweep.poses[self.frames[:, 0]], sweep.poses[self.frames[:, 1]]
+        middle = sweep.probe.corners_mm().mean(axis=0)
+        poses = first.copy()
+        poses[:, :3, :3] = blended(first[:, :3, :3], second[:, :3, :3], self.shares)
+        ways = (second - first)[:, :3, :3] @ middle + (second - first)[:, :3, 3]
+        starts = first[:, :3, :3] @ middle + first[:, :3, 3]
+        poses[:, :3, 3] = starts + self.shares[:, None] * ways - poses[:, :3, :3] @ middle
+        poses[:, :3, 3] += self.beyond_mm[:, None] * first[:, :3, 1]
+        return poses
+
+
+def draw_places(neighbours: Neighbours, count: int, generator: torch.Generator) -> Places:
+    """Places drawn by `Neighbours.weights`, uniformly within a gap, beyond an end the rarer the farther."""
+    weights = torch.from_numpy(neighbours.weights)
+    chosen = torch.multinomial(weights, count, replacement=True, generator=generator).numpy()
+    along = torch.rand(count, generator=generator, dtype=torch.float64).numpy()
+    ends = chosen - len(neighbours.pairs)  # negative: a gap
+    between = ends < 0
+    frames = np.empty((count, 2), np.int64)
+    frames[between] = neighbours.pairs[chosen[between]]
+    frames[~between] = neighbours.ends[ends[~between], None]
+    beyond_mm = np.zeros(count)
+    beyond_mm[~between] = neighbours.outward[ends[~between]] * neighbours.beyond_mm(along[~between])
+    return Places(frames, np.where(between, along, 0.0), beyond_mm)
+
+
+class Views(NamedTuple):
+    """V views as a training takes them."""
+
+    nearer: Tensor  # [V] place of the frame that lies nearer
+    poses: FloatArray  # [V, 4, 4] mm
+    images: Tensor  # [V, H, W] in [0, 1]
+
+
+class ViewsBetween:
+    """Draws views with their expected images."""
+
+    def __init__(self, sweep: Sweep, neighbours: Neighbours, images: Tensor) -> None:  # [F, H, W] uint8
+        """`images` are those of the sweep, on the device of the training."""
+        self._sweep, self._neighbours, self._images = sweep, neighbours, images
+        self.follow_probe = features_follow_probe(sweep, neighbours)
+
+    def draw(self, count: int, generator: torch.Generator) -> Views:
+        """New ones, by `draw_places`."""
+        places = draw_places(self._neighbours, count, generator)
+        poses = places.poses(self._sweep)
+        if self.follow_probe:
+            first, second = self._images[torch.from_numpy(places.frames.T).to(self._images.device)].float().div_(255.0)
+            shares = torch.from_numpy(places.shares).to(first)
+            return Views(torch.from_numpy(places.nearer), poses, torch.lerp(first, second, shares[:, None, None]))
+        images = [
+            self._sweep.images[first] / np.float32(255.0)
+            if first == second
+            else interpolate_planes(self._sweep.select([first, second]), pose[None])[0]
+            for (first, second), pose in zip(places.frames, poses, strict=True)
+        ]
+        return Views(torch.from_numpy(places.nearer), poses, torch.from_numpy(np.stack(images)).to(self._images.device))
+
+
+def features_follow_probe(sweep: Sweep, neighbours: Neighbours) -> bool:
+    """Whether frames blend better pixel by pixel than where their planes cross the plane between them.
+
+    Tracked exactly, a structure that runs straight through the planes stays where it is in space. Poses with errors
+    across the scan lines, and shadows, which turn with the probe, stay where they are in the image.
+    """
+    beside = defaultdict(list)
+    for first, second in neighbours.pairs:
+        beside[first].append(second)
+        beside[second].append(first)
+    gains = []
+    frames = np.array([frame for frame, others in beside.items() if len(others) > 1])
+    for frame in frames[spread_places(len(frames), PREDICTED_FRAMES)]:
+        pose, others = sweep.poses[frame], np.array(beside[frame])
+        ways = (sweep.corners_mm()[others] - sweep.corners_mm()[frame]) @ pose[:3, 1]  # [O, K]
+        heights = ways.mean(axis=1)
+        if heights.min() >= 0.0 or heights.max() <= 0.0:
+            continue
+        above, below = heights.argmax(), heights.argmin()
+        share = heights[above] / (heights[above] - heights[below])
+        pair = others[[above, below]]
+        truth = sweep.images[frame] / 255.0
+        by_pixel = ((1.0 - share) * sweep.images[pair[0]] + share * sweep.images[pair[1]]) / 255.0
+        in_space = interpolate_planes(sweep.select(pair), pose[None])[0]
+        errors = (np.square(image - truth).mean() + EXACT for image in (in_space, by_pixel))
+        gains.append(np.log(next(errors)) - np.log(next(errors)))
+    return len(gains) > 0 and float(np.mean(gains)) > 0.0
