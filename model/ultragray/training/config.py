@@ -32,6 +32,7 @@ else:
 
 RELEASED_STEPS = 30_000  # the length of run that the released rates are tuned for
 RELEASED_TRANSMITTANCE_RATE, MAX_SCALED_RATE = 5e-4, 2e-2
+VIEWS_BETWEEN = 0.75  # of a step; what is blended from two frames is thicker than a beam
 MAX_RANGE_MM = 100.0  # frames further apart have nothing to say about what lies between
 STARTS = ("informed", "random")
 GROWTHS = ("even", "threshold")
@@ -48,8 +49,11 @@ class TrainingConfig(Contract):
 
     steps: int | None = described("Steps of the run; none: from the number of frames.", None, low=1, high=10_000_000)
     batch_size: int = described("Views of one step; fewer where the dataset has few frames.", 8, low=1, high=1_024)
-    views_between: float = described(
-        "Share of them that lies between neighbouring frames or beyond the ends of the sweep.", 0.75, low=0.0, high=1.0
+    views_between: float | None = described(
+        "Share of them that lies between frames or beyond the ends of the sweep; none: 0.75, with a beam 0.",
+        None,
+        low=0.0,
+        high=1.0,
     )
     seed: int = described("Of every random choice.", 0, low=0, high=2**63 - 1)
     initial_gaussians: int | None = described(
@@ -70,7 +74,7 @@ class TrainingConfig(Contract):
     initial_elevation_mm: float | None = described(
         "The same along elevation, for an informed start.", None, low=1e-3, high=1e3
     )
-    initial_transmittance: float = described("Of each Gaussian at the start.", 0.99, low=0.5, high=0.9999)
+    initial_transmittance: float = described("Of each Gaussian at the start.", 0.999, low=0.5, high=0.9999)
     intensity: str = described(
         "Activation of the echo intensity (docs/physics.md §2): released, or sigmoid, without its floor.",
         "sigmoid",
@@ -134,6 +138,12 @@ class TrainingConfig(Contract):
     sh0_rate: float = described("Learning rate of the intensities.", 1e-2, low=0.0, high=1.0)
     shn_rate: float = described("Learning rate of the higher harmonics.", 2e-5, low=0.0, high=1.0)
     final_rate: float = described("Every rate decays exponentially to this share.", 0.1, low=1e-6, high=1.0)
+    absorption_penalty: float = described(
+        "λ of λ·mean(1 − T): the grey value by which a pixel must gain from what absorbs above it.",
+        3e-3,
+        low=0.0,
+        high=100.0,
+    )
     scale_penalty: float = described("λ of λ·mean(exp(scales)), scales in cm.", 1e-3, low=0.0, high=100.0)
     refinements: int = described("How often Gaussians are added and pruned.", 0, low=0, high=1_000)
     refinement_end: float = described(
@@ -220,6 +230,7 @@ class TrainingConfig(Contract):
             initial_scale_mm=initial_scale_mm,
             initial_elevation_mm=self.initial_elevation_mm or thick_mm,
             out_of_plane_mm=out_of_plane_mm,
+            views_between=_given_or(self.views_between, 0.0 if self.has_beam else VIEWS_BETWEEN),
             transmittance_rate=_given_or(self.transmittance_rate, scaled_transmittance_rate(steps)),
         )
 
@@ -248,7 +259,9 @@ PRESETS: dict[str, dict[str, Any]] = {
         "start": "random",
         "initial_scale_mm": 0.5,
         "intensity": "released",
+        "initial_transmittance": 0.99,
         "intensity_floor": 0.0,
+        "absorption_penalty": 0.0,
         "out_of_plane_mm": 2.0,
         "means_rate": 1e-4,
         "scales_rate": 5e-3,

@@ -21,7 +21,7 @@ from ..datasets.sweep import Dataset, spread_places
 from ..errors import DatasetInvalid, MemoryExceeded, TrainingDiverged, TrainingStateInvalid
 from ..evaluation.scoring import evaluate
 from ..files.atomic import remove_stale_temporaries, write_whole
-from ..rendering import choose_backend, render
+from ..rendering import Frames, choose_backend, render
 from ..scene import PARAMETERS, GaussianScene
 from ..scene_info import SceneInfo, check_training_pose_count
 from .board import Board, require_tensorboard
@@ -176,6 +176,7 @@ class Trainer:
         self._generator = torch.Generator().manual_seed(config.seed)
         neighbours = neighbours_of(dataset.train)
         self._views_between = ViewsBetween(dataset.train, neighbours, self._images)
+        assert config.views_between is not None
         self._between_count = min(round(config.views_between * config.batch_size), config.batch_size - 1)
         self._sampler = BatchSampler(len(dataset.train), config.batch_size - self._between_count, self._generator)
         self._batch_size = self._sampler.batch_size + self._between_count
@@ -308,9 +309,10 @@ class Trainer:
             truth = torch.cat([truth, between.images])
         if self.config.out_of_plane_mm:
             poses = shift_out_of_plane(poses, out_of_plane_shift_mm(self.config.out_of_plane_mm, self._generator))
-        image = image_loss(
-            self._rendered(self.refinement.corrected(batch, poses), self._schedule.sh_degree(self.step)), truth
-        )
+        frames = self._rendered(self.refinement.corrected(batch, poses), self._schedule.sh_degree(self.step))
+        image = image_loss(frames["bmode"], truth)
+        if self._has_absorption_penalty:
+            image = image + self.config.absorption_penalty * (1.0 - frames["transmittance"]).mean()
         image.backward()  # type: ignore[no-untyped-call]
         self.refinement.step(self.step / self._schedule.steps)
         with torch.no_grad():
@@ -333,21 +335,23 @@ class Trainer:
             self._refine(self._schedule.gaussian_limit(due))
         return loss
 
-    def _rendered(self, poses: Any, sh_degree: int) -> Tensor:  # [C, 4, 4] mm -> [C, H, W]
+    def _rendered(self, poses: Any, sh_degree: int) -> Frames:  # [C, 4, 4] mm -> [C, H, W] each
         scene = self._view(sh_degree)
         sweep = self.dataset.train
-        frames = render(
+        return render(
             scene,
             self.dataset.probe,
             poses,
             height=sweep.height,
             width=sweep.width,
-            outputs=("bmode",),
+            outputs=("bmode", "transmittance") if self._has_absorption_penalty else ("bmode",),
             backend=self._backend,
             beam=self._beam.numbers,
         )
-        assert frames.bmode is not None
-        return frames.bmode
+
+    @property
+    def _has_absorption_penalty(self) -> bool:
+        return self.config.transmittance and self.config.absorption_penalty > 0.0
 
     def _view(self, sh_degree: int) -> GaussianScene:
         """The parameters as a scene, without the checks of `from_splats`, which read every value."""
@@ -403,7 +407,7 @@ class Trainer:
         val = self.dataset.val.select(spread_places(len(self.dataset.val), VALIDATION_FRAMES))
         truth = torch.tensor(val.images, device=self._device).float().div_(255.0)
         with torch.no_grad():
-            rendered = self._rendered(val.poses, self._schedule.sh_degree(self.step))
+            rendered = self._rendered(val.poses, self._schedule.sh_degree(self.step))["bmode"]
             errors = (rendered - truth).square().mean(dim=(1, 2)).clamp(min=1e-10)
             return float((-10.0 * errors.log10()).mean())
 
