@@ -94,8 +94,14 @@ def render_page(content: ReportContent) -> str:
         tilt_failure=content.tilt.reason if isinstance(content.tilt, Failed) else None,
         tilt_plot=None if tilt is None else plot_tilt(tilt),
         tilt_rows=[] if tilt is None else metric_rows(tilt.evaluations),
-        configuration={} if content.trained is None else content.trained.scene.info.training,
+        configuration=_configuration(content.trained),
     )
+
+
+def _configuration(trained: Trained | None) -> dict[str, Any]:
+    """The settings of the training, without those that were not used."""
+    settings = {} if trained is None else trained.scene.info.training
+    return {name: value for name, value in settings.items() if value is not None}
 
 
 def metric_rows(evaluations: Mapping[str, Evaluation], notes: Mapping[str, list[str]] | None = None) -> list[Row]:
