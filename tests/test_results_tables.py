@@ -16,6 +16,7 @@ from ultragray.datasets import Dataset, Sweep
 from ultragray.datasets.released import write_released
 from ultragray.datasets.source import SourceOptions, load_dataset
 from ultragray.errors import DatasetInvalid
+from ultragray.training.config import VIEWS_BETWEEN
 from ultragray.training.data.geometry import Geometry
 
 SCRIPT = Path(__file__).resolve().parents[1] / "benchmarks" / "results_tables.py"
@@ -88,7 +89,7 @@ def test_a_run_tells_the_steps_that_the_data_decided(
     monkeypatch.setattr(script, "RUNS", (script.Run("default", "ball", options=SourceOptions("0:2", "3:4")),))
     run(script, monkeypatch, data)
     dataset = load_dataset(data / "ball", SourceOptions("0:2", "3:4"))
-    steps = Geometry.of(dataset).steps
+    steps = Geometry.of(dataset).steps(VIEWS_BETWEEN)
     assert json.loads((data / "figures.json").read_text())["default"]["steps"] == steps
     assert f"| default | 2 / 1 | 16x14 | fast | {steps:,} |" in (data / "results.md").read_text()
 

@@ -216,9 +216,11 @@ class TrainingConfig(Contract):
 
     def resolved(self, geometry: Geometry) -> TrainingConfig:
         """The same with everything that was left to the data filled in."""
-        steps = self.steps or geometry.steps
-        limit = self.max_gaussians or max(geometry.gaussian_count, self.initial_gaussians or 0)
-        by_shifts = 0.0 if self.has_beam else min(geometry.out_of_plane_mm, MAX_RANGE_MM)  # the beam takes their part
+        views_between = _given_or(self.views_between, 0.0 if self.has_beam else VIEWS_BETWEEN)
+        steps = self.steps or geometry.steps(views_between)
+        limit = self.max_gaussians or max(geometry.gaussian_count(views_between), self.initial_gaussians or 0)
+        shifted_mm = max(geometry.out_of_plane_mm, geometry.least_out_of_plane_mm(views_between))
+        by_shifts = 0.0 if self.has_beam else min(shifted_mm, MAX_RANGE_MM)  # the beam takes their part
         out_of_plane_mm = _given_or(self.out_of_plane_mm, by_shifts)
         initial_scale_mm = self.initial_scale_mm or geometry.initial_scale_mm
         thick_mm = initial_scale_mm if self.has_beam else geometry.initial_elevation_mm(out_of_plane_mm)
@@ -230,7 +232,7 @@ class TrainingConfig(Contract):
             initial_scale_mm=initial_scale_mm,
             initial_elevation_mm=self.initial_elevation_mm or thick_mm,
             out_of_plane_mm=out_of_plane_mm,
-            views_between=_given_or(self.views_between, 0.0 if self.has_beam else VIEWS_BETWEEN),
+            views_between=views_between,
             transmittance_rate=_given_or(self.transmittance_rate, scaled_transmittance_rate(steps)),
         )
 

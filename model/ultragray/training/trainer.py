@@ -175,6 +175,8 @@ class Trainer:
         )
         self._generator = torch.Generator().manual_seed(config.seed)
         neighbours = neighbours_of(dataset.train)
+        if not config.views_between:
+            neighbours = neighbours.without_ends()  # nothing would train what begins there
         self._views_between = ViewsBetween(dataset.train, neighbours, self._images)
         assert config.views_between is not None
         self._between_count = min(round(config.views_between * config.batch_size), config.batch_size - 1)

@@ -17,6 +17,7 @@ from ultragray.report import page as page_module
 from ultragray.report.page import ReportContent, metric_rows, render_page
 from ultragray.report.study import Failed, ablations, study_tilt, train_and_evaluate
 from ultragray.training import TrainingConfig
+from ultragray.training.config import VIEWS_BETWEEN
 from ultragray.training.data.geometry import Geometry
 
 VOID = {"meta", "img", "link", "br"}
@@ -162,7 +163,7 @@ def test_what_the_data_decides_is_told_as_it_was_decided(turning_dataset: Datase
             trained=trained,
         )
     )
-    steps = Geometry.of(dataset).steps
+    steps = Geometry.of(dataset).steps(VIEWS_BETWEEN)
     assert f"{steps:,} steps in " in text
     assert f"<code>steps = {steps}</code>" in text
     assert "= None" not in text.replace("memory_gb = None", "")

@@ -14,7 +14,13 @@ import pytest
 
 from ultragray.datasets.sweep import Dataset
 from ultragray.errors import InvalidArgument
-from ultragray.training.config import TrainingConfig, parse_value, read_config_file, scaled_transmittance_rate
+from ultragray.training.config import (
+    VIEWS_BETWEEN,
+    TrainingConfig,
+    parse_value,
+    read_config_file,
+    scaled_transmittance_rate,
+)
 from ultragray.training.data.geometry import Geometry
 
 
@@ -43,8 +49,8 @@ def test_frames_however_far_apart_shift_a_batch_by_at_most_ten_centimetres(
 def test_what_is_left_open_follows_from_the_data(tiny_dataset: Callable[..., Dataset]) -> None:
     geometry = Geometry.of(tiny_dataset())
     config = TrainingConfig().resolved(geometry)
-    assert config.steps == geometry.steps
-    assert config.max_gaussians == config.initial_gaussians == geometry.gaussian_count
+    assert config.steps == geometry.steps(VIEWS_BETWEEN)
+    assert config.max_gaussians == config.initial_gaussians == geometry.gaussian_count(VIEWS_BETWEEN)
     assert config.initial_scale_mm == geometry.initial_scale_mm
     assert config.initial_elevation_mm == geometry.initial_elevation_mm(geometry.out_of_plane_mm)
     assert config.out_of_plane_mm == geometry.out_of_plane_mm

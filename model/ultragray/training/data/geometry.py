@@ -12,9 +12,10 @@ from .sampling import out_of_plane_range_mm
 
 SCALE_MARGIN = 1.1  # of the released recipe
 FRAMES_AT_ONCE = 64
-PIXELS_PER_GAUSSIAN = 12  # of the training frames; those between them are learned too
-STEPS_PER_FRAME = 30  # half of them for what lies between
-MIN_STEPS, MAX_STEPS = 500, 1_500  # fewer leave shadows unlearned
+LEAST_RANGE = 1.5  # of the shift out of the plane, × the spacing of the frames
+PIXELS_PER_GAUSSIAN = 25
+STEPS_PER_FRAME = 15  # a frame that is seen more often is learned with its noise
+MIN_STEPS, MAX_STEPS = 250, 1_500  # fewer leave shadows unlearned
 MIN_GAUSSIANS, MAX_GAUSSIANS = 2_000, 150_000  # fewer hold no anatomy, more take longer than they are worth
 
 
@@ -29,9 +30,9 @@ class Geometry:
     scene_scale_cm: float
     frame_spacing_mm: float
     pixel_mm: float  # geometric mean of the axial and the lateral size
-    out_of_plane_mm: float  # full range of the shift of a batch along elevation
-    gaussian_count: int
-    steps: int
+    out_of_plane_mm: float  # full range of the shift of a batch along elevation that the frames tell of; 0: they do not
+    pixel_count: int  # of all training frames
+    frame_count: int
 
     @classmethod
     def of(cls, dataset: Dataset) -> Geometry:
@@ -44,10 +45,24 @@ class Geometry:
             scene_scale_cm=SCALE_MARGIN * reach_mm / 10.0,
             frame_spacing_mm=spacing,
             pixel_mm=(axial * lateral) ** 0.5,
-            out_of_plane_mm=out_of_plane_range_mm(sweep, spacing),
-            gaussian_count=min(max(sweep.images.size // PIXELS_PER_GAUSSIAN, MIN_GAUSSIANS), MAX_GAUSSIANS),
-            steps=min(max(STEPS_PER_FRAME * len(sweep), MIN_STEPS), MAX_STEPS),
+            out_of_plane_mm=out_of_plane_range_mm(sweep),
+            pixel_count=sweep.images.size,
+            frame_count=len(sweep),
         )
+
+    def gaussian_count(self, views_between: float) -> int:
+        """By the pixels of the frames, twice as many where what lies between them is learned too."""
+        count = _times(views_between) * self.pixel_count // PIXELS_PER_GAUSSIAN
+        return min(max(count, MIN_GAUSSIANS), MAX_GAUSSIANS)
+
+    def steps(self, views_between: float) -> int:
+        """By the frames, likewise."""
+        times = _times(views_between)
+        return min(max(times * STEPS_PER_FRAME * self.frame_count, times * MIN_STEPS), MAX_STEPS)
+
+    def least_out_of_plane_mm(self, views_between: float) -> float:
+        """Range of the shift that leaves no gap between frames, where no views between them fill it."""
+        return 0.0 if views_between else LEAST_RANGE * self.frame_spacing_mm
 
     @property
     def initial_scale_mm(self) -> float:
@@ -57,6 +72,10 @@ class Geometry:
     def initial_elevation_mm(self, out_of_plane_mm: float) -> float:
         """Standard deviation across the image plane at the start: as thick as the slice that is learned."""
         return max(self.frame_spacing_mm, out_of_plane_mm / 2.0, self.pixel_mm)
+
+
+def _times(views_between: float) -> int:
+    return 2 if views_between else 1
 
 
 def frame_spacing_mm(sweep: Sweep) -> float:

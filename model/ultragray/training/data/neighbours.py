@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -26,6 +26,11 @@ class Neighbours:
     outward: FloatArray  # [K] +1 where that side lies along the elevation axis, −1 where against it
     spacing_mm: float  # median gap; 0 where there is no pair
     extent_mm: float  # beyond the ends
+
+    def without_ends(self) -> Neighbours:
+        """The gaps alone, where there are any."""
+        none = slice(0, 0 if len(self.pairs) else None)
+        return replace(self, ends=self.ends[none], outward=self.outward[none])
 
     @property
     def weights(self) -> FloatArray:  # [E + K], their sum 1

@@ -11,7 +11,6 @@ from torch import Tensor
 from ...datasets.sweep import IntArray, Sweep, corner_distances_mm, spread_places
 from ...probe import FloatArray
 
-LEAST_RANGE = 1.5  # × the spacing of the frames
 TELLING_NEIGHBOURS = 8  # with fewer, PSNR only says that speckle averages out
 MAX_SLICE_MM = 8.0  # no probe's slice is thicker
 RANGES = (1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 11.0, 16.0, 23.0, 32.0)  # × the distance of neighbouring frames
@@ -36,21 +35,20 @@ class BatchSampler:
         return batch
 
 
-def out_of_plane_range_mm(sweep: Sweep, spacing_mm: float) -> float:
+def out_of_plane_range_mm(sweep: Sweep) -> float:
     """The blur of a slice along elevation that the frames themselves show, as the full range of the shift.
 
     Each frame is predicted by its neighbours within ± half a range, with the weights that the shift is drawn with.
     Half the range with the best mean PSNR is taken (PSNR likes blur; the half has most of the gain and keeps detail),
     at most MAX_SLICE_MM, if the median frame has eight others or more within ± half that range: among fewer the mean of
-    all wins, however far apart they are. Else, and at least, 1.5 spacings: no gap may stay between frames.
+    all wins, however far apart they are. Else 0.
     """
-    least = LEAST_RANGE * spacing_mm
     corners = sweep.corners_mm()  # [F, K, 3]
     distances = np.stack([corner_distances_mm(own, corners) for own in corners])  # [F, F]
     np.fill_diagonal(distances, np.inf)
     step_mm = float(np.median(distances.min(axis=1)))
     if step_mm == 0.0:
-        return least
+        return 0.0
     pixels = sweep.images.reshape(len(sweep), -1)
     stride = max(1, pixels.shape[1] // PREDICTED_PIXELS) | 1  # odd: it must not fall into step with the columns
     images = torch.from_numpy(pixels[:, ::stride].astype(np.float32)) / 255.0  # [F, P]
@@ -59,7 +57,7 @@ def out_of_plane_range_mm(sweep: Sweep, spacing_mm: float) -> float:
     scores = [_psnr_from_neighbours(images, distances[targets], targets, range_mm) for range_mm in ranges_mm]
     best_mm = ranges_mm[int(np.argmax(scores))]
     neighbours = float(np.median((distances[targets] < best_mm / 2).sum(axis=1)))
-    return max(least, min(0.5 * best_mm, MAX_SLICE_MM)) if neighbours >= TELLING_NEIGHBOURS else least
+    return min(0.5 * best_mm, MAX_SLICE_MM) if neighbours >= TELLING_NEIGHBOURS else 0.0
 
 
 def _psnr_from_neighbours(images: Tensor, distances: FloatArray, targets: IntArray, range_mm: float) -> float:

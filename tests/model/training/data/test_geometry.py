@@ -22,9 +22,11 @@ def test_lengths_of_a_straight_sweep(tiny_dataset: Callable[..., Dataset]) -> No
     assert geometry.scene_scale_cm == pytest.approx(1.1 * reach_mm / 10.0)
     assert geometry.pixel_mm == pytest.approx(1.25)
     assert geometry.initial_scale_mm == pytest.approx(1.25)  # a pixel is more than half a spacing
-    assert geometry.out_of_plane_mm == pytest.approx(3.0)  # six frames cannot tell
-    assert geometry.steps == 500
-    assert Geometry.of(tiny_dataset(frames=40)).steps == 30 * 30
+    assert geometry.out_of_plane_mm == 0.0  # six frames cannot tell
+    assert geometry.least_out_of_plane_mm(views_between=0.0) == pytest.approx(3.0)
+    assert geometry.least_out_of_plane_mm(views_between=0.5) == 0.0
+    assert (geometry.steps(0.75), geometry.steps(0.0)) == (500, 250)
+    assert Geometry.of(tiny_dataset(frames=40)).steps(0.75) == 2 * 15 * 30
     assert geometry.initial_elevation_mm(0.0) == pytest.approx(2.0)
     assert geometry.initial_elevation_mm(9.0) == pytest.approx(4.5)
 
