@@ -1,4 +1,4 @@
-"""Trains and measures on the tracked sweeps and writes docs/results.md: what `make results` runs.
+"""Trains and measures on tracked and simulated sweeps and writes docs/results.md: what `make results` runs.
 
     python benchmarks/results_tables.py DATA_FOLDER [--only NAME ...]
 
@@ -15,11 +15,15 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
+from enum import Enum
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
+from in_silico import IN_SILICO
+from origin import origin
 from ultragray.datasets.phantom.shadow import SHADOW_DB, BoneShadow
 from ultragray.datasets.source import PHANTOM, SourceOptions, load_dataset
 from ultragray.datasets.sweep import Dataset
@@ -27,7 +31,6 @@ from ultragray.evaluation.baselines import BASELINES, evaluate_baselines, predic
 from ultragray.evaluation.compounding import affordable_voxel_mm
 from ultragray.evaluation.scoring import render_sweep
 from ultragray.files.atomic import write_whole
-from ultragray.machine import processor_name
 from ultragray.report.study import train_and_evaluate
 from ultragray.scene import GaussianScene
 from ultragray.training import Progress, TrainingConfig
@@ -36,6 +39,7 @@ FOLDER = Path(__file__).resolve().parent
 TABLES = FOLDER.parent / "docs" / "results.md"
 FIGURES = FOLDER / "results_tables.json"
 SECONDS_PER_LINE = 15.0
+THIRD, BAND_SPACINGS = 3, 10
 METRICS = ("psnr_db", "ms_ssim", "gms", "gmsd")
 ROW_NAMES = {
     "scene": "**scene**",
@@ -49,12 +53,21 @@ ROW_NAMES = {
 log = logging.getLogger("results")
 
 
+class Part(Enum):
+    """The frames of a dataset that a run trains from."""
+
+    WHOLE = "all"
+    THIRD = "every third"  # the others are held out
+    BAND = "all but a band"  # of ten spacings in the middle of the sweep, which is held out
+
+
 @dataclass(frozen=True)
 class Run:
-    """One training. `source` is a folder of the data folder, or the word phantom."""
+    """One training. `source` is a folder of the data folder, the word phantom, or a name of IN_SILICO."""
 
     name: str
     source: str
+    part: Part = Part.WHOLE
     preset: str = "fast"
     options: SourceOptions = field(default_factory=SourceOptions)
     settings: Mapping[str, Any] = field(default_factory=dict)
@@ -67,6 +80,12 @@ RUNS = (
     Run("spine_phantom", "spine_phantom"),
     Run("nwire_phantom", "nwire_phantom"),
     Run("phantom", PHANTOM),
+    *(Run(name, name) for name in ("robot", "fourth tilt +6°", "fourth tilt +18°")),
+    *(
+        Run(f"{name}, {part.value}", name, part)
+        for name in ("ultranerf_liver", "liver_convex", "spine_phantom", "nwire_phantom")
+        for part in (Part.THIRD, Part.BAND)
+    ),
     Run(
         "ultranerf_liver_paper",
         "ultranerf_liver",
@@ -101,7 +120,7 @@ def _parser() -> argparse.ArgumentParser:
 
 def measure(run: Run, data_folder: Path) -> dict[str, Any]:
     """Trains and measures one run, and the baselines on the same frames."""
-    dataset = load_dataset(run.source if run.source == PHANTOM else data_folder / run.source, run.options)
+    dataset = part_of(_source(run, data_folder), run.part)
     voxel_mm = affordable_voxel_mm(dataset.train)
     log.info("%s: baselines", run.name)
     baselines = evaluate_baselines(dataset, BASELINES, voxel_mm)
@@ -126,12 +145,28 @@ def measure(run: Run, data_folder: Path) -> dict[str, Any]:
         "gaussians": trained.scene.gaussian_count,
         "step_ms": 1000.0 * trained.step_s,
         "total_s": trained.seconds,
-        "machine": f"{processor_name()}, {torch.get_num_threads()} threads",
+        **origin(),
         "measured_at": datetime.now(timezone.utc).isoformat(timespec="seconds"),
     }
     if run.source == PHANTOM:
         figures["shadow"] = measure_shadow(trained.scene, dataset, voxel_mm)
     return figures
+
+
+def _source(run: Run, data_folder: Path) -> Dataset:
+    if run.source in IN_SILICO:
+        asked = IN_SILICO[run.source]()
+        return Dataset(run.source, train=asked.training, val=asked.unseen)
+    return load_dataset(run.source if run.source == PHANTOM else data_folder / run.source, run.options)
+
+
+def part_of(dataset: Dataset, part: Part) -> Dataset:
+    """The dataset with the part of its training frames to train from, and what that leaves out held out."""
+    if part is Part.WHOLE:
+        return dataset
+    sweep, places = dataset.train, np.arange(len(dataset.train))
+    left_out = {Part.THIRD: places % THIRD != 0, Part.BAND: np.abs(places - len(sweep) // 2) < BAND_SPACINGS / 2}[part]
+    return Dataset(dataset.name, train=sweep.select(places[~left_out]), val=sweep.select(places[left_out]))
 
 
 def measure_shadow(scene: GaussianScene, dataset: Dataset, voxel_mm: float) -> dict[str, float]:
@@ -175,11 +210,31 @@ def tables(figures: Mapping[str, Any]) -> str:
             f"| {name} | {run['train_frames']} / {run['val_frames']} | {run['image']} | {run['preset']} "
             f"| {run['steps']:,} | {run['gaussians']:,} | {run['step_ms']:.0f} | {run['total_s']:.0f} s |"
         )
-    machines = sorted({run["machine"] for run in known.values()})
-    lines += ["", f"Machine: {'; '.join(machines)}.", ""]
+    origins = sorted({f"commit {run['commit']} on {run['machine']}" for run in known.values()})
+    lines += ["", f"Measured at {'; '.join(origins)}.", "", *_comparison(known)]
     for name, run in known.items():
         lines += _metrics_table(name, run)
     return "\n".join(lines)
+
+
+def _comparison(known: Mapping[str, Any]) -> list[str]:
+    """Each run's scene against the better of median compounding and linear interpolation, metric by metric."""
+    lines = [
+        "The scene less the better of median compounding and linear interpolation (GMSD: the better less the scene, so",
+        "that more is better throughout):",
+        "",
+        "| run | PSNR, dB | MS-SSIM | GMS | GMSD |",
+        "|---|---|---|---|---|",
+    ]
+    for name, run in known.items():
+        means = {method: run["metrics"][method]["mean"] for method in ("scene", "median", "linear")}
+        cells = []
+        for key in METRICS:
+            sign = -1.0 if key == "gmsd" else 1.0
+            lead = min(sign * (means["scene"][key] - means[method][key]) for method in ("median", "linear"))
+            cells.append(f"{lead:+.2f}" if key == "psnr_db" else f"{lead:+.3f}")
+        lines.append(f"| {name} | {' | '.join(cells)} |")
+    return [*lines, ""]
 
 
 def _metrics_table(name: str, run: Mapping[str, Any]) -> list[str]:

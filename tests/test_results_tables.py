@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
@@ -25,6 +26,7 @@ SETTINGS = {"steps": 3, "max_gaussians": 40}
 
 @pytest.fixture
 def script(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    monkeypatch.syspath_prepend(str(SCRIPT.parent))
     spec = importlib.util.spec_from_file_location("results_tables", SCRIPT)
     assert spec is not None
     assert spec.loader is not None
@@ -119,3 +121,23 @@ def test_the_phantom_is_measured_in_the_shadow_of_bone(script: ModuleType, monke
     assert f"mean transmittance of the scene {shadow['scene_transmittance']:.3f}" in tables
     del figures["shadow"]
     assert "Where bone" not in script.tables({"phantom": figures})
+
+
+def test_parts_leave_out_two_of_three_frames_or_a_band(script: ModuleType, data: Path) -> None:
+    dataset = load_dataset(data / "ball", SourceOptions("0:5", "5:6"))
+    third = script.part_of(dataset, script.Part.THIRD)
+    assert [third.train.frame_numbers.tolist(), third.val.frame_numbers.tolist()] == [[0, 3], [1, 2, 4]]
+    long = replace(dataset, train=dataset.train.select(np.resize(np.arange(5), 30)))
+    band = script.part_of(long, script.Part.BAND)
+    assert len(band.val) == 9, "ten spacings between the frames that are left"
+    assert len(band.train) == 21
+
+
+def test_each_run_is_compared_with_the_better_baseline(script: ModuleType) -> None:
+    means = {
+        "scene": {"psnr_db": 30.0, "ms_ssim": 0.9, "gms": 0.9, "gmsd": 0.10},
+        "median": {"psnr_db": 29.0, "ms_ssim": 0.95, "gms": 0.8, "gmsd": 0.08},
+        "linear": {"psnr_db": 29.5, "ms_ssim": 0.8, "gms": 0.7, "gmsd": 0.12},
+    }
+    run = {"metrics": {name: {"mean": mean} for name, mean in means.items()}}
+    assert script._comparison({"one": run})[-2] == "| one | +0.50 | -0.050 | +0.100 | -0.020 |"
