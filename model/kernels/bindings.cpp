@@ -180,18 +180,19 @@ NB_MODULE(_cpu, m) {
 
     m.def(
         "image_loss",
-        [](ImageBatch x, ImageBatch y, FreePlanes gradient, int threads, const std::string& instruction_set) {
+        [](ImageBatch x, ImageBatch y, FreePlanes gradient, double texture, int threads,
+           const std::string& instruction_set) {
             const size_t count = x.shape(0), height = x.shape(1), width = x.shape(2);
             for (size_t d = 0; d < 3; ++d)
                 if (y.shape(d) != x.shape(d) || gradient.shape(d) != x.shape(d))
                     throw std::invalid_argument("the images' shapes do not agree");
             if (count == 0 || height < 11 || width < 11) throw std::invalid_argument("images must be at least 11x11 pixels");
             nb::gil_scoped_release release;
-            return image_loss(x.data(), y.data(), int(count), int(height), int(width), threads, instruction_set,
+            return image_loss(x.data(), y.data(), int(count), int(height), int(width), texture, threads, instruction_set,
                               gradient.data());
         },
-        nb::arg("x").noconvert(), nb::arg("y").noconvert(), nb::arg("gradient").noconvert(), nb::arg("threads"),
-        nb::arg("instruction_set"));
+        nb::arg("x").noconvert(), nb::arg("y").noconvert(), nb::arg("gradient").noconvert(), nb::arg("texture"),
+        nb::arg("threads"), nb::arg("instruction_set"));
 
     m.def("instruction_sets", &instruction_sets);
 }

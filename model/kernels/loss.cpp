@@ -9,7 +9,7 @@
 
 namespace ultragray {
 
-double image_loss(const float* x, const float* y, int count, int height, int width, int threads,
+double image_loss(const float* x, const float* y, int count, int height, int width, double texture, int threads,
                   const std::string& instruction_set, float* gradient) {
     const Kernels& kernels = choose_kernels(instruction_set);
     float window[11], sum = 0;
@@ -21,13 +21,14 @@ double image_loss(const float* x, const float* y, int count, int height, int wid
                      thread_local std::vector<float> scratch;
                      scratch.resize(loss_scratch(height, width));
                      const int64_t at = int64_t(i) * height * width;
-                     losses[i] = kernels.image_loss(x + at, y + at, height, width, window, scratch.data(),
-                                                    float(0.5 / pixels), float(-0.5 / windows), gradient + at);
+                     losses[i] =
+                         kernels.image_loss(x + at, y + at, height, width, window, scratch.data(),
+                                            float((1.0 - texture) / pixels), float(-texture / windows), gradient + at);
                  }};
     run_phases({&images}, threads);
     ImageLoss total{0, 0};
     for (const ImageLoss& loss : losses) total.l1 += loss.l1, total.ssim += loss.ssim;
-    return 0.5 * total.l1 / pixels + 0.5 * (1.0 - total.ssim / windows);
+    return (1.0 - texture) * total.l1 / pixels + texture * (1.0 - total.ssim / windows);
 }
 
 }  // namespace ultragray

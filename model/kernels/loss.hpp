@@ -5,9 +5,10 @@
 
 namespace ultragray {
 
-// 0.5 mean |x - y| + 0.5 (1 - SSIM) of images [C, H, W], both sides at least 11, and its gradient by x, [C, H, W].
+// (1 - texture) mean |x - y| + texture (1 - SSIM) of images [C, H, W], both sides at least 11, and its gradient by x,
+// [C, H, W].
 // The result does not depend on the number of threads.
-double image_loss(const float* x, const float* y, int count, int height, int width, int threads,
+double image_loss(const float* x, const float* y, int count, int height, int width, double texture, int threads,
                   const std::string& instruction_set, float* gradient);
 
 }  // namespace ultragray

@@ -138,6 +138,13 @@ class TrainingConfig(Contract):
     sh0_rate: float = described("Learning rate of the intensities.", 1e-2, low=0.0, high=1.0)
     shn_rate: float = described("Learning rate of the higher harmonics.", 2e-5, low=0.0, high=1.0)
     final_rate: float = described("Every rate decays exponentially to this share.", 0.1, low=1e-6, high=1.0)
+    texture: float = described(
+        "Share of structural dissimilarity in the loss, the rest is L1: less for the mean of what speckle may be and a "
+        "better PSNR, more for its texture and a better MS-SSIM.",
+        0.5,
+        low=0.0,
+        high=1.0,
+    )
     absorption_penalty: float = described(
         "λ of λ·mean(1 − T): the grey value by which a pixel must gain from what absorbs above it.",
         3e-3,
@@ -217,6 +224,7 @@ class TrainingConfig(Contract):
     def resolved(self, geometry: Geometry) -> TrainingConfig:
         """The same with everything that was left to the data filled in."""
         views_between = _given_or(self.views_between, 0.0 if self.has_beam else VIEWS_BETWEEN)
+        views_between = min(round(views_between * self.batch_size), self.batch_size - 1) / self.batch_size
         steps = self.steps or geometry.steps(views_between)
         limit = self.max_gaussians or max(geometry.gaussian_count(views_between), self.initial_gaussians or 0)
         shifted_mm = max(geometry.out_of_plane_mm, geometry.least_out_of_plane_mm(views_between))

@@ -179,7 +179,7 @@ class Trainer:
             neighbours = neighbours.without_ends()  # nothing would train what begins there
         self._views_between = ViewsBetween(dataset.train, neighbours, self._images)
         assert config.views_between is not None
-        self._between_count = min(round(config.views_between * config.batch_size), config.batch_size - 1)
+        self._between_count = round(config.views_between * config.batch_size)
         self._sampler = BatchSampler(len(dataset.train), config.batch_size - self._between_count, self._generator)
         self._batch_size = self._sampler.batch_size + self._between_count
         self._schedule = Schedule(config, scene_scale_cm=self._geometry.scene_scale_cm, batch_size=self._batch_size)
@@ -312,7 +312,7 @@ class Trainer:
         if self.config.out_of_plane_mm:
             poses = shift_out_of_plane(poses, out_of_plane_shift_mm(self.config.out_of_plane_mm, self._generator))
         frames = self._rendered(self.refinement.corrected(batch, poses), self._schedule.sh_degree(self.step))
-        image = image_loss(frames["bmode"], truth)
+        image = image_loss(frames["bmode"], truth, self.config.texture)
         if self._has_absorption_penalty:
             image = image + self.config.absorption_penalty * (1.0 - frames["transmittance"]).mean()
         image.backward()  # type: ignore[no-untyped-call]
@@ -385,7 +385,7 @@ class Trainer:
             )
             if not len(refined.parameters["means"]):
                 raise self._diverged(self.step, "refinement pruned every Gaussian")
-            self._floor = torch.where(refined.origin < 0, 0.0, self._floor[refined.origin.clamp(min=0)])
+            self._floor = self._floor[refined.parent]
             self._project(refined.parameters["sh0"])
         self.parameters = self._trainable(refined.parameters)
         self._optimizer.replace(self.parameters, refined.origin)

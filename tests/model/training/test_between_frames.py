@@ -45,6 +45,12 @@ def test_beyond_an_end_the_last_frame_goes_on(tiny_dataset: Datasets, tiny_confi
     assert psnr_db(render_sweep(scene, dataset.val), dataset.val.images) > 20.0
 
 
+def test_a_probe_held_still_is_learned(tiny_dataset: Datasets, tiny_config: Configs) -> None:
+    dataset = tiny_dataset(frames=12, height=40, width=32, spacing_mm=0.0)
+    scene = train(dataset, tiny_config(steps=100, max_gaussians=1000, refinements=0, batch_size=8, confidence=False))
+    assert psnr_db(render_sweep(scene, dataset.val), dataset.val.images) > 22.0
+
+
 def test_darkness_that_is_no_shadow_is_not_explained_by_absorption(
     tiny_dataset: Datasets, tiny_config: Configs
 ) -> None:

@@ -61,6 +61,14 @@ def test_what_is_left_open_follows_from_the_data(tiny_dataset: Callable[..., Dat
     assert resolved.resolved(geometry) == resolved
 
 
+def test_a_step_has_whole_views_between_frames_and_one_frame_at_least(tiny_dataset: Callable[..., Dataset]) -> None:
+    geometry = Geometry.of(tiny_dataset())
+    for batch_size, asked, found in ((8, 0.75, 0.75), (1, 0.75, 0.0), (8, 1.0, 0.875), (4, 0.1, 0.0)):
+        config = TrainingConfig(batch_size=batch_size, views_between=asked).resolved(geometry)
+        assert config.views_between == found
+        assert config.steps == geometry.steps(found)
+
+
 def test_an_unknown_setting_is_refused_with_the_known_ones() -> None:
     with pytest.raises(InvalidArgument, match=r"no setting stepz; it has steps, batch_size, .*, memory_gb") as caught:
         TrainingConfig.preset("fast", stepz=3)

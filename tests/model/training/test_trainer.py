@@ -217,10 +217,10 @@ def test_divergence_keeps_the_last_good_checkpoint(
 ) -> None:
     true_loss, calls = trainer.image_loss, 0
 
-    def loss_that_breaks(rendered: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
+    def loss_that_breaks(rendered: torch.Tensor, truth: torch.Tensor, texture: float) -> torch.Tensor:
         nonlocal calls
         calls += 1
-        return true_loss(rendered, truth) * (float("nan") if calls == 6 else 1.0)
+        return true_loss(rendered, truth, texture) * (float("nan") if calls == 6 else 1.0)
 
     monkeypatch.setattr(trainer, "image_loss", loss_that_breaks)
     with pytest.raises(TrainingDiverged, match="in step 6: the loss is nan; the last good checkpoint is kept"):

@@ -136,12 +136,12 @@ def test_running_out_of_memory_leaves_the_last_good_scene(
 ) -> None:
     true_loss, calls = trainer.image_loss, 0
 
-    def loss_that_runs_out(rendered: torch.Tensor, truth: torch.Tensor) -> Any:
+    def loss_that_runs_out(rendered: torch.Tensor, truth: torch.Tensor, texture: float) -> Any:
         nonlocal calls
         calls += 1
         if calls == 6:
             raise torch.OutOfMemoryError("CUDA out of memory.")
-        return true_loss(rendered, truth)
+        return true_loss(rendered, truth, texture)
 
     monkeypatch.setattr(trainer, "image_loss", loss_that_runs_out)
     output = tmp_path / "scene.ugr"
@@ -218,10 +218,10 @@ def test_warns_of_what_looks_wrong_before_it_trains(dataset: Path, tmp_path: Pat
 def test_divergence_leaves_the_last_good_scene(dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     true_loss, calls = trainer.image_loss, 0
 
-    def loss_that_breaks(rendered: torch.Tensor, truth: torch.Tensor) -> Any:
+    def loss_that_breaks(rendered: torch.Tensor, truth: torch.Tensor, texture: float) -> Any:
         nonlocal calls
         calls += 1
-        return true_loss(rendered, truth) * (float("nan") if calls == 6 else 1.0)
+        return true_loss(rendered, truth, texture) * (float("nan") if calls == 6 else 1.0)
 
     monkeypatch.setattr(trainer, "image_loss", loss_that_breaks)
     output = tmp_path / "scene.ugr"

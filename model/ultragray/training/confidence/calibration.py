@@ -30,7 +30,7 @@ TrainShorter: TypeAlias = Callable[[Dataset], GaussianScene | None]
 
 
 def shorter(config: TrainingConfig, share: float) -> TrainingConfig:
-    """The configuration, with nothing left open, of a training on `share` of the frames: half of the steps, or 250."""
+    """The configuration of a training on `share` of the frames, with nothing left open: half of the steps, or 500."""
     assert config.steps is not None
     assert config.max_gaussians is not None
     assert config.initial_gaussians is not None

@@ -29,7 +29,7 @@ def fit_uncertainty(scene: GaussianScene, views: TrainingViews, sweep: Sweep, *,
     """
     level, spread = _bands(sweep.images)
     images = Uncertainty((0.0,) * len(TERMS), level, spread)
-    stride = max(1, len(sweep) * CELLS**2 // LOOKED_AT)
+    stride = max(1, len(sweep) * CELLS**2 // LOOKED_AT) | 1  # odd: it must not fall into step with the columns
     terms, squares = [], []
     portion = frames_at_once(sweep.height, sweep.width)
     with torch.no_grad():

@@ -1,8 +1,8 @@
 """Views between the frames of a sweep, and beyond its ends: what the frames on either side say that a plane shows.
 
 What a training sees of a gap are only its edges; it may put anything between them. So it is also shown planes between
-neighbouring frames, at a place drawn anew each time, with the two frames blended by their distances. Which frames are
-neighbours, and how they blend, the sweep itself decides: each frame is predicted from those on either side of it.
+neighbouring frames (`neighbours_of`), at a place drawn anew each time, with the two frames blended by their distances,
+in the way that predicts the sweep's own frames best (`features_follow_probe`).
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ...backends import cuda
 from ...datasets.sweep import IntArray, Sweep, spread_places
 from ...evaluation.baselines import interpolate_planes
 from ...probe import FloatArray
@@ -52,7 +53,7 @@ class Places:
 
 
 def draw_places(neighbours: Neighbours, count: int, generator: torch.Generator) -> Places:
-    """Places drawn by `Neighbours.weights`, uniformly within a gap, beyond an end the rarer the farther."""
+    """Places drawn by `Neighbours.weights`, uniformly within a gap, beyond an end fewer with distance."""
     weights = torch.from_numpy(neighbours.weights)
     chosen = torch.multinomial(weights, count, replacement=True, generator=generator).numpy()
     along = torch.rand(count, generator=generator, dtype=torch.float64).numpy()
@@ -87,8 +88,9 @@ class ViewsBetween:
         places = draw_places(self._neighbours, count, generator)
         poses = places.poses(self._sweep)
         if self.follow_probe:
-            first, second = self._images[torch.from_numpy(places.frames.T).to(self._images.device)].float().div_(255.0)
-            shares = torch.from_numpy(places.shares).to(first)
+            frames = cuda.upload(torch.from_numpy(places.frames.T), self._images.device)
+            first, second = self._images[frames].float().div_(255.0)
+            shares = cuda.upload(torch.from_numpy(places.shares).float(), self._images.device)
             return Views(torch.from_numpy(places.nearer), poses, torch.lerp(first, second, shares[:, None, None]))
         images = [
             self._sweep.images[first] / np.float32(255.0)
@@ -103,7 +105,8 @@ def features_follow_probe(sweep: Sweep, neighbours: Neighbours) -> bool:
     """Whether frames blend better pixel by pixel than where their planes cross the plane between them.
 
     Tracked exactly, a structure that runs straight through the planes stays where it is in space. Poses with errors
-    across the scan lines, and shadows, which turn with the probe, stay where they are in the image.
+    across the scan lines, and shadows, which turn with the probe, stay where they are in the image. Where no frame lies
+    between two others, nothing tells, and it is by pixel.
     """
     beside = defaultdict(list)
     for first, second in neighbours.pairs:
@@ -125,4 +128,4 @@ def features_follow_probe(sweep: Sweep, neighbours: Neighbours) -> bool:
         in_space = interpolate_planes(sweep.select(pair), pose[None])[0]
         errors = (np.square(image - truth).mean() + EXACT for image in (in_space, by_pixel))
         gains.append(np.log(next(errors)) - np.log(next(errors)))
-    return len(gains) > 0 and float(np.mean(gains)) > 0.0
+    return not gains or float(np.mean(gains)) > 0.0

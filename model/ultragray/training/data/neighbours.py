@@ -13,6 +13,7 @@ from ...probe import FloatArray
 
 ALIKE_DEG = 20.0  # turned farther, a frame shows the same things from another side
 LEAST_ACROSS = 0.5  # of the way to a neighbour that leads across the image plane; else it lies beside
+CROSSING = 0.25  # of the height of the higher corner over a plane, on its other side: there the frames cross
 EXTENT = 0.25  # lengths of the scan lines, which the space beyond an end is filled to
 
 
@@ -25,12 +26,12 @@ class Neighbours:
     ends: IntArray  # [K] places of frames with none on one side
     outward: FloatArray  # [K] +1 where that side lies along the elevation axis, −1 where against it
     spacing_mm: float  # median gap; 0 where there is no pair
-    extent_mm: float  # beyond the ends
+    nearest_mm: float  # beyond the ends: a spacing, or a pixel of a probe held still
+    extent_mm: float  # the farthest
 
     def without_ends(self) -> Neighbours:
-        """The gaps alone, where there are any."""
-        none = slice(0, 0 if len(self.pairs) else None)
-        return replace(self, ends=self.ends[none], outward=self.outward[none])
+        """The gaps alone."""
+        return replace(self, ends=self.ends[:0], outward=self.outward[:0])
 
     @property
     def weights(self) -> FloatArray:  # [E + K], their sum 1
@@ -48,19 +49,19 @@ class Neighbours:
 
     @property
     def doublings(self) -> float:
-        """Of the distance from an end, from a spacing to the extent."""
-        return max(1.0, math.log2(self.extent_mm / self.spacing_mm)) if self.spacing_mm else 1.0
+        """Of the distance from an end, from the nearest views to the extent."""
+        return max(1.0, math.log2(self.extent_mm / self.nearest_mm))
 
     def beyond_mm(self, shares: FloatArray) -> FloatArray:
         """Distances from an end, for shares from 0 to 1 of the way there in doublings."""
-        nearest = min(self.spacing_mm or self.extent_mm, self.extent_mm)
-        return nearest * (self.extent_mm / nearest) ** shares
+        return self.nearest_mm * (self.extent_mm / self.nearest_mm) ** shares
 
 
 def neighbours_of(sweep: Sweep) -> Neighbours:
     """For each frame the nearest one on either side of its plane, of those that are turned alike and not beside it.
 
-    A frame that has neither a neighbour nor an end is paired with itself, so that each takes part.
+    A probe that is turned in place has frames that cross: there the two nearest are neighbours. A frame without any is
+    paired with itself, so that each takes part.
     """
     corners, middles = sweep.corners_mm(), sweep.corners_mm().mean(axis=1)  # [F, K, 3], [F, 3]
     pairs: dict[tuple[int, int], float] = {}
@@ -73,15 +74,21 @@ def neighbours_of(sweep: Sweep) -> Neighbours:
         across = (offsets @ pose[:3, 1]).mean(axis=1)
         beside = np.linalg.norm(middles - middles[place], axis=1) > np.hypot(breadth_mm, across)
         alike = rotation_angles_deg(pose[None], sweep.poses)[0] < ALIKE_DEG
-        for side in (1, -1):
-            ahead = side * across
-            near = np.flatnonzero((ahead > LEAST_ACROSS * distances) & alike & ~beside)
-            if len(near):
-                other = int(near[distances[near].argmin()])
-                pairs[min(place, other), max(place, other)] = float(distances[other])
-            elif not ((ahead > 0) & (ahead < extent_mm) & ~beside).any():
-                alone.append((place, side))
-    used = {place for pair in pairs for place in pair} | {place for place, _ in alone}
+        candidates = alike & ~beside & (distances > 0.0)
+        nearest = np.flatnonzero(candidates)[np.argsort(distances[candidates], kind="stable")[:2]]
+        if len(nearest) and _crosses(offsets[nearest[0]] @ pose[:3, 1]):
+            found = nearest.tolist()
+        else:
+            found = []
+            for side in (1, -1):
+                ahead = side * across
+                near = np.flatnonzero(candidates & (ahead > LEAST_ACROSS * distances))
+                if len(near):
+                    found.append(int(near[distances[near].argmin()]))
+                elif not ((ahead > 0) & (ahead < extent_mm) & ~beside).any():
+                    alone.append((place, side))
+        pairs |= {(min(place, other), max(place, other)): float(distances[other]) for other in found}
+    used = {place for pair in pairs for place in pair}
     spacing_mm = float(np.median(list(pairs.values()))) if pairs else 0.0
     pairs |= {(place, place): 0.0 for place in range(len(sweep)) if place not in used}
     ends = np.array(alone, dtype=np.int64).reshape(-1, 2)
@@ -91,5 +98,12 @@ def neighbours_of(sweep: Sweep) -> Neighbours:
         ends=ends[:, 0],
         outward=ends[:, 1].astype(np.float64),
         spacing_mm=spacing_mm,
+        nearest_mm=min(spacing_mm or max(sweep.pixel_mm), extent_mm),
         extent_mm=extent_mm,
     )
+
+
+def _crosses(heights_mm: FloatArray) -> bool:  # [K] of the corners of a frame over the plane of another
+    """Whether the planes cross within the images, about evenly: not as frames of a tilt do, whose faces meet."""
+    low, high = float(heights_mm.min()), float(heights_mm.max())
+    return min(-low, high) > CROSSING * max(-low, high)

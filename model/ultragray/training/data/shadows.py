@@ -22,6 +22,7 @@ LEAST_USUAL = 0.03  # grey value, of 1, below which a depth tells nothing
 SMOOTHING_MM = 0.7, 1.0  # standard deviation across the scan lines and along them: speckle is no evidence
 LEAST_LENGTH_MM, LEAST_LENGTH = 5.0, 0.1  # of a shadow; the latter of the scan line
 FACE_MM = 1.0  # within which a line in contact is bright
+NO_CONTACT = 0.05  # of the usual brightness: a scan line that nowhere has more shows nothing at all
 SHADOWED = 0.9  # of the beam left, or less
 SPENT = 0.2  # of the beam left, below which noise outweighs the echo
 
@@ -62,7 +63,8 @@ class Shadows:
         last = max(0, int(self._told[-1] - max(LEAST_LENGTH_MM / self._axial, LEAST_LENGTH * height)))
         below[last:] = below[last]  # too little is left of the line to tell
         at_face = below[: max(1, round(FACE_MM / self._axial))].max(axis=0)
-        left = np.clip(below / np.maximum(at_face, 1e-3), 0.0, 1.0)
+        left = np.clip(below / np.maximum(at_face, NO_CONTACT), 0.0, 1.0)
+        left[:, at_face < NO_CONTACT] = 1.0
         echo = np.where(left < SPENT, 1.0, np.minimum(relative[0] / np.maximum(left, SPENT), 1.0))
         return Beam(left, (self._usual[:, None] * echo).astype(np.float32))
 

@@ -13,13 +13,15 @@ import torch
 from torch import Tensor
 
 from ...datasets.sweep import Sweep
+from ...errors import DatasetInvalid
 from ...evaluation.scoring import frames_at_once, require_frames
 from ...rendering import render
 from ...scene import GaussianScene
-from ..steps.losses import image_loss
+from ..steps.losses import SSIM_WINDOW, image_loss
 from .trained import TrainedCorrections
 
 STEPS = 60
+TEXTURE = 0.5  # of the loss
 RATE = 0.1  # mm a step, falling to 0
 
 
@@ -43,9 +45,14 @@ class HalvesScore:
 
 
 def score_halves(scene: GaussianScene, sweep: Sweep, *, backend: str = "auto") -> HalvesScore:
-    """Of all frames of a sweep. Raises DatasetInvalid where there are none."""
+    """Of all frames of a sweep. Raises DatasetInvalid where there are none, or halves are too narrow to compare."""
     require_frames(sweep)
     middle = sweep.width // 2
+    if min(middle, sweep.height) < SSIM_WINDOW:
+        raise DatasetInvalid(
+            f"{sweep.source}: to be registered by halves, frames must have at least {SSIM_WINDOW} rows and "
+            f"{2 * SSIM_WINDOW} columns, got {sweep.height}x{sweep.width}"
+        )
     halves = (slice(0, middle), slice(middle, sweep.width))
     given, registered, moved = [], [], []
     count = frames_at_once(sweep.height, sweep.width)
@@ -68,7 +75,7 @@ def _fitted(scene: GaussianScene, sweep: Sweep, truth: Tensor, columns: slice, b
     target = truth[..., columns].contiguous()
     for step in range(STEPS):
         frames = _rendered(scene, sweep, corrections.corrected(places, sweep.poses), backend)
-        (len(sweep) * image_loss(frames[..., columns].contiguous(), target)).backward()  # type: ignore[no-untyped-call]
+        (len(sweep) * image_loss(frames[..., columns].contiguous(), target, TEXTURE)).backward()  # type: ignore[no-untyped-call]
         corrections.update(RATE * (1.0 - step / STEPS))
     return corrections.corrected(places, sweep.poses).detach()
 

@@ -81,6 +81,8 @@ class _Match:
         axes = poses[self._moving[len(self._moving) // 2], :3, :3]
         here, last = np.zeros(_NUMBERS), len(LEVELS) - 1
         start = self._correlation(last, poses, here, axes)
+        if not np.isfinite(start):
+            return None  # the planes do not meet: any agreement found elsewhere would be chance
         best = -np.inf
         for place, level in enumerate(LEVELS):
             best = self._correlation(place, poses, here, axes)

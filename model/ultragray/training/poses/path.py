@@ -46,7 +46,8 @@ def sweep_ranges(sweep: Sweep) -> list[range]:
     corners = sweep.corners_mm()
     steps = corner_distances_mm(corners[1:], corners[:-1])
     starts = [0]
-    for place in np.flatnonzero(steps > JUMP * np.median(steps)) + 1:
+    moves = steps[steps > 0.0]  # a tracker may repeat its last pose
+    for place in np.flatnonzero(steps > JUMP * np.median(moves)) + 1 if len(moves) else ():
         if place - starts[-1] >= LEAST_FRAMES and len(sweep) - place >= LEAST_FRAMES:
             starts.append(int(place))
     return [range(first, last) for first, last in pairwise([*starts, len(sweep)])]

@@ -64,7 +64,16 @@ class TrainedCorrections:
             self._roughness().backward()  # type: ignore[no-untyped-call]
         self.update(RATE * (0.0 if done < START else 1.0 - done))
         with torch.no_grad():
-            self._twists -= self._twists[:1].clone() if self._whole else self._twists.mean(dim=0)
+            if self._whole:
+                self._twists[0] = 0.0
+            else:
+                self._remove_common_motion()
+
+    def _remove_common_motion(self) -> None:
+        """Takes the mean of all turns and shifts, in the tracker's axes, off each."""
+        parts = self._twists.reshape(-1, 2, 3)
+        common = torch.einsum("gij,gpj->pi", self._axes, parts) / len(parts)
+        parts -= torch.einsum("gij,pi->gpj", self._axes, common)
 
     def update(self, rate: float) -> None:
         """One update of every group by its own gradient, whatever its neighbours do."""

@@ -11,28 +11,29 @@ from torch.autograd.function import once_differentiable
 from ... import _cpu
 
 
-def image_loss(rendered: Tensor, truth: Tensor, *, instruction_set: str = "auto") -> Tensor:
-    """0.5·mean|rendered − truth| + 0.5·(1 − SSIM) of float32 images [C, H, W] on the CPU, sides of at least 11 pixels.
+def image_loss(rendered: Tensor, truth: Tensor, texture: float, *, instruction_set: str = "auto") -> Tensor:
+    """(1 − texture)·mean|rendered − truth| + texture·(1 − SSIM) of float32 images [C, H, W] on the CPU.
 
-    SSIM is taken with a Gaussian window of 11x11 pixels, σ = 1.5, where the window lies inside the image.
+    Sides have at least 11 pixels. SSIM is taken with a Gaussian window of 11x11 pixels, σ = 1.5, where the window lies
+    inside the image.
     Differentiable with respect to `rendered`. Raises ValueError for smaller images.
     """
-    loss: Tensor = _ImageLoss.apply(rendered, truth, instruction_set)  # type: ignore[no-untyped-call]
+    loss: Tensor = _ImageLoss.apply(rendered, truth, texture, instruction_set)  # type: ignore[no-untyped-call]
     return loss
 
 
 class _ImageLoss(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, rendered: Tensor, truth: Tensor, instruction_set: str) -> Tensor:
+    def forward(ctx: Any, rendered: Tensor, truth: Tensor, texture: float, instruction_set: str) -> Tensor:
         x = rendered.detach().contiguous()
         gradient = torch.empty_like(x)
         value = _cpu.image_loss(
-            x.numpy(), truth.contiguous().numpy(), gradient.numpy(), torch.get_num_threads(), instruction_set
+            x.numpy(), truth.contiguous().numpy(), gradient.numpy(), texture, torch.get_num_threads(), instruction_set
         )
         ctx.gradient = gradient
         return x.new_tensor(value)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, by_loss: Tensor) -> tuple[Tensor, None, None]:
-        return ctx.gradient * by_loss, None, None
+    def backward(ctx: Any, by_loss: Tensor) -> tuple[Tensor, None, None, None]:
+        return ctx.gradient * by_loss, None, None, None

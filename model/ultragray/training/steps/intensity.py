@@ -37,5 +37,5 @@ def project_sh0(sh0: Tensor, intensity: str, floor: Tensor | None) -> None:  # [
         low, high = RELEASED_RANGE
         sh0.clamp_((low - 1.0) / SH_C0, (high - 1.0) / SH_C0)
     if floor is not None:
-        (least,) = torch.nonzero(floor > 0.0, as_tuple=True)
-        sh0[least] = sh0[least].maximum(sh0_of_intensity(floor[least], intensity).reshape(-1, 1, 1))
+        least = torch.where(floor > 0.0, sh0_of_intensity(floor, intensity), -math.inf)
+        sh0.copy_(sh0.maximum(least.reshape(sh0.shape)))

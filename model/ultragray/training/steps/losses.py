@@ -1,4 +1,4 @@
-"""The loss of a rendered frame: half L1, half structural dissimilarity.
+"""The loss of a rendered frame: L1 and structural dissimilarity, mixed by `texture`.
 
 Written in torch for any device and dtype; where both images are float32 on the CPU, the C++ kernel gives the same.
 """
@@ -17,16 +17,16 @@ SSIM_C1 = 0.01**2
 SSIM_C2 = 0.03**2
 
 
-def image_loss(rendered: Tensor, truth: Tensor) -> Tensor:  # [C, H, W], [C, H, W] in [0, 1] -> scalar
-    """0.5·mean|rendered − truth| + 0.5·(1 − SSIM), both sides at least 11 pixels."""
+def image_loss(rendered: Tensor, truth: Tensor, texture: float) -> Tensor:  # [C, H, W] both, in [0, 1] -> scalar
+    """(1 − texture)·mean|rendered − truth| + texture·(1 − SSIM), both sides at least 11 pixels."""
     if all(image.device.type == "cpu" and image.dtype == torch.float32 for image in (rendered, truth)):
-        return kernel_image_loss(rendered, truth)
-    return plain_image_loss(rendered, truth)
+        return kernel_image_loss(rendered, truth, texture)
+    return plain_image_loss(rendered, truth, texture)
 
 
-def plain_image_loss(rendered: Tensor, truth: Tensor) -> Tensor:  # [C, H, W], [C, H, W] -> scalar
+def plain_image_loss(rendered: Tensor, truth: Tensor, texture: float) -> Tensor:  # [C, H, W] both -> scalar
     """The definition of `image_loss`."""
-    return 0.5 * (rendered - truth).abs().mean() + 0.5 * (1.0 - ssim(rendered, truth))
+    return (1.0 - texture) * (rendered - truth).abs().mean() + texture * (1.0 - ssim(rendered, truth))
 
 
 def ssim(x: Tensor, y: Tensor) -> Tensor:  # [C, H, W], [C, H, W] -> scalar

@@ -40,6 +40,7 @@ class Refined(NamedTuple):
 
     parameters: dict[str, Tensor]
     origin: Tensor  # [N]
+    parent: Tensor  # [N] the row before that each comes from, new ones too
 
 
 def refine(
@@ -70,7 +71,8 @@ def refine(
     origin = torch.cat([kept, kept.new_full((len(useful) - len(kept),), -1)])
     (left,) = torch.nonzero(useful, as_tuple=True)
     order = left[spatial_order(grown["means"][left])]
-    return Refined({name: tensor[order] for name, tensor in grown.items()}, origin[order])
+    parent = torch.cat([kept, duplicated, split, split])
+    return Refined({name: tensor[order] for name, tensor in grown.items()}, origin[order], parent[order])
 
 
 def _candidates(pull: Tensor, room: int, config: TrainingConfig) -> Tensor:  # [N] -> [n]

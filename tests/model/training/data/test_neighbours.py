@@ -49,8 +49,23 @@ def test_a_frame_beside_is_no_neighbour_and_hides_no_end(tiny_dataset: Callable[
 def test_a_probe_held_still_has_no_gaps_but_every_frame_takes_part(tiny_dataset: Callable[..., Dataset]) -> None:
     neighbours = neighbours_of(moved(tiny_dataset().train, [0.0, 0.0, 0.0]))
     assert neighbours.spacing_mm == 0.0
-    assert set(neighbours.ends.tolist()) == {0, 1, 2}
-    assert np.isfinite(neighbours.weights).all()
+    assert neighbours.pairs.tolist() == [[0, 0], [1, 1], [2, 2]]
+    assert neighbours.weights[:3].min() > 0.0
+    assert len(neighbours.without_ends().ends) == 0
+
+
+def test_frames_of_a_probe_that_turns_in_place_are_neighbours_by_their_turn(
+    tiny_dataset: Callable[..., Dataset],
+) -> None:
+    sweep = moved(tiny_dataset().train, [0.0] * 12)
+    poses = sweep.poses.copy()
+    angles = np.radians(4.0 * np.arange(12))
+    poses[:, 0, 0] = poses[:, 1, 1] = np.cos(angles)
+    poses[:, 1, 0], poses[:, 0, 1] = np.sin(angles), -np.sin(angles)
+    neighbours = neighbours_of(replace(sweep, poses=poses))
+    chain = [[place, place + 1] for place in range(11)]
+    assert [pair for pair in neighbours.pairs.tolist() if pair[1] - pair[0] == 1] == chain
+    assert len(neighbours.ends) == 0
 
 
 def test_a_frame_that_only_slides_sideways_is_paired_with_itself(tiny_dataset: Callable[..., Dataset]) -> None:

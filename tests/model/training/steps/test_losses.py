@@ -20,15 +20,17 @@ def test_ssim_agrees_with_another_implementation() -> None:
 def test_loss_of_constant_frames() -> None:
     # SSIM of constants a, b is (2ab + C1)/(a² + b² + C1): there is no variance.
     a, b = torch.full((2, 11, 12), 0.25, dtype=torch.float64), torch.full((2, 11, 12), 0.75, dtype=torch.float64)
-    expected = 0.5 * 0.5 + 0.5 * (1.0 - (2 * 0.25 * 0.75 + 1e-4) / (0.25**2 + 0.75**2 + 1e-4))
-    assert float(image_loss(a, b)) == pytest.approx(expected, abs=1e-9)
-    assert float(image_loss(a, a)) == pytest.approx(0.0, abs=1e-9)
+    dissimilarity = 1.0 - (2 * 0.25 * 0.75 + 1e-4) / (0.25**2 + 0.75**2 + 1e-4)
+    for texture in (0.0, 0.3, 1.0):
+        expected = (1.0 - texture) * 0.5 + texture * dissimilarity
+        assert float(image_loss(a, b, texture)) == pytest.approx(expected, abs=1e-9)
+        assert float(image_loss(a, a, texture)) == pytest.approx(0.0, abs=1e-9)
 
 
 def test_gradient() -> None:
     generator = torch.Generator().manual_seed(1)
     x, y = torch.rand((2, 1, 12, 13), generator=generator, dtype=torch.float64)
-    assert torch.autograd.gradcheck(lambda rendered: image_loss(rendered, y), (x.requires_grad_(),))
+    assert torch.autograd.gradcheck(lambda rendered: image_loss(rendered, y, 0.3), (x.requires_grad_(),))
 
 
 def test_kernel_gives_the_same_as_torch() -> None:
@@ -37,9 +39,9 @@ def test_kernel_gives_the_same_as_torch() -> None:
     gradients = []
     for loss in (image_loss, plain_image_loss):
         rendered = x.clone().requires_grad_()
-        value = loss(rendered, y)
+        value = loss(rendered, y, 0.3)
         value.backward()
-        assert float(value.detach()) == pytest.approx(float(plain_image_loss(x.double(), y.double())), abs=1e-5)
+        assert float(value.detach()) == pytest.approx(float(plain_image_loss(x.double(), y.double(), 0.3)), abs=1e-5)
         assert rendered.grad is not None
         gradients.append(rendered.grad)
     assert torch.allclose(*gradients, rtol=1e-3, atol=1e-7)
@@ -48,9 +50,9 @@ def test_kernel_gives_the_same_as_torch() -> None:
 def test_truth_of_another_dtype_does_not_reach_the_kernel() -> None:
     generator = torch.Generator().manual_seed(3)
     x, y = torch.rand((2, 1, 12, 13), generator=generator)
-    expected = float(plain_image_loss(x.double(), y.double()))
-    assert float(image_loss(x, y.double())) == pytest.approx(expected, abs=1e-7)
-    assert float(image_loss(x.double(), y)) == pytest.approx(expected, abs=1e-7)
+    expected = float(plain_image_loss(x.double(), y.double(), 0.3))
+    assert float(image_loss(x, y.double(), 0.3)) == pytest.approx(expected, abs=1e-7)
+    assert float(image_loss(x.double(), y, 0.3)) == pytest.approx(expected, abs=1e-7)
 
 
 def test_windows_are_not_left_to_cudnn(monkeypatch: pytest.MonkeyPatch) -> None:

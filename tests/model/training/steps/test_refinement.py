@@ -46,7 +46,9 @@ def by_parent(parameters: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
 
 
 def test_pulled_gaussians_are_duplicated_or_split_by_their_size() -> None:
-    found, origin = refined([0.05, 0.05, 0.5, 0.5], [0.0, 1e-4, 0.0, 1e-4], limit=100)
+    found, origin, parent = refined([0.05, 0.05, 0.5, 0.5], [0.0, 1e-4, 0.0, 1e-4], limit=100)
+    assert sorted(parent.tolist()) == [0, 1, 1, 2, 3, 3]
+    assert torch.equal(parent[origin >= 0], origin[origin >= 0])
     assert sorted(origin.tolist()) == [-1, -1, -1, 0, 1, 2]
     found = by_parent(found)
     assert found["transmittances"].tolist() == [
@@ -69,7 +71,7 @@ def test_pulled_gaussians_are_duplicated_or_split_by_their_size() -> None:
 
 def test_halves_are_drawn_from_the_gaussian() -> None:
     count = 2000
-    found, origin = refined([0.5] * count, [1.0] * count, limit=2 * count)
+    found, origin, _ = refined([0.5] * count, [1.0] * count, limit=2 * count)
     assert bool((origin == -1).all())
     offsets = by_parent(found)["means"] - splats([0.5] * count)["means"].repeat_interleave(2, dim=0)
     expected = torch.tensor([0.5, 0.5 / math.e, 0.5 / math.e])
@@ -77,24 +79,24 @@ def test_halves_are_drawn_from_the_gaussian() -> None:
 
 
 def test_the_most_pulled_come_first_under_the_limit() -> None:
-    found, _ = refined([0.05] * 4, [2e-5, 4e-5, 1e-6, 3e-5], limit=6)
+    found, _, _ = refined([0.05] * 4, [2e-5, 4e-5, 1e-6, 3e-5], limit=6)
     assert sorted(found["transmittances"].tolist()) == [0.0, 1.0, 1.0, 2.0, 3.0, 3.0]
     assert len(refined([0.05] * 4, [1.0] * 4, limit=3).parameters["means"]) == 4
 
 
 def test_even_growth_takes_no_notice_of_the_threshold_but_of_being_seen() -> None:
-    found, _ = refined([0.05] * 3, [1e-9, 0.0, 2e-9], limit=10, growth="even")
+    found, _, _ = refined([0.05] * 3, [1e-9, 0.0, 2e-9], limit=10, growth="even")
     assert sorted(found["transmittances"].tolist()) == [0.0, 0.0, 1.0, 2.0, 2.0]
 
 
 def test_too_large_and_too_small_are_pruned() -> None:
-    found, origin = refined([1.1, 0.9, 5e-5, 2e-4], [0.0] * 4, limit=10)
+    found, origin, _ = refined([1.1, 0.9, 5e-5, 2e-4], [0.0] * 4, limit=10)
     assert sorted(origin.tolist()) == [1, 3]
     assert found["transmittances"].tolist() == [float(place) for place in origin]
 
 
 def test_a_half_that_is_small_enough_stays_where_the_whole_would_go() -> None:
-    found, origin = refined([1.5], [1.0], limit=10)
+    found, origin, _ = refined([1.5], [1.0], limit=10)
     assert origin.tolist() == [-1, -1]
     assert len(found["means"]) == 2
 
