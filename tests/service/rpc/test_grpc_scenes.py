@@ -9,6 +9,7 @@ from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
 
 from ultragray_proto.v1 import scenes_pb2, scenes_pb2_grpc
 
+from ...waiting import wait_until
 from ..conftest import HEIGHT, RunningService
 from .test_grpc_render import error_info
 
@@ -76,8 +77,13 @@ def test_bad_pages(scenes: Stub) -> None:
 def test_health_and_reflection(channel: grpc.Channel) -> None:
     health = health_pb2_grpc.HealthStub(channel)
     for name in ("", "ultragray.v1.RenderService", "ultragray.v1.SceneService"):
-        answer = health.Check(health_pb2.HealthCheckRequest(service=name), timeout=5)
-        assert answer.status == health_pb2.HealthCheckResponse.SERVING
+        request = health_pb2.HealthCheckRequest(service=name)
+
+        def is_serving(request: health_pb2.HealthCheckRequest = request) -> bool:
+            status = health.Check(request, timeout=5).status
+            return bool(status == health_pb2.HealthCheckResponse.SERVING)
+
+        wait_until(is_serving)
     reflection = reflection_pb2_grpc.ServerReflectionStub(channel)
     request = reflection_pb2.ServerReflectionRequest(list_services="*")
     (answer,) = reflection.ServerReflectionInfo(iter([request]), timeout=5)
