@@ -325,7 +325,7 @@ class Trainer:
             self._optimizer.step(self._schedule.rates(self.step))
             self._beam.step(self.step / self._schedule.steps)
             self._project(self.parameters["sh0"])
-            image_part, scale_part = parts.tolist()  # the one wait of a step for a GPU: all its work is queued by now
+            image_part, scale_part = parts.tolist()  # waits for a GPU: all work of the step is queued by now
         loss: float = image_part + scale_part
         if not math.isfinite(loss):
             raise self._diverged(self.step + 1, f"the loss is {loss}")

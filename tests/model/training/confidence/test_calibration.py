@@ -52,14 +52,25 @@ def ranks(values: FloatArray) -> FloatArray:
     return values.argsort().argsort().astype(np.float64)
 
 
-@pytest.mark.long
-def test_it_tells_what_frames_will_reach() -> None:
+def told_and_actual() -> tuple[FloatArray, FloatArray]:
     scene, (_, val) = trained(), phantom()
     actual = np.array([frame.ms_ssim for frame in evaluate(scene, val).frames])
     told = np.array([frame.confidence for frame in Assessor(scene.info, scene.training_poses).assess(val.poses)])
+    return told, actual
+
+
+@pytest.mark.long
+def test_frames_that_will_reach_more_are_told_more() -> None:
+    told, actual = told_and_actual()
     assert actual.std() > 0.1
-    assert np.abs(told - actual).mean() < 0.12
     assert np.corrcoef(ranks(told), ranks(actual))[0, 1] > 0.8
+
+
+@pytest.mark.long
+@pytest.mark.xfail(strict=True, reason="0.101 since training sees views beyond the ends: the model is to follow them")
+def test_it_tells_what_frames_will_reach() -> None:
+    told, actual = told_and_actual()
+    assert np.abs(told - actual).mean() < 0.1
 
 
 @pytest.mark.long
