@@ -392,8 +392,13 @@ class Trainer:
         self._pull = PullStatistics.empty(self.gaussian_count, self._device)
 
     def _check_finite(self) -> None:
-        finite = torch.stack([torch.isfinite(tensor.detach()).all() for tensor in self.parameters.values()]).tolist()
-        for name, is_finite in zip(self.parameters, finite, strict=True):
+        tensors = {
+            **self.parameters,
+            **{f"pose corrections ({name})": tensor for name, tensor in self.refinement.tensors().items()},
+            **{f"numbers of the beam ({name})": tensor for name, tensor in self._beam.tensors().items()},
+        }
+        finite = torch.stack([torch.isfinite(t.detach()).all().to(self._device) for t in tensors.values()]).tolist()
+        for name, is_finite in zip(tensors, finite, strict=True):
             if not is_finite:
                 raise self._diverged(self.step, f"{name} are no longer finite")
 

@@ -282,6 +282,19 @@ def test_parameters_that_are_not_finite_never_reach_a_checkpoint(
     assert not (tmp_path / "checkpoint.safetensors").exists()
 
 
+@pytest.mark.parametrize(
+    ("part", "what"), [("refinement", "pose corrections \\(numbers\\)"), ("_beam", "numbers of the beam \\(numbers\\)")]
+)
+def test_neither_do_corrections_that_are_not_finite(
+    tiny_dataset: Datasets, tiny_config: Configs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part: str, what: str
+) -> None:
+    run = trainer.Trainer(tiny_dataset(), tiny_config(), folder=tmp_path, device="cpu", backend="auto")
+    monkeypatch.setattr(getattr(run, part), "tensors", lambda: {"numbers": torch.tensor([1.0, float("nan")])})
+    with pytest.raises(TrainingDiverged, match=f"{what} are no longer finite"):
+        run.save_checkpoint()
+    assert not (tmp_path / "checkpoint.safetensors").exists()
+
+
 def test_without_transmittance_nothing_absorbs(tiny_dataset: Datasets, tiny_config: Configs) -> None:
     scene, _ = learned(tiny_dataset(), tiny_config(transmittance=False))
     assert bool((torch.sigmoid(scene.transmittances) == 1.0).all())

@@ -7,6 +7,7 @@ in the way that predicts the sweep's own frames best (`features_follow_probe`).
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -17,9 +18,9 @@ from torch import Tensor
 
 from ...backends import cuda
 from ...datasets.sweep import IntArray, Sweep, spread_places
-from ...evaluation.baselines import interpolate_planes
 from ...probe import FloatArray
 from ...samplers.rotations import blended
+from .blending import blend_in_space
 from .neighbours import Neighbours
 
 EXACT = 1e-9  # a squared error that counts as none
@@ -87,18 +88,14 @@ class ViewsBetween:
         """New ones, by `draw_places`."""
         places = draw_places(self._neighbours, count, generator)
         poses = places.poses(self._sweep)
+        frames = cuda.upload(torch.from_numpy(places.frames), self._images.device)
+        sides = self._images[frames].float().div_(255.0)  # [V, 2, H, W]
         if self.follow_probe:
-            frames = cuda.upload(torch.from_numpy(places.frames.T), self._images.device)
-            first, second = self._images[frames].float().div_(255.0)
             shares = cuda.upload(torch.from_numpy(places.shares).float(), self._images.device)
-            return Views(torch.from_numpy(places.nearer), poses, torch.lerp(first, second, shares[:, None, None]))
-        images = [
-            self._sweep.images[first] / np.float32(255.0)
-            if first == second
-            else interpolate_planes(self._sweep.select([first, second]), pose[None])[0]
-            for (first, second), pose in zip(places.frames, poses, strict=True)
-        ]
-        return Views(torch.from_numpy(places.nearer), poses, torch.from_numpy(np.stack(images)).to(self._images.device))
+            images = torch.lerp(sides[:, 0], sides[:, 1], shares[:, None, None])
+        else:
+            images = blend_in_space(sides, self._sweep.poses[places.frames], poses, self._sweep.probe)
+        return Views(torch.from_numpy(places.nearer), poses, images)
 
 
 def features_follow_probe(sweep: Sweep, neighbours: Neighbours) -> bool:
@@ -123,9 +120,10 @@ def features_follow_probe(sweep: Sweep, neighbours: Neighbours) -> bool:
         above, below = heights.argmax(), heights.argmin()
         share = heights[above] / (heights[above] - heights[below])
         pair = others[[above, below]]
-        truth = sweep.images[frame] / 255.0
-        by_pixel = ((1.0 - share) * sweep.images[pair[0]] + share * sweep.images[pair[1]]) / 255.0
-        in_space = interpolate_planes(sweep.select(pair), pose[None])[0]
-        errors = (np.square(image - truth).mean() + EXACT for image in (in_space, by_pixel))
-        gains.append(np.log(next(errors)) - np.log(next(errors)))
+        truth = torch.from_numpy(sweep.images[frame]).float() / 255.0
+        sides = torch.from_numpy(sweep.images[pair]).float() / 255.0
+        by_pixel = torch.lerp(sides[0], sides[1], share)
+        in_space = blend_in_space(sides[None], sweep.poses[None, pair], pose[None], sweep.probe)[0]
+        errors = (float((image - truth).square().mean()) + EXACT for image in (in_space, by_pixel))
+        gains.append(math.log(next(errors)) - math.log(next(errors)))
     return not gains or float(np.mean(gains)) > 0.0
