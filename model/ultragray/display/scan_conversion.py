@@ -15,6 +15,7 @@ from ..probe import FloatArray, Probe
 FloatImage: TypeAlias = npt.NDArray[np.float32]
 ByteImage: TypeAlias = npt.NDArray[np.uint8]
 BoolArray: TypeAlias = npt.NDArray[np.bool_]
+IntArray: TypeAlias = npt.NDArray[np.int64]
 _NOT_ONE_MORE = 1.0 + 1e-9  # pixel, by rounding
 
 
@@ -60,11 +61,18 @@ def pixel_places(
 
 def interpolated(frame: npt.NDArray[Any], rows: FloatArray, columns: FloatArray) -> FloatArray:
     """A frame [H, W] between its pixels, at places as `pixel_places` gives them."""
-    height, width = frame.shape
+    return interpolated_frames(frame[None], 0, rows, columns)
+
+
+def interpolated_frames(
+    frames: npt.NDArray[Any], which: IntArray | int, rows: FloatArray, columns: FloatArray
+) -> FloatArray:  # [F, H, W], [...] each -> [...]
+    """The same where each place is in a frame of its own, the one numbered `which`."""
+    _, height, width = frames.shape
     i, j = np.floor(rows).astype(np.intp), np.floor(columns).astype(np.intp)
     down, right = rows - i, columns - j
     below, beside = np.minimum(i + 1, height - 1), (j + 1) % width
-    upper = frame[i, j] * (1 - right) + frame[i, beside] * right
-    lower = frame[below, j] * (1 - right) + frame[below, beside] * right
+    upper = frames[which, i, j] * (1 - right) + frames[which, i, beside] * right
+    lower = frames[which, below, j] * (1 - right) + frames[which, below, beside] * right
     values: FloatArray = upper * (1 - down) + lower * down
     return values

@@ -6,6 +6,8 @@ import numpy as np
 
 from ..probe import FloatArray
 
+_NO_TURN = 1e-300  # rad
+
 
 def about_axes(axes: FloatArray, angles: FloatArray) -> FloatArray:  # [C, 3] of length 1, [C] rad -> [C, 3, 3]
     """Rodrigues' formula: 1 + sin a K + (1 − cos a) K²."""
@@ -29,6 +31,19 @@ def blended(first: FloatArray, second: FloatArray, shares: FloatArray) -> FloatA
     relative = first.transpose(0, 2, 1) @ second
     axes, angles = _axes_and_angles(relative)
     return first @ about_axes(axes, shares * angles)
+
+
+def rotations_of(turns: FloatArray) -> FloatArray:  # [C, 3] rad -> [C, 3, 3]
+    """The rotations of turns, each an axis times an angle."""
+    angles = np.linalg.norm(turns, axis=1)
+    return about_axes(turns / np.maximum(angles, _NO_TURN)[:, None], angles)
+
+
+def turns_of(rotations: FloatArray) -> FloatArray:  # [C, 3, 3] -> [C, 3] rad
+    """Axis times angle, at most π, of each rotation."""
+    axes, angles = _axes_and_angles(rotations)
+    turns: FloatArray = axes * angles[:, None]
+    return turns
 
 
 def _axes_and_angles(rotations: FloatArray) -> tuple[FloatArray, FloatArray]:  # [C, 3, 3] -> [C, 3], [C] rad in [0, π]

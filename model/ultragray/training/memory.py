@@ -19,6 +19,7 @@ from ..scene_info import expected_shapes
 from .config import TrainingConfig
 from .data.sampling import PREDICTED_PIXELS
 from .data.shadows import LOOKED_AT_FRAMES
+from .poses import overlap
 
 BASE_BYTES = 440 << 20  # the process with torch loaded, and the scratch memory of its kernels
 COPIES = 16  # parameters, gradients, moments; what refinements, checkpoints and the kernel copy (measured: 14)
@@ -29,6 +30,7 @@ LIST_GAUSSIANS = 4096  # a step lists those that an image plane touches, so many
 LIST_BYTES = 72 * 4160  # of a full list: it begins with room for 1040 slices of 72 bytes and doubles twice
 MEASURED_BYTES = 288  # of a pixel of the held-out frames that are measured at once (measured: 234 to 259)
 COMPARED_BYTES = 8 * 2 * PREDICTED_PIXELS + 32_768  # of a frame beside its distances, when frames are compared
+REGISTERED_BYTES = 4  # of a pixel of the frames that sweeps are registered by: a copy, and its detail of 2 bytes
 SHADOW_BYTES = 4 * 5  # of a pixel of the frames that shadows are looked for in: copies as they are compared
 CUDA_BASE_BYTES = 256 << 20  # what torch's allocator rounds up and leaves unused
 CUDA_SLICE_BYTES = 4 * (20 + 1 + 9)  # of a Gaussian in a pose: the slice, its place and its gradient
@@ -47,7 +49,7 @@ def required_bytes(dataset: Dataset, config: TrainingConfig) -> int:
     measured = max(len(dataset.val), len(dataset.train) if config.confidence else 0)
     measuring = MEASURED_BYTES * min(measured * height * width, max(CHUNK_PIXELS, height * width))
     shadows = SHADOW_BYTES * min(len(dataset.train), LOOKED_AT_FRAMES) * height * width
-    beginning = max(comparison_bytes(dataset), shadows)
+    beginning = max(comparison_bytes(dataset, config), shadows)
     slices = frames * -(-config.max_gaussians // LIST_GAUSSIANS) * LIST_BYTES  # as if all touched all planes
     copies = 3 if config.confidence else 2  # the dataset's, the trainer's and that of the frames it calibrates with
     images = copies * dataset.train.images.nbytes + dataset.val.images.nbytes
@@ -70,10 +72,12 @@ def _gaussian_bytes(config: TrainingConfig) -> int:
     return 4 * config.max_gaussians * (floats * COPIES + STATISTICS)
 
 
-def comparison_bytes(dataset: Dataset) -> int:
-    """An upper bound of what Geometry.of takes to compare the training frames with each other."""
-    count = len(dataset.train)
-    return 8 * count**2 + COMPARED_BYTES * count
+def comparison_bytes(dataset: Dataset, config: TrainingConfig) -> int:
+    """An upper bound of what Geometry.of and the registration of sweeps take to compare the training frames."""
+    count, registered = len(dataset.train), 0
+    if config.refine_poses != "none":
+        registered = min(count, 2 * overlap.FRAMES) * dataset.train.height * dataset.train.width
+    return max(8 * count**2 + COMPARED_BYTES * count, REGISTERED_BYTES * registered)
 
 
 def available_bytes() -> int | None:
@@ -133,7 +137,7 @@ def check_memory(dataset: Dataset, config: TrainingConfig, device: torch.device)
 
 def check_comparison_memory(dataset: Dataset, config: TrainingConfig) -> None:
     """Raises MemoryExceeded where comparing the frames, before anything else, may need more than it can have."""
-    needed = comparison_bytes(dataset)
+    needed = comparison_bytes(dataset, config)
     if missing := _missing(needed, config, available_bytes()):
         raise MemoryExceeded(
             f"{dataset.train.source}: comparing its {len(dataset.train):,} frames needs up to {needed / GIB:.1f} GiB, "

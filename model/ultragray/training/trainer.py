@@ -155,7 +155,7 @@ class Trainer:
         check_training_pose_count(len(dataset.train))
         check_comparison_memory(dataset, config)
         self._dataset_sha256 = dataset.sha256
-        self.refinement = PoseRefinement(dataset, config.refine_poses)
+        self.refinement = PoseRefinement.of(dataset, config.refine_poses)
         dataset = self.refinement.dataset
         self._geometry = Geometry.of(dataset)
         config = config.resolved(self._geometry)

@@ -20,6 +20,7 @@ from ultragray.samplers import (
     SplineSampler,
     TrainingSampler,
 )
+from ultragray.samplers.rotations import rotations_of, turns_of
 
 PROBE = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)
 
@@ -207,3 +208,9 @@ def test_needs_no_torch() -> None:
     program = f"import sys; sys.path[:] = {sys.path!r}; import ultragray.samplers; print('torch' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"
+
+
+def test_turns_come_back_from_their_rotations() -> None:
+    turns = np.random.default_rng(0).normal(0.0, 0.8, (50, 3))
+    turns[0] = 0.0
+    np.testing.assert_allclose(turns_of(rotations_of(turns)), turns, atol=1e-12)

@@ -16,6 +16,7 @@ from ultragray.datasets.sweep import Dataset
 from ultragray.errors import MemoryExceeded
 from ultragray.training import TrainingConfig, memory, train
 from ultragray.training.data.geometry import Geometry
+from ultragray.training.poses import overlap
 
 
 def test_names_what_to_lower(tiny_dataset: Callable[..., Dataset]) -> None:
@@ -105,7 +106,7 @@ def test_frames_that_cannot_be_compared_are_refused_before_they_are(
     tiny_dataset: Callable[..., Dataset], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     dataset, config = tiny_dataset(), TrainingConfig(max_gaussians=1000)
-    monkeypatch.setattr(memory, "available_bytes", lambda: memory.comparison_bytes(dataset) - 1)
+    monkeypatch.setattr(memory, "available_bytes", lambda: memory.comparison_bytes(dataset, config) - 1)
     monkeypatch.setattr(Geometry, "of", lambda dataset: pytest.fail("the frames were compared"))
     with pytest.raises(MemoryExceeded, match=r"comparing its 8 frames needs up to 0\.0 GiB, this machine has free"):
         train(dataset, config)
@@ -113,11 +114,22 @@ def test_frames_that_cannot_be_compared_are_refused_before_they_are(
 
 def test_comparing_frames_grows_with_their_square(tiny_dataset: Callable[..., Dataset]) -> None:
     datasets = [tiny_dataset(frames=frames) for frames in (40, 80, 120)]  # 30, 60 and 90 to train from
-    first, second, third = map(memory.comparison_bytes, datasets)
-    assert (third - second) - (second - first) == 2 * 8 * 30**2
     config = TrainingConfig(max_gaussians=1000)
+    first, second, third = (memory.comparison_bytes(dataset, config) for dataset in datasets)
+    assert (third - second) - (second - first) == 2 * 8 * 30**2
     small, large = (memory.required_bytes(dataset, config) for dataset in datasets[:2])
     assert large - small > second - first
+
+
+def test_the_registration_of_sweeps_takes_a_bounded_share(
+    tiny_dataset: Callable[..., Dataset], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plain, refined = (TrainingConfig(max_gaussians=1000, refine_poses=mode) for mode in ("none", "sweeps"))
+    dataset = tiny_dataset(height=500, width=500, frames=8)  # 6 to train from
+    assert memory.comparison_bytes(dataset, refined) == memory.REGISTERED_BYTES * 6 * 500**2
+    assert memory.comparison_bytes(dataset, plain) < memory.comparison_bytes(dataset, refined)
+    monkeypatch.setattr(overlap, "FRAMES", 2)
+    assert memory.comparison_bytes(dataset, refined) == memory.REGISTERED_BYTES * 4 * 500**2
 
 
 @pytest.mark.parametrize(

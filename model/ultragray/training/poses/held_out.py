@@ -18,7 +18,7 @@ from ...evaluation.scoring import frames_at_once, require_frames
 from ...rendering import render
 from ...scene import GaussianScene
 from ..steps.losses import SSIM_WINDOW, image_loss
-from .trained import TrainedCorrections
+from .trained import Corrections
 
 STEPS = 60
 TEXTURE = 0.5  # of the loss
@@ -70,7 +70,7 @@ def score_halves(scene: GaussianScene, sweep: Sweep, *, backend: str = "auto") -
 
 
 def _fitted(scene: GaussianScene, sweep: Sweep, truth: Tensor, columns: slice, backend: str) -> Tensor:  # [F, 4, 4]
-    corrections = TrainedCorrections(sweep, [range(len(sweep))], whole_sweeps=False)
+    corrections = Corrections(sweep, [[place] for place in range(len(sweep))])
     places = torch.arange(len(sweep))
     target = truth[..., columns].contiguous()
     for step in range(STEPS):

@@ -1,29 +1,34 @@
-"""The registration of a sweep, as a whole, to others that cross it: by what they expect of its frames.
+"""The registration of whole sweeps that cross: each is moved until its frames agree with those of the sweeps before it.
 
-Each point of a frame is predicted by the nearest plane of another sweep on either side, by the distances to them; the
-correlation of prediction and truth is climbed from large steps to small ones. Only detail counts, brightness over a
-wider neighbourhood is taken off: shadows turn with the probe, and with them two sweeps that cross match best where they
-are parallel (on the simulated liver by 6 mm and 6°).
+Each point of a frame is predicted from the two nearest planes of the other side, one on either side of the point,
+weighted by their inverse distances. The motion that maximises the correlation of predicted and true values is searched
+with large steps first, then with small ones. The mean brightness of a wider neighbourhood is subtracted before: shadows
+turn with the probe, and with them two sweeps that cross correlate best where they are parallel (6 mm and 6° off on the
+simulated liver).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import NamedTuple, TypeAlias
 
+import cv2
 import numpy as np
-import torch
-from torch import Tensor
-from torch.nn import functional
+import numpy.typing as npt
 
-from ...datasets.sweep import Sweep
-from ...display.scan_conversion import pixel_places
+from ...datasets.sweep import IntArray, Sweep, spread_places
+from ...display.scan_conversion import FloatImage, interpolated_frames, pixel_places
 from ...probe import FloatArray
-from .motion import about, motions_of
+from ...samplers.rotations import rotations_of
+
+HalfArray: TypeAlias = npt.NDArray[np.float16]
 
 POINTS = 6_000
 ROUNDS = 6  # of one size of step
 _NUMBERS = 6  # of a motion: turns about x, y, z of the probe in degrees, shifts in mm
+_UNITS = np.eye(_NUMBERS)
 _WITHIN_THE_PLANE = (1, 3, 5)
 
 
@@ -40,7 +45,8 @@ LEVELS = (
     Level((2.0, 10.0), (2.0, 1.0, 0.5)),
     Level((0.0, 5.0), (1.0, 0.5, 0.25, 0.125)),
 )
-LARGEST_GAP = 3.0  # times the spacing of frames: farther planes say nothing
+FRAMES = 300  # of either side that are compared, evenly spread: bounds time and memory for long sweeps
+LARGEST_GAP = 3.0  # times the spacing of frames: farther planes predict nothing
 LEAST_POINTS = 0.1  # of all: sweeps with less in common are not compared
 LEAST_GAIN = 0.05  # of the correlation, about that of 1 mm; the best match is off by some tenths of a mm itself
 
@@ -50,129 +56,148 @@ def register_sweeps(sweep: Sweep, ranges: Sequence[range]) -> FloatArray:  # [S,
 
     The identity for the first, and where sweeps have too little in common, or agree as they are.
     """
-    details = [_detail(sweep, *level.pixels) for level in LEVELS]
     motions = np.tile(np.eye(4), (len(ranges), 1, 1))
     poses = sweep.poses.copy()
     for number in range(1, len(ranges)):
-        match = _Match(sweep, details, np.concatenate([np.array(frames) for frames in ranges[:number]]), ranges[number])
-        motion = match.climb(poses)
+        placed, moving = np.concatenate(ranges[:number]), np.array(ranges[number])
+        motion = _Match(_portion(sweep, poses, moving), _portion(sweep, poses, placed)).climb()
         if motion is not None:
             motions[number] = motion
-            poses[ranges[number]] = motion @ poses[ranges[number]]
+            poses[moving] = motion @ poses[moving]
     return motions
 
 
-class _Match:
-    """One sweep against those that are placed already."""
+def _portion(sweep: Sweep, poses: FloatArray, places: IntArray) -> Sweep:
+    """At most FRAMES of the frames at these places, with these poses [F, 4, 4] of the whole sweep."""
+    chosen = places[spread_places(len(places), FRAMES)]
+    return replace(sweep.select(chosen), poses=poses[chosen])
 
-    def __init__(self, sweep: Sweep, details: list[FloatArray], placed: FloatArray, moving: range) -> None:
-        self._probe, self._details = sweep.probe, details
-        self._placed, self._moving = placed, np.array(moving)
+
+class _Crossing(NamedTuple):
+    """Points of one side that lie between two planes of the other, near enough to be predicted by both."""
+
+    points: IntArray  # [P] places of the points among those that were drawn
+    planes: IntArray  # [2, P] places of the nearest frames on either side of each point
+    distances_mm: FloatArray  # [2, P]
+    rows: FloatArray  # [2, P] image coordinates of each point in the planes
+    columns: FloatArray  # [2, P]
+
+
+class _Match:
+    """The search for the motion of one side, `moving`, that makes it agree with the other, which stays."""
+
+    def __init__(self, moving: Sweep, placed: Sweep) -> None:
+        self._probe, self._sweeps = moving.probe, (moving, placed)
         rng = np.random.default_rng(0)
-        self._ends = (rng.choice(self._moving, POINTS), rng.choice(placed, POINTS))
+        self._frames = [rng.choice(len(sweep), POINTS) for sweep in self._sweeps]
         self._rows, self._columns = rng.random((2, POINTS)), rng.random((2, POINTS))
-        corners = sweep.corners_mm()
-        self._centre = corners[self._moving].mean(axis=(0, 1))
-        steps = [np.linalg.norm(np.diff(corners[part].mean(axis=1), axis=0), axis=1) for part in (self._moving, placed)]
+        middles = [sweep.corners_mm().mean(axis=1) for sweep in self._sweeps]
+        self._centre = middles[0].mean(axis=0)
+        self._axes = moving.poses[len(moving) // 2, :3, :3]
+        steps = [np.linalg.norm(np.diff(middle, axis=0), axis=1) for middle in middles]
         self._gap_mm = LARGEST_GAP * float(np.median(np.concatenate(steps)))
 
-    def climb(self, poses: FloatArray) -> FloatArray | None:  # [F, 4, 4] -> [4, 4]
-        """Hooke and Jeeves: one number after another, then on along what was gained. None without a clear gain."""
-        axes = poses[self._moving[len(self._moving) // 2], :3, :3]
-        here, last = np.zeros(_NUMBERS), len(LEVELS) - 1
-        start = self._correlation(last, poses, here, axes)
-        if not np.isfinite(start):
-            return None  # the planes do not meet: any agreement found elsewhere would be chance
-        best = -np.inf
-        for place, level in enumerate(LEVELS):
-            best = self._correlation(place, poses, here, axes)
-            for step in level.steps:
-                for _ in range(ROUNDS):
-                    before, moved = here.copy(), False
-                    for number in level.numbers:
-                        for sign in (1.0, -1.0):
-                            tried = here.copy()
-                            tried[number] += sign * step
-                            score = self._correlation(place, poses, tried, axes)
-                            if score > best:
-                                here, best, moved = tried, score, True
-                                break
-                    if not moved:
-                        break
-                    onwards = 2.0 * here - before
-                    score = self._correlation(place, poses, onwards, axes)
-                    if score > best:
-                        here, best = onwards, score
-        return self._motion(here, axes) if best - start >= LEAST_GAIN else None
+    def climb(self) -> FloatArray | None:  # [4, 4]
+        """The motion of the best correlation; None where the sides do not meet as they are, or little is gained."""
+        here, gain = np.zeros(_NUMBERS), 0.0
+        if not _has_enough(self._crossings(here)):
+            return None  # any agreement found elsewhere would be chance
+        for level in LEVELS:
+            here, gain = self._climb_level(level, here)
+        return self._motion(here) if gain >= LEAST_GAIN else None
 
-    def _motion(self, numbers: FloatArray, axes: FloatArray) -> FloatArray:  # [6] degrees, mm -> [4, 4]
-        twist = np.concatenate([np.radians(axes @ numbers[:3]), np.zeros(3)])
-        motion: FloatArray = about(motions_of(torch.from_numpy(twist[None])).numpy(), self._centre[None])[0]
-        motion[:3, 3] += axes @ numbers[3:]
+    def _climb_level(self, level: Level, start: FloatArray) -> tuple[FloatArray, float]:  # [6] -> [6]
+        """The best numbers that are found from `start`, and what the correlation gains against no motion."""
+        details = [_detail(sweep, *level.pixels) for sweep in self._sweeps]
+        correlation = partial(self._correlation, details)
+        here = _climbed(correlation, start, level)
+        return here, correlation(here) - correlation(np.zeros(_NUMBERS))
+
+    def _motion(self, numbers: FloatArray) -> FloatArray:  # [6] degrees, mm -> [4, 4]
+        motion = np.eye(4)
+        motion[:3, :3] = rotations_of(np.radians(self._axes @ numbers[:3])[None])[0]
+        motion[:3, 3] = self._centre - motion[:3, :3] @ self._centre + self._axes @ numbers[3:]
         return motion
 
-    def _correlation(self, level: int, poses: FloatArray, numbers: FloatArray, axes: FloatArray) -> float:
-        moved = poses.copy()
-        moved[self._moving] = self._motion(numbers, axes) @ poses[self._moving]
-        others = (self._placed, self._moving)
-        truth, predicted = zip(*(self._predicted(level, moved, end, others[end]) for end in (0, 1)), strict=True)
-        x, y = np.concatenate(truth), np.concatenate(predicted)
-        if len(x) < LEAST_POINTS * 2 * POINTS:
+    def _correlation(self, details: Sequence[HalfArray], numbers: FloatArray) -> float:
+        """Of the true and the predicted details of both sides; −∞ where they have too little in common."""
+        crossings = self._crossings(numbers)
+        if not _has_enough(crossings):
             return -np.inf
-        return float(np.corrcoef(x, y)[0, 1])
+        truth, predicted = [], []
+        for side, crossing in enumerate(crossings):
+            frames = self._frames[side][crossing.points]
+            rows, columns = self._rows[side][crossing.points], self._columns[side][crossing.points]
+            truth.append(self._sampled(details[side], frames, rows, columns))
+            values = self._sampled(details[1 - side], crossing.planes, crossing.rows, crossing.columns)
+            weights = 1.0 / np.maximum(crossing.distances_mm, 1e-6)
+            predicted.append((weights * values).sum(axis=0) / weights.sum(axis=0))
+        return float(np.corrcoef(np.concatenate(truth), np.concatenate(predicted))[0, 1])
 
-    def _predicted(self, level: int, poses: FloatArray, end: int, others: FloatArray) -> tuple[FloatArray, FloatArray]:
-        frames, rows, columns = self._ends[end], self._rows[end], self._columns[end]
-        local = self._probe.points_mm(rows, columns)
-        points = np.einsum("pij,pj->pi", poses[frames, :3, :3], local) + poses[frames, :3, 3]
-        normals, origins = poses[others, :3, 1], poses[others, :3, 3]
-        heights = points @ normals.T - np.einsum("fi,fi->f", normals, origins)  # [P, F]
-        known = np.ones(len(points), bool)
-        values, weights = [], []
-        for side in (1.0, -1.0):
-            distances = np.where(side * heights >= 0.0, side * heights, np.inf)
-            nearest = distances.argmin(axis=1)
-            distance = distances[np.arange(len(points)), nearest]
-            plane = others[nearest]
-            seen = np.einsum("pi,pij->pj", points - poses[plane, :3, 3], poses[plane, :3, :3])
-            r, c = self._probe.image_coordinates(seen[:, 0], seen[:, 2])
-            inside = ~np.isnan(r) & (distance < self._gap_mm)
-            known &= inside
-            values.append(self._sampled(level, plane, np.where(inside, r, 0.0), np.where(inside, c, 0.0)))
-            weights.append(1.0 / np.maximum(np.where(inside, distance, 1.0), 1e-6))
-        blended = (weights[0] * values[0] + weights[1] * values[1]) / (weights[0] + weights[1])
-        return self._sampled(level, frames, rows, columns)[known], blended[known]
+    def _crossings(self, numbers: FloatArray) -> list[_Crossing]:
+        """Of the points of either side, the moving one having been moved."""
+        moving, placed = (sweep.poses for sweep in self._sweeps)
+        poses = (self._motion(numbers) @ moving, placed)
+        return [self._crossing(side, poses[side], poses[1 - side]) for side in range(2)]
 
-    def _sampled(
-        self, level: int, frames: FloatArray, rows: FloatArray, columns: FloatArray
-    ) -> FloatArray:  # [P] each -> [P]
-        image = self._details[level]
-        _, height, width = image.shape
-        i, j = pixel_places(self._probe, (height, width), rows, columns)
-        top, left = np.floor(i).astype(np.intp), np.floor(j).astype(np.intp)
-        down, right = i - top, j - left
-        below, beside = np.minimum(top + 1, height - 1), (left + 1) % width
-        upper = image[frames, top, left] * (1 - right) + image[frames, top, beside] * right
-        lower = image[frames, below, left] * (1 - right) + image[frames, below, beside] * right
-        sampled: FloatArray = upper * (1 - down) + lower * down
-        return sampled
+    def _crossing(self, side: int, poses: FloatArray, others: FloatArray) -> _Crossing:
+        local, own = self._probe.points_mm(self._rows[side], self._columns[side]), poses[self._frames[side]]
+        points = np.einsum("pij,pj->pi", own[:, :3, :3], local) + own[:, :3, 3]
+        planes, distances = _nearest_planes(points, others)
+        seen = np.einsum("spi,spij->spj", points - others[planes, :3, 3], others[planes, :3, :3])
+        rows, columns = self._probe.image_coordinates(seen[..., 0], seen[..., 2])
+        known = np.flatnonzero((~np.isnan(rows) & (distances < self._gap_mm)).all(axis=0))
+        return _Crossing(known, planes[:, known], distances[:, known], rows[:, known], columns[:, known])
+
+    def _sampled(self, details: HalfArray, frames: IntArray, rows: FloatArray, columns: FloatArray) -> FloatArray:
+        return interpolated_frames(details, frames, *pixel_places(self._probe, details.shape[1:], rows, columns))
 
 
-def _detail(sweep: Sweep, blur: float, around: float) -> FloatArray:  # [F, H, W]
+def _has_enough(crossings: Sequence[_Crossing]) -> bool:
+    return sum(len(crossing.points) for crossing in crossings) >= LEAST_POINTS * 2 * POINTS
+
+
+def _nearest_planes(points: FloatArray, poses: FloatArray) -> tuple[IntArray, FloatArray]:  # [P, 3], [F, 4, 4]
+    """The nearest of the image planes on either side of each point, and its distance, mm: [2, P] both.
+
+    The distance is infinite where there is no plane on that side.
+    """
+    normals, origins = poses[:, :3, 1], poses[:, :3, 3]
+    heights = points @ normals.T - np.einsum("fi,fi->f", normals, origins)  # [P, F]
+    sides = [np.where(height >= 0.0, height, np.inf) for height in (heights, -heights)]
+    planes = np.stack([side.argmin(axis=1) for side in sides])
+    return planes, np.stack([side[np.arange(len(points)), at] for side, at in zip(sides, planes, strict=True)])
+
+
+def _climbed(score: Callable[[FloatArray], float], start: FloatArray, level: Level) -> FloatArray:  # [6] -> [6]
+    """Hooke and Jeeves: each number is moved a step up or down, then all of them again by what was gained."""
+    here, best = start, score(start)
+    for step in level.steps:
+        for _ in range(ROUNDS):
+            before = here
+            for number in level.numbers:
+                for moved in (here + step * _UNITS[number], here - step * _UNITS[number]):
+                    if (gained := score(moved)) > best:
+                        here, best = moved, gained
+                        break
+            if here is before:
+                break
+            onwards = 2.0 * here - before
+            if (gained := score(onwards)) > best:
+                here, best = onwards, gained
+    return here
+
+
+def _detail(sweep: Sweep, blur: float, around: float) -> HalfArray:  # [F, H, W]
     """Structure wider than one standard deviation and narrower than the other, in pixels."""
-    found = []
-    for image in torch.split(torch.from_numpy(sweep.images), 32):
-        grey = image.float() / 255.0
-        found.append(_blurred(grey, blur) - _blurred(grey, around))
-    made: FloatArray = torch.cat(found).numpy()
-    return made
+    details = np.empty(sweep.images.shape, np.float16)
+    for image, detail in zip(sweep.images, details, strict=True):
+        grey = image / np.float32(255.0)
+        detail[:] = _blurred(grey, blur) - _blurred(grey, around)
+    return details
 
 
-def _blurred(images: Tensor, sigma: float) -> Tensor:  # [F, H, W] -> [F, H, W]
+def _blurred(image: FloatImage, sigma: float) -> FloatImage:  # [H, W] -> [H, W]
     if sigma == 0.0:
-        return images
-    radius = int(3 * sigma)
-    offsets = torch.arange(-radius, radius + 1, dtype=torch.float32)
-    kernel = torch.softmax(-0.5 * (offsets / sigma).square(), dim=0)
-    padded = functional.pad(images[:, None], (radius,) * 4, mode="replicate")
-    return functional.conv2d(functional.conv2d(padded, kernel[None, None, :, None]), kernel[None, None, None])[:, 0]
+        return image
+    return cv2.GaussianBlur(image, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE).astype(np.float32, copy=False)

@@ -1,11 +1,11 @@
-"""The path of the probe: where one sweep ends and the next begins, how much the tracker shakes, and the path without.
+"""Estimates from the tracked path alone: where a new sweep begins, the tracker's noise, and the path without it.
 
-A hand or a robot moves a probe smoothly; a tracker's errors differ from frame to frame. Of each of the six numbers of a
-pose (position of the probe's origin along the sweep's mean axes, turn from its mean orientation) the second differences
-are therefore a sum of two parts: those of the path, independent with variance q, and those of the tracker's error,
-D·e with variance r of e. Their spectra differ, so that q and r follow from the data by maximum likelihood; the path is
-then the posterior mean. A tracker errs alike along all axes: the least r of three is taken, since a probe that does not
-move evenly along its path looks like an error there.
+A hand or a robot moves a probe smoothly, while a tracker's errors differ from frame to frame. A pose has six
+coordinates: the position of the probe's origin along the sweep's mean axes, and the turn from its mean orientation.
+The second differences of each are the sum of two independent parts: those of the path, with variance q, and those of
+the tracker's error, D·e with variance r of e. The two parts have different spectra, so q and r are found by maximum
+likelihood; the path is then the posterior mean. A tracker's errors have the same size along all three axes, but a probe
+that moves unevenly along its path looks noisy in that direction: the smallest r of the three is taken for all.
 """
 
 from __future__ import annotations
@@ -19,11 +19,13 @@ import numpy as np
 from ...datasets.sweep import Sweep, corner_distances_mm
 from ...evaluation.compounding import mean_axes
 from ...probe import FloatArray
-from .motion import rotations_of, turn_vectors_deg
+from ...samplers.rotations import rotations_of, turns_of
+from .second_differences import likelihood_terms, smoothed
 
 JUMP = 6.0  # times the median step: there a new sweep begins
-LEAST_FRAMES = 5  # of a sweep: fewer tell nothing of a path
-STEPS = 10.0 ** np.arange(-6.0, 6.01, 0.25)  # tried ratios of variances
+LEAST_FRAMES = 5  # of a sweep: fewer are not a path
+RATIOS = 10.0 ** np.arange(-6.0, 6.01, 0.25)  # of the variances q/r that are tried
+TINY = 1e-300  # a variance whose logarithm is finite
 GOOD_MM, GOOD_DEG = 0.2, 0.2  # a tracker's error below these, standard deviation along an axis, is left alone
 _NUMBERS = 6
 
@@ -54,30 +56,28 @@ def sweep_ranges(sweep: Sweep) -> list[range]:
 
 
 def tracker_noise(poses: FloatArray, ranges: Sequence[range]) -> TrackerNoise:  # [F, 4, 4] mm
-    """The errors that the path itself shows; 0 where it is too short to tell."""
-    position, turn = _noise_variances(_coordinates(poses, ranges), ranges)
+    """The tracker's errors, estimated from the path alone; 0 where the path is too short for an estimate."""
+    position, turn = _Likelihood.of(_coordinates(poses, ranges), ranges).noise_variances()
     return TrackerNoise(float(np.sqrt(position)), float(np.sqrt(turn)))
 
 
 def without_noise(poses: FloatArray, ranges: Sequence[range]) -> FloatArray:  # [F, 4, 4] mm -> [F, 4, 4] mm
     """The likeliest path of each sweep."""
     coordinates = _coordinates(poses, ranges)
-    noise = np.repeat(_noise_variances(coordinates, ranges), 3)
+    likelihood = _Likelihood.of(coordinates, ranges)
+    noise = np.repeat(likelihood.noise_variances(), 3)
     cleaned = coordinates.copy()
     for number in range(_NUMBERS):
         if noise[number] == 0.0:
             continue
-        _, path = _likeliest([_bends(coordinates, frames, number) for frames in ranges], noise[number])
-        for frames in ranges:
-            if len(frames) >= LEAST_FRAMES:
-                bends = _second_differences(len(frames))
-                weight = np.eye(len(frames)) + noise[number] / path * bends.T @ bends
-                cleaned[frames, number] = np.linalg.solve(weight, coordinates[frames, number])
+        ratio = likelihood.best_ratio(number, noise[number])
+        for frames in _long_enough(ranges):
+            cleaned[frames, number] = smoothed(coordinates[frames, number], ratio)
     found = poses.copy()
     for frames in ranges:
         axes = mean_axes(poses[frames])
         found[frames, :3, 3] = cleaned[frames, :3] @ axes.T
-        found[frames, :3, :3] = axes @ rotations_of(cleaned[frames, 3:])
+        found[frames, :3, :3] = axes @ rotations_of(np.radians(cleaned[frames, 3:]))
     return found
 
 
@@ -86,42 +86,40 @@ def _coordinates(poses: FloatArray, ranges: Sequence[range]) -> FloatArray:  # [
     for frames in ranges:
         axes = mean_axes(poses[frames])
         found[frames, :3] = poses[frames, :3, 3] @ axes
-        found[frames, 3:] = turn_vectors_deg(axes.T @ poses[frames, :3, :3])
+        found[frames, 3:] = np.degrees(turns_of(axes.T @ poses[frames, :3, :3]))
     return found
 
 
-def _noise_variances(coordinates: FloatArray, ranges: Sequence[range]) -> tuple[float, float]:
-    """Of position, mm², and turn, degrees²."""
-    each = [_likeliest([_bends(coordinates, frames, number) for frames in ranges])[0] for number in range(_NUMBERS)]
-    return min(each[:3]), min(each[3:])
+def _long_enough(ranges: Sequence[range]) -> list[range]:
+    return [frames for frames in ranges if len(frames) >= LEAST_FRAMES]
 
 
-def _bends(coordinates: FloatArray, frames: range, number: int) -> FloatArray:
-    return np.diff(coordinates[frames, number], 2) if len(frames) >= LEAST_FRAMES else np.zeros(0)
+@dataclass(frozen=True, eq=False)
+class _Likelihood:
+    """How likely the second differences of each coordinate are, for each of RATIOS q/r.
 
+    Their covariance is r·(q/r·1 + D·Dᵀ).
+    """
 
-def _second_differences(count: int) -> FloatArray:  # [count − 2, count]
-    rows = np.arange(count - 2)
-    found = np.zeros((count - 2, count))
-    found[rows, rows], found[rows, rows + 1], found[rows, rows + 2] = 1.0, -2.0, 1.0
-    return found
+    count: int  # of second differences
+    log_determinants: FloatArray  # [R], without r
+    squares: FloatArray  # [R, 6] of the differences, weighted by the inverse, without r
 
+    @classmethod
+    def of(cls, coordinates: FloatArray, ranges: Sequence[range]) -> _Likelihood:  # [F, 6]
+        bends = [np.diff(coordinates[frames], 2, axis=0) for frames in _long_enough(ranges)]
+        terms = [likelihood_terms(some, RATIOS) for some in bends]
+        nothing = np.zeros(len(RATIOS)), np.zeros((len(RATIOS), _NUMBERS))
+        log_determinants, squares = (np.sum(part, axis=0) for part in zip(nothing, *terms, strict=True))
+        return cls(sum(map(len, bends)), log_determinants, squares)
 
-def _likeliest(bends: Sequence[FloatArray], noise: float | None = None) -> tuple[float, float]:
-    """r and q of the likeliest model of second differences; r is given, or found too."""
-    spectra = []
-    for some in bends:
-        if len(some):
-            differences = _second_differences(len(some) + 2)
-            eigenvalues, vectors = np.linalg.eigh(differences @ differences.T)
-            spectra.append((eigenvalues, (vectors.T @ some) ** 2))
-    if not spectra or sum(float(power.sum()) for _, power in spectra) == 0.0:
-        return 0.0 if noise is None else noise, 1e-12
-    eigenvalues, power = (np.concatenate(part) for part in zip(*spectra, strict=True))
-    best = (np.inf, 0.0, 1.0)
-    for ratio in STEPS:
-        shape = ratio + eigenvalues
-        variance = float((power / shape).mean()) if noise is None else noise
-        cost = float((np.log(variance * shape) + power / (variance * shape)).sum())
-        best = min(best, (cost, variance, ratio * variance))
-    return best[1], best[2]
+    def noise_variances(self) -> tuple[float, float]:
+        """The likeliest r: of position, mm², and of turn, degrees²."""
+        variances = self.squares / max(self.count, 1)
+        costs = self.count * np.log(np.maximum(variances, TINY)) + self.log_determinants[:, None]
+        best = variances[costs.argmin(axis=0), np.arange(_NUMBERS)]
+        return float(best[:3].min()), float(best[3:].min())
+
+    def best_ratio(self, number: int, noise: float) -> float:
+        """The likeliest q/r of one coordinate where r is `noise`."""
+        return float(RATIOS[(self.log_determinants + self.squares[:, number] / noise).argmin()])

@@ -1,4 +1,4 @@
-"""The stages of pose refinement: before the training by path and images, then beside the scene."""
+"""Pose refinement of a training run: before it by the path and the images, and in it together with the scene."""
 
 from __future__ import annotations
 
@@ -13,38 +13,48 @@ from ...datasets.sweep import Dataset
 from ...probe import FloatArray
 from .overlap import register_sweeps
 from .path import sweep_ranges, tracker_noise, without_noise
-from .trained import WITHIN_THE_PLANE, TrainedCorrections
+from .trained import FrameCorrections, SweepCorrections
+
+_TRAINED: dict[str, type[FrameCorrections | SweepCorrections]] = {
+    "frames": FrameCorrections,
+    "sweeps": SweepCorrections,
+}
 
 
 class PoseRefinement:
-    """The corrections of the training frames, left-multiplied to their poses; `dataset` is the one to train from.
+    """The corrections of the training frames, left-multiplied to their poses; `dataset` is the one to train from."""
 
-    `frames`: each sweep is freed from its tracker's noise, then registered as a whole to those that it crosses, then
-    every frame has a correction of its own in the training. `sweeps`: only whole sweeps move. Good poses, whose noise
-    is small and whose sweeps agree, are left alone, as with `none`: then nothing is trained.
-    """
+    def __init__(
+        self, dataset: Dataset, tracked: FloatArray, trained: FrameCorrections | SweepCorrections | None
+    ) -> None:
+        """`dataset` has the poses that the training begins with, `tracked` [F, 4, 4] (mm) are those of its frames."""
+        self.dataset, self._tracked, self._trained = dataset, tracked, trained
 
-    def __init__(self, dataset: Dataset, mode: str) -> None:
-        self.dataset = dataset
-        self._given = dataset.train.poses
-        self._trained: TrainedCorrections | None = None
+    @classmethod
+    def of(cls, dataset: Dataset, mode: str) -> PoseRefinement:
+        """Estimates the poses that the training begins with.
+
+        `frames`: the tracker's noise is taken out of each sweep, each sweep is registered as a whole to those that it
+        crosses, and in the training every frame has a correction of its own. `sweeps`: only whole sweeps move. With
+        `none`, and where the poses are good (little noise, sweeps agree), they stay and none is trained.
+        """
+        tracked = dataset.train.poses
         if mode == "none":
-            return
+            return cls(dataset, tracked, None)
         ranges = sweep_ranges(dataset.train)
-        poses = self._given.copy()
+        poses = tracked.copy()
         if mode == "frames" and not tracker_noise(poses, ranges).is_small:
             poses = without_noise(poses, ranges)
         for frames, motion in zip(ranges, register_sweeps(replace(dataset.train, poses=poses), ranges), strict=True):
             poses[frames] = motion @ poses[frames]
-        if not np.array_equal(poses, self._given):
-            self.dataset = replace(dataset, train=replace(dataset.train, poses=poses))
-            whole = {"sweeps": True, "frames": False}[mode]
-            ease = {} if whole else {"ease": WITHIN_THE_PLANE}
-            self._trained = TrainedCorrections(self.dataset.train, ranges, whole_sweeps=whole, **ease)
+        if np.array_equal(poses, tracked):
+            return cls(dataset, tracked, None)
+        train = replace(dataset.train, poses=poses)
+        return cls(replace(dataset, train=train), tracked, _TRAINED[mode](train, ranges))
 
     @property
     def group_count(self) -> int:
-        """Corrections that are trained: 0 where nothing is."""
+        """The number of corrections that are trained: 0 where none is."""
         return 0 if self._trained is None else self._trained.group_count
 
     def corrected(self, places: Tensor, poses: FloatArray) -> ScenePoses:  # [b], [b, 4, 4] mm -> [b, 4, 4] mm
@@ -62,11 +72,11 @@ class PoseRefinement:
         return poses if self._trained is None else self._trained.all_motions() @ poses
 
     def corrections(self) -> FloatArray | None:  # [F, 4, 4]
-        """What is left-multiplied to the given poses; None where they stay."""
-        return None if self._trained is None else self.poses() @ np.linalg.inv(self._given)
+        """The motions that are left-multiplied to the tracker's poses; None where these stay."""
+        return None if self._trained is None else self.poses() @ np.linalg.inv(self._tracked)
 
     def tensors(self) -> dict[str, Tensor]:
-        """What a checkpoint keeps."""
+        """The state of the trained corrections, for a checkpoint."""
         return {} if self._trained is None else self._trained.tensors()
 
     def load(self, tensors: Mapping[str, Tensor]) -> None:

@@ -10,38 +10,34 @@ from torch import Tensor
 
 from ...datasets.sweep import Sweep
 from ...probe import FloatArray
-from .motion import motions_of
 
 START = 0.1  # share of the run: before, there is no anatomy to compare with
 RATE = 0.01  # mm a step: at the end of a long run some tenths of a mm from where it began
-WITHIN_THE_PLANE = (0.1, 1.0, 0.1, 1.0, 0.1, 1.0)  # a frame's own image says little of moves out of its plane
+WITHIN_THE_PLANE = (0.1, 1.0, 0.1, 1.0, 0.1, 1.0)  # a frame's own image hardly shows moves out of its plane
 SMOOTHNESS = 1e-3  # weight of the squared second differences of neighbouring corrections, mm²
 
 
-class TrainedCorrections:
+class Corrections:
     """One rigid motion for each group of frames, left-multiplied to their poses: a turn about their middle and a shift.
 
-    Both are along the axes of the probe, times `ease` [6]. Turns are held as what they move the image
-    by: radians times the mean distance of its corners from its middle, mm. Frames one by one keep a mean motion of
-    nothing, and neighbours bend little; of whole sweeps the first stays.
+    `groups` holds the places of the frames of each group. A motion is trained as a twist, three numbers of its turn and
+    three of its shift along the axes of the probe, all in mm: of the turn, radians times the mean distance of the
+    image's corners from its middle, which is how far it moves them. `ease` [6] scales the numbers, and with them how
+    fast each is trained.
     """
 
-    def __init__(
-        self, sweep: Sweep, groups: Sequence[range], *, whole_sweeps: bool, ease: Sequence[float] = (1.0,) * 6
-    ) -> None:
+    def __init__(self, sweep: Sweep, groups: Sequence[Sequence[int]], ease: Sequence[float] = (1.0,) * 6) -> None:
         corners = sweep.corners_mm()  # [F, K, 3]
-        self._whole, self._ranges = whole_sweeps, list(groups)
-        frames = [list(group) for group in groups] if whole_sweeps else [[place] for place in range(len(sweep))]
         self._group_of = torch.zeros(len(sweep), dtype=torch.int64)
-        for number, places in enumerate(frames):
-            self._group_of[places] = number
+        for number, places in enumerate(groups):
+            self._group_of[list(places)] = number
         middles = corners.mean(axis=1)
-        middle_frames = [places[len(places) // 2] for places in frames]
+        middle_frames = [places[len(places) // 2] for places in groups]
         self._axes = torch.from_numpy(sweep.poses[middle_frames, :3, :3])  # [G, 3, 3]
         self._ease = torch.tensor(ease, dtype=torch.float64)
-        self._middles = torch.from_numpy(np.stack([middles[places].mean(axis=0) for places in frames]))  # [G, 3]
+        self._middles = torch.from_numpy(np.stack([middles[list(places)].mean(axis=0) for places in groups]))  # [G, 3]
         self._lever_mm = float(np.linalg.norm(corners - middles[:, None], axis=-1).mean())
-        self._twists = torch.zeros((len(frames), 6), dtype=torch.float64, requires_grad=True)
+        self._twists = torch.zeros((len(groups), 6), dtype=torch.float64, requires_grad=True)
         self._adam = torch.optim.Adam([self._twists], lr=0.0, betas=(0.9, 0.99), eps=1e-12)
 
     @property
@@ -58,31 +54,14 @@ class TrainedCorrections:
             found: FloatArray = self._motions(self._group_of).numpy()
         return found
 
-    def step(self, done: float) -> None:
-        """One update by the gradient of a step, `done` being the share of the run that is done."""
-        if not self._whole:
-            self._roughness().backward()  # type: ignore[no-untyped-call]
-        self.update(RATE * (0.0 if done < START else 1.0 - done))
-        with torch.no_grad():
-            if self._whole:
-                self._twists[0] = 0.0
-            else:
-                self._remove_common_motion()
-
-    def _remove_common_motion(self) -> None:
-        """Takes the mean of all turns and shifts, in the tracker's axes, off each."""
-        parts = self._twists.reshape(-1, 2, 3)
-        common = torch.einsum("gij,gpj->pi", self._axes, parts) / len(parts)
-        parts -= torch.einsum("gij,pi->gpj", self._axes, common)
-
     def update(self, rate: float) -> None:
-        """One update of every group by its own gradient, whatever its neighbours do."""
+        """One update of every group by its own gradient, at `rate` mm."""
         self._adam.param_groups[0]["lr"] = rate
         self._adam.step()
         self._adam.zero_grad(set_to_none=True)
 
     def tensors(self) -> dict[str, Tensor]:
-        """What a checkpoint keeps."""
+        """The state, for a checkpoint."""
         state = self._adam.state.get(self._twists, {})
         return {"twists": self._twists.detach(), **state}
 
@@ -94,16 +73,62 @@ class TrainedCorrections:
         if state:
             self._adam.state[self._twists] = state
 
-    def _roughness(self) -> Tensor:
-        bends = [torch.diff(self._twists[group.start : group.stop], 2, dim=0).square().sum() for group in self._ranges]
-        return SMOOTHNESS * torch.stack(bends).sum()
-
     def _motions(self, groups: Tensor) -> Tensor:  # [b] -> [b, 4, 4]
         twists, middles, axes = self._twists[groups] * self._ease, self._middles[groups], self._axes[groups]
-        turns = torch.einsum("gij,gj->gi", axes, twists[:, :3]) / self._lever_mm
-        motions = motions_of(torch.cat([turns, torch.zeros_like(middles)], dim=1))
-        shifts = middles - torch.einsum("gij,gj->gi", motions[:, :3, :3], middles)
+        rotations = rotations_of(torch.einsum("gij,gj->gi", axes, twists[:, :3]) / self._lever_mm)
+        shifts = middles - torch.einsum("gij,gj->gi", rotations, middles)
         shifts = shifts + torch.einsum("gij,gj->gi", axes, twists[:, 3:])
-        moved = torch.zeros_like(motions)
-        moved[:, :3, 3] = shifts
-        return motions + moved
+        upper = torch.cat([rotations, shifts[..., None]], dim=-1)
+        last = upper.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(len(upper), 1, 4)
+        return torch.cat([upper, last], dim=1)
+
+
+class FrameCorrections(Corrections):
+    """A correction for each frame. Their mean is the identity, and those of neighbours are alike."""
+
+    def __init__(self, sweep: Sweep, ranges: Sequence[range]) -> None:
+        super().__init__(sweep, [[place] for place in range(len(sweep))], WITHIN_THE_PLANE)
+        self._ranges = ranges
+
+    def step(self, done: float) -> None:
+        """One update by the gradient of a step, `done` being the share of the run that is done."""
+        self._roughness().backward()  # type: ignore[no-untyped-call]
+        self.update(_rate(done))
+        with torch.no_grad():
+            self._remove_common_motion()
+
+    def _roughness(self) -> Tensor:
+        bends = [torch.diff(self._twists[sweep.start : sweep.stop], 2, dim=0).square().sum() for sweep in self._ranges]
+        return SMOOTHNESS * torch.stack(bends).sum()
+
+    def _remove_common_motion(self) -> None:
+        """Takes the mean of all turns and shifts, in the tracker's axes, off each."""
+        parts = self._twists.reshape(-1, 2, 3)
+        common = torch.einsum("gij,gpj->pi", self._axes, parts) / len(parts)
+        parts -= torch.einsum("gij,pi->gpj", self._axes, common)
+
+
+class SweepCorrections(Corrections):
+    """A correction for each sweep as a whole; that of the first is the identity."""
+
+    def __init__(self, sweep: Sweep, ranges: Sequence[range]) -> None:
+        super().__init__(sweep, ranges)
+
+    def step(self, done: float) -> None:
+        """One update by the gradient of a step, `done` being the share of the run that is done."""
+        self.update(_rate(done))
+        with torch.no_grad():
+            self._twists[0] = 0.0
+
+
+def _rate(done: float) -> float:  # mm a step
+    return RATE * (0.0 if done < START else 1.0 - done)
+
+
+def rotations_of(turns: Tensor) -> Tensor:  # [G, 3] rad -> [G, 3, 3]
+    """The rotations of turns, each an axis times an angle; differentiable, also at 0."""
+    x, y, z = turns.unbind(-1)
+    zero = torch.zeros_like(x)
+    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).reshape(-1, 3, 3)
+    rotations: Tensor = torch.linalg.matrix_exp(cross)
+    return rotations

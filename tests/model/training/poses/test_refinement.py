@@ -13,9 +13,10 @@ import torch
 
 from ultragray import GaussianScene, LinearProbe
 from ultragray.datasets.sweep import Dataset, Sweep
+from ultragray.samplers.rotations import rotations_of
 from ultragray.training import Progress, TrainingConfig, train
+from ultragray.training.poses import overlap, trained
 from ultragray.training.poses.held_out import score_halves
-from ultragray.training.poses.motion import motions_of, rotations_of, turn_vectors_deg
 from ultragray.training.poses.overlap import register_sweeps
 from ultragray.training.poses.path import sweep_ranges, tracker_noise, without_noise
 from ultragray.training.poses.refinement import PoseRefinement
@@ -28,7 +29,7 @@ Configs = Callable[..., TrainingConfig]
 
 def poses_of(turns_deg: np.ndarray, positions_mm: np.ndarray) -> np.ndarray:
     poses = np.tile(np.eye(4), (len(turns_deg), 1, 1))
-    poses[:, :3, :3], poses[:, :3, 3] = rotations_of(turns_deg), positions_mm
+    poses[:, :3, :3], poses[:, :3, 3] = rotations_of(np.radians(turns_deg)), positions_mm
     return poses
 
 
@@ -65,17 +66,11 @@ def angle_deg(rotation: np.ndarray) -> float:
     return float(np.degrees(np.arccos(np.clip((np.trace(rotation) - 1.0) / 2.0, -1.0, 1.0))))
 
 
-def test_turns_come_back() -> None:
-    turns = np.random.default_rng(0).normal(0.0, 40.0, (50, 3))
-    np.testing.assert_allclose(turn_vectors_deg(rotations_of(turns)), turns, atol=1e-8)
-
-
-def test_a_motion_of_nothing_has_a_gradient() -> None:
-    twists = torch.zeros((1, 6), dtype=torch.float64, requires_grad=True)
-    motions_of(twists)[0, :3].sum().backward()
-    assert twists.grad is not None
-    assert torch.isfinite(twists.grad).all()
-    assert twists.grad[0, 3:].tolist() == [1.0, 1.0, 1.0]
+def test_no_turn_has_a_gradient() -> None:
+    turns = torch.zeros((1, 3), dtype=torch.float64, requires_grad=True)
+    trained.rotations_of(turns)[0, 2, 1].backward()
+    assert turns.grad is not None
+    assert turns.grad.tolist() == [[1.0, 0.0, 0.0]]
 
 
 def test_sweeps_are_told_apart_by_the_jump_of_the_path() -> None:
@@ -106,7 +101,10 @@ def test_a_smooth_path_has_no_noise_though_its_steps_are_uneven() -> None:
 
 
 @pytest.mark.long
-def test_a_sweep_that_is_off_as_a_whole_finds_its_place() -> None:
+@pytest.mark.parametrize("frames", [overlap.FRAMES, 20])
+def test_a_sweep_that_is_off_as_a_whole_finds_its_place(frames: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By all of its frames, and by every other where there are more than are compared."""
+    monkeypatch.setattr(overlap, "FRAMES", frames)
     true = np.concatenate([freehand_path(40, tilt_deg=-6.0), freehand_path(40, start_mm=2.0, tilt_deg=6.0)])
     sweep, ranges = seen(true), [range(40), range(40, 80)]
     error = poses_of(np.array([[1.5, -1.0, 1.0]]), np.array([[2.0, 1.5, -2.0]]))[0]
@@ -128,9 +126,14 @@ def test_sweeps_that_agree_stay() -> None:
     )
 
 
+def test_a_single_sweep_is_not_compared_with_anything(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(overlap, "_detail", lambda *_: pytest.fail("its images were looked at"))
+    np.testing.assert_array_equal(register_sweeps(seen(freehand_path(8)), [range(8)]), np.eye(4)[None])
+
+
 def test_good_poses_are_left_alone(tiny_dataset: Datasets) -> None:
     dataset = tiny_dataset(frames=24)
-    refinement = PoseRefinement(dataset, "frames")
+    refinement = PoseRefinement.of(dataset, "frames")
     assert refinement.dataset is dataset
     assert refinement.corrections() is None
     assert refinement.group_count == 0
@@ -145,7 +148,7 @@ def test_corrections_are_trained_and_stored(tiny_dataset: Datasets, tiny_config:
     scene = train(dataset, tiny_config(refine_poses="frames", confidence=False))
     assert scene.pose_corrections is not None
     np.testing.assert_allclose(scene.pose_corrections @ dataset.train.poses, scene.training_poses, atol=1e-9)
-    before_training = PoseRefinement(dataset, "frames").poses()
+    before_training = PoseRefinement.of(dataset, "frames").poses()
     assert np.abs(scene.training_poses - before_training).max() > 1e-5
     scene.save(tmp_path / "scene.ugr")
     again = GaussianScene.load(tmp_path / "scene.ugr")
