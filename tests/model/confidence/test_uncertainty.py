@@ -50,11 +50,16 @@ def test_it_grows_with_the_distance_to_the_views_and_ends_at_what_any_image_coul
     assert frames[-1].square() == pytest.approx(nothing_there, rel=1e-3)
 
 
-@pytest.mark.parametrize("backend", ["reference", "cpu"])
-def test_every_backend_says_the_same(scene: GaussianScene, backend: str) -> None:
+@pytest.mark.parametrize("backend", ["cpu", pytest.param("cuda", marks=pytest.mark.slow)])
+def test_every_backend_agrees_with_the_reference_in_float64(
+    scene: GaussianScene, backend: str, on_device: Callable[[GaussianScene], GaussianScene]
+) -> None:
     poses = moved(0.3, 4.0)
     poses[:, 0, 3] = 7.0
-    torch.testing.assert_close(shown(scene, poses, backend), shown(scene, poses, "auto"), atol=2e-3, rtol=0.0)
+    found = shown(on_device(scene) if backend == "cuda" else scene, poses, backend)
+    exact = shown(scene.to(torch.float64), poses, "reference")
+    assert found.dtype == torch.float32
+    torch.testing.assert_close(found.cpu().double(), exact, atol=2e-3, rtol=0.0)
 
 
 def test_another_size_says_the_same(scene: GaussianScene) -> None:

@@ -21,6 +21,7 @@ from ultragray.training.poses.overlap import register_sweeps
 from ultragray.training.poses.path import sweep_ranges, tracker_noise, without_noise
 from ultragray.training.poses.refinement import PoseRefinement
 from ultragray.training.poses.sizes import CorrectionSizes
+from ultragray.training.poses.trained import SweepCorrections
 
 PROBE = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)
 Datasets = Callable[..., Dataset]
@@ -100,6 +101,20 @@ def test_a_smooth_path_has_no_noise_though_its_steps_are_uneven() -> None:
     assert tracker_noise(freehand_path(4), [range(4)]).is_small
 
 
+def test_an_error_that_changes_slowly_is_taken_for_the_path() -> None:
+    """A drift of some mm and degrees along a sweep is as smooth as a hand: nothing is taken off."""
+    t = np.linspace(0.0, 1.0, 120)
+    drift = poses_of(
+        np.stack([2.0 * t, -1.5 * np.sin(4.0 * t), t * t], axis=1),
+        np.stack([3.0 * np.sin(3.0 * t), 2.0 * t * t, -4.0 * t], axis=1),
+    )
+    given = np.asarray(drift @ freehand_path(120))
+    assert tracker_noise(given, [range(120)]).is_small
+    moved = without_noise(given, [range(120)]) - given
+    assert np.abs(moved[:, :3, 3]).max() < 0.05
+    assert np.abs(moved[:, :3, :3]).max() < np.radians(0.05)
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("frames", [overlap.FRAMES, 20])
 def test_a_sweep_that_is_off_as_a_whole_finds_its_place(frames: int, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -124,6 +139,13 @@ def test_sweeps_that_agree_stay() -> None:
     np.testing.assert_array_equal(
         register_sweeps(seen(true), [range(40), range(40, 80)]), np.tile(np.eye(4), (2, 1, 1))
     )
+
+
+def test_sweeps_that_overlap_little_are_left_alone() -> None:
+    """The last millimetres of one sweep and the first of the next agree by chance almost anywhere."""
+    first, error = freehand_path(40), poses_of(np.zeros((1, 3)), np.array([[1.5, 0.0, -1.0]]))[0]
+    sweep = seen(np.concatenate([first, error @ freehand_path(40, start_mm=first[-6, 1, 3])]))
+    np.testing.assert_array_equal(register_sweeps(sweep, [range(40), range(40, 80)]), np.tile(np.eye(4), (2, 1, 1)))
 
 
 def test_a_single_sweep_is_not_compared_with_anything(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -154,6 +176,42 @@ def test_corrections_are_trained_and_stored(tiny_dataset: Datasets, tiny_config:
     again = GaussianScene.load(tmp_path / "scene.ugr")
     assert again.pose_corrections is not None
     np.testing.assert_array_equal(again.pose_corrections, scene.pose_corrections)
+
+
+def test_whole_sweeps_are_trained_but_for_the_first() -> None:
+    sweep, ranges = seen(freehand_path(12)), [range(6), range(6, 12)]
+    corrections, true = SweepCorrections(sweep, ranges), torch.from_numpy(sweep.poses[:, :3, 3]) + 0.2
+    for _ in range(40):
+        found = corrections.corrected(torch.arange(12), sweep.poses)[:, :3, 3]
+        (found - true).square().sum().backward()
+        corrections.step(0.5)
+    motions = corrections.all_motions()
+    np.testing.assert_array_equal(motions[:6], np.tile(np.eye(4), (6, 1, 1)))
+    np.testing.assert_array_equal(motions[7:], np.broadcast_to(motions[6], (5, 4, 4)))
+    left = (motions @ sweep.poses)[6:, :3, 3] - true[6:].numpy()
+    assert np.abs(left).mean() < 0.1
+
+
+@pytest.mark.long
+def test_a_run_brings_back_a_sweep_that_is_off_as_a_whole(tiny_config: Configs) -> None:
+    true = np.concatenate([freehand_path(40, tilt_deg=-6.0), freehand_path(40, start_mm=-1.7, tilt_deg=6.0)])
+    error = poses_of(np.array([[1.0, -1.5, 1.0]]), np.array([[2.0, -1.0, -2.5]]))[0]
+    given = true.copy()
+    given[40:] = error @ true[40:]
+    train_part = replace(seen(true), poses=given)
+    dataset = Dataset("tissue", train_part, train_part.select([]))
+    scene = train(dataset, tiny_config(refine_poses="sweeps", confidence=False))
+    assert scene.pose_corrections is not None
+    before_training = PoseRefinement.of(dataset, "sweeps").poses()
+    assert np.abs(scene.training_poses[40:] - before_training[40:]).max() > 1e-5
+    np.testing.assert_array_equal(scene.training_poses[:40], given[:40])
+    middles = replace(train_part, poses=true).corners_mm()[40:].mean(axis=1)
+
+    def off_mm(poses: np.ndarray) -> float:
+        moves = poses[40:] @ np.linalg.inv(true[40:])
+        return float(np.linalg.norm(np.einsum("fij,fj->fi", moves[:, :3, :3], middles) + moves[:, :3, 3] - middles))
+
+    assert off_mm(scene.training_poses) < 0.25 * off_mm(given)
 
 
 def test_a_scene_without_corrections_holds_no_tensor_of_them(tiny_dataset: Datasets, tiny_config: Configs) -> None:
