@@ -20,7 +20,7 @@ from torch.nn import functional
 from ..probe import FloatArray, Probe
 from ..scene import GaussianScene
 from .assess import read_model
-from .uncertainty import Uncertainty
+from .uncertainty import DepthBands
 from .views import TrainingViews
 
 CELLS = 32  # a side; no more than pixels
@@ -40,7 +40,7 @@ def deviations(
     assert model is not None
     assert model.uncertainty is not None
     views = TrainingViews(scene.training_poses, scene.info.probe_or(None))
-    terms = variance_terms(planes, view_distances(views, poses, probe), model.uncertainty)
+    terms = variance_terms(planes, view_distances(views, poses, probe), model.uncertainty.bands)
     weighted = [weight * term for weight, term in zip(model.uncertainty.variances, terms, strict=True)]
     deviation = torch.stack(weighted).sum(dim=0).clamp(0.0, 1.0).sqrt()
     return _interpolated(deviation, planes[0].shape[1:])
@@ -58,9 +58,9 @@ def view_distances(
 def variance_terms(
     planes: tuple[Tensor, ...],  # bmode, coverage, transmittance, each [C, H, W]
     distances_mm: tuple[FloatArray, FloatArray],  # of `view_distances`
-    images: Uncertainty,
+    bands: DepthBands,  # of the training images
 ) -> Iterator[Tensor]:  # each [C, h, w]
-    """The vₖ in each cell, in the order of `uncertainty.TERMS`; of `images`, level and spread are looked at."""
+    """The vₖ in each cell, in the order of `uncertainty.TERMS`."""
     mean, coverage, transmittance = map(in_cells, planes)
     cells = mean.shape[1:]
     interpolation, distance = (
@@ -68,7 +68,7 @@ def variance_terms(
     )
     level, spread = (
         _interpolated(torch.tensor(values, dtype=mean.dtype, device=mean.device)[None, :, None], (cells[0], 1))
-        for values in (images.level, images.spread)
+        for values in (bands.level, bands.spread)
     )
     unknown = spread + (level - mean).square()
     yield torch.full_like(mean, 1e-3)

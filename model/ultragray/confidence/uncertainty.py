@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 from ..errors import InvalidArgument
@@ -21,39 +21,56 @@ DIGITS = 6  # in a scene's metadata
 
 
 @dataclass(frozen=True)
+class DepthBands:
+    """Mean and variance of the training images' grey values, in [0, 1], in bands of depth.
+
+    Raises InvalidArgument for numbers that cannot be.
+    """
+
+    level: tuple[float, ...]  # [DEPTHS]
+    spread: tuple[float, ...]  # [DEPTHS]
+
+    def __post_init__(self) -> None:
+        for name in ("level", "spread"):
+            object.__setattr__(self, name, _amounts(name, getattr(self, name), DEPTHS))
+
+
+@dataclass(frozen=True)
 class Uncertainty:
-    """Fitted cₖ, and mean and variance of the training images' grey values in bands of depth, in [0, 1].
+    """Fitted cₖ, and the depth bands of the training images.
 
     Raises InvalidArgument for numbers that cannot be.
     """
 
     variances: tuple[float, ...]  # [TERMS]
-    level: tuple[float, ...]  # [DEPTHS]
-    spread: tuple[float, ...]  # [DEPTHS]
+    bands: DepthBands
 
     def __post_init__(self) -> None:
-        for name, count in (("variances", len(TERMS)), ("level", DEPTHS), ("spread", DEPTHS)):
-            values = getattr(self, name)
-            field = f"uncertainty.{name}"
-            try:
-                numbers = tuple(float(value) for value in values)
-            except (TypeError, ValueError, OverflowError):
-                raise InvalidArgument(f"{field} must be numbers, got {values!r}", field=field) from None
-            if len(numbers) != count or not all(math.isfinite(value) and value >= 0.0 for value in numbers):
-                raise InvalidArgument(f"{field} must be {count} numbers, at least 0, got {values!r}", field=field)
-            object.__setattr__(self, name, numbers)
+        object.__setattr__(self, "variances", _amounts("variances", self.variances, len(TERMS)))
 
     def to_dict(self) -> dict[str, Any]:
         """A JSON object, as a scene's metadata holds it."""
-        return {name: [round(value, DIGITS) for value in values] for name, values in asdict(self).items()}
+        numbers = {"variances": self.variances, "level": self.bands.level, "spread": self.bands.spread}
+        return {name: [round(value, DIGITS) for value in values] for name, values in numbers.items()}
 
     @classmethod
     def from_dict(cls, document: Any) -> Uncertainty:
         """Inverse of `to_dict`, but for the digits. Raises InvalidArgument for keys or values that cannot be."""
-        expected = set(cls.__dataclass_fields__)
+        expected = {"variances", "level", "spread"}
         if not isinstance(document, Mapping) or set(document) != expected:
             found = sorted(document) if isinstance(document, Mapping) else document
             raise InvalidArgument(
                 f"uncertainty must be an object with the keys {sorted(expected)}, got {found!r}", field="uncertainty"
             )
-        return cls(**document)
+        return cls(document["variances"], DepthBands(document["level"], document["spread"]))
+
+
+def _amounts(name: str, values: Any, count: int) -> tuple[float, ...]:
+    field = f"uncertainty.{name}"
+    try:
+        numbers = tuple(float(value) for value in values)
+    except (TypeError, ValueError, OverflowError):
+        raise InvalidArgument(f"{field} must be numbers, got {values!r}", field=field) from None
+    if len(numbers) != count or not all(math.isfinite(value) and value >= 0.0 for value in numbers):
+        raise InvalidArgument(f"{field} must be {count} numbers, at least 0, got {values!r}", field=field)
+    return numbers

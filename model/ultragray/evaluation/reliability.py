@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import torch
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
 from ..datasets.sweep import Sweep
 from ..outputs import UNCERTAINTY
@@ -82,23 +79,6 @@ def measure_reliability(scene: GaussianScene, sweep: Sweep, *, backend: str = "a
 def compare_deviations(errors: npt.NDArray[np.float32], deviations: npt.NDArray[np.float32]) -> Reliability:
     """Of errors of pixels and the deviations that were expected of them, of any one shape."""
     return _of_tally(_tally(errors, deviations))
-
-
-def plot_reliability(named: dict[str, Reliability], path: Path) -> None:
-    """Writes a picture of the bins: expected against actual deviation, one line a name."""
-    figure = Figure(figsize=(4.4, 4.2), layout="constrained")
-    axis = figure.subplots()
-    most = max(max(max(one.expected, one.actual) for one in reliability.bins) for reliability in named.values())
-    axis.plot([0, most], [0, most], color="#9aa5b1", linewidth=1.0)
-    for name, reliability in named.items():
-        axis.plot(
-            [one.expected for one in reliability.bins], [one.actual for one in reliability.bins], ".-", label=name
-        )
-    axis.set(xlabel="expected deviation of a pixel's error", ylabel="actual", aspect="equal")
-    axis.spines[["top", "right"]].set_visible(False)
-    axis.legend(frameon=False)
-    FigureCanvasAgg(figure)
-    figure.savefig(path, dpi=80)
 
 
 def _tally(errors: npt.NDArray[np.float32], deviations: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:

@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from ..evaluation.metrics import FrameMetrics
+from ..evaluation.reliability import Reliability
 from ..evaluation.scoring import Evaluation
 from ..probe import FloatArray
 from .study import TiltStudy, Trained
@@ -50,6 +51,17 @@ def plot_corrections(shift_mm: FloatArray, turn_deg: FloatArray) -> str:  # [P] 
     for axis, values, label in zip(axes, (shift_mm, turn_deg), ("shift, mm", "turn, degrees"), strict=True):
         axis.plot(values, linewidth=1.2, color=COLOURS["scene"])
         axis.set(xlabel="training frame", ylabel=label)
+    return _svg(figure)
+
+
+def plot_reliability(reliability: Reliability) -> str:
+    """Actual over expected deviation of pixels, in bins of the expected one; beside them the line where both agree."""
+    figure, axes = _figure(1, (4.4, 4.2), columns=1)
+    expected, actual = ([getattr(one, name) for one in reliability.bins] for name in ("expected", "actual"))
+    most = max(*expected, *actual)
+    axes[0].plot([0.0, most], [0.0, most], linewidth=1.0, color=COLOURS["nearest"])
+    axes[0].plot(expected, actual, marker=".", linewidth=1.2, color=COLOURS["scene"])
+    axes[0].set(xlabel="expected deviation of a pixel", ylabel="actual deviation", aspect="equal")
     return _svg(figure)
 
 

@@ -71,7 +71,7 @@ def evaluate(
     source: SourceOptions,
 ) -> None:
     """Measure a scene on the held-out frames of a dataset: PSNR, MS-SSIM, GMS, GMSD, speckle, uncertainty."""
-    from ultragray.evaluation.reliability import measure_reliability, plot_reliability
+    from ultragray.evaluation.reliability import measure_reliability
     from ultragray.evaluation.scoring import evaluate as evaluate_scene
     from ultragray.evaluation.scoring import require_frames
     from ultragray.scene import GaussianScene
@@ -100,11 +100,13 @@ def evaluate(
             typer.echo(str(value))
     if output is not None:
         from ultragray.evaluation.side_by_side import write_side_by_side
+        from ultragray.files.atomic import write_whole
+        from ultragray.report.plots import plot_reliability
 
         paths = write_side_by_side(loaded, sweep, evaluation.frames, output, backend=backend)
         if reliability is not None:
-            paths.append(output / "uncertainty.png")
-            plot_reliability({scene.stem: reliability}, paths[-1])
+            paths.append(output / "uncertainty.svg")
+            write_whole(paths[-1], plot_reliability(reliability))
         if (corrections := poses.get("pose_corrections")) is not None:
             paths.append(output / "pose_corrections.svg")
             corrections.write_plot(paths[-1])

@@ -82,7 +82,7 @@ def test_eval_writes_pictures(dataset: Path, scene: Path, tmp_path: Path) -> Non
     assert result.exit_code == 0
     assert len(json.loads(result.stdout)["frames"]) == 2
     assert len(list((tmp_path / "pictures").glob("frame_*.png"))) == 2
-    assert (tmp_path / "pictures" / "uncertainty.png").exists()
+    assert (tmp_path / "pictures" / "uncertainty.svg").read_text().startswith("<svg")
 
 
 def test_compound_prints_what_the_library_measures(dataset: Path) -> None:

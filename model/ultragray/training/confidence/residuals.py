@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from ...confidence.deviation import CELLS, POINTS_PER_SIDE, in_cells, variance_terms, view_distances
-from ...confidence.uncertainty import DEPTHS, TERMS, Uncertainty
+from ...confidence.uncertainty import DEPTHS, DepthBands, Uncertainty
 from ...confidence.views import FAR_MM, TrainingViews
 from ...datasets.sweep import ByteArray, Sweep
 from ...evaluation.scoring import frames_at_once
@@ -27,8 +27,7 @@ def fit_uncertainty(scene: GaussianScene, views: TrainingViews, sweep: Sweep, *,
     `views` are those that the scene was trained from. Far from them no errors are known, and there the variance is
     to be that of the training images.
     """
-    level, spread = _bands(sweep.images)
-    images = Uncertainty((0.0,) * len(TERMS), level, spread)
+    bands = _bands(sweep.images)
     stride = max(1, len(sweep) * CELLS**2 // LOOKED_AT) | 1  # odd: it must not fall into step with the columns
     terms, squares = [], []
     portion = frames_at_once(sweep.height, sweep.width)
@@ -38,18 +37,18 @@ def fit_uncertainty(scene: GaussianScene, views: TrainingViews, sweep: Sweep, *,
             frames = render(scene, some.probe, some.poses, height=some.height, width=some.width, backend=backend)
             planes = tuple(frames[name].cpu() for name in ("bmode", "coverage", "transmittance"))
             distances = view_distances(views, some.poses, some.probe)
-            columns = [term.flatten()[::stride] for term in variance_terms(planes, distances, images)]
+            columns = [term.flatten()[::stride] for term in variance_terms(planes, distances, bands)]
             terms.append(torch.stack(columns, dim=1).double().numpy())
             errors = torch.from_numpy(some.images).float().div_(255.0) - planes[0]
             squares.append(in_cells(errors.square()).flatten()[::stride].double().numpy())
-    far_terms, far_squares = _far_away(images)
+    far_terms, far_squares = _far_away(bands)
     weight = FAR_SHARE * sum(map(len, squares)) / len(far_squares)
     variances = likeliest_variances(
         np.concatenate([*terms, far_terms]),
         np.concatenate([*squares, far_squares]),
         np.concatenate([*(np.ones(len(some)) for some in squares), np.full(len(far_squares), weight)]),
     )
-    return Uncertainty(tuple(variances.tolist()), level, spread)
+    return Uncertainty(tuple(variances.tolist()), bands)
 
 
 def likeliest_variances(terms: FloatArray, squares: FloatArray, weights: FloatArray) -> FloatArray:  # [M, K], [M], [M]
@@ -65,17 +64,16 @@ def likeliest_variances(terms: FloatArray, squares: FloatArray, weights: FloatAr
     return found
 
 
-def _bands(images: ByteArray) -> tuple[tuple[float, ...], tuple[float, ...]]:  # [F, H, W] -> [DEPTHS] both
-    """Mean and variance of the grey values in bands of depth."""
+def _bands(images: ByteArray) -> DepthBands:  # [F, H, W]
     edges = np.linspace(0, images.shape[1], DEPTHS + 1).round().astype(int)
     bands = [images[:, low:high] / np.float32(255.0) for low, high in pairwise(edges)]
-    return tuple(float(band.mean()) for band in bands), tuple(float(band.var()) for band in bands)
+    return DepthBands(tuple(float(band.mean()) for band in bands), tuple(float(band.var()) for band in bands))
 
 
-def _far_away(images: Uncertainty) -> tuple[FloatArray, FloatArray]:  # [DEPTHS, TERMS], [DEPTHS]
+def _far_away(bands: DepthBands) -> tuple[FloatArray, FloatArray]:  # [DEPTHS, TERMS], [DEPTHS]
     """The terms of a black frame far from every view, and its expected squared error, in the middle of each band."""
     dark, lit = torch.zeros(1, DEPTHS, 1), torch.ones(1, DEPTHS, 1)
     far = np.full((1, POINTS_PER_SIDE, POINTS_PER_SIDE), FAR_MM)
-    columns = [term.flatten() for term in variance_terms((dark, dark, lit), (far, far), images)]
-    squares = np.array(images.spread) + np.square(images.level)
+    columns = [term.flatten() for term in variance_terms((dark, dark, lit), (far, far), bands)]
+    squares = np.array(bands.spread) + np.square(bands.level)
     return torch.stack(columns, dim=1).double().numpy(), squares

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ultragray import GaussianScene, LinearProbe, render
-from ultragray.confidence.uncertainty import TERMS
+from ultragray.confidence.uncertainty import DEPTHS, TERMS
 from ultragray.confidence.views import TrainingViews
 from ultragray.datasets import Sweep
 from ultragray.training.confidence.residuals import fit_uncertainty, likeliest_variances
@@ -44,4 +44,4 @@ def test_errors_that_grow_away_from_the_views_do_so_in_the_model(random_scene: C
     found = fit_uncertainty(scene, TrainingViews(poses[:1], PROBE), sweep, backend="auto")
     away = sum(found.variances[TERMS.index(name)] for name in ("gap 0.3 mm", "gap 1 mm", "gap 3 mm", "beyond"))
     assert away > 0.1
-    assert found.level == pytest.approx([0.3 + 0.5 * rendered.mean()] * len(found.level), abs=0.15)
+    assert found.bands.level == pytest.approx([0.3 + 0.5 * rendered.mean()] * DEPTHS, abs=0.15)
