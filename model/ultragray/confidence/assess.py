@@ -40,7 +40,7 @@ def figure_arrays(extrapolations: Sequence[Extrapolation]) -> dict[str, npt.NDAr
 
 
 class Trained(Protocol):
-    """A description of a scene that tells of its training, such as `ultragray.SceneInfo`."""
+    """A description of a scene and of its training, such as `ultragray.SceneInfo`."""
 
     @property
     def probe(self) -> Probe | None: ...
@@ -50,7 +50,7 @@ class Trained(Protocol):
 
 
 class Assessor:
-    """Tells the extrapolation of frames of one scene. Its distances and confidence need the pose alone."""
+    """Computes the extrapolation of frames of one scene. Its distances and confidence need the pose alone."""
 
     def __init__(self, info: Trained, training_poses: FloatArray) -> None:  # [P, 4, 4] mm
         """Raises InvalidArgument where the scene's `confidence` is damaged or made for other training poses."""
@@ -64,7 +64,7 @@ class Assessor:
     ) -> list[Extrapolation]:
         """One for each pose [C, 4, 4] or [4, 4] (mm, probe→scene) of a probe (None: the scene's own).
 
-        `coverage` [C, H, W] is the renderer's γ at these poses; a small image does. Raises InvalidPose, and
+        `coverage` [C, H, W] is the renderer's γ at these poses; a small image suffices. Raises InvalidPose, and
         InvalidProbe where no probe is known.
         """
         checked = check_poses(poses)
@@ -83,7 +83,7 @@ class Assessor:
         return found if coverage is None else self.with_support(found, shares)
 
     def with_support(self, extrapolations: Sequence[Extrapolation], shares: Sequence[float]) -> list[Extrapolation]:
-        """Those of frames that have been rendered, with the share of each one's pixels that has support."""
+        """The extrapolations of rendered frames, completed with the share of each one's pixels that has support."""
         model, found = self._model, []
         for one, share in zip(extrapolations, shares, strict=True):
             confidence = one.confidence

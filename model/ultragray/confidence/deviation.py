@@ -1,6 +1,6 @@
-"""The standard deviation that a pixel's error is expected to have, from what is rendered around and how far views are.
+"""The expected standard deviation of a pixel's error, from the planes rendered around it and the distances of views.
 
-All is computed in CELLS² cells of the image, over which B̄, γ and T are means, and then interpolated. i and d are
+All terms are computed in CELLS² cells of the image, over which B̄, γ and T are means, and then interpolated. i and d are
 `interpolation_mm` and `distance_mm` of `ViewMeasures`, on a grid of POINTS_PER_SIDE² points, interpolated too, and
 reach(x, r) = 1 − exp(−x/r). The terms vₖ:
 

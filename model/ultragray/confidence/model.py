@@ -4,13 +4,13 @@
 
 d, i and φ are the distance, the interpolation distance and the angle of `ViewMeasures`; h is how hard the place is: the
 `hardness` of the training views around the pose, by their weights. b is what a black frame reaches. w₁ … w₄ are not
-negative: a pose farther away never earns more confidence. What d is beyond the farthest point that the weights were
-fitted on counts twice: nothing there says that the curve goes on.
+negative, so that c never rises with d, i, φ or h. Beyond the farthest point that the weights were fitted on, where no
+frame confirms the curve, the excess of d counts twice.
 
-Where Gaussians support only the share s of a frame's pixels, c ≤ b + (1 − b)·g·s, the gain g being what frames with
-little support reached. A pose alone is taken to have s₀·mean over points of exp(−d²/r²); of a rendered frame s is seen.
+Where Gaussians support only the share s of a frame's pixels, c ≤ b + (1 − b)·g·s; the gain g is fitted to frames with
+little support. For a pose alone s is estimated as s₀·mean over points of exp(−d²/r²); of a rendered frame it is known.
 
-Version 1, of older scenes, takes the curve of the means over the points, and knows neither limit. Needs no torch.
+Version 1, of older scenes, takes the curve of the means over the points, and has neither limit. Needs no torch.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ from .views import ViewMeasures
 VERSION = 2
 NEAR_MM, DISTANCE_MM, ANGLE_DEG = 0.3, 5.0, 10.0  # units of the terms
 TERMS = 4  # beside the constant
-PRIOR_WEIGHTS = (3.6, 1.1, 1.5, 0.3, 0.6)  # about those of ten scenes; what the views cannot tell stays near it
-PRIOR_STRENGTH = 0.02  # squared error that a weight costs which is 1 away from its prior
-GAIN_QUANTILE = 0.85  # of the frames that the gain is fitted on keep to the limit by their support
-LEAST_SHARE = 0.02  # less support than that tells nothing of the gain
-REACHES_MM = np.geomspace(0.2, 30.0, 60)  # that are tried for r
+PRIOR_WEIGHTS = (3.6, 1.1, 1.5, 0.3, 0.6)  # about those of ten scenes; one that no view determines stays near its own
+PRIOR_STRENGTH = 0.02  # squared error that is added for a weight that is 1 away from its prior
+GAIN_QUANTILE = 0.85  # share of the frames, of those that the gain is fitted on, that stay below the limit
+LEAST_SHARE = 0.02  # of supported pixels: fewer are taken as this many
+REACHES_MM = np.geomspace(0.2, 30.0, 60)  # values of r that are tried
 FIT_STEPS = 100
 HARDNESS_DIGITS = 3
 
@@ -62,7 +62,7 @@ class Support:
 
 @dataclass(frozen=True)
 class ConfidenceModel:
-    """Fitted weights w₀ … w₄, b, and the hardness of each training view; `fitted_on` and `error` say from what.
+    """Fitted weights w₀ … w₄, b, and the hardness of each training view; `fitted_on` and `error` describe the fit.
 
     Raises InvalidArgument for numbers that are not finite or out of range.
     """
@@ -101,11 +101,11 @@ class ConfidenceModel:
         if self.version == 1:
             measures = measures.averaged()
         terms = terms_of(measures, np.array(self.hardness), self.fitted_to_mm)
-        told = predicted(np.array(self.weights), terms, self.black_ms_ssim)
-        return told if self.support is None else self.limited(told, self.support.expected_shares(measures))
+        expected = predicted(np.array(self.weights), terms, self.black_ms_ssim)
+        return expected if self.support is None else self.limited(expected, self.support.expected_shares(measures))
 
     def limited(self, confidences: FloatArray, supported_shares: FloatArray) -> FloatArray:  # [C] both
-        """The confidences of poses once it is known which share of their pixels has support."""
+        """The confidences of poses, limited by the share of their pixels that has support."""
         if self.support is None:
             return confidences
         shares = np.minimum(1.0, self.support.gain * supported_shares)
@@ -171,7 +171,7 @@ def terms_of(
 
 
 def predicted(weights: FloatArray, terms: FloatArray, black_ms_ssim: float) -> FloatArray:  # [C]
-    """The formula."""
+    """c of each pose, by the formula."""
     shares: FloatArray = _logistic(terms @ weights).mean(axis=1)
     return black_ms_ssim + (1.0 - black_ms_ssim) * shares
 

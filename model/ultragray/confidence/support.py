@@ -1,4 +1,4 @@
-"""Support by Gaussians while frames are rendered: how much of each frame has it, and frames without what has none."""
+"""Support by Gaussians while frames are rendered: its share of each frame, and masks of the pixels that have none."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from .assess import SUPPORT_COVERAGE
 
 
 class SupportWatch:
-    """Looks at the coverage of frames as they are rendered, in the order of their poses."""
+    """Records the support of frames as they are rendered, in the order of their poses."""
 
     def __init__(self, masked: Sequence[bool]) -> None:
-        """`masked` tells for each pose whether pixels without support are to be black."""
+        """`masked`: for each pose, whether pixels without support are to be black."""
         self._masked = masked
         self._shares: list[Tensor] = []
         self._count = 0

@@ -1,9 +1,10 @@
-"""The model behind the output `uncertainty`: which variances add up to that of a pixel's error. Needs no torch.
+"""The model behind the output `uncertainty`: the variances that add up to that of a pixel's error. Needs no torch.
 
     σ² = Σ cₖ·vₖ,  cₖ ≥ 0
 
-The terms vₖ are those of `ultragray.confidence.deviation`. Away from the training views they tend to V = spread +
-(level − B̄)²: the squared error of a pixel that shows B̄ where any pixel of the training images at that depth could be.
+The terms vₖ are those of `ultragray.confidence.deviation`. Those that grow with the distance to
+the training views are shares of V = spread + (level − B̄)²: the mean squared error of a pixel that shows B̄ where the
+true grey value may be any of those that the training images have at that depth.
 """
 
 from __future__ import annotations

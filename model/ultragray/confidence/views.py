@@ -11,10 +11,10 @@ from ..pose import check_poses
 from ..probe import FloatArray, Probe
 
 POINTS_PER_SIDE = 6  # of the grid of image points at which distances are taken
-ANGLE_MM_PER_DEG = 0.02  # of views about as near, the one that is turned least counts as the nearest
-FAR_MM = 20.0  # farther from a view, nothing is left to lose
-MAX_VIEWS = 256  # that a pose is measured against, of those around it: a frame must not cost more than its rendering
-NEIGHBOURHOOD_MM = 3.0  # views this near tell how hard a place is, and where all are farther, the nearest
+ANGLE_MM_PER_DEG = 0.02  # added to distances to choose the nearest view: of two about as near, the less turned one
+FAR_MM = 20.0  # a frame is expected to be no worse farther away: larger distances count as this
+MAX_VIEWS = 256  # around a pose that it is compared with: with more, this would take longer than rendering the frame
+NEIGHBOURHOOD_MM = 3.0  # of views whose hardness counts; where all are farther away, the nearest ones count
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +105,7 @@ class TrainingViews:
         distances = np.hypot(elevation, beside)  # [K, P]
         nearest = (distances + ANGLE_MM_PER_DEG * angles).argmin(axis=1)
         nearest_mm = distances[np.arange(len(points)), nearest]
-        facing = np.sign(self._axes[1][:, views].T @ pose[:3, 1])  # a probe turned round has its front at its back
+        facing = np.sign(self._axes[1][:, views].T @ pose[:3, 1])  # −1: turned by more than 90°, front and back swap
         along = elevation * facing
         sides = [np.where(side, distances, np.inf).min(axis=1) for side in (along >= 0.0, along <= 0.0)]
         front, back = (np.minimum(side, 1e3 * FAR_MM) for side in sides)

@@ -1,4 +1,4 @@
-"""The truth of the output `uncertainty`: expected against actual errors of pixels, on frames that were held out."""
+"""The reliability of the output `uncertainty`: expected against actual errors of pixels, on held-out frames."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from ..scene import GaussianScene
 from .scoring import frames_at_once, require_frames
 
 BINS = np.array([0.0, 0.01, 0.02, 0.03, 0.045, 0.065, 0.09, 0.12, 0.16, 0.22, 0.3, 1.0])  # of the expected deviation
-LEAST_SHARE = 0.001  # of the pixels: what fewer tell is chance
+LEAST_SHARE = 0.001  # of all pixels: bins with fewer are left out, their figures would be chance
 
 
 @dataclass(frozen=True)

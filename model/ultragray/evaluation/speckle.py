@@ -1,13 +1,13 @@
 """The texture of rendered frames against that of the true ones: contrast and size of speckle, histogram of grey values.
 
-A mean over many looks can reach the best PSNR and yet look like no scanner's image: these figures tell.
+A mean over many looks can reach the best PSNR and yet look like no scanner's image: these figures show it.
 
 - Windows: the true frame is tiled with WINDOW_PIXELS². Tiles with more than STRAY_SHARE of black or saturated pixels
   are left out; the CALM_SHARE of the others whose quarters differ least in their mean, relative to the tile's own
   mean, are taken as homogeneous tissue. The rendered frame is measured in the same windows.
-- Envelope: frames are compressed logarithmically, and a ratio such as std/mean means something of amplitudes only. So
-  grey values g are taken back to 10^(R·(g − 1)/20) with R = 60 dB, the range that the display assumes too. Scanners do
-  not tell theirs: where it is another, contrasts are not absolute, yet truth and rendering still compare.
+- Envelope: frames are compressed logarithmically, and a ratio such as std/mean makes sense for amplitudes only. So
+  grey values g are taken back to 10^(R·(g − 1)/20) with R = 60 dB, the range that the display assumes too. The range of
+  the scanner is not known: where it is another, contrasts are not absolute, yet truth and rendering can be compared.
 - contrast: std/mean of the envelope in a window, a mean over the windows. Fully developed speckle has 0.52, its calmest
   windows a little less.
 - axial_mm, lateral_mm: full width at half maximum of the envelope's autocorrelation along rows of depth and across scan

@@ -1,1 +1,1 @@
-"""The fit of a trained scene's confidence: the frames held out for it, and the places that are hard."""
+"""The fit of a trained scene's confidence and uncertainty, by a shorter training that holds frames out."""

@@ -21,7 +21,7 @@ from .hardness import hardness_of_views
 from .held_out import held_out_frames
 from .residuals import fit_uncertainty
 
-SHORTER, ENOUGH_STEPS = 0.5, 500  # of the steps, but not fewer where the run has them: they leave shadows unlearned
+SHORTER, ENOUGH_STEPS = 0.5, 500  # share of the steps, and the number that suffices to learn shadows
 LEAST_HELD_OUT = 3
 MEASURED_FRAMES = 96  # of those held out; of those trained from a third as many
 BLACK_FRAMES = 32
@@ -43,9 +43,9 @@ def shorter(config: TrainingConfig, share: float) -> TrainingConfig:
 
 
 def fit_confidence(dataset: Dataset, train_shorter: TrainShorter, *, backend: str) -> ConfidenceModel | None:
-    """Leaves frames of `dataset.train` out, trains from the others and fits the model to what the left out ones reach.
+    """Holds frames of `dataset.train` out, trains from the others and fits the model to the scores of those held out.
 
-    None where there are too few frames, or where `train_shorter` gave up.
+    None where there are too few frames, or where `train_shorter` returns none.
     """
     sweep = dataset.train
     held_out = held_out_frames(sweep)

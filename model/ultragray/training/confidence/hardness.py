@@ -15,10 +15,10 @@ from ...evaluation.baselines import interpolate_planes
 from ...evaluation.metrics import frame_metrics
 from ...probe import FloatArray
 
-PICTURE_SIDE = 64  # what is smaller than its pixels is speckle
-MAX_FRAMES = 192  # looked at; the others take after their neighbours
+PICTURE_SIDE = 64  # structure smaller than its pixels is speckle
+MAX_FRAMES = 192  # that are predicted; the others take the hardness of their neighbours
 NEIGHBOURS = 16
-EXCLUDED_MM = (0.0, 1.5, 3.0, 5.0)  # frames within this of the one that is predicted do not help
+EXCLUDED_MM = (0.0, 1.5, 3.0, 5.0)  # frames within this distance of the one that is predicted are not used
 LIMITS = (0.02, 0.995)  # of an MS-SSIM whose logit is taken
 SMOOTHING = 0.01
 

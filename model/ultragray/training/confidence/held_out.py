@@ -14,7 +14,7 @@ from ...probe import FloatArray
 STRETCHES = ((0.0, 0.06), (0.20, 0.23), (0.34, 0.39), (0.48, 0.57), (0.68, 0.69), (0.89, 1.0))
 TURNED = (0.73, 0.83)  # in which frames are left out by their tilt instead
 TURNED_SHARE = 1 / 3
-TELLING_TILT_DEG = 2.0  # less is the hand's unrest
+LEAST_TILT_DEG = 2.0  # smaller differences are unsteadiness of the hand
 SINGLE_EVERY = 12  # of the frames that are left
 LEAST_KEPT = 4
 MAX_SHARE = 0.45
@@ -52,12 +52,12 @@ def _path(sweep: Sweep) -> FloatArray:  # [F] in [0, 1]
 
 
 def _most_tilted(poses: FloatArray) -> IntArray:  # [F, 4, 4] -> [≤ F]
-    """Those turned farthest to one side of the others, where the orientations differ by more than unrest."""
+    """Those turned farthest to one side of the others, where the orientations differ by LEAST_TILT_DEG or more."""
     if len(poses) < 3:
         return np.zeros(0, np.int64)
     angles = rotation_angles_deg(poses, poses)
     farthest = angles[int(np.unravel_index(angles.argmax(), angles.shape)[0])]
-    if farthest.max() < TELLING_TILT_DEG:
+    if farthest.max() < LEAST_TILT_DEG:
         return np.zeros(0, np.int64)
     count = max(1, round(TURNED_SHARE * len(poses)))
     return np.argsort(farthest, kind="stable")[:count].astype(np.int64)

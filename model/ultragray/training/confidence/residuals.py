@@ -17,7 +17,7 @@ from ...rendering import render
 from ...scene import GaussianScene
 
 LOOKED_AT = 40_000  # cells, over all frames
-FAR_SHARE = 0.05  # of as many again, where nothing is known and no frame can tell
+FAR_SHARE = 0.05  # of the weight of those cells: weight of places far from all views, where no frame shows the error
 ITERATIONS = 300
 
 
@@ -28,7 +28,7 @@ def fit_uncertainty(scene: GaussianScene, views: TrainingViews, sweep: Sweep, *,
     to be that of the training images.
     """
     bands = _bands(sweep.images)
-    stride = max(1, len(sweep) * CELLS**2 // LOOKED_AT) | 1  # odd: it must not fall into step with the columns
+    stride = max(1, len(sweep) * CELLS**2 // LOOKED_AT) | 1  # odd, while CELLS is even: cells of every column are taken
     terms, squares = [], []
     portion = frames_at_once(sweep.height, sweep.width)
     with torch.no_grad():

@@ -1,1 +1,1 @@
-"""Pose refinement: the tracker's errors, found from the path of the probe and from the images, and taken out."""
+"""Pose refinement: the tracker's errors are estimated from the path of the probe and from the images, and removed."""

@@ -1,7 +1,7 @@
-"""Held-out frames scored honestly where poses may be wrong: registered on one half of a frame, scored on the other.
+"""Scores of held-out frames whose poses may be wrong: each is registered by one half and scored on the other half.
 
-A frame whose pose is off by a millimetre scores badly in a scene that is right. To move it until it fits would flatter
-the scene; so it is moved by its left half alone and scored on its right half, and the other way round.
+A frame whose pose is off by a millimetre scores badly even in a perfect scene. Registering all of it first would score
+the scene too well, so a frame is moved by its left half alone and scored on its right half, and the other way round.
 """
 
 from __future__ import annotations

@@ -22,7 +22,7 @@ from ...probe import FloatArray
 from ...samplers.rotations import rotations_of, turns_of
 from .second_differences import likelihood_terms, smoothed
 
-JUMP = 6.0  # times the median step: there a new sweep begins
+JUMP = 6.0  # median steps: a longer step begins a new sweep
 LEAST_FRAMES = 5  # of a sweep: fewer are not a path
 RATIOS = 10.0 ** np.arange(-6.0, 6.01, 0.25)  # of the variances q/r that are tried
 TINY = 1e-300  # a variance whose logarithm is finite

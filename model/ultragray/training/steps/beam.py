@@ -15,14 +15,14 @@ from ..config import TrainingConfig
 RATE = 0.05  # of Adam, for each of three numbers of the order of one
 BETAS = (0.8, 0.99)
 MIN_THICKNESS_MM = 0.05
-BEGIN = 0.2  # of the run: before, Gaussians that are still dark would be explained by a beam that spreads them
-START_MM = 2.0  # of the thickness; from half a millimetre to eight it ends the same
-LEAST_LENGTHS = 0.05  # of the scan lines, for the depth of field: no lens has less
-MOST_LENGTHS = 20.0  # longer is as good as none
+BEGIN = 0.2  # share of the run before which the beam is held: it would make up for Gaussians that are still too dark
+START_MM = 2.0  # initial thickness; runs that began with 0.5 to 8 mm ended with the same beam
+LEAST_LENGTHS = 0.05  # least depth of field, in lengths of the scan lines: no lens has less
+MOST_LENGTHS = 20.0  # greatest depth of field, likewise: a beam beyond it is as thick at every depth
 
 
 class TrainedBeam:
-    """The beam that frames are rendered with. What is learned: ln thickness, focus, ln depth of field, [3] float64.
+    """The beam that frames are rendered with. Learned numbers: ln thickness, focus, ln depth of field, [3] float64.
 
     Thickness and depth of field are in mm, the focus in lengths of the scan lines.
     """
@@ -49,11 +49,11 @@ class TrainedBeam:
         return torch.stack([thickness.exp(), focus * self._length_mm, depth_of_field.exp()])
 
     def step(self, share: float) -> None:
-        """One update of what is learned, after a share of the run, with a rate that decays as all do."""
+        """One update of the learned numbers, after a share of the run, at a rate that decays like all rates."""
         if not self._config.learn_beam:
             return
         if share < BEGIN:
-            self._raw.grad = torch.zeros_like(self._raw)  # a step of none, so that all steps count alike
+            self._raw.grad = torch.zeros_like(self._raw)  # the beam is held, but Adam counts the step
         self._adam.param_groups[0]["lr"] = RATE * self._config.final_rate**share
         self._adam.step()
         self._adam.zero_grad()
@@ -68,12 +68,12 @@ class TrainedBeam:
         return ElevationBeam(math.exp(thickness), focus * self._length_mm, math.exp(depth_of_field))
 
     def is_doubtful(self, frame_spacing_mm: float) -> bool:
-        """Whether what was learned is so thin that frames have nothing in common: then they do not tell it."""
+        """Whether the learned thickness is below half the spacing of frames, which then cannot show it."""
         found = self.found()
         return self._config.learn_beam and found is not None and found.thickness_mm < 0.5 * frame_spacing_mm
 
     def tensors(self) -> dict[str, Tensor]:
-        """The state of what is learned, as `load` takes it; empty where nothing is."""
+        """The state of the learned numbers, as `load` takes it; empty where none is learned."""
         if not self._config.learn_beam:
             return {}
         return {"raw": self._raw.detach(), **self._adam.state[self._raw]}
