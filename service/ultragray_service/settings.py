@@ -10,6 +10,7 @@ from typing import Any
 from ultragray.contract import Contract, annotated_fields, described, from_text
 from ultragray.errors import InvalidArgument
 from ultragray.image_size import MAX_IMAGE_SIDE
+from ultragray.probe.elevation import MAX_THICKNESS_MM
 from ultragray_workers.jobs.kinds.base import MAX_RUN_S
 from ultragray_workers.pool.pool import MAX_BATCH_POSES
 
@@ -37,6 +38,13 @@ class Settings(Contract):
         "Port of OpenIGTLink, usually 18944; 0 takes a free one; none: off.", None, low=0, high=65535
     )
     igtl_scene: str | None = described("Scene of OpenIGTLink devices whose names name none; none: the only one.", None)
+    igtl_slice_thickness_mm: float | None = described(
+        "Of frames over OpenIGTLink, mm: full width at half maximum along elevation at the focus of the scene's beam; "
+        "0: a plane; none: as trained.",
+        None,
+        low=0.0,
+        high=MAX_THICKNESS_MM,
+    )
     igtl_allow: tuple[str, ...] = described(
         "Other machines that may use OpenIGTLink, which has neither keys nor TLS: addresses or networks with a role, "
         "such as 10.0.0.7=reader; none: this machine alone.",

@@ -19,8 +19,10 @@ import ultragray_client
 from ultragray import ElevationBeam, GaussianScene, render
 from ultragray_client.contract import RenderSettings
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2, rendering_pb2_grpc
+from ultragray_service.igtl.contents import unpack_image
 
 from .conftest import HEIGHT, WIDTH, RunningService
+from .igtl.conftest import Peer, address_of
 
 BEAM = ElevationBeam(thickness_mm=3.0, focus_mm=15.0, depth_of_field_mm=20.0)
 POSE = np.eye(4)
@@ -124,6 +126,25 @@ def test_websocket(thick_service: RunningService, thick: GaussianScene) -> None:
             assert json.loads(message[4:length])["slice_thickness_mm"] == beam.thickness_mm
             pixels = np.frombuffer(message[length:], "<f4").reshape(HEIGHT, WIDTH)
             np.testing.assert_allclose(pixels, frame_of(thick, beam), atol=1e-6)
+
+
+@pytest.mark.parametrize(("settings", "beam"), [({}, BEAM), ({"igtl_slice_thickness_mm": 0.0}, ElevationBeam(0.0))])
+def test_openigtlink(
+    start_service: Callable[..., RunningService],
+    thick: GaussianScene,
+    tmp_path: Path,
+    settings: dict[str, float],
+    beam: ElevationBeam,
+) -> None:
+    thick.save(tmp_path / "thick.ugr")
+    service = start_service(data_folder=tmp_path, igtl_port=0, **settings)
+    peer = Peer(address_of(service))
+    peer.send_pose(POSE, "thick", version=2)
+    message = peer.receive()
+    peer.socket.close()
+    assert message.metadata["slice_thickness_mm"] == repr(beam.thickness_mm)
+    pixels = unpack_image(message.content).pixels / 255.0
+    np.testing.assert_allclose(pixels, frame_of(thick, beam), atol=0.501 / 255.0)
 
 
 def test_render_jobs_take_it(http: httpx.Client) -> None:

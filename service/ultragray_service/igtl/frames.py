@@ -1,4 +1,4 @@
-"""A rendered frame, and the messages that tell it."""
+"""A rendered frame, and the messages that carry it."""
 
 from __future__ import annotations
 
@@ -67,9 +67,12 @@ class FrameMaker:
     def __init__(self, service: Service, scenes: SceneChooser) -> None:
         self._service = service
         self._scenes = scenes
+        self._settings = FrameSettings(slice_thickness_mm=service.settings.igtl_slice_thickness_mm)
 
     async def render(self, underway: Underway) -> Frame:
         """The frame of a pose, or of one that took its turn; probe and size are those the scene was trained with.
+
+        Its thickness is that of the service's setting, else that of the scene's beam.
 
         Raises SceneNotFound, and what RequestPlanner.plan and Service.render raise.
         """
@@ -77,7 +80,7 @@ class FrameMaker:
         scene = await self._scenes.choose(underway.posed.message.device_name)
         ownership = self._service.owners.known(Kind.SCENE, scene)
         planner = self._service.planner
-        plan = await planner.plan(scene, FrameSettings(), Encoding.UINT8, complete=self._true_to_scale)
+        plan = await planner.plan(scene, self._settings, Encoding.UINT8, complete=self._true_to_scale)
         result = await self._service.render(
             plan, underway.posed.pose[None], deadline=planner.deadline(None), turn=underway.turn
         )
