@@ -17,7 +17,7 @@ ARGS ?=
 MINUTES ?= 30
 
 .DEFAULT_GOAL := help
-.PHONY: ALWAYS help serve console test test-fast test-long test-console test-faults test-fuzz test-soak test-overload check check-lint check-types check-generated check-web format bench bench-console bench-cuda results demo-scene generate clean
+.PHONY: ALWAYS help serve console test test-fast test-long test-console test-faults test-fuzz test-soak test-overload check check-lint check-types check-generated check-web format bench bench-console bench-cuda results ablations demo-scene generate clean
 
 help:  ## say what there is
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
@@ -96,6 +96,10 @@ bench-cuda: $(VENV)/installed  ## the same on a GPU, with the distance to what i
 
 results: $(VENV)/installed  ## train on every data set of DATA and write docs/results.md (ARGS="--only liver_convex" for one)
 	$(BIN)/python benchmarks/results_tables.py $(DATA) $(ARGS)
+
+ablations: $(VENV)/installed  ## train without each part of the training, three seeds each, and write docs/results.md; takes an hour
+	$(BIN)/python benchmarks/ablations.py $(DATA) $(ARGS)
+	$(BIN)/python benchmarks/results_tables.py $(DATA) --only
 
 demo-scene: $(VENV)/installed  ## simulate the phantom, train the demo scene from it and put it in its place
 	$(BIN)/python -m ultragray.demo.make

@@ -2,8 +2,8 @@
 
     python benchmarks/results_tables.py DATA_FOLDER [--only NAME ...]
 
-Each run's figures go into the JSON as soon as it is done, so that a killed run keeps them; the tables are written from
-the JSON, which also holds the runs that were not asked for this time.
+Each run's figures go into the JSON as soon as it is done, so that a killed run keeps them; the tables come from
+the JSON, which also holds the runs that were not asked for this time, and from that of `ablations.py`.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 import torch
 
+import ablations
 from in_silico import IN_SILICO
 from origin import origin
 from ultragray.datasets.phantom.shadow import SHADOW_DB, BoneShadow
@@ -102,16 +103,21 @@ def main() -> None:
         torch.set_num_threads(arguments.threads)
     figures = json.loads(arguments.figures.read_text()) if arguments.figures.exists() else {}
     for run in RUNS:
-        if not arguments.only or run.name in arguments.only:
+        if arguments.only is None or run.name in arguments.only:
             figures[run.name] = measure(run, arguments.data_folder)
-            _write(arguments.figures, json.dumps(figures, indent=1, allow_nan=False) + "\n")
-            _write(arguments.tables, tables(figures))
+            write_whole(arguments.figures, json.dumps(figures, indent=1, allow_nan=False) + "\n")
+    write_whole(arguments.tables, tables(figures))
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("data_folder", type=Path, help="folder of the data sets")
-    parser.add_argument("--only", nargs="+", choices=[run.name for run in RUNS], help="leave out the others")
+    parser.add_argument(
+        "--only",
+        nargs="*",
+        choices=[run.name for run in RUNS],
+        help="leave out the others; none: write the tables anew",
+    )
     parser.add_argument("--threads", type=int, default=0, help="0: all cores")
     parser.add_argument("--figures", type=Path, default=FIGURES, help="JSON of the figures")
     parser.add_argument("--tables", type=Path, default=TABLES, help="Markdown that is written from it")
@@ -214,6 +220,7 @@ def tables(figures: Mapping[str, Any]) -> str:
     lines += ["", f"Measured at {'; '.join(origins)}.", "", *_comparison(known)]
     for name, run in known.items():
         lines += _metrics_table(name, run)
+    lines += ablations.section()
     return "\n".join(lines)
 
 
@@ -276,10 +283,6 @@ def _shadow_lines(run: Mapping[str, Any]) -> list[str]:
         f"mean transmittance of the scene {shadow['scene_transmittance']:.3f}.",
         "",
     ]
-
-
-def _write(path: Path, text: str) -> None:
-    write_whole(path, text)
 
 
 if __name__ == "__main__":

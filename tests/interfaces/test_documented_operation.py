@@ -16,7 +16,7 @@ from opentelemetry import trace
 from ultragray import ConvexProbe, LinearProbe, errors, image_size, pose, scene_info
 from ultragray.probe import fan, probe
 from ultragray.settings import Resolved
-from ultragray.training import TrainingConfig
+from ultragray.training.config import PRESETS, TrainingConfig
 from ultragray_service.cli.app import USER_ERROR
 from ultragray_service.cli.app import app as command_line
 from ultragray_service.cli.jobs.watch import JOB_CANCELLED, JOB_FAILED
@@ -59,9 +59,10 @@ def test_command_line() -> None:
 
 
 def test_training_settings() -> None:
-    presets = [TrainingConfig.preset(name).to_dict() for name in ("fast", "paper")]
+    presets = [TrainingConfig.preset(name).to_dict() for name in PRESETS]
     documented = {
-        name: [json.loads(code(cell)[0]) for cell in cells[:2]] for name, cells in table("Training settings").items()
+        name: [json.loads(code(cell)[0]) for cell in cells[: len(presets)]]
+        for name, cells in table("Training settings").items()
     }
     assert documented == {name: [preset[name] for preset in presets] for name in presets[0]}
 

@@ -308,10 +308,11 @@ class Trainer:
         if self._between_count:
             between = self._views_between.draw(self._between_count, self._generator)
             batch, poses = torch.cat([batch, between.nearer]), np.concatenate([poses, between.poses])
-            truth = torch.cat([truth, between.images])
         if self.config.out_of_plane_mm:
             poses = shift_out_of_plane(poses, out_of_plane_shift_mm(self.config.out_of_plane_mm, self._generator))
         frames = self._rendered(self.refinement.corrected(batch, poses), self._schedule.sh_degree(self.step))
+        if self._between_count:
+            truth = torch.cat([truth, between.wanted(frames["bmode"][len(truth) :])])
         image = image_loss(frames["bmode"], truth, self.config.texture)
         if self._has_absorption_penalty:
             image = image + self.config.absorption_penalty * (1.0 - frames["transmittance"]).mean()

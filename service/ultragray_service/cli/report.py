@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ultragray.datasets.source import SourceOptions
-from ultragray.training.config import TrainingConfig
+from ultragray.training.config import PRESET_MEANINGS, TrainingConfig
 
 from .dataset import DatasetArgument, check_scene_fits, read_dataset, warn_about_dataset
 from .eval import VoxelMm
@@ -44,7 +44,7 @@ def report(
         Path | None,
         typer.Option(help="Scene file (.ugr) to report on.", show_default="one is trained"),
     ] = None,
-    preset: Annotated[str, typer.Option(help="Of every training: fast or paper.")] = "fast",
+    preset: Annotated[str, typer.Option(help=f"Of every training. {PRESET_MEANINGS}")] = "fast",
     no_ablations: Annotated[
         bool, typer.Option("--no-ablations", help="Leave out the ablations and growing tilt: seven trainings.")
     ] = False,

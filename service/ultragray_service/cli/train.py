@@ -16,7 +16,7 @@ import typer
 
 from ultragray.datasets.source import SourceOptions
 from ultragray.errors import MemoryExceeded, TrainingDiverged, TrainingStateInvalid
-from ultragray.training.config import TrainingConfig, read_config_file
+from ultragray.training.config import PRESET_MEANINGS, TrainingConfig, read_config_file
 
 from .dataset import DatasetArgument, read_dataset, warn_about_dataset
 from .options import FieldsOf, parse_settings, with_options
@@ -36,7 +36,7 @@ def train(
     output: Annotated[Path, typer.Option("--output", "-o", help="Scene file to write (.ugr).", show_default=False)],
     preset: Annotated[
         str | None,
-        typer.Option(help="fast, or paper: the released recipe.", show_default="fast"),
+        typer.Option(help=PRESET_MEANINGS, show_default="fast"),
     ] = None,
     config: Annotated[
         Path | None,

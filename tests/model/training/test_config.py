@@ -29,8 +29,16 @@ def test_presets() -> None:
     assert (paper.steps, paper.max_gaussians, paper.initial_gaussians) == (30_000, 500_000, 500_000)
     assert (paper.intensity, paper.start, paper.out_of_plane_mm) == ("released", "random", 2.0)
     assert TrainingConfig.preset("fast") == TrainingConfig()
-    with pytest.raises(InvalidArgument, match="preset must be one of fast, paper, got 'slow'"):
+    with pytest.raises(InvalidArgument, match="preset must be one of fast, best, paper, got 'slow'"):
         TrainingConfig.preset("slow")
+
+
+def test_more_effort_is_more_steps_and_gaussians_unless_they_are_given(tiny_dataset: Callable[..., Dataset]) -> None:
+    geometry = Geometry.of(tiny_dataset())
+    fast, best = (TrainingConfig.preset(name).resolved(geometry) for name in ("fast", "best"))
+    assert (best.steps, best.max_gaussians) == (3 * (fast.steps or 0), 3 * (fast.max_gaussians or 0))
+    given = TrainingConfig.preset("best", steps=7, max_gaussians=50).resolved(geometry)
+    assert (given.steps, given.max_gaussians) == (7, 50)
 
 
 def test_half_of_the_gaussians_start_where_only_the_end_is_given(tiny_dataset: Callable[..., Dataset]) -> None:
@@ -70,7 +78,7 @@ def test_a_step_has_whole_views_between_frames_and_one_frame_at_least(tiny_datas
 
 
 def test_an_unknown_setting_is_refused_with_the_known_ones() -> None:
-    with pytest.raises(InvalidArgument, match=r"no setting stepz; it has steps, batch_size, .*, memory_gb") as caught:
+    with pytest.raises(InvalidArgument, match=r"no setting stepz; it has steps, effort, batch_size, .*, memory_gb") as caught:
         TrainingConfig.preset("fast", stepz=3)
     assert caught.value.field == "stepz"
 

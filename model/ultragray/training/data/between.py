@@ -15,16 +15,19 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from ...backends import cuda
 from ...datasets.sweep import IntArray, Sweep, spread_places
 from ...probe import FloatArray
 from ...samplers.rotations import blended
-from .blending import blend_in_space
+from .blending import Blend, blend_by_pixel, blend_in_space
 from .neighbours import Neighbours
 
 EXACT = 1e-9  # a squared error that counts as none
-PREDICTED_FRAMES = 32  # enough to tell which blend is better
+PREDICTED_FRAMES = 32  # enough to tell which blend is better, and how much frames usually differ
+DOUBTFUL = 0.5  # times the usual difference of frames: there a blend counts half
+SMOOTHED = 11  # pixels, over which differences are averaged
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +42,10 @@ class Places:
     def nearer(self) -> IntArray:  # [V]
         """The frame that lies nearer."""
         return np.where(self.shares > 0.5, self.frames[:, 1], self.frames[:, 0])
+
+    def at(self, some: slice) -> Places:
+        """Some of them."""
+        return Places(self.frames[some], self.shares[some], self.beyond_mm[some])
 
     def poses(self, sweep: Sweep) -> FloatArray:  # [V, 4, 4] mm
         """The middles of the images on a straight line, the rotations on the shortest way."""
@@ -74,6 +81,11 @@ class Views(NamedTuple):
     nearer: Tensor  # [V] place of the frame that lies nearer
     poses: FloatArray  # [V, 4, 4] mm
     images: Tensor  # [V, H, W] in [0, 1]
+    trust: Tensor  # [V, H, W] in [0, 1], by how far the two frames agree
+
+    def wanted(self, rendered: Tensor) -> Tensor:  # [V, H, W] -> [V, H, W]
+        """What a rendering is to become: the images where they are trusted, where not it may stay as it is."""
+        return torch.lerp(rendered.detach(), self.images, self.trust)
 
 
 class ViewsBetween:
@@ -83,19 +95,32 @@ class ViewsBetween:
         """`images` are those of the sweep, on the device of the training."""
         self._sweep, self._neighbours, self._images = sweep, neighbours, images
         self.follow_probe = features_follow_probe(sweep, neighbours)
+        some = draw_places(neighbours, PREDICTED_FRAMES, torch.Generator().manual_seed(0))
+        blends = [self._blend(some.at(slice(place, place + 1))) for place in range(PREDICTED_FRAMES)]
+        self._usual = torch.stack([_smooth(blend.differences).mean() for blend in blends]).mean()
 
     def draw(self, count: int, generator: torch.Generator) -> Views:
         """New ones, by `draw_places`."""
         places = draw_places(self._neighbours, count, generator)
-        poses = places.poses(self._sweep)
+        blend = self._blend(places)
+        relative = _smooth(blend.differences) / (DOUBTFUL * self._usual).clamp(min=EXACT)
+        trust = 1.0 / (1.0 + relative.square())
+        return Views(torch.from_numpy(places.nearer), places.poses(self._sweep), blend.images, trust)
+
+    def _blend(self, places: Places) -> Blend:
         frames = cuda.upload(torch.from_numpy(places.frames), self._images.device)
         sides = self._images[frames].float().div_(255.0)  # [V, 2, H, W]
         if self.follow_probe:
-            shares = cuda.upload(torch.from_numpy(places.shares).float(), self._images.device)
-            images = torch.lerp(sides[:, 0], sides[:, 1], shares[:, None, None])
-        else:
-            images = blend_in_space(sides, self._sweep.poses[places.frames], poses, self._sweep.probe)
-        return Views(torch.from_numpy(places.nearer), poses, images)
+            return blend_by_pixel(sides, places.shares)
+        sweep = self._sweep
+        return blend_in_space(sides, sweep.poses[places.frames], places.poses(sweep), sweep.probe)
+
+
+def _smooth(differences: Tensor) -> Tensor:  # [V, H, W] -> [V, H, W]
+    """Size of the differences without speckle, which always differs."""
+    half = SMOOTHED // 2
+    down = functional.avg_pool2d(differences[:, None], (SMOOTHED, 1), stride=1, padding=(half, 0))
+    return functional.avg_pool2d(down, (1, SMOOTHED), stride=1, padding=(0, half))[:, 0].abs()
 
 
 def features_follow_probe(sweep: Sweep, neighbours: Neighbours) -> bool:
@@ -123,7 +148,7 @@ def features_follow_probe(sweep: Sweep, neighbours: Neighbours) -> bool:
         truth = torch.from_numpy(sweep.images[frame]).float() / 255.0
         sides = torch.from_numpy(sweep.images[pair]).float() / 255.0
         by_pixel = torch.lerp(sides[0], sides[1], share)
-        in_space = blend_in_space(sides[None], sweep.poses[None, pair], pose[None], sweep.probe)[0]
+        in_space = blend_in_space(sides[None], sweep.poses[None, pair], pose[None], sweep.probe).images[0]
         errors = (float((image - truth).square().mean()) + EXACT for image in (in_space, by_pixel))
         gains.append(math.log(next(errors)) - math.log(next(errors)))
     return not gains or float(np.mean(gains)) > 0.0

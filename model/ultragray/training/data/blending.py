@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -14,12 +16,26 @@ GRID = 17  # points a side that are projected from plane to plane; between them 
 ON_PLANE_MM = 1e-6  # distances are at least that: the nearer frame then has all the weight
 
 
+class Blend(NamedTuple):
+    """V planes, and by how much the two frames differ there; 0 where only one shows it."""
+
+    images: Tensor  # [V, H, W] in [0, 1]
+    differences: Tensor  # [V, H, W] second less first
+
+
+def blend_by_pixel(images: Tensor, shares: FloatArray) -> Blend:  # [V, 2, H, W] in [0, 1], [V]
+    """Each pixel from the same pixel of both frames; `shares` are those of the second one."""
+    first, second = images.unbind(1)
+    weights = cuda.upload(torch.from_numpy(shares).float(), images.device)
+    return Blend(torch.lerp(first, second, weights[:, None, None]), second - first)
+
+
 def blend_in_space(
     images: Tensor,  # [V, 2, H, W] in [0, 1], on any device
     sides: FloatArray,  # [V, 2, 4, 4] mm, the poses of these frames
     poses: FloatArray,  # [V, 4, 4] mm, of the planes between
     probe: Probe,
-) -> Tensor:  # [V, H, W]
+) -> Blend:
     """The planes, as the baseline `linear` of `ultragray.evaluation` predicts them from two frames.
 
     Each pixel is projected onto both frames along their normals; their grey values there count in inverse proportion to
@@ -41,9 +57,11 @@ def blend_in_space(
         inside &= (columns >= 0.0) & (columns <= 1.0)
     places = torch.stack([2.0 * columns - 1.0, 2.0 * rows - 1.0], dim=-1)
     seen = functional.grid_sample(sources, places, padding_mode="border", align_corners=False)[:, 0]
-    weights = torch.where(inside, 1.0 / distances.clamp(min=ON_PLANE_MM), 0.0).reshape(views, 2, height, width)
-    blended: Tensor = (weights * seen.reshape(weights.shape)).sum(dim=1) / weights.sum(dim=1).clamp(min=1e-9)
-    return blended
+    weights = torch.where(inside, 1.0 / distances.clamp(min=ON_PLANE_MM), 0.0).reshape(images.shape)
+    seen = seen.reshape(images.shape)
+    blended = (weights * seen).sum(dim=1) / weights.sum(dim=1).clamp(min=1e-9)
+    in_both = inside.reshape(images.shape).all(dim=1)
+    return Blend(blended, (seen[:, 1] - seen[:, 0]) * in_both)
 
 
 def _moves(

@@ -67,7 +67,7 @@ def test_images_between_show_what_is_there(tiny_dataset: Callable[..., Dataset],
     sweep = drifting(tiny_dataset().train, with_probe=with_probe)
     every_other = sweep.select(range(0, len(sweep), 2))
     views = ViewsBetween(every_other, neighbours_of(every_other), torch.tensor(every_other.images))
-    _, poses, images = views.draw(600, torch.Generator().manual_seed(1))
+    _, poses, images, _ = views.draw(600, torch.Generator().manual_seed(1))
     nearest = np.abs(poses[:, None, 1, 3] - sweep.poses[:, 1, 3]).argmin(axis=1)
     close = np.abs(poses[:, 1, 3] - sweep.poses[nearest, 1, 3]) < 0.1
     truth = torch.tensor(sweep.images[nearest]).float() / 255.0
@@ -79,10 +79,28 @@ def test_images_between_show_what_is_there(tiny_dataset: Callable[..., Dataset],
 def test_beyond_an_end_the_last_frame_goes_on(tiny_dataset: Callable[..., Dataset]) -> None:
     sweep = tiny_dataset().train
     views = ViewsBetween(sweep, neighbours_of(sweep), torch.tensor(sweep.images))
-    _, poses, images = views.draw(100, torch.Generator().manual_seed(2))
+    _, poses, images, _ = views.draw(100, torch.Generator().manual_seed(2))
     last = poses[:, 1, 3] > sweep.poses[-1, 1, 3]
     assert last.sum() > 3
     assert torch.equal(
         images[torch.from_numpy(last)],
         (torch.tensor(sweep.images[-1]).float() / 255.0).expand(int(last.sum()), -1, -1),
     )
+
+
+@pytest.mark.parametrize("with_probe", [True, False])
+def test_where_neighbours_disagree_a_rendering_may_stay(tiny_dataset: Callable[..., Dataset], with_probe: bool) -> None:
+    sweep = drifting(tiny_dataset().train, with_probe=with_probe)
+    images = sweep.images.copy()
+    images[1::2, 20:, 5:20] //= 20
+    shadowed = replace(sweep, images=images)
+    views = ViewsBetween(shadowed, neighbours_of(shadowed), torch.tensor(images))
+    views.follow_probe = with_probe
+    drawn = views.draw(40, torch.Generator().manual_seed(3))
+    between = torch.from_numpy((drawn.poses[:, 1, 3] > 0.0) & (drawn.poses[:, 1, 3] < len(sweep) - 1))
+    trust = drawn.trust[between]
+    assert float(trust[:, 26:34, 10:15].max()) < 0.3
+    assert float(trust[:, :14, 26:].mean()) > 0.7
+    rendered = torch.full_like(drawn.images, 0.5)
+    wanted = drawn.wanted(rendered)[between]
+    assert torch.allclose(wanted, 0.5 + trust * (drawn.images[between] - 0.5), atol=1e-6)

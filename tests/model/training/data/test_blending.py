@@ -39,7 +39,7 @@ def between(*heights_mm: float) -> FloatArray:  # [V, 4, 4] mm
 
 def blended(sweep: Sweep, poses: FloatArray) -> FloatArray:
     sides = (torch.from_numpy(sweep.images).float() / 255.0).expand(len(poses), -1, -1, -1)
-    return blend_in_space(sides, np.stack([sweep.poses] * len(poses)), poses, sweep.probe).numpy()
+    return blend_in_space(sides, np.stack([sweep.poses] * len(poses)), poses, sweep.probe).images.numpy()
 
 
 @pytest.mark.parametrize("probe", PROBES, ids=lambda probe: probe.kind)

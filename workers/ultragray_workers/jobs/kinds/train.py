@@ -9,7 +9,7 @@ from typing import Any, Literal
 from ultragray.contract import described, kind_field, shown
 from ultragray.errors import InvalidArgument
 from ultragray.machine import memory_bytes
-from ultragray.training.config import PRESETS, TrainingConfig
+from ultragray.training.config import PRESET_MEANINGS, PRESETS, TrainingConfig
 
 from .base import Specification, Surroundings
 
@@ -27,7 +27,7 @@ class TrainJob(Specification):
 
     dataset: str = described("Name of an uploaded dataset.")
     scene: str = described("Name that the scene will be served under.")
-    preset: str = described("fast, or paper: the released recipe.", "fast", choices=tuple(PRESETS))
+    preset: str = described(PRESET_MEANINGS, "fast", choices=tuple(PRESETS))
     settings: dict[str, Any] = described("Any training settings instead of the preset's.", factory=dict)
     device: str = described("auto, cpu, cuda or cuda:N.", "auto")
     kind: Literal["train"] = kind_field("train")

@@ -1,0 +1,156 @@
+"""What each part of the training brings: trainings without it, and along the settings of texture, with three seeds.
+
+    python benchmarks/ablations.py DATA_FOLDER [--only NAME ...]
+
+The figures of a training go into benchmarks/ablations.json as soon as it is done; trainings that the file holds from
+the same commit are not repeated. `results_tables.py` writes the tables into docs/results.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from origin import origin
+from ultragray.datasets.phantom.shadow import BoneShadow
+from ultragray.datasets.source import PHANTOM, SourceOptions, load_dataset
+from ultragray.datasets.sweep import Dataset
+from ultragray.evaluation.scoring import render_sweep
+from ultragray.files.atomic import write_whole
+from ultragray.report.study import train_and_evaluate
+from ultragray.training import TrainingConfig
+
+FIGURES = Path(__file__).resolve().parent / "ablations.json"
+SEEDS = (0, 1, 2)
+SHORTER = {
+    "steps": 600,
+    "max_gaussians": 60_000,
+    "confidence": False,
+}  # than `fast`, so that all of it takes half an hour
+TEXTURES = (0.0, 0.1, 0.3, 0.5, 0.7, 0.9)
+
+
+@dataclass(frozen=True)
+class Variation:
+    """Trainings with some settings changed."""
+
+    name: str
+    settings: Mapping[str, Any] = field(default_factory=dict)
+
+
+AS_IT_IS = Variation("as it is")
+WITHOUT = (
+    AS_IT_IS,
+    Variation("no views between frames", {"views_between": 0.0}),
+    Variation("no shift out of the plane", {"out_of_plane_mm": 0.0}),
+    Variation("no floor in shadows", {"intensity_floor": 0.0}),
+    Variation("no price of absorption", {"absorption_penalty": 0.0}),
+    Variation("no absorption", {"transmittance": False}),
+    Variation("random start", {"start": "random"}),
+)
+CURVE = tuple(Variation(f"texture {value:g}", {"texture": value}) for value in TEXTURES)
+SOURCES = {
+    "ultranerf_liver_other_side": ("ultranerf_liver", SourceOptions("0:90", "90:180")),
+    "spine_phantom": ("spine_phantom", SourceOptions()),
+    "nwire_phantom": ("nwire_phantom", SourceOptions()),
+    "phantom": (PHANTOM, SourceOptions()),
+}
+
+log = logging.getLogger("ablations")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("data_folder", type=Path, help="folder of the data sets")
+    parser.add_argument("--only", nargs="+", choices=SOURCES, default=list(SOURCES), help="leave out the others")
+    parser.add_argument("--threads", type=int, default=0, help="0: all cores")
+    arguments = parser.parse_args()
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
+    if arguments.threads:
+        torch.set_num_threads(arguments.threads)
+    for name in arguments.only:
+        folder, options = SOURCES[name]
+        dataset = load_dataset(folder if folder == PHANTOM else arguments.data_folder / folder, options)
+        for variation in (*WITHOUT, *CURVE):
+            for seed in SEEDS:
+                measure(name, dataset, variation, seed)
+
+
+def measure(name: str, dataset: Dataset, variation: Variation, seed: int) -> None:
+    """One training, into the file, unless that holds it from this commit."""
+    key, where = f"{variation.name}, seed {seed}", origin()
+    if read().get(name, {}).get(key, {}).get("commit") == where["commit"]:
+        return
+    config = TrainingConfig.preset("fast", **{**SHORTER, **variation.settings}, seed=seed)
+    trained = train_and_evaluate(dataset, config)
+    figures = {**trained.evaluation.mean.to_dict(), **trained.evaluation.speckle.figures(), **where}
+    if dataset.name == PHANTOM:
+        shadow = BoneShadow.of(dataset.val)
+        figures["shadow_mae"] = shadow.mean_absolute_error(render_sweep(trained.scene, dataset.val))
+    log.info("%s, %s: %.2f dB", name, key, figures["psnr_db"])
+    everything = read()
+    everything.setdefault(name, {})[key] = figures
+    write_whole(FIGURES, json.dumps(everything, indent=1, allow_nan=False) + "\n")
+
+
+def read() -> dict[str, dict[str, Any]]:
+    """Figures by set, variation and seed."""
+    return json.loads(FIGURES.read_text()) if FIGURES.exists() else {}
+
+
+def section() -> Iterator[str]:
+    """The lines of docs/results.md about this."""
+    figures = read()
+    if not figures:
+        return
+    origins = sorted(
+        {f"commit {one['commit']} on {one['machine']}" for runs in figures.values() for one in runs.values()}
+    )
+    yield "## Ablations"
+    yield ""
+    steps, count = SHORTER["steps"], SHORTER["max_gaussians"]
+    yield f"Trainings without one part each, of {steps} steps and {count:,} Gaussians: less than for the figures above."
+    yield f"PSNR (dB) and MS-SSIM on held-out frames, mean and standard deviation over {len(SEEDS)} seeds; then, where"
+    yield "it is known, the mean absolute error in the shadow of bone."
+    yield ""
+    yield f"| | {' | '.join(figures)} |"
+    yield f"|---{'|---' * len(figures)}|"
+    for variation in WITHOUT:
+        cells = [_cell(runs, variation, ("psnr_db", "ms_ssim", "shadow_mae")) for runs in figures.values()]
+        yield f"| {variation.name} | {' | '.join(cells)} |"
+    yield ""
+    yield "The share of SSIM in the loss (`texture`): PSNR, MS-SSIM and GMSD on held-out frames, and the contrast of"
+    yield "speckle (std/mean of the envelope), rendered and true:"
+    yield ""
+    yield f"| | {' | '.join(figures)} |"
+    yield f"|---{'|---' * len(figures)}|"
+    for variation in CURVE:
+        keys = ("psnr_db", "ms_ssim", "gmsd", "speckle_contrast", "true_speckle_contrast")
+        cells = [_cell(runs, variation, keys) for runs in figures.values()]
+        yield f"| {variation.name} | {' | '.join(cells)} |"
+    yield ""
+    yield f"Measured at {'; '.join(origins)}."
+    yield ""
+
+
+def _cell(runs: Mapping[str, Any], variation: Variation, keys: tuple[str, ...]) -> str:
+    seeds = [runs[key] for seed in SEEDS if (key := f"{variation.name}, seed {seed}") in runs]
+    parts = []
+    for key in keys:
+        values = [one[key] for one in seeds if key in one]
+        if values:
+            digits = {"psnr_db": 2, "shadow_mae": 4}.get(key, 3)
+            parts.append(f"{np.mean(values):.{digits}f} ± {np.std(values):.{digits}f}")
+    return " / ".join(parts) or "–"
+
+
+if __name__ == "__main__":
+    main()
