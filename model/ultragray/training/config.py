@@ -32,7 +32,7 @@ else:
 
 RELEASED_STEPS = 30_000  # the length of run that the released rates are tuned for
 RELEASED_TRANSMITTANCE_RATE, MAX_SCALED_RATE = 5e-4, 2e-2
-VIEWS_BETWEEN = 0.75  # of a step; what is blended from two frames is thicker than a beam
+VIEWS_BETWEEN = 0.5  # of a step; what is blended from two frames is thicker than a beam, and its shadows are wider
 MAX_RANGE_MM = 100.0  # frames further apart have nothing to say about what lies between
 STARTS = ("informed", "random")
 GROWTHS = ("even", "threshold")
@@ -53,7 +53,7 @@ class TrainingConfig(Contract):
     )
     batch_size: int = described("Views of one step; fewer where the dataset has few frames.", 8, low=1, high=1_024)
     views_between: float | None = described(
-        "Share of them that lies between frames or beyond the ends of the sweep; none: 0.75, with a beam 0.",
+        "Share of them that lies between frames or beyond the ends of the sweep; none: 0.5, with a beam 0.",
         None,
         low=0.0,
         high=1.0,
