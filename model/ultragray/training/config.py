@@ -149,8 +149,8 @@ class TrainingConfig(Contract):
         high=1.0,
     )
     absorption_penalty: float = described(
-        "λ of λ·mean(1 − T): the grey value by which a pixel must gain from what absorbs above it.",
-        3e-3,
+        "λ of λ·mean(1 − T) where frames show no shadow: by so much a pixel must gain from what absorbs above it.",
+        3e-2,
         low=0.0,
         high=100.0,
     )

@@ -52,6 +52,7 @@ def required_bytes(dataset: Dataset, config: TrainingConfig) -> int:
     beginning = max(comparison_bytes(dataset, config), shadows)
     slices = frames * -(-config.max_gaussians // LIST_GAUSSIANS) * LIST_BYTES  # as if all touched all planes
     copies = 3 if config.confidence else 2  # the dataset's, the trainer's and that of the frames it calibrates with
+    copies += bool(config.transmittance and config.absorption_penalty)  # a byte says whether a pixel is in a shadow
     images = copies * dataset.train.images.nbytes + dataset.val.images.nbytes
     return BASE_BYTES + _gaussian_bytes(config) + slices + max(stepping, measuring, beginning) + images
 
@@ -63,7 +64,8 @@ def required_device_bytes(dataset: Dataset, config: TrainingConfig) -> int:
     per_frame = config.max_gaussians * CUDA_SLICE_BYTES + 4 * CUDA_PLANES * height * width
     stepping = config.batch_size * (per_frame + 4 * CUDA_LOSS_FLOATS * height * width)
     measuring = min(len(dataset.val), frames_at_once(height, width)) * per_frame
-    return CUDA_BASE_BYTES + _gaussian_bytes(config) + max(stepping, measuring) + dataset.train.images.nbytes
+    images = 2 * dataset.train.images.nbytes  # they, and which of their pixels lie in a shadow
+    return CUDA_BASE_BYTES + _gaussian_bytes(config) + max(stepping, measuring) + images
 
 
 def _gaussian_bytes(config: TrainingConfig) -> int:

@@ -40,6 +40,7 @@ from .data.geometry import Geometry
 from .data.initial import initial_parameters
 from .data.neighbours import neighbours_of
 from .data.sampling import BatchSampler, out_of_plane_shift_mm, shift_out_of_plane
+from .data.shadows import Shadows
 from .device import forget_peak_memory, peak_memory_mb, training_device
 from .memory import check_comparison_memory, check_memory
 from .poses.refinement import PoseRefinement
@@ -189,7 +190,11 @@ class Trainer:
         self._val_psnr_db: float | None = None
         self._val_step: int | None = None
         self._peak_memory_mb: float | None = None
-        start = initial_parameters(dataset, neighbours, self._geometry, config, self._generator)
+        shadows = Shadows(dataset.train) if config.transmittance else None
+        start = initial_parameters(dataset, neighbours, shadows, self._geometry, config, self._generator)
+        self._shadowed: Tensor | None = None  # [F, H, W] pixels in which absorption has no price
+        if shadows is not None and config.absorption_penalty:
+            self._shadowed = torch.from_numpy(shadows.pixels()).to(self._device)
         self._begin_with(start.parameters, start.floor)
         self._backend = choose_backend(backend, self._view(sh_degree=0))
 
@@ -303,19 +308,21 @@ class Trainer:
     def take_step(self) -> float:
         """One batch, one update, and the refinement that is due after it; returns the loss."""
         batch = self._sampler.next_batch()
-        poses = self.dataset.train.poses[batch.numpy()]
+        poses, sides = self.dataset.train.poses[batch.numpy()], batch[:, None].expand(-1, 2)
         truth = self._images[cuda.upload(batch, self._device)].float().div_(255.0)
         if self._between_count:
             between = self._views_between.draw(self._between_count, self._generator)
-            batch, poses = torch.cat([batch, between.nearer]), np.concatenate([poses, between.poses])
+            batch = torch.cat([batch, torch.from_numpy(between.places.nearer)])
+            sides = torch.cat([sides, torch.from_numpy(between.places.frames)])
+            poses = np.concatenate([poses, between.poses])
         if self.config.out_of_plane_mm:
             poses = shift_out_of_plane(poses, out_of_plane_shift_mm(self.config.out_of_plane_mm, self._generator))
         frames = self._rendered(self.refinement.corrected(batch, poses), self._schedule.sh_degree(self.step))
         if self._between_count:
             truth = torch.cat([truth, between.wanted(frames["bmode"][len(truth) :])])
         image = image_loss(frames["bmode"], truth, self.config.texture)
-        if self._has_absorption_penalty:
-            image = image + self.config.absorption_penalty * (1.0 - frames["transmittance"]).mean()
+        if self._shadowed is not None:
+            image = image + self._price_of_absorption(frames["transmittance"], self._shadowed, sides)
         image.backward()  # type: ignore[no-untyped-call]
         self.refinement.step(self.step / self._schedule.steps)
         with torch.no_grad():
@@ -347,14 +354,20 @@ class Trainer:
             poses,
             height=sweep.height,
             width=sweep.width,
-            outputs=("bmode", "transmittance") if self._has_absorption_penalty else ("bmode",),
+            outputs=("bmode",) if self._shadowed is None else ("bmode", "transmittance"),
             backend=self._backend,
             beam=self._beam.numbers,
         )
 
-    @property
-    def _has_absorption_penalty(self) -> bool:
-        return self.config.transmittance and self.config.absorption_penalty > 0.0
+    def _price_of_absorption(
+        self,
+        transmittance: Tensor,  # [C, H, W]
+        shadowed: Tensor,  # [F, H, W]
+        sides: Tensor,  # [C, 2] the frames on either side of each view
+    ) -> Tensor:  # scalar
+        """λ·mean(1 − T), in which pixels count 0 where one of these frames shows a shadow."""
+        is_free = shadowed[cuda.upload(sides, self._device)].any(dim=1)
+        return self.config.absorption_penalty * ((1.0 - transmittance) * ~is_free).mean()
 
     def _view(self, sh_degree: int) -> GaussianScene:
         """The parameters as a scene, without the checks of `from_splats`, which read every value."""

@@ -66,3 +66,17 @@ def test_darkness_that_is_no_shadow_is_not_explained_by_absorption(
     settings = {"steps": 150, "max_gaussians": 1500, "refinements": 0, "batch_size": 8, "confidence": False}
     scene = train(dataset, tiny_config(**settings))
     assert render_sweep(scene, dataset.train, output="transmittance").mean() > 0.9
+
+
+def test_absorption_costs_nothing_where_frames_show_a_shadow(tiny_dataset: Datasets, tiny_config: Configs) -> None:
+    dataset = tiny_dataset(frames=16, height=60, width=48)
+    speckle = np.random.default_rng(0).gamma(4.0, 22.0, (len(dataset.train), 60, 48))
+    speckle[:, 18:22, 15:30] = 230.0
+    speckle[:, 22:, 15:30] /= 20.0
+    images = np.clip(speckle, 0, 255).astype(np.uint8)
+    dataset = replace(dataset, train=replace(dataset.train, images=images), val=dataset.val.select([]))
+    settings = {"steps": 150, "max_gaussians": 1500, "refinements": 0, "batch_size": 8, "confidence": False}
+    scene = train(dataset, tiny_config(**settings, absorption_penalty=1.0))
+    transmittance = render_sweep(scene, dataset.train, output="transmittance")
+    assert transmittance[:, 35:, 18:27].mean() < 0.3
+    assert transmittance[:, :, 38:].mean() > 0.97

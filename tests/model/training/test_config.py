@@ -78,7 +78,9 @@ def test_a_step_has_whole_views_between_frames_and_one_frame_at_least(tiny_datas
 
 
 def test_an_unknown_setting_is_refused_with_the_known_ones() -> None:
-    with pytest.raises(InvalidArgument, match=r"no setting stepz; it has steps, effort, batch_size, .*, memory_gb") as caught:
+    with pytest.raises(
+        InvalidArgument, match=r"no setting stepz; it has steps, effort, batch_size, .*, memory_gb"
+    ) as caught:
         TrainingConfig.preset("fast", stepz=3)
     assert caught.value.field == "stepz"
 

@@ -78,7 +78,7 @@ def draw_places(neighbours: Neighbours, count: int, generator: torch.Generator) 
 class Views(NamedTuple):
     """V views as a training takes them."""
 
-    nearer: Tensor  # [V] place of the frame that lies nearer
+    places: Places
     poses: FloatArray  # [V, 4, 4] mm
     images: Tensor  # [V, H, W] in [0, 1]
     trust: Tensor  # [V, H, W] in [0, 1], by how far the two frames agree
@@ -105,7 +105,7 @@ class ViewsBetween:
         blend = self._blend(places)
         relative = _smooth(blend.differences) / (DOUBTFUL * self._usual).clamp(min=EXACT)
         trust = 1.0 / (1.0 + relative.square())
-        return Views(torch.from_numpy(places.nearer), places.poses(self._sweep), blend.images, trust)
+        return Views(places, places.poses(self._sweep), blend.images, trust)
 
     def _blend(self, places: Places) -> Blend:
         frames = cuda.upload(torch.from_numpy(places.frames), self._images.device)

@@ -38,7 +38,12 @@ class Start(NamedTuple):
 
 
 def initial_parameters(
-    dataset: Dataset, neighbours: Neighbours, geometry: Geometry, config: TrainingConfig, generator: torch.Generator
+    dataset: Dataset,
+    neighbours: Neighbours,
+    shadows: Shadows | None,  # None: nothing absorbs
+    geometry: Geometry,
+    config: TrainingConfig,
+    generator: torch.Generator,
 ) -> Start:
     """The start, float32, drawn with `generator` alone; `config` leaves nothing open.
 
@@ -62,7 +67,7 @@ def initial_parameters(
         means = (2.0 * torch.rand((count, 3), generator=generator) - 1.0) * RELEASED_CUBE * geometry.scene_scale_cm
         brightness = torch.full((count,), RELEASED_INTENSITY)
     else:
-        pixels = _on_planes(dataset, neighbours, count, config.transmittance, generator)
+        pixels = _on_planes(dataset, neighbours, count, shadows, generator)
         means = torch.from_numpy((pixels.points_mm - geometry.centre_mm) / 10.0).float()
         brightness = torch.from_numpy(pixels.brightness).float()
         floor = config.intensity_floor * torch.from_numpy(pixels.unshadowed).float()
@@ -95,7 +100,7 @@ class _Pixels(NamedTuple):
 
 
 def _on_planes(
-    dataset: Dataset, neighbours: Neighbours, count: int, shadows: bool, generator: torch.Generator
+    dataset: Dataset, neighbours: Neighbours, count: int, shadows: Shadows | None, generator: torch.Generator
 ) -> _Pixels:
     sweep, probe = dataset.train, dataset.probe
     places = draw_places(neighbours, count, generator)
@@ -105,9 +110,8 @@ def _on_planes(
     tracked_mm = np.einsum("nij,nj->ni", poses[:, :3, :3], points_mm) + poses[:, :3, 3]
     rows, columns = (deep * sweep.height).astype(np.int64), (across * sweep.width).astype(np.int64)
     brightness, unshadowed = np.zeros((2, 2, count))  # [2, N] each, of the two frames
-    evidence = Shadows(sweep) if shadows else None
     for frame in np.unique(places.frames):
-        beam = evidence.of(frame) if evidence is not None else None
+        beam = shadows.of(frame) if shadows is not None else None
         for side in (0, 1):
             (own,) = np.nonzero(places.frames[:, side] == frame)
             pixels = rows[own], columns[own]

@@ -68,6 +68,10 @@ class Shadows:
         echo = np.where(left < SPENT, 1.0, np.minimum(relative[0] / np.maximum(left, SPENT), 1.0))
         return Beam(left, (self._usual[:, None] * echo).astype(np.float32))
 
+    def pixels(self) -> npt.NDArray[np.bool_]:  # [F, H, W]
+        """Which pixels of all frames lie in a shadow."""
+        return np.stack([self.of(place).is_shadowed for place in range(len(self._sweep))])
+
     def _smooth(self, place: int) -> FloatImage:  # [H, W]
         sigmas = [max(0.5, mm / pixel) for mm, pixel in zip(SMOOTHING_MM, (self._lateral, self._axial), strict=True)]
         image = self._sweep.images[place] / np.float32(255.0)

@@ -67,7 +67,6 @@ def test_frames_that_will_reach_more_are_told_more() -> None:
 
 
 @pytest.mark.long
-@pytest.mark.xfail(strict=True, reason="0.101 since training sees views beyond the ends: the model is to follow them")
 def test_it_tells_what_frames_will_reach() -> None:
     told, actual = told_and_actual()
     assert np.abs(told - actual).mean() < 0.1

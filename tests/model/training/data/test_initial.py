@@ -17,13 +17,15 @@ from ultragray.training import TrainingConfig
 from ultragray.training.data.geometry import Geometry
 from ultragray.training.data.initial import Start, initial_parameters
 from ultragray.training.data.neighbours import neighbours_of
+from ultragray.training.data.shadows import Shadows
 from ultragray.training.steps.refinement import rotate
 
 
 def whole_start_of(dataset: Dataset, config: TrainingConfig) -> Start:
     geometry, neighbours = Geometry.of(dataset), neighbours_of(dataset.train)
+    shadows = Shadows(dataset.train) if config.transmittance else None
     generator = torch.Generator().manual_seed(3)
-    return initial_parameters(dataset, neighbours, geometry, config.resolved(geometry), generator)
+    return initial_parameters(dataset, neighbours, shadows, geometry, config.resolved(geometry), generator)
 
 
 def start_of(dataset: Dataset, config: TrainingConfig) -> dict[str, torch.Tensor]:
