@@ -17,7 +17,7 @@ ARGS ?=
 MINUTES ?= 30
 
 .DEFAULT_GOAL := help
-.PHONY: ALWAYS help serve console test test-fast test-long test-console test-faults test-fuzz test-soak test-overload check check-lint check-types check-generated check-web format bench bench-console bench-cuda results ablations demo-scene generate clean
+.PHONY: ALWAYS help serve console test test-fast test-long test-console test-faults test-fuzz test-soak test-overload check check-lint check-types check-generated check-web format bench bench-console bench-cuda results ablations poses demo-scene generate clean
 
 help:  ## say what there is
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
@@ -100,6 +100,9 @@ results: $(VENV)/installed  ## train on every data set of DATA and write docs/re
 ablations: $(VENV)/installed  ## train without each part of the training, three seeds each, and write docs/results.md; takes an hour
 	$(BIN)/python benchmarks/ablations.py $(DATA) $(ARGS)
 	$(BIN)/python benchmarks/results_tables.py $(DATA) --only
+
+poses: $(VENV)/installed  ## train with errors added to poses, with and without refinement, and write docs/poses.md; takes half an hour
+	$(BIN)/python benchmarks/poses.py $(DATA) $(ARGS)
 
 demo-scene: $(VENV)/installed  ## simulate the phantom, train the demo scene from it and put it in its place
 	$(BIN)/python -m ultragray.demo.make

@@ -10,6 +10,7 @@ import torch
 from ultragray.machine import processor_name
 
 FOLDER = Path(__file__).resolve().parent
+CHANGED = "-dirty"
 
 
 def origin() -> dict[str, str]:
@@ -23,4 +24,9 @@ def model_commit() -> str:
         subprocess.run(["git", "-C", str(FOLDER), *words, "--", "../model"], check=True, capture_output=True, text=True)
         for words in (("log", "-1", "--format=%h"), ("status", "--porcelain"))
     )
-    return commit.stdout.strip() + ("-dirty" if changed.stdout else "")
+    return commit.stdout.strip() + (CHANGED if changed.stdout else "")
+
+
+def is_clean(commit: str) -> bool:
+    """Whether `model_commit` gave this of a model as it was committed."""
+    return not commit.endswith(CHANGED)

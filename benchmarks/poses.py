@@ -1,4 +1,4 @@
-"""What pose refinement takes off errors that were added to the training poses of recorded sets.
+"""Pose refinement of recorded sets whose training poses were given errors.
 
     python benchmarks/poses.py DATA_FOLDER [--only NAME ...] [--seeds N]
 
@@ -148,7 +148,7 @@ def table(figures: dict[str, Any]) -> Iterator[str]:
         added_mm, added_deg, left_mm, left_deg = (
             float(np.mean([run[which][unit] for run in runs])) for which in ("added", "left") for unit in ("mm", "deg")
         )
-        removed = f"{1 - left_mm / added_mm:.0%}, {1 - left_deg / added_deg:.0%}" if added_mm else ""
+        removed = f"{1 - left_mm / added_mm:.0%}, {1 - left_deg / added_deg:.0%}" if error != RECORDED else ""
         seeds = f" ({len(runs)} seeds)" if len(runs) > 1 else ""
         yield f"| {name} | {error}{seeds} | {' | '.join(scores)} | {left_mm:.2f} mm, {left_deg:.2f}° | {removed} |"
     yield ""

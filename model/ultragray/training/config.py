@@ -144,7 +144,7 @@ class TrainingConfig(Contract):
     texture: float = described(
         "Share of structural dissimilarity in the loss, the rest is L1: less for the mean of what speckle may be and a "
         "better PSNR, more for its texture and a better MS-SSIM.",
-        0.25,
+        0.2,
         low=0.0,
         high=1.0,
     )

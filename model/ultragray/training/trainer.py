@@ -178,9 +178,9 @@ class Trainer:
         neighbours = neighbours_of(dataset.train)
         if not config.views_between:
             neighbours = neighbours.without_ends()  # nothing would train what begins there
-        self._views_between = ViewsBetween(dataset.train, neighbours, self._images)
         assert config.views_between is not None
         self._between_count = round(config.views_between * config.batch_size)
+        self._views_between = ViewsBetween(dataset.train, neighbours, self._images) if self._between_count else None
         self._sampler = BatchSampler(len(dataset.train), config.batch_size - self._between_count, self._generator)
         self._batch_size = self._sampler.batch_size + self._between_count
         self._schedule = Schedule(config, scene_scale_cm=self._geometry.scene_scale_cm, batch_size=self._batch_size)
@@ -190,7 +190,8 @@ class Trainer:
         self._val_psnr_db: float | None = None
         self._val_step: int | None = None
         self._peak_memory_mb: float | None = None
-        shadows = Shadows(dataset.train) if config.transmittance else None
+        needs_shadows = config.transmittance and (config.start == "informed" or config.absorption_penalty > 0.0)
+        shadows = Shadows(dataset.train) if needs_shadows else None
         start = initial_parameters(dataset, neighbours, shadows, self._geometry, config, self._generator)
         self._shadowed: Tensor | None = None  # [F, H, W] pixels in which absorption has no price
         if shadows is not None and config.absorption_penalty:
@@ -308,21 +309,23 @@ class Trainer:
     def take_step(self) -> float:
         """One batch, one update, and the refinement that is due after it; returns the loss."""
         batch = self._sampler.next_batch()
-        poses, sides = self.dataset.train.poses[batch.numpy()], batch[:, None].expand(-1, 2)
+        poses, neighbours = self.dataset.train.poses[batch.numpy()], batch[:, None].expand(-1, 2)
         truth = self._images[cuda.upload(batch, self._device)].float().div_(255.0)
-        if self._between_count:
+        if self._views_between is not None:
             between = self._views_between.draw(self._between_count, self._generator)
             batch = torch.cat([batch, torch.from_numpy(between.places.nearer)])
-            sides = torch.cat([sides, torch.from_numpy(between.places.frames)])
+            neighbours = torch.cat([neighbours, torch.from_numpy(between.places.frames)])
             poses = np.concatenate([poses, between.poses])
         if self.config.out_of_plane_mm:
             poses = shift_out_of_plane(poses, out_of_plane_shift_mm(self.config.out_of_plane_mm, self._generator))
         frames = self._rendered(self.refinement.corrected(batch, poses), self._schedule.sh_degree(self.step))
-        if self._between_count:
-            truth = torch.cat([truth, between.wanted(frames["bmode"][len(truth) :])])
-        image = image_loss(frames["bmode"], truth, self.config.texture)
+        rendered = frames["bmode"]
+        if self._views_between is not None:
+            own, others = rendered[: len(truth)], rendered[len(truth) :]
+            rendered, truth = torch.cat([own, between.weighted(others)]), torch.cat([truth, between.images])
+        image = image_loss(rendered, truth, self.config.texture)
         if self._shadowed is not None:
-            image = image + self._price_of_absorption(frames["transmittance"], self._shadowed, sides)
+            image = image + self._price_of_absorption(frames["transmittance"], self._shadowed, neighbours)
         image.backward()  # type: ignore[no-untyped-call]
         self.refinement.step(self.step / self._schedule.steps)
         with torch.no_grad():
@@ -363,10 +366,10 @@ class Trainer:
         self,
         transmittance: Tensor,  # [C, H, W]
         shadowed: Tensor,  # [F, H, W]
-        sides: Tensor,  # [C, 2] the frames on either side of each view
+        neighbours: Tensor,  # [C, 2] the frames on either side of each view
     ) -> Tensor:  # scalar
         """λ·mean(1 − T), in which pixels count 0 where one of these frames shows a shadow."""
-        is_free = shadowed[cuda.upload(sides, self._device)].any(dim=1)
+        is_free = shadowed[cuda.upload(neighbours, self._device)].any(dim=1)
         return self.config.absorption_penalty * ((1.0 - transmittance) * ~is_free).mean()
 
     def _view(self, sh_degree: int) -> GaussianScene:

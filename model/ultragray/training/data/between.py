@@ -25,8 +25,8 @@ from .blending import Blend, blend_by_pixel, blend_in_space
 from .neighbours import Neighbours
 
 EXACT = 1e-9  # a squared error that counts as none
-PREDICTED_FRAMES = 32  # enough to tell which blend is better, and how much frames usually differ
-DOUBTFUL = 0.5  # times the usual difference of frames: there a blend counts half
+PREDICTED_FRAMES = 32  # enough to tell which blend is better
+DOUBTFUL = 4.0  # times the mean difference of two frames: there their blend counts half
 SMOOTHED = 11  # pixels, over which differences are averaged
 
 
@@ -42,10 +42,6 @@ class Places:
     def nearer(self) -> IntArray:  # [V]
         """The frame that lies nearer."""
         return np.where(self.shares > 0.5, self.frames[:, 1], self.frames[:, 0])
-
-    def at(self, some: slice) -> Places:
-        """Some of them."""
-        return Places(self.frames[some], self.shares[some], self.beyond_mm[some])
 
     def poses(self, sweep: Sweep) -> FloatArray:  # [V, 4, 4] mm
         """The middles of the images on a straight line, the rotations on the shortest way."""
@@ -81,11 +77,11 @@ class Views(NamedTuple):
     places: Places
     poses: FloatArray  # [V, 4, 4] mm
     images: Tensor  # [V, H, W] in [0, 1]
-    trust: Tensor  # [V, H, W] in [0, 1], by how far the two frames agree
+    weights: Tensor  # [V, H, W] in [0, 1], by how far the two frames agree
 
-    def wanted(self, rendered: Tensor) -> Tensor:  # [V, H, W] -> [V, H, W]
-        """What a rendering is to become: the images where they are trusted, where not it may stay as it is."""
-        return torch.lerp(rendered.detach(), self.images, self.trust)
+    def weighted(self, rendered: Tensor) -> Tensor:  # [V, H, W] -> [V, H, W]
+        """A rendering to be compared with the images: mixed with them, so that it counts as much as the weights say."""
+        return torch.lerp(self.images, rendered, self.weights)
 
 
 class ViewsBetween:
@@ -95,32 +91,32 @@ class ViewsBetween:
         """`images` are those of the sweep, on the device of the training."""
         self._sweep, self._neighbours, self._images = sweep, neighbours, images
         self.follow_probe = features_follow_probe(sweep, neighbours)
-        some = draw_places(neighbours, PREDICTED_FRAMES, torch.Generator().manual_seed(0))
-        blends = [self._blend(some.at(slice(place, place + 1))) for place in range(PREDICTED_FRAMES)]
-        self._usual = torch.stack([_smooth(blend.differences).mean() for blend in blends]).mean()
 
     def draw(self, count: int, generator: torch.Generator) -> Views:
-        """New ones, by `draw_places`."""
+        """`count` views at places drawn by `draw_places`."""
         places = draw_places(self._neighbours, count, generator)
         blend = self._blend(places)
-        relative = _smooth(blend.differences) / (DOUBTFUL * self._usual).clamp(min=EXACT)
-        trust = 1.0 / (1.0 + relative.square())
-        return Views(places, places.poses(self._sweep), blend.images, trust)
+        differences = _smooth(blend.differences)
+        usual = differences.mean(dim=(1, 2), keepdim=True).clamp(min=EXACT)  # the farther the frames, the more
+        weights = blend.is_seen / (1.0 + (differences / (DOUBTFUL * usual)).square())
+        return Views(places, places.poses(self._sweep), blend.images, weights)
 
     def _blend(self, places: Places) -> Blend:
         frames = cuda.upload(torch.from_numpy(places.frames), self._images.device)
-        sides = self._images[frames].float().div_(255.0)  # [V, 2, H, W]
+        images = self._images[frames].float().div_(255.0)  # [V, 2, H, W]
         if self.follow_probe:
-            return blend_by_pixel(sides, places.shares)
+            return blend_by_pixel(images, places.shares)
         sweep = self._sweep
-        return blend_in_space(sides, sweep.poses[places.frames], places.poses(sweep), sweep.probe)
+        return blend_in_space(images, sweep.poses[places.frames], places.poses(sweep), sweep.probe)
 
 
 def _smooth(differences: Tensor) -> Tensor:  # [V, H, W] -> [V, H, W]
     """Size of the differences without speckle, which always differs."""
     half = SMOOTHED // 2
-    down = functional.avg_pool2d(differences[:, None], (SMOOTHED, 1), stride=1, padding=(half, 0))
-    return functional.avg_pool2d(down, (1, SMOOTHED), stride=1, padding=(0, half))[:, 0].abs()
+    down = functional.avg_pool2d(
+        differences[:, None], (SMOOTHED, 1), stride=1, padding=(half, 0), count_include_pad=False
+    )
+    return functional.avg_pool2d(down, (1, SMOOTHED), stride=1, padding=(0, half), count_include_pad=False)[:, 0].abs()
 
 
 def features_follow_probe(sweep: Sweep, neighbours: Neighbours) -> bool:

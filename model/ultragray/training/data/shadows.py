@@ -70,7 +70,10 @@ class Shadows:
 
     def pixels(self) -> npt.NDArray[np.bool_]:  # [F, H, W]
         """Which pixels of all frames lie in a shadow."""
-        return np.stack([self.of(place).is_shadowed for place in range(len(self._sweep))])
+        found = np.empty(self._sweep.images.shape, bool)
+        for place, pixels in enumerate(found):
+            pixels[:] = self.of(place).is_shadowed
+        return found
 
     def _smooth(self, place: int) -> FloatImage:  # [H, W]
         sigmas = [max(0.5, mm / pixel) for mm, pixel in zip(SMOOTHING_MM, (self._lateral, self._axial), strict=True)]

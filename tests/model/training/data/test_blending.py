@@ -9,14 +9,16 @@ import torch
 from ultragray.datasets.sweep import Sweep
 from ultragray.evaluation.baselines import interpolate_planes
 from ultragray.pose import pose_from_position_quaternion
-from ultragray.probe import ConvexProbe, FloatArray, LinearProbe, Probe, RadialProbe
+from ultragray.probe import ConvexProbe, FloatArray, LinearProbe, PhasedProbe, Probe, RadialProbe, SteeredProbe
 from ultragray.training.data.blending import blend_in_space
 
 SIZE = 48
 PROBES = (
     LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=30.0),
-    ConvexProbe(opening_angle_deg=60.0, near_mm=50.0, far_mm=90.0),
-    RadialProbe(near_mm=5.0, far_mm=30.0),
+    SteeredProbe(width_mm=40.0, steering_deg=15.0, near_mm=0.0, far_mm=30.0),
+    ConvexProbe(opening_angle_deg=60.0, near_mm=10.0, far_mm=90.0),
+    PhasedProbe(opening_angle_deg=80.0, far_mm=80.0),
+    RadialProbe(near_mm=1.0, far_mm=30.0),
 )
 
 
