@@ -160,7 +160,7 @@ describe("the image", () => {
       assert.ok(readFileSync(await download.path()).length > 1000);
       const words = await page.evaluate(() => globalThis.words);
       assert.deepEqual(words.filter(({ fits }) => !fits), []);
-      assert.match(words.map(({ text }) => text).join("\n"), /Simulated, not for diagnosis\.[^]*demo[^]*"quaternion"/);
+      assert.match(words.map(({ text }) => text).join("\n"), /Simulated, not for diagnosis\.[^]*demo[^]*slice 0\.0 mm[^]*"quaternion"/);
       assert.equal(words.find(({ text }) => text === "U").left, side === "left");
       await page.getByLabel("Flip").check();
       await page.locator('[data-testid="orientation-marker"][data-side="right"]').waitFor();

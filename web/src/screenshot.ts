@@ -29,7 +29,8 @@ export async function screenshot(
   const context = canvas.getContext("2d");
   if (context === null) throw new Error("The browser cannot draw the screenshot.");
   context.font = FONT;
-  const words = `Simulated, not for diagnosis.   ${header.scene}   ${new Date().toISOString()}   depth in cm`;
+  const slice = `slice ${header.slice_thickness_mm.toFixed(1)} mm`;
+  const words = `Simulated, not for diagnosis.   ${header.scene}   ${new Date().toISOString()}   ${slice}   depth in cm`;
   const lines = [words.split("   "), poseJson(header.pose.flat()).split(/(?<=,)/)].flatMap((pieces, index) =>
     wrapped(context, pieces, index === 0 ? "   " : "", width + MARGINS.right),
   );
