@@ -14,7 +14,7 @@ const { outputFiles } = buildSync({
   format: "esm",
   write: false,
 });
-const { areAllAround, areUpright, boxOf, isShown, pixelAt, placedOn, pointAt } = await import(
+const { areAllAround, areUpright, boxOf, isShown, outline, pixelAt, placedOn, pointAt } = await import(
   `data:text/javascript,${encodeURIComponent(outputFiles[0].text)}`
 );
 
@@ -30,6 +30,11 @@ const PLANES = {
 };
 const FRAME = { height: 200, width: 128 };
 const picture = { column_unit: "mm", first: [0, 0], step: [1, 1] };
+const isWithin = (corners, [x, y]) =>
+  corners.filter(([x0, y0], i) => {
+    const [x1, y1] = corners.at(i - 1);
+    return y0 > y !== y1 > y && x < x0 + ((y - y0) / (y1 - y0)) * (x1 - x0);
+  }).length % 2 === 1;
 const near = (a, b, most) => assert.ok(Math.abs(a - b) <= most, `${a} is not ${b}`);
 
 describe("a frame as it is stored", () => {
@@ -47,6 +52,7 @@ describe("a frame as it is stored", () => {
         const corner = pointAt(placed, -0.5, FRAME.height - 0.5); // the end of half of the first line
         near(corner.x_mm, (x0 + x1) / 2, 1e-9);
         near(corner.z_mm, (z0 + z1) / 2, 1e-9);
+        assert.equal(outline(placed), null);
       }
     });
 });
@@ -59,7 +65,10 @@ describe("a picture of square pixels", () => {
     const sized = { picture: { column_unit: "mm", first: [left + 0.05, top + 0.05], step }, width: 400, height: (end_mm - top) / 0.1 };
     const placed = placedOn({ lines_mm, face_depth_mm: 0, pivot_depth_mm: 0 }, sized, null);
     const { column, row } = pixelAt(placed, { x_mm, z_mm });
-    return isShown(placed, column, row);
+    const shown = isShown(placed, column, row);
+    const at = [(column + 0.5) / placed.width, (row + 0.5) / placed.height];
+    assert.equal(isWithin(outline(placed), at), shown, `the outline at ${x_mm}, ${z_mm}`);
+    return shown;
   };
 
   it("shows a fan and leaves its corners", () => {

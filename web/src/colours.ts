@@ -29,7 +29,18 @@ const STOPS = {
     [120, 178, 190],
     [40, 120, 160],
   ],
+  uncertainty: [
+    [16, 20, 28],
+    [66, 44, 50],
+    [128, 66, 50],
+    [190, 100, 44],
+    [232, 152, 60],
+    [255, 224, 140],
+  ],
 } satisfies Record<string, Colour[]>;
+
+/** The share at which the colours of a map end, where it hardly ever shows more. */
+const ENDS: Record<string, number> = { attenuation: 0.4, uncertainty: 0.3 };
 
 /** Of labels from 1 on; 0 is nothing. */
 const CATEGORIES: Colour[] = [
@@ -46,6 +57,10 @@ const CATEGORIES: Colour[] = [
 /** Whether values of that name have a ramp of their own. */
 export function isRamp(name: string): name is Ramp {
   return name in STOPS;
+}
+
+export function endOf(name: string): number {
+  return ENDS[name] ?? 1;
 }
 
 /** The colour of a share of a ramp, 0 to 1. */

@@ -71,6 +71,16 @@ export function isShown(placed: Placed, column: number, row: number): boolean {
   return across >= 0 && across <= 1 && along >= 0 && along <= 1;
 }
 
+/** The polygon in which a picture shows something, in shares of its width and height; null: all of it. */
+export function outline(placed: Placed): [number, number][] | null {
+  if (placed.isStored) return null;
+  const ends = placed.lines.map(([x0, z0, x1, z1]) => [{ x_mm: x0, z_mm: z0 }, { x_mm: x1, z_mm: z1 }] as const);
+  return [...ends.map(([near]) => near), ...ends.map(([, far]) => far).reverse()].map((point) => {
+    const { column, row } = pixelAt(placed, point);
+    return [(column + 0.5) / placed.width, (row + 0.5) / placed.height];
+  });
+}
+
 /** Depth below the face, as a scanner counts it: along z, of a fan as it is stored along the scan line. */
 export function depthAtRow({ picture, zero_mm }: Placed, row: number): number {
   return picture.first[1] + picture.step[1] * row - zero_mm;
