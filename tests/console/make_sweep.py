@@ -1,7 +1,8 @@
-"""What the tests of the console upload: writes sweep.zip, broken.zip and compared.ugr into the folder it is given.
+"""What the tests of the console upload: writes sweep.zip, broken.zip, compared.ugr and refined.ugr into a folder.
 
 sweep.zip is a small sweep over the demo scene (28 training and 5 held-out frames of 64x64), broken.zip the same with a
-pose that is none, compared.ugr the demo scene as if it were trained from that sweep.
+pose that is none, compared.ugr the demo scene as if it were trained from that sweep, refined.ugr the demo scene as if
+it were trained with a beam, corrected poses and an uncertainty.
 """
 
 from __future__ import annotations
@@ -14,7 +15,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ultragray import LinearProbe, render
+from ultragray import ElevationBeam, GaussianScene, LinearProbe, render
+from ultragray.confidence import ConfidenceModel
+from ultragray.confidence.uncertainty import DEPTHS, TERMS, DepthBands, Uncertainty
 from ultragray.datasets import Dataset, Sweep
 from ultragray.datasets.released import write_released
 from ultragray.datasets.source import load_dataset
@@ -23,11 +26,15 @@ from ultragray.demo import demo_poses, load_demo_scene
 SIDE = 64
 PROBE = LinearProbe(width_mm=60.0, near_mm=0.0, far_mm=60.0)
 HELD_OUT_EVERY, BROKEN_FRAME = 7, 5
+BEAM_MM = 3.27  # no step of a slider
+SHIFT_MM = 0.01  # of each training pose more than of the one before
+VARIANCES = {"floor": 1.0, "level": 0.1, "gap 1 mm": 0.6, "beyond": 0.4}
 
 
 def main(folder: Path) -> None:
     torch.set_num_threads(1)
     scene = load_demo_scene()
+    refined(scene).save(folder / "refined.ugr")
     poses = demo_poses(33)
     rendered = render(scene, PROBE, poses, height=SIDE, width=SIDE, outputs=("bmode",)).bmode
     assert rendered is not None
@@ -45,6 +52,17 @@ def main(folder: Path) -> None:
     broken[BROKEN_FRAME, 0, 0] = np.nan
     np.save(files / "poses_train.npy", broken)
     pack(files, folder / "broken.zip")
+
+
+def refined(scene: GaussianScene) -> GaussianScene:
+    count = len(scene.training_poses)
+    corrections = np.tile(np.eye(4), (count, 1, 1))
+    corrections[:, 0, 3] = SHIFT_MM * np.arange(count)
+    bands = DepthBands((0.3,) * DEPTHS, (0.04,) * DEPTHS)
+    uncertainty = Uncertainty(tuple(VARIANCES.get(name, 0.0) for name in TERMS), bands)
+    confidence = ConfidenceModel((3.5, 1.2, 0.8, 0.1, 0.6), 0.06, (0.0,) * count, 20, 0.04, uncertainty=uncertainty)
+    info = replace(scene.info, beam=ElevationBeam(BEAM_MM), confidence=confidence.to_dict())
+    return replace(scene, info=info, pose_corrections=corrections)
 
 
 def pack(files: Path, path: Path) -> None:

@@ -7,7 +7,7 @@ import path from "node:path";
 
 import { PYTHON, ROOT, SOURCES } from "./harness.mjs";
 
-/** A folder with sweep.zip, broken.zip and compared.ugr; `remove` when done. */
+/** A folder with sweep.zip, broken.zip, compared.ugr and refined.ugr; `remove` when done. */
 export function makeSweep() {
   const folder = mkdtempSync(path.join(tmpdir(), "ultragray-sweep-"));
   execFileSync(PYTHON, [path.join(ROOT, "tests/console/make_sweep.py"), folder], {
@@ -17,6 +17,7 @@ export function makeSweep() {
     sweep: path.join(folder, "sweep.zip"),
     broken: path.join(folder, "broken.zip"),
     compared: path.join(folder, "compared.ugr"),
+    refined: path.join(folder, "refined.ugr"),
     remove: () => rmSync(folder, { recursive: true, force: true }),
   };
 }
