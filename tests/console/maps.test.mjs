@@ -4,6 +4,7 @@ import assert from "node:assert/strict";
 import { describe, it } from "node:test";
 
 import { canvasState, openPage, picture, seriousFindings, until } from "./harness.mjs";
+import { openScan } from "./scan_page.mjs";
 import { tested } from "./tested.mjs";
 
 const SIDE = 256; // of the frames of the demo scene
@@ -71,7 +72,7 @@ describe("maps", () => {
   });
 
   it("shows B-mode as the product of its neighbours whatever gain Scan has, and nothing beside a fan", async () => {
-    const page = await openPage(at, "#/scan/demo");
+    const { page } = await openScan(at); // a probe that is chosen before the scene is known is not kept
     await page.getByLabel("Gain", { exact: true }).fill("12");
     await page.getByRole("combobox", { name: "Probe" }).selectOption("convex");
     await page.getByRole("link", { name: "Maps", exact: true }).click();
