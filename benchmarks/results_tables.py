@@ -1,4 +1,4 @@
-"""Trains and measures on tracked and simulated sweeps and writes docs/results.md: what `make results` runs.
+"""Trains and measures on tracked and simulated sweeps, writes docs/results.md and the README's table: `make results`.
 
     python benchmarks/results_tables.py DATA_FOLDER [--only NAME ...]
 
@@ -12,7 +12,7 @@ import argparse
 import json
 import logging
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from enum import Enum
@@ -38,6 +38,8 @@ from ultragray.training import Progress, TrainingConfig
 
 FOLDER = Path(__file__).resolve().parent
 TABLES = FOLDER.parent / "docs" / "results.md"
+README = FOLDER.parent / "README.md"
+README_BEGINS, README_ENDS = "<!-- written by make results -->", "<!-- end -->"
 FIGURES = FOLDER / "results_tables.json"
 SECONDS_PER_LINE = 15.0
 THIRD, BAND_SPACINGS = 3, 10
@@ -49,6 +51,16 @@ ROW_NAMES = {
     "maximum": "maximum compounding",
     "linear": "linear between frames",
     "nearest": "nearest training frame",
+}
+
+README_ROWS = {
+    "ultranerf_liver": "simulated liver, two sweeps",
+    "ultranerf_liver_other_side": "the same, trained on one sweep, seen from the other",
+    "liver_convex": "human liver, convex probe",
+    "spine_phantom": "spine phantom, 17 frames",
+    "nwire_phantom": "N-wire phantom: bright dots in black",
+    "phantom": "built-in phantom, a tilt never trained on",
+    "robot": "a robot's sweep of it, with a band of 3.5 mm left out",
 }
 
 log = logging.getLogger("results")
@@ -107,6 +119,10 @@ def main() -> None:
             figures[run.name] = measure(run, arguments.data_folder)
             write_whole(arguments.figures, json.dumps(figures, indent=1, allow_nan=False) + "\n")
     write_whole(arguments.tables, tables(figures))
+    if arguments.tables == TABLES:
+        before, _, rest = README.read_text().partition(README_BEGINS)
+        _, _, after = rest.partition(README_ENDS)
+        write_whole(README, "\n".join([before + README_BEGINS, *readme_table(figures), README_ENDS + after]))
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -222,6 +238,20 @@ def tables(figures: Mapping[str, Any]) -> str:
         lines += _metrics_table(name, run)
     lines += ablations.section()
     return "\n".join(lines)
+
+
+def readme_table(figures: Mapping[str, Any]) -> Iterator[str]:
+    """The lines of the README's table."""
+    yield "| sweep | training time | PSNR, MS-SSIM, GMSD: scene | median compounding | linear between frames |"
+    yield "|---|---|---|---|---|"
+    runs = {label: figures[name] for name, label in README_ROWS.items() if name in figures}
+    for label, run in runs.items():
+        means = [run["metrics"][method]["mean"] for method in ("scene", "median", "linear")]
+        cells = [f"{mean['psnr_db']:.1f} dB, {mean['ms_ssim']:.3f}, {mean['gmsd']:.3f}" for mean in means]
+        yield f"| {label} | {run['total_s']:.0f} s | {' | '.join(cells)} |"
+    origins = sorted({f"commit {run['commit']} on {run['machine']}" for run in runs.values()})
+    yield ""
+    yield f"Measured at {'; '.join(origins)}."
 
 
 def _comparison(known: Mapping[str, Any]) -> list[str]:
