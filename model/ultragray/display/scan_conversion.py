@@ -67,7 +67,7 @@ def interpolated(frame: npt.NDArray[Any], rows: FloatArray, columns: FloatArray)
 def interpolated_frames(
     frames: npt.NDArray[Any], which: IntArray | int, rows: FloatArray, columns: FloatArray
 ) -> FloatArray:  # [F, H, W], [...] each -> [...]
-    """The same where each place is in a frame of its own, the one numbered `which`."""
+    """Frames between their pixels, each place in the frame whose number `which` gives."""
     _, height, width = frames.shape
     i, j = np.floor(rows).astype(np.intp), np.floor(columns).astype(np.intp)
     down, right = rows - i, columns - j

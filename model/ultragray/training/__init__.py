@@ -11,14 +11,14 @@ from .config import TrainingConfig
 from .progress import Progress
 
 if TYPE_CHECKING:
-    from .trainer import train
+    from .run import train
 
 __all__ = ["Progress", "TrainingConfig", "train"]
 
 
 def __getattr__(name: str) -> Any:
     if name == "train":
-        from .trainer import train
+        from .run import train
 
         globals()[name] = train
         return train

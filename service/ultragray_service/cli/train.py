@@ -138,7 +138,8 @@ def _config_of(run: RunOptions, given: Mapping[str, Any]) -> TrainingConfig:
 
 def _train(dataset: Any, config: TrainingConfig, run: RunOptions) -> None:
     from ultragray.training import train as train_scene
-    from ultragray.training.trainer import CHECKPOINT_FILE, scene_of_checkpoint
+    from ultragray.training.run import scene_of_checkpoint
+    from ultragray.training.trainer import CHECKPOINT_FILE
 
     started = time.monotonic()
     last: Progress | None = None

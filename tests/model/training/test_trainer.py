@@ -32,6 +32,7 @@ from ultragray.errors import (
 )
 from ultragray.training import Progress, TrainingConfig, train, trainer
 from ultragray.training.data.geometry import Geometry
+from ultragray.training.run import scene_of_checkpoint
 
 from ...waiting import Deadline
 
@@ -225,7 +226,7 @@ def test_divergence_keeps_the_last_good_checkpoint(
     monkeypatch.setattr(trainer, "image_loss", loss_that_breaks)
     with pytest.raises(TrainingDiverged, match="in step 6: the loss is nan; the last good checkpoint is kept"):
         train(tiny_dataset(), tiny_config(), folder=tmp_path, checkpoint_interval_s=0.0)
-    scene = trainer.scene_of_checkpoint(tiny_dataset(), tmp_path)
+    scene = scene_of_checkpoint(tiny_dataset(), tmp_path)
     assert scene.info.training["step"] == 5
 
 

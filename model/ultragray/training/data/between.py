@@ -25,7 +25,7 @@ from .blending import Blend, blend_by_pixel, blend_in_space
 from .neighbours import Neighbours
 
 EXACT = 1e-9  # a squared error that counts as none
-PREDICTED_FRAMES = 32  # enough to tell which blend is better
+TRIED_FRAMES = 32  # enough to tell which blend is better
 DOUBTFUL = 4.0  # times the mean difference of two frames: there their blend counts half
 SMOOTHED = 11  # pixels, over which differences are averaged
 
@@ -132,7 +132,7 @@ def features_follow_probe(sweep: Sweep, neighbours: Neighbours) -> bool:
         beside[second].append(first)
     gains = []
     frames = np.array([frame for frame, others in beside.items() if len(others) > 1])
-    for frame in frames[spread_places(len(frames), PREDICTED_FRAMES)]:
+    for frame in frames[spread_places(len(frames), TRIED_FRAMES)]:
         pose, others = sweep.poses[frame], np.array(beside[frame])
         ways = (sweep.corners_mm()[others] - sweep.corners_mm()[frame]) @ pose[:3, 1]  # [O, K]
         heights = ways.mean(axis=1)

@@ -75,7 +75,7 @@ class Corrections:
 
     def _motions(self, groups: Tensor) -> Tensor:  # [b] -> [b, 4, 4]
         twists, middles, axes = self._twists[groups] * self._ease, self._middles[groups], self._axes[groups]
-        rotations = rotations_of(torch.einsum("gij,gj->gi", axes, twists[:, :3]) / self._lever_mm)
+        rotations = turned_by(torch.einsum("gij,gj->gi", axes, twists[:, :3]) / self._lever_mm)
         shifts = middles - torch.einsum("gij,gj->gi", rotations, middles)
         shifts = shifts + torch.einsum("gij,gj->gi", axes, twists[:, 3:])
         upper = torch.cat([rotations, shifts[..., None]], dim=-1)
@@ -125,7 +125,7 @@ def _rate(done: float) -> float:  # mm a step
     return RATE * (0.0 if done < START else 1.0 - done)
 
 
-def rotations_of(turns: Tensor) -> Tensor:  # [G, 3] rad -> [G, 3, 3]
+def turned_by(turns: Tensor) -> Tensor:  # [G, 3] rad -> [G, 3, 3]
     """The rotations of turns, each an axis times an angle; differentiable, also at 0."""
     x, y, z = turns.unbind(-1)
     zero = torch.zeros_like(x)

@@ -16,7 +16,7 @@ from ultragray.datasets.sweep import Dataset, Sweep
 from ultragray.errors import TrainingDiverged
 from ultragray.evaluation.scoring import evaluate, render_sweep
 from ultragray.probe import FloatArray
-from ultragray.training import TrainingConfig, train, trainer
+from ultragray.training import TrainingConfig, run, train
 from ultragray.training.confidence.calibration import fit_confidence, shorter
 from ultragray.training.data.geometry import Geometry
 
@@ -148,7 +148,7 @@ def test_a_calibration_that_diverges_costs_no_scene(
     def diverge(*_: object, **__: object) -> None:
         raise TrainingDiverged("training diverged in step 3: the loss is nan")
 
-    monkeypatch.setattr(trainer, "fit_confidence", diverge)
+    monkeypatch.setattr(run, "fit_confidence", diverge)
     scene = train(tiny_dataset(frames=40), tiny_config())
     assert scene.info.confidence == {}
     assert "the scene gets no confidence: training diverged in step 3" in caplog.text

@@ -69,7 +69,7 @@ def angle_deg(rotation: np.ndarray) -> float:
 
 def test_no_turn_has_a_gradient() -> None:
     turns = torch.zeros((1, 3), dtype=torch.float64, requires_grad=True)
-    trained.rotations_of(turns)[0, 2, 1].backward()
+    trained.turned_by(turns)[0, 2, 1].backward()
     assert turns.grad is not None
     assert turns.grad.tolist() == [[1.0, 0.0, 0.0]]
 
