@@ -118,8 +118,14 @@ def main() -> None:
         if arguments.only is None or run.name in arguments.only:
             figures[run.name] = measure(run, arguments.data_folder)
             write_whole(arguments.figures, json.dumps(figures, indent=1, allow_nan=False) + "\n")
-    write_whole(arguments.tables, tables(figures))
-    if arguments.tables == TABLES:
+            write_pages(figures, arguments.tables)
+    write_pages(figures, arguments.tables)
+
+
+def write_pages(figures: Mapping[str, Any], page: Path) -> None:
+    """The page of tables and, where it is the one of the documents, the README's table."""
+    write_whole(page, tables(figures))
+    if page == TABLES:
         before, _, rest = README.read_text().partition(README_BEGINS)
         _, _, after = rest.partition(README_ENDS)
         write_whole(README, "\n".join([before + README_BEGINS, *readme_table(figures), README_ENDS + after]))

@@ -141,3 +141,33 @@ def test_each_run_is_compared_with_the_better_baseline(script: ModuleType) -> No
     }
     run = {"metrics": {name: {"mean": mean} for name, mean in means.items()}}
     assert script._comparison({"one": run})[-2] == "| one | +0.50 | -0.050 | +0.100 | -0.020 |"
+
+
+def test_the_readme_shows_the_runs_that_it_names(
+    script: ModuleType, monkeypatch: pytest.MonkeyPatch, data: Path
+) -> None:
+    readme = data / "README.md"
+    readme.write_text(f"before\n{script.README_BEGINS}\nold\n{script.README_ENDS}\nafter\n")
+    monkeypatch.setattr(script, "README", readme)
+    monkeypatch.setattr(script, "TABLES", data / "results.md")
+    monkeypatch.setattr(script, "README_ROWS", {"two": "a ball, the other half"})
+    run(script, monkeypatch, data, "--only", "two")
+    figures = json.loads((data / "figures.json").read_text())["two"]
+    before, begins, *rows, measured, ends, after = readme.read_text().splitlines()
+    assert (before, begins, ends, after) == ("before", script.README_BEGINS, script.README_ENDS, "after")
+    mean = figures["metrics"]["linear"]["mean"]
+    assert f"| a ball, the other half | {figures['total_s']:.0f} s |" in rows[2]
+    assert rows[2].endswith(f"{mean['psnr_db']:.1f} dB, {mean['ms_ssim']:.3f}, {mean['gmsd']:.3f} |")
+    assert measured == f"Measured at commit {figures['commit']} on {figures['machine']}."
+
+
+def test_an_ablation_says_its_spread(script: ModuleType, monkeypatch: pytest.MonkeyPatch, data: Path) -> None:
+    ablations = script.ablations
+    where = {"commit": "abc", "machine": "a machine"}
+    runs = {f"as it is, seed {seed}": {"psnr_db": 30.0 + seed, "ms_ssim": 0.9, **where} for seed in ablations.SEEDS}
+    (data / "ablations.json").write_text(json.dumps({"ball": runs}))
+    monkeypatch.setattr(ablations, "FIGURES", data / "ablations.json")
+    lines = list(ablations.section())
+    assert "| as it is | 31.00 ± 0.82 / 0.900 ± 0.000 |" in lines
+    assert "| no absorption | – |" in lines
+    assert "Measured at commit abc on a machine." in lines
