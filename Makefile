@@ -17,7 +17,7 @@ ARGS ?=
 MINUTES ?= 30
 
 .DEFAULT_GOAL := help
-.PHONY: ALWAYS help serve console test test-fast test-long test-console test-faults test-fuzz test-soak test-overload check check-lint check-types check-generated check-web format bench bench-console bench-cuda results ablations poses demo-scene generate clean
+.PHONY: ALWAYS help serve console test test-fast test-long test-console test-faults test-fuzz test-soak test-overload check check-lint check-types check-generated check-web format bench bench-console console-picture bench-cuda results ablations poses demo-scene generate clean
 
 help:  ## say what there is
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
@@ -89,6 +89,9 @@ bench: $(VENV)/installed  ## measure the kernel and the service; the table is pr
 bench-console: $(VENV)/installed-dev $(CONSOLE)  ## frames a second, memory and first paint of the console in Debian's Chromium; takes six minutes
 	node tests/console/measure.mjs > build/console.json
 	mv build/console.json benchmarks/console.json
+
+console-picture: $(VENV)/installed-dev $(CONSOLE)  ## take the README's picture of the console
+	node tests/console/picture.mjs
 
 bench-cuda: $(VENV)/installed  ## the same on a GPU, with the distance to what it can do at most
 	$(BIN)/ultragray bench --backend cuda --output benchmarks/cuda.json $(ARGS)
