@@ -60,7 +60,7 @@ README_ROWS = {
     "spine_phantom": "spine phantom, 17 frames",
     "nwire_phantom": "N-wire phantom: bright dots in black",
     "phantom": "built-in phantom, a tilt never trained on",
-    "robot": "a robot's sweep of it, with a band of 3.5 mm left out",
+    "robot": "a simulated robot's sweep of it, every fifth frame and 3.5 mm held out",
 }
 
 log = logging.getLogger("results")

@@ -1,7 +1,7 @@
 """Views between the frames of a sweep, and beyond its ends: what the frames on either side say that a plane shows.
 
-What a training sees of a gap are only its edges; it may put anything between them. So it is also shown planes between
-neighbouring frames (`neighbours_of`), at a place drawn anew each time, with the two frames blended by their distances,
+Frames show only the edges of the gap between them, and a training could put anything inside. So it also sees planes
+between neighbouring frames (`neighbours_of`), at a place drawn anew each time, with the two frames blended by their distances,
 in the way that predicts the sweep's own frames best (`features_follow_probe`).
 """
 

@@ -50,17 +50,17 @@ class Shadows:
         self._axial, self._lateral = sweep.pixel_mm
         some = np.stack([self._smooth(place) for place in spread_places(len(sweep), LOOKED_AT_FRAMES)])
         self._usual = _usual_by_depth(some)  # [H] brightness
-        (self._told,) = np.nonzero(self._usual > LEAST_USUAL)
+        (self._bright_rows,) = np.nonzero(self._usual > LEAST_USUAL)
         self._usual_below = _usual_by_depth(self._brightest_below(self._relative(some)))  # [H]
 
     def of(self, place: int) -> Beam:
         """The evidence of the frame at a place of the sweep."""
         height, width = self._sweep.height, self._sweep.width
-        if not len(self._told):
+        if not len(self._bright_rows):
             return Beam(np.ones((height, width), np.float32), np.zeros((height, width), np.float32))
         relative = self._relative(self._smooth(place)[None])
         below = self._brightest_below(relative)[0] / np.maximum(self._usual_below, 1e-6)[:, None]
-        last = max(0, int(self._told[-1] - max(LEAST_LENGTH_MM / self._axial, LEAST_LENGTH * height)))
+        last = max(0, int(self._bright_rows[-1] - max(LEAST_LENGTH_MM / self._axial, LEAST_LENGTH * height)))
         below[last:] = below[last]  # too little is left of the line to tell
         at_face = below[: max(1, round(FACE_MM / self._axial))].max(axis=0)
         left = np.clip(below / np.maximum(at_face, NO_CONTACT), 0.0, 1.0)
@@ -86,7 +86,7 @@ class Shadows:
     def _relative(self, smooth: FloatImage) -> FloatImage:  # [F, H, W] both
         """Brightness over what is usual at its depth; 0 where the depth tells nothing."""
         relative = np.zeros_like(smooth)
-        relative[:, self._told] = smooth[:, self._told] / self._usual[self._told, None]
+        relative[:, self._bright_rows] = smooth[:, self._bright_rows] / self._usual[self._bright_rows, None]
         return relative
 
     @staticmethod
