@@ -1,8 +1,8 @@
 """Views between the frames of a sweep, and beyond its ends: what the frames on either side say that a plane shows.
 
 Frames show only the edges of the gap between them, and a training could put anything inside. So it also sees planes
-between neighbouring frames (`neighbours_of`), at a place drawn anew each time, with the two frames blended by their distances,
-in the way that predicts the sweep's own frames best (`features_follow_probe`).
+between neighbouring frames (`neighbours_of`), at a place drawn anew each time, with the two frames blended by their
+distances, in the way that predicts the sweep's own frames best (`features_follow_probe`).
 """
 
 from __future__ import annotations

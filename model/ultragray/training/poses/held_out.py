@@ -21,7 +21,7 @@ from ..steps.losses import SSIM_WINDOW, image_loss
 from .trained import Corrections
 
 STEPS = 60
-TEXTURE = 0.5  # of the loss: more than in a training, as structure places a frame better than brightness
+TEXTURE = 0.5  # share of SSIM in the loss that a frame is moved by
 RATE = 0.1  # mm a step, falling to 0
 
 
