@@ -23,8 +23,8 @@ from .patience import Patience
 
 MAX_PIPELINED = 32
 MAX_TARGET_BYTES = 16 * 1024
-_MAX_UNWANTED_BYTES = 2**20  # of a body whose request was answered already
-_LINGER_S = 1.0  # in which a refused client can read why
+_MAX_UNWANTED_BYTES = 2**20  # of a body whose request was answered already: a longer one costs the connection
+_LINGER_S = 1.0  # in which a client that still sends can read its answer
 
 
 @dataclass(frozen=True)
@@ -56,15 +56,15 @@ class BoundedHttp(HttpToolsProtocol):
         self._looked_at = self.loop.time()
         self._idle_bytes = 0  # since the request came on
         self._body_bytes = 0  # since the last look
-        self._unwanted_bytes = 0
+        self._keep_alive = False  # once the body is whole
         self._trailers = self._trailer_bytes = 0
         self._refused_for: UltragrayError | None = None
-        self._is_refused = False
+        self._is_over = False
         self._receiving = Patience(limits.min_bytes_per_s, limits.transfer_patience_s)
         self._sending = _Sending(limits)
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        super().connection_made(_Closing(transport))  # type: ignore[arg-type]  # it has all that a transport has
+        super().connection_made(_Closing(transport, self._linger))  # type: ignore[arg-type]  # it has all that a transport has
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._place.leave()
@@ -77,17 +77,17 @@ class BoundedHttp(HttpToolsProtocol):
             room = self._limits.max_header_bytes - self._idle_bytes
             if len(data) > room:
                 self._take(data[:room])
-                if self._in_head and not self._is_refused:
+                if self._in_head and not self._is_over:
                     self._refuse(self._head_too_large())
                 data = data[room:]
         self._take(data)
 
     def _take(self, data: bytes) -> None:
-        if self._is_refused or self.transport.is_closing():
+        if self._is_over or self.transport.is_closing():
             return
         self._idle_bytes += len(data)
         super().data_received(data)
-        if self._idle_bytes > self._limits.max_header_bytes and not self._is_refused:
+        if self._idle_bytes > self._limits.max_header_bytes and not self._is_over:
             self._refuse(self._head_too_large())
 
     def on_message_begin(self) -> None:
@@ -114,9 +114,13 @@ class BoundedHttp(HttpToolsProtocol):
             self._stop_parsing(self._head_too_large())
         self._in_head = False
         self._head_since = None
-        self._idle_bytes = self._unwanted_bytes = self._trailers = self._trailer_bytes = 0
+        self._idle_bytes = self._trailers = self._trailer_bytes = 0
         self._receiving.renew()
+        earlier = self.cycle
         super().on_headers_complete()
+        if self.cycle is not earlier:  # no upgrade
+            self._keep_alive = self.cycle.keep_alive
+            self.cycle.keep_alive = self._keep_alive and not _may_be_long(self.headers)
         if len(self.pipeline) > MAX_PIPELINED:
             self._stop_parsing(RequestMalformed(f"at most {MAX_PIPELINED} requests may wait for their turn"))
 
@@ -124,14 +128,12 @@ class BoundedHttp(HttpToolsProtocol):
         self._idle_bytes = 0
         self._body_bytes += len(body)
         super().on_body(body)
-        if self.cycle.response_complete:
-            self._unwanted_bytes += len(body)
-            if self._unwanted_bytes > _MAX_UNWANTED_BYTES:
-                self._stop_parsing(RequestMalformed("the request was answered before its body had come"))
 
     def on_message_complete(self) -> None:
         self._in_head = True
         self._idle_bytes = 0
+        if self.cycle is not None:
+            self.cycle.keep_alive = self._keep_alive
         super().on_message_complete()
 
     def _stop_parsing(self, error: UltragrayError) -> None:
@@ -149,7 +151,7 @@ class BoundedHttp(HttpToolsProtocol):
         limits = self._limits
         if self._sending.is_stalled(self.transport, elapsed_s):
             self.transport.abort()
-        elif self._is_refused:
+        elif self._is_over:
             pass
         elif self._in_head:
             if self._head_since is not None and now - self._head_since > limits.header_timeout_s:
@@ -165,7 +167,6 @@ class BoundedHttp(HttpToolsProtocol):
 
     def _refuse(self, error: UltragrayError) -> None:
         """Says why, where no other answer is due, and closes. What still comes is thrown away."""
-        self._is_refused = True
         self._unset_keepalive_if_required()
         cycle = self.cycle
         is_due = cycle is not None and not cycle.response_complete
@@ -178,20 +179,37 @@ class BoundedHttp(HttpToolsProtocol):
             cycle.disconnected = True
             cycle.message_event.set()
         self.pipeline.clear()
-        self.flow.resume_reading()
         if can_answer:
             self._limits.on_refused(error)
             self.transport.write(refusal_bytes(error, self.server_state.default_headers))
+        self._end()
+
+    def _linger(self) -> bool:
+        """Whether the connection closes only after a moment: its client, still sending, may read the answer first."""
+        if self._in_head:
+            return False
+        if not self._is_over:
+            self._end()
+        return True
+
+    def _end(self) -> None:
+        """Says that nothing more is sent, throws away what still comes, and closes a moment later."""
+        self._is_over = True
+        self.flow.resume_reading()
         if self.transport.can_write_eof() and not self.transport.is_closing():
             self.transport.write_eof()
         self.loop.call_later(_LINGER_S, self.transport.abort)
 
 
 class _Closing:
-    """A transport that drops what is written once it closes: the answers under way hear of that a moment later."""
+    """A transport that drops what is written once it closes: the answers under way hear of that a moment later.
 
-    def __init__(self, transport: Any) -> None:
+    It closes later where `linger` says so.
+    """
+
+    def __init__(self, transport: Any, linger: Callable[[], bool]) -> None:
         self._transport = transport
+        self._linger = linger
         self._has_ended = False
 
     def __getattr__(self, name: str) -> Any:
@@ -200,6 +218,13 @@ class _Closing:
     def write(self, data: bytes) -> None:
         if not self._has_ended and not self._transport.is_closing():
             self._transport.write(data)
+
+    def is_closing(self) -> bool:
+        return self._has_ended or bool(self._transport.is_closing())
+
+    def close(self) -> None:
+        if not self._linger():
+            self._transport.close()
 
     def write_eof(self) -> None:
         self._has_ended = True
@@ -253,6 +278,14 @@ class _Sending:
             self._patience.renew()
             return False
         return self._patience.is_over(before - self._waiting_bytes, elapsed_s)
+
+
+def _may_be_long(headers: list[tuple[bytes, bytes]]) -> bool:
+    """Whether the body after these headers may be longer than what is worth reading for its connection alone."""
+    return any(
+        name == b"transfer-encoding" or (name == b"content-length" and int(value) > _MAX_UNWANTED_BYTES)
+        for name, value in headers
+    )
 
 
 def refusal_bytes(error: UltragrayError, default_headers: list[tuple[bytes, bytes]]) -> bytes:

@@ -231,6 +231,26 @@ def test_a_body_at_the_least_rate_is_taken(limited: RunningService) -> None:
         assert status_of(answer(opened)) == 200
 
 
+@pytest.mark.parametrize("length", [b"Transfer-Encoding: chunked", b"Content-Length: %d" % 2**30])
+def test_an_answer_before_the_end_of_a_long_body_says_that_it_ends_the_connection(
+    limited: RunningService, length: bytes
+) -> None:
+    with open_socket(limited) as opened:
+        opened.sendall(b"POST /v1/scenes/demo/render HTTP/1.1\r\nHost: localhost\r\n" + length + b"\r\n\r\n")
+        opened.sendall(b"10000\r\n" + b" " * 2**16 + b"\r\n")  # without a key: refused whatever the body is
+        assert problem_of(answer(opened))["status"] == 401
+        assert is_closed(opened)
+
+
+def test_an_answer_before_the_end_of_a_short_body_keeps_the_connection(limited: RunningService) -> None:
+    with open_socket(limited) as opened:
+        opened.sendall(b"POST /v1/scenes/demo/render HTTP/1.1\r\nHost: localhost\r\nContent-Length: 100000\r\n\r\n")
+        early = answer(opened)
+        assert (status_of(early), b"connection: close" in early.lower()) == (401, False)
+        opened.sendall(b" " * 100000 + REQUEST + b"\r\n")
+        assert status_of(answer(opened)) == 200
+
+
 def test_an_idle_connection_is_closed(limited: RunningService) -> None:
     with open_socket(limited) as opened:
         opened.sendall(REQUEST + b"\r\n")
