@@ -31,7 +31,7 @@ from ultragray.training import TrainingConfig
 FIGURES = Path(__file__).resolve().parent / "ablations.json"
 SEEDS = (0, 1, 2)
 SHORTER = {"steps": 400, "max_gaussians": 40_000, "confidence": False}  # than `fast`, so that an hour is enough
-TEXTURES = (0.0, 0.2, 0.5, 0.75)
+TEXTURES = (0.0, 0.05, 0.2, 0.5)
 
 
 @dataclass(frozen=True, eq=False)

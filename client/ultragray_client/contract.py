@@ -377,7 +377,9 @@ class TrainJob:
     scene: str
     """Name that the scene will be served under."""
     preset: str = "fast"
-    """fast: minutes on two cores; best: three times as many steps and Gaussians; paper: the released recipe."""
+    """fast: minutes on two cores; best: fast, with the effort that frames left out ask for, in half an hour; paper:
+    the released recipe.
+    """
     settings: dict[str, Any] = field(default_factory=dict)
     """Any training settings instead of the preset's."""
     device: str = "auto"

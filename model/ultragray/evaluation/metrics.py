@@ -43,6 +43,11 @@ class FrameMetrics:
         """The four numbers by name, all finite."""
         return asdict(self)
 
+    def is_better_than(self, other: FrameMetrics) -> bool:
+        """In each of the four."""
+        higher = ("psnr_db", "ms_ssim", "gms")
+        return self.gmsd < other.gmsd and all(getattr(self, name) > getattr(other, name) for name in higher)
+
 
 def ms_ssim_scales(height: int, width: int) -> int:
     """The number of MS-SSIM's five scales that fit an image.

@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from ..datasets.sweep import Dataset
-from ..errors import MemoryExceeded, TrainingDiverged
+from ..errors import MemoryExceeded, TrainingDiverged, TrainingStateInvalid
+from ..evaluation.metrics import FrameMetrics
 from ..scene import GaussianScene
 from .board import require_tensorboard
 from .checkpointing import read_checkpoint_header
 from .confidence.calibration import fit_confidence, shorter
 from .config import TrainingConfig
+from .effort import choose_effort
 from .progress import Progress
 from .trainer import CHECKPOINT_FILE, Trainer
 
@@ -41,16 +44,24 @@ def train(
     checkpoints, the journal and the configuration; with `resume` the run goes on from its checkpoint and ends in the
     scene that an undisturbed run gives. `report` is called after every step. When `should_stop` turns true, the run
     ends after the step at hand with a checkpoint and the scene as it is; `scene.info.training["step"]` says how far
-    it came. A finished run then trains once more, shorter, to fit the scene's confidence (`config.confidence`); stopped
-    there, the scene is whole but for that.
+    it came. Where the configuration leaves the effort open, trainings on a part of the frames choose it before; stopped
+    there, the scene has step 0, and the next `train` in the folder goes on with the choice. A finished run trains once
+    more, shorter, to fit the scene's confidence (`config.confidence`); stopped there, the scene is whole but for that.
     Raises TrainingDiverged and MemoryExceeded (the last good checkpoint stays), TrainingStateInvalid, DatasetInvalid,
     BackendUnavailable, and InvalidArgument for a TensorBoard that is not installed; what can be known before the first
     step is, before `folder` is made.
     """
     if tensorboard:
         require_tensorboard()
+    if folder is not None and not resume:
+        _require_no_run(folder)
+    apart = _Apart(report, should_stop, device, backend)
+    given = config or TrainingConfig()
+    config = _with_effort(dataset, given, folder, resume, apart)
+    if config is None:
+        return Trainer(dataset, given, folder=None, device=device, backend=backend).scene()
     try:
-        trainer = Trainer(dataset, config or TrainingConfig(), folder=folder, device=device, backend=backend)
+        trainer = Trainer(dataset, config, folder=folder, device=device, backend=backend)
         if resume:
             trainer.restore()
     except torch.OutOfMemoryError as error:
@@ -66,26 +77,67 @@ def train(
         del trainer  # what it takes of the memory is free for the second training
         refined = replace(dataset, train=replace(dataset.train, poses=scene.training_poses))
         settled = replace(resolved, refine_poses="none")
-        scene.info.confidence.update(_fitted_confidence(refined, settled, should_stop, device, backend))
+        scene.info.confidence.update(_fitted_confidence(refined, settled, apart))
     return scene
 
 
-def _fitted_confidence(
-    dataset: Dataset, config: TrainingConfig, should_stop: Callable[[], bool] | None, device: str, backend: str
-) -> dict[str, Any]:
+@dataclass(frozen=True)
+class _Apart:
+    """How the trainings beside the run are done, each on a part of its frames."""
+
+    report: Callable[[Progress], None] | None
+    should_stop: Callable[[], bool] | None
+    device: str
+    backend: str
+
+    def scene(self, part: Dataset, config: TrainingConfig, trying: float | None = None) -> GaussianScene | None:
+        """None where it was told to stop. `trying`: the effort, for those who are to be told of the progress."""
+        trainer = Trainer(part, config, folder=None, device=self.device, backend=self.backend)
+        report = self.report
+
+        def tell(progress: Progress) -> None:
+            if report is not None and trying is not None:
+                report(replace(progress, trying=trying))
+
+        with trainer.running_out_of_memory_explained():
+            trainer.run(lambda line: None, tell, self.should_stop, math.inf)
+        return trainer.scene() if trainer.is_finished else None
+
+
+def _require_no_run(folder: Path) -> None:
+    checkpoint = folder / CHECKPOINT_FILE
+    if checkpoint.exists():
+        raise TrainingStateInvalid(
+            f"{checkpoint}: there is an unfinished run: resume it, or remove {folder} to begin anew"
+        )
+
+
+def _with_effort(
+    dataset: Dataset, config: TrainingConfig, folder: Path | None, resume: bool, apart: _Apart
+) -> TrainingConfig | None:
+    """The configuration with its effort, chosen where it is open and matters; None where the choice was stopped."""
+    if config.effort is not None or (config.steps is not None and config.max_gaussians is not None):
+        return config
+    if resume and folder is not None:
+        return replace(config, effort=read_checkpoint_header(folder / CHECKPOINT_FILE).config.effort)
+
+    def try_out(part: Dataset, settings: TrainingConfig) -> FrameMetrics | None:
+        scene = apart.scene(part, settings, trying=settings.effort)
+        return None if scene is None else FrameMetrics(**scene.info.metrics)
+
+    effort = choose_effort(dataset, config, try_out, folder)
+    return None if effort is None else replace(config, effort=effort)
+
+
+def _fitted_confidence(dataset: Dataset, config: TrainingConfig, apart: _Apart) -> dict[str, Any]:
     """The scene's `confidence`; empty where the frames are too few or the second training came to nothing."""
 
     def train_part(part: Dataset) -> GaussianScene | None:
-        fewer = shorter(config, len(part.train) / len(dataset.train))
-        trainer = Trainer(part, fewer, folder=None, device=device, backend=backend)
-        while not trainer.is_finished:
-            if should_stop is not None and should_stop():
-                return None
-            trainer.take_step()
-        return trainer.scene().to(device)
+        scene = apart.scene(part, shorter(config, len(part.train) / len(dataset.train)))
+        return None if scene is None else scene.to(apart.device)
 
     try:
-        model = fit_confidence(dataset, train_part, backend=backend)
+        model = fit_confidence(dataset, train_part, backend=apart.backend)
     except (MemoryExceeded, TrainingDiverged, torch.OutOfMemoryError) as error:
         logging.getLogger(__name__).warning("the scene gets no confidence: %s", error)
         return {}

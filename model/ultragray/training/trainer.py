@@ -136,11 +136,6 @@ class Trainer:
         if self.folder is None:
             yield lambda line: None
             return
-        checkpoint = self.folder / CHECKPOINT_FILE
-        if self.step == 0 and checkpoint.exists():
-            raise TrainingStateInvalid(
-                f"{checkpoint}: there is an unfinished run: resume it, or remove {self.folder} to begin anew"
-            )
         self.folder.mkdir(parents=True, exist_ok=True)
         for name in (CHECKPOINT_FILE, JOURNAL_FILE, CONFIG_FILE):
             remove_stale_temporaries(self.folder / name)

@@ -176,6 +176,13 @@ def _train(dataset: Any, config: TrainingConfig, run: RunOptions) -> None:
         scene.save(run.output)
     elapsed_s = time.monotonic() - started
     done, steps = scene.info.training["step"], scene.info.training["steps"]
+    if not done:
+        typer.echo(
+            f"stopped before the first step, while the effort was chosen; wrote {run.output} as it starts; the same "
+            "command goes on with the choice",
+            err=True,
+        )
+        raise typer.Exit(INTERRUPTED)
     if done < steps:
         typer.echo(
             f"stopped after step {done:,} of {steps:,}; wrote {run.output} as it is; go on with the same "
@@ -215,15 +222,24 @@ def _progress_bar() -> Iterator[Callable[[Any], None]]:
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
     console = Console(stderr=True)
-    columns = ("training", BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[figures]}"))
+    columns = (
+        TextColumn("{task.fields[stage]}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[figures]}"),
+    )
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
-        task = progress.add_task("", total=None, figures="")
+        task = progress.add_task("", total=None, stage="training", figures="")
 
         def report(state: Any) -> None:
+            trying = None if state.trying is None else f"trying effort {state.trying:g}"
             if console.is_terminal:
-                progress.update(task, completed=state.step, total=state.steps, figures=_figures(state))
+                progress.update(
+                    task, completed=state.step, total=state.steps, stage=trying or "training", figures=_figures(state)
+                )
             elif state.step * 10 // state.steps > (state.step - 1) * 10 // state.steps:
-                sys.stderr.write(f"step {state.step:,} of {state.steps:,}: {_figures(state)}\n")
+                stage = f"{trying}: " if trying else ""
+                sys.stderr.write(f"{stage}step {state.step:,} of {state.steps:,}: {_figures(state)}\n")
 
         yield report
 

@@ -35,10 +35,11 @@ def test_presets() -> None:
 
 def test_more_effort_is_more_steps_and_gaussians_unless_they_are_given(tiny_dataset: Callable[..., Dataset]) -> None:
     geometry = Geometry.of(tiny_dataset())
-    fast, best = (TrainingConfig.preset(name).resolved(geometry) for name in ("fast", "best"))
-    assert (best.steps, best.max_gaussians) == (3 * (fast.steps or 0), 3 * (fast.max_gaussians or 0))
-    given = TrainingConfig.preset("best", steps=7, max_gaussians=50).resolved(geometry)
+    usual, thrice = (TrainingConfig(effort=effort).resolved(geometry) for effort in (1.0, 3.0))
+    assert (thrice.steps, thrice.max_gaussians) == (3 * (usual.steps or 0), 3 * (usual.max_gaussians or 0))
+    given = TrainingConfig(effort=3.0, steps=7, max_gaussians=50).resolved(geometry)
     assert (given.steps, given.max_gaussians) == (7, 50)
+    assert TrainingConfig.preset("best").resolved(geometry) == usual  # the effort is chosen before, see test_effort.py
 
 
 def test_half_of_the_gaussians_start_where_only_the_end_is_given(tiny_dataset: Callable[..., Dataset]) -> None:

@@ -18,11 +18,10 @@ from ...probe import FloatArray
 from ...scene import GaussianScene
 from ..config import TrainingConfig
 from .hardness import hardness_of_views
-from .held_out import held_out_frames
+from .held_out import LEAST_HELD_OUT, held_out_frames
 from .residuals import fit_uncertainty
 
 SHORTER, ENOUGH_STEPS = 0.5, 500  # share of the steps, and the number that suffices to learn shadows
-LEAST_HELD_OUT = 3
 MEASURED_FRAMES = 96  # of those held out; of those trained from a third as many
 BLACK_FRAMES = 32
 

@@ -18,6 +18,7 @@ LEAST_TILT_DEG = 2.0  # smaller differences are unsteadiness of the hand
 SINGLE_EVERY = 12  # of the frames that are left
 LEAST_KEPT = 4
 MAX_SHARE = 0.45
+LEAST_HELD_OUT = 3  # fewer tell nothing
 
 
 def held_out_frames(sweep: Sweep) -> IntArray:  # [H] places, ascending

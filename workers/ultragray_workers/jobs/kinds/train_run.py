@@ -98,12 +98,13 @@ def _report(job_run: JobRun, state: TrainingProgress) -> None:
             val_psnr_db=state.val_psnr_db,
             gaussians=state.gaussian_count,
             rate_per_s=state.steps_per_s,
-            seconds_left=state.seconds_left if math.isfinite(state.seconds_left) else None,
+            seconds_left=state.seconds_left if state.trying is None and math.isfinite(state.seconds_left) else None,
         )
     )
     if state.step * _LINES // state.steps > (state.step - 1) * _LINES // state.steps:
         held_out = "" if state.val_psnr_db is None else f", held out {state.val_psnr_db:.2f} dB"
         sys.stderr.write(
+            f"{'' if state.trying is None else f'trying effort {state.trying:g} on a part of the frames: '}"
             f"step {state.step:,} of {state.steps:,}: loss {state.loss:.4f}, {state.gaussian_count:,} Gaussians, "
             f"{state.steps_per_s:.1f} steps/s{held_out}\n"
         )
