@@ -7,6 +7,7 @@ import signal
 import time
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -187,25 +188,28 @@ def test_a_dataset_deleted_while_it_is_laid_out(
 def test_a_service_that_stops_or_dies_while_it_lays_a_dataset_out(start_service: StartService, tmp_path: Path) -> None:
     with ThreadPoolExecutor(1) as executor:
 
-        def begin() -> tuple[RunningService, Future[httpx.Response]]:
+        def begin() -> tuple[RunningService, Future[httpx.Response], int]:
             service = start_service(artifact_folder=tmp_path / "artifacts")
             if not (tmp_path / "tiny").is_dir():
                 with httpx.Client(base_url=service.http, timeout=60) as client:
                     upload(client, "tiny", DATASET, tmp_path / "tiny")
             asked = executor.submit(httpx.get, f"{service.http}/v1/datasets/tiny/poses", timeout=60)
-            os.kill(wait_until(lambda: helper_process(service, "lay_out")), signal.SIGSTOP)
-            return service, asked
+            helper = wait_until(lambda: helper_process(service, "lay_out"))
+            os.kill(helper, signal.SIGSTOP)
+            return service, asked, helper
 
         def left() -> list[Path]:
             return list((tmp_path / "artifacts" / "dataset-views").iterdir())
 
-        first, asked = begin()
+        first, asked, _ = begin()
         assert first.terminate() == 0
         answer = asked.result()
         assert (answer.status_code, answer.json()["reason"]) == (503, "DRAINING")
         assert not left()
-        second, asked = begin()
+        second, asked, helper = begin()
         second.process.kill()
+        with suppress(ProcessLookupError):  # it was stopped before it had asked to end with its parent, or has ended
+            os.kill(helper, signal.SIGCONT)
         assert isinstance(asked.exception(), httpx.HTTPError)
         assert left()
         start_service(artifact_folder=tmp_path / "artifacts")
