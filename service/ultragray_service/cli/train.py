@@ -193,7 +193,10 @@ def _train(dataset: Any, config: TrainingConfig, run: RunOptions) -> None:
     (run.folder / CHECKPOINT_FILE).unlink()
     _print_metrics(scene)
     cost = "" if last is None else f" ({_cost(last)})"
-    typer.echo(f"wrote {run.output}: {scene.gaussian_count:,} Gaussians, {done:,} steps, {elapsed_s:.0f} s{cost}")
+    effort = f"chose effort {scene.info.training['effort']:g}, " if config.effort is None else ""
+    typer.echo(
+        f"{effort}wrote {run.output}: {scene.gaussian_count:,} Gaussians, {done:,} steps, {elapsed_s:.0f} s{cost}"
+    )
 
 
 def _cost(state: Progress) -> str:

@@ -204,6 +204,16 @@ def test_further_signals_do_not_stop_the_scene_from_being_written(dataset: Path,
     assert GaussianScene.load(output).info.training["step"] < 3000
 
 
+def test_the_best_effort_is_tried_out_first(dataset: Path, tmp_path: Path) -> None:
+    output = tmp_path / "best.ugr"
+    result = run(dataset, "-o", output, "--preset", "best", "--steps", 6, "--batch-size", 3, "--threads", 1)
+    assert result.exit_code == 0, result.output
+    assert result.stderr.splitlines()[0].startswith("trying effort 1: step 1 of 6")
+    assert result.stderr.splitlines()[-1].startswith("step 6 of 6")
+    effort = GaussianScene.load(output).info.training["effort"]
+    assert f"chose effort {effort:g}, wrote {output}" in result.output
+
+
 def test_warns_of_what_looks_wrong_before_it_trains(dataset: Path, tmp_path: Path) -> None:
     poses = np.load(dataset / "poses_train.npy")
     poses[4, 0, 3] = 30.0
