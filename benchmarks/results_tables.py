@@ -99,7 +99,7 @@ RUNS = (
         for name in ("ultranerf_liver", "liver_convex", "spine_phantom", "nwire_phantom")
         for part in (Part.THIRD, Part.BAND)
     ),
-    *(Run(f"{name}, preset best", name, preset="best") for name in ("nwire_phantom", "liver_convex")),
+    *(Run(f"{name}, preset best", name, preset="best") for name in ("nwire_phantom", "spine_phantom")),
     Run(
         "ultranerf_liver_paper",
         "ultranerf_liver",
