@@ -27,6 +27,7 @@ from ultragray.evaluation.scoring import render_sweep
 from ultragray.files.atomic import write_whole
 from ultragray.report.study import train_and_evaluate
 from ultragray.training import TrainingConfig
+from ultragray.training.config import TEXTURE
 
 FIGURES = Path(__file__).resolve().parent / "ablations.json"
 SEEDS = (0, 1, 2)
@@ -53,8 +54,7 @@ WITHOUT = (
     Variation("random start", {"start": "random"}),
 )
 CURVE = tuple(
-    AS_IT_IS if value == TrainingConfig().texture else Variation(f"texture {value:g}", {"texture": value})
-    for value in TEXTURES
+    AS_IT_IS if value == TEXTURE else Variation(f"texture {value:g}", {"texture": value}) for value in TEXTURES
 )
 SOURCES = {
     "ultranerf_liver_other_side": ("ultranerf_liver", SourceOptions("0:90", "90:180")),

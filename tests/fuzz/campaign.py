@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import os
 import time
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import hypothesis
 from hypothesis import HealthCheck, Phase
+from hypothesis.errors import HypothesisWarning
 
 from ..surroundings import ROOT
 from .mutations import Strategy
@@ -80,7 +82,9 @@ class Door:
             attempt(value)
 
         try:
-            try_one()
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", HypothesisWarning)  # of a long input, in place of what it raised
+                try_one()
         except Exception as error:
             error.__notes__ = [self._told(last)]  # without hypothesis's, which hold the whole input
             raise

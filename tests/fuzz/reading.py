@@ -52,8 +52,9 @@ class ReaderProcess:
         """Asserts that the process has not grown, and that enough of the inputs were read to their end."""
         if self._process is not None:
             self._process.communicate()
-        growth = Growth.of(self._resident_bytes, parts=5)
-        assert growth.absolute < MOST_GROWTH_BYTES, f"the reader has grown: {self._resident_bytes}"
+        if self._resident_bytes:
+            growth = Growth.of(self._resident_bytes, parts=5)
+            assert growth.absolute < MOST_GROWTH_BYTES, f"the reader has grown: {self._resident_bytes}"
         if self._outcomes.total() >= LEAST_OUTCOMES:
             assert self._outcomes["read"] >= LEAST_READ * self._outcomes.total(), self._outcomes
 

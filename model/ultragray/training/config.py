@@ -34,6 +34,7 @@ RELEASED_STEPS = 30_000  # the length of run that the released rates are tuned f
 RELEASED_TRANSMITTANCE_RATE, MAX_SCALED_RATE = 5e-4, 2e-2
 USUAL_EFFORT = 1.0
 VIEWS_BETWEEN = 0.5  # of a step; what is blended from two frames is thicker than a beam, and its shadows are wider
+TEXTURE, TEXTURE_OF_LEARNED_BEAM = 0.05, 0.2  # with less a search that starts too thin ends too thick
 MAX_RANGE_MM = 100.0  # frames further apart have nothing to say about what lies between
 STARTS = ("informed", "random")
 GROWTHS = ("even", "threshold")
@@ -146,10 +147,10 @@ class TrainingConfig(Contract):
     sh0_rate: float = described("Learning rate of the intensities.", 1e-2, low=0.0, high=1.0)
     shn_rate: float = described("Learning rate of the higher harmonics.", 3e-4, low=0.0, high=1.0)
     final_rate: float = described("Every rate decays exponentially to this share.", 0.1, low=1e-6, high=1.0)
-    texture: float = described(
+    texture: float | None = described(
         "Share of structural dissimilarity in the loss, the rest is L1: less for the mean of what speckle may be and a "
-        "better PSNR, more for its texture and a better MS-SSIM.",
-        0.05,
+        "better PSNR, more for its texture and a better MS-SSIM; none: 0.05, 0.2 where the beam is learned.",
+        None,
         low=0.0,
         high=1.0,
     )
@@ -252,6 +253,7 @@ class TrainingConfig(Contract):
             out_of_plane_mm=out_of_plane_mm,
             views_between=views_between,
             effort=effort,
+            texture=_given_or(self.texture, TEXTURE_OF_LEARNED_BEAM if self.learn_beam else TEXTURE),
             transmittance_rate=_given_or(self.transmittance_rate, scaled_transmittance_rate(steps)),
         )
 

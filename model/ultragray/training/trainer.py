@@ -98,6 +98,8 @@ class Trainer:
         if not config.views_between:
             neighbours = neighbours.without_ends()  # nothing would train what begins there
         assert config.views_between is not None
+        assert config.texture is not None
+        self._texture = config.texture
         self._between_count = round(config.views_between * config.batch_size)
         self._views_between = ViewsBetween(dataset.train, neighbours, self._images) if self._between_count else None
         self._sampler = BatchSampler(len(dataset.train), config.batch_size - self._between_count, self._generator)
@@ -237,7 +239,7 @@ class Trainer:
         if self._views_between is not None:
             own, others = rendered[: len(truth)], rendered[len(truth) :]
             rendered, truth = torch.cat([own, between.weighted(others)]), torch.cat([truth, between.images])
-        image = image_loss(rendered, truth, self.config.texture)
+        image = image_loss(rendered, truth, self._texture)
         if self._shadowed is not None:
             image = image + self._price_of_absorption(frames["transmittance"], self._shadowed, neighbours)
         image.backward()  # type: ignore[no-untyped-call]

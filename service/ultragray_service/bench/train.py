@@ -13,7 +13,7 @@ import torch
 
 from ultragray import GaussianScene, render
 from ultragray.backends.spatial_order import spatial_order
-from ultragray.training import TrainingConfig
+from ultragray.training.config import TEXTURE
 from ultragray.training.steps.losses import image_loss
 from ultragray.training.steps.optimizer import Optimizer
 
@@ -67,7 +67,7 @@ def measure_training(
         frames = render(scene, PROBE, poses, height=size[0], width=size[1], outputs=("bmode",), backend=backend)
         at.append(mark(device))
         assert frames.bmode is not None
-        loss = image_loss(frames.bmode, truth, TrainingConfig().texture)
+        loss = image_loss(frames.bmode, truth, TEXTURE)
         at.append(mark(device))
         loss.backward()  # type: ignore[no-untyped-call]
         at.append(mark(device))
