@@ -70,9 +70,11 @@ def test_what_was_found_is_not_tried_again_in_the_same_run(tiny_dataset: Dataset
     dataset, folder = tiny_dataset(frames=40), tmp_path / "run"
     ranks = {1.0: 0.0, 2.0: 1.0, 3.0: 0.5}
     interrupted = TryOut(ranks)
-    assert (
-        choose_effort(dataset, OPEN, lambda *a: None if len(interrupted.asked) > 1 else interrupted(*a), folder) is None
-    )
+
+    def try_out(part: Dataset, config: TrainingConfig) -> FrameMetrics | None:
+        return None if len(interrupted.asked) > 1 else interrupted(part, config)
+
+    assert choose_effort(dataset, OPEN, try_out, folder) is None
     assert interrupted.asked == [1.0, 2.0]
     again = TryOut(ranks)
     assert (choose_effort(dataset, OPEN, again, folder), again.asked) == (2.0, [3.0])
