@@ -67,7 +67,7 @@ def recorded(folder: Path, name: str) -> Asked:
     return Asked(train.select(numbers[~left_out]), train.select(numbers[left_out]), causes)
 
 
-RECORDED = ("spine_phantom", "liver_convex")
+RECORDED = ("spine_phantom", "liver_convex", "ultranerf_liver", "nwire_phantom")
 
 
 def measure(asked: Asked, config: TrainingConfig) -> dict[str, Any]:

@@ -30,12 +30,6 @@ from .views import ViewMeasures
 VERSION = 2
 NEAR_MM, DISTANCE_MM, ANGLE_DEG = 0.3, 5.0, 10.0  # units of the terms
 TERMS = 4  # beside the constant
-PRIOR_WEIGHTS = (3.6, 1.1, 1.5, 0.3, 0.6)  # about those of ten scenes; one that no view determines stays near its own
-PRIOR_STRENGTH = 0.02  # squared error that is added for a weight that is 1 away from its prior
-GAIN_QUANTILE = 0.85  # share of the frames, of those that the gain is fitted on, that stay below the limit
-LEAST_SHARE = 0.02  # of supported pixels: fewer are taken as this many
-REACHES_MM = np.geomspace(0.2, 30.0, 60)  # values of r that are tried
-FIT_STEPS = 100
 HARDNESS_DIGITS = 3
 
 
@@ -57,7 +51,7 @@ class Support:
 
     def expected_shares(self, measures: ViewMeasures) -> FloatArray:  # [C]
         """The share of supported pixels that frames at these poses are taken to have."""
-        return self.share * _within(measures.distance_mm, self.reach_mm)
+        return self.share * within(measures.distance_mm, self.reach_mm)
 
 
 @dataclass(frozen=True)
@@ -172,65 +166,19 @@ def terms_of(
 
 def predicted(weights: FloatArray, terms: FloatArray, black_ms_ssim: float) -> FloatArray:  # [C]
     """c of each pose, by the formula."""
-    shares: FloatArray = _logistic(terms @ weights).mean(axis=1)
+    shares: FloatArray = logistic(terms @ weights).mean(axis=1)
     return black_ms_ssim + (1.0 - black_ms_ssim) * shares
 
 
-def fit_support(
-    measures: ViewMeasures,
-    shares: FloatArray,  # [C] of supported pixels
-    ms_ssim: FloatArray,  # [C]
-    black_ms_ssim: float,
-) -> Support:
-    """The gain, at least 1, that holds for GAIN_QUANTILE of the frames; share and reach of the least squared error."""
-    reached = (ms_ssim - black_ms_ssim) / ((1.0 - black_ms_ssim) * np.maximum(shares, LEAST_SHARE))
-    found = []
-    for reach_mm in REACHES_MM:
-        within = _within(measures.distance_mm, reach_mm)
-        share = min(1.0, max(LEAST_SHARE, float(within @ shares) / max(float(within @ within), 1e-9)))
-        found.append((float(np.square(share * within - shares).sum()), share, float(reach_mm)))
-    _, share, reach_mm = min(found)
-    return Support(max(1.0, float(np.quantile(reached, GAIN_QUANTILE))), share, reach_mm)
-
-
-def fit_weights(
-    terms: FloatArray,  # [C, K, 1 + TERMS]
-    ms_ssim: FloatArray,  # [C]
-    black_ms_ssim: float,
-) -> FloatArray:  # [1 + TERMS]
-    """The weights with the least squared error of the figure, and little away from PRIOR_WEIGHTS; only w₀ may be < 0.
-
-    Levenberg-Marquardt steps; a weight that would turn negative is held at 0.
-    """
-    prior = np.array(PRIOR_WEIGHTS)
-    weights, damping = prior.copy(), 1.0
-
-    def cost(candidate: FloatArray) -> float:
-        misses = predicted(candidate, terms, black_ms_ssim) - ms_ssim
-        return float(misses @ misses + PRIOR_STRENGTH * np.square(candidate - prior).sum())
-
-    for _ in range(FIT_STEPS):
-        share = _logistic(terms @ weights)
-        slope = (1.0 - black_ms_ssim) * ((share * (1.0 - share))[..., None] * terms).mean(axis=1)
-        misses = predicted(weights, terms, black_ms_ssim) - ms_ssim
-        gradient = slope.T @ misses + PRIOR_STRENGTH * (weights - prior)
-        free = (weights > 0.0) | (gradient < 0.0)
-        free[0] = True
-        curvature = slope.T @ slope + (PRIOR_STRENGTH + damping) * np.eye(len(prior))
-        step = np.zeros_like(weights)
-        step[free] = np.linalg.solve(curvature[np.ix_(free, free)], -gradient[free])
-        candidate = weights + step
-        candidate[1:] = np.maximum(candidate[1:], 0.0)
-        if cost(candidate) < cost(weights):
-            weights, damping = candidate, max(0.3 * damping, 1e-6)
-        else:
-            damping = min(4.0 * damping, 1e6)
-    return weights
-
-
-def _within(distance_mm: FloatArray, reach_mm: float) -> FloatArray:  # [C, K] -> [C]
+def within(distance_mm: FloatArray, reach_mm: float) -> FloatArray:  # [C, K] -> [C]
+    """The mean over the points of exp(−d²/r²)."""
     shares: FloatArray = np.exp(-np.square(distance_mm / reach_mm)).mean(axis=1)
     return shares
+
+
+def logistic(values: FloatArray) -> FloatArray:
+    """σ of the formula."""
+    return 1.0 / (1.0 + np.exp(-np.clip(values, -500.0, 500.0)))
 
 
 def _support_of(document: Any) -> Support:
@@ -241,10 +189,6 @@ def _support_of(document: Any) -> Support:
             f"support must be an object with the keys {sorted(expected)}, got {found!r}", field="support"
         )
     return Support(**document)
-
-
-def _logistic(values: FloatArray) -> FloatArray:
-    return 1.0 / (1.0 + np.exp(-np.clip(values, -500.0, 500.0)))
 
 
 def _numbers(name: str, values: Any) -> tuple[float, ...]:

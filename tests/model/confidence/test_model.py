@@ -1,4 +1,4 @@
-"""The model: what it says falls with distance, it is fitted from views, and damaged numbers never become one."""
+"""The model: what it says falls with distance, and damaged numbers never become one."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from ultragray.confidence import ConfidenceModel
-from ultragray.confidence.model import GAIN_QUANTILE, PRIOR_WEIGHTS, Support, fit_support, fit_weights, predicted
+from ultragray.confidence.model import Support
 from ultragray.confidence.views import ViewMeasures
 from ultragray.errors import InvalidArgument
 
@@ -71,17 +71,6 @@ def test_a_pose_alone_is_taken_to_have_the_support_of_its_distance() -> None:
     assert least.predict(measures(6.0)) == pytest.approx([0.06 + 0.94 * 1.5 * 0.9 * np.exp(-((6.0 / 4.0) ** 2))])
 
 
-def test_support_is_fitted_so_that_most_frames_keep_to_it() -> None:
-    distances = np.linspace(0.0, 6.0, 100)
-    away = ViewMeasures(*(distances[:, None],) * 3, np.zeros((100, 1)), np.ones((100, 1)))
-    shares = 0.8 * np.exp(-np.square(distances / 3.0))
-    gains = np.random.default_rng(0).permutation(np.linspace(1.0, 2.0, 100))
-    found = fit_support(away, shares, 0.1 + 0.9 * gains * np.maximum(shares, 0.02), 0.1)
-    assert found.gain == pytest.approx(1.0 + GAIN_QUANTILE, abs=0.02)
-    assert (found.share, found.reach_mm) == pytest.approx((0.8, 3.0), rel=0.05)
-    assert fit_support(away, np.ones(100), np.full(100, 0.6), 0.1).gain == 1.0
-
-
 @pytest.mark.parametrize("name", ["distance_mm", "interpolation_mm", "angle_deg", "weight"])
 def test_farther_is_never_surer(name: str) -> None:
     figures = [MODEL.predict(measures(**{name: value}))[0] for value in (0.0, 0.1, 0.5, 1.0)]
@@ -92,30 +81,6 @@ def test_farther_is_never_surer(name: str) -> None:
 def test_far_away_it_is_what_a_black_frame_reaches() -> None:
     far = ConfidenceModel((3.5, 1.2, 8.0, 0.1, 0.6), 0.06, (0.0, 1.0), 20, 0.04)
     assert far.predict(measures(20.0, 20.0)) == pytest.approx([0.06], abs=1e-4)
-
-
-def test_views_decide_the_weights() -> None:
-    rng = np.random.default_rng(0)
-    terms = np.concatenate([np.ones((400, 5, 1)), -rng.uniform(0.0, 2.0, (400, 5, 4))], axis=2)
-    truth = np.array([2.5, 0.4, 2.0, 0.8, 0.0])
-    fitted = fit_weights(terms, predicted(truth, terms, 0.1), 0.1)
-    assert np.abs(predicted(fitted, terms, 0.1) - predicted(truth, terms, 0.1)).mean() < 0.02
-    assert fitted[2] > 1.5 > 0.8 > fitted[1]
-
-
-def test_no_weight_turns_negative_though_the_views_say_so() -> None:
-    distances = np.linspace(0.0, 2.0, 500)
-    terms = np.column_stack([np.ones(500), -distances, *np.zeros((3, 500))])[:, None]
-    fitted = fit_weights(terms, 0.3 + 0.3 * distances, 0.05)
-    assert fitted[1] == 0.0
-    assert predicted(fitted, terms, 0.05).std() < 1e-12
-
-
-def test_what_the_views_cannot_tell_stays_as_it_was() -> None:
-    terms = np.column_stack([np.ones(30), -np.linspace(0, 2, 30), *np.zeros((3, 30))])[:, None]
-    fitted = fit_weights(terms, predicted(np.array([3.0, 2.0, 0, 0, 0]), terms, 0.05), 0.05)
-    assert fitted[2:] == pytest.approx(PRIOR_WEIGHTS[2:])
-    assert fitted[1] > PRIOR_WEIGHTS[1]
 
 
 def test_json_and_back() -> None:

@@ -10,15 +10,17 @@ from typing import TypeAlias
 import numpy as np
 
 from ...confidence.assess import supported
-from ...confidence.model import ConfidenceModel, fit_support, fit_weights, predicted, terms_of
+from ...confidence.model import ConfidenceModel, predicted, terms_of
 from ...confidence.views import TrainingViews
 from ...datasets.sweep import Dataset, Sweep, spread_places
 from ...evaluation.scoring import evaluate, evaluate_frames, render_sweep
 from ...probe import FloatArray
 from ...scene import GaussianScene
 from ..config import TrainingConfig
+from .fitting import Examples, fit_support, fit_weights
 from .hardness import hardness_of_views
 from .held_out import LEAST_HELD_OUT, held_out_frames
+from .one_sided import one_sided_examples
 from .residuals import fit_uncertainty
 
 SHORTER, ENOUGH_STEPS = 0.5, 500  # share of the steps, and the number that suffices to learn shadows
@@ -44,6 +46,8 @@ def shorter(config: TrainingConfig, share: float) -> TrainingConfig:
 def fit_confidence(dataset: Dataset, train_shorter: TrainShorter, *, backend: str) -> ConfidenceModel | None:
     """Holds frames of `dataset.train` out, trains from the others and fits the model to the scores of those held out.
 
+    How fast scores fall farther away is told by frames that are extrapolated from others without learning, too.
+
     None where there are too few frames, or where `train_shorter` returns none.
     """
     sweep = dataset.train
@@ -62,13 +66,13 @@ def fit_confidence(dataset: Dataset, train_shorter: TrainShorter, *, backend: st
     views = TrainingViews(part.train.poses, sweep.probe)
     measures = views.measure(both.poses, sweep.probe)
     terms = terms_of(measures, hardness_of_views(part.train))
-    black = _black_ms_ssim(sweep)
-    weights = fit_weights(terms, ms_ssim, black)
+    black, hardness = _black_ms_ssim(sweep), hardness_of_views(sweep)
+    weights = fit_weights(Examples(terms, ms_ssim), black, one_sided_examples(sweep, hardness))
     misses = np.abs(predicted(weights, terms, black) - ms_ssim)[: len(unseen)]
     return ConfidenceModel(
         weights=tuple(weights.tolist()),
         black_ms_ssim=black,
-        hardness=tuple(hardness_of_views(sweep).tolist()),
+        hardness=tuple(hardness.tolist()),
         fitted_on=len(unseen),
         error=float(misses.mean()),
         support=fit_support(measures, shares, ms_ssim, black),

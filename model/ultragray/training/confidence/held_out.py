@@ -27,7 +27,8 @@ def held_out_frames(sweep: Sweep) -> IntArray:  # [H] places, ascending
     All frames of a stretch are left out, whichever pass of the probe they come from. At most MAX_SHARE of the frames
     and never more than leave LEAST_KEPT: single frames are given up first, then the last ones of the path.
     """
-    path = _path(sweep)
+    along = path_mm(sweep)
+    path = along / (float(np.ptp(along)) or 1.0)
     chosen = np.zeros(len(sweep), bool)
     for first, last in STRETCHES:
         chosen |= (path >= first) & (path <= last)
@@ -41,15 +42,14 @@ def held_out_frames(sweep: Sweep) -> IntArray:  # [H] places, ascending
     return np.sort(wanted[: max(allowed, 0)]).astype(np.int64)
 
 
-def _path(sweep: Sweep) -> FloatArray:  # [F] in [0, 1]
+def path_mm(sweep: Sweep) -> FloatArray:  # [F], from 0 on
     """The place of each frame along the direction in which the middles of the images spread most."""
     middles = sweep.corners_mm().mean(axis=1)
     offsets = middles - middles.mean(axis=0)
     _, _, directions = np.linalg.svd(offsets, full_matrices=False)
-    along = offsets @ directions[0]
-    spread = float(np.ptp(along))
-    path: FloatArray = (along - along.min()) / (spread or 1.0)
-    return path
+    places: FloatArray = offsets @ directions[0]
+    places -= places.min()
+    return places
 
 
 def _most_tilted(poses: FloatArray) -> IntArray:  # [F, 4, 4] -> [≤ F]
