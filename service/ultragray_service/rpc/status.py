@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from typing import NoReturn
 
 import grpc
@@ -40,7 +41,10 @@ def status_of(error: UltragrayError) -> Status:
 
 
 async def abort(context: grpc.aio.ServicerContext, error: UltragrayError) -> NoReturn:
-    """Ends the call with `error`."""
+    """Ends the call with `error`. Raises CancelledError where the caller is gone, which grpc tells a moment later."""
     details = ((_DETAILS_KEY, status_of(error).SerializeToString()), (REQUEST_ID_KEY, request_id.get()))
-    await context.abort(getattr(grpc.StatusCode, statuses_of(error).grpc), error.detail, details)
+    try:
+        await context.abort(getattr(grpc.StatusCode, statuses_of(error).grpc), error.detail, details)
+    except grpc.aio.InternalError:
+        raise asyncio.CancelledError from None
     raise AssertionError("abort always raises")

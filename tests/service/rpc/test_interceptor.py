@@ -13,7 +13,9 @@ from google.protobuf.empty_pb2 import Empty
 
 from ultragray_service.core.state import Service
 from ultragray_service.rpc.interceptor import CallContext
+from ultragray_service.rpc.status import abort
 from ultragray_service.settings import load_settings
+from ultragray_workers.errors import DeadlineExceeded
 
 METHOD = "/ultragray.v1.JobService/WatchJob"
 
@@ -56,3 +58,15 @@ def test_a_write_to_a_caller_that_is_gone_is_a_cancelled_call(tmp_path: Path, ca
     (record,) = caplog.records
     fields = vars(record)["fields"]
     assert (record.getMessage(), fields["method"], fields["status"]) == ("request", METHOD, "CANCELLED")
+
+
+class Gone:
+    """A context as grpc leaves it for a moment when the caller's deadline passes: it cannot be provoked at will."""
+
+    async def abort(self, *_: Any) -> None:
+        raise grpc.aio.InternalError('Failed "execute_batch"')
+
+
+def test_an_error_for_a_caller_that_is_gone_is_a_cancelled_call() -> None:
+    with pytest.raises(asyncio.CancelledError):
+        asyncio.run(abort(Gone(), DeadlineExceeded("the deadline passed")))
