@@ -15,6 +15,7 @@ constexpr float kMaxM2Attenuation = 9.0f;
 constexpr float kFullG = 2.8906850f;    // G(u) for u >= 3
 constexpr float kNegligible = 24.0f;    // w < 7e-6 beyond m2 + u2: dozens of such tails on a pixel still do not show
 constexpr float kEarlySigma = 1.8f;     // an opaque Gaussian wider than this, cm, absorbs 1/255 above the rows where w does
+constexpr float kPeakedM2 = 0.00201f;   // w stays under kMaxWeight beyond
 constexpr float kMinVariance = 1e-32f;  // cm2; thinner ones touch no row
 
 constexpr float kNode = 0.7745966692f;  // Gauss-Legendre: nodes 0, +-sqrt(0.6)
@@ -22,16 +23,20 @@ constexpr int kRestartRows = 32;
 
 // G of docs/physics.md §3 for unclipped windows, constant beyond the ends of its fit.
 #if defined(__AVX512F__)
-// Parabolas on steps of 0.2 from -3.4 to 3 (the kink at 0 lies between two), looked up within registers: within 3e-5.
-inline Floats absorption_profile(Floats u) {
-    const Floats at = minimum(maximum(u, splat(-3.3999f)), splat(2.9999f));
-    const __m512i step = (__m512i)((at * 5.0f + 16.5f) + 12582912.0f);  // 1.5 * 2^23: the step is in the low bits
+// A table of parabolas, looked up within registers; constant beyond its ends.
+inline Floats looked_up(const ProfileTable& table, Floats u) {
+    const Floats v = limited(u - ProfileTable::kMiddle, splat(3.1999f));
+    const __m512i step = (__m512i)_mm512_fmadd_round_ps((__m512)v, _mm512_set1_ps(5.0f), _mm512_set1_ps(12582912.0f),
+                                                        _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC);  // in its low bits
     const auto coefficient = [&](int power) {
-        const float* row = kProfile.parabola[power];
-        return (Floats)_mm512_permutex2var_ps(_mm512_loadu_ps(row), step, _mm512_loadu_ps(row + 16));
+        const float* row = table.parabola[power];
+        return (Floats)_mm512_permutex2var_ps(_mm512_load_ps(row), step, _mm512_load_ps(row + 16));
     };
-    return (coefficient(2) * at + coefficient(1)) * at + coefficient(0);
+    return (coefficient(2) * v + coefficient(1)) * v + coefficient(0);
 }
+
+// Within 3e-5; the kink at 0 lies between two steps.
+inline Floats absorption_profile(Floats u) { return looked_up(kProfile, u); }
 #else
 // A minimax polynomial in u, within 3.2e-4.
 inline Floats absorption_profile(Floats u) {
@@ -81,17 +86,37 @@ struct Group {
     Floats peak;            // exp(-m2/2) sigma where m2 <= 9, else 0: psi = peak * G(u)
     Floats zero;            // u at depth 0
     Floats across, spread;  // distance of the slice's mean from the line, 1 / its variance in that direction
+    Floats first, last;     // u between which w or alpha reaches 1/255, unless absorption begins after w has ended
     Mask touched;           // the line comes close enough for w to reach 1/255
     Mask opaque;            // alpha reaches 1/255 below the Gaussian
     int base;
 };
 
-template <Profile profile>
-inline void draw_rows(const Group& g, const Slice& s, const Strip& strip, int column, int top, int end) {
+// Rows after which the progression starts anew.
+inline int restart_period(const Group& g) {
+    if (!any(both(g.touched, less_equal(splat(8.0f / kRestartRows), g.du)))) return kRestartRows;
     const float fastest = largest(keep(g.touched, g.du));
-    const int period = fastest * kRestartRows > 8.0f ? (fastest < 8.0f ? int(8.0f / fastest) : 1) : kRestartRows;
+    return fastest < 8.0f ? int(8.0f / fastest) : 1;
+}
+
+// What passes a pixel of psi: 1 - absorb alpha.
+template <Profile profile>
+inline Floats passing(Floats psi, Floats absorb) {
+    if (profile != Profile::Thin) return 1.0f - absorb * minimum(1.0f - exponential(-psi), splat(kMaxWeight));
+    return 1.0f - psi * (absorb - psi * (absorb * (1.0f / 2.0f) - psi * (absorb * (1.0f / 6.0f))));
+}
+
+// `simple`: what counts of a line is one stretch of u, g.first to g.last, and nowhere does w reach its limit.
+template <Profile profile, bool simple>
+inline void draw_rows(const Group& group, const Slice& s, const Strip& strip, int column, int top, int end) {
+    const Group g = group;  // its own: what is stored below could be anything to the compiler
+    const int period = restart_period(g);
     const Floats q = exponential(-g.du * g.du);
     const Floats intensity = splat(s.intensity), absorb = splat(s.absorb);
+    const int64_t stride = strip.stride;
+    float* __restrict weights = strip.weight + column;
+    float* __restrict intensities = strip.intensity + column;
+    float* __restrict local = strip.local + column;
     for (int block = top; block < end; block += period) {
         Floats steps = splat(float(block - g.base));
         Floats u = g.u + steps * g.du;
@@ -99,18 +124,14 @@ inline void draw_rows(const Group& g, const Slice& s, const Strip& strip, int co
         Floats r = exponential(-g.du * (u + 0.5f * g.du));
         const int stop = block + period < end ? block + period : end;
         for (int i = block; i < stop; ++i) {
-            const Floats psi = g.peak * (profile == Profile::Clipped ? clipped_profile(u, g.zero) : absorption_profile(u));
-            const Mask counted = either(less_equal(u * u, g.window2), less_equal(splat(kMinPsi), psi));
-            Floats alpha;
-            if (profile == Profile::Thin)
-                alpha = psi * (1.0f - psi * (0.5f - psi * (1.0f / 6.0f)));
-            else
-                alpha = minimum(1.0f - exponential(-psi), splat(kMaxWeight));
-            const Floats weight = keep(counted, minimum(w, splat(kMaxWeight)));
-            const int64_t at = int64_t(i) * strip.stride + column;
-            store(strip.weight + at, load<Floats>(strip.weight + at) + weight);
-            store(strip.intensity + at, load<Floats>(strip.intensity + at) + intensity * weight);
-            store(strip.local + at, load<Floats>(strip.local + at) * (1.0f - absorb * keep(counted, alpha)));
+            const Floats shape = profile == Profile::Clipped ? clipped_profile(u, g.zero) : absorption_profile(u);
+            const Mask counted = simple ? within(g.first, u, g.last)
+                                        : either(less_equal(u * u, g.window2), less_equal(splat(kMinPsi), g.peak * shape));
+            const Floats weight = keep(counted, simple ? w : minimum(w, splat(kMaxWeight)));
+            const int64_t at = i * stride;
+            store(weights + at, load<Floats>(weights + at) + weight);
+            store(intensities + at, load<Floats>(intensities + at) + intensity * weight);
+            store(local + at, load<Floats>(local + at) * passing<profile>(keep_product(counted, g.peak, shape), absorb));
             w *= r;
             r *= q;
             steps += 1.0f;
@@ -119,30 +140,67 @@ inline void draw_rows(const Group& g, const Slice& s, const Strip& strip, int co
     }
 }
 
-inline Group cross(const View& view, const Slice& s, int line) {
-    const Doubles dx = load<Doubles>(view.dir_x + line), dz = load<Doubles>(view.dir_z + line);
-    const Doubles x = s.mean_x - load<Doubles>(view.line_x + line);
-    const Doubles across = dx * s.mean_z - dz * x;
-    const Doubles spread = 1.0 / (dx * dx * s.cov_zz - 2.0 * dx * dz * s.cov_xz + dz * dz * s.cov_xx);
-    const Doubles star = spread * (dx * (s.cov_zz * x - s.cov_xz * s.mean_z) + dz * (s.cov_xx * s.mean_z - s.cov_xz * x));
-    const Floats variance = to_floats((s.cov_xx * s.cov_zz - s.cov_xz * s.cov_xz) * spread);
-    const double bound = view.height - 1;
-    const double base = (s.depth - view.near) / view.row_step;  // near the centre: u stays exact where it matters
+// What a slice is to all lines of a view.
+struct Course {
+    int base;  // row next to the slice's centre: u stays exact where it matters
+    double base_depth;
+    // Where the lines are parallel, so that these are the same to all:
+    float spread, slant;  // 1 / the variance across lines; how s* moves with the distance from the mean
+    float variance, sigma;
+};
 
+inline Course course_of(const View& view, const Slice& s) {
+    const double bound = view.height - 1, base = (s.depth - view.near) / view.row_step;
+    Course c{};
+    c.base = static_cast<int>(base > 0 ? (base < bound ? base : bound) : 0);
+    c.base_depth = view.near + view.row_step * (c.base + 0.5);
+    if (view.fanned) return c;
+    const double spread = 1.0 / s.cov_xx;
+    c.spread = static_cast<float>(spread), c.slant = static_cast<float>(s.cov_xz * spread);
+    c.variance = static_cast<float>((s.cov_xx * s.cov_zz - s.cov_xz * s.cov_xz) * spread);
+    c.sigma = __builtin_sqrtf(c.variance > kMinVariance ? c.variance : kMinVariance);
+    return c;
+}
+
+inline Group cross(const View& view, const Slice& s, const Course& course, int line) {
     Group g;
-    g.base = static_cast<int>(base > 0 ? (base < bound ? base : bound) : 0);
-    g.m2 = s.m2_plane + to_floats(across * across * spread);
-    g.across = to_floats(across), g.spread = to_floats(spread);
+    g.base = course.base;
+    if (view.fanned) {
+        const Doubles dx = load<Doubles>(view.dir_x + line), dz = load<Doubles>(view.dir_z + line);
+        const Doubles across = dx * s.mean_z - dz * s.mean_x;  // lines start at the apex, the origin
+        const Doubles spread = 1.0 / (dx * dx * s.cov_zz - 2.0 * dx * dz * s.cov_xz + dz * dz * s.cov_xx);
+        const Doubles star =
+            spread * (dx * (s.cov_zz * s.mean_x - s.cov_xz * s.mean_z) + dz * (s.cov_xx * s.mean_z - s.cov_xz * s.mean_x));
+        const Floats variance = to_floats((s.cov_xx * s.cov_zz - s.cov_xz * s.cov_xz) * spread);
+        g.across = to_floats(across), g.spread = to_floats(spread);
+        g.m2 = s.m2_plane + to_floats(across * across * spread);
+        g.touched = less_equal(splat(kMinVariance), variance);
+        g.sigma = square_root(maximum(variance, splat(kMinVariance)));
+        const Floats inverse_sigma = 1.0f / g.sigma;
+        g.u = to_floats(course.base_depth - star) * inverse_sigma;
+        g.du = float(view.row_step) * inverse_sigma;
+        g.zero = -to_floats(star) * inverse_sigma;
+    } else {
+        // Distances from the mean are short: float holds them as well as double does.
+        const Floats x = float(s.mean_x - view.line_x[line]) - load<Floats>(view.spacing);
+        const Floats slanted = course.slant * x;
+        const float inverse_sigma = 1.0f / course.sigma;
+        g.across = -x, g.spread = splat(course.spread);
+        g.m2 = s.m2_plane + x * x * course.spread;
+        g.touched = less_equal(splat(kMinVariance), splat(course.variance));
+        g.sigma = splat(course.sigma);
+        g.u = (float(course.base_depth - s.mean_z) + slanted) * inverse_sigma;
+        g.du = splat(float(view.row_step) * inverse_sigma);
+        g.zero = (slanted - float(s.mean_z)) * inverse_sigma;
+    }
     g.window2 = float(kMaxM2) - g.m2;
-    g.touched = both(less_equal(Floats{}, g.window2), less_equal(splat(kMinVariance), variance));
-    g.sigma = square_root(maximum(variance, splat(kMinVariance)));
-    const Floats inverse_sigma = 1.0f / g.sigma;
-    g.u = to_floats((view.near + view.row_step * (g.base + 0.5)) - star) * inverse_sigma;
-    g.du = float(view.row_step) * inverse_sigma;
-    g.zero = -to_floats(star) * inverse_sigma;
+    g.touched = both(g.touched, less_equal(Floats{}, g.window2));
     const Mask absorbs = both(g.touched, less_equal(g.m2, splat(kMaxM2Attenuation)));
     g.peak = keep(absorbs, exponential(-0.5f * g.m2) * g.sigma);
     g.opaque = less_equal(splat(kMinPsi), g.peak * kFullG);
+    const Floats window = square_root(maximum(g.window2, Floats{}));
+    g.first = select(g.touched, -window, splat(1e9f));
+    g.last = select(g.opaque, splat(1e9f), window);
     return g;
 }
 
@@ -150,48 +208,56 @@ inline Group cross(const View& view, const Slice& s, int line) {
 struct Extent {
     int top, end;
     Profile profile;
+    bool simple;   // see draw_rows
     Floats whole;  // u from which on the Gaussian is fully crossed
 };
 
 inline Extent extent_of(const View& view, const Group& g) {
-    const Floats window = square_root(maximum(g.window2, Floats{}));
+    const auto any_touched = [&g](Mask m) { return any(both(g.touched, m)); };
+    const Floats window = -g.first, none = splat(-1e9f);
     const Floats whole = 3.0f + maximum(g.zero, Floats{});  // the window ends here even where the mean lies before the face
-    const Floats tail = maximum(whole, square_root(maximum(kNegligible - g.m2, Floats{})));
-    const Floats first_row = (-window - g.u) / g.du, last_row = (select(g.opaque, tail, window) - g.u) / g.du;
-    const float top_row = smallest(select(g.touched, first_row, splat(1e9f))) + float(g.base);
-    const float end_row = largest(select(g.touched, last_row, splat(-1e9f))) + float(g.base);
-    const bool early = largest(keep(g.opaque, g.sigma)) > kEarlySigma;
+    Floats last = window;
+    if (any(g.opaque)) {
+        const Floats tail = maximum(whole, square_root(maximum(kNegligible - g.m2, Floats{})));
+        last = select(g.opaque, tail, window);
+    }
+    const Floats rows = g.sigma * float(1.0 / view.row_step);  // of a standard deviation
+    const float top_row = -largest(select(g.touched, (g.u - g.first) * rows, none)) + float(g.base);
+    const float end_row = largest(select(g.touched, (last - g.u) * rows, none)) + float(g.base);
     const float bound = float(view.height - 1);
-    const float nearest = largest(select(g.touched, g.zero, splat(-1e9f)));
-    const bool thick = largest(g.peak) * kFullG > 0.2f;
+    const bool early = any(both(g.opaque, less_equal(splat(kEarlySigma), g.sigma)));
+    const bool clipped = early || any_touched(less_equal(splat(-6.4f), g.zero));
+    const bool thick = any(less_equal(splat(0.2f / kFullG), g.peak));
+    // Absorption may begin only after w has ended; and w reaches its limit only where m2 is near 0.
+    const bool late = any(both(g.opaque, less_equal(g.peak * absorption_profile(window), splat(kMinPsi))));
+    const bool high = any_touched(less_equal(g.m2, splat(kPeakedM2)));
     return {early || !(top_row > 0.0f) ? 0
             : top_row > bound          ? view.height
                                        : static_cast<int>(top_row),
             !(end_row >= 0.0f) ? 0
             : end_row > bound  ? view.height
                                : static_cast<int>(end_row) + 1,
-            nearest > -6.4f || early ? Profile::Clipped
-            : thick                  ? Profile::Thick
-                                     : Profile::Thin,
-            whole};
+            clipped ? Profile::Clipped
+            : thick ? Profile::Thick
+                    : Profile::Thin,
+            !clipped && !late && !high, whole};
 }
 
-inline void draw_group(const View& view, const Slice& s, const Strip& strip, int column) {
-    const Group g = cross(view, s, strip.first + column);
+inline void draw_group(const View& view, const Slice& s, const Course& course, const Strip& strip, int column) {
+    const Group g = cross(view, s, course, strip.first + column);
     if (!any(g.touched)) return;
     const Extent extent = extent_of(view, g);
     const int top = extent.top, end = extent.end;
-    if (top < end) switch (extent.profile) {
-            case Profile::Thin:
-                draw_rows<Profile::Thin>(g, s, strip, column, top, end);
-                break;
-            case Profile::Thick:
-                draw_rows<Profile::Thick>(g, s, strip, column, top, end);
-                break;
-            case Profile::Clipped:
-                draw_rows<Profile::Clipped>(g, s, strip, column, top, end);
-                break;
-        }
+    if (top < end) {
+        if (extent.profile == Profile::Clipped)
+            draw_rows<Profile::Clipped, false>(g, s, strip, column, top, end);
+        else if (extent.profile == Profile::Thick)
+            (extent.simple ? draw_rows<Profile::Thick, true> : draw_rows<Profile::Thick, false>)(g, s, strip, column, top,
+                                                                                                 end);
+        else
+            (extent.simple ? draw_rows<Profile::Thin, true> : draw_rows<Profile::Thin, false>)(g, s, strip, column, top,
+                                                                                               end);
+    }
     if (end < view.height && any(g.opaque)) {
         const Floats below = g.peak * clipped_profile(extent.whole, g.zero);
         const Floats alpha = minimum(1.0f - exponential(-below), splat(kMaxWeight));
@@ -208,7 +274,11 @@ void draw(const View& view, const Slice* slices, int64_t count, const Strip& str
         if (to < 0 || from >= strip.lines) continue;
         from = from > 0 ? from : 0;
         to = to < strip.lines ? to : strip.lines - 1;
-        for (int column = from; column <= to; column += kLanes) draw_group(view, s, strip, column);
+        // Aligned where that takes no more vectors; lines all the way round would meet a slice from behind.
+        const int before = from % kLanes;
+        if (!view.wrap && (to - from + before) / kLanes == (to - from) / kLanes) from -= before;
+        const Course course = course_of(view, s);
+        for (int column = from; column <= to; column += kLanes) draw_group(view, s, course, strip, column);
     }
 }
 

@@ -99,13 +99,7 @@ inline ProfileSlopes clipped_slopes(Floats u, Floats zero) {
 inline Floats profile_slope(Floats u) {
     const Mask crossing = less_equal(u, splat(3.0f));
 #if defined(__AVX512F__)
-    const Floats at = minimum(maximum(u, splat(-3.3999f)), splat(2.9999f));
-    const __m512i step = (__m512i)((at * 5.0f + 16.5f) + 12582912.0f);
-    const auto coefficient = [&](int power) {
-        const float* row = kProfileSlope.parabola[power];
-        return (Floats)_mm512_permutex2var_ps(_mm512_loadu_ps(row), step, _mm512_loadu_ps(row + 16));
-    };
-    return keep(crossing, (coefficient(2) * at + coefficient(1)) * at + coefficient(0));
+    return keep(crossing, looked_up(kProfileSlope, u));
 #else
     return keep(crossing, clipped_slopes(minimum(maximum(u, splat(-8.0f)), splat(3.0f)), splat(-1e3f)).by_u);
 #endif
@@ -122,8 +116,7 @@ struct LineSums {
 template <Profile profile>
 inline void gather_rows(const Group& g, const Slice& s, const PixelGradients& pixels, int line, int top, int end,
                         LineSums& sums) {
-    const float fastest = largest(keep(g.touched, g.du));
-    const int period = fastest * kRestartRows > 8.0f ? (fastest < 8.0f ? int(8.0f / fastest) : 1) : kRestartRows;
+    const int period = restart_period(g);
     const Floats q = exponential(-g.du * g.du);
     const Floats intensity = splat(s.intensity), absorb = splat(s.absorb);
     for (int block = top; block < end; block += period) {
@@ -176,8 +169,9 @@ struct SliceGradient {
     Floats mean_x{}, mean_z{}, cov_xx{}, cov_xz{}, cov_zz{}, m2_plane{}, intensity{}, absorb{};
 };
 
-inline void gather_group(const View& view, const Slice& s, const PixelGradients& pixels, int line, SliceGradient& out) {
-    const Group g = cross(view, s, line);
+inline void gather_group(const View& view, const Slice& s, const Course& course, const PixelGradients& pixels, int line,
+                         SliceGradient& out) {
+    const Group g = cross(view, s, course, line);
     if (!any(g.touched)) return;
     const Extent extent = extent_of(view, g);
     const int top = extent.top, end = extent.end;
@@ -252,7 +246,8 @@ struct SliceGradients {
 
 inline void gather_slice(const View& view, const Slice& s, const PixelGradients& pixels, SliceGradients& out, int lane) {
     SliceGradient sum;
-    for (int line = s.first; line <= s.last; line += kLanes) gather_group(view, s, pixels, line, sum);
+    const Course course = course_of(view, s);
+    for (int line = s.first; line <= s.last; line += kLanes) gather_group(view, s, course, pixels, line, sum);
     out.mean_x[lane] = total(sum.mean_x), out.mean_z[lane] = total(sum.mean_z);
     out.cov_xx[lane] = total(sum.cov_xx), out.cov_xz[lane] = total(sum.cov_xz), out.cov_zz[lane] = total(sum.cov_zz);
     out.m2_plane[lane] = total(sum.m2_plane);

@@ -27,10 +27,11 @@ double absorption_slope(double u) {
 // Interpolates at the Chebyshev nodes of each step: next to the best parabola there.
 ProfileTable make_table(double (*function)(double)) {
     ProfileTable table;
-    for (int k = 0; k < ProfileTable::kSteps; ++k) {
-        const double centre = -3.3 + 0.2 * k, node = 0.1 * std::sqrt(0.75);
-        const double left = function(centre - node), mid = function(centre);
-        const double right = function(centre + node);
+    for (int n = -ProfileTable::kSteps / 2; n < ProfileTable::kSteps / 2; ++n) {
+        const double centre = 0.2 * n + 0.1, node = 0.1 * std::sqrt(0.75);
+        const auto at = [&](double v) { return function(v + double(ProfileTable::kMiddle)); };
+        const double left = at(centre - node), mid = at(centre), right = at(centre + node);
+        const int k = n & (ProfileTable::kSteps - 1);
         const double slope = (right - left) / (2 * node), bend = (right - 2 * mid + left) / (2 * node * node);
         table.parabola[0][k] = static_cast<float>(mid - slope * centre + bend * centre * centre);
         table.parabola[1][k] = static_cast<float>(slope - 2 * bend * centre);

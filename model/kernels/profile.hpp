@@ -6,7 +6,9 @@ namespace ultragray {
 
 struct ProfileTable {
     static constexpr int kSteps = 32;
-    alignas(64) float parabola[3][kSteps];  // coefficients of 1, u, u² on [-3.4 + 0.2 k, -3.2 + 0.2 k]
+    static constexpr float kMiddle = -0.2f;  // of the steps: v = u - kMiddle goes from -3.2 to 3.2
+    alignas(
+        64) float parabola[3][kSteps];  // coefficients of 1, v, v² on [0.2 n, 0.2 n + 0.2], n from -16 on, at n mod kSteps
 };
 
 extern const ProfileTable kProfile;

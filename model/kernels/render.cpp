@@ -51,6 +51,8 @@ View make_view(const ProbeGeometry& probe, const ScanLines& lines, const double*
         view.origin[axis] = pose[4 * axis + 3];
     }
     view.line_x = lines.x.data(), view.dir_x = lines.dir_x.data(), view.dir_z = lines.dir_z.data();
+    if (!probe.fanned)
+        for (int k = 0; k < kMaxLanes; ++k) view.spacing[k] = static_cast<float>(k * probe.span / width);
     view.near = probe.near, view.cull_far = probe.cull_far;
     view.row_step = (probe.far - probe.near) / height;
     view.start = probe.start, view.span = probe.span, view.fanned = probe.fanned, view.wrap = probe.wrap;

@@ -5,7 +5,7 @@
 
 #include <cstdint>
 #include <cstring>
-#if defined(__AVX512F__)
+#if defined(__AVX2__)  // AVX-512 includes it
 #include <immintrin.h>
 #endif
 
@@ -48,6 +48,12 @@ inline Mask either(Mask a, Mask b) { return a | b; }
 inline bool any(Mask m) { return m != 0; }
 inline Floats select(Mask m, Floats a, Floats b) { return (Floats)_mm512_mask_blend_ps(m, (__m512)b, (__m512)a); }
 inline Floats keep(Mask m, Floats a) { return (Floats)_mm512_maskz_mov_ps(m, (__m512)a); }
+inline Mask within(Floats low, Floats x, Floats high) {
+    return _mm512_mask_cmp_ps_mask(less_equal(low, x), (__m512)x, (__m512)high, _CMP_LE_OQ);
+}
+inline Floats keep_product(Mask m, Floats a, Floats b) { return (Floats)_mm512_maskz_mul_ps(m, (__m512)a, (__m512)b); }
+// -most to most, most > 0.
+inline Floats limited(Floats a, Floats most) { return (Floats)_mm512_range_ps((__m512)a, (__m512)most, 0b0010); }
 inline Floats minimum(Floats a, Floats b) { return (Floats)_mm512_min_ps((__m512)a, (__m512)b); }
 inline Floats maximum(Floats a, Floats b) { return (Floats)_mm512_max_ps((__m512)a, (__m512)b); }
 inline Floats square_root(Floats a) { return (Floats)_mm512_sqrt_ps((__m512)a); }
@@ -59,13 +65,19 @@ inline Mask less_equal(Floats a, Floats b) { return a <= b; }
 inline Mask both(Mask a, Mask b) { return a & b; }
 inline Mask either(Mask a, Mask b) { return a | b; }
 inline bool any(Mask m) {
+#if defined(__AVX2__)
+    return _mm256_movemask_ps((__m256)m) != 0;
+#else
     int32_t lanes[kLanes], found = 0;
     store(lanes, m);
     for (int k = 0; k < kLanes; ++k) found |= lanes[k];
     return found != 0;
+#endif
 }
 inline Floats select(Mask m, Floats a, Floats b) { return (Floats)((m & (Ints)a) | (~m & (Ints)b)); }
 inline Floats keep(Mask m, Floats a) { return (Floats)(m & (Ints)a); }
+inline Mask within(Floats low, Floats x, Floats high) { return (low <= x) & (x <= high); }
+inline Floats keep_product(Mask m, Floats a, Floats b) { return keep(m, a * b); }
 inline Floats minimum(Floats a, Floats b) { return select(less_equal(a, b), a, b); }
 inline Floats maximum(Floats a, Floats b) { return select(less_equal(a, b), b, a); }
 inline Floats square_root(Floats a) {
