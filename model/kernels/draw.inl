@@ -142,11 +142,11 @@ inline void draw_rows(const Group& group, const Slice& s, const Strip& strip, in
 
 // What a slice is to all lines of a view.
 struct Course {
-    int base;  // row next to the slice's centre: u stays exact where it matters
-    double base_depth;
+    int base;           // row next to the slice's centre: u stays exact where it matters
+    double base_depth;  // of that row, cm
     // Where the lines are parallel, so that these are the same to all:
-    float spread, slant;  // 1 / the variance across lines; how s* moves with the distance from the mean
-    float variance, sigma;
+    float spread, slant;    // 1 / the variance across lines, 1/cm2; cm that s* moves for each cm from the mean
+    float variance, sigma;  // along a line, cm2 and cm
 };
 
 inline Course course_of(const View& view, const Slice& s) {
