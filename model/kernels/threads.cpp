@@ -1,5 +1,8 @@
 #include "threads.hpp"
 
+#include <pthread.h>
+#include <sched.h>
+
 #include <algorithm>
 #include <exception>
 #include <iterator>
@@ -9,6 +12,27 @@
 #include <vector>
 
 namespace ultragray {
+
+namespace {
+
+// Starts a thread on another processor than the caller's. Left alone, the scheduler of a virtual machine takes a processor
+// that sleeps for one that is busy, and starts a helper where the caller keeps it waiting for milliseconds.
+std::thread start_elsewhere(const std::function<void()>& work) {
+#ifdef __linux__
+    cpu_set_t anywhere;
+    const int here = sched_getcpu();
+    if (here >= 0 && here < CPU_SETSIZE && sched_getaffinity(0, sizeof anywhere, &anywhere) == 0) {
+        cpu_set_t elsewhere = anywhere;
+        CPU_CLR(here, &elsewhere);
+        std::thread helper(work);
+        if (CPU_COUNT(&elsewhere) > 0) pthread_setaffinity_np(helper.native_handle(), sizeof elsewhere, &elsewhere);
+        return helper;
+    }
+#endif
+    return std::thread(work);
+}
+
+}  // namespace
 
 void run_phases(std::initializer_list<Phase*> phases, int threads) {
     std::exception_ptr failure;
@@ -39,7 +63,7 @@ void run_phases(std::initializer_list<Phase*> phases, int threads) {
     const int wanted = std::min(threads, most) - 1;
     helpers.reserve(std::max(0, wanted));
     try {
-        for (int t = 0; t < wanted; ++t) helpers.emplace_back(work);
+        for (int t = 0; t < wanted; ++t) helpers.push_back(start_elsewhere(work));
     } catch (const std::system_error&) {
         // No more threads to be had: those that run do the work.
     }
