@@ -7,7 +7,6 @@
 #include <exception>
 #include <iterator>
 #include <mutex>
-#include <system_error>
 #include <thread>
 #include <vector>
 
@@ -15,21 +14,31 @@ namespace ultragray {
 
 namespace {
 
-// Starts a thread on another processor than the caller's. Left alone, the scheduler of a virtual machine takes a processor
-// that sleeps for one that is busy, and starts a helper where the caller keeps it waiting for milliseconds.
-std::thread start_elsewhere(const std::function<void()>& work) {
-#ifdef __linux__
-    cpu_set_t anywhere;
+void* call(void* work) {
+    (*static_cast<const std::function<void()>*>(work))();
+    return nullptr;
+}
+
+// Starts a thread, on another processor than the caller's where there is one. Left alone, the scheduler of a virtual machine
+// takes a processor that sleeps for one that is busy, and queues a helper behind its caller, for milliseconds.
+// False where no more threads are to be had.
+bool start_elsewhere(const std::function<void()>& work, pthread_t& helper) {
+    void* const argument = const_cast<std::function<void()>*>(&work);
+#ifdef __GLIBC__
+    cpu_set_t processors;
     const int here = sched_getcpu();
-    if (here >= 0 && here < CPU_SETSIZE && sched_getaffinity(0, sizeof anywhere, &anywhere) == 0) {
-        cpu_set_t elsewhere = anywhere;
-        CPU_CLR(here, &elsewhere);
-        std::thread helper(work);
-        if (CPU_COUNT(&elsewhere) > 0) pthread_setaffinity_np(helper.native_handle(), sizeof elsewhere, &elsewhere);
-        return helper;
+    if (here >= 0 && here < CPU_SETSIZE && sched_getaffinity(0, sizeof processors, &processors) == 0) {
+        CPU_CLR(here, &processors);
+        pthread_attr_t elsewhere;
+        pthread_attr_init(&elsewhere);
+        const bool started = CPU_COUNT(&processors) > 0 &&
+                             pthread_attr_setaffinity_np(&elsewhere, sizeof processors, &processors) == 0 &&
+                             pthread_create(&helper, &elsewhere, call, argument) == 0;
+        pthread_attr_destroy(&elsewhere);
+        if (started) return true;
     }
 #endif
-    return std::thread(work);
+    return pthread_create(&helper, nullptr, call, argument) == 0;
 }
 
 }  // namespace
@@ -50,7 +59,7 @@ void run_phases(std::initializer_list<Phase*> phases, int threads) {
             ++phase.done;
         }
     };
-    const auto work = [&] {
+    const std::function<void()> work = [&] {
         for (Phase* phase : phases) {
             take_all(*phase);
             if (phase == *std::prev(phases.end())) return;
@@ -59,16 +68,11 @@ void run_phases(std::initializer_list<Phase*> phases, int threads) {
     };
     int most = 0;
     for (const Phase* phase : phases) most = std::max(most, phase->count);
-    std::vector<std::thread> helpers;
-    const int wanted = std::min(threads, most) - 1;
-    helpers.reserve(std::max(0, wanted));
-    try {
-        for (int t = 0; t < wanted; ++t) helpers.push_back(start_elsewhere(work));
-    } catch (const std::system_error&) {
-        // No more threads to be had: those that run do the work.
-    }
+    std::vector<pthread_t> helpers(std::max(0, std::min(threads, most) - 1));
+    size_t started = 0;
+    while (started < helpers.size() && start_elsewhere(work, helpers[started])) ++started;
     work();
-    for (std::thread& helper : helpers) helper.join();
+    for (size_t t = 0; t < started; ++t) pthread_join(helpers[t], nullptr);
     if (failure) std::rethrow_exception(failure);
 }
 

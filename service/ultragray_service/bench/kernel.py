@@ -19,6 +19,7 @@ from ultragray.probe import FloatArray
 BLOCK_CM = 5.0
 PROBE = LinearProbe(width_mm=50.0, near_mm=0.0, far_mm=50.0)
 BATCH = 8
+REST_S = 0.003  # in which a processor falls asleep
 
 Mark = float | torch.cuda.Event  # seconds of the host's clock, or a place in the device's queue
 
@@ -81,21 +82,22 @@ class KernelTiming:
 
 
 def measure_kernel(bench: BenchScene, thread_counts: Sequence[int], repeats: int) -> list[KernelTiming]:
-    """One pose and a batch of 8, B-mode only, on each number of threads."""
+    """One pose, a batch of 8, and one pose after a rest as a control loop has it; B-mode only, on each number of threads."""
     scene = bench.scene
     before = torch.get_num_threads()
     timings = []
     try:
         for threads in thread_counts:
             torch.set_num_threads(threads)
-            for poses in (1, BATCH):
+            for what, poses, rest_s in (("kernel", 1, 0.0), ("kernel", BATCH, 0.0), ("kernel, rested", 1, REST_S)):
                 poses_cm = scene.poses_to_scene_cm(bench_poses(max(repeats, 10 * poses)))
                 frame_ms = []
                 for first in range(0, len(poses_cm) - poses + 1, poses):
                     views = poses_cm[first : first + poses]
                     size = (bench.height, bench.width)
+                    time.sleep(rest_s)
                     frame_ms.append(time_ms(cpu.render_outputs, scene, PROBE, views, *size, ("bmode",)) / poses)
-                timings.append(KernelTiming("kernel", threads, poses, frame_ms[1:]))
+                timings.append(KernelTiming(what, threads, poses, frame_ms[1:]))
     finally:
         torch.set_num_threads(before)
     return timings

@@ -23,6 +23,7 @@ import grpc
 from ultragray.probe import FloatArray
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2, rendering_pb2_grpc
 from ultragray_workers.errors import NotReady
+from ultragray_workers.jobs.worker.processes import account_of
 
 from ..core.job_client import JobClient
 from .kernel import BenchScene, bench_poses, time_ms
@@ -31,6 +32,7 @@ SCENE = "bench"
 IN_FLIGHT = 8
 WARM_UP = 20  # first requests of a connection, not counted
 START_TIMEOUT_S = 120.0
+SETTLED_SHARE = 0.1  # of a core, which a service at rest does not reach
 
 
 @dataclass(frozen=True)
@@ -78,7 +80,7 @@ class RunningServer:
 def running_server(
     folder: Path, backend: str, scene: str, *, job_threads: int = 0, python: str = sys.executable
 ) -> Iterator[RunningServer]:
-    """A service of the scenes in `folder`, `scene` for OpenIGTLink, run by `python`. Raises NotReady."""
+    """A service at rest of the scenes in `folder`, `scene` for OpenIGTLink, run by `python`. Raises NotReady."""
     http_port, grpc_port, igtl_port = _free_port(), _free_port(), _free_port()
     settings = {
         "ULTRAGRAY_DATA_FOLDER": str(folder),
@@ -94,6 +96,7 @@ def running_server(
     process = subprocess.Popen([python, "-m", "ultragray_service"], env={**os.environ, **settings})
     try:
         _wait_ready(process, http_port)
+        _wait_settled(process.pid)
         yield RunningServer(http_port, grpc_port, igtl_port, process.pid)
     finally:
         process.terminate()
@@ -115,6 +118,17 @@ def _wait_ready(process: subprocess.Popen[bytes], port: int) -> None:
                 return
         time.sleep(0.1)
     raise NotReady(f"the server of the benchmark was not ready within {START_TIMEOUT_S:g} s")
+
+
+def _wait_settled(pid: int) -> None:
+    """Returns when the worker for jobs has started too, which takes some seconds of both cores."""
+    end = time.monotonic() + START_TIMEOUT_S
+    before = account_of(pid).cpu_s
+    while time.monotonic() < end:
+        time.sleep(1.0)
+        before, used_s = (now := account_of(pid).cpu_s), now - before
+        if used_s < SETTLED_SHARE:
+            return
 
 
 def pose_message(pose: FloatArray) -> geometry_pb2.Pose:  # [4, 4] mm

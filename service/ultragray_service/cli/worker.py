@@ -97,6 +97,7 @@ def main(service_pid: str) -> int:
     if os.getppid() != int(service_pid):
         return 1
     try:
+        os.nice(load_settings().job_nice)  # its looks at the queue would hold up frames, as jobs would
         run_worker({})
     except UltragrayError as error:
         sys.stderr.write(f"ultragray worker: {error.detail}\n")

@@ -53,7 +53,7 @@ def main(folder_path: str, worker_pid: str) -> int:
         if folder.outcome() is not None:
             return 0
         request = folder.request()
-        os.nice(request.nice)
+        os.nice(max(0, request.nice - os.nice(0)))  # a worker within the service is nice itself
         Path("/proc/self/oom_score_adj").write_text(_OOM_SCORE_ADJ, encoding="ascii")
         job_run = JobRun(folder, request, lambda: bool(received))
         try:
