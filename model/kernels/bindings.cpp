@@ -137,6 +137,26 @@ NB_MODULE(_cpu, m) {
         nb::arg("width"), nb::arg("threads"), nb::arg("pixels").noconvert(), nb::arg("flag").noconvert().none() = nb::none(),
         nb::arg("number") = 0);
 
+    m.def(
+        "drawing_work",
+        [](const PreparedScene& scene, bool fanned, bool wrap, double start, double span, double near_cm, double far_cm,
+           double cull_far_cm, BeamNumbers beam, Poses poses, int height, int width, int threads,
+           const std::string& instruction_set) {
+            const ProbeGeometry probe{fanned, wrap, start, span, near_cm, far_cm, cull_far_cm, beam_of(beam)};
+            Work work{};
+            {
+                nb::gil_scoped_release release;
+                work = drawing_work(scene, probe, poses.data(), int(poses.shape(0)), height, width, threads, instruction_set);
+            }
+            nb::dict found;
+            found["slices"] = work.slices, found["groups"] = work.groups;
+            found["rows"] = work.rows, found["lanes"] = work.lanes;
+            return found;
+        },
+        nb::arg("scene"), nb::arg("fanned"), nb::arg("wrap"), nb::arg("start"), nb::arg("span"), nb::arg("near_cm"),
+        nb::arg("far_cm"), nb::arg("cull_far_cm"), nb::arg("beam"), nb::arg("poses").noconvert(), nb::arg("height"),
+        nb::arg("width"), nb::arg("threads"), nb::arg("instruction_set"));
+
     nb::class_<Recording>(m, "Recording")
         .def(
             "__init__",

@@ -267,19 +267,41 @@ inline void draw_group(const View& view, const Slice& s, const Course& course, c
     }
 }
 
-void draw(const View& view, const Slice* slices, int64_t count, const Strip& strip) {
+// Passes each slice that a strip of lines sees to `act`, with the columns of the strip at which its vectors begin.
+template <typename Act>
+inline void each_slice(const View& view, const Slice* slices, int64_t count, int first, int lines, const Act& act) {
     for (int64_t i = 0; i < count; ++i) {
         const Slice& s = slices[i];
-        int from = s.first - strip.first, to = s.last - strip.first;
-        if (to < 0 || from >= strip.lines) continue;
+        int from = s.first - first, to = s.last - first;
+        if (to < 0 || from >= lines) continue;
         from = from > 0 ? from : 0;
-        to = to < strip.lines ? to : strip.lines - 1;
+        to = to < lines ? to : lines - 1;
         // Aligned where that takes no more vectors; lines all the way round would meet a slice from behind.
         const int before = from % kLanes;
         if (!view.wrap && (to - from + before) / kLanes == (to - from) / kLanes) from -= before;
+        act(s, from, to);
+    }
+}
+
+void draw(const View& view, const Slice* slices, int64_t count, const Strip& strip) {
+    each_slice(view, slices, count, strip.first, strip.lines, [&](const Slice& s, int from, int to) {
         const Course course = course_of(view, s);
         for (int column = from; column <= to; column += kLanes) draw_group(view, s, course, strip, column);
-    }
+    });
+}
+
+void count_work(const View& view, const Slice* slices, int64_t count, int first, int lines, Work& work) {
+    each_slice(view, slices, count, first, lines, [&](const Slice& s, int from, int to) {
+        const Course course = course_of(view, s);
+        ++work.slices;
+        for (int column = from; column <= to; column += kLanes) {
+            const Group g = cross(view, s, course, first + column);
+            if (!any(g.touched)) continue;
+            const Extent extent = extent_of(view, g);
+            const int64_t rows = extent.top < extent.end ? extent.end - extent.top : 0;
+            ++work.groups, work.rows += rows, work.lanes += rows * how_many(g.touched);
+        }
+    });
 }
 
 // B = E T, E = (1 - exp(-S)) sum(I w) / (S + 1e-8), and the cumulative product of the steps down each scan line.

@@ -138,6 +138,13 @@ struct Strip {
     int first, lines;
 };
 
+// What drawing takes, counted. A group is a vector of scan lines across a slice.
+struct Work {
+    int64_t slices, groups;
+    int64_t rows;   // of all groups
+    int64_t lanes;  // of all rows: those whose scan line its slice touches
+};
+
 // Sums over an image of |x - y|, and over its windows of SSIM.
 struct ImageLoss {
     double l1, ssim;
@@ -154,6 +161,7 @@ struct Kernels {
     const char* name;
     void (*slice)(const SceneView&, const View&, int64_t first_cluster, int64_t last_cluster, SliceList&);
     void (*draw)(const View&, const Slice*, int64_t count, const Strip&);
+    void (*count)(const View&, const Slice*, int64_t count, int first, int lines, Work&);  // of drawing a strip; added to
     void (*finish)(const View&, const Strip&, const FramePointers&, const SavedPlanes&);
     // The backward pass: pixels of `lines` scan lines from `first` on, then slices; [N], sh [N, K], the beam's moments and,
     // where it is not null, the gradient by the view are added to.

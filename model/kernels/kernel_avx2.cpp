@@ -12,7 +12,7 @@ using namespace ultragray;
 namespace ultragray {
 
 const Kernels& kernels_avx2() {
-    static constexpr Kernels kernels{"avx2", slice_clusters, draw, finish, differentiate, gather, image_loss};
+    static constexpr Kernels kernels{"avx2", slice_clusters, draw, count_work, finish, differentiate, gather, image_loss};
     return kernels;
 }
 

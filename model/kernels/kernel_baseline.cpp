@@ -12,7 +12,7 @@ using namespace ultragray;
 namespace ultragray {
 
 const Kernels& kernels_baseline() {
-    static constexpr Kernels kernels{"baseline", slice_clusters, draw, finish, differentiate, gather, image_loss};
+    static constexpr Kernels kernels{"baseline", slice_clusters, draw, count_work, finish, differentiate, gather, image_loss};
     return kernels;
 }
 

@@ -124,6 +124,26 @@ class Batch {
         run_phases({&slicing, &summing}, threads);
     }
 
+    // What drawing all poses takes.
+    Work work(int threads) {
+        std::vector<Work> found(count() * strips());
+        Phase slicing{count() * parts(), [&](int task) { slice(task, {}); }};
+        Phase counting{count() * strips(), [&](int task) {
+                           const View& view = views_[task / strips()];
+                           const int first = task % strips() * kStripLines;
+                           for (int part = 0; part < parts(); ++part) {
+                               const SliceList& list = slices_[int64_t(task / strips()) * parts() + part];
+                               kernels_.count(view, list.data(), list.size(), first,
+                                              std::min(kStripLines, view.lines - first), found[task]);
+                           }
+                       }};
+        run_phases({&slicing, &counting}, threads);
+        Work sum{};
+        for (const Work& one : found)
+            sum.slices += one.slices, sum.groups += one.groups, sum.rows += one.rows, sum.lanes += one.lanes;
+        return sum;
+    }
+
     // Gradients are added to; no two tasks share a Gaussian, and each adds in the order of the poses. Views add up their
     // parts in order, and so does the beam.
     BeamMoments differentiate(const std::vector<SavedPlanes>& saved, const Outputs& gradients,
@@ -270,6 +290,12 @@ void footprints(const PreparedScene& scene, const ProbeGeometry& probe, const do
         Batch batch(scene, probe, poses + 16 * first, std::min(kPosesAtOnce, count - first), height, width, kernels);
         batch.footprints(pixels + first, threads, limits);
     }
+}
+
+Work drawing_work(const PreparedScene& scene, const ProbeGeometry& probe, const double* poses, int count, int height,
+                  int width, int threads, const std::string& instruction_set) {
+    Batch batch(scene, probe, poses, count, height, width, choose_kernels(instruction_set));
+    return batch.work(threads);
 }
 
 struct Recording::State {

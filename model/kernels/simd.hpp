@@ -46,6 +46,7 @@ inline Mask less_equal(Floats a, Floats b) { return _mm512_cmp_ps_mask((__m512)a
 inline Mask both(Mask a, Mask b) { return a & b; }
 inline Mask either(Mask a, Mask b) { return a | b; }
 inline bool any(Mask m) { return m != 0; }
+inline int how_many(Mask m) { return __builtin_popcount(m); }
 inline Floats select(Mask m, Floats a, Floats b) { return (Floats)_mm512_mask_blend_ps(m, (__m512)b, (__m512)a); }
 inline Floats keep(Mask m, Floats a) { return (Floats)_mm512_maskz_mov_ps(m, (__m512)a); }
 inline Mask within(Floats low, Floats x, Floats high) {
@@ -73,6 +74,11 @@ inline bool any(Mask m) {
     for (int k = 0; k < kLanes; ++k) found |= lanes[k];
     return found != 0;
 #endif
+}
+inline int how_many(Mask m) {
+    int found = 0;
+    for (int k = 0; k < kLanes; ++k) found += m[k] != 0;
+    return found;
 }
 inline Floats select(Mask m, Floats a, Floats b) { return (Floats)((m & (Ints)a) | (~m & (Ints)b)); }
 inline Floats keep(Mask m, Floats a) { return (Floats)(m & (Ints)a); }

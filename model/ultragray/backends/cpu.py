@@ -102,6 +102,22 @@ def footprint_pixels(
     return found
 
 
+def drawing_work(
+    scene: GaussianScene,
+    probe: Probe,
+    poses_cm: FloatArray,  # [C, 4, 4] about the scene's centre
+    height: int,
+    width: int,
+    *,
+    instruction_set: str = "auto",
+) -> dict[str, int]:
+    """What drawing the poses takes: `slices` (one for each strip of 64 scan lines that it touches), `groups` (vectors of
+    scan lines across a slice), `rows` of all groups, and `lanes` of all rows whose scan line its slice touches."""
+    view = _view_arguments(probe, poses_cm, height, width, None)
+    work: dict[str, int] = _cpu.drawing_work(_sorted(scene), **view, instruction_set=instruction_set)
+    return work
+
+
 def _sorted(scene: GaussianScene) -> _cpu.PreparedScene:
     """The scene as the kernel takes it for many frames."""
     return scene.prepared("cpu", lambda: _prepare(scene.splats, scene.info.intensity))
