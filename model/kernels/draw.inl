@@ -207,7 +207,9 @@ inline Group cross(const View& view, const Slice& s, const Course& course, int l
 // The rows of a group where its slice counts, and how its absorption is to be computed there.
 struct Extent {
     int top, end;
-    Profile profile;
+    int clear;     // from this row on no window reaches depth 0, top to end
+    bool clipped;  // there is no such row
+    bool thick;    // psi is not small
     bool simple;   // see draw_rows
     Floats whole;  // u from which on the Gaussian is fully crossed
 };
@@ -226,40 +228,38 @@ inline Extent extent_of(const View& view, const Group& g) {
     const float end_row = largest(select(g.touched, (last - g.u) * rows, none)) + float(g.base);
     const float bound = float(view.height - 1);
     const bool early = any(both(g.opaque, less_equal(splat(kEarlySigma), g.sigma)));
-    const bool clipped = early || any_touched(less_equal(splat(-6.4f), g.zero));
+    const bool clipped = early || any_touched(less_equal(splat(-3.0f), g.zero));
     const bool thick = any(less_equal(splat(0.2f / kFullG), g.peak));
     // Absorption may begin only after w has ended; and w reaches its limit only where m2 is near 0.
     const bool late = any(both(g.opaque, less_equal(g.peak * absorption_profile(window), splat(kMinPsi))));
     const bool high = any_touched(less_equal(g.m2, splat(kPeakedM2)));
-    return {early || !(top_row > 0.0f) ? 0
-            : top_row > bound          ? view.height
-                                       : static_cast<int>(top_row),
-            !(end_row >= 0.0f) ? 0
-            : end_row > bound  ? view.height
-                               : static_cast<int>(end_row) + 1,
-            clipped ? Profile::Clipped
-            : thick ? Profile::Thick
-                    : Profile::Thin,
-            !clipped && !late && !high, whole};
+    const int top = early || !(top_row > 0.0f) ? 0 : top_row > bound ? view.height : static_cast<int>(top_row);
+    const int end = !(end_row >= 0.0f) ? 0 : end_row > bound ? view.height : static_cast<int>(end_row) + 1;
+    int clear = clipped ? end : top;
+    if (!clipped && any_touched(less_equal(splat(-6.4f), g.zero))) {  // windows reach 3 standard deviations up
+        const float widest = largest(keep(g.touched, g.sigma));
+        const float row = (3.0f * widest - float(view.near)) * float(1.0 / view.row_step) + 0.5f;
+        clear = !(row > float(top)) ? top : row > float(end) ? end : static_cast<int>(row);
+    }
+    return {top, end, clear, clipped, thick, !late && !high, whole};
 }
 
 inline void draw_group(const View& view, const Slice& s, const Course& course, const Strip& strip, int column) {
     const Group g = cross(view, s, course, strip.first + column);
     if (!any(g.touched)) return;
     const Extent extent = extent_of(view, g);
-    const int top = extent.top, end = extent.end;
-    if (top < end) {
-        if (extent.profile == Profile::Clipped)
-            draw_rows<Profile::Clipped, false>(g, s, strip, column, top, end);
-        else if (extent.profile == Profile::Thick)
-            (extent.simple ? draw_rows<Profile::Thick, true> : draw_rows<Profile::Thick, false>)(g, s, strip, column, top,
+    const int top = extent.top, clear = extent.clear, end = extent.end;
+    if (top < clear) draw_rows<Profile::Clipped, false>(g, s, strip, column, top, clear);
+    if (clear < end) {
+        if (extent.thick)
+            (extent.simple ? draw_rows<Profile::Thick, true> : draw_rows<Profile::Thick, false>)(g, s, strip, column, clear,
                                                                                                  end);
         else
-            (extent.simple ? draw_rows<Profile::Thin, true> : draw_rows<Profile::Thin, false>)(g, s, strip, column, top,
+            (extent.simple ? draw_rows<Profile::Thin, true> : draw_rows<Profile::Thin, false>)(g, s, strip, column, clear,
                                                                                                end);
     }
     if (end < view.height && any(g.opaque)) {
-        const Floats below = g.peak * clipped_profile(extent.whole, g.zero);
+        const Floats below = g.peak * (extent.clipped ? clipped_profile(extent.whole, g.zero) : splat(kFullG));
         const Floats alpha = minimum(1.0f - exponential(-below), splat(kMaxWeight));
         const Mask passes = less_equal(splat(kMinPsi), below);
         const int64_t at = int64_t(end) * strip.stride + column;

@@ -174,22 +174,18 @@ inline void gather_group(const View& view, const Slice& s, const Course& course,
     const Group g = cross(view, s, course, line);
     if (!any(g.touched)) return;
     const Extent extent = extent_of(view, g);
-    const int top = extent.top, end = extent.end;
+    const int top = extent.top, clear = extent.clear, end = extent.end;
     LineSums sums;
-    if (top < end) switch (extent.profile) {
-            case Profile::Thin:
-                gather_rows<Profile::Thin>(g, s, pixels, line, top, end, sums);
-                break;
-            case Profile::Thick:
-                gather_rows<Profile::Thick>(g, s, pixels, line, top, end, sums);
-                break;
-            case Profile::Clipped:
-                gather_rows<Profile::Clipped>(g, s, pixels, line, top, end, sums);
-                break;
-        }
+    if (top < clear) gather_rows<Profile::Clipped>(g, s, pixels, line, top, clear, sums);
+    if (clear < end) {
+        if (extent.thick)
+            gather_rows<Profile::Thick>(g, s, pixels, line, clear, end, sums);
+        else
+            gather_rows<Profile::Thin>(g, s, pixels, line, clear, end, sums);
+    }
     if (end < view.height && any(g.opaque)) {
-        // Beyond `whole` the profile is constant in u.
-        const ProfileSlopes shape = clipped_slopes(extent.whole + 1.0f, g.zero);
+        ProfileSlopes shape = {splat(kFullG), Floats{}, Floats{}};
+        if (extent.clipped) shape = clipped_slopes(extent.whole + 1.0f, g.zero);  // constant in u there
         const Floats psi = g.peak * shape.value;
         const Mask passes = less_equal(splat(kMinPsi), psi);
         const Floats alpha = 1.0f - exponential(-psi), capped = minimum(alpha, splat(kMaxWeight));
