@@ -10,8 +10,8 @@
 namespace ultragray {
 namespace {
 
-constexpr double kMinScale = 1e-15, kMaxScale = 1e15;  // cm; keeps squares within float
-constexpr double kReach = 3.3290429;                   // sqrt(-2 log(1/255)): w < 1/255 beyond this many standard deviations
+constexpr float kMinScale = 1e-15f, kMaxScale = 1e15f;  // cm; keeps squares within float
+constexpr float kReach = 3.3290429f * (1 + 1e-5f);      // sqrt(-2 log(1/255)): w < 1/255 beyond this many standard deviations
 
 double quat_norm(const RawSplats& raw, int64_t i) {
     double squares = 0;
@@ -19,19 +19,17 @@ double quat_norm(const RawSplats& raw, int64_t i) {
     return std::sqrt(squares);
 }
 
-Gaussian activate(const RawSplats& raw, int64_t i) {
+Gaussian activate(const RawSplats& raw, int64_t i, double norm) {
     Gaussian g;
-    double largest = 0;
-    const double norm = quat_norm(raw, i);
+    float largest = 0;
     for (int d = 0; d < 4; ++d) g.quat[d] = static_cast<float>(raw.quats[4 * i + d] / norm);
     for (int d = 0; d < 3; ++d) {
         g.mean[d] = raw.means[3 * i + d];
-        const double scale = std::clamp(std::exp(double(raw.scales[3 * i + d])), kMinScale, kMaxScale);
-        g.scale[d] = static_cast<float>(scale);
-        largest = std::max(largest, scale);
+        g.scale[d] = std::clamp(std::exp(raw.scales[3 * i + d]), kMinScale, kMaxScale);
+        largest = std::max(largest, g.scale[d]);
     }
-    g.absorb = static_cast<float>(1.0 / (1.0 + std::exp(double(raw.transmittances[i]))));
-    g.reach = static_cast<float>(largest * kReach * (1 + 1e-5));
+    g.absorb = 1.0f / (1.0f + std::exp(raw.transmittances[i]));
+    g.reach = largest * kReach;
     return g;
 }
 
@@ -90,26 +88,28 @@ Cluster enclose(const Gaussian* gaussians, int64_t count) {
 PreparedScene::PreparedScene(const RawSplats& raw, Order order, int threads)
     : order_(order), sh_degree_(raw.sh_degree), intensity_(raw.intensity) {
     if (raw.count == 0) return;
-    std::vector<Gaussian> activated(raw.count);
-    if (order == Order::AsGiven) quat_norms_.resize(raw.count);
+    gaussians_.resize(raw.count);
+    quat_norms_.resize(order == Order::AsGiven ? raw.count : 0);
     run_ranges(
         raw.count,
         [&](int64_t begin, int64_t end) {
             for (int64_t i = begin; i < end; ++i) {
-                activated[i] = activate(raw, i);
-                if (order == Order::AsGiven) quat_norms_[i] = static_cast<float>(quat_norm(raw, i));
+                const double norm = quat_norm(raw, i);
+                gaussians_[i] = activate(raw, i, norm);
+                if (order == Order::AsGiven) quat_norms_[i] = static_cast<float>(norm);
             }
         },
         threads);
     std::vector<int64_t> places(raw.count);
     std::iota(places.begin(), places.end(), 0);
     if (order == Order::Sorted) {
-        const std::vector<uint64_t> keys = curve_keys(activated);
+        const std::vector<Gaussian> given = gaussians_;
+        const std::vector<uint64_t> keys = curve_keys(given);
         std::stable_sort(places.begin(), places.end(), [&](int64_t a, int64_t b) { return keys[a] < keys[b]; });
+        for (int64_t i = 0; i < raw.count; ++i) gaussians_[i] = given[places[i]];
     }
 
     const int64_t terms = (sh_degree_ + 1) * (sh_degree_ + 1);
-    gaussians_.resize(raw.count);
     sh_.resize(raw.count * terms);
     clusters_.resize((raw.count + kClusterSize - 1) / kClusterSize);
     run_ranges(
@@ -118,7 +118,6 @@ PreparedScene::PreparedScene(const RawSplats& raw, Order order, int threads)
             for (int64_t cluster = begin; cluster < end; ++cluster) {
                 const int64_t first = cluster * kClusterSize, last = std::min(first + kClusterSize, raw.count);
                 for (int64_t i = first; i < last; ++i) {
-                    gaussians_[i] = activated[places[i]];
                     sh_[i * terms] = raw.sh0[places[i]];
                     std::copy_n(raw.shn + places[i] * (terms - 1), terms - 1, &sh_[i * terms + 1]);
                 }

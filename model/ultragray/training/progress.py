@@ -16,7 +16,8 @@ SMOOTHING = 0.05  # weight of the newest step in the mean time of a step
 class Progress:
     """After a step. `val_psnr_db` is the latest over some held-out frames; None before the first, or without any.
 
-    `trying` is the effort of a training on a part of the frames, before the run itself; None in the run.
+    `beside` names a training on a part of the frames: before the run, to choose its effort, and after it, to fit the
+    scene's confidence; None in the run. `seconds_left` of the run holds the fit too, about; else it is of the part.
     `peak_memory_mb` (10^6 bytes) is the most that the run took of a GPU until it was last looked at; None on the CPU.
     """
 
@@ -29,7 +30,7 @@ class Progress:
     val_psnr_db: float | None
     val_step: int | None  # after which it was measured
     peak_memory_mb: float | None = None
-    trying: float | None = None
+    beside: str | None = None
 
 
 class StepTimer:

@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import torch
 
@@ -17,11 +17,15 @@ from ..evaluation.metrics import FrameMetrics
 from ..scene import GaussianScene
 from .board import require_tensorboard
 from .checkpointing import read_checkpoint_header
-from .confidence.calibration import fit_confidence, shorter
+from .confidence.calibration import fit_confidence, shorter, steps_of_fit
 from .config import TrainingConfig
 from .effort import choose_effort
 from .progress import Progress
 from .trainer import CHECKPOINT_FILE, Trainer
+
+FITTING = "fitting the confidence"
+
+Report: TypeAlias = Callable[[Progress], None]
 
 
 def train(
@@ -30,7 +34,7 @@ def train(
     *,
     folder: Path | None = None,
     resume: bool = False,
-    report: Callable[[Progress], None] | None = None,
+    report: Report | None = None,
     should_stop: Callable[[], bool] | None = None,
     device: str = "cpu",
     backend: str = "auto",
@@ -71,7 +75,7 @@ def train(
         ) from error
     with trainer.running_out_of_memory_explained():
         with trainer.logs(tensorboard) as log:
-            trainer.run(log, report, should_stop, checkpoint_interval_s)
+            trainer.run(log, _with_fit(report, dataset, trainer.config), should_stop, checkpoint_interval_s)
         scene, is_finished, resolved = trainer.scene(), trainer.is_finished, trainer.config
     if resolved.confidence and is_finished:
         del trainer  # what it takes of the memory is free for the second training
@@ -85,23 +89,36 @@ def train(
 class _Apart:
     """How the trainings beside the run are done, each on a part of its frames."""
 
-    report: Callable[[Progress], None] | None
+    report: Report | None
     should_stop: Callable[[], bool] | None
     device: str
     backend: str
 
-    def scene(self, part: Dataset, config: TrainingConfig, trying: float | None = None) -> GaussianScene | None:
-        """None where it was told to stop. `trying`: the effort, for those who are to be told of the progress."""
+    def scene(self, part: Dataset, config: TrainingConfig, purpose: str) -> GaussianScene | None:
+        """None where it was told to stop. `purpose`: for those who are told of the progress."""
         trainer = Trainer(part, config, folder=None, device=self.device, backend=self.backend)
         report = self.report
 
         def tell(progress: Progress) -> None:
-            if report is not None and trying is not None:
-                report(replace(progress, trying=trying))
+            if report is not None:
+                report(replace(progress, beside=purpose))
 
         with trainer.running_out_of_memory_explained():
             trainer.run(lambda line: None, tell, self.should_stop, math.inf)
         return trainer.scene() if trainer.is_finished else None
+
+
+def _with_fit(report: Report | None, dataset: Dataset, config: TrainingConfig) -> Report | None:
+    """The same, told of the time that fitting the scene's confidence takes after the run."""
+    if report is None or not config.confidence:
+        return report
+    steps = steps_of_fit(config, dataset.train)
+
+    def tell(progress: Progress) -> None:
+        fit_s = steps / progress.steps_per_s if progress.steps_per_s else 0.0
+        report(replace(progress, seconds_left=progress.seconds_left + fit_s))
+
+    return tell
 
 
 def _require_no_run(folder: Path) -> None:
@@ -122,7 +139,7 @@ def _with_effort(
         return replace(config, effort=read_checkpoint_header(folder / CHECKPOINT_FILE).config.effort)
 
     def try_out(part: Dataset, settings: TrainingConfig) -> FrameMetrics | None:
-        scene = apart.scene(part, settings, trying=settings.effort)
+        scene = apart.scene(part, settings, f"trying effort {settings.effort:g} on a part of the frames")
         return None if scene is None else FrameMetrics(**scene.info.metrics)
 
     effort = choose_effort(dataset, config, try_out, folder)
@@ -133,7 +150,7 @@ def _fitted_confidence(dataset: Dataset, config: TrainingConfig, apart: _Apart) 
     """The scene's `confidence`; empty where the frames are too few or the second training came to nothing."""
 
     def train_part(part: Dataset) -> GaussianScene | None:
-        scene = apart.scene(part, shorter(config, len(part.train) / len(dataset.train)))
+        scene = apart.scene(part, shorter(config, len(part.train) / len(dataset.train)), FITTING)
         return None if scene is None else scene.to(apart.device)
 
     try:

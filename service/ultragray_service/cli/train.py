@@ -235,13 +235,11 @@ def _progress_bar() -> Iterator[Callable[[Any], None]]:
         task = progress.add_task("", total=None, stage="training", figures="")
 
         def report(state: Any) -> None:
-            trying = None if state.trying is None else f"trying effort {state.trying:g}"
             if console.is_terminal:
-                progress.update(
-                    task, completed=state.step, total=state.steps, stage=trying or "training", figures=_figures(state)
-                )
+                stage = state.beside or "training"
+                progress.update(task, completed=state.step, total=state.steps, stage=stage, figures=_figures(state))
             elif state.step * 10 // state.steps > (state.step - 1) * 10 // state.steps:
-                stage = f"{trying}: " if trying else ""
+                stage = f"{state.beside}: " if state.beside else ""
                 sys.stderr.write(f"{stage}step {state.step:,} of {state.steps:,}: {_figures(state)}\n")
 
         yield report

@@ -14,6 +14,7 @@ from ultragray.evaluation.metrics import FrameMetrics
 from ultragray.training import Progress, TrainingConfig, train
 from ultragray.training.checkpointing import read_checkpoint_header
 from ultragray.training.effort import EFFORTS_FILE, choose_effort
+from ultragray.training.run import FITTING
 from ultragray.training.trainer import CHECKPOINT_FILE
 
 Datasets = Callable[..., Dataset]
@@ -105,28 +106,32 @@ def test_few_frames_are_trained_with_the_usual_effort(tiny_dataset: Datasets) ->
     assert choose_effort(tiny_dataset(frames=6), OPEN, TryOut({}), None) == 1.0
 
 
+def trying(effort: float) -> str:
+    return f"trying effort {effort:g} on a part of the frames"
+
+
 def test_a_run_chooses_first_and_says_so(tiny_dataset: Datasets, tmp_path: Path) -> None:
     dataset, seen = tiny_dataset(frames=40), list[Progress]()
     config = TrainingConfig(effort=None, steps=12, batch_size=3)
     scene = train(dataset, config, folder=tmp_path, report=seen.append)
     chosen = scene.info.training["effort"]
-    tried = list(dict.fromkeys(progress.trying for progress in seen))
-    assert tried[:2] == [1.0, 2.0]
-    assert tried[-1] is None
-    assert chosen in tried
-    assert seen[-1].step == 12
+    told = list(dict.fromkeys(progress.beside for progress in seen))
+    assert told[:2] == [trying(1.0), trying(2.0)]
+    assert told[-2:] == [None, FITTING]
+    assert trying(chosen) in told
+    assert [progress.step for progress in seen if progress.beside is None][-1] == 12
     assert scene.to_bytes() == train(dataset, replace(config, effort=chosen)).to_bytes()
 
 
 def test_a_run_whose_choice_is_stopped_goes_on_with_it(tiny_dataset: Datasets, tmp_path: Path) -> None:
     dataset, seen = tiny_dataset(frames=40), list[Progress]()
     config = TrainingConfig(effort=None, steps=12, batch_size=3, confidence=False)
-    stopped = train(dataset, config, folder=tmp_path, report=seen.append, should_stop=lambda: seen[-1].trying == 2.0)
+    stopped = train(dataset, config, folder=tmp_path, report=seen.append, should_stop=lambda: seen[-1].beside == trying(2.0))
     assert (stopped.info.training["step"], stopped.info.training["steps"]) == (0, 12)
     assert not (tmp_path / CHECKPOINT_FILE).exists()
     rest = list[Progress]()
-    train(dataset, config, folder=tmp_path, report=rest.append, should_stop=lambda: rest[-1].trying is None)
-    assert 1.0 not in [progress.trying for progress in rest]
+    train(dataset, config, folder=tmp_path, report=rest.append, should_stop=lambda: rest[-1].beside is None)
+    assert trying(1.0) not in [progress.beside for progress in rest]
     effort = read_checkpoint_header(tmp_path / CHECKPOINT_FILE).config.effort
     whole = train(dataset, config, folder=tmp_path, resume=True)
     assert whole.to_bytes() == train(dataset, replace(config, effort=effort)).to_bytes()
@@ -136,4 +141,4 @@ def test_nothing_is_chosen_where_the_effort_changes_nothing(tiny_dataset: Datase
     seen: list[Progress] = []
     config = TrainingConfig(effort=None, steps=3, max_gaussians=40, batch_size=3, confidence=False)
     train(tiny_dataset(frames=40), config, report=seen.append)
-    assert [progress.trying for progress in seen] == [None] * 3
+    assert [progress.beside for progress in seen] == [None] * 3

@@ -43,6 +43,17 @@ def shorter(config: TrainingConfig, share: float) -> TrainingConfig:
     )
 
 
+def steps_of_fit(config: TrainingConfig, sweep: Sweep) -> float:
+    """The steps of a run on all frames of the sweep that take about as long as the shorter training; 0 without one."""
+    held_out = len(held_out_frames(sweep))
+    if held_out < LEAST_HELD_OUT:
+        return 0.0
+    share = 1.0 - held_out / len(sweep)
+    steps = shorter(config, share).steps
+    assert steps is not None
+    return share * steps
+
+
 def fit_confidence(dataset: Dataset, train_shorter: TrainShorter, *, backend: str) -> ConfidenceModel | None:
     """Holds frames of `dataset.train` out, trains from the others and fits the model to the scores of those held out.
 

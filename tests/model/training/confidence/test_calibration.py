@@ -16,7 +16,7 @@ from ultragray.datasets.sweep import Dataset, Sweep
 from ultragray.errors import TrainingDiverged
 from ultragray.evaluation.scoring import evaluate, render_sweep
 from ultragray.probe import FloatArray
-from ultragray.training import TrainingConfig, run, train
+from ultragray.training import Progress, TrainingConfig, run, train
 from ultragray.training.confidence.calibration import fit_confidence, shorter
 from ultragray.training.data.geometry import Geometry
 
@@ -116,6 +116,19 @@ def test_it_can_be_left_out(tiny_dataset: Datasets, tiny_config: Configs) -> Non
     assert having.info.confidence["version"] == 2
     assert len(having.info.confidence["uncertainty"]["variances"]) == len(TERMS)
     assert having.means.equal(without.means)
+
+
+def test_the_time_left_holds_the_fit_and_the_fit_is_told(tiny_dataset: Datasets, tiny_config: Configs) -> None:
+    seen: list[Progress] = []
+    train(tiny_dataset(frames=40), tiny_config(), report=seen.append)
+    own = [progress for progress in seen if progress.beside is None]
+    fit = [progress for progress in seen if progress.beside == run.FITTING]
+    assert seen == own + fit
+    assert fit[-1].step == fit[-1].steps > 0
+    steps_left = [progress.seconds_left * progress.steps_per_s for progress in own]
+    later = steps_left[-1]
+    assert 0.5 * fit[-1].steps <= later <= fit[-1].steps
+    assert steps_left == pytest.approx([own[-1].steps - progress.step + later for progress in own])
 
 
 def test_too_few_frames_give_none(tiny_dataset: Datasets, tiny_config: Configs) -> None:

@@ -23,6 +23,7 @@ from ultragray.scene import GaussianScene
 from ultragray.training import Progress as TrainingProgress
 from ultragray.training import TrainingConfig
 from ultragray.training import train as train_scene
+from ultragray.training.run import FITTING
 from ultragray.training.trainer import CHECKPOINT_FILE, CONFIG_FILE, JOURNAL_FILE
 
 from ...datasets.store import DatasetStore
@@ -90,29 +91,36 @@ def _take_over_run(job_run: JobRun) -> None:
 
 
 def _report(job_run: JobRun, state: TrainingProgress) -> None:
-    job_run.report(
-        Progress(
-            step=state.step,
-            steps=state.steps,
-            loss=state.loss,
-            val_psnr_db=state.val_psnr_db,
-            gaussians=state.gaussian_count,
-            rate_per_s=state.steps_per_s,
-            seconds_left=state.seconds_left if state.trying is None and math.isfinite(state.seconds_left) else None,
-        )
-    )
+    known_s = state.seconds_left if math.isfinite(state.seconds_left) else None
+    if state.beside == FITTING:  # what the run itself has reached stands
+        job_run.report(replace(job_run.progress, seconds_left=known_s))
+    else:
+        job_run.report(_told(state, known_s if state.beside is None else None))
     if state.step * _LINES // state.steps > (state.step - 1) * _LINES // state.steps:
         held_out = "" if state.val_psnr_db is None else f", held out {state.val_psnr_db:.2f} dB"
         sys.stderr.write(
-            f"{'' if state.trying is None else f'trying effort {state.trying:g} on a part of the frames: '}"
+            f"{'' if state.beside is None else f'{state.beside}: '}"
             f"step {state.step:,} of {state.steps:,}: loss {state.loss:.4f}, {state.gaussian_count:,} Gaussians, "
             f"{state.steps_per_s:.1f} steps/s{held_out}\n"
         )
         sys.stderr.flush()
 
 
+def _told(state: TrainingProgress, seconds_left: float | None) -> Progress:
+    return Progress(
+        step=state.step,
+        steps=state.steps,
+        loss=state.loss,
+        val_psnr_db=state.val_psnr_db,
+        gaussians=state.gaussian_count,
+        rate_per_s=state.steps_per_s,
+        seconds_left=seconds_left,
+    )
+
+
 def _finish(job_run: JobRun, job: TrainJob, dataset: Dataset, scene: GaussianScene, device: str) -> Outcome:
-    job_run.progress = replace(job_run.progress, step=scene.info.training["step"], steps=scene.info.training["steps"])
+    step, steps = scene.info.training["step"], scene.info.training["steps"]
+    job_run.progress = replace(job_run.progress, step=step, steps=steps, seconds_left=0.0)
     metrics = {name: float(value) for name, value in scene.info.metrics.items()}
     with job_run.folder.new_artifacts() as folder:
         scene.save(folder / f"{job.scene}{SUFFIX}")
