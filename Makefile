@@ -82,6 +82,7 @@ format: $(VENV)/installed-dev  ## rewrite the sources in the project's format
 
 bench: $(VENV)/installed  ## measure the kernel and the service; the table is printed, the JSON written
 	$(BIN)/ultragray bench --output benchmarks/results.json $(ARGS)
+	$(BIN)/ultragray bench --kernel-details --output benchmarks/kernel.json $(ARGS)
 	$(BIN)/ultragray bench --train --output benchmarks/training.json $(ARGS)
 	$(BIN)/ultragray bench --jobs --output benchmarks/jobs.json $(ARGS)
 	$(BIN)/ultragray bench --clients --output benchmarks/clients.json $(ARGS)

@@ -124,17 +124,19 @@ NB_MODULE(_cpu, m) {
     m.def(
         "footprints",
         [](const PreparedScene& scene, bool fanned, bool wrap, double start, double span, double near_cm, double far_cm,
-           double cull_far_cm, BeamNumbers beam, Poses poses, int height, int width, int threads, FreeCounts pixels,
+           double cull_far_cm, BeamNumbers beam, Poses poses, int height, int width, int threads,
+           const std::string& instruction_set, FreeCounts pixels,
            std::optional<Flag> flag, int64_t number) {
             if (pixels.shape(0) != poses.shape(0)) throw std::invalid_argument("there must be one count per pose");
             const ProbeGeometry probe{fanned, wrap, start, span, near_cm, far_cm, cull_far_cm, beam_of(beam)};
             const Limits limits = limits_of({}, flag, number);
             nb::gil_scoped_release release;
-            footprints(scene, probe, poses.data(), int(poses.shape(0)), height, width, threads, limits, pixels.data());
+            footprints(scene, probe, poses.data(), int(poses.shape(0)), height, width, threads, instruction_set, limits,
+                       pixels.data());
         },
         nb::arg("scene"), nb::arg("fanned"), nb::arg("wrap"), nb::arg("start"), nb::arg("span"), nb::arg("near_cm"),
         nb::arg("far_cm"), nb::arg("cull_far_cm"), nb::arg("beam"), nb::arg("poses").noconvert(), nb::arg("height"),
-        nb::arg("width"), nb::arg("threads"), nb::arg("pixels").noconvert(), nb::arg("flag").noconvert().none() = nb::none(),
+        nb::arg("width"), nb::arg("threads"), nb::arg("instruction_set"), nb::arg("pixels").noconvert(), nb::arg("flag").noconvert().none() = nb::none(),
         nb::arg("number") = 0);
 
     m.def(

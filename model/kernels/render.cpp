@@ -284,8 +284,8 @@ void render(const PreparedScene& scene, const ProbeGeometry& probe, const double
 }
 
 void footprints(const PreparedScene& scene, const ProbeGeometry& probe, const double* poses, int count, int height,
-                int width, int threads, const Limits& limits, int64_t* pixels) {
-    const Kernels& kernels = choose_kernels("auto");
+                int width, int threads, const std::string& instruction_set, const Limits& limits, int64_t* pixels) {
+    const Kernels& kernels = choose_kernels(instruction_set);
     for (int first = 0; first < count; first += kPosesAtOnce) {
         Batch batch(scene, probe, poses + 16 * first, std::min(kPosesAtOnce, count - first), height, width, kernels);
         batch.footprints(pixels + first, threads, limits);

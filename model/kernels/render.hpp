@@ -31,7 +31,7 @@ void render(const PreparedScene& scene, const ProbeGeometry& probe, const double
 
 // The cost of each pose [C] in footprint pixels (footprint.hpp), without drawing it. Throws GivenUp, std::bad_alloc.
 void footprints(const PreparedScene& scene, const ProbeGeometry& probe, const double* poses, int count, int height,
-                int width, int threads, const Limits& limits, int64_t* pixels);
+                int width, int threads, const std::string& instruction_set, const Limits& limits, int64_t* pixels);
 
 // What drawing the poses takes, all together, without drawing. A slice counts for each strip of scan lines that it touches.
 Work drawing_work(const PreparedScene& scene, const ProbeGeometry& probe, const double* poses, int count, int height,

@@ -90,12 +90,21 @@ def footprint_pixels(
     width: int,
     limits: Limits = UNLIMITED,
     beam: Tensor | None = None,  # [3] cm
+    *,
+    instruction_set: str = "auto",
 ) -> list[int]:  # [C]
     """The cost of each pose (`ultragray.limits`), without drawing it. Raises GivenUp."""
     view = _view_arguments(probe, poses_cm, height, width, beam)
     pixels = np.empty(len(poses_cm), np.int64)
     try:
-        _cpu.footprints(_sorted(scene), **view, pixels=pixels, flag=limits.flag, number=limits.number)
+        _cpu.footprints(
+            _sorted(scene),
+            **view,
+            instruction_set=instruction_set,
+            pixels=pixels,
+            flag=limits.flag,
+            number=limits.number,
+        )
     except _cpu.GivenUp:
         raise GivenUp from None
     found: list[int] = pixels.tolist()

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -58,7 +61,8 @@ def render_to_file(
     portion = frames_at_once(settings.height, settings.width)
     assessor = Assessor(scene.info, scene.training_poses)
     found: list[Extrapolation] = []
-    with export_pngs(path, header) if format is None else export_to(path, format, header) as add, torch.no_grad():
+    exporting = export_pngs(path, header) if format is None else export_to(path, format, header)
+    with exporting as add, _written_behind(add) as write, torch.no_grad():
         for first in range(0, len(poses), portion):
             if before_portion is not None:
                 before_portion(first)
@@ -81,7 +85,25 @@ def render_to_file(
             shown = show(asked, settings.probe, settings.display, blackened)
             shares = watch.shares(0, len(frames.coverage))
             found.extend(assessor.with_support(extrapolations[places], shares))
-            add({name: pixels.cpu().numpy() for name, pixels in shown.items()}, found[first:])
-        if before_portion is not None:
-            before_portion(len(poses))
+            write({name: pixels.cpu().numpy() for name, pixels in shown.items()}, found[first:])
+    if before_portion is not None:
+        before_portion(len(poses))
     return found
+
+
+@contextmanager
+def _written_behind(write: Callable[..., object]) -> Iterator[Callable[..., None]]:
+    """The same in a thread of its own, so that a portion is written while the next one is rendered, and not more than
+    one waits. Raises what `write` raises, at the next call or at the end."""
+    with ThreadPoolExecutor(1, "writer") as thread:
+        latest: Future[object] | None = None
+
+        def later(*arguments: Any) -> None:
+            nonlocal latest
+            if latest is not None:
+                latest.result()
+            latest = thread.submit(write, *arguments)
+
+        yield later
+        if latest is not None:
+            latest.result()

@@ -17,6 +17,7 @@ _BENCHES = {
     ("train", "cuda"): "cuda_train",
     ("jobs", "cpu"): "jobs",
     ("clients", "cpu"): "clients",
+    ("kernel-details", "cpu"): "kernel_details",
 }
 BACKENDS = tuple(dict.fromkeys(backend for _, backend in _BENCHES))
 

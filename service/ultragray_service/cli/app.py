@@ -195,6 +195,9 @@ def bench(
     clients: Annotated[
         bool, typer.Option("--clients", help="Measure what control loops, pages and scripts get instead.")
     ] = False,
+    kernel_details: Annotated[
+        bool, typer.Option("--kernel-details", help="Measure the parts of a frame in the kernel, and its work, instead.")
+    ] = False,
     backend: Annotated[str, typer.Option(help="cpu, or cuda: the first GPU.")] = "cpu",
 ) -> None:
     """Measure the kernel and the service on this machine and print a table."""
@@ -203,7 +206,8 @@ def bench(
 
     if output is not None:
         check_writable(output)
-    chosen = [name for name, wanted in (("train", train), ("jobs", jobs), ("clients", clients)) if wanted]
+    wanted = {"train": train, "jobs": jobs, "clients": clients, "kernel-details": kernel_details}
+    chosen = [name for name, is_wanted in wanted.items() if is_wanted]
     if len(chosen) > 1:
-        raise InvalidArgument("give one of --train, --jobs and --clients", field=chosen[0])
+        raise InvalidArgument("give one of --train, --jobs, --clients and --kernel-details", field=chosen[0])
     chosen_bench(chosen[0] if chosen else "frames", backend)(output, quick)

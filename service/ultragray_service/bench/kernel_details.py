@@ -1,0 +1,127 @@
+"""`ultragray bench --kernel-details`: where the time of a frame goes in the kernel, on one thread, and what it does there.
+
+Slicing is timed by asking for the cost of a frame, which slices without drawing; finishing by a frame that shows
+nothing. Drawing is the rest. Its times are of vectors: a group is one of scan lines across a slice, with its rows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+
+from ultragray import GaussianScene
+from ultragray.backends import cpu
+from ultragray.datasets.sweep import spread_places
+from ultragray.demo import load_demo_scene
+from ultragray.probe import FloatArray, Probe
+
+from .kernel import PROBE, bench_poses, bench_scenes, time_ms
+from .report import Report
+
+ELSEWHERE_CM = 1e4  # so far away no Gaussian is cut
+LANES = {"avx512": 16, "avx2": 8, "baseline": 4}  # floats of a vector
+FLOAT_BYTES, TOUCHED_PLANES = 4, 3  # each of which a row loads and stores
+
+
+class View(NamedTuple):
+    """Some poses of a scene."""
+
+    what: str
+    scene: GaussianScene
+    probe: Probe
+    poses_cm: FloatArray  # [C, 4, 4]
+    height: int
+    width: int
+
+
+def views(quick: bool) -> Iterator[View]:
+    """The blocks of random Gaussians, and the demo scene at some of its training poses."""
+    count = 12 if quick else 48
+    for bench in bench_scenes(quick):
+        poses_cm = bench.scene.poses_to_scene_cm(bench_poses(count))
+        yield View(f"{bench.gaussian_count:,} random", bench.scene, PROBE, poses_cm, bench.height, bench.width)
+    demo = load_demo_scene()
+    assert demo.info.probe is not None
+    poses = demo.training_poses[spread_places(len(demo.training_poses), count)]
+    yield View("demo scene", demo, demo.info.probe, demo.poses_to_scene_cm(poses), 512, 512)
+
+
+def measure_details(view: View, instruction_set: str) -> dict[str, Any]:
+    """Medians of a frame's parts, ms, on one thread, and the work of drawing a frame."""
+    scene, probe, size = view.scene, view.probe, (view.height, view.width)
+    elsewhere = view.poses_cm.copy()
+    elsewhere[:, :3, 3] += ELSEWHERE_CM
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        frame, slicing, finishing = (
+            float(np.median([work(poses[None]) for poses in of][1:]))
+            for of, work in (
+                (view.poses_cm, lambda poses: time_ms(_draw, scene, probe, poses, size, instruction_set)),
+                (view.poses_cm, lambda poses: time_ms(_slice, scene, probe, poses, size, instruction_set)),
+                (elsewhere, lambda poses: time_ms(_draw, scene, probe, poses, size, instruction_set)),
+            )
+        )
+        work = cpu.drawing_work(scene, probe, view.poses_cm, *size, instruction_set=instruction_set)
+    finally:
+        torch.set_num_threads(before)
+    drawing = frame - slicing - finishing
+    count, lanes = len(view.poses_cm), LANES[instruction_set]
+    return {
+        "what": view.what,
+        "instruction_set": instruction_set,
+        "frame_ms": frame,
+        "slicing_ms": slicing,
+        "drawing_ms": drawing,
+        "finishing_ms": finishing,
+        "slices": work["slices"] / count,
+        "groups": work["groups"] / count,
+        "rows": work["rows"] / count,
+        "lanes_used": work["lanes"] / (work["rows"] * lanes),
+        "ns_per_group": 1e6 * drawing / (work["groups"] / count),
+        "ns_per_row": 1e6 * drawing / (work["rows"] / count),
+        "megabytes_moved": 2 * TOUCHED_PLANES * FLOAT_BYTES * lanes * work["rows"] / count / 1e6,
+    }
+
+
+def _draw(scene: GaussianScene, probe: Probe, poses_cm: FloatArray, size: tuple[int, int], instruction_set: str) -> None:
+    cpu.render_outputs(scene, probe, poses_cm, *size, ("bmode",), instruction_set=instruction_set)
+
+
+def _slice(scene: GaussianScene, probe: Probe, poses_cm: FloatArray, size: tuple[int, int], instruction_set: str) -> None:
+    cpu.footprint_pixels(scene, probe, poses_cm, *size, instruction_set=instruction_set)
+
+
+def run(output: Path | None, quick: bool) -> None:
+    """Print the table; write it as JSON to `output`. `quick` takes few poses and leaves the large scene out."""
+    report = Report(output)
+    report.time_yard()
+    rows = []
+    for view in views(quick):
+        report.tell(f"{view.what} ...")
+        rows += [measure_details(view, name) for name in cpu.INSTRUCTION_SETS]
+    report.time_yard()
+    report.conclude(
+        report.cpu_document(rows=rows),
+        {
+            "scene": "{what}, {instruction_set}",
+            "ms": "{frame_ms:.2f}",
+            "slicing": "{slicing_ms:.2f}",
+            "drawing": "{drawing_ms:.2f}",
+            "finish": "{finishing_ms:.2f}",
+            "groups": "{groups:,.0f}",
+            "rows": "{rows:,.0f}",
+            "lanes": "{lanes_used:.0%}",
+            "ns/row": "{ns_per_row:.1f}",
+            "MB": "{megabytes_moved:.0f}",
+        },
+        rows,
+        [
+            "One thread. A group is a vector of scan lines across a slice; lanes: those of its rows that the slice touches.",
+            "MB: between registers and the accumulators of a strip, which stay in the level-2 cache.",
+        ],
+    )
