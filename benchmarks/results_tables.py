@@ -230,7 +230,7 @@ def tables(figures: Mapping[str, Any]) -> str:
         "Written by `make results`; edit `benchmarks/results_tables.py` instead. Every figure is measured on frames",
         "that were held out of the training, per frame, then averaged; compounding and the nearest frame are measured",
         "alike. No setting is tuned to a set. The time of a step is the mean over the run, validation included; the",
-        "scene's confidence is fitted afterwards, which takes about half as long again.",
+        "scene's confidence is fitted afterwards, which takes about a quarter as long again.",
         "",
         "| run | training / held-out frames | image | preset | steps | Gaussians | ms a step | total |",
         "|---|---|---|---|---|---|---|---|",

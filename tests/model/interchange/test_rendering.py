@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,9 @@ from ultragray import ConvexProbe, GaussianScene, render
 from ultragray.confidence import SUPPORT_COVERAGE, Extrapolation
 from ultragray.contract import to_dict
 from ultragray.display import Display
+from ultragray.display.pixels import PixelArray
 from ultragray.interchange import rendering
+from ultragray.interchange.exports.npz import NpzExporter
 from ultragray.interchange.rendering import render_to_file
 from ultragray.settings import Below, Resolved
 
@@ -69,4 +72,24 @@ def test_what_is_stopped_leaves_nothing(tmp_path: Path, random_scene: Callable[.
 
     with pytest.raises(KeyboardInterrupt):
         written(tmp_path / "frames.npz", random_scene(3), settings(Display()), before_portion=stop)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("failing", [1, len(CONFIDENCES)])
+def test_a_portion_that_cannot_be_written_ends_it_and_leaves_nothing(
+    tmp_path: Path, random_scene: Callable[..., GaussianScene], monkeypatch: pytest.MonkeyPatch, failing: int
+) -> None:
+    portions = 0
+
+    def write(self: NpzExporter, frames: Mapping[str, PixelArray], count: int) -> None:
+        nonlocal portions
+        portions += 1
+        if portions == failing:
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(NpzExporter, "_write", write)
+    monkeypatch.setattr(rendering, "frames_at_once", lambda height, width: 1)
+    with pytest.raises(OSError, match="No space left"):
+        written(tmp_path / "frames.npz", random_scene(3), settings(Display()))
+    assert portions == failing
     assert list(tmp_path.iterdir()) == []

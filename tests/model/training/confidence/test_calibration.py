@@ -98,8 +98,8 @@ def test_nothing_of_what_is_left_out_is_trained_from(tiny_dataset: Datasets) -> 
     assert len(part.val) == 0
 
 
-@pytest.mark.parametrize(("steps", "fewer_steps"), [(1_001, 501), (800, 500), (24, 24)])
-def test_half_the_steps_and_fewer_gaussians(
+@pytest.mark.parametrize(("steps", "fewer_steps"), [(1_001, 251), (400, 150), (24, 24)])
+def test_a_quarter_of_the_steps_and_fewer_gaussians(
     tiny_dataset: Datasets, tiny_config: Configs, steps: int, fewer_steps: int
 ) -> None:
     config = tiny_config(steps=steps).resolved(Geometry.of(tiny_dataset()))
