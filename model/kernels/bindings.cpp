@@ -125,8 +125,7 @@ NB_MODULE(_cpu, m) {
         "footprints",
         [](const PreparedScene& scene, bool fanned, bool wrap, double start, double span, double near_cm, double far_cm,
            double cull_far_cm, BeamNumbers beam, Poses poses, int height, int width, int threads,
-           const std::string& instruction_set, FreeCounts pixels,
-           std::optional<Flag> flag, int64_t number) {
+           const std::string& instruction_set, FreeCounts pixels, std::optional<Flag> flag, int64_t number) {
             if (pixels.shape(0) != poses.shape(0)) throw std::invalid_argument("there must be one count per pose");
             const ProbeGeometry probe{fanned, wrap, start, span, near_cm, far_cm, cull_far_cm, beam_of(beam)};
             const Limits limits = limits_of({}, flag, number);
@@ -136,8 +135,8 @@ NB_MODULE(_cpu, m) {
         },
         nb::arg("scene"), nb::arg("fanned"), nb::arg("wrap"), nb::arg("start"), nb::arg("span"), nb::arg("near_cm"),
         nb::arg("far_cm"), nb::arg("cull_far_cm"), nb::arg("beam"), nb::arg("poses").noconvert(), nb::arg("height"),
-        nb::arg("width"), nb::arg("threads"), nb::arg("instruction_set"), nb::arg("pixels").noconvert(), nb::arg("flag").noconvert().none() = nb::none(),
-        nb::arg("number") = 0);
+        nb::arg("width"), nb::arg("threads"), nb::arg("instruction_set"), nb::arg("pixels").noconvert(),
+        nb::arg("flag").noconvert().none() = nb::none(), nb::arg("number") = 0);
 
     m.def(
         "drawing_work",
@@ -145,14 +144,11 @@ NB_MODULE(_cpu, m) {
            double cull_far_cm, BeamNumbers beam, Poses poses, int height, int width, int threads,
            const std::string& instruction_set) {
             const ProbeGeometry probe{fanned, wrap, start, span, near_cm, far_cm, cull_far_cm, beam_of(beam)};
-            Work work{};
-            {
-                nb::gil_scoped_release release;
-                work = drawing_work(scene, probe, poses.data(), int(poses.shape(0)), height, width, threads, instruction_set);
-            }
-            nb::dict found;
-            found["slices"] = work.slices, found["groups"] = work.groups;
-            found["rows"] = work.rows, found["lanes"] = work.lanes;
+            nb::gil_scoped_release release;
+            std::vector<std::array<int64_t, 4>> found;
+            for (const Work& one :
+                 drawing_work(scene, probe, poses.data(), int(poses.shape(0)), height, width, threads, instruction_set))
+                found.push_back({one.slices, one.groups, one.rows, one.lanes});
             return found;
         },
         nb::arg("scene"), nb::arg("fanned"), nb::arg("wrap"), nb::arg("start"), nb::arg("span"), nb::arg("near_cm"),

@@ -12,7 +12,8 @@ using namespace ultragray;
 namespace ultragray {
 
 const Kernels& kernels_baseline() {
-    static constexpr Kernels kernels{"baseline", slice_clusters, draw, count_work, finish, differentiate, gather, image_loss};
+    static constexpr Kernels kernels{"baseline", slice_clusters, draw,   count_work,
+                                     finish,     differentiate,  gather, image_loss};
     return kernels;
 }
 

@@ -124,8 +124,8 @@ class Batch {
         run_phases({&slicing, &summing}, threads);
     }
 
-    // What drawing all poses takes.
-    Work work(int threads) {
+    // What drawing each strip takes: [poses, strips].
+    std::vector<Work> work(int threads) {
         std::vector<Work> found(count() * strips());
         Phase slicing{count() * parts(), [&](int task) { slice(task, {}); }};
         Phase counting{count() * strips(), [&](int task) {
@@ -138,10 +138,7 @@ class Batch {
                            }
                        }};
         run_phases({&slicing, &counting}, threads);
-        Work sum{};
-        for (const Work& one : found)
-            sum.slices += one.slices, sum.groups += one.groups, sum.rows += one.rows, sum.lanes += one.lanes;
-        return sum;
+        return found;
     }
 
     // Gradients are added to; no two tasks share a Gaussian, and each adds in the order of the poses. Views add up their
@@ -292,8 +289,8 @@ void footprints(const PreparedScene& scene, const ProbeGeometry& probe, const do
     }
 }
 
-Work drawing_work(const PreparedScene& scene, const ProbeGeometry& probe, const double* poses, int count, int height,
-                  int width, int threads, const std::string& instruction_set) {
+std::vector<Work> drawing_work(const PreparedScene& scene, const ProbeGeometry& probe, const double* poses, int count,
+                               int height, int width, int threads, const std::string& instruction_set) {
     Batch batch(scene, probe, poses, count, height, width, choose_kernels(instruction_set));
     return batch.work(threads);
 }

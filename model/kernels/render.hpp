@@ -33,9 +33,9 @@ void render(const PreparedScene& scene, const ProbeGeometry& probe, const double
 void footprints(const PreparedScene& scene, const ProbeGeometry& probe, const double* poses, int count, int height,
                 int width, int threads, const std::string& instruction_set, const Limits& limits, int64_t* pixels);
 
-// What drawing the poses takes, all together, without drawing. A slice counts for each strip of scan lines that it touches.
-Work drawing_work(const PreparedScene& scene, const ProbeGeometry& probe, const double* poses, int count, int height,
-                  int width, int threads, const std::string& instruction_set);
+// What drawing each strip of scan lines of the poses takes, [C, strips], without drawing.
+std::vector<Work> drawing_work(const PreparedScene& scene, const ProbeGeometry& probe, const double* poses, int count,
+                               int height, int width, int threads, const std::string& instruction_set);
 
 // Frames that remember what their gradients need. The scene must outlive the recording.
 class Recording {

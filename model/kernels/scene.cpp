@@ -11,7 +11,7 @@ namespace ultragray {
 namespace {
 
 constexpr float kMinScale = 1e-15f, kMaxScale = 1e15f;  // cm; keeps squares within float
-constexpr float kReach = 3.3290429f * (1 + 1e-5f);      // sqrt(-2 log(1/255)): w < 1/255 beyond this many standard deviations
+constexpr float kReach = 3.3290429f * (1 + 1e-5f);  // sqrt(-2 log(1/255)): w < 1/255 beyond this many standard deviations
 
 double quat_norm(const RawSplats& raw, int64_t i) {
     double squares = 0;

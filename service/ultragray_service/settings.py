@@ -175,7 +175,9 @@ class Settings(Contract):
     training_threads: int = described(
         "Threads of a job's process; 0: all cores but one, at least one.", 0, low=0, high=1024
     )
-    job_nice: int = described("Nice level of jobs and of the worker within the service: frames go first.", 10, low=0, high=19)
+    job_nice: int = described(
+        "Nice level of jobs and of the worker within the service: frames go first.", 10, low=0, high=19
+    )
     job_stall_timeout_s: float = described(
         "Time in which the process of a job must get on (compute, read or write), or it is ended: JOB_STALLED; 0: any.",
         120.0,

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
@@ -119,12 +120,17 @@ def drawing_work(
     width: int,
     *,
     instruction_set: str = "auto",
-) -> dict[str, int]:
-    """What drawing the poses takes: `slices` (one for each strip of 64 scan lines that it touches), `groups` (vectors of
-    scan lines across a slice), `rows` of all groups, and `lanes` of all rows whose scan line its slice touches."""
+) -> dict[str, npt.NDArray[np.int64]]:
+    """What drawing takes, each [C, S] for the strips of 64 scan lines that a frame is drawn in.
+
+    `slices`, `groups` (vectors of scan lines across a slice), `rows` of all groups, and `lanes` of all rows: those
+    whose scan line its slice touches.
+    """
     view = _view_arguments(probe, poses_cm, height, width, None)
-    work: dict[str, int] = _cpu.drawing_work(_sorted(scene), **view, instruction_set=instruction_set)
-    return work
+    work = np.array(_cpu.drawing_work(_sorted(scene), **view, instruction_set=instruction_set), np.int64)
+    return dict(
+        zip(("slices", "groups", "rows", "lanes"), work.reshape(len(poses_cm), -1, 4).transpose(2, 0, 1), strict=True)
+    )
 
 
 def _sorted(scene: GaussianScene) -> _cpu.PreparedScene:

@@ -82,7 +82,7 @@ class KernelTiming:
 
 
 def measure_kernel(bench: BenchScene, thread_counts: Sequence[int], repeats: int) -> list[KernelTiming]:
-    """One pose, a batch of 8, and one pose after a rest as a control loop has it; B-mode only, on each number of threads."""
+    """One pose, a batch of 8, and one pose after a rest as control loops have it; B-mode, on each number of threads."""
     scene = bench.scene
     before = torch.get_num_threads()
     timings = []

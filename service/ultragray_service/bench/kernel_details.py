@@ -1,11 +1,12 @@
-"""`ultragray bench --kernel-details`: where the time of a frame goes in the kernel, on one thread, and what it does there.
+"""`ultragray bench --kernel-details`: where the time of a frame goes in the kernel, and what it does there.
 
 Slicing is timed by asking for the cost of a frame, which slices without drawing; finishing by a frame that shows
-nothing. Drawing is the rest. Its times are of vectors: a group is one of scan lines across a slice, with its rows.
+nothing. Drawing is the rest.
 """
 
 from __future__ import annotations
 
+import heapq
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -24,6 +25,8 @@ from .report import Report
 
 ELSEWHERE_CM = 1e4  # so far away no Gaussian is cut
 LANES = {"avx512": 16, "avx2": 8, "baseline": 4}  # floats of a vector
+ROWS_PER_GROUP = 10  # that take as long as what a group takes before its first row
+MODELLED_THREADS = (2, 4, 8, 16)
 FLOAT_BYTES, TOUCHED_PLANES = 4, 3  # each of which a row loads and stores
 
 
@@ -70,7 +73,10 @@ def measure_details(view: View, instruction_set: str) -> dict[str, Any]:
     finally:
         torch.set_num_threads(before)
     drawing = frame - slicing - finishing
+    costs = work["rows"] + ROWS_PER_GROUP * work["groups"] + 1  # [C, S]
+    strip_ms = (drawing * costs / costs.sum(axis=1, keepdims=True) + finishing / costs.shape[1]).tolist()
     count, lanes = len(view.poses_cm), LANES[instruction_set]
+    slices, groups, rows, used = (float(work[name].sum()) / count for name in ("slices", "groups", "rows", "lanes"))
     return {
         "what": view.what,
         "instruction_set": instruction_set,
@@ -78,21 +84,36 @@ def measure_details(view: View, instruction_set: str) -> dict[str, Any]:
         "slicing_ms": slicing,
         "drawing_ms": drawing,
         "finishing_ms": finishing,
-        "slices": work["slices"] / count,
-        "groups": work["groups"] / count,
-        "rows": work["rows"] / count,
-        "lanes_used": work["lanes"] / (work["rows"] * lanes),
-        "ns_per_group": 1e6 * drawing / (work["groups"] / count),
-        "ns_per_row": 1e6 * drawing / (work["rows"] / count),
-        "megabytes_moved": 2 * TOUCHED_PLANES * FLOAT_BYTES * lanes * work["rows"] / count / 1e6,
+        "slices": slices,
+        "groups": groups,
+        "rows": rows,
+        "lanes_used": used / (rows * lanes),
+        "ns_per_row": 1e6 * drawing / rows,
+        "megabytes_moved": 2 * TOUCHED_PLANES * FLOAT_BYTES * lanes * rows / 1e6,
+        "modelled_speedups": {
+            threads: frame / float(np.median([slicing / threads + _makespan(one, threads) for one in strip_ms]))
+            for threads in MODELLED_THREADS
+        },
     }
 
 
-def _draw(scene: GaussianScene, probe: Probe, poses_cm: FloatArray, size: tuple[int, int], instruction_set: str) -> None:
+def _makespan(parts_ms: list[float], threads: int) -> float:
+    """The time until all parts are done, where each thread takes the next one as soon as it is free, ms."""
+    free_at = [0.0] * threads
+    for part in parts_ms:
+        heapq.heapreplace(free_at, free_at[0] + part)
+    return max(free_at)
+
+
+def _draw(
+    scene: GaussianScene, probe: Probe, poses_cm: FloatArray, size: tuple[int, int], instruction_set: str
+) -> None:
     cpu.render_outputs(scene, probe, poses_cm, *size, ("bmode",), instruction_set=instruction_set)
 
 
-def _slice(scene: GaussianScene, probe: Probe, poses_cm: FloatArray, size: tuple[int, int], instruction_set: str) -> None:
+def _slice(
+    scene: GaussianScene, probe: Probe, poses_cm: FloatArray, size: tuple[int, int], instruction_set: str
+) -> None:
     cpu.footprint_pixels(scene, probe, poses_cm, *size, instruction_set=instruction_set)
 
 
@@ -118,10 +139,12 @@ def run(output: Path | None, quick: bool) -> None:
             "lanes": "{lanes_used:.0%}",
             "ns/row": "{ns_per_row:.1f}",
             "MB": "{megabytes_moved:.0f}",
+            **{f"x{threads}": f"{{modelled_speedups[{threads}]:.1f}}" for threads in MODELLED_THREADS},
         },
         rows,
         [
-            "One thread. A group is a vector of scan lines across a slice; lanes: those of its rows that the slice touches.",
+            "One thread. A group is a vector of scan lines across a slice; lanes: of its rows, those that it touches.",
             "MB: between registers and the accumulators of a strip, which stay in the level-2 cache.",
+            "x2 … x16: by how much so many cores shorten a frame, modelled from the counted work of its strips.",
         ],
     )

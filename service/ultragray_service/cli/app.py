@@ -196,7 +196,8 @@ def bench(
         bool, typer.Option("--clients", help="Measure what control loops, pages and scripts get instead.")
     ] = False,
     kernel_details: Annotated[
-        bool, typer.Option("--kernel-details", help="Measure the parts of a frame in the kernel, and its work, instead.")
+        bool,
+        typer.Option("--kernel-details", help="Measure the parts of a frame in the kernel, and its work, instead."),
     ] = False,
     backend: Annotated[str, typer.Option(help="cpu, or cuda: the first GPU.")] = "cpu",
 ) -> None:

@@ -126,7 +126,9 @@ def test_a_run_chooses_first_and_says_so(tiny_dataset: Datasets, tmp_path: Path)
 def test_a_run_whose_choice_is_stopped_goes_on_with_it(tiny_dataset: Datasets, tmp_path: Path) -> None:
     dataset, seen = tiny_dataset(frames=40), list[Progress]()
     config = TrainingConfig(effort=None, steps=12, batch_size=3, confidence=False)
-    stopped = train(dataset, config, folder=tmp_path, report=seen.append, should_stop=lambda: seen[-1].beside == trying(2.0))
+    stopped = train(
+        dataset, config, folder=tmp_path, report=seen.append, should_stop=lambda: seen[-1].beside == trying(2.0)
+    )
     assert (stopped.info.training["step"], stopped.info.training["steps"]) == (0, 12)
     assert not (tmp_path / CHECKPOINT_FILE).exists()
     rest = list[Progress]()

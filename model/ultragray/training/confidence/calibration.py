@@ -31,7 +31,8 @@ TrainShorter: TypeAlias = Callable[[Dataset], GaussianScene | None]
 
 
 def shorter(config: TrainingConfig, share: float) -> TrainingConfig:
-    """The configuration of a training on `share` of the frames, with nothing left open: a quarter of the steps, or 150."""
+    """The configuration of a training on `share` of the frames, with nothing left open: a quarter of the steps, or
+    ENOUGH_STEPS."""
     assert config.steps is not None
     assert config.max_gaussians is not None
     assert config.initial_gaussians is not None
