@@ -30,10 +30,10 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-RELEASED_STEPS, RELEASED_BATCH = 30_000, 8  # the run that the released rates are tuned for
+RELEASED_STEPS = 30_000  # the length of run that the released rates are tuned for
 RELEASED_TRANSMITTANCE_RATE, MAX_SCALED_RATE = 5e-4, 2e-2
 USUAL_EFFORT = 1.0
-VIEWS_BETWEEN = 2 / 3  # of a step; what is blended from two frames is thicker than a beam, and its shadows are wider
+VIEWS_BETWEEN = 0.5  # of a step; what is blended from two frames is thicker than a beam, and its shadows are wider
 TEXTURE, TEXTURE_OF_LEARNED_BEAM = 0.05, 0.2  # with less a search that starts too thin ends too thick
 MAX_RANGE_MM = 100.0  # frames further apart have nothing to say about what lies between
 STARTS = ("informed", "random")
@@ -57,9 +57,9 @@ class TrainingConfig(Contract):
         low=0.01,
         high=100.0,
     )
-    batch_size: int = described("Views of one step; fewer where the dataset has few frames.", 6, low=1, high=1_024)
+    batch_size: int = described("Views of one step; fewer where the dataset has few frames.", 8, low=1, high=1_024)
     views_between: float | None = described(
-        "Share of them that lies between frames or beyond the ends of the sweep; none: two thirds, with a beam 0.",
+        "Share of them that lies between frames or beyond the ends of the sweep; none: 0.5, with a beam 0.",
         None,
         low=0.0,
         high=1.0,
@@ -277,7 +277,6 @@ PRESETS: dict[str, dict[str, Any]] = {
     "best": {"effort": None},
     "paper": {
         "steps": RELEASED_STEPS,
-        "batch_size": RELEASED_BATCH,
         "views_between": 0.0,
         "texture": 0.5,
         "initial_gaussians": 500_000,
