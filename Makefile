@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 # A file of tests belongs to one process, which shares its services among them. Most of the time they wait for others: four fit two cores.
 PYTEST := $(BIN)/pytest --numprocesses 4 --dist loadfile
 KERNEL_SOURCES := $(wildcard model/kernels/*) CMakeLists.txt pyproject.toml
-GENERATED_TESTS := tests/proto tests/client/test_client_generated.py tests/interfaces/test_generated_tables.py tests/service/test_snapshots.py
+GENERATED_TESTS := tests/proto tests/client/test_client_generated.py tests/interfaces/test_generated_tables.py tests/interfaces/test_measured_tables.py tests/service/test_snapshots.py
 PYTHON_SOURCES := model service workers proto client tests benchmarks docs examples
 NPM := $(shell command -v npm)
 CONSOLE := service/ultragray_service/console/index.html
@@ -86,6 +86,7 @@ bench: $(VENV)/installed  ## measure the kernel and the service; the table is pr
 	$(BIN)/ultragray bench --train --output benchmarks/training.json $(ARGS)
 	$(BIN)/ultragray bench --jobs --output benchmarks/jobs.json $(ARGS)
 	$(BIN)/ultragray bench --clients --output benchmarks/clients.json $(ARGS)
+	$(BIN)/python benchmarks/performance.py
 
 bench-console: $(VENV)/installed-dev $(CONSOLE)  ## frames a second, memory and first paint of the console in Debian's Chromium; takes six minutes
 	node tests/console/measure.mjs > build/console.json

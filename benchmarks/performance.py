@@ -61,7 +61,8 @@ def frames(measured: Measured) -> Lines:
         )
         for row in measured["rows"]
     )
-    return _table(("What", "Gaussians", "Threads", "Poses at once", "p50 ms", "p99 ms", "Frames/s", "Above kernel ms"), rows)
+    head = ("What", "Gaussians", "Threads", "Poses at once", "p50 ms", "p99 ms", "Frames/s", "Above kernel ms")
+    return _table(head, rows)
 
 
 def frames_at_a_glance(measured: Measured) -> Lines:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import threading
 import time
@@ -64,6 +65,30 @@ def test_a_tensor_changed_in_place_is_noticed(random_scene: SceneMaker) -> None:
     scene.transmittances.fill_(-10.0)
     after = render(scene, PROBE, poses(1), height=32, width=32, outputs=("transmittance",)).transmittance
     assert after.mean() < before.mean() - 0.01
+
+
+@pytest.mark.usefixtures("threads")
+def test_helpers_leave_the_caller_the_processors_it_may_run_on(random_scene: SceneMaker) -> None:
+    scene, before = random_scene(count=50), os.sched_getaffinity(0)
+    torch.set_num_threads(4)
+    for _ in range(200):  # so short that many a helper ends before its caller goes on
+        render(scene, PROBE, poses(1), height=16, width=128, backend="cpu")
+    assert os.sched_getaffinity(0) == before
+
+
+@pytest.mark.usefixtures("threads")
+def test_a_caller_bound_to_one_processor_renders_the_same(random_scene: SceneMaker) -> None:
+    scene, before = random_scene(count=500), os.sched_getaffinity(0)
+    torch.set_num_threads(2)
+    free = render(scene, PROBE, poses(1), height=64, width=128, backend="cpu")
+    os.sched_setaffinity(0, {min(before)})
+    try:
+        bound = render(scene, PROBE, poses(1), height=64, width=128, backend="cpu")
+    finally:
+        os.sched_setaffinity(0, before)
+    assert free.bmode is not None
+    assert bound.bmode is not None
+    assert torch.equal(free.bmode, bound.bmode)
 
 
 def test_other_python_threads_run_while_it_renders(random_scene: SceneMaker) -> None:
