@@ -69,8 +69,9 @@ def frames_at_a_glance(measured: Measured) -> Lines:
     """The same for a reader in a hurry: p50 and p99 by number of Gaussians."""
     by_what: dict[str, dict[int, Measured]] = {}
     for row in measured["rows"]:
-        of_kernel = f", {row['threads']} thread(s), {row['poses']} pose(s) at once" if "kernel" in row["what"] else ""
-        by_what.setdefault(f"{row['what']}{of_kernel}", {})[row["gaussians"]] = row
+        threads = f", {row['threads']} thread{'s' if row['threads'] > 1 else ''}" if "kernel" in row["what"] else ""
+        together = f", batches of {row['poses']}" if row["poses"] > 1 else ""
+        by_what.setdefault(f"{row['what']}{threads}{together}", {})[row["gaussians"]] = row
     counts = sorted({row["gaussians"] for row in measured["rows"]}, reverse=True)
     yield from _table(
         ("one 512x512 frame, p50 / p99", *(f"{count:,} Gaussians" for count in counts)),
