@@ -7,7 +7,8 @@ nothing. Drawing is the rest.
 from __future__ import annotations
 
 import heapq
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,7 +26,7 @@ from .report import Report
 
 ELSEWHERE_CM = 1e4  # so far away no Gaussian is cut
 LANES = {"avx512": 16, "avx2": 8, "baseline": 4}  # floats of a vector
-ROWS_PER_GROUP = 10  # that take as long as what a group takes before its first row
+ROWS_PER_GROUP = 20  # that take as long as what a group takes before its first row
 MODELLED_THREADS = (2, 4, 8, 16)
 FLOAT_BYTES, TOUCHED_PLANES = 4, 3  # each of which a row loads and stores
 
@@ -61,14 +62,9 @@ def measure_details(view: View, instruction_set: str) -> dict[str, Any]:
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        frame, slicing, finishing = (
-            float(np.median([work(poses[None]) for poses in of][1:]))
-            for of, work in (
-                (view.poses_cm, lambda poses: time_ms(_draw, scene, probe, poses, size, instruction_set)),
-                (view.poses_cm, lambda poses: time_ms(_slice, scene, probe, poses, size, instruction_set)),
-                (elsewhere, lambda poses: time_ms(_draw, scene, probe, poses, size, instruction_set)),
-            )
-        )
+        draw = partial(_draw, scene, probe, size, instruction_set)
+        frame, finishing = _median_ms(draw, view.poses_cm), _median_ms(draw, elsewhere)
+        slicing = _median_ms(partial(_slice, scene, probe, size, instruction_set), view.poses_cm)
         work = cpu.drawing_work(scene, probe, view.poses_cm, *size, instruction_set=instruction_set)
     finally:
         torch.set_num_threads(before)
@@ -105,16 +101,20 @@ def _makespan(parts_ms: list[float], threads: int) -> float:
     return max(free_at)
 
 
+def _median_ms(work: Callable[[FloatArray], object], poses_cm: FloatArray) -> float:  # [C, 4, 4]
+    return float(np.median([time_ms(work, pose[None]) for pose in poses_cm][1:]))
+
+
 def _draw(
-    scene: GaussianScene, probe: Probe, poses_cm: FloatArray, size: tuple[int, int], instruction_set: str
-) -> None:
-    cpu.render_outputs(scene, probe, poses_cm, *size, ("bmode",), instruction_set=instruction_set)
+    scene: GaussianScene, probe: Probe, size: tuple[int, int], instruction_set: str, poses_cm: FloatArray
+) -> object:
+    return cpu.render_outputs(scene, probe, poses_cm, *size, ("bmode",), instruction_set=instruction_set)
 
 
 def _slice(
-    scene: GaussianScene, probe: Probe, poses_cm: FloatArray, size: tuple[int, int], instruction_set: str
-) -> None:
-    cpu.footprint_pixels(scene, probe, poses_cm, *size, instruction_set=instruction_set)
+    scene: GaussianScene, probe: Probe, size: tuple[int, int], instruction_set: str, poses_cm: FloatArray
+) -> object:
+    return cpu.footprint_pixels(scene, probe, poses_cm, *size, instruction_set=instruction_set)
 
 
 def run(output: Path | None, quick: bool) -> None:
