@@ -19,9 +19,9 @@ void* call(void* work) {
     return nullptr;
 }
 
-// Starts a thread, on another processor than the caller's where there is one. Left alone, the scheduler of a virtual machine
-// takes a processor that sleeps for one that is busy, and queues a helper behind its caller, for milliseconds.
-// False where no more threads are to be had.
+// Starts a thread, on another processor than the caller's where there is one: left alone, the scheduler of a virtual machine
+// may queue it behind its caller for milliseconds, while another processor sleeps. The processor is chosen as the thread is
+// made: given to one that has ended, an affinity would fall on the caller. False where no more threads are to be had.
 bool start_elsewhere(const std::function<void()>& work, pthread_t& helper) {
     void* const argument = const_cast<std::function<void()>*>(&work);
 #ifdef __GLIBC__
