@@ -12,9 +12,9 @@ Bench = Callable[[Path | None, bool], None]  # the JSON file to write, and wheth
 
 _BENCHES = {
     ("frames", "cpu"): "frames",
-    ("frames", "cuda"): "cuda_frames",
+    ("frames", "cuda"): "cuda.frames",
     ("train", "cpu"): "train",
-    ("train", "cuda"): "cuda_train",
+    ("train", "cuda"): "cuda.train",
     ("jobs", "cpu"): "jobs",
     ("clients", "cpu"): "clients",
     ("kernel-details", "cpu"): "kernel_details",

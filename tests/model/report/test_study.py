@@ -42,7 +42,7 @@ def test_a_finished_run_is_read_from_its_journal(
     turning_dataset: Dataset, small_config: TrainingConfig, tmp_path: Path
 ) -> None:
     seen: list[Progress] = []
-    scene = train(turning_dataset, small_config, folder=tmp_path, report=seen.append)
+    scene = train(turning_dataset, replace(small_config, confidence=False), folder=tmp_path, report=seen.append)
     evaluation = evaluate(scene, turning_dataset.val)
     trained = trained_of_journal(scene, evaluation, tmp_path / JOURNAL_FILE)
     assert trained.losses == [progress.loss for progress in seen]

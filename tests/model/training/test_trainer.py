@@ -53,7 +53,7 @@ def test_learns(tiny_dataset: Datasets, tiny_config: Configs, intensity: str) ->
 
 
 def test_reports_every_step(tiny_dataset: Datasets, tiny_config: Configs) -> None:
-    scene, seen = learned(tiny_dataset(), tiny_config())
+    scene, seen = learned(tiny_dataset(), tiny_config(confidence=False))
     assert [progress.step for progress in seen] == list(range(1, 25))
     assert {progress.steps for progress in seen} == {24}
     assert seen[-1].seconds_left == 0

@@ -30,7 +30,8 @@ def benched(tmp_path_factory: pytest.TempPathFactory) -> Benched:
     """What the command printed, and its two documents."""
     if not cuda.available():
         pytest.skip("there is no GPU, and Triton is not installed, which could interpret the kernels")
-    from ultragray_service.bench import cuda_frames, cuda_train
+    from ultragray_service.bench.cuda import frames as cuda_frames
+    from ultragray_service.bench.cuda import train as cuda_train
 
     folder = tmp_path_factory.mktemp("bench")
     printed, documents = "", []
@@ -93,7 +94,7 @@ def test_training_step(benched: Benched) -> None:
 def test_limits_are_those_of_multiply_adds() -> None:
     if not cuda.available():
         pytest.skip("there is no GPU, and Triton is not installed, which could interpret the kernel")
-    from ultragray_service.bench.gpu import LANES, multiply_add
+    from ultragray_service.bench.cuda.gpu import LANES, multiply_add
 
     sums = torch.empty(2 * LANES, device=cuda.device())
     multiply_add[(2,)](sums, 0.5, 0.25, 3, LANES=LANES)
@@ -125,5 +126,5 @@ def test_other_backends_are_refused() -> None:
 
 
 def test_choices_that_do_not_go_together() -> None:
-    assert "give one of --train, --jobs and --clients" in refused("--train", "--clients")
+    assert "give one of --train, --jobs, --clients and --kernel-details" in refused("--train", "--clients")
     assert "--jobs goes without --backend" in refused("--jobs", "--backend", "cuda")

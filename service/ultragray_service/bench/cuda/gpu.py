@@ -16,8 +16,8 @@ import triton.language as tl
 from ultragray.backends import cuda
 from ultragray.machine import processor_name
 
-from .kernel import elapsed_ms, finish, mark
-from .report import versions
+from ..kernel import elapsed_ms, finish, mark
+from ..report import versions
 
 COPY_BYTES = 2 << 30  # far more than any cache holds
 REPEATS = 10

@@ -12,9 +12,9 @@ from ultragray.backends import cuda
 from ultragray.training.device import forget_peak_memory, peak_memory_mb
 
 from .gpu import gpu_machine
-from .kernel import BATCH
-from .report import Report
-from .train import PARTS, measure_training, training_scenes
+from ..kernel import BATCH
+from ..report import Report
+from ..train import PARTS, measure_training, training_scenes
 
 STEPS = 200  # a tenth of them where it is to be quick
 
