@@ -21,10 +21,10 @@ from ultragray.backends.cuda.work import Work, count_work
 from ultragray.probe import FloatArray
 from ultragray_workers.pool.process.transfer import to_uint8
 
-from .gpu import Limits, gpu_machine, measure_limits
 from ..kernel import PROBE, BenchScene, bench_poses, bench_scenes, elapsed_ms, finish, mark
 from ..report import Report, percentiles
 from ..served import measure_served
+from .gpu import Limits, gpu_machine, measure_limits
 
 BATCHES = (1, 8, 64, 256)  # poses rendered by one call
 POSES = 256  # that the calls go through

@@ -11,10 +11,10 @@ import torch
 from ultragray.backends import cuda
 from ultragray.training.device import forget_peak_memory, peak_memory_mb
 
-from .gpu import gpu_machine
 from ..kernel import BATCH
 from ..report import Report
 from ..train import PARTS, measure_training, training_scenes
+from .gpu import gpu_machine
 
 STEPS = 200  # a tenth of them where it is to be quick
 
