@@ -291,6 +291,7 @@ void footprints(const PreparedScene& scene, const ProbeGeometry& probe, const do
 
 std::vector<Work> drawing_work(const PreparedScene& scene, const ProbeGeometry& probe, const double* poses, int count,
                                int height, int width, int threads, const std::string& instruction_set) {
+    if (count == 0) throw std::invalid_argument("there must be at least one pose");
     Batch batch(scene, probe, poses, count, height, width, choose_kernels(instruction_set));
     return batch.work(threads);
 }

@@ -62,9 +62,8 @@ def measure_jobs(extent: JobsExtent, tell: Callable[[str], None]) -> dict[str, A
             _finish_one(server.jobs())
         _copy_jobs(folder / "artifacts", extent.jobs)
         tell(f"start with {extent.jobs:,} jobs, and pages of them ...")
-        started = time.perf_counter()
         with running_server(folder, "cpu", SCENE) as server:
-            start_s = time.perf_counter() - started
+            start_s = server.ready_s
             port, client = server.http_port, server.jobs()
             pages = {
                 f"page of {PAGE}, newest": _pages(port, extent.pages, f"/v1/jobs?page_size={PAGE}"),

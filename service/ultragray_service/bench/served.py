@@ -70,6 +70,7 @@ class RunningServer:
     grpc_port: int
     igtl_port: int
     pid: int
+    ready_s: float  # from its start until it was ready
 
     def jobs(self) -> JobClient:
         """A client of its jobs."""
@@ -93,11 +94,13 @@ def running_server(
         "ULTRAGRAY_PRELOAD": scene,
         "ULTRAGRAY_LOG_LEVEL": "error",
     }
+    started = time.perf_counter()
     process = subprocess.Popen([python, "-m", "ultragray_service"], env={**os.environ, **settings})
     try:
         _wait_ready(process, http_port)
+        ready_s = time.perf_counter() - started
         _wait_settled(process.pid)
-        yield RunningServer(http_port, grpc_port, igtl_port, process.pid)
+        yield RunningServer(http_port, grpc_port, igtl_port, process.pid, ready_s)
     finally:
         process.terminate()
         process.wait(timeout=30)
@@ -121,7 +124,7 @@ def _wait_ready(process: subprocess.Popen[bytes], port: int) -> None:
 
 
 def _wait_settled(pid: int) -> None:
-    """Returns when the worker for jobs has started too, which takes some seconds of both cores."""
+    """Returns when the worker for jobs has started too, which takes some seconds of both cores. Raises NotReady."""
     end = time.monotonic() + START_TIMEOUT_S
     before = account_of(pid).cpu_s
     while time.monotonic() < end:
@@ -129,6 +132,7 @@ def _wait_settled(pid: int) -> None:
         before, used_s = (now := account_of(pid).cpu_s), now - before
         if used_s < SETTLED_SHARE:
             return
+    raise NotReady(f"the server of the benchmark did not come to rest within {START_TIMEOUT_S:g} s")
 
 
 def pose_message(pose: FloatArray) -> geometry_pb2.Pose:  # [4, 4] mm
