@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 from dataclasses import asdict
 from pathlib import Path
 from types import ModuleType
@@ -14,18 +13,15 @@ from ultragray.display import AS_RENDERED
 from ultragray_client import Display, RenderSettings
 from ultragray_service.errors import STATUSES
 
+from ..scripts import loaded
+
 CLIENT = Path(__file__).resolve().parents[2] / "client"
 BY_HAND = {"__init__.py", "transport.py"}
 
 
 @pytest.fixture(scope="module")
 def generator() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("generate_client", CLIENT / "generate.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return loaded(CLIENT / "generate.py")
 
 
 def test_the_client_for_threads_is_current(generator: ModuleType, tmp_path: Path) -> None:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import importlib.util
 from pathlib import Path
 from types import ModuleType
 
 import pytest
 
+from ..scripts import loaded
 from .document import DOCUMENT
 
 GENERATOR = Path(__file__).resolve().parents[2] / "docs" / "generate.py"
@@ -15,12 +15,7 @@ GENERATOR = Path(__file__).resolve().parents[2] / "docs" / "generate.py"
 
 @pytest.fixture(scope="module")
 def generator() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("generate_docs", GENERATOR)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return loaded(GENERATOR)
 
 
 def test_tables_are_current(generator: ModuleType) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 from importlib.resources import files
 from pathlib import Path
 from types import ModuleType
@@ -14,6 +13,8 @@ from grpc_tools import protoc
 
 from ultragray_proto.v1 import access_pb2, datasets_pb2, geometry_pb2, jobs_pb2, rendering_pb2, scenes_pb2, workers_pb2
 
+from ..scripts import loaded
+
 PROTO = Path(__file__).resolve().parents[2] / "proto"
 COMMITTED = PROTO / "ultragray_proto" / "v1"
 VERSION_LINE = "# Protobuf Python Version: "
@@ -21,12 +22,7 @@ VERSION_LINE = "# Protobuf Python Version: "
 
 @pytest.fixture(scope="module")
 def generator() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("generate", PROTO / "generate.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return loaded(PROTO / "generate.py")
 
 
 def protoc_version(folder: Path) -> str:
