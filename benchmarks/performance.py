@@ -156,12 +156,10 @@ def clients(measured: Measured) -> Lines:
 
 def jobs(measured: Measured) -> Lines:
     """A service with a long list of jobs."""
-    yield from _table(
+    return _table(
         ("What", "p50 ms", "p99 ms"),
         ((what, f"{of['p50']:.1f}", f"{of['p99']:.1f}") for what, of in measured["latency_ms"].items()),
     )
-    yield ""
-    yield f"A service with {measured['extent']['jobs']:,} finished jobs is ready after {measured['start_s']:.1f} s."
 
 
 BLOCKS: dict[str, tuple[str, Callable[[Measured], Lines]]] = {
