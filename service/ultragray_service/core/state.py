@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
 from enum import Enum
 from functools import partial
 
@@ -27,7 +28,9 @@ from ..access.limits.limits import Limits
 from ..access.oidc.tokens import OidcTokens
 from ..access.origins import Origins
 from ..access.owners import Owners
-from ..access.principal import caller
+from ..access.permissions import require
+from ..access.principal import Principal, act_as, caller
+from ..access.rules import Operation
 from ..access.sessions import Sessions
 from ..access.snapshot import Snapshot
 from ..settings import Settings
@@ -125,6 +128,28 @@ class Service:
         self.comparisons = Comparisons(store, self.catalog, self.datasets, settings, pictures)
         self.training_views = TrainingViews(self.jobs, self.datasets, settings, pictures)
         self._prepared = (self.dataset_views, self.comparisons, self.training_views)
+
+    @asynccontextmanager
+    async def permitted(
+        self,
+        principal: Principal,
+        credential: str | None,
+        operation: Operation,
+        target: str,
+        *,
+        address: str,
+        connection: str,
+    ) -> AsyncIterator[None]:
+        """What a caller may do runs within: counted, audited, and cut off when the credential counts no more.
+
+        `connection`: the caller's address with the port. Raises RateLimited, PermissionDenied and JobNotFound.
+        """
+        act_as(principal, address=address, connection=connection)
+        with self.audit.refusals(principal.name, address, operation, target):
+            self.limits.take_request()
+        with self.audit.request(principal.name, address, operation, target), self.sessions.held(principal, credential):
+            await require(principal, operation, target, self.owners)
+            yield
 
     def require_frames(self) -> None:
         """Raises NotReady or Draining, saying why no frame would be rendered now."""

@@ -16,8 +16,6 @@ from ..access.audit import NOBODY
 from ..access.credentials import credentials_of_subprotocols, offered_credential
 from ..access.guard import Guard
 from ..access.origins import Origins
-from ..access.permissions import require
-from ..access.principal import act_as
 from ..access.rules import UNKNOWN, WEBSOCKET, HttpRules, Operation
 from ..core.state import Service
 from ..errors import BodyTooLarge, HostRefused, OriginRefused
@@ -157,14 +155,8 @@ class Authorize:
         with service.audit.refusals(NOBODY, address, operation, target):
             credential = offered_credential(headers.getlist("authorization"), keys)
             principal = service.guard.authenticate(credential)
-        act_as(principal, address=address, connection=f"{address}:{port}")
-        with service.audit.refusals(principal.name, address, operation, target):
-            service.limits.take_request()
-        with (
-            service.audit.request(principal.name, address, operation, target),
-            service.sessions.held(principal, credential),
-        ):
-            await require(principal, operation, target, service.owners)
+        connection = f"{address}:{port}"
+        async with service.permitted(principal, credential, operation, target, address=address, connection=connection):
             await self._app(scope, receive, send)
 
 

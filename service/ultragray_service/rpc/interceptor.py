@@ -15,8 +15,7 @@ from ultragray.errors import UltragrayError
 
 from ..access.audit import NOBODY, Entry
 from ..access.credentials import offered_credential
-from ..access.permissions import require
-from ..access.principal import Principal, act_as
+from ..access.principal import Principal
 from ..access.rules import GRPC_OPERATIONS, REFLECTION, Operation
 from ..core.state import Service
 from ..errors import statuses_of
@@ -76,15 +75,9 @@ class CallContext(grpc.aio.ServerInterceptor):  # type: ignore[misc]
 
         async def call(request: Any, context: Any) -> Any:
             peer, target = context.peer(), name_in(request, operation)
-            address = address_of(peer)
-            act_as(principal, address=address, connection=peer)
-            with service.audit.refusals(principal.name, address, operation, target):
-                service.limits.take_request()
-            with (
-                service.audit.request(principal.name, address, operation, target),
-                service.sessions.held(principal, credential),
+            async with service.permitted(
+                principal, credential, operation, target, address=address_of(peer), connection=peer
             ):
-                await require(principal, operation, target, service.owners)
                 return await method(request, context)
 
         return call
