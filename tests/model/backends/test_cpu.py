@@ -71,8 +71,8 @@ def test_a_tensor_changed_in_place_is_noticed(random_scene: SceneMaker) -> None:
 def test_helpers_leave_the_caller_the_processors_it_may_run_on(random_scene: SceneMaker) -> None:
     scene, before = random_scene(count=50), os.sched_getaffinity(0)
     torch.set_num_threads(4)
-    for _ in range(200):  # so short that many a helper ends before its caller goes on
-        render(scene, PROBE, poses(1), height=16, width=128, backend="cpu")
+    for _ in range(5000):  # so short that many a helper ends before its caller goes on
+        render(scene, PROBE, poses(1), height=2, width=512, backend="cpu")
     assert os.sched_getaffinity(0) == before
 
 
