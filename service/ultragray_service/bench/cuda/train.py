@@ -14,7 +14,7 @@ from ultragray.training.device import forget_peak_memory, peak_memory_mb
 from ..kernel import BATCH
 from ..report import Report
 from ..train import PARTS, measure_training, training_scenes
-from .gpu import gpu_machine
+from .gpu import gpu_document
 
 STEPS = 200  # a tenth of them where it is to be quick
 
@@ -37,7 +37,7 @@ def run(output: Path | None, quick: bool) -> None:
             }
         )
     report.conclude(
-        {"machine": gpu_machine(device), "rows": rows},
+        gpu_document(device, rows=rows),
         {
             "Gaussians": "{gaussians:,}",
             "images": "{images}",
