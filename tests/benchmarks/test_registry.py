@@ -17,6 +17,7 @@ from ..surroundings import ROOT
 registry = benchmark("registry")
 FIGURES = registry.FIGURES
 TARGETS = sorted({file.target for file in FIGURES.values()})
+MAKES_OWN = ("MAKEFLAGS", "MFLAGS", "MAKELEVEL")
 NOT_MEASURED_YET = {"benchmarks/cuda.json", "benchmarks/cuda_training.json"}
 
 
