@@ -1,6 +1,6 @@
 """The truth of confidence and uncertainty: what scenes tell of frames that they have not seen, against what comes out.
 
-    python benchmarks/confidence.py [--only NAME ...] [--data FOLDER] [--steps N]
+    python benchmarks/confidence.py [--only NAME ...] [--data FOLDER]
 
 Each scene is trained from in-silico sweeps that leave something out, or with --data from sets of that folder; it is
 then asked for what was left out, cause by cause. Each scene's figures go into build/bench/confidence.json as soon as
@@ -201,10 +201,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--only", nargs="+", choices=[*IN_SILICO, *RECORDED], help="leave out the others")
     parser.add_argument("--data", type=Path, metavar="FOLDER", help="of the recorded sets; without, they are left out")
-    parser.add_argument("--steps", type=int, help="of each training, instead of what the frames ask for")
     given = parser.parse_args()
     torch.set_num_threads(1)
-    config = TrainingConfig.preset("fast", **({} if given.steps is None else {"steps": given.steps}))
+    config = TrainingConfig.preset("fast")
     runs = dict(IN_SILICO)
     if given.data is not None:
         runs |= {name: partial(recorded, given.data, name) for name in RECORDED}

@@ -65,6 +65,8 @@ def taken_over(file: Figures, here: str) -> Document:
     """
     staged = json.loads(file.staged.read_text(encoding="utf-8")) if file.staged.exists() else {}
     fresh = _of_commit(staged, here)
+    if fresh.get("quick"):
+        raise NotRecordable(f"{file.staged} is of a quick run; measure it whole with make {file.target}")
     if not fresh:
         raise NotRecordable(f"{file.staged} has no figures of commit {here}; measure them with make {file.target}")
     kept = json.loads(file.kept.read_text(encoding="utf-8")) if file.kept.exists() else {}

@@ -65,6 +65,9 @@ def test_a_file_takes_the_place_of_the_former(repository: Repository, monkeypatc
     write(results.staged, figures(f"{here}-dirty", 2))
     with pytest.raises(SystemExit, match="has no figures"):
         run(monkeypatch, "results")
+    write(results.staged, {**figures(here, 2), "quick": True})
+    with pytest.raises(SystemExit, match="is of a quick run; measure it whole with make bench"):
+        run(monkeypatch, "results")
     assert json.loads(results.kept.read_text())["value"] == 1
     write(results.staged, figures(here, 2))
     run(monkeypatch, "results")

@@ -31,7 +31,7 @@ COLUMNS = {
 
 def run(output: Path | None, quick: bool) -> None:
     """Print the table; write it as JSON to `output`. `quick` takes few repetitions and leaves the large scene out."""
-    report = Report(output)
+    report = Report(output, quick)
     repeats = 20 if quick else 200
     threads = torch.get_num_threads()
     rows: list[Row] = []

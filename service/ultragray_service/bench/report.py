@@ -27,10 +27,11 @@ TABLE_WIDTH = 110  # columns, where no terminal says
 class Report:
     """One benchmark on its way: says what is measured, then prints the table and writes the JSON."""
 
-    def __init__(self, output: Path | None) -> None:
+    def __init__(self, output: Path | None, quick: bool) -> None:
         console = Console()
         self._console = console if console.is_terminal else Console(width=TABLE_WIDTH)
         self._output = output
+        self._quick = quick
         self._yards_ms: list[float] = []
 
     def tell(self, what: str) -> None:
@@ -67,7 +68,8 @@ class Report:
         for note in notes:
             self._console.print(note)
         if self._output is not None:
-            write_whole(self._output, json.dumps(document, indent=1) + "\n")
+            quick = {"quick": True} if self._quick else {}  # too few repetitions to be recorded
+            write_whole(self._output, json.dumps({**document, **quick}, indent=1) + "\n")
             self._console.print(f"written to {self._output}")
 
 

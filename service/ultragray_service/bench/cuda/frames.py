@@ -50,7 +50,7 @@ COLUMNS = {
 
 def run(output: Path | None, quick: bool) -> None:
     """Print the table; write it as JSON to `output`. `quick` takes few repetitions and leaves the large scene out."""
-    report, device = Report(output), cuda.device()
+    report, device = Report(output, quick), cuda.device()
     rounds = ROUNDS // 4 if quick else ROUNDS
     limits = measure_limits(device)
     rows: list[Row] = []

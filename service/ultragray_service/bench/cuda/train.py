@@ -21,7 +21,7 @@ STEPS = 200  # a tenth of them where it is to be quick
 
 def run(output: Path | None, quick: bool) -> None:
     """Print the table; write it as JSON to `output`. `quick` takes few repetitions and leaves the large scene out."""
-    report, device = Report(output), cuda.device()
+    report, device = Report(output, quick), cuda.device()
     rows: list[dict[str, Any]] = []
     for bench in training_scenes()[1 if quick else 0 :]:
         report.tell(f"{bench.gaussian_count:,} Gaussians: training ...")
