@@ -23,7 +23,7 @@ KEEP = @$(if $(RECORD),$(BIN)/python benchmarks/record.py,:)
 MINUTES ?= 30
 
 .DEFAULT_GOAL := help
-.PHONY: ALWAYS help serve console test test-fast test-long test-console test-faults test-fuzz test-soak test-overload check check-lint check-types check-generated check-web check-figures format bench bench-record bench-console console-picture bench-cuda results ablations poses confidence figures demo-scene generate clean
+.PHONY: ALWAYS help serve console test test-fast test-long test-console test-faults test-fuzz test-soak test-overload check check-lint check-types check-generated check-web check-figures format bench bench-record bench-console console-picture bench-cuda results ablations poses confidence libraries figures demo-scene generate clean
 
 help:  ## say what there is
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
@@ -153,6 +153,12 @@ confidence: $(VENV)/installed-dev  ## how true confidence and uncertainty are, s
 	$(BIN)/python benchmarks/confidence.py --data $(DATA) $(ARGS)
 	@$(BIN)/python benchmarks/documents.py --show confidence
 	$(KEEP) confidence
+
+libraries: $(VENV)/installed-dev  ## the image processing here beside scikit-image's: time and difference
+	$(READY)
+	$(BIN)/python benchmarks/libraries.py
+	@$(BIN)/python benchmarks/documents.py --show libraries
+	$(KEEP) libraries
 
 demo-scene: $(VENV)/installed  ## simulate the phantom, train the demo scene from it and put it in its place
 	$(BIN)/python -m ultragray.demo.make

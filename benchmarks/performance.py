@@ -1,4 +1,4 @@
-"""The tables of what `ultragray bench` and `make bench-console` measured."""
+"""The tables of what `ultragray bench`, `make bench-console` and `make libraries` measured."""
 
 from __future__ import annotations
 
@@ -147,3 +147,36 @@ def console(measured: Document) -> Iterator[str]:
             ("Size of the page", f"{measured['bundle_gzip_kb']:.0f} KB gzipped"),
         ),
     )
+
+
+def imports(measured: Document) -> Iterator[str]:
+    """What scikit-image takes to install, and to import."""
+    sizes = measured["installed_mb"]
+    parts = ", ".join(f"{name} {size:.0f} MB" for name, size in sizes.items() if size >= 1.0)
+    yield f"Installed: {sum(sizes.values()):.0f} MB ({parts})."
+    yield ""
+    yield "| Import | ms |"
+    yield "|---|---|"
+    for name, spent_ms in measured["import_ms"].items():
+        yield f"| `{name}` | {spent_ms:.0f} |"
+
+
+def beside_scikit_image(measured: Document) -> Iterator[str]:
+    """The table of comparisons."""
+    yield "| What | here | ms | scikit-image | ms | largest difference |"
+    yield "|---|---|---|---|---|---|"
+    for row in measured["rows"]:
+        ours, theirs = (f"{row[f'{whose}_ms']:.2f}" for whose in ("ours", "theirs"))
+        yield (
+            f"| {row['what']} | {row['ours_with']} | {ours} | `{row['theirs_with']}` | {theirs} "
+            f"| {row['difference']:.1g} |"
+        )
+
+
+def shadows(measured: Document) -> Iterator[str]:
+    """The table of shadows."""
+    yield "| Method | precision | recall | intersection over union | of speckle without a shadow |"
+    yield "|---|---|---|---|---|"
+    for row in measured["shadows"]:
+        shares = (f"{row[key]:.0%}" for key in ("precision", "recall", "overlap", "of_speckle"))
+        yield f"| {row['method']} | {' | '.join(shares)} |"

@@ -87,6 +87,17 @@ _FILES = (
         "confidence",
         (*_TRAINED, "model/ultragray/confidence", "benchmarks/confidence.py", "benchmarks/in_silico.py"),
     ),
+    Figures(
+        "benchmarks/libraries.json",
+        "libraries",
+        (
+            "model/ultragray/display",
+            "model/ultragray/evaluation/metrics.py",
+            "model/ultragray/datasets/images.py",
+            "model/ultragray/training/data/shadows.py",
+            "benchmarks/libraries.py",
+        ),
+    ),
     Figures("tests/long-run.json", "test-long", (*_PRODUCT, "tests", ":(exclude)tests/*-run.json")),
     Figures("tests/soak-run.json", "test-soak", (*_PRODUCT, "tests/soak")),
     Figures("tests/overload-run.json", "test-overload", (*_PRODUCT, "tests/overload")),
