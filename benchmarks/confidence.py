@@ -71,7 +71,7 @@ RECORDED = ("spine_phantom", "liver_convex", "ultranerf_liver", "nwire_phantom")
 
 def measure(asked: Asked, config: TrainingConfig) -> dict[str, Any]:
     """Trains a scene, renders what it has not seen and measures each frame and its pixels."""
-    started = time.monotonic()
+    head, started = measured(torch.get_num_threads()), time.monotonic()
     unseen, causes = asked.unseen, asked.causes
     scene = train(Dataset("asked", asked.training, unseen.select([])), config)
     seconds = time.monotonic() - started
@@ -83,7 +83,7 @@ def measure(asked: Asked, config: TrainingConfig) -> dict[str, Any]:
     of_poses = assessor.assess(unseen.poses)
     errors = truth - frames["bmode"]
     figures: dict[str, Any] = {
-        "measured": measured(torch.get_num_threads()),
+        "measured": head,
         "training_frames": len(asked.training),
         "seconds": round(seconds, 1),
         "causes": {},

@@ -74,7 +74,7 @@ def read() -> dict[str, Any]:
 
 def measure(dataset: Dataset, error: str, seed: int) -> dict[str, Any]:
     """Two trainings from the same poses, one that refines them; what is left of the errors after the second."""
-    true = dataset.train
+    head, true = measured(torch.get_num_threads()), dataset.train
     given = replace(true, poses=with_errors(true, error, seed))
     scores, refined = {}, given.poses
     for mode in ("none", "frames"):
@@ -87,7 +87,7 @@ def measure(dataset: Dataset, error: str, seed: int) -> dict[str, Any]:
         **{f"{key}_{mode}": value for mode, score in scores.items() for key, value in score.items()},
         "added": deviation(true, given.poses),
         "left": deviation(true, refined),
-        "measured": measured(torch.get_num_threads()),
+        "measured": head,
     }
 
 

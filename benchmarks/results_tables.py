@@ -135,6 +135,7 @@ def _parser() -> argparse.ArgumentParser:
 
 def measure(run: Run, data_folder: Path) -> dict[str, Any]:
     """Trains and measures one run, and the baselines on the same frames."""
+    head = measured(torch.get_num_threads())
     dataset = part_of(_source(run, data_folder), run.part)
     voxel_mm = affordable_voxel_mm(dataset.train)
     log.info("%s: baselines", run.name)
@@ -160,7 +161,7 @@ def measure(run: Run, data_folder: Path) -> dict[str, Any]:
         "gaussians": trained.scene.gaussian_count,
         "step_ms": 1000.0 * trained.step_s,
         "total_s": trained.seconds,
-        "measured": measured(torch.get_num_threads()),
+        "measured": head,
     }
     if run.source == PHANTOM:
         figures["shadow"] = measure_shadow(trained.scene, dataset, voxel_mm)

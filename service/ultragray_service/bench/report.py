@@ -32,6 +32,7 @@ class Report:
         self._console = console if console.is_terminal else Console(width=TABLE_WIDTH)
         self._output = output
         self._quick = quick
+        self._head = measured(torch.get_num_threads())  # now: a commit may be made while it is measured
         self._yards_ms: list[float] = []
 
     def tell(self, what: str) -> None:
@@ -45,7 +46,7 @@ class Report:
 
     def cpu_document(self, **figures: Any) -> dict[str, Any]:
         """A document that begins with commit, date, machine, versions and the yard."""
-        head = {"measured": measured(torch.get_num_threads()), "versions": versions()}
+        head = {"measured": self._head, "versions": versions()}
         return {**head, "yard_ms": float(np.median(self._yards_ms)), **figures}
 
     def conclude(
