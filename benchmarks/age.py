@@ -31,8 +31,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n\n")[0])
     parser.add_argument("--changed", action="store_true", help="warn about those whose code has changed, no more")
     given = parser.parse_args()
-    ages = [age_of(file) for file in FIGURES.values()]
-    for age in ages:
+    if given.changed and (reason := why_unknown()):
+        sys.stdout.write(f"warning: whether measured figures are current is not known: {reason}\n")
+        return
+    for age in map(age_of, FIGURES.values()):
         if not given.changed:
             sys.stdout.write(f"{age.file.path}: {age.origin or 'not measured yet'}\n")
             if age.origin:
@@ -41,13 +43,20 @@ def main() -> None:
             sys.stdout.write(f"warning: {age.file.path}: {age.since} (make {age.file.target} RECORD=1)\n")
 
 
+def why_unknown() -> str:
+    """Why the history does not tell the age of figures; empty where it does."""
+    if git("rev-parse", "HEAD") is None:
+        return "there is no git checkout here"
+    return "the clone is shallow" if git("rev-parse", "--is-shallow-repository") == "true" else ""
+
+
 def age_of(file: Figures) -> Age:
     """The age of a file; of each of its commits where it has several."""
     if not file.kept.exists():
         return Age(file, "", "")
     found = list(heads(json.loads(file.kept.read_text(encoding="utf-8"))))
-    if git("rev-parse", "HEAD") is None:
-        since = "whether the code has changed is not known: there is no git checkout here"
+    if reason := why_unknown():
+        since = f"whether the code has changed is not known: {reason}"
     else:
         told = [changes_since(commit, file.measures) for commit in sorted({str(head["commit"]) for head in found})]
         uncommitted = "uncommitted changes" if git("status", "--porcelain", "--", *file.measures) else ""
@@ -59,8 +68,7 @@ def changes_since(commit: str, paths: tuple[str, ...]) -> str:
     """What has changed in some paths since a commit, in words; empty: nothing."""
     clean = commit.removesuffix("-dirty")
     if git("cat-file", "-e", f"{clean}^{{commit}}") is None:
-        shallow = ", which is shallow" if git("rev-parse", "--is-shallow-repository") == "true" else ""
-        return f"whether the code has changed is not known: commit {clean} is not in this clone{shallow}"
+        return f"whether the code has changed is not known: commit {clean} is not in this clone"
     count = int(git("rev-list", "--count", f"{clean}..HEAD", "--", *paths) or 0)
     commits = f"{count} commit{'s'[: count != 1]} changed what it measures since {clean}" if count else ""
     unclean = f"measured with uncommitted changes to {clean}" if commit != clean else ""

@@ -44,14 +44,26 @@ def test_commits_to_what_a_file_measures_are_counted(repository: Repository) -> 
     assert age.age_of(FILE).since.startswith(f"measured with uncommitted changes to {third}")
 
 
-def test_a_shallow_clone_cannot_tell(repository: Repository, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_shallow_clone_cannot_tell(
+    repository: Repository, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     first = repository.git("rev-parse", "--short=12", "HEAD")
     repository.commit("model/code.py", "second")
     repository.git("clone", "--quiet", "--depth", "1", f"file://{repository.path}", str(tmp_path / "shallow"))
     adopt(monkeypatch, tmp_path / "shallow")
     write_figures(tmp_path / "shallow", first)
+    assert age.age_of(FILE).since == "whether the code has changed is not known: the clone is shallow"
+    monkeypatch.setattr("sys.argv", ["age.py", "--changed"])
+    age.main()
+    assert capsys.readouterr().out == (
+        "warning: whether measured figures are current is not known: the clone is shallow\n"
+    )
+
+
+def test_a_commit_may_be_lost(repository: Repository) -> None:
+    write_figures(repository.path, "0123456789ab")
     assert age.age_of(FILE).since == (
-        f"whether the code has changed is not known: commit {first} is not in this clone, which is shallow"
+        "whether the code has changed is not known: commit 0123456789ab is not in this clone"
     )
 
 
