@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 # A file of tests belongs to one process, which shares its services among them. Most of the time they wait for others: four fit two cores.
 PYTEST := $(BIN)/pytest --numprocesses 4 --dist loadfile
 KERNEL_SOURCES := $(wildcard model/kernels/*) CMakeLists.txt pyproject.toml
-GENERATED_TESTS := tests/proto tests/client/test_client_generated.py tests/interfaces/test_generated_tables.py tests/interfaces/test_measured_tables.py tests/service/test_snapshots.py
+GENERATED_TESTS := tests/proto tests/client/test_client_generated.py tests/interfaces/test_generated_tables.py tests/interfaces/test_measured_tables.py tests/benchmarks/test_registry.py tests/service/test_snapshots.py
 PYTHON_SOURCES := model service workers proto client tests benchmarks docs examples
 NPM := $(shell command -v npm)
 CONSOLE := service/ultragray_service/console/index.html
@@ -14,10 +14,16 @@ CONSOLE_SOURCES := $(shell find web -type f -not -path 'web/node_modules/*' -not
 CONSOLE_IF_POSSIBLE = [ -z "$(NPM)" ] || $(MAKE) --no-print-directory console || echo "The console could not be built; all else works without it."
 DATA ?= ../shared/data
 ARGS ?=
+# Whatever measures leaves its figures in build/bench. With RECORD=1 they then take the place of those under version
+# control, and the documents are rewritten: only from a committed checkout, so that the figures can name their commit.
+RECORD ?=
+FIGURES := build/bench
+READY = @$(if $(RECORD),$(BIN)/python benchmarks/record.py --ready &&) mkdir -p $(FIGURES)
+KEEP = @$(if $(RECORD),$(BIN)/python benchmarks/record.py,:)
 MINUTES ?= 30
 
 .DEFAULT_GOAL := help
-.PHONY: ALWAYS help serve console test test-fast test-long test-console test-faults test-fuzz test-soak test-overload check check-lint check-types check-generated check-web format bench bench-console console-picture bench-cuda results ablations poses demo-scene generate clean
+.PHONY: ALWAYS help serve console test test-fast test-long test-console test-faults test-fuzz test-soak test-overload check check-lint check-types check-generated check-web check-figures format bench bench-record bench-console console-picture bench-cuda results ablations poses confidence libraries figures demo-scene generate clean
 
 help:  ## say what there is
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
@@ -35,9 +41,11 @@ test: $(VENV)/installed-dev  ## set up, then run the tests in random order (ARGS
 test-fast: $(VENV)/installed-dev  ## those that take a minute together, for while one works: without processes of their own
 	$(PYTEST) -m "not slow and not long" $(ARGS)
 
-test-long: $(VENV)/installed-dev  ## those that make test leaves out; what came of it goes to tests/long-run.json
+test-long: $(VENV)/installed-dev  ## those that make test leaves out (RECORD=1: what came of it to tests/long-run.json)
+	$(READY)
 	@$(CONSOLE_IF_POSSIBLE)
-	$(PYTEST) -m long --record-in tests/long-run.json $(ARGS)
+	$(PYTEST) -m long --record-in $(FIGURES)/long-run.json $(ARGS)
+	$(KEEP) long-run
 
 test-console: $(VENV)/installed-dev $(CONSOLE)  ## the console in Debian's Chromium against a real service; leaves screenshots in build
 	node --test --test-concurrency=1 tests/console/*.test.mjs
@@ -49,15 +57,19 @@ test-faults: $(VENV)/installed-dev  ## processes killed at random: render worker
 test-fuzz: $(VENV)/installed-dev  ## 100,000 inputs that are nearly right, on every door and in every file format (ARGS="--seed N" for the same again)
 	ULTRAGRAY_FUZZ_INPUTS=100000 $(BIN)/pytest --numprocesses 2 --dist loadfile tests/fuzz $(ARGS)
 
-test-soak: $(VENV)/installed-dev  ## clients of all kinds for MINUTES (30) while processes are killed; the result goes to tests/soak-run.json
-	ULTRAGRAY_SOAK_SECONDS=$$(($(MINUTES) * 60)) ULTRAGRAY_SOAK_RECORD=tests/soak-run.json $(BIN)/pytest tests/soak $(ARGS)
+test-soak: $(VENV)/installed-dev  ## clients of all kinds for MINUTES (30) while processes are killed (RECORD=1: the result to tests/soak-run.json)
+	$(READY)
+	ULTRAGRAY_SOAK_SECONDS=$$(($(MINUTES) * 60)) ULTRAGRAY_SOAK_RECORD=$(FIGURES)/soak-run.json $(BIN)/pytest tests/soak $(ARGS)
+	$(KEEP) soak-run
 
-test-overload: $(VENV)/installed-dev  ## ten times the capacity for a minute at each door; the figures go to tests/overload-run.json
-	@rm -f tests/overload-run.json
-	ULTRAGRAY_OVERLOAD_SECONDS=60 ULTRAGRAY_OVERLOAD_RECORD=tests/overload-run.json $(BIN)/pytest tests/overload $(ARGS)
+test-overload: $(VENV)/installed-dev  ## ten times the capacity for a minute at each door (RECORD=1: the figures to tests/overload-run.json)
+	$(READY)
+	@rm -f $(FIGURES)/overload-run.json
+	ULTRAGRAY_OVERLOAD_SECONDS=60 ULTRAGRAY_OVERLOAD_RECORD=$(FIGURES)/overload-run.json $(BIN)/pytest tests/overload $(ARGS)
+	$(KEEP) overload-run
 
 check: $(VENV)/installed-dev  ## lint, types, formatting, and whether what is generated is current; all at the same time
-	@$(MAKE) --no-print-directory --keep-going --jobs --output-sync=target check-lint check-types check-generated check-web
+	@$(MAKE) --no-print-directory --keep-going --jobs --output-sync=target check-lint check-types check-generated check-web check-figures
 
 check-lint:
 	$(BIN)/ruff check $(PYTHON_SOURCES)
@@ -75,39 +87,78 @@ check-web:
 	@$(CONSOLE_IF_POSSIBLE)
 	@[ ! -d web/node_modules ] || npm --prefix web run --silent check
 
+# Warns, no more: figures are taken anew when there is time for it.
+check-figures:
+	@$(BIN)/python benchmarks/age.py --changed
+
+figures: $(VENV)/python  ## list the measured figures: commit, date, machine, and whether their code has changed since
+	@$(BIN)/python benchmarks/age.py
+
 format: $(VENV)/installed-dev  ## rewrite the sources in the project's format
 	$(BIN)/ruff check --fix $(PYTHON_SOURCES)
 	$(BIN)/ruff format $(PYTHON_SOURCES)
 	$(BIN)/clang-format -i model/kernels/*.[ch]pp model/kernels/*.inl
 
-bench: $(VENV)/installed  ## measure the kernel and the service; the table is printed, the JSON written
-	$(BIN)/ultragray bench --output benchmarks/results.json $(ARGS)
-	$(BIN)/ultragray bench --kernel-details --output benchmarks/kernel.json $(ARGS)
-	$(BIN)/ultragray bench --train --output benchmarks/training.json $(ARGS)
-	$(BIN)/ultragray bench --jobs --output benchmarks/jobs.json $(ARGS)
-	$(BIN)/ultragray bench --clients --output benchmarks/clients.json $(ARGS)
-	$(BIN)/python benchmarks/performance.py
+BENCHED := results kernel training jobs clients
+
+bench: $(VENV)/installed  ## measure kernel, service, training, jobs and clients; prints tables (RECORD=1: into the documents)
+	$(READY)
+	@rm -f $(BENCHED:%=$(FIGURES)/%.json)
+	$(BIN)/ultragray bench --output $(FIGURES)/results.json $(ARGS)
+	$(BIN)/ultragray bench --kernel-details --output $(FIGURES)/kernel.json $(ARGS)
+	$(BIN)/ultragray bench --train --output $(FIGURES)/training.json $(ARGS)
+	$(BIN)/ultragray bench --jobs --output $(FIGURES)/jobs.json $(ARGS)
+	$(BIN)/ultragray bench --clients --output $(FIGURES)/clients.json $(ARGS)
+	$(KEEP) $(BENCHED)
+
+bench-record:  ## measure all that bench and bench-console do, and record it: all from this commit
+	@$(MAKE) --no-print-directory bench RECORD=1
+	@$(MAKE) --no-print-directory bench-console RECORD=1
 
 bench-console: $(VENV)/installed-dev $(CONSOLE)  ## frames a second, memory and first paint of the console in Debian's Chromium; takes six minutes
-	node tests/console/measure.mjs > build/console.json
-	mv build/console.json benchmarks/console.json
+	$(READY)
+	node tests/console/measure.mjs > $(FIGURES)/console.json
+	$(KEEP) console
 
 console-picture: $(VENV)/installed-dev $(CONSOLE)  ## take the README's picture of the console
 	node tests/console/picture.mjs
 
 bench-cuda: $(VENV)/installed  ## the same on a GPU, with the distance to what it can do at most
-	$(BIN)/ultragray bench --backend cuda --output benchmarks/cuda.json $(ARGS)
-	$(BIN)/ultragray bench --backend cuda --train --output benchmarks/cuda_training.json $(ARGS)
+	$(READY)
+	@rm -f $(FIGURES)/cuda.json $(FIGURES)/cuda_training.json
+	$(BIN)/ultragray bench --backend cuda --output $(FIGURES)/cuda.json $(ARGS)
+	$(BIN)/ultragray bench --backend cuda --train --output $(FIGURES)/cuda_training.json $(ARGS)
+	$(KEEP) cuda cuda_training
 
-results: $(VENV)/installed  ## train on every data set of DATA and write docs/results.md (ARGS="--only liver_convex" for one)
+results: $(VENV)/installed-dev  ## train on every data set of DATA; prints the tables of docs/results.md (ARGS="--only liver_convex" for one)
+	$(READY)
 	$(BIN)/python benchmarks/results_tables.py $(DATA) $(ARGS)
+	@$(BIN)/python benchmarks/documents.py --show results
+	$(KEEP) results_tables
 
-ablations: $(VENV)/installed  ## train without each part of the training, three seeds each, and write docs/results.md; takes an hour
+ablations: $(VENV)/installed-dev  ## train without each part of the training, three seeds each; takes an hour
+	$(READY)
 	$(BIN)/python benchmarks/ablations.py $(DATA) $(ARGS)
-	$(BIN)/python benchmarks/results_tables.py $(DATA) --only
+	@$(BIN)/python benchmarks/documents.py --show ablations
+	$(KEEP) ablations
 
-poses: $(VENV)/installed  ## train with errors added to poses, with and without refinement, and write docs/poses.md; takes half an hour
+poses: $(VENV)/installed-dev  ## train with errors added to poses, with and without refinement; takes half an hour
+	$(READY)
 	$(BIN)/python benchmarks/poses.py $(DATA) $(ARGS)
+	@$(BIN)/python benchmarks/documents.py --show poses
+	$(KEEP) poses
+
+confidence: $(VENV)/installed-dev  ## how true confidence and uncertainty are, scene by scene; takes an hour
+	$(READY)
+	$(BIN)/python benchmarks/confidence.py --data $(DATA) $(ARGS)
+	@$(BIN)/python benchmarks/documents.py --show confidence
+	$(KEEP) confidence
+
+libraries: $(VENV)/installed-dev  ## the image processing here beside scikit-image's: time and difference
+	$(READY)
+	$(BIN)/python benchmarks/libraries.py
+	@$(BIN)/python benchmarks/documents.py --show libraries
+	$(KEEP) libraries
 
 demo-scene: $(VENV)/installed  ## simulate the phantom, train the demo scene from it and put it in its place
 	$(BIN)/python -m ultragray.demo.make

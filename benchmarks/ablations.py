@@ -2,8 +2,8 @@
 
     python benchmarks/ablations.py DATA_FOLDER [--only NAME ...]
 
-The figures of a training go into benchmarks/ablations.json as soon as it is done; trainings that the file holds from
-the same commit are not repeated. `results_tables.py` writes the tables into docs/results.md.
+The figures of a training go into build/bench/ablations.json as soon as it is done; trainings that the file holds from
+the same commit are not repeated. The tables of docs/results.md come from it.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from origin import is_clean, origin
+from registry import FIGURES, Document
 from ultragray.datasets.phantom.shadow import BoneShadow
 from ultragray.datasets.source import PHANTOM, SourceOptions, load_dataset
 from ultragray.datasets.sweep import Dataset
@@ -28,8 +28,9 @@ from ultragray.files.atomic import write_whole
 from ultragray.report.study import train_and_evaluate
 from ultragray.training import TrainingConfig
 from ultragray.training.config import TEXTURE
+from ultragray_service.bench.measured import DIRTY, measured
 
-FIGURES = Path(__file__).resolve().parent / "ablations.json"
+OUTPUT = FIGURES["ablations"].staged
 SEEDS = (0, 1, 2)
 SHORTER = {"steps": 400, "max_gaussians": 40_000, "confidence": False}  # than `fast`, so that an hour is enough
 TEXTURES = (0.0, 0.05, 0.2, 0.5)
@@ -85,16 +86,16 @@ def main() -> None:
 
 def measure(name: str, dataset: Dataset, variation: Variation, seed: int) -> None:
     """One training, into the file, unless that holds it from this commit."""
-    key, where = f"{variation.name}, seed {seed}", origin()
+    key, head = f"{variation.name}, seed {seed}", measured(torch.get_num_threads())
     config = TrainingConfig.preset("fast", **{**SHORTER, **variation.settings}, seed=seed)
     known = read().get(name, {}).get(key, {})
-    if (known.get("commit"), known.get("config")) == (where["commit"], config.to_dict()) and is_clean(where["commit"]):
+    if known and known["config"] == config.to_dict() and is_of_commit(known, head["commit"]):
         return
     trained = train_and_evaluate(dataset, config)
     figures = {
         **trained.evaluation.mean.to_dict(),
         **trained.evaluation.speckle.figures(),
-        **where,
+        "measured": head,
         "config": config.to_dict(),
     }
     if dataset.name == PHANTOM:
@@ -102,25 +103,23 @@ def measure(name: str, dataset: Dataset, variation: Variation, seed: int) -> Non
         figures["shadow_mae"] = shadow.mean_absolute_error(render_sweep(trained.scene, dataset.val))
     log.info("%s, %s: %.2f dB", name, key, figures["psnr_db"])
     everything = read()
+    OUTPUT.parent.mkdir(parents=True, exist_ok=True)
     everything.setdefault(name, {})[key] = figures
-    write_whole(FIGURES, json.dumps(everything, indent=1, allow_nan=False) + "\n")
+    write_whole(OUTPUT, json.dumps(everything, indent=1, allow_nan=False) + "\n")
+
+
+def is_of_commit(figures: Document, commit: str | None) -> bool:
+    """Whether figures were taken at a commit, without changes to it."""
+    return commit is not None and not commit.endswith(DIRTY) and figures["measured"]["commit"] == commit
 
 
 def read() -> dict[str, dict[str, Any]]:
     """Figures by set, variation and seed."""
-    return json.loads(FIGURES.read_text()) if FIGURES.exists() else {}
+    return json.loads(OUTPUT.read_text()) if OUTPUT.exists() else {}
 
 
-def section() -> Iterator[str]:
-    """The lines of docs/results.md about this."""
-    figures = read()
-    if not figures:
-        return
-    origins = sorted(
-        {f"commit {one['commit']} on {one['machine']}" for runs in figures.values() for one in runs.values()}
-    )
-    yield "## Ablations"
-    yield ""
+def tables(figures: Document) -> Iterator[str]:
+    """Trainings without one part each, then the curve of texture."""
     steps, count = SHORTER["steps"], SHORTER["max_gaussians"]
     yield f"Trainings without one part each, of {steps} steps and {count:,} Gaussians: less than for the figures above."
     yield f"PSNR (dB) and MS-SSIM on held-out frames, mean and standard deviation over {len(SEEDS)} seeds; then, where"
@@ -141,9 +140,6 @@ def section() -> Iterator[str]:
         keys = ("psnr_db", "ms_ssim", "gmsd", "speckle_contrast", "true_speckle_contrast")
         cells = [_cell(runs, variation, keys) for runs in figures.values()]
         yield f"| {variation.name} | {' | '.join(cells)} |"
-    yield ""
-    yield f"Measured at {'; '.join(origins)}."
-    yield ""
 
 
 def _cell(runs: Mapping[str, Any], variation: Variation, keys: tuple[str, ...]) -> str:

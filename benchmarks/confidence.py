@@ -1,11 +1,10 @@
 """The truth of confidence and uncertainty: what scenes tell of frames that they have not seen, against what comes out.
 
-    python benchmarks/confidence.py [--only NAME ...] [--data FOLDER] [--steps N]
+    python benchmarks/confidence.py [--only NAME ...] [--data FOLDER]
 
 Each scene is trained from in-silico sweeps that leave something out, or with --data from sets of that folder; it is
-then asked for what was left out, cause by cause. Each scene's figures go into benchmarks/confidence.json as soon as
-they are known, with commit and machine; from the JSON the tables of docs/confidence.md are written, and
-docs/images/confidence_reliability.png and docs/images/uncertainty_reliability.png are drawn.
+then asked for what was left out, cause by cause. Each scene's figures go into build/bench/confidence.json as soon as
+they are known; the tables of docs/confidence.md come from it, and the pictures that `draw` makes.
 """
 
 from __future__ import annotations
@@ -26,20 +25,20 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from in_silico import IN_SILICO, Asked
-from origin import origin
+from registry import FIGURES, ROOT, Document
 from ultragray.confidence import Assessor
 from ultragray.datasets.source import load_dataset
 from ultragray.datasets.sweep import Dataset
 from ultragray.evaluation.metrics import frame_metrics
 from ultragray.evaluation.reliability import compare_deviations
 from ultragray.evaluation.scoring import render_sweep
+from ultragray.files.atomic import write_whole
 from ultragray.probe import FloatArray
 from ultragray.training import TrainingConfig, train
+from ultragray_service.bench.measured import measured
 
-FOLDER = Path(__file__).resolve().parent
-FIGURES = FOLDER / "confidence.json"
-DOCUMENT = FOLDER.parent / "docs" / "confidence.md"
-IMAGES = FOLDER.parent / "docs" / "images"
+OUTPUT = FIGURES["confidence"].staged
+IMAGES = ROOT / "docs" / "images"
 ERROR, RANK = 0.07, 0.8  # that are aimed at
 TELLING_STD = 0.05  # of actual values; where they vary less, ranks mean little
 COLOURS = {
@@ -72,7 +71,7 @@ RECORDED = ("spine_phantom", "liver_convex", "ultranerf_liver", "nwire_phantom")
 
 def measure(asked: Asked, config: TrainingConfig) -> dict[str, Any]:
     """Trains a scene, renders what it has not seen and measures each frame and its pixels."""
-    started = time.monotonic()
+    head, started = measured(torch.get_num_threads()), time.monotonic()
     unseen, causes = asked.unseen, asked.causes
     scene = train(Dataset("asked", asked.training, unseen.select([])), config)
     seconds = time.monotonic() - started
@@ -84,7 +83,7 @@ def measure(asked: Asked, config: TrainingConfig) -> dict[str, Any]:
     of_poses = assessor.assess(unseen.poses)
     errors = truth - frames["bmode"]
     figures: dict[str, Any] = {
-        **origin(),
+        "measured": head,
         "training_frames": len(asked.training),
         "seconds": round(seconds, 1),
         "causes": {},
@@ -101,12 +100,9 @@ def measure(asked: Asked, config: TrainingConfig) -> dict[str, Any]:
     return figures
 
 
-def tables(figures: dict[str, Any]) -> str:
+def tables(figures: Document) -> Iterator[str]:
     """The Markdown of what was measured."""
-    return "\n".join(_lines(figures))
-
-
-def _lines(figures: dict[str, Any]) -> Iterator[str]:
+    figures = _ordered(figures)
     yield "| scene | frames | cause | actual | of the frame | of the pose alone |"
     yield "|---|---|---|---|---|---|"
     for name, cause, found in _cells(figures):
@@ -131,10 +127,10 @@ def _lines(figures: dict[str, Any]) -> Iterator[str]:
         numbers = [f"{pixels[key]:.3f}" for key in ("expected", "actual")]
         shares = [f"{pixels[key]:.0%}" for key in ("within_1", "within_2")]
         yield f"| {name} | {cause} | {' | '.join(numbers + shares)} |"
-    yield ""
-    commits = sorted({one["commit"] for one in figures.values()})
-    machines = sorted({one["machine"] for one in figures.values()})
-    yield f"Measured at {', '.join(commits)} on {', '.join(machines)}."
+
+
+def _ordered(figures: Document) -> Document:
+    return {name: figures[name] for name in (*IN_SILICO, *RECORDED) if name in figures}
 
 
 def _error(found: dict[str, Any], key: str) -> float:
@@ -162,8 +158,9 @@ def rank_correlation(first: FloatArray, second: FloatArray) -> float:
     return float(np.corrcoef(*ranks)[0, 1])
 
 
-def draw(figures: dict[str, Any]) -> None:
+def draw(figures: Document) -> None:
     """The two pictures of docs/confidence.md."""
+    figures = _ordered(figures)
     names = list(figures)
     rows, columns = -(-len(names) // 3), min(3, len(names))
     for key, picture in (("told", "confidence_reliability.png"), ("uncertainty", "uncertainty_reliability.png")):
@@ -202,27 +199,21 @@ def _rounded(values: list[float | None]) -> list[float]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--only", nargs="*", choices=[*IN_SILICO, *RECORDED], help="leave out the others")
+    parser.add_argument("--only", nargs="+", choices=[*IN_SILICO, *RECORDED], help="leave out the others")
     parser.add_argument("--data", type=Path, metavar="FOLDER", help="of the recorded sets; without, they are left out")
-    parser.add_argument("--steps", type=int, help="of each training, instead of what the frames ask for")
     given = parser.parse_args()
     torch.set_num_threads(1)
-    config = TrainingConfig.preset("fast", **({} if given.steps is None else {"steps": given.steps}))
+    config = TrainingConfig.preset("fast")
     runs = dict(IN_SILICO)
     if given.data is not None:
         runs |= {name: partial(recorded, given.data, name) for name in RECORDED}
-    known = json.loads(FIGURES.read_text()) if FIGURES.exists() else {}
+    OUTPUT.parent.mkdir(parents=True, exist_ok=True)
+    known = json.loads(OUTPUT.read_text()) if OUTPUT.exists() else {}
     for name, ask in runs.items():
         if given.only is None or name in given.only:
             known[name] = measure(ask(), config)
             sys.stderr.write(f"{name}: {known[name]['seconds']:.0f} s\n")
-            FIGURES.write_text(json.dumps(known, indent=1) + "\n")
-    figures = {name: known[name] for name in (*IN_SILICO, *RECORDED) if name in known}
-    draw(figures)
-    begin, end = "<!-- measured: benchmarks/confidence.py -->\n", "<!-- end -->"
-    before, _, rest = DOCUMENT.read_text(encoding="utf-8").partition(begin)
-    after = rest.partition(end)[2]
-    DOCUMENT.write_text(f"{before}{begin}{tables(figures)}\n{end}{after}", encoding="utf-8")
+            write_whole(OUTPUT, json.dumps(known, indent=1, allow_nan=False) + "\n")
 
 
 if __name__ == "__main__":

@@ -1,41 +1,10 @@
-"""Writes what `make bench` measured into README.md and docs/performance.md: `python benchmarks/performance.py`.
-
-Each place stands between `<!-- measured: NAME -->` and `<!-- end -->`; BLOCKS says what is written there.
-"""
+"""The tables of what `ultragray bench`, `make bench-console` and `make libraries` measured."""
 
 from __future__ import annotations
 
-import json
-import re
-from collections.abc import Callable, Iterable, Iterator
-from pathlib import Path
-from typing import Any, TypeAlias
+from collections.abc import Iterable, Iterator
 
-FOLDER = Path(__file__).resolve().parent
-DOCUMENTS = (FOLDER.parent / "README.md", FOLDER.parent / "docs" / "performance.md")
-_MEASURED = re.compile(r"(?<=<!-- measured: )([\w ,-]+?)( -->\n).*?(?=<!-- end -->)", flags=re.DOTALL)
-
-Measured: TypeAlias = dict[str, Any]
-Lines: TypeAlias = Iterable[str]
-
-
-def current(document: str, folder: Path = FOLDER) -> str:
-    """The document with the figures that the files of `folder` hold."""
-    return _MEASURED.sub(lambda match: f"{match[1]}{match[2]}{_written(match[1], folder)}", document)
-
-
-def _written(block: str, folder: Path) -> str:
-    file, write = BLOCKS[block]
-    measured = json.loads((folder / file).read_text(encoding="utf-8"))
-    return "".join(f"{line}\n" for line in (*write(measured), "", _origin(measured, file)))
-
-
-def _origin(measured: Measured, file: str) -> str:
-    machine = measured["machine"]
-    return (
-        f"`benchmarks/{file}`, commit {machine['commit']}, {machine['measured_at'][:10]}: {machine['processor']}, "
-        f"{machine['instruction_set']}, {machine['threads']} threads; yard {measured['yard_ms']:.1f} ms."
-    )
+from registry import Document
 
 
 def _table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> Iterator[str]:
@@ -46,7 +15,7 @@ def _table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> Iterator[str]:
         yield f"| {' | '.join(row)} |"
 
 
-def frames(measured: Measured) -> Lines:
+def frames(measured: Document) -> Iterator[str]:
     """The kernel and the front doors."""
     rows = (
         (
@@ -65,9 +34,9 @@ def frames(measured: Measured) -> Lines:
     return _table(head, rows)
 
 
-def frames_at_a_glance(measured: Measured) -> Lines:
+def frames_at_a_glance(measured: Document) -> Iterator[str]:
     """The same for a reader in a hurry: p50 and p99 by number of Gaussians."""
-    by_what: dict[str, dict[int, Measured]] = {}
+    by_what: dict[str, dict[int, Document]] = {}
     for row in measured["rows"]:
         threads = f", {row['threads']} thread{'s' if row['threads'] > 1 else ''}" if "kernel" in row["what"] else ""
         together = f", batches of {row['poses']}" if row["poses"] > 1 else ""
@@ -85,7 +54,7 @@ def frames_at_a_glance(measured: Measured) -> Lines:
     yield f"Memory of a worker process: with {memory}."
 
 
-def steps(measured: Measured) -> Lines:
+def steps(measured: Document) -> Iterator[str]:
     """Training steps and the shares of their parts."""
     return _table(
         ("Gaussians", "Images", "Threads", "Step ms", "Forward", "Loss", "Backward", "Optimizer"),
@@ -102,7 +71,7 @@ def steps(measured: Measured) -> Lines:
     )
 
 
-def parts(measured: Measured) -> Lines:
+def parts(measured: Document) -> Iterator[str]:
     """The parts of a frame in the kernel, and its work."""
     cores = list(measured["rows"][0]["modelled_speedups"])
     return _table(
@@ -126,7 +95,7 @@ def parts(measured: Measured) -> Lines:
     )
 
 
-def clients(measured: Measured) -> Lines:
+def clients(measured: Document) -> Iterator[str]:
     """What each kind of client gets."""
     extent, by_client = measured["extent"], measured["clients"]
     loop, igtl, batch = (by_client[name] for name in ("control loop", "OpenIGTLink", "augmentation"))
@@ -154,7 +123,7 @@ def clients(measured: Measured) -> Lines:
     )
 
 
-def jobs(measured: Measured) -> Lines:
+def jobs(measured: Document) -> Iterator[str]:
     """A service with a long list of jobs."""
     return _table(
         ("What", "p50 ms", "p99 ms"),
@@ -162,21 +131,52 @@ def jobs(measured: Measured) -> Lines:
     )
 
 
-BLOCKS: dict[str, tuple[str, Callable[[Measured], Lines]]] = {
-    "frames": ("results.json", frames),
-    "frames at a glance": ("results.json", frames_at_a_glance),
-    "training steps": ("training.json", steps),
-    "parts of a frame": ("kernel.json", parts),
-    "clients": ("clients.json", clients),
-    "jobs": ("jobs.json", jobs),
-}
+def console(measured: Document) -> Iterator[str]:
+    """The console in Chromium."""
+    rate, heap = measured["frames_per_s"], measured["heap_mib"]
+    yield from _table(
+        ("What", "Measured"),
+        (
+            (
+                f"A sweep played at 512x512 for {measured['seconds']:.0f} s",
+                f"{rate['median']:.0f} frames/s, {rate['least']:.0f} in its slowest ten seconds",
+            ),
+            ("Heap after a collection", f"{heap['first']:.0f} MiB at first, at most {heap['most']:.0f} MiB"),
+            ("First paint", f"{measured['first_contentful_paint_ms'] / 1000:.1f} s"),
+            ("First image", f"{measured['first_image_ms'] / 1000:.1f} s"),
+            ("Size of the page", f"{measured['bundle_gzip_kb']:.0f} KB gzipped"),
+        ),
+    )
 
 
-def main() -> None:
-    """Rewrite the documents."""
-    for document in DOCUMENTS:
-        document.write_text(current(document.read_text(encoding="utf-8")), encoding="utf-8")
+def imports(measured: Document) -> Iterator[str]:
+    """What scikit-image takes to install, and to import."""
+    sizes = measured["installed_mb"]
+    parts = ", ".join(f"{name} {size:.0f} MB" for name, size in sizes.items() if size >= 1.0)
+    yield f"Installed: {sum(sizes.values()):.0f} MB ({parts})."
+    yield ""
+    yield "| Import | ms |"
+    yield "|---|---|"
+    for name, spent_ms in measured["import_ms"].items():
+        yield f"| `{name}` | {spent_ms:.0f} |"
 
 
-if __name__ == "__main__":
-    main()
+def beside_scikit_image(measured: Document) -> Iterator[str]:
+    """The table of comparisons."""
+    yield "| What | here | ms | scikit-image | ms | largest difference |"
+    yield "|---|---|---|---|---|---|"
+    for row in measured["rows"]:
+        ours, theirs = (f"{row[f'{whose}_ms']:.2f}" for whose in ("ours", "theirs"))
+        yield (
+            f"| {row['what']} | {row['ours_with']} | {ours} | `{row['theirs_with']}` | {theirs} "
+            f"| {row['difference']:.1g} |"
+        )
+
+
+def shadows(measured: Document) -> Iterator[str]:
+    """The table of shadows."""
+    yield "| Method | precision | recall | intersection over union | of speckle without a shadow |"
+    yield "|---|---|---|---|---|"
+    for row in measured["shadows"]:
+        shares = (f"{row[key]:.0%}" for key in ("precision", "recall", "overlap", "of_speckle"))
+        yield f"| {row['method']} | {' | '.join(shares)} |"

@@ -2,8 +2,8 @@
 
     python benchmarks/poses.py DATA_FOLDER [--only NAME ...] [--seeds N]
 
-The figures of a training go into benchmarks/poses.json as soon as it is done; the table of docs/poses.md is written
-from it.
+The figures of a training go into build/bench/poses.json as soon as it is done. The table of docs/poses.md comes from
+it.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from origin import origin
+from registry import FIGURES, Document
 from ultragray.datasets.source import load_dataset
 from ultragray.datasets.sweep import Dataset, Sweep
 from ultragray.files.atomic import write_whole
@@ -29,11 +29,9 @@ from ultragray.report.study import train_and_evaluate
 from ultragray.samplers.rotations import about_axes, random_directions
 from ultragray.training import TrainingConfig
 from ultragray.training.poses.path import sweep_ranges
+from ultragray_service.bench.measured import measured
 
-FOLDER = Path(__file__).resolve().parent
-FIGURES = FOLDER / "poses.json"
-DOCUMENT = FOLDER.parent / "docs" / "poses.md"
-TABLE_BEGINS, TABLE_ENDS = "<!-- written by benchmarks/poses.py -->", "<!-- end -->"
+OUTPUT = FIGURES["poses"].staged
 SHAKEN, MOVED, RECORDED = "each frame by 1 mm and 1°", "the second sweep by 8 mm and 4°", "poses as recorded"
 CASES = (  # sets, and the errors that are added
     ("ultranerf_liver", RECORDED),
@@ -51,7 +49,7 @@ log = logging.getLogger("poses")
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("data_folder", type=Path, help="folder of the data sets")
-    parser.add_argument("--only", nargs="*", help="names of sets; none: write the table anew")
+    parser.add_argument("--only", nargs="+", help="names of sets")
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--threads", type=int, default=0, help="0: all cores")
     arguments = parser.parse_args()
@@ -65,21 +63,18 @@ def main() -> None:
                 found = measure(dataset, error, seed)
                 log.info("%s, %s, seed %d: %s", name, error, seed, found)
                 figures = {**read(), f"{name}, {error}, seed {seed}": found}
-                write_whole(FIGURES, json.dumps(figures, indent=1, allow_nan=False) + "\n")
-    text = DOCUMENT.read_text()
-    before, _, rest = text.partition(TABLE_BEGINS)
-    _, _, after = rest.partition(TABLE_ENDS)
-    write_whole(DOCUMENT, "\n".join([before + TABLE_BEGINS, *table(read()), TABLE_ENDS + after]))
+                OUTPUT.parent.mkdir(parents=True, exist_ok=True)
+                write_whole(OUTPUT, json.dumps(figures, indent=1, allow_nan=False) + "\n")
 
 
 def read() -> dict[str, Any]:
     """Figures by set, error and seed."""
-    return json.loads(FIGURES.read_text()) if FIGURES.exists() else {}
+    return json.loads(OUTPUT.read_text()) if OUTPUT.exists() else {}
 
 
 def measure(dataset: Dataset, error: str, seed: int) -> dict[str, Any]:
     """Two trainings from the same poses, one that refines them; what is left of the errors after the second."""
-    true = dataset.train
+    head, true = measured(torch.get_num_threads()), dataset.train
     given = replace(true, poses=with_errors(true, error, seed))
     scores, refined = {}, given.poses
     for mode in ("none", "frames"):
@@ -92,7 +87,7 @@ def measure(dataset: Dataset, error: str, seed: int) -> dict[str, Any]:
         **{f"{key}_{mode}": value for mode, score in scores.items() for key, value in score.items()},
         "added": deviation(true, given.poses),
         "left": deviation(true, refined),
-        **origin(),
+        "measured": head,
     }
 
 
@@ -133,7 +128,7 @@ def deviation(true: Sweep, poses: FloatArray) -> dict[str, float]:
     return {"mm": float(np.sqrt(np.square(shifts).mean())), "deg": float(np.sqrt(np.square(turns).mean()))}
 
 
-def table(figures: dict[str, Any]) -> Iterator[str]:
+def table(figures: Document) -> Iterator[str]:
     """The Markdown of what was measured."""
     yield "| set | errors | PSNR and MS-SSIM without refinement | with it | error left over | removed |"
     yield "|---|---|---|---|---|---|"
@@ -151,9 +146,6 @@ def table(figures: dict[str, Any]) -> Iterator[str]:
         removed = f"{1 - left_mm / added_mm:.0%}, {1 - left_deg / added_deg:.0%}" if error != RECORDED else ""
         seeds = f" ({len(runs)} seeds)" if len(runs) > 1 else ""
         yield f"| {name} | {error}{seeds} | {' | '.join(scores)} | {left_mm:.2f} mm, {left_deg:.2f}° | {removed} |"
-    yield ""
-    origins = sorted({f"commit {run['commit']} on {run['machine']}" for run in figures.values()})
-    yield f"Measured at {'; '.join(origins)}."
 
 
 def _mean(runs: Sequence[dict[str, Any]], key: str) -> float:

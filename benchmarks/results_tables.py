@@ -1,9 +1,9 @@
-"""Trains and measures on tracked and simulated sweeps, writes docs/results.md and the README's table: `make results`.
+"""Trains and measures on tracked and simulated sweeps: `make results`.
 
     python benchmarks/results_tables.py DATA_FOLDER [--only NAME ...]
 
-Each run's figures go into the JSON as soon as it is done, so that a killed run keeps them; the tables come from
-the JSON, which also holds the runs that were not asked for this time, and from that of `ablations.py`.
+Each run's figures go into the JSON as soon as it is done, so that a killed run keeps them. The tables of
+docs/results.md and README.md come from it.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ import logging
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from datetime import datetime, timezone
 from enum import Enum
 from pathlib import Path
 from typing import Any
@@ -22,9 +21,8 @@ from typing import Any
 import numpy as np
 import torch
 
-import ablations
 from in_silico import IN_SILICO
-from origin import origin
+from registry import FIGURES, Document
 from ultragray.datasets.phantom.shadow import SHADOW_DB, BoneShadow
 from ultragray.datasets.source import PHANTOM, SourceOptions, load_dataset
 from ultragray.datasets.sweep import Dataset
@@ -35,12 +33,8 @@ from ultragray.files.atomic import write_whole
 from ultragray.report.study import train_and_evaluate
 from ultragray.scene import GaussianScene
 from ultragray.training import Progress, TrainingConfig
+from ultragray_service.bench.measured import measured
 
-FOLDER = Path(__file__).resolve().parent
-TABLES = FOLDER.parent / "docs" / "results.md"
-README = FOLDER.parent / "README.md"
-README_BEGINS, README_ENDS = "<!-- written by make results -->", "<!-- end -->"
-FIGURES = FOLDER / "results_tables.json"
 SECONDS_PER_LINE = 15.0
 THIRD, BAND_SPACINGS = 3, 10
 METRICS = ("psnr_db", "ms_ssim", "gms", "gmsd")
@@ -114,22 +108,13 @@ def main() -> None:
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
     if arguments.threads:
         torch.set_num_threads(arguments.threads)
-    figures = json.loads(arguments.figures.read_text()) if arguments.figures.exists() else {}
+    output: Path = arguments.figures
+    output.parent.mkdir(parents=True, exist_ok=True)
+    figures = json.loads(output.read_text()) if output.exists() else {}
     for run in RUNS:
         if arguments.only is None or run.name in arguments.only:
             figures[run.name] = measure(run, arguments.data_folder)
-            write_whole(arguments.figures, json.dumps(figures, indent=1, allow_nan=False) + "\n")
-            write_pages(figures, arguments.tables)
-    write_pages(figures, arguments.tables)
-
-
-def write_pages(figures: Mapping[str, Any], page: Path) -> None:
-    """The page of tables and, where it is the one of the documents, the README's table."""
-    write_whole(page, tables(figures))
-    if page == TABLES:
-        before, _, rest = README.read_text().partition(README_BEGINS)
-        _, _, after = rest.partition(README_ENDS)
-        write_whole(README, "\n".join([before + README_BEGINS, *readme_table(figures), README_ENDS + after]))
+            write_whole(output, json.dumps(figures, indent=1, allow_nan=False) + "\n")
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -137,18 +122,20 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("data_folder", type=Path, help="folder of the data sets")
     parser.add_argument(
         "--only",
-        nargs="*",
+        nargs="+",
         choices=[run.name for run in RUNS],
-        help="leave out the others; none: write the tables anew",
+        help="leave out the others",
     )
     parser.add_argument("--threads", type=int, default=0, help="0: all cores")
-    parser.add_argument("--figures", type=Path, default=FIGURES, help="JSON of the figures")
-    parser.add_argument("--tables", type=Path, default=TABLES, help="Markdown that is written from it")
+    parser.add_argument(
+        "--figures", type=Path, default=FIGURES["results_tables"].staged, help="JSON; keeps the runs it has"
+    )
     return parser
 
 
 def measure(run: Run, data_folder: Path) -> dict[str, Any]:
     """Trains and measures one run, and the baselines on the same frames."""
+    head = measured(torch.get_num_threads())
     dataset = part_of(_source(run, data_folder), run.part)
     voxel_mm = affordable_voxel_mm(dataset.train)
     log.info("%s: baselines", run.name)
@@ -174,8 +161,7 @@ def measure(run: Run, data_folder: Path) -> dict[str, Any]:
         "gaussians": trained.scene.gaussian_count,
         "step_ms": 1000.0 * trained.step_s,
         "total_s": trained.seconds,
-        **origin(),
-        "measured_at": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        "measured": head,
     }
     if run.source == PHANTOM:
         figures["shadow"] = measure_shadow(trained.scene, dataset, voxel_mm)
@@ -221,45 +207,35 @@ def _teller(name: str) -> Callable[[Progress], None]:
     return tell
 
 
-def tables(figures: Mapping[str, Any]) -> str:
-    """The page: one table of the trainings, then one of the metrics for each run."""
+def tables(figures: Document) -> Iterator[str]:
+    """One table of the trainings, one of each run's lead, then one of the metrics for each run."""
     known = {run.name: figures[run.name] for run in RUNS if run.name in figures}
-    lines = [
-        "# Results",
-        "",
-        "Written by `make results`; edit `benchmarks/results_tables.py` instead. Every figure is measured on frames",
-        "that were held out of the training, per frame, then averaged; compounding and the nearest frame are measured",
-        "alike. No setting is tuned to a set. The time of a step is the mean over the run, validation included; the",
-        "scene's confidence is fitted afterwards, which takes about a quarter as long again.",
-        "",
-        "| run | training / held-out frames | image | preset | steps | Gaussians | ms a step | total |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
+    yield "| run | training / held-out frames | image | preset | steps | Gaussians | ms a step | total |"
+    yield "|---|---|---|---|---|---|---|---|"
     for name, run in known.items():
-        lines.append(
+        yield (
             f"| {name} | {run['train_frames']} / {run['val_frames']} | {run['image']} | {run['preset']} "
             f"| {run['steps']:,} | {run['gaussians']:,} | {run['step_ms']:.0f} | {run['total_s']:.0f} s |"
         )
-    origins = sorted({f"commit {run['commit']} on {run['machine']}" for run in known.values()})
-    lines += ["", f"Measured at {'; '.join(origins)}.", "", *_comparison(known)]
+    yield ""
+    yield from _comparison(known)
     for name, run in known.items():
-        lines += _metrics_table(name, run)
-    lines += ablations.section()
-    return "\n".join(lines)
+        yield from _metrics_table(name, run)
 
 
-def readme_table(figures: Mapping[str, Any]) -> Iterator[str]:
-    """The lines of the README's table."""
+def glanced_at(figures: Document) -> Document:
+    """The runs that the README shows."""
+    return {name: figures[name] for name in README_ROWS if name in figures}
+
+
+def at_a_glance(figures: Document) -> Iterator[str]:
+    """The README's table, of the runs that it shows."""
     yield "| sweep | training time | PSNR, MS-SSIM, GMSD: scene | median compounding | linear between frames |"
     yield "|---|---|---|---|---|"
-    runs = {label: figures[name] for name, label in README_ROWS.items() if name in figures}
-    for label, run in runs.items():
+    for name, run in figures.items():
         means = [run["metrics"][method]["mean"] for method in ("scene", "median", "linear")]
         cells = [f"{mean['psnr_db']:.1f} dB, {mean['ms_ssim']:.3f}, {mean['gmsd']:.3f}" for mean in means]
-        yield f"| {label} | {run['total_s']:.0f} s | {' | '.join(cells)} |"
-    origins = sorted({f"commit {run['commit']} on {run['machine']}" for run in runs.values()})
-    yield ""
-    yield f"Measured at {'; '.join(origins)}."
+        yield f"| {README_ROWS[name]} | {run['total_s']:.0f} s | {' | '.join(cells)} |"
 
 
 def _comparison(known: Mapping[str, Any]) -> list[str]:

@@ -22,9 +22,9 @@ from ultragray.interchange.released_config import stretch_released_far
 from ultragray.outputs import PLANES
 from ultragray.probe import FloatArray
 from ultragray.scene import PARAMETERS
+from ultragray_service.bench.measured import measured
 
 from .postgres import new_database, postgres
-from .records import origin
 from .surroundings import ROOT, forget_the_users_environment, home_of_the_tests, working_folder
 
 __all__ = ["home_of_the_tests", "new_database", "postgres", "working_folder"]
@@ -199,7 +199,7 @@ def pytest_terminal_summary(terminalreporter: Any, exitstatus: int, config: pyte
         return
     counts = {kind: len(terminalreporter.stats.get(kind, ())) for kind in ("passed", "failed", "error", "skipped")}
     record = {
-        **origin(),
+        "measured": measured(os.cpu_count() or 1),
         "seconds": round(time.monotonic() - BEGAN),
         "exit_status": int(exitstatus),
         **counts,
@@ -207,7 +207,8 @@ def pytest_terminal_summary(terminalreporter: Any, exitstatus: int, config: pyte
             report.nodeid for kind in ("failed", "error") for report in terminalreporter.stats.get(kind, ())
         ),
     }
-    path.write_text(json.dumps(record, indent=2) + "\n")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(record, indent=1) + "\n")
 
 
 @pytest.fixture(scope="session")

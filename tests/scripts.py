@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
+import sys
 from pathlib import Path
 from types import ModuleType
+
+from .surroundings import ROOT
+
+BENCHMARKS = ROOT / "benchmarks"
 
 
 def loaded(path: Path) -> ModuleType:
@@ -15,3 +21,12 @@ def loaded(path: Path) -> ModuleType:
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
+
+
+def benchmark(name: str) -> ModuleType:
+    """A module of the folder benchmarks, whose scripts import each other as they do when they are run."""
+    sys.path.insert(0, str(BENCHMARKS))
+    try:
+        return importlib.import_module(name)
+    finally:
+        sys.path.remove(str(BENCHMARKS))

@@ -14,13 +14,31 @@ _GROUP_LIMITS = (  # of the control group that a container is
 
 
 def processor_name() -> str:
-    """Model of the processor where the system tells it, else its architecture."""
-    cpuinfo = Path("/proc/cpuinfo")
-    if cpuinfo.exists():
-        for line in cpuinfo.read_text().splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    return platform.processor() or platform.machine()
+    """Name of the processor where the system tells it, else its architecture."""
+    return _cpu_info().get("model name") or platform.processor() or platform.machine()
+
+
+def processor_maker() -> str | None:
+    """The maker as the processor names itself, such as AuthenticAMD, or its number on Arm; None where nothing tells."""
+    told = _cpu_info()
+    return told.get("vendor_id") or told.get("CPU implementer")
+
+
+def processor_model() -> str | None:
+    """The maker's numbers for the generation: a virtual machine often hides it from the name."""
+    told = _cpu_info()
+    if "cpu family" in told:
+        return f"family {told['cpu family']}, model {told.get('model')}"
+    return f"part {told['CPU part']}" if "CPU part" in told else None
+
+
+def _cpu_info() -> dict[str, str]:
+    """What Linux says of the first processor."""
+    path = Path("/proc/cpuinfo")
+    if not path.exists():
+        return {}
+    pairs = (line.partition(":") for line in reversed(path.read_text().splitlines()))
+    return {name.strip(): value.strip() for name, _, value in pairs}  # the first of a name comes last, and stays
 
 
 def memory_bytes() -> int:

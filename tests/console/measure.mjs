@@ -3,11 +3,12 @@
  * node tests/console/measure.mjs [SECONDS]: a sweep is played at 512x512 for so long (default 300). Prints JSON.
  */
 
+import { execFileSync } from "node:child_process";
 import { readdirSync, readFileSync, statSync } from "node:fs";
 import path from "node:path";
 import { gzipSync } from "node:zlib";
 
-import { canvasState, launch, openPage, ROOT, Service, until } from "./harness.mjs";
+import { canvasState, launch, openPage, PYTHON, ROOT, Service, until } from "./harness.mjs";
 
 const IMAGE = '[aria-label="Live image"]';
 const SAMPLE_S = 10;
@@ -70,6 +71,7 @@ try {
   const rounded = (value) => Math.round(value * 10) / 10;
   const heaps_mib = heaps.map((bytes) => rounded(bytes / MEBIBYTE));
   const figures = {
+    measured: JSON.parse(execFileSync(PYTHON, ["-m", "ultragray_service.bench.measured"])),
     seconds,
     frames_per_s: { median: rounded(sorted[sorted.length >> 1]), least: rounded(sorted[0]), most: rounded(sorted.at(-1)) },
     heap_mib: { first: heaps_mib[0], last: heaps_mib.at(-1), most: Math.max(...heaps_mib) },

@@ -15,6 +15,11 @@ def test_what_the_system_tells(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     told.write_text("processor : 0\nmodel name\t: Abacus 3000: fast\nmodel name\t: another\n")
     monkeypatch.setattr(machine, "Path", lambda _: told)
     assert machine.processor_name() == "Abacus 3000: fast"
+    assert (machine.processor_maker(), machine.processor_model()) == (None, None)
+    told.write_text("vendor_id : Counting House\ncpu family\t: 26\nmodel\t\t: 2\nmodel name : Abacus\n")
+    assert (machine.processor_maker(), machine.processor_model()) == ("Counting House", "family 26, model 2")
+    told.write_text("CPU implementer\t: 0x41\nCPU part\t: 0xd40\n")
+    assert (machine.processor_maker(), machine.processor_model()) == ("0x41", "part 0xd40")
 
 
 def test_else_the_architecture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

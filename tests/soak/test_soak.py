@@ -23,10 +23,10 @@ import pytest
 from ultragray.datasets import Dataset
 from ultragray.datasets.released import write_released
 from ultragray.files.atomic import file_sha256
+from ultragray_service.bench.measured import measured
 
 from ..model.training.conftest import make_tiny_dataset
 from ..processes import Growth, Taken, by_role, family
-from ..records import origin
 from ..service.conftest import RunningService, service_starter
 from ..service.igtl.conftest import address_of
 from ..surroundings import ROOT
@@ -134,7 +134,7 @@ def test_all_kinds_of_clients_for_a_long_time(place: Place) -> None:
     soak.run(SECONDS)
     growth = soak.growth()
     if RECORD:
-        (ROOT / RECORD).write_text(json.dumps(record_of(soak, growth), indent=2) + "\n")
+        (ROOT / RECORD).write_text(json.dumps(record_of(soak, growth), indent=1) + "\n")
     assert not soak.errors, soak.errors[:10]
     assert all(soak.visits[name] for name in VISITORS), soak.visits
     assert_log_is_clean(place.service)
@@ -152,7 +152,7 @@ def assert_log_is_clean(service: RunningService) -> None:
 def record_of(soak: Soak, growth: dict[str, dict[str, Growth]]) -> dict[str, Any]:
     """What the file of the run says."""
     return {
-        **origin(),
+        "measured": measured(os.cpu_count() or 1),
         "seconds": round(SECONDS),
         "visits": dict(sorted(soak.visits.items())),
         "kills": dict(soak.kills),

@@ -82,7 +82,7 @@ def measure_clients(extent: ClientsExtent, tell: Callable[[str], None]) -> dict[
 
 def run(output: Path | None, quick: bool) -> None:
     """Measure what each kind of client gets of a served demo scene."""
-    report = Report(output)
+    report = Report(output, quick)
     short = ClientsExtent(loop_s=5.0, stream_s=2.0, ping_pongs=100, frames=500, kernel_repeats=50)
     extent = short if quick else ClientsExtent()
     report.time_yard()

@@ -31,7 +31,7 @@ COLUMNS = {
 
 def run(output: Path | None, quick: bool) -> None:
     """Print the table; write it as JSON to `output`. `quick` takes few repetitions and leaves the large scene out."""
-    report = Report(output)
+    report = Report(output, quick)
     repeats = 20 if quick else 200
     threads = torch.get_num_threads()
     rows: list[Row] = []
@@ -52,7 +52,7 @@ def run(output: Path | None, quick: bool) -> None:
             row = _row(scene, yard, door.what, threads, 1, door.latency_ms)
             rows.append({**row, "frames_per_s": door.frames_per_s, "above_kernel_ms": row["p50_ms"] - kernel_p50})
     document = report.cpu_document(worker_memory_mb=memory_mb, rows=rows)
-    machine = document["machine"]
+    versions = document["versions"]
     names = ("ultragray", "torch", "numpy", "grpc", "uvicorn", "python")
     report.conclude(
         document,
@@ -60,7 +60,7 @@ def run(output: Path | None, quick: bool) -> None:
         rows,
         [
             *(f"worker memory with {int(count):,} Gaussians: {mb:.0f} MB" for count, mb in memory_mb.items()),
-            ", ".join(f"{name} {machine[name]}" for name in names),
+            ", ".join(f"{name} {versions[name]}" for name in names),
         ],
     )
 

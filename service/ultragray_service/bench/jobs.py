@@ -85,7 +85,7 @@ def _percentiles(times_ms: list[float]) -> dict[str, float]:
 
 def run(output: Path | None, quick: bool) -> None:
     """Measure a full list of jobs, the start of a service that has one, and frames while a training runs."""
-    report = Report(output)
+    report = Report(output, quick)
     extent = JobsExtent(rounds=2, seconds=4.0) if quick else JobsExtent()
     report.time_yard()
     measured = measure_jobs(extent, report.tell)

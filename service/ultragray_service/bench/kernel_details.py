@@ -119,7 +119,7 @@ def _slice(
 
 def run(output: Path | None, quick: bool) -> None:
     """Print the table; write it as JSON to `output`. `quick` takes few poses and leaves the large scene out."""
-    report = Report(output)
+    report = Report(output, quick)
     report.time_yard()
     rows = []
     for view in views(quick):

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import json
 import platform
-import subprocess
 from collections.abc import Iterable, Mapping, Sequence
-from datetime import datetime, timezone
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -18,11 +16,10 @@ from rich.console import Console
 from rich.table import Table
 
 import ultragray
-from ultragray.backends import cpu
 from ultragray.files.atomic import write_whole
-from ultragray.machine import processor_name
 
 from .kernel import time_yard_ms
+from .measured import measured
 
 TABLE_WIDTH = 110  # columns, where no terminal says
 
@@ -30,10 +27,12 @@ TABLE_WIDTH = 110  # columns, where no terminal says
 class Report:
     """One benchmark on its way: says what is measured, then prints the table and writes the JSON."""
 
-    def __init__(self, output: Path | None) -> None:
+    def __init__(self, output: Path | None, quick: bool) -> None:
         console = Console()
         self._console = console if console.is_terminal else Console(width=TABLE_WIDTH)
         self._output = output
+        self._quick = quick
+        self._head = measured(torch.get_num_threads())  # now: a commit may be made while it is measured
         self._yards_ms: list[float] = []
 
     def tell(self, what: str) -> None:
@@ -46,14 +45,9 @@ class Report:
         return float(np.median(self._yards_ms[-2:]))
 
     def cpu_document(self, **figures: Any) -> dict[str, Any]:
-        """A document that begins with this machine and the yard."""
-        machine = {
-            "processor": processor_name(),
-            "threads": torch.get_num_threads(),
-            "instruction_set": cpu.INSTRUCTION_SETS[0],
-            **versions(),
-        }
-        return {"machine": machine, "yard_ms": float(np.median(self._yards_ms)), **figures}
+        """A document that begins with commit, date, machine, versions and the yard."""
+        head = {"measured": self._head, "versions": versions()}
+        return {**head, "yard_ms": float(np.median(self._yards_ms)), **figures}
 
     def conclude(
         self,
@@ -75,7 +69,8 @@ class Report:
         for note in notes:
             self._console.print(note)
         if self._output is not None:
-            write_whole(self._output, json.dumps(document, indent=1) + "\n")
+            quick = {"quick": True} if self._quick else {}  # too few repetitions to be recorded
+            write_whole(self._output, json.dumps({**document, **quick}, indent=1) + "\n")
             self._console.print(f"written to {self._output}")
 
 
@@ -92,46 +87,25 @@ def percentiles(times_ms: Sequence[float], *wanted: float) -> list[float]:
     return [float(one) for one in np.percentile(times_ms, wanted)]
 
 
-def versions() -> dict[str, str | None]:
-    """Versions of the system, of what is measured and what measures, and the time."""
+def versions() -> dict[str, str]:
+    """Versions of the system, of what is measured and what measures."""
     return {
         "system": platform.platform(),
         "python": platform.python_version(),
         "ultragray": ultragray.__version__,
-        "commit": _commit(),
         "torch": torch.__version__,
         "numpy": np.__version__,
         "grpc": grpc.__version__,
         "uvicorn": version("uvicorn"),
-        "measured_at": datetime.now(timezone.utc).isoformat(timespec="seconds"),
     }
 
 
-def _commit() -> str | None:
-    """The commit of the sources, where they are a checkout; with -dirty where these have changed since.
-
-    What a benchmark writes, figures and documents, is not among them.
-    """
-    top = Path(__file__).parents[3]
-    try:
-        commit, changed = (
-            subprocess.run(["git", "-C", str(top), *words], capture_output=True, text=True, check=True).stdout.strip()
-            for words in (
-                ("rev-parse", "--short", "HEAD"),
-                ("status", "--porcelain", "--", "model", "workers", "service", "proto"),
-            )
-        )
-    except (OSError, subprocess.CalledProcessError):
-        return None
-    return f"{commit}-dirty" if changed else commit
-
-
 def _title(document: Mapping[str, Any]) -> str:
-    machine = document["machine"]
-    if "renderer" in machine:  # of a GPU
+    machine = document["measured"]["machine"]
+    if (gpu := document.get("gpu")) is not None:
         return (
-            f"{machine.get('gpu', machine['processor'])}, {machine['renderer']}; driver {machine.get('driver')}, "
-            f"CUDA {machine['cuda']}, torch {machine['torch']}, triton {machine['triton']}"
+            f"{gpu.get('name', machine['processor'])}, {gpu['renderer']}; driver {gpu.get('driver')}, "
+            f"CUDA {gpu['cuda']}, torch {document['versions']['torch']}, triton {gpu['triton']}"
         )
     return (
         f"{machine['processor']}, {machine['threads']} threads, {machine['instruction_set']}; "

@@ -94,7 +94,7 @@ def measure_training(
 
 def run(output: Path | None, quick: bool) -> None:
     """Print the table; write it as JSON to `output`. `quick` takes few repetitions and leaves the large scene out."""
-    report = Report(output)
+    report = Report(output, quick)
     threads = torch.get_num_threads()
     rows: list[dict[str, Any]] = []
     for scene in training_scenes()[1 if quick else 0 :]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from skimage.transform import resize_local_mean
 
 from ultragray.datasets.images import CropBox, grey_frames, parse_crop, parse_image_size, resize_frames
 from ultragray.errors import DatasetInvalid, InvalidArgument
@@ -55,6 +56,14 @@ def test_a_box_is_the_mean_of_what_it_covers() -> None:
     np.testing.assert_array_equal(resize_frames(image, 2, 2), [[[0, 90], [0, 0]]])
     third = resize_frames(image, 4, 2)[0, 0]  # columns of 1.5 pixels: the edge at column 3 stays where it is
     assert third.tolist() == [0, 0, 90, 90]
+
+
+@pytest.mark.parametrize("size", [(40, 30), (17, 23), (50, 7)])
+def test_boxes_are_those_of_scikit_image(size: tuple[int, int]) -> None:
+    image = np.random.default_rng(0).integers(0, 256, (60, 50), dtype=np.uint8)
+    width, height = size
+    expected = resize_local_mean(image, (height, width), preserve_range=True)
+    np.testing.assert_allclose(resize_frames(image[None], width, height)[0], expected, atol=0.51)  # rounded to bytes
 
 
 def test_crops() -> None:

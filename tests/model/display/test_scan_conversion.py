@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import pytest
+from skimage.transform import warp
 
-from ultragray import ConvexProbe, PhasedProbe
-from ultragray.display.scan_conversion import scan_convert, scan_convert_labels
+from ultragray import ConvexProbe, LinearProbe, PhasedProbe, Probe
+from ultragray.display.scan_conversion import samples, scan_convert, scan_convert_labels
 
 CONVEX = ConvexProbe(opening_angle_deg=60.0, near_mm=50.0, far_mm=150.0)
 PHASED = PhasedProbe(opening_angle_deg=90.0, far_mm=120.0)
@@ -55,6 +57,14 @@ def test_scan_conversion_puts_range_and_angle_where_they_are() -> None:
     np.testing.assert_allclose(shown_angle[well_inside], theta[well_inside], atol=0.01)
     outside = (r < 50) | (r > 150) | (np.abs(theta) > 30)
     assert not shown_range[outside].any()
+
+
+@pytest.mark.parametrize("probe", [CONVEX, PHASED, LinearProbe(40.0, 0.0, 50.0)])
+def test_pixels_are_interpolated_as_scikit_image_does(probe: Probe) -> None:
+    frame = np.random.default_rng(0).random((60, 50))
+    rows, columns, inside = samples(probe, frame.shape, 0.9)
+    expected = np.where(inside, warp(frame, np.stack([rows, columns]), order=1, mode="edge"), 0.0)
+    np.testing.assert_allclose(scan_convert(frame, probe, 0.9), expected, atol=1e-6)
 
 
 def test_scan_conversion_of_one_pixel() -> None:

@@ -28,6 +28,7 @@ def test_training_bench(
     document = json.loads((tmp_path / "bench.json").read_text())
     assert [row["gaussians"] for row in document["rows"]] == gaussians
     assert document["yard_ms"] == 4.0
+    assert document.get("quick", False) == quick
     for row in document["rows"]:
         assert row["images"] == "8 of 24x20"
         assert row["step_yards"] == pytest.approx(row["step_ms"] / 4.0)

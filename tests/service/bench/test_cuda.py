@@ -74,8 +74,8 @@ def test_rates_stand_beside_the_limits(benched: Benched) -> None:
         )
     assert (door["what"], door["p50_ms"], door["frames_per_s"]) == ("HTTP of cuda", 3.0, 9.0)
     assert door["bandwidth_share"] is None
-    assert document["machine"]["renderer"] == cuda.renderer(cuda.device())
-    assert document["machine"]["triton"]
+    assert document["gpu"]["renderer"] == cuda.renderer(cuda.device())
+    assert document["gpu"]["triton"]
     assert "HTTP of cuda" in printed
     assert f"{100 * rendered[0]['arithmetic_share']:.1f}%" in printed
 

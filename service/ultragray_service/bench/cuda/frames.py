@@ -24,7 +24,7 @@ from ultragray_workers.pool.process.transfer import to_uint8
 from ..kernel import PROBE, BenchScene, bench_poses, bench_scenes, elapsed_ms, finish, mark
 from ..report import Report, percentiles
 from ..served import measure_served
-from .gpu import Limits, gpu_machine, measure_limits
+from .gpu import Limits, gpu_document, measure_limits
 
 BATCHES = (1, 8, 64, 256)  # poses rendered by one call
 POSES = 256  # that the calls go through
@@ -50,7 +50,7 @@ COLUMNS = {
 
 def run(output: Path | None, quick: bool) -> None:
     """Print the table; write it as JSON to `output`. `quick` takes few repetitions and leaves the large scene out."""
-    report, device = Report(output), cuda.device()
+    report, device = Report(output, quick), cuda.device()
     rounds = ROUNDS // 4 if quick else ROUNDS
     limits = measure_limits(device)
     rows: list[Row] = []
@@ -70,14 +70,8 @@ def run(output: Path | None, quick: bool) -> None:
         rows += [
             _row(bench, door.what, 1, door.latency_ms, frames_per_s=door.frames_per_s) for door in served.front_doors
         ]
-    document = {
-        "machine": gpu_machine(device),
-        "limits": asdict(limits),
-        "work_per_frame": work,
-        "rows": rows,
-    }
     report.conclude(
-        document,
+        gpu_document(device, limits=asdict(limits), work_per_frame=work, rows=rows),
         COLUMNS,
         rows,
         [

@@ -14,9 +14,9 @@ import triton
 import triton.language as tl
 
 from ultragray.backends import cuda
-from ultragray.machine import processor_name
 
 from ..kernel import elapsed_ms, finish, mark
+from ..measured import measured
 from ..report import versions
 
 COPY_BYTES = 2 << 30  # far more than any cache holds
@@ -71,18 +71,19 @@ def multiply_add(out: Any, factor: Any, term: Any, rounds: Any, LANES: tl.conste
     tl.store(out + places, a + b + c + d)
 
 
-def gpu_machine(device: torch.device) -> dict[str, Any]:
-    """The GPU, its driver and the versions of what is measured and measures."""
-    machine: dict[str, Any] = {"processor": processor_name(), "renderer": cuda.renderer(device)}
+def gpu_document(device: torch.device, **figures: Any) -> dict[str, Any]:
+    """A document that begins with commit, date, machine, versions and the GPU with its driver."""
+    gpu: dict[str, Any] = {"renderer": cuda.renderer(device)}
     if device.type == "cuda":
         properties = torch.cuda.get_device_properties(device)
-        machine |= {
-            "gpu": properties.name,
-            "gpu_memory_mb": properties.total_memory / 1e6,
+        gpu |= {
+            "name": properties.name,
+            "memory_mb": properties.total_memory / 1e6,
             "multiprocessors": properties.multi_processor_count,
             "driver": _driver_version(),
         }
-    return {**machine, "cuda": torch.version.cuda, "triton": triton.__version__, **versions()}
+    gpu |= {"cuda": torch.version.cuda, "triton": triton.__version__}
+    return {"measured": measured(torch.get_num_threads()), "versions": versions(), "gpu": gpu, **figures}
 
 
 def _driver_version() -> str | None:

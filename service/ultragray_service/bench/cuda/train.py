@@ -14,14 +14,14 @@ from ultragray.training.device import forget_peak_memory, peak_memory_mb
 from ..kernel import BATCH
 from ..report import Report
 from ..train import PARTS, measure_training, training_scenes
-from .gpu import gpu_machine
+from .gpu import gpu_document
 
 STEPS = 200  # a tenth of them where it is to be quick
 
 
 def run(output: Path | None, quick: bool) -> None:
     """Print the table; write it as JSON to `output`. `quick` takes few repetitions and leaves the large scene out."""
-    report, device = Report(output), cuda.device()
+    report, device = Report(output, quick), cuda.device()
     rows: list[dict[str, Any]] = []
     for bench in training_scenes()[1 if quick else 0 :]:
         report.tell(f"{bench.gaussian_count:,} Gaussians: training ...")
@@ -37,7 +37,7 @@ def run(output: Path | None, quick: bool) -> None:
             }
         )
     report.conclude(
-        {"machine": gpu_machine(device), "rows": rows},
+        gpu_document(device, rows=rows),
         {
             "Gaussians": "{gaussians:,}",
             "images": "{images}",

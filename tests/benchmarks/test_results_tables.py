@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
-import sys
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from ultragray import LinearProbe
 from ultragray.datasets import Dataset, Sweep
@@ -20,19 +20,14 @@ from ultragray.errors import DatasetInvalid
 from ultragray.training.config import VIEWS_BETWEEN
 from ultragray.training.data.geometry import Geometry
 
-SCRIPT = Path(__file__).resolve().parents[1] / "benchmarks" / "results_tables.py"
+from ..scripts import benchmark
+
 SETTINGS = {"steps": 3, "max_gaussians": 40}
 
 
 @pytest.fixture
 def script(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    monkeypatch.syspath_prepend(str(SCRIPT.parent))
-    spec = importlib.util.spec_from_file_location("results_tables", SCRIPT)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    monkeypatch.setitem(sys.modules, spec.name, module)
-    spec.loader.exec_module(module)
+    module = benchmark("results_tables")
     monkeypatch.setattr(
         module,
         "RUNS",
@@ -57,27 +52,34 @@ def data(tmp_path: Path) -> Path:
 
 
 def run(script: ModuleType, monkeypatch: pytest.MonkeyPatch, data: Path, *arguments: str) -> None:
-    files = ("--figures", str(data / "figures.json"), "--tables", str(data / "results.md"))
-    monkeypatch.setattr(sys, "argv", ["results_tables.py", str(data), *files, *arguments])
+    monkeypatch.setattr("sys.argv", ["results_tables.py", str(data), "--figures", str(figures_of(data)), *arguments])
     script.main()
+
+
+def figures_of(data: Path) -> Path:
+    return data / "new" / "figures.json"
+
+
+def read(data: Path) -> dict[str, Any]:
+    return dict(json.loads(figures_of(data).read_text()))
 
 
 def test_runs_are_kept_one_by_one_and_tabled_together(
     script: ModuleType, monkeypatch: pytest.MonkeyPatch, data: Path
 ) -> None:
     run(script, monkeypatch, data, "--only", "two")
-    first = json.loads((data / "figures.json").read_text())
+    first = read(data)
     assert list(first) == ["two"]
     assert first["two"]["split"] == {"train": "0:3", "val": "3:6"}
     run(script, monkeypatch, data, "--only", "one")
-    figures = json.loads((data / "figures.json").read_text())
+    figures = read(data)
     assert figures["two"] == first["two"]
     assert figures["one"]["train_frames"] == 6
     assert figures["one"]["gaussians"] > 0
     assert figures["one"]["steps"] == 3
     assert figures["one"]["total_s"] == pytest.approx(0.003 * figures["one"]["step_ms"])
-    tables = (data / "results.md").read_text()
-    assert tables == script.tables(figures)
+    assert figures["one"]["measured"]["machine"]["threads"] == torch.get_num_threads()
+    tables = "\n".join(script.tables(figures))
     assert tables.index("## one") < tables.index("## two")
     mean = figures["one"]["metrics"]["scene"]["mean"]
     assert f"{mean['psnr_db']:.2f}" in tables
@@ -92,15 +94,14 @@ def test_a_run_tells_the_steps_that_the_data_decided(
     run(script, monkeypatch, data)
     dataset = load_dataset(data / "ball", SourceOptions("0:2", "3:4"))
     steps = Geometry.of(dataset).steps(VIEWS_BETWEEN)
-    assert json.loads((data / "figures.json").read_text())["default"]["steps"] == steps
-    assert f"| default | 2 / 1 | 16x14 | fast | {steps:,} |" in (data / "results.md").read_text()
+    assert read(data)["default"]["steps"] == steps
+    assert f"| default | 2 / 1 | 16x14 | fast | {steps:,} |" in list(script.tables(read(data)))[2]
 
 
 def test_a_run_that_fails_loses_nothing(script: ModuleType, monkeypatch: pytest.MonkeyPatch, data: Path) -> None:
     with pytest.raises(DatasetInvalid, match="none"):
         run(script, monkeypatch, data)
-    assert set(json.loads((data / "figures.json").read_text())) == {"one", "two"}
-    assert "## two" in (data / "results.md").read_text()
+    assert set(read(data)) == {"one", "two"}
 
 
 def test_the_phantom_is_measured_in_the_shadow_of_bone(script: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -116,11 +117,11 @@ def test_the_phantom_is_measured_in_the_shadow_of_bone(script: ModuleType, monke
     assert 0.0 < shadow["scene_mae"] < 0.8
     assert 0.0 <= shadow["scene_transmittance"] <= 1.0
     monkeypatch.setattr(script, "RUNS", (script.Run("phantom", script.PHANTOM),))
-    tables = script.tables({"phantom": figures})
+    tables = "\n".join(script.tables({"phantom": figures}))
     assert f"{shadow['scene_mae']:.4f} (scene) against {shadow['median_mae']:.4f} (median compounding)" in tables
     assert f"mean transmittance of the scene {shadow['scene_transmittance']:.3f}" in tables
     del figures["shadow"]
-    assert "Where bone" not in script.tables({"phantom": figures})
+    assert "Where bone" not in "\n".join(script.tables({"phantom": figures}))
 
 
 def test_parts_leave_out_two_of_three_frames_or_a_band(script: ModuleType, data: Path) -> None:
@@ -140,34 +141,32 @@ def test_each_run_is_compared_with_the_better_baseline(script: ModuleType) -> No
         "linear": {"psnr_db": 29.5, "ms_ssim": 0.8, "gms": 0.7, "gmsd": 0.12},
     }
     run = {"metrics": {name: {"mean": mean} for name, mean in means.items()}}
-    assert script._comparison({"one": run})[-2] == "| one | +0.50 | -0.050 | +0.100 | -0.020 |"
+    assert list(script._comparison({"one": run}))[-2] == "| one | +0.50 | -0.050 | +0.100 | -0.020 |"
 
 
 def test_the_readme_shows_the_runs_that_it_names(
     script: ModuleType, monkeypatch: pytest.MonkeyPatch, data: Path
 ) -> None:
-    readme = data / "README.md"
-    readme.write_text(f"before\n{script.README_BEGINS}\nold\n{script.README_ENDS}\nafter\n")
-    monkeypatch.setattr(script, "README", readme)
-    monkeypatch.setattr(script, "TABLES", data / "results.md")
     monkeypatch.setattr(script, "README_ROWS", {"two": "a ball, the other half"})
-    run(script, monkeypatch, data, "--only", "two")
-    figures = json.loads((data / "figures.json").read_text())["two"]
-    before, begins, *rows, measured, ends, after = readme.read_text().splitlines()
-    assert (before, begins, ends, after) == ("before", script.README_BEGINS, script.README_ENDS, "after")
-    mean = figures["metrics"]["linear"]["mean"]
-    assert f"| a ball, the other half | {figures['total_s']:.0f} s |" in rows[2]
-    assert rows[2].endswith(f"{mean['psnr_db']:.1f} dB, {mean['ms_ssim']:.3f}, {mean['gmsd']:.3f} |")
-    assert measured == f"Measured at commit {figures['commit']} on {figures['machine']}."
+    run(script, monkeypatch, data, "--only", "one", "two")
+    figures = script.glanced_at(read(data))
+    assert list(figures) == ["two"]
+    *_, row = script.at_a_glance(figures)
+    mean = figures["two"]["metrics"]["linear"]["mean"]
+    assert row.startswith(f"| a ball, the other half | {figures['two']['total_s']:.0f} s |")
+    assert row.endswith(f"{mean['psnr_db']:.1f} dB, {mean['ms_ssim']:.3f}, {mean['gmsd']:.3f} |")
 
 
-def test_an_ablation_says_its_spread(script: ModuleType, monkeypatch: pytest.MonkeyPatch, data: Path) -> None:
-    ablations = script.ablations
-    where = {"commit": "abc", "machine": "a machine"}
-    runs = {f"as it is, seed {seed}": {"psnr_db": 30.0 + seed, "ms_ssim": 0.9, **where} for seed in ablations.SEEDS}
-    (data / "ablations.json").write_text(json.dumps({"ball": runs}))
-    monkeypatch.setattr(ablations, "FIGURES", data / "ablations.json")
-    lines = list(ablations.section())
+def test_an_ablation_says_its_spread() -> None:
+    ablations = benchmark("ablations")
+    runs = {f"as it is, seed {seed}": {"psnr_db": 30.0 + seed, "ms_ssim": 0.9} for seed in ablations.SEEDS}
+    lines = list(ablations.tables({"ball": runs}))
     assert "| as it is | 31.00 ± 0.82 / 0.900 ± 0.000 |" in lines
     assert "| no absorption | – |" in lines
-    assert "Measured at commit abc on a machine." in lines
+
+
+def test_an_ablation_is_not_repeated_at_its_commit() -> None:
+    ablations = benchmark("ablations")
+    assert ablations.is_of_commit({"measured": {"commit": "abc"}}, "abc")
+    for of, here in (("abc", "def"), ("abc-dirty", "abc-dirty"), (None, None)):
+        assert not ablations.is_of_commit({"measured": {"commit": of}}, here)
