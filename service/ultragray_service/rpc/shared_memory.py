@@ -20,11 +20,11 @@ HEADER_BYTES = 4096
 TOKEN_BYTES = 32
 MAX_SLOTS = 64
 PAGE_BYTES = 4096
-MAX_SLOT_BYTES = 64 * 2**20
+MAX_BYTES = 256 * 2**20  # of all slots of one stream
 
 _FIELD = "shared_memory"
 _NAME = re.compile(r"ultragray-[0-9a-f]{32}")
-_LENT, _FREE = b"\0", b"\1"
+FREE, _LENT = b"\1", b"\0"
 
 
 class SharedMemory:
@@ -68,7 +68,7 @@ class SharedMemory:
         if size > self._slot_bytes:
             return None
         try:
-            slot = os.pread(self._descriptor, self._slots, TOKEN_BYTES).find(_FREE)
+            slot = os.pread(self._descriptor, self._slots, TOKEN_BYTES).find(FREE)
             if slot < 0:
                 return None
             os.lseek(self._descriptor, HEADER_BYTES + slot * self._slot_bytes, os.SEEK_SET)
@@ -100,9 +100,9 @@ def _check_sizes(asked: rendering_pb2.SharedMemory) -> None:
         raise InvalidArgument(
             f"{_FIELD}.slots must be from 1 to {MAX_SLOTS}, got {asked.slots}", field=f"{_FIELD}.slots"
         )
-    if not 0 < asked.slot_bytes <= MAX_SLOT_BYTES or asked.slot_bytes % PAGE_BYTES:
+    if not 0 < asked.slots * asked.slot_bytes <= MAX_BYTES or asked.slot_bytes % PAGE_BYTES:
         raise InvalidArgument(
-            f"{_FIELD}.slot_bytes must be a multiple of {PAGE_BYTES} of at most {MAX_SLOT_BYTES}, "
+            f"{_FIELD}.slot_bytes must be a multiple of {PAGE_BYTES}, and at most {MAX_BYTES} for all slots together, "
             f"got {asked.slot_bytes}",
             field=f"{_FIELD}.slot_bytes",
         )
