@@ -83,8 +83,9 @@ class SharedMemory:
         return Place(slot, size)
 
     def close(self) -> None:
-        """Lets go of the memory; frames that the client has stay where they are."""
-        os.close(self._descriptor)
+        """Lets go of the memory; frames that the client has stay where they are. Nothing is put there any more."""
+        descriptor, self._descriptor = self._descriptor, -1
+        os.close(descriptor)
 
 
 def _check_sizes(asked: rendering_pb2.SharedMemory) -> None:

@@ -291,6 +291,12 @@ def test_no_file_is_looked_for_on_behalf_of_other_peers(memory: ClientMemory, pe
     assert memory.path.exists()
 
 
+@pytest.mark.parametrize("peer", [LOCAL_PEER, "ipv6:%5B::1%5D:50000"])
+def test_a_loopback_address_is_that_of_either_protocol(memory: ClientMemory, peer: str) -> None:
+    SharedMemory(memory.message, peer).close()
+    assert not memory.path.exists()
+
+
 def test_a_slot_that_cannot_be_written_is_not_taken(memory: ClientMemory, tmp_path: Path) -> None:
     source = (tmp_path / "frame").open("wb+", buffering=0)
     source.write(np.arange(8192, dtype=np.uint8).tobytes())
@@ -306,6 +312,7 @@ def test_a_slot_that_cannot_be_written_is_not_taken(memory: ClientMemory, tmp_pa
     assert shared.put(source.fileno(), 8193) is None  # the file has less
     assert memory.flags == b"\0\1\1"
     shared.close()
+    assert shared.put(source.fileno(), 8192) is None
     source.close()
 
 
