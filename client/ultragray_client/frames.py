@@ -126,10 +126,12 @@ def settings_message(scene: str, settings: RenderSettings | None) -> rendering_p
     return message_of(settings, rendering_pb2.RenderSettings, scene=scene)
 
 
-def frame_from_message(message: rendering_pb2.Frame, *, sequence: int = 0, dropped: int = 0) -> Frame:
-    """The frame; its arrays are views of one buffer."""
+def frame_from_message(message: rendering_pb2.Frame, *, sequence: int = 0, dropped: int = 0, data: Any = None) -> Frame:
+    """The frame; its arrays are read-only views of the buffer `data`; None: of the message's own."""
     dtype = _PIXEL_TYPES[_ENCODINGS[message.encoding]]
-    pixels = np.frombuffer(message.data, dtype).reshape(-1, message.height, message.width)
+    pixels = np.frombuffer(message.data if data is None else data, dtype)
+    pixels.setflags(write=False)
+    pixels = pixels.reshape(-1, message.height, message.width)
     names = [_OUTPUTS[number] for number in message.outputs]
     sent_ns = message.client_time_ns if message.HasField("client_time_ns") else None
     return from_message(

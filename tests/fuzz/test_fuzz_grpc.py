@@ -6,6 +6,7 @@ import pkgutil
 from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 import grpc
@@ -42,10 +43,13 @@ SETTINGS = rendering_pb2.RenderSettings(
     probe=geometry_pb2.Probe(linear=geometry_pb2.LinearProbe(width_mm=40, far_mm=40)),
     display=rendering_pb2.Display(gain_db=3, dynamic_range_db=50, tgc_db=[0, 3], depth_mm=30, pixel_mm=1),
 )
+SHARED = rendering_pb2.SharedMemory(name=f"ultragray-{'f' * 32}", token=bytes(range(32)), slots=2, slot_bytes=4096)
+SHARED_FILE = Path("/dev/shm", SHARED.name)
 VALID: tuple[Message, ...] = (
     rendering_pb2.RenderRequest(settings=SETTINGS, pose=POSE),
     rendering_pb2.RenderBatchRequest(settings=SETTINGS, poses=[POSE, MATRIX]),
     rendering_pb2.RenderStreamRequest(sequence=1, settings=SETTINGS, pose=POSE, timeout_ms=5000, client_time_ns=7),
+    rendering_pb2.RenderStreamRequest(sequence=2, settings=SETTINGS, pose=POSE, shared_memory=SHARED),
     scenes_pb2.GetSceneRequest(scene="demo"),
     scenes_pb2.LoadSceneRequest(scene="demo"),
     scenes_pb2.ListScenesRequest(page_size=2),
@@ -106,6 +110,21 @@ METHODS = all_methods()
 RENDERING = [method for method in METHODS if "RenderService" in method.path]
 
 
+@pytest.fixture(autouse=True)
+def no_file_stays() -> Iterator[None]:
+    yield
+    SHARED_FILE.unlink(missing_ok=True)
+
+
+def offer_shared_file() -> None:
+    """Makes the file that SHARED tells of, which a service that takes it removes."""
+    if not SHARED_FILE.exists():
+        SHARED_FILE.touch(0o600)
+        SHARED_FILE.write_bytes(
+            (SHARED.token + b"\1" * SHARED.slots).ljust(4096 + SHARED.slots * SHARED.slot_bytes, b"\0")
+        )
+
+
 @pytest.fixture
 def channel(well: FuzzedService) -> Iterator[grpc.Channel]:
     options = [("grpc.max_receive_message_length", -1), ("grpc.initial_reconnect_backoff_ms", 100)]
@@ -127,6 +146,8 @@ def calls(of: Any) -> Strategy:
 
 def asked(well: FuzzedService, channel: grpc.Channel, method: Method, requests: list[bytes]) -> None:
     well.require_alive()
+    if method.path.endswith("RenderStream"):
+        offer_shared_file()
     answers: list[bytes] = []
     told = "OK"
     try:

@@ -27,6 +27,7 @@ from ultragray_service.core.streams import pose_stream
 from ultragray_service.errors import STATUSES
 from ultragray_service.listening import http_server
 from ultragray_service.rpc import server as grpc_server
+from ultragray_service.rpc import shared_memory
 from ultragray_service.settings import LEAST_KEY_LENGTH, load_settings
 from ultragray_service.telemetry.logs import JsonFormatter, request_id
 from ultragray_service.tls.certificates import HANDSHAKE_TIMEOUT_S
@@ -131,6 +132,7 @@ def test_fixed_limits() -> None:
         "Frames in flight in one ordered stream": pose_stream.MAX_FRAMES_IN_FLIGHT,
         "Bytes of these frames, if there are several": pose_stream.MAX_BYTES_IN_FLIGHT,
         "Frames in the window of a latest stream": pose_stream.MAX_WINDOW,
+        "Memory that one stream shares": shared_memory.MAX_BYTES,
         "Message to a WebSocket": http_server.MAX_STREAM_MESSAGE_BYTES,
         "gRPC message received, where `ULTRAGRAY_MAX_BODY_BYTES` is less": grpc_server.LEAST_MAX_MESSAGE_BYTES,
         "Keepalive pings of a gRPC client, no more often than every": grpc_server.LEAST_PING_INTERVAL_MS,

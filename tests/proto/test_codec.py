@@ -48,7 +48,18 @@ PAIRS: list[tuple[type[Any], type[Any], set[str]]] = [
     (
         FrameHeader,
         rendering_pb2.Frame,
-        {"sequence", "data", "error", "dropped", "client_time_ns", "timings", "queue_ms", "render_ms", "encode_ms"},
+        {
+            "sequence",
+            "data",
+            "shared_data",
+            "error",
+            "dropped",
+            "client_time_ns",
+            "timings",
+            "queue_ms",
+            "render_ms",
+            "encode_ms",
+        },
     ),
 ]
 

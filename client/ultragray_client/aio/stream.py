@@ -60,3 +60,4 @@ class AsyncFrameStream:
 
     async def __aexit__(self, *_: object) -> None:
         await self._call.close()
+        self._exchange.close()

@@ -41,7 +41,7 @@ class PoseCall:
         self._exchange = exchange
         self._opening: Any = exchange.opening()
         self._sending = asyncio.Lock()
-        self._answers = NewestAnswers()
+        self._answers = NewestAnswers(exchange.skip)
         self._come = asyncio.Event()  # an answer, or the end of them
         self._taken = asyncio.Event()
         self._taken_sequence = 0

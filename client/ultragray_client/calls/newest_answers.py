@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from typing import Any
 
 WINDOW = 2  # answers that may wait for the caller: one is on its way while the other is looked at
@@ -11,7 +12,9 @@ WINDOW = 2  # answers that may wait for the caller: one is on its way while the 
 class NewestAnswers:
     """Answers in their order; of frames that nobody came for, only the newest one is kept."""
 
-    def __init__(self) -> None:
+    def __init__(self, skip: Callable[[Any], None]) -> None:
+        """`skip` is called with each frame that is not kept."""
+        self._skip = skip
         self._waiting: deque[Any] = deque()
         self._skipped = 0
 
@@ -21,7 +24,9 @@ class NewestAnswers:
     def put(self, answer: Any) -> None:
         """An answer has come. It takes the place of a frame; a refusal that waits is kept, and told before it."""
         if self._waiting and not self._waiting[-1].HasField("error") and not answer.HasField("error"):
-            self._skipped += 1 + self._waiting.pop().dropped
+            skipped = self._waiting.pop()
+            self._skipped += 1 + skipped.dropped
+            self._skip(skipped)
         self._waiting.append(answer)
 
     def take(self) -> Any:

@@ -11,6 +11,7 @@ from ..errors import InvalidArgument
 from ..frames import Frame, frame_from_message
 from ..geometry import PoseLike, pose_message
 from .newest_answers import WINDOW
+from .shared_memory import SharedMemory
 from .statuses import error_of_frame
 
 TAKES_NO_MORE = "the stream takes no more poses: done_sending was called, or it is over"
@@ -26,8 +27,10 @@ class StreamMode(str, Enum):
 class PoseExchange:
     """The messages of a stream: poses numbered from 1 (0 are its settings), and their frames."""
 
-    def __init__(self, settings: rendering_pb2.RenderSettings, mode: StreamMode | str) -> None:
-        """Raises InvalidArgument for a mode that does not exist."""
+    def __init__(
+        self, settings: rendering_pb2.RenderSettings, mode: StreamMode | str, *, shared_memory: bool = False
+    ) -> None:
+        """Raises InvalidArgument for a mode that does not exist, and where this system cannot share memory."""
         try:
             self.mode = StreamMode(mode)
         except ValueError:
@@ -36,12 +39,16 @@ class PoseExchange:
         self._settings = settings
         self._sequence = 0
         self._dropped = 0
+        self._memory = SharedMemory() if shared_memory else None
 
     def opening(self) -> rendering_pb2.RenderStreamRequest:
         """The first message: settings and mode, no pose. If they are refused, the first answer says so."""
         mode = f"STREAM_MODE_{self.mode.name}"
         window = WINDOW if self.mode is StreamMode.LATEST else None
-        return rendering_pb2.RenderStreamRequest(settings=self._settings, mode=mode, window=window)
+        memory = None if self._memory is None else self._memory.message()
+        return rendering_pb2.RenderStreamRequest(
+            settings=self._settings, mode=mode, window=window, shared_memory=memory
+        )
 
     def acknowledgement(self, sequence: int) -> rendering_pb2.RenderStreamRequest:
         """The message that the answer of that sequence was taken: a newer one may come."""
@@ -69,4 +76,15 @@ class PoseExchange:
         if message.HasField("error"):
             raise error_of_frame(message.error, message.sequence)
         dropped, self._dropped = self._dropped, 0
-        return frame_from_message(message, sequence=message.sequence, dropped=dropped)
+        data = None if self._memory is None else self._memory.taken(message)
+        return frame_from_message(message, sequence=message.sequence, dropped=dropped, data=data)
+
+    def skip(self, message: rendering_pb2.Frame) -> None:
+        """The caller does not want a frame that came."""
+        if self._memory is not None:
+            self._memory.skip(message)
+
+    def close(self) -> None:
+        """No frames are asked for any more; those that came stay."""
+        if self._memory is not None:
+            self._memory.close()

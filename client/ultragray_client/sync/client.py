@@ -90,12 +90,18 @@ class Client:
         *,
         mode: StreamMode | str = "ordered",
         timeout_s: float | None = None,
+        shared_memory: bool = False,
     ) -> FrameStream:
         """A stream of poses: `with client.stream("demo", mode="latest") as stream: stream.send(pose)`.
 
         `timeout_s` is the deadline of the whole stream; None: it has none. Otherwise as `render`.
+
+        `shared_memory`: pixels come through memory that is shared with the service instead of the connection, which
+        takes a Linux host that both run on, as the same user, and a loopback `address`; else InvalidArgument. The
+        arrays of a frame are views of that memory, and stay as they are for as long as anything refers to one of
+        them. While 16 frames are held, others come through the connection, as do those of more than 16 MiB.
         """
-        exchange = PoseExchange(settings_message(scene, settings), mode)
+        exchange = PoseExchange(settings_message(scene, settings), mode, shared_memory=shared_memory)
         call = self._connection.pose_call(self._calls.RenderStream, exchange, timeout_s)
         return FrameStream(self._connection.address, exchange, call)
 

@@ -61,3 +61,4 @@ class FrameStream:
 
     def __exit__(self, *_: object) -> None:
         self._call.close()
+        self._exchange.close()

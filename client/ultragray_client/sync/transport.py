@@ -49,7 +49,7 @@ class PoseCall:
         self._changed = threading.Condition()
         self._closed = False
         self._replaced = 0
-        self._answers = NewestAnswers()
+        self._answers = NewestAnswers(exchange.skip)
         self._acknowledgement: Any = None  # to be sent
         self._over = False  # no more answers come
         self._call = start(self._messages())

@@ -81,7 +81,8 @@ class RenderServiceServicer:
         HTTP/2's flow control lets through (some megabytes) waits for the reader and grows old. A message that cannot be answered (a bad pose, an unknown scene, a full
         queue, a deadline) gets a Frame with its sequence and `error` set, and the stream goes on; refused settings
         change nothing. The call itself fails only where it cannot go on: UNAVAILABLE with reason DRAINING when the service
-        stops (after the frames in flight), UNAUTHENTICATED, or INVALID_ARGUMENT for an unknown mode.
+        stops (after the frames in flight), UNAUTHENTICATED, or INVALID_ARGUMENT for an unknown mode or for shared_memory that is
+        refused.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')

@@ -12,7 +12,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
@@ -27,6 +27,7 @@ from ultragray_workers.jobs.worker.processes import account_of
 
 from ..core.job_client import JobClient
 from .kernel import BenchScene, bench_poses, time_ms
+from .shared_file import SharedFile
 
 SCENE = "bench"
 IN_FLIGHT = 8
@@ -140,28 +141,31 @@ def pose_message(pose: FloatArray) -> geometry_pb2.Pose:  # [4, 4] mm
     return geometry_pb2.Pose(matrix=geometry_pb2.Matrix(values=pose.ravel().tolist()))
 
 
-def _grpc_stream(server: RunningServer, poses: FloatArray) -> FrontDoor:  # [C, 4, 4]
-    settings = rendering_pb2.RenderSettings(scene=SCENE)
+def _grpc_stream(
+    what: str, outputs: Sequence[str], encoding: str, shares: bool, server: RunningServer, poses: FloatArray
+) -> FrontDoor:
+    """`shares`: frames come through shared memory."""
+    settings = rendering_pb2.RenderSettings(scene=SCENE, outputs=outputs, encoding=encoding)
     with grpc.insecure_channel(f"127.0.0.1:{server.grpc_port}") as channel:
         stub = rendering_pb2_grpc.RenderServiceStub(channel)
-        room = _Turns()
-        stream = stub.RenderStream(room.requests(settings, poses))
+        memory, room = SharedFile(2 * IN_FLIGHT) if shares else None, _Turns()
+        stream = stub.RenderStream(room.requests(settings, poses, memory))
         latency_ms = []
         for _ in poses:
             started = time.perf_counter()
             room.release()
-            _check(next(stream))
+            _take(next(stream), memory)
             latency_ms.append(1000.0 * (time.perf_counter() - started))
-        room = _Turns()
+        memory, room = SharedFile(2 * IN_FLIGHT) if shares else None, _Turns()
         started = time.perf_counter()
-        stream = stub.RenderStream(room.requests(settings, poses))
+        stream = stub.RenderStream(room.requests(settings, poses, memory))
         for _ in range(IN_FLIGHT):
             room.release()
         for frame in stream:
-            _check(frame)
+            _take(frame, memory)
             room.release()
         rate = len(poses) / (time.perf_counter() - started)
-    return FrontDoor("gRPC stream", latency_ms[WARM_UP:], rate)
+    return FrontDoor(what, latency_ms[WARM_UP:], rate)
 
 
 class _Turns:
@@ -174,18 +178,26 @@ class _Turns:
         self._turns.put(None)
 
     def requests(
-        self, settings: rendering_pb2.RenderSettings, poses: FloatArray
+        self, settings: rendering_pb2.RenderSettings, poses: FloatArray, memory: SharedFile | None
     ) -> Iterator[rendering_pb2.RenderStreamRequest]:
         for sequence, pose in enumerate(poses):
             self._turns.get()
-            yield rendering_pb2.RenderStreamRequest(
-                sequence=sequence, pose=pose_message(pose), settings=settings if sequence == 0 else None
-            )
+            request = rendering_pb2.RenderStreamRequest(sequence=sequence, pose=pose_message(pose))
+            if sequence == 0:
+                request.settings.CopyFrom(settings)
+                if memory is not None:
+                    request.shared_memory.CopyFrom(memory.message)
+            yield request
 
 
-def _check(frame: rendering_pb2.Frame) -> None:
+def _take(frame: rendering_pb2.Frame, memory: SharedFile | None) -> None:
+    """Raises NotReady for an error in place of a frame, and for pixels that do not lie where they should."""
     if frame.HasField("error"):
         raise NotReady(f"the benchmark's frame {frame.sequence} failed: {frame.error.detail}")
+    if memory is not None:
+        if not frame.HasField("shared_data"):
+            raise NotReady(f"the benchmark's frame {frame.sequence} did not come through shared memory")
+        memory.free(frame.shared_data)
 
 
 def _grpc_unary(server: RunningServer, poses: FloatArray) -> FrontDoor:
@@ -222,8 +234,16 @@ def _one_by_one(what: str, poses: FloatArray, render: Callable[[FloatArray], obj
     return FrontDoor(what, counted, 1000.0 * len(counted) / sum(counted))
 
 
+_BMODE = ("OUTPUT_BMODE",), "ENCODING_UINT8"
+_PLANES = ("OUTPUT_BMODE", "OUTPUT_ECHO", "OUTPUT_TRANSMITTANCE"), "ENCODING_FLOAT32"
+_STREAMS = {
+    "gRPC stream": (*_BMODE, False),
+    "gRPC stream, shared memory": (*_BMODE, True),
+    "gRPC stream, 3 float32 outputs": (*_PLANES, False),
+    "gRPC stream, 3 float32 outputs, shared memory": (*_PLANES, True),
+}
 DOORS: dict[str, Callable[[RunningServer, FloatArray], FrontDoor]] = {
-    "gRPC stream": _grpc_stream,
+    **{what: partial(_grpc_stream, what, *how) for what, how in _STREAMS.items()},
     "gRPC unary": _grpc_unary,
     "HTTP raw": partial(_http, "HTTP raw", "application/octet-stream"),
     "HTTP PNG": partial(_http, "HTTP PNG", "image/png"),

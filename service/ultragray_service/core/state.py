@@ -15,7 +15,7 @@ from ultragray_workers.errors import Draining, NotReady, SceneNotFound, StartupF
 from ultragray_workers.jobs.queue.owners import Kind
 from ultragray_workers.jobs.store import SCENES_FOLDER, JobStore
 from ultragray_workers.pool.pool import MAX_SCENE_CHANGES, PoolConfig, RenderPool
-from ultragray_workers.pool.types import Priority, RenderRequest, RenderResult, SceneChangedError
+from ultragray_workers.pool.types import Destination, Priority, RenderRequest, RenderResult, SceneChangedError
 from ultragray_workers.pool.waiting import Turn
 from ultragray_workers.scenes import SceneStore
 
@@ -228,6 +228,7 @@ class Service:
         priority: Priority = Priority.INTERACTIVE,
         turn: Turn | None = None,
         begin_by: float | None = None,  # time.monotonic() in seconds; else it is refused
+        destination: Destination | None = None,
     ) -> RenderResult:
         """Renders, with the settings as they are for the scene that is there when it is rendered.
 
@@ -242,7 +243,7 @@ class Service:
         turn = turn or Turn()
         for _ in range(MAX_SCENE_CHANGES):
             asked = RenderRequest(
-                plan.scene, plan.settings, poses, priority, deadline, plan.version, caller(), begin_by
+                plan.scene, plan.settings, poses, priority, deadline, plan.version, caller(), begin_by, destination
             )
             try:
                 with scene_to_blame():

@@ -21,6 +21,7 @@ from ..core.state import Service
 from ..errors import statuses_of
 from ..telemetry.logs import choose_request_id, request_id
 from .handlers import Method, method_of, refusing_what_is_no_message, with_method
+from .peers import address_of
 from .status import REQUEST_ID_KEY, abort
 
 _OPEN_PREFIX = "/grpc.health.v1."
@@ -129,11 +130,6 @@ def _telling_errors(method: Method) -> Method:
             await abort(context, error)
 
     return call
-
-
-def address_of(peer: str) -> str:
-    """The address of a peer as gRPC writes it: `ipv4:127.0.0.1:50000`."""
-    return peer.partition(":")[2].rpartition(":")[0]
 
 
 def name_in(request: Any, operation: Operation) -> str:

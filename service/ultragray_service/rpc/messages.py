@@ -90,6 +90,8 @@ def read_poses(messages: Sequence[geometry_pb2.Pose], field: str) -> FloatArray:
 
 def frame_message(result: RenderResult, sequence: int, **others: Any) -> rendering_pb2.Frame:
     """The frame of a result of one pose."""
+    if (place := result.place) is not None:
+        others["shared_data"] = rendering_pb2.SharedData(slot=place.slot, bytes=place.size)
     frame = to_message(FrameFacts.of(result), rendering_pb2.Frame, sequence=sequence, data=result.data, **others)
     frame.MergeFrom(_settings_message(result.settings))
     return frame

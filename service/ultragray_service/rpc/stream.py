@@ -15,6 +15,7 @@ from ..core.streams.pose_stream import MAX_WINDOW, Answered, StreamMode
 from ..core.streams.stream import SceneSettings, checked_s
 from ..errors import Refusal
 from .messages import frame_message, read_pose, read_settings, read_word
+from .shared_memory import SharedMemory
 
 
 class _Message:
@@ -76,10 +77,18 @@ class _Unreadable:
 
 
 class CallTransport:
-    """One call of RenderStream. Its mode is read from the first message that can be read."""
+    """One call of RenderStream; a context manager. Its mode is read from the first message that can be read."""
 
     def __init__(self, context: grpc.aio.ServicerContext) -> None:
         self._context = context
+        self.destination: SharedMemory | None = None
+
+    def __enter__(self) -> CallTransport:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self.destination is not None:
+            self.destination.close()
 
     async def receive(self) -> _Message | _Unreadable | None:
         try:
@@ -89,10 +98,16 @@ class CallTransport:
         return None if message is grpc.aio.EOF else _Message(message, self._context.time_remaining())
 
     def mode(self, message: Any) -> StreamMode | None:
-        """Raises InvalidArgument for a mode that does not exist."""
+        """Opens the memory that the client shares, too.
+
+        Raises InvalidArgument for a mode that does not exist, and for memory that is refused.
+        """
         if isinstance(message, _Unreadable):
             return None
-        return StreamMode(read_word(message.message, "mode") or StreamMode.ORDERED)
+        mode = StreamMode(read_word(message.message, "mode") or StreamMode.ORDERED)
+        if message.message.HasField("shared_memory"):
+            self.destination = SharedMemory(message.message.shared_memory, self._context.peer())
+        return mode
 
     async def send(self, answered: Answered) -> None:
         about: dict[str, Any] = {"dropped": answered.dropped}

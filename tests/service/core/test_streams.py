@@ -88,6 +88,8 @@ class Faulty:
 class FaultyTransport:
     """Brings one such message, and takes answers."""
 
+    destination = None
+
     def __init__(self) -> None:
         self.messages: Iterator[Faulty] = iter([Faulty()])
         self.answers: list[Answered] = []

@@ -233,10 +233,10 @@ class RenderPool:
             self._open.add(ticket)
             self._dispatcher.submit(ticket)
             rendered = await ticket.done
-            if rendered.size > _READ_IN_THREAD_BYTES:
-                data = await asyncio.to_thread(read_start, ticket.reply_memory, rendered.size)
-            else:
-                data = read_start(ticket.reply_memory, rendered.size)
+            place = None
+            if request.destination is not None:
+                place = request.destination.put(ticket.reply_memory, rendered.size)
+            data = b"" if place is not None else await _read(ticket.reply_memory, rendered.size)
         finally:
             turn.expiry.cancel()
             self._open.discard(ticket)
@@ -253,6 +253,7 @@ class RenderPool:
             encode_ms=rendered.encode_ms,
             extrapolations=rendered.extrapolations,
             batch_size=ticket.batch_size,
+            place=place,
         )
 
     def _ticket(self, request: RenderRequest) -> Ticket:
@@ -277,3 +278,10 @@ class RenderPool:
             done=asyncio.get_running_loop().create_future(),
             submitted=time.monotonic(),
         )
+
+
+async def _read(memory: int, size: int) -> bytes:
+    """The first `size` bytes of a file; many of them in a thread."""
+    if size > _READ_IN_THREAD_BYTES:
+        return await asyncio.to_thread(read_start, memory, size)
+    return read_start(memory, size)

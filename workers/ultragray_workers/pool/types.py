@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import Protocol
 
 from ultragray.confidence import Extrapolation
 from ultragray.probe import FloatArray
@@ -20,6 +21,21 @@ class Priority(IntEnum):
     BATCH = 1
 
 
+@dataclass(frozen=True)
+class Place:
+    """Where a destination has put data."""
+
+    slot: int
+    size: int  # bytes
+
+
+class Destination(Protocol):
+    """Memory of a caller, which its frames are put into."""
+
+    def put(self, descriptor: int, size: int) -> Place | None:
+        """Copies the first `size` bytes of a file into it; None where it has no room for them."""
+
+
 @dataclass(frozen=True, eq=False)
 class RenderRequest:
     """Frames of one scene for some poses; everything but the scene has been checked by the caller."""
@@ -32,6 +48,7 @@ class RenderRequest:
     version: FileVersion | None = None  # of the scene's file that the settings are for; None: any
     caller: Caller = UNKNOWN_CALLER
     begin_by: float | None = None  # time.monotonic() in seconds; it is given up where none of it has begun by then
+    destination: Destination | None = None  # of the reply; None: RenderResult.data
 
 
 class SceneChangedError(Exception):
@@ -53,12 +70,13 @@ class RenderResult:
     renderer: str  # such as "ultragray/0.1.0 cpu-avx512"
     settings: Resolved
     poses: FloatArray  # [C, 4, 4] mm, as used
-    data: bytes
+    data: bytes  # empty where the destination of the request took them
     queue_ms: float  # from the call to the start of its rendering
     render_ms: float  # of the batch it was rendered in
     encode_ms: float
     extrapolations: tuple[Extrapolation, ...]  # [C]
     batch_size: int  # poses rendered together
+    place: Place | None = None  # of the data in that destination
 
     @property
     def height(self) -> int:

@@ -14,7 +14,7 @@ from typing import Any
 from ultragray.errors import UltragrayError
 from ultragray.probe import FloatArray
 from ultragray_workers.errors import Draining
-from ultragray_workers.pool.types import RenderResult
+from ultragray_workers.pool.types import Destination, RenderResult
 from ultragray_workers.pool.waiting import Turn
 
 from ..requests import Plan
@@ -130,7 +130,8 @@ class PoseStream:
     """One stream of one client."""
 
     def __init__(self, service: Service) -> None:
-        self.mode = StreamMode.ORDERED  # to be set before the first pose
+        self.mode = StreamMode.ORDERED  # to be set before the first pose, likewise:
+        self.destination: Destination | None = None  # of its frames
         self._service = service
         self._room = _Room()
         self._answers: asyncio.Queue[_Underway | None] = asyncio.Queue()
@@ -240,7 +241,9 @@ class PoseStream:
         return await self._render(asked, Turn())
 
     async def _render(self, asked: Asked, turn: Turn) -> RenderResult:
-        return await self._service.render(asked.plan, asked.pose[None], deadline=asked.deadline, turn=turn)
+        return await self._service.render(
+            asked.plan, asked.pose[None], deadline=asked.deadline, turn=turn, destination=self.destination
+        )
 
     async def _outcome(self, rendering: Awaitable[RenderResult]) -> RenderResult | UltragrayError:
         try:

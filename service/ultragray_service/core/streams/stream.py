@@ -7,6 +7,7 @@ from typing import Protocol
 from ultragray.errors import InvalidArgument, UltragrayError
 from ultragray.probe import FloatArray
 from ultragray.settings import RenderSettings
+from ultragray_workers.pool.types import Destination
 
 from ..requests import Plan
 from ..state import Service
@@ -51,6 +52,10 @@ class Message(Protocol):
 class Transport(Protocol):
     """The connection that messages come through."""
 
+    @property
+    def destination(self) -> Destination | None:
+        """Where frames are put, of a transport whose mode was asked for; None: into the answers."""
+
     async def receive(self) -> Message | None:
         """The next message; None after the last."""
 
@@ -88,7 +93,7 @@ class FrameStream:
         mode = None
         while (message := await self._transport.receive()) is not None:
             if mode is None and (mode := self._transport.mode(message)) is not None:
-                self._poses.mode = mode
+                self._poses.mode, self._poses.destination = mode, self._transport.destination
                 if message.window is not None:
                     self._poses.open_window(message.window)
             if message.acknowledged is not None:

@@ -136,6 +136,8 @@ _NUMBERS = TypeAdapter(_Numbers)
 class _WebSocketTransport:
     """One connection. Its mode is read from the first message that can be read."""
 
+    destination = None
+
     def __init__(self, websocket: WebSocket, scene: str) -> None:
         self._websocket = websocket
         self._scene = scene

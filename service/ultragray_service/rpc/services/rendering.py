@@ -78,8 +78,8 @@ class RenderService:
     async def RenderStream(  # noqa: N802
         self, messages: object, context: grpc.aio.ServicerContext
     ) -> None:
-        with self._service.limits.stream():
-            await FrameStream(self._service, CallTransport(context)).run()
+        with self._service.limits.stream(), CallTransport(context) as transport:
+            await FrameStream(self._service, transport).run()
 
     async def _plan(self, request: rendering_pb2.RenderRequest | rendering_pb2.RenderBatchRequest) -> Plan:
         """The plan of a request. Raises what RequestPlanner.plan raises; the field is a path."""

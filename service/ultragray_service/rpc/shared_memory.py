@@ -1,0 +1,113 @@
+"""Frames in memory that a client on this host shares with its stream; rendering.proto has the layout of the file."""
+
+from __future__ import annotations
+
+import hmac
+import os
+import re
+import stat
+from contextlib import suppress
+
+from ultragray.errors import InvalidArgument
+from ultragray_proto.v1 import rendering_pb2
+from ultragray_workers.pool.types import Place
+
+from ..access.addresses import is_loopback
+from .peers import address_of
+
+FOLDER = "/dev/shm"
+HEADER_BYTES = 4096
+TOKEN_BYTES = 32
+MAX_SLOTS = 64
+PAGE_BYTES = 4096
+MAX_BYTES = 256 * 2**20  # of all slots of one stream
+
+_FIELD = "shared_memory"
+_NAME = re.compile(r"ultragray-[0-9a-f]{32}")
+FREE, _LENT = b"\1", b"\0"
+
+
+class SharedMemory:
+    """The file of one stream. It is written to, never mapped: a client that truncates it harms nobody but itself."""
+
+    def __init__(self, asked: rendering_pb2.SharedMemory, peer: str) -> None:
+        """Opens the file and removes its name. Raises InvalidArgument for one that the peer may not share."""
+        if not is_loopback(address_of(peer)):
+            raise InvalidArgument(
+                f"{_FIELD} is for clients that reach the service by a loopback address, got one at {peer}",
+                field=_FIELD,
+            )
+        _check_sizes(asked)
+        self._slots, self._slot_bytes = asked.slots, asked.slot_bytes
+        path = f"{FOLDER}/{asked.name}"
+        try:
+            self._descriptor = os.open(path, os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+        except OSError as error:
+            raise _refused(asked, f"the service cannot open it: {error.strerror}") from None
+        try:
+            self._check_file(asked)
+        except BaseException:
+            self.close()
+            raise
+        with suppress(OSError):
+            os.unlink(path)
+
+    def _check_file(self, asked: rendering_pb2.SharedMemory) -> None:
+        """Raises InvalidArgument unless the file is one that the client made to be shared."""
+        status = os.fstat(self._descriptor)
+        expected = HEADER_BYTES + self._slots * self._slot_bytes
+        if not stat.S_ISREG(status.st_mode) or status.st_uid != os.geteuid():
+            raise _refused(asked, "it must be a file of the user that the service runs as")
+        if status.st_size != expected:
+            raise _refused(asked, f"it must have {expected} bytes, got {status.st_size}")
+        if not hmac.compare_digest(os.pread(self._descriptor, TOKEN_BYTES, 0), asked.token):
+            raise _refused(asked, "it does not begin with the token")
+
+    def put(self, descriptor: int, size: int) -> Place | None:
+        """Copies the first `size` bytes of a file into the first slot that is free; None where there is no room."""
+        if size > self._slot_bytes:
+            return None
+        try:
+            slot = os.pread(self._descriptor, self._slots, TOKEN_BYTES).find(FREE)
+            if slot < 0:
+                return None
+            os.lseek(self._descriptor, HEADER_BYTES + slot * self._slot_bytes, os.SEEK_SET)
+            copied = 0
+            while copied < size:
+                if not (count := os.sendfile(self._descriptor, descriptor, copied, size - copied)):
+                    return None
+                copied += count
+            os.pwrite(self._descriptor, _LENT, TOKEN_BYTES + slot)
+        except OSError:  # such as a full /dev/shm
+            return None
+        return Place(slot, size)
+
+    def close(self) -> None:
+        """Lets go of the memory; frames that the client has stay where they are. Nothing is put there any more."""
+        descriptor, self._descriptor = self._descriptor, -1
+        os.close(descriptor)
+
+
+def _check_sizes(asked: rendering_pb2.SharedMemory) -> None:
+    if not _NAME.fullmatch(asked.name):
+        raise InvalidArgument(
+            f"{_FIELD}.name must be ultragray- and 32 hexadecimal digits, got {asked.name!r}", field=f"{_FIELD}.name"
+        )
+    if len(asked.token) != TOKEN_BYTES:
+        raise InvalidArgument(
+            f"{_FIELD}.token must have {TOKEN_BYTES} bytes, got {len(asked.token)}", field=f"{_FIELD}.token"
+        )
+    if not 1 <= asked.slots <= MAX_SLOTS:
+        raise InvalidArgument(
+            f"{_FIELD}.slots must be from 1 to {MAX_SLOTS}, got {asked.slots}", field=f"{_FIELD}.slots"
+        )
+    if not 0 < asked.slots * asked.slot_bytes <= MAX_BYTES or asked.slot_bytes % PAGE_BYTES:
+        raise InvalidArgument(
+            f"{_FIELD}.slot_bytes must be a multiple of {PAGE_BYTES}, and at most {MAX_BYTES} for all slots together, "
+            f"got {asked.slot_bytes}",
+            field=f"{_FIELD}.slot_bytes",
+        )
+
+
+def _refused(asked: rendering_pb2.SharedMemory, why: str) -> InvalidArgument:
+    return InvalidArgument(f"{_FIELD} {FOLDER}/{asked.name} is refused: {why}", field=f"{_FIELD}.name")

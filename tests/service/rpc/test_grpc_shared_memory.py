@@ -1,0 +1,351 @@
+"""Streams whose frames go through memory that the client shares, laid out as rendering.proto says."""
+
+from __future__ import annotations
+
+import os
+import resource
+import secrets
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import grpc
+import numpy as np
+import pytest
+
+from ultragray.errors import InvalidArgument
+from ultragray_proto.v1 import geometry_pb2, rendering_pb2, rendering_pb2_grpc
+from ultragray_service.rpc.peers import address_of
+from ultragray_service.rpc.shared_memory import FOLDER, SharedMemory
+from ultragray_workers.pool.types import Place
+
+from ...waiting import wait_until
+from ..access.test_addresses import own_address
+from ..conftest import ROOT, RunningService, StartService
+from .test_grpc_render import Conversation, Stub, error_info, moved
+
+SLOT_BYTES = 2**20
+HEADER_BYTES, FLAGS = 4096, 32  # where the slots begin, and the bytes that say which are free
+LOCAL_PEER = "ipv4:127.0.0.1:50000"
+
+
+class ClientMemory:
+    """A client's file, by the words of rendering.proto."""
+
+    def __init__(self, slots: int = 3) -> None:
+        self.path = Path(FOLDER, f"ultragray-{secrets.token_hex(16)}")
+        self.message = rendering_pb2.SharedMemory(
+            name=self.path.name, token=secrets.token_bytes(32), slots=slots, slot_bytes=SLOT_BYTES
+        )
+        self.file = os.fdopen(os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600), "r+b", buffering=0)
+        self.file.truncate(HEADER_BYTES + slots * SLOT_BYTES)
+        self.write(0, self.message.token + b"\1" * slots)
+
+    def write(self, offset: int, data: bytes) -> None:
+        os.pwrite(self.file.fileno(), data, offset)
+
+    @property
+    def flags(self) -> bytes:
+        return os.pread(self.file.fileno(), self.message.slots, FLAGS)
+
+    def free(self, slot: int) -> None:
+        self.write(FLAGS + slot, b"\1")
+
+    def pixels(self, frame: rendering_pb2.Frame) -> bytes:
+        """The data of a frame that came here."""
+        assert frame.HasField("shared_data"), frame.error
+        assert not frame.data
+        place = HEADER_BYTES + frame.shared_data.slot * SLOT_BYTES
+        return os.pread(self.file.fileno(), frame.shared_data.bytes, place)
+
+    def close(self) -> None:
+        self.file.close()
+        self.path.unlink(missing_ok=True)
+
+
+@pytest.fixture
+def memory() -> Iterator[ClientMemory]:
+    made = ClientMemory()
+    yield made
+    made.close()
+
+
+def opened(renders: Stub, memory: ClientMemory, **settings: Any) -> Conversation:
+    conversation = Conversation(renders)
+    asked = rendering_pb2.RenderSettings(**{"scene": "demo", **settings})
+    conversation.send(settings=asked, shared_memory=memory.message)
+    return conversation
+
+
+ENCODINGS: dict[str, dict[str, Any]] = {
+    "uint8": {"encoding": rendering_pb2.ENCODING_UINT8},
+    "float32": {"encoding": rendering_pb2.ENCODING_FLOAT32, "outputs": [1, 2, 3, 4, 6]},
+    "png": {"encoding": rendering_pb2.ENCODING_PNG},
+    "jpeg": {"encoding": rendering_pb2.ENCODING_JPEG},
+}
+
+
+@pytest.mark.parametrize("settings", ENCODINGS.values(), ids=ENCODINGS)
+def test_frames_are_those_of_messages_byte_for_byte(
+    renders: Stub, memory: ClientMemory, settings: dict[str, Any]
+) -> None:
+    ordinary = Conversation(renders)
+    ordinary.send(settings=rendering_pb2.RenderSettings(scene="demo", **settings))
+    shared = opened(renders, memory, **settings)
+    for sequence in range(5):
+        one, other = ordinary.ask(sequence, pose=moved(sequence)), shared.ask(sequence, pose=moved(sequence))
+        assert memory.pixels(other) == one.data
+        memory.free(other.shared_data.slot)
+        for frame in (one, other):
+            frame.ClearField("data")
+            frame.ClearField("shared_data")
+            frame.ClearField("timings")
+        assert one == other
+    assert not memory.path.exists()  # the service has taken the name away
+    ordinary.finish()
+    shared.finish()
+
+
+def test_a_slot_is_written_again_only_once_it_is_free(renders: Stub, memory: ClientMemory) -> None:
+    conversation = opened(renders, memory)
+    frames = [conversation.ask(k, pose=moved(k)) for k in range(3)]
+    assert [frame.shared_data.slot for frame in frames] == [0, 1, 2]
+    assert memory.flags == b"\0\0\0"
+    held = [memory.pixels(frame) for frame in frames]
+    beyond = conversation.ask(3, pose=moved(3))
+    assert (len(beyond.data), beyond.HasField("shared_data")) == (len(held[0]), False)
+    memory.free(1)
+    again = conversation.ask(4, pose=moved(4))
+    assert again.shared_data.slot == 1
+    assert [memory.pixels(frame) for frame in frames] == [held[0], memory.pixels(again), held[2]]
+    assert len({*held, beyond.data, memory.pixels(again)}) == 5
+    conversation.finish()
+
+
+def test_a_frame_larger_than_a_slot_comes_in_its_message(renders: Stub, memory: ClientMemory) -> None:
+    conversation = opened(renders, memory, height=600, width=600, encoding=rendering_pb2.ENCODING_FLOAT32)
+    assert len(conversation.ask(1, pose=moved(0)).data) == 600 * 600 * 4
+    assert memory.flags == b"\1\1\1"
+    conversation.finish()
+
+
+def test_errors_and_new_settings_are_as_without(renders: Stub, memory: ClientMemory, settings_message: Any) -> None:
+    conversation = opened(renders, memory, scene="nowhere")
+    assert next(conversation.call).error.reason == "SCENE_NOT_FOUND"
+    assert len(memory.pixels(conversation.ask(1, settings=settings_message, pose=moved(0)))) == 64 * 48
+    assert conversation.ask(2, pose=geometry_pb2.Pose()).error.reason == "INVALID_POSE"
+    assert conversation.ask(3, pose=moved(0), timeout_ms=1e-6).error.reason == "DEADLINE_EXCEEDED"
+    small = rendering_pb2.RenderSettings(scene="second", height=10, width=12)
+    assert len(memory.pixels(conversation.ask(4, settings=small, pose=moved(0)))) == 10 * 12
+    assert memory.flags == b"\0\0\1"
+    conversation.finish()
+
+
+def test_a_latest_stream_takes_slots_only_for_frames_that_it_sends(renders: Stub, memory: ClientMemory) -> None:
+    conversation = Conversation(renders)
+    settings = rendering_pb2.RenderSettings(scene="demo", height=400, width=400)
+    conversation.send(settings=settings, mode=rendering_pb2.STREAM_MODE_LATEST, shared_memory=memory.message)
+    for sequence in range(200):
+        conversation.send(sequence, pose=moved(0))
+    frames = conversation.finish()
+    assert sum(1 + frame.dropped for frame in frames) == 200
+    slots = [frame.shared_data.slot for frame in frames if frame.HasField("shared_data")]
+    assert slots == list(range(min(3, len(frames))))
+
+
+def test_a_file_that_is_cut_off_or_scribbled_on_harms_its_client_alone(
+    service: RunningService, renders: Stub, memory: ClientMemory
+) -> None:
+    conversation = opened(renders, memory)
+    expected = memory.pixels(conversation.ask(1, pose=moved(1)))
+    memory.file.truncate(0)
+    assert conversation.ask(2, pose=moved(1)).data == expected  # no byte says that a slot is free
+    memory.free(2)
+    assert memory.pixels(conversation.ask(3, pose=moved(1))) == expected
+    memory.write(0, b"\xff" * HEADER_BYTES)
+    assert conversation.ask(4, pose=moved(1)).data == expected
+    conversation.finish()
+    assert service.process.poll() is None
+
+
+def refused(renders: Stub, message: rendering_pb2.SharedMemory) -> tuple[str, str]:
+    """The field that a call is refused for, and why."""
+    conversation = Conversation(renders)
+    settings = rendering_pb2.RenderSettings(scene="demo")
+    conversation.send(1, settings=settings, pose=moved(0), shared_memory=message)
+    with pytest.raises(grpc.RpcError) as caught:
+        next(conversation.call)
+    assert caught.value.code() == grpc.StatusCode.INVALID_ARGUMENT
+    return error_info(caught.value)[0].metadata["field"], caught.value.details()
+
+
+BAD_MESSAGES: dict[str, tuple[dict[str, Any], str, str]] = {
+    "no name": ({"name": ""}, "name", "hexadecimal"),
+    "a path": ({"name": "/etc/passwd"}, "name", "hexadecimal"),
+    "a way out": ({"name": f"../{'0' * 32}"}, "name", "hexadecimal"),
+    "a name in capitals": ({"name": f"ultragray-{'A' * 32}"}, "name", "hexadecimal"),
+    "a line after the name": ({"name": f"ultragray-{'0' * 32}\n"}, "name", "hexadecimal"),
+    "a file that is not there": ({"name": f"ultragray-{'0' * 32}"}, "name", "No such file"),
+    "no token": ({"token": b""}, "token", "32 bytes, got 0"),
+    "another token": ({"token": b"0" * 32}, "name", "begin with the token"),
+    "no slots": ({"slots": 0}, "slots", "from 1 to 64, got 0"),
+    "many slots": ({"slots": 65}, "slots", "from 1 to 64, got 65"),
+    "fewer slots": ({"slots": 2}, "name", "must have 2101248 bytes, got 3149824"),
+    "no size": ({"slot_bytes": 0}, "slot_bytes", "multiple of 4096"),
+    "half a page": ({"slot_bytes": 2**20 + 2048}, "slot_bytes", "multiple of 4096"),
+    "another size": ({"slot_bytes": 2**21}, "name", "must have 6295552 bytes"),
+    "a large size": ({"slot_bytes": 2**28 // 3 // 4096 * 4096 + 4096}, "slot_bytes", "at most 268435456 for all"),
+}
+
+
+@pytest.mark.parametrize(("changes", "field", "words"), BAD_MESSAGES.values(), ids=BAD_MESSAGES)
+def test_what_a_message_must_tell(
+    renders: Stub, memory: ClientMemory, changes: dict[str, Any], field: str, words: str
+) -> None:
+    message = rendering_pb2.SharedMemory()
+    message.CopyFrom(memory.message)
+    for name, value in changes.items():
+        setattr(message, name, value)
+    told, detail = refused(renders, message)
+    assert told == f"shared_memory.{field}"
+    assert words in detail
+    assert memory.path.exists()
+    assert memory.flags == b"\1\1\1"
+
+
+def as_link(path: Path) -> None:
+    path.rename(path.with_suffix(".moved"))
+    path.symlink_to(path.with_suffix(".moved"))
+
+
+def as_folder(path: Path) -> None:
+    path.unlink()
+    path.mkdir()
+
+
+def as_pipe(path: Path) -> None:
+    path.unlink()
+    os.mkfifo(path)
+
+
+def as_file_of_another_user(path: Path) -> None:
+    if os.geteuid() != 0:
+        pytest.skip("only root can give files away")
+    os.chown(path, 65534, 65534)
+
+
+@pytest.mark.parametrize("become", [as_link, as_folder, as_pipe, as_file_of_another_user])
+def test_only_a_file_of_the_own_user_is_opened(
+    renders: Stub, memory: ClientMemory, become: Callable[[Path], None]
+) -> None:
+    try:
+        become(memory.path)
+        assert refused(renders, memory.message)[0] == "shared_memory.name"
+        assert memory.flags == b"\1\1\1"
+    finally:
+        memory.path.with_suffix(".moved").unlink(missing_ok=True)
+        if memory.path.is_dir():
+            memory.path.rmdir()
+
+
+def test_a_file_is_opened_once(renders: Stub, memory: ClientMemory) -> None:
+    conversation = opened(renders, memory)
+    memory.pixels(conversation.ask(1, pose=moved(0)))
+    assert refused(renders, memory.message)[0] == "shared_memory.name"
+    memory.pixels(conversation.ask(2, pose=moved(0)))
+    conversation.finish()
+
+
+def test_clients_by_another_address_than_loopback_are_refused(
+    start_service: StartService, memory: ClientMemory
+) -> None:
+    address = own_address()
+    if address is None:
+        pytest.skip("this machine has no address but loopback's to connect from")
+    service = start_service(host="0.0.0.0", insecure=True)
+    port = service.grpc.rpartition(":")[2]
+    with grpc.insecure_channel(f"{address}:{port}") as channel:
+        field, detail = refused(rendering_pb2_grpc.RenderServiceStub(channel), memory.message)
+    assert field == "shared_memory"
+    assert "loopback" in detail
+    assert address in detail
+    with grpc.insecure_channel(f"127.0.0.1:{port}") as channel:
+        conversation = opened(rendering_pb2_grpc.RenderServiceStub(channel), memory)
+        memory.pixels(conversation.ask(1, pose=moved(0)))
+        conversation.finish()
+
+
+def test_addresses_of_peers() -> None:
+    assert address_of("ipv4:127.0.0.1:50000") == "127.0.0.1"
+    assert address_of("ipv6:%5Bfd00::1%5D:50000") == "fd00::1"
+    assert address_of("unix:") == ""
+
+
+@pytest.mark.parametrize("peer", ["ipv4:10.0.0.7:50000", "ipv6:%5Bfd00::1%5D:50000", "unix:", ""])
+def test_no_file_is_looked_for_on_behalf_of_other_peers(memory: ClientMemory, peer: str) -> None:
+    with pytest.raises(InvalidArgument, match="loopback"):
+        SharedMemory(memory.message, peer)
+    assert memory.path.exists()
+
+
+@pytest.mark.parametrize("peer", [LOCAL_PEER, "ipv6:%5B::1%5D:50000"])
+def test_a_loopback_address_is_that_of_either_protocol(memory: ClientMemory, peer: str) -> None:
+    SharedMemory(memory.message, peer).close()
+    assert not memory.path.exists()
+
+
+def test_a_slot_that_cannot_be_written_is_not_taken(memory: ClientMemory, tmp_path: Path) -> None:
+    source = (tmp_path / "frame").open("wb+", buffering=0)
+    source.write(np.arange(8192, dtype=np.uint8).tobytes())
+    shared = SharedMemory(memory.message, LOCAL_PEER)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (HEADER_BYTES + 4096, before[1]))  # like a /dev/shm that is full
+    try:
+        assert shared.put(source.fileno(), 8192) is None
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert memory.flags == b"\1\1\1"
+    assert shared.put(source.fileno(), 8192) == Place(0, 8192)
+    assert shared.put(source.fileno(), 8193) is None  # the file has less
+    assert memory.flags == b"\0\1\1"
+    shared.close()
+    assert shared.put(source.fileno(), 8192) is None
+    source.close()
+
+
+def shared_files(service: RunningService) -> list[str]:
+    """The shared memory that the service has open."""
+    links = (os.readlink(link) for link in Path(f"/proc/{service.process.pid}/fd").iterdir() if link.is_symlink())
+    return [link for link in links if "shm/ultragray-" in link]
+
+
+DYING_CLIENT = """
+import sys, numpy as np
+from ultragray_client import Client
+stream = Client(sys.argv[1]).stream("demo", shared_memory=True)
+held = []
+for _ in range(3):
+    stream.send(np.eye(4))
+    held.append(stream.receive())
+print("streams", flush=True)
+sys.stdin.read()
+"""
+
+
+def test_a_client_that_dies_leaves_nothing(service: RunningService, renders: Stub) -> None:
+    before = set(Path(FOLDER).glob("ultragray-*"))
+    assert shared_files(service) == []
+    command = [sys.executable, "-c", DYING_CLIENT, service.grpc]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(str(ROOT / name) for name in ("client", "proto"))}
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment, text=True) as client:
+        assert client.stdout is not None
+        assert client.stdout.readline() == "streams\n"
+        assert len(shared_files(service)) == 1
+        client.send_signal(signal.SIGKILL)
+    wait_until(lambda: shared_files(service) == [])
+    wait_until(lambda: set(Path(FOLDER).glob("ultragray-*")) <= before)  # other tests may make some, for a moment
+    settings = rendering_pb2.RenderSettings(scene="demo")
+    assert renders.Render(rendering_pb2.RenderRequest(settings=settings, pose=moved(0)), timeout=60).data
