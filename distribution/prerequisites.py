@@ -54,7 +54,7 @@ def console_problem() -> str | None:
         return None
     return (
         "the console is not built, and a wheel or sdist without it would serve no page; run `make console` first "
-        "(needs Node 20 or newer), or install the checkout itself: pip install --editable"
+        "(needs Node 20 or newer), or install the checkout itself: pip install --editable ."
     )
 
 

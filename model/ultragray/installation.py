@@ -23,21 +23,29 @@ MODULES_OF_EXTRAS = {
     "tracing": ("opentelemetry.exporter", "opentelemetry.sdk"),
     "zarr": ("zarr",),
 }
+_SINCE_PYTHON_311 = {"serve", "zarr"}  # FastAPI and zarr have no releases for Python 3.10
 _CHECKOUT = Path(__file__).resolve().parents[2]
 
 
 def extra_of(module: str) -> str | None:
     """The extra that brings a module; None where the core's dependencies do, or nothing of ours."""
+    return _entry(module)[0]
+
+
+def _entry(module: str) -> tuple[str | None, str]:
+    """The extra that brings a module, and the module as the table names it: opentelemetry.sdk before opentelemetry."""
     parts = module.split(".")
-    names = {".".join(parts[:length]) for length in (1, 2)}
-    found = [extra for extra, modules in MODULES_OF_EXTRAS.items() if names.intersection(modules)]
-    return found[-1] if found else None  # opentelemetry.sdk is more than opentelemetry
+    for name in (".".join(parts[:2]), parts[0]):
+        for extra, modules in MODULES_OF_EXTRAS.items():
+            if name in modules:
+                return extra, name
+    return None, module
 
 
 def install_advice(extra: str) -> str:
     """The command that installs an extra into this installation, from where it was installed."""
-    if extra == "zarr" and sys.version_info < (3, 11):
-        return "there is no zarr for Python 3.10, use Python 3.11 or newer"
+    if extra in _SINCE_PYTHON_311 and sys.version_info < (3, 11):
+        return "its releases need Python 3.11 or newer, this is Python 3.10"
     if not (_CHECKOUT / "proto" / "pyproject.toml").is_file():
         return f"pip install 'ultragray[{extra}]'"
     pip = ".venv/bin/pip" if Path(sys.prefix) == _CHECKOUT / ".venv" else "pip"
@@ -50,7 +58,7 @@ def missing_extra(error: ImportError, purpose: str, *, field: str | None = None)
 
     Raises `error` again where it is about a module that no extra brings.
     """
-    extra = extra_of(error.name or "")
+    extra, module = _entry(error.name or "")
     if extra is None:
         raise error
-    return ExtraMissing(f"{purpose} needs {error.name}, which is not installed: {install_advice(extra)}", field=field)
+    return ExtraMissing(f"{purpose} needs {module}, which is not installed: {install_advice(extra)}", field=field)

@@ -22,6 +22,7 @@ from ultragray import LinearProbe
 from ultragray.confidence import FIGURES, Extrapolation, figure_arrays
 from ultragray.contract import to_dict
 from ultragray.errors import ExtraMissing, InvalidArgument
+from ultragray.installation import install_advice
 from ultragray.interchange.exports import FORMATS, ExportHeader, check_format, export_to
 from ultragray.interchange.exports.exporter import stored_pixels
 from ultragray.interchange.exports.npz import NpzExporter
@@ -343,7 +344,7 @@ def test_a_missing_package_is_named_with_its_extra(tmp_path: Path, format: str, 
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout.splitlines() == [
-        f"format {format} needs {package}, which is not installed: pip install 'ultragray[{format}]'",
+        f"format {format} needs {package}, which is not installed: {install_advice(format)}",
         "False",
     ]
     assert ExtraMissing.reason == "EXTRA_MISSING"
