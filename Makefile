@@ -129,7 +129,7 @@ clean:  ## remove what was built
 $(VENV)/python: Makefile
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 		{ echo "error: Python 3.11 or newer is needed, and $(PYTHON) is not; choose one with: make PYTHON=/path/to/python3"; exit 1; }
-	@$(PYTHON) -c 'import ensurepip, venv' 2> /dev/null || \
+	@$(PYTHON) -c 'import venv; from ensurepip import bootstrap' 2> /dev/null || \
 		{ echo "error: $(PYTHON) cannot make virtual environments; on Debian: sudo apt-get install python3-venv"; exit 1; }
 	@echo "Creating the virtual environment in $(VENV) ..."
 	@$(PYTHON) -m venv $(VENV)

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import sys
+import subprocess
+import tomllib
 from functools import cache
 from importlib import metadata
+from pathlib import Path
 from typing import Any
 
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 from ..surroundings import ROOT
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
 
 FOLDERS = {"ultragray": ROOT, "ultragray-client": ROOT / "client", "ultragray-proto": ROOT / "proto"}
 
@@ -38,6 +35,14 @@ def packages(name: str) -> list[str]:
         else tool["hatch"]["build"]["targets"]["wheel"]["packages"]
     )
     return [folder.rpartition("/")[2] for folder in folders]
+
+
+def unpacked(sdist: Path, folder: Path) -> Path:
+    """The one folder that an sdist holds. By `tar`: the filters and warnings of tarfile depend on Python's version."""
+    folder.mkdir()
+    subprocess.run(["tar", "-xf", str(sdist), "-C", str(folder)], check=True)
+    (source,) = folder.iterdir()
+    return source
 
 
 def required(requirements: list[str]) -> set[str]:

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from ..surroundings import ROOT
+from .projects import unpacked
 
 PACKAGES = {"client": "ultragray_client", "proto": "ultragray_proto"}
 
@@ -37,10 +38,8 @@ def test_a_wheel_holds_its_package_and_the_licence(project: str, tmp_path: Path)
 
 @pytest.mark.parametrize("project", PACKAGES)
 def test_a_wheel_of_the_sdist_is_the_same(project: str, tmp_path: Path) -> None:
-    with tarfile.open(build(ROOT / project, "sdist", tmp_path / "sdist")) as sdist:
-        sdist.extractall(tmp_path / "unpacked", filter="data")
-    (unpacked,) = (tmp_path / "unpacked").iterdir()
-    with zipfile.ZipFile(build(unpacked, "wheel", tmp_path / "wheel")) as wheel:
+    source = unpacked(build(ROOT / project, "sdist", tmp_path / "sdist"), tmp_path / "source")
+    with zipfile.ZipFile(build(source, "wheel", tmp_path / "wheel")) as wheel:
         files = {name for name in wheel.namelist() if ".dist-info/" not in name}
     assert files == sources(ROOT / project / PACKAGES[project])
 
