@@ -5,9 +5,12 @@ VENV := .venv
 BIN := $(VENV)/bin
 # A file of tests belongs to one process, which shares its services among them. Most of the time they wait for others: four fit two cores.
 PYTEST := $(BIN)/pytest --numprocesses 4 --dist loadfile
-KERNEL_SOURCES := $(wildcard model/kernels/*) CMakeLists.txt pyproject.toml
+KERNEL_SOURCES := $(wildcard model/kernels/*) CMakeLists.txt
+PACKAGES := . proto client
+PACKAGE_SOURCES := $(KERNEL_SOURCES) $(PACKAGES:%=%/pyproject.toml) $(wildcard distribution/*.py)
+PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 GENERATED_TESTS := tests/proto tests/client/test_client_generated.py tests/interfaces/test_generated_tables.py tests/interfaces/test_measured_tables.py tests/benchmarks/test_registry.py tests/service/test_snapshots.py
-PYTHON_SOURCES := model service workers proto client tests benchmarks docs examples
+PYTHON_SOURCES := model service workers proto client distribution tests benchmarks docs examples
 NPM := $(shell command -v npm)
 CONSOLE := service/ultragray_service/console/index.html
 CONSOLE_SOURCES := $(shell find web -type f -not -path 'web/node_modules/*' -not -path 'web/src/api/generated/*')
@@ -23,7 +26,7 @@ KEEP = @$(if $(RECORD),$(BIN)/python benchmarks/record.py,:)
 MINUTES ?= 30
 
 .DEFAULT_GOAL := help
-.PHONY: ALWAYS help serve console test test-fast test-long test-console test-faults test-fuzz test-soak test-overload check check-lint check-types check-generated check-web check-figures format bench bench-record bench-console console-picture bench-cuda results ablations poses confidence libraries figures demo-scene generate clean
+.PHONY: ALWAYS help serve console test test-fast test-long test-console test-faults test-fuzz test-soak test-overload check check-lint check-types check-generated check-web check-figures format bench bench-record bench-console console-picture bench-cuda results ablations poses confidence libraries figures demo-scene generate packages clean
 
 help:  ## say what there is
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
@@ -168,12 +171,17 @@ generate: $(VENV)/installed-dev  ## rewrite what is generated: the gRPC stubs, m
 	$(BIN)/python client/generate.py
 	$(BIN)/python docs/generate.py
 
+packages: $(VENV)/installed-dev $(CONSOLE)  ## build the three packages into dist: sdists, and wheels for this Python
+	for package in $(PACKAGES); do $(BIN)/python -m build --outdir dist $$package || exit 1; done
+
 clean:  ## remove what was built
-	rm -rf $(VENV) build web/node_modules $(dir $(CONSOLE))
+	rm -rf $(VENV) build dist web/node_modules $(dir $(CONSOLE))
 
 $(VENV)/python: Makefile
-	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' || \
-		{ echo "Python 3.10 or newer is needed; choose one with: make PYTHON=/path/to/python3"; exit 1; }
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+		{ echo "error: Python 3.11 or newer is needed, and $(PYTHON) is not; choose one with: make PYTHON=/path/to/python3"; exit 1; }
+	@$(PYTHON) -c 'import venv; from ensurepip import bootstrap' 2> /dev/null || \
+		{ echo "error: $(PYTHON) cannot make virtual environments; on Debian: sudo apt-get install python3-venv"; exit 1; }
 	@echo "Creating the virtual environment in $(VENV) ..."
 	@$(PYTHON) -m venv $(VENV)
 	@touch $@
@@ -183,14 +191,16 @@ $(VENV)/modules: ALWAYS | $(VENV)/python
 	@find model workers service proto client -name '*.py' | sort > $@.new
 	@cmp --quiet $@.new $@ && rm $@.new || mv $@.new $@
 
-$(VENV)/installed: $(VENV)/python $(VENV)/modules $(KERNEL_SOURCES)
+$(VENV)/installed: $(VENV)/python $(VENV)/modules $(PACKAGE_SOURCES)
+	@$(BIN)/python distribution/prerequisites.py
 	@echo "Installing the libraries and compiling the kernel (a minute or two the first time) ..."
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable .
+	@$(PIP_INSTALL) --editable ./proto --editable '.[all]' --editable ./client || { echo "error: pip could not install it all,\
+	for the reason above; if it found no cmake or ninja: sudo apt-get install cmake ninja-build"; exit 1; }
 	@touch $@
 
-$(VENV)/installed-dev: $(VENV)/installed client/pyproject.toml
-	@echo "Installing the client and the test and lint tools ..."
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]' --editable ./client
+$(VENV)/installed-dev: $(VENV)/installed
+	@echo "Installing the test and lint tools ..."
+	@$(PIP_INSTALL) 'ultragray[dev]'
 	@touch $@
 
 web/node_modules/.package-lock.json: web/package-lock.json

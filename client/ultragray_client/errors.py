@@ -408,8 +408,8 @@ class BackendUnavailable(Unimplemented):
 
 
 class ExtraMissing(Unimplemented):
-    """A format whose package is not installed: `pip install 'ultragray[dicom]'` and the like (uploads, jobs, command
-    line, library).
+    """A format, a command or traces whose package is not installed; the sentence says how to install it (uploads,
+    jobs, command line, library).
     """
 
     reason = "EXTRA_MISSING"

@@ -11,10 +11,10 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from .errors import UltragrayError
+from .installation import __version__ as __version__
 from .pose import check_poses, pose_from_position_quaternion, quaternion_from_pose
 from .probe import ConvexProbe, ElevationBeam, LinearProbe, PhasedProbe, Probe, RadialProbe, SteeredProbe
 from .scene_info import SceneHeader, SceneInfo, read_header
-from .version import __version__ as __version__
 
 if TYPE_CHECKING:
     from .rendering import Frames, render

@@ -170,8 +170,8 @@ class BackendUnavailable(UltragrayError):
 
 
 class ExtraMissing(UltragrayError):
-    """A format whose package is not installed: `pip install 'ultragray[dicom]'` and the like (uploads, jobs,
-    command line, library).
+    """A format, a command or traces whose package is not installed; the sentence says how to install it (uploads,
+    jobs, command line, library).
     """
 
     reason = "EXTRA_MISSING"

@@ -13,11 +13,11 @@ from .backends.beam import beam_cm
 from .backends.poses import ScenePoses, as_array, scene_poses
 from .errors import BackendUnavailable
 from .image_size import check_image_size
+from .installation import __version__
 from .limits import UNLIMITED, Limits
 from .outputs import OUTPUTS, PLANES, check_available, check_outputs
 from .probe import ElevationBeam, FloatArray, Probe
 from .scene import GaussianScene
-from .version import __version__
 
 Backend = Callable[
     [GaussianScene, Probe, ScenePoses, int, int, Sequence[str], Limits, Tensor | None], dict[str, Tensor]

@@ -17,8 +17,9 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import DatasetInvalid, ExtraMissing, InvalidPose
+from ..errors import DatasetInvalid, InvalidPose
 from ..files.poses import load_poses
+from ..installation import missing_extra
 from ..probe import FloatArray
 from .calibration import poses_from_image_transforms
 from .images import MAX_PIXEL_BYTES, CropBox, parse_crop
@@ -71,8 +72,8 @@ def _in_our_words(where: Path | str) -> Iterator[None]:
             yield
     except (DatasetInvalid, MemoryError):
         raise
-    except ImportError:
-        raise ExtraMissing("DICOM needs the package pydicom: pip install 'ultragray[dicom]'") from None
+    except ImportError as error:
+        raise missing_extra(error, "DICOM") from None
     except Exception as error:
         raise DatasetInvalid(f"{where}: it cannot be read as DICOM: {error}") from error
 

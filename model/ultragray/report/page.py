@@ -18,8 +18,8 @@ from ..evaluation.metrics import FrameMetrics
 from ..evaluation.scoring import Evaluation
 from ..evaluation.side_by_side import as_picture, side_by_side_panels
 from ..evaluation.speckle import Speckle
+from ..installation import __version__
 from ..scene import GaussianScene
-from ..version import __version__
 from .plots import LABELS, plot_counts, plot_frames, plot_tilt, plot_training
 from .study import GAUSSIAN_SHARES, Failed, TiltStudy, Trained
 

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from ..errors import InvalidArgument
+from ..installation import install_advice
 
 
 def require_tensorboard() -> None:
@@ -14,7 +15,7 @@ def require_tensorboard() -> None:
         import torch.utils.tensorboard  # noqa: F401
     except ImportError as error:
         raise InvalidArgument(
-            "TensorBoard is not installed: pip install 'ultragray[tensorboard]'", field="tensorboard"
+            f"TensorBoard is not installed: {install_advice('tensorboard')}", field="tensorboard"
         ) from error
 
 

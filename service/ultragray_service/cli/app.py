@@ -14,6 +14,7 @@ from typer.core import TyperGroup
 
 import ultragray
 from ultragray.errors import InvalidArgument, UltragrayError
+from ultragray.installation import missing_extra
 from ultragray.interchange.exports.formats import DTYPES, FORMATS
 from ultragray.samplers import Sampler
 from ultragray.settings import FrameSettings
@@ -45,6 +46,8 @@ class _Commands(TyperGroup):
             raise
         except UltragrayError as error:
             message = error.detail
+        except ModuleNotFoundError as error:
+            message = missing_extra(error, "this command").detail
         except OSError as error:
             message = f"{error.filename}: {error.strerror}" if error.filename and error.strerror else str(error)
         typer.secho(f"error: {message}", fg=typer.colors.RED, err=True)

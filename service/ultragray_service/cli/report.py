@@ -55,6 +55,7 @@ def report(
     source: SourceOptions,
 ) -> None:
     """Train and measure a scene, the baselines and the paper's ablations; write one self-contained HTML page."""
+    import ultragray.report.page  # noqa: F401  # where its packages are missing, that is told before all the work
     from ultragray.evaluation.compounding import affordable_voxel_mm
     from ultragray.evaluation.scoring import require_frames
 

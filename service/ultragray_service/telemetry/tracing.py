@@ -14,7 +14,8 @@ from contextlib import contextmanager
 from opentelemetry import propagate, trace
 
 from ultragray import __version__
-from ultragray.errors import ExtraMissing, InvalidArgument
+from ultragray.errors import InvalidArgument
+from ultragray.installation import missing_extra
 from ultragray_workers.pool.types import RenderResult
 
 from .logs import request_id
@@ -39,8 +40,8 @@ class Tracing:
             from opentelemetry.sdk.resources import Resource
             from opentelemetry.sdk.trace import TracerProvider
             from opentelemetry.sdk.trace.export import BatchSpanProcessor
-        except ImportError:
-            raise ExtraMissing("traces need packages of OpenTelemetry: pip install 'ultragray[tracing]'") from None
+        except ImportError as error:
+            raise missing_extra(error, "OTEL_EXPORTER_OTLP_ENDPOINT") from None
         name = os.environ.get("OTEL_SERVICE_NAME", f"ultragray-{component}")
         self.provider = TracerProvider(resource=Resource.create({"service.name": name, "service.version": __version__}))
         self.provider.add_span_processor(BatchSpanProcessor(OTLPSpanExporter()))

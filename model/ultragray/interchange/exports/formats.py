@@ -10,7 +10,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from ...display.settings import true_to_scale
-from ...errors import ExtraMissing, InvalidArgument
+from ...errors import InvalidArgument
+from ...installation import extra_of, missing_extra
 from ...settings import Resolved
 from .exporter import Exporter
 
@@ -28,8 +29,12 @@ class Format:
     dtypes: tuple[str, ...] = DTYPES
     bmode_only: bool = False
     in_mm: bool = False  # whether a pixel has one size in mm: fans are scan-converted
-    package: str | None = None  # what it needs, as it is imported
-    extra: str | None = None  # of ours, that installs it
+    package: str | None = None  # what it needs beyond the core's dependencies, as it is imported
+
+    @property
+    def extra(self) -> str | None:
+        """The extra that brings its package."""
+        return None if self.package is None else extra_of(self.package)
 
     def shown(self, settings: Resolved) -> Resolved:
         """The settings as frames have them in a file of this format: scan-converted where it must be."""
@@ -55,7 +60,6 @@ _ALL = (
         "A Zarr 3 group in a zip: an array of each output in chunks of a frame, poses, figures; origin as attributes",
         "zarr_zip",
         package="zarr",
-        extra="zarr",
     ),
     Format(
         "hdf5",
@@ -63,7 +67,6 @@ _ALL = (
         "HDF5: a data set of each output in chunks of a frame, poses, figures; origin as attributes, objects as JSON",
         "hdf5",
         package="h5py",
-        extra="hdf5",
     ),
     Format(
         "dicom",
@@ -74,7 +77,6 @@ _ALL = (
         bmode_only=True,
         in_mm=True,
         package="pydicom",
-        extra="dicom",
     ),
     Format(
         "plus",
@@ -118,11 +120,6 @@ def exporter_class(name: str) -> type[Exporter]:
     try:
         module = importlib.import_module(f".{chosen.module}", __package__)
     except ImportError as error:
-        if chosen.package is None or (error.name or "").partition(".")[0] != chosen.package:
-            raise
-        raise ExtraMissing(
-            f"format {name} needs {chosen.package}, which is not installed: pip install 'ultragray[{chosen.extra}]'",
-            field="format",
-        ) from error
+        raise missing_extra(error, f"format {name}", field="format") from error
     found: type[Exporter] = module.EXPORTER
     return found

@@ -1,0 +1,151 @@
+"""Every module that is imported comes with the core's dependencies or with an extra that errors name."""
+
+from __future__ import annotations
+
+import ast
+import re
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+from packaging.utils import canonicalize_name
+
+from ultragray import installation
+from ultragray.errors import ExtraMissing
+from ultragray.installation import MODULES_OF_EXTRAS, extra_of, install_advice, missing_extra
+
+from ..surroundings import ROOT
+from .projects import packages, project, pyproject, required
+
+BESIDE_TORCH = {"triton"}  # comes with torch's CUDA build, and is asked for by find_spec
+NO_FEATURES = {"all", "dev"}
+
+
+def imported() -> dict[str, Path]:
+    """Modules of others that the packages of `ultragray` import anywhere, and one file that does."""
+    found: dict[str, Path] = {}
+    for folder in pyproject("ultragray")["tool"]["scikit-build"]["wheel"]["packages"]:
+        for path in sorted((ROOT / folder).rglob("*.py")):
+            for name in imports_of(path):
+                if name.partition(".")[0] not in {*sys.stdlib_module_names, *packages("ultragray")}:
+                    found.setdefault(name, path)
+    return found
+
+
+def imports_of(path: Path) -> Iterator[str]:
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and not node.level and node.module:
+            yield node.module
+
+
+def owners(module: str, holders: Mapping[str, Sequence[str]]) -> set[str]:
+    """The canonical names of the distributions that may hold a module: those that do, or of its own name."""
+    top = module.partition(".")[0]
+    return {canonicalize_name(name) for name in (top, *holders.get(top, ()))}
+
+
+@pytest.mark.slow
+def test_every_imported_module_is_brought_by_what_the_table_says() -> None:
+    own, holders = project("ultragray"), metadata.packages_distributions()
+    brought = {None: required(own["dependencies"])}
+    brought |= {extra: required(own["optional-dependencies"][extra]) for extra in MODULES_OF_EXTRAS}
+    for module, path in imported().items():
+        extra = extra_of(module)
+        if module.partition(".")[0] not in BESIDE_TORCH:
+            assert owners(module, holders) & brought[extra], f"{path} imports {module}; the table: {extra or 'core'}"
+
+
+def test_the_table_names_the_extras_that_there_are() -> None:
+    assert set(MODULES_OF_EXTRAS) == set(project("ultragray")["optional-dependencies"]) - NO_FEATURES
+
+
+def test_all_holds_every_extra() -> None:
+    (everything,) = project("ultragray")["optional-dependencies"]["all"]
+    assert set(re.findall(r"\w+", everything)) - {"ultragray"} == set(MODULES_OF_EXTRAS)
+
+
+def test_no_sentence_names_an_extra_by_hand() -> None:
+    """Those that do grow old; `install_advice` knows how this installation was made."""
+    for folder in ("model", "workers", "service", "client"):
+        for path in (ROOT / folder).rglob("*.py"):
+            if path.name != "installation.py":
+                named = re.findall(r"ultragray\[(\w+)\]", path.read_text(encoding="utf-8"))
+                assert not named, f"{path}: {named}"
+
+
+@pytest.mark.parametrize("extra", MODULES_OF_EXTRAS)
+def test_advice_fits_the_installation(extra: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "version_info", (3, 11, 0))
+    monkeypatch.setattr(installation, "_CHECKOUT", tmp_path)
+    assert install_advice(extra) == f"pip install 'ultragray[{extra}]'"
+    (tmp_path / "proto").mkdir()
+    (tmp_path / "proto" / "pyproject.toml").touch()
+    stubs = "./proto " if extra == "serve" else ""
+    assert install_advice(extra) == f"pip install {stubs}'ultragray[{extra}]'"
+    monkeypatch.setattr(sys, "prefix", str(tmp_path / ".venv"))
+    assert install_advice(extra) == f".venv/bin/pip install {stubs}'ultragray[{extra}]'"
+
+
+def test_advice_on_a_python_that_is_too_old(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "version_info", (3, 10, 13))
+    assert "Python 3.11" in install_advice("serve")
+    assert "pip install" in install_advice("hdf5")
+
+
+def test_a_module_of_nobody_is_no_missing_extra() -> None:
+    with pytest.raises(ModuleNotFoundError):
+        missing_extra(ModuleNotFoundError("no module", name="ultragray.renderring"), "it")
+    told = missing_extra(ModuleNotFoundError("no module", name="opentelemetry.sdk"), "it")
+    assert isinstance(told, ExtraMissing)
+    assert "[tracing]" in told.detail
+
+
+CORE_ALONE = f"""
+import sys
+sys.path[:] = {sys.path!r}
+
+class NoExtras:
+    def find_spec(self, name, path=None, target=None):
+        if name in {sorted(name for names in MODULES_OF_EXTRAS.values() for name in names)!r}:
+            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
+
+sys.meta_path.insert(0, NoExtras())
+from ultragray_service.cli.app import app
+app()
+"""
+
+
+def core_alone(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-c", CORE_ALONE, *arguments], capture_output=True, text=True, timeout=120)
+
+
+@pytest.mark.slow
+def test_the_core_renders_without_any_extra(working_folder: Path) -> None:
+    for arguments in (
+        ("demo", "-o", "demo.ugr"),
+        ("render", "demo.ugr", "--height", "16", "--width", "16", "-o", "frames.npz"),
+        ("render", "demo.ugr", "--height", "16", "--width", "16", "-o", "pictures"),
+        ("export", "demo.ugr", "-o", "demo.ply"),
+    ):
+        done = core_alone(*arguments)
+        assert done.returncode == 0, done.stderr
+    assert (working_folder / "frames.npz").stat().st_size > 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("command", "extra"),
+    [("serve", "serve"), ("worker", "serve"), ("keys list", "serve"), ("report absent -o r.html", "train")],
+)
+def test_a_command_without_its_extra_says_what_to_install(command: str, extra: str) -> None:
+    done = core_alone(*command.split())
+    assert done.returncode == 2
+    *_, last = done.stderr.splitlines()
+    assert re.fullmatch(r"error: this command needs \w+, which is not installed: .*", last), done.stderr
+    assert last.endswith(install_advice(extra))
+    assert "Traceback" not in done.stderr

@@ -1,0 +1,71 @@
+"""What the three projects say about themselves, and which of them owns which package."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from ultragray.installation import __version__
+
+from ..surroundings import ROOT
+from .projects import FOLDERS, packages, project, pyproject
+
+PROJECTS = sorted(FOLDERS)
+PYTHONS = [f"3.{minor}" for minor in range(10, 15)]
+
+
+@pytest.mark.parametrize("name", PROJECTS)
+def test_metadata_is_complete(name: str) -> None:
+    own = project(name)
+    assert own["name"] == name
+    assert own["version"] == __version__
+    assert own["requires-python"] == f">={PYTHONS[0]}"
+    assert own["license"] == "Apache-2.0"
+    assert own["authors"] == [{"name": "The UltraG-Ray contributors"}]
+    assert own["keywords"]
+    assert own["description"].endswith(".")
+    prefix = "Programming Language :: Python :: "
+    assert [one.removeprefix(prefix) for one in own["classifiers"] if re.fullmatch(prefix + r"3\.\d+", one)] == PYTHONS
+    assert own["classifiers"] == sorted(
+        own["classifiers"], key=lambda one: [int(n) if n.isdigit() else n for n in re.split(r"(\d+)", one)]
+    )
+
+
+@pytest.mark.parametrize("name", PROJECTS)
+def test_licence_file(name: str) -> None:
+    assert project(name)["license-files"] == ["LICENSE"]
+    assert (FOLDERS[name] / "LICENSE").read_bytes() == (ROOT / "LICENSE").read_bytes()
+
+
+@pytest.mark.parametrize("name", PROJECTS)
+def test_the_readme_holds_without_the_repository(name: str) -> None:
+    text = (FOLDERS[name] / project(name)["readme"]).read_text(encoding="utf-8")
+    links = re.findall(r"\]\(([^)]*)\)", re.sub(r"```.*?```", "", text, flags=re.DOTALL))
+    assert [link for link in links if "://" not in link] == [], "a package index does not have the files beside it"
+
+
+def test_every_package_has_one_owner() -> None:
+    owned = [package for name in PROJECTS for package in packages(name)]
+    there = {path.parent.name for path in ROOT.glob("*/ultragray*/__init__.py")}
+    assert sorted(owned) == sorted(there)
+
+
+def test_service_and_client_need_the_messages_of_their_version() -> None:
+    wanted = f"ultragray-proto~={__version__}"
+    assert wanted in project("ultragray")["optional-dependencies"]["serve"]
+    assert wanted in project("ultragray-client")["dependencies"]
+
+
+def test_client_and_messages_pin_what_the_service_pins() -> None:
+    own = project("ultragray")
+    service = {*own["dependencies"], *own["optional-dependencies"]["serve"]}
+    for name in ("ultragray-client", "ultragray-proto"):
+        assert set(project(name)["dependencies"]) <= service
+
+
+def test_wheels_are_built_for_all_that_the_metadata_names() -> None:
+    config = pyproject("ultragray")["tool"]["cibuildwheel"]
+    assert config["build"] == [f"cp{python.replace('.', '')}-*" for python in PYTHONS]
+    assert config["linux"]["archs"] == ["x86_64", "aarch64"]
+    assert (ROOT / config["test-command"].split("{project}/")[1]).is_file()

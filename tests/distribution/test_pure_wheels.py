@@ -1,0 +1,50 @@
+"""The wheels and sdists of client and messages: each holds its own package and nothing else."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tarfile
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from ..surroundings import ROOT
+from .projects import unpacked
+
+PACKAGES = {"client": "ultragray_client", "proto": "ultragray_proto"}
+
+
+def sources(folder: Path) -> set[str]:
+    files = (path for path in folder.rglob("*") if path.is_file() and "__pycache__" not in path.parts)
+    return {path.relative_to(folder.parent).as_posix() for path in files}
+
+
+def build(folder: Path, target: str, output: Path) -> Path:
+    command = [sys.executable, "-m", "hatchling", "build", "-t", target, "-d", str(output)]
+    subprocess.run(command, cwd=folder, check=True, capture_output=True)
+    return next(output.iterdir())
+
+
+@pytest.mark.parametrize("project", PACKAGES)
+def test_a_wheel_holds_its_package_and_the_licence(project: str, tmp_path: Path) -> None:
+    with zipfile.ZipFile(build(ROOT / project, "wheel", tmp_path)) as wheel:
+        about = {name for name in wheel.namelist() if ".dist-info/" in name}
+        (licence,) = (wheel.read(name) for name in about if name.endswith("/licenses/LICENSE"))
+        assert set(wheel.namelist()) - about == sources(ROOT / project / PACKAGES[project])
+    assert licence == (ROOT / "LICENSE").read_bytes()
+
+
+@pytest.mark.parametrize("project", PACKAGES)
+def test_a_wheel_of_the_sdist_is_the_same(project: str, tmp_path: Path) -> None:
+    source = unpacked(build(ROOT / project, "sdist", tmp_path / "sdist"), tmp_path / "source")
+    with zipfile.ZipFile(build(source, "wheel", tmp_path / "wheel")) as wheel:
+        files = {name for name in wheel.namelist() if ".dist-info/" not in name}
+    assert files == sources(ROOT / project / PACKAGES[project])
+
+
+def test_the_sdist_of_the_messages_has_what_other_languages_generate_stubs_from(tmp_path: Path) -> None:
+    with tarfile.open(build(ROOT / "proto", "sdist", tmp_path)) as sdist:
+        held = {Path(name).name for name in sdist.getnames()}
+    assert {path.name for path in (ROOT / "proto/ultragray/v1").glob("*.proto")} <= held
