@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import subprocess
-import tomllib
 from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+import tomllib
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 

@@ -130,7 +130,6 @@ def test_the_core_renders_without_any_extra(working_folder: Path) -> None:
         ("demo", "-o", "demo.ugr"),
         ("render", "demo.ugr", "--height", "16", "--width", "16", "-o", "frames.npz"),
         ("render", "demo.ugr", "--height", "16", "--width", "16", "-o", "pictures"),
-        ("export", "demo.ugr", "-o", "demo.ply"),
     ):
         done = core_alone(*arguments)
         assert done.returncode == 0, done.stderr
