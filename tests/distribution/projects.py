@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import subprocess
-import tomllib
-from functools import cache
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+import tomllib
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
@@ -45,34 +43,6 @@ def unpacked(sdist: Path, folder: Path) -> Path:
     return source
 
 
-def required(requirements: list[str]) -> set[str]:
-    """The canonical names of the distributions that requirements, whatever their markers, bring, and those in turn."""
-    found: set[tuple[str, str]] = set()  # with the extra, "" for none
-    waiting = [Requirement(text) for text in requirements]
-    while waiting:
-        one = waiting.pop()
-        name = canonicalize_name(one.name)
-        for extra in ("", *one.extras):
-            if (name, extra) not in found:
-                found.add((name, extra))
-                waiting += needs(name, extra)
-    return {name for name, _ in found}
-
-
-def needs(name: str, extra: str) -> list[Requirement]:
-    """What a distribution needs here for an extra; "" for none."""
-    if name in FOLDERS:
-        own = project(name)
-        return [
-            Requirement(text)
-            for text in (own.get("optional-dependencies", {})[extra] if extra else own["dependencies"])
-        ]
-    return [need for need in of_distribution(name) if need.marker is None or need.marker.evaluate({"extra": extra})]
-
-
-@cache
-def of_distribution(name: str) -> list[Requirement]:
-    try:
-        return [Requirement(text) for text in metadata.requires(name) or ()]
-    except metadata.PackageNotFoundError:  # of another platform, or an extra that is not installed
-        return []
+def names_of(requirements: list[str]) -> set[str]:
+    """The canonical names of the distributions that requirements name."""
+    return {canonicalize_name(Requirement(text).name) for text in requirements}
