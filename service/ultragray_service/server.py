@@ -45,7 +45,7 @@ _log = logging.getLogger("ultragray.service")
 
 def run(settings: Settings) -> None:
     """Serve until SIGTERM or SIGINT. Raises StartupFailed where it cannot start."""
-    configure_logging(settings.log_level)
+    configure_logging(settings.log_level, settings.log_format)
     _return_large_blocks()
     raise_open_files_limit(_DOORS * settings.max_connections + _OTHER_FILES)
     uvloop.run(serve(settings))

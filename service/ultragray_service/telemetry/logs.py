@@ -1,4 +1,4 @@
-"""Structured logging: one JSON object a line on stderr, with the id of the request it belongs to."""
+"""Logging on stderr: a line for people on a terminal, else one JSON object a line with the id of its request."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import sys
 import uuid
 from contextvars import ContextVar
 from datetime import datetime, timezone
+from typing import ClassVar
 
 from opentelemetry import trace
 
@@ -44,10 +45,34 @@ class JsonFormatter(logging.Formatter):
         return json.dumps(document, ensure_ascii=False, default=str)
 
 
-def configure_logging(level: str) -> None:
-    """Sends every logger of the process, uvicorn's and grpc's included, through one JSON handler."""
+class HumanFormatter(logging.Formatter):
+    """A record as a line for people: the time of day, the level where it is not usual, and the sentence."""
+
+    _MARKS: ClassVar[dict[int, str]] = {
+        logging.DEBUG: "debug: ",
+        logging.WARNING: "\x1b[33mwarning:\x1b[0m ",
+        logging.ERROR: "\x1b[31merror:\x1b[0m ",
+        logging.CRITICAL: "\x1b[31merror:\x1b[0m ",
+    }
+
+    def format(self, record: logging.LogRecord) -> str:
+        time = datetime.fromtimestamp(record.created).astimezone().strftime("%H:%M:%S")
+        line = f"\x1b[2m{time}\x1b[0m {self._MARKS.get(record.levelno, '')}{record.getMessage()}"
+        return f"{line}\n{self.formatException(record.exc_info)}" if record.exc_info else line
+
+
+def is_for_people(log_format: str) -> bool:
+    """Whether the log goes to people: `human`, or `auto` where stderr is a terminal."""
+    return log_format == "human" or (log_format == "auto" and sys.stderr.isatty())
+
+
+def configure_logging(level: str, log_format: str = "json") -> None:
+    """Send every logger of the process, uvicorn's and grpc's included, through one handler.
+
+    `log_format`: `human`, `json`, or `auto` as `is_for_people` decides.
+    """
     handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(JsonFormatter())
+    handler.setFormatter(HumanFormatter() if is_for_people(log_format) else JsonFormatter())
     root = logging.getLogger()
     root.handlers[:] = [handler]
     root.setLevel(level.upper())

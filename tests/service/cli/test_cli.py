@@ -34,18 +34,27 @@ from .command_line import python, refused, run
 COMMANDS = (
     "serve",
     "render",
-    "info",
-    "dataset",
+    "show",
+    "check",
+    "draw",
+    "convert",
+    "scenes",
+    "datasets",
     "jobs",
+    "workers",
+    "keys",
     "train",
     "eval",
-    "compound",
+    "compare",
     "report",
     "export",
-    "import-ply",
-    "import-checkpoint",
+    "import",
     "demo",
     "bench",
+    "backup",
+    "restore",
+    "audit",
+    "worker",
 )
 
 
@@ -87,12 +96,12 @@ def test_the_defaults_that_serve_names_are_those_of_the_settings() -> None:
 def test_a_bad_scene_file_is_named(tmp_path: Path) -> None:
     path = tmp_path / "bad.ugr"
     path.write_bytes(b"nonsense that is long enough")
-    for command in (["info", path], ["render", path, "-o", tmp_path / "f.npz"], ["serve", path]):
+    for command in (["show", path], ["render", path, "-o", tmp_path / "f.npz"], ["serve", path]):
         assert "bad.ugr: not a scene file" in refused(*command)
 
 
-def test_info_tells_what_the_file_says(scene_file: Path) -> None:
-    result = run("info", scene_file, "--json")
+def test_show_tells_what_the_file_says(scene_file: Path) -> None:
+    result = run("show", scene_file, "--json")
     assert result.exit_code == 0
     document = json.loads(result.output)
     assert document["sha256"] == file_sha256(scene_file)
@@ -100,7 +109,7 @@ def test_info_tells_what_the_file_says(scene_file: Path) -> None:
     assert document["probe"] == {"kind": "linear", "width_mm": 30.0, "near_mm": 0.0, "far_mm": 40.0}
     assert document["centre_mm"] == [1.0, 2.0, 3.0]
     assert document["training_poses"]["count"] == 5
-    table = run("info", scene_file).output
+    table = run("show", scene_file).output
     for expected in (file_sha256(scene_file), "gaussian_count", "60", "width_mm=30"):
         assert expected in table
 
@@ -120,23 +129,24 @@ def released(tmp_path: Path, random_scene: Callable[..., GaussianScene], random_
     return tmp_path
 
 
-def test_import_checkpoint_writes_a_scene(released: Path) -> None:
+def test_import_of_a_checkpoint_writes_a_scene(released: Path) -> None:
     output = released / "scene.ugr"
-    common = ("import-checkpoint", released / "ckpt.pt", "--config", released / "conf.json", "-o", output)
+    common = ("import", released / "ckpt.pt", "--config", released / "conf.json", "-o", output)
     result = run(*common, "--poses", released / "poses_train.npy")
     assert result.exit_code == 0, result.output
     scene = GaussianScene.load(output)
     assert scene.info.probe == LinearProbe(width_mm=30.0, near_mm=0.0, far_mm=45.0)
     assert len(scene.training_poses) == 4
-    assert run(*common, "--center", "-1", "2.5", "-3e2").exit_code == 0
+    assert f"{output} exists: --force replaces it" in refused(*common, "--centered")
+    assert run(*common, "--force", "--center", "-1", "2.5", "-3e2").exit_code == 0
     assert GaussianScene.load(output).info.centre_mm == (-1.0, 2.5, -300.0)
-    assert run(*common, "--centered", "--image-height", 5).exit_code == 0
+    assert run(*common, "--force", "--centered", "--image-height", 5).exit_code == 0
     assert GaussianScene.load(output).info.image_height == 5
 
 
-def test_import_checkpoint_says_what_it_needs(released: Path) -> None:
+def test_import_of_a_checkpoint_says_what_it_needs(released: Path) -> None:
     output = released / "scene.ugr"
-    common = ("import-checkpoint", released / "ckpt.pt", "--config", released / "conf.json", "-o", output)
+    common = ("import", released / "ckpt.pt", "--config", released / "conf.json", "-o", output)
     for extra in ([], ["--centered", "--center", 0, 0, 0]):
         message = refused(*common, *extra)
         assert all(option in message for option in ("--poses", "--center X Y Z", "--centered"))
