@@ -95,15 +95,16 @@ class LazyGroup(TyperGroup):
         self,
         args: Sequence[str] | None = None,
         prog_name: str | None = None,
-        *,
+        complete_var: str | None = None,
         standalone_mode: bool = True,
-        **others: Any,
+        windows_expand_args: bool = True,
+        **extra: Any,
     ) -> Any:
         """Run the command line; in standalone mode the process ends with its exit code."""
         if not standalone_mode:
-            return super().main(args, prog_name, standalone_mode=False, **others)
+            return super().main(args, prog_name, complete_var, False, windows_expand_args, **extra)
         try:
-            code = super().main(args, prog_name, standalone_mode=False, **others)
+            code = super().main(args, prog_name, complete_var, False, windows_expand_args, **extra)
         except typer.TyperException as error:
             if type(error).__name__ != "NoArgsIsHelpError":  # the help has been printed
                 _say_error(_in_one_line(error))

@@ -117,7 +117,7 @@ def train(
     )
     if resume:
         _check_resumable(run)
-    check_file(output, [SCENE_SUFFIX], force=force or resume)
+    check_file(output, [SCENE_SUFFIX], force=force or resume or _is_unfinished(run))
     chosen = _config_of(run, given)
 
     from ultragray.training.device import training_device
@@ -143,6 +143,15 @@ class RunOptions:
     tensorboard: bool
     device: str
     backend: str
+
+
+def _is_unfinished(run: RunOptions) -> bool:
+    """Whether the output is of a run that was stopped: the training refuses it, with the words for that."""
+    if not (run.output.exists() and run.folder.is_dir()):
+        return False
+    from ultragray.training.trainer import CHECKPOINT_FILE
+
+    return (run.folder / CHECKPOINT_FILE).exists()
 
 
 def _check_resumable(run: RunOptions) -> None:
