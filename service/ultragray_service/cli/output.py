@@ -6,8 +6,12 @@ import os
 from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from ultragray.errors import InvalidArgument
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 SCENE_SUFFIX = ".ugr"  # the service lists no other files
 _PIPE_COLUMNS = 400  # where no terminal says how wide it is, nothing is cut
@@ -66,14 +70,20 @@ def is_folder_name(path: Path) -> bool:
 
 def print_table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
     """Print rows under their columns; the first column is never cut."""
-    from rich.console import Console
     from rich.table import Table
 
-    console = Console()
-    if not console.is_terminal:
-        console.width = _PIPE_COLUMNS
     table = Table(*columns, box=None, pad_edge=False)
     table.columns[0].no_wrap = True
     for row in rows:
         table.add_row(*row)
-    console.print(table)
+    wide_console().print(table)
+
+
+def wide_console() -> Console:
+    """Standard output; what is not a terminal is so wide that nothing is cut."""
+    from rich.console import Console
+
+    console = Console()
+    if not console.is_terminal:
+        console.width = _PIPE_COLUMNS
+    return console

@@ -9,12 +9,12 @@ import sys
 import uuid
 from contextvars import ContextVar
 from datetime import datetime, timezone
-from typing import ClassVar
 
 from opentelemetry import trace
 
 request_id: ContextVar[str] = ContextVar("request_id", default="")
 
+_DIM, _RED, _YELLOW = 2, 31, 33  # of ANSI
 _ACCEPTED_REQUEST_ID = re.compile(r"[A-Za-z0-9._:/+=-]{1,128}")
 
 
@@ -48,17 +48,29 @@ class JsonFormatter(logging.Formatter):
 class HumanFormatter(logging.Formatter):
     """A record as a line for people: the time of day, the level where it is not usual, and the sentence."""
 
-    _MARKS: ClassVar[dict[int, str]] = {
-        logging.DEBUG: "debug: ",
-        logging.WARNING: "\x1b[33mwarning:\x1b[0m ",
-        logging.ERROR: "\x1b[31merror:\x1b[0m ",
-        logging.CRITICAL: "\x1b[31merror:\x1b[0m ",
-    }
+    def __init__(self, *, in_colour: bool) -> None:
+        super().__init__()
+        self._in_colour = in_colour
 
     def format(self, record: logging.LogRecord) -> str:
         time = datetime.fromtimestamp(record.created).astimezone().strftime("%H:%M:%S")
-        line = f"\x1b[2m{time}\x1b[0m {self._MARKS.get(record.levelno, '')}{record.getMessage()}"
+        level = "" if record.levelno == logging.INFO else f"{record.levelname.lower()}: "
+        if record.levelno >= logging.WARNING:
+            level = self._coloured(level, _YELLOW if record.levelno == logging.WARNING else _RED)
+        line = f"{self._coloured(time, _DIM)} {level}{_sentence(record)}"
         return f"{line}\n{self.formatException(record.exc_info)}" if record.exc_info else line
+
+    def _coloured(self, text: str, code: int) -> str:
+        return f"\x1b[{code}m{text}\x1b[0m" if self._in_colour else text
+
+
+def _sentence(record: logging.LogRecord) -> str:
+    """The message; of a request, whose facts are fields, these in words."""
+    fields = getattr(record, "fields", {})
+    if "duration_ms" not in fields:
+        return record.getMessage()
+    what = " ".join(str(fields[name]) for name in ("method", "path") if name in fields)
+    return f"{what}: {fields['status']} in {fields['duration_ms']:.0f} ms"
 
 
 def is_for_people(log_format: str) -> bool:
@@ -72,7 +84,9 @@ def configure_logging(level: str, log_format: str = "json") -> None:
     `log_format`: `human`, `json`, or `auto` as `is_for_people` decides.
     """
     handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(HumanFormatter() if is_for_people(log_format) else JsonFormatter())
+    handler.setFormatter(
+        HumanFormatter(in_colour=sys.stderr.isatty()) if is_for_people(log_format) else JsonFormatter()
+    )
     root = logging.getLogger()
     root.handlers[:] = [handler]
     root.setLevel(level.upper())

@@ -85,9 +85,8 @@ def upload(
     for text in record["warnings"]:
         warn(text)
     frames = f"{record['train_frames']} training and {record['val_frames']} held-out frames"
-    was = "uploaded" if is_new else "is there already, the same:"
-    sentence = f"{was} {called}: {frames} of {record['width']}x{record['height']}"
-    tell(sentence if is_new else f"{called} {sentence}", record, as_json=json)
+    was = f"uploaded {called}" if is_new else f"{called} is there already, the same"
+    tell(f"{was}: {frames} of {record['width']}x{record['height']}", record, as_json=json)
 
 
 @command_app.command(epilog=examples("ultragray datasets delete liver"))

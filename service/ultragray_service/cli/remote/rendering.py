@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from ultragray.contract import from_dict, to_dict
 from ultragray.errors import InvalidArgument
 from ultragray.files.atomic import write_whole
@@ -75,8 +73,8 @@ def render_remotely(connection: Connection, wanted: Wanted) -> dict[str, Any]:
                 f"a picture holds one frame, there are {len(poses)} poses: write a .npz file or a folder",
                 field="output",
             )
-        body = {**settings, **({"pose": poses[0]} if len(poses) == 1 else {"poses": list(poses)})}
-        answer = scenes.render(wanted.scene, _plain(body), MEDIA_TYPES[wanted.suffix])
+        body = {**settings, **({"pose": _pose(poses[0])} if len(poses) == 1 else {"poses": list(map(_pose, poses))})}
+        answer = scenes.render(wanted.scene, body, MEDIA_TYPES[wanted.suffix])
         write_whole(wanted.output, answer.data)
         shape = answer.headers["x-ultragray-shape"]
     _, _, height, width = map(int, shape.split(","))
@@ -112,12 +110,12 @@ def _poses(scenes: Scenes, wanted: Wanted, given: FloatArray | None) -> FloatArr
 def _write_folder(scenes: Scenes, wanted: Wanted, settings: dict[str, Any], poses: FloatArray) -> str:
     """A PNG for each pose and output, and a file that describes the frames; their shape as a header tells it."""
     shape, documents = "", []
-    wanted.output.mkdir(parents=True, exist_ok=True)
     with counted("rendering", len(poses)) as report:
         for number, pose in enumerate(poses):
             for output in wanted.settings.outputs:
-                body = _plain({**settings, "outputs": [output], "pose": pose})
+                body = {**settings, "outputs": [output], "pose": _pose(pose)}
                 answer = scenes.render(wanted.scene, body, MEDIA_TYPES[".png"])
+                wanted.output.mkdir(parents=True, exist_ok=True)  # only now: a refusal leaves no folder
                 write_whole(wanted.output / f"frame_{number:05d}_{output}.png", answer.data)
                 shape = answer.headers["x-ultragray-shape"]
             documents.append({"frame": number, "pose": answer.fact("pose"), **(answer.fact("extrapolation") or {})})
@@ -126,9 +124,5 @@ def _write_folder(scenes: Scenes, wanted: Wanted, settings: dict[str, Any], pose
     return shape
 
 
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_plain(item) for item in value]
-    return value.tolist() if isinstance(value, np.ndarray) else value
+def _pose(pose: FloatArray) -> dict[str, Any]:  # [4, 4] mm
+    return {"matrix": pose.tolist()}

@@ -55,9 +55,10 @@ def show(
 
 def print_facts(document: dict[str, Any]) -> None:
     """A table of names and values for a person; what is unknown is left out."""
-    from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
+
+    from ..output import wide_console
 
     table = Table(show_header=False, box=None, pad_edge=False)
     table.add_column(style="bold", no_wrap=True)
@@ -65,7 +66,7 @@ def print_facts(document: dict[str, Any]) -> None:
     for key, value in document.items():
         if value not in (None, {}, []):
             table.add_row(key, escape(_text(value)))  # a scene's own strings must not be read as markup
-    Console().print(table)
+    wide_console().print(table)
 
 
 def describe_scene(path: Path) -> dict[str, Any]:
