@@ -21,6 +21,7 @@ from .access.addresses import is_loopback
 from .core.state import Service
 from .doors import Doors
 from .embedded_worker import EmbeddedWorker
+from .environment import unknown_variables
 from .http.app import create_app
 from .igtl.server import IgtlServer
 from .listening.connections import Connections
@@ -48,6 +49,8 @@ _log = logging.getLogger("ultragray.service")
 def run(settings: Settings) -> None:
     """Serve until SIGTERM or SIGINT. Raises StartupFailed where it cannot start."""
     configure_logging(settings.log_level, settings.log_format)
+    for sentence in unknown_variables():
+        _log.warning(sentence)
     _return_large_blocks()
     raise_open_files_limit(_DOORS * settings.max_connections + _OTHER_FILES)
     uvloop.run(serve(settings))

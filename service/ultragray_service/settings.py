@@ -17,8 +17,9 @@ from ultragray_workers.pool.pool import MAX_BATCH_POSES
 from .access.addresses import parse_allowed
 from .access.limits.allowance import NAMES, Allowance, of_key
 from .access.oidc.claims import check_url, parse_roles
+from .environment import PREFIX
 
-ENVIRONMENT_PREFIX = "ULTRAGRAY_"
+ENVIRONMENT_PREFIX = PREFIX
 LEAST_KEY_LENGTH = 16
 LOG_FORMATS = ("auto", "human", "json")
 ADDRESSES, TLS, INSTALLATION, COMPUTE, LOGS = "Addresses", "TLS", "Installation", "Compute", "Logs"  # topics

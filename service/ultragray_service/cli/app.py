@@ -67,13 +67,15 @@ def _print_version(wanted: bool) -> None:
 
 @app.callback()
 def main(
+    context: typer.Context,
     version: Annotated[
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
     ] = False,
 ) -> None:
-    """Look for environment variables that are misspelt, whatever the command."""
-    from .environment import unknown_variables
+    """Look for environment variables that are misspelt, whatever the command; a service logs them itself."""
+    from ..environment import unknown_variables
     from .style import warn
 
-    for sentence in unknown_variables():
-        warn(sentence)
+    if context.invoked_subcommand != "serve":
+        for sentence in unknown_variables():
+            warn(sentence)

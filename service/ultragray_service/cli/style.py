@@ -57,6 +57,11 @@ def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
+def frames_in_words(count: int) -> str:
+    """Such as `1 frame` or `1,200 frames`."""
+    return f"{count:,} frame{'' if count == 1 else 's'}"
+
+
 def warn(text: str) -> None:
     """A warning on stderr."""
     typer.secho(f"warning: {text}", fg=typer.colors.YELLOW, err=True)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
-from ..environment import ADDRESS, API_KEY, CA, CLIENT_CERTIFICATE, CLIENT_KEY
+from ...environment import ADDRESS, API_KEY, CA, CLIENT_CERTIFICATE, CLIENT_KEY
 from ..options import keyword, with_parameters
 from ..style import warn
 

@@ -15,7 +15,7 @@ from ..options import with_options
 from ..output import SCENE_SUFFIX, check_file, print_table
 from ..progress import transferred
 from ..scenes.show import print_facts
-from ..style import Force, Json, command_group, examples, output_option, tell, to_json
+from ..style import Force, Json, command_group, examples, frames_in_words, output_option, tell, to_json
 from .connection import with_connection
 from .rendering import SUFFIXES, Wanted, checked_kind
 
@@ -135,7 +135,9 @@ def render(
     document = render_remotely(connection, wanted)
     size = f"{document['height']}x{document['width']}"
     tell(
-        f"wrote {output}: {document['frames']} frames of {size}, {', '.join(settings.outputs)}", document, as_json=json
+        f"wrote {output}: {frames_in_words(document['frames'])} of {size}, {', '.join(settings.outputs)}",
+        document,
+        as_json=json,
     )
 
 

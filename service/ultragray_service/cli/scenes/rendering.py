@@ -21,6 +21,7 @@ from ultragray.scene_info import read_header
 from ultragray.settings import Encoding, FrameSettings, Resolved
 
 from ..progress import counted
+from ..style import frames_in_words
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,7 @@ class Rendered:
     def in_words(self) -> str:
         """One sentence."""
         size = f"{self.settings.height}x{self.settings.width}"
-        what = f"{len(self.extrapolations)} frames of {size}, {', '.join(self.settings.outputs)}"
+        what = f"{frames_in_words(len(self.extrapolations))} of {size}, {', '.join(self.settings.outputs)}"
         return f"wrote {self.output}: {what}, in {self.seconds:.1f} s; {_trust(self.extrapolations)}"
 
     def document(self) -> dict[str, Any]:

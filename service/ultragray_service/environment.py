@@ -36,7 +36,7 @@ def known_variables() -> tuple[str, ...]:
     """Every variable that is read, those of the settings included."""
     from ultragray.contract import annotated_fields
 
-    from ..settings import Settings
+    from .settings import Settings
 
     settings = (f"{PREFIX}{item.name.upper()}" for item, _ in annotated_fields(Settings))
     return (*settings, *COMMAND_VARIABLES, *OTHER_VARIABLES)
