@@ -101,6 +101,7 @@ class LazyGroup(TyperGroup):
         **extra: Any,
     ) -> Any:
         """Run the command line; in standalone mode the process ends with its exit code."""
+        prog_name = prog_name or "ultragray"  # also by `python -m` and the like
         if not standalone_mode:
             return super().main(args, prog_name, complete_var, False, windows_expand_args, **extra)
         try:
@@ -140,9 +141,20 @@ def _in_one_line(error: typer.TyperException) -> str:
     if option is not None and type(error).__name__ == "NoSuchOption":
         sentence = f"no such option: {option}{_perhaps(option, _options_of(context))}"
     else:
-        sentence = " ".join(error.format_message().split()).rstrip(".")
+        sentence = _about_value(error) or " ".join(error.format_message().split()).rstrip(".")
         sentence = sentence[:1].lower() + sentence[1:]
     return sentence if context is None else f"{sentence} (see `{context.command_path} --help`)"
+
+
+def _about_value(error: typer.TyperException) -> str | None:
+    """The sentence for a value that an option cannot take, with the value; None for other mistakes."""
+    parameter, reasons = getattr(error, "param", None), getattr(error.__cause__, "errors", None)
+    if parameter is None or reasons is None:  # of pydantic's ValidationError, which typer reads values with
+        return None
+    reason = reasons()[0]
+    expected = str(reason["msg"]).partition(",")[0].replace("Input should be", "must be")
+    name = parameter.opts[0] if parameter.param_type_name == "option" else parameter.display_name_raw.upper()
+    return f"{name} {expected}, got {reason['input']!r}" if "must be" in expected else None
 
 
 def _options_of(context: Any) -> list[str]:
