@@ -152,7 +152,11 @@ def _about_value(error: typer.TyperException) -> str | None:
     if parameter is None or reasons is None:  # of pydantic's ValidationError, which typer reads values with
         return None
     reason = reasons()[0]
-    expected = str(reason["msg"]).partition(",")[0].replace("Input should be", "must be")
+    message, _, choices = str(reason["msg"]).partition(" is not one of ")
+    if choices:
+        expected = f"must be one of {choices}".replace("'", "")
+    else:
+        expected = message.partition(",")[0].replace("Input should be", "must be")
     name = parameter.opts[0] if parameter.param_type_name == "option" else parameter.display_name_raw.upper()
     return f"{name} {expected}, got {reason['input']!r}" if "must be" in expected else None
 
