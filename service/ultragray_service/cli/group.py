@@ -154,7 +154,7 @@ def _about_value(error: typer.TyperException) -> str | None:
     reason = reasons()[0]
     message, _, choices = str(reason["msg"]).partition(" is not one of ")
     if choices:
-        expected = f"must be one of {choices}".replace("'", "")
+        expected = f"must be one of {choices.rstrip('.')}".replace("'", "")
     else:
         expected = message.partition(",")[0].replace("Input should be", "must be")
     name = parameter.opts[0] if parameter.param_type_name == "option" else parameter.display_name_raw.upper()
