@@ -81,11 +81,11 @@ format: $(VENV)/installed-dev  ## rewrite the sources in the project's format
 	$(BIN)/clang-format -i model/kernels/*.[ch]pp model/kernels/*.inl
 
 bench: $(VENV)/installed  ## measure the kernel and the service; the table is printed, the JSON written
-	$(BIN)/ultragray bench --output benchmarks/results.json $(ARGS)
-	$(BIN)/ultragray bench --kernel-details --output benchmarks/kernel.json $(ARGS)
-	$(BIN)/ultragray bench --train --output benchmarks/training.json $(ARGS)
-	$(BIN)/ultragray bench --jobs --output benchmarks/jobs.json $(ARGS)
-	$(BIN)/ultragray bench --clients --output benchmarks/clients.json $(ARGS)
+	$(BIN)/ultragray bench --output benchmarks/results.json --force $(ARGS)
+	$(BIN)/ultragray bench --kernel-details --output benchmarks/kernel.json --force $(ARGS)
+	$(BIN)/ultragray bench --train --output benchmarks/training.json --force $(ARGS)
+	$(BIN)/ultragray bench --jobs --output benchmarks/jobs.json --force $(ARGS)
+	$(BIN)/ultragray bench --clients --output benchmarks/clients.json --force $(ARGS)
 	$(BIN)/python benchmarks/performance.py
 
 bench-console: $(VENV)/installed-dev $(CONSOLE)  ## frames a second, memory and first paint of the console in Debian's Chromium; takes six minutes
@@ -96,8 +96,8 @@ console-picture: $(VENV)/installed-dev $(CONSOLE)  ## take the README's picture 
 	node tests/console/picture.mjs
 
 bench-cuda: $(VENV)/installed  ## the same on a GPU, with the distance to what it can do at most
-	$(BIN)/ultragray bench --backend cuda --output benchmarks/cuda.json $(ARGS)
-	$(BIN)/ultragray bench --backend cuda --train --output benchmarks/cuda_training.json $(ARGS)
+	$(BIN)/ultragray bench --backend cuda --output benchmarks/cuda.json --force $(ARGS)
+	$(BIN)/ultragray bench --backend cuda --train --output benchmarks/cuda_training.json --force $(ARGS)
 
 results: $(VENV)/installed  ## train on every data set of DATA and write docs/results.md (ARGS="--only liver_convex" for one)
 	$(BIN)/python benchmarks/results_tables.py $(DATA) $(ARGS)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import re
 import shutil
 import signal
@@ -17,6 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+import typer
 
 import ultragray
 from ultragray import GaussianScene, LinearProbe
@@ -31,31 +33,24 @@ from ultragray_workers.jobs.store import SCENES_FOLDER
 from ...waiting import at_this_load
 from .command_line import python, refused, run
 
-COMMANDS = (
-    "serve",
-    "render",
-    "show",
-    "check",
-    "draw",
-    "convert",
-    "scenes",
-    "datasets",
-    "jobs",
-    "workers",
-    "keys",
-    "train",
-    "eval",
-    "compare",
-    "report",
-    "export",
-    "import",
-    "demo",
-    "bench",
-    "backup",
-    "restore",
-    "audit",
-    "worker",
-)
+SILENT = ("serve", "worker")  # they tell in a log
+
+
+def all_commands() -> dict[str, Any]:
+    """Every command that does something itself, by its words."""
+    waiting = list(typer.main.get_command(app).commands.items())  # type: ignore[attr-defined]
+    found = {}
+    while waiting:
+        name, command = waiting.pop(0)
+        if hasattr(command, "commands"):
+            waiting += [(f"{name} {word}", inner) for word, inner in command.commands.items()]
+        else:
+            found[name] = command
+    return found
+
+
+COMMANDS = all_commands()
+FIRST_WORDS = tuple(dict.fromkeys(name.split()[0] for name in COMMANDS))
 
 
 def test_help_is_instant_it_imports_nothing_heavy() -> None:
@@ -64,16 +59,51 @@ def test_help_is_instant_it_imports_nothing_heavy() -> None:
         "print(sorted({'torch', 'fastapi', 'grpc', 'cv2', 'uvicorn'} & set(sys.modules)))"
     )
     answer = subprocess.run(python(program, "--help"), capture_output=True, text=True, check=True)
-    for command in COMMANDS:
+    for command in FIRST_WORDS:
         assert re.search(rf"\b{command}\b", answer.stdout)
     assert answer.stdout.splitlines()[-1] == "[]"
 
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_explains_itself(command: str) -> None:
-    result = run(command, "--help")
+    result = run(*command.split(), "--help")
     assert result.exit_code == 0
-    assert "Usage" in result.output
+    assert f"Usage: root {command}" in result.output
+    assert "Examples" in result.output
+    lines = re.findall(r"^ (?:\w+=\S+ )?ultragray ([a-z].*)$", result.output, re.MULTILINE)
+    assert any(line.startswith(command) for line in lines), "an example is of another command"
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_that_tells_something_tells_it_to_programs_too(command: str) -> None:
+    options = {name: parameter for parameter in COMMANDS[command].params for name in parameter.opts}
+    assert ("--json" in options) is (command not in SILENT)
+    if "--output" in options:
+        assert "--force" in options
+    for name, option in options.items():
+        if name.startswith("--") and name not in ("--help",):
+            assert str(option.help)[-1] in ".)]", f"{command} {name}: {option.help}"
+
+
+def test_lists_of_commands_load_none_of_them() -> None:
+    program = (
+        "from ultragray_service.cli.app import app; app(standalone_mode=False); "
+        "print(sorted(name for name in sys.modules if name in ('numpy', 'pydantic', 'ultragray.errors')))"
+    )
+    answer = subprocess.run(python(program, "--help"), capture_output=True, text=True, check=True)
+    assert answer.stdout.splitlines()[-1] == "[]"
+
+
+def test_completion_knows_commands_and_options() -> None:
+    def completed(words: str) -> str:
+        environment = {**os.environ, "_ULTRAGRAY_COMPLETE": "complete_bash", "COMP_WORDS": words}
+        environment["COMP_CWORD"] = str(len(words.split(" ")) - 1)
+        program = "from ultragray_service.cli.app import app; app(prog_name='ultragray')"
+        return subprocess.run(python(program), env=environment, capture_output=True, text=True, check=False).stdout
+
+    assert completed("ultragray re").split() == ["render", "report", "restore"]
+    assert completed("ultragray scenes do").split() == ["download"]
+    assert "--outputs" in completed("ultragray render --out").split()
 
 
 def test_version() -> None:
@@ -81,8 +111,6 @@ def test_version() -> None:
 
 
 def test_the_defaults_that_serve_names_are_those_of_the_settings() -> None:
-    import typer
-
     options = {p.name: p for p in typer.main.get_command(app).commands["serve"].params}  # type: ignore[attr-defined]
     for name, option in options.items():
         field = "threads_per_process" if name == "threads" else name

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from ultragray.training import Progress
 
 RUN = "Run"
+MEASURING = "measuring what was reached"
 METRIC_NAMES = {"psnr_db": "PSNR, dB", "ms_ssim": "MS-SSIM", "gms": "GMS", "gmsd": "GMSD"}
 
 
@@ -280,7 +281,10 @@ def _stop_on_signal() -> Iterator[Callable[[], bool]]:
 
 @contextlib.contextmanager
 def _progress_bar() -> Iterator[Callable[[Any], None]]:
-    """A bar with rate, loss and time left on a terminal's stderr; elsewhere a line for every tenth of the run."""
+    """A bar with rate, loss and time left on a terminal's stderr; elsewhere a line for every tenth of the run.
+
+    After the last step of a training what it reached is measured, which takes a while and has no steps.
+    """
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
@@ -295,12 +299,17 @@ def _progress_bar() -> Iterator[Callable[[Any], None]]:
         task = progress.add_task("", total=None, stage="training", figures="")
 
         def report(state: Any) -> None:
+            stage, is_last = state.beside or "training", state.step == state.steps
             if console.is_terminal:
-                stage = state.beside or "training"
                 progress.update(task, completed=state.step, total=state.steps, stage=stage, figures=_figures(state))
-            elif state.step * 10 // state.steps > (state.step - 1) * 10 // state.steps:
-                stage = f"{state.beside}: " if state.beside else ""
-                sys.stderr.write(f"{stage}step {state.step:,} of {state.steps:,}: {_figures(state)}\n")
+                if is_last:
+                    progress.update(task, total=None, stage=f"{stage}: {MEASURING}", figures="")
+                return
+            if state.step * 10 // state.steps > (state.step - 1) * 10 // state.steps:
+                named = f"{state.beside}: " if state.beside else ""
+                sys.stderr.write(f"{named}step {state.step:,} of {state.steps:,}: {_figures(state)}\n")
+            if is_last:
+                sys.stderr.write(f"{stage}: {MEASURING} …\n")
 
         yield report
 
