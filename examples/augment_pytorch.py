@@ -24,9 +24,11 @@ import ultragray
 from ultragray.contract import from_dict
 from ultragray.samplers import AroundSampler, SplineSampler
 from ultragray_client import Client, Frame, RenderSettings, Scene
+from ultragray_client.errors import ClientError
 
 Sample = dict[str, torch.Tensor]
 PATH_POSES = 200
+FIRST_ANSWER_S = 1.0  # where nobody answers within this time, there is no service
 
 
 class SimulatedFrames(IterableDataset[Sample]):
@@ -96,6 +98,16 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
 
+    try:
+        with Client(given.address) as client:
+            client.who_am_i(timeout_s=FIRST_ANSWER_S)
+        measure_epoch(given)
+    except ClientError as error:
+        raise SystemExit(f"error: {error.detail}") from None
+
+
+def measure_epoch(given: argparse.Namespace) -> None:
+    """Load the frames of an epoch as a training would, and print how fast they came. Raises ClientError."""
     frames = SimulatedFrames(given.address, given.scene, given.frames, labels=given.labels, seed=given.seed)
     loader = DataLoader(
         frames,

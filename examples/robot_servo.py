@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ultragray_client import AsyncClient, AsyncFrameStream, Frame, LinearProbe, RenderSettings
-from ultragray_client.errors import DeadlineExceeded, StreamEnded
+from ultragray_client.errors import ClientError, DeadlineExceeded, StreamEnded
 
 Floats = npt.NDArray[np.float64]
 
@@ -40,6 +40,7 @@ MAX_MM_PER_S, MAX_MM_PER_S2 = 40.0, 400.0
 SWAY_MM, SWAY_HZ = 3.0, 0.2
 SETTLING_S = 1.0
 POSE_TIMEOUT_S = 0.1
+FIRST_ANSWER_S = 1.0  # where nobody answers within this time, there is no service
 
 
 class VesselFinder:
@@ -218,6 +219,7 @@ class Servo:
 async def servo(address: str, *, scene: str = "demo", seconds: float = 10.0, rate_hz: float = 100.0) -> Record:
     """Runs the robot and returns what happened. Raises ClientError."""
     async with AsyncClient(address) as client:
+        await client.who_am_i(timeout_s=FIRST_ANSWER_S)
         first = await client.render(scene, Robot().pose(), SETTINGS)
         if not isinstance(first.probe, LinearProbe):
             raise SystemExit(f"the template is made for a linear probe, {scene} has {first.probe}")
@@ -234,7 +236,10 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--rate-hz", type=float, default=100.0, help="of the control loop")
     given = parser.parse_args()
-    record = asyncio.run(servo(given.address, scene=given.scene, seconds=given.seconds, rate_hz=given.rate_hz))
+    try:
+        record = asyncio.run(servo(given.address, scene=given.scene, seconds=given.seconds, rate_hz=given.rate_hz))
+    except ClientError as error:
+        raise SystemExit(f"error: {error.detail}") from None
     print(record.tell())
 
 

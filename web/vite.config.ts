@@ -3,7 +3,7 @@ import { svelte } from "@sveltejs/vite-plugin-svelte";
 import { defineConfig, type Plugin } from "vite";
 
 // `npm run dev` serves the sources and passes on what is asked of the API to a service that runs.
-const service = process.env.ULTRAGRAY_SERVER ?? "http://127.0.0.1:8000";
+const service = process.env.ULTRAGRAY_ADDRESS ?? "http://127.0.0.1:8000";
 
 /** The licences of what is bundled, which ask to come along. */
 function licences(): Plugin {

@@ -102,6 +102,11 @@ class Frame:
     dropped: int = 0  # in a stream: poses that newer ones replaced since the frame before
     latency_ms: float | None = None  # in a stream: from `measured_ns` of the pose to the arrival of the frame here
 
+    def __repr__(self) -> str:
+        x, y, z = self.pose[:3, 3]
+        pictures = ", ".join(f"{name} {'x'.join(map(str, pixels.shape))}" for name, pixels in self.arrays.items())
+        return f"Frame({self.scene!r}, {pictures}, at ({x:.4g}, {y:.4g}, {z:.4g}) mm)"
+
     def __getitem__(self, output: str) -> npt.NDArray[Any]:  # [H, W]
         return self.arrays[output]
 

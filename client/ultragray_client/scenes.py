@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from ultragray_proto.codec import from_message
 from ultragray_proto.v1 import scenes_pb2
@@ -56,7 +56,7 @@ class Scene:
     training_pose_count: int
     training_position_min_mm: Point | None  # of the probe's origin
     training_position_max_mm: Point | None
-    training_poses: tuple[FloatArray, ...]  # the first, the middle and the last, each [4, 4] mm
+    training_poses: tuple[FloatArray, ...] = field(repr=False)  # the first, the middle and the last, each [4, 4] mm
     metrics: Mapping[str, float]
     dataset_name: str
     dataset_sha256: str

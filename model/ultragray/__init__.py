@@ -2,23 +2,25 @@
 
     from ultragray import GaussianScene, LinearProbe, render
 
-The names that need torch are imported on first use, so that a process which only checks poses stays light.
+Every name is imported on first use, so that a process which only checks poses needs no torch, and `ultragray --help`
+no NumPy.
 """
 
 from __future__ import annotations
 
 import importlib
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
-from .errors import UltragrayError
 from .installation import __version__ as __version__
-from .pose import check_poses, pose_from_position_quaternion, quaternion_from_pose
-from .probe import ConvexProbe, ElevationBeam, LinearProbe, PhasedProbe, Probe, RadialProbe, SteeredProbe
-from .scene_info import SceneHeader, SceneInfo, read_header
 
 if TYPE_CHECKING:
+    from .errors import UltragrayError
+    from .pose import check_poses, pose_from_position_quaternion, quaternion_from_pose
+    from .probe import ConvexProbe, ElevationBeam, LinearProbe, PhasedProbe, Probe, RadialProbe, SteeredProbe
     from .rendering import Frames, render
     from .scene import GaussianScene
+    from .scene_info import SceneHeader, SceneInfo, read_header
 
 __all__ = [
     "ConvexProbe",
@@ -40,12 +42,27 @@ __all__ = [
     "render",
 ]
 
-_NEEDS_TORCH = {"Frames": "rendering", "GaussianScene": "scene", "render": "rendering"}
+_MODULES = {
+    "errors": ("UltragrayError",),
+    "pose": ("check_poses", "pose_from_position_quaternion", "quaternion_from_pose"),
+    "probe": ("ConvexProbe", "ElevationBeam", "LinearProbe", "PhasedProbe", "Probe", "RadialProbe", "SteeredProbe"),
+    "rendering": ("Frames", "render"),
+    "scene": ("GaussianScene",),
+    "scene_info": ("SceneHeader", "SceneInfo", "read_header"),
+}
+_MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 
 
 def __getattr__(name: str) -> Any:
-    if name in _NEEDS_TORCH:
-        value = getattr(importlib.import_module(f".{_NEEDS_TORCH[name]}", __name__), name)
+    """One of the names above, or a module of this package."""
+    if name in _MODULE_OF:
+        value = getattr(importlib.import_module(f".{_MODULE_OF[name]}", __name__), name)
         globals()[name] = value
         return value
+    if not name.startswith("_") and find_spec(f".{name}", __name__) is not None:
+        return importlib.import_module(f".{name}", __name__)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

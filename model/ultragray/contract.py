@@ -44,17 +44,21 @@ def described(
     most: int | None = None,
     error: type[InvalidArgument] | None = None,
     example: Any = None,
+    topic: str | None = None,
     **options: Any,
 ) -> Any:
     """A dataclass field that says what it means.
 
     A number must lie from `low` (or above `above`) to `high`; a word must be one of `choices`, a list may have `most`
     elements, each within the limits. `error`: what is raised instead of the error of the class. `example`: a value of a
-    usual member of a family. `options` are those of `dataclasses.field`.
+    usual member of a family. `topic`: the heading under which a help lists it, where that is not the class's.
+    `options` are those of `dataclasses.field`.
     """
     metadata: dict[str, Any] = {"description": meaning}
     limits = {"low": low, "high": high, "above": above, "choices": choices, "most": most, "error": error}
-    metadata |= {name: fact for name, fact in {**limits, "example": example}.items() if fact is not None}
+    metadata |= {
+        name: fact for name, fact in {**limits, "example": example, "topic": topic}.items() if fact is not None
+    }
     if schema := _schema(**limits):
         if choices is not None and default is None:
             schema["enum"] = [*choices, None]
@@ -78,6 +82,7 @@ class Contract:
     """
 
     error: ClassVar[type[InvalidArgument]] = InvalidArgument
+    __topic__: ClassVar[str | None] = None  # the heading under which a help lists the fields
     # Read by pydantic, which the service checks JSON with: values are taken at their word.
     __pydantic_config__: ClassVar[dict[str, Any]] = {"extra": "forbid", "strict": True, "allow_inf_nan": False}
 

@@ -49,8 +49,8 @@ class Frames(Mapping[str, Tensor]):
         return self._outputs.get(name)
 
     def __repr__(self) -> str:
-        shapes = ", ".join(f"{name} {list(pixels.shape)}" for name, pixels in self._outputs.items())
-        return f"Frames({shapes})"
+        count, height, width = next(iter(self._outputs.values())).shape if self._outputs else (0, 0, 0)
+        return f"Frames({count:,} of {height}x{width}: {', '.join(self._outputs)})"
 
 
 class Drawing:

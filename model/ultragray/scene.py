@@ -72,6 +72,10 @@ class GaussianScene:
     pose_corrections: FloatArray | None = None  # [P, 4, 4] mm: training poses = corrections · poses of the tracker
     _prepared: dict[str, _Kept] = field(default_factory=dict, init=False, repr=False)
 
+    def __repr__(self) -> str:
+        name = "" if self.info.dataset_name is None else f"{self.info.dataset_name!r}, "
+        return f"GaussianScene({name}{len(self.means):,} Gaussians, {self.info.probe or 'no probe'})"
+
     @classmethod
     def from_splats(
         cls,

@@ -9,7 +9,7 @@ All but the Gaussians is bounded, so that the description of any file is read in
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -143,9 +143,10 @@ class SceneHeader:
     """The description and the training poses of a scene file, without the Gaussians."""
 
     info: SceneInfo
-    training_poses: FloatArray  # [P, 4, 4] mm, probe→scene
+    training_poses: FloatArray = field(repr=False)  # [P, 4, 4] mm, probe→scene
     file_bytes: int
-    pose_corrections: FloatArray | None = None  # [P, 4, 4] mm: training poses = corrections · poses of the tracker
+    # [P, 4, 4] mm: training poses = corrections · poses of the tracker
+    pose_corrections: FloatArray | None = field(default=None, repr=False)
 
 
 def read_header(path: str | Path) -> SceneHeader:

@@ -60,6 +60,7 @@ class FrameSettings(Contract):
     Raises InvalidProbe, InvalidImageSize, UnknownOutput, InvalidArgument.
     """
 
+    __topic__ = "Frames"
     height: int | None = described(
         "Depth samples. Default: as trained, else 512.", None, low=1, high=MAX_IMAGE_SIDE, error=InvalidImageSize
     )
@@ -67,9 +68,11 @@ class FrameSettings(Contract):
         "Scan lines. Default: as trained, else 512.", None, low=1, high=MAX_IMAGE_SIDE, error=InvalidImageSize
     )
     probe: Probe | None = described("Instead of the scene's own.", None, error=InvalidProbe)
-    min_confidence: float | None = described("What is below is refused, or masked.", None, low=0.0, high=1.0)
+    min_confidence: float | None = described(
+        "What is below is refused, or masked.", None, low=0.0, high=1.0, topic="Confidence"
+    )
     below_min_confidence: Below = described(
-        "mask: pixels of such frames that Gaussians do not support are 0.", Below.REFUSE
+        "mask: pixels of such frames that Gaussians do not support are 0.", Below.REFUSE, topic="Confidence"
     )
     slice_thickness_mm: float | None = described(
         "Full width at half maximum along elevation at the focus of the scene's beam; 0: a plane. Default: as trained.",

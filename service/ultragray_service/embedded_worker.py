@@ -27,6 +27,7 @@ _PASSED_ON = (
     "max_footprint_pixels",
     "job_drain_timeout_s",
     "job_retention_days",
+    "log_format",
     "log_level",
 )
 

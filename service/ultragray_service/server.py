@@ -8,6 +8,7 @@ import ctypes
 import gc
 import logging
 import signal
+import sys
 from collections.abc import Awaitable
 from typing import Any
 
@@ -18,17 +19,19 @@ from ultragray_workers.rounds import Rounds
 
 from .access.addresses import is_loopback
 from .core.state import Service
+from .doors import Doors
 from .embedded_worker import EmbeddedWorker
+from .environment import unknown_variables
 from .http.app import create_app
 from .igtl.server import IgtlServer
 from .listening.connections import Connections
 from .listening.http_server import HttpServer
 from .listening.open_sockets import OpenSockets
-from .listening.sockets import authority, listen, raise_open_files_limit
+from .listening.sockets import authority, check_port_is_free, listen, raise_open_files_limit
 from .rpc.server import GrpcServer
 from .service_manager import READY, STOPPING, ServiceManager
 from .settings import Settings
-from .telemetry.logs import configure_logging
+from .telemetry.logs import configure_logging, is_for_people
 from .tls.watch import CertificateWatch
 
 _HEALTH_POLL_S = 0.2
@@ -45,7 +48,9 @@ _log = logging.getLogger("ultragray.service")
 
 def run(settings: Settings) -> None:
     """Serve until SIGTERM or SIGINT. Raises StartupFailed where it cannot start."""
-    configure_logging(settings.log_level)
+    configure_logging(settings.log_level, settings.log_format)
+    for sentence in unknown_variables():
+        _log.warning(sentence)
     _return_large_blocks()
     raise_open_files_limit(_DOORS * settings.max_connections + _OTHER_FILES)
     uvloop.run(serve(settings))
@@ -81,17 +86,17 @@ async def serve(settings: Settings) -> None:
         ]
         if certificates is not None:
             watching.append(asyncio.ensure_future(certificates.follow()))
-        _log.info("starting the render processes")
+        _log.info(f"starting to serve the scenes of {settings.data_folder}")
         worker = EmbeddedWorker(settings)
         try:
             if await signals.unless_stopped(service.start()):
                 worker.start()
                 gc.freeze()  # what lives this long is never garbage: shorter pauses
-                _tell_where(settings, http_socket.getsockname()[1], grpc_port, igtl)
+                _tell_where(Doors.of(settings, http_socket.getsockname()[1], grpc_port, igtl), service.guard.asks)
                 manager.tell(READY)
                 await signals.stop.wait()
             manager.tell(STOPPING)
-            _log.info("stopping: frames that wait are answered first")
+            _log.info("stopping: frames that wait are answered first; Ctrl-C again stops at once")
         finally:
             for task in watching:
                 task.cancel()
@@ -111,16 +116,11 @@ async def serve(settings: Settings) -> None:
     _log.info("stopped")
 
 
-def _tell_where(settings: Settings, http_port: int, grpc_port: int, igtl: str | None) -> None:
-    tls = settings.tls_certificate is not None
-    http = f"{'https' if tls else 'http'}://{authority(settings.host, http_port)}"
-    grpc = authority(settings.host, grpc_port)
-    fields = {"http": http, "grpc": grpc, "docs": f"{http}/docs", "data_folder": str(settings.data_folder)}
-    message = f"serving HTTP on {http} (docs at {http}/docs) and gRPC on {grpc}{' with TLS' if tls else ''}"
-    if igtl is not None:
-        fields["igtl"] = igtl
-        message += f", OpenIGTLink on {igtl}"
-    _log.info(message, extra={"fields": fields})
+def _tell_where(doors: Doors, asks_for_keys: bool) -> None:
+    if is_for_people(doors.settings.log_format):
+        sys.stderr.write(doors.banner(asks_for_keys))
+    else:
+        _log.info(doors.in_words(), extra={"fields": doors.fields()})
 
 
 def _return_large_blocks() -> None:
@@ -169,12 +169,12 @@ async def _unless(event: asyncio.Event, work: Awaitable[Any]) -> bool:
 
 
 def _bind_grpc(server: GrpcServer, settings: Settings, certificates: CertificateWatch | None) -> int:
+    check_port_is_free(settings.host, settings.grpc_port, "gRPC", "grpc_port")  # gRPC would print lines of its own
     try:
         return server.bind(settings.host, settings.grpc_port, certificates)
-    except RuntimeError as error:
+    except RuntimeError as error:  # somebody was faster
         raise StartupFailed(
-            f"gRPC cannot listen on {authority(settings.host, settings.grpc_port)}: the port is in use "
-            "or the address is not this machine's; set ULTRAGRAY_GRPC_PORT to another port",
+            f"gRPC cannot listen on {authority(settings.host, settings.grpc_port)}: the port is in use",
             field="grpc_port",
         ) from error
 

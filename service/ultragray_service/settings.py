@@ -17,9 +17,12 @@ from ultragray_workers.pool.pool import MAX_BATCH_POSES
 from .access.addresses import parse_allowed
 from .access.limits.allowance import NAMES, Allowance, of_key
 from .access.oidc.claims import check_url, parse_roles
+from .environment import PREFIX
 
-ENVIRONMENT_PREFIX = "ULTRAGRAY_"
+ENVIRONMENT_PREFIX = PREFIX
 LEAST_KEY_LENGTH = 16
+LOG_FORMATS = ("auto", "human", "json")
+ADDRESSES, TLS, INSTALLATION, COMPUTE, LOGS = "Addresses", "TLS", "Installation", "Compute", "Logs"  # topics
 _MAX_MB = 16_777_216
 _HOUR_S = 3600.0
 
@@ -31,11 +34,14 @@ class Settings(Contract):
     host: str = described(
         "Address that all servers listen on; 0.0.0.0 for all. Others than this machine's own need API keys.",
         "127.0.0.1",
+        topic=ADDRESSES,
     )
-    http_port: int = described("Port of HTTP; 0 takes a free one, which the log tells.", 8000, low=0, high=65535)
-    grpc_port: int = described("Port of gRPC; 0 takes a free one.", 50051, low=0, high=65535)
+    http_port: int = described(
+        "Port of HTTP; 0 takes a free one, which the log tells.", 8000, low=0, high=65535, topic=ADDRESSES
+    )
+    grpc_port: int = described("Port of gRPC; 0 takes a free one.", 50051, low=0, high=65535, topic=ADDRESSES)
     igtl_port: int | None = described(
-        "Port of OpenIGTLink, usually 18944; 0 takes a free one; none: off.", None, low=0, high=65535
+        "Port of OpenIGTLink, usually 18944; 0 takes a free one; none: off.", None, low=0, high=65535, topic=ADDRESSES
     )
     igtl_scene: str | None = described("Scene of OpenIGTLink devices whose names name none; none: the only one.", None)
     igtl_slice_thickness_mm: float | None = described(
@@ -54,26 +60,37 @@ class Settings(Contract):
         "PEM file of the server's certificate, then those of intermediate authorities: HTTP and gRPC speak TLS, and "
         "nothing else. None: no TLS.",
         None,
+        topic=TLS,
     )
-    tls_key: Path | None = described("PEM file of the certificate's key, not encrypted.", None)
+    tls_key: Path | None = described("PEM file of the certificate's key, not encrypted.", None, topic=TLS)
     tls_client_ca: Path | None = described(
-        "PEM file of authorities: a client must present a certificate that one of them signed (mutual TLS).", None
+        "PEM file of authorities: a client must present a certificate that one of them signed (mutual TLS).",
+        None,
+        topic=TLS,
     )
     data_folder: Path = described(
         "Existing folder of the scene files (*.ugr); `ultragray serve` makes the default one, and puts the demo scene "
         "where there is none.",
         Path("data"),
+        topic=INSTALLATION,
     )
     preload: tuple[str, ...] = described("Scenes that are loaded before the service is ready.", ())
 
     processes: int = described(
-        "Render processes; 0: one per GPU, on the CPU one. More than there are GPUs share them.", 0, low=0, high=256
+        "Render processes; 0: one per GPU, on the CPU one. More than there are GPUs share them.",
+        0,
+        low=0,
+        high=256,
+        topic=COMPUTE,
     )
-    threads_per_process: int = described("Render threads of each; 0: cores // processes.", 0, low=0, high=1024)
+    threads_per_process: int = described(
+        "Render threads of each; 0: cores // processes.", 0, low=0, high=1024, topic=COMPUTE
+    )
     backend: str = described(
         "Render backend; auto: cuda where there is a GPU, else cpu.",
         "auto",
         choices=("auto", "cpu", "cuda", "reference"),
+        topic=COMPUTE,
     )
     queue_limit_frames: int = described(
         "Frames that may wait, interactive and batch frames each; beyond: QUEUE_FULL.", 256, low=1, high=100_000
@@ -124,7 +141,9 @@ class Settings(Contract):
     )
 
     artifact_folder: Path | None = described(
-        "Folder of datasets and jobs, which all services and workers share; none: artifacts in the data folder.", None
+        "Folder of datasets and jobs, which all services and workers share; none: artifacts in the data folder.",
+        None,
+        topic=INSTALLATION,
     )
     max_dataset_bytes: int = described(
         "Largest upload: a scene file, or a dataset, packed and unpacked.", 8 * 2**30, low=1024, high=2**50
@@ -163,7 +182,10 @@ class Settings(Contract):
     transfer_patience_s: float = described("How long it may do less before it is cut off.", 30.0, low=1.0, high=_HOUR_S)
 
     database_url: str | None = described(
-        "PostgreSQL URL of the queue of jobs; none: a SQLite file in the artifact folder.", None, repr=False
+        "PostgreSQL URL of the queue of jobs; none: a SQLite file in the artifact folder.",
+        None,
+        repr=False,
+        topic=INSTALLATION,
     )
     job_queue_limit: int = described("Jobs that may wait; beyond: JOB_QUEUE_FULL.", 1000, low=1, high=100_000)
     ready_without_jobs: bool = described(
@@ -173,7 +195,7 @@ class Settings(Contract):
     )
     embedded_worker: bool = described("Whether `ultragray serve` starts a worker for jobs as well.", True)
     training_threads: int = described(
-        "Threads of a job's process; 0: all cores but one, at least one.", 0, low=0, high=1024
+        "Threads of a job's process; 0: all cores but one, at least one.", 0, low=0, high=1024, topic=COMPUTE
     )
     job_nice: int = described(
         "Nice level of jobs and of the worker within the service: frames go first.", 10, low=0, high=19
@@ -250,6 +272,7 @@ class Settings(Contract):
     insecure: bool = described(
         "Whether other machines are served even without any API key: whoever reaches the address is an admin.",
         False,
+        topic=ADDRESSES,
     )
     allowed_hosts: tuple[str, ...] = described(
         "Names of this machine in URLs, beside localhost and its addresses: without API keys others are refused; * for "
@@ -259,7 +282,15 @@ class Settings(Contract):
     cors_origins: tuple[str, ...] = described(
         "Origins of other sites, such as https://app.example, whose pages may use the service; * for all.", ()
     )
-    log_level: str = described("Least level that is logged.", "info", choices=("debug", "info", "warning", "error"))
+    log_format: str = described(
+        "human: a line for people; json: an object a line; auto: human on a terminal, else json.",
+        "auto",
+        choices=LOG_FORMATS,
+        topic=LOGS,
+    )
+    log_level: str = described(
+        "Least level that is logged.", "info", choices=("debug", "info", "warning", "error"), topic=LOGS
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()

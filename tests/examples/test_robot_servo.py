@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from types import ModuleType
 
@@ -94,3 +95,15 @@ def test_as_a_program(demo_service: RunningService) -> None:
     told = subprocess.run(command, check=True, capture_output=True, text=True, timeout=60).stdout
     assert "latency p50" in told
     assert "off centre by" in told
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("example", ["robot_servo", "augment_pytorch"])
+def test_without_a_service_it_ends_at_once_with_one_line(example: str) -> None:
+    command = [sys.executable, str(EXAMPLES / f"{example}.py"), "--address", "127.0.0.1:9"]
+    started = time.monotonic()
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert time.monotonic() - started < at_this_load(10)  # most of it imports torch
+    assert ended.returncode == 1
+    assert ended.stderr.startswith("error: no service answers at 127.0.0.1:9")
+    assert ended.stderr.count("\n") == 1

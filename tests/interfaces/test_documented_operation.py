@@ -17,10 +17,9 @@ from ultragray import ConvexProbe, LinearProbe, errors, image_size, pose, scene_
 from ultragray.probe import fan, probe
 from ultragray.settings import Resolved
 from ultragray.training.config import PRESETS, TrainingConfig
-from ultragray_service.cli.app import USER_ERROR
 from ultragray_service.cli.app import app as command_line
-from ultragray_service.cli.jobs.watch import JOB_CANCELLED, JOB_FAILED
-from ultragray_service.cli.train import INTERRUPTED
+from ultragray_service.cli.group import INTERRUPTED, USER_ERROR
+from ultragray_service.cli.remote.watch import JOB_CANCELLED, JOB_FAILED
 from ultragray_service.core import catalog, dataset_uploads
 from ultragray_service.core.state import Service
 from ultragray_service.core.streams import pose_stream
@@ -45,7 +44,7 @@ from .document import code, rows, table
 
 
 def test_command_line() -> None:
-    commands = typer.main.get_command(command_line).commands  # type: ignore[attr-defined]
+    commands = dict(typer.main.get_command(command_line).commands)  # type: ignore[attr-defined]
     assert list(table("Command line")) == list(commands)
     while groups := [name for name in commands if hasattr(commands[name], "commands")]:
         name = groups[0]

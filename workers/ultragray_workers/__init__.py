@@ -1,8 +1,17 @@
-"""The render pool: worker processes that turn poses into encoded frames. Free of torch."""
+"""The render pool: worker processes that turn poses into encoded frames. Free of torch.
 
-from .pool.pool import PoolConfig, PoolStatistics, RenderPool
-from .pool.types import Priority, RenderRequest, RenderResult
-from .scenes import SceneStore
+The names are imported on first use: most of the package does without the pool.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from .pool.pool import PoolConfig, PoolStatistics, RenderPool
+    from .pool.types import Priority, RenderRequest, RenderResult
+    from .scenes import SceneStore
 
 __all__ = [
     "PoolConfig",
@@ -13,3 +22,18 @@ __all__ = [
     "RenderResult",
     "SceneStore",
 ]
+
+_MODULES = {
+    "pool.pool": ("PoolConfig", "PoolStatistics", "RenderPool"),
+    "pool.types": ("Priority", "RenderRequest", "RenderResult"),
+    "scenes": ("SceneStore",),
+}
+_MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULE_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(importlib.import_module(f".{_MODULE_OF[name]}", __name__), name)
+    globals()[name] = value
+    return value

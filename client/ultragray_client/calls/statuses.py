@@ -24,6 +24,7 @@ _TLS_FAILURES = {  # by a part of what grpc says
     "Hostname Verification Check failed": "shows a certificate of another name: reach it by a name of its certificate, "
     "or give one as tls.server_name",
 }
+_NO_ADDRESS = "failed to connect to all addresses"
 _CUT_OFF = ("Socket closed", "Connection reset")  # all that grpc says where a server wanted TLS, or a certificate
 _BY_REASON = {error.reason: error for error in ERRORS}
 _BY_STATUS = {error.grpc_status: error for error in reversed(ERRORS)}  # of several, the root of the branch
@@ -55,6 +56,8 @@ def _unreachable(sentence: str, address: str) -> ClientError:
     hint = ""
     if any(part in sentence for part in _CUT_OFF):
         hint = "; it may want TLS, or a client's certificate: see tls"
+    if sentence.startswith(_NO_ADDRESS):  # of gRPC's words for each address that it tried the last ones say why
+        sentence = sentence.rpartition(": ")[2].lower()
     return Unreachable(f"no service answers at {address} ({sentence}){hint}")
 
 

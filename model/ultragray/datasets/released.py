@@ -98,21 +98,22 @@ def _read_poses(path: Path) -> FloatArray:  # [F, 4, 4]
     return check_frame_poses(np.array(poses, np.float64), np.arange(len(poses)), str(path))
 
 
-def write_released(dataset: Dataset, folder: str | Path) -> None:
+def write_released(dataset: Dataset, folder: str | Path, *, replace: bool = False) -> None:
     """Write the dataset in this layout; conf.json comes last, so that a folder which has it is complete.
 
     Our reader gives the same dataset back (`Dataset.sha256`) where the planes are whole multiples of 1e-9 mm. Paths in
     conf.json are written as the released trainer expects them, from the folder that holds `data/`. Raises
-    InvalidArgument where one of the files already exists: nothing is replaced.
+    InvalidArgument where one of the files already exists, unless `replace` allows it.
     """
     folder = Path(folder)
     parts = [(part, sweep) for part, sweep in (("train", dataset.train), ("val", dataset.val)) if len(sweep)]
     arrays = {(kind, part): getattr(sweep, kind) for part, sweep in parts for kind in ("images", "poses")}
     for file_name in (CONFIG_NAME, *(_array_name(*key) for key in arrays)):
-        if (folder / file_name).exists():
+        if (folder / file_name).exists() and not replace:
             raise InvalidArgument(f"{folder / file_name} already exists: choose another folder", field="output")
     keys = probe_keys(dataset.probe)
     folder.mkdir(parents=True, exist_ok=True)
+    (folder / CONFIG_NAME).unlink(missing_ok=True)
     name = folder.resolve().name
     document: dict[str, Any] = {}
     for (kind, part), array in arrays.items():

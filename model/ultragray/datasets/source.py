@@ -25,6 +25,7 @@ PHANTOM = "phantom"
 class SourceOptions(Contract):
     """Options of reading a source. None leaves the choice to the source."""
 
+    __topic__ = "Reading the sweep"
     train_frames: str | None = described(
         "Frames to train from, such as 0:90 or 0:90,100:120:2: places in the training file, or in the sequence.", None
     )
@@ -86,7 +87,7 @@ def load_dataset(source: str | Path, options: SourceOptions | None = None) -> Da
     the frame and the reason; InvalidArgument, naming the field, for options that cannot be met.
     """
     options = options or SourceOptions()
-    chosen = _format_of(source)
+    chosen = format_of(source)
     for item in fields(options):
         if getattr(options, item.name) is not None and item.name not in (*EVERY_FORMAT_TAKES, *chosen.options):
             takers = " and ".join(f"{one.noun}s" for one in FORMATS.values() if item.name in one.options)
@@ -101,8 +102,8 @@ def load_dataset(source: str | Path, options: SourceOptions | None = None) -> Da
     return replace(dataset, train=train, val=val)
 
 
-def _format_of(source: str | Path) -> DatasetFormat:
-    """The format that a source is in, by its name. Raises DatasetInvalid."""
+def format_of(source: str | Path) -> DatasetFormat:
+    """The format that a source is in, by its name; nothing is read. Raises DatasetInvalid where there is none."""
     path = Path(source)
     for one in FORMATS.values():
         if one.is_source(str(source)):

@@ -56,6 +56,10 @@ class Sweep:
     source: str
     notes: tuple[str, ...] = ()  # what reading it left out or assumed, for a person
 
+    def __repr__(self) -> str:
+        frames = f"{len(self.images):,} frames of {self.images.shape[1]}x{self.images.shape[2]}"
+        return f"Sweep({frames}, {self.probe}, {self.source!r})"
+
     def __post_init__(self) -> None:
         images, count = self.images, len(self.images)
         if images.dtype != np.uint8 or images.ndim != 3 or 0 in images.shape[1:]:

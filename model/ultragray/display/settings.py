@@ -27,6 +27,7 @@ class Display(Contract):
     Raises InvalidArgument for numbers beyond the limits.
     """
 
+    __topic__ = "Display"
     gain_db: float = described("Added to every echo.", 0.0, low=-100.0, high=100.0)
     dynamic_range_db: float = described("From white down to black.", FRAME_RANGE_DB, low=1.0, high=200.0)
     tgc_db: tuple[float, ...] = described(

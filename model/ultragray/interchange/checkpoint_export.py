@@ -44,13 +44,13 @@ class CheckpointExport:
     largest_intensity_error: float  # of a `sigmoid` scene's intensities in [0, 1]; 0 for a `released` one
 
 
-def export_checkpoint(scene: GaussianScene, checkpoint: str | Path) -> CheckpointExport:
+def export_checkpoint(scene: GaussianScene, checkpoint: str | Path, *, replace: bool = False) -> CheckpointExport:
     """Write `checkpoint` (`ckpt_29999.pt`) and, beside it, conf.json and poses_train.npy.
 
     The folder is made where only it is missing. conf.json needs the scene's probe, poses_train.npy its training poses;
     what is left out for want of them is in the notes, and so is how well the released activation fits a `sigmoid`
-    scene. Raises InvalidArgument where a conf.json or poses_train.npy of something else lies there already, which is
-    never replaced, and for a scene of images with one row, which the released depth grid does not have; OSError.
+    scene. Raises InvalidArgument where a conf.json or poses_train.npy of something else lies there already, unless
+    `replace` allows it, and for a scene of images with one row, which the released depth grid does not have; OSError.
     """
     checkpoint = Path(checkpoint)
     notes: list[str] = []
@@ -78,7 +78,8 @@ def export_checkpoint(scene: GaussianScene, checkpoint: str | Path) -> Checkpoin
         )
     splats, largest_error = _splats(scene, centre_mm, notes)
     folder = checkpoint.absolute().parent
-    _check_not_replaced(folder, beside)
+    if not replace:
+        _check_not_replaced(folder, beside)
     beside[checkpoint.name] = _saved({"step": _step(scene), "global_tic": 0.0, "splats": splats})
     folder.mkdir(exist_ok=True)
     for name, data in beside.items():  # the checkpoint last: where it lies, everything does

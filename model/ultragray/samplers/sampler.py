@@ -16,6 +16,7 @@ MAX_SEED = 2**63 - 1
 class Sampler(Family):
     """Makes poses from base poses: those that the caller gives, else the training poses of a scene."""
 
+    __topic__ = "Sampling"
     kind: str
     draws: ClassVar[bool] = False
     """Whether it draws `count` poses by a `seed`, so that another seed gives others."""

@@ -49,6 +49,7 @@ class TrainingConfig(Contract):
     naming the field, for a value outside its range.
     """
 
+    __topic__ = "Training"
     steps: int | None = described("Steps of the run; none: from the number of frames.", None, low=1, high=10_000_000)
     effort: float | None = described(
         "Factor on the steps and the Gaussians that follow from the data; none: chosen by trainings on a part of the "

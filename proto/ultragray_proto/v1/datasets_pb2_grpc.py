@@ -65,7 +65,7 @@ class DatasetServiceServicer:
     """Missing associated documentation comment in .proto file."""
 
     def UploadDataset(self, request_iterator, context):
-        """Uploads a dataset, checks it as `ultragray dataset check` does, and keeps it. The first message is the header; then,
+        """Uploads a dataset, checks it as `ultragray check` does, and keeps it. The first message is the header; then,
         of separate files, the path of each before its chunks, or else the chunks of one archive. The same content and
         options again give the dataset that is there. DATASET_INVALID with the file and the frame, DATASET_EXISTS,
         UPLOAD_TOO_LARGE, STORAGE_FULL, MEMORY_EXCEEDED, QUEUE_FULL.

@@ -22,7 +22,7 @@ from ultragray.probe import FloatArray
 from ultragray_proto.v1 import rendering_pb2, rendering_pb2_grpc
 from ultragray_workers.errors import NotReady
 
-from ..core.job_client import JobClient
+from ..remote.jobs import Jobs
 from .igtl import PingPong
 from .kernel import BenchScene, bench_poses, measure_kernel, time_ms
 from .report import Report, percentiles
@@ -170,7 +170,7 @@ def _ping_pong(port: int, repeats: int) -> dict[str, float]:
         return _percentiles([time_ms(client.render, poses[number % len(poses)]) for number in range(repeats)])
 
 
-def _augment(client: JobClient, extent: ClientsExtent) -> float:
+def _augment(client: Jobs, extent: ClientsExtent) -> float:
     """Frames per second of a rendering job, from its start to the whole archive."""
     specification = {
         "scene": AUGMENTED,

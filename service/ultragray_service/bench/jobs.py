@@ -27,7 +27,7 @@ from ultragray_proto.v1 import rendering_pb2, rendering_pb2_grpc
 from ultragray_workers.errors import NotReady
 from ultragray_workers.jobs.queue.database import JobDatabase
 
-from ..core.job_client import JobClient
+from ..remote.jobs import Jobs
 from .kernel import time_ms
 from .report import Report, percentiles
 from .served import pose_message, running_server
@@ -101,13 +101,13 @@ def run(output: Path | None, quick: bool) -> None:
     )
 
 
-def _finish_one(client: JobClient) -> None:
+def _finish_one(client: Jobs) -> None:
     specification = {"scene": SCENE, "sampler": {"kind": "training"}, "height": 8, "width": 8}
     job, _ = client.submit({"kind": "render", "specification": specification})
     _until(client, job["id"], lambda job: job["state"] == "succeeded")
 
 
-def _until(client: JobClient, job_id: str, reached: Callable[[dict[str, Any]], bool]) -> None:
+def _until(client: Jobs, job_id: str, reached: Callable[[dict[str, Any]], bool]) -> None:
     end = time.monotonic() + WAIT_S
     while not reached(job := client.get(job_id)):
         if time.monotonic() > end or job["state"] == "failed":
@@ -161,7 +161,7 @@ def _middle(port: int, jobs: int) -> str:
 
 
 def _frames_beside_training(
-    client: JobClient, http_port: int, grpc_port: int, extent: JobsExtent
+    client: Jobs, http_port: int, grpc_port: int, extent: JobsExtent
 ) -> dict[str, list[list[float]]]:
     """Latencies of gRPC unary frames, one after another; a list for each round."""
     _upload(http_port, load_phantom())

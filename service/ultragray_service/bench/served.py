@@ -25,7 +25,8 @@ from ultragray_proto.v1 import geometry_pb2, rendering_pb2, rendering_pb2_grpc
 from ultragray_workers.errors import NotReady
 from ultragray_workers.jobs.worker.processes import account_of
 
-from ..core.job_client import JobClient
+from ..remote.connection import Connection
+from ..remote.jobs import Jobs
 from .kernel import BenchScene, bench_poses, time_ms
 from .shared_file import SharedFile
 
@@ -73,9 +74,9 @@ class RunningServer:
     pid: int
     ready_s: float  # from its start until it was ready
 
-    def jobs(self) -> JobClient:
+    def jobs(self) -> Jobs:
         """A client of its jobs."""
-        return JobClient(f"http://127.0.0.1:{self.http_port}", None)
+        return Jobs(Connection(f"http://127.0.0.1:{self.http_port}"))
 
 
 @contextmanager

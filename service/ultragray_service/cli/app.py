@@ -1,57 +1,44 @@
-"""The command line `ultragray`: serving, rendering, datasets, training, evaluation, export, benchmarks.
-
-Only names and help live here; what a command needs (torch, FastAPI) is imported when it runs, so that
-`--help` is instant.
-"""
+"""The command line `ultragray`. Its commands stand in one table here; each is imported when it is used."""
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
-from typer.core import TyperGroup
 
-import ultragray
-from ultragray.errors import InvalidArgument, UltragrayError
-from ultragray.installation import missing_extra
-from ultragray.interchange.exports.formats import DTYPES, FORMATS
-from ultragray.samplers import Sampler
-from ultragray.settings import FrameSettings
+from .group import Entry, LazyGroup
+from .style import examples
 
-from ..settings import ENVIRONMENT_PREFIX, Settings
-from . import convert as cli_convert
-from . import dataset as cli_dataset
-from . import eval as cli_eval
-from . import report as cli_report
-from . import train as cli_train
-from . import worker as cli_worker
-from .administration import audit as cli_audit
-from .administration import backup as cli_backup
-from .administration import keys as cli_keys
-from .administration import workers as cli_workers
-from .jobs import commands as cli_jobs
-from .options import FieldsOf, with_options
-
-USER_ERROR = 2  # the exit code of a mistake that the caller can mend
+_SERVING, _SCENES, _SWEEPS = "Serve", "Scenes and frames", "Sweeps and training"
+_REMOTE, _INSTALLATION = "A running service (--address)", "An installation's folders"
 
 
-class _Commands(TyperGroup):
-    """A group that turns the errors of the project and of the file system into one red line and exit code 2."""
-
-    def invoke(self, context: Any) -> Any:
-        try:
-            return super().invoke(context)
-        except BrokenPipeError:  # `ultragray info scene.ugr | head`: nobody is left to tell
-            raise
-        except UltragrayError as error:
-            message = error.detail
-        except ModuleNotFoundError as error:
-            message = missing_extra(error, "this command").detail
-        except OSError as error:
-            message = f"{error.filename}: {error.strerror}" if error.filename and error.strerror else str(error)
-        typer.secho(f"error: {message}", fg=typer.colors.RED, err=True)
-        raise typer.Exit(USER_ERROR)
+class _Commands(LazyGroup):
+    entries = (
+        Entry("serve", "serve", _SERVING, "Serve scenes over HTTP and gRPC, until Ctrl-C or SIGTERM."),
+        Entry("worker", "worker", _SERVING, "Take jobs from the queue, one at a time, until Ctrl-C."),
+        Entry("demo", "scenes.demo", _SCENES, "Write the built-in demo scene."),
+        Entry("show", "scenes.show", _SCENES, "Print what a scene file or a sweep says about itself."),
+        Entry("render", "scenes.render", _SCENES, "Render frames from poses into one file or a folder of PNGs."),
+        Entry("export", "scenes.export", _SCENES, "Write a scene as PLY or as a checkpoint of the released code."),
+        Entry("import", "scenes.importing", _SCENES, "Turn a PLY file or a released checkpoint into a scene file."),
+        Entry("check", "sweeps.check", _SWEEPS, "Tell what is in a sweep, and what looks wrong."),
+        Entry("draw", "sweeps.draw", _SWEEPS, "Draw the image planes in space and a contact sheet of the frames."),
+        Entry("convert", "sweeps.convert", _SWEEPS, "Write a sweep in the layout of the released trainer."),
+        Entry("train", "studies.train", _SWEEPS, "Train a scene from a tracked sweep."),
+        Entry("eval", "studies.eval", _SWEEPS, "Measure a scene on the held-out frames of a sweep."),
+        Entry("compare", "studies.compare", _SWEEPS, "Measure classical compounding on the same held-out frames."),
+        Entry("report", "studies.report", _SWEEPS, "Train, measure and compare; write one HTML page."),
+        Entry("bench", "studies.bench", _SWEEPS, "Measure the kernel and the service on this machine."),
+        Entry("scenes", "remote.scenes", _REMOTE, "List, upload, download, delete and render scenes."),
+        Entry("datasets", "remote.datasets", _REMOTE, "List, upload and delete the sweeps that trainings use."),
+        Entry("jobs", "remote.jobs", _REMOTE, "Submit, watch and fetch trainings, evaluations and batch renderings."),
+        Entry("workers", "administration.workers", _INSTALLATION, "List the workers; pause, drain and resume them."),
+        Entry("keys", "administration.keys", _INSTALLATION, "Make, list and revoke API keys."),
+        Entry("backup", "administration.backup", _INSTALLATION, "Save scenes, datasets, jobs and their database."),
+        Entry("restore", "administration.restore", _INSTALLATION, "Make an installation what it was at a backup."),
+        Entry("audit", "administration.audit", _INSTALLATION, "Print who did what: the audit log."),
+    )
 
 
 app = typer.Typer(
@@ -60,158 +47,35 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
     context_settings={"help_option_names": ["-h", "--help"]},
-    help="Ultrasound from trained 3D Gaussian scenes: a probe pose goes in, a B-mode frame comes out.",
+    help="Ultrasound from trained 3D Gaussian scenes: a probe pose goes in, a B-mode frame comes out.\n\n"
+    "Lengths are in mm, angles in degrees; poses are rigid probe→scene transforms.",
+    epilog=examples(
+        "ultragray serve  # the console at http://127.0.0.1:8000, with a demo scene",
+        "ultragray demo -o demo.ugr && ultragray render demo.ugr -o frames/",
+        "ultragray check sweep/ && ultragray train sweep/ -o liver.ugr",
+    ),
 )
-
-Scene = Annotated[Path, typer.Argument(help="Scene file (.ugr).", show_default=False)]
 
 
 def _print_version(wanted: bool) -> None:
     if wanted:
-        typer.echo(f"ultragray {ultragray.__version__}")
+        from ultragray.installation import __version__
+
+        typer.echo(f"ultragray {__version__}")
         raise typer.Exit
 
 
 @app.callback()
 def main(
+    context: typer.Context,
     version: Annotated[
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
     ] = False,
 ) -> None:
-    """Lengths are in mm, angles in degrees; poses are rigid probe→scene transforms."""
+    """Look for environment variables that are misspelt, whatever the command; a service logs them itself."""
+    from ..environment import unknown_variables
+    from .style import warn
 
-
-@app.command(epilog="Every other setting has an environment variable: see docs/interfaces.md.")
-@with_options
-def serve(
-    scenes: Annotated[
-        list[Path] | None,
-        typer.Argument(help="Scene files to serve alone, without those of a data folder.", show_default=False),
-    ] = None,
-    *,
-    options: Annotated[
-        dict[str, Any],
-        FieldsOf(
-            Settings,
-            *("data_folder", "artifact_folder", "host", "insecure", "http_port", "grpc_port", "igtl_port"),
-            *("tls_certificate", "tls_key", "tls_client_ca"),
-            *("processes", "threads_per_process", "backend", "log_level"),
-            environment=ENVIRONMENT_PREFIX,
-        ),
-    ],
-) -> None:
-    """Serve scenes over HTTP and gRPC, in the foreground, until Ctrl-C or SIGTERM."""
-    from .serve import serve_scenes
-
-    serve_scenes(scenes or [], options)
-
-
-@app.command()
-@with_options
-def render(
-    scene: Scene,
-    output: Annotated[
-        Path,
-        typer.Option(
-            "--output",
-            "-o",
-            help=f"A file ({', '.join(one.suffix for one in FORMATS.values())}), or a folder for PNGs "
-            "(frame_00000_bmode.png).",
-        ),
-    ],
-    sampler: Sampler | None,
-    settings: FrameSettings,
-    poses: Annotated[
-        Path | None,
-        typer.Option(
-            help="Poses in mm: .npy or .json, [P, 4, 4] or [P, 3, 4].",
-            show_default="the scene's training poses",
-        ),
-    ] = None,
-    dtype: Annotated[
-        str | None, typer.Option(help=f"{' or '.join(DTYPES)}, of a file.", show_default="the format's own")
-    ] = None,
-    backend: Annotated[str, typer.Option(help="auto, cpu, cuda or reference.")] = "auto",
-    threads: Annotated[int, typer.Option(min=0, help="Render threads; 0: all cores.")] = 0,
-) -> None:
-    """Render frames from poses into one file or a folder of PNGs."""
-    from .render import render_frames
-
-    typer.echo(render_frames(scene, output, poses, sampler, settings, dtype=dtype, backend=backend, threads=threads))
-
-
-@app.command()
-def info(
-    scene: Scene,
-    json: Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")] = False,
-) -> None:
-    """Print what a scene file says about itself."""
-    from .info import print_json, print_table
-
-    (print_json if json else print_table)(scene)
-
-
-app.add_typer(cli_dataset.dataset_app, name="dataset")
-app.add_typer(cli_jobs.jobs_app, name="jobs")
-app.add_typer(cli_workers.workers_app, name="workers")
-app.add_typer(cli_keys.keys_app, name="keys")
-app.command()(cli_train.train)
-app.command("eval")(cli_eval.evaluate)
-app.command()(cli_eval.compound)
-app.command()(cli_report.report)
-app.command()(cli_convert.export)
-app.command()(cli_convert.import_ply)
-app.command()(cli_convert.import_checkpoint)
-app.command()(cli_worker.worker)
-app.command()(cli_audit.audit)
-app.command()(cli_backup.backup)
-app.command()(cli_backup.restore)
-
-
-@app.command()
-def demo(
-    output: Annotated[Path, typer.Option("--output", "-o", help="Scene file to write (.ugr).")] = Path("demo.ugr"),
-) -> None:
-    """Write the built-in demo scene."""
-    from ultragray.demo import copy_demo_scene
-    from ultragray.scene_info import read_header
-
-    from .output import SCENE_SUFFIX, check_writable
-
-    check_writable(output, SCENE_SUFFIX)
-    copy_demo_scene(output)
-    info = read_header(output).info
-    typer.echo(f"wrote {output}: {info.dataset_name}, {info.gaussian_count:,} Gaussians")
-
-
-@app.command()
-def bench(
-    output: Annotated[
-        Path | None,
-        typer.Option("--output", "-o", help="Also write the figures as JSON.", show_default=False),
-    ] = None,
-    quick: Annotated[bool, typer.Option("--quick", help="Fewer repetitions: a minute instead of several.")] = False,
-    train: Annotated[bool, typer.Option("--train", help="Measure a training step and its parts instead.")] = False,
-    jobs: Annotated[
-        bool, typer.Option("--jobs", help="Measure a long list of jobs, and frames beside a training, instead.")
-    ] = False,
-    clients: Annotated[
-        bool, typer.Option("--clients", help="Measure what control loops, pages and scripts get instead.")
-    ] = False,
-    kernel_details: Annotated[
-        bool,
-        typer.Option("--kernel-details", help="Measure the parts of a frame in the kernel, and its work, instead."),
-    ] = False,
-    backend: Annotated[str, typer.Option(help="cpu, or cuda: the first GPU.")] = "cpu",
-) -> None:
-    """Measure the kernel and the service on this machine and print a table."""
-    from ..bench.command import chosen_bench
-    from .output import check_writable
-
-    if output is not None:
-        check_writable(output)
-    wanted = {"train": train, "jobs": jobs, "clients": clients, "kernel-details": kernel_details}
-    chosen = [name for name, is_wanted in wanted.items() if is_wanted]
-    if len(chosen) > 1:
-        raise InvalidArgument("give one of --train, --jobs, --clients and --kernel-details", field=chosen[0])
-    chosen_bench(chosen[0] if chosen else "frames", backend)(output, quick)
+    if context.invoked_subcommand != "serve":
+        for sentence in unknown_variables():
+            warn(sentence)

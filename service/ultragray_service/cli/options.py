@@ -92,7 +92,10 @@ def with_parameters(command: Callable[..., Any], parameters: list[inspect.Parame
 
 
 def parameters_of(cls: Any, name: str = "") -> list[inspect.Parameter]:
-    """The options of a contract dataclass, or of a family under a name. The first required field is an argument."""
+    """The options of a contract dataclass, or of a family under a name, each in the panel of its topic.
+
+    The first required field is an argument.
+    """
     if issubclass(cls, _WITH_AN_OPTION_A_FIELD):
         return [*_family_parameters(cls, name)]
     argument = next((item for item, _ in _fields(cls) if _is_required(item)), None)
@@ -101,9 +104,9 @@ def parameters_of(cls: Any, name: str = "") -> list[inspect.Parameter]:
         if _is_within(kind):
             found += parameters_of(kind, item.name)
         elif item is argument:
-            found.insert(0, _parameter(item, kind, is_argument=True))
+            found.insert(0, _parameter(item, kind, topic=None, is_argument=True))
         else:
-            found.append(_parameter(item, kind))
+            found.append(_parameter(item, kind, topic=cls.__topic__))
     return found
 
 
@@ -148,18 +151,22 @@ def _is_within(kind: Any) -> bool:
 
 def _family_parameters(family: Any, name: str) -> Iterator[inspect.Parameter]:
     help = f"One of {', '.join(family.members)}; each takes its own options only."
-    yield keyword(name, Annotated[str | None, typer.Option(_flag(name), help=help, show_default=False)], None)
+    option = typer.Option(_flag(name), help=help, show_default=False, rich_help_panel=family.__topic__)
+    yield keyword(name, Annotated[str | None, option], None)
     members = {kind: {item.name: (item, of) for item, of in _fields(cls)} for kind, cls in family.members.items()}
     for option in dict.fromkeys(option for taken in members.values() for option in taken):
         takers = [kind for kind, taken in members.items() if option in taken]
         item, kind = members[takers[0]][option]
-        yield _parameter(item, kind, takers=takers)
+        yield _parameter(item, kind, topic=family.__topic__, takers=takers)
 
 
 def _parameter(
-    item: Field[Any], kind: Any, *, is_argument: bool = False, takers: Sequence[str] = ()
+    item: Field[Any], kind: Any, *, topic: str | None, is_argument: bool = False, takers: Sequence[str] = ()
 ) -> inspect.Parameter:
-    """The option of a field; `takers`: the kinds of a family that take it, each in its own right."""
+    """The option of a field, in the panel of its own topic, else of `topic`.
+
+    `takers`: the kinds of a family that take it, each in its own right.
+    """
     meaning = str(item.metadata["description"])
     if takers:
         meaning = f"{', '.join(takers)}: {meaning[:1].lower()}{meaning[1:]}"
@@ -176,7 +183,13 @@ def _parameter(
     parsed: Any = list[str] if is_table else Path if item.name == "poses" else kind if kind in _PARSED else str
     flags = FLAGS.get(item.name, (_flag(f"no_{item.name}" if item.default is True else item.name),))
     shown = not is_switch and _shown_default(item)
-    option = typer.Option(*flags, help=meaning, metavar="NAME=VALUE" if is_table else None, show_default=shown)
+    option = typer.Option(
+        *flags,
+        help=meaning,
+        metavar="NAME=VALUE" if is_table else None,
+        show_default=shown,
+        rich_help_panel=item.metadata.get("topic", topic),
+    )
     if is_switch:
         return keyword(item.name, Annotated[bool, option], False)
     if is_argument:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import typer
 
@@ -14,10 +14,42 @@ from ultragray.errors import InvalidArgument
 from ultragray.scene_info import read_header
 from ultragray_workers.scenes import SUFFIX, SceneStore
 
-from ..server import run
-from ..settings import Settings, load_settings
+from ..settings import ENVIRONMENT_PREFIX, Settings, load_settings
+from .options import FieldsOf, with_options
+from .style import command_group, examples
 
 DEMO_NAME = "demo"
+command_app = command_group()
+
+
+@command_app.command(
+    epilog=examples(
+        "ultragray serve  # the scenes of ./data; the demo scene where there are none",
+        "ultragray serve liver.ugr spine.ugr --http-port 8080",
+        "ULTRAGRAY_API_KEYS=$(openssl rand -hex 16) ultragray serve --host 0.0.0.0",
+        "Every other setting has an environment variable: ULTRAGRAY_ and its name.",
+    )
+)
+@with_options
+def serve(
+    scenes: Annotated[
+        list[Path] | None,
+        typer.Argument(help="Scene files to serve alone, without those of a data folder.", show_default=False),
+    ] = None,
+    *,
+    options: Annotated[
+        dict[str, Any],
+        FieldsOf(
+            Settings,
+            *("data_folder", "artifact_folder", "host", "insecure", "http_port", "grpc_port", "igtl_port"),
+            *("tls_certificate", "tls_key", "tls_client_ca"),
+            *("processes", "threads_per_process", "backend", "log_format", "log_level"),
+            environment=ENVIRONMENT_PREFIX,
+        ),
+    ],
+) -> None:
+    """It runs in the foreground until Ctrl-C or SIGTERM, and then ends what it has begun."""
+    serve_scenes(scenes or [], options)
 
 
 def serve_scenes(scenes: Iterable[Path], options: Mapping[str, Any]) -> None:
@@ -34,7 +66,7 @@ def serve_scenes(scenes: Iterable[Path], options: Mapping[str, Any]) -> None:
         if settings.data_folder == Settings().data_folder:
             settings.data_folder.mkdir(exist_ok=True)  # any other folder must exist: its name may be mistyped
         ensure_scenes(settings.data_folder)
-        run(settings)
+        _run(settings)
         return
     if "data_folder" in options:
         raise InvalidArgument("scenes and --data-folder cannot be given together", field="data_folder")
@@ -48,7 +80,13 @@ def serve_scenes(scenes: Iterable[Path], options: Mapping[str, Any]) -> None:
                     field="artifact_folder",
                 )
             typer.echo("Datasets and jobs end with this service; --artifact-folder keeps them", err=True)
-        run(settings)
+        _run(settings)
+
+
+def _run(settings: Settings) -> None:
+    from ..server import run  # imports all that a service needs, which takes long: mistakes are told before
+
+    run(settings)
 
 
 def ensure_scenes(folder: Path) -> None:

@@ -17,8 +17,17 @@ from ultragray_workers.parent import end_with_parent
 from ..service_manager import ALIVE, READY, ServiceManager
 from ..settings import ENVIRONMENT_PREFIX, Settings, load_settings
 from .options import FieldsOf, with_options
+from .style import command_group, examples
+
+command_app = command_group()
 
 
+@command_app.command(
+    epilog=examples(
+        "ultragray worker --artifact-folder /srv/ultragray/artifacts",
+        "ultragray worker --device cuda:1 --name gpu-1",
+    )
+)
 @with_options
 def worker(
     name: Annotated[
@@ -30,14 +39,14 @@ def worker(
         dict[str, Any],
         FieldsOf(
             Settings,
-            *("data_folder", "artifact_folder", "database_url", "training_threads"),
+            *("data_folder", "artifact_folder", "database_url", "training_threads", "log_format", "log_level"),
             environment=ENVIRONMENT_PREFIX,
         ),
     ],
 ) -> None:
-    """Train and render in the background: take jobs from the queue, one at a time, until Ctrl-C.
+    """A job at hand is put back with a checkpoint when the worker stops.
 
-    What is not given here comes from the settings (ULTRAGRAY_…). A job at hand is put back with a checkpoint.
+    What is not given here comes from the settings (ULTRAGRAY_…).
     """
     run_worker(options, name=name, device=device)
 
@@ -55,7 +64,7 @@ def run_worker(overrides: dict[str, Any], *, name: str | None = None, device: st
     from ..telemetry.tracing import start_tracing
 
     settings = load_settings(**overrides)
-    configure_logging(settings.log_level)
+    configure_logging(settings.log_level, settings.log_format)
     if not settings.artifacts.is_dir() and not settings.data_folder.is_dir():
         raise StartupFailed(
             f"artifact_folder must be an existing folder, got {str(settings.artifacts)!r}", field="artifact_folder"

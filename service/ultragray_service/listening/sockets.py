@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import logging
 import resource
 import socket
@@ -25,13 +26,29 @@ def listen(host: str, port: int, what: str, field: str) -> socket.socket:
     except OSError as error:
         listener.close()
         raise StartupFailed(
-            f"{what} cannot listen on {authority(host, port)}: {error.strerror}; "
-            f"set {ENVIRONMENT_PREFIX}{field.upper()} to another port",
-            field=field,
+            f"{what} cannot listen on {authority(host, port)}: {_remedy(error, field)}", field=field
         ) from error
     listener.listen(_BACKLOG)
     listener.setblocking(False)
     return listener
+
+
+def check_port_is_free(host: str, port: int, what: str, field: str) -> None:
+    """Raise StartupFailed as `listen` does, for a server that opens its socket itself and says less."""
+    if port:
+        listen(host, port, what, field).close()
+
+
+def _remedy(error: OSError, field: str) -> str:
+    """Why a port cannot be had, and what to give instead."""
+    if error.errno == errno.EADDRINUSE:
+        return f"the port is in use; give another one with {_named(field)}"
+    reason = (error.strerror or str(error)).lower()
+    return f"{reason}; give another address with {_named('host')}, or another port with {_named(field)}"
+
+
+def _named(field: str) -> str:
+    return f"--{field.replace('_', '-')} or {ENVIRONMENT_PREFIX}{field.upper()}"
 
 
 def authority(host: str, port: int) -> str:

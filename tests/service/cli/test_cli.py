@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import re
 import shutil
 import signal
@@ -17,6 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+import typer
 
 import ultragray
 from ultragray import GaussianScene, LinearProbe
@@ -31,22 +33,24 @@ from ultragray_workers.jobs.store import SCENES_FOLDER
 from ...waiting import at_this_load
 from .command_line import python, refused, run
 
-COMMANDS = (
-    "serve",
-    "render",
-    "info",
-    "dataset",
-    "jobs",
-    "train",
-    "eval",
-    "compound",
-    "report",
-    "export",
-    "import-ply",
-    "import-checkpoint",
-    "demo",
-    "bench",
-)
+SILENT = ("serve", "worker")  # they tell in a log
+
+
+def all_commands() -> dict[str, Any]:
+    """Every command that does something itself, by its words."""
+    waiting = list(typer.main.get_command(app).commands.items())  # type: ignore[attr-defined]
+    found = {}
+    while waiting:
+        name, command = waiting.pop(0)
+        if hasattr(command, "commands"):
+            waiting += [(f"{name} {word}", inner) for word, inner in command.commands.items()]
+        else:
+            found[name] = command
+    return found
+
+
+COMMANDS = all_commands()
+FIRST_WORDS = tuple(dict.fromkeys(name.split()[0] for name in COMMANDS))
 
 
 def test_help_is_instant_it_imports_nothing_heavy() -> None:
@@ -55,16 +59,51 @@ def test_help_is_instant_it_imports_nothing_heavy() -> None:
         "print(sorted({'torch', 'fastapi', 'grpc', 'cv2', 'uvicorn'} & set(sys.modules)))"
     )
     answer = subprocess.run(python(program, "--help"), capture_output=True, text=True, check=True)
-    for command in COMMANDS:
+    for command in FIRST_WORDS:
         assert re.search(rf"\b{command}\b", answer.stdout)
     assert answer.stdout.splitlines()[-1] == "[]"
 
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_explains_itself(command: str) -> None:
-    result = run(command, "--help")
+    result = run(*command.split(), "--help")
     assert result.exit_code == 0
-    assert "Usage" in result.output
+    assert f"Usage: root {command}" in result.output
+    assert "Examples" in result.output
+    lines = re.findall(r"^ (?:\w+=\S+ )?ultragray ([a-z].*)$", result.output, re.MULTILINE)
+    assert any(line.startswith(command) for line in lines), "an example is of another command"
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_that_tells_something_tells_it_to_programs_too(command: str) -> None:
+    options = {name: parameter for parameter in COMMANDS[command].params for name in parameter.opts}
+    assert ("--json" in options) is (command not in SILENT)
+    if "--output" in options:
+        assert "--force" in options
+    for name, option in options.items():
+        if name.startswith("--") and name not in ("--help",):
+            assert str(option.help)[-1] in ".)]", f"{command} {name}: {option.help}"
+
+
+def test_lists_of_commands_load_none_of_them() -> None:
+    program = (
+        "from ultragray_service.cli.app import app; app(standalone_mode=False); "
+        "print(sorted(name for name in sys.modules if name in ('numpy', 'pydantic', 'ultragray.errors')))"
+    )
+    answer = subprocess.run(python(program, "--help"), capture_output=True, text=True, check=True)
+    assert answer.stdout.splitlines()[-1] == "[]"
+
+
+def test_completion_knows_commands_and_options() -> None:
+    def completed(words: str) -> str:
+        environment = {**os.environ, "_ULTRAGRAY_COMPLETE": "complete_bash", "COMP_WORDS": words}
+        environment["COMP_CWORD"] = str(len(words.split(" ")) - 1)
+        program = "from ultragray_service.cli.app import app; app(prog_name='ultragray')"
+        return subprocess.run(python(program), env=environment, capture_output=True, text=True, check=False).stdout
+
+    assert completed("ultragray re").split() == ["render", "report", "restore"]
+    assert completed("ultragray scenes do").split() == ["download"]
+    assert "--outputs" in completed("ultragray render --out").split()
 
 
 def test_version() -> None:
@@ -72,8 +111,6 @@ def test_version() -> None:
 
 
 def test_the_defaults_that_serve_names_are_those_of_the_settings() -> None:
-    import typer
-
     options = {p.name: p for p in typer.main.get_command(app).commands["serve"].params}  # type: ignore[attr-defined]
     for name, option in options.items():
         field = "threads_per_process" if name == "threads" else name
@@ -87,12 +124,12 @@ def test_the_defaults_that_serve_names_are_those_of_the_settings() -> None:
 def test_a_bad_scene_file_is_named(tmp_path: Path) -> None:
     path = tmp_path / "bad.ugr"
     path.write_bytes(b"nonsense that is long enough")
-    for command in (["info", path], ["render", path, "-o", tmp_path / "f.npz"], ["serve", path]):
+    for command in (["show", path], ["render", path, "-o", tmp_path / "f.npz"], ["serve", path]):
         assert "bad.ugr: not a scene file" in refused(*command)
 
 
-def test_info_tells_what_the_file_says(scene_file: Path) -> None:
-    result = run("info", scene_file, "--json")
+def test_show_tells_what_the_file_says(scene_file: Path) -> None:
+    result = run("show", scene_file, "--json")
     assert result.exit_code == 0
     document = json.loads(result.output)
     assert document["sha256"] == file_sha256(scene_file)
@@ -100,7 +137,7 @@ def test_info_tells_what_the_file_says(scene_file: Path) -> None:
     assert document["probe"] == {"kind": "linear", "width_mm": 30.0, "near_mm": 0.0, "far_mm": 40.0}
     assert document["centre_mm"] == [1.0, 2.0, 3.0]
     assert document["training_poses"]["count"] == 5
-    table = run("info", scene_file).output
+    table = run("show", scene_file).output
     for expected in (file_sha256(scene_file), "gaussian_count", "60", "width_mm=30"):
         assert expected in table
 
@@ -120,23 +157,24 @@ def released(tmp_path: Path, random_scene: Callable[..., GaussianScene], random_
     return tmp_path
 
 
-def test_import_checkpoint_writes_a_scene(released: Path) -> None:
+def test_import_of_a_checkpoint_writes_a_scene(released: Path) -> None:
     output = released / "scene.ugr"
-    common = ("import-checkpoint", released / "ckpt.pt", "--config", released / "conf.json", "-o", output)
+    common = ("import", released / "ckpt.pt", "--config", released / "conf.json", "-o", output)
     result = run(*common, "--poses", released / "poses_train.npy")
     assert result.exit_code == 0, result.output
     scene = GaussianScene.load(output)
     assert scene.info.probe == LinearProbe(width_mm=30.0, near_mm=0.0, far_mm=45.0)
     assert len(scene.training_poses) == 4
-    assert run(*common, "--center", "-1", "2.5", "-3e2").exit_code == 0
+    assert f"{output} exists: --force replaces it" in refused(*common, "--centered")
+    assert run(*common, "--force", "--center", "-1", "2.5", "-3e2").exit_code == 0
     assert GaussianScene.load(output).info.centre_mm == (-1.0, 2.5, -300.0)
-    assert run(*common, "--centered", "--image-height", 5).exit_code == 0
+    assert run(*common, "--force", "--centered", "--image-height", 5).exit_code == 0
     assert GaussianScene.load(output).info.image_height == 5
 
 
-def test_import_checkpoint_says_what_it_needs(released: Path) -> None:
+def test_import_of_a_checkpoint_says_what_it_needs(released: Path) -> None:
     output = released / "scene.ugr"
-    common = ("import-checkpoint", released / "ckpt.pt", "--config", released / "conf.json", "-o", output)
+    common = ("import", released / "ckpt.pt", "--config", released / "conf.json", "-o", output)
     for extra in ([], ["--centered", "--center", 0, 0, 0]):
         message = refused(*common, *extra)
         assert all(option in message for option in ("--poses", "--center X Y Z", "--centered"))

@@ -87,16 +87,16 @@ def test_eval_writes_pictures(dataset: Path, scene: Path, tmp_path: Path) -> Non
 
 def test_compound_prints_what_the_library_measures(dataset: Path) -> None:
     expected = evaluate_baselines(read_released(dataset), voxel_mm=0.7)
-    document = printed_json("compound", dataset, "--json", "--voxel-mm", 0.7)
+    document = printed_json("compare", dataset, "--json", "--voxel-mm", 0.7)
     assert document["voxel_mm"] == 0.7
     assert document["methods"] == {name: evaluation.to_dict() for name, evaluation in expected.items()}
-    table = run("compound", dataset, "--voxel-mm", 0.7).stdout
+    table = run("compare", dataset, "--voxel-mm", 0.7).stdout
     for name, evaluation in expected.items():
         assert re.search(rf"{name} +{evaluation.mean.psnr_db:.2f} ± ", table)
 
 
 def test_compound_by_one_method(dataset: Path) -> None:
-    document = printed_json("compound", dataset, "--json", "--method", "maximum")
+    document = printed_json("compare", dataset, "--json", "--method", "maximum")
     assert list(document["methods"]) == ["maximum"]
     assert document["voxel_mm"] == 0.5
 
@@ -167,8 +167,8 @@ def test_mistakes(dataset: Path, scene: Path, tmp_path: Path) -> None:
     assert "file is a file" in refused("eval", scene, dataset, "-o", tmp_path / "file")
     assert f"new or empty folder, {tmp_path} holds files" in refused("eval", scene, dataset, "-o", tmp_path)
     assert "no such file" in refused("eval", tmp_path / "none.ugr", dataset)
-    assert "no such file or folder" in refused("compound", tmp_path / "none")
-    assert "voxel_mm must be" in refused("compound", dataset, "--voxel-mm", 0.001)
+    assert "no such file or folder" in refused("compare", tmp_path / "none")
+    assert "voxel_mm must be" in refused("compare", dataset, "--voxel-mm", 0.001)
     assert "is a folder" in refused("report", dataset, "-o", tmp_path)
     assert "must end in .html, got 'page.pdf'" in refused("report", dataset, "-o", tmp_path / "page.pdf")
     assert "preset must be" in refused("report", dataset, "-o", tmp_path / "page.html", "--preset", "slow")
@@ -213,7 +213,7 @@ def test_a_dataset_without_held_out_frames_is_refused(dataset: Path, scene: Path
     write_released(Dataset("alone", sweep, sweep.select([])), tmp_path / "alone")
     for arguments in (
         ("eval", scene, tmp_path / "alone"),
-        ("compound", tmp_path / "alone"),
+        ("compare", tmp_path / "alone"),
         ("report", tmp_path / "alone", "-o", tmp_path / "page.html"),
     ):
         assert "no frames to measure with" in refused(*arguments)

@@ -22,7 +22,7 @@ from ultragray import LinearProbe
 from ultragray.datasets import Dataset, Sweep
 from ultragray.datasets.released import write_released
 from ultragray_service.cli.app import app
-from ultragray_service.cli.jobs.watch import JOB_CANCELLED, JOB_FAILED
+from ultragray_service.cli.remote.watch import JOB_CANCELLED, JOB_FAILED
 
 from ..conftest import ROOT, SOURCE_FOLDERS, RunningService, StartService
 
@@ -31,7 +31,7 @@ KEY = "0123456789abcdef-jobs"
 
 
 def run(server: RunningService, *arguments: object, key: str = KEY) -> Result:
-    environment = {"ULTRAGRAY_SERVER": server.http, "ULTRAGRAY_API_KEY": key}
+    environment = {"ULTRAGRAY_ADDRESS": server.http, "ULTRAGRAY_API_KEY": key}
     return CliRunner().invoke(app, ["jobs", *map(str, arguments)], env=environment)
 
 
@@ -156,8 +156,8 @@ def test_a_cancelled_job_has_its_own_exit_code_and_can_be_retried(server: Runnin
     ("arguments", "told"),
     [
         (("watch", "0" * 24), "there is no job"),
-        (("list", "--server", "localhost:8000"), "--server must be a URL"),
-        (("list", "--server", "http://127.0.0.1:9"), "no service answers at http://127.0.0.1:9"),
+        (("list", "--address", "localhost:8000"), "--address must be a URL"),
+        (("list", "--address", "http://127.0.0.1:9"), "no service answers at http://127.0.0.1:9"),
         (("list", "--api-key", "x" * 16), "API key"),
         (("submit", "render", "demo", "--count", "3"), "--count is of a sampler: name it with --sampler"),
         (("submit", "render", "demo", "--sampler", "fan", "--count", "3"), "kind fan takes tilt_deg, step_deg"),
@@ -179,7 +179,7 @@ def test_mistakes_give_one_line(server: RunningService, arguments: tuple[str, ..
 def test_submitting_needs_no_torch() -> None:
     program = (
         "import sys; from typer.testing import CliRunner; from ultragray_service.cli.app import app\n"
-        "arguments = 'jobs submit train tiny --scene new --set steps=3 --server http://127.0.0.1:9'\n"
+        "arguments = 'jobs submit train tiny --scene new --set steps=3 --address http://127.0.0.1:9'\n"
         "print(CliRunner().invoke(app, arguments.split()).exit_code, 'torch' in sys.modules)"
     )
     path = os.pathsep.join(str(ROOT / folder) for folder in SOURCE_FOLDERS)
@@ -195,7 +195,7 @@ def test_a_watch_outlives_a_restart_of_the_service(start_service: StartService, 
     path = os.pathsep.join(str(ROOT / folder) for folder in SOURCE_FOLDERS)
     watching = subprocess.Popen(
         [sys.executable, "-c", "from ultragray_service.cli.app import app; app()", "jobs", "watch", job],
-        env={**os.environ, "PYTHONPATH": path, "ULTRAGRAY_SERVER": first.http, "ULTRAGRAY_API_KEY": KEY},
+        env={**os.environ, "PYTHONPATH": path, "ULTRAGRAY_ADDRESS": first.http, "ULTRAGRAY_API_KEY": KEY},
         stderr=subprocess.PIPE,
         text=True,
     )

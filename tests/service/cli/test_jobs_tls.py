@@ -8,7 +8,8 @@ import pytest
 import trustme
 from typer.testing import CliRunner, Result
 
-from ultragray_service.cli.app import USER_ERROR, app
+from ultragray_service.cli.app import app
+from ultragray_service.cli.group import USER_ERROR
 from ultragray_service.tls.client import exposes_key
 
 from ...certificates import Mounted, write_client
@@ -24,7 +25,7 @@ def mounted(tmp_path_factory: pytest.TempPathFactory) -> Mounted:
 
 def listed(server: str, **environment: object) -> Result:
     variables = {f"ULTRAGRAY_{name.upper()}": str(value) for name, value in environment.items()}
-    return CliRunner().invoke(app, ["jobs", "list", "--server", server], env=variables)
+    return CliRunner().invoke(app, ["jobs", "list", "--address", server], env=variables)
 
 
 def refusal(server: str, **environment: object) -> str:

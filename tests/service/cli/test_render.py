@@ -130,7 +130,7 @@ def test_render_tells_and_stores_how_far_frames_extrapolate(
 
 def test_render_keeps_to_a_least_confidence(knowing_file: Path, scene_file: Path, tmp_path: Path) -> None:
     scene = GaussianScene.load(knowing_file)
-    arguments = ("render", knowing_file, "-o", tmp_path / "f.npz", "--min-confidence", 0.5)
+    arguments = ("render", knowing_file, "-o", tmp_path / "f.npz", "--force", "--min-confidence", 0.5)
     assert run(*arguments, "--sampler", "around", "--count", 30, "--translation-mm", 8).exit_code == 0
     with np.load(tmp_path / "f.npz") as frames:
         assert frames["confidence"].shape == (30,)
@@ -145,7 +145,7 @@ def test_render_keeps_to_a_least_confidence(knowing_file: Path, scene_file: Path
     with np.load(tmp_path / "f.npz") as frames:
         np.testing.assert_array_equal(frames["poses"], poses[[0, 1, 2, 4]])
     told = figure_arrays(Assessor(scene.info, scene.training_poses).assess(scene.training_poses))["confidence"]
-    some = run("render", knowing_file, "-o", tmp_path / "f.npz", "--min-confidence", np.median(told))
+    some = run("render", knowing_file, "-o", tmp_path / "f.npz", "--force", "--min-confidence", np.median(told))
     assert "wrote" in some.output
     with np.load(tmp_path / "f.npz") as frames:
         np.testing.assert_array_equal(frames["poses"], scene.training_poses[told >= np.median(told)])
@@ -153,11 +153,11 @@ def test_render_keeps_to_a_least_confidence(knowing_file: Path, scene_file: Path
 
 
 def test_info_tells_how_well_a_scene_knows_its_confidence(knowing_file: Path, scene_file: Path) -> None:
-    document = json.loads(run("info", knowing_file, "--json").output)
+    document = json.loads(run("show", knowing_file, "--json").output)
     assert (document["confidence"]["error"], document["confidence"]["fitted_on"]) == (0.04, 20)
     assert "hardness" not in document["confidence"]
-    assert "error=0.04" in run("info", knowing_file).output
-    assert json.loads(run("info", scene_file, "--json").output)["confidence"] == {}
+    assert "error=0.04" in run("show", knowing_file).output
+    assert json.loads(run("show", scene_file, "--json").output)["confidence"] == {}
 
 
 def test_render_samples_poses_into_the_format_of_the_name(scene_file: Path, pose_file: Path, tmp_path: Path) -> None:
@@ -216,10 +216,10 @@ def test_labels_are_written_as_they_are(labelled_file: Path, tmp_path: Path) -> 
 
 
 def test_info_tells_of_labels_and_a_phased_probe(labelled_file: Path) -> None:
-    document = json.loads(run("info", labelled_file, "--json").output)
+    document = json.loads(run("show", labelled_file, "--json").output)
     assert document["label_names"] == {"1": "bone", "2": "fat"}
     assert document["probe"] == {"kind": "phased", "opening_angle_deg": 90.0, "far_mm": 50.0}
-    assert "1=bone" in run("info", labelled_file).output
+    assert "1=bone" in run("show", labelled_file).output
 
 
 def test_threads_and_backend_are_used(scene_file: Path, tmp_path: Path) -> None:
@@ -247,7 +247,11 @@ def test_threads_and_backend_are_used(scene_file: Path, tmp_path: Path) -> None:
         (["--gain-db", 1000], "gain_db must be a finite number from -100 to 100"),
         (["--below-min-confidence", "hide"], "below_min_confidence must be one of refuse, mask"),
         (["--scan-convert", 0.0, "--probe", CONVEX_JSON], "pixel_mm must be a finite number from"),
-        (["-o", "frames.png"], "ends in .npz, .tar, .zarr.zip, .h5, .dcm, .igs.mha, or a folder"),
+        (["-o", "frames.png"], "end in .npz, .tar, .zarr.zip, .h5, .dcm or .igs.mha, or be a folder for PNGs"),
+        (["-o", "frames.foo"], "or be a folder for PNGs (a name without an ending), got 'frames.foo'"),
+        (["-o", "frames.hdf5"], "got 'frames.hdf5'; did you mean .h5?"),
+        (["-o", "frames.mha"], "got 'frames.mha'; did you mean .igs.mha?"),
+        (["-o", "frames.zarr"], "got 'frames.zarr'; did you mean .zarr.zip?"),
         (["-o", "frames.dcm", "--outputs", "echo"], "bmode alone in format dicom"),
         (["-o", "frames.tar", "--dtype", "int8"], "dtype must be one of"),
         (["--dtype", "uint8"], "--dtype must be left out for PNGs"),
@@ -265,6 +269,30 @@ def test_mistakes_of_render_are_named(
     output = [] if "-o" in arguments else ["-o", "pictures"]
     assert message in refused("render", scene_file, *output, *arguments)
     assert sorted(tmp_path.iterdir()) == before
+
+
+def test_what_is_there_is_replaced_only_with_force(scene_file: Path, tmp_path: Path) -> None:
+    file, folder = tmp_path / "f.npz", tmp_path / "pictures"
+    file.write_text("mine")
+    folder.mkdir()
+    (folder / "notes.txt").write_text("mine")
+    small = ("render", scene_file, "--height", 8, "--width", 8, "-o")
+    assert f"{file} exists: --force replaces it" in refused(*small, file)
+    assert f"{folder} holds files: --force writes among them" in refused(*small, folder)
+    assert file.read_text() == "mine"
+    assert [path.name for path in folder.iterdir()] == ["notes.txt"]
+    assert run(*small, file, "--force").exit_code == run(*small, folder, "--force").exit_code == 0
+    assert np.load(file)["bmode"].shape == (5, 8, 8)
+    assert (folder / "frame_00000_bmode.png").exists()
+    assert (folder / "notes.txt").exists()
+
+
+def test_a_sentence_for_people_is_a_document_for_programs(scene_file: Path, tmp_path: Path) -> None:
+    output = tmp_path / "f.npz"
+    result = run("render", scene_file, "-o", output, "--json", "--height", 8, "--width", 8)
+    document = json.loads(result.stdout)
+    assert (document["output"], document["frames"], document["height"]) == (str(output), 5, 8)
+    assert document["confidence_min"] is None
 
 
 def test_a_scene_that_knows_no_probe_or_poses_asks_for_them(

@@ -211,7 +211,8 @@ def test_the_best_effort_is_tried_out_first(dataset: Path, tmp_path: Path) -> No
     assert result.exit_code == 0, result.output
     assert result.stderr.splitlines()[0].startswith("trying effort 1 on a part of the frames: step 1 of 6")
     assert any(line.startswith("step 6 of 6") for line in result.stderr.splitlines())
-    assert result.stderr.splitlines()[-1].startswith("fitting the confidence: step 6 of 6")
+    assert result.stderr.splitlines()[-2].startswith("fitting the confidence: step 6 of 6")
+    assert result.stderr.splitlines()[-1] == "fitting the confidence: measuring what was reached …"
     effort = GaussianScene.load(output).info.training["effort"]
     assert f"chose effort {effort:g}, wrote {output}" in result.output
 

@@ -264,7 +264,9 @@ def test_without_a_port_it_is_off(service: RunningService) -> None:
 def test_a_port_in_use_stops_the_start(start_service: StartService, igtl_service: RunningService) -> None:
     service = start_service(wait=False, igtl_port=address_of(igtl_service).rpartition(":")[2])
     assert service.process.wait(60) != 0
-    assert "ULTRAGRAY_IGTL_PORT to another port" in service.log_path.read_text()
+    assert (
+        "the port is in use; give another one with --igtl-port or ULTRAGRAY_IGTL_PORT" in service.log_path.read_text()
+    )
 
 
 class SlowPeer:

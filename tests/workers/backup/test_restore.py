@@ -34,7 +34,7 @@ def test_nothing_is_overwritten_unasked(
     with pytest.raises(RestoreRefused, match="a service or a worker is at work"):
         restore(backups, folders, database_url, overwrite=True)
     store.close()
-    with pytest.raises(RestoreRefused, match=r"holds something already, such as datasets/tiny/.*--overwrite"):
+    with pytest.raises(RestoreRefused, match=r"holds something already, such as datasets/tiny/.*--force"):
         restore(backups, folders, database_url)
     restore(backups, folders, database_url, overwrite=True)
     again = JobStore(folders.artifacts, database_url)

@@ -112,11 +112,11 @@ def _require_empty(folders: Folders, database: Database) -> None:
         if "/" in str(file.path) or file.path.suffix == SUFFIX:
             raise RestoreRefused(
                 f"{folders.root(file.root)} holds something already, such as {file.path}: name empty folders, or give "
-                "--overwrite to replace all that is there"
+                "--force to replace all that is there"
             )
     if database.holds_jobs():
         raise RestoreRefused(
-            "the database holds jobs already: name an empty one, or give --overwrite to replace all that is there",
+            "the database holds jobs already: name an empty one, or give --force to replace all that is there",
             field="database_url",
         )
 

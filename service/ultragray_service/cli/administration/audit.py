@@ -13,11 +13,18 @@ import typer
 from ...settings import ENVIRONMENT_PREFIX, Settings, load_settings
 from ..options import FieldsOf, with_options
 from ..output import print_table
+from ..style import Json, command_group, examples, to_json
 
 _COLUMNS = ("time", "who", "address", "what", "target", "result", "facts")
 _HOUR_S = 3600.0
 
 
+command_app = command_group()
+
+
+@command_app.command(
+    epilog=examples("ultragray audit --since-hours 168 --who console", "ultragray audit --what scene.delete --json")
+)
 @with_options
 def audit(
     *,
@@ -27,13 +34,13 @@ def audit(
         str | None, typer.Option(help="Only this operation, such as scene.delete, or scene.", show_default="all")
     ] = None,
     limit: Annotated[int, typer.Option(min=1, help="The last ones, at most.")] = 1000,
-    json: Annotated[bool, typer.Option("--json", help="A JSON object a line, for scripts.")] = False,
+    json: Json = False,
     where: Annotated[
         dict[str, Any],
         FieldsOf(Settings, "data_folder", "artifact_folder", "database_url", environment=ENVIRONMENT_PREFIX),
     ],
 ) -> None:
-    """Print the audit log, oldest first: who, from where, what, on which scene, dataset or job, with which result."""
+    """Oldest first. What is not given here comes from the settings (ULTRAGRAY_…)."""
     from ultragray_workers.jobs.queue.database import JobDatabase
 
     from ...access.audit import read_audit
@@ -46,8 +53,7 @@ def audit(
     finally:
         database.close()
     if json:
-        for entry in entries:
-            typer.echo(json_text.dumps({**asdict(entry), "time": _time(entry.at_s)}))
+        typer.echo(to_json([{**asdict(entry), "time": _time(entry.at_s)} for entry in entries]))
         return
     rows = [
         (_time(one.at_s), one.who, one.address, one.what, one.target, one.result, json_text.dumps(one.facts))

@@ -1,4 +1,4 @@
-"""`ultragray backup` and `ultragray restore`: a whole installation into a folder, and back."""
+"""`ultragray backup`: a whole installation into a folder."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from ultragray_workers.errors import BackupInvalid
 
 from ...settings import ENVIRONMENT_PREFIX, Settings, load_settings
 from ..options import FieldsOf, with_options
+from ..style import Json, command_group, examples, tell, to_json
 
 if TYPE_CHECKING:
     from ultragray_workers.backup.contents import Folders
@@ -24,8 +25,14 @@ Stores = Annotated[
     FieldsOf(Settings, "data_folder", "artifact_folder", "database_url", environment=ENVIRONMENT_PREFIX),
 ]
 _SHOWN = 3
+command_app = command_group()
 
 
+@command_app.command(
+    epilog=examples(
+        "ultragray backup /mnt/backups --keep 14", "ultragray backup /mnt/backups --verify  # reads every byte"
+    )
+)
 @with_options
 def backup(
     folder: BackupFolder,
@@ -36,84 +43,74 @@ def backup(
         int | None,
         typer.Option(min=1, help="Remove all but so many of the newest backups of the folder.", show_default="all"),
     ] = None,
+    json: Json = False,
     *,
     stores: Stores,
 ) -> None:
-    """Save scenes, datasets, jobs and their database into a folder, while service and workers go on.
+    """Service and workers go on meanwhile.
 
     Again into the same folder it copies only what is new. Exit code 2: there is no new backup, or one is damaged.
     """
     if verify:
-        _verify(folder)
+        _verify(folder, as_json=json)
         return
     from ultragray_workers.backup.backing_up import back_up
 
     settings = load_settings(**stores)
-    report = back_up(_folders(settings), settings.database_url, folder, keep=keep)
-    typer.echo(_in_words(report.manifest))
-    typer.echo(f"new: {report.new_files:,} files, {_mb(report.new_bytes)}")
+    report = back_up(folders_of(settings), settings.database_url, folder, keep=keep)
+    lines = [in_words(report.manifest), f"new: {report.new_files:,} files, {megabytes(report.new_bytes)}"]
     if report.removed_backups:
-        typer.echo(f"removed: {report.removed_backups} older backups, {_mb(report.removed_bytes)}")
+        lines.append(f"removed: {report.removed_backups} older backups, {megabytes(report.removed_bytes)}")
+    document = {
+        **document_of(report.manifest),
+        "new_files": report.new_files,
+        "new_bytes": report.new_bytes,
+        "removed_backups": report.removed_backups,
+        "removed_bytes": report.removed_bytes,
+    }
+    tell("\n".join(lines), document, as_json=json)
 
 
-@with_options
-def restore(
-    folder: BackupFolder,
-    backup: Annotated[
-        str | None, typer.Option(help="Name of a backup of the folder.", show_default="the newest")
-    ] = None,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace all that the folders and the database hold now.")
-    ] = False,
-    *,
-    stores: Stores,
-) -> None:
-    """Make an installation what it was at a backup; service and workers must be stopped.
-
-    Every hash is checked before anything is changed. Interrupted, the same command goes on. Jobs that ran at the time
-    of the backup wait again, and go on from their checkpoints.
-    """
-    from ultragray_workers.backup.restoring import restore as restore_backup
-
-    settings = load_settings(**stores)
-    manifest = restore_backup(
-        folder,
-        _folders(settings),
-        settings.database_url,
-        name=backup,
-        overwrite=overwrite,
-        say=lambda sentence: typer.echo(sentence, err=True),
-    )
-    typer.echo(f"restored {_in_words(manifest)}")
-
-
-def _verify(folder: Path) -> None:
+def _verify(folder: Path, *, as_json: bool) -> None:
     from ultragray_workers.backup.backing_up import verify
 
     damaged: dict[str, list[str]] = {}
-    found = 0
+    backups: list[dict[str, Any]] = []
     for manifest, bad in verify(folder):
-        found += 1
-        typer.echo(f"{_in_words(manifest)}: {f'{len(bad)} contents missing or damaged' if bad else 'whole'}")
+        backups.append({**document_of(manifest), "damaged": bad})
+        if not as_json:
+            typer.echo(f"{in_words(manifest)}: {f'{len(bad)} contents missing or damaged' if bad else 'whole'}")
         if bad:
             damaged[manifest.name] = bad
-    if not found:
+    if as_json:
+        typer.echo(to_json(backups))
+    if not backups:
         raise BackupInvalid(f"{folder} holds no backup")
     if damaged:
         name, bad = next(iter(damaged.items()))
-        raise BackupInvalid(f"{len(damaged)} of {found} backups are damaged; of {name}: {', '.join(bad[:_SHOWN])}")
+        raise BackupInvalid(
+            f"{len(damaged)} of {len(backups)} backups are damaged; of {name}: {', '.join(bad[:_SHOWN])}"
+        )
 
 
-def _folders(settings: Settings) -> Folders:
+def folders_of(settings: Settings) -> Folders:
+    """The folders that a backup saves."""
     from ultragray_workers.backup.contents import Folders
 
     return Folders(settings.data_folder, settings.artifacts)
 
 
-def _in_words(manifest: Manifest) -> str:
+def in_words(manifest: Manifest) -> str:
+    """A backup in one sentence."""
     counts = ", ".join(f"{count:,} {what}" for what, count in manifest.counts.items())
-    return f"backup {manifest.name}: {counts}; {len(manifest.files):,} files, {_mb(manifest.bytes)}"
+    return f"backup {manifest.name}: {counts}; {len(manifest.files):,} files, {megabytes(manifest.bytes)}"
 
 
-def _mb(size: int) -> str:
+def document_of(manifest: Manifest) -> dict[str, Any]:
+    """The same for a program."""
+    return {"backup": manifest.name, **manifest.counts, "files": len(manifest.files), "bytes": manifest.bytes}
+
+
+def megabytes(size: int) -> str:
+    """A size for a person, in 10^6 bytes."""
     return f"{size / 1e6:,.1f} MB"

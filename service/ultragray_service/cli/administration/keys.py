@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json as json_text
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -17,13 +16,12 @@ from ...access.principal import Role
 from ...settings import ENVIRONMENT_PREFIX, Settings, load_settings
 from ..options import FieldsOf, with_options
 from ..output import print_table
+from ..style import Json, command_group, examples, tell, to_json
 
 if TYPE_CHECKING:
     from ...access.keys import Key, KeyStore
 
-keys_app = typer.Typer(
-    no_args_is_help=True, help="API keys: who may use the service, and as what. Changes count within two seconds."
-)
+command_app = command_group("They live in the installation's database; changes count within two seconds.")
 
 Where = Annotated[
     dict[str, Any],
@@ -32,7 +30,12 @@ Where = Annotated[
 _COLUMNS = ("id", "name", "role", "state", "created", "expires", "last used", "limits")
 
 
-@keys_app.command()
+@command_app.command(
+    epilog=examples(
+        "ultragray keys create alice --role operator --expires-days 90",
+        "ultragray keys create console --role reader --limit frames_per_s=60",
+    )
+)
 @with_options
 def create(
     name: Annotated[str, typer.Argument(help="Whose it is: a person, a machine or a program.", show_default=False)],
@@ -54,6 +57,7 @@ def create(
             show_default="the settings key_NAME of the service",
         ),
     ] = None,
+    json: Json = False,
     where: Where,
 ) -> None:
     """Make a key, and print it: alone on standard output, and never again."""
@@ -65,35 +69,39 @@ def create(
     for other in others:
         typer.echo(f"{name} still has the key {other.id}, {_role(other)}, too", err=True)
     typer.echo("Keep it now: it is shown only once.", err=True)
-    typer.echo(secret)
+    tell(secret, {**_document(key), "secret": secret}, as_json=json)
 
 
-@keys_app.command("list")
+@command_app.command("list", epilog=examples("ultragray keys list", "ultragray keys list --json"))
 @with_options
 def list_keys(
     *,
-    json: Annotated[bool, typer.Option("--json", help="A JSON list, for scripts.")] = False,
+    json: Json = False,
     where: Where,
 ) -> None:
     """List the keys, oldest first, also those that count no more; no secrets."""
     with _key_store(where) as store:
         keys = list(store.keys().values())
     if json:
-        typer.echo(json_text.dumps([{**asdict(key), "state": _state(key)} for key in keys], indent=2))
+        typer.echo(to_json([_document(key) for key in keys]))
         return
     print_table(_COLUMNS, [_row(key) for key in keys])
 
 
-@keys_app.command()
+@command_app.command(epilog=examples("ultragray keys revoke alice"))
 @with_options
 def revoke(
-    name: Annotated[str, typer.Argument(help="Name, or id of one key.", show_default=False)], *, where: Where
+    name: Annotated[str, typer.Argument(help="Name, or id of one key.", show_default=False)],
+    *,
+    json: Json = False,
+    where: Where,
 ) -> None:
     """Revoke all keys of a name, or the one of an id. What runs on them is cut within two seconds."""
     with _key_store(where) as store:
         revoked = store.revoke(name)
-    for key in revoked:
-        typer.echo(f"revoked {key.id} of {key.name}, {_role(key)}")
+    lines = [f"revoked {key.id} of {key.name}, {_role(key)}" for key in revoked]
+    if lines or json:
+        tell("\n".join(lines), [_document(key) for key in revoked], as_json=json)
     if not revoked:
         typer.echo(f"no key of {name} opened any door", err=True)
 
@@ -110,6 +118,10 @@ def _key_store(where: dict[str, Any]) -> Iterator[KeyStore]:
         yield KeyStore(database.engine)
     finally:
         database.close()
+
+
+def _document(key: Key) -> dict[str, Any]:
+    return {**asdict(key), "state": _state(key)}
 
 
 def _row(key: Key) -> tuple[str, ...]:

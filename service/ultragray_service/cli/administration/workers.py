@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json as json_text
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
@@ -13,13 +12,12 @@ import typer
 from ...settings import ENVIRONMENT_PREFIX, Settings, load_settings
 from ..options import FieldsOf, with_options
 from ..output import print_table
+from ..style import Json, command_group, examples, tell, to_json
 
 if TYPE_CHECKING:
     from ultragray_workers.jobs.queue.database import JobDatabase
 
-workers_app = typer.Typer(
-    no_args_is_help=True, help="Workers for jobs: who is there, and who is to rest. They obey within two seconds."
-)
+command_app = command_group("They are told through the database of the jobs, and obey within two seconds.")
 
 Name = Annotated[str, typer.Argument(help="Name of the worker.", show_default=False)]
 Where = Annotated[
@@ -29,11 +27,11 @@ Where = Annotated[
 _COLUMNS = ("name", "state", "job", "host", "pid", "device", "version", "started", "last sign")
 
 
-@workers_app.command("list")
+@command_app.command("list", epilog=examples("ultragray workers list", "ultragray workers list --json"))
 @with_options
 def list_workers(
     *,
-    json: Annotated[bool, typer.Option("--json", help="A JSON list, for scripts.")] = False,
+    json: Json = False,
     where: Where,
 ) -> None:
     """List the workers, also those that were lost within a day."""
@@ -42,7 +40,7 @@ def list_workers(
     with _database(where) as jobs:
         workers = attendance.list_workers(jobs)
     if json:
-        typer.echo(json_text.dumps([asdict(worker) for worker in workers], indent=2))
+        typer.echo(to_json([asdict(worker) for worker in workers]))
         return
     rows = [
         (
@@ -61,34 +59,35 @@ def list_workers(
     print_table(_COLUMNS, rows)
 
 
-@workers_app.command()
+@command_app.command(epilog=examples("ultragray workers pause gpu-1"))
 @with_options
-def pause(name: Name, *, where: Where) -> None:
+def pause(name: Name, *, json: Json = False, where: Where) -> None:
     """Let a worker take no more jobs; it ends the one at hand. Holds until resume, restarts included."""
-    _want(where, name, "pause")
+    _want(where, name, "pause", as_json=json)
 
 
-@workers_app.command()
+@command_app.command(epilog=examples("ultragray workers drain gpu-1"))
 @with_options
-def drain(name: Name, *, where: Where) -> None:
+def drain(name: Name, *, json: Json = False, where: Where) -> None:
     """As pause, but a training at hand goes back into the queue at once, and on elsewhere from its checkpoint."""
-    _want(where, name, "drain")
+    _want(where, name, "drain", as_json=json)
 
 
-@workers_app.command()
+@command_app.command(epilog=examples("ultragray workers resume gpu-1"))
 @with_options
-def resume(name: Name, *, where: Where) -> None:
+def resume(name: Name, *, json: Json = False, where: Where) -> None:
     """Let a worker take jobs again."""
-    _want(where, name, "work")
+    _want(where, name, "work", as_json=json)
 
 
-def _want(where: dict[str, Any], name: str, wanted: str) -> None:
+def _want(where: dict[str, Any], name: str, wanted: str, *, as_json: bool) -> None:
     from ultragray_workers.jobs.queue import attendance
     from ultragray_workers.jobs.queue.wishes import Wanted
 
     with _database(where) as jobs:
         worker = attendance.want(jobs, name, Wanted(wanted))
-    typer.echo(f"{worker.name} {worker.state.value}{f', at the job {worker.job}' if worker.job else ''}")
+    at_hand = f", at the job {worker.job}" if worker.job else ""
+    tell(f"{worker.name} {worker.state.value}{at_hand}", asdict(worker), as_json=as_json)
 
 
 @contextmanager

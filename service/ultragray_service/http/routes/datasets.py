@@ -95,7 +95,7 @@ async def put_dataset(
     options: GivenOptions,
     private: Private = False,
 ) -> DatasetRecord:
-    """Uploads a dataset, checks it as `ultragray dataset check` does, and keeps it. Empty options: as it is stored."""
+    """Uploads a dataset, checks it as `ultragray check` does, and keeps it. Empty options: as it is stored."""
     service.require_serving()
     media_type = _media_type(request)
     announced = request.headers.get("content-length", "")

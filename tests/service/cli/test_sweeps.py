@@ -1,4 +1,4 @@
-"""`ultragray dataset`: real files in, a table, files and a picture out."""
+"""`ultragray check`, `draw` and `convert`: real files in, a table, files and a picture out."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ REAL_SETS = Path(__file__).resolve().parents[4] / "shared" / "data"
 
 
 def run(*arguments: object) -> Result:
-    return CliRunner().invoke(app, ["dataset", *map(str, arguments)])
+    return CliRunner().invoke(app, list(map(str, arguments)))
 
 
 @pytest.fixture
@@ -61,7 +61,7 @@ def test_bad_data_is_one_line_and_exit_code_two(folder: Path) -> None:
     images = np.load(folder / "images_train.npy")
     images[3] = 0
     np.save(folder / "images_train.npy", images)
-    for command in (["check"], ["convert", "-o", folder.parent / "other"], ["show", "-o", folder.parent / "a.png"]):
+    for command in (["check"], ["convert", "-o", folder.parent / "other"], ["draw", "-o", folder.parent / "a.png"]):
         result = run(command[0], folder, *command[1:])
         assert result.exit_code == 2
         assert result.stderr.startswith("error: ")
@@ -85,7 +85,9 @@ def test_convert_writes_what_is_read_back(folder: Path) -> None:
     assert load_dataset(folder.parent / "half").train.images.shape == (8, 10, 8)
     again = run("convert", folder, "-o", folder.parent / "half")
     assert again.exit_code == 2
-    assert "conf.json already exists: choose another folder" in again.stderr
+    assert f"new or empty folder, {folder.parent / 'half'} holds files" in again.stderr
+    assert run("convert", folder, "-o", folder.parent / "half", "--force").exit_code == 0
+    assert load_dataset(folder.parent / "half").sha256 == load_dataset(folder).sha256
 
 
 def test_a_plus_sequence_by_the_documented_command(tmp_path: Path) -> None:
@@ -103,11 +105,11 @@ def test_a_plus_sequence_by_the_documented_command(tmp_path: Path) -> None:
     np.testing.assert_allclose(made.val.poses, given.val.poses, atol=1e-3)
 
 
-def test_show_draws_a_png(folder: Path) -> None:
+def test_draw_draws_a_png(folder: Path) -> None:
     picture = folder.parent / "sweep.png"
-    result = run("show", folder, "-o", picture)
+    result = run("draw", folder, "-o", picture)
     assert result.exit_code == 0, result.output
     assert picture.read_bytes().startswith(b"\x89PNG")
-    wrong = run("show", folder, "-o", folder.parent / "sweep.jpg")
+    wrong = run("draw", folder, "-o", folder.parent / "sweep.jpg")
     assert wrong.exit_code == 2
-    assert "output must be a .png file" in wrong.stderr
+    assert "output must end in .png, got 'sweep.jpg'" in wrong.stderr

@@ -12,12 +12,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ultragray.datasets.source import SourceOptions
+from ultragray.scene_info import read_header
 from ultragray.training.config import PRESET_MEANINGS, TrainingConfig
 
-from .dataset import DatasetArgument, check_scene_fits, read_dataset, warn_about_dataset
-from .eval import VoxelMm
-from .options import FieldsOf, with_options
-from .output import check_writable
+from ..options import FieldsOf, with_options
+from ..output import check_file
+from ..progress import working
+from ..style import Force, Json, Threads, command_group, examples, output_option, tell
+from ..sweeps.source import SweepArgument, check_scene_fits, check_source, read_dataset, warn_about_dataset
+from .compare import VoxelMm
 
 if TYPE_CHECKING:
     from ultragray.datasets import Dataset
@@ -36,43 +39,61 @@ class ReportOptions:
     voxel_mm: float
 
 
+command_app = command_group()
+
+
+@command_app.command(
+    epilog=examples(
+        "ultragray report sweep/ -o report.html  # trains eight times: hours",
+        "ultragray report sweep/ -o report.html --scene liver.ugr --no-ablations # minutes",
+    )
+)
 @with_options
 def report(
-    dataset: DatasetArgument,
-    output: Annotated[Path, typer.Option("--output", "-o", help="Page to write (.html).", show_default=False)],
+    sweep: SweepArgument,
+    output: Annotated[Path, output_option("Page to write (.html).")],
+    force: Force = False,
+    json: Json = False,
     scene: Annotated[
         Path | None,
         typer.Option(help="Scene file (.ugr) to report on.", show_default="one is trained"),
     ] = None,
-    preset: Annotated[str, typer.Option(help=f"Of every training. {PRESET_MEANINGS}")] = "fast",
     no_ablations: Annotated[
         bool, typer.Option("--no-ablations", help="Leave out the ablations and growing tilt: seven trainings.")
     ] = False,
     voxel_mm: VoxelMm = None,
-    threads: Annotated[int, typer.Option(min=0, help="Threads; 0: all cores.")] = 0,
+    preset: Annotated[
+        str, typer.Option(help=f"Of every training. {PRESET_MEANINGS}", rich_help_panel=TrainingConfig.__topic__)
+    ] = "fast",
+    threads: Threads = 0,
     *,
     settings: Annotated[dict[str, Any], FieldsOf(TrainingConfig, "steps", "max_gaussians", "seed")],
     source: SourceOptions,
 ) -> None:
-    """Train and measure a scene, the baselines and the paper's ablations; write one self-contained HTML page."""
+    """The page is one self-contained HTML file: a scene, the baselines and the paper's ablations, measured alike."""
+    check_file(output, [".html"], force=force)
     import ultragray.report.page  # noqa: F401  # where its packages are missing, that is told before all the work
+
+    config = TrainingConfig.preset(preset, **settings)
+    if scene is not None:
+        read_header(scene)
+    check_source(sweep)
+
     from ultragray.evaluation.compounding import affordable_voxel_mm
     from ultragray.evaluation.scoring import require_frames
 
-    check_writable(output, ".html")
-    config = TrainingConfig.preset(preset, **settings)
     if threads:
         import torch
 
         torch.set_num_threads(threads)
-    read = read_dataset(dataset, source)
+    read = read_dataset(sweep, source)
     require_frames(read.val)
     warn_about_dataset(read)
     voxel_mm = affordable_voxel_mm(read.train) if voxel_mm is None else voxel_mm
     failures = _write_report(read, config, output, ReportOptions(scene, not no_ablations, voxel_mm))
     for name, reason in failures.items():
         typer.echo(f"failed: {name}: {reason}", err=True)
-    typer.echo(f"wrote {output}")
+    tell(f"wrote {output}", {"output": str(output), "failed": failures}, as_json=json)
 
 
 def _write_report(dataset: Dataset, config: TrainingConfig, output: Path, options: ReportOptions) -> dict[str, str]:
@@ -90,8 +111,9 @@ def _write_report(dataset: Dataset, config: TrainingConfig, output: Path, option
     scene = None if options.scene is None else GaussianScene.load(options.scene)
     if scene is not None:
         check_scene_fits(scene.info, dataset)
-    with _following() as follow:
+    with working("measuring the baselines …"):
         baselines = evaluate_baselines(dataset, voxel_mm=options.voxel_mm)
+    with _following() as follow:
         content: dict[str, Any] = {}
         if scene is None:
             trained = train_and_evaluate(dataset, config, report=follow("scene"))

@@ -12,8 +12,9 @@ import typer
 
 from ultragray_workers.errors import NotReady
 
-from ...core.job_client import JobClient
-from ..train import INTERRUPTED
+from ...remote.jobs import Jobs
+from ..group import INTERRUPTED
+from ..style import tell
 
 JOB_FAILED = 3  # the exit code of a command that watched a job fail
 JOB_CANCELLED = 4
@@ -22,20 +23,22 @@ _RETRY_S = 1.0
 _GONE_S = 60.0  # a service that comes back within this time is asked again
 
 
-def follow(client: JobClient, job_id: str) -> None:
+def follow(jobs: Jobs, job_id: str, *, as_json: bool = False) -> None:
     """Return when the job has succeeded; exit with 3 where it failed, 4 where it was cancelled, 130 at Ctrl-C.
 
     Raises UltragrayError: no such job, or a service that stays away.
     """
     try:
         with _display(job_id) as show:
-            job = _watched(client, job_id, show)
+            job = _watched(jobs, job_id, show)
     except KeyboardInterrupt:
         typer.echo(f"job {job_id} goes on; `ultragray jobs cancel {job_id}` stops it", err=True)
         raise typer.Exit(INTERRUPTED) from None
     if job["state"] == "succeeded":
-        typer.echo(f"{job_id} succeeded{_results(job)}")
+        tell(f"{job_id} succeeded{_results(job)}", job, as_json=as_json)
         return
+    if as_json:
+        tell("", job, as_json=True)
     if job["state"] == "failed":
         typer.secho(f"error: {job_id} failed: {job['reason']}", fg=typer.colors.RED, err=True)
         raise typer.Exit(JOB_FAILED)
@@ -43,13 +46,13 @@ def follow(client: JobClient, job_id: str) -> None:
     raise typer.Exit(JOB_CANCELLED)
 
 
-def _watched(client: JobClient, job_id: str, show: Callable[[dict[str, Any]], None]) -> dict[str, Any]:
+def _watched(jobs: Jobs, job_id: str, show: Callable[[dict[str, Any]], None]) -> dict[str, Any]:
     """The job in its final state; a service that was restarted in the meantime is asked again."""
-    client.get(job_id)  # nobody there, or no such job: said at once
+    jobs.get(job_id)  # nobody there, or no such job: said at once
     seen = time.monotonic()
     while True:
         try:
-            for job in client.changes(job_id):
+            for job in jobs.changes(job_id):
                 seen = time.monotonic()
                 show(job)
                 if job["state"] in _FINAL_STATES:

@@ -1,4 +1,4 @@
-"""`ultragray export` and `ultragray import-ply`: files of other programs, and back."""
+"""`ultragray export` and `ultragray import`: files of other programs, and back."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def test_a_ply_and_back_is_the_same_file(make_file: Callable[..., Path], tmp_pat
     result = run("export", scene, "-o", tmp_path / "a.ply")
     assert (result.exit_code, result.stderr) == (0, "")
     assert "60 Gaussians, 5 training poses" in result.stdout
-    assert run("import-ply", tmp_path / "a.ply", "-o", tmp_path / "b.ugr").exit_code == 0
+    assert run("import", tmp_path / "a.ply", "-o", tmp_path / "b.ugr").exit_code == 0
     assert (tmp_path / "b.ugr").read_bytes() == scene.read_bytes()
 
 
@@ -42,7 +42,7 @@ def test_a_checkpoint_and_back_by_the_documented_commands(make_file: Callable[..
     assert (result.exit_code, result.stderr) == (0, "")
     assert all(str(folder / name) in result.stdout for name in ("ckpt_0.pt", "conf.json", "poses_train.npy"))
     back = run(
-        *("import-checkpoint", folder / "ckpt_0.pt", "--config", folder / "conf.json"),
+        *("import", folder / "ckpt_0.pt", "--config", folder / "conf.json"),
         *("--poses", folder / "poses_train.npy", "-o", tmp_path / "back.ugr"),
     )
     assert back.exit_code == 0, back.output
@@ -61,9 +61,12 @@ def test_mistakes_are_told_in_one_line(make_file: Callable[..., Path], tmp_path:
     assert "does not" in refused("export", scene, "-o", tmp_path / "none" / "a.ply")
     assert "does not" in refused("export", scene, "-o", tmp_path / "none" / "none" / "ckpt.pt")
     assert "no such file" in refused("export", tmp_path / "none.ugr", "-o", tmp_path / "a.ply")
-    assert "no such file" in refused("import-ply", tmp_path / "none.ply", "-o", tmp_path / "b.ugr")
-    assert "must end in .ugr, got 'b.txt'" in refused("import-ply", scene, "-o", tmp_path / "b.txt")
-    assert "does not begin like a PLY" in refused("import-ply", scene, "-o", tmp_path / "b.ugr")
+    assert "no such file" in refused("import", tmp_path / "none.ply", "-o", tmp_path / "b.ugr")
+    assert "import reads .ply and .pt files" in refused("import", scene, "-o", tmp_path / "b.ugr")
+    scene.with_suffix(".ply").write_bytes(scene.read_bytes())
+    assert "must end in .ugr, got 'b.txt'" in refused("import", scene.with_suffix(".ply"), "-o", tmp_path / "b.txt")
+    assert "does not begin like a PLY" in refused("import", scene.with_suffix(".ply"), "-o", tmp_path / "b.ugr")
+    scene.with_suffix(".ply").unlink()
     (tmp_path / "conf.json").write_text("{}")
     assert "folder of its own" in refused("export", scene, "-o", tmp_path / "ckpt.pt")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["conf.json", "scene.ugr"]
@@ -71,7 +74,7 @@ def test_mistakes_are_told_in_one_line(make_file: Callable[..., Path], tmp_path:
 
 def test_help_imports_nothing_heavy() -> None:
     program = (
-        f"import sys; sys.path[:0] = {sys.path!r}; from ultragray_service.cli import convert; "
+        f"import sys; sys.path[:0] = {sys.path!r}; from ultragray_service.cli.scenes import export, importing; "
         "print(sorted({'torch', 'numpy.testing', 'cv2', 'safetensors.torch'} & set(sys.modules)))"
     )
     answer = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)

@@ -1,9 +1,9 @@
-"""`ultragray train`: a dataset becomes a scene file; the run can be stopped and resumed."""
+"""`ultragray train`: a sweep becomes a scene file; the run can be stopped and resumed."""
 
 from __future__ import annotations
 
 import contextlib
-import json
+import json as json_text
 import signal
 import sys
 import time
@@ -18,61 +18,95 @@ from ultragray.datasets.source import SourceOptions
 from ultragray.errors import MemoryExceeded, TrainingDiverged, TrainingStateInvalid
 from ultragray.training.config import PRESET_MEANINGS, TrainingConfig, read_config_file
 
-from .dataset import DatasetArgument, read_dataset, warn_about_dataset
-from .options import FieldsOf, parse_settings, with_options
-from .output import SCENE_SUFFIX, check_writable
+from ..group import INTERRUPTED
+from ..options import FieldsOf, parse_settings, with_options
+from ..output import SCENE_SUFFIX, check_file
+from ..style import COMPUTE, Backend, Force, Json, Threads, command_group, examples, output_option, tell
+from ..sweeps.source import SweepArgument, check_source, read_dataset, warn_about_dataset
 
 if TYPE_CHECKING:
     from ultragray.scene import GaussianScene
     from ultragray.training import Progress
 
-INTERRUPTED = 130  # the exit code of a run that Ctrl-C or SIGTERM stopped
+RUN = "Run"
+MEASURING = "measuring what was reached"
 METRIC_NAMES = {"psnr_db": "PSNR, dB", "ms_ssim": "MS-SSIM", "gms": "GMS", "gmsd": "GMSD"}
 
 
+command_app = command_group()
+
+
+@command_app.command(
+    epilog=examples(
+        "ultragray train sweep/ -o liver.ugr",
+        "ultragray train sweep/ -o liver.ugr --preset best --threads 8",
+        "ultragray train scan.igs.mha --device-set plus.xml -o liver.ugr --set steps=4000 --set sh_degree=2",
+        "ultragray train sweep/ -o liver.ugr --resume  # after Ctrl-C",
+    )
+)
 @with_options
 def train(
-    dataset: DatasetArgument,
-    output: Annotated[Path, typer.Option("--output", "-o", help="Scene file to write (.ugr).", show_default=False)],
+    sweep: SweepArgument,
+    output: Annotated[Path, output_option("Scene file to write (.ugr).")],
+    force: Force = False,
+    json: Json = False,
     preset: Annotated[
         str | None,
-        typer.Option(help=PRESET_MEANINGS, show_default="fast"),
+        typer.Option(help=PRESET_MEANINGS, show_default="fast", rich_help_panel=RUN),
     ] = None,
     config: Annotated[
         Path | None,
-        typer.Option(help="TOML file of settings: any field of TrainingConfig, and preset.", show_default=False),
+        typer.Option(
+            help="TOML file of settings: any field of TrainingConfig, and preset.",
+            show_default=False,
+            rich_help_panel=RUN,
+        ),
     ] = None,
     setting: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="NAME=VALUE", help="Any field of TrainingConfig; repeat.", show_default=False),
+        typer.Option(
+            "--set",
+            metavar="NAME=VALUE",
+            help="Any field of TrainingConfig; repeat.",
+            show_default=False,
+            rich_help_panel=RUN,
+        ),
     ] = None,
     folder: Annotated[
         Path | None,
-        typer.Option(help="Folder of the run: checkpoint, metrics.jsonl, config.json.", show_default="OUTPUT.run"),
+        typer.Option(
+            help="Folder of the run: checkpoint, metrics.jsonl, config.json.",
+            show_default="OUTPUT.run",
+            rich_help_panel=RUN,
+        ),
     ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint in the run's folder.")] = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on from the checkpoint in the run's folder.", rich_help_panel=RUN)
+    ] = False,
     checkpoint_every: Annotated[
-        float, typer.Option(metavar="SECONDS", min=0.0, help="How often a checkpoint is written.")
+        float,
+        typer.Option(metavar="SECONDS", min=0.0, help="How often a checkpoint is written.", rich_help_panel=RUN),
     ] = 30.0,
-    tensorboard: Annotated[bool, typer.Option("--tensorboard", help="Also write TensorBoard events.")] = False,
-    device: Annotated[str, typer.Option(help="cpu, or a GPU: cuda, or cuda:N for one of several.")] = "cpu",
-    backend: Annotated[str, typer.Option(help="auto (the one for the device), cpu, cuda or reference.")] = "auto",
-    threads: Annotated[int, typer.Option(min=0, help="Threads; 0: all cores.")] = 0,
+    tensorboard: Annotated[
+        bool, typer.Option("--tensorboard", help="Also write TensorBoard events.", rich_help_panel=RUN)
+    ] = False,
+    device: Annotated[
+        str, typer.Option(help="cpu, or a GPU: cuda, or cuda:N for one of several.", rich_help_panel=COMPUTE)
+    ] = "cpu",
+    backend: Backend = "auto",
+    threads: Threads = 0,
     *,
     settings: Annotated[dict[str, Any], FieldsOf(TrainingConfig)],
     source: SourceOptions,
 ) -> None:
-    """Train a scene from a tracked sweep. Ctrl-C leaves a usable scene; --resume goes on."""
-    from ultragray.training.device import training_device
-
+    """Ctrl-C leaves a usable scene, and --resume goes on. Frames are held out to measure the scene with."""
     given = {
         **({} if config is None else read_config_file(config)),
         **parse_settings(setting or []),
         **settings,
         **({} if preset is None else {"preset": preset}),
     }
-    check_writable(output, SCENE_SUFFIX)
-    training_device(device, backend)  # refused before the dataset is read, which may take long
+    check_source(sweep)
     run = RunOptions(
         output=output,
         folder=folder or output.with_name(f"{output.name}.run"),
@@ -84,14 +118,19 @@ def train(
     )
     if resume:
         _check_resumable(run)
+    check_file(output, [SCENE_SUFFIX], force=force or resume or _is_unfinished(run))
     chosen = _config_of(run, given)
+
+    from ultragray.training.device import training_device
+
+    training_device(device, backend)  # refused before the sweep is read, which may take long
     if threads:
         import torch
 
         torch.set_num_threads(threads)
-    read = read_dataset(dataset, source)
+    read = read_dataset(sweep, source)
     warn_about_dataset(read)
-    _train(read, chosen, run)
+    _train(read, chosen, run, as_json=json)
 
 
 @dataclass(frozen=True)
@@ -107,17 +146,28 @@ class RunOptions:
     backend: str
 
 
+def _is_unfinished(run: RunOptions) -> bool:
+    """Whether the output is of a run that was stopped: the training refuses it, with the words for that."""
+    if not (run.output.exists() and run.folder.is_dir()):
+        return False
+    from ultragray.training.trainer import CHECKPOINT_FILE
+
+    return (run.folder / CHECKPOINT_FILE).exists()
+
+
 def _check_resumable(run: RunOptions) -> None:
     """Raise TrainingStateInvalid, with the reason, where the folder of the run holds no checkpoint."""
+    if not run.folder.is_dir():
+        raise TrainingStateInvalid(f"{run.folder}: no such folder, so there is no checkpoint to resume from")
     from ultragray.training.trainer import CHECKPOINT_FILE, CONFIG_FILE, JOURNAL_FILE
 
     if (run.folder / CHECKPOINT_FILE).exists():
         return
     steps = last_step = None
     with contextlib.suppress(OSError, ValueError, LookupError, TypeError):  # whatever is there is no finished run
-        steps = json.loads((run.folder / CONFIG_FILE).read_text(encoding="utf-8"))["steps"]
+        steps = json_text.loads((run.folder / CONFIG_FILE).read_text(encoding="utf-8"))["steps"]
         last_line = (run.folder / JOURNAL_FILE).read_text(encoding="utf-8").splitlines()[-1]
-        last_step = json.loads(last_line)["step"]
+        last_step = json_text.loads(last_line)["step"]
     if steps is not None and last_step == steps:
         raise TrainingStateInvalid(f"{run.folder}: the run is finished, all {steps} steps are done; nothing to resume")
     raise TrainingStateInvalid(f"{run.folder}: no checkpoint to resume from; leave out --resume to begin a run")
@@ -125,18 +175,18 @@ def _check_resumable(run: RunOptions) -> None:
 
 def _config_of(run: RunOptions, given: Mapping[str, Any]) -> TrainingConfig:
     """The preset with what was given; of a resumed run the one it was begun with, and what was given again."""
-    from ultragray.training.checkpointing import read_checkpoint_header
-    from ultragray.training.trainer import CHECKPOINT_FILE
-
     values = dict(given)
     preset = values.pop("preset", None)
     if run.resume and preset is None:
+        from ultragray.training.checkpointing import read_checkpoint_header
+        from ultragray.training.trainer import CHECKPOINT_FILE
+
         stored = read_checkpoint_header(run.folder / CHECKPOINT_FILE).config
         return TrainingConfig.from_dict({**stored.to_dict(), **values})
     return TrainingConfig.preset(preset or "fast", **values)
 
 
-def _train(dataset: Any, config: TrainingConfig, run: RunOptions) -> None:
+def _train(dataset: Any, config: TrainingConfig, run: RunOptions, *, as_json: bool) -> None:
     from ultragray.training import train as train_scene
     from ultragray.training.run import scene_of_checkpoint
     from ultragray.training.trainer import CHECKPOINT_FILE
@@ -179,7 +229,7 @@ def _train(dataset: Any, config: TrainingConfig, run: RunOptions) -> None:
     if not done:
         typer.echo(
             f"stopped before the first step, while the effort was chosen; wrote {run.output} as it starts; the same "
-            "command goes on with the choice",
+            "command with --force goes on with the choice",
             err=True,
         )
         raise typer.Exit(INTERRUPTED)
@@ -191,11 +241,22 @@ def _train(dataset: Any, config: TrainingConfig, run: RunOptions) -> None:
         )
         raise typer.Exit(INTERRUPTED)
     (run.folder / CHECKPOINT_FILE).unlink()
-    _print_metrics(scene)
+    if not as_json:
+        _print_metrics(scene)
     cost = "" if last is None else f" ({_cost(last)})"
     effort = f"chose effort {scene.info.training['effort']:g}, " if config.effort is None else ""
-    typer.echo(
-        f"{effort}wrote {run.output}: {scene.gaussian_count:,} Gaussians, {done:,} steps, {elapsed_s:.0f} s{cost}"
+    tell(
+        f"{effort}wrote {run.output}: {scene.gaussian_count:,} Gaussians, {done:,} steps, {elapsed_s:.0f} s{cost}",
+        {
+            "output": str(run.output),
+            "folder": str(run.folder),
+            "gaussian_count": scene.gaussian_count,
+            "steps": done,
+            "seconds": round(elapsed_s, 1),
+            "metrics": scene.info.metrics,
+            "training": scene.info.training,
+        },
+        as_json=as_json,
     )
 
 
@@ -220,7 +281,10 @@ def _stop_on_signal() -> Iterator[Callable[[], bool]]:
 
 @contextlib.contextmanager
 def _progress_bar() -> Iterator[Callable[[Any], None]]:
-    """A bar with rate, loss and time left on a terminal's stderr; elsewhere a line for every tenth of the run."""
+    """A bar with rate, loss and time left on a terminal's stderr; elsewhere a line for every tenth of the run.
+
+    After the last step of a training what it reached is measured, which takes a while and has no steps.
+    """
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
@@ -235,12 +299,17 @@ def _progress_bar() -> Iterator[Callable[[Any], None]]:
         task = progress.add_task("", total=None, stage="training", figures="")
 
         def report(state: Any) -> None:
+            stage, is_last = state.beside or "training", state.step == state.steps
             if console.is_terminal:
-                stage = state.beside or "training"
                 progress.update(task, completed=state.step, total=state.steps, stage=stage, figures=_figures(state))
-            elif state.step * 10 // state.steps > (state.step - 1) * 10 // state.steps:
-                stage = f"{state.beside}: " if state.beside else ""
-                sys.stderr.write(f"{stage}step {state.step:,} of {state.steps:,}: {_figures(state)}\n")
+                if is_last:
+                    progress.update(task, total=None, stage=f"{stage}: {MEASURING}", figures="")
+                return
+            if state.step * 10 // state.steps > (state.step - 1) * 10 // state.steps:
+                named = f"{state.beside}: " if state.beside else ""
+                sys.stderr.write(f"{named}step {state.step:,} of {state.steps:,}: {_figures(state)}\n")
+            if is_last:
+                sys.stderr.write(f"{stage}: {MEASURING} …\n")
 
         yield report
 

@@ -1,1 +1,0 @@
-"""`ultragray jobs`: commands for the jobs of a running service."""

@@ -1,0 +1,128 @@
+"""Frames that a running service renders, into a picture, an archive or a folder of PNGs."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ultragray.contract import from_dict, to_dict
+from ultragray.errors import InvalidArgument
+from ultragray.files.atomic import write_whole
+from ultragray.files.poses import load_poses
+from ultragray.probe import FloatArray, Probe
+from ultragray.samplers import Sampler
+from ultragray.settings import FrameSettings
+
+from ..output import OR_A_FOLDER, check_ending, check_file, check_folder, is_folder_name
+from ..progress import counted
+
+if TYPE_CHECKING:
+    from ...remote.connection import Connection
+    from ...remote.scenes import Scenes
+
+MEDIA_TYPES = {".png": "image/png", ".jpg": "image/jpeg", ".npz": "application/x-npz"}
+SUFFIXES = tuple(MEDIA_TYPES)
+FRAMES_FILE = "frames.json"
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What a command line asks for."""
+
+    scene: str
+    output: Path
+    suffix: str | None  # of SUFFIXES; None: a folder of PNGs
+    pose_file: Path | None
+    sampler: Sampler | None
+    settings: FrameSettings
+
+
+def checked_kind(output: Path, settings: FrameSettings, *, force: bool) -> str | None:
+    """The ending of the output, of SUFFIXES; None for a folder.
+
+    Raises InvalidArgument for an output that cannot or may not be written, and for a picture of several outputs.
+    """
+    if is_folder_name(output):
+        check_folder(output, force=force)
+        return None
+    check_ending(output, SUFFIXES, otherwise=OR_A_FOLDER)
+    check_file(output, force=force)
+    if output.suffix != ".npz" and len(settings.outputs) != 1:
+        raise InvalidArgument(
+            f"a picture holds one output, got {', '.join(settings.outputs)}: write a .npz file or a folder",
+            field="outputs",
+        )
+    return output.suffix
+
+
+def render_remotely(connection: Connection, wanted: Wanted) -> dict[str, Any]:
+    """Write the frames; what they are, for a program. Raises InvalidArgument and what the connection raises."""
+    from ...remote.scenes import Scenes
+
+    given = None if wanted.pose_file is None else load_poses(wanted.pose_file)
+    scenes = Scenes(connection)
+    poses = _poses(scenes, wanted, given)
+    settings = to_dict(wanted.settings, with_none=False)
+    if wanted.suffix is None:
+        shape = _write_folder(scenes, wanted, settings, poses)
+    else:
+        if wanted.suffix != ".npz" and len(poses) != 1:
+            raise InvalidArgument(
+                f"a picture holds one frame, there are {len(poses)} poses: write a .npz file or a folder",
+                field="output",
+            )
+        body = {**settings, **({"pose": _pose(poses[0])} if len(poses) == 1 else {"poses": list(map(_pose, poses))})}
+        answer = scenes.render(wanted.scene, body, MEDIA_TYPES[wanted.suffix])
+        write_whole(wanted.output, answer.data)
+        shape = answer.headers["x-ultragray-shape"]
+    _, _, height, width = map(int, shape.split(","))
+    return {
+        "output": str(wanted.output),
+        "scene": wanted.scene,
+        "frames": len(poses),
+        "height": height,
+        "width": width,
+        "outputs": list(wanted.settings.outputs),
+    }
+
+
+def _poses(scenes: Scenes, wanted: Wanted, given: FloatArray | None) -> FloatArray:  # [C, 4, 4] mm
+    """The poses of a file, or those that a sampler makes; without either the middle training pose."""
+    if wanted.sampler is None and given is not None:
+        return given
+    base = scenes.training_poses(wanted.scene) if given is None else given
+    if not len(base):
+        raise InvalidArgument("--poses must be given: the scene holds no training poses", field="poses")
+    if wanted.sampler is None:
+        middle: FloatArray = base[len(base) // 2][None]
+        return middle
+    probe = wanted.settings.probe
+    if probe is None:
+        document = scenes.get(wanted.scene)["probe"]
+        if document is None:
+            raise InvalidArgument("--probe must be given: the scene does not know its own", field="probe")
+        probe = from_dict(Probe, document)
+    return wanted.sampler.poses(base, probe)
+
+
+def _write_folder(scenes: Scenes, wanted: Wanted, settings: dict[str, Any], poses: FloatArray) -> str:
+    """A PNG for each pose and output, and a file that describes the frames; their shape as a header tells it."""
+    shape, documents = "", []
+    with counted("rendering", len(poses)) as report:
+        for number, pose in enumerate(poses):
+            for output in wanted.settings.outputs:
+                body = {**settings, "outputs": [output], "pose": _pose(pose)}
+                answer = scenes.render(wanted.scene, body, MEDIA_TYPES[".png"])
+                wanted.output.mkdir(parents=True, exist_ok=True)  # only now: a refusal leaves no folder
+                write_whole(wanted.output / f"frame_{number:05d}_{output}.png", answer.data)
+                shape = answer.headers["x-ultragray-shape"]
+            documents.append({"frame": number, "pose": answer.fact("pose"), **(answer.fact("extrapolation") or {})})
+            report(number + 1)
+    write_whole(wanted.output / FRAMES_FILE, json.dumps(documents))
+    return shape
+
+
+def _pose(pose: FloatArray) -> dict[str, Any]:  # [4, 4] mm
+    return {"matrix": pose.tolist()}

@@ -1,0 +1,1 @@
+"""Commands on scene files: rendering, looking, exchange with other programs."""

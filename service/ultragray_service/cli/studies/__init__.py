@@ -1,0 +1,1 @@
+"""Commands that train and measure: train, eval, compare, report, bench."""

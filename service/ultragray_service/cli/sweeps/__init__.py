@@ -1,0 +1,1 @@
+"""Commands on tracked sweeps: checking, drawing, converting."""

@@ -1,0 +1,66 @@
+"""The addresses at which a service answers, told when it is ready: to people as a banner, to programs as a record."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from ultragray.installation import __version__
+
+from .access.addresses import is_loopback
+from .listening.sockets import authority
+from .settings import Settings
+
+_ANY = ("0.0.0.0", "::")  # not addresses that a browser can open
+_LABEL_WIDTH = 12
+
+
+@dataclass(frozen=True)
+class Doors:
+    """Where HTTP, gRPC and, where it has a port, OpenIGTLink answer."""
+
+    settings: Settings
+    http: str  # URL
+    grpc: str
+    igtl: str | None
+
+    @classmethod
+    def of(cls, settings: Settings, http_port: int, grpc_port: int, igtl: str | None) -> Doors:
+        """The doors of a service on these ports; `igtl` is an address."""
+        scheme = "https" if settings.tls_certificate is not None else "http"
+        http = f"{scheme}://{authority(settings.host, http_port)}"
+        return cls(settings, http, authority(settings.host, grpc_port), igtl)
+
+    def fields(self) -> dict[str, str]:
+        """The addresses for a program."""
+        found = {"http": self.http, "grpc": self.grpc, "docs": f"{self.http}/docs"}
+        found["data_folder"] = str(self.settings.data_folder)
+        return found if self.igtl is None else {**found, "igtl": self.igtl}
+
+    def in_words(self) -> str:
+        """One sentence for a log."""
+        tls = " with TLS" if self.settings.tls_certificate is not None else ""
+        sentence = f"serving HTTP on {self.http} (docs at {self.http}/docs) and gRPC on {self.grpc}{tls}"
+        return sentence if self.igtl is None else f"{sentence}, OpenIGTLink on {self.igtl}"
+
+    def banner(self, asks_for_keys: bool) -> str:
+        """A few lines for who has started the service on a terminal."""
+        host = self.settings.host
+        http = self.http.replace(host, "localhost", 1) if host in _ANY else self.http
+        lines = {
+            "console": f"{http}/",
+            "HTTP docs": f"{http}/docs",
+            "gRPC": self.grpc,
+            "OpenIGTLink": self.igtl,
+            "scenes": str(self.settings.data_folder),
+            "API key": self._about_keys(asks_for_keys),
+            "stop": "Ctrl-C",
+        }
+        told = (f"  {name:<{_LABEL_WIDTH}}{value}\n" for name, value in lines.items() if value is not None)
+        return f"\nUltraG-Ray {__version__} is ready\n{''.join(told)}\n"
+
+    def _about_keys(self, asks_for_keys: bool) -> str:
+        if asks_for_keys:
+            return "needed"
+        return (
+            "not needed: this machine alone is served" if is_loopback(self.settings.host) else "NOT NEEDED BY ANYBODY"
+        )

@@ -1,0 +1,176 @@
+"""The connection to a running service: requests, pages, downloads and uploads over HTTP."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import ssl
+import urllib.error
+import urllib.request
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import IO, Any
+from urllib.parse import quote, urlencode, urlsplit
+
+from ultragray.errors import InvalidArgument, UltragrayError
+from ultragray.files.atomic import atomic_path
+from ultragray_workers.errors import NotReady
+
+from ..tls.client import cut_off_hint, tls_problem
+
+JSON = "application/json"
+_TIMEOUT_S = 60.0  # without a byte; event streams send a comment every 15 s
+_CHECK_TIMEOUT_S = 1800.0  # for the answer to an upload, which is checked first
+_BLOCK_BYTES = 1 << 20
+_PAGE = 100
+
+Count = Callable[[int], object]  # is told how many more bytes went through
+
+
+class Connection:
+    """Asks the service at an address. What it refuses is raised as UltragrayError with its sentence.
+
+    Raises NotReady where nobody answers, and where the service is starting or stopping. `tls` None: the certificates
+    that the system trusts.
+    """
+
+    def __init__(self, address: str, api_key: str | None = None, tls: ssl.SSLContext | None = None) -> None:
+        """Connects to nothing yet. Raises InvalidArgument for an address that is not a URL."""
+        parts = urlsplit(address)
+        if parts.scheme not in ("http", "https") or not parts.netloc:
+            raise InvalidArgument(
+                f"--address must be a URL such as http://127.0.0.1:8000, got {address!r}", field="address"
+            )
+        self.address = address.rstrip("/")
+        self._tls = tls
+        self._headers = {} if api_key is None else {"X-API-Key": api_key}
+
+    def json(self, method: str, route: str, body: Mapping[str, Any] | None = None) -> Any:
+        """The JSON of an answer; None where it has none."""
+        with self.open(method, route, body) as answer:
+            content = answer.read()
+        return json.loads(content) if content else None
+
+    def listed(self, route: str, key: str, limit: int | None = None, **query: str) -> list[dict[str, Any]]:
+        """The items of all pages of a list, at most `limit`; `key` names them in a page."""
+        found: list[dict[str, Any]] = []
+        token = ""
+        while limit is None or len(found) < limit:
+            size = _PAGE if limit is None else min(limit - len(found), _PAGE)
+            page = self.json("GET", f"{route}?{urlencode({**query, 'page_size': size, 'page_token': token})}")
+            found += page[key]
+            token = page["next_page_token"]
+            if not token:
+                break
+        return found
+
+    def open(
+        self, method: str, route: str, body: Mapping[str, Any] | None = None, accept: str = JSON
+    ) -> http.client.HTTPResponse:
+        """An answer that is still to be read."""
+        content = None if body is None else json.dumps(body, default=str).encode()
+        headers = self._headers | {"Accept": accept} | ({} if content is None else {"Content-Type": JSON})
+        request = urllib.request.Request(self.address + route, content, headers, method=method)
+        try:
+            answer: http.client.HTTPResponse = urllib.request.urlopen(request, timeout=_TIMEOUT_S, context=self._tls)
+        except urllib.error.HTTPError as error:
+            with error:
+                raise self._refusal(error.code, error.read()) from None
+        except (OSError, http.client.HTTPException) as error:
+            raise self._unreachable(error.reason if isinstance(error, urllib.error.URLError) else error) from error
+        return answer
+
+    def download(self, route: str, path: Path, progress: Callable[[int | None], Count]) -> int:
+        """Write an answer to `path`, whole or not at all, and return its size in bytes.
+
+        `progress` is given the size that the service announces, and returns what is told of each block.
+        """
+        with self.open("GET", route, accept="*/*") as answer, atomic_path(path) as temporary:
+            announced = answer.headers.get("Content-Length")
+            size = None if announced is None else int(announced)
+            count = progress(size)
+            written = 0
+            with temporary.open("wb") as file:
+                while block := answer.read(_BLOCK_BYTES):
+                    file.write(block)
+                    written += len(block)
+                    count(len(block))
+            if size is not None and written != size:
+                raise NotReady(f"{self.address} broke off after {written:,} of {size:,} bytes of {path.name}")
+        return written
+
+    def upload(self, route: str, path: Path, count: Count) -> tuple[Any, bool]:
+        """The JSON of the answer to a PUT of a file, and whether something new was made of it.
+
+        A service that has seen enough answers before the file is sent: its refusal is raised all the same.
+        """
+        parts = urlsplit(self.address)
+        secure = parts.scheme == "https"
+        if secure:
+            connection: http.client.HTTPConnection = http.client.HTTPSConnection(
+                parts.netloc, timeout=_CHECK_TIMEOUT_S, context=self._tls
+            )
+        else:
+            connection = http.client.HTTPConnection(parts.netloc, timeout=_CHECK_TIMEOUT_S, blocksize=_BLOCK_BYTES)
+        headers = {"Content-Type": "application/octet-stream", "Content-Length": str(path.stat().st_size)}
+        try:
+            with path.open("rb") as file:
+                body = _Counted(file, count)
+                try:
+                    connection.request("PUT", parts.path + route, body, headers=self._headers | headers)
+                except (BrokenPipeError, ConnectionResetError):
+                    if not body.is_begun:
+                        raise
+                answer = connection.getresponse()
+                content = answer.read()
+        except (OSError, http.client.HTTPException) as error:
+            raise self._unreachable(error) from error
+        finally:
+            connection.close()
+        if answer.status >= 400:
+            raise self._refusal(answer.status, content)
+        return json.loads(content), answer.status == 201
+
+    def _unreachable(self, reason: object) -> UltragrayError:
+        if (problem := tls_problem(self.address, reason)) is not None:
+            return UltragrayError(problem)
+        return NotReady(
+            f"no service answers at {self.address} ({_in_words(reason)}); start one with `ultragray serve`, or name it "
+            f"with --address{cut_off_hint(self.address, reason)}"
+        )
+
+    def _refusal(self, status: int, content: bytes) -> UltragrayError:
+        try:
+            problem = json.loads(content)
+            detail, field = str(problem["detail"]), problem.get("field")
+        except (ValueError, LookupError, TypeError):
+            return UltragrayError(
+                f"{self.address} answered with status {status}, but not as an UltraG-Ray service does"
+            )
+        return (NotReady if status == 503 else UltragrayError)(detail, field=field)
+
+
+class _Counted:
+    """A file that tells how much of it was read."""
+
+    def __init__(self, file: IO[bytes], count: Count) -> None:
+        self._file, self._count = file, count
+        self.is_begun = False
+
+    def read(self, size: int = -1) -> bytes:
+        block = self._file.read(size)
+        self.is_begun = True
+        self._count(len(block))
+        return block
+
+
+def route(*parts: str, suffix: str = "") -> str:
+    """The path of a resource, below /v1; `suffix` stands behind it as it is."""
+    return "/v1/" + "/".join(quote(part, safe="") for part in parts) + suffix
+
+
+def _in_words(reason: object) -> str:
+    """Why a connection failed, without the number of the error."""
+    if isinstance(reason, OSError) and reason.strerror:
+        return reason.strerror.lower()
+    return str(reason) or type(reason).__name__

@@ -1,0 +1,178 @@
+"""`ultragray scenes` and `ultragray datasets` against a real service."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner, Result
+
+from ultragray import LinearProbe, read_header
+from ultragray.datasets import Dataset, Sweep
+from ultragray.datasets.released import write_released
+from ultragray_service.cli.app import app
+
+from ..conftest import HEIGHT, WIDTH, RunningService, StartService
+
+KEY = "0123456789abcdef-remote"
+
+
+@pytest.fixture(scope="module")
+def server(start_service: StartService, tmp_path_factory: pytest.TempPathFactory) -> RunningService:
+    return start_service(artifact_folder=tmp_path_factory.mktemp("artifacts"), api_keys=KEY)
+
+
+def run(server: RunningService, *arguments: object, key: str = KEY) -> Result:
+    environment = {"ULTRAGRAY_ADDRESS": server.http, "ULTRAGRAY_API_KEY": key}
+    return CliRunner().invoke(app, list(map(str, arguments)), env=environment)
+
+
+def done(server: RunningService, *arguments: object) -> str:
+    result = run(server, *arguments)
+    assert result.exit_code == 0, result.output
+    return result.stdout
+
+
+def refused(server: RunningService, *arguments: object, key: str = KEY) -> str:
+    result = run(server, *arguments, key=key)
+    assert result.exit_code == 2, result.output
+    assert result.stderr.startswith("error: ")
+    assert result.stderr.count("\n") == 1
+    return result.stderr
+
+
+@pytest.fixture
+def scene(server: RunningService, tmp_path: Path) -> Iterator[str]:
+    """The name of a scene that was uploaded."""
+    done(server, "scenes", "download", "demo", "-o", tmp_path / "demo.ugr")
+    yield done(server, "scenes", "upload", tmp_path / "demo.ugr", "--name", "mine", "--json") and "mine"
+    done(server, "scenes", "delete", "mine")
+
+
+def test_a_scene_goes_down_and_up_again(server: RunningService, scene: str, tmp_path: Path) -> None:
+    assert read_header(tmp_path / "demo.ugr").info.gaussian_count == 400
+    listed = json.loads(done(server, "scenes", "list", "--json"))
+    assert {"demo", scene} <= {one["name"] for one in listed}
+    assert "mine" in done(server, "scenes", "list")
+    shown = json.loads(done(server, "scenes", "show", scene, "--json"))
+    assert (shown["name"], shown["gaussian_count"]) == (scene, 400)
+    assert "gaussian_count" in done(server, "scenes", "show", scene)
+    assert "there is already a scene 'mine'" in refused(
+        server, "scenes", "upload", tmp_path / "demo.ugr", "--name", scene
+    )
+    assert "demo.ugr exists: --force" in refused(server, "scenes", "download", scene, "-o", tmp_path / "demo.ugr")
+    assert "there is no scene 'none'" in refused(server, "scenes", "download", "none", "-o", tmp_path / "none.ugr")
+    assert not (tmp_path / "none.ugr").exists()
+
+
+def test_a_frame_as_a_picture(server: RunningService, tmp_path: Path) -> None:
+    picture = tmp_path / "frame.png"
+    assert f"wrote {picture}: 1 frame of {HEIGHT}x{WIDTH}" in done(server, "scenes", "render", "demo", "-o", picture)
+    assert cv2.imread(str(picture), cv2.IMREAD_GRAYSCALE).shape == (HEIGHT, WIDTH)
+    before = picture.read_bytes()
+    assert "frame.png exists: --force" in refused(server, "scenes", "render", "demo", "-o", picture, "--gain-db", 20)
+    done(server, "scenes", "render", "demo", "-o", picture, "--gain-db", 20, "--force")
+    assert picture.read_bytes() != before
+
+
+def test_frames_of_poses_in_one_archive_are_those_that_are_rendered_here(
+    server: RunningService, tmp_path: Path
+) -> None:
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    poses[:, 1, 3] = [0.0, 1.5, 3.0]
+    np.save(tmp_path / "poses.npy", poses)
+    asked = ("--poses", tmp_path / "poses.npy", "--height", 24, "--width", 20, "--outputs", "bmode,echo")
+    done(server, "scenes", "render", "demo", "-o", tmp_path / "there.npz", *asked)
+    done(server, "scenes", "download", "demo", "-o", tmp_path / "demo.ugr")
+    done(server, "render", tmp_path / "demo.ugr", "-o", tmp_path / "here.npz", *asked)
+    with np.load(tmp_path / "there.npz") as there, np.load(tmp_path / "here.npz") as here:
+        assert there["bmode"].shape == (3, 24, 20)
+        np.testing.assert_array_equal(there["poses"], poses)
+        for name in ("bmode", "echo"):
+            np.testing.assert_allclose(there[name], here[name], atol=1e-5)
+
+
+def test_a_sampler_makes_a_folder_of_pictures(server: RunningService, tmp_path: Path) -> None:
+    folder = tmp_path / "pictures"
+    sampled = ("--sampler", "training", "--height", 8, "--width", 8, "--outputs", "bmode,transmittance")
+    document = json.loads(done(server, "scenes", "render", "demo", "-o", folder, *sampled, "--json"))
+    assert (document["frames"], document["height"], document["width"]) == (5, 8, 8)
+    assert len(list(folder.glob("frame_*_bmode.png"))) == len(list(folder.glob("frame_*_transmittance.png"))) == 5
+    frames = json.loads((folder / "frames.json").read_text())
+    assert [frame["frame"] for frame in frames] == [0, 1, 2, 3, 4]
+    assert np.shape(frames[0]["pose"]) == (4, 4)
+    assert "holds files" in refused(server, "scenes", "render", "demo", "-o", folder)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (("-o", "f.gif"), "must end in .png, .jpg or .npz, or be a folder for PNGs"),
+        (("-o", "f.png", "--outputs", "bmode,echo"), "a picture holds one output"),
+        (("-o", "f.png", "--sampler", "training"), "a picture holds one frame, there are 5 poses"),
+        (("-o", "f.png", "--poses", "none.npy"), "none.npy: no such file"),
+        (("-o", "f.png", "--height", 100_000), "height must be"),
+        (("-o", "pictures", "--outputs", "labels"), "labels"),
+    ],
+)
+def test_mistakes_leave_nothing(
+    server: RunningService,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    arguments: tuple[object, ...],
+    told: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert told in refused(server, "scenes", "render", "demo", *arguments)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.fixture
+def sweep(tmp_path: Path) -> Path:
+    images = np.random.default_rng(0).integers(0, 250, (10, 20, 16), dtype=np.uint8)
+    poses = np.tile(np.eye(4), (10, 1, 1))
+    poses[:, 1, 3] = np.arange(10)
+    whole = Sweep(images, poses, LinearProbe(40.0, 0.0, 50.0), np.arange(10), "sweep")
+    write_released(Dataset("tiny", whole.select(range(8)), whole.select([8, 9])), tmp_path / "tiny")
+    return tmp_path / "tiny"
+
+
+def test_a_folder_becomes_a_dataset(server: RunningService, sweep: Path) -> None:
+    assert "uploaded tiny: 8 training and 2 held-out frames of 16x20" in done(server, "datasets", "upload", sweep)
+    assert "tiny is there already, the same" in done(server, "datasets", "upload", sweep / "conf.json")
+    record = json.loads(done(server, "datasets", "show", "tiny", "--json"))
+    assert (record["kind"], record["train_frames"], record["private"]) == ("released", 8, False)
+    named = ("datasets", "upload", sweep, "--name", "half", "--val-frames", "0:4", "--private")
+    assert "uploaded half" in done(server, *named)
+    listed = json.loads(done(server, "datasets", "list", "--json"))
+    assert [(one["name"], one["val_frames"]) for one in listed] == [("half", 4), ("tiny", 2)]
+    assert "(private)" in done(server, "datasets", "list")
+    for name in ("tiny", "half"):
+        assert done(server, "datasets", "delete", name) == f"{name} deleted\n"
+    assert "tiny" in refused(server, "datasets", "show", "tiny")
+
+
+def test_what_is_no_sweep_is_not_sent(server: RunningService, tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("nothing")
+    assert "no sweep lies in this folder" in refused(server, "datasets", "upload", tmp_path)
+    assert "an upload is an archive" in refused(server, "datasets", "upload", tmp_path / "notes.txt")
+    assert "no such file or folder" in refused(server, "datasets", "upload", tmp_path / "none")
+    (tmp_path / "a.zip").write_bytes(b"no zip at all")
+    assert refused(server, "datasets", "upload", tmp_path / "a.zip")
+    assert json.loads(done(server, "datasets", "list", "--json")) == []
+
+
+def test_without_a_key_nothing_is_told(server: RunningService, sweep: Path) -> None:
+    for arguments in (("scenes", "list"), ("datasets", "list"), ("datasets", "upload", sweep)):
+        assert "API key" in refused(server, *arguments, key="wrong-key-0123456789")
+
+
+def test_a_large_upload_that_is_refused_at_once_tells_why(server: RunningService, tmp_path: Path) -> None:
+    large = tmp_path / "large.zip"
+    with large.open("wb") as file:
+        file.truncate(2**27)
+    assert "API key" in refused(server, "datasets", "upload", large, key="wrong-key-0123456789")

@@ -1,0 +1,234 @@
+"""Wrong command lines, one a row: exit code 2, one line that says what is wrong, and nothing is written."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ultragray import LinearProbe
+from ultragray.datasets import Dataset, Sweep
+from ultragray.datasets.released import write_released
+from ultragray.demo import copy_demo_scene
+
+from .command_line import python, run
+
+SOURCES = str(Path(__file__).resolve().parents[3])
+NOBODY = "http://127.0.0.1:9"  # the port of `discard`, where nobody listens
+
+WRONG = {  # the command line, and a part of the line that it gives
+    # Commands and options.
+    "rendr scene.ugr": "no such command 'rendr'. Did you mean 'render'?",
+    "info scene.ugr": "no such command 'info'",
+    "scenes lst": "no such command 'lst'. Did you mean 'list'",
+    "jobs submit trian liver": "no such command 'trian'. Did you mean 'train'?",
+    "--vresion": "no such option: --vresion; did you mean --version?",
+    "render scene.ugr -o a.npz --heigth 3": "no such option: --heigth; did you mean --height",
+    "jobs list --server http://x": "no such option: --server",
+    "train sweep -o a.ugr --step 3": "no such option: --step; did you mean --steps",
+    "render": "missing argument 'SCENE'",
+    "render scene.ugr": "missing option '--output' / '-o'",
+    "render scene.ugr -o": "option '-o' requires an argument",
+    "render scene.ugr other.ugr -o a.npz": "unexpected extra argument",
+    "import ckpt.pt": "missing option '--output' / '-o'",
+    "keys create alice": "missing option '--role'",
+    # Values of options.
+    "render scene.ugr -o a.npz --height tall": "--height must be a valid integer, got 'tall'",
+    "render scene.ugr -o a.npz --height 0": "height must be an integer from 1",
+    "render scene.ugr -o a.npz --outputs doppler": "doppler",
+    "render scene.ugr -o a.npz --sampler orbit": "kind must be one of around",
+    "render scene.ugr -o a.npz --probe {": "--probe must be a JSON object",
+    "render scene.ugr -o a.npz --dtype int8": "dtype must be one of float32, uint8",
+    "render scene.ugr -o a.npz --min-confidence 2": "min_confidence must be",
+    "render scene.ugr -o a.npz --backend gpu": "backend must be one of",
+    "render scene.ugr -o a.npz --threads -1": "--threads must be greater than or equal to 0, got '-1'",
+    "train sweep -o a.ugr --steps 0": "steps must be an integer from 1",
+    "train sweep -o a.ugr --preset slow": "preset must be",
+    "train sweep -o a.ugr --set stepz=3": "stepz",
+    "train sweep -o a.ugr --set steps": "--set takes NAME=VALUE, got 'steps'",
+    "train sweep -o a.ugr --device gpu": "device must be cpu, cuda or cuda:N",
+    "train sweep -o a.ugr --config none.toml": "none.toml",
+    "train sweep -o a.ugr --resume": "no checkpoint to resume from",
+    "compare sweep --method middle": "--method must be one of all, median, mean, maximum, linear, nearest",
+    "compare sweep --voxel-mm 0.0001": "voxel_mm must be",
+    "eval scene.ugr sweep --split half": "--split must be one of val, train, got 'half'",
+    "check sweep --train-frames x": "train_frames",
+    "check sweep --crop 1:2,3:4": "crop is for PLUS sequences",
+    "convert sweep -o made --image-size huge": "image_size",
+    "keys create alice --role king": "--role must be one of reader, operator, admin, got 'king'",
+    "keys create alice --role reader --limit speed=3": "speed",
+    "jobs submit train liver --scene s --priority 5000": "--priority must be less than or equal to 1000, got '5000'",
+    "bench --train --jobs": "give one of --train, --jobs",
+    "bench --backend gpu": "backend must be cpu or cuda",
+    "serve scene.ugr --http-port 70000": "http_port",
+    "serve scene.ugr --backend gpu": "must be one of auto, cpu, cuda, reference, got 'gpu'",
+    "serve scene.ugr --log-format xml": "log_format",
+    "serve scene.ugr --data-folder .": "cannot be given together",
+    "serve --data-folder none": "data_folder must be an existing folder",
+    "serve scene.ugr --http-port 0 --grpc-port BUSY": "the port is in use; give another one with --grpc-port",
+    "serve scene.ugr --grpc-port 0 --http-port BUSY": "the port is in use; give another one with --http-port",
+    # Files that are not there, or are something else.
+    "render none.ugr -o a.npz": "none.ugr: no such file",
+    "render notes.ugr -o a.npz": "notes.ugr: not a scene file",
+    "render . -o a.npz": ".: ",
+    "render scene.ugr -o a.npz --poses none.npy": "none.npy: no such file",
+    "render scene.ugr -o a.npz --poses notes.txt": "poses are read from .npy and .json files",
+    "show none.ugr": "none.ugr: no such file",
+    "show notes.txt": "notes.txt: a dataset is",
+    "show scene.ugr --crop 1:2,3:4": "options of sweeps are not for scene.ugr",
+    "check none": "none: no such file or folder",
+    "draw none -o a.png": "none: no such file or folder",
+    "eval none.ugr sweep": "none.ugr: no such file",
+    "eval scene.ugr none": "none: no such file or folder",
+    "report none -o a.html": "none: no such file or folder",
+    "train none -o a.ugr": "none: no such file or folder",
+    "export none.ugr -o a.ply": "none.ugr: no such file",
+    "import scene.ugr -o a.ugr": "import reads .ply and .pt files",
+    "import none.ply -o a.ugr": "none.ply: no such file",
+    "import notes.ply -o a.ugr": "notes.ply",
+    "import notes.pt -o a.ugr": "--config must be given",
+    "serve none.ugr": "none.ugr: no such file",
+    "serve notes.ugr": "notes.ugr: not a scene file",
+    "datasets upload none": "none: no such file or folder",
+    "scenes upload notes.ugr": "notes.ugr: not a scene file",
+    "backup backups --data-folder none": "none",
+    "restore none": "none",
+    # Outputs.
+    "render scene.ugr -o a.foo": "got 'a.foo'",
+    "render scene.ugr -o a.hdf5": "did you mean .h5?",
+    "render scene.ugr -o a.mha": "did you mean .igs.mha?",
+    "render scene.ugr -o a.zarr": "did you mean .zarr.zip?",
+    "render scene.ugr -o kept.npz": "kept.npz exists: --force replaces it",
+    "render scene.ugr -o sweep": "sweep holds files: --force writes among them",
+    "render scene.ugr -o none/a.npz": "none does not",
+    "train sweep -o a.txt": "output must end in .ugr, got 'a.txt'",
+    "train sweep -o scene.ugr": "scene.ugr exists: --force",
+    "eval scene.ugr sweep -o sweep": "sweep holds files",
+    "convert sweep -o sweep": "sweep holds files",
+    "draw sweep -o a.jpg": "output must end in .png",
+    "report sweep -o a.pdf": "output must end in .html",
+    "export scene.ugr -o a.stl": "output must end in .ply or .pt",
+    "demo -o scene.ugr": "scene.ugr exists: --force",
+    "bench -o scene.ugr": "scene.ugr exists: --force",
+    f"scenes download demo -o scene.ugr --address {NOBODY}": "scene.ugr exists: --force",
+    f"scenes render demo -o a.gif --address {NOBODY}": "must end in .png, .jpg or .npz",
+    # A service that is not there.
+    "scenes list --address localhost:8000": "--address must be a URL such as http://127.0.0.1:8000",
+    f"scenes list --address {NOBODY}": f"no service answers at {NOBODY} (connection refused)",
+    f"scenes upload scene.ugr --address {NOBODY}": f"no service answers at {NOBODY}",
+    f"datasets upload sweep --address {NOBODY}": f"no service answers at {NOBODY}",
+    f"jobs watch 7 --address {NOBODY}": f"no service answers at {NOBODY}",
+    f"jobs list --address {NOBODY} --ca notes.txt": "--ca: notes.txt holds no certificates",
+    f"jobs list --address {NOBODY} --client-key k.pem": "--client-certificate and --client-key must be given together",
+}
+
+AS_PROCESSES = (  # the start of a process and its end are real here
+    "rendr scene.ugr",
+    "render scene.ugr -o a.npz --heigth 3",
+    "render none.ugr -o a.npz",
+    "render scene.ugr -o a.npz --backend gpu",
+    "train none -o a.ugr",
+    "import notes.ply -o a.ugr",
+    f"jobs watch 7 --address {NOBODY}",
+    "serve scene.ugr --http-port 0 --grpc-port BUSY",
+    "serve scene.ugr --grpc-port 0 --http-port BUSY",
+)
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a scene, a sweep, and files that are something else."""
+    folder = tmp_path_factory.mktemp("place")
+    copy_demo_scene(folder / "scene.ugr")
+    images = np.random.default_rng(0).integers(0, 250, (10, 20, 16), dtype=np.uint8)
+    poses = np.tile(np.eye(4), (10, 1, 1))
+    poses[:, 1, 3] = np.arange(10)
+    sweep = Sweep(images, poses, LinearProbe(40.0, 0.0, 50.0), np.arange(10), "sweep")
+    write_released(Dataset("sweep", sweep.select(range(8)), sweep.select([8, 9])), folder / "sweep")
+    for name in ("notes.txt", "notes.ugr", "notes.ply", "notes.pt", "kept.npz"):
+        (folder / name).write_text("some notes, long enough to be looked at")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def busy_port() -> Iterator[int]:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        yield taken.getsockname()[1]
+
+
+def contents(folder: Path) -> dict[str, bytes | None]:
+    return {str(path.relative_to(folder)): path.read_bytes() if path.is_file() else None for path in folder.rglob("*")}
+
+
+def check(line: str, code: int, stdout: str, stderr: str) -> None:
+    assert code == 2, stderr
+    assert stdout == ""
+    (told,) = [one for one in stderr.splitlines() if not one.startswith(("simulating", "warning: "))]
+    assert told.startswith("error: ")
+    assert WRONG[line] in told
+    for noise in ("Traceback", SOURCES, ".py", "PosixPath", "<class", "0x", ".tmp", "Errno"):
+        assert noise not in told
+
+
+@pytest.mark.parametrize("line", [line for line in WRONG if line not in AS_PROCESSES])
+def test_one_line_tells_a_mistake(line: str, place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(place)
+    before = contents(place)
+    result = run(*line.split())
+    check(line, result.exit_code, result.stdout, result.stderr)
+    assert contents(place) == before
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("line", AS_PROCESSES)
+def test_a_process_ends_with_one_line(line: str, place: Path, busy_port: int) -> None:
+    before = contents(place)
+    arguments = line.replace("BUSY", str(busy_port)).split()
+    program = "from ultragray_service.cli.app import app; app()"
+    ended = subprocess.run(
+        python(program, *arguments), cwd=place, env=clean_environment(), capture_output=True, text=True, timeout=120
+    )
+    log = [one for one in ended.stderr.splitlines() if not one.startswith(("{", "Datasets and jobs end"))]
+    check(line, ended.returncode, ended.stdout, "\n".join(log))
+    assert contents(place) == before
+
+
+def clean_environment() -> dict[str, str]:
+    return {name: value for name, value in os.environ.items() if not name.startswith("ULTRAGRAY_")}
+
+
+def test_a_mistake_is_told_before_torch_is_imported(place: Path) -> None:
+    lines = [
+        line for line in WRONG if line.split()[0] in ("render", "train", "eval", "check", "scenes", "jobs", "show")
+    ]
+    quick = [line for line in lines if not line.endswith(("--backend gpu", "--device gpu")) and "BUSY" not in line]
+    program = (
+        "from typer.testing import CliRunner; from ultragray_service.cli.app import app\n"
+        f"for line in {quick!r}:\n"
+        "    CliRunner().invoke(app, line.split()); assert 'torch' not in sys.modules, line"
+    )
+    done = subprocess.run(python(program), cwd=place, env=clean_environment(), capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize(
+    ("variable", "meant"),
+    [("ULTRAGRAY_ADRESS", "ULTRAGRAY_ADDRESS"), ("ULTRAGRAY_HTTP_PROT", "ULTRAGRAY_HTTP_PORT")],
+)
+def test_a_misspelt_variable_is_told(variable: str, meant: str, place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(variable, "1")
+    result = run("show", place / "scene.ugr", "--json")
+    assert result.exit_code == 0
+    assert f"the environment variable {variable} is not known and is ignored; did you mean {meant}?" in result.stderr
+
+
+def test_there_are_at_least_sixty_rows() -> None:
+    assert len(WRONG) >= 60
+    assert set(AS_PROCESSES) <= set(WRONG)
+    assert sys.executable
