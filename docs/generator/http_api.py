@@ -69,8 +69,8 @@ def _operation(method: str, path: str, operation: dict[str, Any]) -> str:
 
 def _content(content: dict[str, Any]) -> Iterator[str]:
     for media_type, what in content.items():
-        reference = what.get("schema", {}).get("$ref", "").rpartition("/")[2]
-        yield f"[{code(reference)}](#{reference.lower()})" if reference else code(media_type)
+        schema = what.get("schema", {})
+        yield _kind(schema) if "$ref" in schema else code(media_type)
 
 
 def _default(schema: dict[str, Any]) -> str:

@@ -137,7 +137,7 @@ def _readable(found: inspect.Signature, *, is_class: bool) -> inspect.Signature:
         default = one.default
         if isinstance(default, Enum):
             default = _Word(f"{type(default).__name__}.{default.name}")
-        elif repr(default) == "<factory>":
+        elif repr(default) == "<factory>" or inspect.isroutine(default):
             default = _Word("…")
         kept.append(one.replace(annotation=_written(one.annotation), default=default))
     told = inspect.Signature.empty if is_class else _written(found.return_annotation)
@@ -182,9 +182,11 @@ def _documented(value: Any) -> str:
     if isinstance(value, type) and not issubclass(value, Enum):
         if is_dataclass(value) and issubclass(value, Contract):
             parts.append(library.keys(value, "Field"))
-        parts += (f"`{name}{signature(inner)}`\n: {_indented(inner)}" for name, inner in members(value))
+        parts += (f"`{name}{signature(inner)}`{_indented(inner)}" for name, inner in members(value))
     return "\n\n".join(part for part in parts if part)
 
 
 def _indented(value: Any) -> str:
-    return prose(inspect.getdoc(value) or "").replace("\n", "\n    ") or "—"
+    """The docstring of a member as the definition of its name."""
+    words = prose(inspect.getdoc(value) or "").replace("\n", "\n    ")
+    return f"\n: {words}" if words else ""

@@ -24,11 +24,11 @@ SECTIONS: Mapping[str, tuple[str, ...]] = {
     "Operation": ("operation.md", "access.md", "tls.md", "backup.md"),
     "Results": ("results.md", "performance.md"),
     "Reference": (
-        "reference/index.md",
-        *("reference/conventions.md", "reference/frames.md", "reference/probes-and-poses.md"),
-        *("reference/http.md", "reference/stream.md", "reference/grpc.md", "reference/openigtlink.md"),
-        *("reference/command-line.md", "reference/settings.md", "reference/python.md", "reference/client.md"),
-        "reference/*.md",
+        *("reference/index.md", "reference/command-line.md", "reference/http.md", "reference/stream.md"),
+        *("reference/grpc.md", "reference/openigtlink.md", "reference/client.md", "reference/python.md"),
+        *("reference/frames.md", "reference/export-formats.md", "reference/samplers.md", "reference/datasets.md"),
+        *("reference/scene-file.md", "reference/training.md", "reference/jobs.md", "reference/settings.md"),
+        *("reference/metrics.md", "reference/errors.md"),
     ),
     "Contributing": ("contributing.md", "extending.md", "security.md", "changelog.md"),
 }
@@ -37,7 +37,7 @@ _CONFIGURATION = """
 site_name = "UltraG-Ray"
 site_description = "Ultrasound simulation from trained 3D Gaussian scenes"
 docs_dir = "pages"
-site_dir = "{site}"
+site_dir = "site"
 use_directory_urls = false
 extra_css = ["site.css"]
 nav = [
@@ -85,17 +85,17 @@ def order(pages: set[str]) -> dict[str, list[str]]:
 
 
 def build(folder: Path = FOLDER) -> Path:
-    """The site in `folder`/site. Raises CalledProcessError where a link leads nowhere."""
-    source, site = folder / "docs", folder / "site"
-    shutil.rmtree(source, ignore_errors=True)
-    write_pages(ROOT, source / "pages", PARTS)
-    shutil.copyfile(Path(__file__).with_name("site.css"), source / "pages" / "site.css")
+    """The site in `folder`/site, made of `folder`/pages. Raises CalledProcessError where a link leads nowhere."""
+    pages, site = folder / "pages", folder / "site"
+    for old in (pages, site):
+        shutil.rmtree(old, ignore_errors=True)
+    write_pages(ROOT, pages, PARTS)
+    shutil.copyfile(Path(__file__).with_name("site.css"), pages / "site.css")
     sections = order({place.as_posix() for place in pages_of(ROOT).values()})
     nav = ",\n".join(
-        f"    {{ {json.dumps(section)} = {json.dumps(pages[0] if len(pages) == 1 else pages)} }}"
-        for section, pages in sections.items()
+        f"    {{ {json.dumps(section)} = {json.dumps(those[0] if len(those) == 1 else those)} }}"
+        for section, those in sections.items()
     )
-    (source / "zensical.toml").write_text(_CONFIGURATION.format(site=site, nav=nav), encoding="utf-8")
-    shutil.rmtree(site, ignore_errors=True)
-    subprocess.run([sys.executable, "-m", "zensical", "build", "--strict"], cwd=source, check=True)
+    (folder / "zensical.toml").write_text(_CONFIGURATION.format(nav=nav), encoding="utf-8")
+    subprocess.run([sys.executable, "-m", "zensical", "build", "--strict"], cwd=folder, check=True)
     return site
