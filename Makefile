@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 # A file of tests belongs to one process, which shares its services among them. Most of the time they wait for others: four fit two cores.
 PYTEST := $(BIN)/pytest --numprocesses 4 --dist loadfile
 KERNEL_SOURCES := $(wildcard model/kernels/*) CMakeLists.txt pyproject.toml
-GENERATED_TESTS := tests/proto tests/client/test_client_generated.py tests/interfaces/test_generated_tables.py tests/interfaces/test_measured_tables.py tests/service/test_snapshots.py
+GENERATED_TESTS := tests/proto tests/client/test_client_generated.py tests/documents/test_measured_tables.py tests/documents/test_public_names.py tests/service/test_snapshots.py
 PYTHON_SOURCES := model service workers proto client tests benchmarks docs examples
 NPM := $(shell command -v npm)
 CONSOLE := service/ultragray_service/console/index.html
@@ -17,7 +17,7 @@ ARGS ?=
 MINUTES ?= 30
 
 .DEFAULT_GOAL := help
-.PHONY: ALWAYS help serve console test test-fast test-long test-console test-faults test-fuzz test-soak test-overload check check-lint check-types check-generated check-web format bench bench-console console-picture bench-cuda results ablations poses demo-scene generate clean
+.PHONY: ALWAYS help serve console test test-fast test-long test-console test-faults test-fuzz test-soak test-overload check check-lint check-types check-generated check-web format bench bench-console console-picture bench-cuda results ablations poses demo-scene docs generate clean
 
 help:  ## say what there is
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
@@ -112,10 +112,12 @@ poses: $(VENV)/installed  ## train with errors added to poses, with and without 
 demo-scene: $(VENV)/installed  ## simulate the phantom, train the demo scene from it and put it in its place
 	$(BIN)/python -m ultragray.demo.make
 
-generate: $(VENV)/installed-dev  ## rewrite what is generated: the gRPC stubs, most of the client, tables of the documents
+docs: $(VENV)/installed-dev  ## build the site of the documents into build/site; broken links and anchors fail
+	$(BIN)/python -m docs.generator
+
+generate: $(VENV)/installed-dev  ## rewrite what is generated: the gRPC stubs and most of the client
 	$(BIN)/python proto/generate.py
 	$(BIN)/python client/generate.py
-	$(BIN)/python docs/generate.py
 
 clean:  ## remove what was built
 	rm -rf $(VENV) build web/node_modules $(dir $(CONSOLE))
@@ -139,7 +141,7 @@ $(VENV)/installed: $(VENV)/python $(VENV)/modules $(KERNEL_SOURCES)
 
 $(VENV)/installed-dev: $(VENV)/installed client/pyproject.toml
 	@echo "Installing the client and the test and lint tools ..."
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]' --editable ./client
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,docs]' --editable ./client
 	@touch $@
 
 web/node_modules/.package-lock.json: web/package-lock.json
