@@ -14,6 +14,8 @@ from .markdown import code, in_line, prose, sections, table
 
 _MARKUP = re.compile(r"\[/?(?:bold|dim|italic|red|green|blue|cyan|yellow|link[^\]]*)(?: [a-z ]+)?\]")
 
+_VARIABLE = re.compile(r"\[(ULTRAGRAY_\w+)\]")
+
 
 def commands() -> str:
     """Each command that does something itself, with its arguments, options and examples."""
@@ -60,13 +62,13 @@ def _plain(text: str) -> str:
 def _parameter(parameter: Any) -> tuple[str, str, str]:
     is_argument = parameter.param_type_name == "argument"
     names = [parameter.name.upper()] if is_argument else [*parameter.opts, *parameter.secondary_opts]
-    meaning = in_line(_plain(parameter.help or ""))
-    if parameter.envvar:
-        meaning += f". Environment: {code(parameter.envvar)}"
+    meaning = _VARIABLE.sub(r"`\1`", in_line(_plain(parameter.help or "")))
+    if parameter.envvar and parameter.envvar not in meaning:
+        meaning += f". {code(parameter.envvar)}"
     if parameter.required:
         default = "required"
     elif isinstance(parameter.show_default, str):
-        default = parameter.show_default
+        default = code(parameter.show_default)
     elif parameter.show_default and parameter.default not in (None, False):
         default = code(getattr(parameter.default, "value", parameter.default))
     else:
