@@ -18,21 +18,25 @@ _VARIABLE = re.compile(r"\[(ULTRAGRAY_\w+)\]")
 
 
 def commands() -> str:
-    """Each command that does something itself, with its arguments, options and examples."""
-    return sections(2, ((f"ultragray {name}", _command(name, command)) for name, command in all_commands()))
+    """Each command that does something itself, with its arguments, options and examples, by the panels of `--help`."""
+    panels: dict[str, list[tuple[str, str]]] = {}
+    for panel, name, command in all_commands():
+        panels.setdefault(panel, []).append((f"ultragray {name}", _command(name, command)))
+    return sections(2, ((panel, sections(3, those)) for panel, those in panels.items()))
 
 
-def all_commands() -> Iterator[tuple[str, Any]]:
-    """Every command that does something itself, by its words, in the order of `--help`."""
+def all_commands() -> Iterator[tuple[str, str, Any]]:
+    """Every command that does something itself, by its panel and its words, in the order of `--help`."""
 
-    def below(prefix: str, group: Any) -> Iterator[tuple[str, Any]]:
+    def below(panel: str, prefix: str, group: Any) -> Iterator[tuple[str, str, Any]]:
         for word, command in group.commands.items():
+            inside = panel or getattr(command, "rich_help_panel", None) or "Commands"
             if hasattr(command, "commands"):
-                yield from below(f"{prefix}{word} ", command)
+                yield from below(inside, f"{prefix}{word} ", command)
             elif not command.hidden:
-                yield f"{prefix}{word}", command
+                yield inside, f"{prefix}{word}", command
 
-    return below("", typer.main.get_command(app))
+    return below("", "", typer.main.get_command(app))
 
 
 def _command(name: str, command: Any) -> str:
@@ -44,10 +48,16 @@ def _command(name: str, command: Any) -> str:
         usual = "Arguments" if parameter.param_type_name == "argument" else "Options"
         panels.setdefault(getattr(parameter, "rich_help_panel", None) or usual, []).append(parameter)
     tables = [table((panel, "Default", "Meaning"), map(_parameter, those)) for panel, those in panels.items()]
-    epilog = f"```text\n{_plain(command.epilog).strip()}\n```" if command.epilog else ""
-    return "\n\n".join(
-        part for part in (f"```text\n{usage}\n```", prose(_plain(command.help or "")), *tables, epilog) if part
-    )
+    parts = (f"```text\n{usage}\n```", prose(_plain(command.help or "")), *tables, _epilogue(command.epilog or ""))
+    return "\n\n".join(part for part in parts if part)
+
+
+def _epilogue(text: str) -> str:
+    """Examples as one block; what else there is as words."""
+    lines = [line for line in _plain(text).splitlines() if line.strip() and line != "Examples"]
+    examples = [line for line in lines if "ultragray " in line or line.startswith("#")]
+    block = "\n".join(("```bash", *examples, "```")) if examples else ""
+    return "\n\n".join(part for part in (block, *(prose(line) for line in lines if line not in examples)) if part)
 
 
 def _metavar(argument: Any) -> str:
