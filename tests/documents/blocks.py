@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -35,12 +36,24 @@ class Block:
         """The commands of a shell block, for bash. A console block's output is left out."""
         if self.language == "bash":
             return self.code
-        commands, goes_on = [], False
+        commands: list[str] = []
         for line in self.code.splitlines():
-            if goes_on or line.startswith("$ "):
-                commands.append(line if goes_on else line[2:])
-                goes_on = line.endswith("\\")
+            if commands and _goes_on(commands[-1]):
+                commands[-1] += f"\n{line}"
+            elif line.startswith("$ "):
+                commands.append(line[2:])
         return "\n".join(commands) + "\n"
+
+
+def _goes_on(command: str) -> bool:
+    """Whether the next line belongs to a command: after a backslash, or in quotes that are still open."""
+    if command.endswith("\\"):
+        return True
+    try:
+        shlex.split(command, comments=True)
+    except ValueError:
+        return True
+    return False
 
 
 @dataclass(frozen=True)

@@ -71,8 +71,8 @@ def page_of(text: str, folder: Path) -> Page:
 
 
 def test_commands_are_told_from_output(tmp_path: Path) -> None:
-    (block,) = page_of("```console\n$ a \\\n    b\nout $ c\n$ d\n```\n", tmp_path).blocks
-    assert block.script() == "a \\\n    b\nd\n"
+    (block,) = page_of("```console\n$ a \\\n    b\nout $ c\n$ d '{\n}'  # isn't\nout\n```\n", tmp_path).blocks
+    assert block.script() == "a \\\n    b\nd '{\n}'  # isn't\n"
 
 
 def test_comments_belong_to_the_next_block(tmp_path: Path) -> None:
