@@ -69,12 +69,16 @@ def training_settings() -> str:
     rows = (
         (
             code(item.name),
-            *(code(json.dumps(settings[item.name])) for settings in presets.values()),
+            *(code(_short(settings[item.name])) for settings in presets.values()),
             described(item),
         )
         for item, _ in annotated_fields(TrainingConfig)
     )
     return table(("Setting", *map(code, presets), "Meaning"), rows)
+
+
+def _short(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else json.dumps(value)
 
 
 def keys(cls: type[Any], head: str = "Key") -> str:

@@ -9,6 +9,7 @@ from collections.abc import Iterable
 Row = Iterable[str]
 
 _CODE = re.compile(r"(`[^`]*`)")
+_PAGE = re.compile(r"docs/([\w/-]+\.md)")
 
 
 def table(head: Row, rows: Iterable[Row]) -> str:
@@ -32,8 +33,15 @@ def in_line(text: str) -> str:
 
 
 def prose(text: str) -> str:
-    """Text with what looks like a tag of HTML, such as `<name>` outside of code, made harmless."""
-    return "".join(part if part.startswith("`") else part.replace("<", "&lt;") for part in _CODE.split(text))
+    """Text of the code for a page of the reference.
+
+    What looks like a tag of HTML, such as `<name>` outside of code, is made harmless; the name of another page, such as
+    docs/physics.md, becomes a link.
+    """
+    return "".join(
+        part if part.startswith("`") else _PAGE.sub(r"[\1](../\1)", part.replace("<", "&lt;"))
+        for part in _CODE.split(text)
+    )
 
 
 def summary(thing: object) -> str:
