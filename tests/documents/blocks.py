@@ -89,6 +89,8 @@ def read_page(path: Path) -> Page:
                 if word == "needs":
                     needs.append(value)
                 elif word == "not run":
+                    if not value:
+                        raise PageInvalid(f"{path}:{line}: a block that is not run says why")
                     steering.not_run = value
                 elif word == "prepare":
                     steering.prepare.append(value)
@@ -103,5 +105,7 @@ def read_page(path: Path) -> Page:
             blocks.append(
                 Block(line + 1, language, token.content, steering.not_run, tuple(steering.prepare), steering.serves)
             )
+            if language in SHELL and not blocks[-1].script().strip():
+                raise PageInvalid(f"{path}:{line}: a block without a command; one of output alone is text")
             steering = _Steering()
     return Page(path, tuple(needs), tuple(blocks))

@@ -82,8 +82,15 @@ def test_comments_belong_to_the_next_block(tmp_path: Path) -> None:
     assert [(block.not_run, block.line) for block in page.blocks] == [("no", 6), (None, 12)]
 
 
-@pytest.mark.parametrize("text", ["    make serve\n", "```\nx\n```\n", "```sh\nx\n```\n"])
-def test_a_block_without_a_known_language_is_refused(text: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "text",
+    [
+        *("    make serve\n", "```\nx\n```\n", "```sh\nx\n```\n"),  # in no language that is known
+        "```console\nmake serve\n```\n",
+        "<!-- not run -->\n```bash\nfalse\n```\n",
+    ],
+)
+def test_what_the_convention_does_not_know_is_refused(text: str, tmp_path: Path) -> None:
     with pytest.raises(PageInvalid, match=r"page\.md:1: "):
         page_of(text, tmp_path)
 
