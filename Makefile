@@ -9,7 +9,7 @@ KERNEL_SOURCES := $(wildcard model/kernels/*) CMakeLists.txt
 PACKAGES := . proto client
 PACKAGE_SOURCES := $(KERNEL_SOURCES) $(PACKAGES:%=%/pyproject.toml) $(wildcard distribution/*.py)
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check
-GENERATED_TESTS := tests/proto tests/client/test_client_generated.py tests/interfaces/test_generated_tables.py tests/interfaces/test_measured_tables.py tests/benchmarks/test_registry.py tests/service/test_snapshots.py
+GENERATED_TESTS := tests/proto tests/client/test_client_generated.py tests/documents/test_measured_tables.py tests/documents/test_public_names.py tests/benchmarks/test_registry.py tests/service/test_snapshots.py
 PYTHON_SOURCES := model service workers proto client distribution tests benchmarks docs examples
 NPM := $(shell command -v npm)
 CONSOLE := service/ultragray_service/console/index.html
@@ -26,7 +26,7 @@ KEEP = @$(if $(RECORD),$(BIN)/python benchmarks/record.py,:)
 MINUTES ?= 30
 
 .DEFAULT_GOAL := help
-.PHONY: ALWAYS help serve console test test-fast test-long test-console test-faults test-fuzz test-soak test-overload check check-lint check-types check-generated check-web check-figures format bench bench-record bench-console console-picture bench-cuda results ablations poses confidence libraries figures demo-scene generate packages clean
+.PHONY: ALWAYS help serve console test test-fast test-long test-console test-faults test-fuzz test-soak test-overload check check-lint check-types check-generated check-web check-figures format bench bench-record bench-console console-picture bench-cuda results ablations poses confidence libraries figures demo-scene docs generate packages clean
 
 help:  ## say what there is
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
@@ -166,10 +166,12 @@ libraries: $(VENV)/installed-dev  ## the image processing here beside scikit-ima
 demo-scene: $(VENV)/installed  ## simulate the phantom, train the demo scene from it and put it in its place
 	$(BIN)/python -m ultragray.demo.make
 
-generate: $(VENV)/installed-dev  ## rewrite what is generated: the gRPC stubs, most of the client, tables of the documents
+docs: $(VENV)/installed-dev  ## build the site of the documents into build/site; broken links and anchors fail
+	$(BIN)/python -m docs.generator
+
+generate: $(VENV)/installed-dev  ## rewrite what is generated: the gRPC stubs and most of the client
 	$(BIN)/python proto/generate.py
 	$(BIN)/python client/generate.py
-	$(BIN)/python docs/generate.py
 
 packages: $(VENV)/installed-dev $(CONSOLE)  ## build the three packages into dist: sdists, and wheels for this Python
 	for package in $(PACKAGES); do $(BIN)/python -m build --outdir dist $$package || exit 1; done
@@ -200,7 +202,7 @@ $(VENV)/installed: $(VENV)/python $(VENV)/modules $(PACKAGE_SOURCES)
 
 $(VENV)/installed-dev: $(VENV)/installed
 	@echo "Installing the test and lint tools ..."
-	@$(PIP_INSTALL) 'ultragray[dev]'
+	@$(PIP_INSTALL) 'ultragray[dev,docs]'
 	@touch $@
 
 web/node_modules/.package-lock.json: web/package-lock.json

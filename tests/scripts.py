@@ -1,4 +1,4 @@
-"""Scripts that are no part of a package, such as generators, as modules."""
+"""Scripts and packages that are not installed, such as generators, as modules."""
 
 from __future__ import annotations
 
@@ -30,3 +30,17 @@ def benchmark(name: str) -> ModuleType:
         return importlib.import_module(name)
     finally:
         sys.path.remove(str(BENCHMARKS))
+
+
+def loaded_package(folder: Path) -> ModuleType:
+    """The package in a folder, kept among the imported modules, so that `import_module` finds what is in it."""
+    if folder.name not in sys.modules:
+        places = [str(folder)]
+        spec = importlib.util.spec_from_file_location(
+            folder.name, folder / "__init__.py", submodule_search_locations=places
+        )
+        assert spec is not None
+        assert spec.loader is not None
+        sys.modules[folder.name] = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(sys.modules[folder.name])
+    return sys.modules[folder.name]

@@ -22,7 +22,7 @@ UltragrayError
 └── those of the front doors: ultragray_service.errors
 
 Each class carries a `reason` that never changes: clients match on it, and the service looks up the statuses that its
-front doors answer with. The first paragraph of its docstring is its line in docs/interfaces.md.
+front doors answer with. The first paragraph of its docstring is its line in docs/reference/errors.md.
 """
 
 from __future__ import annotations

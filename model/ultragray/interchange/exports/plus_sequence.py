@@ -1,6 +1,6 @@
 """PLUS sequences: a MetaImage .igs.mha whose frames have their transforms, as the recorder of a sweep writes it.
 
-`ImageToProbe` takes pixels (column, row) to mm in the probe frame (docs/interfaces.md, Frames), `ProbeToTracker` is the
+`ImageToProbe` takes pixels (column, row) to mm in the probe frame (docs/reference/frames.md), `ProbeToTracker` is the
 pose; the third column of `ImageToProbe` makes it right-handed. Every frame has the status OK, times 25 a second, and
 its figures as `UltraGRayConfidence` and the like, nan where one is not known.
 `read_plus_sweep` gives back the same frames; of a linear probe also the poses, moved by `near_mm` along the axial axis.

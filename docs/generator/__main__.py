@@ -1,0 +1,17 @@
+"""`python -m docs.generator` builds the site into build/site."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+from .pages import SiteInvalid
+from .site import build
+
+try:
+    site = build()
+except SiteInvalid as error:
+    sys.exit(f"error: {error}")
+except subprocess.CalledProcessError as error:
+    sys.exit(error.returncode)
+print(f"The site is in {site}. To read it: python3 -m http.server --directory {site}")  # noqa: T201

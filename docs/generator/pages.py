@@ -1,0 +1,93 @@
+"""The pages of the site: the documents of the repository, with their generated parts and with links that hold there."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+
+# Documents outside docs/, by their place in the site.
+ADOPTED = {
+    "README.md": "index.md",
+    "CONTRIBUTING.md": "contributing.md",
+    "SECURITY.md": "security.md",
+    "CHANGELOG.md": "changelog.md",
+}
+_MARKER = re.compile(r"^<!-- generated: ([\w -]+) -->$", flags=re.MULTILINE)
+_LINK = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^)\s]+)\)")
+_SOURCE = re.compile(r"(<img [^>]*src=\")([^\"]+)(\")")
+
+
+class SiteInvalid(Exception):
+    """A document that cannot become a page."""
+
+
+def pages_of(root: Path) -> dict[Path, Path]:
+    """Where each document of the repository lies in the site; both paths are relative."""
+    docs = {path.relative_to(root): path.relative_to(root / "docs") for path in (root / "docs").rglob("*.md")}
+    return docs | {Path(name): Path(place) for name, place in ADOPTED.items() if (root / name).exists()}
+
+
+def write_pages(root: Path, folder: Path, parts: Mapping[str, Callable[[], str]]) -> None:
+    """Writes all pages into a folder, with the pictures that they show. Raises SiteInvalid for an unknown part."""
+    places = pages_of(root)
+    for document, place in places.items():
+        text = with_parts((root / document).read_text(encoding="utf-8"), parts, document)
+        target = folder / place
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_text(_with_links(text, document, place, root, places), encoding="utf-8")
+    for picture in (root / "docs").rglob("*.*"):
+        if picture.suffix in {".png", ".svg", ".jpg", ".css"}:
+            target = folder / picture.relative_to(root / "docs")
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(picture, target)
+
+
+def with_parts(text: str, parts: Mapping[str, Callable[[], str]], document: Path) -> str:
+    """The text with what its markers ask for."""
+
+    def made(match: re.Match[str]) -> str:
+        if match[1] not in parts:
+            raise SiteInvalid(f"{document}: there is no part {match[1]!r}; known are {', '.join(sorted(parts))}")
+        return parts[match[1]]()
+
+    return _MARKER.sub(made, text)
+
+
+def markers_of(text: str) -> Iterator[str]:
+    return (match[1] for match in _MARKER.finditer(text))
+
+
+def _with_links(text: str, document: Path, place: Path, root: Path, places: Mapping[Path, Path]) -> str:
+    """Links lead to pages and pictures of the site; of those to other files of the repository the words stay."""
+
+    def moved(target: str) -> str | None:
+        path, _, anchor = target.partition("#")
+        if "://" in target or target.startswith("mailto:") or not path:
+            return target
+        wanted = Path(os.path.normpath(document.parent / path))
+        if wanted in places:
+            found = places[wanted]
+        elif wanted.parts[0] == "docs" and (root / wanted).is_file():
+            found = wanted.relative_to("docs")
+        elif (root / wanted).exists():
+            return None
+        else:
+            return target  # for the strict build to refuse
+        return os.path.relpath(found, place.parent) + (f"#{anchor}" if anchor else "")
+
+    def link(match: re.Match[str]) -> str:
+        inner = _LINK.sub(link, match[2])  # a picture in a link
+        target = moved(match[3])
+        return inner if target is None else f"{match[1]}[{inner}]({target})"
+
+    def source(match: re.Match[str]) -> str:
+        return f"{match[1]}{moved(match[2]) or match[2]}{match[3]}"
+
+    # Code in backticks within a link's words is part of the link: only fences and code outside of links are left alone.
+    pieces = re.split(r"(^```.*?^```)", text, flags=re.MULTILINE | re.DOTALL)
+    return "".join(
+        piece if piece.startswith("```") else _SOURCE.sub(source, _LINK.sub(link, piece)) for piece in pieces
+    )

@@ -1,0 +1,168 @@
+"""Runs the blocks of a page in a folder, one after another."""
+
+from __future__ import annotations
+
+import ast
+import contextlib
+import doctest
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+import urllib.request
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from ..waiting import Deadline
+from .blocks import SHELL, Block, Page
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+COMMAND_TIMEOUT_S = 1200.0  # a training, on a machine that is busy with other tests
+START_TIMEOUT_S = 120.0
+PORTS = {"8000": "http", "50051": "grpc", "18944": "igtl"}  # as documents write them
+_ADDRESS = re.compile(r"((?:localhost|127\.0\.0\.1)[\"']?[:,] ?|port[ =])(8000|50051|18944)\b")
+_PARSERS = {"json": json.loads, "toml": tomllib.loads, "yaml": yaml.safe_load}
+
+
+class PageRun:
+    """The run of a page: its folder, the names of its Python blocks, and the service that it started."""
+
+    def __init__(self, page: Page, folder: Path, ports: Mapping[str, int] | None) -> None:
+        """`ports`: those of the shared service by door, where the page needs it."""
+        self.page, self.folder, self.ports = page, folder, ports
+        self.names: dict[str, Any] = {"__name__": "__main__"}
+        self.served: subprocess.Popen[bytes] | None = None
+
+    def __enter__(self) -> PageRun:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop_serving()
+
+    def run(self, block: Block) -> None:
+        for command in block.prepare:
+            self._shell(command, block)
+        code = self._with_ports(block.code)
+        if block.language in _PARSERS:
+            _PARSERS[block.language](code)
+        elif block.language == "python":
+            self._python(code, block)
+        elif block.language in SHELL and block.not_run is None:
+            if block.serves:
+                self._serve(block)
+            else:
+                self._shell(self._with_ports(block.script()), block)
+
+    def environment(self) -> dict[str, str]:
+        """That of the commands. A service that a page starts gets ports of its own from it."""
+        path = os.pathsep.join((str(Path(sys.executable).parent), os.environ["PATH"]))
+        found = {**os.environ, "PATH": path, "COLUMNS": "120", "ULTRAGRAY_THREADS_PER_PROCESS": "1"}
+        if self.ports is not None:
+            found["ULTRAGRAY_ADDRESS"] = f"http://127.0.0.1:{self.ports['http']}"
+        return found
+
+    def _with_ports(self, text: str) -> str:
+        ports = self.ports
+        return text if ports is None else _ADDRESS.sub(lambda match: f"{match[1]}{ports[PORTS[match[2]]]}", text)
+
+    def _place(self, block: Block) -> str:
+        return f"{self.page.path}:{block.line}"
+
+    def _python(self, code: str, block: Block) -> None:
+        if code.startswith(">>>"):
+            if block.not_run is None:
+                self._doctest(code, block)
+            return
+        tree = ast.parse(code, str(self.page.path))
+        ast.increment_lineno(tree, block.line - 1)  # a traceback names the line of the page
+        compiled = compile(tree, str(self.page.path), "exec")
+        if block.not_run is None:
+            exec(compiled, self.names)
+
+    def _doctest(self, code: str, block: Block) -> None:
+        path = str(self.page.path)
+        test = doctest.DocTestParser().get_doctest(code, self.names, path, path, block.line - 1)
+        told: list[str] = []
+        runner = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE)
+        runner.run(test, out=told.append, clear_globs=False)
+        self.names.update(test.globs)
+        assert not runner.failures, f"{self._place(block)}: " + "".join(told)
+
+    def _shell(self, script: str, block: Block) -> None:
+        with tempfile.TemporaryFile() as output:  # no pipe: a process left in the background would keep it open
+            done = subprocess.run(
+                ["bash", "-e", "-o", "pipefail", "-c", script],
+                cwd=self.folder,
+                env=self.environment(),
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                timeout=COMMAND_TIMEOUT_S,
+            )
+            output.seek(0)
+            told = output.read().decode(errors="replace")
+        assert done.returncode == 0, f"{self._place(block)}: exit code {done.returncode}\n{script}\n{told[-4000:]}"
+
+    def _serve(self, block: Block) -> None:
+        """Runs the block in the background, with the ports of a service of its own."""
+        self._stop_serving()
+        self.ports = {door: _free_port() for door in PORTS.values()}
+        own = {f"ULTRAGRAY_{door.upper()}_PORT": str(self.ports[door]) for door in ("http", "grpc")}
+        log = self.folder.parent / f"{self.folder.name}.log"
+        with log.open("wb") as output:
+            self.served = subprocess.Popen(
+                ["bash", "-e", "-c", self._with_ports(block.script())],
+                cwd=self.folder,
+                env={**self.environment(), **own},
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )
+        end = Deadline(START_TIMEOUT_S)
+        while not _answers(self.ports["http"]):
+            told = log.read_text(errors="replace")[-4000:]
+            assert self.served.poll() is None, f"{self._place(block)}: the service ended\n{told}"
+            assert not end.passed, f"{self._place(block)}: not ready after {START_TIMEOUT_S} s\n{told}"
+            time.sleep(0.1)
+
+    def _stop_serving(self) -> None:
+        if self.served is not None and self.served.poll() is None:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(self.served.pid, signal.SIGTERM)
+            try:
+                self.served.wait(60)
+            except subprocess.TimeoutExpired:
+                os.killpg(self.served.pid, signal.SIGKILL)
+                self.served.wait()
+                raise
+
+
+def _free_port() -> int:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port: int = free.getsockname()[1]
+    return port
+
+
+def _answers(port: int) -> bool:
+    """Whether a service at a port is ready. One that speaks TLS cuts this off, and is taken for ready."""
+    try:
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/v1/health/ready", timeout=10) as answer:
+            return bool(answer.status == 200)
+    except ConnectionResetError:
+        return True
+    except OSError:
+        return False

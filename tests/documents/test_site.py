@@ -1,0 +1,88 @@
+"""The site: every page is in it, every part is made and used, and nothing is loaded from elsewhere."""
+
+from __future__ import annotations
+
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+
+from ..surroundings import ROOT
+from .conftest import Generator
+
+LOADING = {"script": "src", "img": "src", "iframe": "src", "source": "src", "video": "src", "link": "href"}
+LEADING = {"canonical", "prev", "next", "alternate"}  # links in a page's head that load nothing
+
+
+def test_every_part_is_made(generator: Generator) -> None:
+    for name, make in generator("parts").PARTS.items():
+        assert make().strip(), f"the part {name!r} is empty"
+
+
+def test_every_part_has_its_page(generator: Generator) -> None:
+    pages = generator("pages")
+    used = [
+        name for path in (ROOT / "docs").rglob("*.md") for name in pages.markers_of(path.read_text(encoding="utf-8"))
+    ]
+    assert sorted(used) == sorted(generator("parts").PARTS)
+
+
+def test_an_unknown_part_is_refused(generator: Generator) -> None:
+    pages = generator("pages")
+    with pytest.raises(pages.SiteInvalid, match=r"a\.md: there is no part 'x'"):
+        pages.with_parts("<!-- generated: x -->\n", {}, Path("a.md"))
+
+
+def test_a_page_in_no_section_is_refused(generator: Generator) -> None:
+    site, pages = generator("site"), generator("pages")
+    assert site.order({"index.md", "howto/new.md"}) == {"Home": ["index.md"], "How-to": ["howto/new.md"]}
+    with pytest.raises(pages.SiteInvalid, match=r"lost\.md"):
+        site.order({"lost.md"})
+
+
+def test_links_hold_in_the_site(generator: Generator, tmp_path: Path) -> None:
+    root, site = tmp_path / "root", tmp_path / "site"
+    (root / "docs" / "howto").mkdir(parents=True)
+    (root / "docs" / "a.png").write_bytes(b"")
+    (root / "script.py").touch()
+    (root / "README.md").write_text(
+        "[one](docs/howto/one.md#x) [![p](docs/a.png)](docs/howto/one.md) [`run`](script.py)\n"
+    )
+    (root / "docs" / "howto" / "one.md").write_text(
+        "[home](../../README.md) [lost](lost.md) [out](https://a.example)\n"
+    )
+    generator("pages").write_pages(root, site, {})
+    assert (site / "index.md").read_text() == ("[one](howto/one.md#x) [![p](a.png)](howto/one.md) `run`\n")
+    assert (site / "howto" / "one.md").read_text() == "[home](../index.md) [lost](lost.md) [out](https://a.example)\n"
+    assert (site / "a.png").exists()
+
+
+class Loaded(HTMLParser):
+    """What a page loads when it is opened."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        given = dict(attrs)
+        if tag in LOADING and not (tag == "link" and set((given.get("rel") or "").split()) & LEADING):
+            self.found.append(given.get(LOADING[tag]) or "")
+        self.found += re.findall(r"url\(([^)]+)\)", given.get("style") or "")
+
+
+def test_the_site_builds_and_loads_nothing_from_elsewhere(generator: Generator, tmp_path: Path) -> None:
+    pytest.importorskip("zensical", reason="zensical is not installed: pip install '.[docs]'")
+    site = generator("site").build(tmp_path)
+    pages = list(site.rglob("*.html"))
+    assert len(pages) > len(generator("pages").pages_of(ROOT))  # and the page that is shown for lost ones
+    foreign = re.compile(r"^['\"]?(https?:)?//")
+    for page in pages:
+        loaded = Loaded()
+        loaded.feed(page.read_text(encoding="utf-8"))
+        assert loaded.found
+        assert not [source for source in loaded.found if foreign.match(source)], page
+    for sheet in site.rglob("*.css"):
+        sources = re.findall(r"(?:url\(|@import )([^)\s;]+)", sheet.read_text(encoding="utf-8"))
+        assert not [source for source in sources if foreign.match(source)], sheet
