@@ -34,7 +34,7 @@ def _origin(measured: Measured, file: str) -> str:
     machine = measured["machine"]
     return (
         f"`benchmarks/{file}`, commit {machine['commit']}, {machine['measured_at'][:10]}: {machine['processor']}, "
-        f"{machine['instruction_set']}, {machine['threads']} threads; yard {measured['yard_ms']:.1f} ms."
+        f"{machine['instruction_set']}, {machine['threads']} threads."
     )
 
 
@@ -47,7 +47,7 @@ def _table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> Iterator[str]:
 
 
 def frames(measured: Measured) -> Lines:
-    """The kernel and the front doors."""
+    """The kernel and the front doors, and the memory of a worker process."""
     rows = (
         (
             row["what"],
@@ -62,27 +62,30 @@ def frames(measured: Measured) -> Lines:
         for row in measured["rows"]
     )
     head = ("What", "Gaussians", "Threads", "Poses at once", "p50 ms", "p99 ms", "Frames/s", "Above kernel ms")
-    return _table(head, rows)
-
-
-def frames_at_a_glance(measured: Measured) -> Lines:
-    """The same for a reader in a hurry: p50 and p99 by number of Gaussians."""
-    by_what: dict[str, dict[int, Measured]] = {}
-    for row in measured["rows"]:
-        threads = f", {row['threads']} thread{'s' if row['threads'] > 1 else ''}" if "kernel" in row["what"] else ""
-        together = f", batches of {row['poses']}" if row["poses"] > 1 else ""
-        by_what.setdefault(f"{row['what']}{threads}{together}", {})[row["gaussians"]] = row
-    counts = sorted({row["gaussians"] for row in measured["rows"]}, reverse=True)
-    yield from _table(
-        ("one 512x512 frame, p50 / p99", *(f"{count:,} Gaussians" for count in counts)),
-        (
-            (what, *(f"{of[count]['p50_ms']:.1f} / {of[count]['p99_ms']:.1f} ms" for count in counts))
-            for what, of in by_what.items()
-        ),
-    )
+    yield from _table(head, rows)
     memory = ", ".join(f"{int(count):,} Gaussians {mb:.0f} MB" for count, mb in measured["worker_memory_mb"].items())
     yield ""
     yield f"Memory of a worker process: with {memory}."
+
+
+def frames_at_a_glance(measured: Measured) -> Lines:
+    """What a reader of the README wants to know: the kernel and each front door, p50 and p99 by number of Gaussians."""
+    names = {
+        ("kernel", 1): "the kernel alone, 1 thread",
+        ("kernel", 2): "the kernel alone, 2 threads",
+        ("gRPC stream", 2): "gRPC stream, to the client",
+        ("HTTP raw", 2): "HTTP, raw pixels, to the client",
+        ("HTTP PNG", 2): "HTTP, PNG, to the client",
+    }
+    of = {(row["what"], row["threads"], row["gaussians"]): row for row in measured["rows"] if row["poses"] == 1}
+    counts = sorted({row["gaussians"] for row in measured["rows"]}, reverse=True)
+    return _table(
+        ("Median / 99th percentile", *(f"{count:,} Gaussians" for count in counts)),
+        (
+            (name, *(f"{of[(*key, count)]['p50_ms']:.1f} / {of[(*key, count)]['p99_ms']:.1f} ms" for count in counts))
+            for key, name in names.items()
+        ),
+    )
 
 
 def steps(measured: Measured) -> Lines:
