@@ -1,4 +1,4 @@
-"""Writes what `make bench` measured into README.md and docs/performance.md: `python benchmarks/performance.py`.
+"""Writes what `make bench` measured into README.md and pages of docs: `python benchmarks/performance.py`.
 
 Each place stands between `<!-- measured: NAME -->` and `<!-- end -->`; BLOCKS says what is written there.
 """
@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 FOLDER = Path(__file__).resolve().parent
-DOCUMENTS = (FOLDER.parent / "README.md", FOLDER.parent / "docs" / "performance.md")
+DOCUMENTS = tuple(FOLDER.parent / page for page in ("README.md", "docs/performance.md", "docs/howto/robotics.md"))
 _MEASURED = re.compile(r"(?<=<!-- measured: )([\w ,-]+?)( -->\n).*?(?=<!-- end -->)", flags=re.DOTALL)
 
 Measured: TypeAlias = dict[str, Any]
@@ -157,6 +157,20 @@ def clients(measured: Measured) -> Lines:
     )
 
 
+def control_loop(measured: Measured) -> Lines:
+    """What a robot waits for."""
+    loop = measured["clients"]["control loop"]
+    return _table(
+        ("From sending a pose to having its frame", "ms"),
+        (
+            ("median", f"{loop['p50_ms']:.1f}"),
+            ("99 of 100 frames", f"{loop['p99_ms']:.1f}"),
+            ("999 of 1,000 frames", f"{loop['p99.9_ms']:.1f}"),
+            ("time between two frames, standard deviation", f"{loop['jitter_ms']:.1f}"),
+        ),
+    )
+
+
 def jobs(measured: Measured) -> Lines:
     """A service with a long list of jobs."""
     return _table(
@@ -171,6 +185,7 @@ BLOCKS: dict[str, tuple[str, Callable[[Measured], Lines]]] = {
     "training steps": ("training.json", steps),
     "parts of a frame": ("kernel.json", parts),
     "clients": ("clients.json", clients),
+    "control loop": ("clients.json", control_loop),
     "jobs": ("jobs.json", jobs),
 }
 
