@@ -50,6 +50,7 @@ BLOCKS = {
     "training steps": Block("training", performance.steps),
     "parts of a frame": Block("kernel", performance.parts),
     "clients": Block("clients", performance.clients),
+    "control loop": Block("clients", performance.control_loop),
     "jobs": Block("jobs", performance.jobs),
     "console": Block("console", performance.console),
     "imports": Block("libraries", performance.imports),

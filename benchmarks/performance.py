@@ -16,7 +16,7 @@ def _table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> Iterator[str]:
 
 
 def frames(measured: Document) -> Iterator[str]:
-    """The kernel and the front doors."""
+    """The kernel and the front doors, and the memory of a worker process."""
     rows = (
         (
             row["what"],
@@ -31,27 +31,30 @@ def frames(measured: Document) -> Iterator[str]:
         for row in measured["rows"]
     )
     head = ("What", "Gaussians", "Threads", "Poses at once", "p50 ms", "p99 ms", "Frames/s", "Above kernel ms")
-    return _table(head, rows)
-
-
-def frames_at_a_glance(measured: Document) -> Iterator[str]:
-    """The same for a reader in a hurry: p50 and p99 by number of Gaussians."""
-    by_what: dict[str, dict[int, Document]] = {}
-    for row in measured["rows"]:
-        threads = f", {row['threads']} thread{'s' if row['threads'] > 1 else ''}" if "kernel" in row["what"] else ""
-        together = f", batches of {row['poses']}" if row["poses"] > 1 else ""
-        by_what.setdefault(f"{row['what']}{threads}{together}", {})[row["gaussians"]] = row
-    counts = sorted({row["gaussians"] for row in measured["rows"]}, reverse=True)
-    yield from _table(
-        ("one 512x512 frame, p50 / p99", *(f"{count:,} Gaussians" for count in counts)),
-        (
-            (what, *(f"{of[count]['p50_ms']:.1f} / {of[count]['p99_ms']:.1f} ms" for count in counts))
-            for what, of in by_what.items()
-        ),
-    )
+    yield from _table(head, rows)
     memory = ", ".join(f"{int(count):,} Gaussians {mb:.0f} MB" for count, mb in measured["worker_memory_mb"].items())
     yield ""
     yield f"Memory of a worker process: with {memory}."
+
+
+def frames_at_a_glance(measured: Document) -> Iterator[str]:
+    """What a reader of the README wants to know: the kernel and each front door, p50 and p99 by number of Gaussians."""
+    names = {
+        ("kernel", 1): "the kernel alone, 1 thread",
+        ("kernel", 2): "the kernel alone, 2 threads",
+        ("gRPC stream", 2): "gRPC stream, to the client",
+        ("HTTP raw", 2): "HTTP, raw pixels, to the client",
+        ("HTTP PNG", 2): "HTTP, PNG, to the client",
+    }
+    of = {(row["what"], row["threads"], row["gaussians"]): row for row in measured["rows"] if row["poses"] == 1}
+    counts = sorted({row["gaussians"] for row in measured["rows"]}, reverse=True)
+    yield from _table(
+        ("Median / 99th percentile", *(f"{count:,} Gaussians" for count in counts)),
+        (
+            (name, *(f"{of[(*key, count)]['p50_ms']:.1f} / {of[(*key, count)]['p99_ms']:.1f} ms" for count in counts))
+            for key, name in names.items()
+        ),
+    )
 
 
 def steps(measured: Document) -> Iterator[str]:
@@ -119,6 +122,20 @@ def clients(measured: Document) -> Iterator[str]:
                 f"{batch['frames_per_s']:.0f} frames/s; the kernel by itself {batch['kernel_frames_per_s']:.0f}: "
                 f"{batch['share_of_kernel']:.0%}",
             ),
+        ),
+    )
+
+
+def control_loop(measured: Document) -> Iterator[str]:
+    """What a robot waits for."""
+    loop = measured["clients"]["control loop"]
+    return _table(
+        ("From sending a pose to having its frame", "ms"),
+        (
+            ("median", f"{loop['p50_ms']:.1f}"),
+            ("99 of 100 frames", f"{loop['p99_ms']:.1f}"),
+            ("999 of 1,000 frames", f"{loop['p99.9_ms']:.1f}"),
+            ("time between two frames, standard deviation", f"{loop['jitter_ms']:.1f}"),
         ),
     )
 

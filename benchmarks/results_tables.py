@@ -49,12 +49,10 @@ ROW_NAMES = {
 
 README_ROWS = {
     "ultranerf_liver": "simulated liver, two sweeps",
-    "ultranerf_liver_other_side": "the same, trained on one sweep, seen from the other",
     "liver_convex": "human liver, convex probe",
     "spine_phantom": "spine phantom, 17 frames",
     "nwire_phantom": "N-wire phantom: bright dots in black",
-    "phantom": "built-in phantom, a tilt never trained on",
-    "robot": "a simulated robot's sweep of it, every fifth frame and 3.5 mm held out",
+    "phantom": "built-in phantom, a tilt that was not trained on",
 }
 
 log = logging.getLogger("results")

@@ -1,0 +1,183 @@
+"""Draws the pictures of the documents from the demo scene: `python docs/pictures.py`, into docs/images.
+
+`python docs/pictures.py FOLDER` also takes the tutorial's pictures from the folder in which its commands were run.
+The README's pictures come from `make demo-scene` and `make console-picture`.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import matplotlib as mpl
+import numpy as np
+import numpy.typing as npt
+
+mpl.use("Agg")
+import matplotlib.pyplot as plt
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+
+from ultragray import GaussianScene, read_header, render
+from ultragray.confidence import Assessor, supported
+from ultragray.demo import DEMO_FILE
+from ultragray.display import Display
+from ultragray.display.frames import show
+from ultragray.samplers import AroundSampler
+
+IMAGES = Path(__file__).resolve().parent / "images"
+Floats = npt.NDArray[np.float64]
+
+SIDE = 256
+EXTENT_MM = (-30.0, 30.0, 60.0, 0.0)  # of the demo scene's probe: left, right, bottom, top
+OVER_CANAL_MM = 19.0  # along the spine: bone to both sides, the canal between them
+LABEL_COLOURS = {"bone": "#f4d58d", "muscle": "#d1495b", "fat": "#edae49", "vessel": "#30a0e0"}
+
+
+def main() -> None:
+    scene = GaussianScene.load(DEMO_FILE)
+    draw_maps(scene, IMAGES / "maps.png")
+    draw_display_settings(scene, IMAGES / "display_settings.png")
+    draw_confidence(scene, IMAGES / "confidence_off_the_sweep.png")
+    draw_augmentation(scene, IMAGES / "augmentation.png")
+    for folder in sys.argv[1:]:
+        shrink(Path(folder) / "sweep.png", IMAGES / "tutorial_sweep.png", width=1000)
+        shrink(Path(folder) / "pictures" / "frame_00007.png", IMAGES / "tutorial_eval.png", width=1000)
+
+
+def along_spine(y_mm: float) -> Floats:  # [4, 4]
+    """The pose of an upright transverse view at `y_mm` along the spine."""
+    pose = np.eye(4)
+    pose[1, 3] = y_mm
+    return pose
+
+
+def draw_maps(scene: GaussianScene, path: Path) -> None:
+    """Every output of one view."""
+    brightest = {"attenuation": 0.3, "uncertainty": 0.25}
+    captions = {
+        "bmode": "bmode: what a scanner shows",
+        "echo": "echo: what tissue reflects",
+        "transmittance": "transmittance: beam that is left",
+        "attenuation": "attenuation: beam lost here",
+        "coverage": "coverage: support by the scene",
+        "uncertainty": "uncertainty: expected error",
+        "labels": "labels: what lies here",
+    }
+    frames = render(scene, None, along_spine(OVER_CANAL_MM), height=SIDE, width=SIDE, outputs=tuple(captions))
+    figure, panels = panel_row(rows=2, columns=4)
+    for panel, (output, caption) in zip(panels, captions.items(), strict=False):
+        if output == "labels":
+            draw_labels(panel, frames[output][0].numpy(), scene.info.label_names)
+        else:
+            colours = "gray" if output in ("bmode", "echo") else "magma"
+            values, top = frames[output][0].numpy(), brightest.get(output, 1.0)
+            panel.imshow(values, cmap=colours, vmin=0.0, vmax=top, extent=EXTENT_MM)
+        panel.set_title(caption, fontsize=8)
+    panels[-1].axis("off")
+    panels[-1].legend(
+        handles=[Patch(color=LABEL_COLOURS[name], label=name) for name in scene.info.label_names.values()],
+        title="labels",
+        loc="center",
+        frameon=False,
+    )
+    save(figure, path)
+
+
+def draw_labels(panel: Axes, labels: npt.NDArray[np.uint8], names: dict[int, str]) -> None:  # [H, W]
+    """Labels in their colours; black where there is none."""
+    colours = np.zeros((256, 3))
+    for number, name in names.items():
+        colours[number] = mpl.colors.to_rgb(LABEL_COLOURS[name])
+    panel.imshow(colours[labels], extent=EXTENT_MM, interpolation="nearest")
+
+
+def draw_display_settings(scene: GaussianScene, path: Path) -> None:
+    """One frame as a sonographer's settings show it."""
+    settings = {
+        "as rendered: gain 0 dB, range 60 dB": Display(),
+        "gain +10 dB": Display(gain_db=10.0),
+        "dynamic range 40 dB": Display(dynamic_range_db=40.0),
+        "TGC: −12 dB at the skin … +12 dB deep": Display(tgc_db=(-12.0, 0.0, 12.0)),
+        "depth 35 mm": Display(depth_mm=35.0),
+        "edge enhancement 2": Display(edge=2.0),
+    }
+    probe = scene.info.probe_or(None)
+    frames = render(scene, None, along_spine(OVER_CANAL_MM), height=SIDE, width=SIDE, outputs=("bmode",))
+    figure, panels = panel_row(rows=2, columns=3)
+    for panel, (caption, display) in zip(panels, settings.items(), strict=True):
+        left, right, bottom, top = EXTENT_MM
+        shown_mm = display.depth_mm or bottom
+        image = show(frames, probe, display)["bmode"][0].numpy()
+        panel.imshow(image, cmap="gray", vmin=0.0, vmax=1.0, extent=(left, right, shown_mm, top))
+        panel.set_title(caption, fontsize=8)
+    save(figure, path)
+
+
+def draw_confidence(scene: GaussianScene, path: Path) -> None:
+    """Frames that leave the sweep at its end, with what each says about itself."""
+    places_mm = (36.0, 40.0, 44.0, 50.0, 60.0)
+    poses = np.stack([along_spine(y) for y in places_mm])
+    frames = render(scene, None, poses, height=SIDE, width=SIDE, outputs=("bmode", "coverage"))
+    header = read_header(DEMO_FILE)
+    told = Assessor(header.info, header.training_poses).assess(poses, coverage=frames["coverage"].numpy())
+    figure, panels = panel_row(rows=1, columns=len(places_mm))
+    for panel, image, one in zip(panels, frames["bmode"].numpy(), told, strict=True):
+        panel.imshow(image, cmap="gray", vmin=0.0, vmax=1.0, extent=EXTENT_MM)
+        panel.set_title(f"{one.distance_mm:.1f} mm away: confidence {one.confidence:.2f}", fontsize=8)
+    save(figure, path)
+
+
+def draw_augmentation(scene: GaussianScene, path: Path) -> None:
+    """Views drawn around the training poses, and the labels that come with them where the scene supports a pixel."""
+    probe = scene.info.probe_or(None)
+    sampler = AroundSampler(count=6, translation_mm=4.0, rotation_deg=8.0, seed=3)
+    poses = sampler.poses(scene.training_poses, probe)
+    frames = render(scene, None, poses, height=SIDE, width=SIDE, outputs=("bmode", "labels", "coverage"))
+    labels = np.where(supported(frames["coverage"].numpy()), frames["labels"].numpy(), 0)
+    figure, panels = panel_row(rows=2, columns=len(poses))
+    for number in range(len(poses)):
+        panels[number].imshow(frames["bmode"][number].numpy(), cmap="gray", vmin=0.0, vmax=1.0, extent=EXTENT_MM)
+        draw_labels(panels[number + len(poses)], labels[number], scene.info.label_names)
+    save(figure, path)
+
+
+def panel_row(*, rows: int, columns: int) -> tuple[Figure, Sequence[Axes]]:
+    """A figure and its panels, row by row, without ticks."""
+    size = (2.4 * columns, 2.55 * rows)
+    figure, grid = plt.subplots(rows, columns, figsize=size, squeeze=False, layout="constrained")
+    for panel in grid.flat:
+        panel.set_xticks([])
+        panel.set_yticks([])
+    return figure, list(grid.flat)
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Writes a compact PNG of 256 colours."""
+    figure.savefig(path, dpi=100)
+    plt.close(figure)
+    compress(path)
+
+
+def shrink(source: Path, target: Path, *, width: int) -> None:
+    """A smaller copy of a picture."""
+    picture = cv2.imread(str(source))
+    if picture is None:
+        raise SystemExit(f"{source} is no picture: run the tutorial's commands in its folder first")
+    size = (width, round(picture.shape[0] * width / picture.shape[1]))
+    cv2.imwrite(str(target), cv2.resize(picture, size, interpolation=cv2.INTER_AREA))
+    compress(target)
+
+
+def compress(path: Path) -> None:
+    """The same PNG with a palette, a third of the size."""
+    from PIL import Image  # comes with matplotlib
+
+    Image.open(path).convert("RGB").quantize(255, dither=Image.Dither.NONE).save(path, optimize=True)
+
+
+if __name__ == "__main__":
+    main()
