@@ -11,7 +11,9 @@ from ultragray.demo import DEMO_FILE
 
 began = time.perf_counter()
 scene = GaussianScene.load(DEMO_FILE)
-frame = render(scene, None, scene.training_poses[:1], height=128, width=128, backend="cpu").bmode[0]
+frames = render(scene, None, scene.training_poses[:1], height=128, width=128, backend="cpu")
+assert frames.bmode is not None
+frame = frames.bmode[0]
 if tuple(frame.shape) != (128, 128) or not float(frame.std()) > 0.01:
     sys.exit(
         f"error: the frame is blank, or of the wrong size: {tuple(frame.shape)}, deviation {float(frame.std()):.3g}"

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
+from typing import Any
 
 import pytest
 
+from ultragray.demo import copy_demo_scene
 from ultragray.installation import __version__
 
 from ..surroundings import ROOT
@@ -43,6 +46,16 @@ def test_the_readme_holds_without_the_repository(name: str) -> None:
     text = (FOLDERS[name] / project(name)["readme"]).read_text(encoding="utf-8")
     links = re.findall(r"\]\(([^)]*)\)", re.sub(r"```.*?```", "", text, flags=re.DOTALL))
     assert [link for link in links if "://" not in link] == [], "a package index does not have the files beside it"
+
+
+@pytest.mark.slow
+def test_the_example_of_the_library_runs(working_folder: Path) -> None:
+    copy_demo_scene(working_folder / "demo.ugr")
+    text = (ROOT / project("ultragray")["readme"]).read_text(encoding="utf-8")
+    (example,) = re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL)
+    names: dict[str, Any] = {}
+    exec(example, names)
+    assert tuple(names["frames"].bmode.shape) == (4, 256, 256)
 
 
 def test_every_package_has_one_owner() -> None:
