@@ -19,8 +19,14 @@ FOLDER = ROOT / "build"
 SECTIONS: Mapping[str, tuple[str, ...]] = {
     "Home": ("index.md",),
     "Tutorial": ("tutorial.md",),
-    "How-to": ("howto/robotics.md", "howto/simulator.md", "howto/data-science.md", "howto/*.md"),
-    "Concepts": ("physics.md", "confidence.md", "concepts/*.md", "poses.md"),
+    "How-to": (
+        *("howto/robotics.md", "howto/simulator.md", "howto/data-science.md", "howto/sonographer.md"),
+        *("howto/recording.md", "howto/operator.md", "howto/*.md"),
+    ),
+    "Concepts": (
+        *("concepts/frame.md", "physics.md", "concepts/training.md", "confidence.md", "concepts/limits.md", "poses.md"),
+        "concepts/*.md",
+    ),
     "Operation": ("operation.md", "access.md", "tls.md", "backup.md"),
     "Results": ("results.md", "performance.md"),
     "Reference": (

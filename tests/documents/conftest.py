@@ -1,17 +1,29 @@
-"""The generator of the site."""
+"""The generator of the site, and the run of a page."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import shutil
+from collections.abc import Callable, Iterator
 from importlib import import_module
+from pathlib import Path
 from types import ModuleType
 
 import pytest
 
+from ultragray.demo import copy_demo_scene
+
 from ..scripts import loaded_package
+from ..service.conftest import StartService, service_starter
 from ..surroundings import ROOT
+from .blocks import read_page
+from .running import PageRun
+
+DEMO_SERVICE = "demo service"
+TUTORIAL = ROOT / "docs" / "tutorial.md"
 
 Generator = Callable[[str], ModuleType]
+SharedPorts = Callable[[], dict[str, int]]
+RunPage = Callable[[Path], None]
 
 
 @pytest.fixture(scope="session")
@@ -19,3 +31,46 @@ def generator() -> Generator:
     """A module of docs/generator by its name."""
     package = loaded_package(ROOT / "docs" / "generator")
     return lambda name: import_module(f"{package.__name__}.{name}")
+
+
+@pytest.fixture(scope="module")
+def start_service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StartService]:
+    folder = tmp_path_factory.mktemp("demo")
+    copy_demo_scene(folder / "demo.ugr")
+    yield from service_starter(tmp_path_factory, folder)
+
+
+@pytest.fixture(scope="module")
+def shared_ports(start_service: StartService) -> SharedPorts:
+    """The ports of the service that the pages share, which is started by the first page that needs it."""
+    found: dict[str, int] = {}
+
+    def ports() -> dict[str, int]:
+        if not found:
+            service = start_service(igtl_port=0, igtl_scene="demo", embedded_worker=True)
+            (record,) = (record for record in service.log() if "grpc" in record)
+            found.update((door, int(record[door].rpartition(":")[2])) for door in ("http", "grpc", "igtl"))
+        return found
+
+    return ports
+
+
+@pytest.fixture
+def run_page(shared_ports: SharedPorts, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> RunPage:
+    """Runs a page in a folder of its own."""
+
+    def run(path: Path) -> None:
+        page = read_page(path)
+        for need in set(page.needs) - {DEMO_SERVICE}:
+            if shutil.which(need) is None:
+                pytest.skip(f"{need} is not installed")
+        folder = tmp_path / "page"
+        folder.mkdir()
+        monkeypatch.chdir(folder)
+        with PageRun(page, folder, shared_ports() if DEMO_SERVICE in page.needs else None) as page_run:
+            for name, value in page_run.environment().items():
+                monkeypatch.setenv(name, value)
+            for block in page.runs:
+                page_run.run(block)
+
+    return run

@@ -2,66 +2,27 @@
 
 from __future__ import annotations
 
-import shutil
-from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
-from ultragray.demo import copy_demo_scene
-
-from ..service.conftest import StartService, service_starter
 from ..surroundings import ROOT
 from .blocks import Page, PageInvalid, read_page
+from .conftest import TUTORIAL, RunPage
 from .running import PageRun
 
-DEMO_SERVICE = "demo service"
 DOCUMENTS = sorted(
     path
     for pattern in ("*.md", "docs/**/*.md", "*/README.md")
     for path in ROOT.glob(pattern)
-    if path.name != "CHANGELOG.md"
+    if path.name not in ("CHANGELOG.md", TUTORIAL.name)  # no commands; in a test module of its own
 )
 
-SharedPorts = Callable[[], dict[str, int]]
 
-
-@pytest.fixture(scope="module")
-def start_service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StartService]:
-    folder = tmp_path_factory.mktemp("demo")
-    copy_demo_scene(folder / "demo.ugr")
-    yield from service_starter(tmp_path_factory, folder)
-
-
-@pytest.fixture(scope="module")
-def shared_ports(start_service: StartService) -> SharedPorts:
-    """The ports of the service that the pages share, which is started by the first page that needs it."""
-    found: dict[str, int] = {}
-
-    def ports() -> dict[str, int]:
-        if not found:
-            service = start_service(igtl_port=0, igtl_scene="demo", embedded_worker=True)
-            (record,) = (record for record in service.log() if "grpc" in record)
-            found.update((door, int(record[door].rpartition(":")[2])) for door in ("http", "grpc", "igtl"))
-        return found
-
-    return ports
-
-
+@pytest.mark.filterwarnings("ignore::ResourceWarning")  # what a snippet leaves open is closed with its page
 @pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
-def test_blocks_run(path: Path, shared_ports: SharedPorts, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    page = read_page(path)
-    for need in set(page.needs) - {DEMO_SERVICE}:
-        if shutil.which(need) is None:
-            pytest.skip(f"{need} is not installed")
-    folder = tmp_path / "page"
-    folder.mkdir()
-    monkeypatch.chdir(folder)
-    with PageRun(page, folder, shared_ports() if DEMO_SERVICE in page.needs else None) as run:
-        for name, value in run.environment().items():
-            monkeypatch.setenv(name, value)
-        for block in page.runs:
-            run.run(block)
+def test_blocks_run(path: Path, run_page: RunPage) -> None:
+    run_page(path)
 
 
 def page_of(text: str, folder: Path) -> Page:

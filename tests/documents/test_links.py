@@ -1,4 +1,4 @@
-"""Every link of a document leads to a file that is there, and to a heading that it has."""
+"""Every link of a document leads to a file that is there, and to a heading that it has, in the repository too."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 
 from ..surroundings import ROOT
 
-DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), *sorted(ROOT.glob("*/README.md"))]
+DOCUMENTS = sorted(path for pattern in ("*.md", "docs/**/*.md", "*/README.md") for path in ROOT.glob(pattern))
 LINK = re.compile(r"\]\(([^)\s]+)\)")
 CODE = re.compile(r"^```.*?^```|`[^`\n]*`", re.MULTILINE | re.DOTALL)
 
@@ -32,5 +32,5 @@ def test_every_link_leads_somewhere(document: Path) -> None:
         path, _, anchor = link.partition("#")
         target = document.parent / path if path else document
         assert target.exists(), f"{document.name} names {link}, and there is no {path}"
-        if anchor:
+        if anchor and "<!-- generated: " not in target.read_text(encoding="utf-8"):  # else the site's build looks
             assert anchor in headings_of(target), f"{document.name} names {link}; {target.name} has no such heading"
