@@ -10,6 +10,7 @@ from ultragray_service.errors import STATUSES
 from ultragray_service.igtl import connection, waiting
 from ultragray_service.listening import http_server
 from ultragray_service.rpc import server as grpc_server
+from ultragray_service.rpc import shared_memory
 from ultragray_service.settings import LEAST_KEY_LENGTH
 from ultragray_service.tls.certificates import HANDSHAKE_TIMEOUT_S
 from ultragray_workers import scenes
@@ -43,6 +44,7 @@ def fixed() -> str:
         ("Frames in flight in an ordered stream", f"{pose_stream.MAX_FRAMES_IN_FLIGHT}"),
         ("Their bytes, if there are several", _bytes(pose_stream.MAX_BYTES_IN_FLIGHT)),
         ("Window of a latest stream", f"{pose_stream.MAX_WINDOW} frames"),
+        ("Memory that a stream shares", _bytes(shared_memory.MAX_BYTES)),
         ("Message to the WebSocket", _bytes(http_server.MAX_STREAM_MESSAGE_BYTES)),
         ("gRPC message, if `ULTRAGRAY_MAX_BODY_BYTES` is less", _bytes(grpc_server.LEAST_MAX_MESSAGE_BYTES)),
         ("Time between keepalive pings of a gRPC client, at least", f"{grpc_server.LEAST_PING_INTERVAL_MS:,} ms"),
