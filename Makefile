@@ -179,7 +179,8 @@ packages: $(VENV)/installed-dev $(CONSOLE)  ## build the three packages into dis
 clean:  ## remove what was built
 	rm -rf $(VENV) build dist web/node_modules $(dir $(CONSOLE))
 
-$(VENV)/python: Makefile
+# Made once, by the PYTHON of that time: another one over it would mix the two.
+$(VENV)/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 		{ echo "error: Python 3.11 or newer is needed, and $(PYTHON) is not; choose one with: make PYTHON=/path/to/python3"; exit 1; }
 	@$(PYTHON) -c 'import venv; from ensurepip import bootstrap' 2> /dev/null || \
@@ -196,8 +197,8 @@ $(VENV)/modules: ALWAYS | $(VENV)/python
 $(VENV)/installed: $(VENV)/python $(VENV)/modules $(PACKAGE_SOURCES)
 	@$(BIN)/python distribution/prerequisites.py
 	@echo "Installing the libraries and compiling the kernel (a minute or two the first time) ..."
-	@$(PIP_INSTALL) --editable ./proto --editable '.[all]' --editable ./client || { echo "error: pip could not install it all,\
-	for the reason above; if it found no cmake or ninja: sudo apt-get install cmake ninja-build"; exit 1; }
+	@$(PIP_INSTALL) --editable ./proto --editable '.[all]' --editable ./client || \
+		{ echo "error: pip said above why it failed; if it found no cmake or ninja: sudo apt-get install cmake ninja-build"; exit 1; }
 	@touch $@
 
 $(VENV)/installed-dev: $(VENV)/installed

@@ -97,3 +97,12 @@ def test_make_with_a_python_without_venv(tmp_path: Path) -> None:
     assert done.returncode != 0
     assert "on Debian: sudo apt-get install python3-venv" in done.stdout.splitlines()[0]
     assert not (tmp_path / "venv").exists()
+
+
+def test_make_leaves_the_environment_that_there_is_to_its_python(tmp_path: Path) -> None:
+    stamp = tmp_path / "venv" / "python"
+    stamp.parent.mkdir()
+    stamp.touch()
+    os.utime(stamp, (0, 0))  # older than the Makefile
+    done = made(tmp_path, "exit 1")
+    assert done.returncode == 0, done.stdout
