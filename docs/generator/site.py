@@ -36,7 +36,7 @@ SECTIONS: Mapping[str, tuple[str, ...]] = {
         *("reference/scene-file.md", "reference/training.md", "reference/jobs.md", "reference/settings.md"),
         *("reference/metrics.md", "reference/errors.md"),
     ),
-    "Contributing": ("contributing.md", "extending.md", "security.md", "changelog.md"),
+    "Contributing": ("contributing.md", "extending.md", "libraries.md", "security.md", "changelog.md"),
 }
 _CONFIGURATION = """
 [project]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import subprocess
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -70,6 +71,20 @@ class Loaded(HTMLParser):
         if tag in LOADING and not (tag == "link" and set((given.get("rel") or "").split()) & LEADING):
             self.found.append(given.get(LOADING[tag]) or "")
         self.found += re.findall(r"url\(([^)]+)\)", given.get("style") or "")
+
+
+@pytest.mark.parametrize("target", ["docs/lost.md", "#lost", "docs/access.md#lost"])
+def test_a_link_that_leads_nowhere_stops_the_build(
+    target: str, generator: Generator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("zensical", reason="zensical is not installed: pip install '.[docs]'")
+    site, root = generator("site"), tmp_path / "root"
+    (root / "docs").mkdir(parents=True)
+    (root / "README.md").write_text(f"# Home\n\n[link]({target})\n")
+    (root / "docs" / "access.md").write_text("# A page\n")
+    monkeypatch.setattr(site, "ROOT", root)
+    with pytest.raises(subprocess.CalledProcessError):
+        site.build(tmp_path / "build")
 
 
 def test_the_site_builds_and_loads_nothing_from_elsewhere(generator: Generator, tmp_path: Path) -> None:
