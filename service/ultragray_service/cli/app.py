@@ -73,7 +73,7 @@ def main(
     ] = False,
 ) -> None:
     """Look for environment variables that are misspelt, whatever the command; a service logs them itself."""
-    from ..environment import unknown_variables
+    from ..misspelt import unknown_variables
     from .style import warn
 
     if context.invoked_subcommand != "serve":
