@@ -21,13 +21,13 @@ from .access.addresses import is_loopback
 from .core.state import Service
 from .doors import Doors
 from .embedded_worker import EmbeddedWorker
-from .environment import unknown_variables
 from .http.app import create_app
 from .igtl.server import IgtlServer
 from .listening.connections import Connections
 from .listening.http_server import HttpServer
 from .listening.open_sockets import OpenSockets
 from .listening.sockets import authority, check_port_is_free, listen, raise_open_files_limit
+from .misspelt import unknown_variables
 from .rpc.server import GrpcServer
 from .service_manager import READY, STOPPING, ServiceManager
 from .settings import Settings

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import glob
 import hashlib
 import os
@@ -11,23 +12,38 @@ from collections.abc import Iterator
 from pathlib import Path
 
 TEMPORARY_SUFFIX = ".tmp"
+_OF_WRITING = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS)
 
 
 @contextlib.contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
     """A temporary path beside `path`; on success it is synced and renamed to `path`, on failure removed."""
     path = Path(path)
-    descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=TEMPORARY_SUFFIX)
-    os.close(descriptor)
-    temporary = Path(name)
+    temporary: Path | None = None
     try:
+        descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=TEMPORARY_SUFFIX)
+        os.close(descriptor)
+        temporary = Path(name)
         yield temporary
         temporary.chmod(0o666 & ~_umask())
         sync(temporary)
         temporary.replace(path)
         sync(path.parent)
+    except OSError as error:
+        if not _is_about_temporary(error, path):
+            raise
+        raise OSError(error.errno, error.strerror, str(path)) from error  # the caller knows of no other file
     finally:
-        temporary.unlink(missing_ok=True)
+        if temporary is not None:
+            temporary.unlink(missing_ok=True)
+
+
+def _is_about_temporary(error: OSError, path: Path) -> bool:
+    """Whether an error names the temporary file of `path`, or is one of writing that names no file."""
+    if error.filename is None:
+        return error.errno in _OF_WRITING
+    named = Path(os.fsdecode(error.filename))
+    return named.parent == path.parent and named.name.startswith(f".{path.name}.")
 
 
 def remove_stale_temporaries(path: str | Path) -> None:

@@ -33,7 +33,7 @@ class _Commands(LazyGroup):
         Entry("scenes", "remote.scenes", _REMOTE, "List, upload, download, delete and render scenes."),
         Entry("datasets", "remote.datasets", _REMOTE, "List, upload and delete the sweeps that trainings use."),
         Entry("jobs", "remote.jobs", _REMOTE, "Submit, watch and fetch trainings, evaluations and batch renderings."),
-        Entry("workers", "administration.workers", _INSTALLATION, "List the workers; pause, drain and resume them."),
+        Entry("workers", "remote.workers", _REMOTE, "List the workers of the jobs; pause, drain and resume them."),
         Entry("keys", "administration.keys", _INSTALLATION, "Make, list and revoke API keys."),
         Entry("backup", "administration.backup", _INSTALLATION, "Save scenes, datasets, jobs and their database."),
         Entry("restore", "administration.restore", _INSTALLATION, "Make an installation what it was at a backup."),
@@ -73,7 +73,7 @@ def main(
     ] = False,
 ) -> None:
     """Look for environment variables that are misspelt, whatever the command; a service logs them itself."""
-    from ..environment import unknown_variables
+    from ..misspelt import unknown_variables
     from .style import warn
 
     if context.invoked_subcommand != "serve":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -62,3 +63,18 @@ def test_what_a_killed_process_left_is_removed_and_nothing_else(tmp_path: Path) 
         (tmp_path / name).touch()
     remove_stale_temporaries(path)
     assert sorted(os.listdir(tmp_path)) == sorted(others)
+
+
+def test_an_error_names_the_file_that_was_wanted(tmp_path: Path) -> None:
+    path = tmp_path / "none" / "scene.ugr"
+    with pytest.raises(FileNotFoundError) as missing, atomic_path(path):
+        raise AssertionError("its folder is not there")
+    assert missing.value.filename == str(path)
+    path = tmp_path / "scene.ugr"
+    with pytest.raises(OSError, match="No space left") as full, atomic_path(path):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    assert full.value.filename == str(path)
+    with pytest.raises(IsADirectoryError) as other, atomic_path(path):
+        tmp_path.read_bytes()
+    assert other.value.filename == str(tmp_path)
+    assert os.listdir(tmp_path) == []

@@ -35,8 +35,8 @@ def database(tmp_path: Path) -> Iterator[JobDatabase]:
 
 
 def entries(folder: Path, *options: object) -> list[dict[str, object]]:
-    lines = run("audit", "--json", "--artifact-folder", folder, *options).stdout.splitlines()
-    return [json.loads(line) for line in lines]
+    found: list[dict[str, object]] = json.loads(run("audit", "--json", "--artifact-folder", folder, *options).stdout)
+    return found
 
 
 def test_a_service_writes_who_did_what(

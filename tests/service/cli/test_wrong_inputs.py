@@ -99,6 +99,10 @@ WRONG = {  # the command line, and a part of the line that it gives
     "scenes upload notes.ugr": "notes.ugr: not a scene file",
     "backup backups --data-folder none": "none",
     "restore none": "none",
+    "keys list --data-folder none": "data_folder must be an existing folder, got 'none'",
+    "keys create alice --role reader --data-folder none": "data_folder must be an existing folder, got 'none'",
+    "workers list --data-folder none": "no such option: --data-folder",
+    "audit --data-folder none": "data_folder must be an existing folder, got 'none'",
     # Outputs.
     "render scene.ugr -o a.foo": "got 'a.foo'",
     "render scene.ugr -o a.hdf5": "did you mean .h5?",
@@ -123,6 +127,7 @@ WRONG = {  # the command line, and a part of the line that it gives
     f"scenes list --address {NOBODY}": f"no service answers at {NOBODY} (connection refused)",
     f"scenes upload scene.ugr --address {NOBODY}": f"no service answers at {NOBODY}",
     f"datasets upload sweep --address {NOBODY}": f"no service answers at {NOBODY}",
+    f"workers pause gpu-1 --address {NOBODY}": f"no service answers at {NOBODY}",
     f"jobs watch 7 --address {NOBODY}": f"no service answers at {NOBODY}",
     f"jobs list --address {NOBODY} --ca notes.txt": "--ca: notes.txt holds no certificates",
     f"jobs list --address {NOBODY} --client-key k.pem": "--client-certificate and --client-key must be given together",

@@ -6,14 +6,14 @@ import json as json_text
 import time
 from dataclasses import asdict
 from datetime import datetime, timezone
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
-from ...settings import ENVIRONMENT_PREFIX, Settings, load_settings
-from ..options import FieldsOf, with_options
+from ..options import with_options
 from ..output import print_table
 from ..style import Json, command_group, examples, to_json
+from .database import Where, opened_database
 
 _COLUMNS = ("time", "who", "address", "what", "target", "result", "facts")
 _HOUR_S = 3600.0
@@ -35,23 +35,14 @@ def audit(
     ] = None,
     limit: Annotated[int, typer.Option(min=1, help="The last ones, at most.")] = 1000,
     json: Json = False,
-    where: Annotated[
-        dict[str, Any],
-        FieldsOf(Settings, "data_folder", "artifact_folder", "database_url", environment=ENVIRONMENT_PREFIX),
-    ],
+    where: Where,
 ) -> None:
     """Oldest first. What is not given here comes from the settings (ULTRAGRAY_…)."""
-    from ultragray_workers.jobs.queue.database import JobDatabase
-
     from ...access.audit import read_audit
 
-    settings = load_settings(**where)
-    database = JobDatabase(settings.artifacts, settings.database_url)
-    try:
-        since_s = time.time() - since_hours * _HOUR_S
+    since_s = time.time() - since_hours * _HOUR_S
+    with opened_database(where) as database:
         entries = read_audit(database.engine, since_s=since_s, who=who, what=what, limit=limit)
-    finally:
-        database.close()
     if json:
         typer.echo(to_json([{**asdict(entry), "time": _time(entry.at_s)} for entry in entries]))
         return

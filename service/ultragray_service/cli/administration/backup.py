@@ -9,9 +9,10 @@ import typer
 
 from ultragray_workers.errors import BackupInvalid
 
-from ...settings import ENVIRONMENT_PREFIX, Settings, load_settings
-from ..options import FieldsOf, with_options
+from ...settings import Settings, load_settings
+from ..options import with_options
 from ..style import Json, command_group, examples, tell, to_json
+from .database import Where
 
 if TYPE_CHECKING:
     from ultragray_workers.backup.contents import Folders
@@ -19,10 +20,6 @@ if TYPE_CHECKING:
 
 BackupFolder = Annotated[
     Path, typer.Argument(help="Folder of backups, on another disk than the data.", show_default=False)
-]
-Stores = Annotated[
-    dict[str, Any],
-    FieldsOf(Settings, "data_folder", "artifact_folder", "database_url", environment=ENVIRONMENT_PREFIX),
 ]
 _SHOWN = 3
 command_app = command_group()
@@ -45,7 +42,7 @@ def backup(
     ] = None,
     json: Json = False,
     *,
-    stores: Stores,
+    where: Where,
 ) -> None:
     """Service and workers go on meanwhile.
 
@@ -56,7 +53,7 @@ def backup(
         return
     from ultragray_workers.backup.backing_up import back_up
 
-    settings = load_settings(**stores)
+    settings = load_settings(**where)
     report = back_up(folders_of(settings), settings.database_url, folder, keep=keep)
     lines = [in_words(report.manifest), f"new: {report.new_files:,} files, {megabytes(report.new_bytes)}"]
     if report.removed_backups:

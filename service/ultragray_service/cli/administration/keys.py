@@ -13,20 +13,17 @@ import typer
 
 from ...access.limits.allowance import NAMES, read_limits
 from ...access.principal import Role
-from ...settings import ENVIRONMENT_PREFIX, Settings, load_settings
-from ..options import FieldsOf, with_options
+from ...settings import Settings
+from ..options import with_options
 from ..output import print_table
 from ..style import Json, command_group, examples, tell, to_json
+from .database import Where, opened_database
 
 if TYPE_CHECKING:
     from ...access.keys import Key, KeyStore
 
 command_app = command_group("They live in the installation's database; changes count within two seconds.")
 
-Where = Annotated[
-    dict[str, Any],
-    FieldsOf(Settings, "data_folder", "artifact_folder", "database_url", environment=ENVIRONMENT_PREFIX),
-]
 _COLUMNS = ("id", "name", "role", "state", "created", "expires", "last used", "limits")
 
 
@@ -62,6 +59,8 @@ def create(
 ) -> None:
     """Make a key, and print it: alone on standard output, and never again."""
     limits = read_limits(limit or ())
+    if not where:
+        Settings().data_folder.mkdir(exist_ok=True)  # as `serve` makes it: keys may come first
     with _key_store(where) as store:
         others = [key for key in store.keys().values() if key.name == name and key.is_valid(time.time())]
         key, secret = store.create(name, role, expires_days, limits)
@@ -108,16 +107,10 @@ def revoke(
 
 @contextmanager
 def _key_store(where: dict[str, Any]) -> Iterator[KeyStore]:
-    from ultragray_workers.jobs.queue.database import JobDatabase
-
     from ...access.keys import KeyStore
 
-    settings = load_settings(**where)
-    database = JobDatabase(settings.artifacts, settings.database_url)
-    try:
+    with opened_database(where) as database:
         yield KeyStore(database.engine)
-    finally:
-        database.close()
 
 
 def _document(key: Key) -> dict[str, Any]:

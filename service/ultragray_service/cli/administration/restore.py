@@ -9,7 +9,8 @@ import typer
 from ...settings import load_settings
 from ..options import with_options
 from ..style import Json, command_group, examples, tell
-from .backup import BackupFolder, Stores, document_of, folders_of, in_words
+from .backup import BackupFolder, document_of, folders_of, in_words
+from .database import Where
 
 command_app = command_group()
 
@@ -31,7 +32,7 @@ def restore(
     ] = False,
     json: Json = False,
     *,
-    stores: Stores,
+    where: Where,
 ) -> None:
     """Service and workers must be stopped.
 
@@ -40,7 +41,7 @@ def restore(
     """
     from ultragray_workers.backup.restoring import restore as restore_backup
 
-    settings = load_settings(**stores)
+    settings = load_settings(**where)
     manifest = restore_backup(
         folder,
         folders_of(settings),

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -139,24 +137,3 @@ def test_a_second_signal_ends_the_drain_of_a_worker_at_once(
         assert store.get(job.id).state is JobState.QUEUED
     finally:
         worker.kill()
-
-
-def test_commands_list_pause_and_resume(store: JobStore, artifact_folder: Path, start_worker: StartWorker) -> None:
-    start_worker()
-    reaches(store, "one", WorkerState.IDLE)
-
-    def run(*arguments: str) -> Any:
-        done = subprocess.run(
-            [*COMMAND, *arguments, "--artifact-folder", str(artifact_folder)],
-            env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
-            capture_output=True,
-            text=True,
-        )
-        assert done.returncode == 0, done.stderr
-        return done.stdout
-
-    assert run("pause", "one") == "one paused\n"
-    (told,) = json.loads(run("list", "--json"))
-    assert (told["name"], told["state"]) == ("one", "paused")
-    assert run("resume", "one") == "one idle\n"
-    assert run("list").splitlines()[0].split()[:3] == ["name", "state", "job"]

@@ -149,6 +149,8 @@ class JobDatabase:
                 undo.pop_all()
         except (SQLAlchemyError, OSError) as error:
             cause = getattr(error, "orig", None) or error
+            if isinstance(cause, OSError) and cause.strerror:
+                cause = f"{cause.filename}: {cause.strerror.lower()}"
             raise StartupFailed(
                 f"the database of the jobs cannot be opened: {' '.join(str(cause).split())} "
                 "(ULTRAGRAY_DATABASE_URL names it: server and database must be there, user and password right)",

@@ -1,0 +1,39 @@
+"""The database of an installation, as the commands find it that look after one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Annotated, Any
+
+from ultragray.errors import InvalidArgument
+
+from ...settings import ENVIRONMENT_PREFIX, Settings, load_settings
+from ..options import FieldsOf
+
+if TYPE_CHECKING:
+    from ultragray_workers.jobs.queue.database import JobDatabase
+
+Where = Annotated[
+    dict[str, Any],
+    FieldsOf(Settings, "data_folder", "artifact_folder", "database_url", environment=ENVIRONMENT_PREFIX),
+]
+
+
+@contextmanager
+def opened_database(where: dict[str, Any]) -> Iterator[JobDatabase]:
+    """The database that the options name. Raises InvalidArgument where there is no such installation, StartupFailed."""
+    from ultragray_workers.jobs.queue.database import JobDatabase
+
+    settings = load_settings(**where)
+    if settings.database_url is None and not (settings.artifacts.is_dir() or settings.data_folder.is_dir()):
+        raise InvalidArgument(
+            f"data_folder must be an existing folder, got {str(settings.data_folder)!r}: name that of the service with "
+            "--data-folder",
+            field="data_folder",
+        )
+    database = JobDatabase(settings.artifacts, settings.database_url)
+    try:
+        yield database
+    finally:
+        database.close()
