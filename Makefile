@@ -26,7 +26,7 @@ KEEP = @$(if $(RECORD),$(BIN)/python benchmarks/record.py,:)
 MINUTES ?= 30
 
 .DEFAULT_GOAL := help
-.PHONY: ALWAYS help serve console test test-fast test-long test-console test-faults test-fuzz test-soak test-overload check check-lint check-types check-generated check-web check-figures format bench bench-record bench-console console-picture bench-cuda results ablations poses confidence libraries figures demo-scene docs generate packages clean
+.PHONY: ALWAYS help serve console test test-fast test-long test-console test-faults test-fuzz test-soak test-overload test-newcomer check check-lint check-types check-generated check-web check-figures format bench bench-record bench-console console-picture bench-cuda results ablations poses confidence libraries figures demo-scene docs generate packages clean
 
 help:  ## say what there is
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
@@ -70,6 +70,9 @@ test-overload: $(VENV)/installed-dev  ## ten times the capacity for a minute at 
 	@rm -f $(FIGURES)/overload-run.json
 	ULTRAGRAY_OVERLOAD_SECONDS=60 ULTRAGRAY_OVERLOAD_RECORD=$(FIGURES)/overload-run.json $(BIN)/pytest tests/overload $(ARGS)
 	$(KEEP) overload-run
+
+test-newcomer: $(VENV)/installed-dev $(CONSOLE)  ## play a newcomer with Debian's Python: clone, serve, the documents, the tests, the wheels; takes twenty minutes
+	$(BIN)/python tests/newcomer/play.py $(ARGS)
 
 check: $(VENV)/installed-dev  ## lint, types, formatting, and whether what is generated is current; all at the same time
 	@$(MAKE) --no-print-directory --keep-going --jobs --output-sync=target check-lint check-types check-generated check-web check-figures

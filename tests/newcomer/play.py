@@ -168,7 +168,7 @@ def test(newcomer: Newcomer) -> None:
 def packages(newcomer: Newcomer) -> None:
     """Wheels into empty environments; each goes on without the other."""
     with newcomer.step("wheels"):
-        newcomer.run(".venv/bin/pytest", "-m", "long", "tests/packaging")
+        newcomer.run(".venv/bin/pytest", "-m", "long", "tests/distribution")
 
 
 def _frame_shown(newcomer: Newcomer, picture: str) -> float:
@@ -206,17 +206,18 @@ def _require_free_ports() -> None:
                 raise Failed(f"port {port} is taken; the newcomer needs {PORTS[0]} and {PORTS[1]}") from None
 
 
-STEPS = (clone, serve, command_line, test, packages)
+STEPS = {step.__name__: step for step in (clone, serve, command_line, test, packages)}
 
 
-def main() -> None:
+def main(names: Sequence[str]) -> None:
+    """All steps, or those of the names."""
     RECORD.parent.mkdir(exist_ok=True)
     folder = Path(tempfile.mkdtemp(prefix="ultragray-newcomer-"))
     newcomer = Newcomer(folder)
     try:
         _require_free_ports()
-        for step in STEPS:
-            step(newcomer)
+        for name in names or STEPS:
+            STEPS[name](newcomer)
     except Failed as error:
         sys.exit(f"error: {error}")
     finally:
@@ -225,4 +226,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    main(sys.argv[1:])
