@@ -55,18 +55,22 @@ def show(
 
 def print_facts(document: dict[str, Any]) -> None:
     """A table of names and values for a person; what is unknown is left out."""
+    from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
 
-    from ..output import wide_console
-
+    facts = {key: _text(value) for key, value in document.items() if value not in (None, {}, [])}
+    console = Console()
+    if not console.is_terminal:  # no padding for other programs, and nothing is cut
+        width = max(map(len, facts), default=0)
+        typer.echo("\n".join(f"{key:<{width}}  {text}" for key, text in facts.items()))
+        return
     table = Table(show_header=False, box=None, pad_edge=False)
     table.add_column(style="bold", no_wrap=True)
     table.add_column(overflow="fold")
-    for key, value in document.items():
-        if value not in (None, {}, []):
-            table.add_row(key, escape(_text(value)))  # a scene's own strings must not be read as markup
-    wide_console().print(table)
+    for key, text in facts.items():
+        table.add_row(key, escape(text))  # a scene's own strings must not be read as markup
+    console.print(table)
 
 
 def describe_scene(path: Path) -> dict[str, Any]:
