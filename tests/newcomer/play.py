@@ -27,6 +27,7 @@ RECORD = ROOT / "build" / "newcomer.json"
 PYTHON = "/usr/bin/python3"  # Debian's
 PORTS = (8000, 50051)
 CONSOLE = f"http://localhost:{PORTS[0]}"
+DEVELOPERS = ("ULTRAGRAY_", "VIRTUAL_ENV", "PYTHON", "MAKE", "MFLAGS")  # beginnings of variables that a newcomer lacks
 PAGES = ("README.md", "docs/tutorial.md")
 REPEATS = 7
 # Seconds, of the two cores that the project is measured on.
@@ -44,8 +45,7 @@ class Newcomer:
         self.folder = folder
         self.clone = folder / "ultragray"
         self.times_s: dict[str, float] = {}
-        own = ("PATH", "HOME", "TERM", "LANG", "TMPDIR")  # and nothing that the project's developers have set
-        self.environment = {name: os.environ[name] for name in own if name in os.environ}
+        self.environment = {name: value for name, value in os.environ.items() if not name.startswith(DEVELOPERS)}
         self.environment["PATH"] = _without(self.environment["PATH"], ROOT / ".venv")
 
     @contextlib.contextmanager
@@ -105,6 +105,10 @@ class Terminal:
     def shown(self) -> str:
         return self._shown.decode(errors="replace")
 
+    @property
+    def ended(self) -> bool:
+        return self._process.poll() is not None
+
     def _read(self) -> None:
         with contextlib.suppress(OSError):  # the terminal closes with its last process
             while part := os.read(self._ours, 65536):
@@ -134,7 +138,7 @@ def serve(newcomer: Newcomer) -> None:
     """The first start from the clone, the documents against it, and the second start."""
     began = time.time() - newcomer.times_s["git clone"]
     with newcomer.serving() as terminal:
-        newcomer.note("first frame", _frame_shown(newcomer, "first.png") - began)
+        newcomer.note("first frame", _frame_shown(newcomer, terminal, "first.png") - began)
         for expected in (CONSOLE, "Ctrl-C"):
             if expected not in terminal.shown:
                 raise Failed(f"the terminal does not say {expected!r}\n{terminal.shown[-3000:]}")
@@ -142,8 +146,8 @@ def serve(newcomer: Newcomer) -> None:
             with newcomer.step(f"the blocks of {page}"):
                 run_blocks(newcomer, newcomer.clone / page)
     began = time.time()
-    with newcomer.serving():
-        newcomer.note("first frame of the second start", _frame_shown(newcomer, "second.png") - began)
+    with newcomer.serving() as terminal:
+        newcomer.note("first frame of the second start", _frame_shown(newcomer, terminal, "second.png") - began)
 
 
 def run_blocks(newcomer: Newcomer, page: Path) -> None:
@@ -171,10 +175,17 @@ def packages(newcomer: Newcomer) -> None:
         newcomer.run(".venv/bin/pytest", "-m", "long", "tests/distribution")
 
 
-def _frame_shown(newcomer: Newcomer, picture: str) -> float:
-    """When the first frame was on the console, in seconds since the epoch."""
-    shown = newcomer.run("node", str(ROOT / "tests/newcomer/first_frame.mjs"), CONSOLE, str(RECORD.parent / picture))
-    return float(shown.split()[-1])
+def _frame_shown(newcomer: Newcomer, terminal: Terminal, picture: str) -> float:
+    """When the first frame was on the console, in seconds since the epoch. Raises Failed."""
+    command = ["node", str(ROOT / "tests/newcomer/first_frame.mjs"), CONSOLE, str(RECORD.parent / picture)]
+    with subprocess.Popen(command, env=newcomer.environment, stdout=subprocess.PIPE, text=True) as browser:
+        while browser.poll() is None:
+            time.sleep(0.1)
+            if terminal.ended:
+                browser.terminate()
+        if browser.returncode != 0:
+            raise Failed(f"no frame came to the console; the terminal shows\n{terminal.shown[-3000:]}")
+        return float(browser.communicate()[0].split()[-1])
 
 
 def _median_s(command: Callable[[], object]) -> float:
