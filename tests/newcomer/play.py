@@ -139,7 +139,7 @@ def serve(newcomer: Newcomer) -> None:
     began = time.time() - newcomer.times_s["git clone"]
     with newcomer.serving() as terminal:
         newcomer.note("first frame", _frame_shown(newcomer, terminal, "first.png") - began)
-        for expected in (CONSOLE, "Ctrl-C"):
+        for expected in (f":{PORTS[0]}", "Ctrl-C"):
             if expected not in terminal.shown:
                 raise Failed(f"the terminal does not say {expected!r}\n{terminal.shown[-3000:]}")
         for page in PAGES:
