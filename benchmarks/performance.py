@@ -40,11 +40,11 @@ def frames(measured: Document) -> Iterator[str]:
 def frames_at_a_glance(measured: Document) -> Iterator[str]:
     """What a reader of the README wants to know: the kernel and each front door, p50 and p99 by number of Gaussians."""
     names = {
-        ("kernel", 1): "the kernel alone, 1 thread",
-        ("kernel", 2): "the kernel alone, 2 threads",
-        ("gRPC stream", 2): "gRPC stream, to the client",
-        ("HTTP raw", 2): "HTTP, raw pixels, to the client",
-        ("HTTP PNG", 2): "HTTP, PNG, to the client",
+        ("kernel", 1): "renderer, 1 thread",
+        ("kernel", 2): "renderer, 2 threads",
+        ("gRPC stream", 2): "to a client over a gRPC stream",
+        ("HTTP raw", 2): "to a client over HTTP, raw pixels",
+        ("HTTP PNG", 2): "to a client over HTTP, PNG",
     }
     of = {(row["what"], row["threads"], row["gaussians"]): row for row in measured["rows"] if row["poses"] == 1}
     counts = sorted({row["gaussians"] for row in measured["rows"]}, reverse=True)

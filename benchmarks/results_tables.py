@@ -48,11 +48,11 @@ ROW_NAMES = {
 }
 
 README_ROWS = {
-    "ultranerf_liver": "simulated liver, two sweeps",
+    "ultranerf_liver": "simulated liver, trained on two sweeps",
     "liver_convex": "human liver, convex probe",
     "spine_phantom": "spine phantom, 17 frames",
     "nwire_phantom": "N-wire phantom: bright dots in black",
-    "phantom": "built-in phantom, a tilt that was not trained on",
+    "phantom": "built-in phantom, an unseen tilt",
 }
 
 log = logging.getLogger("results")
@@ -228,7 +228,7 @@ def glanced_at(figures: Document) -> Document:
 
 def at_a_glance(figures: Document) -> Iterator[str]:
     """The README's table, of the runs that it shows."""
-    yield "| sweep | training time | PSNR, MS-SSIM, GMSD: scene | median compounding | linear between frames |"
+    yield "| PSNR, MS-SSIM, GMSD | training | this scene | median compounding | linear interpolation |"
     yield "|---|---|---|---|---|"
     for name, run in figures.items():
         means = [run["metrics"][method]["mean"] for method in ("scene", "median", "linear")]
