@@ -27,7 +27,14 @@ RECORD = ROOT / "build" / "newcomer.json"
 PYTHON = "/usr/bin/python3"  # Debian's
 PORTS = (8000, 50051)
 CONSOLE = f"http://localhost:{PORTS[0]}"
-DEVELOPERS = ("ULTRAGRAY_", "VIRTUAL_ENV", "PYTHON", "MAKE", "MFLAGS")  # beginnings of variables that a newcomer lacks
+DEVELOPERS = (
+    "ULTRAGRAY_",
+    "VIRTUAL_ENV",
+    "PYTHON",
+    "MAKE",
+    "MFLAGS",
+    "ARGS",
+)  # beginnings of variables that a newcomer lacks
 PAGES = ("README.md", "docs/tutorial.md")
 REPEATS = 7
 # Seconds, of the two cores that the project is measured on.
