@@ -121,7 +121,7 @@ def check_same_origin(info: SceneInfo, dataset: Dataset) -> list[str]:
             f"{dataset.name}: its probe is {dataset.probe.kind}, the scene was trained with a {info.probe.kind} one"
         )
     if info.probe not in (None, dataset.probe):
-        warnings.append(f"the scene was trained with {info.probe}, {dataset.name} has {dataset.probe}")
+        warnings.append(f"the scene was trained with a {info.probe}, {dataset.name} has a {dataset.probe}")
     if info.dataset_sha256 not in (None, dataset.sha256):
         warnings.append(
             f"the scene was trained from other data than {dataset.name}, or from another split of it: it may have "

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -19,6 +19,7 @@ _P = TypeVar("_P", bound="Probe")
 BoolArray = npt.NDArray[np.bool_]
 
 MAX_LENGTH_MM = 10_000.0
+_UNITS = {"mm": " mm", "deg": "°"}
 
 
 def length_field(meaning: str, **options: Any) -> Any:
@@ -44,6 +45,14 @@ class Probe(Family):
             raise InvalidProbe(
                 f"far_mm must be greater than near_mm ({self.near_mm:g}), got {self.far_mm:g}", field="far_mm"
             )
+
+    def __str__(self) -> str:
+        """In words, for messages: `linear probe (width 60 mm, near 0 mm, far 60 mm)`."""
+        numbers = []
+        for name in (item.name for item in fields(self) if item.name != "kind"):
+            what, _, unit = name.replace("_", " ").rpartition(" ")
+            numbers.append(f"{what} {getattr(self, name):g}{_UNITS[unit]}")
+        return f"{self.kind} probe ({', '.join(numbers)})"
 
     @property
     def lines(self) -> Lines:

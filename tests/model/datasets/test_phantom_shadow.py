@@ -45,5 +45,5 @@ def test_means_are_taken_over_the_shadow_alone() -> None:
 def test_sweeps_that_cannot_tell_are_refused() -> None:
     with pytest.raises(DatasetInvalid, match="noise: no pixel lies in the shadow"):
         BoneShadow.of(sweep_at(90.0))
-    with pytest.raises(DatasetInvalid, match="noise: the phantom is scanned along upright lines, got ConvexProbe"):
+    with pytest.raises(DatasetInvalid, match="noise: the phantom is scanned along upright lines, got convex probe"):
         BoneShadow.of(sweep_at(0.0, ConvexProbe(opening_angle_deg=60.0, near_mm=10.0, far_mm=50.0)))

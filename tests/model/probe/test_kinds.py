@@ -129,3 +129,10 @@ def test_lines_that_are_not_steered_are_those_of_a_linear_probe() -> None:
     steered, linear = SteeredProbe(40.0, 0.0, 5.0, 50.0), LinearProbe(40.0, 5.0, 50.0)
     assert steered.lines == linear.lines
     assert steered.is_true_to_scale
+
+
+def test_a_message_names_a_probe_in_words() -> None:
+    assert f"{SteeredProbe(40.0, -15.0, 0.0, 50.0)}" == (
+        "steered probe (width 40 mm, steering -15°, near 0 mm, far 50 mm)"
+    )
+    assert f"{RadialProbe(near_mm=1.5, far_mm=20.0)}" == "radial probe (near 1.5 mm, far 20 mm)"

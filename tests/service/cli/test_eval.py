@@ -187,7 +187,7 @@ def test_a_scene_of_another_probe_or_of_other_data(dataset: Path, scene: Path, t
         return tmp_path / name
 
     wide = run("eval", scene, written("wide", LinearProbe(30.0, 0.0, 25.0)), "--json")
-    assert "warning: the scene was trained with LinearProbe(width_mm=20.0" in wide.stderr
+    assert "warning: the scene was trained with a linear probe (width 20 mm" in wide.stderr
     convex = written("convex", ConvexProbe(60.0, 10.0, 35.0))
     reported = ("report", convex, "-o", tmp_path / "page.html", "--scene", scene, "--no-ablations")
     for arguments in (("eval", scene, convex), reported):

@@ -35,7 +35,7 @@ def folder(tmp_path: Path) -> Path:
 def test_check_prints_a_table_and_warnings(folder: Path) -> None:
     result = run("check", folder, "--train-frames", "0:4,8:10")
     assert result.exit_code == 0, result.output
-    assert "tiny: LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)" in result.output
+    assert "tiny: linear probe (width 40 mm, near 0 mm, far 50 mm)" in result.output
     assert [line.split()[-2:] for line in result.output.splitlines() if line.startswith("frames ")] == [["6", "2"]]
     assert "held-out frames lie 1.50 mm (median) to 2.00 mm" in result.output
     assert "nothing suspicious" in result.output
