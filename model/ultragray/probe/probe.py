@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
-from ..contract import Family, described
+from ..contract import Family, annotated_fields, described
 from ..errors import InvalidProbe
 from .picture import Picture
 from .scan_lines import Box, FloatArray, Lines
@@ -49,7 +49,7 @@ class Probe(Family):
     def __str__(self) -> str:
         """In words, for messages: `linear probe (width 60 mm, near 0 mm, far 60 mm)`."""
         numbers = []
-        for name in (item.name for item in fields(self) if item.name != "kind"):
+        for name in (item.name for item, _ in annotated_fields(type(self)) if item.name != "kind"):
             what, _, unit = name.replace("_", " ").rpartition(" ")
             numbers.append(f"{what} {getattr(self, name):g}{_UNITS[unit]}")
         return f"{self.kind} probe ({', '.join(numbers)})"
