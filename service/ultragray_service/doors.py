@@ -45,7 +45,8 @@ class Doors:
     def banner(self, asks_for_keys: bool) -> str:
         """A few lines for who has started the service on a terminal."""
         host = self.settings.host
-        http = self.http.replace(host, "localhost", 1) if host in _ANY else self.http
+        scheme, port = self.http.partition(":")[0], self.http.rpartition(":")[2]
+        http = f"{scheme}://localhost:{port}" if host in _ANY else self.http
         lines = {
             "console": f"{http}/",
             "HTTP docs": f"{http}/docs",

@@ -15,9 +15,10 @@ def unknown_variables() -> Iterator[str]:
     if not given:
         return  # the usual case; to know the settings takes a while
     known = known_variables()
+    words = [one.removeprefix(PREFIX) for one in known]  # what they share makes none of them more alike
     for name in sorted(given - set(known)):
-        near = get_close_matches(name, known, n=1, cutoff=0.8)
-        perhaps = f"; did you mean {near[0]}?" if near else ""
+        near = get_close_matches(name.removeprefix(PREFIX), words, n=1, cutoff=0.8)
+        perhaps = f"; did you mean {PREFIX}{near[0]}?" if near else ""
         yield f"the environment variable {name} is not known and is ignored{perhaps}"
 
 

@@ -58,9 +58,7 @@ def test_measuring_leaves_the_tree_clean_and_recording_is_asked_for(target: str,
 
 def recipe(target: str, *variables: str) -> str:
     """The commands of a target, not run; a make that runs this test passes nothing on."""
-    environment = {
-        name: value for name, value in os.environ.items() if name not in ("MAKEFLAGS", "MFLAGS", "MAKELEVEL")
-    }
+    environment = {name: value for name, value in os.environ.items() if name not in MAKES_OWN}
     command = [
         "make",
         "--dry-run",

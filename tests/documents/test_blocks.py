@@ -13,7 +13,7 @@ from .running import PageRun
 
 DOCUMENTS = sorted(
     path
-    for pattern in ("*.md", "docs/**/*.md", "*/README.md")
+    for pattern in ("*.md", "docs/**/*.md", "*/README.md", "tests/documents/README.md")
     for path in ROOT.glob(pattern)
     if path.name not in ("CHANGELOG.md", TUTORIAL.name)  # no commands; in a test module of its own
 )

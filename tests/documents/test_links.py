@@ -9,7 +9,11 @@ import pytest
 
 from ..surroundings import ROOT
 
-DOCUMENTS = sorted(path for pattern in ("*.md", "docs/**/*.md", "*/README.md") for path in ROOT.glob(pattern))
+DOCUMENTS = sorted(
+    path
+    for pattern in ("*.md", "docs/**/*.md", "*/README.md", "tests/documents/README.md")
+    for path in ROOT.glob(pattern)
+)
 LINK = re.compile(r"\]\(([^)\s]+)\)")
 CODE = re.compile(r"^```.*?^```|`[^`\n]*`", re.MULTILINE | re.DOTALL)
 

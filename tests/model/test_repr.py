@@ -12,7 +12,7 @@ from ultragray.datasets import Dataset, Sweep
 from ultragray.scene_info import SceneHeader
 
 PROBE = LinearProbe(40.0, 0.0, 50.0)
-IN_WORDS = "LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)"
+IN_WORDS = "linear probe (width 40 mm, near 0 mm, far 50 mm)"
 
 
 def test_frames() -> None:

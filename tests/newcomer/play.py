@@ -62,6 +62,11 @@ class Newcomer:
         yield
         self.note(name, time.perf_counter() - began)
 
+    @property
+    def missed(self) -> list[str]:
+        """The goals that were not reached."""
+        return [name for name, goal_s in GOALS.items() if self.times_s.get(name, 0.0) > goal_s]
+
     def note(self, name: str, taken_s: float) -> None:
         goal = f" (goal {GOALS[name]:g} s)" if name in GOALS else ""
         self.times_s[name] = round(taken_s, 3)
@@ -91,8 +96,11 @@ class Newcomer:
         terminal = Terminal(["make", "serve", f"PYTHON={PYTHON}"], self.clone, self.environment)
         try:
             yield terminal
-        finally:
-            terminal.interrupt()
+        except BaseException:
+            with contextlib.suppress(Failed):  # the first failure is the one to tell
+                terminal.interrupt()
+            raise
+        terminal.interrupt()
 
 
 class Terminal:
@@ -236,6 +244,8 @@ def main(names: Sequence[str]) -> None:
         _require_free_ports()
         for name in names or STEPS:
             STEPS[name](newcomer)
+        if newcomer.missed:
+            raise Failed(f"goals missed: {', '.join(newcomer.missed)}")
     except Failed as error:
         sys.exit(f"error: {error}")
     finally:

@@ -40,8 +40,9 @@ def test_a_banner_has_the_addresses_and_how_to_stop() -> None:
     assert re.search(r"API key +needed\n", doors.banner(True))
 
 
-def test_a_banner_names_an_address_that_a_browser_opens() -> None:
-    doors = Doors.of(Settings(host="0.0.0.0", tls_certificate=Path("c.pem"), tls_key=Path("k.pem")), 80, 50051, None)
+@pytest.mark.parametrize("host", ["0.0.0.0", "::"])
+def test_a_banner_names_an_address_that_a_browser_opens(host: str) -> None:
+    doors = Doors.of(Settings(host=host, tls_certificate=Path("c.pem"), tls_key=Path("k.pem")), 80, 50051, None)
     assert "console     https://localhost:80/" in doors.banner(True)
     assert "OpenIGTLink" not in doors.banner(True)
     assert "NOT NEEDED BY ANYBODY" in doors.banner(False)
@@ -53,6 +54,10 @@ def test_a_line_for_people_is_time_level_and_sentence() -> None:
     assert plain.format(record(logging.WARNING, "no space"))[9:] == "warning: no space"
     facts = {"method": "GET", "path": "/v1/scenes", "status": 200, "duration_ms": 12.34}
     assert plain.format(record(logging.INFO, "request", **facts))[9:] == "GET /v1/scenes: 200 in 12 ms"
+    forged = {"method": "GET", "path": "/\x1b[2J\n12:00:00 stopped", "status": 404, "duration_ms": 1.0}
+    assert plain.format(record(logging.INFO, "request", **forged))[9:] == (
+        "GET /\\x1b[2J\\n12:00:00 stopped: 404 in 1 ms"
+    )
     assert "\x1b[31merror: \x1b[0m" in HumanFormatter(in_colour=True).format(record(logging.ERROR, "lost"))
 
 

@@ -59,5 +59,7 @@ class AsyncFrameStream:
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        await self._call.close()
-        self._exchange.close()
+        try:
+            await self._call.close()
+        finally:
+            self._exchange.close()

@@ -60,5 +60,7 @@ class FrameStream:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._call.close()
-        self._exchange.close()
+        try:
+            self._call.close()
+        finally:
+            self._exchange.close()

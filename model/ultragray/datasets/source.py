@@ -63,6 +63,7 @@ class DatasetFormat:
     load: Callable[[str, SourceOptions], Dataset]
     files: tuple[str, ...] = ()  # none: built in, never a file
     options: tuple[str, ...] = ()  # fields of SourceOptions that it takes, beside EVERY_FORMAT_TAKES
+    beside: tuple[str, ...] = ()  # endings of the files that lie beside such a file, with its stem, and belong to it
     companions: Mapping[str, str] = field(default_factory=dict)  # pattern of the file of an upload that is an option
     check_upload: Callable[[Path, Path], None] = lambda source, folder: None  # raises where it needs files elsewhere
 
@@ -185,6 +186,7 @@ FORMATS: Mapping[str, DatasetFormat] = {
             load=_load_plus,
             files=tuple(f"*{suffix}" for suffix in PLUS_SUFFIXES),
             options=("frames", "device_set", "crop"),
+            beside=(".raw", ".zraw", ".raw.gz"),
             companions={"device_set": "*.xml"},
         ),
         DatasetFormat(
@@ -195,6 +197,7 @@ FORMATS: Mapping[str, DatasetFormat] = {
             load=_load_dicom,
             files=("*.dcm",),
             options=("frames", "crop"),
+            beside=(".poses.npy", ".poses.json"),
         ),
         DatasetFormat(
             name=PHANTOM,

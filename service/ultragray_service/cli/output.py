@@ -70,12 +70,13 @@ def is_folder_name(path: Path) -> bool:
 
 def print_table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
     """Print rows under their columns; the first column is never cut."""
+    from rich.markup import escape
     from rich.table import Table
 
     table = Table(*columns, box=None, pad_edge=False)
     table.columns[0].no_wrap = True
     for row in rows:
-        table.add_row(*row)
+        table.add_row(*map(escape, row))  # a reason or a name may hold brackets
     wide_console().print(table)
 
 

@@ -10,10 +10,10 @@ from collections.abc import Callable, Iterator
 def counted(what: str, total: int) -> Iterator[Callable[[int], None]]:
     """A function that is told how many of `total` are done: a bar on a terminal, nothing elsewhere."""
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     console = Console(stderr=True)
-    columns = ("[progress.description]{task.description}", BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
         task = progress.add_task(what, total=total)
         yield lambda done: progress.update(task, completed=done)
@@ -26,11 +26,11 @@ def transferred(what: str) -> Iterator[Callable[[int | None], Callable[[int], No
     A bar with rate and time left on a terminal, nothing elsewhere.
     """
     from rich.console import Console
-    from rich.progress import BarColumn, DownloadColumn, Progress, TimeRemainingColumn, TransferSpeedColumn
+    from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn, TransferSpeedColumn
 
     console = Console(stderr=True)
     columns = (
-        "[progress.description]{task.description}",
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
         DownloadColumn(),
         TransferSpeedColumn(),
@@ -49,10 +49,11 @@ def transferred(what: str) -> Iterator[Callable[[int | None], Callable[[int], No
 def working(what: str) -> Iterator[None]:
     """A line that moves while something of unknown length is done: on a terminal only."""
     from rich.console import Console
+    from rich.markup import escape
 
     console = Console(stderr=True)
     if console.is_terminal:
-        with console.status(what):
+        with console.status(escape(what)):
             yield
     else:
         yield

@@ -26,8 +26,8 @@ command_app = command_group()
     epilog=examples(
         "ultragray serve  # the scenes of ./data; the demo scene where there are none",
         "ultragray serve liver.ugr spine.ugr --http-port 8080",
-        "ULTRAGRAY_API_KEYS=$(openssl rand -hex 16) ultragray serve --host 0.0.0.0",
-        "Every other setting has an environment variable: ULTRAGRAY_ and its name.",
+        "ultragray keys create alice --role admin > alice.key",
+        "ultragray serve --host 0.0.0.0 --tls-certificate tls.crt --tls-key tls.key",
     )
 )
 @with_options
@@ -48,7 +48,10 @@ def serve(
         ),
     ],
 ) -> None:
-    """It runs in the foreground until Ctrl-C or SIGTERM, and then ends what it has begun."""
+    """It runs in the foreground until Ctrl-C or SIGTERM, and then ends what it has begun.
+
+    Every other setting has an environment variable: ULTRAGRAY_ and its name.
+    """
     serve_scenes(scenes or [], options)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import http.client
 import json
 import ssl
@@ -43,23 +44,39 @@ class Connection:
             )
         self.address = address.rstrip("/")
         self._tls = tls
+        # A key goes to the address that it was given for: not on to where that redirects, nor by way of a proxy.
+        self._opener = urllib.request.build_opener(
+            urllib.request.ProxyHandler({}), _NoRedirect, urllib.request.HTTPSHandler(context=tls)
+        )
         self._headers = {} if api_key is None else {"X-API-Key": api_key}
 
     def json(self, method: str, route: str, body: Mapping[str, Any] | None = None) -> Any:
         """The JSON of an answer; None where it has none."""
+        return self.answered(method, route, body)[0]
+
+    def answered(self, method: str, route: str, body: Mapping[str, Any] | None = None) -> tuple[Any, int]:
+        """The JSON of an answer, None where it has none, and its status."""
         with self.open(method, route, body) as answer:
-            content = answer.read()
-        return json.loads(content) if content else None
+            return self._document(self.whole(answer)), answer.status
+
+    def whole(self, answer: http.client.HTTPResponse) -> bytes:
+        """All that is left of an answer. Raises NotReady where it breaks off."""
+        try:
+            return answer.read()
+        except (OSError, http.client.HTTPException) as error:
+            raise NotReady(f"{self.address} broke off its answer ({_in_words(error)})") from error
 
     def listed(self, route: str, key: str, limit: int | None = None, **query: str) -> list[dict[str, Any]]:
         """The items of all pages of a list, at most `limit`; `key` names them in a page."""
         found: list[dict[str, Any]] = []
-        token = ""
+        token: str | None = ""
         while limit is None or len(found) < limit:
             size = _PAGE if limit is None else min(limit - len(found), _PAGE)
             page = self.json("GET", f"{route}?{urlencode({**query, 'page_size': size, 'page_token': token})}")
+            if not isinstance(page, dict) or key not in page:
+                raise self._foreign()
             found += page[key]
-            token = page["next_page_token"]
+            token = page.get("next_page_token")
             if not token:
                 break
         return found
@@ -72,10 +89,10 @@ class Connection:
         headers = self._headers | {"Accept": accept} | ({} if content is None else {"Content-Type": JSON})
         request = urllib.request.Request(self.address + route, content, headers, method=method)
         try:
-            answer: http.client.HTTPResponse = urllib.request.urlopen(request, timeout=_TIMEOUT_S, context=self._tls)
+            answer: http.client.HTTPResponse = self._opener.open(request, timeout=_TIMEOUT_S)
         except urllib.error.HTTPError as error:
             with error:
-                raise self._refusal(error.code, error.read()) from None
+                raise self._refusal(error.code, error.read(), error.headers.get("Location")) from None
         except (OSError, http.client.HTTPException) as error:
             raise self._unreachable(error.reason if isinstance(error, urllib.error.URLError) else error) from error
         return answer
@@ -90,7 +107,7 @@ class Connection:
             size = None if announced is None else int(announced)
             count = progress(size)
             written = 0
-            with temporary.open("wb") as file:
+            with temporary.open("wb") as file, contextlib.suppress(http.client.HTTPException):
                 while block := answer.read(_BLOCK_BYTES):
                     file.write(block)
                     written += len(block)
@@ -113,23 +130,32 @@ class Connection:
         else:
             connection = http.client.HTTPConnection(parts.netloc, timeout=_CHECK_TIMEOUT_S, blocksize=_BLOCK_BYTES)
         headers = {"Content-Type": "application/octet-stream", "Content-Length": str(path.stat().st_size)}
-        try:
-            with path.open("rb") as file:
-                body = _Counted(file, count)
+        with path.open("rb") as file, contextlib.closing(connection):
+            body = _Counted(file, count)
+            try:
                 try:
                     connection.request("PUT", parts.path + route, body, headers=self._headers | headers)
-                except (BrokenPipeError, ConnectionResetError):
+                except (BrokenPipeError, ConnectionResetError, ssl.SSLError):
                     if not body.is_begun:
                         raise
                 answer = connection.getresponse()
                 content = answer.read()
-        except (OSError, http.client.HTTPException) as error:
-            raise self._unreachable(error) from error
-        finally:
-            connection.close()
-        if answer.status >= 400:
-            raise self._refusal(answer.status, content)
-        return json.loads(content), answer.status == 201
+            except (OSError, http.client.HTTPException) as error:
+                if body.is_begun:
+                    raise NotReady(f"{self.address} closed the connection while {path.name} was sent") from error
+                raise self._unreachable(error) from error
+        if answer.status >= 300:
+            raise self._refusal(answer.status, content, answer.headers.get("Location"))
+        return self._document(content), answer.status == 201
+
+    def _document(self, content: bytes) -> Any:
+        try:
+            return json.loads(content) if content else None
+        except ValueError:
+            raise self._foreign() from None
+
+    def _foreign(self) -> UltragrayError:
+        return UltragrayError(f"{self.address} answered, but not as an UltraG-Ray service does")
 
     def _unreachable(self, reason: object) -> UltragrayError:
         if (problem := tls_problem(self.address, reason)) is not None:
@@ -139,7 +165,9 @@ class Connection:
             f"with --address{cut_off_hint(self.address, reason)}"
         )
 
-    def _refusal(self, status: int, content: bytes) -> UltragrayError:
+    def _refusal(self, status: int, content: bytes, elsewhere: str | None) -> UltragrayError:
+        if elsewhere is not None and status < 400:
+            return UltragrayError(f"{self.address} redirects to {elsewhere}: give the address of the service itself")
         try:
             problem = json.loads(content)
             detail, field = str(problem["detail"]), problem.get("field")
@@ -148,6 +176,13 @@ class Connection:
                 f"{self.address} answered with status {status}, but not as an UltraG-Ray service does"
             )
         return (NotReady if status == 503 else UltragrayError)(detail, field=field)
+
+
+class _NoRedirect(urllib.request.HTTPRedirectHandler):
+    """Takes a redirection for the refusal that it is to us."""
+
+    def redirect_request(self, *_: object) -> None:
+        return None
 
 
 class _Counted:

@@ -60,7 +60,7 @@ def archive_of(source: Path, device_set: Path | None = None) -> Iterator[Path]:
     files = _files_of(source) + ([] if device_set is None else [device_set])
     with tempfile.TemporaryDirectory(prefix="ultragray-upload-") as folder:
         archive = Path(folder, "upload.zip")
-        with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as made:
+        with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED, compresslevel=1, strict_timestamps=False) as made:
             for path in files:
                 below = source if source.is_dir() else source.parent
                 name = path.relative_to(below) if path.is_relative_to(below) else Path(path.name)
@@ -70,7 +70,7 @@ def archive_of(source: Path, device_set: Path | None = None) -> Iterator[Path]:
 
 def _files_of(source: Path) -> list[Path]:
     if source.is_dir():
-        files = sorted(path for path in source.rglob("*") if path.is_file() and not path.name.startswith("."))
+        files = sorted(path for path in source.rglob("*") if path.is_file() and not _is_hidden(path, source))
         if not any(one.is_file(path) for one in UPLOADED_FORMATS for path in files):
             expected = "; ".join(one.meaning for one in UPLOADED_FORMATS)
             raise DatasetInvalid(f"{source}: no sweep lies in this folder; expected is one of: {expected}")
@@ -79,9 +79,15 @@ def _files_of(source: Path) -> list[Path]:
         raise DatasetInvalid(f"{source}: no such file or folder")
     if source.name == "conf.json":
         return _files_of(source.parent)
-    if not any(one.is_file(source) for one in UPLOADED_FORMATS):
+    format = next((one for one in UPLOADED_FORMATS if one.is_file(source)), None)
+    if format is None:
         expected = "; ".join(one.meaning for one in UPLOADED_FORMATS)
         raise DatasetInvalid(f"{source}: an upload is an archive ({', '.join(ARCHIVE_SUFFIXES)}) or one of: {expected}")
-    stem = source.name.split(".")[0]
-    beside = source.parent.glob(f"{stem}.*")  # data of a header, poses of a cine loop
-    return sorted({source, *(path for path in beside if path.is_file())})
+    stems = {source.stem, source.name.split(".")[0]}  # of sweep.igs.mhd: sweep.igs and sweep
+    beside = (source.with_name(f"{stem}{ending}") for stem in stems for ending in format.beside)
+    return [source, *sorted(path for path in beside if path.is_file())]
+
+
+def _is_hidden(path: Path, folder: Path) -> bool:
+    """Whether a file, or a folder on the way to it, is hidden: no part of a sweep, such as .git."""
+    return any(part.startswith(".") for part in path.relative_to(folder).parts)

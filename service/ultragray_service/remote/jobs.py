@@ -5,6 +5,7 @@ from __future__ import annotations
 import http.client
 import json
 from collections.abc import Callable, Iterator
+from http import HTTPStatus
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +20,8 @@ class Jobs:
 
     def submit(self, body: dict[str, Any]) -> tuple[dict[str, Any], bool]:
         """The job, and whether it is new."""
-        with self._connection.open("POST", "/v1/jobs", body) as answer:
-            return json.load(answer), answer.status == 201
+        job, status = self._connection.answered("POST", "/v1/jobs", body)
+        return job, status == HTTPStatus.CREATED
 
     def get(self, job_id: str) -> dict[str, Any]:
         """The job as it is now."""
@@ -49,7 +50,7 @@ class Jobs:
         """The end of its log."""
         suffix = f"/log?max_bytes={max_bytes}"
         with self._connection.open("GET", route("jobs", job_id, suffix=suffix), accept="*/*") as answer:
-            return answer.read().decode("utf-8", "replace")
+            return self._connection.whole(answer).decode("utf-8", "replace")
 
     def download(self, job_id: str, name: str, path: Path, progress: Callable[[int | None], Count]) -> int:
         """Write an artifact to `path`, whole or not at all; its size in bytes."""

@@ -67,4 +67,4 @@ class Scenes:
     def render(self, name: str, body: dict[str, Any], media_type: str) -> Answer:
         """The frames of a request, as the body of a render route."""
         with self._connection.open("POST", route("scenes", name, "render"), body, accept=media_type) as answer:
-            return Answer(answer.read(), {key.lower(): value for key, value in answer.headers.items()})
+            return Answer(self._connection.whole(answer), {key.lower(): value for key, value in answer.headers.items()})

@@ -21,6 +21,7 @@ TOKEN_BYTES = 32
 MAX_SLOTS = 64
 PAGE_BYTES = 4096
 MAX_BYTES = 256 * 2**20  # of all slots of one stream
+MAX_SLOT_BYTES = 16 * 2**20  # copied within the event loop: some milliseconds
 
 _FIELD = "shared_memory"
 _NAME = re.compile(r"ultragray-[0-9a-f]{32}")
@@ -101,10 +102,11 @@ def _check_sizes(asked: rendering_pb2.SharedMemory) -> None:
         raise InvalidArgument(
             f"{_FIELD}.slots must be from 1 to {MAX_SLOTS}, got {asked.slots}", field=f"{_FIELD}.slots"
         )
-    if not 0 < asked.slots * asked.slot_bytes <= MAX_BYTES or asked.slot_bytes % PAGE_BYTES:
+    fits = asked.slot_bytes <= MAX_SLOT_BYTES and asked.slots * asked.slot_bytes <= MAX_BYTES
+    if not fits or asked.slot_bytes == 0 or asked.slot_bytes % PAGE_BYTES:
         raise InvalidArgument(
-            f"{_FIELD}.slot_bytes must be a multiple of {PAGE_BYTES}, and at most {MAX_BYTES} for all slots together, "
-            f"got {asked.slot_bytes}",
+            f"{_FIELD}.slot_bytes must be a multiple of {PAGE_BYTES}, at most {MAX_SLOT_BYTES}, "
+            f"and at most {MAX_BYTES} for all slots together, got {asked.slot_bytes}",
             field=f"{_FIELD}.slot_bytes",
         )
 

@@ -57,7 +57,10 @@ class HumanFormatter(logging.Formatter):
         level = "" if record.levelno == logging.INFO else f"{record.levelname.lower()}: "
         if record.levelno >= logging.WARNING:
             level = self._coloured(level, _YELLOW if record.levelno == logging.WARNING else _RED)
-        line = f"{self._coloured(time, _DIM)} {level}{_sentence(record)}"
+        sentence = "".join(
+            one if one.isprintable() else ascii(one)[1:-1] for one in _sentence(record)
+        )  # paths are theirs
+        line = f"{self._coloured(time, _DIM)} {level}{sentence}"
         return f"{line}\n{self.formatException(record.exc_info)}" if record.exc_info else line
 
     def _coloured(self, text: str, code: int) -> str:

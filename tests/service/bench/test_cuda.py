@@ -46,7 +46,7 @@ def benched(tmp_path_factory: pytest.TempPathFactory) -> Benched:
         patch.setattr(cuda_train, "STEPS", 20)
         for options in ([], ["--train"]):
             output = folder / "bench.json"
-            arguments = ["bench", "--backend", "cuda", "--quick", "--output", str(output), *options]
+            arguments = ["bench", "--backend", "cuda", "--quick", "--force", "--output", str(output), *options]
             result = CliRunner().invoke(app, arguments)
             assert result.exit_code == 0, result.output
             printed += result.stdout

@@ -1,4 +1,4 @@
-"""`ultragray eval`, `compound` and `report`: from a folder of frames to figures, pictures and a page."""
+"""`ultragray eval`, `compare` and `report`: from a folder of frames to figures, pictures and a page."""
 
 from __future__ import annotations
 
@@ -16,11 +16,12 @@ from ultragray import ConvexProbe, GaussianScene, LinearProbe, Probe
 from ultragray.datasets import Dataset, Sweep
 from ultragray.datasets.released import read_released, write_released
 from ultragray.errors import MemoryExceeded, TrainingDiverged
-from ultragray.evaluation.baselines import evaluate_baselines
+from ultragray.evaluation.baselines import BASELINES, evaluate_baselines
 from ultragray.evaluation.reliability import measure_reliability
 from ultragray.evaluation.scoring import evaluate
 from ultragray.report import study
 from ultragray.training import TrainingConfig, train
+from ultragray_service.cli.studies.compare import Method
 
 from .command_line import refused, run
 
@@ -217,3 +218,7 @@ def test_a_dataset_without_held_out_frames_is_refused(dataset: Path, scene: Path
         ("report", tmp_path / "alone", "-o", tmp_path / "page.html"),
     ):
         assert "no frames to measure with" in refused(*arguments)
+
+
+def test_every_baseline_can_be_asked_for() -> None:
+    assert {method.value for method in Method} == {"all", *BASELINES}

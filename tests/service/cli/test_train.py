@@ -180,7 +180,7 @@ def test_stopped_run_leaves_a_scene_and_goes_on(dataset: Path, tmp_path: Path, n
     stopped_at = GaussianScene.load(output).info.training["step"]
     assert 5 <= stopped_at < 300
     assert f"stopped after step {stopped_at} of 300; wrote {output} as it is" in told
-    assert "unfinished run: resume it, or remove" in refused(dataset, "-o", output, *small)
+    assert "unfinished run: --resume continues it, --force begins anew" in refused(dataset, "-o", output, *small)
     assert "steps is 300 there, 50 here" in refused(dataset, "-o", output, "--resume", "--steps", 50)
     resumed = run(dataset, "-o", output, "--resume")  # the settings are those of the run
     assert resumed.exit_code == 0, resumed.output

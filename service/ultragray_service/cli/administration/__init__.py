@@ -1,1 +1,1 @@
-"""Commands of who looks after a service: keys, workers, backups and the like."""
+"""Commands of who looks after a service: keys, backups and the like."""

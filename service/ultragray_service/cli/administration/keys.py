@@ -13,7 +13,7 @@ import typer
 
 from ...access.limits.allowance import NAMES, read_limits
 from ...access.principal import Role
-from ...settings import Settings
+from ...settings import Settings, load_settings
 from ..options import with_options
 from ..output import print_table
 from ..style import Json, command_group, examples, tell, to_json
@@ -59,8 +59,9 @@ def create(
 ) -> None:
     """Make a key, and print it: alone on standard output, and never again."""
     limits = read_limits(limit or ())
-    if not where:
-        Settings().data_folder.mkdir(exist_ok=True)  # as `serve` makes it: keys may come first
+    settings = load_settings(**where)
+    if settings.database_url is None and settings.data_folder == Settings().data_folder:
+        settings.data_folder.mkdir(exist_ok=True)  # as `serve` makes it: keys may come first
     with _key_store(where) as store:
         others = [key for key in store.keys().values() if key.name == name and key.is_valid(time.time())]
         key, secret = store.create(name, role, expires_days, limits)
@@ -102,7 +103,7 @@ def revoke(
     if lines or json:
         tell("\n".join(lines), [_document(key) for key in revoked], as_json=json)
     if not revoked:
-        typer.echo(f"no key of {name} opened any door", err=True)
+        typer.echo(f"nothing changed: every key of {name} was revoked already, or has expired", err=True)
 
 
 @contextmanager

@@ -6,16 +6,13 @@ import inspect
 from collections.abc import Callable
 from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
+from typing import Annotated, Any, get_type_hints
 
 import typer
 
 from ...environment import ADDRESS, API_KEY, CA, CLIENT_CERTIFICATE, CLIENT_KEY
 from ..options import keyword, with_parameters
 from ..style import warn
-
-if TYPE_CHECKING:
-    pass
 
 CONNECTION, TLS = "Connection", "TLS"
 
@@ -27,7 +24,7 @@ def _option(help: str, envvar: str, panel: str, show_default: str | bool) -> Any
 _OPTIONS = [
     keyword(
         "address",
-        Annotated[str, _option("URL of the service.", ADDRESS, CONNECTION, "http://127.0.0.1:8000")],
+        Annotated[str, _option("URL of the service.", ADDRESS, CONNECTION, True)],
         "http://127.0.0.1:8000",
     ),
     keyword(

@@ -26,7 +26,9 @@ DatasetName = Annotated[str, typer.Argument(metavar="NAME", help="Name of the da
 _COLUMNS = ("name", "format", "training", "held out", "pixels", "MB", "created", "owner")
 
 
-@command_app.command("list", epilog=examples("ultragray datasets list", "ultragray datasets list --json | jq .[].name"))
+@command_app.command(
+    "list", epilog=examples("ultragray datasets list", "ultragray datasets list --json | jq '.[].name'")
+)
 @with_connection
 def list_datasets(connection: Connection, json: Json = False) -> None:
     """List the datasets by name."""

@@ -38,7 +38,7 @@ _COLUMNS = ("id", "kind", "state", "scene", "progress", "created", "reason")
 
 
 @command_app.command(
-    "list", epilog=examples("ultragray jobs list", "ultragray jobs list --state failed --json | jq -r .[].id")
+    "list", epilog=examples("ultragray jobs list", "ultragray jobs list --state failed --json | jq -r '.[].id'")
 )
 @with_connection
 def list_jobs(

@@ -27,7 +27,7 @@ SceneName = Annotated[str, typer.Argument(metavar="NAME", help="Name of the scen
 _COLUMNS = ("name", "Gaussians", "image", "MB", "loaded", "owner", "error")
 
 
-@command_app.command("list", epilog=examples("ultragray scenes list", "ultragray scenes list --json | jq .[].name"))
+@command_app.command("list", epilog=examples("ultragray scenes list", "ultragray scenes list --json | jq '.[].name'"))
 @with_connection
 def list_scenes(connection: Connection, json: Json = False) -> None:
     """List the scenes by name."""

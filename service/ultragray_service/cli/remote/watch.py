@@ -20,6 +20,7 @@ JOB_FAILED = 3  # the exit code of a command that watched a job fail
 JOB_CANCELLED = 4
 _FINAL_STATES = ("succeeded", "failed", "cancelled")
 _RETRY_S = 1.0
+_HELD_S = 5.0  # a connection that lasted so long was one to a service that works
 _GONE_S = 60.0  # a service that comes back within this time is asked again
 
 
@@ -51,15 +52,18 @@ def _watched(jobs: Jobs, job_id: str, show: Callable[[dict[str, Any]], None]) ->
     jobs.get(job_id)  # nobody there, or no such job: said at once
     seen = time.monotonic()
     while True:
+        asked, gone = time.monotonic(), NotReady(f"nothing is heard of the job {job_id}")
         try:
             for job in jobs.changes(job_id):
-                seen = time.monotonic()
                 show(job)
                 if job["state"] in _FINAL_STATES:
                     return job
-        except NotReady:
-            if time.monotonic() - seen > _GONE_S:
-                raise
+        except NotReady as error:
+            gone = error
+        if (now := time.monotonic()) - asked > _HELD_S:
+            seen = now  # the service was there until now, though perhaps nothing changed
+        elif now - seen > _GONE_S:
+            raise gone
         time.sleep(_RETRY_S)
 
 

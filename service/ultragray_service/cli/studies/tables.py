@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 def print_metrics(title: str, evaluations: Mapping[str, Evaluation]) -> None:
     """A table of mean ± standard deviation over the frames, one row a name."""
     from rich.console import Console
+    from rich.markup import escape
     from rich.table import Table
 
     table = Table(box=None, pad_edge=False)
@@ -21,7 +22,7 @@ def print_metrics(title: str, evaluations: Mapping[str, Evaluation]) -> None:
     for name, evaluation in evaluations.items():
         mean, std = evaluation.mean, evaluation.std
         table.add_row(
-            name,
+            escape(name),
             f"{mean.psnr_db:.2f} ± {std.psnr_db:.2f}",
             *(f"{getattr(mean, key):.3f} ± {getattr(std, key):.3f}" for key in ("ms_ssim", "gms", "gmsd")),
         )
@@ -36,6 +37,7 @@ def print_metrics(title: str, evaluations: Mapping[str, Evaluation]) -> None:
 def print_speckle(evaluations: Mapping[str, Evaluation]) -> None:
     """A table of the statistics of speckle, means over the frames: the true frames, then one row a name."""
     from rich.console import Console
+    from rich.markup import escape
     from rich.table import Table
 
     table = Table(box=None, pad_edge=False)
@@ -49,5 +51,5 @@ def print_speckle(evaluations: Mapping[str, Evaluation]) -> None:
     }
     for name, (speckle, distance) in rows.items():
         figures = ("–",) * 3 if speckle is None else [f"{value:.3f}" for value in astuple(speckle)]
-        table.add_row(name, *figures, distance)
+        table.add_row(escape(name), *figures, distance)
     Console().print(table)

@@ -118,7 +118,9 @@ def train(
     )
     if resume:
         _check_resumable(run)
-    check_file(output, [SCENE_SUFFIX], force=force or resume or _is_unfinished(run))
+    else:
+        _check_no_run(run, force=force)
+    check_file(output, [SCENE_SUFFIX], force=force or resume)
     chosen = _config_of(run, given)
 
     from ultragray.training.device import training_device
@@ -130,6 +132,8 @@ def train(
         torch.set_num_threads(threads)
     read = read_dataset(sweep, source)
     warn_about_dataset(read)
+    if not resume:
+        _forget_run(run)
     _train(read, chosen, run, as_json=json)
 
 
@@ -146,13 +150,23 @@ class RunOptions:
     backend: str
 
 
-def _is_unfinished(run: RunOptions) -> bool:
-    """Whether the output is of a run that was stopped: the training refuses it, with the words for that."""
-    if not (run.output.exists() and run.folder.is_dir()):
-        return False
+def _check_no_run(run: RunOptions, *, force: bool) -> None:
+    """Raise TrainingStateInvalid where the folder of the run holds one that was stopped, and is not to be replaced."""
+    if not run.folder.is_dir() or force:
+        return
     from ultragray.training.trainer import CHECKPOINT_FILE
 
-    return (run.folder / CHECKPOINT_FILE).exists()
+    if (run.folder / CHECKPOINT_FILE).exists():
+        raise TrainingStateInvalid(
+            f"{run.folder}: there is an unfinished run: --resume continues it, --force begins anew"
+        )
+
+
+def _forget_run(run: RunOptions) -> None:
+    """Remove the checkpoint of a run that is begun anew."""
+    from ultragray.training.trainer import CHECKPOINT_FILE
+
+    (run.folder / CHECKPOINT_FILE).unlink(missing_ok=True)
 
 
 def _check_resumable(run: RunOptions) -> None:
