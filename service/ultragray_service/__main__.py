@@ -6,14 +6,12 @@ import sys
 
 from ultragray.errors import UltragrayError
 
-from .environment import wait_without_spinning
 from .server import run
 from .settings import load_settings
 
 
 def main() -> int:
     """Serve until SIGTERM or SIGINT: 0 after a clean stop, 1 and a sentence on stderr where it cannot start."""
-    wait_without_spinning()
     try:
         run(load_settings())
     except UltragrayError as error:

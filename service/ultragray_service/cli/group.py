@@ -12,8 +12,6 @@ from typing import Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from ..environment import wait_without_spinning
-
 USER_ERROR = 2  # the exit code of a mistake that the caller can mend
 INTERRUPTED = 130  # the exit code of a command that Ctrl-C or SIGTERM stopped
 
@@ -103,7 +101,6 @@ class LazyGroup(TyperGroup):
         **extra: Any,
     ) -> Any:
         """Run the command line; in standalone mode the process ends with its exit code."""
-        wait_without_spinning()
         prog_name = prog_name or "ultragray"  # also by `python -m` and the like
         if not standalone_mode:
             return super().main(args, prog_name, complete_var, False, windows_expand_args, **extra)

@@ -36,18 +36,6 @@ from .command_line import python, refused, run
 SILENT = ("serve", "worker")  # they tell in a log
 
 
-def test_threads_of_torch_sleep_while_they_wait() -> None:
-    program = (
-        "import os, sys; from ultragray_service.cli.app import app; sys.argv = ['ultragray', '--version']\n"
-        "try: app()\n"
-        "finally: print(os.environ['OMP_WAIT_POLICY'], 'torch' in sys.modules)"
-    )
-    for given, expected in (({}, "passive False"), ({"OMP_WAIT_POLICY": "active"}, "active False")):
-        environment = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"} | given
-        told = subprocess.run(python(program), env=environment, capture_output=True, text=True, check=True).stdout
-        assert told.splitlines()[-1] == expected
-
-
 def all_commands() -> dict[str, Any]:
     """Every command that does something itself, by its words."""
     waiting = list(typer.main.get_command(app).commands.items())  # type: ignore[attr-defined]
