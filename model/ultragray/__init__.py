@@ -9,10 +9,16 @@ no NumPy.
 from __future__ import annotations
 
 import importlib
+import os
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 from .installation import __version__ as __version__
+
+# torch reads it when it is imported. Its threads sleep while they wait for each other, and leave the processors to the
+# kernels' own threads and to other programs. If they spin, a training step takes half as long again on two cores, and
+# beside other busy programs many times as long.
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 if TYPE_CHECKING:
     from .errors import UltragrayError
