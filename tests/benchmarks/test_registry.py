@@ -33,6 +33,7 @@ def test_a_file_says_commit_date_and_machine(name: str) -> None:
     assert heads
     for head in heads:
         assert head["commit"]
+        assert "dirty" not in head["commit"]
         assert datetime.fromisoformat(head["date"]).tzinfo is not None
         assert head["machine"]["processor"]
 
