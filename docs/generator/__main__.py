@@ -14,4 +14,4 @@ except SiteInvalid as error:
     sys.exit(f"error: {error}")
 except subprocess.CalledProcessError as error:
     sys.exit(error.returncode)
-print(f"The site is in {site}. To read it: python3 -m http.server --directory {site}")  # noqa: T201
+sys.stdout.write(f"The site is in {site}. To read it: python3 -m http.server --directory {site}\n")

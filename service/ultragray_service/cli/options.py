@@ -199,6 +199,15 @@ def _parameter(
     return keyword(item.name, Annotated[parsed | None, option], None)
 
 
+def poses_option(*, default: str) -> Any:
+    """`--poses FILE`; `default`: the words for the poses that are taken without it."""
+    return typer.Option(
+        help="Poses in mm: .npy or .json, [P, 4, 4] or [P, 3, 4].",
+        show_default=default,
+        rich_help_panel=Sampler.__topic__,
+    )
+
+
 def _signature(member: Any) -> str:
     """A member of a family as JSON without its values."""
     return "{" + ", ".join([f'"kind": "{member.kind}"', *(f'"{item.name}": …' for item, _ in _fields(member))]) + "}"

@@ -7,6 +7,7 @@ import zipfile
 from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from typing import ClassVar
 
 import pytest
 from typer.testing import CliRunner
@@ -21,8 +22,8 @@ KEY = "0123456789abcdef-strangers"
 class Stranger(BaseHTTPRequestHandler):
     """Answers by the path, and remembers the keys that it was given."""
 
-    keys: list[str | None] = []  # noqa: RUF012  # of the one server of a test
-    answers = {  # noqa: RUF012
+    keys: ClassVar[list[str | None]] = []
+    answers: ClassVar[dict[str, tuple[int, dict[str, str], bytes]]] = {
         "/page": (200, {"Content-Type": "text/html"}, b"<html>welcome</html>"),
         "/list": (200, {}, b"[]"),
         "/short": (200, {"Content-Length": "100"}, b"{"),

@@ -197,6 +197,7 @@ BAD_MESSAGES: dict[str, tuple[dict[str, Any], str, str]] = {
     "no size": ({"slot_bytes": 0}, "slot_bytes", "multiple of 4096"),
     "half a page": ({"slot_bytes": 2**20 + 2048}, "slot_bytes", "multiple of 4096"),
     "another size": ({"slot_bytes": 2**21}, "name", "must have 6295552 bytes"),
+    "a large slot": ({"slot_bytes": 2**24 + 4096}, "slot_bytes", "at most 16777216"),
     "a large size": ({"slot_bytes": 2**28 // 3 // 4096 * 4096 + 4096}, "slot_bytes", "at most 268435456 for all"),
 }
 

@@ -11,7 +11,7 @@ from ultragray.samplers import Sampler
 from ultragray.scene_info import read_header
 from ultragray.settings import FrameSettings
 
-from ..options import with_options
+from ..options import poses_option, with_options
 from ..output import SCENE_SUFFIX, check_file, print_table
 from ..progress import transferred
 from ..scenes.show import print_facts
@@ -116,14 +116,7 @@ def render(
     output: Annotated[Path, output_option(f"A file ({', '.join(SUFFIXES)}), or a folder for PNGs.")],
     force: Force = False,
     json: Json = False,
-    poses: Annotated[
-        Path | None,
-        typer.Option(
-            help="Poses in mm: .npy or .json, [P, 4, 4] or [P, 3, 4].",
-            show_default="the middle training pose",
-            rich_help_panel=Sampler.__topic__,
-        ),
-    ] = None,
+    poses: Annotated[Path | None, poses_option(default="the middle training pose")] = None,
     *,
     sampler: Sampler | None,
     settings: FrameSettings,

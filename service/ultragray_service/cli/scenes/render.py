@@ -12,7 +12,7 @@ from ultragray.interchange.exports.formats import DTYPES, FORMATS, check_format,
 from ultragray.samplers import Sampler
 from ultragray.settings import FrameSettings
 
-from ..options import with_options
+from ..options import poses_option, with_options
 from ..output import OR_A_FOLDER, check_ending, check_file, check_folder, is_folder_name
 from ..style import COMPUTE, OUTPUT, Backend, Force, Json, SceneFile, command_group, examples, output_option, tell
 
@@ -43,14 +43,7 @@ def render(
     ] = None,
     force: Force = False,
     json: Json = False,
-    poses: Annotated[
-        Path | None,
-        typer.Option(
-            help="Poses in mm: .npy or .json, [P, 4, 4] or [P, 3, 4].",
-            show_default="the scene's training poses",
-            rich_help_panel=Sampler.__topic__,
-        ),
-    ] = None,
+    poses: Annotated[Path | None, poses_option(default="the scene's training poses")] = None,
     *,
     sampler: Sampler | None,
     settings: FrameSettings,

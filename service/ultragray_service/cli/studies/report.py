@@ -45,7 +45,7 @@ command_app = command_group()
 @command_app.command(
     epilog=examples(
         "ultragray report sweep/ -o report.html  # trains eight times: hours",
-        "ultragray report sweep/ -o report.html --scene liver.ugr --no-ablations # minutes",
+        "ultragray report sweep/ -o report.html --scene liver.ugr --no-ablations  # minutes",
     )
 )
 @with_options
