@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from ultragray_proto.v1 import geometry_pb2, rendering_pb2, scenes_pb2
 
 from ..freshness import check_fresh
 from ..service.conftest import StartService
+from ..waiting import wait_until
 from .test_client_render import moved
 
 
@@ -81,6 +83,13 @@ def test_refused_settings_are_told_first(client: Any) -> None:
         client.stream("demo", mode="newest")
 
 
+def send_until_it_ends(stream: Any) -> None:
+    """Or 50 poses long: an ordered stream that nobody reads takes no more than 64."""
+    with suppress(errors.StreamEnded, errors.Unavailable):
+        for _ in range(50):
+            stream.send(moved(0.0))
+
+
 def test_a_stream_may_be_used_by_two_threads(client: Any) -> None:
     with client.stream("demo", RenderSettings(height=8, width=8)) as stream:
 
@@ -106,6 +115,21 @@ def test_a_service_that_stops_ends_a_stream(make_client: Any, start_service: Sta
             stream.receive()
         with pytest.raises(errors.ClientError):
             stream.send(moved(0.0))
+
+
+def test_the_frames_before_the_end_of_a_stream_come(make_client: Any, start_service: StartService) -> None:
+    service = start_service()
+    stream = make_client(service.grpc).stream("demo", RenderSettings(height=8, width=8))
+    for _ in range(5):
+        stream.send(moved(0.0))
+    wait_until(lambda: service.metric("ultragray_frames_total") >= 5)
+    service.terminate()
+    send_until_it_ends(stream)
+    sequences: list[int] = []
+    with pytest.raises(errors.Unavailable):
+        sequences.extend(frame.sequence for frame in stream)
+    assert sequences == list(range(1, len(sequences) + 1))
+    assert len(sequences) >= 5
 
 
 def test_what_was_dropped_before_an_error_is_told_with_the_next_frame() -> None:

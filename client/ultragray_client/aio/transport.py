@@ -30,6 +30,25 @@ async def run_blocking(function: Callable[P, R], *arguments: P.args, **keywords:
     return await asyncio.to_thread(function, *arguments, **keywords)
 
 
+class _CallThatKeepsItsStatus:
+    """The inner call of a stream under grpc.aio, which gives up the answers and the status that the service sent when
+    a write fails because the stream is over (https://github.com/grpc/grpc/issues/36066). This one keeps them.
+    """
+
+    def __init__(self, inner: Any) -> None:
+        self._inner = inner
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._inner, name)
+
+    async def send_serialized_message(self, message: bytes) -> None:
+        """Raises StreamEnded where the stream is over; reading says why."""
+        try:
+            await self._inner.send_serialized_message(message)
+        except grpc.aio.InternalError:
+            raise StreamEnded(TAKES_NO_MORE) from None
+
+
 class PoseCall:
     """The call of a stream: poses out, frames in. All raise grpc.RpcError where the call failed.
 
@@ -38,6 +57,7 @@ class PoseCall:
 
     def __init__(self, start: Callable[..., Any], exchange: PoseExchange) -> None:
         self._call = start()
+        self._call._cython_call = _CallThatKeepsItsStatus(self._call._cython_call)
         self._exchange = exchange
         self._opening: Any = exchange.opening()
         self._sending = asyncio.Lock()
@@ -111,5 +131,5 @@ class PoseCall:
             async with self._sending:
                 try:
                     await self._call.write(self._exchange.acknowledgement(self._taken_sequence))
-                except (asyncio.InvalidStateError, grpc.RpcError):
+                except (asyncio.InvalidStateError, StreamEnded, grpc.RpcError):
                     return  # nothing is sent any more
