@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from enum import Enum
@@ -14,6 +15,8 @@ from ultragray.contract import described
 
 from .folder import JobFolder, Outcome, Progress
 from .kinds import KINDS
+from .matching.demand import Demand
+from .matching.offer import LivingWorker, waits_for
 from .queue import database
 from .queue.owners import Ownership
 
@@ -71,8 +74,11 @@ class Job:
     private: bool = described("Whether others may not see it, nor the scene that it makes.")
 
 
-def job_of_row(row: WorkflowStatus, artifact_folder: Path) -> Job:
-    """The job of a row of the queue; the folder of an unfinished one says how far it is."""
+def job_of_row(row: WorkflowStatus, artifact_folder: Path, workers: Sequence[LivingWorker]) -> Job:
+    """The job of a row of the queue; the folder of an unfinished one says how far it is.
+
+    `workers`: those that live; of a job that does not wait, none need be given.
+    """
     state = _STATE_OF[row.status]
     outcome, ownership = _outcome(row), ownership_of(row)
     started = state is not JobState.QUEUED or bool(row.recovery_attempts)
@@ -92,7 +98,7 @@ def job_of_row(row: WorkflowStatus, artifact_folder: Path) -> Job:
         finished_at=_iso_not_before(max(row.created_at, row.dequeued_at or 0), row.completed_at),
         reason=outcome.reason,
         error=outcome.error,
-        progress=replace(outcome.progress, waits_for=_waits_for(row) if state is JobState.QUEUED else None),
+        progress=replace(outcome.progress, waits_for=_waits_for(row, workers) if state is JobState.QUEUED else None),
         artifacts=outcome.artifacts,
         metrics=outcome.metrics,
         worker=row.executor_id if started else None,
@@ -108,11 +114,11 @@ def ownership_of(row: WorkflowStatus) -> Ownership:
     return Ownership(row.authenticated_user, bool(attribute(row, "private")))
 
 
-def _waits_for(row: WorkflowStatus) -> str | None:
-    """The need of a job that no worker of this release can do."""
+def _waits_for(row: WorkflowStatus, workers: Sequence[LivingWorker]) -> str | None:
+    """The need of a job that no worker of this release, or none that lives, can do."""
     version = row.app_version
     if version in (database.VERSION, *database.OLDER_VERSIONS, None):
-        return None
+        return waits_for(Demand.of(attribute(row, "specification")), workers)
     return f"a worker of another release: the job has version {version}, those of this release do {database.VERSION}"
 
 

@@ -7,7 +7,7 @@ import os
 import re
 import threading
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from datetime import datetime
@@ -39,6 +39,8 @@ from ..store import OpenStore
 from .folder import JobFolder, Progress
 from .job import MAX_PRIORITY, PRIORITY_ZERO, STATUSES, Job, JobState, attribute, job_of_row, ownership_of
 from .kinds import Specification
+from .matching.demand import Demand
+from .matching.offer import LivingWorker
 from .overview import JobsOverview, overview
 from .publication import SCENES_FOLDER, give_name_back
 from .queue import attendance, database, runs, unfinished
@@ -174,6 +176,7 @@ class JobStore:
                 "workflow_id": job_id,
                 "workflow_id_reuse_policy": "reject",
                 "app_version": database.VERSION,
+                "queue_partition_key": Demand.of(short).key,
                 "priority": PRIORITY_ZERO - priority,
                 "attributes": {
                     "request_id": request_id,
@@ -281,7 +284,8 @@ class JobStore:
             page_size=page_size,
             page_token=page_token,
         )
-        return [self._seen(row) for row in rows], token
+        workers = self._workers_for(rows)
+        return [job_of_row(row, self._artifact_folder, workers) for row in rows], token
 
     def ownership(self, job_id: str) -> Ownership:
         """Whose a job is. Raises JobNotFound."""
@@ -438,7 +442,12 @@ class JobStore:
         return row
 
     def _seen(self, row: WorkflowStatus) -> Job:
-        return job_of_row(row, self._artifact_folder)
+        return job_of_row(row, self._artifact_folder, self._workers_for([row]))
+
+    def _workers_for(self, rows: Sequence[WorkflowStatus]) -> Sequence[LivingWorker]:
+        """The workers that live, if any of the jobs waits for one."""
+        is_asked = any(row.status in database.QUEUED for row in rows)
+        return attendance.living_workers(self.database) if is_asked else ()
 
     def _folder(self, job_id: str) -> JobFolder:
         return JobFolder(self._artifact_folder, job_id)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
@@ -11,8 +12,11 @@ from pathlib import Path
 
 import pytest
 
+from ultragray.machine import memory_bytes
+from ultragray_workers.errors import StartupFailed
+from ultragray_workers.jobs.matching.offer import WorkerDevice
 from ultragray_workers.jobs.store import Job, JobState, JobStore
-from ultragray_workers.jobs.worker.device import Device, DeviceLock, device_of, lock_path
+from ultragray_workers.jobs.worker.device import DeviceLock, HostDevice, devices_of, lock_path
 from ultragray_workers.jobs.worker.processes import holder_of
 
 from ....postgres import PostgresServer
@@ -21,7 +25,13 @@ from ..conftest import RunningWorker, train_job
 
 StartWorker = Callable[..., RunningWorker]
 Until = Callable[..., Job]
-CPU = Device("cpu", "cpu")
+
+
+def device(name: str, lock_name: str) -> HostDevice:
+    return HostDevice(WorkerDevice(name=name, model="a model", memory_bytes=8 * 10**9), lock_name)
+
+
+CPU = device("cpu", "cpu")
 
 
 @pytest.fixture
@@ -54,9 +64,23 @@ def test_lock_is_of_one_worker_until_both_it_and_its_process_let_go(tmp_path: Pa
 
 
 def test_every_device_has_a_lock_of_its_own(tmp_path: Path) -> None:
-    assert device_of("cpu") == CPU
-    devices = [CPU, Device("cuda", "gpu-1"), Device("cuda:1", "gpu-2")]
-    assert len({lock_path(tmp_path, device) for device in devices}) == 3
+    assert [one.lock_name for one in devices_of("cpu")] == ["cpu"]
+    devices = [CPU, device("cuda:0", "gpu-1"), device("cuda:1", "gpu-2")]
+    assert len({lock_path(tmp_path, one) for one in devices}) == 3
+
+
+def test_the_processor_is_offered_with_the_cores_and_the_memory_of_the_host() -> None:
+    (processor,) = devices_of("cpu")
+    assert processor.offered.name == "cpu"
+    assert processor.offered.cores == len(os.sched_getaffinity(0))
+    assert processor.offered.memory_bytes == memory_bytes()
+
+
+@pytest.mark.parametrize("asked", ["cuda:99", "tpu"])
+def test_a_worker_does_not_start_for_a_device_that_its_host_does_not_have(asked: str) -> None:
+    with pytest.raises(StartupFailed, match="device must be .*got '(cuda:99|tpu)'") as caught:
+        devices_of(asked)
+    assert caught.value.field == "device"
 
 
 @pytest.mark.long
@@ -83,10 +107,10 @@ def test_who_waits_for_a_device_takes_no_job_and_another_host_does(
 def test_a_job_that_asks_for_a_device_in_use_waits_in_the_queue(
     store: JobStore, artifact_folder: Path, start_worker: StartWorker, until: Until
 ) -> None:
-    """The worker's own device is free, and nobody loses an attempt."""
+    """Nobody loses an attempt."""
     held = DeviceLock(artifact_folder.resolve(), CPU, "somebody")
     assert held.take()
-    start_worker("one", device="cuda:7")
+    start_worker("one")
     job, _ = store.submit(train_job("one"))
     time.sleep(3.0)
     job = store.get(job.id)

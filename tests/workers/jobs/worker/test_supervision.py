@@ -20,7 +20,7 @@ from ultragray_workers.jobs.queue.database import JobDatabase
 from ultragray_workers.jobs.queue.internals import WORKFLOWS
 from ultragray_workers.jobs.store import Job, JobState, JobStore
 from ultragray_workers.jobs.worker import supervision
-from ultragray_workers.jobs.worker.device import DeviceLock, device_of
+from ultragray_workers.jobs.worker.device import DeviceLock, devices_of
 from ultragray_workers.jobs.worker.gate import Gate
 from ultragray_workers.jobs.worker.supervision import Supervisor
 
@@ -76,8 +76,8 @@ def alone(store: JobStore, artifact_folder: Path) -> Iterator[tuple[Supervisor, 
     """The supervisor, in this process, and what DBOS does: takes a job, and has it done."""
     jobs = JobDatabase(artifact_folder, None)
     folder = artifact_folder.resolve()
-    gate = Gate(jobs.folder, DeviceLock(folder, device_of("cpu"), "me"))
-    supervisor = Supervisor(supervision.WorkerConfig(folder, "me", device="cpu"), jobs, gate)
+    gate = Gate(jobs.folder, [DeviceLock(folder, device, "me") for device in devices_of("cpu")])
+    supervisor = Supervisor(supervision.WorkerConfig(folder, "me"), jobs, gate)
 
     def take(job_id: str) -> Outcome:
         taken = {"status": database.RUNNING[0], "executor_id": "me"}

@@ -11,6 +11,7 @@ from ultragray.contract import Family, described
 from ultragray.scene_info import SceneHeader
 
 from ...scenes import check_scene_name
+from ..matching.demand import AUTO, MAX_LABELS, MAX_MEMORY_GB, check_device, check_labels
 
 MAX_RUN_S = 31_536_000.0
 
@@ -43,6 +44,17 @@ class Specification(Family):
         high=MAX_RUN_S,
         kw_only=True,
     )
+    device: str = described(
+        "auto, cpu, cuda or cuda:N: what the worker must offer; auto: a GPU where it offers one, else its processor.",
+        AUTO,
+        kw_only=True,
+    )
+    min_memory_gb: int | None = described(
+        "Least memory of the device, 10^9 bytes; of cpu: of the host.", None, low=1, high=MAX_MEMORY_GB, kw_only=True
+    )
+    worker_labels: dict[str, str] = described(
+        'Labels that the worker must have, such as {"site": "lab1"}.', factory=dict, most=MAX_LABELS, kw_only=True
+    )
     run_module: ClassVar[str]  # of this folder: its `run(job_run, specification)` does the work
     needs_dataset: ClassVar[str | None] = None  # field: the dataset stays while the job waits or runs
     needs_scene: ClassVar[str | None] = None  # field: the scene is kept for the job as it is at the submission
@@ -51,6 +63,8 @@ class Specification(Family):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        check_device(self.device)
+        check_labels(self.worker_labels, "worker_labels")
         for field in (self.needs_scene, self.makes_scene):
             if field is not None:
                 check_scene_name(getattr(self, field), field)

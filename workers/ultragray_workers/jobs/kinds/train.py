@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -15,7 +14,6 @@ from .base import Specification, Surroundings
 
 _MAX_SETTINGS, _MAX_SETTING_CHARACTERS = 100, 100
 _GIB = 1 << 30
-_DEVICE = re.compile(r"auto|cpu|cuda(:\d{1,3})?")
 
 
 @dataclass(frozen=True)
@@ -29,7 +27,6 @@ class TrainJob(Specification):
     scene: str = described("Name that the scene will be served under.")
     preset: str = described(PRESET_MEANINGS, "fast", choices=tuple(PRESETS))
     settings: dict[str, Any] = described("Any training settings instead of the preset's.", factory=dict)
-    device: str = described("auto, cpu, cuda or cuda:N.", "auto")
     kind: Literal["train"] = kind_field("train")
 
     run_module = "train_run"
@@ -40,7 +37,6 @@ class TrainJob(Specification):
     def __post_init__(self) -> None:
         super().__post_init__()
         _require(self.dataset != "", "dataset", "the name of a dataset", self.dataset)
-        _require(_DEVICE.fullmatch(self.device) is not None, "device", "auto, cpu, cuda or cuda:N", self.device)
         is_object = isinstance(self.settings, dict) and len(self.settings) <= _MAX_SETTINGS
         _require(is_object, "settings", f"an object of at most {_MAX_SETTINGS} training settings", self.settings)
         for name, value in self.settings.items():

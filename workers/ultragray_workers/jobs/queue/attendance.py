@@ -11,6 +11,7 @@ import sqlalchemy as sa
 from ultragray.contract import described
 
 from ...errors import WorkerNotFound, known_names
+from ..matching.offer import LivingWorker, WorkerDevice, offer_of_json
 from .database import JobDatabase
 from .heartbeat import DEAD_AFTER_S, now_s
 from .tables import WORKERS
@@ -47,7 +48,9 @@ class Worker:
     state: WorkerState = described("lost: it has given no sign of life for 10 s, or was stopped while paused.")
     host: str
     pid: int
-    device: str = described("auto, cpu, cuda or cuda:N.")
+    device: str = described("As it was started with: auto, cpu, cuda or cuda:N.")
+    devices: tuple[WorkerDevice, ...] = described("Those that it does jobs on, the preferred one first.")
+    labels: dict[str, str] = described("Those that jobs can ask for.")
     version: str = described("Of its release.")
     started_at: str | None = described("ISO 8601, UTC.")
     seconds_since_beat: float | None = described("Since its last sign of life; null: it was stopped.")
@@ -60,6 +63,17 @@ def list_workers(jobs: JobDatabase) -> list[Worker]:
     with jobs.engine.begin() as connection:
         rows = connection.execute(sa.select(WORKERS, age_s.label("age_s")).order_by(WORKERS.c.executor)).all()
     return [_worker_of(row) for row in rows]
+
+
+def living_workers(jobs: JobDatabase) -> list[LivingWorker]:
+    """The workers that give signs of life, by name."""
+    is_alive = WORKERS.c.seen_at_s > now_s(jobs) - DEAD_AFTER_S
+    found = sa.select(WORKERS.c.executor, WORKERS.c.offer, WORKERS.c.wanted).where(is_alive)
+    with jobs.engine.connect() as connection:
+        return [
+            LivingWorker(row.executor, offer_of_json(row.offer), wanted_of(row.wanted) is not Wanted.WORK)
+            for row in connection.execute(found.order_by(WORKERS.c.executor))
+        ]
 
 
 def want(jobs: JobDatabase, name: str, wanted: Wanted) -> Worker:
@@ -77,6 +91,7 @@ def want(jobs: JobDatabase, name: str, wanted: Wanted) -> Worker:
 def _worker_of(row: sa.Row[tuple[object, ...]]) -> Worker:
     facts = row._mapping
     is_lost = facts["age_s"] > DEAD_AFTER_S
+    offer = offer_of_json(facts["offer"])
     state = _STATES[wanted_of(facts["wanted"]), facts["job_id"] is not None]
     return Worker(
         name=facts["executor"],
@@ -84,6 +99,8 @@ def _worker_of(row: sa.Row[tuple[object, ...]]) -> Worker:
         host=facts["host"] or "",
         pid=facts["pid"] or 0,
         device=facts["device"] or "",
+        devices=offer.devices,
+        labels=dict(offer.labels),
         version=facts["version"] or "",
         started_at=_iso(facts["started_at_s"]),
         seconds_since_beat=max(0.0, round(facts["age_s"], 1)) if facts["seen_at_s"] else None,

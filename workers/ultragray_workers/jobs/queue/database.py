@@ -24,7 +24,7 @@ from .writable import WriteProbe
 APPLICATION = "ultragray"
 # Of the workflow's inputs and steps: workers take the jobs of their own version only, and make jobs of older ones that
 # they can do as well their own.
-VERSION, OLDER_VERSIONS = "2", ("1",)
+VERSION, OLDER_VERSIONS = "3", ("1", "2")
 QUEUE = "ultragray-jobs"
 SQLITE_FILE = "jobs.sqlite"
 _POSTGRES_SCHEMES = ("postgresql", "postgres", "postgresql+psycopg")

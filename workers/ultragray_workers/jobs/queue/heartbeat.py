@@ -22,6 +22,7 @@ import ultragray
 from ultragray.errors import UltragrayError
 
 from ...rounds import Rounds
+from ..matching.offer import NO_OFFER, Offer
 from . import unfinished
 from .database import JobDatabase
 from .tables import WORKERS
@@ -46,6 +47,7 @@ class Heartbeat:
         is_stuck: Callable[[], bool] = lambda: False,
         *,
         device: str = "",
+        offer: Offer = NO_OFFER,
         obey: Callable[[Wanted], None] = lambda wanted: None,
     ) -> None:
         """The first beat is done when this returns. While the worker `is_stuck`, there are none.
@@ -58,6 +60,7 @@ class Heartbeat:
             "host": socket.gethostname(),
             "pid": os.getpid(),
             "device": device,
+            "offer": offer.to_json(),
             "version": ultragray.__version__,
             "started_at_s": time.time(),
         }

@@ -6,7 +6,9 @@
 - `put_back`: `DBOSClient.resume_workflow` would revive a job that was cancelled a moment ago, and would take a job from
   the worker that has just taken it over. DBOS's own recovery calls the same method as `put_back`.
 - `take_back`: the same, and the attempt is not counted.
-- `take_only_through`: DBOS takes whatever a queue holds; which worker can do a job is known to us alone.
+- `take_only_through`: DBOS takes whatever a queue holds; which worker can do a job is known to us alone. The demand of
+  a job stands where DBOS keeps the partition of a queue, by which its rows are indexed. The queue is not declared
+  partitioned: DBOS would serve the partitions one by one, in any order, with a transaction for each.
 - `leave_others_room`: DBOS bounds the running jobs of a queue, or of a part of it by one number for all parts.
 - `NotMine`: an execution that raises it ends without an entry in the queue. Any other error is kept as the job's end,
   even while another worker is at the job.
@@ -17,7 +19,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import sqlalchemy as sa
@@ -40,6 +42,7 @@ WORKFLOWS = sa.Table(
     sa.Column("name", sa.Text),
     sa.Column("status", sa.Text),
     sa.Column("queue_name", sa.Text),
+    sa.Column("queue_partition_key", sa.Text),  # the key of the job's demand
     sa.Column("authenticated_user", sa.Text),
     sa.Column("application_version", sa.Text),
     sa.Column("executor_id", sa.Text),
@@ -73,14 +76,20 @@ def take_back(engine: sa.Engine, client: DBOSClient, job_id: str, executor: str,
     return put_back(client, job_id, executor, queue)
 
 
-def take_only_through(dbos: DBOS, queue: str, opens: Callable[[], bool], close: Callable[[], None]) -> None:
-    """Lets a worker take jobs of a queue only while a gate opens; it is closed again where there was none to take."""
-    take = dbos._sys_db.start_queued_workflows
+def take_only_through(dbos: DBOS, queue: str, opens: Callable[[], Sequence[str]], close: Callable[[], None]) -> None:
+    """Lets a worker take jobs of a queue only while a gate opens, and only those with a demand that it opens for.
+
+    It is closed again where there was none to take.
+    """
+    take, rows = dbos._sys_db.start_queued_workflows, dbos._sys_db.tables.workflow_status
+    demands: Sequence[str] = ()
+    _add_condition(dbos, queue, lambda: rows.c.queue_partition_key.in_(demands))
 
     def take_if_open(asked: Any, *arguments: Any, **options: Any) -> Any:
+        nonlocal demands
         if asked.name != queue:
             return take(asked, *arguments, **options)
-        if not opens():
+        if not (demands := opens()):
             return [], None
         taken: list[str] = []
         try:
@@ -109,4 +118,13 @@ def leave_others_room(dbos: DBOS, queue: str) -> None:
     )
     most: Any = rows.c.attributes[MOST_RUNNING].as_integer()
     has_room = sa.or_(most.is_(None), count < most)
-    vars(dbos._sys_db)["_claim_gate"] = lambda name, partition: [has_room] if name == queue else []
+    _add_condition(dbos, queue, lambda: has_room)
+
+
+def _add_condition(dbos: DBOS, queue: str, condition: Callable[[], sa.ColumnElement[bool]]) -> None:
+    """Lets a worker take only jobs of a queue that meet one more condition."""
+    others = dbos._sys_db._claim_gate
+    vars(dbos._sys_db)["_claim_gate"] = lambda name, partition: [
+        *others(name, partition),
+        *([condition()] if name == queue else []),
+    ]

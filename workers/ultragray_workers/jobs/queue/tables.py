@@ -28,6 +28,7 @@ WORKERS = sa.Table(
     sa.Column("started_at_s", sa.Double),
     sa.Column("job_id", sa.Text),
     sa.Column("wanted", sa.Text),  # by an administrator; NULL: that it takes jobs
+    sa.Column("offer", sa.Text),  # JSON of its devices and labels; NULL: a worker of a release without them
 )
 KEYS = sa.Table(  # API keys: rows stay when a key is revoked or has expired
     "ultragray_keys",
@@ -179,6 +180,11 @@ def _to_version_6(connection: sa.Connection) -> None:
     _add_columns(connection, "ultragray_owners", {"claim": "TEXT"})
 
 
+def _to_version_7(connection: sa.Connection) -> None:
+    """The offers of workers."""
+    _add_columns(connection, "ultragray_workers", {"offer": "TEXT"})
+
+
 def _add_columns(connection: sa.Connection, table: str, types: dict[str, str]) -> None:
     place = table if connection.dialect.name == "sqlite" else f"{SCHEMA}.{table}"
     for name, kind in types.items():
@@ -194,6 +200,7 @@ STEPS: tuple[Callable[[sa.Connection], None], ...] = (
     _to_version_4,
     _to_version_5,
     _to_version_6,
+    _to_version_7,
 )
 VERSION = len(STEPS)
 

@@ -10,6 +10,7 @@ from typing import Any
 import sqlalchemy as sa
 
 from ..kinds import KINDS, Specification
+from ..matching.demand import Demand
 from . import database
 from .database import JobDatabase
 from .internals import WORKFLOWS
@@ -29,6 +30,16 @@ def count_waiting(jobs: JobDatabase) -> int:
     counted = sa.select(sa.func.count()).select_from(WORKFLOWS).where(_has_status(*database.QUEUED))
     with jobs.engine.connect() as connection:
         return connection.execute(counted).scalar_one()
+
+
+def demands_waiting(jobs: JobDatabase) -> list[str]:
+    """The keys of the demands that jobs which wait have: one step in an index for each, however many jobs there are."""
+    waits, key = _has_status(*database.QUEUED), _ROWS.queue_partition_key
+    found = sa.select(sa.func.min(key).label("key")).where(waits, key.is_not(None)).cte("found", recursive=True)
+    following = sa.select(sa.func.min(key)).where(waits, key > found.c.key).scalar_subquery()
+    found = found.union_all(sa.select(following).where(found.c.key.is_not(None)))
+    with jobs.engine.connect() as connection:
+        return list(connection.execute(sa.select(found.c.key).where(found.c.key.is_not(None))).scalars())
 
 
 def oldest_waiting_ms(jobs: JobDatabase) -> int | None:
@@ -76,7 +87,10 @@ def adopt_older(jobs: JobDatabase) -> None:
     """Makes jobs that wait for a worker of an older release those of this one, which can do them too."""
     older = sa.and_(_has_status(*database.QUEUED), _ROWS.application_version.in_(database.OLDER_VERSIONS))
     with jobs.engine.begin() as connection:
-        connection.execute(sa.update(WORKFLOWS).where(older).values(application_version=database.VERSION))
+        for job_id, attributes in connection.execute(sa.select(_ROWS.workflow_uuid, _ROWS.attributes).where(older)):
+            adopted = sa.update(WORKFLOWS).where(_ROWS.workflow_uuid == job_id, older)
+            key = Demand.of(attributes["specification"]).key
+            connection.execute(adopted.values(application_version=database.VERSION, queue_partition_key=key))
 
 
 def _source() -> sa.ColumnElement[Any]:

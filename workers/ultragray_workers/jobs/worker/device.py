@@ -1,6 +1,6 @@
-"""The devices of a host: which one a worker uses, and one job at a time on it, whichever workers share the folder.
+"""The devices of a host: which ones a worker uses, and one job at a time on each, whichever workers share the folder.
 
-A worker holds its device before it takes a job: those that wait for a device leave the jobs to other hosts. Free of
+A worker holds a device before it takes a job: those that wait for a device leave the jobs to other hosts. Free of
 torch, which a process of its own asks about GPUs.
 """
 
@@ -15,51 +15,79 @@ import subprocess
 import sys
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import IO
+
+from ultragray.errors import InvalidArgument
+from ultragray.machine import memory_bytes, processor_name
+
+from ...errors import StartupFailed
+from ..matching.demand import AUTO, CPU, CUDA, check_device
+from ..matching.offer import WorkerDevice
 
 LOCK_FOLDER = "workers"  # of the artifact folder, which several hosts may share
 _DRIVERS = (Path("/dev/nvidiactl"), Path("/dev/dxg"))
 _ANSWER_TIMEOUT_S = 120.0
 _ASK_TORCH = """
-import json, sys, torch
-asked = sys.argv[1]
-found = torch.cuda.device_count() if torch.cuda.is_available() else 0
-index = int(asked.partition(":")[2] or 0)
-device = "cpu" if asked == "auto" and not found else "cuda" if asked == "auto" else asked
-known = device != "cpu" and index < found
-print(json.dumps([device, str(torch.cuda.get_device_properties(index).uuid) if known else None]))
+import json, torch
+count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+found = [torch.cuda.get_device_properties(index) for index in range(count)]
+print(json.dumps([[one.name, one.total_memory, str(one.uuid)] for one in found]))
 """
 
 
 @dataclass(frozen=True)
-class Device:
-    """A device as torch calls it on this host, and the name of its lock: the same by whatever number it is known."""
+class HostDevice:
+    """A device as a worker offers it, and the name of its lock: the same by whatever number the host knows it."""
 
-    name: str  # cpu, cuda or cuda:N
+    offered: WorkerDevice
     lock_name: str
 
 
-@cache
-def device_of(asked: str) -> Device:
-    """The device that auto, cpu, cuda or cuda:N means here; auto: a GPU where there is one."""
-    if asked == "cpu" or (asked == "auto" and not any(driver.exists() for driver in _DRIVERS)):
-        return Device("cpu", "cpu")
+def devices_of(asked: str) -> tuple[HostDevice, ...]:
+    """The devices of this host that auto, cpu, cuda or cuda:N means, the preferred one first.
+
+    auto: every GPU, then the processor; cuda: every GPU. Raises StartupFailed for a GPU that is not there, and for what
+    is no device.
+    """
+    try:
+        check_device(asked)
+    except InvalidArgument as error:
+        raise StartupFailed(error.detail, field="device") from None
+    if asked == CPU or (asked == AUTO and not any(driver.exists() for driver in _DRIVERS)):
+        return (_processor(),)
+    gpus = _gpus()
+    if asked == AUTO:
+        return (*gpus, _processor())
+    chosen = tuple(gpu for gpu in gpus if asked in (CUDA, gpu.offered.name))
+    if not chosen:
+        there = ", ".join(gpu.offered.name for gpu in gpus) or "no GPU that torch can use"
+        raise StartupFailed(f"device must be one of this host, got {asked!r}; it has {there}", field="device")
+    return chosen
+
+
+def _processor() -> HostDevice:
+    cores = len(os.sched_getaffinity(0))
+    return HostDevice(
+        WorkerDevice(name=CPU, model=processor_name(), memory_bytes=memory_bytes(), cores=cores), lock_name=CPU
+    )
+
+
+def _gpus() -> tuple[HostDevice, ...]:
     told = subprocess.run(
-        [sys.executable, "-c", _ASK_TORCH, asked],
+        [sys.executable, "-c", _ASK_TORCH],
         env={**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)},
         stdout=subprocess.PIPE,
         timeout=_ANSWER_TIMEOUT_S,
         check=True,
     ).stdout
-    name, gpu = json.loads(told)
-    if name == "cpu":
-        return Device("cpu", "cpu")
-    return Device(name, f"cuda-{name.partition(':')[2] or 0}" if gpu is None else f"gpu-{gpu}")  # None: the job fails
+    return tuple(
+        HostDevice(WorkerDevice(name=f"{CUDA}:{index}", model=model, memory_bytes=memory), lock_name=f"gpu-{uuid}")
+        for index, (model, memory, uuid) in enumerate(json.loads(told))
+    )
 
 
-def lock_path(artifact_folder: Path, device: Device) -> Path:
+def lock_path(artifact_folder: Path, device: HostDevice) -> Path:
     """The file that is locked: of this host and of the device."""
     host = re.sub(r"[^A-Za-z0-9.-]", "-", socket.gethostname()) or "host"
     return artifact_folder / LOCK_FOLDER / f"{host}.{device.lock_name}.device"
@@ -68,8 +96,8 @@ def lock_path(artifact_folder: Path, device: Device) -> Path:
 class DeviceLock:
     """The lock of one device, which the process of a job shares with its worker: held until both have let go."""
 
-    def __init__(self, artifact_folder: Path, device: Device, worker: str) -> None:
-        self.device, self.path = device, lock_path(artifact_folder, device)
+    def __init__(self, artifact_folder: Path, device: HostDevice, worker: str) -> None:
+        self.device, self.path = device.offered, lock_path(artifact_folder, device)
         self._worker = worker
         self._file: IO[str] | None = None
 

@@ -1,7 +1,7 @@
-"""The gate before the queue: a worker takes a job only while it can do one.
+"""The gate before the queue: a worker takes a job only while it can do one, and only one that it can do.
 
-The artifact folder must be the one that the jobs belong to, and the worker's device must be its own: a worker that
-waits leaves the jobs to others.
+The artifact folder must be the one that the jobs belong to, and a device that fits a waiting job must be the worker's
+own: a worker that waits leaves the jobs to others.
 """
 
 from __future__ import annotations
@@ -10,9 +10,12 @@ import logging
 import os
 import signal
 import time
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 
-from ...errors import ArtifactFolderUnavailable
+from ...errors import ArtifactFolderUnavailable, DatabaseUnavailable
+from ..matching.demand import Demand, demand_of_key
+from ..matching.offer import Offer
 from ..queue import heartbeat
 from ..queue.folder_identity import FolderIdentity
 from .device import DeviceLock
@@ -24,30 +27,71 @@ _log = logging.getLogger("ultragray.jobs")
 class Gate:
     """Opens for one job at a time."""
 
-    def __init__(self, folder: FolderIdentity, device: DeviceLock) -> None:
-        self.folder, self.device = folder, device
-        self._stopped: tuple[tuple[int, str], float] | None = None  # a holder of the device, and since when
+    def __init__(
+        self,
+        folder: FolderIdentity,
+        devices: Sequence[DeviceLock],
+        labels: tuple[tuple[str, str], ...] = (),
+        waiting: Callable[[], Iterable[str]] = lambda: (),
+    ) -> None:
+        """`devices`: those that the worker offers, the preferred one first. `waiting`: the demands of waiting jobs."""
+        self.folder = folder
+        self.offer = Offer(tuple(lock.device for lock in devices), labels)
+        self._locks = {lock.device.name: lock for lock in devices}
+        self._waiting = waiting
+        self._stopped: dict[str, tuple[tuple[int, str], float]] = {}  # the holder of a device, and since when
         self._is_folder_there = True
         self._closed_until_s = float("-inf")
         self.is_resting = False  # an administrator wants no jobs to be taken
 
-    def opens(self) -> bool:
-        """Whether a job may be taken now; then the device is held until `close`."""
+    def opens(self) -> list[str]:
+        """The keys of the demands of which a job may be taken now; none: no job may be.
+
+        Devices that fit them are held until `hold` or `close`.
+        """
         if self.is_resting or time.monotonic() < self._closed_until_s or not self._has_folder():
-            return False
-        try:
-            if not self.device.take():
-                self._end_stopped_holder()
-                return False
-        except OSError as error:
-            _log.error(f"no job is taken: the lock of {self.device.device.name} cannot be used: {error.strerror}")
-            return False
-        return True
+            return []
+        # All that are free: which one fits is known when the job is.
+        held = {name for name, lock in self._locks.items() if self._takes(lock)}
+        keys = []
+        if held:  # the database is not asked before: who holds a device and was stopped may hold the database, too
+            with suppress(DatabaseUnavailable):
+                keys = [key for key in self._waiting() if held & self._fitting(demand_of_key(key))]
+        if not keys:
+            self.close()
+        return keys
+
+    def hold(self, demand: Demand) -> DeviceLock | None:
+        """The lock of a device that fits a job, held; the others are let go. None: all of them are in use.
+
+        Raises OSError.
+        """
+        fitting = [self._locks[device.name] for device in self.offer.fitting(demand)]
+        chosen = next((lock for lock in fitting if lock.take()), None)
+        for lock in self._locks.values():
+            if lock is not chosen:
+                lock.release()
+        return chosen
 
     def close(self, *, for_s: float = 0.0) -> None:
-        """Lets others have the device; the gate stays closed for so many seconds at least."""
+        """Lets others have the devices; the gate stays closed for so many seconds at least."""
         self._closed_until_s = max(self._closed_until_s, time.monotonic() + for_s)
-        self.device.release()
+        for lock in self._locks.values():
+            lock.release()
+
+    def _fitting(self, demand: Demand) -> set[str]:
+        return {device.name for device in self.offer.fitting(demand)}
+
+    def _takes(self, lock: DeviceLock) -> bool:
+        """Whether the device of a lock is held now."""
+        try:
+            if lock.take():
+                self._stopped.pop(lock.device.name, None)
+                return True
+            self._end_stopped_holder(lock)
+        except OSError as error:
+            _log.error(f"no job is taken: the lock of {lock.device.name} cannot be used: {error.strerror}")
+        return False
 
     def _has_folder(self) -> bool:
         try:
@@ -62,21 +106,21 @@ class Gate:
         self._is_folder_there = True
         return True
 
-    def _end_stopped_holder(self) -> None:
+    def _end_stopped_holder(self, lock: DeviceLock) -> None:
         """Ends a worker of this host that was stopped for so long that it is dead to all others.
 
         It would keep the device for ever, and on SQLite perhaps the database, too, which therefore is not asked.
         """
-        holder = holder_of(self.device.path)
+        holder, name = holder_of(lock.path), lock.device.name
         if holder is None or not is_stopped(holder[0]):
-            self._stopped = None
+            self._stopped.pop(name, None)
             return
         now_s = time.monotonic()
-        if self._stopped is None or self._stopped[0] != holder:
-            self._stopped = (holder, now_s)
-        elif now_s - self._stopped[1] > heartbeat.DEAD_AFTER_S:
+        known, since_s = self._stopped.get(name, (None, now_s))
+        if known != holder:
+            self._stopped[name] = (holder, now_s)
+        elif now_s - since_s > heartbeat.DEAD_AFTER_S:
             pid, worker = holder
-            name = self.device.device.name
             _log.warning(f"the worker {worker} (process {pid}) was stopped, and kept {name}: it is ended")
             with suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)

@@ -30,12 +30,13 @@ from ...errors import (
 )
 from ...scenes import SUFFIX
 from ..folder import JobFolder, Outcome, Request
+from ..matching.demand import Demand
 from ..publication import give_name_back, publish_scene
 from ..queue import database, runs
 from ..queue.database import JobDatabase
 from ..specification import has_checkpoints, value_in
 from ..tracing import job_span
-from .device import DeviceLock, device_of
+from .device import DeviceLock
 from .gate import Gate
 from .job_process import STOP_WAIT_S, end_process_of_another_worker, end_with_checkpoint, job_process
 from .run_job import STOPPED, STORAGE_FULL
@@ -62,7 +63,6 @@ class WorkerConfig:
 
     artifact_folder: Path
     executor: str  # name of the worker, the same after a restart
-    device: str = "auto"
     threads: int = 1
     nice: int = 10
     max_footprint_pixels: int | None = None  # of a frame of a render job; None: no limit
@@ -173,18 +173,16 @@ class Supervisor:
 
     @contextmanager
     def _device_for(self, job_id: str, specification: dict[str, Any]) -> Iterator[DeviceLock]:
-        """The device of a job: its own wish, else the worker's. Raises Interrupted where another job has it."""
-        asked = specification.get("device", "auto")
-        device, lock = device_of(self._config.device if asked == "auto" else asked), self._gate.device
-        if device.lock_name != lock.device.lock_name:
-            lock.release()
-            lock = DeviceLock(self._config.artifact_folder, device, self._config.executor)
+        """A device that fits a job, held; the gate holds one, but not for a job that this worker had before it died.
+
+        Raises Interrupted where another job has it, or this worker offers none any more.
+        """
+        lock = None
         try:
-            is_ours = lock.take()
+            lock = self._gate.hold(Demand.of(specification))
         except OSError:
             self._require_folder(job_id)
-            is_ours = False
-        if not is_ours:
+        if lock is None:
             self._gate.close(for_s=_PAUSE_S)
             self._until_the_database_answers(job_id, lambda: self._database.take_back(job_id, self._config.executor))
             raise Interrupted

@@ -10,7 +10,7 @@ import os
 import re
 import socket
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ from ..queue.database import JobDatabase, dbos_config, quiet_dbos
 from ..queue.heartbeat import Heartbeat
 from ..queue.internals import NotMine, leave_others_room, take_only_through
 from ..queue.wishes import Wanted
-from .device import DeviceLock, device_of
+from .device import DeviceLock, devices_of
 from .gate import Gate
 from .housekeeping import Housekeeper
 from .supervision import Interrupted, Supervisor, WorkerConfig
@@ -44,6 +44,7 @@ def work(
     hurry: threading.Event | None = None,
     name: str | None = None,
     device: str = "auto",
+    labels: Mapping[str, str] | None = None,
     threads: int = 0,
     nice: int = 10,
     max_footprint_pixels: int | None = None,
@@ -60,26 +61,29 @@ def work(
     One that has no checkpoints gets `drain_timeout_s` to end first, or until `hurry` is set. `ready` is called when
     jobs are taken, and `tell_alive` every `alive_every_s` while the worker is not stuck.
 
+    `device`: auto (every GPU of the host, and its processor), cpu, cuda (every GPU) or cuda:N. Jobs that ask for
+    another one, for more memory than it has, or for other labels than `labels` are left to other workers.
+
     No other worker may have the `name` (None: that of the host, numbered); a worker that is started again under its
     name goes on with its jobs at once. `threads` 0: all cores but one. A render job fails at a frame that costs more
     than `max_footprint_pixels`, see ultragray.limits. Finished jobs are removed after `retention_days`; a job fails
     whose process does not get on for `stall_timeout_s`, or that runs for `max_run_s` in all; 0: never. Threads of
     DBOS are left behind: end the process by os._exit. Raises StartupFailed.
     """
+    devices = devices_of(device)
     with contextlib.closing(OpenStore(artifact_folder)), claim_name(artifact_folder, name) as executor:
         jobs = JobDatabase(artifact_folder, database_url)
         config = WorkerConfig(
             artifact_folder=artifact_folder.resolve(),
             executor=executor,
-            device=device,
             threads=threads or max(1, (os.cpu_count() or 1) - 1),
             nice=nice,
             max_footprint_pixels=max_footprint_pixels,
             stall_timeout_s=stall_timeout_s,
             max_run_s=max_run_s,
         )
-        device_lock = DeviceLock(config.artifact_folder, device_of(device), executor)
-        gate = Gate(jobs.folder, device_lock)
+        locks = [DeviceLock(config.artifact_folder, one, executor) for one in devices]
+        gate = Gate(jobs.folder, locks, tuple(sorted((labels or {}).items())), lambda: unfinished.demands_waiting(jobs))
         supervisor = Supervisor(config, jobs, gate)
 
         def obey(wanted: Wanted) -> None:
@@ -94,6 +98,7 @@ def work(
             job_at_hand=lambda: supervisor.job_at_hand,
             is_stuck=lambda: supervisor.is_stuck,
             device=device,
+            offer=gate.offer,
             obey=obey,
         )
         unfinished.adopt_older(jobs)
@@ -102,7 +107,7 @@ def work(
         if retention_days:
             housekeeper.start()
         fields = {"worker": executor, "threads": config.threads, "device": device}
-        _log.info(f"worker {executor} takes jobs", extra={"fields": fields})
+        _log.info(f"worker {executor} takes jobs: {gate.offer}", extra={"fields": fields})
         ready()
         while not stop.wait(alive_every_s):
             if not supervisor.is_stuck:

@@ -1,0 +1,1 @@
+"""Which worker can do which job: what jobs demand, what workers offer. Free of torch."""
