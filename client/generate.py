@@ -235,7 +235,10 @@ def _field_source(item: Field[Any], *, kw_only: bool) -> str:
     elif item.default_factory is not MISSING:
         default = f" = field(default_factory={item.default_factory.__name__})"
     if kw_only:
-        default = f" = field(default={item.default!r}, kw_only=True)"
+        given = f"default={item.default!r}"
+        if item.default_factory is not MISSING:
+            given = f"default_factory={item.default_factory.__name__}"
+        default = f" = field({given}, kw_only=True)"
     annotation = re.sub(r"\w+", lambda word: OWN_TYPES.get(word[0], word[0]), str(item.type))
     return f"    {item.name}: {annotation}{default}\n    {_quoted(_wrapped(item.metadata['description']))}"
 

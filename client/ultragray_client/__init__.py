@@ -21,7 +21,7 @@ from .jobs import Job, JobError, JobEvent, JobProgress, JobState
 from .scenes import ConfidenceFit, Scene, SceneEntry
 from .sync.client import Client
 from .sync.stream import FrameStream
-from .workers import Worker, WorkerState
+from .workers import Worker, WorkerDevice, WorkerState
 
 __all__ = [
     "AsyncClient",
@@ -49,6 +49,7 @@ __all__ = [
     "Timings",
     "Tls",
     "Worker",
+    "WorkerDevice",
     "WorkerState",
     "errors",
 ]

@@ -46,7 +46,7 @@ class JobProgress:
     frames: int | None
     rate_per_s: float | None  # steps or frames
     seconds_left: float | None
-    waits_for: str | None  # the device, while another job of the same host is at work on it
+    waits_for: str | None  # of a job that waits: what else it needs than its turn, such as a worker that fits it
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from dataclasses import MISSING, Field
 from enum import Enum
 from functools import wraps
 from pathlib import Path
-from typing import Annotated, Any, get_origin, get_type_hints
+from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
 import typer
 
@@ -38,6 +38,7 @@ FLAGS = {
     "out_of_plane_mm": ("--out-of-plane",),
     "threads_per_process": ("--threads",),
     "training_threads": ("--threads",),
+    "worker_labels": ("--require",),
 }
 _WITH_AN_OPTION_A_FIELD = (Sampler,)  # of all families
 _PARSED = (bool, int, float, Path)
@@ -249,7 +250,7 @@ def _read(value: Any, kind: Any, name: str) -> Any:
     if get_origin(kind) is tuple:
         return from_text(value, kind)
     if get_origin(kind) is dict:
-        return parse_settings(value)
+        return pairs_of(value, FLAGS[name][0]) if get_args(kind)[1] is str else parse_settings(value)
     if isinstance(kind, type) and issubclass(kind, Family):
         return from_dict(kind, _parsed_json(value, name))
     return load_poses(value) if name == "poses" else value
@@ -266,12 +267,17 @@ def parse_settings(settings: list[str]) -> dict[str, Any]:
     """NAME=VALUE pairs, the value as in TOML; a bare word is itself."""
     from ultragray.training.config import parse_value
 
+    return {name: parse_value(value) for name, value in pairs_of(settings, "--set").items()}
+
+
+def pairs_of(texts: list[str], flag: str) -> dict[str, str]:
+    """NAME=VALUE pairs as they were written. Raises InvalidArgument, naming the option."""
     found = {}
-    for text in settings:
+    for text in texts:
         name, equals, value = text.partition("=")
         if not equals:
-            raise InvalidArgument(f"--set takes NAME=VALUE, got {text!r}", field="set")
-        found[name.strip()] = parse_value(value.strip())
+            raise InvalidArgument(f"{flag} takes NAME=VALUE, got {text!r}", field=flag.removeprefix("--"))
+        found[name.strip()] = value.strip()
     return found
 
 

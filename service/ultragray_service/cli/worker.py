@@ -6,6 +6,8 @@ import os
 import signal
 import sys
 import threading
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Annotated, Any
 
 import typer
@@ -16,7 +18,7 @@ from ultragray_workers.parent import end_with_parent
 
 from ..service_manager import ALIVE, READY, ServiceManager
 from ..settings import ENVIRONMENT_PREFIX, Settings, load_settings
-from .options import FieldsOf, with_options
+from .options import FieldsOf, pairs_of, with_options
 from .style import command_group, examples
 
 command_app = command_group()
@@ -25,7 +27,7 @@ command_app = command_group()
 @command_app.command(
     epilog=examples(
         "ultragray worker --artifact-folder /srv/ultragray/artifacts",
-        "ultragray worker --device cuda:1 --name gpu-1",
+        "ultragray worker --device cuda:1 --name gpu-1 --label site=lab1 --label rack=4",
     )
 )
 @with_options
@@ -33,7 +35,13 @@ def worker(
     name: Annotated[
         str | None, typer.Option(help="Name of this worker, its alone.", show_default="of the host, numbered")
     ] = None,
-    device: Annotated[str, typer.Option(help="auto, cpu, cuda or cuda:N; a GPU where there is one.")] = "auto",
+    device: Annotated[
+        str, typer.Option(help="auto: every GPU of the host, and its processor; cpu; cuda: every GPU; or cuda:N.")
+    ] = "auto",
+    label: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME=VALUE", help="A label that jobs can ask for; may be given several times."),
+    ] = None,
     *,
     options: Annotated[
         dict[str, Any],
@@ -48,10 +56,16 @@ def worker(
 
     What is not given here comes from the settings (ULTRAGRAY_…).
     """
-    run_worker(options, name=name, device=device)
+    run_worker(options, name=name, device=device, labels=pairs_of(label or [], "--label"))
 
 
-def run_worker(overrides: dict[str, Any], *, name: str | None = None, device: str = "auto") -> None:
+def run_worker(
+    overrides: dict[str, Any],
+    *,
+    name: str | None = None,
+    device: str = "auto",
+    labels: Mapping[str, str] = MappingProxyType({}),
+) -> None:
     """Do jobs until SIGTERM or SIGINT, then end the process; a second signal ends the drain at once.
 
     Raises StartupFailed, InvalidArgument.
@@ -83,6 +97,7 @@ def run_worker(overrides: dict[str, Any], *, name: str | None = None, device: st
         hurry=hurry,
         name=name,
         device=device,
+        labels=labels,
         threads=settings.training_threads,
         nice=settings.job_nice,
         max_footprint_pixels=settings.max_footprint_pixels,

@@ -21,7 +21,7 @@ export interface Described {
 }
 
 const UNUSUAL: Record<string, string> = { bmode: "B-mode", tgc: "TGC", val: "held-out" };
-const UNITS: Record<string, string> = { mm: "mm", deg: "°", db: "dB", s: "s", ms: "ms" };
+const UNITS: Record<string, string> = { mm: "mm", deg: "°", db: "dB", s: "s", ms: "ms", gb: "GB" };
 
 /** The name of a field as people read it, and its unit, by which the name ends. */
 export function labelOf(name: string): { label: string; unit: string } {

@@ -42,7 +42,9 @@ class Progress:
     frames: int | None = None
     rate_per_s: float | None = described("Steps or frames.", None)
     seconds_left: float | None = None
-    waits_for: str | None = described("Of a job that waits: what else it needs than its turn.", None)
+    waits_for: str | None = described(
+        "Of a job that waits: what else it needs than its turn, such as a worker that offers what it asks for.", None
+    )
 
     @classmethod
     def from_dict(cls, document: Mapping[str, Any]) -> Progress:

@@ -17,7 +17,7 @@ from ..options import parameters_of, values_of, with_parameters
 from ..output import check_file, print_table
 from ..progress import transferred
 from ..scenes.show import print_facts
-from ..style import Force, Json, command_group, examples, output_option, tell, to_json
+from ..style import Force, Json, command_group, examples, output_option, tell, to_json, warn
 from .connection import with_connection
 
 if TYPE_CHECKING:
@@ -30,7 +30,10 @@ command_app.add_typer(submit_app, name="submit")
 JobArgument = Annotated[str, typer.Argument(help="Id of the job.", show_default=False)]
 QUEUE = "Queue"
 _SUBMITS = {
-    "train": ("ultragray jobs submit train liver --scene liver --preset best --wait",),
+    "train": (
+        "ultragray jobs submit train liver --scene liver --preset best --wait",
+        "ultragray jobs submit train liver --scene liver --device cuda --min-memory-gb 16 --require site=lab1",
+    ),
     "evaluate": ("ultragray jobs submit evaluate liver --scene liver --wait",),
     "render": ("ultragray jobs submit render liver --format hdf5 --sampler around --count 5000 --translation-mm 3",),
 }
@@ -185,6 +188,8 @@ def _submit(
     if wait and json:
         follow(jobs, job["id"], as_json=True)
         return
+    if job["progress"]["waits_for"] is not None:
+        warn(f"{job['id']} waits for {job['progress']['waits_for']}")
     tell(job["id"], job, as_json=json)
     if wait:
         follow(jobs, job["id"], as_json=False)

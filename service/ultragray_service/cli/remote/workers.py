@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from ultragray_workers.jobs.matching.demand import GB
+
 from ..output import print_table
 from ..style import Json, command_group, examples, tell, to_json
 from .connection import with_connection
@@ -15,7 +17,7 @@ if TYPE_CHECKING:
 
 command_app = command_group("They obey within two seconds; `ultragray worker` starts one.")
 Name = Annotated[str, typer.Argument(help="Name of the worker.", show_default=False)]
-_COLUMNS = ("name", "state", "job", "host", "pid", "device", "version", "started", "last sign")
+_COLUMNS = ("name", "state", "job", "host", "pid", "devices", "labels", "version", "started", "last sign")
 
 
 @command_app.command("list", epilog=examples("ultragray workers list", "ultragray workers list --json"))
@@ -68,7 +70,8 @@ def _row(worker: dict[str, Any]) -> tuple[str, ...]:
         worker["job"] or "",
         worker["host"],
         str(worker["pid"]),
-        worker["device"],
+        ", ".join(f"{device['name']} {device['memory_bytes'] / GB:.0f} GB" for device in worker["devices"]),
+        " ".join(f"{name}={value}" for name, value in worker["labels"].items()),
         worker["version"],
         (worker["started_at"] or "")[:19].replace("T", " "),
         "" if beat_s is None else f"{beat_s:.0f} s ago",

@@ -78,7 +78,7 @@ def test_the_processor_is_offered_with_the_cores_and_the_memory_of_the_host() ->
 
 @pytest.mark.parametrize("asked", ["cuda:99", "tpu"])
 def test_a_worker_does_not_start_for_a_device_that_its_host_does_not_have(asked: str) -> None:
-    with pytest.raises(StartupFailed, match="device must be .*got '(cuda:99|tpu)'") as caught:
+    with pytest.raises(StartupFailed, match=r"device must be .*got '(cuda:99|tpu)'") as caught:
         devices_of(asked)
     assert caught.value.field == "device"
 

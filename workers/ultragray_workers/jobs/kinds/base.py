@@ -11,9 +11,10 @@ from ultragray.contract import Family, described
 from ultragray.scene_info import SceneHeader
 
 from ...scenes import check_scene_name
-from ..matching.demand import AUTO, MAX_LABELS, MAX_MEMORY_GB, check_device, check_labels
+from ..matching.demand import AUTO, MAX_MEMORY_GB, check_device, check_labels
 
 MAX_RUN_S = 31_536_000.0
+TOPIC = "Worker"
 
 if TYPE_CHECKING:
     from ..folder import Outcome
@@ -47,13 +48,19 @@ class Specification(Family):
     device: str = described(
         "auto, cpu, cuda or cuda:N: what the worker must offer; auto: a GPU where it offers one, else its processor.",
         AUTO,
+        topic=TOPIC,
         kw_only=True,
     )
     min_memory_gb: int | None = described(
-        "Least memory of the device, 10^9 bytes; of cpu: of the host.", None, low=1, high=MAX_MEMORY_GB, kw_only=True
+        "Least memory of the device, 10^9 bytes; of cpu: of the host.",
+        None,
+        low=1,
+        high=MAX_MEMORY_GB,
+        topic=TOPIC,
+        kw_only=True,
     )
     worker_labels: dict[str, str] = described(
-        'Labels that the worker must have, such as {"site": "lab1"}.', factory=dict, most=MAX_LABELS, kw_only=True
+        'Labels that the worker must have, such as {"site": "lab1"}.', factory=dict, topic=TOPIC, kw_only=True
     )
     run_module: ClassVar[str]  # of this folder: its `run(job_run, specification)` does the work
     needs_dataset: ClassVar[str | None] = None  # field: the dataset stays while the job waits or runs

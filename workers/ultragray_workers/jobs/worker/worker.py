@@ -12,13 +12,17 @@ import socket
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from dbos import DBOS, PortableWorkflowError, WorkflowSerializationFormat
 
+from ultragray.errors import InvalidArgument
+
 from ...errors import StartupFailed
 from ...store import OpenStore
 from ..kinds import KINDS
+from ..matching.demand import check_labels
 from ..queue import database, unfinished
 from ..queue.database import JobDatabase, dbos_config, quiet_dbos
 from ..queue.heartbeat import Heartbeat
@@ -44,7 +48,7 @@ def work(
     hurry: threading.Event | None = None,
     name: str | None = None,
     device: str = "auto",
-    labels: Mapping[str, str] | None = None,
+    labels: Mapping[str, str] = MappingProxyType({}),
     threads: int = 0,
     nice: int = 10,
     max_footprint_pixels: int | None = None,
@@ -70,6 +74,10 @@ def work(
     whose process does not get on for `stall_timeout_s`, or that runs for `max_run_s` in all; 0: never. Threads of
     DBOS are left behind: end the process by os._exit. Raises StartupFailed.
     """
+    try:
+        check_labels(labels, "label")
+    except InvalidArgument as error:
+        raise StartupFailed(error.detail, field="label") from None
     devices = devices_of(device)
     with contextlib.closing(OpenStore(artifact_folder)), claim_name(artifact_folder, name) as executor:
         jobs = JobDatabase(artifact_folder, database_url)
@@ -83,7 +91,7 @@ def work(
             max_run_s=max_run_s,
         )
         locks = [DeviceLock(config.artifact_folder, one, executor) for one in devices]
-        gate = Gate(jobs.folder, locks, tuple(sorted((labels or {}).items())), lambda: unfinished.demands_waiting(jobs))
+        gate = Gate(jobs.folder, locks, tuple(sorted(labels.items())), lambda: unfinished.demands_waiting(jobs))
         supervisor = Supervisor(config, jobs, gate)
 
         def obey(wanted: Wanted) -> None:
@@ -106,8 +114,8 @@ def work(
         housekeeper = Housekeeper(jobs, config.artifact_folder, retention_days)
         if retention_days:
             housekeeper.start()
-        fields = {"worker": executor, "threads": config.threads, "device": device}
-        _log.info(f"worker {executor} takes jobs: {gate.offer}", extra={"fields": fields})
+        fields = {"worker": executor, "threads": config.threads, "offer": str(gate.offer)}
+        _log.info(f"worker {executor} takes jobs", extra={"fields": fields})
         ready()
         while not stop.wait(alive_every_s):
             if not supervisor.is_stuck:

@@ -1,0 +1,164 @@
+"""Jobs go only to workers that fit them, past those ahead of them in the queue, as soon as such a worker comes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+
+from ultragray.machine import memory_bytes
+from ultragray_workers.jobs.matching.demand import Demand
+from ultragray_workers.jobs.matching.offer import WorkerDevice
+from ultragray_workers.jobs.queue.database import JobDatabase
+from ultragray_workers.jobs.queue.unfinished import demands_waiting
+from ultragray_workers.jobs.store import Job, JobState, JobStore
+from ultragray_workers.jobs.worker.device import DeviceLock, HostDevice
+from ultragray_workers.jobs.worker.gate import Gate
+
+from ....postgres import NewDatabase
+from ....waiting import wait_until
+from ..conftest import RunningWorker, train_job
+
+StartWorker = Callable[..., RunningWorker]
+Until = Callable[..., Job]
+
+
+@pytest.fixture
+def database_url(new_database: NewDatabase) -> str | None:
+    return new_database()
+
+
+def submit(store: JobStore, scene: str, *, device: str = "cpu", memory_gb: int | None = None, **labels: str) -> Job:
+    asked = {"device": device, "min_memory_gb": memory_gb, "worker_labels": labels}
+    return store.submit(replace(train_job(scene), **asked))[0]
+
+
+def is_there(store: JobStore, worker: str) -> Callable[[], bool]:
+    return lambda: worker in {one.name for one in store.workers()}
+
+
+def test_each_job_goes_to_a_worker_that_fits_it_and_holds_nobody_up(
+    store: JobStore, start_worker: StartWorker, until: Until
+) -> None:
+    """Jobs that nobody can take are first in the queue; those behind them are done in their order, by who fits."""
+    too_large = submit(store, "too-large", memory_gb=memory_bytes() // 10**9 + 1)
+    for_gpu = submit(store, "for-gpu", device="cuda")
+    elsewhere = [submit(store, f"elsewhere-{number}", site="lab3") for number in range(3)]
+    one = [submit(store, f"one-{number}", site="lab1") for number in range(2)]
+    two = [submit(store, f"two-{number}", site="lab2", rack="4") for number in range(2)]
+    anywhere = submit(store, "anywhere", device="auto", memory_gb=1)
+    start_worker("first", host="first", labels={"site": "lab1"})
+    start_worker("second", host="second", labels={"site": "lab2", "rack": "4"})
+
+    assert [until(job).worker for job in one] == ["first", "first"]
+    assert [until(job).worker for job in two] == ["second", "second"]
+    assert until(anywhere).state is JobState.SUCCEEDED
+    done = [store.get(job.id) for job in (*one, *two)]
+    for worker in ("first", "second"):
+        began = [job.started_at or "" for job in done if job.worker == worker]
+        assert all(before < after for before, after in pairwise(began))
+    assert {(job.state, job.attempts) for job in done} == {(JobState.SUCCEEDED, 1)}
+    left = [store.get(job.id) for job in (too_large, for_gpu, *elsewhere)]
+    assert {(job.state, job.attempts, job.worker) for job in left} == {(JobState.QUEUED, 0, None)}
+
+    start_worker("third", host="third", labels={"site": "lab3"})
+    assert [until(job).worker for job in elsewhere] == ["third"] * 3
+
+
+def test_a_job_that_nobody_can_take_says_so_and_starts_when_a_fitting_worker_comes(
+    store: JobStore, start_worker: StartWorker, until: Until
+) -> None:
+    job = submit(store, "made", site="lab2")
+    asked = "a worker with the device cpu and the label site=lab2"
+    assert job.progress.waits_for == f"{asked}: none is running"
+    running = start_worker("first", labels={"site": "lab1"})
+    wait_until(is_there(store, "first"))
+    memory = f"{memory_bytes() / 10**9:.0f}"
+    expected = f"{asked}; there is first (cpu of {memory} GB, site=lab1)"
+    assert store.get(job.id).progress.waits_for == expected
+    listed, _ = store.list()
+    assert [one.progress.waits_for for one in listed] == [expected]
+    assert submit(store, "other", site="lab1").progress.waits_for is None
+    running.kill()
+    start_worker("second", labels={"site": "lab2"})
+    job = until(job)
+    assert (job.state, job.worker, job.progress.waits_for) == (JobState.SUCCEEDED, "second", None), job
+
+
+def test_workers_tell_their_devices_and_labels(store: JobStore, start_worker: StartWorker) -> None:
+    start_worker("one", labels={"site": "lab1"})
+    wait_until(is_there(store, "one"))
+    (worker,) = store.workers()
+    (device,) = worker.devices
+    assert (device.name, device.memory_bytes) == ("cpu", memory_bytes())
+    assert device.cores is not None
+    assert device.model
+    assert (worker.device, worker.labels) == ("cpu", {"site": "lab1"})
+
+
+@pytest.fixture
+def workstation(jobs: JobDatabase, artifact_folder: Path) -> Callable[[str], Gate]:
+    """The gate of a worker, in this process, on a host with two GPUs and a processor."""
+
+    def make(name: str) -> Gate:
+        names = ("cuda:0", "cuda:1", "cpu")
+        devices = [WorkerDevice(name=one, model="a model", memory_bytes=8 * 10**9) for one in names]
+        locks = [DeviceLock(artifact_folder, HostDevice(one, one.name), name) for one in devices]
+        return Gate(jobs.folder, locks, (), lambda: demands_waiting(jobs))
+
+    return make
+
+
+def test_a_worker_of_several_devices_holds_one_that_fits_and_leaves_the_others(
+    store: JobStore, workstation: Callable[[str], Gate]
+) -> None:
+    one, two = workstation("one"), workstation("two")
+    assert one.opens() == []  # no job waits
+    job = submit(store, "gpu", device="auto")
+    (key,) = one.opens()
+    assert two.opens() == []  # `one` holds all of them until it knows the job
+    demand = Demand.of(job.specification)
+    held = one.hold(demand)
+    assert held is not None
+    assert held.device.name == "cuda:0"
+    assert two.opens() == [key]
+    assert two.hold(demand) is not None
+    third = workstation("third")
+    assert third.opens() == []  # the processor is free, and is for jobs that ask for it
+    cpu = Demand.of(submit(store, "cpu", device="cpu").specification)
+    assert third.opens() == [cpu.key]
+    assert third.hold(demand) is None
+    one.close()
+    assert third.hold(demand) is not None
+    for gate in (two, third):
+        gate.close()
+
+
+def test_a_worker_that_rests_or_fits_nothing_does_not_hold_its_devices(
+    store: JobStore, workstation: Callable[[str], Gate]
+) -> None:
+    submit(store, "elsewhere", site="lab1")
+    one, two = workstation("one"), workstation("two")
+    assert one.opens() == []
+    submit(store, "here")
+    assert two.opens() != []
+    two.close()
+    one.is_resting = True
+    assert one.opens() == []
+    one.is_resting = False
+    assert one.opens() != []
+    one.close()
+
+
+@pytest.mark.parametrize("new_database", ["sqlite"], indirect=True)
+def test_the_demands_that_wait_are_told_once_each(store: JobStore, jobs: JobDatabase) -> None:
+    assert demands_waiting(jobs) == []
+    for number in range(3):
+        submit(store, f"one-{number}", site="lab1")
+        submit(store, f"two-{number}", device="cuda")
+    gone = submit(store, "gone", site="lab2")
+    store.cancel(gone.id)
+    assert len(demands_waiting(jobs)) == 2
