@@ -261,6 +261,12 @@ class EvaluateJob:
     kind: Literal["evaluate"] = field(default="evaluate", repr=False, kw_only=True)
     max_run_s: float | None = field(default=None, kw_only=True)
     """Longest time that the job may run in all, s; then it fails, and a retry goes on. None: the service's longest."""
+    device: str = field(default="auto", kw_only=True)
+    """auto, cpu, cuda or cuda:N: what the worker must offer; auto: a GPU where it offers one, else its processor."""
+    min_memory_gb: int | None = field(default=None, kw_only=True)
+    """Least memory of the device, 10^9 bytes; of cpu: of the host."""
+    worker_labels: dict[str, str] = field(default_factory=dict, kw_only=True)
+    """Labels that the worker must have, such as {"site": "lab1"}."""
 
 
 @dataclass(frozen=True)
@@ -366,6 +372,12 @@ class RenderJob(FrameSettings):
     kind: Literal["render"] = field(default="render", repr=False, kw_only=True)
     max_run_s: float | None = field(default=None, kw_only=True)
     """Longest time that the job may run in all, s; then it fails, and a retry goes on. None: the service's longest."""
+    device: str = field(default="auto", kw_only=True)
+    """auto, cpu, cuda or cuda:N: what the worker must offer; auto: a GPU where it offers one, else its processor."""
+    min_memory_gb: int | None = field(default=None, kw_only=True)
+    """Least memory of the device, 10^9 bytes; of cpu: of the host."""
+    worker_labels: dict[str, str] = field(default_factory=dict, kw_only=True)
+    """Labels that the worker must have, such as {"site": "lab1"}."""
 
 
 @dataclass(frozen=True)
@@ -382,11 +394,15 @@ class TrainJob:
     """
     settings: dict[str, Any] = field(default_factory=dict)
     """Any training settings instead of the preset's."""
-    device: str = "auto"
-    """auto, cpu, cuda or cuda:N."""
     kind: Literal["train"] = field(default="train", repr=False, kw_only=True)
     max_run_s: float | None = field(default=None, kw_only=True)
     """Longest time that the job may run in all, s; then it fails, and a retry goes on. None: the service's longest."""
+    device: str = field(default="auto", kw_only=True)
+    """auto, cpu, cuda or cuda:N: what the worker must offer; auto: a GPU where it offers one, else its processor."""
+    min_memory_gb: int | None = field(default=None, kw_only=True)
+    """Least memory of the device, 10^9 bytes; of cpu: of the host."""
+    worker_labels: dict[str, str] = field(default_factory=dict, kw_only=True)
+    """Labels that the worker must have, such as {"site": "lab1"}."""
 
 
 Specification: TypeAlias = EvaluateJob | RenderJob | TrainJob

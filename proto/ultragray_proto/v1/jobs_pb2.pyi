@@ -38,23 +38,41 @@ JOB_STATE_FAILED: JobState
 JOB_STATE_CANCELLED: JobState
 
 class TrainJob(_message.Message):
-    __slots__ = ("dataset", "scene", "preset", "settings", "device", "max_run_s")
+    __slots__ = ("dataset", "scene", "preset", "settings", "device", "max_run_s", "min_memory_gb", "worker_labels")
+    class WorkerLabelsEntry(_message.Message):
+        __slots__ = ("key", "value")
+        KEY_FIELD_NUMBER: _ClassVar[int]
+        VALUE_FIELD_NUMBER: _ClassVar[int]
+        key: str
+        value: str
+        def __init__(self, key: _Optional[str] = ..., value: _Optional[str] = ...) -> None: ...
     DATASET_FIELD_NUMBER: _ClassVar[int]
     SCENE_FIELD_NUMBER: _ClassVar[int]
     PRESET_FIELD_NUMBER: _ClassVar[int]
     SETTINGS_FIELD_NUMBER: _ClassVar[int]
     DEVICE_FIELD_NUMBER: _ClassVar[int]
     MAX_RUN_S_FIELD_NUMBER: _ClassVar[int]
+    MIN_MEMORY_GB_FIELD_NUMBER: _ClassVar[int]
+    WORKER_LABELS_FIELD_NUMBER: _ClassVar[int]
     dataset: str
     scene: str
     preset: str
     settings: _struct_pb2.Struct
     device: str
     max_run_s: float
-    def __init__(self, dataset: _Optional[str] = ..., scene: _Optional[str] = ..., preset: _Optional[str] = ..., settings: _Optional[_Union[_struct_pb2.Struct, _Mapping]] = ..., device: _Optional[str] = ..., max_run_s: _Optional[float] = ...) -> None: ...
+    min_memory_gb: int
+    worker_labels: _containers.ScalarMap[str, str]
+    def __init__(self, dataset: _Optional[str] = ..., scene: _Optional[str] = ..., preset: _Optional[str] = ..., settings: _Optional[_Union[_struct_pb2.Struct, _Mapping]] = ..., device: _Optional[str] = ..., max_run_s: _Optional[float] = ..., min_memory_gb: _Optional[int] = ..., worker_labels: _Optional[_Mapping[str, str]] = ...) -> None: ...
 
 class RenderJob(_message.Message):
-    __slots__ = ("scene", "poses", "sampler", "height", "width", "outputs", "format", "pose_count", "dtype", "min_confidence", "probe", "display", "below_min_confidence", "slice_thickness_mm", "max_run_s")
+    __slots__ = ("scene", "poses", "sampler", "height", "width", "outputs", "format", "pose_count", "dtype", "min_confidence", "probe", "display", "below_min_confidence", "slice_thickness_mm", "max_run_s", "device", "min_memory_gb", "worker_labels")
+    class WorkerLabelsEntry(_message.Message):
+        __slots__ = ("key", "value")
+        KEY_FIELD_NUMBER: _ClassVar[int]
+        VALUE_FIELD_NUMBER: _ClassVar[int]
+        key: str
+        value: str
+        def __init__(self, key: _Optional[str] = ..., value: _Optional[str] = ...) -> None: ...
     SCENE_FIELD_NUMBER: _ClassVar[int]
     POSES_FIELD_NUMBER: _ClassVar[int]
     SAMPLER_FIELD_NUMBER: _ClassVar[int]
@@ -70,6 +88,9 @@ class RenderJob(_message.Message):
     BELOW_MIN_CONFIDENCE_FIELD_NUMBER: _ClassVar[int]
     SLICE_THICKNESS_MM_FIELD_NUMBER: _ClassVar[int]
     MAX_RUN_S_FIELD_NUMBER: _ClassVar[int]
+    DEVICE_FIELD_NUMBER: _ClassVar[int]
+    MIN_MEMORY_GB_FIELD_NUMBER: _ClassVar[int]
+    WORKER_LABELS_FIELD_NUMBER: _ClassVar[int]
     scene: str
     poses: _containers.RepeatedCompositeFieldContainer[_geometry_pb2.Pose]
     sampler: PoseSampler
@@ -85,19 +106,35 @@ class RenderJob(_message.Message):
     below_min_confidence: _rendering_pb2.BelowConfidence
     slice_thickness_mm: float
     max_run_s: float
-    def __init__(self, scene: _Optional[str] = ..., poses: _Optional[_Iterable[_Union[_geometry_pb2.Pose, _Mapping]]] = ..., sampler: _Optional[_Union[PoseSampler, _Mapping]] = ..., height: _Optional[int] = ..., width: _Optional[int] = ..., outputs: _Optional[_Iterable[_Union[_rendering_pb2.Output, str]]] = ..., format: _Optional[str] = ..., pose_count: _Optional[int] = ..., dtype: _Optional[str] = ..., min_confidence: _Optional[float] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., display: _Optional[_Union[_rendering_pb2.Display, _Mapping]] = ..., below_min_confidence: _Optional[_Union[_rendering_pb2.BelowConfidence, str]] = ..., slice_thickness_mm: _Optional[float] = ..., max_run_s: _Optional[float] = ...) -> None: ...
+    device: str
+    min_memory_gb: int
+    worker_labels: _containers.ScalarMap[str, str]
+    def __init__(self, scene: _Optional[str] = ..., poses: _Optional[_Iterable[_Union[_geometry_pb2.Pose, _Mapping]]] = ..., sampler: _Optional[_Union[PoseSampler, _Mapping]] = ..., height: _Optional[int] = ..., width: _Optional[int] = ..., outputs: _Optional[_Iterable[_Union[_rendering_pb2.Output, str]]] = ..., format: _Optional[str] = ..., pose_count: _Optional[int] = ..., dtype: _Optional[str] = ..., min_confidence: _Optional[float] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., display: _Optional[_Union[_rendering_pb2.Display, _Mapping]] = ..., below_min_confidence: _Optional[_Union[_rendering_pb2.BelowConfidence, str]] = ..., slice_thickness_mm: _Optional[float] = ..., max_run_s: _Optional[float] = ..., device: _Optional[str] = ..., min_memory_gb: _Optional[int] = ..., worker_labels: _Optional[_Mapping[str, str]] = ...) -> None: ...
 
 class EvaluateJob(_message.Message):
-    __slots__ = ("dataset", "scene", "baselines", "max_run_s")
+    __slots__ = ("dataset", "scene", "baselines", "max_run_s", "device", "min_memory_gb", "worker_labels")
+    class WorkerLabelsEntry(_message.Message):
+        __slots__ = ("key", "value")
+        KEY_FIELD_NUMBER: _ClassVar[int]
+        VALUE_FIELD_NUMBER: _ClassVar[int]
+        key: str
+        value: str
+        def __init__(self, key: _Optional[str] = ..., value: _Optional[str] = ...) -> None: ...
     DATASET_FIELD_NUMBER: _ClassVar[int]
     SCENE_FIELD_NUMBER: _ClassVar[int]
     BASELINES_FIELD_NUMBER: _ClassVar[int]
     MAX_RUN_S_FIELD_NUMBER: _ClassVar[int]
+    DEVICE_FIELD_NUMBER: _ClassVar[int]
+    MIN_MEMORY_GB_FIELD_NUMBER: _ClassVar[int]
+    WORKER_LABELS_FIELD_NUMBER: _ClassVar[int]
     dataset: str
     scene: str
     baselines: bool
     max_run_s: float
-    def __init__(self, dataset: _Optional[str] = ..., scene: _Optional[str] = ..., baselines: _Optional[bool] = ..., max_run_s: _Optional[float] = ...) -> None: ...
+    device: str
+    min_memory_gb: int
+    worker_labels: _containers.ScalarMap[str, str]
+    def __init__(self, dataset: _Optional[str] = ..., scene: _Optional[str] = ..., baselines: _Optional[bool] = ..., max_run_s: _Optional[float] = ..., device: _Optional[str] = ..., min_memory_gb: _Optional[int] = ..., worker_labels: _Optional[_Mapping[str, str]] = ...) -> None: ...
 
 class PoseSampler(_message.Message):
     __slots__ = ("kind", "count", "translation_mm", "rotation_deg", "seed", "spacing_mm", "tilt_deg", "step_deg")

@@ -24,27 +24,33 @@ _sym_db = _symbol_database.Default()
 
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1aultragray/v1/workers.proto\x12\x0cultragray.v1\"\xd5\x01\n\x06Worker\x12\x0c\n\x04name\x18\x01 \x01(\t\x12(\n\x05state\x18\x02 \x01(\x0e\x32\x19.ultragray.v1.WorkerState\x12\x0c\n\x04host\x18\x03 \x01(\t\x12\x0b\n\x03pid\x18\x04 \x01(\x05\x12\x0e\n\x06\x64\x65vice\x18\x05 \x01(\t\x12\x0f\n\x07version\x18\x06 \x01(\t\x12\x12\n\nstarted_at\x18\x07 \x01(\t\x12\x1f\n\x12seconds_since_beat\x18\x08 \x01(\x01H\x00\x88\x01\x01\x12\x0b\n\x03job\x18\t \x01(\tB\x15\n\x13_seconds_since_beat\"\x14\n\x12ListWorkersRequest\"<\n\x13ListWorkersResponse\x12%\n\x07workers\x18\x01 \x03(\x0b\x32\x14.ultragray.v1.Worker\"$\n\x12PauseWorkerRequest\x12\x0e\n\x06worker\x18\x01 \x01(\t\"$\n\x12\x44rainWorkerRequest\x12\x0e\n\x06worker\x18\x01 \x01(\t\"%\n\x13ResumeWorkerRequest\x12\x0e\n\x06worker\x18\x01 \x01(\t*\xdb\x01\n\x0bWorkerState\x12\x1c\n\x18WORKER_STATE_UNSPECIFIED\x10\x00\x12\x15\n\x11WORKER_STATE_IDLE\x10\x01\x12\x18\n\x14WORKER_STATE_WORKING\x10\x02\x12\x18\n\x14WORKER_STATE_PAUSING\x10\x03\x12\x17\n\x13WORKER_STATE_PAUSED\x10\x04\x12\x19\n\x15WORKER_STATE_DRAINING\x10\x05\x12\x18\n\x14WORKER_STATE_DRAINED\x10\x06\x12\x15\n\x11WORKER_STATE_LOST\x10\x07\x32\xba\x02\n\rWorkerService\x12R\n\x0bListWorkers\x12 .ultragray.v1.ListWorkersRequest\x1a!.ultragray.v1.ListWorkersResponse\x12\x45\n\x0bPauseWorker\x12 .ultragray.v1.PauseWorkerRequest\x1a\x14.ultragray.v1.Worker\x12\x45\n\x0b\x44rainWorker\x12 .ultragray.v1.DrainWorkerRequest\x1a\x14.ultragray.v1.Worker\x12G\n\x0cResumeWorker\x12!.ultragray.v1.ResumeWorkerRequest\x1a\x14.ultragray.v1.Workerb\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1aultragray/v1/workers.proto\x12\x0cultragray.v1\"\xe3\x02\n\x06Worker\x12\x0c\n\x04name\x18\x01 \x01(\t\x12(\n\x05state\x18\x02 \x01(\x0e\x32\x19.ultragray.v1.WorkerState\x12\x0c\n\x04host\x18\x03 \x01(\t\x12\x0b\n\x03pid\x18\x04 \x01(\x05\x12\x0e\n\x06\x64\x65vice\x18\x05 \x01(\t\x12\x0f\n\x07version\x18\x06 \x01(\t\x12\x12\n\nstarted_at\x18\x07 \x01(\t\x12\x1f\n\x12seconds_since_beat\x18\x08 \x01(\x01H\x00\x88\x01\x01\x12\x0b\n\x03job\x18\t \x01(\t\x12+\n\x07\x64\x65vices\x18\n \x03(\x0b\x32\x1a.ultragray.v1.WorkerDevice\x12\x30\n\x06labels\x18\x0b \x03(\x0b\x32 .ultragray.v1.Worker.LabelsEntry\x1a-\n\x0bLabelsEntry\x12\x0b\n\x03key\x18\x01 \x01(\t\x12\r\n\x05value\x18\x02 \x01(\t:\x02\x38\x01\x42\x15\n\x13_seconds_since_beat\"_\n\x0cWorkerDevice\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\r\n\x05model\x18\x02 \x01(\t\x12\x14\n\x0cmemory_bytes\x18\x03 \x01(\x03\x12\x12\n\x05\x63ores\x18\x04 \x01(\x05H\x00\x88\x01\x01\x42\x08\n\x06_cores\"\x14\n\x12ListWorkersRequest\"<\n\x13ListWorkersResponse\x12%\n\x07workers\x18\x01 \x03(\x0b\x32\x14.ultragray.v1.Worker\"$\n\x12PauseWorkerRequest\x12\x0e\n\x06worker\x18\x01 \x01(\t\"$\n\x12\x44rainWorkerRequest\x12\x0e\n\x06worker\x18\x01 \x01(\t\"%\n\x13ResumeWorkerRequest\x12\x0e\n\x06worker\x18\x01 \x01(\t*\xdb\x01\n\x0bWorkerState\x12\x1c\n\x18WORKER_STATE_UNSPECIFIED\x10\x00\x12\x15\n\x11WORKER_STATE_IDLE\x10\x01\x12\x18\n\x14WORKER_STATE_WORKING\x10\x02\x12\x18\n\x14WORKER_STATE_PAUSING\x10\x03\x12\x17\n\x13WORKER_STATE_PAUSED\x10\x04\x12\x19\n\x15WORKER_STATE_DRAINING\x10\x05\x12\x18\n\x14WORKER_STATE_DRAINED\x10\x06\x12\x15\n\x11WORKER_STATE_LOST\x10\x07\x32\xba\x02\n\rWorkerService\x12R\n\x0bListWorkers\x12 .ultragray.v1.ListWorkersRequest\x1a!.ultragray.v1.ListWorkersResponse\x12\x45\n\x0bPauseWorker\x12 .ultragray.v1.PauseWorkerRequest\x1a\x14.ultragray.v1.Worker\x12\x45\n\x0b\x44rainWorker\x12 .ultragray.v1.DrainWorkerRequest\x1a\x14.ultragray.v1.Worker\x12G\n\x0cResumeWorker\x12!.ultragray.v1.ResumeWorkerRequest\x1a\x14.ultragray.v1.Workerb\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
 _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'ultragray.v1.workers_pb2', _globals)
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
-  _globals['_WORKERSTATE']._serialized_start=460
-  _globals['_WORKERSTATE']._serialized_end=679
+  _globals['_WORKER_LABELSENTRY']._loaded_options = None
+  _globals['_WORKER_LABELSENTRY']._serialized_options = b'8\001'
+  _globals['_WORKERSTATE']._serialized_start=699
+  _globals['_WORKERSTATE']._serialized_end=918
   _globals['_WORKER']._serialized_start=45
-  _globals['_WORKER']._serialized_end=258
-  _globals['_LISTWORKERSREQUEST']._serialized_start=260
-  _globals['_LISTWORKERSREQUEST']._serialized_end=280
-  _globals['_LISTWORKERSRESPONSE']._serialized_start=282
-  _globals['_LISTWORKERSRESPONSE']._serialized_end=342
-  _globals['_PAUSEWORKERREQUEST']._serialized_start=344
-  _globals['_PAUSEWORKERREQUEST']._serialized_end=380
-  _globals['_DRAINWORKERREQUEST']._serialized_start=382
-  _globals['_DRAINWORKERREQUEST']._serialized_end=418
-  _globals['_RESUMEWORKERREQUEST']._serialized_start=420
-  _globals['_RESUMEWORKERREQUEST']._serialized_end=457
-  _globals['_WORKERSERVICE']._serialized_start=682
-  _globals['_WORKERSERVICE']._serialized_end=996
+  _globals['_WORKER']._serialized_end=400
+  _globals['_WORKER_LABELSENTRY']._serialized_start=332
+  _globals['_WORKER_LABELSENTRY']._serialized_end=377
+  _globals['_WORKERDEVICE']._serialized_start=402
+  _globals['_WORKERDEVICE']._serialized_end=497
+  _globals['_LISTWORKERSREQUEST']._serialized_start=499
+  _globals['_LISTWORKERSREQUEST']._serialized_end=519
+  _globals['_LISTWORKERSRESPONSE']._serialized_start=521
+  _globals['_LISTWORKERSRESPONSE']._serialized_end=581
+  _globals['_PAUSEWORKERREQUEST']._serialized_start=583
+  _globals['_PAUSEWORKERREQUEST']._serialized_end=619
+  _globals['_DRAINWORKERREQUEST']._serialized_start=621
+  _globals['_DRAINWORKERREQUEST']._serialized_end=657
+  _globals['_RESUMEWORKERREQUEST']._serialized_start=659
+  _globals['_RESUMEWORKERREQUEST']._serialized_end=696
+  _globals['_WORKERSERVICE']._serialized_start=921
+  _globals['_WORKERSERVICE']._serialized_end=1235
 # @@protoc_insertion_point(module_scope)

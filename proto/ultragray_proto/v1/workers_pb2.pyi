@@ -27,7 +27,14 @@ WORKER_STATE_DRAINED: WorkerState
 WORKER_STATE_LOST: WorkerState
 
 class Worker(_message.Message):
-    __slots__ = ("name", "state", "host", "pid", "device", "version", "started_at", "seconds_since_beat", "job")
+    __slots__ = ("name", "state", "host", "pid", "device", "version", "started_at", "seconds_since_beat", "job", "devices", "labels")
+    class LabelsEntry(_message.Message):
+        __slots__ = ("key", "value")
+        KEY_FIELD_NUMBER: _ClassVar[int]
+        VALUE_FIELD_NUMBER: _ClassVar[int]
+        key: str
+        value: str
+        def __init__(self, key: _Optional[str] = ..., value: _Optional[str] = ...) -> None: ...
     NAME_FIELD_NUMBER: _ClassVar[int]
     STATE_FIELD_NUMBER: _ClassVar[int]
     HOST_FIELD_NUMBER: _ClassVar[int]
@@ -37,6 +44,8 @@ class Worker(_message.Message):
     STARTED_AT_FIELD_NUMBER: _ClassVar[int]
     SECONDS_SINCE_BEAT_FIELD_NUMBER: _ClassVar[int]
     JOB_FIELD_NUMBER: _ClassVar[int]
+    DEVICES_FIELD_NUMBER: _ClassVar[int]
+    LABELS_FIELD_NUMBER: _ClassVar[int]
     name: str
     state: WorkerState
     host: str
@@ -46,7 +55,21 @@ class Worker(_message.Message):
     started_at: str
     seconds_since_beat: float
     job: str
-    def __init__(self, name: _Optional[str] = ..., state: _Optional[_Union[WorkerState, str]] = ..., host: _Optional[str] = ..., pid: _Optional[int] = ..., device: _Optional[str] = ..., version: _Optional[str] = ..., started_at: _Optional[str] = ..., seconds_since_beat: _Optional[float] = ..., job: _Optional[str] = ...) -> None: ...
+    devices: _containers.RepeatedCompositeFieldContainer[WorkerDevice]
+    labels: _containers.ScalarMap[str, str]
+    def __init__(self, name: _Optional[str] = ..., state: _Optional[_Union[WorkerState, str]] = ..., host: _Optional[str] = ..., pid: _Optional[int] = ..., device: _Optional[str] = ..., version: _Optional[str] = ..., started_at: _Optional[str] = ..., seconds_since_beat: _Optional[float] = ..., job: _Optional[str] = ..., devices: _Optional[_Iterable[_Union[WorkerDevice, _Mapping]]] = ..., labels: _Optional[_Mapping[str, str]] = ...) -> None: ...
+
+class WorkerDevice(_message.Message):
+    __slots__ = ("name", "model", "memory_bytes", "cores")
+    NAME_FIELD_NUMBER: _ClassVar[int]
+    MODEL_FIELD_NUMBER: _ClassVar[int]
+    MEMORY_BYTES_FIELD_NUMBER: _ClassVar[int]
+    CORES_FIELD_NUMBER: _ClassVar[int]
+    name: str
+    model: str
+    memory_bytes: int
+    cores: int
+    def __init__(self, name: _Optional[str] = ..., model: _Optional[str] = ..., memory_bytes: _Optional[int] = ..., cores: _Optional[int] = ...) -> None: ...
 
 class ListWorkersRequest(_message.Message):
     __slots__ = ()
