@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ultragray.machine import memory_bytes
 from ultragray_client import (
     AroundSampler,
     ConvexProbe,
@@ -193,6 +194,9 @@ def test_workers_rest_and_resume(client: Any) -> None:
     (worker,) = wait_until(lambda: [one for one in client.workers.list() if one.state is WorkerState.IDLE])
     assert (worker.pid > 0, worker.device) == (True, "auto")
     try:
+        (device,) = [one for one in worker.devices if one.name == "cpu"]
+        assert device.memory_bytes == memory_bytes()
+        assert worker.labels == {}
         assert client.workers.drain(worker.name).state is WorkerState.DRAINED
         assert client.workers.pause(worker.name).state is WorkerState.PAUSED
         assert client.workers.list()[0].state is WorkerState.PAUSED

@@ -75,6 +75,26 @@ def client(server: RunningService, tmp_path_factory: pytest.TempPathFactory) -> 
         yield client
 
 
+def test_a_job_that_no_worker_can_take_is_submitted_with_a_warning(server: RunningService) -> None:
+    asked = ("--min-memory-gb", "900000", "--require", "site=lab1", "--require", "rack=4")
+    result = run(server, "submit", "render", "demo", "--sampler", "training", *asked)
+    assert result.exit_code == 0, result.output
+    job = result.stdout.strip()
+    told = json.loads(done(server, "show", job, "--json"))
+    assert told["specification"]["worker_labels"] == {"site": "lab1", "rack": "4"}
+    wanted = "a worker with a device of at least 900000 GB and the labels rack=4, site=lab1"
+    assert " ".join(result.stderr.split()).startswith(f"warning: {job} waits for {wanted}")
+    assert told["progress"]["waits_for"].startswith(wanted)
+    done(server, "cancel", job)
+
+
+@pytest.mark.parametrize("label", ["lab1", "site=", "site=lab 1"])
+def test_a_label_that_is_none_is_refused(server: RunningService, label: str) -> None:
+    result = run(server, "submit", "render", "demo", "--require", label)
+    assert result.exit_code == 2
+    assert "--require" in result.stderr or "worker_labels must be" in " ".join(result.stderr.split())
+
+
 def test_a_scene_is_trained_watched_and_served(server: RunningService, client: httpx.Client, tmp_path: Path) -> None:
     settings = ("--set", "steps=12", "--set", "max_gaussians=60", "--device", "cpu")
     options = (*settings, "--request-id", "first", "--wait")

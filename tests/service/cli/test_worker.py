@@ -72,6 +72,23 @@ def test_worker_command_does_a_job_and_stops(demo_store: JobStore, tmp_path: Pat
     demo_store.close()
 
 
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (("--device", "cuda:99"), "device must be one of this host, got 'cuda:99'"),
+        (("--device", "tpu"), "device must be auto, cpu, cuda or cuda:N, got 'tpu'"),
+        (("--label", "lab1"), "--label takes NAME=VALUE, got 'lab1'"),
+        (("--label", "site=lab 1"), "label must be names and values of 1 to 63 letters"),
+    ],
+)
+def test_worker_command_refuses_devices_that_are_not_there_and_labels_that_are_none(
+    options: tuple[str, str], told: str, tmp_path: Path
+) -> None:
+    done = subprocess.run([*WORKER, "--artifact-folder", str(tmp_path), *options], capture_output=True, text=True)
+    assert done.returncode == 2
+    assert told in " ".join(done.stderr.split())
+
+
 def test_worker_command_refuses_a_folder_that_is_not_there(tmp_path: Path) -> None:
     done = subprocess.run([*WORKER, "--data-folder", str(tmp_path / "none")], capture_output=True, text=True)
     assert done.returncode == 2

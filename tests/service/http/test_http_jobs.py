@@ -55,8 +55,19 @@ def test_a_submitted_job_waits_and_tells_what_it_is(client: httpx.Client) -> Non
     assert job["specification"]["scene"] == "demo"
     assert job["started_at"] is job["finished_at"] is job["reason"] is job["request_id"] is None
     assert job["artifacts"] == []
-    assert set(job["progress"].values()) == {None}
+    assert {name: value for name, value in job["progress"].items() if value is not None} == {
+        "waits_for": "a worker: none is running"
+    }
     assert client.get(f"/v1/jobs/{job['id']}").json() == job
+
+
+def test_a_job_that_no_worker_can_take_says_what_it_asks_for_when_it_is_submitted(client: httpx.Client) -> None:
+    asked = {"device": "cuda", "min_memory_gb": 16, "worker_labels": {"site": "lab1"}}
+    job = submit(client, specification=RENDER["specification"] | asked)
+    assert {name: job["specification"][name] for name in asked} == asked
+    assert job["progress"]["waits_for"] == (
+        "a worker with a GPU of at least 16 GB and the label site=lab1: none is running"
+    )
 
 
 def test_poses_are_counted_not_repeated(client: httpx.Client) -> None:

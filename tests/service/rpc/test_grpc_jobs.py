@@ -70,8 +70,33 @@ def test_a_render_job_comes_back_as_it_was_asked_for(jobs: jobs_pb2_grpc.JobServ
     assert (job.render.format, job.render.dtype, job.render.sampler) == ("tar", "float32", render.sampler)
     assert list(job.render.outputs) == [rendering_pb2.OUTPUT_ECHO, rendering_pb2.OUTPUT_BMODE]
     assert not job.HasField("error")
-    assert not any(job.progress.HasField(field.name) for field in job.progress.DESCRIPTOR.fields)
+    assert MessageToDict(job.progress) == {"waitsFor": "a worker: none is running"}
     assert jobs.GetJob(jobs_pb2.GetJobRequest(job=job.id)) == job
+
+
+@pytest.mark.parametrize(
+    ("kind", "named"),
+    [
+        ("train", jobs_pb2.TrainJob(dataset="liver", scene="liver")),
+        ("render", jobs_pb2.RenderJob(scene="liver", sampler=jobs_pb2.PoseSampler(kind="training"))),
+        ("evaluate", jobs_pb2.EvaluateJob(dataset="liver", scene="liver")),
+    ],
+)
+def test_what_a_job_asks_of_its_worker_is_read_from_the_messages_of_all_kinds(kind: str, named: Any) -> None:
+    named.MergeFrom(type(named)(device="cuda:1", min_memory_gb=16, worker_labels={"site": "lab1", "rack": "4"}))
+    specification, field = read_specification(jobs_pb2.SubmitJobRequest(**{kind: named}))
+    assert field == kind
+    assert (specification.device, specification.min_memory_gb) == ("cuda:1", 16)
+    assert specification.worker_labels == {"site": "lab1", "rack": "4"}
+
+
+def test_a_demand_comes_back_with_what_the_job_waits_for(jobs: jobs_pb2_grpc.JobServiceStub) -> None:
+    request = training_poses()
+    request.render.MergeFrom(jobs_pb2.RenderJob(device="cpu", min_memory_gb=8, worker_labels={"site": "lab1"}))
+    job = jobs.SubmitJob(request).job
+    assert (job.render.device, job.render.min_memory_gb) == ("cpu", 8)
+    assert dict(job.render.worker_labels) == {"site": "lab1"}
+    assert job.progress.waits_for.startswith("a worker with the device cpu of at least 8 GB and the label site=lab1")
 
 
 def test_the_same_request_id_gives_the_same_job(jobs: jobs_pb2_grpc.JobServiceStub) -> None:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import pytest
 import sqlalchemy as sa
 
-from ultragray_workers.jobs.queue import unfinished
+from ultragray_workers.jobs.matching.demand import Demand
+from ultragray_workers.jobs.queue import database, unfinished
 from ultragray_workers.jobs.queue.database import JobDatabase
 from ultragray_workers.jobs.queue.internals import WORKFLOWS
 from ultragray_workers.jobs.store import JobStore
@@ -42,11 +44,39 @@ def test_answers(jobs: JobDatabase, store: JobStore) -> None:
     assert unfinished.sources(jobs) == set()
 
 
+def test_the_demands_that_wait_are_told_once_each(jobs: JobDatabase, store: JobStore) -> None:
+    assert unfinished.demands_waiting(jobs) == []
+    in_lab = replace(train_job("one"), worker_labels={"site": "lab1"})
+    for scene in ("one", "two", "three"):
+        store.submit(replace(in_lab, scene=scene))
+        store.submit(train_job(f"{scene}-anywhere"))
+    gone, _ = store.submit(replace(train_job("gone"), device="cuda"))
+    store.cancel(gone.id)
+    expected = [Demand("cpu"), Demand("cpu", labels=(("site", "lab1"),))]
+    assert sorted(unfinished.demands_waiting(jobs)) == sorted(demand.key for demand in expected)
+
+
+def test_a_job_of_an_older_release_gets_its_demand_when_it_is_adopted(jobs: JobDatabase, store: JobStore) -> None:
+    older, running = (store.submit(train_job(scene))[0] for scene in ("older", "running"))
+    with jobs.engine.begin() as connection:
+        as_before = sa.update(WORKFLOWS).values(queue_partition_key=None, application_version="2")
+        connection.execute(as_before)
+        connection.execute(as_before.where(WORKFLOWS.c.workflow_uuid == running.id).values(status="PENDING"))
+    assert store.get(older.id).progress.waits_for == "a worker with the device cpu: none is running"
+    assert unfinished.demands_waiting(jobs) == []
+    unfinished.adopt_older(jobs)
+    assert unfinished.demands_waiting(jobs) == [Demand("cpu").key]
+    with jobs.engine.begin() as connection:
+        versions = connection.execute(sa.select(WORKFLOWS.c.workflow_uuid, WORKFLOWS.c.application_version)).all()
+    assert {tuple(row) for row in versions} == {(older.id, database.VERSION), (running.id, "2")}
+
+
 @pytest.mark.parametrize(
     "ask",
     [
         unfinished.running,
         unfinished.count_waiting,
+        unfinished.demands_waiting,
         unfinished.sources,
         lambda jobs: unfinished.count_of_owner(jobs, "me"),
         lambda jobs: unfinished.naming(jobs, "needs_dataset", "tiny"),
