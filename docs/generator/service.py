@@ -19,6 +19,7 @@ from ultragray_service.settings import ENVIRONMENT_PREFIX, Settings
 from ultragray_workers import errors as workers_errors
 from ultragray_workers.errors import QueueFull
 from ultragray_workers.jobs.job import JobState
+from ultragray_workers.jobs.matching.demand import AUTO
 from ultragray_workers.jobs.overview import JobsOverview
 from ultragray_workers.jobs.queue.attendance import WorkerState
 from ultragray_workers.pool.types import RenderResult
@@ -88,4 +89,4 @@ def _count_everything(service: Service) -> None:
     )
     service.metrics.count_limited("streams")
     service.metrics.tell_certificate_expiry(lambda: datetime(2030, 1, 1, tzinfo=timezone.utc))
-    service.jobs.overview = JobsOverview({JobState.QUEUED: 1}, {WorkerState.IDLE: 1})
+    service.jobs.overview = JobsOverview({JobState.QUEUED: 1}, {WorkerState.IDLE: 1}, {AUTO: 1.0})

@@ -69,8 +69,13 @@ class _JobsCollector(Collector):
         for worker_state, count in now.workers.items():
             family.add_metric([worker_state.value], count)
         yield family
-        oldest = "Time that the job has waited that waits longest; 0 where none waits."
-        yield GaugeMetricFamily("ultragray_oldest_waiting_job_seconds", oldest, now.oldest_waiting_s)
+        oldest = "Time that the job has waited that waits longest, by the device that it asks for; 0 where none waits."
+        family = GaugeMetricFamily("ultragray_oldest_waiting_job_seconds", oldest, labels=["device"])
+        for device, oldest_s in now.oldest_waiting_s.items():
+            family.add_metric([device], oldest_s)
+        yield family
+        unfit = "Jobs that wait for a worker that is not there: none that is alive has what they ask for."
+        yield GaugeMetricFamily("ultragray_unfit_jobs", unfit, now.unfit)
 
 
 def _role() -> str:

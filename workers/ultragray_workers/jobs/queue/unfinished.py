@@ -10,7 +10,7 @@ from typing import Any
 import sqlalchemy as sa
 
 from ..kinds import KINDS, Specification
-from ..matching.demand import Demand
+from ..matching.demand import Demand, demand_of_key
 from . import database
 from .database import JobDatabase
 from .internals import WORKFLOWS
@@ -42,11 +42,13 @@ def demands_waiting(jobs: JobDatabase) -> list[str]:
         return list(connection.execute(sa.select(found.c.key).where(found.c.key.is_not(None))).scalars())
 
 
-def oldest_waiting_ms(jobs: JobDatabase) -> int | None:
-    """The time of submission, ms since 1970, of the job that has waited longest; None where none waits."""
-    oldest = sa.select(sa.func.min(_ROWS.created_at)).where(_has_status(*database.QUEUED))
+def waiting(jobs: JobDatabase) -> list[tuple[Demand, int, int]]:
+    """Each demand of jobs that wait, how many there are, and when the first was submitted, ms since 1970."""
+    key = _ROWS.queue_partition_key
+    grouped = sa.select(key, sa.func.count(), sa.func.min(_ROWS.created_at)).group_by(key)
     with jobs.engine.connect() as connection:
-        return connection.execute(oldest).scalar()
+        rows = connection.execute(grouped.where(_has_status(*database.QUEUED))).all()
+    return [(Demand() if row[0] is None else demand_of_key(row[0]), row[1], row[2]) for row in rows]
 
 
 def count_of_owner(jobs: JobDatabase, owner: str) -> int:
