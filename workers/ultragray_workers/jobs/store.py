@@ -39,7 +39,6 @@ from ..store import OpenStore
 from .folder import JobFolder, Progress
 from .job import MAX_PRIORITY, PRIORITY_ZERO, STATUSES, Job, JobState, attribute, job_of_row, ownership_of
 from .kinds import Specification
-from .matching.demand import Demand
 from .matching.offer import LivingWorker
 from .overview import JobsOverview, overview
 from .publication import SCENES_FOLDER, give_name_back
@@ -176,7 +175,6 @@ class JobStore:
                 "workflow_id": job_id,
                 "workflow_id_reuse_policy": "reject",
                 "app_version": database.VERSION,
-                "queue_partition_key": Demand.of(short).key,
                 "priority": PRIORITY_ZERO - priority,
                 "attributes": {
                     "request_id": request_id,

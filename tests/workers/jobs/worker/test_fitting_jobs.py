@@ -71,6 +71,7 @@ def test_a_job_that_nobody_can_take_says_so_and_starts_when_a_fitting_worker_com
     job = submit(store, "made", site="lab2")
     asked = "a worker with the device cpu and the label site=lab2"
     assert job.progress.waits_for == f"{asked}: none is running"
+    assert store.overview().unfit == 1
     running = start_worker("first", labels={"site": "lab1"})
     wait_until(is_there(store, "first"))
     memory = f"{memory_bytes() / 10**9:.0f}"
@@ -79,6 +80,13 @@ def test_a_job_that_nobody_can_take_says_so_and_starts_when_a_fitting_worker_com
     listed, _ = store.list()
     assert [one.progress.waits_for for one in listed] == [expected]
     assert submit(store, "other", site="lab1").progress.waits_for is None
+    overview = store.overview()
+    assert overview.unfit == 1
+    assert {device: waited > 0 for device, waited in overview.oldest_waiting_s.items()} == {
+        "auto": False,
+        "cpu": True,
+        "cuda": False,
+    }
     running.kill()
     start_worker("second", labels={"site": "lab2"})
     job = until(job)

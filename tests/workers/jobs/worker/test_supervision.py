@@ -76,7 +76,7 @@ def alone(store: JobStore, artifact_folder: Path) -> Iterator[tuple[Supervisor, 
     """The supervisor, in this process, and what DBOS does: takes a job, and has it done."""
     jobs = JobDatabase(artifact_folder, None)
     folder = artifact_folder.resolve()
-    gate = Gate(jobs.folder, [DeviceLock(folder, device, "me") for device in devices_of("cpu")])
+    gate = Gate(jobs.folder, [DeviceLock(folder, device, "me") for device in devices_of("cpu")], (), list)
     supervisor = Supervisor(supervision.WorkerConfig(folder, "me"), jobs, gate)
 
     def take(job_id: str) -> Outcome:

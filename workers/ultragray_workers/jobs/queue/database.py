@@ -16,6 +16,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from ...errors import DatabaseUnavailable, StartupFailed, StorageFull
 from ...store import PRIVATE_FILE, PRIVATE_FOLDER
+from ..matching.demand import Demand
 from . import runs, tables
 from .folder_identity import FolderIdentity, identify
 from .internals import SCHEMA, SQLITE_ISOLATION, SQLITE_SETTINGS, WORKFLOWS, put_back, take_back
@@ -172,6 +173,8 @@ class JobDatabase:
     ) -> None:
         """Puts a workflow into the queue behind all others of its priority, and does `also` in the same transaction.
 
+        The specification among its attributes says what it asks of a worker.
+
         DBOS orders by the time of submission, which on SQLite it may know to the second only: here it is set to the
         millisecond, and after that of every other job.
         """
@@ -192,8 +195,11 @@ class JobDatabase:
                 rows.c.workflow_uuid != options["workflow_id"]
             )
             submitted_ms = max(int(time.time() * 1000), 1 + (connection.execute(last_ms).scalar() or 0))
+            demand = Demand.of(options["attributes"]["specification"])
             connection.execute(
-                sa.update(rows).where(rows.c.workflow_uuid == options["workflow_id"]).values(created_at=submitted_ms)
+                sa.update(rows)
+                .where(rows.c.workflow_uuid == options["workflow_id"])
+                .values(created_at=submitted_ms, queue_partition_key=demand.key)
             )
             also(connection)
 

@@ -31,8 +31,8 @@ class Gate:
         self,
         folder: FolderIdentity,
         devices: Sequence[DeviceLock],
-        labels: tuple[tuple[str, str], ...] = (),
-        waiting: Callable[[], Iterable[str]] = lambda: (),
+        labels: tuple[tuple[str, str], ...],
+        waiting: Callable[[], Iterable[str]],
     ) -> None:
         """`devices`: those that the worker offers, the preferred one first. `waiting`: the demands of waiting jobs."""
         self.folder = folder
@@ -51,15 +51,17 @@ class Gate:
         """
         if self.is_resting or time.monotonic() < self._closed_until_s or not self._has_folder():
             return []
-        # All that are free: which one fits is known when the job is.
-        held = {name for name, lock in self._locks.items() if self._takes(lock)}
-        keys = []
-        if held:  # the database is not asked before: who holds a device and was stopped may hold the database, too
-            with suppress(DatabaseUnavailable):
-                keys = [key for key in self._waiting() if held & self._fitting(demand_of_key(key))]
-        if not keys:
+        # The database is asked only with a device in hand: whoever holds all and was stopped may hold it, too.
+        if not any(self._takes(lock) for lock in self._locks.values()):
+            return []
+        fitting: dict[str, set[str]] = {}
+        with suppress(DatabaseUnavailable):
+            fitting = {key: self._fitting(demand_of_key(key)) for key in self._waiting()}
+        wanted = set().union(*fitting.values())  # which one it will be is known when the job is
+        held = {name for name, lock in self._locks.items() if name in wanted and self._takes(lock)}
+        if not held:
             self.close()
-        return keys
+        return [key for key, names in fitting.items() if names & held]
 
     def hold(self, demand: Demand) -> DeviceLock | None:
         """The lock of a device that fits a job, held; the others are let go. None: all of them are in use.
