@@ -157,6 +157,7 @@ describe("the workers", () => {
     const addresses = () => row.getByRole("link").evaluateAll((links) => links.map((link) => link.getAttribute("href")));
     await until(addresses, ([address]) => address === `#/train/${id}`, "the job at hand is not told");
     await row.getByText("working").waitFor();
+    await row.getByText(/^cpu \d+(\.\d)? GB$/).waitFor(); // what it does jobs on
     const other = await pageOf(at, "bob", "#/scenes");
     const seen = other.getByTestId(/^worker-/);
     await seen.getByText("working").waitFor();

@@ -102,6 +102,22 @@ describe("train", () => {
     assert.deepEqual(names, ["sweep"]);
   });
 
+  it("says what a job waits for that no worker can take, and cancels it", async () => {
+    const specification = { scene: "demo", sampler: { kind: "training" }, worker_labels: { site: "lab1" } };
+    const answer = await fetch(`${at.service.url}/v1/jobs`, {
+      method: "POST",
+      headers: { "Content-Type": "application/json" },
+      body: JSON.stringify({ kind: "render", specification }),
+    });
+    const { id } = await answer.json();
+    const page = await openPage(at, `#/train/${id}`);
+    await page.getByTestId("waits-for").getByText("It waits for a worker with the label site=lab1; there is").waitFor();
+    assert.deepEqual(await seriousFindings(page), []);
+    await picture(page, "train-waits");
+    await page.getByRole("button", { name: "Cancel" }).click();
+    await until(() => state(page), (text) => text === "cancelled", "it was not cancelled");
+  });
+
   it("says that a job is gone", async () => {
     const page = await openPage(at, "#/train/0123456789abcdef01234567");
     await page.getByText("There is no such job").waitFor();
