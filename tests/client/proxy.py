@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import socket
 import threading
+from contextlib import suppress
 
 
 class Proxy:
@@ -28,6 +29,8 @@ class Proxy:
 
     def close(self) -> None:
         for one in self._open:
+            with suppress(OSError):  # it is shut already
+                one.shutdown(socket.SHUT_RDWR)  # closing alone would not wake those that wait for it
             one.close()
 
     def _accept(self) -> None:

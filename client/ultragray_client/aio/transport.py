@@ -64,7 +64,7 @@ class PoseCall:
         self.reconnections = 0
         self._start, self._exchange, self._retries, self._address = start, exchange, retries, address
         self._is_latest = exchange.mode is StreamMode.LATEST
-        self._unanswered = Unanswered(newest_alone=self._is_latest)
+        self._unanswered = Unanswered(newest_alone=self._is_latest, goes_on=retries.may_go_on)
         self._unsent: deque[Any] = deque()  # of the call that is open
         self._sending = asyncio.Lock()
         self._closed = False  # no more poses come
@@ -171,11 +171,11 @@ class PoseCall:
                 continue
             if message is grpc.aio.EOF:
                 return None
-            self._retries.progress()
-            self.reconnections += self._is_resumed
-            self._is_resumed = False
-            self._unanswered.answered(message)
-            return self._exchange.arrived(message)
+            if self._unanswered.answered(message):
+                self._retries.progress()
+                self.reconnections += self._is_resumed
+                self._is_resumed = False
+                return self._exchange.arrived(message)
 
     async def _go_on(self, broken: Any, error: ClientError) -> bool:
         """Starts another call after a pause; False where nothing is left to be asked. Raises what ends the stream."""
