@@ -59,7 +59,8 @@ def run(settings: Settings) -> None:
 async def serve(settings: Settings) -> None:
     """Serve HTTP, gRPC and, where it has a port, OpenIGTLink, until SIGTERM or SIGINT.
 
-    Then drains: ready turns false, what waits is answered. A second signal stops at once.
+    Then drains: ready turns false, after `drain_delay_s` nothing new is taken, and what waits is answered. A second
+    signal stops at once.
     Raises StartupFailed: a port in use, no data folder, a bad preload, certificates that cannot be used, other machines
     served without API keys.
     """
@@ -96,6 +97,10 @@ async def serve(settings: Settings) -> None:
                 manager.tell(READY)
                 await signals.stop.wait()
             manager.tell(STOPPING)
+            if settings.drain_delay_s:
+                service.begin_leaving()
+                _log.info(f"not ready any more; stopping in {settings.drain_delay_s:g} s")
+                await signals.unless_forced(asyncio.sleep(settings.drain_delay_s))
             _log.info("stopping: frames that wait are answered first; Ctrl-C again stops at once")
         finally:
             for task in watching:

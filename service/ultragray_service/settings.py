@@ -239,6 +239,13 @@ class Settings(Contract):
         above=0.0,
         high=24 * _HOUR_S,
     )
+    drain_delay_s: float = described(
+        "How long a service that is told to stop goes on as before but for its readiness: behind a proxy, longer than "
+        "that takes to notice and to send what is new elsewhere.",
+        0.0,
+        low=0.0,
+        high=_HOUR_S,
+    )
     drain_timeout_s: float = described("How long frames that wait may take at a stop.", 10.0, low=0.0, high=_HOUR_S)
 
     api_keys: tuple[str, ...] = described(

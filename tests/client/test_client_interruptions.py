@@ -24,57 +24,8 @@ from ultragray_proto.v1 import jobs_pb2
 from ..service.conftest import RunningService
 from ..waiting import at_this_load
 from .conftest import KEY
+from .proxy import Proxy
 from .test_client_errors import FailedCall
-
-
-class Proxy:
-    """Passes bytes on to a service; `cut_after` breaks a connection once so many came back over it."""
-
-    def __init__(self, target: str) -> None:
-        host, _, port = target.rpartition(":")
-        self._target = (host, int(port))
-        self._listener = socket.create_server(("127.0.0.1", 0))
-        self._open: list[socket.socket] = [self._listener]
-        self._left: int | None = None
-        self.cuts = 0
-        self.address = f"127.0.0.1:{self._listener.getsockname()[1]}"
-        threading.Thread(target=self._accept, daemon=True).start()
-
-    def cut_after(self, count: int) -> None:
-        self._left = count
-
-    def close(self) -> None:
-        for one in self._open:
-            one.close()
-
-    def _accept(self) -> None:
-        while True:
-            try:
-                near, _ = self._listener.accept()
-            except OSError:
-                return
-            far = socket.create_connection(self._target)
-            self._open += [near, far]
-            threading.Thread(target=self._pass, args=(near, far, False), daemon=True).start()
-            threading.Thread(target=self._pass, args=(far, near, True), daemon=True).start()
-
-    def _pass(self, source: socket.socket, sink: socket.socket, counted: bool) -> None:
-        try:
-            while data := source.recv(16384):
-                sink.sendall(data)
-                if counted and self._left is not None:
-                    self._left -= len(data)
-                    if self._left < 0:
-                        self._left = None
-                        self.cuts += 1
-                        break
-        except OSError:
-            pass
-        for one in (source, sink):
-            try:
-                one.shutdown(socket.SHUT_RDWR)
-            except OSError:
-                continue
 
 
 @pytest.fixture

@@ -19,7 +19,7 @@ from .test_client_render import moved
 
 
 def test_pauses_grow_after_the_delay_that_the_service_told() -> None:
-    retries = Retries(1000.0, patience_s=0.0)
+    retries = Retries(1000.0, patience_s=None)
     full = errors.QueueFull("full", retry_after_s=2.0)
     pauses_s = [retries.pause_s(full) for _ in range(10)]
     for failures, pause_s in enumerate(pauses_s):
@@ -27,7 +27,7 @@ def test_pauses_grow_after_the_delay_that_the_service_told() -> None:
         assert 2.0 + 0.5 * backoff_s <= pause_s <= 2.0 + backoff_s
     retries.progress()
     assert retries.pause_s(full) <= 2.1
-    assert len({Retries(1000.0, 0.0).pause_s(full) for _ in range(5)}) > 1
+    assert len({Retries(1000.0, None).pause_s(full) for _ in range(5)}) > 1
 
 
 @pytest.mark.parametrize(
@@ -67,6 +67,15 @@ def test_without_a_deadline_patience_counts_from_the_first_failure_since_anythin
         retries.pause_s(gone)
     retries.progress()
     assert retries.pause_s(gone) < 0.3
+
+
+def test_the_shorter_of_deadline_and_patience_counts() -> None:
+    gone = errors.Unreachable("gone", retry_after_s=2.0)
+    for retries in (Retries(1.0, patience_s=60.0), Retries(60.0, patience_s=1.0)):
+        with pytest.raises(errors.Unreachable):
+            retries.pause_s(gone)
+    with pytest.raises(errors.Unreachable):
+        Retries(60.0, patience_s=0.0).pause_s(errors.Unreachable("gone"))
 
 
 def free_port() -> int:

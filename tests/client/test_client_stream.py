@@ -104,10 +104,12 @@ def test_a_stream_may_be_used_by_two_threads(client: Any) -> None:
         sender.join()
 
 
-def test_a_service_that_stops_ends_a_stream(make_client: Any, start_service: StartService) -> None:
+def test_a_service_that_stops_ends_a_stream_that_is_not_to_reconnect(
+    make_client: Any, start_service: StartService
+) -> None:
     service = start_service()
     client = make_client(service.grpc)
-    with client.stream("demo", RenderSettings(height=8, width=8)) as stream:
+    with client.stream("demo", RenderSettings(height=8, width=8), reconnect_s=0.0) as stream:
         stream.send(moved(0.0))
         stream.receive()
         service.terminate()
@@ -119,7 +121,7 @@ def test_a_service_that_stops_ends_a_stream(make_client: Any, start_service: Sta
 
 def test_the_frames_before_the_end_of_a_stream_come(make_client: Any, start_service: StartService) -> None:
     service = start_service()
-    stream = make_client(service.grpc).stream("demo", RenderSettings(height=8, width=8))
+    stream = make_client(service.grpc).stream("demo", RenderSettings(height=8, width=8), reconnect_s=0.0)
     for _ in range(5):
         stream.send(moved(0.0))
     wait_until(lambda: service.metric("ultragray_frames_total") >= 5)
@@ -136,7 +138,7 @@ def test_what_was_dropped_before_an_error_is_told_with_the_next_frame() -> None:
     exchange = PoseExchange(settings_message("demo", None), "latest")
     error = scenes_pb2.Error(reason="DEADLINE_EXCEEDED", detail="late")
     with pytest.raises(errors.DeadlineExceeded):
-        exchange.frame(rendering_pb2.Frame(sequence=3, error=error, dropped=2))
+        exchange.frame(exchange.arrived(rendering_pb2.Frame(sequence=3, error=error, dropped=2)))
     answer = rendering_pb2.Frame(
         sequence=5,
         outputs=[rendering_pb2.OUTPUT_BMODE],
@@ -151,8 +153,8 @@ def test_what_was_dropped_before_an_error_is_told_with_the_next_frame() -> None:
         picture=rendering_pb2.Picture(),
         dropped=1,
     )
-    assert exchange.frame(answer, dropped_here=4).dropped == 7
-    assert exchange.frame(answer).dropped == 1
+    assert exchange.frame(exchange.arrived(answer), dropped_here=4).dropped == 7
+    assert exchange.frame(exchange.arrived(answer)).dropped == 1
 
 
 class ClientDoor:

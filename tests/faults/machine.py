@@ -31,7 +31,7 @@ elif "worker" in line:
     heartbeat.DEAD_AFTER_S = {DEAD_AFTER_S}
 """
 _SERVE = [sys.executable, "-m", "ultragray_service"]
-_WORK = [sys.executable, "-c", "from ultragray_service.cli.app import app; app()", "worker", "--device", "cpu"]
+WORK = [sys.executable, "-c", "from ultragray_service.cli.app import app; app()", "worker", "--device", "cpu"]
 
 
 class Machine:
@@ -81,10 +81,10 @@ class Machine:
         """Starts again what has died, and learns where the server listens."""
         if not self._servers or self._servers[-1].poll() is not None:
             self.http = self.grpc = None
-            embedded = {"ULTRAGRAY_EMBEDDED_WORKER": str(self._with_workers)}
+            embedded = {"ULTRAGRAY_EMBEDDEDWORKER": str(self._with_workers)}
             self._servers.append(self._spawn(_SERVE, f"server-{len(self._servers)}", embedded))
         if self._with_workers and (not self._workers or self._workers[-1].poll() is not None):
-            self._workers.append(self._spawn(_WORK, f"worker-{len(self._workers)}", {}))
+            self._workers.append(self._spawn(WORK, f"worker-{len(self._workers)}", {}))
         if self.http is None:
             log = self._logs / f"server-{len(self._servers) - 1}"
             for line in log.read_text().splitlines():

@@ -14,6 +14,7 @@ from typing import Any
 import grpc
 import httpx
 import pytest
+from grpc_health.v1 import health_pb2, health_pb2_grpc
 
 from ultragray_proto.v1 import rendering_pb2, rendering_pb2_grpc
 
@@ -85,6 +86,44 @@ def test_a_second_signal_stops_at_once(start_service: StartService) -> None:
         for answer in pending:
             error = answer.exception()
             assert isinstance(error, httpx.TransportError) if error else answer.result().status_code == 503
+
+
+def test_a_service_that_leaves_is_not_ready_and_answers_until_it_stops(start_service: StartService) -> None:
+    service = start_service(drain_delay_s=3)
+    with service.channel() as channel, httpx.Client(timeout=60) as client:
+        conversation = Conversation(rendering_pb2_grpc.RenderServiceStub(channel))
+        conversation.send(settings=rendering_pb2.RenderSettings(scene="demo", **SMALL))
+        health = health_pb2_grpc.HealthStub(channel)
+        assert health.Check(health_pb2.HealthCheckRequest()).status == health_pb2.HealthCheckResponse.SERVING
+        began = time.monotonic()
+        service.process.send_signal(signal.SIGTERM)
+        readiness = wait_until(lambda: not_ready(service, client), within_s=2)
+        assert (readiness["reason"], readiness["components"]["frames"]["ready"]) == ("DRAINING", False)
+        wait_until(
+            lambda: health.Check(health_pb2.HealthCheckRequest()).status == health_pb2.HealthCheckResponse.NOT_SERVING
+        )
+        assert render(service, client, **SMALL).status_code == 200  # a new request
+        conversation.send(7, pose=moved(0))
+        assert next(conversation.call).sequence == 7
+        with pytest.raises(grpc.RpcError) as caught:
+            next(conversation.call)
+        assert error_info(caught.value)[0].reason == "DRAINING"
+        assert time.monotonic() - began >= 3
+        assert service.process.wait(60) == 0
+
+
+def not_ready(service: RunningService, client: httpx.Client) -> Any:
+    """The problem that readiness tells; None: the service is ready."""
+    answer = client.get(f"{service.http}/v1/health/ready")
+    return answer.json() if answer.status_code == 503 else None
+
+
+def test_a_second_signal_ends_the_delay(start_service: StartService) -> None:
+    service = start_service(drain_delay_s=600)
+    service.process.send_signal(signal.SIGTERM)
+    wait_until(lambda: any("not ready any more" in record["message"] for record in service.log()))
+    service.process.send_signal(signal.SIGTERM)
+    assert service.process.wait(60) == 0
 
 
 def test_sigterm_while_starting(start_service: StartService) -> None:

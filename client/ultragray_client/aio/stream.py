@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import AsyncIterator
 
 from ..calls.pose_exchange import PoseExchange
-from ..calls.statuses import client_errors
 from ..errors import StreamEnded
 from ..frames import Frame
 from ..geometry import PoseLike
@@ -15,8 +14,13 @@ from .transport import PoseCall
 class AsyncFrameStream:
     """Poses in, frames out; sending and receiving may go on side by side. Leaving it as a context ends it."""
 
-    def __init__(self, address: str, exchange: PoseExchange, call: PoseCall) -> None:
-        self._address, self._exchange, self._call = address, exchange, call
+    def __init__(self, exchange: PoseExchange, call: PoseCall) -> None:
+        self._exchange, self._call = exchange, call
+
+    @property
+    def reconnections(self) -> int:
+        """How often frames went on over another connection."""
+        return self._call.reconnections
 
     async def send(self, pose: PoseLike, *, timeout_s: float | None = None, measured_ns: int | None = None) -> int:
         """Sends a pose ([4, 4] mm, or a Placement) and returns the sequence that its frame will carry, from 1.
@@ -26,8 +30,7 @@ class AsyncFrameStream:
         `latency_ms` counts from it. Raises InvalidPose, StreamEnded, and what ended the stream.
         """
         message = self._exchange.pose(pose, timeout_s, measured_ns)
-        with client_errors(self._address):
-            await self._call.send(message)
+        await self._call.send(message)
         return int(message.sequence)
 
     async def done_sending(self) -> None:
@@ -38,13 +41,12 @@ class AsyncFrameStream:
         """Waits for the next frame; of a latest stream the newest: those it takes the place of are dropped.
 
         Raises the ClientError that is told in its place, with the `sequence` of its pose: the stream goes on. Raises
-        StreamEnded after the last frame, and what ended the stream, such as Draining: open another one.
+        StreamEnded after the last frame, and what ended the stream, such as Unreachable where it could not go on.
         """
-        with client_errors(self._address):
-            message = await self._call.receive()
-        if message is None:
+        answer = await self._call.receive()
+        if answer is None:
             raise StreamEnded("the stream is over")
-        return self._exchange.frame(message, self._call.take_replaced())
+        return self._exchange.frame(answer, self._call.take_replaced())
 
     def __aiter__(self) -> AsyncIterator[Frame]:
         return self

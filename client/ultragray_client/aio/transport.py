@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections import deque
 from collections.abc import Callable
 from typing import Any, ParamSpec, TypeVar
 
@@ -10,9 +11,12 @@ import grpc
 
 from ..calls.connection import CHANNEL_OPTIONS
 from ..calls.newest_answers import NewestAnswers
-from ..calls.pose_exchange import TAKES_NO_MORE, PoseExchange, StreamMode
+from ..calls.pose_exchange import MAX_WAITING, TAKES_NO_MORE, Answer, PoseExchange, StreamMode
+from ..calls.retries import Retries
+from ..calls.statuses import error_of_call
 from ..calls.tls import Tls
-from ..errors import StreamEnded
+from ..calls.unanswered import Unanswered
+from ..errors import ClientError, StreamEnded
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -50,76 +54,160 @@ class _CallThatKeepsItsStatus:
 
 
 class PoseCall:
-    """The call of a stream: poses out, frames in. All raise grpc.RpcError where the call failed.
+    """The calls of a stream, one after another: poses out, frames in. All raise ClientError where none can follow.
 
-    Of a latest stream a task takes answers as they come; each is acknowledged when the caller takes it.
+    A call that broke is followed by another when the caller asks for the next answer; meanwhile poses wait. Of a latest
+    stream a task takes answers as they come; each is acknowledged when the caller takes it.
     """
 
-    def __init__(self, start: Callable[..., Any], exchange: PoseExchange) -> None:
-        self._call = start()
-        self._call._cython_call = _CallThatKeepsItsStatus(self._call._cython_call)
-        self._exchange = exchange
-        self._opening: Any = exchange.opening()
+    def __init__(self, start: Callable[[], Any], exchange: PoseExchange, retries: Retries, address: str) -> None:
+        self.reconnections = 0
+        self._start, self._exchange, self._retries, self._address = start, exchange, retries, address
+        self._is_latest = exchange.mode is StreamMode.LATEST
+        self._unanswered = Unanswered(newest_alone=self._is_latest, goes_on=retries.may_go_on)
+        self._unsent: deque[Any] = deque()  # of the call that is open
         self._sending = asyncio.Lock()
-        self._answers = NewestAnswers(exchange.skip)
+        self._closed = False  # no more poses come
+        self._failure: ClientError | None = None  # that ended the stream
+        self._is_resumed = False  # the call that is open has brought nothing yet, and is not the first one
+        self._waiting_to_go_on = 0  # poses since the call broke
+        self._may_send = asyncio.Event()
+        self._lost = 0
+        self._answers = NewestAnswers()
         self._come = asyncio.Event()  # an answer, or the end of them
         self._taken = asyncio.Event()
         self._taken_sequence = 0
         self._tasks: tuple[asyncio.Task[None], ...] = ()  # of a latest stream, once it has begun
+        self._resending: asyncio.Task[None] | None = None
+        self._open()
 
     async def send(self, message: Any) -> None:
         """Raises StreamEnded where no more are taken."""
+        if self._waiting_to_go_on >= MAX_WAITING and not self._is_latest:
+            await self._may_send.wait()
         async with self._sending:
-            try:
-                if self._opening is not None:
-                    opening, self._opening = self._opening, None
-                    self._begin()
-                    await self._call.write(opening)
-                await self._call.write(message)
-            except asyncio.InvalidStateError:
-                raise StreamEnded(TAKES_NO_MORE) from None
+            if self._failure is not None:
+                raise self._failure
+            if self._closed:
+                raise StreamEnded(TAKES_NO_MORE)
+            self._begin()
+            self._unanswered.sent(message)
+            self._unsent.append(message)
+            if await self._send_waiting():
+                return
+        if not self._retries.may_go_on:
+            raise StreamEnded(TAKES_NO_MORE)
+        self._waiting_to_go_on += 1
 
     async def done_sending(self) -> None:
         """Takes no more poses."""
+        self._closed = True
         async with self._sending:
-            await self._call.done_writing()
+            await self._send_waiting()
 
-    async def receive(self) -> Any:
+    async def receive(self) -> Answer | None:
         """The next answer, of a latest stream the newest one; None after the last one."""
+        if not self._is_latest:
+            return await self._next()
         self._begin()
-        if self._tasks:
-            await self._come.wait()
-            if self._answers:
-                answer = self._answers.take()
-                if not self._answers and not self._tasks[0].done():
-                    self._come.clear()
-                self._taken_sequence = answer.sequence
-                self._taken.set()
-                return answer
-        answer = await self._call.read()
-        return None if answer is grpc.aio.EOF else answer
+        await self._come.wait()
+        if self._answers:
+            answer = self._answers.take()
+            if not self._answers and not self._tasks[0].done():
+                self._come.clear()
+            self._taken_sequence = answer.message.sequence
+            self._taken.set()
+            return answer
+        if self._failure is not None:
+            raise self._failure
+        return None
 
     def take_replaced(self) -> int:
-        """The number of poses replaced here since the last call, and of frames that newer ones took the place of."""
-        return self._answers.take_skipped()
+        """The number of poses since the last call that got no frame: lost with a connection, or replaced by newer
+        ones.
+        """
+        lost, self._lost = self._lost, 0
+        return lost + self._answers.take_skipped()
 
     async def close(self) -> None:
+        self._closed = True
         self._call.cancel()
-        for task in self._tasks:
+        tasks = [task for task in (*self._tasks, self._resending) if task is not None]
+        for task in tasks:
             task.cancel()
-        await asyncio.gather(*self._tasks, return_exceptions=True)
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+    def _open(self) -> None:
+        """Starts a call for the poses that have no answer."""
+        self._unsent = deque([self._exchange.opening(), *self._unanswered.again()])
+        self._lost += self._unanswered.take_lost()
+        self._call = self._start()
+        self._call._cython_call = _CallThatKeepsItsStatus(self._call._cython_call)
+
+    async def _send_waiting(self) -> bool:
+        """Sends what waits; False where the call is over: reading says why."""
+        call = self._call
+        try:
+            while self._unsent:
+                await self._call.write(self._unsent.popleft())
+            if self._closed:
+                await self._call.done_writing()
+        except (asyncio.InvalidStateError, StreamEnded, grpc.RpcError):
+            return call is not self._call  # else another call has begun meanwhile, with all that has no answer
+        return True
+
+    async def _resend(self) -> None:
+        async with self._sending:
+            await self._send_waiting()
+
+    async def _next(self) -> Answer | None:
+        while True:
+            call = self._call
+            try:
+                message = await call.read()
+            except grpc.RpcError as failure:
+                if not await self._go_on(call, error_of_call(failure, self._address)):
+                    return None
+                continue
+            if message is grpc.aio.EOF:
+                return None
+            if self._unanswered.answered(message):
+                self._retries.progress()
+                self.reconnections += self._is_resumed
+                self._is_resumed = False
+                return self._exchange.arrived(message)
+
+    async def _go_on(self, broken: Any, error: ClientError) -> bool:
+        """Starts another call after a pause; False where nothing is left to be asked. Raises what ends the stream."""
+        try:
+            pause_s = self._retries.pause_s(error)
+            if self._closed and not self._unanswered:
+                return False
+            await asyncio.sleep(pause_s)
+            if self._call is broken:
+                self._open()
+                self._is_resumed = True
+                self._waiting_to_go_on = 0
+                self._resending = asyncio.ensure_future(self._resend())
+        except ClientError as final:
+            self._failure = final
+            raise
+        finally:
+            self._may_send.set()
+            self._may_send.clear()
+        return True
 
     def _begin(self) -> None:
-        if self._exchange.mode is StreamMode.LATEST and not self._tasks:
+        if self._is_latest and not self._tasks:
             self._tasks = tuple(map(asyncio.ensure_future, (self._take_answers(), self._acknowledge())))
 
     async def _take_answers(self) -> None:
         try:
-            while (answer := await self._call.read()) is not grpc.aio.EOF:
+            while (answer := await self._next()) is not None:
                 self._answers.put(answer)
                 self._come.set()
-        except grpc.RpcError:
-            pass  # reading once more raises it again, for the caller
+        except ClientError:
+            pass  # the caller is told when there is no answer left
         finally:
             self._come.set()
             self._tasks[1].cancel()
@@ -129,7 +217,5 @@ class PoseCall:
             await self._taken.wait()
             self._taken.clear()
             async with self._sending:
-                try:
-                    await self._call.write(self._exchange.acknowledgement(self._taken_sequence))
-                except (asyncio.InvalidStateError, StreamEnded, grpc.RpcError):
-                    return  # nothing is sent any more
+                self._unsent.append(self._exchange.acknowledgement(self._taken_sequence))
+                await self._send_waiting()

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import Any, Generic, TypeAlias, TypeVar
+from urllib.parse import quote
 
 from ..errors import ClientError, InvalidArgument
 from .retries import Retries
@@ -14,6 +15,7 @@ ApiKey: TypeAlias = str | Callable[[], str]  # of which the function gives one t
 
 DEFAULT_ADDRESS = "localhost:50051"
 DEFAULT_TIMEOUT_S = 30.0
+LONGEST_PAUSE_OF_STREAMS_S = 1.0  # between attempts to go on: a control loop waits
 PAGE_SIZE = 1000  # the most that the service gives at once
 CHANNEL_OPTIONS: tuple[tuple[str, str | int], ...] = (
     ("grpc.max_receive_message_length", -1),  # a frame of float32 outputs may be larger than the usual 4 MiB
@@ -22,6 +24,21 @@ CHANNEL_OPTIONS: tuple[tuple[str, str | int], ...] = (
     ("grpc.initial_reconnect_backoff_ms", 100),
     ("grpc.max_reconnect_backoff_ms", 2_000),
 )
+SCENE_KEY = "x-ultragray-scene"
+Metadata: TypeAlias = tuple[tuple[str, str], ...]
+
+
+def metadata_of(request: Any, api_key: ApiKey | None) -> Metadata:
+    """The metadata of a call: the key, and the scene that the request names, by which a proxy sends the calls of one
+    scene to the same replica.
+
+    `request`: a message, or anything else with the same `scene` or `settings.scene`.
+    """
+    scene = getattr(getattr(request, "settings", request), "scene", "")
+    metadata: Metadata = ((SCENE_KEY, quote(scene, safe="")),) if scene else ()
+    if api_key is None:
+        return metadata
+    return (*metadata, ("x-api-key", api_key if isinstance(api_key, str) else api_key()))
 
 
 class Conversation(ABC, Generic[T]):
@@ -49,3 +66,10 @@ def check_timeout(timeout_s: float) -> float:
     if not timeout_s > 0.0:
         raise InvalidArgument(f"timeout_s must be above 0, got {timeout_s:g}", field="timeout_s")
     return timeout_s
+
+
+def check_reconnect(reconnect_s: float) -> float:
+    """Raises InvalidArgument for less than 0."""
+    if not reconnect_s >= 0.0:
+        raise InvalidArgument(f"reconnect_s must be at least 0, got {reconnect_s:g}", field="reconnect_s")
+    return reconnect_s

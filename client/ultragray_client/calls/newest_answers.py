@@ -3,33 +3,29 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
-from typing import Any
 
-WINDOW = 2  # answers that may wait for the caller: one is on its way while the other is looked at
+from .pose_exchange import Answer
 
 
 class NewestAnswers:
     """Answers in their order; of frames that nobody came for, only the newest one is kept."""
 
-    def __init__(self, skip: Callable[[Any], None]) -> None:
-        """`skip` is called with each frame that is not kept."""
-        self._skip = skip
-        self._waiting: deque[Any] = deque()
+    def __init__(self) -> None:
+        self._waiting: deque[Answer] = deque()
         self._skipped = 0
 
     def __len__(self) -> int:
         return len(self._waiting)
 
-    def put(self, answer: Any) -> None:
+    def put(self, answer: Answer) -> None:
         """An answer has come. It takes the place of a frame; a refusal that waits is kept, and told before it."""
-        if self._waiting and not self._waiting[-1].HasField("error") and not answer.HasField("error"):
+        if self._waiting and not any(one.message.HasField("error") for one in (self._waiting[-1], answer)):
             skipped = self._waiting.pop()
-            self._skipped += 1 + skipped.dropped
-            self._skip(skipped)
+            self._skipped += 1 + skipped.message.dropped
+            skipped.skip()
         self._waiting.append(answer)
 
-    def take(self) -> Any:
+    def take(self) -> Answer:
         """The oldest of those that are kept."""
         return self._waiting.popleft()
 

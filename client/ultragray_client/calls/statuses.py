@@ -26,6 +26,7 @@ _TLS_FAILURES = {  # by a part of what grpc says
 }
 _NO_ADDRESS = "failed to connect to all addresses"
 _CUT_OFF = ("Socket closed", "Connection reset")  # all that grpc says where a server wanted TLS, or a certificate
+_BROKEN = "Received RST_STREAM"  # with any status: a proxy lost the service in the middle of a call
 _BY_REASON = {error.reason: error for error in ERRORS}
 _BY_STATUS = {error.grpc_status: error for error in reversed(ERRORS)}  # of several, the root of the branch
 
@@ -43,7 +44,7 @@ def error_of_call(error: grpc.RpcError, address: str) -> ClientError:
     """The error of a failed call, from its ErrorInfo and RetryInfo, else from its status."""
     status, sentence = error.code().name, error.details() or ""
     reason, field, retry_after_s = _details(dict(error.trailing_metadata() or ()).get(_DETAILS_KEY, b""))
-    if reason is None and status == "UNAVAILABLE":
+    if reason is None and (status == "UNAVAILABLE" or sentence.startswith(_BROKEN)):
         return _unreachable(sentence, address)
     cls = _BY_REASON.get(reason or status) or _BY_STATUS.get(status, ClientError)
     return cls(sentence, reason=reason or status, field=field, retry_after_s=retry_after_s)

@@ -91,10 +91,16 @@ class Client:
         mode: StreamMode | str = "ordered",
         timeout_s: float | None = None,
         shared_memory: bool = False,
+        reconnect_s: float | None = None,
     ) -> FrameStream:
         """A stream of poses: `with client.stream("demo", mode="latest") as stream: stream.send(pose)`.
 
         `timeout_s` is the deadline of the whole stream; None: it has none. Otherwise as `render`.
+
+        Where the connection is lost, or the service stops, the stream goes on over another connection, with the same
+        sequences: it sends the poses without an answer again, a latest one the newest of them alone, and the others
+        count as dropped. `reconnect_s`: for so long it tries, before `receive` raises why it cannot (0: at once; None:
+        the client's `timeout_s`). `stream.reconnections` tells how often it went on.
 
         `shared_memory`: pixels come through memory that is shared with the service instead of the connection, which
         takes a Linux host that both run on, as the same user, and a loopback `address`; else InvalidArgument. The
@@ -102,8 +108,8 @@ class Client:
         them. While 16 frames are held, others come through the connection, as do those of more than 16 MiB.
         """
         exchange = PoseExchange(settings_message(scene, settings), mode, shared_memory=shared_memory)
-        call = self._connection.pose_call(self._calls.RenderStream, exchange, timeout_s)
-        return FrameStream(self._connection.address, exchange, call)
+        call = self._connection.pose_call(self._calls.RenderStream, exchange, timeout_s, reconnect_s)
+        return FrameStream(exchange, call)
 
     def who_am_i(self, *, timeout_s: float | None = None) -> Me:
         """The name and the role that the key stands for."""

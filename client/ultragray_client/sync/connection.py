@@ -6,10 +6,17 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Generator, Iterator
 from contextlib import contextmanager
-from functools import partial
 from typing import Any, TypeAlias, TypeVar
 
-from ..calls.connection import PAGE_SIZE, ApiKey, Conversation, check_timeout
+from ..calls.connection import (
+    LONGEST_PAUSE_OF_STREAMS_S,
+    PAGE_SIZE,
+    ApiKey,
+    Conversation,
+    check_reconnect,
+    check_timeout,
+    metadata_of,
+)
 from ..calls.pose_exchange import PoseExchange
 from ..calls.retries import Retries
 from ..calls.statuses import client_errors
@@ -37,20 +44,20 @@ class Connection:
 
     def answer(self, call: Call, request: Any, timeout_s: float | None) -> Any:
         """The answer to a request, within `timeout_s` (None: the client's) for all attempts together."""
-        return self._answer(call, lambda: request, self._short_retries(timeout_s))
+        return self._answer(call, lambda: request, request, self._short_retries(timeout_s))
 
     def delete(self, call: Call, request: Any, timeout_s: float | None) -> None:
         """Asks for a deletion. What is not found any more where an attempt broke off was deleted by that."""
         retries = self._short_retries(timeout_s)
         try:
-            self._answer(call, lambda: request, retries)
+            self._answer(call, lambda: request, request, retries)
         except NotFound:
             if not retries.was_unavailable:
                 raise
 
     def upload(self, call: Call, messages: Callable[[], Iterator[Any]], timeout_s: float | None) -> Any:
         """The answer to messages that each attempt sends from the first one on; None: as long as it takes."""
-        return self._answer(call, messages, self._retries(timeout_s))
+        return self._answer(call, messages, None, self._retries(timeout_s))
 
     def listed(
         self, call: Call, request: Any, items: str, timeout_s: float | None, *, limit: int | None = None
@@ -79,34 +86,47 @@ class Connection:
             except ClientError as error:
                 time.sleep(conversation.pause_s(error, retries))
 
-    def pose_call(self, call: Call, exchange: PoseExchange, timeout_s: float | None) -> PoseCall:
-        """The call of a stream, which ends after `timeout_s`; None: it may last."""
-        timeout = None if timeout_s is None else check_timeout(timeout_s)
-        return PoseCall(partial(call, timeout=timeout, metadata=self._metadata()), exchange)
+    def pose_call(
+        self, call: Call, exchange: PoseExchange, timeout_s: float | None, reconnect_s: float | None
+    ) -> PoseCall:
+        """The calls of a stream, one after another.
 
-    def _metadata(self) -> tuple[tuple[str, str], ...]:
-        if self._api_key is None:
-            return ()
-        return (("x-api-key", self._api_key if isinstance(self._api_key, str) else self._api_key()),)
+        They end after `timeout_s` (None: they may last), or when no other call has brought anything for `reconnect_s`
+        after one that broke (None: the client's timeout_s).
+        """
+        retries = Retries(
+            None if timeout_s is None else check_timeout(timeout_s),
+            self._timeout_s if reconnect_s is None else check_reconnect(reconnect_s),
+            longest_pause_s=LONGEST_PAUSE_OF_STREAMS_S,
+        )
+
+        def start(*messages: Any) -> Any:
+            return call(*messages, timeout=retries.remaining_s(), metadata=metadata_of(exchange, self._api_key))
+
+        return PoseCall(start, exchange, retries, self.address)
 
     def _retries(self, timeout_s: float | None) -> Retries:
-        return Retries(None if timeout_s is None else check_timeout(timeout_s), self._timeout_s)
+        if timeout_s is None:
+            return Retries(None, self._timeout_s)
+        return Retries(check_timeout(timeout_s), None)
 
     def _short_retries(self, timeout_s: float | None) -> Retries:
         return self._retries(self._timeout_s if timeout_s is None else timeout_s)
 
-    def _answer(self, call: Call, request: Callable[[], Any], retries: Retries) -> Any:
+    def _answer(self, call: Call, content: Callable[[], Any], about: Any, retries: Retries) -> Any:
+        """The answer to what `content` gives for each attempt; `about` names the scene, if it is about one."""
         while True:
+            metadata = metadata_of(about, self._api_key)
             try:
                 with client_errors(self.address):
-                    return call(request(), timeout=retries.remaining_s(), metadata=self._metadata())
+                    return call(content(), timeout=retries.remaining_s(), metadata=metadata)
             except ClientError as error:
                 time.sleep(retries.pause_s(error))
 
     @contextmanager
     def _streamed(self, call: Call, request: Any, retries: Retries) -> Iterator[Any]:
         """The messages that a call streams; the call ends with the context."""
-        messages = call(request, timeout=retries.remaining_s(), metadata=self._metadata())
+        messages = call(request, timeout=retries.remaining_s(), metadata=metadata_of(request, self._api_key))
         try:
             with client_errors(self.address):
                 yield messages

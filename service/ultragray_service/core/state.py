@@ -53,6 +53,7 @@ class Phase(Enum):
 
     STARTING = "starting"
     SERVING = "serving"
+    LEAVING = "leaving"  # serves, and is not ready: proxies send what is new elsewhere
     DRAINING = "draining"
 
 
@@ -101,7 +102,7 @@ class Service:
         self.jobs = Jobs(settings, store, self.datasets)
         self.readiness = Readiness(
             lambda: self.jobs.database,
-            require_serving=self.require_serving,
+            require_serving=self._require_staying,
             require_frames=self.require_frames,
             without_jobs=settings.ready_without_jobs,
         )
@@ -163,6 +164,12 @@ class Service:
             raise NotReady("the service is starting")
         if self.phase is Phase.DRAINING:
             raise Draining("the service is stopping")
+
+    def _require_staying(self) -> None:
+        """Raises NotReady or Draining, the latter also while the service still serves and will stop."""
+        self.require_serving()
+        if self.phase is Phase.LEAVING:
+            raise Draining("the service will stop; it still answers")
 
     async def open(self) -> None:
         """Opens the jobs' database, and reads who may do what; before any door opens. Raises StartupFailed."""
@@ -294,6 +301,10 @@ class Service:
     async def _forget(self, is_doomed: Callable[[str], bool]) -> None:
         for prepared in self._prepared:
             await prepared.forget(is_doomed)
+
+    def begin_leaving(self) -> None:
+        """From now on the service is not ready, and answers as before."""
+        self.phase = Phase.LEAVING
 
     def begin_draining(self) -> None:
         """From now on frames are refused with Draining; streams end after the frames they have in flight."""

@@ -1,0 +1,67 @@
+"""A proxy between a client and its service, which can break connections and lead elsewhere."""
+
+from __future__ import annotations
+
+import socket
+import threading
+from contextlib import suppress
+
+
+class Proxy:
+    """Passes bytes on to a service; `cut_after` breaks a connection once so many came back over it."""
+
+    def __init__(self, target: str) -> None:
+        self.lead_to(target)
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self._open: list[socket.socket] = [self._listener]
+        self._left: int | None = None
+        self.cuts = 0
+        self.address = f"127.0.0.1:{self._listener.getsockname()[1]}"
+        threading.Thread(target=self._accept, daemon=True).start()
+
+    def lead_to(self, target: str) -> None:
+        """New connections lead to another service (HOST:PORT) from now on."""
+        host, _, port = target.rpartition(":")
+        self._target = (host, int(port))
+
+    def cut_after(self, count: int) -> None:
+        self._left = count
+
+    def close(self) -> None:
+        for one in self._open:
+            with suppress(OSError):  # it is shut already
+                one.shutdown(socket.SHUT_RDWR)  # closing alone would not wake those that wait for it
+            one.close()
+
+    def _accept(self) -> None:
+        while True:
+            try:
+                near, _ = self._listener.accept()
+            except OSError:
+                return
+            try:
+                far = socket.create_connection(self._target)
+            except OSError:  # nobody is there
+                near.close()
+                continue
+            self._open += [near, far]
+            threading.Thread(target=self._pass, args=(near, far, False), daemon=True).start()
+            threading.Thread(target=self._pass, args=(far, near, True), daemon=True).start()
+
+    def _pass(self, source: socket.socket, sink: socket.socket, counted: bool) -> None:
+        try:
+            while data := source.recv(16384):
+                sink.sendall(data)
+                if counted and self._left is not None:
+                    self._left -= len(data)
+                    if self._left < 0:
+                        self._left = None
+                        self.cuts += 1
+                        break
+        except OSError:
+            pass
+        for one in (source, sink):
+            try:
+                one.shutdown(socket.SHUT_RDWR)
+            except OSError:
+                continue

@@ -1,0 +1,244 @@
+"""Streams whose connection is lost, or whose service stops: they go on elsewhere, each pose with one frame."""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent import futures
+from typing import Any
+
+import grpc
+import numpy as np
+import pytest
+
+from ultragray_client import RenderSettings, errors
+from ultragray_client.calls.unanswered import Unanswered
+from ultragray_proto.v1 import rendering_pb2
+
+from ..service.conftest import RunningService, StartService
+from ..waiting import at_this_load, wait_until
+from .conftest import KEY
+from .proxy import Proxy
+from .test_client_render import moved
+from .test_client_shared_memory import is_shared
+
+SMALL = RenderSettings(height=16, width=16)
+RESUMES_WITHIN_S = 2.0
+
+
+@pytest.fixture
+def proxy(client_service: RunningService) -> Iterator[Proxy]:
+    proxy = Proxy(client_service.grpc)
+    yield proxy
+    proxy.close()
+
+
+@pytest.fixture
+def far_client(make_client: Callable[..., Any], proxy: Proxy) -> Any:
+    return make_client(proxy.address, api_key=KEY, timeout_s=60.0)
+
+
+def test_an_ordered_stream_gets_the_frame_of_each_pose_once(far_client: Any, proxy: Proxy) -> None:
+    shifts = np.linspace(-4, 4, 300)
+    with far_client.stream("demo", SMALL) as stream:
+
+        def send() -> None:
+            for x in shifts:
+                stream.send(moved(x))
+            stream.done_sending()
+
+        sender = threading.Thread(target=send)
+        sender.start()
+        frames = []
+        for frame in stream:
+            frames.append(frame)
+            if len(frames) in (30, 90, 200):
+                proxy.cut_after(3000)  # some frames later, in the middle of one
+        sender.join()
+    assert [frame.sequence for frame in frames] == list(range(1, 301))
+    assert [frame.pose[0, 3] for frame in frames] == shifts.tolist()
+    assert {frame.dropped for frame in frames} == {0}
+    assert stream.reconnections == proxy.cuts == 3
+
+
+def test_a_latest_stream_goes_on_with_the_newest_pose(far_client: Any, proxy: Proxy) -> None:
+    frames: list[Any] = []
+    with far_client.stream("demo", SMALL, mode="latest") as stream:
+        for number, x in enumerate(np.linspace(-4, 4, 300), start=1):
+            stream.send(moved(x))
+            if number % 3 == 0:
+                frames.append(stream.receive())
+            if number in (60, 150):
+                proxy.cut_after(0)
+        stream.done_sending()
+        frames += list(stream)
+    sequences = [frame.sequence for frame in frames]
+    assert sequences == sorted(set(sequences))
+    assert sequences[-1] == 300
+    for frame in frames:
+        assert frame.pose[0, 3] == np.linspace(-4, 4, 300)[frame.sequence - 1]
+    assert len(frames) + sum(frame.dropped for frame in frames) == 300
+    assert stream.reconnections == proxy.cuts == 2
+
+
+def test_errors_in_place_of_frames_come_once(far_client: Any, proxy: Proxy) -> None:
+    told: list[tuple[int, str]] = []
+    with far_client.stream("demo", SMALL) as stream:
+        for number in range(1, 41):
+            stream.send(2 * np.eye(4) if number % 4 == 0 else moved(0.0))
+        stream.done_sending()
+        proxy.cut_after(6000)
+        for _ in range(40):
+            try:
+                told.append((stream.receive().sequence, ""))
+            except errors.InvalidPose as error:
+                told.append((error.sequence or 0, error.reason))
+        with pytest.raises(errors.StreamEnded):
+            stream.receive()
+    assert proxy.cuts == 1
+    assert told == [(number, "INVALID_POSE" if number % 4 == 0 else "") for number in range(1, 41)]
+
+
+@pytest.mark.parametrize("mode", ["ordered", "latest"])
+def test_a_stream_with_shared_memory_goes_on_with_new_memory(far_client: Any, proxy: Proxy, mode: str) -> None:
+    def frame_of(stream: Any, x: float) -> Any:
+        stream.send(moved(x))
+        return stream.receive()
+
+    with far_client.stream("demo", SMALL) as ordinary:
+        expected = [frame_of(ordinary, x)["bmode"] for x in range(12)]
+    with far_client.stream("demo", SMALL, mode=mode, shared_memory=True) as stream:
+        frames = []
+        for x in range(12):
+            frames.append(frame_of(stream, x))
+            if x == 5:
+                proxy.cut_after(0)
+        assert stream.reconnections == proxy.cuts == 1
+    assert all(map(is_shared, frames))
+    for frame, pixels in zip(frames, expected, strict=True):
+        np.testing.assert_array_equal(frame["bmode"], pixels)
+
+
+@pytest.mark.parametrize("mode", ["ordered", "latest"])
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+def test_a_stream_goes_on_at_another_service(
+    make_client: Callable[..., Any], start_service: StartService, number: signal.Signals, mode: str
+) -> None:
+    first, second = start_service(), start_service()
+    second_data = second.data_folder
+    proxy = Proxy(first.grpc)
+    client = make_client(proxy.address, timeout_s=60.0)
+    with client.stream("demo", SMALL, mode=mode) as stream:
+        for x in range(5):
+            stream.send(moved(x))
+            stream.receive()
+        proxy.lead_to(second.grpc)
+        stream.send(moved(5.0))
+        first.process.send_signal(number)
+        began = time.monotonic()
+        frames = [stream.receive()]
+        while not stream.reconnections:
+            stream.send(moved(6.0))
+            frames.append(stream.receive())
+        assert time.monotonic() - began < at_this_load(RESUMES_WITHIN_S)
+        stream.send(moved(7.0))
+        frames.append(stream.receive())
+    assert second_data == first.data_folder
+    assert [frame.sequence for frame in frames] == list(range(6, 6 + len(frames)))
+    assert [frame.pose[0, 3] for frame in frames] == [5.0, *[6.0] * (len(frames) - 2), 7.0]
+    proxy.close()
+
+
+@pytest.mark.parametrize("mode", ["ordered", "latest"])
+def test_patience_ends(make_client: Callable[..., Any], client_service: RunningService, mode: str) -> None:
+    proxy = Proxy(client_service.grpc)
+    client = make_client(proxy.address, api_key=KEY)
+    with client.stream("demo", SMALL, mode=mode, reconnect_s=1.0) as stream:
+        stream.send(moved(0.0))
+        assert stream.receive().sequence == 1
+        proxy.close()
+        began = time.monotonic()
+        with pytest.raises(errors.Unreachable):
+            stream.receive()
+        assert time.monotonic() - began < at_this_load(4.0)
+        with pytest.raises(errors.Unreachable):
+            stream.send(moved(0.0))
+    with pytest.raises(errors.InvalidArgument, match="reconnect_s"):
+        client.stream("demo", reconnect_s=-1.0)
+
+
+def test_a_stream_that_has_all_its_frames_asks_nobody(far_client: Any, proxy: Proxy) -> None:
+    with far_client.stream("demo", SMALL) as stream:
+        stream.send(moved(0.0))
+        stream.receive()
+        proxy.close()
+        stream.done_sending()
+        with pytest.raises(errors.StreamEnded):
+            stream.receive()
+        assert stream.reconnections == 0
+
+
+def test_a_sender_may_be_ahead_while_nobody_reads(far_client: Any, proxy: Proxy) -> None:
+    with far_client.stream("demo", SMALL) as stream:
+        stream.send(moved(0.0))
+        wait_until(lambda: stream.receive().sequence == 1)
+        proxy.cut_after(0)
+        for x in range(30):
+            stream.send(moved(x))
+            time.sleep(0.01)
+        stream.done_sending()
+        assert [frame.pose[0, 3] for frame in stream] == list(range(30))
+        assert stream.reconnections == proxy.cuts == 1
+
+
+def test_a_pose_is_sent_again_with_what_is_left_of_its_time() -> None:
+    unanswered = Unanswered(newest_alone=False)
+    unanswered.sent(rendering_pb2.RenderStreamRequest(sequence=1, timeout_ms=5000.0))
+    unanswered.sent(rendering_pb2.RenderStreamRequest(sequence=2, timeout_ms=1.0))
+    unanswered.sent(rendering_pb2.RenderStreamRequest(sequence=3))
+    time.sleep(0.05)
+    first, second, third = unanswered.again()
+    assert 1000.0 < first.timeout_ms <= 4950.0
+    assert 0.0 < second.timeout_ms < 0.01  # which the service refuses, as it came too late
+    assert not third.HasField("timeout_ms")
+    unanswered.answered(rendering_pb2.Frame(sequence=2))
+    assert [message.sequence for message in unanswered.again()] == [1, 3]
+
+
+class _Recorder(grpc.GenericRpcHandler):  # type: ignore[misc]
+    """Notes the metadata of every call, and refuses it."""
+
+    def __init__(self) -> None:
+        self.scenes: dict[str, list[str]] = {}
+
+    def service(self, details: Any) -> Any:
+        named = [value for key, value in details.invocation_metadata if key == "x-ultragray-scene"]
+        self.scenes.setdefault(details.method.rpartition("/")[2], []).extend(named)
+        return None
+
+
+def test_every_call_about_a_scene_names_it_to_proxies(make_client: Callable[..., Any]) -> None:
+    recorder = _Recorder()
+    server = grpc.server(futures.ThreadPoolExecutor(2), handlers=[recorder])
+    client = make_client(f"127.0.0.1:{server.add_insecure_port('127.0.0.1:0')}")
+    server.start()
+    about = "liver 2/ö"
+    with client.stream(about) as stream:
+        calls = [
+            stream.receive,
+            lambda: client.render(about, moved(0.0)),
+            lambda: next(client.render_batch(about, [moved(0.0)])),
+            lambda: client.scenes.get(about),
+            lambda: client.scenes.load(about),
+            lambda: client.scenes.list(),
+            lambda: client.jobs.list(),
+        ]
+        for call in calls:
+            with pytest.raises(errors.ClientError, match="Method"):
+                call()
+    server.stop(None)
+    quoted = ["liver%202%2F%C3%B6"]
+    expected = dict.fromkeys(("RenderStream", "Render", "RenderBatch", "GetScene", "LoadScene"), quoted)
+    assert recorder.scenes == {**expected, "ListScenes": [], "ListJobs": []}
