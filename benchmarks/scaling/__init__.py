@@ -8,9 +8,9 @@
     routing.py     event by event: the replica of every request and stream, replicas that die and join
     queues.py      pose by pose: how long each waits in its replica
     outcome.py     one run in figures, several runs in means with confidence
-    theory.py      formulas for cases that are known, and how near the simulation comes
-    study.py       the runs that are made
-    tables.py      their figures as Markdown; picture.py draws them
+    study.py       a case, and one run of it; cases.py has all that are run
+    theory.py      formulas for cases with known answers; checks.py compares the simulation with them
+    tables.py      the figures as Markdown; picture.py draws them
 
 `python benchmarks/simulation.py` runs it; docs/scaling.md says what follows.
 """

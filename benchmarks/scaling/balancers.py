@@ -83,8 +83,9 @@ class Hashed:
 
 
 class BoundedLoad:
-    """The home of a scene unless it has more open requests than its share, `factor` per cent of the mean; else the first
-    replica below its share in an order that depends on the scene alone.
+    """The home of a scene, unless it has more open requests than its share, which is `factor` per cent of the mean.
+
+    Then it is the first replica below its share in an order that depends on the scene alone.
 
     Envoy does not take the next on the ring: it shuffles all replicas by the hash of the key, so that the scenes of a
     full replica spread over all others.
@@ -111,30 +112,32 @@ class BoundedLoad:
             return home
         if (order := self._orders.get(scene)) is None:
             order = self._orders[scene] = _Order(self._numbers, self._seed * 2**32 + scene)
-        place = 0
-        while True:  # ends: all shares together are more than all open requests
-            replica = order[place]
+        for replica in order.drawn:
             if opened[replica] <= shares[kind[replica]]:
                 return replica
-            place += 1
+        while opened[replica := order.draw()] > shares[kind[replica]]:
+            pass  # ends: all shares together are more than all open requests
+        return replica
 
 
 class _Order:
-    """A shuffle that is made as far as it is needed. Each draw is scaled to the number of replicas, as Envoy does it:
-    where one joins or leaves, the order changes in part."""
+    """A shuffle of the replicas that is made as far as it is needed.
+
+    Each draw is scaled to the number of replicas, as in Envoy: where one joins or leaves, the order changes in part.
+    """
 
     def __init__(self, numbers: Sequence[int], seed: int) -> None:
+        self.drawn: list[int] = []
         self._numbers = list(numbers)
-        self._made = 0
         self._random = random.Random(seed)
 
-    def __getitem__(self, place: int) -> int:
-        numbers = self._numbers
-        while self._made <= place:
-            other = self._made + int(self._random.random() * (len(numbers) - self._made))
-            numbers[self._made], numbers[other] = numbers[other], numbers[self._made]
-            self._made += 1
-        return numbers[place]
+    def draw(self) -> int:
+        """The next replica."""
+        numbers, first = self._numbers, len(self.drawn)
+        other = first + int(self._random.random() * (len(numbers) - first))
+        numbers[first], numbers[other] = numbers[other], numbers[first]
+        self.drawn.append(numbers[first])
+        return numbers[first]
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from .costs import SceneCosts
 from .routing import PATIENCE_S, Routed
 from .workload import Floats, Integers, Traffic, Workload
 
-_STUDENTS_T = {3: 4.303, 5: 2.776}  # 97.5% quantiles of the t distribution, by the number of runs
+_STUDENTS_T = {3: 4.303, 5: 2.776}  # 97.5% quantiles of the t distribution, by the number of values
 
 
 @dataclass(frozen=True)
@@ -153,9 +153,12 @@ def _work(
 
 def with_confidence(outcomes: Sequence[Outcome]) -> dict[str, list[float]]:
     """Of each figure the mean over runs, and half the width of its 95% confidence interval."""
-    found = {}
-    for field in fields(Outcome):
-        values = np.array([asdict(one)[field.name] for one in outcomes])
-        half = _STUDENTS_T[len(values)] * values.std(ddof=1) / math.sqrt(len(values))
-        found[field.name] = [float(f"{values.mean():.5g}"), float(f"{half:.2g}")]
-    return found
+    return {
+        field.name: mean_with_confidence([getattr(one, field.name) for one in outcomes]) for field in fields(Outcome)
+    }
+
+
+def mean_with_confidence(values: Sequence[float]) -> list[float]:
+    """The mean of 3 or 5 independent values, and half the width of its 95% confidence interval."""
+    half = _STUDENTS_T[len(values)] * float(np.std(values, ddof=1)) / math.sqrt(len(values))
+    return [float(f"{np.mean(values):.5g}"), float(f"{half:.2g}")]

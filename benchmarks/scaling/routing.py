@@ -1,7 +1,7 @@
 """Event by event: which replica each request and stream gets, and where it finds the scene.
 
-Waiting in the queues of replicas is computed afterwards (queues.py). While a request is open, an Envoy counts it for the
-time that it would take with the mean wait of so many streams (Pollaczek and Khinchine), and the fetch.
+Waiting in the queues of replicas is computed afterwards (queues.py). An Envoy counts a request as open for the time of
+its fetch, its work, and the mean wait at a replica with so many streams (Pollaczek and Khinchine).
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
@@ -18,7 +18,7 @@ from .routing import Change, Cluster, route
 from .workload import GRPC, HTTP, Workload, draw_traffic
 
 SETTLING_S = 60.0  # in which the caches fill
-MEASURED_S = 10.0
+MEASURED_S = 6.0
 HOT_SCENES = 10  # that have several keys, where any have
 
 
@@ -30,7 +30,7 @@ class Policy:
     factor: int | None = DEFAULTS.hash_balance_factor
     ring_size: int = DEFAULTS.minimum_ring_size
     by_hostname: bool = DEFAULTS.hash_by_hostname
-    keys: int = 1  # of each of the HOT_SCENES, so that they have as many homes
+    keys: int = DEFAULTS.keys_of_hot_scene  # of each of the HOT_SCENES, so that they have as many homes
     weighted: bool = True  # by the speed of the replicas
 
     def balancer(self, replicas: Replicas, door: int, scenes: int, seed: int) -> Balancer:
@@ -54,15 +54,14 @@ class Policy:
 class Case:
     """One row of a table, run with several seeds."""
 
-    name: str
-    policy: Policy = Policy()
-    workload: Workload = Workload()
+    policy: Policy = field(default_factory=Policy)
+    workload: Workload = field(default_factory=Workload)
     replicas: int = 1000
-    sizes: CacheSizes = CacheSizes()
-    storage: Storage = Storage()
+    sizes: CacheSizes = field(default_factory=CacheSizes)
+    storage: Storage = field(default_factory=Storage)
     proxies: int = 1
     speeds: tuple[float, ...] = (1.0,)  # of the replicas in turn
-    changes: tuple[Change, ...] = field(default=())
+    changes: tuple[Change, ...] = ()
     measured_s: float = MEASURED_S
 
 
