@@ -26,7 +26,7 @@ KEEP = @$(if $(RECORD),$(BIN)/python benchmarks/record.py,:)
 MINUTES ?= 30
 
 .DEFAULT_GOAL := help
-.PHONY: ALWAYS help serve console test test-fast test-long test-console test-faults test-fuzz test-soak test-overload test-newcomer check check-lint check-types check-generated check-web check-figures format bench bench-record bench-console console-picture bench-cuda results ablations poses confidence libraries figures demo-scene docs generate packages clean
+.PHONY: ALWAYS help serve console test test-fast test-long test-console test-faults test-fuzz test-soak test-overload test-newcomer check check-lint check-types check-generated check-web check-figures format bench bench-record bench-console console-picture bench-cuda results ablations poses confidence libraries simulation figures demo-scene docs generate packages clean
 
 help:  ## say what there is
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
@@ -165,6 +165,12 @@ libraries: $(VENV)/installed-dev  ## the image processing here beside scikit-ima
 	$(BIN)/python benchmarks/libraries.py
 	@$(BIN)/python benchmarks/documents.py --show libraries
 	$(KEEP) libraries
+
+simulation: $(VENV)/installed-dev  ## simulate 1,000 replicas behind Envoy, for docs/scaling.md; takes some minutes (ARGS="--only load" for one study)
+	$(READY)
+	$(BIN)/python benchmarks/simulation.py $(ARGS)
+	@$(BIN)/python benchmarks/documents.py --show simulation
+	$(KEEP) simulation
 
 demo-scene: $(VENV)/installed  ## simulate the phantom, train the demo scene from it and put it in its place
 	$(BIN)/python -m ultragray.demo.make

@@ -23,6 +23,7 @@ import performance
 import poses
 import results_tables
 from registry import FIGURES, ROOT, Document, described, heads
+from scaling import tables
 from ultragray.files.atomic import write_whole
 
 
@@ -61,6 +62,10 @@ BLOCKS = {
     "ablations": Block("ablations", ablations.tables),
     "poses": Block("poses", poses.table),
     "confidence": Block("confidence", confidence.tables),
+    "simulated costs": Block("simulation", tables.costs),
+    "simulation against theory": Block("simulation", tables.checks),
+    "simulated defaults": Block("simulation", tables.defaults),
+    **{f"simulated {name}": Block("simulation", tables.study(name)) for name in tables.STUDIES},
 }
 _PLACE = re.compile(r"(?<=<!-- measured: )([\w ,-]+?)( -->\n).*?(?=<!-- end -->)", flags=re.DOTALL)
 Read: TypeAlias = Callable[[str], Any]  # a file of FIGURES by its name

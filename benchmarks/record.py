@@ -15,6 +15,7 @@ import sys
 
 import confidence
 import documents
+import simulation
 from registry import FIGURES, Document, Figures
 from ultragray.files.atomic import write_whole
 from ultragray_service.bench.measured import changed_sources, commit
@@ -40,6 +41,8 @@ def main() -> None:
             documents.write()
             if "confidence" in taken:
                 confidence.draw(taken["confidence"])
+            if "simulation" in taken:
+                simulation.draw(taken["simulation"])
     except NotRecordable as error:
         sys.exit(f"error: {error}")
 

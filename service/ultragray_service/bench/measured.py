@@ -22,6 +22,7 @@ _WRITTEN_BY_RECORDING = (
     "README.md",
     "docs/*.md",
     "docs/images/*_reliability.png",
+    "docs/images/scaling.png",
 )
 
 
