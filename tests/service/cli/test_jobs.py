@@ -221,7 +221,7 @@ def test_a_watch_outlives_a_restart_of_the_service(start_service: StartService, 
     )
     try:
         assert watching.stderr is not None
-        assert watching.stderr.readline() == f"{job} queued\n"
+        assert watching.stderr.readline() == f"{job} queued waits for a worker: none is running\n"
         first.process.kill()
         first.process.wait(WAIT_S)
         time.sleep(0.5)

@@ -89,7 +89,8 @@ def adopt_older(jobs: JobDatabase) -> None:
     """Makes jobs that wait for a worker of an older release those of this one, which can do them too."""
     older = sa.and_(_has_status(*database.QUEUED), _ROWS.application_version.in_(database.OLDER_VERSIONS))
     with jobs.engine.begin() as connection:
-        for job_id, attributes in connection.execute(sa.select(_ROWS.workflow_uuid, _ROWS.attributes).where(older)):
+        found = connection.execute(sa.select(_ROWS.workflow_uuid, _ROWS.attributes).where(older)).all()
+        for job_id, attributes in found:
             adopted = sa.update(WORKFLOWS).where(_ROWS.workflow_uuid == job_id, older)
             key = Demand.of(attributes["specification"]).key
             connection.execute(adopted.values(application_version=database.VERSION, queue_partition_key=key))
