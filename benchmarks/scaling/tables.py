@@ -44,8 +44,9 @@ _BRIEFLY = (*_BALANCE, "pose_p99_ms", "unanswered", "request_p99_ms")
 
 # Of each study: the head of its first column, and the figures that it shows.
 STUDIES: dict[str, tuple[str, tuple[str, ...]]] = {
-    "balance": ("Policy; exponent", (*_BALANCE, "replicas_of_hottest")),
-    "latency": ("Policy; exponent", (*_POSES, *_REQUESTS)),
+    "balance": ("Policy", (*_BALANCE, "replicas_of_hottest")),
+    "latency": ("Policy", (*_POSES, *_REQUESTS)),
+    "exponents": ("Policy; exponent", (*_BRIEFLY, "replicas_of_hottest")),
     "factors": ("Bound of the mean", (*_BRIEFLY, "replicas_of_hottest")),
     "rings": ("Points of the ring", _BRIEFLY),
     "doors": ("Replicas are hashed", _BRIEFLY),
