@@ -14,8 +14,8 @@ class Defaults:
     hash_by_hostname: bool = True  # so that a scene has the same home behind HTTP's port and gRPC's
     keys_of_hot_scene: int = 1  # the bound spreads it
     memory_budget_mb: int = 4096  # of loaded scenes, the service's own default
-    utilisation: float = 0.6  # share of its time that a replica works; more replicas are wanted above
-    queue_ms: float = 4.0  # mean wait of a frame; more replicas are wanted above
+    utilisation: float = 0.5  # share of its time that a replica works; more replicas are wanted above
+    queue_ms: float = 3.0  # mean wait of a frame; more replicas are wanted above
 
 
 DEFAULTS = Defaults()
