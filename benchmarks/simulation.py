@@ -21,9 +21,8 @@ from registry import FIGURES, ROOT
 from scaling import checks, picture
 from scaling.cases import STUDIES
 from scaling.costs import SceneCosts, Storage, measured_costs
-from scaling.defaults import DEFAULTS
 from scaling.outcome import Outcome, mean_with_confidence, with_confidence
-from scaling.study import Case, run
+from scaling.study import Case, Policy, run
 from scaling.workload import Workload
 from ultragray.files.atomic import write_whole
 from ultragray_service.bench.measured import measured
@@ -50,7 +49,7 @@ def main() -> None:
         "costs": [asdict(one) for one in costs],
         "storage": asdict(Storage()),
         "workload": asdict(Workload()),
-        "defaults": asdict(DEFAULTS),
+        "policy": asdict(Policy()),
         "checks": {
             name: {"known": known, "simulated": mean_with_confidence([one[name] for one in answers])}
             for name, (known, _) in checks.CHECKS.items()

@@ -63,11 +63,9 @@ STUDIES: Mapping[str, Mapping[str, Case]] = {
         "263 a replica": QUARTER,
     },
     "doors": {
-        "both by hostname": QUARTER,
-        "each by its address and port": _with(Policy(by_hostname=False)),
-        "both by hostname, all streams by gRPC": replace(
-            QUARTER, workload=replace(QUARTER.workload, websocket_share=0.0)
-        ),
+        "with the port of the door": QUARTER,
+        "without ports": _with(Policy(one_home=True)),
+        "with the port, all streams by gRPC": replace(QUARTER, workload=replace(QUARTER.workload, websocket_share=0.0)),
     },
     "hot scenes": {
         "1": QUARTER,

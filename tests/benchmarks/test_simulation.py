@@ -181,12 +181,12 @@ def test_of_two_replicas_the_one_with_fewer_open_requests_is_taken() -> None:
     assert counts[0] / 4_000 == pytest.approx(1.0 - 0.75**2, abs=0.03)
 
 
-def test_both_doors_have_the_same_homes_only_where_hostnames_are_hashed() -> None:
+def test_both_doors_have_the_same_homes_only_where_ports_are_not_hashed() -> None:
     those = balancers.Replicas.equal(range(REPLICAS))
-    for by_hostname in (True, False):
-        policy = study.Policy(factor=None, by_hostname=by_hostname)
+    for one_home in (True, False):
+        policy = study.Policy(factor=None, one_home=one_home)
         grpc, http = (policy.balancer(those, door, 200, 0).homes for door in (workload.GRPC, workload.HTTP))
-        assert (grpc == http).all() == by_hostname
+        assert (grpc == http).all() == one_home
 
 
 # Whole runs.
@@ -265,7 +265,7 @@ def test_a_confidence_interval_is_students() -> None:
 
 def test_the_recorded_figures_are_those_of_the_defaults_and_of_every_case() -> None:
     recorded = json.loads(registry.FIGURES["simulation"].kept.read_text(encoding="utf-8"))
-    assert recorded["defaults"] == asdict(benchmark("scaling.defaults").DEFAULTS)
+    assert recorded["policy"] == asdict(study.Policy())
     assert {name: list(rows) for name, rows in recorded["studies"].items()} == {
         name: list(rows) for name, rows in cases.STUDIES.items()
     }
