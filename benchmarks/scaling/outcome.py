@@ -27,7 +27,7 @@ class Outcome:
     most_over_mean: float  # work of the busiest replica
     variation: float  # of the replicas' work, standard deviation over mean
     overfull: float  # share of replicas with more work than time
-    wait_ms: float  # mean, of poses
+    wait_ms: float  # mean in the queue, as `ultragray_queue_seconds` counts it: of a pose since it came
     wait_p95_ms: float
     pose_p50_ms: float
     pose_p99_ms: float
@@ -84,7 +84,7 @@ def evaluate(
     answered = ~np.isnan(begun)
     of_stream = work.stream != queues.ALONE
     poses, requests = answered & of_stream, answered & ~of_stream
-    waits_ms = 1000.0 * (begun - work.arrival_s)[poses]
+    waits_ms = 1000.0 * (begun - work.arrival_s)[answered]
     taken_ms = 1000.0 * (begun - work.asked_s + work.work_s + work.overhead_s)
     busy = np.bincount(work.replica, work.work_s, minlength=len(speeds))[list(alive)] / window.length_s
     asked, source = np.array(routed.asked_s), np.array(routed.source)

@@ -106,5 +106,5 @@ def defaults(_: dict[str, Any]) -> Iterator[str]:
     yield f"| Envoy: replicas are hashed by | {one_home} |"
     yield f"| Envoy: keys of a hot scene | {DEFAULTS.keys_of_hot_scene}: the bound spreads it |"
     yield f"| Replica: `memory_budget_mb` | {DEFAULTS.memory_budget_mb} |"
-    yield f"| More replicas where the 95th percentile of `ultragray_queue_seconds` is above | {DEFAULTS.queue_p95_ms:g} ms |"
+    yield f"| More replicas where 5% of `ultragray_queue_seconds` are above | {DEFAULTS.queue_p95_ms:g} ms |"
     yield f"| which is where replicas are busy for | {100.0 * DEFAULTS.utilisation:.0f}% of their time |"
