@@ -1,4 +1,4 @@
-"""Simulates many replicas behind Envoy: `python benchmarks/simulation.py [--only STUDY ...]`.
+"""Simulates many replicas behind Envoy: `python benchmarks/simulation.py [--seeds 3] [--only STUDY ...]`.
 
 1,000 replicas, 100,000 clients and 10,000 scenes; the policies of Envoy beside each other, then each setting by itself.
 The figures go into build/bench/simulation.json; the tables of docs/scaling.md come from it. All that is random is
@@ -8,7 +8,6 @@ seeded: the same costs give the same figures.
 from __future__ import annotations
 
 import argparse
-import itertools
 import json
 import multiprocessing
 import os
@@ -22,35 +21,35 @@ from registry import FIGURES, ROOT
 from scaling import checks, picture
 from scaling.cases import STUDIES
 from scaling.costs import SceneCosts, Storage, measured_costs
-from scaling.defaults import DEFAULTS
-from scaling.outcome import mean_with_confidence, with_confidence
-from scaling.study import Case, run
+from scaling.outcome import Outcome, mean_with_confidence, with_confidence
+from scaling.study import Case, Policy, run
 from scaling.workload import Workload
 from ultragray.files.atomic import write_whole
 from ultragray_service.bench.measured import measured
 
 OUTPUT = FIGURES["simulation"].staged
 PICTURE = ROOT / "docs" / "images" / "scaling.png"
-SEEDS = range(3)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition(":")[0])
+    parser.add_argument("--seeds", type=int, choices=(3, 5), default=5, help="runs of each case")
     parser.add_argument("--only", nargs="+", choices=list(STUDIES), metavar="STUDY", help=", ".join(STUDIES))
     given = parser.parse_args()
     head, costs = measured(1), measured_costs()
     studies = {name: cases for name, cases in STUDIES.items() if given.only is None or name in given.only}
     with ProcessPoolExecutor(os.cpu_count(), multiprocessing.get_context("spawn")) as processes:
-        answers = list(processes.map(checks.run, SEEDS))
-        found = _run({case for cases in studies.values() for case in cases.values()}, costs, processes)
+        answers = list(processes.map(checks.run, range(given.seeds)))
+        cases = dict.fromkeys(case for cases in studies.values() for case in cases.values())
+        found = _run(list(cases), costs, given.seeds, processes)
     document = {
         "measured": head,
         **({"quick": True} if given.only else {}),
-        "seeds": len(SEEDS),
+        "seeds": given.seeds,
         "costs": [asdict(one) for one in costs],
         "storage": asdict(Storage()),
         "workload": asdict(Workload()),
-        "defaults": asdict(DEFAULTS),
+        "policy": asdict(Policy()),
         "checks": {
             name: {"known": known, "simulated": mean_with_confidence([one[name] for one in answers])}
             for name, (known, _) in checks.CHECKS.items()
@@ -61,17 +60,17 @@ def main() -> None:
     write_whole(OUTPUT, json.dumps(document, indent=1, allow_nan=False) + "\n")
 
 
-def _run(cases: set[Case], costs: Sequence[SceneCosts], processes: ProcessPoolExecutor) -> dict[Case, Any]:
-    """Every case with every seed; a case that several studies have is run once."""
-    ordered = list(cases)
-    runs = list(itertools.product(ordered, SEEDS))
-    outcomes = []
-    for outcome in processes.map(run, *zip(*((case, costs, seed) for case, seed in runs), strict=True)):
+def _run(
+    cases: Sequence[Case], costs: Sequence[SceneCosts], seeds: int, processes: ProcessPoolExecutor
+) -> dict[Case, Any]:
+    """Every case with every seed."""
+    runs = [(case, costs, seed) for case in cases for seed in range(seeds)]
+    outcomes: list[Outcome] = []
+    for outcome in processes.map(run, *zip(*runs, strict=True)):
         outcomes.append(outcome)
         sys.stderr.write(f"\r{len(outcomes)} of {len(runs)} runs")
     sys.stderr.write("\n")
-    count = len(SEEDS)
-    return {case: with_confidence(outcomes[count * i : count * (i + 1)]) for i, case in enumerate(ordered)}
+    return {case: with_confidence(outcomes[seeds * i : seeds * (i + 1)]) for i, case in enumerate(cases)}
 
 
 def draw(document: dict[str, Any]) -> None:

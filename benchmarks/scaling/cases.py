@@ -1,7 +1,6 @@
 """What is compared: every table of docs/scaling.md with its rows. What a row does not name is as DEFAULTS has it.
 
-The policies are compared at full size. All else is compared in a quarter of it, with as many clients, scenes and
-streams for each replica.
+The policies are compared at full size. All else is compared in a quarter of it: as many replicas, clients, scenes.
 """
 
 from __future__ import annotations
@@ -47,8 +46,9 @@ def _with_memory(size: int) -> Case:
 
 
 STUDIES: Mapping[str, Mapping[str, Case]] = {
-    "policies": {
-        f"{name}; {exponent}": Case(policy, Workload(exponent=exponent))
+    "policies": {name: Case(policy) for name, policy in POLICIES.items()},
+    "exponents": {
+        f"{name}; {exponent}": replace(QUARTER, policy=policy, workload=replace(QUARTER.workload, exponent=exponent))
         for exponent in EXPONENTS
         for name, policy in POLICIES.items()
     },
@@ -63,11 +63,9 @@ STUDIES: Mapping[str, Mapping[str, Case]] = {
         "263 a replica": QUARTER,
     },
     "doors": {
-        "both by hostname": QUARTER,
-        "each by its address and port": _with(Policy(by_hostname=False)),
-        "both by hostname, all streams by gRPC": replace(
-            QUARTER, workload=replace(QUARTER.workload, websocket_share=0.0)
-        ),
+        "with the port of the door": QUARTER,
+        "without ports": _with(Policy(one_home=True)),
+        "with the port, all streams by gRPC": replace(QUARTER, workload=replace(QUARTER.workload, websocket_share=0.0)),
     },
     "hot scenes": {
         "1": QUARTER,

@@ -21,7 +21,7 @@ from ultragray_service.bench.kernel import BenchScene, bench_poses, bench_scenes
 from ultragray_workers.pool.process.scene_cache import SceneCache
 from ultragray_workers.scenes import resident_bytes
 
-REPEATS = 15
+REPEATS = 9
 SIDE = 512  # pixels, as in `make bench`
 _P99_OF_NORMAL = 2.3263
 

@@ -11,11 +11,11 @@ class Defaults:
 
     hash_balance_factor: int = 110  # per cent of the mean that one replica may have of open requests and streams
     minimum_ring_size: int = 65_536  # points of the ring: 66 for each of 1,000 replicas
-    hash_by_hostname: bool = True  # so that a scene has the same home behind HTTP's port and gRPC's
+    one_home: bool = False  # of a scene behind both doors: replicas under one DNS name are hashed with ports
     keys_of_hot_scene: int = 1  # the bound spreads it
     memory_budget_mb: int = 4096  # of loaded scenes, the service's own default
-    utilisation: float = 0.6  # share of its time that a replica works; more replicas are wanted above
-    queue_ms: float = 4.0  # mean wait of a frame; more replicas are wanted above
+    utilisation: float = 0.5  # share of its time that a replica works; more replicas are wanted above
+    queue_p95_ms: float = 12.0  # 95% of frames wait less; more replicas are wanted above
 
 
 DEFAULTS = Defaults()

@@ -27,7 +27,8 @@ class Outcome:
     most_over_mean: float  # work of the busiest replica
     variation: float  # of the replicas' work, standard deviation over mean
     overfull: float  # share of replicas with more work than time
-    wait_ms: float  # mean, of poses
+    wait_ms: float  # mean in the queue, as `ultragray_queue_seconds` counts it: of a pose since it came
+    wait_p95_ms: float
     pose_p50_ms: float
     pose_p99_ms: float
     pose_p999_ms: float
@@ -83,6 +84,7 @@ def evaluate(
     answered = ~np.isnan(begun)
     of_stream = work.stream != queues.ALONE
     poses, requests = answered & of_stream, answered & ~of_stream
+    waits_ms = 1000.0 * (begun - work.arrival_s)[answered]
     taken_ms = 1000.0 * (begun - work.asked_s + work.work_s + work.overhead_s)
     busy = np.bincount(work.replica, work.work_s, minlength=len(speeds))[list(alive)] / window.length_s
     asked, source = np.array(routed.asked_s), np.array(routed.source)
@@ -97,7 +99,8 @@ def evaluate(
         most_over_mean=float(busy.max() / busy.mean()),
         variation=float(busy.std() / busy.mean()),
         overfull=float((busy > 1.0).mean()),
-        wait_ms=float(1000.0 * (begun - work.arrival_s)[poses].mean()),
+        wait_ms=float(waits_ms.mean()),
+        wait_p95_ms=float(np.quantile(waits_ms, 0.95)),
         **_quantiles("pose", taken_ms[poses]),
         unanswered=float(1.0 - poses.sum() / of_stream.sum()),
         **_quantiles("request", taken_ms[requests]),

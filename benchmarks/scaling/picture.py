@@ -18,9 +18,9 @@ def draw(document: dict[str, Any], path: Path) -> None:
     """Hits and unanswered poses of the policies, and the wait by load."""
     figure = Figure(figsize=(10.5, 3.4), layout="constrained")
     hits, unanswered, waits = figure.subplots(1, 3)
-    policies, load = document["studies"]["policies"], document["studies"]["load"]
-    _by_exponent(hits, policies, "hits", "scene in memory, % of requests")
-    _by_exponent(unanswered, policies, "unanswered", "unanswered poses, %")
+    exponents, load = document["studies"]["exponents"], document["studies"]["load"]
+    _by_exponent(hits, exponents, "hits", "scene in memory, % of requests")
+    _by_exponent(unanswered, exponents, "unanswered", "unanswered poses, %")
     unanswered.set_yscale("log")
     hits.legend(frameon=False, fontsize="x-small", loc="lower right")
     small = [found for name, found in load.items() if "fast" not in name]

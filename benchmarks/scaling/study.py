@@ -29,7 +29,7 @@ class Policy:
     name: str = "ring hash"  # or: random, least request, Maglev
     factor: int | None = DEFAULTS.hash_balance_factor
     ring_size: int = DEFAULTS.minimum_ring_size
-    by_hostname: bool = DEFAULTS.hash_by_hostname
+    one_home: bool = DEFAULTS.one_home  # behind both doors
     keys: int = DEFAULTS.keys_of_hot_scene  # of each of the HOT_SCENES, so that they have as many homes
     weighted: bool = True  # by the speed of the replicas
 
@@ -38,7 +38,7 @@ class Policy:
             return balancers.Random(replicas, seed + door)
         if self.name == "least request":
             return LeastRequest(replicas, seed + door)
-        hashes = Hashes(seed, 0 if self.by_hostname else door)
+        hashes = Hashes(seed, 0 if self.one_home else door)
         if self.name == "ring hash":
             homes = balancers.ring_homes(replicas, hashes, scenes, self.keys, self.ring_size)
         elif self.name == "Maglev":

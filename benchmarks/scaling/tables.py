@@ -6,6 +6,8 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
 
+from .defaults import DEFAULTS
+
 Lines = Callable[[dict[str, Any]], Iterator[str]]
 Format = Callable[[float, float], str]
 
@@ -27,6 +29,7 @@ _FIGURES: dict[str, tuple[str, Format]] = {
     "variation": ("Variation", _number(2)),
     "overfull": ("Overfull", _share(1)),
     "wait_ms": ("Mean wait ms", _number(1)),
+    "wait_p95_ms": ("95% wait less than ms", _number(1)),
     "pose_p50_ms": ("Pose p50 ms", _number(1)),
     "pose_p99_ms": ("p99", _number(1)),
     "pose_p999_ms": ("p99.9", _number(0)),
@@ -44,15 +47,16 @@ _BRIEFLY = (*_BALANCE, "pose_p99_ms", "unanswered", "request_p99_ms")
 
 # Of each study: the head of its first column, and the figures that it shows.
 STUDIES: dict[str, tuple[str, tuple[str, ...]]] = {
-    "balance": ("Policy; exponent", (*_BALANCE, "replicas_of_hottest")),
-    "latency": ("Policy; exponent", (*_POSES, *_REQUESTS)),
+    "balance": ("Policy", (*_BALANCE, "replicas_of_hottest")),
+    "latency": ("Policy", (*_POSES, *_REQUESTS)),
+    "exponents": ("Policy; exponent", (*_BRIEFLY, "replicas_of_hottest")),
     "factors": ("Bound of the mean", (*_BRIEFLY, "replicas_of_hottest")),
     "rings": ("Points of the ring", _BRIEFLY),
     "doors": ("Replicas are hashed", _BRIEFLY),
     "hot scenes": ("Keys of each of the 10 hottest scenes", (*_BRIEFLY, "replicas_of_hottest")),
     "proxies": ("Envoys that share the clients", _BRIEFLY),
     "caches": ("Memory of each replica for scenes", ("hits", "fetched_mb_per_s", "busy", *_POSES[1:], *_REQUESTS[:3])),
-    "load": ("Streams for each replica", ("busy", "overfull", "wait_ms", *_POSES, "request_p99_ms")),
+    "load": ("Streams for each replica", ("busy", "overfull", "wait_ms", "wait_p95_ms", *_POSES, "request_p99_ms")),
     "changes": ("Policy", ("hits", "fetched_mb_per_s", "overfull", *_POSES[1:], *_REQUESTS[1:])),
     "speeds": ("Policy", _BRIEFLY),
 }
@@ -92,16 +96,15 @@ def checks(document: dict[str, Any]) -> Iterator[str]:
         yield f"| {name} | {found['known']:.3f} | {_number(3)(*found['simulated'])} |"
 
 
-def defaults(document: dict[str, Any]) -> Iterator[str]:
+def defaults(_: dict[str, Any]) -> Iterator[str]:
     """What was decided."""
-    decided = document["defaults"]
+    one_home = "each replica's own name" if DEFAULTS.one_home else "address and port"
     yield "| Setting | Value |"
     yield "|---|---|"
-    yield f"| Envoy: `consistent_hashing_lb_config.hash_balance_factor` | {decided['hash_balance_factor']} |"
-    yield f"| Envoy: `minimum_ring_size` | {decided['minimum_ring_size']} |"
-    by_name = str(decided["hash_by_hostname"]).lower()
-    yield f"| Envoy: `consistent_hashing_lb_config.use_hostname_for_hashing` | {by_name} |"
-    yield f"| Keys of a hot scene | {decided['keys_of_hot_scene']} |"
-    yield f"| Memory of a replica for scenes, `memory_budget_mb` | {decided['memory_budget_mb']} |"
-    yield f"| More replicas where the mean of `ultragray_queue_seconds` is above | {decided['queue_ms']:g} ms |"
-    yield f"| More replicas where they are busier than | {100.0 * decided['utilisation']:.0f}% |"
+    yield f"| Envoy: `hash_balance_factor` | {DEFAULTS.hash_balance_factor} |"
+    yield f"| Envoy: `minimum_ring_size` | {DEFAULTS.minimum_ring_size} |"
+    yield f"| Envoy: replicas are hashed by | {one_home} |"
+    yield f"| Envoy: keys of a hot scene | {DEFAULTS.keys_of_hot_scene}: the bound spreads it |"
+    yield f"| Replica: `memory_budget_mb` | {DEFAULTS.memory_budget_mb} |"
+    yield f"| More replicas where 5% of `ultragray_queue_seconds` are above | {DEFAULTS.queue_p95_ms:g} ms |"
+    yield f"| which is where replicas are busy for | {100.0 * DEFAULTS.utilisation:.0f}% of their time |"

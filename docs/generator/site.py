@@ -27,7 +27,7 @@ SECTIONS: Mapping[str, tuple[str, ...]] = {
         *("concepts/frame.md", "physics.md", "concepts/training.md", "confidence.md", "concepts/limits.md", "poses.md"),
         "concepts/*.md",
     ),
-    "Operation": ("operation.md", "access.md", "tls.md", "backup.md"),
+    "Operation": ("operation.md", "scaling.md", "access.md", "tls.md", "backup.md"),
     "Results": ("results.md", "performance.md"),
     "Reference": (
         *("reference/index.md", "reference/command-line.md", "reference/http.md", "reference/stream.md"),
