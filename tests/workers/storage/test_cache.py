@@ -85,7 +85,7 @@ def test_the_least_recently_used_goes_and_the_bound_holds(cache: Cache, source: 
     for key in ("a", "b", "c", "a", "d"):
         fetch(cache, source, key)
         time.sleep(0.01)
-        assert cache.bytes() <= cache.max_bytes
+        assert cache.held_bytes() <= cache.max_bytes
     for key in ("a", "c", "d"):
         fetch(cache, source, key)
     assert source.asked == ["a", "b", "c", "d"]
@@ -129,7 +129,7 @@ def test_a_version_that_has_gone_is_not_there(cache: Cache, source: SlowStorage)
     for key, version in (("a", "old"), ("absent", "any")):
         with pytest.raises(NotThere):
             cache.pin(source, key, version)
-    assert cache.bytes() == 0
+    assert cache.held_bytes() == 0
 
 
 DIES = """
@@ -152,10 +152,10 @@ Cache(Path(sys.argv[1]), 3000).pin(storage, "a", storage.entry("a").version)
 
 def test_a_process_that_dies_while_it_fetches_leaves_nothing_that_stays(cache: Cache, source: SlowStorage) -> None:
     assert subprocess.run([sys.executable, "-c", DIES, cache.folder, source.folder], timeout=60).returncode == 7
-    assert cache.bytes() == SIZE  # its space
+    assert cache.held_bytes() == SIZE  # its space
     for key in ("b", "c", "d", "a"):
         assert fetch(cache, source, key) == key.encode() * SIZE
-        assert cache.bytes() <= cache.max_bytes
+        assert cache.held_bytes() <= cache.max_bytes
     assert not [path for path in (cache.folder / "files").iterdir() if path.name.startswith(".")]
     assert not list((cache.folder / "fetching").iterdir())
 
@@ -180,7 +180,7 @@ def test_several_processes_share_the_bound(cache: Cache, source: SlowStorage) ->
     ]
     most = 0
     while any(process.poll() is None for process in processes):
-        most = max(most, cache.bytes())
+        most = max(most, cache.held_bytes())
         time.sleep(0.001)
     assert [process.returncode for process in processes] == [0, 0, 0]
     assert 0 < most <= cache.max_bytes

@@ -112,7 +112,7 @@ class Cache:
                 pass
             file.close()
 
-    def bytes(self) -> int:
+    def held_bytes(self) -> int:
         """Of the objects that are here or being fetched."""
         with self._room():
             return sum(size for _, size, _ in self._held())
