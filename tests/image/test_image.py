@@ -88,7 +88,8 @@ def contained(container: Container, demo_scene: Any) -> Iterator[ContainedServic
 
 
 @pytest.mark.parametrize(
-    ("form", "outputs"), [("image/png", ["bmode"]), ("application/octet-stream;dtype=float32", ["bmode", "transmittance"])]
+    ("form", "outputs"),
+    [("image/png", ["bmode"]), ("application/octet-stream;dtype=float32", ["bmode", "transmittance"])],
 )
 def test_frames_are_those_of_this_machine(
     contained: ContainedService, start_shared_service: StartService, form: str, outputs: list[str]
@@ -130,7 +131,9 @@ def test_jobs_train_and_render_in_it(contained: ContainedService) -> None:
 
 
 def test_user_has_no_privileges_and_the_root_is_read_only(container: Container) -> None:
-    done = container.run("sh", "-c", "id -u; grep CapEff /proc/self/status; touch /opt/ultragray/x; touch /data/x /tmp/x")
+    done = container.run(
+        "sh", "-c", "id -u; grep CapEff /proc/self/status; touch /opt/ultragray/x; touch /data/x /tmp/x"
+    )
     assert done.stdout.split() == ["10001", "CapEff:", "0000000000000000"]
     assert "Read-only file system" in done.stderr
     assert done.stderr.count("\n") == 1, "only the first touch may fail"
@@ -175,7 +178,9 @@ def components(container: Container, name: str) -> dict[str, dict[str, Any]]:
 
 def licences(component: dict[str, Any]) -> str:
     found = component.get("licenses", [])
-    return " ".join(str(one.get("expression") or one["license"].get("id") or one["license"].get("name")) for one in found)
+    return " ".join(
+        str(one.get("expression") or one["license"].get("id") or one["license"].get("name")) for one in found
+    )
 
 
 def test_bill_of_materials_names_every_python_distribution_with_a_permissive_licence(container: Container) -> None:
