@@ -1,4 +1,4 @@
-"""The compose files as Compose itself reads them: what they name is there, and what they start has no more rights than it needs."""
+"""The compose files as Compose reads them: what they name is there, and what they start has few rights."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SETS = {
     "operation": ("compose.yaml", "compose.operation.yaml"),
     "cluster": ("compose.yaml", "compose.operation.yaml", "compose.cluster.yaml"),
 }
-SECRETS = {name: "a-secret" for name in (*OTHER_VARIABLES, "GRAFANA_PASSWORD")}
+SECRETS = dict.fromkeys((*OTHER_VARIABLES, "GRAFANA_PASSWORD"), "a-secret")
 OWN_IMAGES = ("ultragray:cpu", "ultragray:cuda")
 
 

@@ -45,7 +45,7 @@ def problems() -> Iterator[str]:
     """A sentence for each thing that the build needs and this machine lacks."""
     missing = [tool for tool in TOOLS if shutil.which(tool) is None]
     if missing:
-        yield f"{', '.join(missing)}: not installed; on Debian: sudo apt-get install --no-install-recommends {' '.join(missing)}"
+        yield f"not installed: {', '.join(missing)}; on Debian: sudo apt-get install {' '.join(missing)}"
     if os.geteuid() != 0:
         yield "the image is built and mounted as root; run: sudo make test-image"
 

@@ -1,4 +1,4 @@
-"""A container of an image without an engine: its files as the root of processes that may do what the image lets them."""
+"""A container without an engine: an image's files as the root of processes, with the rights that the image gives."""
 
 from __future__ import annotations
 
