@@ -18,8 +18,9 @@ import httpx
 import pytest
 
 from ultragray.datasets.released import write_released
+from ultragray.demo import copy_demo_scene
 
-from ..service.conftest import RunningService, StartService
+from ..service.conftest import StartService, service_starter
 from ..service.test_lifecycle import IDENTITY
 from ..waiting import wait_until
 from ..workers.jobs.conftest import tiny_dataset
@@ -71,9 +72,15 @@ class ContainedService:
 
 
 @pytest.fixture(scope="module")
-def contained(container: Container, demo_scene: Any) -> Iterator[ContainedService]:
-    """Ends with a SIGTERM, to which the service must say 0."""
-    demo_scene.save(container.data / "demo.ugr")
+def start_service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StartService]:
+    folder = tmp_path_factory.mktemp("data")
+    copy_demo_scene(folder / "demo.ugr")
+    yield from service_starter(tmp_path_factory, folder)
+
+
+@pytest.fixture(scope="module")
+def contained(container: Container) -> Iterator[ContainedService]:
+    """Ends with a SIGTERM, at which the service must exit with 0. It puts the demo scene into its folder by itself."""
     service = ContainedService(container)
     try:
         wait_until(lambda: service.process.poll() is not None or service.healthy(), within_s=300, every_s=0.5)
@@ -91,9 +98,9 @@ def contained(container: Container, demo_scene: Any) -> Iterator[ContainedServic
     [("image/png", ["bmode"]), ("application/octet-stream;dtype=float32", ["bmode", "transmittance"])],
 )
 def test_frames_are_those_of_this_machine(
-    contained: ContainedService, start_shared_service: StartService, form: str, outputs: list[str]
+    contained: ContainedService, start_service: StartService, form: str, outputs: list[str]
 ) -> None:
-    here: RunningService = start_shared_service()
+    here = start_service()
 
     def frame(address: str) -> bytes:
         answer = httpx.post(
