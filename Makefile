@@ -26,7 +26,7 @@ KEEP = @$(if $(RECORD),$(BIN)/python benchmarks/record.py,:)
 MINUTES ?= 30
 
 .DEFAULT_GOAL := help
-.PHONY: ALWAYS help serve console test test-fast test-long test-console test-faults test-fuzz test-soak test-overload test-replicas test-newcomer check check-lint check-types check-generated check-web check-figures format bench bench-record bench-console console-picture bench-cuda results ablations poses confidence libraries simulation figures demo-scene docs generate packages clean
+.PHONY: ALWAYS help serve console test test-fast test-long test-console test-faults test-fuzz test-soak test-overload test-image test-replicas test-newcomer check check-lint check-types check-generated check-web check-figures format bench bench-record bench-console console-picture bench-cuda results ablations poses confidence libraries simulation figures demo-scene docs generate packages clean
 
 help:  ## say what there is
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
@@ -79,6 +79,10 @@ test-replicas: $(VENV)/installed-dev  ## 200 clients on 40 scenes of 4 replicas 
 		$(BIN)/pytest tests/replicas tests/docker/test_envoy.py $(ARGS)
 	$(KEEP) replicas-run
 
+test-image: $(VENV)/installed-dev  ## build the image with neither engine nor registry (as root, with buildah and mmdebstrap), run it and compare its frames
+	$(BIN)/python tests/image/build.py
+	ULTRAGRAY_TEST_IMAGE=localhost/ultragray:cpu $(BIN)/pytest tests/image -s $(ARGS)
+
 test-newcomer: $(VENV)/installed-dev $(CONSOLE)  ## play a newcomer with Debian's Python: clone, serve, the documents, the tests, the wheels; takes twenty minutes
 	$(BIN)/python tests/newcomer/play.py $(ARGS)
 
@@ -89,7 +93,7 @@ check-lint:
 	$(BIN)/ruff check $(PYTHON_SOURCES)
 	$(BIN)/ruff format --check $(PYTHON_SOURCES)
 	$(BIN)/clang-format --dry-run --Werror model/kernels/*.[ch]pp model/kernels/*.inl
-	$(BIN)/hadolint docker/Dockerfile.cpu docker/Dockerfile.cuda
+	$(BIN)/hadolint docker/Dockerfile
 
 check-types:
 	$(BIN)/mypy

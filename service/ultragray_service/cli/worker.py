@@ -79,7 +79,7 @@ def run_worker(
 
     settings = load_settings(**overrides)
     configure_logging(settings.log_level, settings.log_format)
-    if not settings.artifacts.is_dir() and not settings.data_folder.is_dir():
+    if not settings.is_there:
         raise StartupFailed(
             f"artifact_folder must be an existing folder, got {str(settings.artifacts)!r}", field="artifact_folder"
         )
@@ -91,7 +91,7 @@ def run_worker(
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda received, frame: (hurry if stop.is_set() else stop).set())
     work(
-        settings.artifacts,
+        settings.working_folder,
         settings.database_url,
         stop,
         hurry=hurry,

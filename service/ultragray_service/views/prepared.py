@@ -58,8 +58,8 @@ class Prepared:
     fill: ClassVar[Callable[..., None]]  # a staticmethod
 
     def __init__(self, settings: Settings, processes: HelperProcesses) -> None:
-        self._artifacts = settings.artifacts
-        self.folder = settings.artifacts / self.name
+        self._artifacts = settings.working_folder
+        self.folder = settings.working_folder / self.name
         self._processes = processes
         self._kept_bytes = settings.max_dataset_bytes
         self._tasks: dict[str, asyncio.Task[UltragrayError | None]] = {}

@@ -13,9 +13,6 @@ import pytest
 import yaml
 from prometheus_client.parser import text_string_to_metric_families
 
-from ultragray.contract import annotated_fields
-from ultragray_service.settings import ENVIRONMENT_PREFIX, Settings
-
 from ..conftest import ROOT, RunningService
 
 MONITORING = ROOT / "docker" / "monitoring"
@@ -89,18 +86,3 @@ def test_files_of_grafana_name_one_another() -> None:
         if "datasource" in panel
     }
     assert used == {source["uid"] for source in read("grafana-datasource.yaml")["datasources"]}
-
-
-@pytest.mark.parametrize("name", ["compose.yaml", "compose.operation.yaml"])
-def test_containers_are_given_settings_that_there_are(name: str) -> None:
-    services = yaml.safe_load((ROOT / "docker" / name).read_text())["services"].values()
-    given = {
-        key for service in services for key in service.get("environment", {}) if key.startswith(ENVIRONMENT_PREFIX)
-    }
-    assert given <= {ENVIRONMENT_PREFIX + item.name.upper() for item, _ in annotated_fields(Settings)}
-
-
-def test_containers_find_the_files_that_they_are_given() -> None:
-    services = yaml.safe_load((ROOT / "docker" / "compose.operation.yaml").read_text())["services"].values()
-    files = [volume.split(":")[0] for service in services for volume in service.get("volumes", ())]
-    assert all((ROOT / "docker" / file).is_file() for file in files if file.startswith("./"))

@@ -26,13 +26,13 @@ def opened_database(where: dict[str, Any]) -> Iterator[JobDatabase]:
     from ultragray_workers.jobs.queue.database import JobDatabase
 
     settings = load_settings(**where)
-    if settings.database_url is None and not (settings.artifacts.is_dir() or settings.data_folder.is_dir()):
+    if settings.database_url is None and not settings.is_there:
         raise InvalidArgument(
             f"data_folder must be an existing folder, got {str(settings.data_folder)!r}: name that of the service with "
             "--data-folder",
             field="data_folder",
         )
-    database = JobDatabase(settings.artifacts, settings.database_url)
+    database = JobDatabase(settings.working_folder, settings.database_url)
     try:
         yield database
     finally:

@@ -87,7 +87,7 @@ class Jobs:
         settings = self._settings
         self._opened = await asyncio.to_thread(
             JobStore,
-            settings.artifacts,
+            settings.working_folder,
             settings.database_url,
             settings.job_queue_limit,
             scenes=self._scenes,
@@ -198,7 +198,7 @@ class Jobs:
             await asyncio.sleep(COUNT_INTERVAL_S)
 
     def _log_path(self, job_id: str) -> Path:
-        return JobFolder(self._settings.artifacts, job_id).log
+        return JobFolder(self._settings.working_folder, job_id).log
 
 
 @contextmanager

@@ -1,0 +1,213 @@
+"""The image of docker/Dockerfile as it runs: read-only, without privileges, with the frames of this machine.
+
+ULTRAGRAY_TEST_IMAGE names it; `make test-image` builds it and sets that.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import socket
+import subprocess
+from collections.abc import Iterator
+from importlib.metadata import version
+from typing import Any
+
+import httpx
+import pytest
+
+from ultragray.datasets.released import write_released
+from ultragray.demo import copy_demo_scene
+
+from ..service.conftest import StartService, service_starter
+from ..service.test_lifecycle import IDENTITY
+from ..waiting import wait_until
+from ..workers.jobs.conftest import tiny_dataset
+from .container import Container, container_of
+
+IMAGE = os.environ.get("ULTRAGRAY_TEST_IMAGE", "")
+MAX_BYTES = 1_250_000_000
+PERMISSIVE = re.compile(
+    r"(?i)0BSD|Apache|BSD|HPND|ISC|MIT|PSF|Python-2\.0|Unlicense|Zlib|CC0-1\.0|MPL-2\.0|LGPL|Unicode|BSL-1\.0"
+)
+
+pytestmark = pytest.mark.skipif(not IMAGE, reason="no image is named: make test-image builds one")
+
+
+@pytest.fixture(scope="module")
+def container(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Container]:
+    with container_of(IMAGE, tmp_path_factory.mktemp("container")) as container:
+        yield container
+
+
+class ContainedService:
+    """The image's own command, on free ports of this machine."""
+
+    def __init__(self, container: Container) -> None:
+        with socket.socket() as one, socket.socket() as other:
+            one.bind(("127.0.0.1", 0))
+            other.bind(("127.0.0.1", 0))
+            self.http_port, grpc_port = one.getsockname()[1], other.getsockname()[1]
+        self.http = f"http://127.0.0.1:{self.http_port}"
+        self.environment = {
+            "ULTRAGRAY_HOST": "127.0.0.1",
+            "ULTRAGRAY_HTTP_PORT": str(self.http_port),
+            "ULTRAGRAY_GRPC_PORT": str(grpc_port),
+            "ULTRAGRAY_ADDRESS": self.http,
+        }
+        self.container = container
+        self.log_path = container.folder / "log"
+        with self.log_path.open("wb") as log:
+            self.process = container.start(container.configuration["Cmd"], self.environment, log)
+
+    def healthy(self) -> bool:
+        """What the image's health check says."""
+        kind, *words = self.container.configuration["Healthcheck"]["Test"]
+        assert kind == "CMD"
+        return self.run(*words).returncode == 0
+
+    def run(self, *words: str) -> subprocess.CompletedProcess[str]:
+        return self.container.run(*words, environment=self.environment)
+
+
+@pytest.fixture(scope="module")
+def start_service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StartService]:
+    folder = tmp_path_factory.mktemp("data")
+    copy_demo_scene(folder / "demo.ugr")
+    yield from service_starter(tmp_path_factory, folder)
+
+
+@pytest.fixture(scope="module")
+def contained(container: Container) -> Iterator[ContainedService]:
+    """Ends with a SIGTERM, at which the service must exit with 0. It puts the demo scene into its folder by itself."""
+    service = ContainedService(container)
+    try:
+        wait_until(lambda: service.process.poll() is not None or service.healthy(), within_s=300, every_s=0.5)
+        assert service.process.poll() is None, service.log_path.read_text()
+        yield service
+        service.process.terminate()
+        assert service.process.wait(60) == 0
+    finally:
+        service.process.kill()
+        service.process.wait()
+
+
+@pytest.mark.parametrize(
+    ("form", "outputs"),
+    [("image/png", ["bmode"]), ("application/octet-stream;dtype=float32", ["bmode", "transmittance"])],
+)
+def test_frames_are_those_of_this_machine(
+    contained: ContainedService, start_service: StartService, form: str, outputs: list[str]
+) -> None:
+    here = start_service()
+
+    def frame(address: str) -> bytes:
+        answer = httpx.post(
+            f"{address}/v1/scenes/demo/render",
+            json={"pose": IDENTITY, "height": 256, "width": 256, "outputs": outputs},
+            headers={"Accept": form},
+            timeout=120,
+        )
+        assert answer.status_code == 200, answer.text
+        return answer.content
+
+    assert frame(contained.http) == frame(here.http)
+
+
+def test_console_is_in_the_image(contained: ContainedService) -> None:
+    answer = httpx.get(contained.http, timeout=60)
+    assert answer.status_code == 200
+    assert "<html" in answer.text
+
+
+def test_jobs_train_and_render_in_it(contained: ContainedService) -> None:
+    write_released(tiny_dataset(), contained.container.folder / "tmp" / "tiny")
+
+    def succeed(*words: str) -> None:
+        done = contained.run("ultragray", *words)
+        assert done.returncode == 0, done.stdout + done.stderr + contained.log_path.read_text()
+
+    settings = ("--set", "steps=20", "--set", "max_gaussians=40", "--set", "batch_size=2")
+    succeed("datasets", "upload", "/tmp/tiny", "--name", "tiny")
+    succeed("jobs", "submit", "train", "tiny", "--scene", "trained", *settings, "--wait")
+    succeed("jobs", "submit", "render", "trained", "--sampler", "around", "--count", "4", "--wait")
+    succeed("jobs", "submit", "evaluate", "trained", "tiny", "--wait")
+    assert (contained.container.data / "trained.ugr").is_file()
+
+
+def test_user_has_no_privileges_and_the_root_is_read_only(container: Container) -> None:
+    script = "id -u; grep CapEff /proc/self/status; touch /opt/ultragray/x; touch /data/x /tmp/x /var/cache/ultragray/x"
+    done = container.run("sh", "-c", script)
+    assert done.stdout.split() == ["10001", "CapEff:", "0000000000000000"]
+    assert "Read-only file system" in done.stderr
+    assert done.stderr.count("\n") == 1, "only the first touch may fail"
+
+
+def test_command_line_and_library_are_there(container: Container) -> None:
+    assert "Serve scenes over HTTP and gRPC" in container.run("ultragray", "--help").stdout
+    assert container.run("ultragray", "--version").stdout.strip().endswith(version("ultragray"))
+
+
+@pytest.mark.parametrize("command", ["gcc", "c++", "make", "pip", "node"])
+def test_nothing_is_left_of_what_built_it(container: Container, command: str) -> None:
+    assert container.run("sh", "-c", f"command -v {command}").stdout == ""
+
+
+def test_image_says_what_it_is(container: Container) -> None:
+    says = container.configuration
+    assert says["User"] == "10001:10001"
+    assert set(says["ExposedPorts"]) == {"8000/tcp", "50051/tcp", "18944/tcp"}
+    assert set(says["Volumes"]) == {"/data", "/var/cache/ultragray"}
+    labels = {name.removeprefix("org.opencontainers.image."): value for name, value in says["Labels"].items()}
+    assert labels["version"] == version("ultragray")
+    assert re.match(r"[0-9a-f]{40}", labels["revision"])
+    assert all(labels[name] for name in ("title", "description", "licenses", "base.name"))
+
+
+def test_image_is_of_a_bounded_size(container: Container) -> None:
+    listed = subprocess.run(["buildah", "images", "--json", IMAGE], check=True, capture_output=True, text=True)
+    digest = json.loads(listed.stdout)[0]["id"]
+    files = (path for path in container.root.rglob("*") if path.is_file() and not path.is_symlink())
+    size = sum(path.stat().st_size for path in files)
+    print(f"{IMAGE} {digest[:12]}: {size / 1e6:.0f} MB")  # noqa: T201
+    assert size < MAX_BYTES
+
+
+def components(container: Container, name: str) -> dict[str, dict[str, Any]]:
+    """The components of one of the image's bills of materials, by their names."""
+    bill = json.loads((container.root / "opt/ultragray/sbom" / f"{name}.cdx.json").read_text())
+    assert bill["bomFormat"] == "CycloneDX"
+    return {component["name"]: component for component in bill["components"]}
+
+
+def licences(component: dict[str, Any]) -> str:
+    found = component.get("licenses", [])
+    return " ".join(
+        str(one.get("expression") or one["license"].get("id") or one["license"].get("name")) for one in found
+    )
+
+
+def test_bill_of_materials_names_every_python_distribution_with_a_permissive_licence(container: Container) -> None:
+    named = components(container, "python")
+    listed = container.run(
+        "python", "-c", "import importlib.metadata as m; print(*(d.name for d in m.distributions()))"
+    ).stdout.split()
+    assert {name.lower() for name in listed} <= {name.lower() for name in named}
+    others = {name: licences(part) for name, part in named.items() if not PERMISSIVE.search(licences(part))}
+    assert others == {}
+
+
+def test_bill_of_materials_names_what_the_console_holds(container: Container) -> None:
+    named = components(container, "console")
+    assert {"svelte", "three"} <= set(named)
+    others = {name: licences(part) for name, part in named.items() if not PERMISSIVE.search(licences(part))}
+    assert others == {}
+
+
+def test_bill_of_materials_names_every_package_of_debian(container: Container) -> None:
+    named = components(container, "debian")
+    listed = container.run("dpkg-query", "--show", "--showformat", "${Package}\n").stdout.split()
+    assert set(listed) <= set(named)
+    unlicensed = {name for name in listed if not licences(named[name])}
+    assert unlicensed <= {"libcrypt1"}, "licences that Debian states in words alone"
