@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 from .manifest import MANIFEST_FILE, ShardEntry, manifest
+from .names import names_in, stands_for
 from .plan import SHARD_FRAMES, BatchPlan
 
-__all__ = ["MANIFEST_FILE", "SHARD_FRAMES", "BatchPlan", "ShardEntry", "manifest"]
+__all__ = ["MANIFEST_FILE", "SHARD_FRAMES", "BatchPlan", "ShardEntry", "manifest", "names_in", "stands_for"]

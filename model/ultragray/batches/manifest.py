@@ -31,17 +31,17 @@ class ShardEntry:
 
 
 def manifest(plan: BatchPlan, entries: Sequence[ShardEntry]) -> dict[str, Any]:
-    """The manifest of a batch whose shards are all there, in their order.
+    """The manifest of a batch whose shards are all there, in the order of their files.
 
     Raises InvalidArgument where they are not exactly the frames of the plan.
     """
-    expected = [
-        (plan.file_name(number), plan.frames_of(number).start, len(plan.frames_of(number)), plan.identity)
-        for number in range(plan.shard_count)
-    ]
-    found = [(entry.file, entry.first, entry.frames, entry.plan) for entry in entries]
-    if found != expected:
-        wrong = next((a for a, b in zip(expected, found, strict=False) if a != b), expected[min(len(found), 0)])
-        raise InvalidArgument(f"the shards are not those of the plan: {wrong[0]} is missing or another batch's")
+    by_file = {entry.file: entry for entry in entries}
+    for number in range(plan.shard_count):
+        file, frames = plan.file_name(number), plan.frames_of(number)
+        entry = by_file.get(file)
+        if entry is None:
+            raise InvalidArgument(f"{file} is missing: it is no shard of the batch yet")
+        if (entry.first, entry.frames, entry.plan) != (frames.start, len(frames), plan.identity):
+            raise InvalidArgument(f"{file} is of another batch")
     shards = [{name: value for name, value in asdict(entry).items() if name != "plan"} for entry in entries]
     return {**plan.document(), "plan": plan.identity, "files": plan.file_names, "shards": shards}

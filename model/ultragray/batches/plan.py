@@ -20,6 +20,7 @@ from ..samplers import Assess, DrawnSampler, Sampler, assessed_part
 from ..samplers.sampler import BLOCK_POSES
 from ..scene_info import SceneHeader
 from ..settings import Encoding, FrameSettings, Resolved
+from .names import name_range
 
 SHARD_FRAMES = BLOCK_POSES  # of a shard where nothing else is asked for; a search draws no block twice then
 MAX_SHARDS = 20_000  # the queue keeps a row of each, and a manifest names them all
@@ -105,7 +106,7 @@ class BatchPlan:
     @property
     def file_names(self) -> str:
         """The names of all files, as WebDataset writes them: frames-{000000..000199}.tar."""
-        return f"{self.name}-{{{0:06d}..{self.shard_count - 1:06d}}}.tar"
+        return name_range(f"{self.name}-", self.shard_count - 1, ".tar")
 
     def key(self, frame: int) -> str:
         """The name of a frame within its shard, unique in the batch and of one length."""

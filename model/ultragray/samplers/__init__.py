@@ -7,7 +7,7 @@ A sampler is made of numbers, travels as a JSON object with a `kind`, and makes 
 from __future__ import annotations
 
 from .around import AroundSampler
-from .confident import Assess, assessed_part, assessed_poses, confident_poses
+from .confident import Assess, assessed_part, assessed_poses, confident_poses, require_drawn
 from .covered import CoveredSampler
 from .fan import FanSampler
 from .sampler import BLOCK_POSES, MAX_POSES, DrawnSampler, Sampler
@@ -28,4 +28,5 @@ __all__ = [
     "assessed_part",
     "assessed_poses",
     "confident_poses",
+    "require_drawn",
 ]

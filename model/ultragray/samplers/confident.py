@@ -83,15 +83,21 @@ def assessed_part(
         places = slice(first - blocks.start * BLOCK_POSES, last - blocks.start * BLOCK_POSES)
         return made[places], found[places]
     if sampler is not None and min_confidence is not None:
+        require_drawn(sampler)
+    poses = (check_poses(base) if sampler is None else sampler.poses(base, probe))[first:last]
+    extrapolations = assess(poses)
+    require_confidence(extrapolations, min_confidence, first=first)
+    return poses, extrapolations
+
+
+def require_drawn(sampler: Sampler) -> None:
+    """Raises InvalidArgument for a sampler that leaves out poses without a least confidence: in shards, none can."""
+    if not isinstance(sampler, DrawnSampler):
         raise InvalidArgument(
             f"min_confidence in shards needs a sampler that draws (around, covered), got {sampler.kind}, which leaves "
             "poses out: mask such frames, or render them into one file",
             field="min_confidence",
         )
-    poses = (check_poses(base) if sampler is None else sampler.poses(base, probe))[first:last]
-    extrapolations = assess(poses)
-    require_confidence(extrapolations, min_confidence, first=first)
-    return poses, extrapolations
 
 
 def _of_blocks(

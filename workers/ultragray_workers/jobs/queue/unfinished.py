@@ -26,13 +26,14 @@ def running(jobs: JobDatabase) -> list[tuple[str, str]]:
 
 def count_waiting(jobs: JobDatabase) -> int:
     """The number of jobs that wait."""
-    counted = sa.select(sa.func.count()).select_from(WORKFLOWS).where(_has_status(*database.QUEUED))
+    is_job = sa.and_(_has_status(*database.QUEUED), _ROWS.name.in_(KINDS))
+    counted = sa.select(sa.func.count()).select_from(WORKFLOWS).where(is_job)
     with jobs.engine.connect() as connection:
         return connection.execute(counted).scalar_one()
 
 
 def oldest_waiting_ms(jobs: JobDatabase) -> int | None:
-    """The time of submission, ms since 1970, of the job that has waited longest; None where none waits."""
+    """The time of submission, ms since 1970, of the job, or share of one, that has waited longest; None: none waits."""
     oldest = sa.select(sa.func.min(_ROWS.created_at)).where(_has_status(*database.QUEUED))
     with jobs.engine.connect() as connection:
         return connection.execute(oldest).scalar()
@@ -40,7 +41,7 @@ def oldest_waiting_ms(jobs: JobDatabase) -> int | None:
 
 def count_of_owner(jobs: JobDatabase, owner: str) -> int:
     """The number of an owner's jobs that wait or run."""
-    of_owner = sa.and_(_is_unfinished(), _ROWS.authenticated_user == owner)
+    of_owner = sa.and_(_is_unfinished(), _ROWS.authenticated_user == owner, _ROWS.name.in_(KINDS))
     with jobs.engine.connect() as connection:
         return connection.execute(sa.select(sa.func.count()).select_from(WORKFLOWS).where(of_owner)).scalar_one()
 
