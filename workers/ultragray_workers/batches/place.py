@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shutil
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
@@ -81,6 +82,8 @@ class ShardPlace:
             document = json.dumps(manifest(self.plan, entries), indent=1) + "\n"
             self.storage.write(self.key(MANIFEST_FILE), document.encode())
             list(threads.map(self.storage.delete, map(self._entry_key, shards)))
+        if self.storage.local is not None:
+            shutil.rmtree(self.storage.local / self.key(_ENTRIES), ignore_errors=True)
 
     def take_over(self, before: ShardPlace) -> None:
         """Takes the whole shards of a batch of the same plan that was not finished, where files can be linked."""

@@ -50,10 +50,9 @@ def run(job_run: JobRun, job: RenderJob) -> Outcome:
     plan = job.plan(read_header(scene_file), file_sha256(scene_file))
     place = ShardPlace(storage, f"{FOLDER}/{batch}/{BATCH}", plan)
     queue = ShardQueue(job_run.channel, check)
-    outcome = Outcome(artifacts=(MANIFEST_FILE, plan.file_names))
     if is_batch:
         if place.is_finished():  # by a process that died before it said so
-            return outcome
+            return _complete(job_run, plan)
         if job_run.request.retry_of is not None and not place.whole():
             place.take_over(ShardPlace(storage, f"{FOLDER}/{job_run.request.retry_of}/{BATCH}", plan))
         queue.lay_out(plan, done := place.whole())
@@ -65,7 +64,12 @@ def run(job_run: JobRun, job: RenderJob) -> Outcome:
     if not is_batch:
         return Outcome()
     place.finish()
-    return outcome
+    return _complete(job_run, plan)
+
+
+def _complete(job_run: JobRun, plan: BatchPlan) -> Outcome:
+    job_run.report(Progress(frames_done=plan.frames, frames=plan.frames, seconds_left=0.0))
+    return Outcome(artifacts=(MANIFEST_FILE, plan.file_names))
 
 
 def _make_shards(job_run: JobRun, queue: ShardQueue, place: ShardPlace, scene_file: Path) -> None:
