@@ -24,9 +24,10 @@ FIGURES := build/bench
 READY = @$(if $(RECORD),$(BIN)/python benchmarks/record.py --ready &&) mkdir -p $(FIGURES)
 KEEP = @$(if $(RECORD),$(BIN)/python benchmarks/record.py,:)
 MINUTES ?= 30
+FRAMES ?= 100000
 
 .DEFAULT_GOAL := help
-.PHONY: ALWAYS help serve console test test-fast test-long test-console test-faults test-fuzz test-soak test-overload test-newcomer check check-lint check-types check-generated check-web check-figures format bench bench-record bench-console console-picture bench-cuda results ablations poses confidence libraries figures demo-scene docs generate packages clean
+.PHONY: ALWAYS help serve console test test-fast test-long test-console test-faults test-fuzz test-soak test-overload test-shards test-newcomer check check-lint check-types check-generated check-web check-figures format bench bench-record bench-console console-picture bench-cuda results ablations poses confidence libraries figures demo-scene docs generate packages clean
 
 help:  ## say what there is
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
@@ -70,6 +71,11 @@ test-overload: $(VENV)/installed-dev  ## ten times the capacity for a minute at 
 	@rm -f $(FIGURES)/overload-run.json
 	ULTRAGRAY_OVERLOAD_SECONDS=60 ULTRAGRAY_OVERLOAD_RECORD=$(FIGURES)/overload-run.json $(BIN)/pytest tests/overload $(ARGS)
 	$(KEEP) overload-run
+
+test-shards: $(VENV)/installed-dev  ## a batch of FRAMES (100000) in 200 shards: workers killed at random, Ray beside them (RECORD=1: into the documents)
+	$(READY)
+	ULTRAGRAY_SHARDS_FRAMES=$(FRAMES) ULTRAGRAY_SHARDS_RECORD=$(FIGURES)/shards.json $(BIN)/pytest -m long tests/batches $(ARGS)
+	$(KEEP) shards
 
 test-newcomer: $(VENV)/installed-dev $(CONSOLE)  ## play a newcomer with Debian's Python: clone, serve, the documents, the tests, the wheels; takes twenty minutes
 	$(BIN)/python tests/newcomer/play.py $(ARGS)

@@ -140,6 +140,21 @@ def control_loop(measured: Document) -> Iterator[str]:
     )
 
 
+def shards(measured: Document) -> Iterator[str]:
+    """A batch on the queue and on Ray, beside the kernel."""
+    extent, kernel = measured["extent"], measured["kernel_frames_per_s"]
+    rows = [(f"kernel alone, {extent['workers']} processes of one thread", f"{kernel:,.0f}", "", "")]
+    for engine, name in (("queue", "queue"), ("ray", "Ray")):
+        if (found := measured.get(engine)) is not None:
+            share = f"{found['share_of_kernel']:.0%}"
+            rows.append(
+                (f"{name}, {extent['workers']} workers", f"{found['frames_per_s']:,.0f}", share, found["kills"])
+            )
+    return _table(
+        (f"{extent['frames']:,} frames of {extent['side']}x{extent['side']}", "Frames/s", "Share", "Killed"), rows
+    )
+
+
 def jobs(measured: Document) -> Iterator[str]:
     """A service with a long list of jobs."""
     return _table(

@@ -98,6 +98,11 @@ _FILES = (
             "benchmarks/libraries.py",
         ),
     ),
+    Figures(
+        "benchmarks/shards.json",
+        "test-shards",
+        (*_KERNEL, *_JOBS, "model/ultragray/batches", "workers/ultragray_workers/batches", "tests/batches"),
+    ),
     Figures("tests/long-run.json", "test-long", (*_PRODUCT, "tests", ":(exclude)tests/*-run.json")),
     Figures("tests/soak-run.json", "test-soak", (*_PRODUCT, "tests/soak")),
     Figures("tests/overload-run.json", "test-overload", (*_PRODUCT, "tests/overload")),

@@ -17,6 +17,7 @@ from ultragray import render
 from ultragray.demo import copy_demo_scene
 from ultragray.samplers import AroundSampler
 from ultragray.scene import GaussianScene
+from ultragray.scene_info import read_header
 from ultragray_workers.jobs.kinds import RenderJob
 from ultragray_workers.jobs.queue.internals import WORKFLOWS
 from ultragray_workers.jobs.queue.tables import SHARDS
@@ -102,15 +103,14 @@ def test_a_batch_goes_on_without_the_workers_that_die_and_has_each_frame_once(
 def test_a_shard_that_cannot_be_made_fails_the_job_which_names_it_and_a_retry_goes_on(
     store: JobStore, scene: Path, start_worker: StartWorker, until: Until
 ) -> None:
-    poses = np.tile(np.eye(4), (90, 1, 1))
-    poses[:, 1, 3] = np.linspace(0.0, 40.0, 90)
-    poses[70, 1, 3] = 4000.0
-    job = RenderJob(scene="spine", poses=poses, shard_frames=20, height=16, width=12, min_confidence=0.01)
+    poses = np.tile(read_header(scene).training_poses, (6, 1, 1))  # too many to look at each when they are submitted
+    poses[1000, :3, 3] += 500.0
+    job = RenderJob(scene="spine", poses=poses, shard_frames=300, height=16, width=12, min_confidence=0.5)
     submitted, _ = store.submit(job)
     start_worker()
     failed = until(submitted)
     assert (failed.state, failed.error) == (JobState.FAILED, "LOW_CONFIDENCE")
-    assert (failed.reason or "").startswith("shard 3 (frames 60 to 79): poses[70] has a confidence of 0.00"), failed
+    assert (failed.reason or "").startswith("shard 3 (frames 900 to 1,199): poses[1000] has a confidence of 0."), failed
     folder = scene.parents[1] / "jobs" / failed.id / "batch"
     made = {path.name: path.stat().st_ino for path in folder.glob("*.tar")}
     assert sorted(made) == ["frames-000000.tar", "frames-000001.tar", "frames-000002.tar"]
