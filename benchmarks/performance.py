@@ -143,16 +143,14 @@ def control_loop(measured: Document) -> Iterator[str]:
 def shards(measured: Document) -> Iterator[str]:
     """A batch on the queue and on Ray, beside the kernel."""
     extent, kernel = measured["extent"], measured["kernel_frames_per_s"]
-    rows = [(f"kernel alone, {extent['workers']} processes of one thread", f"{kernel:,.0f}", "", "")]
+    workers = extent["workers"]
+    rows = [(f"kernel alone, {workers} processes of one thread", f"{kernel:,.0f}", "", "")]
     for engine, name in (("queue", "queue"), ("ray", "Ray")):
         if (found := measured.get(engine)) is not None:
             share = f"{found['share_of_kernel']:.0%}"
-            rows.append(
-                (f"{name}, {extent['workers']} workers", f"{found['frames_per_s']:,.0f}", share, found["kills"])
-            )
-    return _table(
-        (f"{extent['frames']:,} frames of {extent['side']}x{extent['side']}", "Frames/s", "Share", "Killed"), rows
-    )
+            rows.append((f"{name}, {workers} workers", f"{found['frames_per_s']:,.0f}", share, str(found["kills"])))
+    what = f"{extent['frames']:,} frames of {extent['side']}x{extent['side']}, {extent['shards']} shards"
+    return _table((what, "Frames/s", "Of the kernel", "Killed in the second half"), rows)
 
 
 def jobs(measured: Document) -> Iterator[str]:

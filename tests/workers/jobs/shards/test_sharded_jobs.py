@@ -140,7 +140,7 @@ def test_cancelling_ends_the_batch_and_its_shares(
 def test_a_share_leaves_its_worker_to_other_jobs(
     store: JobStore, scene: Path, start_worker: StartWorker, until: Until
 ) -> None:
-    job, _ = store.submit(batch(3_000_000, 50))
+    job, _ = store.submit(batch(500_000, 50))
     workers = [start_worker(name, host=name, longest_share_s=0.5) for name in ("one", "two")]
     until(job, lambda _: all(worker.job_process() for worker in workers))
     other, _ = store.submit(train_job("other"))
