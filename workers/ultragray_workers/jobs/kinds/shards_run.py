@@ -39,17 +39,12 @@ def run(job_run: JobRun, job: RenderJob) -> Outcome:
     Raises Stopped, what `BatchPlan.prepared` and `ShardRenderer` raise, and OSError.
     """
     assert job_run.channel is not None
-
-    def check() -> None:
-        if job_run.should_stop():
-            raise Stopped
-
     batch, storage = batch_of(job_run.folder.job_id), open_storage(job_run.folder.artifact_folder)
     is_batch = batch == job_run.folder.job_id
     scene_file = _scene_file(job_run, storage, batch, f"{job.scene}{SUFFIX}")
     plan = job.plan(read_header(scene_file), file_sha256(scene_file))
     place = ShardPlace(storage, f"{FOLDER}/{batch}/{BATCH}", plan)
-    queue = ShardQueue(job_run.channel, check)
+    queue = ShardQueue(job_run.channel)
     if is_batch:
         if place.is_finished():  # by a process that died before it said so
             return _complete(job_run, plan)
@@ -79,7 +74,7 @@ def _make_shards(job_run: JobRun, queue: ShardQueue, place: ShardPlace, scene_fi
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()
     with _Keeper(job_run, queue, place) as keeper:
-        while (shard := queue.take()) is not None:
+        while (shard := queue.take(meter.look)) is not None:
             if place.entry(shard) is not None:  # made by a process that died before it said so
                 queue.done(shard)
                 continue
@@ -118,11 +113,13 @@ class _Keeper:
         self._job_run, self._queue, self._place = job_run, queue, place
         self._thread = ThreadPoolExecutor(1, "keeper")
         self._last: Future[None] | None = None
+        self._is_given_up = False
 
     def __enter__(self) -> _Keeper:
         return self
 
-    def __exit__(self, *exception: object) -> None:
+    def __exit__(self, kind: object, *exception: object) -> None:
+        self._is_given_up = kind is not None
         self._thread.shutdown()
 
     def keep(self, path: Path, shard: int, entry: ShardEntry) -> None:
@@ -143,7 +140,7 @@ class _Keeper:
                 break
             except StorageUnavailable as error:
                 sys.stderr.write(f"waiting with {entry.file}: {error.detail}\n")
-            if self._job_run.should_stop():
+            if self._is_given_up or self._job_run.should_stop():
                 raise Stopped
             time.sleep(_RETRY_S)
         path.unlink()
@@ -157,19 +154,26 @@ class _Meter:
         self._job_run, self._queue = job_run, queue
         self._is_batch = batch_of(job_run.folder.job_id) == job_run.folder.job_id
         self._frames = plan.frames
-        self._finished = 0  # here
+        self._finished = self._furthest = 0
         self._since: tuple[float, int] | None = None  # a time, and the frames that were done then
 
     def finished(self, frames: int) -> None:
         """Counts a shard that was made here."""
         self._finished += frames
 
+    def look(self) -> None:
+        """Tells how far others are. Raises Stopped, BatchFailed."""
+        self.before_portion(0)
+
     def before_portion(self, done: int) -> None:
         """Tells that so many frames of the shard at hand are done. Raises Stopped, BatchFailed."""
         if self._job_run.should_stop():
             raise Stopped
         self._queue.look()
-        total = done + (self._queue.frames_done if self._is_batch else self._finished)
+        before_it = self._queue.frames_done if self._is_batch else self._finished
+        if before_it is None:
+            return
+        total = self._furthest = max(self._furthest, done + before_it)
         now_s = time.monotonic()
         since_s, before = self._since = self._since or (now_s, total)
         rate = (total - before) / (now_s - since_s) if total > before else None

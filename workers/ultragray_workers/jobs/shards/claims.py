@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass
+from typing import Any
 
 import sqlalchemy as sa
 
@@ -54,12 +55,23 @@ def lay_out(engine: sa.Engine, batch: str, frames: int, shard_frames: int, done:
 
 def take(engine: sa.Engine, batch: str, share: str) -> int | None:
     """The next free shard, which is the share's now; None where there is none."""
-    free = sa.select(_ROWS.number).where(_ROWS.job_id == batch, *_IS_FREE).order_by(_ROWS.number).limit(1)
+    others = SHARDS.alias()
+    free = (
+        sa.select(others.c.number)
+        .where(others.c.job_id == batch, *_is_free(others.c))
+        .order_by(others.c.number)
+        .limit(1)
+        .with_for_update(skip_locked=True)
+    )
+    # One statement: a SQLite file is locked from a change on, not from the question before it.
+    taking = (
+        sa.update(SHARDS)
+        .where(_ROWS.job_id == batch, _ROWS.number == free.scalar_subquery(), _ROWS.share.is_(None))
+        .values(share=share, tries=_ROWS.tries + 1)
+        .returning(_ROWS.number)
+    )
     with engine.begin() as connection:
-        number = connection.execute(free.with_for_update(skip_locked=True)).scalar()
-        if number is not None:
-            connection.execute(_of(batch, number).values(share=share, tries=_ROWS.tries + 1))
-        return number
+        return connection.execute(taking).scalar()
 
 
 def complete(engine: sa.Engine, batch: str, number: int) -> None:
@@ -111,7 +123,7 @@ def release_lost(engine: sa.Engine, batch: str) -> None:
 def tally(engine: sa.Engine, batch: str) -> Tally:
     """The shards as they are now."""
     done = sa.case((_ROWS.done, 1), else_=0)
-    free = sa.case((sa.and_(*_IS_FREE), 1), else_=0)
+    free = sa.case((sa.and_(*_is_free(_ROWS)), 1), else_=0)
     counted = sa.select(
         sa.func.count(),
         sa.func.coalesce(sa.func.sum(free), 0),
@@ -127,7 +139,8 @@ def forget(connection: sa.Connection, batch: str) -> None:
     connection.execute(sa.delete(SHARDS).where(_ROWS.job_id == batch))
 
 
-_IS_FREE = (_ROWS.done.is_(False), _ROWS.share.is_(None), _ROWS.error.is_(None), _ROWS.tries < MOST_TRIES)
+def _is_free(row: Any) -> tuple[sa.ColumnElement[bool], ...]:
+    return row.done.is_(False), row.share.is_(None), row.error.is_(None), row.tries < MOST_TRIES
 
 
 def _of(batch: str, number: int) -> sa.Update:

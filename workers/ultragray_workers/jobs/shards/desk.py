@@ -14,7 +14,7 @@ from ..folder import Outcome
 from ..queue import database, unfinished
 from ..queue.database import JobDatabase
 from . import claims
-from .channel import Channel, channel
+from .channel import channel
 from .claims import Failed
 from .shares import SHARE_OF, call_help
 
@@ -34,22 +34,17 @@ class ShardDesk:
         self._jobs, self._request = jobs, request
         self._share = row.workflow_id
         self._batch = request.get(SHARE_OF) or row.workflow_id
+        claims.release(jobs.engine, self._batch, self._share)
         self._channel, self._there = channel()
         self._heard: deque[dict[str, Any]] = deque()  # and not answered, since the database is away
         self._at_hand: deque[int] = deque()  # handed out, in that order, and not done
         self._told_at_s = float("-inf")
         self._since_s = time.monotonic()
-        claims.release(jobs.engine, self._batch, self._share)
 
     @property
     def descriptors(self) -> tuple[int, int]:
         """For the process, which inherits them."""
         return self._there
-
-    @property
-    def channel(self) -> Channel:
-        """This side of the pipes."""
-        return self._channel
 
     def attend(self, timeout_s: float) -> None:
         """Answers what the process says within a time. Raises BatchOver."""

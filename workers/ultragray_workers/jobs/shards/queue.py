@@ -25,24 +25,26 @@ class BatchFailed(Exception):
 class ShardQueue:
     """Shards to make. One is asked for ahead, so that rendering never waits for the database."""
 
-    def __init__(self, channel: Channel, check: Callable[[], None]) -> None:
-        """`check` is called while there is nothing to do; to stop, it raises."""
-        self._channel, self._check = channel, check
+    def __init__(self, channel: Channel) -> None:
+        self._channel = channel
         self._next: list[int] = []
         self._is_asked = self._is_over = self._must_wait = False
         self._failed: Failed | None = None
-        self.frames_done = 0  # of the whole batch, as far as it is known
+        self.frames_done: int | None = None  # of the whole batch; None: not known yet
 
     def lay_out(self, plan: BatchPlan, done: list[int]) -> None:
         """Says what the batch is, and which of its shards are there already."""
         self._channel.send({"plan": {"frames": plan.frames, "shard_frames": plan.shard_frames, "done": done}})
 
-    def take(self) -> int | None:
-        """The next shard; None where this process is not needed any more. Raises BatchFailed."""
+    def take(self, meanwhile: Callable[[], None]) -> int | None:
+        """The next shard; None where this process is not needed any more.
+
+        `meanwhile` is called while there is nothing to do; to stop, it raises. Raises BatchFailed.
+        """
         self._ask()
         while not self._next and not self._is_over:
             self.look(_POLL_S)
-            self._check()
+            meanwhile()
             if self._must_wait:
                 time.sleep(_ASK_AGAIN_S)
                 self._must_wait = False
