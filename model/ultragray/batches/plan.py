@@ -16,7 +16,8 @@ from ..contract import to_dict
 from ..errors import InvalidArgument
 from ..pose import check_poses
 from ..probe import FloatArray, Probe
-from ..samplers import Assess, DrawnSampler, Sampler, assessed_part
+from ..samplers import Assess, DrawnSampler, Sampler
+from ..samplers.confident import assessed_part
 from ..samplers.sampler import BLOCK_POSES
 from ..scene_info import SceneHeader
 from ..settings import Encoding, FrameSettings, Resolved

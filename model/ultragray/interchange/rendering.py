@@ -23,6 +23,8 @@ from ..settings import Below, Resolved
 from .exports import FORMATS, ExportHeader, check_format, export_to
 from .exports.png_folder import export_pngs
 
+__all__ = ["render_portions", "render_to_file"]
+
 
 def render_to_file(
     path: Path,

@@ -7,15 +7,14 @@ A sampler is made of numbers, travels as a JSON object with a `kind`, and makes 
 from __future__ import annotations
 
 from .around import AroundSampler
-from .confident import Assess, assessed_part, assessed_poses, confident_poses, require_drawn
+from .confident import Assess, assessed_poses, confident_poses
 from .covered import CoveredSampler
 from .fan import FanSampler
-from .sampler import BLOCK_POSES, MAX_POSES, DrawnSampler, Sampler
+from .sampler import MAX_POSES, DrawnSampler, Sampler
 from .spline import SplineSampler
 from .training import TrainingSampler
 
 __all__ = [
-    "BLOCK_POSES",
     "MAX_POSES",
     "AroundSampler",
     "Assess",
@@ -25,8 +24,6 @@ __all__ = [
     "Sampler",
     "SplineSampler",
     "TrainingSampler",
-    "assessed_part",
     "assessed_poses",
     "confident_poses",
-    "require_drawn",
 ]

@@ -12,7 +12,8 @@ from ultragray.errors import InvalidArgument, InvalidProbe
 from ultragray.files.atomic import file_sha256
 from ultragray.files.poses import load_poses
 from ultragray.interchange.exports.formats import check_format
-from ultragray.samplers import Sampler, require_drawn
+from ultragray.samplers import Sampler
+from ultragray.samplers.confident import require_drawn
 from ultragray.scene_info import read_header
 from ultragray.settings import FrameSettings
 from ultragray_workers.batches.on_ray import RayBatch, check_address

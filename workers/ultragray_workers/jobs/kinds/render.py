@@ -26,8 +26,8 @@ from ultragray.samplers import (
     Sampler,
     TrainingSampler,
     assessed_poses,
-    require_drawn,
 )
+from ultragray.samplers.confident import require_drawn
 from ultragray.scene_info import SceneHeader
 from ultragray.settings import Encoding, FrameSettings
 
