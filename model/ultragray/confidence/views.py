@@ -126,8 +126,9 @@ class TrainingViews:
         facing = np.einsum("xbv,bx->bv", self._axes[1][:, views], poses[:, :3, 1])
         along *= np.sign(facing)[:, None]  # −1: turned by more than 90°, front and back swap
         largest = np.float32(1e3 * FAR_MM)  # of a side without a view
-        np.minimum(distances, largest, out=distances)
-        front, back = (np.where(side, distances, largest).min(axis=2) for side in (along >= 0.0, along <= 0.0))
+        np.clip(distances, 1.0 / largest, largest, out=distances)
+        nearness = np.copysign(1.0 / distances, along)  # the nearest view in front has the highest, behind the lowest
+        front, back = (1.0 / np.maximum(side, 1.0 / largest) for side in (nearness.max(axis=2), -nearness.min(axis=2)))
         between = front * back / np.maximum(front + back, 1e-9)
         capped = [np.minimum(value, FAR_MM) for value in (nearest_mm, between)]
         around = _root_mean_square(distances)
