@@ -14,6 +14,7 @@ POINTS_PER_SIDE = 6  # of the grid of image points at which distances are taken
 ANGLE_MM_PER_DEG = 0.02  # added to distances to choose the nearest view: of two about as near, the less turned one
 FAR_MM = 20.0  # a frame is expected to be no worse farther away: larger distances count as this
 MAX_VIEWS = 256  # around a pose that it is compared with: with more, this would take longer than rendering the frame
+SMALLEST_MM = 1e-6  # of a distance: nearer ones count as this
 POSES_AT_ONCE = 8  # so that their distances stay in the processor's cache
 NEIGHBOURHOOD_MM = 3.0  # of views whose hardness counts; where all are farther away, the nearest ones count
 
@@ -126,7 +127,7 @@ class TrainingViews:
         facing = np.einsum("xbv,bx->bv", self._axes[1][:, views], poses[:, :3, 1])
         along *= np.sign(facing)[:, None]  # −1: turned by more than 90°, front and back swap
         largest = np.float32(1e3 * FAR_MM)  # of a side without a view
-        np.clip(distances, 1.0 / largest, largest, out=distances)
+        np.clip(distances, SMALLEST_MM, largest, out=distances)
         nearness = np.copysign(1.0 / distances, along)  # the nearest view in front has the highest, behind the lowest
         front, back = (1.0 / np.maximum(side, 1.0 / largest) for side in (nearness.max(axis=2), -nearness.min(axis=2)))
         between = front * back / np.maximum(front + back, 1e-9)
