@@ -24,9 +24,10 @@ FIGURES := build/bench
 READY = @$(if $(RECORD),$(BIN)/python benchmarks/record.py --ready &&) mkdir -p $(FIGURES)
 KEEP = @$(if $(RECORD),$(BIN)/python benchmarks/record.py,:)
 MINUTES ?= 30
+FRAMES ?= 100000
 
 .DEFAULT_GOAL := help
-.PHONY: ALWAYS help serve console test test-fast test-long test-console test-faults test-fuzz test-soak test-overload test-image test-replicas test-newcomer check check-lint check-types check-generated check-web check-figures format bench bench-record bench-console console-picture bench-cuda results ablations poses confidence libraries simulation figures demo-scene docs generate packages clean
+.PHONY: ALWAYS help serve console test test-fast test-long test-console test-faults test-fuzz test-soak test-overload test-shards test-image test-replicas test-newcomer check check-lint check-types check-generated check-web check-figures format bench bench-record bench-console console-picture bench-cuda results ablations poses confidence libraries simulation figures demo-scene docs generate packages clean
 
 help:  ## say what there is
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
@@ -82,6 +83,9 @@ test-replicas: $(VENV)/installed-dev  ## 200 clients on 40 scenes of 4 replicas 
 test-image: $(VENV)/installed-dev  ## build the image with neither engine nor registry (as root, with buildah and mmdebstrap), run it and compare its frames
 	$(BIN)/python tests/image/build.py
 	ULTRAGRAY_TEST_IMAGE=localhost/ultragray:cpu $(BIN)/pytest tests/image -s $(ARGS)
+test-shards: $(VENV)/installed-dev  ## a batch of FRAMES (100000) in 200 shards: workers killed at random, Ray beside them (RECORD=1: into the documents)
+	ULTRAGRAY_SHARDS_FRAMES=$(FRAMES) ULTRAGRAY_SHARDS_RECORD=$(FIGURES)/shards.json $(BIN)/pytest -m long tests/batches $(ARGS)
+	$(KEEP) shards
 
 test-newcomer: $(VENV)/installed-dev $(CONSOLE)  ## play a newcomer with Debian's Python: clone, serve, the documents, the tests, the wheels; takes twenty minutes
 	$(BIN)/python tests/newcomer/play.py $(ARGS)

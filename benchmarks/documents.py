@@ -53,6 +53,7 @@ BLOCKS = {
     "clients": Block("clients", performance.clients),
     "control loop": Block("clients", performance.control_loop),
     "jobs": Block("jobs", performance.jobs),
+    "shards": Block("shards", performance.shards),
     "console": Block("console", performance.console),
     "imports": Block("libraries", performance.imports),
     "beside scikit-image": Block("libraries", performance.beside_scikit_image),

@@ -140,6 +140,19 @@ def control_loop(measured: Document) -> Iterator[str]:
     )
 
 
+def shards(measured: Document) -> Iterator[str]:
+    """A batch on the queue and on Ray, beside the kernel."""
+    extent, kernel = measured["extent"], measured["kernel_frames_per_s"]
+    workers = extent["workers"]
+    rows = [(f"kernel alone, {workers} processes of one thread", f"{kernel:,.0f}", "", "")]
+    for engine, name in (("queue", "queue"), ("ray", "Ray")):
+        if (found := measured.get(engine)) is not None:
+            share = f"{found['share_of_kernel']:.0%}"
+            rows.append((f"{name}, {workers} workers", f"{found['frames_per_s']:,.0f}", share, str(found["kills"])))
+    what = f"{extent['frames']:,} frames of {extent['side']}x{extent['side']}, {extent['shards']} shards"
+    return _table((what, "Frames/s", "Of the kernel", "Killed in the second half"), rows)
+
+
 def jobs(measured: Document) -> Iterator[str]:
     """A service with a long list of jobs."""
     return _table(

@@ -99,6 +99,11 @@ _FILES = (
         ),
     ),
     Figures("benchmarks/simulation.json", "simulation", ("benchmarks/scaling", "benchmarks/simulation.py")),
+    Figures(
+        "benchmarks/shards.json",
+        "test-shards",
+        (*_KERNEL, *_JOBS, "model/ultragray/batches", "workers/ultragray_workers/batches", "tests/batches"),
+    ),
     Figures("tests/long-run.json", "test-long", (*_PRODUCT, "tests", ":(exclude)tests/*-run.json")),
     Figures("tests/soak-run.json", "test-soak", (*_PRODUCT, "tests/soak")),
     Figures("tests/replicas-run.json", "test-replicas", (*_PRODUCT, "docker/envoy", "tests/replicas")),

@@ -352,7 +352,7 @@ Sampler: TypeAlias = AroundSampler | CoveredSampler | FanSampler | SplineSampler
 
 @dataclass(frozen=True)
 class RenderJob(FrameSettings):
-    """Many frames of a scene become one archive, at `poses`, or at those that `sampler` makes.
+    """Many frames of a scene become one archive, or many, at `poses`, or at those that `sampler` makes.
 
     The sampler makes them of `poses`, or where none are given of the scene's training poses. Poses are kept as an array
     of exact ones: up to 100,000 of them would be millions of Python's objects. Where `below_min_confidence` is refuse,
@@ -365,10 +365,14 @@ class RenderJob(FrameSettings):
     """4x4 matrices, mm, probe to scene."""
     sampler: Sampler | None = None
     """Makes poses of the given ones, else of the scene's training poses."""
-    format: str = "npz"
-    """tar: WebDataset; dicom and plus (.igs.mha): bmode in uint8, true to scale."""
+    format: str | None = None
+    """tar: WebDataset; dicom and plus (.igs.mha): bmode in uint8, true to scale. Default: npz; in shards tar."""
     dtype: str | None = None
     """Default: the format's own."""
+    shard_frames: int | None = None
+    """Frames of a file: the job becomes many files, which all workers make. Default: one file, above 100,000 frames
+    5,000 in each.
+    """
     kind: Literal["render"] = field(default="render", repr=False, kw_only=True)
     max_run_s: float | None = field(default=None, kw_only=True)
     """Longest time that the job may run in all, s; then it fails, and a retry goes on. None: the service's longest."""

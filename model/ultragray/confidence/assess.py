@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import Any, Protocol
 
 import numpy as np
@@ -84,13 +84,13 @@ class Assessor:
 
     def with_support(self, extrapolations: Sequence[Extrapolation], shares: Sequence[float]) -> list[Extrapolation]:
         """The extrapolations of rendered frames, completed with the share of each one's pixels that has support."""
-        model, found = self._model, []
-        for one, share in zip(extrapolations, shares, strict=True):
-            confidence = one.confidence
-            if confidence is not None and model is not None:
-                confidence = float(model.limited(np.array(confidence), np.array(share)))
-            found.append(replace(one, supported_share=share, confidence=confidence))
-        return found
+        confidences = [one.confidence for one in extrapolations]
+        if self._model is not None and None not in confidences:
+            confidences = self._model.limited(np.array(confidences), np.array(shares)).tolist()
+        return [
+            Extrapolation(one.distance_mm, one.angle_deg, confidence, share)
+            for one, confidence, share in zip(extrapolations, confidences, shares, strict=True)
+        ]
 
 
 def supported(coverage: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:  # [C, H, W] -> [C, H, W]

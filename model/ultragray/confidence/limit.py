@@ -22,10 +22,15 @@ def low_confidence(extrapolation: Extrapolation, min_confidence: float, field: s
     return LowConfidence(detail, field=field)
 
 
-def require_confidence(extrapolations: Sequence[Extrapolation], min_confidence: float | None) -> None:
-    """Raises LowConfidence for the first of many poses that does not have the least confidence (None: any will do)."""
+def require_confidence(
+    extrapolations: Sequence[Extrapolation], min_confidence: float | None, *, first: int = 0
+) -> None:
+    """Raises LowConfidence for the first of many poses that does not have the least confidence (None: any will do).
+
+    `first`: the number that they begin with.
+    """
     if min_confidence is None:
         return
-    for number, extrapolation in enumerate(extrapolations):
+    for number, extrapolation in enumerate(extrapolations, first):
         if not is_confident(extrapolation, min_confidence):
             raise low_confidence(extrapolation, min_confidence, f"poses[{number}]")

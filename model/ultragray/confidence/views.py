@@ -14,6 +14,8 @@ POINTS_PER_SIDE = 6  # of the grid of image points at which distances are taken
 ANGLE_MM_PER_DEG = 0.02  # added to distances to choose the nearest view: of two about as near, the less turned one
 FAR_MM = 20.0  # a frame is expected to be no worse farther away: larger distances count as this
 MAX_VIEWS = 256  # around a pose that it is compared with: with more, this would take longer than rendering the frame
+SMALLEST_MM = 1e-6  # of a distance: nearer ones count as this
+POSES_AT_ONCE = 8  # so that their distances stay in the processor's cache
 NEIGHBOURHOOD_MM = 3.0  # of views whose hardness counts; where all are farther away, the nearest ones count
 
 
@@ -48,8 +50,9 @@ class TrainingViews:
 
     def __init__(self, poses: FloatArray, probe: Probe) -> None:
         self._probe = probe
-        self._axes = np.ascontiguousarray(poses[:, :3, :3].transpose(2, 1, 0))  # [axis, xyz, P]
-        self._offsets = np.einsum("axp,px->ap", self._axes, poses[:, :3, 3])  # [axis, P]
+        axes = np.ascontiguousarray(poses[:, :3, :3].transpose(2, 1, 0))  # [axis, xyz, P]
+        self._axes = axes.astype(np.float32)
+        self._offsets = np.einsum("axp,px->ap", axes, poses[:, :3, 3]).astype(np.float32)  # [axis, P]
         self._rotations = poses[:, :3, :3].reshape(len(poses), 9)
         self._middles = (
             poses[:, :3, :3] @ _image_points(probe, POINTS_PER_SIDE).mean(axis=0) + poses[:, :3, 3]
@@ -64,10 +67,13 @@ class TrainingViews:
         count = len(poses)
         measures = np.zeros((4, count, len(points)))
         weights = np.zeros((count, len(self)))
-        for place, pose in enumerate(check_poses(poses) if count else poses):
-            seen = points @ pose[:3, :3].T + pose[:3, 3]
-            views = self._nearby(seen.mean(axis=0))
-            measures[:, place], weights[place, views] = self._measure(seen, pose, views)
+        checked = check_poses(poses) if count else poses
+        for first in range(0, count, POSES_AT_ONCE):
+            some = checked[first : first + POSES_AT_ONCE]
+            places = np.arange(first, first + len(some))
+            seen = points @ some[:, :3, :3].transpose(0, 2, 1) + some[:, None, :3, 3]
+            views = self._nearby(seen.mean(axis=1))
+            measures[:, places], weights[places[:, None], views] = self._measure(seen, some, views)
         nearest, distance, interpolation, angle = measures
         return ViewMeasures(nearest, distance, interpolation, angle, weights)
 
@@ -75,51 +81,67 @@ class TrainingViews:
         """Root of the mean square distance of the points of each image to each view."""
         points = _image_points(probe, POINTS_PER_SIDE)
         distances = np.zeros((len(poses), len(self)))
+        everyone = np.arange(len(self))[None]
         for place, pose in enumerate(poses):
-            elevation, beside = self._offsets_mm(points @ pose[:3, :3].T + pose[:3, 3], slice(None))
-            distances[place] = _root_mean_square(np.hypot(elevation, beside))
+            _, apart = self._offsets_mm((points @ pose[:3, :3].T + pose[:3, 3])[None], everyone)
+            distances[place] = _root_mean_square(apart)[0]
         return distances
 
-    def _nearby(self, point: FloatArray) -> slice | npt.NDArray[np.intp]:
+    def _nearby(self, middles: FloatArray) -> npt.NDArray[np.intp]:  # [B, 3] mm -> [B, V] or [1, P]
         """The views that can matter: all, or of very many those whose images have their middles nearest to a point."""
         if len(self) <= MAX_VIEWS:
-            return slice(None)
-        return np.argpartition(((self._middles - point) ** 2).sum(axis=1), MAX_VIEWS)[:MAX_VIEWS]
+            return np.arange(len(self))[None]
+        away = ((self._middles - middles[:, None]) ** 2).sum(axis=2)
+        return np.argpartition(away, MAX_VIEWS, axis=1)[:, :MAX_VIEWS]
 
     def _offsets_mm(
-        self, points: FloatArray, views: slice | npt.NDArray[np.intp]
-    ) -> tuple[FloatArray, FloatArray]:  # [K, 3] mm -> [K, P] both
-        """Distances of points off the planes of views along elevation, and beside the images within the planes."""
-        x, elevation, z = (points @ self._axes[axis][:, views] - self._offsets[axis][views] for axis in range(3))
+        self, points: FloatArray, views: npt.NDArray[np.intp]
+    ) -> tuple[FloatArray, FloatArray]:  # [B, K, 3] mm, [B, V] -> [B, K, V] both
+        """Distances of points off the planes of views along elevation, and from the images within the planes.
+
+        In float32, and squares are added up here: `np.hypot` of doubles takes ten times as long.
+        """
+        single = points.astype(np.float32)
+        x, elevation, z = (single @ self._axes[axis][:, views].transpose(1, 0, 2) for axis in range(3))
+        for coordinate, offsets in zip((x, elevation, z), self._offsets, strict=True):
+            coordinate -= offsets[views][:, None]
         probe = self._probe
         lateral, depth = probe.lines.beside(x, z)
-        middle, reach = 0.5 * (probe.near_mm + probe.far_mm), 0.5 * probe.scan_line_length_mm
-        axial = np.abs(depth - middle) - reach
-        return elevation, np.hypot(np.maximum(lateral, 0.0), np.maximum(axial, 0.0))
+        depth -= 0.5 * (probe.near_mm + probe.far_mm)
+        axial = np.abs(depth, out=depth)
+        axial -= 0.5 * probe.scan_line_length_mm
+        squares = elevation * elevation
+        for beside in (lateral, axial):
+            np.maximum(beside, 0.0, out=beside)
+            beside *= beside
+            squares += beside
+        return elevation, np.sqrt(squares, out=squares)
 
     def _measure(
-        self, points: FloatArray, pose: FloatArray, views: slice | npt.NDArray[np.intp]
-    ) -> tuple[FloatArray, FloatArray]:  # [4, K], [V]
-        elevation, beside = self._offsets_mm(points, views)
-        angles = self._angles_deg(pose)[views]
-        distances = np.hypot(elevation, beside)  # [K, P]
-        nearest = (distances + ANGLE_MM_PER_DEG * angles).argmin(axis=1)
-        nearest_mm = distances[np.arange(len(points)), nearest]
-        facing = np.sign(self._axes[1][:, views].T @ pose[:3, 1])  # −1: turned by more than 90°, front and back swap
-        along = elevation * facing
-        sides = [np.where(side, distances, np.inf).min(axis=1) for side in (along >= 0.0, along <= 0.0)]
-        front, back = (np.minimum(side, 1e3 * FAR_MM) for side in sides)
+        self, points: FloatArray, poses: FloatArray, views: npt.NDArray[np.intp]
+    ) -> tuple[FloatArray, FloatArray]:  # [B, K, 3], [B, 4, 4], [B, V] -> [4, B, K], [B, V]
+        along, distances = self._offsets_mm(points, views)  # [B, K, V]
+        angles = np.take_along_axis(self._angles_deg(poses), views, axis=1)[:, None].astype(np.float32)
+        nearest = (distances + np.float32(ANGLE_MM_PER_DEG) * angles).argmin(axis=2)[..., None]
+        nearest_mm = np.take_along_axis(distances, nearest, axis=2)[..., 0]
+        facing = np.einsum("xbv,bx->bv", self._axes[1][:, views], poses[:, :3, 1])
+        along *= np.sign(facing)[:, None]  # −1: turned by more than 90°, front and back swap
+        largest = np.float32(1e3 * FAR_MM)  # of a side without a view
+        np.clip(distances, SMALLEST_MM, largest, out=distances)
+        nearness = np.copysign(1.0 / distances, along)  # the nearest view in front has the highest, behind the lowest
+        front, back = (1.0 / np.maximum(side, 1.0 / largest) for side in (nearness.max(axis=2), -nearness.min(axis=2)))
         between = front * back / np.maximum(front + back, 1e-9)
         capped = [np.minimum(value, FAR_MM) for value in (nearest_mm, between)]
-        around = _root_mean_square(np.minimum(distances, 1e3 * FAR_MM))
-        least = around.min()
-        reach = max(NEIGHBOURHOOD_MM, 1.3 * least)
+        around = _root_mean_square(distances)
+        least = around.min(axis=1, keepdims=True)
+        reach = np.maximum(NEIGHBOURHOOD_MM, 1.3 * least)
         weights = np.exp((least / reach) ** 2 - (around / reach) ** 2)
-        return np.stack([nearest_mm, *capped, angles[nearest]]), weights / weights.sum()
+        turned = np.take_along_axis(np.broadcast_to(angles, distances.shape), nearest, axis=2)[..., 0]
+        return np.stack([nearest_mm, *capped, turned]), weights / weights.sum(axis=1, keepdims=True)
 
-    def _angles_deg(self, pose: FloatArray) -> FloatArray:  # [P]
-        """Angle of the rotation from the pose to each view."""
-        cosine = 0.5 * (self._rotations @ pose[:3, :3].ravel() - 1.0)
+    def _angles_deg(self, poses: FloatArray) -> FloatArray:  # [B, 4, 4] -> [B, P]
+        """Angle of the rotation from each pose to each view."""
+        cosine = 0.5 * (poses[:, :3, :3].reshape(-1, 9) @ self._rotations.T - 1.0)
         return np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
 
 
@@ -129,6 +151,6 @@ def _image_points(probe: Probe, per_side: int) -> FloatArray:  # [K, 3] mm, prob
     return points.reshape(-1, 3)
 
 
-def _root_mean_square(values: FloatArray) -> FloatArray:  # [K, P] -> [P]
-    root: FloatArray = np.sqrt((values * values).mean(axis=0))
+def _root_mean_square(values: FloatArray) -> FloatArray:  # [B, K, P] -> [B, P]
+    root: FloatArray = np.sqrt(np.einsum("bkp,bkp->bp", values, values) / values.shape[1]).astype(np.float64)
     return root

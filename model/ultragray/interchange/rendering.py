@@ -13,6 +13,7 @@ import torch
 from ..confidence import Assessor, Extrapolation, is_confident
 from ..confidence.support import SupportWatch
 from ..display.frames import show
+from ..display.pixels import PixelArray
 from ..evaluation.scoring import frames_at_once
 from ..limits import UNLIMITED, Limits
 from ..probe import FloatArray
@@ -21,6 +22,8 @@ from ..scene import GaussianScene
 from ..settings import Below, Resolved
 from .exports import FORMATS, ExportHeader, check_format, export_to
 from .exports.png_folder import export_pngs
+
+__all__ = ["render_portions", "render_to_file"]
 
 
 def render_to_file(
@@ -55,18 +58,44 @@ def render_to_file(
         scene_sha256=scene_sha256,
         renderer=renderer_name(backend, scene),
     )
+    found: list[Extrapolation] = []
+    exporting = export_pngs(path, header) if format is None else export_to(path, format, header)
+    portions = render_portions(
+        scene, settings, poses, extrapolations, backend=backend, limits=limits, before_portion=before_portion
+    )
+    with exporting as add, written_behind(add) as write:
+        for frames, figures in portions:
+            write(frames, figures)
+            found.extend(figures)
+    return found
+
+
+def render_portions(
+    scene: GaussianScene,
+    settings: Resolved,
+    poses: FloatArray,  # [C, 4, 4] mm
+    extrapolations: Sequence[Extrapolation],  # [C]
+    *,
+    backend: str = "auto",
+    limits: Limits = UNLIMITED,
+    before_portion: Callable[[int], object] | None = None,
+    assessor: Assessor | None = None,
+) -> Iterator[tuple[dict[str, PixelArray], list[Extrapolation]]]:  # [B, H, W] by output, [B]
+    """The frames of many poses as they are shown, a portion at a time, with all figures of each.
+
+    `before_portion` is told how many frames are done, at last all of them; to stop, it raises. `assessor`: the scene's,
+    where the caller has one. Raises what `render` raises.
+    """
     limit = settings.min_confidence if settings.below_min_confidence is Below.MASK else None
     masked = [limit is not None and not is_confident(one, limit) for one in extrapolations]
     wanted = tuple(dict.fromkeys((*settings.outputs, "coverage")))
     portion = frames_at_once(settings.height, settings.width)
-    assessor = Assessor(scene.info, scene.training_poses)
-    found: list[Extrapolation] = []
-    exporting = export_pngs(path, header) if format is None else export_to(path, format, header)
-    with exporting as add, _written_behind(add) as write, torch.no_grad():
-        for first in range(0, len(poses), portion):
-            if before_portion is not None:
-                before_portion(first)
-            places = slice(first, first + portion)
+    assessor = assessor or Assessor(scene.info, scene.training_poses)
+    for first in range(0, len(poses), portion):
+        if before_portion is not None:
+            before_portion(first)
+        places = slice(first, first + portion)
+        with torch.no_grad():
             frames = render(
                 scene,
                 settings.probe,
@@ -84,15 +113,14 @@ def render_to_file(
             asked = {name: getattr(frames, name) for name in settings.outputs}
             shown = show(asked, settings.probe, settings.display, blackened)
             shares = watch.shares(0, len(frames.coverage))
-            found.extend(assessor.with_support(extrapolations[places], shares))
-            write({name: pixels.cpu().numpy() for name, pixels in shown.items()}, found[first:])
+        figures = assessor.with_support(extrapolations[places], shares)
+        yield {name: pixels.cpu().numpy() for name, pixels in shown.items()}, figures
     if before_portion is not None:
         before_portion(len(poses))
-    return found
 
 
 @contextmanager
-def _written_behind(write: Callable[..., object]) -> Iterator[Callable[..., None]]:
+def written_behind(write: Callable[..., object]) -> Iterator[Callable[..., None]]:
     """The same in a thread of its own, so that a portion is written while the next one is rendered, and not more than
     one waits. Raises what `write` raises, at the next call or at the end."""
     with ThreadPoolExecutor(1, "writer") as thread:

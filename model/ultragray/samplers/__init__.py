@@ -10,7 +10,7 @@ from .around import AroundSampler
 from .confident import Assess, assessed_poses, confident_poses
 from .covered import CoveredSampler
 from .fan import FanSampler
-from .sampler import MAX_POSES, Sampler
+from .sampler import MAX_POSES, DrawnSampler, Sampler
 from .spline import SplineSampler
 from .training import TrainingSampler
 
@@ -19,6 +19,7 @@ __all__ = [
     "AroundSampler",
     "Assess",
     "CoveredSampler",
+    "DrawnSampler",
     "FanSampler",
     "Sampler",
     "SplineSampler",

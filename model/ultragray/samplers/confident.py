@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import Any, TypeAlias
 
 import numpy as np
 
 from ..confidence import Extrapolation, is_confident, require_confidence
-from ..errors import LowConfidence
+from ..errors import InvalidArgument, LowConfidence
 from ..pose import check_poses
 from ..probe import FloatArray, Probe
-from .sampler import Sampler
+from .sampler import BLOCK_POSES, DrawnSampler, Sampler, seed_of
 
 MOST_DRAWS_PER_POSE, LEAST_DRAWS = 20, 1000  # where so many do not suffice, the search is given up
 SMALLEST_ROUND = 64
@@ -43,13 +42,14 @@ def confident_poses(
 ) -> tuple[FloatArray, list[Extrapolation]]:  # base [P, 4, 4] -> [C, 4, 4] mm, [C]
     """Those poses of a sampler that have at least `min_confidence`, and what `assess` finds about each.
 
-    A random sampler draws on until it has its `count`, at most 20 poses for each of them (at least 1000): the same
-    arguments give the same poses, and where all of its first poses will do, they are these. The others leave out what
-    does not have it. `assess` is an Assessor's, with the probe of the frames. Raises LowConfidence where no pose is
-    left, or too few are found, and what `sampler.poses` raises.
+    A random sampler draws on until it has the `count` of each of its blocks, at most 20 poses for each of them (at
+    least 1000): the same arguments give the same poses, and where all of its first poses will do, they are these. The
+    others leave out what does not have it. `assess` is an Assessor's, with the probe of the frames. Raises
+    LowConfidence where no pose is left, or too few are found, and what `sampler.poses` raises.
     """
-    if sampler.draws:
-        return _drawn_on(sampler, base, probe, assess, min_confidence)
+    if isinstance(sampler, DrawnSampler):
+        sampler.require_few()
+        return _of_blocks(sampler, base, probe, assess, min_confidence, range(sampler.block_count))
     poses = sampler.poses(base, probe)
     extrapolations = list(assess(poses))
     kept = [place for place, one in enumerate(extrapolations) if is_confident(one, min_confidence)]
@@ -63,8 +63,62 @@ def confident_poses(
     return poses[kept], [extrapolations[place] for place in kept]
 
 
+def assessed_part(
+    sampler: Sampler | None,
+    base: Any,  # [P, 4, 4] mm
+    probe: Probe,
+    assess: Assess,
+    min_confidence: float | None,
+    first: int,
+    last: int,
+) -> tuple[FloatArray, Sequence[Extrapolation]]:  # [C, 4, 4] mm, [C]
+    """Those of `assessed_poses` from number `first` to before `last`, without making many others.
+
+    Raises InvalidArgument for a sampler that leaves poses out, whose poses have no numbers before all are made, and
+    what `assessed_poses` raises.
+    """
+    if isinstance(sampler, DrawnSampler):
+        blocks = range(first // BLOCK_POSES, -(-last // BLOCK_POSES))
+        made, found = _of_blocks(sampler, base, probe, assess, min_confidence, blocks)
+        places = slice(first - blocks.start * BLOCK_POSES, last - blocks.start * BLOCK_POSES)
+        return made[places], found[places]
+    if sampler is not None and min_confidence is not None:
+        require_drawn(sampler)
+    poses = (check_poses(base) if sampler is None else sampler.poses(base, probe))[first:last]
+    extrapolations = assess(poses)
+    require_confidence(extrapolations, min_confidence, first=first)
+    return poses, extrapolations
+
+
+def require_drawn(sampler: Sampler) -> None:
+    """Raises InvalidArgument for a sampler that leaves out poses without a least confidence: in shards, none can."""
+    if not isinstance(sampler, DrawnSampler):
+        raise InvalidArgument(
+            f"min_confidence in shards needs a sampler that draws (around, covered), got {sampler.kind}, which leaves "
+            "poses out: mask such frames, or render them into one file",
+            field="min_confidence",
+        )
+
+
+def _of_blocks(
+    sampler: DrawnSampler, base: Any, probe: Probe, assess: Assess, min_confidence: float | None, blocks: range
+) -> tuple[FloatArray, list[Extrapolation]]:
+    poses: list[FloatArray] = []
+    extrapolations: list[Extrapolation] = []
+    for number in blocks:
+        block = sampler.block(number)
+        if min_confidence is None:
+            made = block.poses(base, probe)
+            found = assess(made)
+        else:
+            made, found = _drawn_on(block, base, probe, assess, min_confidence)
+        poses.append(made)
+        extrapolations.extend(found)
+    return np.concatenate(poses), extrapolations
+
+
 def _drawn_on(
-    sampler: Any, base: Any, probe: Probe, assess: Assess, min_confidence: float
+    sampler: DrawnSampler, base: Any, probe: Probe, assess: Assess, min_confidence: float
 ) -> tuple[FloatArray, list[Extrapolation]]:
     count, most = sampler.count, max(LEAST_DRAWS, MOST_DRAWS_PER_POSE * sampler.count)
     poses: list[FloatArray] = []
@@ -87,8 +141,4 @@ def _drawn_on(
             )
         wanted = math.ceil(SPARE * (count - found) * drawn / max(found, 1))
         size = min(max(wanted, SMALLEST_ROUND), max(count, SMALLEST_ROUND), most - drawn)
-        draw = replace(sampler, count=size, seed=_seed_of_round(sampler.seed, rounds))
-
-
-def _seed_of_round(seed: int, number: int) -> int:
-    return int(np.random.SeedSequence([seed, number]).generate_state(1, np.uint64)[0] >> np.uint64(1))
+        draw = sampler.with_draws(size, seed_of(sampler.seed, rounds))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
@@ -11,14 +12,14 @@ from ..contract import kind_field
 from ..errors import InvalidArgument
 from ..probe import FloatArray, Probe
 from .rotations import about_axes, blended, random_directions
-from .sampler import Sampler, count_field, seed_field
+from .sampler import MAX_DRAWN, DrawnSampler, count_field, seed_field
 
 MAX_BASE_POSES = 10_000  # all are compared with all
 LARGEST_GAP = 4.0  # in median lengths of the links
 
 
 @dataclass(frozen=True)
-class CoveredSampler(Sampler):
+class CoveredSampler(DrawnSampler):
     """`count` poses, uniform within the region that the base poses cover.
 
     How far apart two poses are is the mean distance of the corresponding corners of their image planes, mm, so that
@@ -29,13 +30,11 @@ class CoveredSampler(Sampler):
     turned about a random axis by an angle uniform up to the angle between them. Raises InvalidArgument.
     """
 
-    count: int = count_field()
+    count: int = count_field(high=MAX_DRAWN)
     seed: int = seed_field()
     kind: Literal["covered"] = kind_field("covered")
 
-    draws = True
-
-    def _made(self, base: FloatArray, probe: Probe) -> FloatArray:
+    def _drawn(self, base: FloatArray, probe: Probe) -> FloatArray:
         if len(base) < 2:
             raise InvalidArgument("sampler covered needs at least two base poses, got one", field="kind")
         if len(base) > MAX_BASE_POSES:
@@ -43,7 +42,7 @@ class CoveredSampler(Sampler):
                 f"sampler covered takes at most {MAX_BASE_POSES:,} base poses, got {len(base):,}", field="kind"
             )
         corners = np.einsum("pij,kj->pki", base[:, :3, :3], probe.corners_mm()) + base[:, None, :3, 3]  # [P, K, 3] mm
-        links, lengths = _shortest_links(corners)
+        links, lengths = _shortest_links(corners.tobytes(), len(corners))
         lengths = np.where(lengths > LARGEST_GAP * np.median(lengths), 0.0, lengths)
         ends = np.cumsum(lengths)
         if not ends[-1] > 0.0:
@@ -64,9 +63,10 @@ class CoveredSampler(Sampler):
         return made
 
 
-def _shortest_links(corners: FloatArray) -> tuple[np.ndarray, FloatArray]:  # [P, K, 3] -> [P-1, 2], [P-1] mm
-    """Prim's algorithm: the tree grows by the pose nearest to it."""
-    count = len(corners)
+@lru_cache(1)  # the same for all blocks
+def _shortest_links(packed: bytes, count: int) -> tuple[np.ndarray, FloatArray]:  # [P, K, 3] -> [P-1, 2], [P-1] mm
+    """Prim's algorithm: the tree grows by the pose nearest to it. `packed`: the corners, float64; none is changed."""
+    corners = np.frombuffer(packed).reshape(count, -1, 3)
     links, lengths = np.zeros((count - 1, 2), np.int64), np.zeros(count - 1)
     waiting, nearest, newest = np.arange(1, count), np.zeros(count - 1, np.int64), 0
     distances = np.full(count - 1, np.inf)

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from ultragray import ConvexProbe, LinearProbe
+from ultragray.confidence import Extrapolation
 from ultragray.contract import from_dict, to_dict
-from ultragray.errors import InvalidArgument
+from ultragray.errors import InvalidArgument, LowConfidence
 from ultragray.pose import check_poses, position_distances_mm, rotation_angles_deg
 from ultragray.samplers import (
     AroundSampler,
@@ -19,8 +20,11 @@ from ultragray.samplers import (
     Sampler,
     SplineSampler,
     TrainingSampler,
+    assessed_poses,
 )
+from ultragray.samplers.confident import assessed_part
 from ultragray.samplers.rotations import rotations_of, turns_of
+from ultragray.samplers.sampler import BLOCK_POSES
 
 PROBE = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)
 
@@ -157,6 +161,39 @@ def test_covered_stays_between_neighbours_and_out_of_gaps() -> None:
     np.testing.assert_allclose(share, [0.203, 0.25, 0.25, 0.203], atol=0.02)  # the ends lose 3/64 to their outside
 
 
+def test_more_poses_than_can_be_made_at_once_are_refused_in_words() -> None:
+    with pytest.raises(InvalidArgument, match=r"100,001 is more than the 100,000 poses .* in shards") as caught:
+        AroundSampler(100_001).poses(np.eye(4), PROBE)
+    assert caught.value.field == "count"
+
+
+@pytest.mark.parametrize("sampler", [AroundSampler(BLOCK_POSES * 2 + 7, seed=3), CoveredSampler(BLOCK_POSES + 7)])
+@pytest.mark.parametrize("limit", [None, 0.5])
+def test_any_part_of_drawn_poses_is_made_alone(sampler: Any, limit: float | None) -> None:
+    def assess(poses: Any) -> list[Extrapolation]:
+        return [Extrapolation(None, None, float(pose[0, 3] > 0.0), None) for pose in poses]
+
+    whole, found = assessed_poses(sampler, swept(), PROBE, assess, limit)
+    assert len(whole) == len(np.unique(whole[:, :3, 3], axis=0)) == sampler.count
+    for first, last in [(0, 10), (4990, 5003), (BLOCK_POSES, sampler.count), (sampler.count - 1, sampler.count)]:
+        part, told = assessed_part(sampler, swept(), PROBE, assess, limit, first, last)
+        np.testing.assert_array_equal(part, whole[first:last])
+        assert list(told) == list(found[first:last])
+
+
+def test_any_part_of_other_poses_has_the_numbers_of_the_whole() -> None:
+    def assess(poses: Any) -> list[Extrapolation]:
+        return [Extrapolation(1.0, 1.0, 0.5, None) for _ in poses]
+
+    sampler = SplineSampler(count=30)
+    part, _ = assessed_part(sampler, swept(), PROBE, assess, None, 20, 25)
+    np.testing.assert_array_equal(part, sampler.poses(swept(), PROBE)[20:25])
+    with pytest.raises(InvalidArgument, match="needs a sampler that draws"):
+        assessed_part(sampler, swept(), PROBE, assess, 0.2, 20, 25)
+    with pytest.raises(LowConfidence, match=r"poses\[3\] has"):
+        assessed_part(None, swept(), PROBE, assess, 0.9, 3, 5)
+
+
 def test_covered_turns_no_further_than_its_neighbours() -> None:
     base = turned(0, [0.0, 2.0, 4.0])
     poses = CoveredSampler(500, seed=1).poses(base, PROBE)
@@ -175,7 +212,8 @@ def test_covered_turns_no_further_than_its_neighbours() -> None:
         ({"kind": "training", "count": 3}, "count", "takes nothing"),
         ({"kind": "around"}, "count", "required"),
         ({"kind": "around", "count": True}, "count", "integer"),
-        ({"kind": "around", "count": 100_001}, "count", "100000"),
+        ({"kind": "around", "count": 100_000_001}, "count", "100000000"),
+        ({"kind": "spline", "count": 100_001}, "count", "100000"),
         ({"kind": "around", "count": 1, "translation_mm": -1}, "translation_mm", "from 0 to 1000"),
         ({"kind": "around", "count": 1, "rotation_deg": float("nan")}, "rotation_deg", "180"),
         ({"kind": "around", "count": 1, "seed": 0.5}, "seed", "integer"),

@@ -21,6 +21,7 @@ from typer.testing import CliRunner, Result
 from ultragray import LinearProbe
 from ultragray.datasets import Dataset, Sweep
 from ultragray.datasets.released import write_released
+from ultragray.files.atomic import file_sha256
 from ultragray_service.cli.app import app
 from ultragray_service.cli.remote.watch import JOB_CANCELLED, JOB_FAILED
 
@@ -143,6 +144,25 @@ def test_poses_of_a_file_become_an_archive(server: RunningService, client: httpx
     listed = json.loads(done(server, "list", "--kind", "render", "--json"))
     assert job in {entry["id"] for entry in listed}
     assert job in done(server, "list", "--state", "succeeded")
+
+
+def test_shards_are_downloaded_by_one_name_those_that_are_missing(
+    server: RunningService, client: httpx.Client, tmp_path: Path
+) -> None:
+    sampler = ("--sampler", "around", "--count", 50, "--shard-frames", 20, "--height", 24, "--width", 16)
+    job = done(server, "submit", "render", "demo", *sampler, "--wait").splitlines()[0]
+    told = client.get(f"/v1/jobs/{job}").json()
+    files = "frames-{000000..000002}.tar"
+    assert told["artifacts"] == ["manifest.json", files]
+    assert (told["specification"]["format"], told["progress"]["frames_done"]) == ("tar", 50)
+    assert "wrote 3 files" in done(server, "download", job, files, "-o", tmp_path / "frames")
+    (tmp_path / "frames" / "frames-000001.tar").unlink()
+    again = json.loads(done(server, "download", job, files, "-o", tmp_path / "frames", "--json"))
+    assert (again["files"], again["there_before"]) == (1, 2)
+    for shard in client.get(f"/v1/jobs/{job}/artifacts/manifest.json").json()["shards"]:
+        assert file_sha256(tmp_path / "frames" / shard["file"]) == shard["sha256"]
+    assert client.get(f"/v1/jobs/{job}/artifacts/frames-000003.tar").status_code == 404
+    assert client.get(f"/v1/jobs/{job}/artifacts/{files}").status_code == 404
 
 
 def test_a_job_is_private_where_that_is_said(server: RunningService, client: httpx.Client) -> None:

@@ -8,6 +8,7 @@ progress.json   how far it is
 log.txt         what the process said
 reserve         room on the disk, given back when the process has ended
 artifacts/      what can be downloaded; appears whole
+batch/          of a job in shards: what can be downloaded instead, see `batches.place`; other hosts write to it, too
 outcome.json    how it ended: the last thing that the process writes
 """
 
@@ -24,7 +25,7 @@ from typing import Any, ClassVar
 from ultragray.contract import described
 from ultragray.files.atomic import remove_stale_temporaries, sync, write_whole
 
-FOLDER = "jobs"
+FOLDER, BATCH = "jobs", "batch"
 
 
 @dataclass(frozen=True)
@@ -100,6 +101,7 @@ class JobFolder:
         self.log = self.path / "log.txt"
         self.reserve = self.path / "reserve"
         self.artifacts = self.path / "artifacts"
+        self.batch = self.path / BATCH
         self._partial = self.path / "artifacts.partial"
         self._request = self.path / "job.json"
         self._progress = self.path / "progress.json"

@@ -65,7 +65,7 @@ class Job:
     reason: str | None = described("Why it failed: one sentence.")
     error: str | None = described("Why it failed: the stable reason, such as DATASET_INVALID.")
     progress: Progress
-    artifacts: tuple[str, ...] = described("Names of the files to download.")
+    artifacts: tuple[str, ...] = described("Names of files to download; frames-{000000..000199}.tar stands for 200.")
     metrics: dict[str, float] = described("Of a scene on the held-out frames.")
     worker: str | None
     retry_of: str | None = described("The job that this one goes on from.")

@@ -7,11 +7,13 @@ import fcntl
 import time
 from collections.abc import Iterator
 
-from ..claims import out_of_sight
+from ..claims import out_of_sight, remove_whole
 from ..errors import JobInUse
 from .folder import JobFolder
 from .queue import runs
 from .queue.database import JobDatabase
+from .shards import claims
+from .shards.shares import forget_shares
 
 _LOCK_WAIT_S = 2.0  # for the process of a job that was cancelled a moment ago
 _LOCK_POLL_S = 0.05
@@ -26,9 +28,12 @@ def remove_job(jobs: JobDatabase, folder: JobFolder) -> None:
         if folder.path.is_dir():
             stack.enter_context(_locked(folder))
         stack.enter_context(out_of_sight(folder.path))
+        for share in forget_shares(jobs, folder.job_id):
+            remove_whole(JobFolder(folder.artifact_folder, share).path)
         jobs.client.delete_workflows([folder.job_id])
         with jobs.engine.begin() as connection:
             runs.forget(connection, folder.job_id)
+            claims.forget(connection, folder.job_id)
 
 
 @contextlib.contextmanager

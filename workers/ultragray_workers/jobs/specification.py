@@ -51,7 +51,12 @@ def value_in(document: Mapping[str, Any], role: str) -> str | None:
 
 def has_checkpoints(document: Mapping[str, Any]) -> bool:
     """Whether a job's JSON asks for work that, interrupted, goes on from where it was."""
-    return Specification.member(document["kind"]).has_checkpoints
+    return Specification.member(document["kind"]).has_checkpoints or is_in_shards(document)
+
+
+def is_in_shards(document: Mapping[str, Any]) -> bool:
+    """Whether a job's JSON asks for a batch, whose shards many workers make."""
+    return Specification.member(document["kind"]).is_in_shards(document)
 
 
 def _without_poses(specification: Specification) -> tuple[dict[str, Any], FloatArray | None]:

@@ -17,6 +17,7 @@ import sqlalchemy as sa
 from dbos import EnqueueOptions, WorkflowSerializationFormat, WorkflowStatus
 from dbos import error as dbos_error
 
+from ultragray.batches import stands_for
 from ultragray.errors import InvalidArgument
 from ultragray.image_size import MAX_IMAGE_SIDE
 
@@ -51,7 +52,8 @@ from .queue.owners import NOBODYS, Kind, Ownership, add_owner, claim_of_job, for
 from .queue.wishes import Wanted
 from .removal import remove_job
 from .requirements import Requirements
-from .specification import from_dict, in_short, to_dict, value_in
+from .shards.shares import batch_of, cancel_shares
+from .specification import from_dict, in_short, is_in_shards, to_dict, value_in
 from .tracing import TRACE, current_trace
 
 __all__ = ["SCENES_FOLDER", "Job", "JobState", "JobStore", "Progress"]
@@ -299,6 +301,7 @@ class JobStore:
             if not runs.decide(self.database.engine, job_id, runs.CANCELLED):
                 raise JobFinished(f"the scene of the job {job_id} is being served: it is as good as done", field="job")
             self.database.client.cancel_workflow(job_id)
+            cancel_shares(self.database, job_id)
             job = self.get(job_id)
         if job.state is not JobState.CANCELLED:
             raise JobFinished(f"the job {job_id} has {job.state.value} already", field="job")
@@ -357,8 +360,9 @@ class JobStore:
     def artifact_files_of(self, owner: str) -> Iterator[Path]:
         """The files that can be downloaded of an owner's jobs."""
         for job_id in ids_of_owner(self.database, owner):
-            with suppress(FileNotFoundError):
-                yield from self._folder(job_id).artifacts.iterdir()
+            for folder in (self._folder(job_id).artifacts, self._folder(job_id).batch):
+                with suppress(FileNotFoundError):
+                    yield from folder.iterdir()
 
     def log_tail(self, job_id: str, bytes: int = _TAIL_BYTES) -> str:
         """The end of the log of a job's process; empty where there is none yet. Raises JobNotFound."""
@@ -373,8 +377,10 @@ class JobStore:
     def artifact(self, job_id: str, name: str) -> Path:
         """The file of an artifact. Raises JobNotFound, ArtifactNotFound."""
         job = self.get(job_id)
-        path = self._folder(job_id).artifacts / name
-        if name not in job.artifacts or not path.is_file():
+        in_shards = is_in_shards({**job.specification, "kind": job.kind})
+        folder = self._folder(job_id).batch if in_shards else self._folder(job_id).artifacts
+        path = folder / name
+        if not any(stands_for(one, name) for one in job.artifacts) or not path.is_file():
             known = ", ".join(job.artifacts) or "none"
             raise ArtifactNotFound(f"the job {job_id} has no artifact {name[:128]!r}; it has {known}", field="name")
         return path
@@ -383,8 +389,9 @@ class JobStore:
         """The workers of the queue, by name; a job at hand that is not `shown`, or gone again, is left out."""
 
         def told(worker: Worker) -> Worker:
-            row = None if worker.job is None else self.database.workflow(worker.job)
-            return worker if row is not None and shown(ownership_of(row)) else replace(worker, job=None)
+            job = None if worker.job is None else batch_of(worker.job)
+            row = None if job is None else self.database.workflow(job)
+            return replace(worker, job=job if row is not None and shown(ownership_of(row)) else None)
 
         return tuple(map(told, attendance.list_workers(self.database)))
 

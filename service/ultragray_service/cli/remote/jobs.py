@@ -9,19 +9,21 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 import numpy as np
 import typer
 
+from ultragray.batches import names_in
 from ultragray.contract import to_dict
 from ultragray.samplers import TrainingSampler
 from ultragray_workers.jobs.kinds import KINDS, Specification
 
 from ..options import parameters_of, values_of, with_parameters
 from ..output import check_file, print_table
-from ..progress import transferred
+from ..progress import counted, transferred
 from ..scenes.show import print_facts
 from ..style import Force, Json, command_group, examples, output_option, tell, to_json, warn
 from .connection import with_connection
 
 if TYPE_CHECKING:
     from ...remote.connection import Connection
+    from ...remote.jobs import Jobs
 
 command_app = command_group("Work in the background, on a running service: it goes on when this command ends.")
 submit_app = command_group("Put a job into the queue; its id is printed.")
@@ -35,7 +37,10 @@ _SUBMITS = {
         "ultragray jobs submit train liver --scene liver --device cuda --min-memory-gb 16 --require site=lab1",
     ),
     "evaluate": ("ultragray jobs submit evaluate liver --scene liver --wait",),
-    "render": ("ultragray jobs submit render liver --format hdf5 --sampler around --count 5000 --translation-mm 3",),
+    "render": (
+        "ultragray jobs submit render liver --format hdf5 --sampler around --count 5000 --translation-mm 3",
+        "ultragray jobs submit render liver --sampler around --count 10000000 --height 64 --width 64 --wait",
+    ),
 }
 _COLUMNS = ("id", "kind", "state", "scene", "progress", "created", "reason")
 
@@ -134,24 +139,45 @@ def logs(
         typer.echo(log, nl=False)
 
 
-@command_app.command(epilog=examples("ultragray jobs download 7f3c2a frames.npz -o frames.npz"))
+@command_app.command(
+    epilog=examples(
+        "ultragray jobs download 7f3c2a frames.npz -o frames.npz",
+        "ultragray jobs download 7f3c2a 'frames-{000000..000199}.tar' -o frames/  # those that are not there yet",
+    )
+)
 @with_connection
 def download(
     connection: Connection,
     job: JobArgument,
-    name: Annotated[str, typer.Argument(help="One of the job's artifacts.", show_default=False)],
-    output: Annotated[Path | None, output_option("File to write.", default="NAME, here")] = None,
+    name: Annotated[str, typer.Argument(help="One of the job's artifacts, or a range of them.", show_default=False)],
+    output: Annotated[Path | None, output_option("File to write; of a range the folder.", default="NAME, here")] = None,
     force: Force = False,
     json: Json = False,
 ) -> None:
     """Download a file that a job made."""
     from ...remote.jobs import Jobs
 
+    if len(names := list(names_in(name))) > 1:
+        _download_all(Jobs(connection), job, names, Path() if output is None else output, as_json=json, force=force)
+        return
     path = Path(Path(name).name) if output is None else output
     check_file(path, force=force)
     with transferred(f"downloading {name}") as begin:
         size = Jobs(connection).download(job, name, path, begin)
     tell(f"wrote {path}: {size:,} bytes", {"output": str(path), "bytes": size}, as_json=json)
+
+
+def _download_all(jobs: Jobs, job: str, names: list[str], folder: Path, *, as_json: bool, force: bool) -> None:
+    """Downloads the files that are not in the folder yet, whole each."""
+    folder.mkdir(parents=True, exist_ok=True)
+    missing = [name for name in names if force or not (folder / Path(name).name).exists()]
+    size = 0
+    with counted(f"downloading {len(missing):,} files", len(missing)) as report:
+        for number, name in enumerate(missing, 1):
+            size += jobs.download(job, name, folder / Path(name).name, lambda total: lambda count: None)
+            report(number)
+    document = {"output": str(folder), "files": len(missing), "there_before": len(names) - len(missing), "bytes": size}
+    tell(f"wrote {len(missing):,} files to {folder}: {size:,} bytes", document, as_json=as_json)
 
 
 def _submit(

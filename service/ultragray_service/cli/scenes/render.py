@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from ultragray.batches import SHARD_FRAMES
 from ultragray.errors import InvalidArgument
 from ultragray.interchange.exports.formats import DTYPES, FORMATS, check_format, exporter_class, format_of
 from ultragray.samplers import Sampler
@@ -16,6 +17,7 @@ from ..options import poses_option, with_options
 from ..output import OR_A_FOLDER, check_ending, check_file, check_folder, is_folder_name
 from ..style import COMPUTE, OUTPUT, Backend, Force, Json, SceneFile, command_group, examples, output_option, tell
 
+SHARDS = "Shards"
 SUFFIXES = tuple(one.suffix for one in FORMATS.values())
 command_app = command_group()
 
@@ -26,14 +28,18 @@ command_app = command_group()
         "ultragray render liver.ugr -o pictures/ --poses path.npy  # a folder of PNGs",
         "ultragray render liver.ugr -o augmented.tar --sampler around --count 500 --translation-mm 3",
         "ultragray render liver.ugr -o labels.h5 --outputs bmode,labels --min-confidence 0.8",
+        "ultragray render liver.ugr -o s3://frames/liver --sampler around --count 10000000 --on ray://head:10001",
     )
 )
 @with_options
 def render(
     scene: SceneFile,
     output: Annotated[
-        Path,
-        output_option(f"A file ({', '.join(SUFFIXES)}), or a folder for PNGs (frame_00000_bmode.png)."),
+        str,
+        output_option(
+            f"A file ({', '.join(SUFFIXES)}), or a folder for PNGs (frame_00000_bmode.png); with --on a folder or "
+            "s3://BUCKET/PREFIX for shards (frames-000000.tar)."
+        ),
     ],
     dtype: Annotated[
         str | None,
@@ -48,14 +54,39 @@ def render(
     sampler: Sampler | None,
     settings: FrameSettings,
     backend: Backend = "auto",
-    threads: Annotated[int, typer.Option(min=0, help="Render threads; 0: all cores.", rich_help_panel=COMPUTE)] = 0,
+    threads: Annotated[
+        int, typer.Option(min=0, help="Render threads; 0: all cores, of a shard one.", rich_help_panel=COMPUTE)
+    ] = 0,
+    on: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ray|ray://HEAD:PORT",
+            help="Render in shards on a Ray cluster, or on one of this machine; what is there already is kept.",
+            show_default=False,
+            rich_help_panel=SHARDS,
+        ),
+    ] = None,
+    shard_frames: Annotated[
+        int | None,
+        typer.Option(min=1, help="Frames of a shard.", show_default=f"{SHARD_FRAMES:,}", rich_help_panel=SHARDS),
+    ] = None,
 ) -> None:
     """Each frame comes with its pose and with how far it can be trusted. Lengths are in mm, angles in degrees."""
+    if on is not None:
+        from .sharding import Shards, render_shards
+
+        shards = Shards.prepared(scene, poses, sampler, settings, dtype=dtype, shard_frames=shard_frames)
+        told = render_shards(shards, output, on, backend=backend, threads=threads)
+        tell(told.in_words(), told.document(), as_json=json)
+        return
+    if shard_frames is not None:
+        raise InvalidArgument("--shard-frames is of shards: name an engine with --on", field="shard_frames")
     from .rendering import Task, render_frames
 
-    format = checked_format(output, settings, dtype, force=force)
+    path = Path(output)
+    format = checked_format(path, settings, dtype, force=force)
     task = Task.prepared(scene, poses, sampler, settings)
-    found = render_frames(task, output, format, dtype=dtype, backend=backend, threads=threads)
+    found = render_frames(task, path, format, dtype=dtype, backend=backend, threads=threads)
     tell(found.in_words(), found.document(), as_json=json)
 
 

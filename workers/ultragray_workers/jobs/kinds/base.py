@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -78,6 +79,11 @@ class Specification(Family):
 
     def check(self, surroundings: Surroundings) -> None:
         """Raises what the job would fail with, as far as its submission can know."""
+
+    @classmethod
+    def is_in_shards(cls, document: Mapping[str, Any]) -> bool:
+        """Whether a job of this JSON is a batch, whose shards many workers make, see `jobs.shards`."""
+        return False
 
     def run(self, job_run: JobRun) -> Outcome:
         """Does the work; in the job's own process, for it imports torch."""

@@ -3,28 +3,39 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
+from ultragray.batches import BatchPlan
 from ultragray.confidence import Assessor, Extrapolation, require_confidence
 from ultragray.contract import described, kind_field, shown, under
 from ultragray.errors import InvalidArgument
-from ultragray.interchange.exports import FORMATS, check_format
+from ultragray.interchange.exports import FORMATS, Format, check_format
 from ultragray.interchange.exports.formats import DTYPES
 from ultragray.outputs import OUTPUTS
 from ultragray.pose import check_poses
 from ultragray.probe import FloatArray, Picture, Probe
-from ultragray.samplers import MAX_POSES, Assess, Sampler, TrainingSampler, assessed_poses
+from ultragray.samplers import (
+    MAX_POSES,
+    Assess,
+    DrawnSampler,
+    Sampler,
+    TrainingSampler,
+    assessed_poses,
+)
+from ultragray.samplers.confident import require_drawn
+from ultragray.scene_info import SceneHeader
 from ultragray.settings import Encoding, FrameSettings
 
 from ...errors import StorageFull
 from .base import Specification, Surroundings
 
 ASSESSED_AT_ONCE = 250_000  # poses times training poses that submissions wait for: about a fifth of a second
+_MEMBER_BYTES = 1024  # of a shard, around the pixels of a member
 _MB, _GB = 1e6, 1e9
 
 Poses: TypeAlias = FloatArray | list[list[list[float]]]  # [C, 4, 4] mm
@@ -32,7 +43,7 @@ Poses: TypeAlias = FloatArray | list[list[list[float]]]  # [C, 4, 4] mm
 
 @dataclass(frozen=True, eq=False)
 class RenderJob(FrameSettings, Specification):
-    """Many frames of a scene become one archive, at `poses`, or at those that `sampler` makes.
+    """Many frames of a scene become one archive, or many, at `poses`, or at those that `sampler` makes.
 
     The sampler makes them of `poses`, or where none are given of the scene's training poses. Poses are kept as an array
     of exact ones: up to 100,000 of them would be millions of Python's objects. Where `below_min_confidence` is refuse,
@@ -43,10 +54,19 @@ class RenderJob(FrameSettings, Specification):
     scene: str = described("Name of a scene.")
     poses: Poses | None = described("4x4 matrices, mm, probe to scene.", None)
     sampler: Sampler | None = described("Makes poses of the given ones, else of the scene's training poses.", None)
-    format: str = described(
-        "tar: WebDataset; dicom and plus (.igs.mha): bmode in uint8, true to scale.", "npz", choices=tuple(FORMATS)
+    format: str | None = described(
+        "tar: WebDataset; dicom and plus (.igs.mha): bmode in uint8, true to scale. Default: npz; in shards tar.",
+        None,
+        choices=tuple(FORMATS),
     )
     dtype: str | None = described("Default: the format's own.", None, choices=DTYPES)
+    shard_frames: int | None = described(
+        "Frames of a file: the job becomes many files, which all workers make. Default: one file, above 100,000 frames "
+        "5,000 in each.",
+        None,
+        low=1,
+        high=MAX_POSES,
+    )
     kind: Literal["render"] = kind_field("render")
 
     run_module = "render_run"
@@ -66,7 +86,10 @@ class RenderJob(FrameSettings, Specification):
                     f"poses must be a list of 1 to {MAX_POSES} 4x4 matrices, got {shown(length)}", field="poses"
                 )
             object.__setattr__(self, "poses", check_poses(self.poses))
-        check_format(self.format, self.outputs, self.dtype)
+        if self.is_sharded and self.format not in (None, "tar"):
+            raise InvalidArgument(f"format must be tar in shards, got {self.format}", field="format")
+        object.__setattr__(self, "format", self.format or ("tar" if self.is_sharded else "npz"))
+        check_format(self.file_format.name, self.outputs, self.dtype)
 
     def __eq__(self, other: object) -> bool:
         from ..specification import to_dict  # imports the kinds
@@ -74,6 +97,36 @@ class RenderJob(FrameSettings, Specification):
         return isinstance(other, RenderJob) and to_dict(self) == to_dict(other)
 
     __hash__ = None  # type: ignore[assignment]
+
+    @classmethod
+    def is_in_shards(cls, document: Mapping[str, Any]) -> bool:
+        """As `Specification`: where it asks for a number of frames in a file, or for more than one file holds."""
+        sampler = document.get("sampler") or {}
+        return document.get("shard_frames") is not None or (sampler.get("count") or 0) > MAX_POSES
+
+    @property
+    def is_sharded(self) -> bool:
+        """Whether the frames become many files, which all workers make."""
+        drawn = isinstance(self.sampler, DrawnSampler) and self.sampler.count > MAX_POSES
+        return self.shard_frames is not None or drawn
+
+    @property
+    def file_format(self) -> Format:
+        """The format of its file, or files."""
+        return FORMATS[self.format or "npz"]
+
+    def plan(self, scene: SceneHeader, scene_sha256: str) -> BatchPlan:
+        """The plan of a job in shards. Raises InvalidArgument and its kind where no shard could be made."""
+        return BatchPlan.prepared(
+            scene,
+            self,
+            sampler=self.sampler,
+            poses=None if self.poses is None else check_poses(self.poses),
+            shard_frames=self.shard_frames,
+            scene=self.scene,
+            scene_sha256=scene_sha256,
+            dtype=check_format(self.file_format.name, self.outputs, self.dtype),
+        )
 
     def check(self, surroundings: Surroundings) -> None:
         """Raises UnknownOutput, InvalidProbe, InvalidImageSize; InvalidArgument for a sampler without use for the poses
@@ -83,14 +136,25 @@ class RenderJob(FrameSettings, Specification):
         scene = surroundings.scene
         assert scene is not None
         settings = self.resolved(scene.info, Encoding.FLOAT32, max_image_side=surroundings.max_image_side)
-        poses = self.poses_of(scene.training_poses, settings.probe)
-        few = len(poses) * len(scene.training_poses) <= ASSESSED_AT_ONCE
-        if self.least_confidence is not None and self.sampler is None and few:
-            assessor = Assessor(scene.info, scene.training_poses)
-            require_confidence(assessor.assess(poses, probe=settings.probe), self.least_confidence)
+        if self.is_sharded:
+            frames = self._planned_frames(scene)
+        else:
+            frames = len(self.poses_of(scene.training_poses, settings.probe))
+        if self.least_confidence is not None and self.sampler is None:
+            poses = self.poses_of(scene.training_poses, settings.probe)
+            if len(poses) * len(scene.training_poses) <= ASSESSED_AT_ONCE:
+                assessor = Assessor(scene.info, scene.training_poses)
+                require_confidence(assessor.assess(poses, probe=settings.probe), self.least_confidence)
         with under("display"):
-            picture = FORMATS[self.format].shown(settings).picture
-        self._check_room(len(poses), picture, surroundings.artifact_folder)
+            picture = self.file_format.shown(settings).picture
+        self._check_room(frames, picture, surroundings.artifact_folder)
+
+    def _planned_frames(self, scene: SceneHeader) -> int:
+        """The frames of a job in shards. Raises InvalidArgument where no shard could be made."""
+        self._base(scene.training_poses)
+        if self.least_confidence is not None and self.sampler is not None:
+            require_drawn(self.sampler)
+        return self.plan(scene, "").frames
 
     def poses_of(self, training_poses: FloatArray, probe: Probe) -> FloatArray:  # [P, 4, 4] -> [C, 4, 4] mm
         """The poses that the job asks for, whatever their confidence; the same training poses and probe give the same.
@@ -117,9 +181,12 @@ class RenderJob(FrameSettings, Specification):
         return training_poses
 
     def _check_room(self, frames: int, picture: Picture, folder: Path) -> None:
-        dtype = np.dtype(check_format(self.format, self.outputs, self.dtype))
+        dtype = np.dtype(check_format(self.file_format.name, self.outputs, self.dtype))
         pixel_bytes = sum(1 if OUTPUTS[name].is_numbers else dtype.itemsize for name in self.outputs)
-        needed, free = frames * picture.height * picture.width * pixel_bytes, shutil.disk_usage(folder).free
+        frame_bytes = picture.height * picture.width * pixel_bytes
+        if self.is_sharded:  # blocks of the tar around the pixels, pose and figures of each frame
+            frame_bytes += _MEMBER_BYTES * (1 + len(self.outputs))
+        needed, free = frames * frame_bytes, shutil.disk_usage(folder).free
         if needed > free:
             raise StorageFull(
                 f"{frames:,} frames of {picture.height}x{picture.width} take up to {_size(needed)}, the artifact "

@@ -7,7 +7,6 @@ import time
 
 from ultragray.confidence import Assessor, Extrapolation
 from ultragray.files.atomic import file_sha256
-from ultragray.interchange.exports import FORMATS
 from ultragray.interchange.rendering import render_to_file
 from ultragray.limits import Limits
 from ultragray.probe import FloatArray, Probe
@@ -20,6 +19,7 @@ from ultragray.training.device import training_device
 from ...scenes import SUFFIX
 from ..folder import Outcome, Progress
 from ..worker.job_run import JobRun, Stopped
+from . import shards_run
 from .render import RenderJob
 
 ASSESSED_AT_ONCE = 100_000  # poses times training poses, of about a tenth of a second
@@ -31,6 +31,8 @@ def run(job_run: JobRun, job: RenderJob) -> Outcome:
     Raises Stopped, InvalidArgument, LowConfidence, InvalidProbe, FrameTooCostly, SceneFileInvalid,
     ExtraMissing.
     """
+    if job.is_sharded:
+        return shards_run.run(job_run, job)
     device = training_device(job_run.request.device, "auto")
     path = job_run.folder.path / f"{job.scene}{SUFFIX}"
     described = read_header(path)
@@ -52,8 +54,8 @@ def run(job_run: JobRun, job: RenderJob) -> Outcome:
 
     with job_run.folder.new_artifacts() as folder:
         render_to_file(
-            folder / f"frames{FORMATS[job.format].suffix}",
-            job.format,
+            folder / f"frames{job.file_format.suffix}",
+            job.file_format.name,
             scene,
             settings,
             poses,

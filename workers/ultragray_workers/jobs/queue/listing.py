@@ -73,7 +73,7 @@ def _rows_after(
 ) -> list[WorkflowStatus]:
     before_ms, seen = place
     rows = jobs.client.list_workflows(
-        name=kind,
+        name=list(KINDS) if kind is None else kind,
         status=None if statuses is None else list(statuses),
         end_time=None if before_ms is None else _iso_after(before_ms),
         sort_desc=True,

@@ -84,6 +84,18 @@ USAGE = sa.Table(  # stays when jobs are deleted
     sa.Column("day", sa.Date, primary_key=True),  # UTC
     sa.Column("run_s", sa.Double, nullable=False),
 )
+SHARDS = sa.Table(  # of render jobs in shards; see jobs.shards.claims
+    "ultragray_shards",
+    TABLES,
+    sa.Column("job_id", sa.Text, primary_key=True),
+    sa.Column("number", sa.Integer, primary_key=True, autoincrement=False),
+    sa.Column("frames", sa.Integer, nullable=False),
+    sa.Column("done", sa.Boolean, nullable=False),
+    sa.Column("share", sa.Text),  # the workflow that is at it; NULL: none
+    sa.Column("tries", sa.Integer, nullable=False),  # how often it was taken
+    sa.Column("error", sa.Text),  # why it cannot be made; NULL: it can
+    sa.Column("reason", sa.Text),
+)
 SCHEMA_VERSION = sa.Table("ultragray_schema", TABLES, sa.Column("version", sa.Integer, nullable=False))
 
 _LOCK_NUMBER = 0x756C7472  # of PostgreSQL's advisory locks
@@ -185,6 +197,24 @@ def _to_version_7(connection: sa.Connection) -> None:
     _add_columns(connection, "ultragray_workers", {"offer": "TEXT"})
 
 
+def _to_version_8(connection: sa.Connection) -> None:
+    """The shards of render jobs."""
+    made = sa.MetaData(schema=SCHEMA)
+    sa.Table(
+        "ultragray_shards",
+        made,
+        sa.Column("job_id", sa.Text, primary_key=True),
+        sa.Column("number", sa.Integer, primary_key=True, autoincrement=False),
+        sa.Column("frames", sa.Integer, nullable=False),
+        sa.Column("done", sa.Boolean, nullable=False),
+        sa.Column("share", sa.Text),
+        sa.Column("tries", sa.Integer, nullable=False),
+        sa.Column("error", sa.Text),
+        sa.Column("reason", sa.Text),
+    )
+    made.create_all(connection, checkfirst=False)
+
+
 def _add_columns(connection: sa.Connection, table: str, types: dict[str, str]) -> None:
     place = table if connection.dialect.name == "sqlite" else f"{SCHEMA}.{table}"
     for name, kind in types.items():
@@ -201,6 +231,7 @@ STEPS: tuple[Callable[[sa.Connection], None], ...] = (
     _to_version_5,
     _to_version_6,
     _to_version_7,
+    _to_version_8,
 )
 VERSION = len(STEPS)
 

@@ -27,7 +27,8 @@ def running(jobs: JobDatabase) -> list[tuple[str, str]]:
 
 def count_waiting(jobs: JobDatabase) -> int:
     """The number of jobs that wait."""
-    counted = sa.select(sa.func.count()).select_from(WORKFLOWS).where(_has_status(*database.QUEUED))
+    is_job = sa.and_(_has_status(*database.QUEUED), _ROWS.name.in_(KINDS))
+    counted = sa.select(sa.func.count()).select_from(WORKFLOWS).where(is_job)
     with jobs.engine.connect() as connection:
         return connection.execute(counted).scalar_one()
 
@@ -53,7 +54,7 @@ def waiting(jobs: JobDatabase) -> list[tuple[Demand, int, int]]:
 
 def count_of_owner(jobs: JobDatabase, owner: str) -> int:
     """The number of an owner's jobs that wait or run."""
-    of_owner = sa.and_(_is_unfinished(), _ROWS.authenticated_user == owner)
+    of_owner = sa.and_(_is_unfinished(), _ROWS.authenticated_user == owner, _ROWS.name.in_(KINDS))
     with jobs.engine.connect() as connection:
         return connection.execute(sa.select(sa.func.count()).select_from(WORKFLOWS).where(of_owner)).scalar_one()
 

@@ -34,7 +34,7 @@ STEP_PAUSE_S = 1.0
 AT_ONCE = 20  # jobs of one step
 DAY_S = 86_400.0
 _FINISHED = (*database.SUCCEEDED, *database.FAILED, *database.CANCELLED)
-_JOB_ID = re.compile(r"[0-9a-f]{24}")
+_JOB_ID = re.compile(r"[0-9a-f]{24}(-[0-9a-f]{8})?")  # of a job, or a share of it
 
 _log = logging.getLogger("ultragray.jobs")
 

@@ -6,7 +6,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 
 from ..folder import JobFolder
@@ -18,11 +18,19 @@ _KILL_WAIT_S, _KILL_POLL_S = 5.0, 0.02
 
 
 @contextmanager
-def job_process(folder: JobFolder, device: DeviceLock, threads: int) -> Iterator[subprocess.Popen[bytes]]:
-    """A process at work in the folder, which shares the lock of its device; killed with its group at the end."""
+def job_process(
+    folder: JobFolder, device: DeviceLock, threads: int, descriptors: Sequence[int] = ()
+) -> Iterator[subprocess.Popen[bytes]]:
+    """A process at work in the folder, which shares the lock of its device; killed with its group at the end.
+
+    `descriptors`: its end of a channel to this worker; this process has it no more.
+    """
     with folder.log.open("ab") as log:
         process = subprocess.Popen(
-            [sys.executable, "-m", "ultragray_workers.jobs.worker.run_job", str(folder.path), str(os.getpid())],
+            [
+                *(sys.executable, "-m", "ultragray_workers.jobs.worker.run_job", str(folder.path), str(os.getpid())),
+                *map(str, descriptors),
+            ],
             stdin=subprocess.DEVNULL,
             stdout=log,
             stderr=log,
@@ -33,8 +41,10 @@ def job_process(folder: JobFolder, device: DeviceLock, threads: int) -> Iterator
                 "OPENBLAS_NUM_THREADS": str(threads),
             },
             start_new_session=True,
-            pass_fds=[device.fileno()],
+            pass_fds=[device.fileno(), *descriptors],
         )
+    for descriptor in descriptors:
+        os.close(descriptor)
     try:
         yield process
     finally:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from contextlib import suppress
 
 from ..folder import JobFolder, Progress, Request
+from ..shards.channel import Channel
 
 _PROGRESS_INTERVAL_S = 0.5
 
@@ -18,8 +19,11 @@ class Stopped(Exception):
 class JobRun:
     """One job in its process."""
 
-    def __init__(self, folder: JobFolder, request: Request, should_stop: Callable[[], bool]) -> None:
-        self.folder, self.request, self.should_stop = folder, request, should_stop
+    def __init__(
+        self, folder: JobFolder, request: Request, should_stop: Callable[[], bool], channel: Channel | None = None
+    ) -> None:
+        """`channel`: to the worker, of a job in shards."""
+        self.folder, self.request, self.should_stop, self.channel = folder, request, should_stop, channel
         self.progress = folder.progress()
         self._reported_at = float("-inf")
 

@@ -1,4 +1,6 @@
-"""`python -m ultragray_workers.jobs.worker.run_job JOB_FOLDER WORKER_PID`: the process that does the work of one job.
+"""The process of a job: `python -m ultragray_workers.jobs.worker.run_job JOB_FOLDER WORKER_PID [READ WRITE]`.
+
+READ and WRITE are the descriptors of a channel to the worker, of a job in shards.
 
 It dies with its worker, works alone in the folder, and as its last act says in outcome.json how the job ended. A job
 that fails is a process that ends well; SIGTERM ends it with exit code STOPPED and a checkpoint to go on from, and files
@@ -23,6 +25,7 @@ from ultragray.errors import InvalidArgument, MemoryExceeded, UltragrayError
 from ...claims import is_no_room, storage_full
 from ...parent import end_with_parent
 from ..folder import JobFolder, Outcome
+from ..shards.channel import Channel
 from ..specification import from_dict
 from .job_run import JobRun, Stopped
 
@@ -32,7 +35,7 @@ _FOLDERS = re.compile(r"(?<![\w./:])/(?:[^\s/:,;'\"()]+/)+")  # of an absolute p
 _OOM_SCORE_ADJ = "500"  # of 1000: where memory runs out, jobs go before the service and its workers
 
 
-def main(folder_path: str, worker_pid: str) -> int:
+def main(folder_path: str, worker_pid: str, *descriptors: str) -> int:
     """The exit code: 0 where outcome.json says how the job ended."""
     end_with_parent(signal.SIGKILL)
     if os.getppid() != int(worker_pid):  # it died before the line above
@@ -55,7 +58,8 @@ def main(folder_path: str, worker_pid: str) -> int:
         request = folder.request()
         os.nice(max(0, request.nice - os.nice(0)))  # a worker within the service is nice itself
         Path("/proc/self/oom_score_adj").write_text(_OOM_SCORE_ADJ, encoding="ascii")
-        job_run = JobRun(folder, request, lambda: bool(received))
+        channel = Channel(*map(int, descriptors)) if descriptors else None
+        job_run = JobRun(folder, request, lambda: bool(received), channel)
         try:
             outcome = _outcome_of(job_run)
             folder.write_progress(outcome.progress)
@@ -119,4 +123,4 @@ def _failed(job_run: JobRun, error: str, reason: str) -> Outcome:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1], sys.argv[2]))
+    sys.exit(main(*sys.argv[1:]))

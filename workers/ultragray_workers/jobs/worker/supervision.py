@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import shutil
 import signal
 import threading
 import time
@@ -29,12 +30,14 @@ from ...errors import (
     StorageFull,
 )
 from ...scenes import SUFFIX
-from ..folder import JobFolder, Outcome, Request
+from ..folder import FOLDER, JobFolder, Outcome, Request
 from ..matching.demand import Demand
 from ..publication import give_name_back, publish_scene
 from ..queue import database, runs
 from ..queue.database import JobDatabase
-from ..specification import has_checkpoints, value_in
+from ..shards.desk import BatchOver, ShardDesk
+from ..shards.shares import SHARE_OF, cancel_shares
+from ..specification import has_checkpoints, is_in_shards, value_in
 from ..tracing import job_span
 from .device import DeviceLock
 from .gate import Gate
@@ -87,6 +90,7 @@ class Supervisor:
         self._goes_on_elsewhere = False  # the job at hand, from its checkpoint
         self.is_draining = False  # an administrator wants the job at hand to go to another worker
         self.job_at_hand: str | None = None
+        self._desk: ShardDesk | None = None  # of a job in shards
 
     @property
     def is_stuck(self) -> bool:
@@ -131,6 +135,8 @@ class Supervisor:
             row = self._require_ours(job_id)
             if self._stop.is_set():
                 self._give_back(job_id)
+            if SHARE_OF in request and not self._goes_on(request[SHARE_OF]):
+                return Outcome()
             with (
                 self._device_for(job_id, request["specification"]) as device,
                 job_span(row, self._config.executor) as span,
@@ -141,11 +147,15 @@ class Supervisor:
             if outcome.error is not None:
                 self._require_folder(job_id)
                 self._give_name_back(row, request["specification"])
+                if self._desk is not None:
+                    self._until_the_database_answers(job_id, partial(self._desk.fail, outcome))
+            if is_in_shards(request["specification"]):
+                self._end_shares(job_id, request)
             _log.info(f"job {job_id} {'succeeded' if outcome.error is None else f'failed: {outcome.reason}'}")
             return outcome
         finally:
             self._gate.close()
-            self.job_at_hand = None
+            self.job_at_hand = self._desk = None
             self._idle.set()
 
     def _outcome_of(self, row: WorkflowStatus, request: dict[str, Any], device: DeviceLock) -> Outcome:
@@ -222,7 +232,7 @@ class Supervisor:
             self._require_ours(folder.job_id)
             end_process_of_another_worker(folder)
             with _room_for_the_end(folder):
-                code = self._run_process(folder, device, run_time)
+                code = self._run_process(folder, row, request, device, run_time)
             if (outcome := folder.outcome()) is not None:
                 return replace(outcome, attempts=attempt)
             if run_time.is_over:
@@ -244,9 +254,48 @@ class Supervisor:
                 return replace(failed, progress=folder.progress(), attempts=attempt)
             attempt += 1
 
-    def _run_process(self, folder: JobFolder, device: DeviceLock, run_time: RunTime) -> int:
+    @contextmanager
+    def _desk_for(self, row: WorkflowStatus, request: dict[str, Any]) -> Iterator[ShardDesk | None]:
+        """The desk of a process at a job in shards."""
+        if not is_in_shards(request["specification"]):
+            yield None
+            return
+        desk = self._desk = self._until_the_database_answers(
+            row.workflow_id, lambda: ShardDesk(self._database, row, request)
+        )
+        try:
+            yield desk
+        except BatchOver:
+            _log.info(f"the batch of {row.workflow_id} is over: its process is ended")
+            raise Interrupted from None
+        finally:
+            desk.close()
+
+    def _goes_on(self, batch: str) -> bool:
+        """Whether a batch waits or runs."""
+        row = self._until_the_database_answers(batch, lambda: self._database.workflow(batch))
+        return row is not None and row.status in (*database.QUEUED, *database.RUNNING)
+
+    def _end_shares(self, job_id: str, request: dict[str, Any]) -> None:
+        """Ends the shares of a batch that has ended; of a share, removes its folder."""
+        if SHARE_OF in request:
+            shutil.rmtree(self._config.artifact_folder / FOLDER / job_id, ignore_errors=True)
+        else:
+            self._until_the_database_answers(job_id, lambda: cancel_shares(self._database, job_id))
+
+    def _run_process(
+        self,
+        folder: JobFolder,
+        row: WorkflowStatus,
+        request: dict[str, Any],
+        device: DeviceLock,
+        run_time: RunTime,
+    ) -> int:
         """Runs the job's process to its end, or to that of its time; its exit code. Raises Interrupted, JobStalled."""
-        with job_process(folder, device, self._config.threads) as process:
+        with (
+            self._desk_for(row, request) as desk,
+            job_process(folder, device, self._config.threads, desk.descriptors if desk else ()) as process,
+        ):
             watchdog = Watchdog(process.pid, self._config.stall_timeout_s)
             watched_at_s = float("-inf")
             is_given_back = False
@@ -273,10 +322,15 @@ class Supervisor:
                             self._raise_unless_ours(folder.job_id)
                         watched_at_s = time.monotonic()
                     self._moved_at_s = time.monotonic()
-                    time.sleep(_POLL_INTERVAL_S)
+                    if desk is None:
+                        time.sleep(_POLL_INTERVAL_S)
+                    else:
+                        desk.attend(_POLL_INTERVAL_S)
             finally:
                 run_time.add(watchdog.look())
                 run_time.save()
+            if desk is not None:
+                desk.settle()
             if is_given_back:
                 self._give_back(folder.job_id)
         return process.returncode

@@ -28,6 +28,7 @@ from ..queue.database import JobDatabase, dbos_config, quiet_dbos
 from ..queue.heartbeat import Heartbeat
 from ..queue.internals import NotMine, leave_others_room, take_only_through
 from ..queue.wishes import Wanted
+from ..shards.shares import SHARE
 from .device import DeviceLock, devices_of
 from .gate import Gate
 from .housekeeping import Housekeeper
@@ -139,7 +140,7 @@ def _launch(url: str, config: WorkerConfig, supervisor: Supervisor, gate: Gate) 
         return outcome.to_dict()
 
     dbos = DBOS(config=dbos_config(url, config.executor))
-    for kind in KINDS:
+    for kind in (*KINDS, SHARE):
         # However often its worker dies, a job does not fail for it.
         DBOS.workflow(name=kind, max_recovery_attempts=None, serialization_type=WorkflowSerializationFormat.PORTABLE)(
             run

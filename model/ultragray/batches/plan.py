@@ -1,0 +1,150 @@
+"""The plan of a batch: which frames it has, and how they are divided into shards. Free of torch."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from ..confidence import Extrapolation
+from ..contract import to_dict
+from ..errors import InvalidArgument
+from ..pose import check_poses
+from ..probe import FloatArray, Probe
+from ..samplers import Assess, DrawnSampler, Sampler
+from ..samplers.confident import assessed_part
+from ..samplers.sampler import BLOCK_POSES
+from ..scene_info import SceneHeader
+from ..settings import Encoding, FrameSettings, Resolved
+from .names import name_range
+
+SHARD_FRAMES = BLOCK_POSES  # of a shard where nothing else is asked for; a search draws no block twice then
+MAX_SHARDS = 20_000  # the queue keeps a row of each, and a manifest names them all
+_VERSION = 1  # of how frames follow from a plan: another one gives other plans
+
+
+@dataclass(frozen=True, eq=False)
+class BatchPlan:
+    """The frames of a batch and their division into shards: with the scene file, all that an engine needs.
+
+    Frame i is the same however many frames a shard has and whoever renders it: its pose follows from i and the seed of
+    the sampler. Plans of one `identity` make the same files, byte for byte on the same kind of processor.
+    """
+
+    scene: str  # its name
+    scene_sha256: str
+    settings: FrameSettings
+    sampler: Sampler | None  # makes poses of `poses`
+    poses: FloatArray | None  # [P, 4, 4] mm; None: the training poses of the scene
+    frames: int
+    shard_frames: int
+    dtype: str = "uint8"  # of pixels; or float32
+    name: str = "frames"  # of the files
+
+    @classmethod
+    def prepared(
+        cls,
+        header: SceneHeader,
+        settings: FrameSettings,
+        *,
+        sampler: Sampler | None,
+        poses: FloatArray | None,
+        shard_frames: int | None = None,
+        **named: str,
+    ) -> BatchPlan:
+        """The plan for a scene; `named` are scene, scene_sha256, and where they are not the usual ones dtype and name.
+
+        Raises InvalidArgument and its kind for what no frame can be rendered with, or too many shards.
+        """
+        resolved = settings.resolved(header.info, Encoding.FLOAT32)
+        base = header.training_poses if poses is None else check_poses(poses)
+        if not len(base):
+            raise InvalidArgument("poses must be given: the scene has no training poses", field="poses")
+        if sampler is None:
+            frames = len(base)
+        elif isinstance(sampler, DrawnSampler):
+            sampler.with_draws(1, sampler.seed).poses(base, resolved.probe)  # raises where the base does not suffice
+            frames = sampler.count
+        else:
+            frames = len(sampler.poses(base, resolved.probe))
+        shard_frames = shard_frames or SHARD_FRAMES
+        plan = cls(
+            settings=FrameSettings(**{one.name: getattr(settings, one.name) for one in fields(FrameSettings)}),
+            sampler=sampler,
+            poses=None if poses is None else base,
+            frames=frames,
+            shard_frames=shard_frames,
+            **named,
+        )
+        if plan.shard_count > MAX_SHARDS:
+            least = -(-frames // MAX_SHARDS)
+            raise InvalidArgument(
+                f"shard_frames must be at least {least:,} for {frames:,} frames (at most {MAX_SHARDS:,} shards), got "
+                f"{shard_frames:,}",
+                field="shard_frames",
+            )
+        return plan
+
+    @property
+    def shard_count(self) -> int:
+        """The number of shards; all but the last have `shard_frames` frames."""
+        return -(-self.frames // self.shard_frames)
+
+    def frames_of(self, shard: int) -> range:
+        """The numbers of the frames of a shard."""
+        first = shard * self.shard_frames
+        return range(first, min(first + self.shard_frames, self.frames))
+
+    def file_name(self, shard: int) -> str:
+        """Such as frames-000017.tar."""
+        return f"{self.name}-{shard:06d}.tar"
+
+    @property
+    def file_names(self) -> str:
+        """The names of all files, as WebDataset writes them: frames-{000000..000199}.tar."""
+        return name_range(f"{self.name}-", self.shard_count - 1, ".tar")
+
+    def key(self, frame: int) -> str:
+        """The name of a frame within its shard, unique in the batch and of one length."""
+        return f"{frame:0{max(6, len(str(self.frames - 1)))}d}"
+
+    def poses_of(
+        self, shard: int, training_poses: FloatArray, probe: Probe, assess: Assess
+    ) -> tuple[FloatArray, Sequence[Extrapolation]]:  # [P, 4, 4] -> [C, 4, 4] mm, [C]
+        """The poses of a shard, and what `assess` finds about each. Raises what `assessed_part` raises."""
+        base = training_poses if self.poses is None else self.poses
+        places = self.frames_of(shard)
+        least = self.settings.least_confidence
+        return assessed_part(self.sampler, base, probe, assess, least, places.start, places.stop)
+
+    def resolved(self, header: SceneHeader) -> Resolved:
+        """The settings of the frames with nothing left open. Raises what `FrameSettings.resolved` raises."""
+        return self.settings.resolved(header.info, Encoding.FLOAT32)
+
+    def document(self) -> dict[str, Any]:
+        """The plan as a manifest has it; of given poses their number and hash."""
+        poses = None if self.poses is None else np.ascontiguousarray(self.poses, "<f8")
+        return {
+            "version": _VERSION,
+            "name": self.name,
+            "scene": self.scene,
+            "scene_sha256": self.scene_sha256,
+            "settings": to_dict(self.settings, with_none=False),
+            "sampler": None if self.sampler is None else to_dict(self.sampler, with_none=False),
+            "poses": None
+            if poses is None
+            else {"count": len(poses), "sha256": hashlib.sha256(poses.tobytes()).hexdigest()},
+            "dtype": self.dtype,
+            "frames": self.frames,
+            "shard_frames": self.shard_frames,
+        }
+
+    @cached_property
+    def identity(self) -> str:
+        """Tells the plan from any other: the SHA-256 of its document."""
+        return hashlib.sha256(json.dumps(self.document(), sort_keys=True).encode()).hexdigest()

@@ -1,0 +1,73 @@
+"""Batches on a real Ray cluster of this machine."""
+
+from __future__ import annotations
+
+import os
+import signal
+from pathlib import Path
+
+import pytest
+import torch
+
+from ultragray.batches import names_in
+from ultragray.batches.shard import ShardRenderer
+from ultragray.errors import InvalidArgument
+from ultragray_workers.batches import on_ray
+from ultragray_workers.batches.on_ray import RayBatch
+
+from .conftest import plan_of
+
+pytest.importorskip("ray", reason="Ray is not installed: pip install 'ultragray[ray]'")
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]  # of Ray's own
+
+
+def shard_processes() -> list[int]:
+    """The processes of the cluster that make shards."""
+    found = []
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            if (folder / "cmdline").read_bytes().startswith(b"ray::ultragray shard"):
+                found.append(int(folder.name))
+        except OSError:
+            continue
+    return found
+
+
+def test_files_are_those_of_one_process_though_a_worker_is_killed_and_made_once(
+    scene_file: Path, tmp_path: Path
+) -> None:
+    plan = plan_of(scene_file, 20_000, 1_000)
+    killed: list[int] = []
+    told: list[int] = []
+
+    def report(frames: int) -> None:
+        told.append(frames)
+        if frames and not killed and (found := shard_processes()):
+            killed.append(found[0])
+            os.kill(found[0], signal.SIGKILL)
+
+    folder = tmp_path / "made"
+    RayBatch(plan, scene_file, str(folder)).render("ray", report)
+    assert killed
+    assert told == sorted(told)
+    assert told[-1] == 20_000
+    made = {path.name: path for path in folder.iterdir()}
+    assert sorted(made) == [*names_in(plan.file_names), "manifest.json"]
+    renderer = ShardRenderer(plan, scene_file, torch.device("cpu"))
+    for shard in (0, 7, 19):
+        renderer.render(shard, tmp_path / "shard.tar")
+        assert (tmp_path / "shard.tar").read_bytes() == made[plan.file_name(shard)].read_bytes()
+
+    before = {name: path.stat().st_mtime_ns for name, path in made.items()}
+    RayBatch(plan, scene_file, str(folder)).render("ray", told.append)  # needs no cluster
+    assert {name: path.stat().st_mtime_ns for name, path in made.items()} == before
+    with pytest.raises(InvalidArgument, match=r"manifest\.json of another batch"):
+        RayBatch(plan_of(scene_file, 20_001, 1_000), scene_file, str(folder)).render("ray", told.append)
+
+
+def test_a_release_of_the_cluster_that_differs_is_told(
+    scene_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(on_ray.ultragray, "__version__", "99.0")
+    with pytest.raises(Exception, match=r"shard 0: the Ray cluster has ultragray .*, this is 99\.0"):
+        RayBatch(plan_of(scene_file, 20, 20), scene_file, str(tmp_path / "made")).render("ray", lambda frames: None)
