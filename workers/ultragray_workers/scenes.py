@@ -13,6 +13,7 @@ from ultragray.scene_info import SceneHeader, SceneInfo, read_header, scene_file
 
 from .errors import SceneNotFound, known_names
 from .scene_names import SUFFIX, SceneReference, base_name, check_scene_name
+from .shelves.bucket import BucketShelf
 from .shelves.folder import FolderShelf
 from .shelves.headers import KeptHeaders, floats_per_gaussian
 from .shelves.shelf import Shelf
@@ -141,14 +142,14 @@ class SceneStore:
         known = shelf.sha256(reference.name)
         return self._hash_of_file(reference.name, self.path(text))[1] if known is None else known
 
-    def bytes_of(self, name: str) -> int:
-        """Of the file of a scene; 0 where there is none."""
-        return next((size for shelf in self.shelves if (size := shelf.bytes_of(name))), 0)
+    def file(self, name: str) -> Path | None:
+        """The path of a scene's file in the first folder that has it; None where no folder does."""
+        folders = [shelf for shelf in self.shelves if isinstance(shelf, FolderShelf)]
+        return next((path for shelf in folders if (path := shelf.here(name)) is not None), None)
 
-    def file(self, name: str) -> Path:
-        """The path of a scene's file in the first folder that has it; in the first folder where none does."""
-        paths = [shelf.path(name) for shelf in self.shelves if isinstance(shelf, FolderShelf)]
-        return next((path for path in paths if path.is_file()), paths[0])
+    def bytes_in_buckets(self, name: str) -> int:
+        """Of the files that the buckets have of a scene."""
+        return sum(shelf.bytes_of(name) for shelf in self.shelves if isinstance(shelf, BucketShelf))
 
     def forget(self, name: str) -> None:
         """Drops what is kept of a scene that was deleted."""

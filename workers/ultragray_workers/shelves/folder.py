@@ -52,11 +52,6 @@ class FolderShelf:
     def header(self, name: str) -> SceneHeader:
         return read_header(self.fetch(name))
 
-    def bytes_of(self, name: str) -> int:
-        with contextlib.suppress(OSError):
-            return self.path(name).stat().st_size
-        return 0
-
     def sha256(self, name: str) -> str | None:
         return None
 

@@ -67,9 +67,14 @@ class SceneIndex:
         """Since the list was read last."""
         return float("inf") if self._read_at_s is None else time.monotonic() - self._read_at_s
 
+    @property
+    def is_usable(self) -> bool:
+        """Whether scenes are served as they were found last."""
+        return self.age_s <= self._longest_stale_s
+
     def known(self) -> dict[str, Placed]:
         """The scenes as they were found last; none where that is too long ago."""
-        return self._known if self.age_s <= self._longest_stale_s else {}
+        return self._known if self.is_usable else {}
 
     def scenes(self) -> dict[str, Placed]:
         """The scenes as they are, or were at most `longest_stale_s` ago. Raises StorageUnavailable."""
