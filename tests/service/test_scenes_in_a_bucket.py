@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,14 +11,13 @@ import httpx
 import numpy as np
 import pytest
 
-from ultragray import GaussianScene
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2, rendering_pb2_grpc
 from ultragray_workers.storage.opening import open_storage
 
 from ..object_storage import FaultyProxy, ObjectServer, credentials
 from ..postgres import PostgresServer
 from ..waiting import wait_until
-from .conftest import RunningService, StartService
+from .conftest import DEMO_PROBE, RunningService, StartService, make_scene
 
 WITHIN_S = 10.0
 
@@ -108,11 +106,11 @@ def test_a_scene_is_imported_listed_pinned_and_deleted(
 
 
 def test_what_is_cached_is_served_while_the_bucket_is_away(
-    replicas: list[RunningService], proxy: FaultyProxy, random_scene: Callable[..., GaussianScene], tmp_path: Path
+    replicas: list[RunningService], proxy: FaultyProxy, tmp_path: Path
 ) -> None:
     one, other = replicas
     for seed, name in enumerate(("cached", "elsewhere")):
-        random_scene(60, seed=seed, info={"image_height": 24, "image_width": 20}).save(tmp_path / f"{name}.ugr")
+        make_scene(60, probe=DEMO_PROBE, seed=seed).save(tmp_path / f"{name}.ugr")
         content = (tmp_path / f"{name}.ugr").read_bytes()
         assert httpx.put(f"{other.http}/v1/scenes/{name}", content=content, timeout=60).status_code == 201
     frame = render(one, "demo").content
