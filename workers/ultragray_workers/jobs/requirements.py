@@ -13,7 +13,8 @@ from ultragray.scene_info import SceneHeader, read_header
 from ..claims import storage_full
 from ..datasets.store import DatasetStore
 from ..errors import SceneExists
-from ..scenes import SUFFIX, SceneStore
+from ..scene_names import SUFFIX, base_name
+from ..scenes import SceneStore
 from .folder import JobFolder
 from .kinds import Specification
 from .kinds.base import Surroundings
@@ -60,7 +61,7 @@ class Requirements:
             _named(specification, one) for one in (specification.needs_dataset, specification.needs_scene)
         )
         found = [] if dataset is None else [(Kind.DATASET, dataset)]
-        return found if scene is None or _kept(scene, before) is not None else [*found, (Kind.SCENE, scene)]
+        return found if scene is None or _kept(scene, before) is not None else [*found, (Kind.SCENE, base_name(scene))]
 
     def require_dataset(self, specification: Specification) -> None:
         """Raises DatasetNotFound, DatasetInvalid where the job's dataset is not there."""

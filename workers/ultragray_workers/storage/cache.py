@@ -18,7 +18,7 @@ import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import IO
 
 from ultragray.files.atomic import file_sha256, remove_stale_temporaries
@@ -111,6 +111,10 @@ class Cache:
             except FileNotFoundError:  # removed before it was locked
                 pass
             file.close()
+
+    def count_hit(self) -> None:
+        """Counts a use of a file that was pinned before."""
+        self._count(hits=1)
 
     def held_bytes(self) -> int:
         """Of the objects that are here or being fetched."""
@@ -236,8 +240,9 @@ class Cache:
 
 
 def cache_name(storage: Storage, key: str, version: str, sha256: str | None) -> str:
-    """The name under which a cache keeps an object: by its content where that is known."""
-    return sha256 or "v-" + hashlib.sha256(f"{storage.location}\n{key}\n{version}".encode()).hexdigest()
+    """The name under which a cache keeps an object: by its content where that is known, with the suffix of its key."""
+    content = sha256 or "v-" + hashlib.sha256(f"{storage.location}\n{key}\n{version}".encode()).hexdigest()
+    return content + PurePosixPath(key).suffix
 
 
 def _try_lock(file: IO[bytes]) -> bool:
