@@ -83,6 +83,7 @@ test-replicas: $(VENV)/installed-dev  ## 200 clients on 40 scenes of 4 replicas 
 test-image: $(VENV)/installed-dev  ## build the image with neither engine nor registry (as root, with buildah and mmdebstrap), run it and compare its frames
 	$(BIN)/python tests/image/build.py
 	ULTRAGRAY_TEST_IMAGE=localhost/ultragray:cpu $(BIN)/pytest tests/image -s $(ARGS)
+
 test-shards: $(VENV)/installed-dev  ## a batch of FRAMES (100000) in 200 shards: workers killed at random, Ray beside them (RECORD=1: into the documents)
 	ULTRAGRAY_SHARDS_FRAMES=$(FRAMES) ULTRAGRAY_SHARDS_RECORD=$(FIGURES)/shards.json $(BIN)/pytest -m long tests/batches $(ARGS)
 	$(KEEP) shards
