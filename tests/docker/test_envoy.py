@@ -83,7 +83,8 @@ class Stub(grpc.GenericRpcHandler):  # type: ignore[misc]
                 status = 200
                 self.rfile.read(int(self.headers.get("content-length", 0)))
                 if self.path == READY:
-                    status = 200 if stub.ready else 503
+                    is_known = self.headers["host"] == "localhost"  # a service without keys refuses other names
+                    status = 200 if stub.ready and is_known else 503
                 else:
                     stub.asked.append(f"{self.command} {self.path}")
                     if stub.breaks:

@@ -36,6 +36,7 @@ class ReplicaHost:
             "ULTRAGRAY_GRPC_PORT": str(self.grpc_port),
             "ULTRAGRAY_DRAIN_DELAY_S": str(DRAIN_DELAY_S),
             "ULTRAGRAY_READY_WITHOUT_JOBS": "true",
+            "ULTRAGRAY_MAX_QUEUE_MS": "60000",  # others may keep the machine busy: no frame is refused for that
             "ULTRAGRAY_MAX_CONNECTIONS_PER_ADDRESS": "2048",  # all of Envoy's
         }
         self.starts = 0
