@@ -156,7 +156,8 @@ def test_a_weight_gives_a_larger_part_of_ring_and_bound() -> None:
     assert balancer.choose(0, opened(*([15] * 5 + [5] * 5))) == 0
 
 
-@pytest.mark.parametrize(("name", "most"), [("ring hash", 0.08), ("Maglev", 0.2)])
+# Of a ring of the same size the others get more points, so that more scenes move than those of the dead replica.
+@pytest.mark.parametrize(("name", "most"), [("ring hash", 0.07), ("Maglev", 0.2)])
 def test_only_some_scenes_move_where_a_replica_dies(name: str, most: float) -> None:
     def homes(numbers: list[int]) -> np.ndarray:
         those, hashes = balancers.Replicas.equal(numbers), balancers.Hashes(0)
@@ -165,7 +166,9 @@ def test_only_some_scenes_move_where_a_replica_dies(name: str, most: float) -> N
         return np.asarray(balancers.ring_homes(those, hashes, 5_000, 1, 4096)[0])
 
     before, after = homes(list(range(20))), homes(list(range(1, 20)))
-    assert (before[before != 0] != after[before != 0]).mean() < most - 0.05
+    moved = before != after
+    assert 0.0 < moved[before != 0].mean() < most
+    assert moved[before == 0].all()
     assert (before == 0).mean() == pytest.approx(0.05, abs=0.02)
 
 
@@ -230,7 +233,7 @@ def test_streams_of_dead_replicas_come_again_and_nothing_reaches_the_dead() -> N
         sizes=caches.CacheSizes(),
         storage=costs.Storage(),
         proxies=1,
-        balancers=lambda alive: [bounded(110, REPLICAS)] * 2 if 0 in alive else [balancers.Random(those(alive), 0)] * 2,
+        balancers=lambda alive: [balancers.LeastRequest(balancers.Replicas.equal(alive), 0)] * 2,
         changes=(change,),
     )
     routed = routing.route(traffic, FEW, KINDS, cluster, random)
@@ -243,10 +246,6 @@ def test_streams_of_dead_replicas_come_again_and_nothing_reaches_the_dead() -> N
     assert cut > 0
     assert 0 < again <= cut
     assert (replica[asked > 11.0] == REPLICAS).any()
-
-
-def those(alive: list[int]) -> object:
-    return balancers.Replicas.equal(alive)
 
 
 def test_the_work_of_replicas_is_that_of_the_clients() -> None:
