@@ -171,6 +171,25 @@ def test_selectors_choose_the_pods_that_they_mean(manifests: list[Manifest]) -> 
         assert "replicas" not in of_kind(manifests, "Deployment", "StatefulSet")[name]["spec"]
 
 
+def test_envoy_asks_the_services_of_its_release(manifests: list[Manifest]) -> None:
+    configuration = yaml.safe_load(of_kind(manifests, "ConfigMap")[f"{NAME}-envoy"]["data"]["envoy.yaml"])
+    asked = {
+        (cluster["name"].partition("_")[0], *endpoint["endpoint"]["address"]["socket_address"].values())
+        for cluster in configuration["static_resources"]["clusters"]
+        for group in cluster["load_assignment"]["endpoints"]
+        for endpoint in group["lb_endpoints"]
+    }
+    services = of_kind(manifests, "Service")
+    replicas = services[f"{NAME}-service"]["spec"]
+    assert replicas["clusterIP"] == "None", "Envoy must see the address of each replica"
+    assert asked == {(port["name"], f"{NAME}-service", port["port"]) for port in replicas["ports"]}
+    listening = {
+        one["name"]: one["address"]["socket_address"]["port_value"]
+        for one in configuration["static_resources"]["listeners"]
+    }
+    assert listening == {port["name"]: port["port"] for port in services[NAME]["spec"]["ports"]}
+
+
 def test_workers_on_gpus_ask_for_them_and_take_the_image_for_them() -> None:
     for name, container in containers(rendered(ALL)):
         on_gpu = name in (f"{NAME}-service", f"{NAME}-worker-gpu")

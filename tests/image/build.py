@@ -105,11 +105,13 @@ def pip_configuration(folder: Path) -> list[str]:
         name, _, value = rest.partition("=")
         words = value.strip("'\"").replace("\\n", " ").split()
         for number, word in enumerate(words):
-            path = Path(urlsplit(word).path if word.startswith("file://") else word)
-            if path.is_absolute() and path.exists():
+            if word.startswith("file://"):  # an index, whose pages lead to files beside it
+                folder_of_index = Path(urlsplit(word).path).parent
+                volumes.append(f"--volume={folder_of_index}:{folder_of_index}:ro")
+            elif (path := Path(word)).is_absolute() and path.exists():
                 inside = path if path.is_dir() else Path("/mnt", path.name)  # a file may be in a package's way
                 volumes.append(f"--volume={path}:{inside}:ro")
-                words[number] = word.replace(str(path), str(inside))
+                words[number] = str(inside)
         if section == ":env:" or name not in configuration["global"]:  # the environment goes before the files
             configuration["global"][name] = " ".join(words)
     written = folder / "pip.conf"
