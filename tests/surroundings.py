@@ -10,7 +10,9 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 
-_SWITCHES_OF_TESTS = tuple(f"ULTRAGRAY_{of}_" for of in ("FAULT", "FUZZ", "OVERLOAD", "SHARDS", "SOAK", "TEST", "UPDATE"))
+_SWITCHES_OF_TESTS = tuple(
+    f"ULTRAGRAY_{of}_" for of in ("FAULT", "FUZZ", "OVERLOAD", "SHARDS", "SOAK", "TEST", "UPDATE")
+)
 _FOREIGN_PREFIXES = (
     "ULTRAGRAY_",
     "DBOS_",
