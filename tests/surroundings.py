@@ -11,7 +11,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 
 _SWITCHES_OF_TESTS = tuple(
-    f"ULTRAGRAY_{of}_" for of in ("FAULT", "FUZZ", "OVERLOAD", "REPLICAS", "SOAK", "TEST", "UPDATE")
+    f"ULTRAGRAY_{of}_" for of in ("FAULT", "FUZZ", "OVERLOAD", "REPLICAS", "SHARDS", "SOAK", "TEST", "UPDATE")
 )
 _FOREIGN_PREFIXES = (
     "ULTRAGRAY_",
