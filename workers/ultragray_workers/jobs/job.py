@@ -5,14 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from enum import Enum
-from pathlib import Path
 from typing import Any
 
 from dbos import WorkflowStatus
 
 from ultragray.contract import described
 
-from .folder import JobFolder, Outcome, Progress
+from .files import JobFiles
+from .folder import Outcome, Progress
 from .kinds import KINDS
 from .queue import database
 from .queue.owners import Ownership
@@ -71,13 +71,13 @@ class Job:
     private: bool = described("Whether others may not see it, nor the scene that it makes.")
 
 
-def job_of_row(row: WorkflowStatus, artifact_folder: Path) -> Job:
-    """The job of a row of the queue; the folder of an unfinished one says how far it is."""
+def job_of_row(row: WorkflowStatus, files: JobFiles) -> Job:
+    """The job of a row of the queue; the files of an unfinished one say how far it is."""
     state = _STATE_OF[row.status]
     outcome, ownership = _outcome(row), ownership_of(row)
     started = state is not JobState.QUEUED or bool(row.recovery_attempts)
     if outcome is None:
-        progress = JobFolder(artifact_folder, row.workflow_id).progress() if started else Progress()
+        progress = files.progress(row.workflow_id) if started else Progress()
         outcome = Outcome(progress=progress, attempts=row.recovery_attempts or 0)
     assert row.created_at is not None
     return Job(

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import hashlib
-import os
 import re
 import threading
 import uuid
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
@@ -35,7 +33,9 @@ from ..errors import (
     job_not_found,
 )
 from ..scenes import SceneStore
+from ..storage.storage import Storage
 from ..store import OpenStore
+from .files import Artifact, files_of_jobs, read_log, size_of_log
 from .folder import JobFolder, Progress
 from .job import MAX_PRIORITY, PRIORITY_ZERO, STATUSES, Job, JobState, attribute, job_of_row, ownership_of
 from .kinds import Specification
@@ -89,25 +89,30 @@ class JobStore:
         *,
         scenes: SceneStore | None = None,
         datasets: DatasetStore | None = None,
+        shared: Storage | None = None,
         max_image_side: int = MAX_IMAGE_SIDE,
     ) -> None:
         """`scenes`: those that jobs may need, and whose names they may not make. None: those that jobs made.
 
         `datasets`: those that jobs may need. None: those of the artifact folder.
 
+        `shared`: the storage in which several hosts have the files of jobs; None: they are in the artifact folder.
+
         `max_image_side`: of frames, pixels. Raises StartupFailed where the database cannot be reached.
         """
         self._artifact_folder = Path(artifact_folder)
         self._open = OpenStore(self._artifact_folder)
         try:
-            self.database = JobDatabase(self._artifact_folder, database_url)
+            self.database = JobDatabase(self._artifact_folder, database_url, shared)
         except BaseException:
             self._open.close()
             raise
         self._queue_limit = queue_limit
+        self.files = files_of_jobs(self._artifact_folder, shared)
         self._requirements = Requirements(
-            datasets=datasets or DatasetStore(self._artifact_folder),
+            datasets=datasets or DatasetStore(self._artifact_folder, shared),
             scenes=scenes or SceneStore(self._artifact_folder / SCENES_FOLDER),
+            files=self.files,
             artifact_folder=self._artifact_folder,
             max_image_side=max_image_side,
         )
@@ -164,9 +169,8 @@ class JobStore:
             if unfinished.count_waiting(self.database) >= self._queue_limit:
                 raise JobQueueFull(f"{self._queue_limit} jobs wait already: try again later, or cancel some")
             most_running = admit(self)
-            before = None if retry_of is None else self._folder(retry_of)
-            self._requirements.provide(specification, self._folder(job_id), before)
-            used = self._requirements.taken(specification, before)
+            self._requirements.provide(specification, job_id, retry_of)
+            used = self._requirements.taken(specification, retry_of)
             private |= self._are_private(used, owner, by)
             options: EnqueueOptions = {
                 "workflow_name": specification.kind,
@@ -338,7 +342,7 @@ class JobStore:
             raise JobInUse(f"the job {job_id} is {job.state.value}: cancel it first", field="job")
         if (successor := unfinished.successor(self.database, job_id)) is not None:
             raise JobInUse(f"the job {successor} goes on from the job {job_id}", field="job")
-        remove_job(self.database, self._folder(job_id))
+        remove_job(self.database, self.files, job_id)
 
     def overview(self) -> JobsOverview:
         """The jobs in numbers."""
@@ -352,30 +356,25 @@ class JobStore:
         """How long the jobs of an owner ran since the day of `since` (UTC), s, by device: cpu, gpu."""
         return runs.usage_s(self.database.engine, owner, since)
 
-    def artifact_files_of(self, owner: str) -> Iterator[Path]:
+    def artifact_files_of(self, owner: str) -> Iterator[Artifact]:
         """The files that can be downloaded of an owner's jobs."""
         for job_id in ids_of_owner(self.database, owner):
-            with suppress(FileNotFoundError):
-                yield from self._folder(job_id).artifacts.iterdir()
+            yield from self.files.artifacts(job_id).values()
 
     def log_tail(self, job_id: str, bytes: int = _TAIL_BYTES) -> str:
         """The end of the log of a job's process; empty where there is none yet. Raises JobNotFound."""
         self._row(job_id)
-        try:
-            with self._folder(job_id).log.open("rb") as file:
-                file.seek(max(0, os.fstat(file.fileno()).st_size - bytes))
-                return file.read(bytes).decode("utf-8", "replace")
-        except FileNotFoundError:
-            return ""
+        log = self.files.log(job_id)
+        return read_log(log, max(0, size_of_log(log) - bytes), bytes).decode("utf-8", "replace")
 
-    def artifact(self, job_id: str, name: str) -> Path:
+    def artifact(self, job_id: str, name: str) -> Artifact:
         """The file of an artifact. Raises JobNotFound, ArtifactNotFound."""
         job = self.get(job_id)
-        path = self._folder(job_id).artifacts / name
-        if name not in job.artifacts or not path.is_file():
+        found = self.files.artifacts(job_id).get(name) if name in job.artifacts else None
+        if found is None:
             known = ", ".join(job.artifacts) or "none"
             raise ArtifactNotFound(f"the job {job_id} has no artifact {name[:128]!r}; it has {known}", field="name")
-        return path
+        return found
 
     def workers(self, shown: Shown = _all_are_shown) -> tuple[Worker, ...]:
         """The workers of the queue, by name; a job at hand that is not `shown`, or gone again, is left out."""
@@ -438,7 +437,7 @@ class JobStore:
         return row
 
     def _seen(self, row: WorkflowStatus) -> Job:
-        return job_of_row(row, self._artifact_folder)
+        return job_of_row(row, self.files)
 
     def _folder(self, job_id: str) -> JobFolder:
         return JobFolder(self._artifact_folder, job_id)
