@@ -24,10 +24,19 @@ from ultragray.probe import FloatArray
 from ultragray.scene import PARAMETERS
 from ultragray_service.bench.measured import measured
 
+from .object_storage import new_bucket, object_proxy, object_server
 from .postgres import new_database, postgres
 from .surroundings import ROOT, forget_the_users_environment, home_of_the_tests, working_folder
 
-__all__ = ["home_of_the_tests", "new_database", "postgres", "working_folder"]
+__all__ = [
+    "home_of_the_tests",
+    "new_bucket",
+    "new_database",
+    "object_proxy",
+    "object_server",
+    "postgres",
+    "working_folder",
+]
 
 if not torch.cuda.is_available():
     os.environ.setdefault("TRITON_INTERPRET", "1")  # before any kernel is imported: they run on the CPU then
@@ -167,6 +176,7 @@ def random_poses() -> Callable[..., FloatArray]:
 _STARTING = {
     "benched",
     "machine",
+    "object_server",
     "open_pool",
     "postgres",
     "start_service",

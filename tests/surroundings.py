@@ -11,7 +11,19 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 
 _SWITCHES_OF_TESTS = tuple(f"ULTRAGRAY_{of}_" for of in ("FAULT", "FUZZ", "OVERLOAD", "SOAK", "TEST", "UPDATE"))
-_FOREIGN_PREFIXES = ("ULTRAGRAY_", "DBOS_", "OTEL_", "PG", "XDG_", "GRPC_", "UVICORN_", "WEB_CONCURRENCY")
+_FOREIGN_PREFIXES = (
+    "ULTRAGRAY_",
+    "DBOS_",
+    "OTEL_",
+    "PG",
+    "XDG_",
+    "GRPC_",
+    "UVICORN_",
+    "WEB_CONCURRENCY",
+    "AWS_",
+    "AZURE_",
+    "GOOGLE_",
+)
 _FOREIGN = {
     *("ALL_PROXY", "HTTP_PROXY", "HTTPS_PROXY", "NO_PROXY"),  # in either case
     *("NETRC", "SSL_CERT_FILE", "SSL_CERT_DIR", "SSLKEYLOGFILE"),

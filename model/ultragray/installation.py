@@ -19,6 +19,7 @@ MODULES_OF_EXTRAS = {
     "train": ("jinja2", "matplotlib"),
     "dicom": ("pydicom",),
     "hdf5": ("h5py",),
+    "storage": ("obstore",),
     "tensorboard": ("tensorboard",),
     "tracing": ("opentelemetry.exporter", "opentelemetry.sdk"),
     "zarr": ("zarr",),

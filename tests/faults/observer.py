@@ -16,7 +16,7 @@ import numpy as np
 
 from ultragray.scene import GaussianScene
 from ultragray_workers.jobs.store import Job, JobState, JobStore
-from ultragray_workers.scenes import FileVersion
+from ultragray_workers.storage.local import FileVersion
 
 from .machine import Machine
 

@@ -51,6 +51,13 @@ class StorageFull(UltragrayError):
     title = "No room on the disk"
 
 
+class StorageUnavailable(UltragrayError):
+    """The object storage does not answer, or refuses its credentials; what is cached is served all the same; retry."""
+
+    reason = "STORAGE_UNAVAILABLE"
+    title = "The object storage cannot be used"
+
+
 class SceneExists(UltragrayError):
     """A scene of that name is there, or a job is making it."""
 

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import os
 import re
 import threading
 from collections import OrderedDict
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +13,7 @@ from ultragray.errors import InvalidArgument, SceneFileInvalid
 from ultragray.scene_info import SceneHeader, SceneInfo, read_header, scene_file_invalid
 
 from .errors import SceneNotFound, known_names
+from .storage.local import FileVersion
 
 SUFFIX = ".ugr"
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
@@ -35,26 +34,6 @@ def resident_bytes(info: SceneInfo) -> int:
 
 def _floats_per_gaussian(info: SceneInfo) -> int:
     return 3 + 3 + 4 + 1 + (info.sh_degree + 1) ** 2  # means, scales, quats, transmittances, SH
-
-
-@dataclass(frozen=True)
-class FileVersion:
-    """Tells one content of a file from the next, without reading it."""
-
-    mtime_ns: int
-    size: int
-    inode: int
-
-    @property
-    def tag(self) -> str:
-        """The version as a word."""
-        return f"{self.mtime_ns:x}-{self.size:x}-{self.inode:x}"
-
-    @classmethod
-    def of(cls, path: str | Path | int) -> FileVersion:
-        """That of a file, by its path or descriptor. Raises OSError."""
-        status = os.stat(path)
-        return cls(mtime_ns=status.st_mtime_ns, size=status.st_size, inode=status.st_ino)
 
 
 class _KeptHeaders:

@@ -16,7 +16,8 @@ from typing import Any
 from ultragray.errors import InvalidArgument, SceneFileInvalid, UltragrayError
 from ultragray.scene_info import SceneHeader
 from ultragray_workers.errors import SceneNotFound, SceneTooLarge
-from ultragray_workers.scenes import FileVersion, SceneStore
+from ultragray_workers.scenes import SceneStore
+from ultragray_workers.storage.local import FileVersion
 
 from ..views.scene_points import point_message
 from .own_thread import in_own_thread

@@ -11,7 +11,7 @@ from ultragray.contract import under
 from ultragray.errors import InvalidImageSize, TooManyPoses
 from ultragray.scene_info import SceneInfo
 from ultragray.settings import Encoding, FrameSettings, Resolved
-from ultragray_workers.scenes import FileVersion
+from ultragray_workers.storage.local import FileVersion
 
 from ..settings import Settings
 from .catalog import SceneCatalog

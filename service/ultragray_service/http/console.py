@@ -14,7 +14,7 @@ from starlette.responses import HTMLResponse, Response
 from starlette.staticfiles import StaticFiles
 from starlette.types import Scope
 
-from ultragray_workers.scenes import FileVersion
+from ultragray_workers.storage.local import FileVersion
 
 from ..errors import RouteNotFound
 from .docs import NOT_FRAMED

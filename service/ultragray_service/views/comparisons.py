@@ -13,7 +13,8 @@ from ultragray.files.atomic import file_sha256
 from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import ArtifactNotFound, DatasetNotFound
 from ultragray_workers.helpers.comparison import FRAMES_NAME, compare
-from ultragray_workers.scenes import FileVersion, SceneStore
+from ultragray_workers.scenes import SceneStore
+from ultragray_workers.storage.local import FileVersion
 
 from ..core.catalog import SceneCatalog
 from ..core.helper_processes import HelperProcesses

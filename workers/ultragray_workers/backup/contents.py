@@ -12,7 +12,8 @@ from ..datasets.store import DatasetStore
 from ..jobs.folder import FOLDER as JOBS
 from ..jobs.folder import JobFolder
 from ..jobs.publication import SCENES_FOLDER
-from ..scenes import SUFFIX, FileVersion, SceneStore
+from ..scenes import SUFFIX, SceneStore
+from ..storage.local import FileVersion
 from ..store import MARKER
 
 DATA, ARTIFACTS = "data", "artifacts"

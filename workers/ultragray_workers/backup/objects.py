@@ -12,7 +12,7 @@ from pathlib import Path
 
 from ultragray.files.atomic import file_sha256, sync
 
-from ..scenes import FileVersion
+from ..storage.local import FileVersion
 
 FOLDER = "objects"
 _INCOMING = ".incoming-"

@@ -9,7 +9,7 @@ from ultragray.errors import UltragrayError
 from ultragray.probe import FloatArray
 from ultragray.settings import Resolved
 
-from ..scenes import FileVersion
+from ..storage.local import FileVersion
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from ultragray.confidence import Extrapolation
 from ultragray.probe import FloatArray
 from ultragray.settings import Resolved
 
-from ..scenes import FileVersion
+from ..storage.local import FileVersion
 from .fairness.turns import UNKNOWN_CALLER, Caller
 
 

@@ -16,7 +16,8 @@ from ultragray.scene import GaussianScene
 from ultragray.scene_info import read_header, scene_file_invalid
 
 from ...errors import SceneTooLarge
-from ...scenes import FileVersion, resident_bytes
+from ...scenes import resident_bytes
+from ...storage.local import FileVersion
 
 MAX_SCENES = 256
 _READ_ATTEMPTS = 3

@@ -1,0 +1,30 @@
+"""A storage of each kind."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from ultragray_workers.storage.opening import open_storage
+from ultragray_workers.storage.storage import Storage
+
+
+@pytest.fixture
+def nothing_left_behind() -> None:
+    """Instead of the one for pools: there are none here, and obstore keeps its connections."""
+
+
+@pytest.fixture(params=["folder", pytest.param("bucket", marks=pytest.mark.slow)])
+def storage(request: pytest.FixtureRequest, tmp_path: Path) -> Storage:
+    """An empty storage: a folder, or a bucket of a real S3 server."""
+    if request.param == "folder":
+        return open_storage(tmp_path / "storage")
+    return open_storage(request.getfixturevalue("new_bucket")(), patience_s=5)
+
+
+@pytest.fixture
+def bucket(new_bucket: Callable[[], str]) -> Storage:
+    """An empty bucket, whose requests are repeated for 2 s."""
+    return open_storage(new_bucket(), patience_s=2)

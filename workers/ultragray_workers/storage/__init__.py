@@ -1,0 +1,1 @@
+"""Where scenes, datasets and jobs are kept: a folder, or a bucket of an object storage."""

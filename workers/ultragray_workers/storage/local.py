@@ -1,0 +1,167 @@
+"""A folder as a storage: its files are the objects, and stay where they are."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import secrets
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from ultragray.files.atomic import TEMPORARY_SUFFIX, atomic_path, sync
+from ultragray.files.link import link_or_copy
+
+from .storage import Entry, NotThere, check_key
+
+_LOCK = ".storage.lock"  # held while an object is compared and replaced
+_CHUNK_BYTES = 2**20
+
+
+@dataclass(frozen=True)
+class FileVersion:
+    """Tells one content of a file from the next, without reading it."""
+
+    mtime_ns: int
+    size: int
+    inode: int
+
+    @property
+    def tag(self) -> str:
+        """The version as a word."""
+        return f"{self.mtime_ns:x}-{self.size:x}-{self.inode:x}"
+
+    @classmethod
+    def of(cls, path: str | Path | int) -> FileVersion:
+        """That of a file, by its path or descriptor. Raises OSError."""
+        return cls._of(os.stat(path))
+
+    @classmethod
+    def _of(cls, status: os.stat_result) -> FileVersion:
+        return cls(mtime_ns=status.st_mtime_ns, size=status.st_size, inode=status.st_ino)
+
+
+class LocalStorage:
+    """The files below a folder. The folder is made by the first write."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.location = str(folder)
+        self.local: Path | None = folder
+
+    def entries(self, prefix: str = "") -> Iterator[Entry]:
+        top = self.folder / check_key(prefix) if prefix else self.folder
+        for folder, _, names in os.walk(top):
+            for name in names:
+                if name == _LOCK or (name.startswith(".") and name.endswith(TEMPORARY_SUFFIX)):
+                    continue
+                path = Path(folder, name)
+                with contextlib.suppress(FileNotFoundError):  # gone meanwhile
+                    yield self._entry(path.relative_to(self.folder).as_posix(), path.stat())
+
+    def entry(self, key: str) -> Entry | None:
+        path = self._path(key)
+        try:
+            return self._entry(key, path.stat()) if path.is_file() else None
+        except (FileNotFoundError, NotADirectoryError):
+            return None
+
+    def read(self, key: str, *, start: int = 0, length: int | None = None) -> bytes:
+        with self._open(key) as descriptor, open(descriptor, "rb", closefd=False) as file:
+            file.seek(start)
+            return file.read(-1 if length is None else length)
+
+    def write(self, key: str, data: bytes, *, if_absent: bool = False, if_version: str | None = None) -> bool:
+        path = self._path(key)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with self._whole(path) as made:
+            made.write_bytes(data)
+            sync(made)
+            if if_absent:
+                try:
+                    os.link(made, path)
+                except FileExistsError:
+                    return path.read_bytes() == data
+            elif if_version is not None:
+                with self._alone():
+                    found = self.entry(key)
+                    if found is None or found.version != if_version:
+                        return found is not None and path.read_bytes() == data
+                    made.replace(path)
+            else:
+                made.replace(path)
+        sync(path.parent)
+        return True
+
+    def upload(self, path: Path, key: str, *, if_absent: bool = False) -> bool:
+        target = self._path(key)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if if_absent and target.exists():
+            return False
+        with self._whole(target) as made:
+            link_or_copy(path, made)
+            if not if_absent:
+                made.replace(target)
+                sync(target.parent)
+            else:
+                try:
+                    os.link(made, target)
+                except FileExistsError:
+                    return False
+        sync(target.parent)
+        return True
+
+    def download(self, key: str, path: Path, *, version: str | None = None) -> Entry:
+        with self._open(key, version) as descriptor, atomic_path(path) as temporary:
+            with open(descriptor, "rb", closefd=False) as file, temporary.open("wb") as copy:
+                shutil.copyfileobj(file, copy, _CHUNK_BYTES)
+            return self._entry(key, os.stat(descriptor))
+
+    def chunks(self, key: str, *, version: str | None = None) -> Iterator[bytes]:
+        with self._open(key, version) as descriptor, open(descriptor, "rb", closefd=False) as file:
+            while chunk := file.read(_CHUNK_BYTES):
+                yield chunk
+
+    def delete(self, key: str) -> None:
+        path = self._path(key)
+        with contextlib.suppress(FileNotFoundError, NotADirectoryError):
+            path.unlink()
+            sync(path.parent)
+
+    def _path(self, key: str) -> Path:
+        return self.folder / check_key(key)
+
+    @contextlib.contextmanager
+    def _open(self, key: str, version: str | None = None) -> Iterator[int]:
+        """The descriptor of a file, of the version asked for. Raises NotThere."""
+        try:
+            descriptor = os.open(self._path(key), os.O_RDONLY)
+        except (FileNotFoundError, NotADirectoryError):
+            raise NotThere(f"there is no {key} in {self.location}") from None
+        try:
+            if version is not None and FileVersion.of(descriptor).tag != version:
+                raise NotThere(f"{key} in {self.location} is no longer of the version {version}")
+            yield descriptor
+        finally:
+            os.close(descriptor)
+
+    @contextlib.contextmanager
+    def _whole(self, path: Path) -> Iterator[Path]:
+        """A path beside `path` on which nothing is yet; what is there at the end is removed."""
+        made = path.with_name(f".{path.name}.{secrets.token_hex(6)}{TEMPORARY_SUFFIX}")
+        try:
+            yield made
+        finally:
+            made.unlink(missing_ok=True)
+
+    @contextlib.contextmanager
+    def _alone(self) -> Iterator[None]:
+        with (self.folder / _LOCK).open("a") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            yield
+
+    @staticmethod
+    def _entry(key: str, status: os.stat_result) -> Entry:
+        return Entry(key, status.st_size, FileVersion._of(status).tag, status.st_mtime)

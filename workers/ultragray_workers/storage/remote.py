@@ -1,0 +1,220 @@
+"""A bucket of an object storage (S3 and what speaks like it, Google Cloud Storage, Azure), by obstore.
+
+What the URL does not say, obstore takes from the usual environment variables: AWS_*, GOOGLE_*, AZURE_*. It repeats
+requests that fail with growing pauses, and goes on with a torn download where that broke off.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+from collections.abc import Iterator
+from datetime import timedelta
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ultragray.errors import InvalidArgument
+from ultragray.files.atomic import atomic_path
+from ultragray.installation import missing_extra
+
+from ..errors import StorageUnavailable
+from .location import StorageUrl
+from .storage import Entry, NotThere, check_key
+
+if TYPE_CHECKING:
+    pass
+
+_ENVIRONMENT = {"s3": "AWS", "gs": "GOOGLE", "az": "AZURE"}
+_CONNECT_TIMEOUT_S, _SILENCE_TIMEOUT_S = 5, 30  # a request that hears nothing so long is repeated
+_REQUEST_TIMEOUT_S = 3600  # of a whole request: the largest object over the slowest line
+_LONGEST_PAUSE_S = 5
+_SINGLE_REQUEST_BYTES = 16 * 2**20  # larger files are uploaded in parts
+_PART_BYTES, _MOST_PARTS, _PARTS_AT_ONCE = 8 * 2**20, 9000, 4  # S3 takes 10,000 parts
+_STATUS = re.compile(r"Server returned non-2xx status code: (\d{3}[ A-Za-z]*)")
+_REFUSED = re.compile(r"NoSuchBucket|ContainerNotFound|specified bucket does not exist")
+
+
+class RemoteStorage:
+    """The objects of a bucket whose keys begin with a prefix."""
+
+    local: Path | None = None
+
+    def __init__(self, url: StorageUrl, *, patience_s: float) -> None:
+        """`patience_s`: how long a request that fails is repeated. Raises ExtraMissing, InvalidArgument."""
+        try:
+            import obstore.exceptions
+            from obstore.store import from_url
+        except ImportError as error:
+            raise missing_extra(error, f"object storage ({url})") from error
+        self.location = str(url)
+        self._obstore = obstore
+        self._errors: tuple[type[Exception], ...] = (obstore.exceptions.BaseError, OSError, ValueError)
+        self._conflicts = (obstore.exceptions.AlreadyExistsError, obstore.exceptions.PreconditionError)
+        try:
+            self._store = from_url(
+                self.location,
+                client_options=_client_options(url.scheme),
+                retry_config={
+                    "max_retries": 1000,  # the time limits them
+                    "retry_timeout": timedelta(seconds=patience_s),
+                    "backoff": {"max_backoff": timedelta(seconds=_LONGEST_PAUSE_S)},
+                },
+            )
+        except self._errors as error:
+            raise InvalidArgument(f"{url} cannot be opened: {_first_line(error)}") from None
+
+    def entries(self, prefix: str = "") -> Iterator[Entry]:
+        with self._asking():
+            pages = iter(self._obstore.list(self._store, check_key(prefix) if prefix else None))
+        while True:
+            with self._asking():
+                page = next(pages, None)
+            if page is None:
+                return
+            for found in page:
+                yield _entry(found)
+
+    def entry(self, key: str) -> Entry | None:
+        try:
+            return _entry(self._head(key))
+        except NotThere:
+            return None
+
+    def read(self, key: str, *, start: int = 0, length: int | None = None) -> bytes:
+        if length == 0:
+            return b""
+        options: dict[str, Any] = {}
+        if length is not None:
+            options["range"] = (start, start + length)
+        elif start:
+            options["range"] = {"offset": start}
+        with self._asking(key):
+            return bytes(self._obstore.get(self._store, check_key(key), options=options).bytes())
+
+    def write(self, key: str, data: bytes, *, if_absent: bool = False, if_version: str | None = None) -> bool:
+        mode: Any = "create" if if_absent else "overwrite"
+        if if_version is not None:
+            try:
+                found = self._head(key)
+            except NotThere:
+                return False
+            if found["e_tag"] != if_version:
+                return self._holds(key, data)
+            # Google's storage compares the version, the others the ETag.
+            mode = {name: found[name] for name in ("e_tag", "version") if found[name] is not None}
+        try:
+            with self._asking():
+                self._obstore.put(self._store, check_key(key), data, mode=mode, use_multipart=False)
+        except self._conflicts:
+            return self._holds(key, data)
+        return True
+
+    def upload(self, path: Path, key: str, *, if_absent: bool = False) -> bool:
+        size = path.stat().st_size
+        if size <= _SINGLE_REQUEST_BYTES:
+            return self.write(key, path.read_bytes(), if_absent=if_absent)
+        if if_absent and self.entry(key) is not None:
+            return False
+        with self._asking():
+            self._obstore.put(
+                self._store,
+                check_key(key),
+                path,
+                use_multipart=True,
+                chunk_size=max(_PART_BYTES, size // _MOST_PARTS + 1),
+                max_concurrency=_PARTS_AT_ONCE,
+            )
+        return True
+
+    def download(self, key: str, path: Path, *, version: str | None = None) -> Entry:
+        entry, chunks = self._get(key, version)
+        with atomic_path(path) as temporary:
+            with temporary.open("wb") as file:
+                for chunk in chunks:
+                    file.write(chunk)
+            if (got := temporary.stat().st_size) != entry.bytes:
+                raise StorageUnavailable(f"{self.location} sent {got} of the {entry.bytes} bytes of {key}")
+        return entry
+
+    def chunks(self, key: str, *, version: str | None = None) -> Iterator[bytes]:
+        yield from self._get(key, version)[1]
+
+    def delete(self, key: str) -> None:
+        with contextlib.suppress(NotThere), self._asking(key):
+            self._obstore.delete(self._store, check_key(key))
+
+    def _get(self, key: str, version: str | None) -> tuple[Entry, Iterator[bytes]]:
+        options = {} if version is None else {"if_match": version}
+        try:
+            with self._asking(key):
+                result = self._obstore.get(self._store, check_key(key), options=options)
+        except self._conflicts:
+            raise NotThere(f"{key} in {self.location} is no longer of the version {version}") from None
+        return _entry(result.meta), self._pieces(key, iter(result.stream(min_chunk_size=_PART_BYTES)))
+
+    def _pieces(self, key: str, stream: Iterator[Any]) -> Iterator[bytes]:
+        while True:
+            with self._asking(key):
+                piece = next(stream, None)
+            if piece is None:
+                return
+            yield bytes(piece)
+
+    def _head(self, key: str) -> Any:
+        with self._asking(key):
+            return self._obstore.head(self._store, check_key(key))
+
+    def _holds(self, key: str, data: bytes) -> bool:
+        """Whether an object is `data`: then a write whose answer was lost has succeeded."""
+        try:
+            return self.read(key) == data
+        except NotThere:
+            return False
+
+    @contextlib.contextmanager
+    def _asking(self, key: str | None = None) -> Iterator[None]:
+        """What obstore raises, in our words; the conflicts of conditional requests pass. Raises NotThere for a key."""
+        try:
+            yield
+        except self._conflicts:
+            raise
+        except InvalidArgument:
+            raise
+        except self._errors as error:
+            text = str(error)
+            if key is not None and isinstance(error, FileNotFoundError) and not _REFUSED.search(text):
+                raise NotThere(f"there is no {key} in {self.location}") from None
+            # Without the error as its cause: the URL in its text may hold a signature.
+            raise StorageUnavailable(f"{self.location} cannot be used: {_reason(text)}") from None
+
+
+def _client_options(scheme: str) -> Any:
+    """Time-outs, and what the environment says of the connections: obstore looks there only where it is given none."""
+    options = {
+        "connect_timeout": f"{_CONNECT_TIMEOUT_S}s",
+        "read_timeout": f"{_SILENCE_TIMEOUT_S}s",
+        "timeout": f"{_REQUEST_TIMEOUT_S}s",
+    }
+    names = (*options, "allow_http", "allow_invalid_certificates", "proxy_url", "proxy_excludes", "user_agent")
+    given = {name: os.environ.get(f"{_ENVIRONMENT[scheme]}_{name.upper()}") for name in names}
+    return options | {name: value for name, value in given.items() if value}
+
+
+def _entry(found: Any) -> Entry:
+    version = found["e_tag"] or found["version"] or f"{found['last_modified'].timestamp():.6f}-{found['size']}"
+    return Entry(found["path"], found["size"], version, found["last_modified"].timestamp())
+
+
+def _reason(text: str) -> str:
+    if _REFUSED.search(text):
+        return "there is no such bucket"
+    if status := _STATUS.search(text):
+        return f"it answers {status[1].strip()}"
+    if "timed out" in text.lower():
+        return "it does not answer in time"
+    return "it does not answer"
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).partition("\n")[0]

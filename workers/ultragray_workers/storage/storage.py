@@ -1,0 +1,89 @@
+"""Objects by key, wherever they are: the methods that a folder and a bucket have in common.
+
+A key is a relative POSIX path such as `jobs/0c5f/outcome.json`. All methods block; call them in a thread.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from ultragray.errors import InvalidArgument
+
+_MAX_KEY_BYTES = 1024  # of S3
+
+
+class NotThere(LookupError):
+    """There is no object of that key, or not the version that was asked for."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """An object without its content."""
+
+    key: str
+    bytes: int
+    version: str  # tells one content from the next: of a bucket the ETag, of a folder that of the file
+    modified: float  # seconds since 1970
+
+
+class Storage(Protocol):
+    """The objects of a folder or of a bucket. Its methods may be called from any thread.
+
+    Every method raises StorageUnavailable where a bucket does not answer, or refuses: the same call may succeed later.
+    Of a folder they raise the OSError of the file system. InvalidArgument: a key that no object can have.
+    """
+
+    @property
+    def location(self) -> str:
+        """Where it is, as a person wrote it, without credentials."""
+
+    @property
+    def local(self) -> Path | None:
+        """The folder whose files are the objects, to be read in place; None where they must be downloaded."""
+
+    def entries(self, prefix: str = "") -> Iterator[Entry]:
+        """The objects below `prefix` (whole parts of a path: `jobs` has `jobs/a`, not `jobs2/a`), in any order."""
+
+    def entry(self, key: str) -> Entry | None:
+        """One object without its content; None where it is absent."""
+
+    def read(self, key: str, *, start: int = 0, length: int | None = None) -> bytes:
+        """The content from byte `start` on, at most `length` bytes; what lies beyond the end is left out.
+
+        Raises NotThere.
+        """
+
+    def write(self, key: str, data: bytes, *, if_absent: bool = False, if_version: str | None = None) -> bool:
+        """Writes a small object, whole or not at all. False: the condition does not hold, and nothing changed.
+
+        `if_absent`: only where there is none; `if_version`: only over that version. An object that holds exactly `data`
+        counts as written, since an answer that was lost cannot be told from a success: where one writer must win, each
+        puts something of its own into `data`.
+        """
+
+    def upload(self, path: Path, key: str, *, if_absent: bool = False) -> bool:
+        """Writes an object from a file, which must not change later: a folder may keep a link to it.
+
+        It appears whole or not at all. False: `if_absent`, and there is one (of a bucket, for a file over 16 MiB, as
+        seen before the upload begins: give such objects keys that only one content can have).
+        """
+
+    def download(self, key: str, path: Path, *, version: str | None = None) -> Entry:
+        """Writes an object to a file, which appears whole or not at all. Raises NotThere, OSError of the file."""
+
+    def chunks(self, key: str, *, version: str | None = None) -> Iterator[bytes]:
+        """The content piece by piece, of one version throughout. Raises NotThere before the first piece."""
+
+    def delete(self, key: str) -> None:
+        """Removes an object; nothing where it is absent."""
+
+
+def check_key(key: str) -> str:
+    """The key itself. Raises InvalidArgument for one that could leave the storage, or that a bucket would change."""
+    parts = key.split("/")
+    if any(part in ("", ".", "..") for part in parts) or "\0" in key or len(key.encode()) > _MAX_KEY_BYTES:
+        raise InvalidArgument(f"a key must be a relative path of at most {_MAX_KEY_BYTES} bytes, got {key[:128]!r}")
+    return key
