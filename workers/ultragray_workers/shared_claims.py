@@ -25,7 +25,10 @@ class SharedClaims:
 
     @contextlib.contextmanager
     def claimed(self, token: str) -> Iterator[None]:
-        """Others find the token claimed during the body. Raises StorageUnavailable. Enter and leave it in any threads."""
+        """Others find the token claimed during the body. Enter and leave it in any threads.
+
+        Raises StorageUnavailable.
+        """
         key = f"{PREFIX}/{token}"
         self._write(key)
         ended = threading.Event()

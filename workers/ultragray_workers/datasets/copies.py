@@ -1,4 +1,4 @@
-"""Copies of shared datasets in a folder of this host: made whole, kept while they are used, the oldest removed for room.
+"""Copies of shared datasets on this host: made whole, kept while they are used, the oldest removed for room.
 
 NAME/content/   what was fetched
 NAME/lock       locked together by those who use the copy, alone by who removes it

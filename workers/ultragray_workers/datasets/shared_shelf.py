@@ -89,7 +89,9 @@ class SharedShelf:
     def contact_sheet(self, name: str) -> Path:
         """As `Shelf`; the copy may go when other datasets are fetched."""
         shared = self._files_of(name)
-        with self._copies.held(f"{shared.upload}-sheet", lambda folder: self._fetch(shared, folder, CONTACT_SHEET_NAME)) as folder:
+        with self._copies.held(
+            f"{shared.upload}-sheet", lambda folder: self._fetch(shared, folder, CONTACT_SHEET_NAME)
+        ) as folder:
             return folder / CONTACT_SHEET_NAME
 
     @contextlib.contextmanager
@@ -179,7 +181,9 @@ class SharedShelf:
             except NotThere:
                 raise DatasetNotFound("the dataset has been deleted", field="dataset") from None
             if file_sha256(copy) != shared.sha256[path]:
-                raise DatasetInvalid(f"the file {path} of the dataset is not what was uploaded: it was changed in the storage")
+                raise DatasetInvalid(
+                    f"the file {path} of the dataset is not what was uploaded: it was changed in the storage"
+                )
 
         if any(Path(path).is_absolute() or ".." in Path(path).parts for path in paths):
             raise DatasetInvalid("the manifest of the dataset names files outside of the dataset")

@@ -1,4 +1,4 @@
-"""Places of datasets: whole ones by name, each a manifest, the files that were sent, and a contact sheet. Free of torch."""
+"""Where datasets are: by name, each a manifest, the files that were sent, and a contact sheet. Free of torch."""
 
 from __future__ import annotations
 

@@ -20,7 +20,10 @@ from .shared.record import StoredFile, prefix_of, read_record, record_key
 
 Artifact: TypeAlias = Path | SharedFile
 Log: TypeAlias = Path | SharedLog
-JOURNAL_NAME, CHECKPOINT_NAME = "metrics.jsonl", "checkpoint.safetensors"  # of a run: `ultragray.training` imports torch
+JOURNAL_NAME, CHECKPOINT_NAME = (
+    "metrics.jsonl",
+    "checkpoint.safetensors",
+)  # of a run: `ultragray.training` imports torch
 
 
 def size_of_log(log: Log) -> int:
@@ -194,7 +197,7 @@ class SharedFiles:
 
     @contextlib.contextmanager
     def removed(self, job_id: str) -> Iterator[None]:
-        """As `JobFiles`. A worker that was told a moment ago to end the job finds its record gone, and writes no more."""
+        """As `JobFiles`. A worker that still ends the job finds its record gone, and writes no more."""
         self._storage.delete(record_key(job_id))
         for entry in list(self._storage.entries(prefix_of(job_id))):
             self._storage.delete(entry.key)

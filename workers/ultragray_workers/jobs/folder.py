@@ -85,6 +85,7 @@ class Request:
     threads: int
     nice: int
     max_footprint_pixels: int | None = None  # of a frame, see ultragray.limits; None: no limit
+    storage: str | None = None  # that several hosts share; None: all is in the artifact folder
 
 
 class JobFolder:

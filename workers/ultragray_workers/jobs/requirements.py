@@ -31,7 +31,7 @@ class Requirements:
     datasets: DatasetStore
     scenes: SceneStore
     files: JobFiles
-    artifact_folder: Path
+    artifact_folder: Path | None  # in which jobs work; None: in folders of other hosts
     max_image_side: int
 
     def provide(self, specification: Specification, job_id: str, before: str | None) -> None:

@@ -113,7 +113,7 @@ class JobStore:
             datasets=datasets or DatasetStore(self._artifact_folder, shared),
             scenes=scenes or SceneStore(self._artifact_folder / SCENES_FOLDER),
             files=self.files,
-            artifact_folder=self._artifact_folder,
+            artifact_folder=self._artifact_folder if shared is None else None,
             max_image_side=max_image_side,
         )
         self._submitting = threading.Lock()  # so that one service keeps the queue limit to the job

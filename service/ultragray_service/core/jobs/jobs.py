@@ -10,7 +10,6 @@ from contextlib import contextmanager
 from contextvars import copy_context
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Concatenate, ParamSpec, TypeVar
 
 from sqlalchemy.exc import SQLAlchemyError
@@ -19,7 +18,6 @@ from ultragray.contract import described, under
 from ultragray.errors import DatasetInvalid, InvalidArgument, SceneFileInvalid, UltragrayError
 from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import DatabaseUnavailable, DatasetNotFound, NotReady, SceneExists, SceneNotFound
-from ultragray_workers.jobs.folder import JobFolder
 from ultragray_workers.jobs.kinds import Specification
 from ultragray_workers.jobs.overview import JobsOverview
 from ultragray_workers.jobs.queue.attendance import Worker
@@ -71,7 +69,9 @@ class Jobs:
         self._opened: JobStore | None = None
         # Of their own, so that a database that does not answer keeps nobody else waiting.
         self._threads = ThreadPoolExecutor(_THREADS, "jobs")
-        self.hub = JobHub(lambda job_id: self._store.get(job_id), self._log_path, self._threads)
+        self.hub = JobHub(
+            lambda job_id: self._store.get(job_id), lambda job_id: self._store.files.log(job_id), self._threads
+        )
         self.admit: Admit = lambda jobs: None
         self.overview = JobsOverview()  # as it was up to COUNT_INTERVAL_S ago
         self._counting: asyncio.Task[None] | None = None
@@ -196,9 +196,6 @@ class Jobs:
                 except (UltragrayError, SQLAlchemyError):
                     self.overview = JobsOverview()
             await asyncio.sleep(COUNT_INTERVAL_S)
-
-    def _log_path(self, job_id: str) -> Path:
-        return JobFolder(self._settings.artifacts, job_id).log
 
 
 @contextmanager

@@ -90,7 +90,8 @@ class RenderJob(FrameSettings, Specification):
             require_confidence(assessor.assess(poses, probe=settings.probe), self.least_confidence)
         with under("display"):
             picture = FORMATS[self.format].shown(settings).picture
-        self._check_room(len(poses), picture, surroundings.artifact_folder)
+        if surroundings.artifact_folder is not None:
+            self.check_room(len(poses), picture, surroundings.artifact_folder)
 
     def poses_of(self, training_poses: FloatArray, probe: Probe) -> FloatArray:  # [P, 4, 4] -> [C, 4, 4] mm
         """The poses that the job asks for, whatever their confidence; the same training poses and probe give the same.
@@ -116,7 +117,8 @@ class RenderJob(FrameSettings, Specification):
             raise InvalidArgument(f"sampler needs training poses, the scene {self.scene!r} has none", field="sampler")
         return training_poses
 
-    def _check_room(self, frames: int, picture: Picture, folder: Path) -> None:
+    def check_room(self, frames: int, picture: Picture, folder: Path) -> None:
+        """Raises StorageFull where the disk of a folder has no room for so many frames."""
         dtype = np.dtype(check_format(self.format, self.outputs, self.dtype))
         pixel_bytes = sum(1 if OUTPUTS[name].is_numbers else dtype.itemsize for name in self.outputs)
         needed, free = frames * picture.height * picture.width * pixel_bytes, shutil.disk_usage(folder).free

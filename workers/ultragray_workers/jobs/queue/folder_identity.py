@@ -37,7 +37,9 @@ class FolderIdentity:
     def check(self) -> None:
         """Raises ArtifactFolderUnavailable where the folder is gone or is another one now."""
         if self._folder.read() != self._known:
-            raise ArtifactFolderUnavailable(f"{self._folder.name} is not the one that the jobs belong to{self._folder.hint}")
+            raise ArtifactFolderUnavailable(
+                f"{self._folder.name} is not the one that the jobs belong to{self._folder.hint}"
+            )
 
     def check_writable(self) -> None:
         """As `check`, and raises ArtifactFolderUnavailable where no file can be made in the folder."""

@@ -1,37 +1,49 @@
-"""The objects of a shared storage that services read of jobs: files in ranges, and the log as one. Free of torch."""
+"""The files of jobs that services read, piece by piece, wherever they are. Free of torch."""
 
 from __future__ import annotations
 
+import contextlib
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
+from typing import IO
 
-from ...storage.storage import NotThere, Storage
+from ...storage.storage import Storage
 from .record import StoredFile, read_record
-
-_CHUNK_BYTES = 2**22  # of one request
 
 
 @dataclass(frozen=True)
 class SharedFile:
-    """A whole object to download."""
+    """A whole object of a storage, to download."""
 
     storage: Storage
     name: str
     stored: StoredFile
 
-    @property
-    def bytes(self) -> int:
-        """Its length."""
-        return self.stored.bytes
 
-    def chunks(self, start: int, end: int) -> Iterator[bytes]:
-        """The bytes from `start` to before `end`. Raises StorageUnavailable, and NotThere where it was removed."""
-        while start < end:
-            chunk = self.storage.read(self.stored.key, start=start, length=min(_CHUNK_BYTES, end - start))
-            if not chunk:
-                raise NotThere(f"{self.stored.key} is shorter than it was")
-            yield chunk
-            start += len(chunk)
+@dataclass(frozen=True)
+class OpenFile:
+    """A file whose bytes can be read from any place."""
+
+    length: int  # bytes
+    source: IO[bytes] | SharedFile
+
+    def read(self, start: int, length: int) -> bytes:
+        """At most `length` bytes from `start` on; none at the end. Raises OSError, StorageUnavailable, NotThere."""
+        if isinstance(self.source, SharedFile):
+            return self.source.storage.read(self.source.stored.key, start=start, length=length)
+        return os.pread(self.source.fileno(), length, start)
+
+
+@contextlib.contextmanager
+def opened(file: Path | SharedFile) -> Iterator[OpenFile]:
+    """The file, open during the body. Raises OSError."""
+    if isinstance(file, SharedFile):
+        yield OpenFile(file.stored.bytes, file)
+        return
+    with file.open("rb") as source:
+        yield OpenFile(os.fstat(source.fileno()).st_size, source)
 
 
 @dataclass(frozen=True)

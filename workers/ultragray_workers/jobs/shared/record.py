@@ -6,9 +6,9 @@ jobs/ID/WRITER/log-N       pieces of the log; the last of a writer grows
 jobs/ID/WRITER/run-N/      a checkpoint, with the journal and the configuration of its training
 jobs/ID/WRITER/artifacts/  what can be downloaded
 
-An object counts only where the record names it, so that a checkpoint is there whole or not at all. The record belongs to
-the writer that it names, one attempt of one worker: a worker that was cut off, and comes back when another one has gone
-on with the job, can change it no more. Free of torch.
+An object counts only where the record names it, so that a checkpoint is there whole or not at all. The record belongs
+to the writer that it names, one attempt of one worker: a worker that was cut off, and comes back when another one has
+gone on with the job, can change it no more. Free of torch.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class JobRecord:
     attempt: int  # of the queue: a higher one comes later
     writer: str  # who may replace the record
     serial: int = 0  # of the writer's records, no two of which are the same
-    progress: Progress = Progress()
+    progress: Progress = field(default_factory=Progress)
     log: tuple[LogPiece, ...] = ()
     run: Mapping[str, StoredFile] = field(default_factory=dict)  # the newest checkpoint, by the names of its files
     artifacts: Mapping[str, StoredFile] = field(default_factory=dict)
@@ -64,7 +64,8 @@ class JobRecord:
 
     def keys(self) -> set[str]:
         """The objects that it names."""
-        return {one.key for one in (*self.log, *self.run.values(), *self.artifacts.values())}
+        files = {one.key for one in (*self.run.values(), *self.artifacts.values())}
+        return files | {piece.key for piece in self.log}
 
     def to_json(self) -> bytes:
         """The content of the object."""

@@ -12,7 +12,7 @@ import shutil
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import Future
+from concurrent.futures import Future, wait
 from dataclasses import replace
 from pathlib import Path
 from typing import Protocol, TypeVar
@@ -144,8 +144,9 @@ class ThroughStorage:
         if self._record is None or self._record.outcome is not None:
             return
         last = _in_thread(lambda: self._tell(is_last=True))
-        with contextlib.suppress(TimeoutError, StorageUnavailable, Superseded, OSError):
-            last.result(LAST_WAIT_S)
+        wait([last], LAST_WAIT_S)
+        if not last.done() or last.exception() is not None:
+            _log.warning(f"the end of the work at the job {self._folder.job_id} here could not be told to others")
 
     def end(self, outcome: Outcome) -> None:
         """As `Sharing`; waits for a storage that is away."""
@@ -209,28 +210,30 @@ class ThroughStorage:
         shutil.rmtree(partial, ignore_errors=True)
 
     def _tell_now_and_then(self) -> None:
-        wait_s = TELL_INTERVAL_S
-        while not self._ended.wait(wait_s):
+        pause_s = TELL_INTERVAL_S
+        while not self._ended.wait(pause_s):
             try:
                 self._tell(is_last=False)
             except (StorageUnavailable, OSError) as error:
                 self._note_away(error)
-                wait_s = min(2.0 * wait_s, _LONGEST_RETRY_S)
+                pause_s = min(2.0 * pause_s, _LONGEST_RETRY_S)
             except Superseded:  # the queue will say so, too
                 return
             else:
                 self._note_back()
-                wait_s = TELL_INTERVAL_S
+                pause_s = TELL_INTERVAL_S
 
     def _tell(self, *, is_last: bool) -> None:
         with self._telling:
             record = self._record
             assert record is not None
             progress, log = self._folder.progress(), self._told_log(everything=is_last)
-            run = self._told_run(wait=is_last)
+            run = self._told_run(is_last=is_last)
             if progress == record.progress and log == record.log and run is None:
                 return
-            self._change(lambda before: replace(before, progress=progress, log=log, run=before.run if run is None else run))
+            self._change(
+                lambda before: replace(before, progress=progress, log=log, run=before.run if run is None else run)
+            )
             if run is not None:
                 self._remove(record.run, keep=run)
 
@@ -258,20 +261,18 @@ class ThroughStorage:
             pass
         return (*inherited, *self._own_log)
 
-    def _told_run(self, *, wait: bool) -> dict[str, StoredFile] | None:
+    def _told_run(self, *, is_last: bool) -> dict[str, StoredFile] | None:
         """The files of a new checkpoint that are there whole; None: there is none since the last one."""
-        if self._uploading is not None and (wait or self._uploading.done()):
-            uploaded, self._uploading = self._uploading, None
-            return uploaded.result() if not wait else (self._newer_run() or uploaded.result())
-        if self._uploading is None and wait:
-            return self._newer_run()
-        if self._uploading is None and (version := _version_of(self._folder.run / CHECKPOINT_NAME)) != self._run_version:
-            self._uploading = _in_thread(lambda: self._upload_run(version))
-        return None
-
-    def _newer_run(self) -> dict[str, StoredFile] | None:
+        uploaded: dict[str, StoredFile] | None = None
+        if self._uploading is not None and (is_last or self._uploading.done()):
+            uploading, self._uploading = self._uploading, None
+            uploaded = uploading.result()
         version = _version_of(self._folder.run / CHECKPOINT_NAME)
-        return None if version in (None, self._run_version) else self._upload_run(version)
+        if self._uploading is None and version not in (None, self._run_version):
+            if is_last:
+                return self._upload_run(version)
+            self._uploading = _in_thread(lambda: self._upload_run(version))
+        return uploaded
 
     def _upload_run(self, version: int | None) -> dict[str, StoredFile]:
         """Uploads the checkpoint as it is now: a link to it stays when the process replaces it."""
@@ -307,7 +308,7 @@ class ThroughStorage:
                     artifacts[name] = self._upload(self._folder.artifacts / name, f"artifacts/{name}")
             run: Mapping[str, StoredFile] = {}
             if outcome.error is not None:  # a retry goes on from it
-                run = self._told_run(wait=True) or record.run
+                run = self._told_run(is_last=True) or record.run
             log = self._told_log(everything=True)
             self._change(
                 lambda before: replace(
@@ -335,13 +336,12 @@ class ThroughStorage:
 
     def _patiently(self, work: Callable[[], _T]) -> _T:
         """What the work gives, tried again while the storage is away. Raises what `watch` raises meanwhile."""
-        wait_s = _RETRY_S
+        pause_s = _RETRY_S
         while True:
             future = _in_thread(work)
             while not future.done():
                 self._watch()
-                with contextlib.suppress(TimeoutError, Exception):
-                    future.result(_LOOK_S)
+                wait([future], _LOOK_S)
             try:
                 found = future.result()
             except StorageUnavailable as error:
@@ -349,11 +349,11 @@ class ThroughStorage:
             else:
                 self._note_back()
                 return found
-            end_s = time.monotonic() + wait_s
+            end_s = time.monotonic() + pause_s
             while time.monotonic() < end_s:
                 self._watch()
                 time.sleep(_LOOK_S)
-            wait_s = min(2.0 * wait_s, _LONGEST_RETRY_S)
+            pause_s = min(2.0 * pause_s, _LONGEST_RETRY_S)
 
     def _note_away(self, error: Exception) -> None:
         if not self._is_away:
