@@ -35,11 +35,12 @@ from ..errors import (
 from ..scenes import SceneStore
 from ..storage.storage import Storage
 from ..store import OpenStore
-from .files import Artifact, files_of_jobs, read_log, size_of_log
+from .files import Artifact, read_log, size_of_log
 from .folder import JobFolder, Progress
 from .job import MAX_PRIORITY, PRIORITY_ZERO, STATUSES, Job, JobState, attribute, job_of_row, ownership_of
 from .kinds import Specification
 from .overview import JobsOverview, overview
+from .places import files_of_jobs
 from .publication import SCENES_FOLDER, give_name_back
 from .queue import attendance, database, runs, unfinished
 from .queue.attendance import Worker

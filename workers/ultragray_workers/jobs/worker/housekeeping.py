@@ -26,9 +26,9 @@ from ...datasets.store import FOLDER as DATASETS
 from ...errors import JobInUse, StorageUnavailable
 from ...rounds import Rounds
 from ...storage.storage import Storage
-from ..files import files_of_jobs
 from ..folder import FOLDER, JobFolder
 from ..kinds import KINDS
+from ..places import files_of_jobs
 from ..queue import database, unfinished
 from ..queue.database import JobDatabase
 from ..removal import remove_job
