@@ -21,6 +21,8 @@ _STOP_WAIT_S = 20.0  # beside what a job has to end
 _PASSED_ON = (
     "data_folder",
     "artifact_folder",
+    "cache_folder",
+    "max_cache_bytes",
     "database_url",
     "training_threads",
     "job_nice",

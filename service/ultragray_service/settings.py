@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +14,7 @@ from ultragray.image_size import MAX_IMAGE_SIDE
 from ultragray.probe.elevation import MAX_THICKNESS_MM
 from ultragray_workers.jobs.kinds.base import MAX_RUN_S
 from ultragray_workers.pool.pool import MAX_BATCH_POSES
+from ultragray_workers.storage.location import Location, StorageUrl, parse_location
 
 from .access.addresses import parse_allowed
 from .access.limits.allowance import NAMES, Allowance, of_key
@@ -68,9 +70,10 @@ class Settings(Contract):
         None,
         topic=TLS,
     )
-    data_folder: Path = described(
-        "Existing folder of the scene files (*.ugr); `ultragray serve` makes the default one, and puts the demo scene "
-        "where there is none.",
+    data_folder: Location = described(
+        "Existing folder of the scene files (*.ugr), or the URL of a bucket that holds them: s3://BUCKET/PREFIX, "
+        "gs://, az://, with what the URL does not say in AWS_*, GOOGLE_* or AZURE_* variables. `ultragray serve` makes the "
+        "default one, and puts the demo scene where there is none.",
         Path("data"),
         topic=INSTALLATION,
     )
@@ -140,10 +143,23 @@ class Settings(Contract):
         high=2**30,
     )
 
-    artifact_folder: Path | None = described(
-        "Folder of datasets and jobs, which all services and workers share; none: artifacts in the data folder.",
+    artifact_folder: Location | None = described(
+        "Folder of datasets, jobs and the scenes that they make, which all services and workers share, or the URL of a "
+        "bucket, which needs database_url; none: artifacts in the data folder.",
         None,
         topic=INSTALLATION,
+    )
+    cache_folder: Path | None = described(
+        "Folder of this host for what is fetched from a bucket, and for what is under way; none: ultragray in the "
+        "user's folder of caches.",
+        None,
+        topic=INSTALLATION,
+    )
+    max_cache_bytes: int = described(
+        "Bytes of fetched objects in it, of all processes together; the least recently used goes.",
+        20 * 2**30,
+        low=2**20,
+        high=2**50,
     )
     max_dataset_bytes: int = described(
         "Largest upload: a scene file, or a dataset, packed and unpacked.", 8 * 2**30, low=1024, high=2**50
@@ -294,6 +310,15 @@ class Settings(Contract):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        for name in ("data_folder", "artifact_folder"):
+            if (given := getattr(self, name)) is not None:
+                object.__setattr__(self, name, parse_location(given, name))
+        if isinstance(self.artifacts, StorageUrl) and self.database_url is None:
+            raise InvalidArgument(
+                "database_url must name a PostgreSQL database where datasets and jobs are in a bucket "
+                f"({self.artifacts}): SQLite is a file of one host",
+                field="database_url",
+            )
         if not self.host:
             raise InvalidArgument("host must be an address, got none", field="host")
         parse_allowed(self.igtl_allow)
@@ -319,9 +344,34 @@ class Settings(Contract):
         return Allowance(**{name: getattr(self, f"key_{name}") for name in NAMES})
 
     @property
-    def artifacts(self) -> Path:
-        """The artifact folder, resolved."""
-        return self.data_folder / "artifacts" if self.artifact_folder is None else self.artifact_folder
+    def artifacts(self) -> Location:
+        """Where datasets and jobs are: the artifact folder, or that within the data folder."""
+        if self.artifact_folder is not None:
+            return self.artifact_folder
+        return _below(self.data_folder, "artifacts")
+
+    @property
+    def working_folder(self) -> Path:
+        """The folder of this host for locks and for what is under way: the artifact folder, where that is one."""
+        if isinstance(self.artifacts, Path):
+            return self.artifacts
+        return self.cache / "work" / hashlib.sha256(str(self.artifacts).encode()).hexdigest()[:16]
+
+    @property
+    def is_there(self) -> bool:
+        """Whether a folder of scenes or of artifacts is there; of a bucket that is not asked."""
+        return any(not isinstance(one, Path) or one.is_dir() for one in (self.artifacts, self.data_folder))
+
+    @property
+    def cache(self) -> Path:
+        """The folder of this host for what is fetched from buckets."""
+        if self.cache_folder is not None:
+            return self.cache_folder
+        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ultragray"
+
+
+def _below(location: Location, name: str) -> Location:
+    return location / name if isinstance(location, Path) else location.below(name)
 
 
 def load_settings(**overrides: Any) -> Settings:

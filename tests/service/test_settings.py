@@ -54,3 +54,23 @@ def test_short_keys_are_refused_and_no_key_is_shown(monkeypatch: pytest.MonkeyPa
     assert "hunter2" not in str(caught.value)
     monkeypatch.setenv("ULTRAGRAY_API_KEYS", "0123456789abcdef")
     assert "0123456789abcdef" not in repr(load_settings())
+
+
+def test_folders_are_paths_or_urls(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ULTRAGRAY_DATA_FOLDER", "s3://scenes/of/us")
+    with pytest.raises(InvalidArgument, match=r"ULTRAGRAY_DATABASE_URL.*s3://scenes/of/us/artifacts.*SQLite"):
+        load_settings()
+    assert load_settings(artifact_folder="here").artifacts == Path("here")
+    settings = load_settings(database_url="postgresql://host/jobs", cache_folder=Path("/var/cache/ultragray"))
+    assert str(settings.data_folder) == "s3://scenes/of/us"
+    assert str(settings.artifacts) == "s3://scenes/of/us/artifacts"
+    assert settings.working_folder.parent == Path("/var/cache/ultragray/work")
+    others = load_settings(database_url="postgresql://host/jobs", artifact_folder="s3://jobs", cache_folder=Path("c"))
+    assert others.working_folder.name != settings.working_folder.name
+    assert load_settings(data_folder="file:///srv/scenes").working_folder == Path("/srv/scenes/artifacts")
+
+
+def test_urls_that_cannot_be_name_the_variable(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ULTRAGRAY_ARTIFACT_FOLDER", "http://host/artifacts")
+    with pytest.raises(InvalidArgument, match=r"ULTRAGRAY_ARTIFACT_FOLDER.*must be a path.*'http'"):
+        load_settings()

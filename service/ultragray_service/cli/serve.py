@@ -66,16 +66,18 @@ def serve_scenes(scenes: Iterable[Path], options: Mapping[str, Any]) -> None:
     files = list(scenes)
     if not files:
         settings = load_settings(**options)
-        if settings.data_folder == Settings().data_folder:
-            settings.data_folder.mkdir(exist_ok=True)  # any other folder must exist: its name may be mistyped
-        ensure_scenes(settings.data_folder)
+        folder = settings.data_folder
+        if isinstance(folder, Path):
+            if folder == Settings().data_folder:
+                folder.mkdir(exist_ok=True)  # any other folder must exist: its name may be mistyped
+            ensure_scenes(folder)
         _run(settings)
         return
     if "data_folder" in options:
         raise InvalidArgument("scenes and --data-folder cannot be given together", field="data_folder")
-    with tempfile.TemporaryDirectory(prefix="ultragray-scenes-", ignore_cleanup_errors=True) as folder:
-        link_scenes(files, Path(folder))
-        settings = load_settings(**{**options, "data_folder": Path(folder)})
+    with tempfile.TemporaryDirectory(prefix="ultragray-scenes-", ignore_cleanup_errors=True) as links:
+        link_scenes(files, Path(links))
+        settings = load_settings(**{**options, "data_folder": Path(links)})
         if settings.artifact_folder is None:
             if settings.database_url is not None:
                 raise InvalidArgument(

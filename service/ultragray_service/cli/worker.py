@@ -58,6 +58,7 @@ def run_worker(overrides: dict[str, Any], *, name: str | None = None, device: st
     """
     from opentelemetry import trace
 
+    from ultragray_workers.jobs.places import shared_storage
     from ultragray_workers.jobs.worker.worker import work
 
     from ..telemetry.logs import configure_logging
@@ -65,7 +66,7 @@ def run_worker(overrides: dict[str, Any], *, name: str | None = None, device: st
 
     settings = load_settings(**overrides)
     configure_logging(settings.log_level, settings.log_format)
-    if not settings.artifacts.is_dir() and not settings.data_folder.is_dir():
+    if not settings.is_there:
         raise StartupFailed(
             f"artifact_folder must be an existing folder, got {str(settings.artifacts)!r}", field="artifact_folder"
         )
@@ -77,9 +78,10 @@ def run_worker(overrides: dict[str, Any], *, name: str | None = None, device: st
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda received, frame: (hurry if stop.is_set() else stop).set())
     work(
-        settings.artifacts,
+        settings.working_folder,
         settings.database_url,
         stop,
+        shared=shared_storage(settings.artifacts),
         hurry=hurry,
         name=name,
         device=device,

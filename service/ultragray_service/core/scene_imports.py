@@ -50,7 +50,7 @@ class SceneImports:
         self._checks = checks
         self._owners = owners
         self._holdings = holdings
-        self._folder = settings.artifacts / SCENES_FOLDER
+        self._folder = settings.working_folder / SCENES_FOLDER
         self._slots = Slots(MAX_IMPORTS, "imports of scenes")
 
     @contextlib.asynccontextmanager

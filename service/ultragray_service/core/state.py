@@ -7,11 +7,13 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from enum import Enum
 from functools import partial
+from pathlib import Path
 
 from ultragray.errors import RenderFailed, UltragrayError
 from ultragray.probe import FloatArray
 from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import Draining, NotReady, SceneNotFound, StartupFailed
+from ultragray_workers.jobs.places import shared_storage
 from ultragray_workers.jobs.queue.owners import Kind
 from ultragray_workers.jobs.store import SCENES_FOLDER, JobStore
 from ultragray_workers.pool.pool import MAX_SCENE_CHANGES, PoolConfig, RenderPool
@@ -60,12 +62,12 @@ class Service:
     """All that the front doors share."""
 
     def __init__(self, settings: Settings) -> None:
-        if not settings.data_folder.is_dir():
+        if not isinstance(settings.data_folder, Path) or not settings.data_folder.is_dir():
             raise StartupFailed(
                 f"data_folder must be an existing folder, got {str(settings.data_folder)!r}",
                 field="data_folder",
             )
-        folders = (settings.data_folder, settings.artifacts / SCENES_FOLDER)
+        folders = (settings.data_folder, settings.working_folder / SCENES_FOLDER)
         store = SceneStore(*folders)
         self.settings = settings
         self.scenes = store
@@ -97,7 +99,7 @@ class Service:
                 backend=settings.backend,
             ),
         )
-        self.datasets = DatasetStore(settings.artifacts)
+        self.datasets = DatasetStore(settings.working_folder, shared_storage(settings.artifacts))
         self.jobs = Jobs(settings, store, self.datasets)
         self.readiness = Readiness(
             lambda: self.jobs.database,

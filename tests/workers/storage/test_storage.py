@@ -37,6 +37,9 @@ def test_entries_are_those_below_whole_parts_of_a_path(storage: Storage) -> None
         storage.write(key, b"x")
     assert {entry.key for entry in storage.entries("jobs")} == {"jobs/a", "jobs/b/c"}
     assert {entry.key for entry in storage.entries()} == {"jobs/a", "jobs/b/c", "jobs2/d", "e"}
+    assert {entry.key for entry in storage.entries_in("jobs")} == {"jobs/a"}
+    assert {entry.key for entry in storage.entries_in()} == {"e"}
+    assert list(storage.entries_in("absent")) == []
     (listed,) = (entry for entry in storage.entries() if entry.key == "e")
     assert listed == storage.entry("e")
 

@@ -21,7 +21,7 @@ from ultragray.errors import DatasetInvalid
 from ultragray.files.atomic import file_sha256
 
 from ..claims import is_claimed
-from ..errors import DatasetNotFound
+from ..errors import DatasetNotFound, StorageUnavailable
 from ..shared_claims import SharedClaims
 from ..storage.storage import Entry, NotThere, Storage
 from .copies import LocalCopies
@@ -29,6 +29,7 @@ from .shelf import CONTACT_SHEET_NAME, FILES_NAME, MANIFEST_NAME
 
 MANIFESTS, FILES = "datasets", "dataset-files"  # prefixes of keys
 _AT_ONCE = 8  # files
+_LISTED_FOR_S = 1.0  # after which a dataset that was listed is asked for again
 _STRAY_AFTER_S = 86_400.0  # longer than any upload may take
 _SHARED = "shared"  # key of the manifest
 
@@ -63,15 +64,22 @@ class SharedShelf:
         self._copies = LocalCopies(folder)
         self._claims = SharedClaims(storage)
         self._known: dict[str, tuple[str, str]] = {}  # version and manifest, by name
+        self._listed: dict[str, Entry] = {}
+        self._listed_at_s = float("-inf")
         self._knowing = threading.Lock()
 
     def names(self) -> list[str]:
         """As `Shelf`."""
-        return list(self._entries())
+        entries = self._entries()
+        with self._knowing:
+            self._listed, self._listed_at_s = entries, time.monotonic()
+        return list(entries)
 
     def manifest(self, name: str) -> str | None:
         """As `Shelf`."""
-        entry = self._storage.entry(_manifest_key(name))
+        with self._knowing:
+            entry = self._listed.get(name) if time.monotonic() - self._listed_at_s < _LISTED_FOR_S else None
+        entry = entry or self._storage.entry(_manifest_key(name))
         if entry is None:
             return None
         with self._knowing:
@@ -127,6 +135,8 @@ class SharedShelf:
             return
         key = _manifest_key(name)
         self._storage.delete(key)
+        with self._knowing:
+            self._listed_at_s = float("-inf")
         try:
             yield True
         except BaseException:
@@ -191,8 +201,10 @@ class SharedShelf:
             list(threads.map(fetch, paths))
 
     def _remove_files(self, shared: SharedFiles) -> None:
-        for path in shared.sha256:
-            self._storage.delete(shared.key(path))
+        """Removes the files of an upload; those that a storage that is away keeps go as strays."""
+        with contextlib.suppress(StorageUnavailable):
+            for path in shared.sha256:
+                self._storage.delete(shared.key(path))
 
 
 def _manifest_key(name: str) -> str:

@@ -8,6 +8,8 @@ from pathlib import Path
 
 from ..claims import out_of_sight
 from ..scenes import SUFFIX
+from ..storage.location import Location
+from ..storage.opening import PATIENCE_S, open_storage
 from ..storage.storage import Storage
 from .files import CHECKPOINT_NAME, JOURNAL_NAME, Artifact, JobFiles, Log
 from .folder import JobFolder, Progress
@@ -77,6 +79,14 @@ class FolderFiles:
 
     def _folder(self, job_id: str) -> JobFolder:
         return JobFolder(self._artifact_folder, job_id)
+
+
+def shared_storage(location: Location, *, patience_s: float = PATIENCE_S) -> Storage | None:
+    """The storage that several hosts share; None where the location is a folder, whose files are used in place.
+
+    `patience_s`: as `open_storage`, which also says what is raised.
+    """
+    return None if isinstance(location, Path) else open_storage(location, patience_s=patience_s)
 
 
 def files_of_jobs(artifact_folder: Path, shared: Storage | None) -> JobFiles:

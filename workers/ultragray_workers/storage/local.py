@@ -7,7 +7,7 @@ import fcntl
 import os
 import secrets
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -52,12 +52,21 @@ class LocalStorage:
         self.local: Path | None = folder
 
     def entries(self, prefix: str = "") -> Iterator[Entry]:
-        top = self.folder / check_key(prefix) if prefix else self.folder
-        for folder, _, names in os.walk(top):
-            for name in names:
-                if name == _LOCK or (name.startswith(".") and name.endswith(TEMPORARY_SUFFIX)):
-                    continue
-                path = Path(folder, name)
+        for folder, _, names in os.walk(self._folder(prefix)):
+            yield from self._entries_of(Path(folder), names)
+
+    def entries_in(self, prefix: str = "") -> Iterator[Entry]:
+        folder = self._folder(prefix)
+        try:
+            names = [item.name for item in os.scandir(folder) if item.is_file()]
+        except (FileNotFoundError, NotADirectoryError):
+            return
+        yield from self._entries_of(folder, names)
+
+    def _entries_of(self, folder: Path, names: Iterable[str]) -> Iterator[Entry]:
+        for name in names:
+            if name != _LOCK and not (name.startswith(".") and name.endswith(TEMPORARY_SUFFIX)):
+                path = folder / name
                 with contextlib.suppress(FileNotFoundError):  # gone meanwhile
                     yield self._entry(path.relative_to(self.folder).as_posix(), path.stat())
 
@@ -129,6 +138,9 @@ class LocalStorage:
         with contextlib.suppress(FileNotFoundError, NotADirectoryError):
             path.unlink()
             sync(path.parent)
+
+    def _folder(self, prefix: str) -> Path:
+        return self.folder / check_key(prefix) if prefix else self.folder
 
     def _path(self, key: str) -> Path:
         return self.folder / check_key(key)

@@ -75,6 +75,11 @@ class RemoteStorage:
             for found in page:
                 yield _entry(found)
 
+    def entries_in(self, prefix: str = "") -> Iterator[Entry]:
+        with self._asking():
+            found = self._obstore.list_with_delimiter(self._store, check_key(prefix) if prefix else None)
+        yield from map(_entry, found["objects"])
+
     def entry(self, key: str) -> Entry | None:
         try:
             return _entry(self._head(key))

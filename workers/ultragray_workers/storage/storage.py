@@ -47,6 +47,9 @@ class Storage(Protocol):
     def entries(self, prefix: str = "") -> Iterator[Entry]:
         """The objects below `prefix` (whole parts of a path: `jobs` has `jobs/a`, not `jobs2/a`), in any order."""
 
+    def entries_in(self, prefix: str = "") -> Iterator[Entry]:
+        """The objects directly below `prefix`: of `a/b` and `a/c/d`, below `a`, the first alone."""
+
     def entry(self, key: str) -> Entry | None:
         """One object without its content; None where it is absent."""
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from ultragray.errors import InvalidArgument
 from ultragray_workers.errors import BackupInvalid
 
 from ...settings import Settings, load_settings
@@ -91,10 +92,17 @@ def _verify(folder: Path, *, as_json: bool) -> None:
 
 
 def folders_of(settings: Settings) -> Folders:
-    """The folders that a backup saves."""
+    """The folders that a backup saves. Raises InvalidArgument where they are in a bucket."""
     from ultragray_workers.backup.contents import Folders
 
-    return Folders(settings.data_folder, settings.artifacts)
+    data, artifacts = settings.data_folder, settings.artifacts
+    if not isinstance(data, Path) or not isinstance(artifacts, Path):
+        raise InvalidArgument(
+            "backups are of folders: what is in a bucket is kept by its versions and replication, and the database by "
+            "that of PostgreSQL",
+            field="artifact_folder" if isinstance(data, Path) else "data_folder",
+        )
+    return Folders(data, artifacts)
 
 
 def in_words(manifest: Manifest) -> str:

@@ -23,16 +23,17 @@ Where = Annotated[
 @contextmanager
 def opened_database(where: dict[str, Any]) -> Iterator[JobDatabase]:
     """The database that the options name. Raises InvalidArgument where there is no such installation, StartupFailed."""
+    from ultragray_workers.jobs.places import shared_storage
     from ultragray_workers.jobs.queue.database import JobDatabase
 
     settings = load_settings(**where)
-    if settings.database_url is None and not (settings.artifacts.is_dir() or settings.data_folder.is_dir()):
+    if settings.database_url is None and not settings.is_there:
         raise InvalidArgument(
             f"data_folder must be an existing folder, got {str(settings.data_folder)!r}: name that of the service with "
             "--data-folder",
             field="data_folder",
         )
-    database = JobDatabase(settings.artifacts, settings.database_url)
+    database = JobDatabase(settings.working_folder, settings.database_url, shared_storage(settings.artifacts))
     try:
         yield database
     finally:

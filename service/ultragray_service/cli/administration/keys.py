@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from datetime import datetime, timezone
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -60,8 +61,9 @@ def create(
     """Make a key, and print it: alone on standard output, and never again."""
     limits = read_limits(limit or ())
     settings = load_settings(**where)
-    if settings.database_url is None and settings.data_folder == Settings().data_folder:
-        settings.data_folder.mkdir(exist_ok=True)  # as `serve` makes it: keys may come first
+    default = Settings().data_folder
+    if settings.database_url is None and settings.data_folder == default and isinstance(default, Path):
+        default.mkdir(exist_ok=True)  # as `serve` makes it: keys may come first
     with _key_store(where) as store:
         others = [key for key in store.keys().values() if key.name == name and key.is_valid(time.time())]
         key, secret = store.create(name, role, expires_days, limits)

@@ -8,9 +8,8 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
-from ...datasets.store import DatasetStore
+from ...datasets.opening import open_datasets
 from ...errors import StorageUnavailable
-from ...storage.opening import open_storage
 from ..folder import JobFolder, Progress, Request
 
 if TYPE_CHECKING:
@@ -37,8 +36,7 @@ class JobRun:
 
         Raises Stopped, DatasetNotFound, DatasetInvalid.
         """
-        shared = None if self.request.storage is None else open_storage(self.request.storage)
-        datasets, is_away = DatasetStore(self.folder.artifact_folder, shared), False
+        datasets, is_away = open_datasets(self.folder.artifact_folder, self.request.storage), False
         while True:
             try:
                 return datasets.load(name)

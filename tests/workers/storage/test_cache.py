@@ -1,0 +1,208 @@
+"""The cache of fetched objects: bounded, shared, never half, and never without what is in use."""
+
+from __future__ import annotations
+
+import hashlib
+import subprocess
+import sys
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+
+from ultragray_workers.errors import StorageFull, StorageUnavailable
+from ultragray_workers.storage import cache as cache_module
+from ultragray_workers.storage.cache import Cache
+from ultragray_workers.storage.local import LocalStorage
+from ultragray_workers.storage.storage import Entry, NotThere, Storage
+
+from ...object_storage import Fault, FaultyProxy
+from ...waiting import wait_until
+
+SIZE = 1000
+
+
+class SlowStorage(LocalStorage):
+    """A folder of whose downloads each waits until the test lets it go."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder)
+        self.asked: list[str] = []
+        self.go = threading.Event()
+
+    def download(self, key: str, path: Path, *, version: str | None = None) -> Entry:
+        self.asked.append(key)
+        if key.startswith("slow"):
+            assert self.go.wait(20)
+        return super().download(key, path, version=version)
+
+
+@pytest.fixture
+def cache(tmp_path: Path) -> Cache:
+    """Of room for three objects."""
+    return Cache(tmp_path / "cache", 3 * SIZE)
+
+
+@pytest.fixture
+def source(tmp_path: Path) -> SlowStorage:
+    storage = SlowStorage(tmp_path / "source")
+    for key in ("a", "b", "c", "d", "slow"):
+        storage.write(key, key.encode() * (SIZE // len(key)))
+    return storage
+
+
+def fetch(cache: Cache, storage: Storage, key: str) -> bytes:
+    entry = storage.entry(key)
+    assert entry is not None
+    with cache.file(storage, key, entry.version) as path:
+        return path.read_bytes()
+
+
+def test_an_object_is_fetched_once(cache: Cache, source: SlowStorage) -> None:
+    assert fetch(cache, source, "a") == fetch(cache, source, "a") == b"a" * SIZE
+    assert source.asked == ["a"]
+    counts = cache.counts
+    assert (counts.hits, counts.misses, counts.fetched_bytes) == (1, 1, SIZE)
+    again = Cache(cache.folder, cache.max_bytes)  # as after a restart, or of another process
+    assert fetch(again, source, "a") == b"a" * SIZE
+    assert source.asked == ["a"]
+
+
+def test_many_that_ask_at_once_wait_for_one_fetch_and_others_do_not(cache: Cache, source: SlowStorage) -> None:
+    with ThreadPoolExecutor(8) as threads:
+        asked = [threads.submit(fetch, cache, source, "slow") for _ in range(6)]
+        wait_until(lambda: source.asked == ["slow"], within_s=10)
+        assert fetch(cache, source, "a") == b"a" * SIZE
+        assert not any(one.done() for one in asked)
+        source.go.set()
+        assert {one.result(20) for one in asked} == {b"slow" * (SIZE // 4)}
+    assert source.asked == ["slow", "a"]
+
+
+def test_the_least_recently_used_goes_and_the_bound_holds(cache: Cache, source: SlowStorage) -> None:
+    for key in ("a", "b", "c", "a", "d"):
+        fetch(cache, source, key)
+        time.sleep(0.01)
+        assert cache.held_bytes() <= cache.max_bytes
+    for key in ("a", "c", "d"):
+        fetch(cache, source, key)
+    assert source.asked == ["a", "b", "c", "d"]
+
+
+def test_what_is_in_use_stays(cache: Cache, source: SlowStorage, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cache_module, "_WAIT_FOR_ROOM_S", 0.3)
+    pins = []
+    for key in ("a", "b", "c"):
+        entry = source.entry(key)
+        assert entry is not None
+        pins.append(cache.pin(source, key, entry.version))
+    with pytest.raises(StorageFull, match=r"in use.*max_cache_bytes"):
+        fetch(cache, source, "d")
+    assert all(pin.path.stat().st_size == SIZE for pin in pins)
+    pins[1].let_go()
+    assert fetch(cache, source, "d") == b"d" * SIZE
+    assert [pin.path.exists() for pin in pins] == [True, False, True]
+    for pin in pins:
+        pin.let_go()
+
+
+def test_an_object_larger_than_the_cache_names_the_setting(source: SlowStorage, tmp_path: Path) -> None:
+    with pytest.raises(StorageFull, match="1000 bytes does not fit the cache of 999: raise max_cache_bytes"):
+        fetch(Cache(tmp_path / "small", SIZE - 1), source, "a")
+
+
+def test_content_is_kept_by_its_hash_and_checked(cache: Cache, source: SlowStorage) -> None:
+    sha256 = hashlib.sha256(b"a" * SIZE).hexdigest()
+    with cache.file(source, "a", "any", sha256) as path:
+        assert path.name == sha256
+    source.delete("a")
+    with cache.file(source, "elsewhere", "any", sha256) as path:
+        assert path.read_bytes() == b"a" * SIZE
+    with pytest.raises(StorageUnavailable, match=r"b in .* is damaged: its SHA-256 is"):
+        cache.pin(source, "b", "any", "0" * 64)
+    assert [path.name for path in (cache.folder / "files").iterdir()] == [sha256]
+
+
+def test_a_version_that_has_gone_is_not_there(cache: Cache, source: SlowStorage) -> None:
+    for key, version in (("a", "old"), ("absent", "any")):
+        with pytest.raises(NotThere):
+            cache.pin(source, key, version)
+    assert cache.held_bytes() == 0
+
+
+DIES = """
+import os, sys
+from pathlib import Path
+from ultragray.files.atomic import atomic_path
+from ultragray_workers.storage.cache import Cache
+from ultragray_workers.storage.local import LocalStorage
+
+class Deadly(LocalStorage):
+    def download(self, key, path, *, version=None):
+        with atomic_path(path) as temporary:
+            temporary.write_bytes(b"half")
+            os._exit(7)
+
+storage = Deadly(Path(sys.argv[2]))
+Cache(Path(sys.argv[1]), 3000).pin(storage, "a", storage.entry("a").version)
+"""
+
+
+def test_a_process_that_dies_while_it_fetches_leaves_nothing_that_stays(cache: Cache, source: SlowStorage) -> None:
+    assert subprocess.run([sys.executable, "-c", DIES, cache.folder, source.folder], timeout=60).returncode == 7
+    assert cache.held_bytes() == SIZE  # its space
+    for key in ("b", "c", "d", "a"):
+        assert fetch(cache, source, key) == key.encode() * SIZE
+        assert cache.held_bytes() <= cache.max_bytes
+    assert not [path for path in (cache.folder / "files").iterdir() if path.name.startswith(".")]
+    assert not list((cache.folder / "fetching").iterdir())
+
+
+FETCHES = """
+import sys
+from pathlib import Path
+from ultragray_workers.storage.cache import Cache
+from ultragray_workers.storage.local import LocalStorage
+
+cache, storage = Cache(Path(sys.argv[1]), 3000), LocalStorage(Path(sys.argv[2]))
+for number in range(100):
+    key = "abcd"[(int(sys.argv[3]) + number) % 4]
+    with cache.file(storage, key, storage.entry(key).version) as path:
+        assert path.read_bytes() == key.encode() * 1000
+"""
+
+
+def test_several_processes_share_the_bound(cache: Cache, source: SlowStorage) -> None:
+    processes = [
+        subprocess.Popen([sys.executable, "-c", FETCHES, cache.folder, source.folder, str(first)]) for first in range(3)
+    ]
+    most = 0
+    while any(process.poll() is None for process in processes):
+        most = max(most, cache.held_bytes())
+        time.sleep(0.001)
+    assert [process.returncode for process in processes] == [0, 0, 0]
+    assert 0 < most <= cache.max_bytes
+
+
+@pytest.fixture
+def bucket_of_one(bucket: Storage) -> Storage:
+    bucket.write("a", b"a" * SIZE)
+    return bucket
+
+
+@pytest.mark.slow
+def test_what_is_cached_is_there_without_the_bucket(
+    cache: Cache, bucket_of_one: Storage, object_proxy: FaultyProxy
+) -> None:
+    entry = bucket_of_one.entry("a")
+    assert entry is not None
+    object_proxy.faults.append(Fault("cut_answer", "GET", bytes=300))
+    with cache.file(bucket_of_one, "a", entry.version) as path:
+        assert path.read_bytes() == b"a" * SIZE
+    object_proxy.away = True
+    with cache.file(bucket_of_one, "a", entry.version) as path:
+        assert path.read_bytes() == b"a" * SIZE
+    with pytest.raises(StorageUnavailable):
+        cache.pin(bucket_of_one, "b", "any")

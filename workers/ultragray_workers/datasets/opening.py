@@ -1,0 +1,13 @@
+"""The datasets at a place that a process is told in words."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ..storage.opening import open_storage
+from .store import DatasetStore
+
+
+def open_datasets(artifact_folder: str | Path, storage: str | None) -> DatasetStore:
+    """Those of a storage that several hosts share, with copies below the folder; None: those of the folder."""
+    return DatasetStore(Path(artifact_folder), None if storage is None else open_storage(storage))
