@@ -122,6 +122,8 @@ class StoragePlace:
         """As `Place`."""
         if not self._storage.write(FILE, f"{identity}\n".encode(), if_absent=True):
             raise StartupFailed(f"{self} belongs to another database since a moment ago", field="artifact_folder")
+        with self._asking:
+            self._answer = identity
 
     def probe(self) -> None:
         """As `Place`."""
