@@ -72,10 +72,16 @@ class Settings(Contract):
     )
     data_folder: Location = described(
         "Existing folder of the scene files (*.ugr), or the URL of a bucket that holds them: s3://BUCKET/PREFIX, "
-        "gs://, az://, with what the URL does not say in AWS_*, GOOGLE_* or AZURE_* variables. `ultragray serve` makes the "
-        "default one, and puts the demo scene where there is none.",
+        "gs://, az://, with what the URL does not say in AWS_*, GOOGLE_* or AZURE_* variables. `ultragray serve` makes "
+        "the default one, and puts the demo scene where there is none.",
         Path("data"),
         topic=INSTALLATION,
+    )
+    scene_list_max_age_s: float = described(
+        "How long scenes of a bucket are served from the cache, as they were listed last, while it does not answer.",
+        _HOUR_S,
+        low=1.0,
+        high=24 * _HOUR_S,
     )
     preload: tuple[str, ...] = described("Scenes that are loaded before the service is ready.", ())
 

@@ -1,4 +1,4 @@
-"""A host of several: services and workers in processes of their own, which share a bucket and a database with others."""
+"""A host of several: its services and workers are processes that share a bucket and a database with others."""
 
 from __future__ import annotations
 

@@ -7,9 +7,10 @@ import weakref
 import pytest
 
 from ultragray.errors import SceneFileInvalid
-from ultragray_workers import SceneStore, scenes
+from ultragray_workers import SceneStore
 from ultragray_workers.errors import SceneNotFound
 from ultragray_workers.scenes import resident_bytes
+from ultragray_workers.shelves import headers
 
 
 def test_names_are_the_files_whose_names_can_stand_in_a_url(scene_folder):
@@ -38,7 +39,7 @@ def test_the_first_folder_wins_over_further_ones(scene_folder, tmp_path):
     assert store.names() == ["a", "b", "c"]
     assert store.path("b") == scene_folder / "b.ugr"
     assert store.path("c") == further / "c.ugr"
-    assert store.file("d") == scene_folder / "d.ugr"
+    assert store.file("d") is None
     assert store.header("c").info == store.header("a").info
     (scene_folder / "b.ugr").unlink()
     assert store.path("b") == further / "b.ugr"
@@ -78,8 +79,8 @@ def test_a_loaded_scene_costs_two_and_a_half_times_its_parameters(scene_folder):
 
 
 def test_only_the_headers_used_last_are_kept(scene_folder, monkeypatch):
-    described = scenes._described_bytes(SceneStore(scene_folder).header("a"))
-    monkeypatch.setattr(scenes, "_KEPT_HEADER_BYTES", 2.5 * described)
+    described = headers._described_bytes(SceneStore(scene_folder).header("a"))
+    monkeypatch.setattr(headers, "_KEPT_BYTES", 2.5 * described)
     store = SceneStore(scene_folder)
     for name in ("c", "d"):
         (scene_folder / f"{name}.ugr").write_bytes((scene_folder / "a.ugr").read_bytes())
@@ -109,4 +110,4 @@ def test_what_is_described_is_all_but_the_gaussians(scene_folder):
     header = SceneStore(scene_folder).header("a")
     path = scene_folder / "a.ugr"
     length = int.from_bytes(path.read_bytes()[:8], "little")
-    assert scenes._described_bytes(header) == 30 * (8 + length) + header.training_poses.nbytes
+    assert headers._described_bytes(header) == 30 * (8 + length) + header.training_poses.nbytes

@@ -1,181 +1,216 @@
-"""The scene files of one or more folders, and what a loaded scene costs. Free of torch."""
+"""The scenes of one or more places, and what a loaded scene costs. Free of torch."""
 
 from __future__ import annotations
 
-import re
 import threading
-from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
-from ultragray.errors import InvalidArgument, SceneFileInvalid
+from ultragray.errors import SceneFileInvalid
+from ultragray.files.atomic import file_sha256
 from ultragray.scene_info import SceneHeader, SceneInfo, read_header, scene_file_invalid
 
 from .errors import SceneNotFound, known_names
+from .scene_names import SUFFIX, SceneReference, base_name, check_scene_name
+from .shelves.bucket import BucketShelf
+from .shelves.folder import FolderShelf
+from .shelves.headers import KeptHeaders, floats_per_gaussian
+from .shelves.shelf import Shelf
 from .storage.local import FileVersion
 
-SUFFIX = ".ugr"
-_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
+__all__ = ["SUFFIX", "SceneStore", "check_scene_file", "check_scene_name", "resident_bytes"]
 
 # What the kernel prepares of a scene once (axes, activations, bounds) takes about 1.5 times the raw parameters.
 _RESIDENT_PER_RAW_BYTE = 2.5
-_KEPT_HEADER_BYTES = 128 * 2**20  # of headers: training poses, and what metadata becomes
-_OBJECT_BYTES_PER_TEXT_BYTE = 30  # of the most wasteful metadata: empty lists in a list
+_ATTEMPTS = 3
 
 
 def resident_bytes(info: SceneInfo) -> int:
     """Memory of a loaded scene in a worker: its raw float32 parameters and what the kernel prepares of them."""
-    floats = _floats_per_gaussian(info)
+    floats = floats_per_gaussian(info)
     if info.label_names:
         floats += 3 + 3 + 4 + 1 + 1  # the parts by label, of degree 0
     return int(_RESIDENT_PER_RAW_BYTE * 4 * floats * info.gaussian_count)
 
 
-def _floats_per_gaussian(info: SceneInfo) -> int:
-    return 3 + 3 + 4 + 1 + (info.sh_degree + 1) ** 2  # means, scales, quats, transmittances, SH
-
-
-class _KeptHeaders:
-    """The headers that were used last, within a budget. Its methods may be called from any thread."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._kept: OrderedDict[str, tuple[FileVersion, SceneHeader]] = OrderedDict()  # least recently used first
-        self._bytes = 0
-
-    def get(self, name: str, version: FileVersion) -> SceneHeader | None:
-        """The header of a scene if it is of this version; one of another version is dropped."""
-        with self._lock:
-            kept = self._kept.get(name)
-            if kept is None or kept[0] != version:
-                self._drop(name)
-                return None
-            self._kept.move_to_end(name)
-            return kept[1]
-
-    def keep(self, name: str, version: FileVersion, header: SceneHeader) -> None:
-        with self._lock:
-            self._drop(name)
-            self._kept[name] = version, header
-            self._bytes += _described_bytes(header)
-            while self._bytes > _KEPT_HEADER_BYTES:
-                self._drop(next(iter(self._kept)))
-
-    def drop(self, name: str) -> None:
-        with self._lock:
-            self._drop(name)
-
-    def _drop(self, name: str) -> None:
-        if (kept := self._kept.pop(name, None)) is not None:
-            self._bytes -= _described_bytes(kept[1])
-
-
-def _described_bytes(header: SceneHeader) -> int:
-    """Of a scene file without its Gaussians, as what is read from it: text becomes objects."""
-    bytes_per_gaussian = 4 * _floats_per_gaussian(header.info) + bool(header.info.label_names)
-    gaussians_bytes = bytes_per_gaussian * header.info.gaussian_count
-    text_bytes = header.file_bytes - gaussians_bytes - header.training_poses.nbytes
-    return header.training_poses.nbytes + _OBJECT_BYTES_PER_TEXT_BYTE * max(text_bytes, 0)
-
-
 class SceneStore:
-    """The scenes of some folders: `NAME.ugr` is the scene NAME, in the first folder that has it.
+    """The scenes of some folders and buckets: of several that have a name, the first counts.
 
-    Files and folders may come, change and go at any time.
+    A scene is asked for by its name, or by its name with a pin (see `scene_names`): then it must have that content.
+    What blocks raises StorageUnavailable where a bucket does not answer.
     """
 
-    def __init__(self, *folders: Path) -> None:
-        self.folders = tuple(Path(folder) for folder in folders)
+    def __init__(self, *places: Path | Shelf) -> None:
+        self.shelves = tuple(FolderShelf(place) if isinstance(place, Path) else place for place in places)
         self.hides: Callable[[str], bool] = lambda name: False  # from whoever asks: what is hidden is not found
-        self._headers = _KeptHeaders()
+        self._headers: KeptHeaders[FileVersion] = KeptHeaders()
+        self._hashes: dict[str, tuple[FileVersion, str]] = {}
+        self._hashing = threading.Lock()
 
     def names(self) -> list[str]:
         """The names of all scenes, sorted; files whose name could not stand in a URL are left out."""
-        return sorted({name for folder in self.folders for name in _names_in(folder)})
+        return sorted({name for shelf in self.shelves for name in shelf.names()})
 
     def shown_names(self) -> list[str]:
         """As `names`, without those that are hidden."""
         return [name for name in self.names() if not self.hides(name)]
 
-    def names_of(self, folder: Path) -> set[str]:
-        """The names of the scenes that are those of one of the folders: none before it has the name."""
-        before = self.folders[: self.folders.index(folder)]
-        return set(_names_in(folder)).difference(*map(_names_in, before))
+    def names_of(self, shelf: Shelf) -> set[str]:
+        """The names of the scenes that are those of one of the shelves: none before it has the name."""
+        before = self.shelves[: self.shelves.index(shelf)]
+        return shelf.names().difference(*(other.names() for other in before))
 
-    def path(self, name: str) -> Path:
-        """The file of a scene. Raises SceneNotFound, also for a name that no scene can have."""
-        if _NAME.fullmatch(name) and not self.hides(name) and (path := self.file(name)).is_file():
-            return path
-        raise self._not_found(name)
+    def shelf_of(self, name: str) -> Shelf | None:
+        """The shelf that has the scene of a name; None where none does."""
+        return next((shelf for shelf in self.shelves if shelf.has(name)), None)
 
-    def file(self, name: str) -> Path:
-        """The path of a scene's file; in the first folder where there is none."""
-        paths = [folder / f"{name}{SUFFIX}" for folder in self.folders]
-        return next((path for path in paths if path.is_file()), paths[0])
+    def require(self, text: str) -> str:
+        """The name of the scene that is asked for. Raises SceneNotFound, also for one that no scene can have."""
+        return self._found(text)[0].name
 
-    def header(self, name: str) -> SceneHeader:
+    def path(self, text: str) -> Path:
+        """The file of a scene, on this host from now on. Raises SceneNotFound, StorageFull."""
+        reference, shelf = self._found(text)
+        try:
+            return shelf.fetch(reference.name)
+        except FileNotFoundError:
+            raise self._not_found(text) from None
+
+    def header(self, text: str) -> SceneHeader:
         """A scene's description and training poses. Raises SceneNotFound, SceneFileInvalid."""
-        return self.versioned_header(name)[1]
+        reference, shelf = self._found(text)
+        if shelf.here(reference.name) is not None:
+            return self.versioned_header(text)[1]
+        try:
+            return shelf.header(reference.name)
+        except FileNotFoundError:
+            raise self._not_found(text) from None
 
-    def versioned_header(self, name: str) -> tuple[FileVersion, SceneHeader]:
-        """The same, with the version of the file that it is of."""
-        version = self.version(name)  # before reading, so that a change meanwhile counts as newer
+    def versioned_header(self, text: str) -> tuple[FileVersion, SceneHeader]:
+        """The same, with the version of the file that it is of; the file is fetched."""
+        path, version = self._versioned(text)  # before reading, so that a change meanwhile counts as newer
+        name = base_name(text)
         cached = self._headers.get(name, version)
         if cached is not None:
             return version, cached
-        header = read_header(self.file(name))
+        header = read_header(path)
         self._headers.keep(name, version, header)
         return version, header
 
-    def version(self, name: str) -> FileVersion:
+    def version(self, text: str) -> FileVersion:
         """The version of a scene's file as it is now. Raises SceneNotFound, SceneFileInvalid."""
-        path = self.path(name)
-        try:
-            return FileVersion.of(path)
-        except FileNotFoundError:
-            raise self._not_found(name) from None
-        except OSError as error:
-            raise scene_file_invalid(path, error) from error
+        return self._versioned(text)[1]
 
-    def cached_versioned_header(self, name: str) -> tuple[FileVersion, SceneHeader] | None:
+    def cached_versioned_header(self, text: str) -> tuple[FileVersion, SceneHeader] | None:
         """The versioned header if it was read before and the file is unchanged, at the cost of one stat."""
-        if self.hides(name):
+        reference = SceneReference.of(text)
+        if reference is None or self.hides(reference.name):
             return None
+        name = reference.name
         try:
-            version = FileVersion.of(self.file(name))
-        except (OSError, ValueError):  # ValueError: no file can have the name
+            path = self._here(name)
+            version = None if path is None else FileVersion.of(path)
+        except (OSError, ValueError):
+            version = None
+        if version is None:
             self._headers.drop(name)
             return None
+        if reference.pin is not None:
+            hashed = self._hashes.get(name)
+            if hashed is None or hashed[0] != version or not reference.fits(hashed[1]):
+                return None
         header = self._headers.get(name, version)
         return None if header is None else (version, header)
+
+    @contextmanager
+    def hold(self, name: str) -> Iterator[Path | None]:
+        """The file of a scene, which stays on this host during the body; None where it is not on this host now."""
+        shelf = next((shelf for shelf in self.shelves if shelf.knows(name)), None)
+        if shelf is None:
+            yield None
+            return
+        with shelf.hold(name) as path:
+            yield path
+
+    def sha256(self, text: str) -> str:
+        """The hash of the content that a scene has now, its file fetched where nothing else tells it.
+
+        Raises SceneNotFound, SceneFileInvalid.
+        """
+        reference, shelf = self._found(text)
+        known = shelf.sha256(reference.name)
+        return self._hash_of_file(reference.name, self.path(text))[1] if known is None else known
+
+    def file(self, name: str) -> Path | None:
+        """The path of a scene's file in the first folder that has it; None where no folder does."""
+        folders = [shelf for shelf in self.shelves if isinstance(shelf, FolderShelf)]
+        return next((path for shelf in folders if (path := shelf.here(name)) is not None), None)
+
+    def bytes_in_buckets(self, name: str) -> int:
+        """Of the files that the buckets have of a scene."""
+        return sum(shelf.bytes_of(name) for shelf in self.shelves if isinstance(shelf, BucketShelf))
 
     def forget(self, name: str) -> None:
         """Drops what is kept of a scene that was deleted."""
         self._headers.drop(name)
+        self._hashes.pop(name, None)
 
-    def _not_found(self, name: str) -> SceneNotFound:
+    def _found(self, text: str) -> tuple[SceneReference, Shelf]:
+        """The shelf of the scene that is asked for, with the content that is asked for. Raises SceneNotFound."""
+        reference = SceneReference.of(text)
+        if reference is None or self.hides(reference.name) or (shelf := self.shelf_of(reference.name)) is None:
+            raise self._not_found(text)
+        if reference.pin is not None:
+            found = shelf.sha256(reference.name)
+            if found is None:
+                try:
+                    _, found = self._hash_of_file(reference.name, shelf.fetch(reference.name))
+                except FileNotFoundError:
+                    raise self._not_found(text) from None
+            if not reference.fits(found):
+                raise SceneNotFound(
+                    f"the scene {reference.name!r} no longer has the content {reference.pin}; it is now "
+                    f"{reference.name}@{found}",
+                    field="scene",
+                )
+        return reference, shelf
+
+    def _here(self, name: str) -> Path | None:
+        shelf = next((shelf for shelf in self.shelves if shelf.knows(name)), None)
+        return None if shelf is None else shelf.here(name)
+
+    def _versioned(self, text: str) -> tuple[Path, FileVersion]:
+        name, is_pinned = base_name(text), "@" in text
+        for _ in range(_ATTEMPTS):
+            path = self.path(text)
+            try:
+                version = FileVersion.of(path)
+            except FileNotFoundError:
+                raise self._not_found(text) from None
+            except OSError as error:
+                raise scene_file_invalid(path, error) from error
+            if not is_pinned or self._hash_of_file(name, path)[0] == version:
+                return path, version  # else it was replaced after its content was compared
+        raise SceneFileInvalid(f"{path}: it changed {_ATTEMPTS} times while it was being read")
+
+    def _hash_of_file(self, name: str, path: Path) -> tuple[FileVersion, str]:
+        with self._hashing:  # one reads a file, the others learn of it
+            try:
+                version = FileVersion.of(path)
+                known = self._hashes.get(name)
+                if known is None or known[0] != version:
+                    known = self._hashes[name] = (version, file_sha256(path))
+            except FileNotFoundError:
+                raise self._not_found(name) from None
+            except OSError as error:
+                raise scene_file_invalid(path, error) from error
+            return known
+
+    def _not_found(self, text: str) -> SceneNotFound:
         return SceneNotFound(
-            f"there is no scene {name[:128]!r}; {known_names('scene', self.shown_names())}", field="scene"
+            f"there is no scene {text[:128]!r}; {known_names('scene', self.shown_names())}", field="scene"
         )
-
-
-def check_scene_name(name: Any, field: str = "scene") -> None:
-    """Raises InvalidArgument for a name that no scene can have."""
-    if not isinstance(name, str) or not _NAME.fullmatch(name):
-        raise InvalidArgument(
-            f"{field} must be 1 to 128 letters, digits, '.', '_', '-', got {str(name)[:128]!r}", field=field
-        )
-
-
-def _names_in(folder: Path) -> list[str]:
-    try:
-        entries = list(folder.iterdir())
-    except (FileNotFoundError, NotADirectoryError):
-        return []
-    return [
-        entry.stem for entry in entries if entry.suffix == SUFFIX and _NAME.fullmatch(entry.stem) and entry.is_file()
-    ]
 
 
 def check_scene_file(path: str) -> None:

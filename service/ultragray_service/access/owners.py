@@ -21,6 +21,7 @@ from ultragray_workers.jobs.queue.owners import (
     read_owner,
     read_owners,
 )
+from ultragray_workers.scene_names import base_name
 
 from .principal import Principal, Role, acting
 
@@ -56,8 +57,8 @@ class Owners:
             self._known = read_owners(connection)
 
     def known(self, kind: Kind, name: str) -> Ownership:
-        """Whose a dataset or scene is."""
-        return self._known.get((kind, name), NOBODYS)
+        """Whose a dataset or scene is; a scene also by its name with a pin."""
+        return self._known.get((kind, base_name(name) if kind is Kind.SCENE else name), NOBODYS)
 
     def owned(self, kind: Kind, owner: str) -> list[str]:
         """The datasets or scenes of an owner. May be called from any thread."""

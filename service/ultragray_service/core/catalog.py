@@ -45,7 +45,9 @@ class SceneCatalog:
 
     async def header(self, name: str) -> SceneHeader:
         """The header of a scene. Raises SceneNotFound, SceneFileInvalid; both name the field `scene`."""
-        return (await self.versioned_header(name))[1]
+        with scene_to_blame():
+            cached = self._store.cached_versioned_header(name)
+            return cached[1] if cached is not None else await asyncio.to_thread(self._store.header, name)
 
     async def versioned_header(self, name: str) -> tuple[FileVersion, SceneHeader]:
         """The same, with the version of the file that it is of."""
@@ -62,7 +64,7 @@ class SceneCatalog:
         """At most `limit` Gaussians of a scene, as `point_message`. Raises SceneNotFound, SceneFileInvalid."""
         header = await self.header(name)
         with scene_to_blame():
-            path = self._store.path(name)
+            path = await asyncio.to_thread(self._store.path, name)
             async with self._reading_points:  # all the Gaussians of one scene in memory are enough
                 return await in_own_thread(lambda: point_message(path, header.info, limit))
 

@@ -11,6 +11,7 @@ from ultragray.contract import under
 from ultragray.errors import InvalidImageSize, TooManyPoses
 from ultragray.scene_info import SceneInfo
 from ultragray.settings import Encoding, FrameSettings, Resolved
+from ultragray_workers.scene_names import base_name
 from ultragray_workers.storage.local import FileVersion
 
 from ..settings import Settings
@@ -21,7 +22,8 @@ class Plan:
     """What a client wants of a scene: its settings, with nothing left open as the scene is now.
 
     A frame is rendered for the version of the scene's file that they are for. Where the file has another by then, they
-    are resolved anew: what they left open is as the new scene has it.
+    are resolved anew: what they left open is as the new scene has it. A scene that is asked for with a pin must have
+    that content.
     """
 
     settings: Resolved
@@ -29,7 +31,8 @@ class Plan:
 
     def __init__(self, catalog: SceneCatalog, scene: str, resolve: Callable[[SceneInfo], Resolved], path: str) -> None:
         """`path`: the place of the settings in the client's message, for errors. To be renewed before it is used."""
-        self.scene = scene
+        self.scene = base_name(scene)
+        self._asked = scene
         self._catalog = catalog
         self._resolve = resolve
         self._path = path
@@ -37,7 +40,7 @@ class Plan:
     async def renew(self) -> None:
         """Resolves the settings for the scene as it is now. Raises what RequestPlanner.plan raises."""
         with under(self._path) if self._path else nullcontext():
-            version, header = await self._catalog.versioned_header(self.scene)
+            version, header = await self._catalog.versioned_header(self._asked)
             self.settings, self.version = self._resolve(header.info), version
 
 

@@ -9,14 +9,14 @@ from functools import partial
 from pathlib import Path
 
 from ultragray.errors import SceneFileInvalid
-from ultragray.files.atomic import file_sha256, sync
-from ultragray.files.link import link_or_copy
+from ultragray.files.atomic import sync
 from ultragray.scene_info import SceneHeader, read_header
-from ultragray_workers.claims import claimed_folder, is_claimed, remove_abandoned, storage_full
+from ultragray_workers.claims import storage_full
 from ultragray_workers.errors import SceneExists, SceneNotFound, UploadTooLarge
-from ultragray_workers.jobs.publication import SCENES_FOLDER
 from ultragray_workers.jobs.queue.owners import Kind
-from ultragray_workers.scenes import SUFFIX, SceneStore, check_scene_file, check_scene_name
+from ultragray_workers.scene_names import SUFFIX, check_scene_name
+from ultragray_workers.scenes import SceneStore, check_scene_file
+from ultragray_workers.shelves.shelf import Shelf
 
 from ..access.limits.holdings import Holdings
 from ..access.limits.slots import Slots
@@ -28,7 +28,6 @@ from .own_thread import in_own_thread, to_its_end
 
 CHECK_TIMEOUT_S = 600.0
 MAX_IMPORTS = 4
-_PREFIX = ".importing-"
 
 
 class SceneImports:
@@ -37,20 +36,21 @@ class SceneImports:
     def __init__(
         self,
         store: SceneStore,
+        shelf: Shelf,
         settings: Settings,
         maker_of: Callable[[str], Awaitable[str | None]],
         checks: HelperProcesses,
         owners: Owners,
         holdings: Holdings,
     ) -> None:
-        """`maker_of`: the job that makes a scene, in words; None where none does."""
+        """`shelf`: of the store, for what is imported; `maker_of`: the job that makes a scene, in words; or None."""
         self._store = store
         self._settings = settings
         self._maker_of = maker_of
         self._checks = checks
         self._owners = owners
         self._holdings = holdings
-        self._folder = settings.working_folder / SCENES_FOLDER
+        self._shelf = shelf
         self._slots = Slots(MAX_IMPORTS, "imports of scenes")
 
     @contextlib.asynccontextmanager
@@ -67,7 +67,7 @@ class SceneImports:
             try:
                 room, most = await self._holdings.room(), self._settings.max_dataset_bytes
                 with storage_full("the scene"), room.to_blame(most):
-                    folder = await to_its_end(lambda: claim.enter_context(claimed_folder(self._folder, _PREFIX)))
+                    folder = await to_its_end(lambda: claim.enter_context(self._shelf.making()))
                     received = folder / f"{name}{SUFFIX}"
                     await self._write(received, blocks, room.at_most(most))
                     yield received
@@ -106,12 +106,12 @@ class SceneImports:
 
     async def removable(self) -> set[str]:
         """The names of the scenes that `delete` removes."""
-        return await asyncio.to_thread(self._store.names_of, self._folder)
+        return await asyncio.to_thread(self._store.names_of, self._shelf)
 
     async def remove_stale(self) -> None:
         """Removes what services that died during an import left."""
 
-        await asyncio.to_thread(remove_abandoned, self._folder, _PREFIX)
+        await asyncio.to_thread(self._shelf.remove_abandoned)
 
     async def _write(self, path: Path, blocks: AsyncIterator[bytes], max_bytes: int) -> None:
         received = 0
@@ -125,42 +125,40 @@ class SceneImports:
         await in_own_thread(lambda: sync(path))
 
     def _publish(self, received: Path, name: str, claim: Claim) -> None:
-        target = self._folder / f"{name}{SUFFIX}"
-        link_or_copy(received, target)
-        if not target.samefile(received) and file_sha256(target) != file_sha256(received):  # another one was quicker
-            raise self._exists(name)
+        try:
+            self._shelf.publish(received, name)
+        except SceneExists:  # another one was quicker
+            raise self._exists(name) from None
         claim.is_made = True
 
     async def _is_there(self, name: str, claim: str | None) -> bool:
         """Whether the scene of a claim is there, or is being made: in this order it is not missed."""
-        if claim is not None and await asyncio.to_thread(is_claimed, self._folder / claim):
+        if claim is not None and await asyncio.to_thread(self._shelf.is_making, claim):
             return True
         if await self._maker_of(name) is not None:
             return True
-        return name in await asyncio.to_thread(self._store.names)
+        return await asyncio.to_thread(self._store.shelf_of, name) is not None
 
     async def _require_free(self, name: str) -> None:
-        if name in await asyncio.to_thread(self._store.names):
-            raise self._exists(name)
+        if await asyncio.to_thread(self._store.shelf_of, name) is not None:
+            raise await asyncio.to_thread(self._exists, name)
         if (maker := await self._maker_of(name)) is not None:
             raise SceneExists(f"{maker} makes a scene {name!r}: choose another name", field="scene")
 
     def _exists(self, name: str) -> SceneExists:
-        is_removable = self._store.file(name).parent == self._folder
+        is_removable = self._store.shelf_of(name) is self._shelf
         advice = "delete it first, or choose another name" if is_removable else "choose another name"
         return SceneExists(f"there is already a scene {name!r}: {advice}", field="scene")
 
     def _delete(self, name: str) -> None:
-        path = self._store.path(name)
-        if path.parent != self._folder:
+        check_scene_name(name)
+        self._store.require(name)
+        if self._store.shelf_of(name) is not self._shelf:
             raise SceneReadOnly(
                 f"the scene {name!r} lies in the data folder of the service: only scenes that were imported, or that "
                 "jobs made, can be deleted",
                 field="scene",
             )
-        try:
-            path.unlink()
-        except FileNotFoundError:
-            raise SceneNotFound(f"there is no scene {name!r} any more", field="scene") from None
+        if not self._shelf.remove(name):
+            raise SceneNotFound(f"there is no scene {name!r} any more", field="scene")
         self._store.forget(name)
-        sync(self._folder)

@@ -10,6 +10,7 @@ from ultragray.outputs import OUTPUTS
 from ultragray.probe import ElevationBeam, Probe
 from ultragray.scene_info import SceneHeader
 from ultragray_workers.jobs.queue.owners import Kind, Ownership
+from ultragray_workers.scene_names import base_name
 
 from ..errors import Refusal
 from .catalog import CatalogEntry, finite_metrics
@@ -162,12 +163,13 @@ class SceneLoaded:
     @classmethod
     def of(cls, scene: str, loaded_processes: int) -> SceneLoaded:
         """The scene, which so many render processes hold."""
-        return cls(scene, loaded_processes > 0, loaded_processes)
+        return cls(base_name(scene), loaded_processes > 0, loaded_processes)
 
 
 async def scene(service: Service, name: str) -> Scene:
     """Raises SceneNotFound, SceneFileInvalid."""
-    header, loaded_processes = await service.catalog.header(name), service.pool.loaded().get(name, 0)
+    header, name = await service.catalog.header(name), base_name(name)
+    loaded_processes = service.pool.loaded().get(name, 0)
     return Scene.of(name, header, loaded_processes, service.owners.known(Kind.SCENE, name))
 
 

@@ -7,7 +7,6 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from enum import Enum
 from functools import partial
-from pathlib import Path
 
 from ultragray.errors import RenderFailed, UltragrayError
 from ultragray.probe import FloatArray
@@ -15,7 +14,7 @@ from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import Draining, NotReady, SceneNotFound, StartupFailed
 from ultragray_workers.jobs.places import shared_storage
 from ultragray_workers.jobs.queue.owners import Kind
-from ultragray_workers.jobs.store import SCENES_FOLDER, JobStore
+from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.pool.pool import MAX_SCENE_CHANGES, PoolConfig, RenderPool
 from ultragray_workers.pool.types import Destination, Priority, RenderRequest, RenderResult, SceneChangedError
 from ultragray_workers.pool.waiting import Turn
@@ -48,6 +47,7 @@ from .jobs.jobs import Jobs
 from .readiness.readiness import Readiness
 from .requests import Plan, RequestPlanner
 from .scene_imports import SceneImports
+from .scene_places import ScenePlaces
 
 
 class Phase(Enum):
@@ -62,13 +62,8 @@ class Service:
     """All that the front doors share."""
 
     def __init__(self, settings: Settings) -> None:
-        if not isinstance(settings.data_folder, Path) or not settings.data_folder.is_dir():
-            raise StartupFailed(
-                f"data_folder must be an existing folder, got {str(settings.data_folder)!r}",
-                field="data_folder",
-            )
-        folders = (settings.data_folder, settings.working_folder / SCENES_FOLDER)
-        store = SceneStore(*folders)
+        self.places = ScenePlaces(settings)
+        store = SceneStore(self.places.data, self.places.made)
         self.settings = settings
         self.scenes = store
         self.catalog = SceneCatalog(store)
@@ -84,7 +79,8 @@ class Service:
         self._following_sessions: asyncio.Task[None] | None = None
         self._snapshot: Snapshot | None = None
         self.pool = RenderPool(
-            SceneStore(*folders),  # its own: nothing is hidden from the pool, which works for everybody at once
+            # Its own: nothing is hidden from the pool, which works for everybody at once.
+            SceneStore(self.places.data, self.places.made),
             PoolConfig(
                 processes=settings.processes,
                 threads_per_process=settings.threads_per_process,
@@ -105,15 +101,16 @@ class Service:
             lambda: self.jobs.database,
             require_serving=self.require_serving,
             require_frames=self.require_frames,
+            scenes=self.places,
             without_jobs=settings.ready_without_jobs,
         )
         self.owners = Owners(
             lambda job_id: self.jobs.do(JobStore.ownership, job_id),
-            {Kind.SCENE: store.path, Kind.DATASET: self.datasets.get},
+            {Kind.SCENE: store.require, Kind.DATASET: self.datasets.get},
         )
         store.hides = partial(self.owners.hides, Kind.SCENE)
         self.datasets.hides = partial(self.owners.hides, Kind.DATASET)
-        self.metrics = Metrics(self.pool, lambda: self.jobs.overview)
+        self.metrics = Metrics(self.pool, lambda: self.jobs.overview, self.places)
         self.limits = Limits(settings.allowance, self.metrics.count_limited)
         holdings = Holdings(self.limits, self.owners, self.datasets, store, self.jobs)
         self.jobs.admit = holdings.admit_job
@@ -125,7 +122,9 @@ class Service:
         checks, pictures = (HelperProcesses(settings.dataset_memory_mb << 20) for _ in range(2))
         self.uploads = DatasetUploads(self.datasets, settings, self.draining, checks, self.owners, holdings)
         self.datasets.in_use = self.jobs.uses_dataset
-        self.imports = SceneImports(store, settings, self.jobs.makes_scene, checks, self.owners, holdings)
+        self.imports = SceneImports(
+            store, self.places.made, settings, self.jobs.makes_scene, checks, self.owners, holdings
+        )
         self.dataset_views = DatasetViews(self.datasets, settings, pictures)
         self.comparisons = Comparisons(store, self.catalog, self.datasets, settings, pictures)
         self.training_views = TrainingViews(self.jobs, self.datasets, settings, pictures)
@@ -168,6 +167,7 @@ class Service:
 
     async def open(self) -> None:
         """Opens the jobs' database, and reads who may do what; before any door opens. Raises StartupFailed."""
+        await self.places.open()
         await self.jobs.open()
         self._snapshot = await asyncio.to_thread(Snapshot, self.jobs.database.engine, self._keys, self.owners)
         self.owners.open(self.jobs.database.engine, self.jobs.threads)
@@ -195,6 +195,7 @@ class Service:
         await asyncio.to_thread(self.audit.close)
         self.readiness.close()
         await self.jobs.close()
+        await self.places.close()
         if self.tracing is not None:
             await asyncio.to_thread(self.tracing.stop)
 
@@ -263,17 +264,17 @@ class Service:
         """
         self.require_serving()
         with scene_to_blame():
-            await asyncio.to_thread(self.scenes.path, scene)
-            await self.pool.load(scene)
-        return self.pool.loaded().get(scene, 0)
+            name = await asyncio.to_thread(self.scenes.require, scene)
+            await self.pool.load(name)
+        return self.pool.loaded().get(name, 0)
 
     async def unload(self, scene: str) -> int:
         """Frees a scene; how many processes still hold it. Raises SceneNotFound."""
         self.require_serving()
         with scene_to_blame():
-            await asyncio.to_thread(self.scenes.path, scene)
-            await self.pool.unload(scene)
-        return self.pool.loaded().get(scene, 0)
+            name = await asyncio.to_thread(self.scenes.require, scene)
+            await self.pool.unload(name)
+        return self.pool.loaded().get(name, 0)
 
     async def delete_dataset(self, name: str) -> None:
         """Deletes a dataset, and all that was made of it to be looked at. Raises DatasetNotFound, DatasetInUse."""

@@ -20,7 +20,10 @@ async def _service(connection: HTTPConnection) -> Service:  # async: FastAPI run
 
 ServiceDep = Annotated[Service, Depends(_service)]
 _REFERENCE = "#/components/schemas/{}"
-_NAME_MEANS = "Name of the scene: its file name without .ugr."
+_NAME_MEANS = (
+    "Name of the scene: its file name without .ugr. NAME@SHA256, or NAME@ and at least 12 digits of it, asks for that "
+    "content alone."
+)
 SceneName = Annotated[str, Path(description=_NAME_MEANS, examples=["demo"])]
 SCENE_NAME = {"description": _NAME_MEANS, "schema": {"type": "string", "title": "Scene", "examples": ["demo"]}}
 

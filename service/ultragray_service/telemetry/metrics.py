@@ -16,6 +16,7 @@ from ultragray_workers.pool.pool import RenderPool
 from ultragray_workers.pool.types import RenderResult
 
 from ..access.principal import acting
+from ..core.scene_places import ScenePlaces
 from ..errors import statuses_of
 from .statistics import Statistics
 
@@ -73,6 +74,27 @@ class _JobsCollector(Collector):
         yield GaugeMetricFamily("ultragray_oldest_waiting_job_seconds", oldest, now.oldest_waiting_s)
 
 
+class _ScenesCollector(Collector):
+    """The cache of scenes, and the buckets that they come from; nothing where all are in folders."""
+
+    def __init__(self, places: ScenePlaces) -> None:
+        self._places = places
+
+    def collect(self) -> Iterator[Metric]:
+        buckets, counts = self._places.buckets, self._places.cache.counts
+        counter, gauge = CounterMetricFamily, GaugeMetricFamily
+        yield counter("ultragray_scene_cache_hits", "Requests whose scene was cached.", counts.hits)
+        yield counter("ultragray_scene_cache_misses", "Scenes that were fetched from a bucket.", counts.misses)
+        yield counter("ultragray_scene_cache_fetched_bytes", "Bytes of those.", counts.fetched_bytes)
+        yield counter("ultragray_scene_cache_fetch_seconds", "Time that their fetches took in all.", counts.fetch_s)
+        held = self._places.cache.held_bytes() if buckets else 0
+        yield gauge("ultragray_scene_cache_bytes", "Bytes that the cache of this host holds.", held)
+        errors = sum(one.index.unavailable_total for one in buckets)
+        yield counter("ultragray_scene_list_errors", "Times that a bucket did not tell its scenes.", errors)
+        age = max((one.index.age_s for one in buckets), default=0.0)
+        yield gauge("ultragray_scene_list_age_seconds", "Age of the oldest list of the scenes of a bucket.", age)
+
+
 def _role() -> str:
     """The role of who asks."""
     try:
@@ -84,7 +106,7 @@ def _role() -> str:
 class Metrics:
     """One registry per service. `jobs`: the jobs in numbers, as they were counted last."""
 
-    def __init__(self, pool: RenderPool, jobs: Callable[[], JobsOverview]) -> None:
+    def __init__(self, pool: RenderPool, jobs: Callable[[], JobsOverview], scenes: ScenePlaces) -> None:
         self.registry = CollectorRegistry()
         self.statistics = Statistics()
         counter = partial(Counter, registry=self.registry)
@@ -122,6 +144,7 @@ class Metrics:
         self._batch = histogram("ultragray_batch_poses", "Poses rendered together.", buckets=_POSES)
         self.registry.register(_PoolCollector(pool))
         self.registry.register(_JobsCollector(jobs))
+        self.registry.register(_ScenesCollector(scenes))
         ProcessCollector(registry=self.registry)
 
     def tell_certificate_expiry(self, not_after: Callable[[], datetime]) -> None:

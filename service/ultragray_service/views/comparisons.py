@@ -9,12 +9,10 @@ from pathlib import Path
 from typing import Literal
 
 from ultragray.contract import described
-from ultragray.files.atomic import file_sha256
 from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import ArtifactNotFound, DatasetNotFound
 from ultragray_workers.helpers.comparison import FRAMES_NAME, compare
 from ultragray_workers.scenes import SceneStore
-from ultragray_workers.storage.local import FileVersion
 
 from ..core.catalog import SceneCatalog
 from ..core.helper_processes import HelperProcesses
@@ -72,7 +70,6 @@ class Comparisons(Prepared):
         self._scenes = scenes
         self._catalog = catalog
         self._datasets = datasets
-        self._hashes: dict[str, tuple[FileVersion, str]] = {}
 
     async def get(self, scene: str) -> Comparison:
         """Begin the comparison unless it is there; how far it is.
@@ -123,13 +120,6 @@ class Comparisons(Prepared):
                 f"the dataset that the scene {scene!r} was trained from{named} is not among those of the service",
                 field="scene",
             )
-        path = self._scenes.path(scene)
-        scene_sha256 = await in_own_thread(lambda: self._sha256(scene, path))
+        path = await asyncio.to_thread(self._scenes.path, scene)
+        scene_sha256 = await in_own_thread(lambda: self._scenes.sha256(scene))
         return f"{_FORMAT}-{scene_sha256}-{wanted}", present[wanted], path
-
-    def _sha256(self, scene: str, path: Path) -> str:
-        version = FileVersion.of(path)
-        known = self._hashes.get(scene)
-        if known is None or known[0] != version:
-            known = self._hashes[scene] = (version, file_sha256(path))
-        return known[1]

@@ -21,6 +21,7 @@ def test_an_object_is_written_read_and_deleted(storage: Storage) -> None:
     assert storage.read("a/b.json", start=2, length=3) == b"234"
     assert storage.read("a/b.json", start=8) == b"89"
     assert storage.read("a/b.json", start=8, length=5) == b"89"
+    assert storage.read("a/b.json", start=10, length=5) == storage.read("a/b.json", start=99) == b""
     entry = storage.entry("a/b.json")
     assert entry is not None
     assert (entry.key, entry.bytes) == ("a/b.json", 10)

@@ -1,17 +1,20 @@
-"""A scene that a job made becomes one that is served: one rename or link, and never over another scene.
+"""A scene that a job made becomes one that is served: one link or one conditional write, never over another scene.
 
 The job has its name from the submission on, and gives it back where it ends without the scene.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 from ultragray.files.atomic import file_sha256
-from ultragray.files.link import link_or_copy
 
 from ..errors import SceneExists
-from ..scenes import SUFFIX
+from ..scene_names import SUFFIX
+from ..shelves.folder import FolderShelf
+from ..shelves.index import SceneIndex
+from ..storage.storage import Storage
 from .folder import JobFolder
 from .queue.database import JobDatabase
 from .queue.owners import Kind, Ownership, claim_of_job, forget_owner
@@ -19,26 +22,39 @@ from .queue.owners import Kind, Ownership, claim_of_job, forget_owner
 SCENES_FOLDER = "scenes"  # of the artifact folder: scenes that jobs made
 
 
-def publish_scene(folder: JobFolder, scene: str) -> None:
+def publish_scene(folder: JobFolder, scene: str, shared: Storage | None = None) -> None:
     """Serves the scene among the job's artifacts; nothing where it is served already.
 
-    Raises SceneExists where another scene has the name, OSError.
+    `shared`: the storage whose scenes it becomes one of; None: those of the artifact folder. Raises SceneExists where
+    another scene has the name, StorageUnavailable, OSError.
     """
-    target = _target(folder, scene)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    made = folder.artifacts / target.name
-    link_or_copy(made, target)
-    if file_sha256(target) != file_sha256(made):
-        raise SceneExists(f"a scene {scene!r} appeared while this job made another: choose another name", field="scene")
+    try:
+        _publish_into(folder, shared)(folder.artifacts / f"{scene}{SUFFIX}", scene)
+    except SceneExists:
+        raise SceneExists(
+            f"a scene {scene!r} appeared while this job made another: choose another name", field="scene"
+        ) from None
 
 
-def give_name_back(jobs: JobDatabase, folder: JobFolder, scene: str, owner: str | None) -> None:
-    """Forgets whose the scene was to be of a job that has ended, unless it is served."""
-    served, made = _target(folder, scene), folder.artifacts / f"{scene}{SUFFIX}"
-    if not (served.is_file() and made.is_file() and file_sha256(served) == file_sha256(made)):
+def give_name_back(
+    jobs: JobDatabase, folder: JobFolder, scene: str, owner: str | None, shared: Storage | None = None
+) -> None:
+    """Forgets whose the scene was to be of a job that has ended, unless it is served. Raises StorageUnavailable."""
+    made = folder.artifacts / f"{scene}{SUFFIX}"
+    if not (made.is_file() and _served_sha256(folder, scene, shared) == file_sha256(made)):
         with jobs.engine.begin() as connection:
             forget_owner(connection, Kind.SCENE, scene, Ownership(owner, claim=claim_of_job(folder.job_id)))
 
 
-def _target(folder: JobFolder, scene: str) -> Path:
-    return folder.artifact_folder / SCENES_FOLDER / f"{scene}{SUFFIX}"
+def _publish_into(folder: JobFolder, shared: Storage | None) -> Callable[[Path, str], None]:
+    if shared is None:
+        return FolderShelf(folder.artifact_folder / SCENES_FOLDER).publish
+    return SceneIndex(shared, SCENES_FOLDER).publish
+
+
+def _served_sha256(folder: JobFolder, scene: str, shared: Storage | None) -> str | None:
+    if shared is not None:
+        placed = SceneIndex(shared, SCENES_FOLDER).look_up(scene)
+        return None if placed is None else placed.sha256
+    served = FolderShelf(folder.artifact_folder / SCENES_FOLDER).here(scene)
+    return None if served is None else file_sha256(served)

@@ -14,7 +14,8 @@ from ultragray.scene_info import SceneHeader, read_header
 from ..claims import storage_full
 from ..datasets.store import DatasetStore
 from ..errors import SceneExists
-from ..scenes import SUFFIX, SceneStore
+from ..scene_names import SUFFIX, base_name
+from ..scenes import SceneStore
 from .folder import JobFolder
 from .kinds import Specification
 from .kinds.base import Surroundings
@@ -73,7 +74,7 @@ class Requirements:
         if scene is None:
             return found
         with self._kept(scene, before) as kept:
-            return found if kept is not None else [*found, (Kind.SCENE, scene)]
+            return found if kept is not None else [*found, (Kind.SCENE, base_name(scene))]
 
     def require_dataset(self, specification: Specification) -> None:
         """Raises DatasetNotFound, DatasetInvalid where the job's dataset is not there."""

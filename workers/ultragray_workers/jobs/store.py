@@ -33,6 +33,7 @@ from ..errors import (
     job_not_found,
 )
 from ..scenes import SceneStore
+from ..shared_claims import SharedClaims
 from ..storage.storage import Storage
 from ..store import OpenStore
 from .files import Artifact, read_log, size_of_log
@@ -109,6 +110,7 @@ class JobStore:
             self._open.close()
             raise
         self._queue_limit = queue_limit
+        self._shared = shared
         self.files = files_of_jobs(self._artifact_folder, shared)
         self._requirements = Requirements(
             datasets=datasets or DatasetStore(self._artifact_folder, shared),
@@ -407,11 +409,17 @@ class JobStore:
         """Forgets whose a scene was to be that nobody makes any more, such as an import of a service that died."""
         with self.database.engine.begin() as connection:
             holder = read_owner(connection, Kind.SCENE, scene)
-        if holder == NOBODYS or is_claimed(self._artifact_folder / SCENES_FOLDER / str(holder.claim)):
+        if holder == NOBODYS or self._is_claimed(str(holder.claim)):
             return
         if self.makes_scene(scene) is None and scene not in self._requirements.scenes.names():
             with self.database.engine.begin() as connection:
                 forget_owner(connection, Kind.SCENE, scene, holder)
+
+    def _is_claimed(self, claim: str) -> bool:
+        """Whether a service that lives imports the scene of a claim."""
+        if is_claimed(self._artifact_folder / SCENES_FOLDER / claim):
+            return True
+        return self._shared is not None and SharedClaims(self._shared).is_claimed(claim)
 
     def _unfinished(self, role: str, name: str, shown: Shown) -> str | None:
         job_id = unfinished.naming(self.database, role, name)

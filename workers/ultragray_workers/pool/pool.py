@@ -13,6 +13,7 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 from ultragray.contract import Contract, described
 from ultragray.errors import InvalidArgument, RenderFailed
@@ -154,8 +155,8 @@ class RenderPool:
                 except SceneChangedError:
                     if request.version is not None:
                         raise
-                    assert turn.ticket is not None
-                    request = turn.ticket.request  # perhaps with newer poses
+                    if turn.ticket is not None:
+                        request = turn.ticket.request  # perhaps with newer poses
                     continue
                 if self.on_rendered is not None:
                     self.on_rendered(result)
@@ -169,14 +170,19 @@ class RenderPool:
     async def load(self, scene: str) -> None:
         """Loads a scene in every process. Raises SceneNotFound, SceneFileInvalid, SceneTooLarge, MemoryExceeded."""
         self._check_accepting()
-        path = self._store.path(scene)
-        await self._dispatcher.command_all(LoadTask(scene, str(path)))
+        for _ in range(MAX_SCENE_CHANGES):
+            await asyncio.to_thread(self._store.path, scene)
+            with self._store.hold(scene) as path:
+                if path is not None:
+                    await self._dispatcher.command_all(LoadTask(scene, str(path)))
+                    return
+        raise RenderFailed(f"scene {scene!r} kept changing while it was being loaded", field="scene")
 
     async def unload(self, scene: str) -> None:
         """Drops a scene from every process. Raises SceneNotFound for one that neither is held nor exists."""
         self._check_accepting()
         if scene not in self.loaded():
-            self._store.path(scene)
+            await asyncio.to_thread(self._store.require, scene)
         await self.forget(scene)
 
     async def forget(self, scene: str) -> None:
@@ -227,7 +233,14 @@ class RenderPool:
             raise NotReady("the service is starting; try again in a few seconds")
 
     async def _render(self, request: RenderRequest, turn: Turn) -> RenderResult:
-        turn.ticket = ticket = self._ticket(request)
+        with self._store.hold(request.scene) as path:
+            if path is not None:
+                return await self._render_file(request, turn, path)
+        await asyncio.to_thread(self._store.path, request.scene)  # fetches it, or raises that there is none
+        raise SceneChangedError
+
+    async def _render_file(self, request: RenderRequest, turn: Turn, path: Path) -> RenderResult:
+        turn.ticket = ticket = self._ticket(request, path)
         turn.expiry = Expiry(ticket, self._waiting)
         try:
             self._open.add(ticket)
@@ -256,7 +269,7 @@ class RenderPool:
             place=place,
         )
 
-    def _ticket(self, request: RenderRequest) -> Ticket:
+    def _ticket(self, request: RenderRequest, path: Path) -> Ticket:
         """Raises InvalidArgument for a request that no reply can hold."""
         settings, poses = request.settings, len(request.poses)
         if poses == 0:
@@ -274,7 +287,7 @@ class RenderPool:
             )
         return Ticket(
             request=request,
-            path=str(self._store.path(request.scene)),
+            path=str(path),
             done=asyncio.get_running_loop().create_future(),
             submitted=time.monotonic(),
         )

@@ -112,6 +112,10 @@ class Cache:
                 pass
             file.close()
 
+    def count_hit(self) -> None:
+        """Counts a use of a file that was pinned before."""
+        self._count(hits=1)
+
     def held_bytes(self) -> int:
         """Of the objects that are here or being fetched."""
         with self._room():

@@ -35,6 +35,10 @@ _STATUS = re.compile(r"Server returned non-2xx status code: (\d{3}[ A-Za-z]*)")
 _REFUSED = re.compile(r"NoSuchBucket|ContainerNotFound|specified bucket does not exist")
 
 
+class _BeyondTheEnd(Exception):
+    """A range that begins at the end of an object or later."""
+
+
 class RemoteStorage:
     """The objects of a bucket whose keys begin with a prefix."""
 
@@ -94,8 +98,11 @@ class RemoteStorage:
             options["range"] = (start, start + length)
         elif start:
             options["range"] = {"offset": start}
-        with self._asking(key):
-            return bytes(self._obstore.get(self._store, check_key(key), options=options).bytes())
+        try:
+            with self._asking(key):
+                return bytes(self._obstore.get(self._store, check_key(key), options=options).bytes())
+        except _BeyondTheEnd:
+            return b""
 
     def write(self, key: str, data: bytes, *, if_absent: bool = False, if_version: str | None = None) -> bool:
         mode: Any = "create" if if_absent else "overwrite"
@@ -190,6 +197,8 @@ class RemoteStorage:
             text = str(error)
             if key is not None and isinstance(error, FileNotFoundError) and not _REFUSED.search(text):
                 raise NotThere(f"there is no {key} in {self.location}") from None
+            if "416 " in (_STATUS.search(text) or [""])[0]:
+                raise _BeyondTheEnd from None
             # Without the error as its cause: the URL in its text may hold a signature.
             raise StorageUnavailable(f"{self.location} cannot be used: {_reason(text)}") from None
 

@@ -98,7 +98,9 @@ class Holdings:
         for name in self._owners.owned(Kind.DATASET, owner):
             with suppress(UltragrayError):  # a damaged one, or one that has just gone
                 dataset_bytes += self._datasets.get(name).bytes
-        scenes = [self._scenes.file(name) for name in self._owners.owned(Kind.SCENE, owner)]
+        names = self._owners.owned(Kind.SCENE, owner)
+        scenes = [path for name in names if (path := self._scenes.file(name)) is not None]
+        dataset_bytes += sum(self._scenes.bytes_in_buckets(name) for name in names)
         return dataset_bytes + _bytes_of([*scenes, *jobs.artifact_files_of(owner)])
 
 

@@ -11,6 +11,7 @@ from ultragray.errors import UltragrayError
 from ultragray_workers.errors import ArtifactFolderUnavailable, DatabaseUnavailable
 from ultragray_workers.jobs.queue.database import JobDatabase
 
+from ..scene_places import ScenePlaces
 from .watched import WatchedPart
 
 
@@ -34,6 +35,9 @@ class Components:
     frames: Component = described("The render processes; as they are now.")
     jobs: Component = described("The jobs' database, into which a row is written and taken back every 5 s.")
     artifacts: Component = described("The artifact folder, in which a file is made and removed every 5 s.")
+    scenes: Component = described(
+        "The buckets of the scenes, which are listed every 2 s; what is cached is served all the same, for a while."
+    )
 
 
 class Readiness:
@@ -45,6 +49,7 @@ class Readiness:
         *,
         require_serving: Callable[[], None],
         require_frames: Callable[[], None],
+        scenes: ScenePlaces,
         without_jobs: bool,
     ) -> None:
         """`require_serving`, `require_frames`: raise what keeps everything, and frames, from being answered.
@@ -52,6 +57,7 @@ class Readiness:
         `without_jobs`: whether the service is ready as soon as frames are.
         """
         self._require_serving, self._require_frames = require_serving, require_frames
+        self._scenes = scenes
         self._without_jobs = without_jobs
         self._jobs = WatchedPart("the database of the jobs", lambda: database().check(), DatabaseUnavailable)
         self._artifacts = WatchedPart(
@@ -78,15 +84,14 @@ class Readiness:
     @property
     def problem(self) -> UltragrayError | None:
         """Why the service is not ready; None: it is."""
-        frames, *others = self._problems()
-        if frames is not None or self._without_jobs:
-            return frames
-        return next((problem for problem in others if problem is not None), None)
+        frames, jobs, artifacts, _ = self._problems()
+        frames = frames or self._scenes.stale_problem
+        return frames if self._without_jobs else frames or jobs or artifacts
 
-    def _problems(self) -> tuple[UltragrayError | None, UltragrayError | None, UltragrayError | None]:
+    def _problems(self) -> tuple[UltragrayError | None, ...]:
         if (everywhere := _raised_by(self._require_serving)) is not None:
-            return everywhere, everywhere, everywhere
-        return _raised_by(self._require_frames), self._jobs.problem, self._artifacts.problem
+            return everywhere, everywhere, everywhere, everywhere
+        return _raised_by(self._require_frames), self._jobs.problem, self._artifacts.problem, self._scenes.problem
 
 
 def _raised_by(requirement: Callable[[], None]) -> UltragrayError | None:

@@ -50,7 +50,9 @@ async def ready(service: ServiceDep) -> Ready | Response:
 
     503 while the service starts (NOT_READY) or stops (DRAINING), no frame would be rendered (NOT_READY), or the jobs'
     database (DATABASE_UNAVAILABLE) or the artifact folder (ARTIFACT_FOLDER_UNAVAILABLE) is away: `components` tells of
-    every part, in both answers. With ULTRAGRAY_READY_WITHOUT_JOBS the last two are told and do not count.
+    every part, in both answers. A bucket of scenes that is away (STORAGE_UNAVAILABLE) counts once its list is older
+    than ULTRAGRAY_SCENE_LIST_MAX_AGE_S. With ULTRAGRAY_READY_WITHOUT_JOBS database and artifact folder are told and do
+    not count.
     """
     readiness = service.readiness
     components = readiness.components

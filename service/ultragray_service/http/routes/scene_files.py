@@ -18,7 +18,7 @@ from ultragray.scene_info import SceneHeader
 from ultragray.training.poses.sizes import CorrectionSizes
 from ultragray_workers.errors import UploadTooLarge
 from ultragray_workers.jobs.queue.owners import Kind
-from ultragray_workers.scenes import SUFFIX
+from ultragray_workers.scene_names import SUFFIX, base_name
 
 from ...arrival import arrival
 from ...core.helper_processes import PATIENCE_S
@@ -88,7 +88,8 @@ async def get_training_poses(request: Request, service: ServiceDep, scene: Scene
 async def download_scene(service: ServiceDep, scene: SceneName) -> FileResponse:
     """Downloads the scene file. Ranges are answered, so that a download can go on."""
     await service.catalog.header(scene)
-    return FileResponse(service.scenes.path(scene), media_type=RAW, filename=f"{scene}{SUFFIX}")
+    path = await asyncio.to_thread(service.scenes.path, scene)
+    return FileResponse(path, media_type=RAW, filename=f"{base_name(scene)}{SUFFIX}")
 
 
 @router.put(

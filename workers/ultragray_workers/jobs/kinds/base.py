@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from ultragray.contract import Family, described
 from ultragray.scene_info import SceneHeader
 
-from ...scenes import check_scene_name
+from ...scene_names import check_scene_name, check_scene_reference
 
 MAX_RUN_S = 31_536_000.0
 
@@ -51,9 +51,10 @@ class Specification(Family):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for field in (self.needs_scene, self.makes_scene):
-            if field is not None:
-                check_scene_name(getattr(self, field), field)
+        if self.needs_scene is not None:
+            check_scene_reference(getattr(self, self.needs_scene), self.needs_scene)
+        if self.makes_scene is not None:
+            check_scene_name(getattr(self, self.makes_scene), self.makes_scene)
 
     def check(self, surroundings: Surroundings) -> None:
         """Raises what the job would fail with, as far as its submission can know."""

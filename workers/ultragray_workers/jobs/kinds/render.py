@@ -40,7 +40,7 @@ class RenderJob(FrameSettings, Specification):
     InvalidArgument, InvalidPose, InvalidProbe, InvalidImageSize, UnknownOutput.
     """
 
-    scene: str = described("Name of a scene.")
+    scene: str = described("Name of a scene; NAME@SHA256, or NAME@ and 12 digits of it: with that content alone.")
     poses: Poses | None = described("4x4 matrices, mm, probe to scene.", None)
     sampler: Sampler | None = described("Makes poses of the given ones, else of the scene's training poses.", None)
     format: str = described(

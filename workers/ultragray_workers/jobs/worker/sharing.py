@@ -63,6 +63,9 @@ class Sharing(Protocol):
     def end(self, outcome: Outcome) -> None:
         """Tells the end of the job, with all that it made. Raises Superseded."""
 
+    def patiently(self, work: Callable[[], _T]) -> _T:
+        """What the work gives, tried again while a storage is away."""
+
     def forget(self) -> None:
         """Removes what this host alone has of the job at hand."""
 
@@ -86,6 +89,10 @@ class InOneFolder:
 
     def end(self, outcome: Outcome) -> None:
         """As `Sharing`."""
+
+    def patiently(self, work: Callable[[], _T]) -> _T:
+        """As `Sharing`."""
+        return work()
 
     def forget(self) -> None:
         """As `Sharing`."""
@@ -123,7 +130,7 @@ class ThroughStorage:
 
     def take_over(self) -> None:
         """As `Sharing`; waits for a storage that is away."""
-        self._patiently(self._take_over)
+        self.patiently(self._take_over)
 
     @contextlib.contextmanager
     def telling(self) -> Iterator[None]:
@@ -151,7 +158,7 @@ class ThroughStorage:
     def end(self, outcome: Outcome) -> None:
         """As `Sharing`; waits for a storage that is away."""
         self._ended.set()
-        self._patiently(lambda: self._end(outcome))
+        self.patiently(lambda: self._end(outcome))
 
     def forget(self) -> None:
         """As `Sharing`."""
@@ -334,8 +341,8 @@ class ThroughStorage:
             if entry.key not in named and "/" in entry.key.removeprefix(f"{top}/"):
                 self._storage.delete(entry.key)
 
-    def _patiently(self, work: Callable[[], _T]) -> _T:
-        """What the work gives, tried again while the storage is away. Raises what `watch` raises meanwhile."""
+    def patiently(self, work: Callable[[], _T]) -> _T:
+        """As `Sharing`, in a thread. Raises what `watch` raises meanwhile."""
         pause_s = _RETRY_S
         while True:
             future = _in_thread(work)

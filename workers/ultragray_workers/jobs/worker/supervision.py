@@ -175,7 +175,7 @@ class Supervisor:
                 outcome = replace(kept, attempts=attempt)
             if outcome.error is None and made is not None:
                 sharing.end(outcome)  # first: a worker that goes on from here serves the scene
-                self._publish(folder, made)
+                self._publish(folder, made, sharing)
                 folder.remove_checkpoints()
         except SceneExists as error:
             outcome = replace(outcome, error=error.reason, reason=error.detail)  # the scene can be downloaded
@@ -325,7 +325,7 @@ class Supervisor:
                 self._give_back(folder.job_id)
         return process.returncode
 
-    def _publish(self, folder: JobFolder, scene: str) -> None:
+    def _publish(self, folder: JobFolder, scene: str, sharing: Sharing) -> None:
         """Serves the scene, unless the job was cancelled first: from here on it cannot be. Raises Interrupted."""
 
         def decide() -> bool:
@@ -336,14 +336,18 @@ class Supervisor:
             cancel = self._database.client.cancel_workflow  # again: whoever decided it may have died before
             self._until_the_database_answers(folder.job_id, lambda: cancel(folder.job_id))
             raise Interrupted
-        publish_scene(folder, scene)
+        shared = () if self._config.shared is None else (self._config.shared,)
+        sharing.patiently(lambda: publish_scene(folder, scene, *shared))
 
     def _give_name_back(self, row: WorkflowStatus, specification: dict[str, Any]) -> None:
         """Lets others have the name of the scene that a job was to make and did not."""
         if (scene := value_in(specification, "makes_scene")) is not None:
             folder = JobFolder(self._config.artifact_folder, row.workflow_id)
-            give = partial(give_name_back, self._database, folder, scene, row.authenticated_user)
-            self._until_the_database_answers(row.workflow_id, give)
+            user, shared = row.authenticated_user, self._config.shared
+            give = partial(give_name_back, self._database, folder, scene, user, shared)
+            give_at_last = partial(self._until_the_database_answers, row.workflow_id, give)
+            assert self._sharing is not None  # of the job whose end this is
+            self._sharing.patiently(give_at_last)
 
     def _require_folder(self, job_id: str) -> None:
         """Puts a job back that failed because its folder is gone. Raises Interrupted."""

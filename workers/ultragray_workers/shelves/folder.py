@@ -1,0 +1,84 @@
+"""A folder of scenes: `NAME.ugr` is the scene NAME, used in place. Files may come, change and go at any time."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+
+from ultragray.files.atomic import file_sha256, sync
+from ultragray.files.link import link_or_copy
+from ultragray.scene_info import SceneHeader, read_header
+
+from ..claims import claimed_folder, is_claimed, remove_abandoned
+from ..errors import SceneExists
+from ..scene_names import SUFFIX, is_scene_name
+
+MAKING_PREFIX = ".importing-"
+
+
+class FolderShelf:
+    """The scenes of a folder, which need not exist yet."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = Path(folder)
+
+    def names(self) -> set[str]:
+        try:
+            entries = list(self.folder.iterdir())
+        except (FileNotFoundError, NotADirectoryError):
+            return set()
+        return {path.stem for path in entries if path.suffix == SUFFIX and is_scene_name(path.stem) and path.is_file()}
+
+    def has(self, name: str) -> bool:
+        return self.path(name).is_file()
+
+    def knows(self, name: str) -> bool:
+        return self.has(name)
+
+    def here(self, name: str) -> Path | None:
+        path = self.path(name)
+        return path if path.is_file() else None
+
+    def fetch(self, name: str) -> Path:
+        if (path := self.here(name)) is None:
+            raise FileNotFoundError(name)
+        return path
+
+    @contextlib.contextmanager
+    def hold(self, name: str) -> Iterator[Path | None]:
+        yield self.here(name)
+
+    def header(self, name: str) -> SceneHeader:
+        return read_header(self.fetch(name))
+
+    def sha256(self, name: str) -> str | None:
+        return None
+
+    def publish(self, file: Path, name: str) -> None:
+        self.folder.mkdir(parents=True, exist_ok=True)
+        target = self.path(name)
+        link_or_copy(file, target)
+        if not target.samefile(file) and file_sha256(target) != file_sha256(file):  # another one was quicker
+            raise SceneExists(f"there is already a scene {name!r}", field="scene")
+
+    def remove(self, name: str) -> bool:
+        try:
+            self.path(name).unlink()
+        except FileNotFoundError:
+            return False
+        sync(self.folder)
+        return True
+
+    def making(self) -> contextlib.AbstractContextManager[Path]:
+        return claimed_folder(self.folder, MAKING_PREFIX)
+
+    def is_making(self, token: str) -> bool:
+        return is_claimed(self.folder / token)
+
+    def remove_abandoned(self) -> None:
+        remove_abandoned(self.folder, MAKING_PREFIX)
+
+    def path(self, name: str) -> Path:
+        """Where the file of a scene is, or would be."""
+        return self.folder / f"{name}{SUFFIX}"
