@@ -104,6 +104,7 @@ def test_a_training_goes_on_at_another_host_to_the_same_scene(
     dataset = replace(load_dataset(tmp_path / "released"), name="tiny")
     undisturbed = train(dataset, TrainingConfig.preset("fast", **SETTINGS)).to_bytes()
     for http in (a, b):
+        wait_until(lambda http=http: "made" in get(http, "scenes").text, within_s=60, every_s=0.5)
         assert get(http, f"jobs/{job}/artifacts/made.ugr").content == undisturbed
         rest = get(http, f"jobs/{job}/artifacts/made.ugr", headers={"Range": "bytes=100-"})
         assert (rest.status_code, rest.content) == (206, undisturbed[100:])
