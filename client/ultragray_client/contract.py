@@ -354,7 +354,7 @@ class RenderJob(FrameSettings):
     """
 
     scene: str
-    """Name of a scene."""
+    """Name of a scene; NAME@SHA256, or NAME@ and 12 digits of it: with that content alone."""
     poses: Iterable[PoseLike] | None = None
     """4x4 matrices, mm, probe to scene."""
     sampler: Sampler | None = None

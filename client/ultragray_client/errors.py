@@ -19,6 +19,7 @@ ClientError
 ├── Unavailable
 │   ├── IssuerUnavailable
 │   ├── TooManyConnections
+│   ├── StorageUnavailable
 │   ├── DatabaseUnavailable
 │   ├── ArtifactFolderUnavailable
 │   ├── NotReady
@@ -174,6 +175,12 @@ class TooManyConnections(Unavailable):
     """Connections over `ULTRAGRAY_MAX_CONNECTIONS`, or of one address over the limit of those; retry."""
 
     reason = "TOO_MANY_CONNECTIONS"
+
+
+class StorageUnavailable(Unavailable):
+    """The object storage does not answer, or refuses its credentials; what is cached is served all the same; retry."""
+
+    reason = "STORAGE_UNAVAILABLE"
 
 
 class DatabaseUnavailable(Unavailable):
@@ -464,6 +471,7 @@ ERRORS = (
     Unavailable,
     IssuerUnavailable,
     TooManyConnections,
+    StorageUnavailable,
     DatabaseUnavailable,
     ArtifactFolderUnavailable,
     NotReady,

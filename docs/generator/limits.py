@@ -13,7 +13,7 @@ from ultragray_service.rpc import server as grpc_server
 from ultragray_service.rpc import shared_memory
 from ultragray_service.settings import LEAST_KEY_LENGTH
 from ultragray_service.tls.certificates import HANDSHAKE_TIMEOUT_S
-from ultragray_workers import scenes
+from ultragray_workers import scene_names
 from ultragray_workers.datasets import store as dataset_store
 from ultragray_workers.datasets import unpack as dataset_unpack
 from ultragray_workers.pool.process import encoding
@@ -25,7 +25,7 @@ _HEAD = ("Limit", "Value")
 
 def fixed() -> str:
     rows = [
-        ("Name of a scene", code(scenes._NAME.pattern)),
+        ("Name of a scene", code(scene_names._NAME.pattern)),
         ("Name of a dataset", code(dataset_store._NAME.pattern)),
         ("Deviation from a rotation that is corrected", f"{pose.ROTATION_TOLERANCE:g}"),
         ("Coordinate of a pose", f"{pose.MAX_POSITION_MM:,.0f} mm"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import weakref
 
 import pytest
@@ -11,6 +12,7 @@ from ultragray_workers import SceneStore
 from ultragray_workers.errors import SceneNotFound
 from ultragray_workers.scenes import resident_bytes
 from ultragray_workers.shelves import headers
+from ultragray_workers.shelves.folder import FolderShelf
 
 
 def test_names_are_the_files_whose_names_can_stand_in_a_url(scene_folder):
@@ -111,3 +113,45 @@ def test_what_is_described_is_all_but_the_gaussians(scene_folder):
     path = scene_folder / "a.ugr"
     length = int.from_bytes(path.read_bytes()[:8], "little")
     assert headers._described_bytes(header) == 30 * (8 + length) + header.training_poses.nbytes
+
+
+def test_a_pin_asks_for_one_content_of_a_file(scene_folder):
+    store = SceneStore(scene_folder)
+    content, other = (hashlib.sha256((scene_folder / f"{name}.ugr").read_bytes()).hexdigest() for name in "ab")
+    for pin in (content, content[:12]):
+        version, header = store.versioned_header(f"a@{pin}")
+        assert store.cached_versioned_header(f"a@{pin}") == (version, header)
+        assert store.header(f"a@{pin}") is header
+    with pytest.raises(SceneNotFound, match=f"no longer has the content {other}; it is now a@{content}"):
+        store.versioned_header(f"a@{other}")
+    (scene_folder / "b.ugr").replace(scene_folder / "a.ugr")
+    assert store.cached_versioned_header(f"a@{content}") is None
+    with pytest.raises(SceneNotFound, match=f"it is now a@{other}"):
+        store.path(f"a@{content}")
+    assert store.path(f"a@{other}") == scene_folder / "a.ugr"
+
+
+def test_a_pin_hides_nothing_and_shows_nothing(scene_folder):
+    store = SceneStore(scene_folder)
+    content = store.sha256("a")
+    store.hides = lambda name: name == "a"
+    for text in ("a", f"a@{content}"):
+        assert store.cached_versioned_header(text) is None
+        with pytest.raises(SceneNotFound, match="known scenes: b"):
+            store.header(text)
+
+
+def test_a_file_that_is_replaced_between_the_looks_at_it_is_looked_at_again(scene_folder, monkeypatch):
+    """Else a frame of the new file would be told for the pin of the old one."""
+    store = SceneStore(scene_folder)
+    content = store.sha256("a")
+    fetch = FolderShelf.fetch
+
+    def replace_first(shelf, name):
+        if (scene_folder / "b.ugr").exists():
+            (scene_folder / "b.ugr").replace(scene_folder / "a.ugr")
+        return fetch(shelf, name)
+
+    monkeypatch.setattr(FolderShelf, "fetch", replace_first)
+    with pytest.raises(SceneNotFound, match="no longer has the content"):
+        store.versioned_header(f"a@{content}")

@@ -37,6 +37,7 @@ class _Commands(LazyGroup):
         Entry("keys", "administration.keys", _INSTALLATION, "Make, list and revoke API keys."),
         Entry("backup", "administration.backup", _INSTALLATION, "Save scenes, datasets, jobs and their database."),
         Entry("restore", "administration.restore", _INSTALLATION, "Make an installation what it was at a backup."),
+        Entry("storage", "administration.storage", _INSTALLATION, "Copy scenes into a bucket, or out of it."),
         Entry("audit", "administration.audit", _INSTALLATION, "Print who did what: the audit log."),
     )
 

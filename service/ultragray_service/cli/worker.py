@@ -82,6 +82,7 @@ def run_worker(overrides: dict[str, Any], *, name: str | None = None, device: st
         settings.database_url,
         stop,
         shared=shared_storage(settings.artifacts),
+        max_copies_bytes=settings.max_cache_bytes,
         hurry=hurry,
         name=name,
         device=device,

@@ -95,7 +95,9 @@ class Service:
                 backend=settings.backend,
             ),
         )
-        self.datasets = DatasetStore(settings.working_folder, shared_storage(settings.artifacts))
+        self.datasets = DatasetStore(
+            settings.working_folder, shared_storage(settings.artifacts), settings.max_cache_bytes
+        )
         self.jobs = Jobs(settings, store, self.datasets)
         self.readiness = Readiness(
             lambda: self.jobs.database,

@@ -59,7 +59,8 @@ _MEANINGS = {
     "than it may (RATE_LIMITED): retry after the seconds of Retry-After. Or it has all that it may (LIMIT_REACHED).",
     500: "Rendering failed (RENDER_FAILED, INTERNAL).",
     501: "The format needs an optional package that the service lacks (EXTRA_MISSING).",
-    503: "The service is starting or stopping (NOT_READY, DRAINING); retry after the seconds of Retry-After.",
+    503: "The service is starting or stopping (NOT_READY, DRAINING), or a bucket does not answer "
+    "(STORAGE_UNAVAILABLE); retry after the seconds of Retry-After.",
     504: "The deadline passed before the answer was ready, or an upload came to a halt (DEADLINE_EXCEEDED).",
     507: "The memory or the disk has no room (SCENE_TOO_LARGE, MEMORY_EXCEEDED, STORAGE_FULL).",
 }

@@ -3,7 +3,15 @@
 from __future__ import annotations
 
 from ultragray.errors import BackendUnavailable, InvalidArgument, MemoryExceeded, SceneFileInvalid, UltragrayError
-from ultragray_workers.errors import DeadlineExceeded, Draining, NotReady, QueueFull, SceneNotFound, SceneTooLarge
+from ultragray_workers.errors import (
+    DeadlineExceeded,
+    Draining,
+    NotReady,
+    QueueFull,
+    SceneNotFound,
+    SceneTooLarge,
+    StorageUnavailable,
+)
 
 from ..errors import (
     IgtlMessageInvalid,
@@ -35,6 +43,7 @@ _CODES: dict[type[UltragrayError], int] = {
     IgtlMessageInvalid: UNKNOWN_INSTRUCTION,
     BackendUnavailable: UNKNOWN_INSTRUCTION,
     NotReady: NOT_READY,
+    StorageUnavailable: NOT_READY,
     Draining: SHUTTING_DOWN,
 }
 

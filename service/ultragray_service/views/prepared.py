@@ -59,9 +59,9 @@ class Prepared:
     fill: ClassVar[Callable[..., None]]  # a staticmethod
 
     def __init__(self, settings: Settings, processes: HelperProcesses) -> None:
-        self._places = {"artifact_folder": str(settings.working_folder)}
+        self._places: dict[str, str | int] = {"artifact_folder": str(settings.working_folder)}
         if not isinstance(settings.artifacts, Path):
-            self._places["storage"] = str(settings.artifacts)
+            self._places |= {"storage": str(settings.artifacts), "max_copies_bytes": settings.max_cache_bytes}
         self.folder = settings.working_folder / self.name
         self._processes = processes
         self._kept_bytes = settings.max_dataset_bytes

@@ -64,7 +64,7 @@ def service(start_service: StartService, folder: Path) -> RunningService:
 
 
 def test_every_part_of_a_service_in_order_is_told(service: RunningService) -> None:
-    parts = {"frames": IN_ORDER, "jobs": IN_ORDER, "artifacts": IN_ORDER}
+    parts = {"frames": IN_ORDER, "jobs": IN_ORDER, "artifacts": IN_ORDER, "scenes": IN_ORDER}
     status, said = ready(service)
     assert (status, said["status"], said["components"]) == (200, "ready", parts)
 
@@ -77,7 +77,12 @@ def test_a_service_whose_sqlite_file_was_removed_is_not_ready_until_it_is_back(
     assert problem["reason"] == "DATABASE_UNAVAILABLE"
     assert "removed or replaced" in problem["detail"]
     jobs = {"ready": False, "detail": problem["detail"]}
-    assert problem["components"] == {"frames": IN_ORDER, "jobs": jobs, "artifacts": IN_ORDER}
+    assert problem["components"] == {
+        "frames": IN_ORDER,
+        "jobs": jobs,
+        "artifacts": IN_ORDER,
+        "scenes": IN_ORDER,
+    }
     assert renders(service, pose_body) == 200
     wait_until(lambda: health(service, "") == NOT_SERVING)
     assert health(service, "ultragray.v1.JobService") == NOT_SERVING

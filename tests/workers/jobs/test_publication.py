@@ -13,6 +13,7 @@ from ultragray_workers.jobs.publication import give_name_back, publish_scene
 from ultragray_workers.jobs.queue.database import JobDatabase
 from ultragray_workers.jobs.queue.owners import Kind, read_owner
 from ultragray_workers.jobs.store import JobStore
+from ultragray_workers.storage.local import LocalStorage
 
 from .conftest import train_job
 
@@ -48,6 +49,17 @@ def test_another_scene_of_that_name_stays(folder: JobFolder) -> None:
         publish_scene(folder, "new")
     assert served.read_bytes() == b"another"
     assert [path.name for path in served.parent.iterdir()] == ["new.ugr"]
+
+
+def test_a_scene_of_a_shared_storage_is_named_there_alone(folder: JobFolder, tmp_path: Path) -> None:
+    shared = LocalStorage(tmp_path / "shared")
+    for _ in range(2):
+        publish_scene(folder, "new", shared)
+    assert {entry.key.partition("/objects/")[0] for entry in shared.entries()} == {"scenes", "scenes/new.json"}
+    assert not (folder.artifact_folder / "scenes").exists()
+    (folder.artifacts / "new.ugr").write_bytes(b"another")
+    with pytest.raises(SceneExists, match="appeared"):
+        publish_scene(folder, "new", shared)
 
 
 @pytest.mark.parametrize("is_served", [False, True])

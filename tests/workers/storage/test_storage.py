@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -9,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from ultragray.errors import InvalidArgument
+from ultragray_workers.storage.local import LocalStorage
 from ultragray_workers.storage.storage import NotThere, Storage
 
 LARGE = 17 * 2**20  # uploaded in parts
@@ -102,3 +104,17 @@ def test_keys_that_no_object_can_have_are_refused(storage: Storage, key: str) ->
         storage.write(key, b"x")
     with pytest.raises(InvalidArgument, match="a key must be"):
         storage.read(key)
+
+
+def test_a_folder_without_links_keeps_the_promises(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*arguments: object) -> None:
+        raise OSError(errno.EPERM, "no links here")
+
+    monkeypatch.setattr(os, "link", refuse)
+    storage = LocalStorage(tmp_path / "storage")
+    assert storage.write("a", b"first", if_absent=True)
+    assert not storage.write("a", b"second", if_absent=True)
+    (tmp_path / "file").write_bytes(b"content")
+    assert storage.upload(tmp_path / "file", "b", if_absent=True)
+    assert not storage.upload(tmp_path / "file", "a", if_absent=True)
+    assert (storage.read("a"), storage.read("b")) == (b"first", b"content")

@@ -19,13 +19,13 @@ from ..claims import LOCK_NAME, claimed_folder, remove_abandoned
 
 FOLDER = ".copies"
 _PREFIX, _CONTENT = ".fetching-", "content"
-MAX_BYTES = 50 * 10**9  # of the copies that nobody uses
+DEFAULT_MAX_BYTES = 20 * 2**30
 
 
 class LocalCopies:
     """The copies below a folder, which the processes of one host share."""
 
-    def __init__(self, folder: Path, max_bytes: int = MAX_BYTES) -> None:
+    def __init__(self, folder: Path, max_bytes: int = DEFAULT_MAX_BYTES) -> None:
         """`max_bytes`: of all copies; those in use may take more."""
         self._folder = folder / FOLDER
         self._max_bytes = max_bytes

@@ -24,7 +24,7 @@ from ..claims import is_claimed
 from ..errors import DatasetNotFound, StorageUnavailable
 from ..shared_claims import SharedClaims
 from ..storage.storage import Entry, NotThere, Storage
-from .copies import LocalCopies
+from .copies import DEFAULT_MAX_BYTES, LocalCopies
 from .shelf import CONTACT_SHEET_NAME, FILES_NAME, MANIFEST_NAME
 
 MANIFESTS, FILES = "datasets", "dataset-files"  # prefixes of keys
@@ -57,11 +57,11 @@ class SharedFiles:
 class SharedShelf:
     """The datasets of a storage, with copies on this host of those that were used last."""
 
-    def __init__(self, storage: Storage, folder: Path) -> None:
-        """`folder`: of this host, for the copies."""
+    def __init__(self, storage: Storage, folder: Path, max_copies_bytes: int = DEFAULT_MAX_BYTES) -> None:
+        """`folder`: of this host, for the copies, which take at most `max_copies_bytes` beside those in use."""
         self._storage = storage
         self._folder = folder
-        self._copies = LocalCopies(folder)
+        self._copies = LocalCopies(folder, max_copies_bytes)
         self._claims = SharedClaims(storage)
         self._known: dict[str, tuple[str, str]] = {}  # version and manifest, by name
         self._listed: dict[str, Entry] = {}

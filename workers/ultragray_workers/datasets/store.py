@@ -20,6 +20,7 @@ from ultragray.probe import Probe
 from ..errors import DatasetExists, DatasetInUse, DatasetNotFound, known_names
 from ..storage.storage import Storage
 from .contents import find_source
+from .copies import DEFAULT_MAX_BYTES
 from .shared_shelf import SharedShelf
 from .shelf import FILES_NAME as FILES_NAME
 from .shelf import MANIFEST_NAME, FolderShelf, Shelf
@@ -66,10 +67,17 @@ class DatasetRecord(Contract):
 class DatasetStore:
     """The datasets that several services and workers share."""
 
-    def __init__(self, artifact_folder: Path, shared: Storage | None = None) -> None:
-        """`shared`: where the datasets of several hosts lie; None: in the artifact folder, for all who see that."""
+    def __init__(
+        self, artifact_folder: Path, shared: Storage | None = None, max_copies_bytes: int = DEFAULT_MAX_BYTES
+    ) -> None:
+        """`shared`: where the datasets of several hosts lie; None: in the artifact folder, for all who see that.
+
+        `max_copies_bytes`: of this host's copies of shared ones, beside those in use.
+        """
         self.folder = Path(artifact_folder) / FOLDER  # in which uploads to this host arrive
-        self.shelf: Shelf = FolderShelf(self.folder) if shared is None else SharedShelf(shared, self.folder)
+        self.shelf: Shelf = FolderShelf(self.folder)
+        if shared is not None:
+            self.shelf = SharedShelf(shared, self.folder, max_copies_bytes)
         self.hides: Callable[[str], bool] = lambda name: False  # from whoever asks: what is hidden is not found
         self.in_use: Callable[[str], str | None] = lambda name: None  # who needs a dataset, in words
 

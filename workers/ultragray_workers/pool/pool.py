@@ -19,6 +19,7 @@ from ultragray.contract import Contract, described
 from ultragray.errors import InvalidArgument, RenderFailed
 
 from ..errors import Draining, NotReady
+from ..scene_names import base_name
 from ..scenes import SceneStore
 from .channel import MAX_DESCRIPTORS
 from .dispatcher import Dispatcher
@@ -170,11 +171,12 @@ class RenderPool:
     async def load(self, scene: str) -> None:
         """Loads a scene in every process. Raises SceneNotFound, SceneFileInvalid, SceneTooLarge, MemoryExceeded."""
         self._check_accepting()
+        name = base_name(scene)
         for _ in range(MAX_SCENE_CHANGES):
             await asyncio.to_thread(self._store.path, scene)
-            with self._store.hold(scene) as path:
+            with self._store.hold(name) as path:
                 if path is not None:
-                    await self._dispatcher.command_all(LoadTask(scene, str(path)))
+                    await self._dispatcher.command_all(LoadTask(name, str(path)))
                     return
         raise RenderFailed(f"scene {scene!r} kept changing while it was being loaded", field="scene")
 

@@ -18,7 +18,7 @@ import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import IO
 
 from ultragray.files.atomic import file_sha256, remove_stale_temporaries
@@ -240,8 +240,9 @@ class Cache:
 
 
 def cache_name(storage: Storage, key: str, version: str, sha256: str | None) -> str:
-    """The name under which a cache keeps an object: by its content where that is known."""
-    return sha256 or "v-" + hashlib.sha256(f"{storage.location}\n{key}\n{version}".encode()).hexdigest()
+    """The name under which a cache keeps an object: by its content where that is known, with the suffix of its key."""
+    content = sha256 or "v-" + hashlib.sha256(f"{storage.location}\n{key}\n{version}".encode()).hexdigest()
+    return content + PurePosixPath(key).suffix
 
 
 def _try_lock(file: IO[bytes]) -> bool:

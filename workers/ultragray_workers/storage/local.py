@@ -89,9 +89,7 @@ class LocalStorage:
             made.write_bytes(data)
             sync(made)
             if if_absent:
-                try:
-                    os.link(made, path)
-                except FileExistsError:
+                if not self._place_new(made, path):
                     return path.read_bytes() == data
             elif if_version is not None:
                 with self._alone():
@@ -114,11 +112,8 @@ class LocalStorage:
             if not if_absent:
                 made.replace(target)
                 sync(target.parent)
-            else:
-                try:
-                    os.link(made, target)
-                except FileExistsError:
-                    return False
+            elif not self._place_new(made, target):
+                return False
         sync(target.parent)
         return True
 
@@ -167,6 +162,19 @@ class LocalStorage:
             yield made
         finally:
             made.unlink(missing_ok=True)
+
+    def _place_new(self, made: Path, path: Path) -> bool:
+        """Gives a whole file its place, unless there is one already."""
+        try:
+            os.link(made, path)
+        except FileExistsError:
+            return False
+        except OSError:  # a file system without links
+            with self._alone():
+                if path.exists():
+                    return False
+                made.replace(path)
+        return True
 
     @contextlib.contextmanager
     def _alone(self) -> Iterator[None]:

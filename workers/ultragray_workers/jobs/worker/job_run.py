@@ -36,7 +36,8 @@ class JobRun:
 
         Raises Stopped, DatasetNotFound, DatasetInvalid.
         """
-        datasets, is_away = open_datasets(self.folder.artifact_folder, self.request.storage), False
+        request, is_away = self.request, False
+        datasets = open_datasets(self.folder.artifact_folder, request.storage, request.max_copies_bytes)
         while True:
             try:
                 return datasets.load(name)

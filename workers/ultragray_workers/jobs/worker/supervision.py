@@ -20,6 +20,7 @@ from opentelemetry.trace import Status, StatusCode
 from ultragray.errors import MemoryExceeded
 
 from ...claims import is_no_room
+from ...datasets.copies import DEFAULT_MAX_BYTES
 from ...errors import (
     ArtifactFolderUnavailable,
     DatabaseUnavailable,
@@ -66,6 +67,7 @@ class WorkerConfig:
     artifact_folder: Path
     executor: str  # name of the worker, the same after a restart
     shared: Storage | None = None  # where several hosts have the files of jobs; None: in the artifact folder
+    max_copies_bytes: int = DEFAULT_MAX_BYTES  # of shared datasets on this host
     device: str = "auto"
     threads: int = 1
     nice: int = 10
@@ -256,6 +258,7 @@ class Supervisor:
                 nice=config.nice,
                 max_footprint_pixels=config.max_footprint_pixels,
                 storage=None if config.shared is None else config.shared.location,
+                max_copies_bytes=config.max_copies_bytes,
             )
         )
         attempt = row.recovery_attempts or 1

@@ -17,6 +17,7 @@ from typing import Any
 
 from dbos import DBOS, PortableWorkflowError, WorkflowSerializationFormat
 
+from ...datasets.copies import DEFAULT_MAX_BYTES
 from ...errors import StartupFailed
 from ...storage.local import LocalStorage
 from ...storage.storage import Storage
@@ -46,6 +47,7 @@ def work(
     stop: threading.Event,
     *,
     shared: Storage | None = None,
+    max_copies_bytes: int = DEFAULT_MAX_BYTES,
     hurry: threading.Event | None = None,
     name: str | None = None,
     device: str = "auto",
@@ -66,11 +68,12 @@ def work(
     jobs are taken, and `tell_alive` every `alive_every_s` while the worker is not stuck.
 
     `shared` is the storage in which several hosts have datasets and the files of jobs; the artifact folder is this
-    host's own then. No other worker may have the `name` (None: that of the host, numbered); a worker that is started
-    again under its name goes on with its jobs at once. `threads` 0: all cores but one. A render job fails at a frame
-    that costs more than `max_footprint_pixels`, see ultragray.limits. Finished jobs are removed after `retention_days`;
-    a job fails whose process does not get on for `stall_timeout_s`, or that runs for `max_run_s` in all; 0: never.
-    Threads of DBOS are left behind: end the process by os._exit. Raises StartupFailed.
+    host's own then, with copies of datasets of at most `max_copies_bytes`. No other worker may have the `name` (None:
+    that of the host, numbered); a worker that is started again under its name goes on with its jobs at once. `threads`
+    0: all cores but one. A render job fails at a frame that costs more than `max_footprint_pixels`, see
+    ultragray.limits. Finished jobs are removed after `retention_days`; a job fails whose process does not get on for
+    `stall_timeout_s`, or that runs for `max_run_s` in all; 0: never. Threads of DBOS are left behind: end the process
+    by os._exit. Raises StartupFailed.
     """
     with (
         contextlib.closing(OpenStore(artifact_folder)),
@@ -81,6 +84,7 @@ def work(
             artifact_folder=artifact_folder.resolve(),
             executor=executor,
             shared=shared,
+            max_copies_bytes=max_copies_bytes,
             device=device,
             threads=threads or max(1, (os.cpu_count() or 1) - 1),
             nice=nice,

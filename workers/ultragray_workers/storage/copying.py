@@ -1,0 +1,80 @@
+"""Copies the scenes of an installation from one storage to another, such as from a folder to a bucket.
+
+The keys are the same below both, so that a service that is started with the other location serves the same scenes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from ultragray.files.atomic import file_sha256
+
+from ..errors import RestoreRefused, StorageUnavailable
+from .storage import NotThere, Storage
+
+_SCENES = re.compile(
+    r"(artifacts/)?(scenes/(objects/)?)?[A-Za-z0-9][A-Za-z0-9._-]*\.ugr|(artifacts/)?scenes/[^./][^/]*\.json"
+)
+
+
+@dataclass(frozen=True)
+class Copied:
+    """What a copy has done."""
+
+    scenes: int = 0
+    bytes: int = 0
+    already_there: int = 0
+
+
+def copy_scenes(source: Storage, target: Storage, say: Callable[[str], None] = lambda sentence: None) -> Copied:
+    """Copies the scenes of `source` that `target` has not, and compares each with its copy by SHA-256.
+
+    Interrupted, the same call goes on: what is there already is compared, not copied. Names come after the files that
+    they name. Raises RestoreRefused where the target has other content under a key, StorageUnavailable, OSError.
+    """
+    keys = sorted((entry.key for entry in source.entries() if _SCENES.fullmatch(entry.key)), key=_names_last)
+    copied = bytes_ = there = 0
+    for number, key in enumerate(keys, 1):
+        with _file(source, key) as file:
+            sha256 = file_sha256(file)
+            is_new = target.entry(key) is None and target.upload(file, key, if_absent=True)
+            found = _sha256(target, key)
+            if found != sha256 and is_new:
+                raise StorageUnavailable(f"the copy of {key} in {target.location} has another SHA-256: copy again")
+            if found != sha256:
+                raise RestoreRefused(f"{target.location} has another {key}: remove it there, or choose another place")
+            copied, there = copied + is_new, there + (not is_new)
+            bytes_ += file.stat().st_size if is_new else 0
+        say(f"{number} of {len(keys)}: {key} {'copied' if is_new else 'is there already'}")
+    return Copied(copied, bytes_, there)
+
+
+def _names_last(key: str) -> tuple[bool, str]:
+    return key.endswith(".json"), key
+
+
+@contextmanager
+def _file(storage: Storage, key: str) -> Iterator[Path]:
+    if storage.local is not None:
+        yield storage.local / key
+        return
+    with tempfile.TemporaryDirectory(prefix="ultragray-copy-") as folder:
+        path = Path(folder, "object")
+        storage.download(key, path)
+        yield path
+
+
+def _sha256(storage: Storage, key: str) -> str:
+    digest = hashlib.sha256()
+    try:
+        for chunk in storage.chunks(key):
+            digest.update(chunk)
+    except NotThere as error:
+        raise StorageUnavailable(str(error)) from None
+    return digest.hexdigest()
