@@ -228,7 +228,7 @@ class JobStore:
                 self.database.client.cancel_workflow(job_id)
                 self.database.client.delete_workflows([job_id])
                 if made is not None:
-                    give_name_back(self.database, self._folder(job_id), made, owner)
+                    give_name_back(self.database, self._folder(job_id), made, owner, self._shared)
                 raise
         return self.get(job_id), True
 
@@ -309,7 +309,7 @@ class JobStore:
             raise JobFinished(f"the job {job_id} has {job.state.value} already", field="job")
         made = value_in({**job.specification, "kind": job.kind}, "makes_scene")
         if made is not None:
-            give_name_back(self.database, self._folder(job_id), made, job.owner)
+            give_name_back(self.database, self._folder(job_id), made, job.owner, self._shared)
         return job
 
     def retry(self, job_id: str, *, by: str | None = None, admit: Admit = _admit_any) -> tuple[Job, bool]:
