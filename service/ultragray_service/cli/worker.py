@@ -72,6 +72,7 @@ def run_worker(
     """
     from opentelemetry import trace
 
+    from ultragray_workers.jobs.places import shared_storage
     from ultragray_workers.jobs.worker.worker import work
 
     from ..telemetry.logs import configure_logging
@@ -94,6 +95,8 @@ def run_worker(
         settings.working_folder,
         settings.database_url,
         stop,
+        shared=shared_storage(settings.artifacts),
+        max_copies_bytes=settings.max_cache_bytes,
         hurry=hurry,
         name=name,
         device=device,

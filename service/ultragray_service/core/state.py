@@ -12,6 +12,7 @@ from ultragray.errors import RenderFailed, UltragrayError
 from ultragray.probe import FloatArray
 from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import Draining, NotReady, SceneNotFound, StartupFailed
+from ultragray_workers.jobs.places import shared_storage
 from ultragray_workers.jobs.queue.owners import Kind
 from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.pool.pool import MAX_SCENE_CHANGES, PoolConfig, RenderPool
@@ -95,7 +96,9 @@ class Service:
                 backend=settings.backend,
             ),
         )
-        self.datasets = DatasetStore(settings.working_folder)
+        self.datasets = DatasetStore(
+            settings.working_folder, shared_storage(settings.artifacts), settings.max_cache_bytes
+        )
         self.jobs = Jobs(settings, store, self.datasets)
         self.readiness = Readiness(
             lambda: self.jobs.database,

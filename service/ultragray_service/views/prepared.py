@@ -48,9 +48,10 @@ class Prepared:
     """Base of a kind of pictures and figures: one folder for each key, which names what is in it.
 
     A subclass says in which folder of the artifact folder its own lie, what its helper process does, in the words of
-    errors, and which function fills a folder: it takes `folder`, `artifact_folder` and what the kind asks of it. Keys
-    end with the SHA-256 of the dataset that the pictures are of. The folders that were asked for last are kept:
-    KEPT_FOLDERS, and beside the newest no more bytes than a dataset may have. All methods belong to one event loop.
+    errors, and which function fills a folder: it takes `folder`, `artifact_folder`, `storage` where hosts share one,
+    and what the kind asks of it. Keys end with the SHA-256 of the dataset that the pictures are of. The folders that
+    were asked for last are kept: KEPT_FOLDERS, and beside the newest no more bytes than a dataset may have. All methods
+    belong to one event loop.
     """
 
     name: ClassVar[str]
@@ -58,7 +59,9 @@ class Prepared:
     fill: ClassVar[Callable[..., None]]  # a staticmethod
 
     def __init__(self, settings: Settings, processes: HelperProcesses) -> None:
-        self._artifacts = settings.working_folder
+        self._places: dict[str, str | int] = {"artifact_folder": str(settings.working_folder)}
+        if not isinstance(settings.artifacts, Path):
+            self._places |= {"storage": str(settings.artifacts), "max_copies_bytes": settings.max_cache_bytes}
         self.folder = settings.working_folder / self.name
         self._processes = processes
         self._kept_bytes = settings.max_dataset_bytes
@@ -162,7 +165,7 @@ class Prepared:
                 making = self._making[key] = await to_its_end(begin)
                 await self._processes.run(
                     self.fill,
-                    {**arguments, "artifact_folder": str(self._artifacts), "folder": str(making)},
+                    {**arguments, **self._places, "folder": str(making)},
                     what=self.what,
                     timeout_s=TIMEOUT_S,
                     killed=DatasetInvalid,

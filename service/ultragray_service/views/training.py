@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -14,7 +14,6 @@ from ultragray.errors import TrainingStateInvalid
 from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import ArtifactNotFound
 from ultragray_workers.helpers.training_preview import PICTURES, draw_preview
-from ultragray_workers.jobs.folder import JobFolder
 from ultragray_workers.jobs.store import Job, JobStore
 
 from ..core.helper_processes import HelperProcesses
@@ -23,7 +22,6 @@ from ..settings import Settings
 from .prepared import Prepared
 
 MAX_POINTS = 500
-_JOURNAL, _CHECKPOINT = "metrics.jsonl", "checkpoint.safetensors"  # of a run: `ultragray.training` imports torch
 
 
 @dataclass(frozen=True)
@@ -54,9 +52,7 @@ class TrainingViews(Prepared):
 
     async def curve(self, job_id: str) -> TrainingCurve:
         """The training so far. Raises JobNotFound."""
-        job = await self._jobs.do(JobStore.get, job_id)
-        folder = JobFolder(self._artifacts, job.id)
-        return TrainingCurve(await asyncio.to_thread(_curve_of, (folder.artifacts / _JOURNAL, folder.run / _JOURNAL)))
+        return TrainingCurve(_curve_of(await self._jobs.do(_journal, job_id)))
 
     async def preview_png(self, job_id: str) -> bytes:
         """Truth, and to its right the rendering, PNG.
@@ -65,16 +61,17 @@ class TrainingViews(Prepared):
         """
         job = await self._jobs.do(JobStore.get, job_id)
         await self.settled(lambda key: key.startswith(f"{job_id}-"))  # one a job at a time: the newest
-        checkpoint = JobFolder(self._artifacts, job.id).run / _CHECKPOINT
-        version = await asyncio.to_thread(_version_of, checkpoint)
-        if version is None:
-            raise self._none(job)
-        dataset = await asyncio.to_thread(self._datasets.get, job.specification["dataset"])
-        key = f"{job.id}-{version}-{dataset.sha256}"
-        try:
-            await self.path(key, dataset=dataset.name, checkpoint=str(checkpoint))
-        except TrainingStateInvalid:  # the training ended a moment ago
-            raise self._none(job) from None
+        with contextlib.ExitStack() as stack:
+            newest = await asyncio.to_thread(stack.enter_context, self._jobs.files.checkpoint(job.id))
+            if newest is None:
+                raise self._none(job)
+            checkpoint, version = newest
+            dataset = await asyncio.to_thread(self._datasets.get, job.specification["dataset"])
+            key = f"{job.id}-{version}-{dataset.sha256}"
+            try:
+                await self.path(key, dataset=dataset.name, checkpoint=str(checkpoint))
+            except TrainingStateInvalid:  # the training ended a moment ago
+                raise self._none(job) from None
         if (png := await self.picture_png(key, 0, *PICTURES)) is None:  # the folder went this very moment
             raise self._none(job)
         return png
@@ -87,29 +84,20 @@ class TrainingViews(Prepared):
         return ArtifactNotFound(f"the job {job.id} has no checkpoint to render (any more)", field="job")
 
 
-def _curve_of(journals: tuple[Path, ...]) -> list[CurvePoint]:
-    for journal in journals:
-        try:
-            text = journal.read_text(encoding="utf-8")
-        except FileNotFoundError:
-            continue
-        complete = [line for line in text.splitlines(keepends=True) if line.endswith("\n")]  # the last is being written
-        lines = [json.loads(line) for line in complete]
-        width = max(1, -(-len(lines) // MAX_POINTS))
-        groups = [lines[start : start + width] for start in range(0, len(lines), width)]
-        return [
-            CurvePoint(
-                step=int(group[-1]["step"]),
-                loss=float(np.mean([line["loss"] for line in group])),
-                val_psnr_db=next((line["val_psnr_db"] for line in reversed(group) if "val_psnr_db" in line), None),
-            )
-            for group in groups
-        ]
-    return []
+def _journal(jobs: JobStore, job_id: str) -> str | None:
+    return jobs.files.journal(jobs.get(job_id).id)
 
 
-def _version_of(checkpoint: Path) -> int | None:
-    try:
-        return checkpoint.stat().st_mtime_ns
-    except FileNotFoundError:
-        return None
+def _curve_of(journal: str | None) -> list[CurvePoint]:
+    complete = [line for line in (journal or "").splitlines(keepends=True) if line.endswith("\n")]  # one may be half
+    lines = [json.loads(line) for line in complete]
+    width = max(1, -(-len(lines) // MAX_POINTS))
+    groups = [lines[start : start + width] for start in range(0, len(lines), width)]
+    return [
+        CurvePoint(
+            step=int(group[-1]["step"]),
+            loss=float(np.mean([line["loss"] for line in group])),
+            val_psnr_db=next((line["val_psnr_db"] for line in reversed(group) if "val_psnr_db" in line), None),
+        )
+        for group in groups
+    ]

@@ -11,8 +11,9 @@ from typing import IO
 from ultragray.errors import DatasetInvalid
 from ultragray.files.atomic import sync
 
-from ..claims import DELETED_PREFIX, claimed_folder, is_claimed, remove_abandoned, storage_full
-from .store import FILES_NAME, DatasetRecord, DatasetStore
+from ..claims import DELETED_PREFIX, claimed_folder, remove_abandoned, storage_full
+from .shelf import FILES_NAME
+from .store import DatasetRecord, DatasetStore
 from .unpack import FileBudget, create_below
 
 PREFIX = ".incoming-"
@@ -35,6 +36,7 @@ class IncomingDataset:
         self._discarded = False
         with storage_full("the dataset"), contextlib.ExitStack() as stack:
             self.folder = stack.enter_context(claimed_folder(store.folder, PREFIX))
+            stack.enter_context(store.shelf.claimed(self.folder.name))
             (self.folder / DATASET_NAME / FILES_NAME).mkdir(parents=True)
             self._claim = stack.pop_all()
 
@@ -75,7 +77,7 @@ class IncomingDataset:
 
         In the other order a dataset that appears in between would be missed.
         """
-        return (claim is not None and is_claimed(self._store.folder / claim)) or self._store.is_taken(name)
+        return (claim is not None and self._store.shelf.is_claimed(claim)) or self._store.is_taken(name)
 
     def present(self, name: str) -> DatasetRecord:
         """As `DatasetStore.present`."""

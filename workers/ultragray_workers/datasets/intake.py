@@ -15,7 +15,8 @@ from ultragray.files.atomic import sync
 from ..claims import storage_full
 from .contents import find_source
 from .incoming import ARCHIVE_NAME, DATASET_NAME
-from .store import CONTACT_SHEET_NAME, FILES_NAME, DatasetRecord, write_manifest
+from .shelf import CONTACT_SHEET_NAME, FILES_NAME
+from .store import DatasetRecord, write_manifest
 from .unpack import unpack
 
 

@@ -1,9 +1,8 @@
-"""The datasets of an artifact folder: each a folder `datasets/NAME`, which appears and goes whole. Free of torch."""
+"""The datasets of an artifact folder, or of a storage that hosts share: each appears and goes whole. Free of torch."""
 
 from __future__ import annotations
 
 import contextlib
-import errno
 import json
 import re
 from collections.abc import Callable
@@ -14,20 +13,23 @@ from typing import TYPE_CHECKING, Any
 from ultragray.contract import Contract, described, from_dict, to_dict
 from ultragray.datasets.source import UPLOADED_FORMATS
 from ultragray.errors import DatasetInvalid, InvalidArgument, UltragrayError
-from ultragray.files.atomic import sync, write_whole
+from ultragray.files.atomic import write_whole
 from ultragray.files.format_version import require_version
 from ultragray.probe import Probe
 
-from ..claims import out_of_sight
 from ..errors import DatasetExists, DatasetInUse, DatasetNotFound, known_names
+from ..storage.storage import Storage
 from .contents import find_source
+from .copies import DEFAULT_MAX_BYTES
+from .shared_shelf import SharedShelf
+from .shelf import FILES_NAME as FILES_NAME
+from .shelf import MANIFEST_NAME, FolderShelf, Shelf
 
 if TYPE_CHECKING:
     from ultragray.datasets import Dataset
 
 FOLDER = "datasets"
 FORMAT_VERSION = 1  # of the manifest
-MANIFEST_NAME, FILES_NAME, CONTACT_SHEET_NAME = "dataset.json", "files", "contact_sheet.png"
 _NOT_KEPT = ("owner", "private")  # in the manifest: they are the database's
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
 
@@ -63,20 +65,25 @@ class DatasetRecord(Contract):
 
 
 class DatasetStore:
-    """The datasets below `artifact_folder`, which several services and workers share."""
+    """The datasets that several services and workers share."""
 
-    def __init__(self, artifact_folder: Path) -> None:
-        self.folder = Path(artifact_folder) / FOLDER
+    def __init__(
+        self, artifact_folder: Path, shared: Storage | None = None, max_copies_bytes: int = DEFAULT_MAX_BYTES
+    ) -> None:
+        """`shared`: where the datasets of several hosts lie; None: in the artifact folder, for all who see that.
+
+        `max_copies_bytes`: of this host's copies of shared ones, beside those in use.
+        """
+        self.folder = Path(artifact_folder) / FOLDER  # in which uploads to this host arrive
+        self.shelf: Shelf = FolderShelf(self.folder)
+        if shared is not None:
+            self.shelf = SharedShelf(shared, self.folder, max_copies_bytes)
         self.hides: Callable[[str], bool] = lambda name: False  # from whoever asks: what is hidden is not found
         self.in_use: Callable[[str], str | None] = lambda name: None  # who needs a dataset, in words
 
     def names(self) -> list[str]:
         """The names of all datasets, sorted."""
-        try:
-            entries = list(self.folder.iterdir())
-        except (FileNotFoundError, NotADirectoryError):
-            return []
-        return sorted(entry.name for entry in entries if _NAME.fullmatch(entry.name) and self.is_taken(entry.name))
+        return sorted(name for name in self.shelf.names() if _NAME.fullmatch(name))
 
     def shown_names(self) -> list[str]:
         """As `names`, without those that are hidden."""
@@ -84,14 +91,16 @@ class DatasetStore:
 
     def get(self, name: str) -> DatasetRecord:
         """Raises DatasetNotFound, also for a name that no dataset can have; DatasetInvalid for a damaged manifest."""
-        return self._read(name, self._existing(name))
+        if not self._is_shown(name):
+            raise self._not_found(name)
+        return self._read(name)
 
-    def _read(self, name: str, folder: Path) -> DatasetRecord:
-        path = folder / MANIFEST_NAME
+    def _read(self, name: str) -> DatasetRecord:
+        manifest = self.shelf.manifest(name)
+        if manifest is None:
+            raise self._not_found(name)
         try:
-            return DatasetRecord.from_json(path.read_text(encoding="utf-8"))
-        except FileNotFoundError:
-            raise self._not_found(name) from None
+            return DatasetRecord.from_json(manifest)
         except (ValueError, KeyError, TypeError) as error:
             reason = f"it has no {error}" if isinstance(error, KeyError) else error
             raise DatasetInvalid(f"the manifest of the dataset {name!r} cannot be used: {reason}") from error
@@ -107,32 +116,29 @@ class DatasetStore:
     def load(self, name: str) -> Dataset:
         """Read a dataset as it was when it was accepted. Raises DatasetNotFound, DatasetInvalid."""
         record = self.get(name)
-        return replace(find_source(self._existing(name) / FILES_NAME).load(record.options), name=name)
+        with self.shelf.files(name) as files:
+            return replace(find_source(files).load(record.options), name=name)
 
     def contact_sheet(self, name: str) -> Path:
         """The PNG. Raises DatasetNotFound."""
-        return self._existing(name) / CONTACT_SHEET_NAME
+        self._require_existing(name)
+        return self.shelf.contact_sheet(name)
 
     def add(self, folder: Path, name: str) -> tuple[DatasetRecord, bool]:
-        """Makes a complete folder the dataset `name`, by one rename; its record, and whether it is new.
+        """Makes a complete folder the dataset `name`, at once; its record, and whether it is new.
 
         Where there is one already, it stays: with the same content and options it is the answer, else
         DatasetExists is raised.
         """
         record = DatasetRecord.from_json((folder / MANIFEST_NAME).read_text(encoding="utf-8"))
-        try:
-            folder.rename(self.folder / name)
-        except OSError as error:
-            if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
-                raise
-            return self.present(folder, name), False
-        sync(self.folder)
-        return record, True
+        if self.shelf.put(folder, name):
+            return record, True
+        return self.present(folder, name), False
 
     def present(self, folder: Path, name: str) -> DatasetRecord:
         """The dataset `name`, where it is the one in a complete folder. Raises DatasetExists for another."""
         record = DatasetRecord.from_json((folder / MANIFEST_NAME).read_text(encoding="utf-8"))
-        present = self._read(name, self.folder / name)
+        present = self._read(name)
         if (present.sha256, present.options) == (record.sha256, record.options) and not self.hides(name):
             return present
         raise DatasetExists(
@@ -147,26 +153,27 @@ class DatasetStore:
         `in_use` is asked again when nobody finds the dataset any more: who came in between gets it back, unless
         another one has taken its name.
         """
-        path = self._existing(name)
+        self._require_existing(name)
         self._require_unused(name)
-        with out_of_sight(path) as found:
+        with self.shelf.without(name) as found:
             if not found:
                 raise self._not_found(name)
             self._require_unused(name)
-        sync(self.folder)
 
     def _require_unused(self, name: str) -> None:
         if (user := self.in_use(name)) is not None:
             raise DatasetInUse(f"the dataset {name!r} is needed by {user}", field="dataset")
 
-    def _existing(self, name: str) -> Path:
-        if _NAME.fullmatch(name) and self.is_taken(name) and not self.hides(name):
-            return self.folder / name
-        raise self._not_found(name)
+    def _require_existing(self, name: str) -> None:
+        if not (self._is_shown(name) and self.is_taken(name)):
+            raise self._not_found(name)
+
+    def _is_shown(self, name: str) -> bool:
+        return _NAME.fullmatch(name) is not None and not self.hides(name)
 
     def is_taken(self, name: str) -> bool:
         """Whether there is a dataset of that name, hidden or not."""
-        return (self.folder / name / MANIFEST_NAME).is_file()
+        return self.shelf.manifest(name) is not None
 
     def _not_found(self, name: str) -> DatasetNotFound:
         return DatasetNotFound(

@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from ..datasets.store import DatasetStore
+from ..datasets.copies import DEFAULT_MAX_BYTES
+from ..datasets.opening import open_datasets
 from .helper import write_progress
 from .picture_stack import write_stacks
 
@@ -14,7 +15,14 @@ PICTURES = ("truth", "rendering", "median", "difference")
 _COMPARED = ("psnr_db", "ms_ssim", "gms", "gmsd")
 
 
-def compare(folder: str, artifact_folder: str, dataset: str, scene_path: str) -> None:
+def compare(
+    folder: str,
+    artifact_folder: str,
+    dataset: str,
+    scene_path: str,
+    storage: str | None = None,
+    max_copies_bytes: int = DEFAULT_MAX_BYTES,
+) -> None:
     """Fill `folder` with metrics and pictures of a scene on the frames that the dataset of this name holds out.
 
     It says meanwhile which share is done. Raises DatasetNotFound, DatasetInvalid where the dataset holds out none,
@@ -31,7 +39,7 @@ def compare(folder: str, artifact_folder: str, dataset: str, scene_path: str) ->
 
     torch.set_num_threads(1)
     filled = Path(folder)
-    sweeps = DatasetStore(Path(artifact_folder)).load(dataset)
+    sweeps = open_datasets(artifact_folder, storage, max_copies_bytes).load(dataset)
     scene = GaussianScene.load(scene_path)
     check_same_origin(scene.info, sweeps)
     require_frames(sweeps.val)

@@ -4,13 +4,21 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ..datasets.store import DatasetStore
+from ..datasets.copies import DEFAULT_MAX_BYTES
+from ..datasets.opening import open_datasets
 from .picture_stack import write_stacks
 
 PICTURES = ("truth", "rendering")
 
 
-def draw_preview(folder: str, artifact_folder: str, dataset: str, checkpoint: str) -> None:
+def draw_preview(
+    folder: str,
+    artifact_folder: str,
+    dataset: str,
+    checkpoint: str,
+    storage: str | None = None,
+    max_copies_bytes: int = DEFAULT_MAX_BYTES,
+) -> None:
     """Write truth and rendering of one frame of the dataset of this name into `folder`.
 
     The frame is the middle one of those held out, else of those trained from; the scene is that of `checkpoint`.
@@ -26,7 +34,7 @@ def draw_preview(folder: str, artifact_folder: str, dataset: str, checkpoint: st
 
     torch.set_num_threads(1)
     header, tensors = read_checkpoint(Path(checkpoint))
-    sweeps = DatasetStore(Path(artifact_folder)).load(dataset)
+    sweeps = open_datasets(artifact_folder, storage, max_copies_bytes).load(dataset)
     scene = GaussianScene.from_splats(
         {name: tensors[f"parameter.{name}"] for name in PARAMETERS},
         info=SceneInfo(centre_mm=sweeps.centre_mm.tolist(), probe=sweeps.probe, intensity=header.config.intensity),

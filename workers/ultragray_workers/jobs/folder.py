@@ -25,6 +25,8 @@ from typing import Any, ClassVar
 from ultragray.contract import described
 from ultragray.files.atomic import remove_stale_temporaries, sync, write_whole
 
+from ..datasets.copies import DEFAULT_MAX_BYTES
+
 FOLDER, BATCH = "jobs", "batch"
 
 
@@ -88,6 +90,8 @@ class Request:
     threads: int
     nice: int
     max_footprint_pixels: int | None = None  # of a frame, see ultragray.limits; None: no limit
+    storage: str | None = None  # that several hosts share; None: all is in the artifact folder
+    max_copies_bytes: int = DEFAULT_MAX_BYTES  # of shared datasets on this host
 
 
 class JobFolder:

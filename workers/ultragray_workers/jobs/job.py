@@ -6,14 +6,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from enum import Enum
-from pathlib import Path
 from typing import Any
 
 from dbos import WorkflowStatus
 
 from ultragray.contract import described
 
-from .folder import JobFolder, Outcome, Progress
+from .files import JobFiles
+from .folder import Outcome, Progress
 from .kinds import KINDS
 from .matching.demand import Demand
 from .matching.offer import LivingWorker, waits_for
@@ -74,8 +74,8 @@ class Job:
     private: bool = described("Whether others may not see it, nor the scene that it makes.")
 
 
-def job_of_row(row: WorkflowStatus, artifact_folder: Path, workers: Sequence[LivingWorker]) -> Job:
-    """The job of a row of the queue; the folder of an unfinished one says how far it is.
+def job_of_row(row: WorkflowStatus, files: JobFiles, workers: Sequence[LivingWorker]) -> Job:
+    """The job of a row of the queue; the files of an unfinished one say how far it is.
 
     `workers`: those that live; of a job that does not wait, none need be given.
     """
@@ -83,7 +83,7 @@ def job_of_row(row: WorkflowStatus, artifact_folder: Path, workers: Sequence[Liv
     outcome, ownership = _outcome(row), ownership_of(row)
     started = state is not JobState.QUEUED or bool(row.recovery_attempts)
     if outcome is None:
-        progress = JobFolder(artifact_folder, row.workflow_id).progress() if started else Progress()
+        progress = files.progress(row.workflow_id) if started else Progress()
         outcome = Outcome(progress=progress, attempts=row.recovery_attempts or 0)
     assert row.created_at is not None
     return Job(

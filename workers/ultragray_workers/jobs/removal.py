@@ -1,4 +1,4 @@
-"""Removing a job: its folder, then its row, so that no other job can have the id before the folder is gone."""
+"""Removing a job: its files, then its row, so that no other job can have the id before the files are gone."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import contextlib
 import fcntl
 import time
 from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
-from ..claims import out_of_sight, remove_whole
 from ..errors import JobInUse
 from .folder import JobFolder
 from .queue import runs
@@ -15,29 +15,32 @@ from .queue.database import JobDatabase
 from .shards import claims
 from .shards.shares import forget_shares
 
+if TYPE_CHECKING:
+    from .files import JobFiles
+
 _LOCK_WAIT_S = 2.0  # for the process of a job that was cancelled a moment ago
 _LOCK_POLL_S = 0.05
 
 
-def remove_job(jobs: JobDatabase, folder: JobFolder) -> None:
+def remove_job(jobs: JobDatabase, files: JobFiles, job_id: str) -> None:
     """Removes a finished job; the scene that it made stays.
 
-    Raises JobInUse while its process still ends, OSError, and what the database raises: then all is as before.
+    Raises JobInUse while its process still ends, OSError, StorageUnavailable, and what the database raises: the job is
+    still there then.
     """
-    with contextlib.ExitStack() as stack:
-        if folder.path.is_dir():
-            stack.enter_context(_locked(folder))
-        stack.enter_context(out_of_sight(folder.path))
-        for share in forget_shares(jobs, folder.job_id):
-            remove_whole(JobFolder(folder.artifact_folder, share).path)
-        jobs.client.delete_workflows([folder.job_id])
+    with files.removed(job_id):
+        for share in forget_shares(jobs, job_id):
+            with contextlib.suppress(JobInUse), files.removed(share):  # housekeeping removes what is left of it
+                pass
+        jobs.client.delete_workflows([job_id])
         with jobs.engine.begin() as connection:
-            runs.forget(connection, folder.job_id)
-            claims.forget(connection, folder.job_id)
+            runs.forget(connection, job_id)
+            claims.forget(connection, job_id)
 
 
 @contextlib.contextmanager
-def _locked(folder: JobFolder) -> Iterator[None]:
+def locked(folder: JobFolder) -> Iterator[None]:
+    """No process works in the folder during the body. Raises JobInUse."""
     end = time.monotonic() + _LOCK_WAIT_S
     with folder.lock.open("a") as lock:
         while True:

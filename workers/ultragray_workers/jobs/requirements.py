@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ultragray.files.atomic import sync
 from ultragray.files.link import link_or_copy
@@ -20,6 +21,9 @@ from .kinds import Specification
 from .kinds.base import Surroundings
 from .queue.owners import Kind
 
+if TYPE_CHECKING:
+    from .files import JobFiles
+
 
 @dataclass(frozen=True)
 class Requirements:
@@ -27,15 +31,16 @@ class Requirements:
 
     datasets: DatasetStore
     scenes: SceneStore
-    artifact_folder: Path
+    files: JobFiles
+    artifact_folder: Path | None  # in which jobs work; None: in folders of other hosts
     max_image_side: int
 
-    def provide(self, specification: Specification, folder: JobFolder, before: JobFolder | None) -> None:
-        """Puts the scene that the job needs, as it is now, into the folder of the job, once the job can be done.
+    def provide(self, specification: Specification, job_id: str, before: str | None) -> None:
+        """Keeps the scene that the job needs, as it is now, for the job, once the job can be done.
 
-        `before`: the folder of the job that it replaces, whose scene is taken where it is still there. Raises
-        DatasetNotFound, DatasetInvalid, SceneExists, SceneNotFound, SceneFileInvalid, StorageFull and what `check` of
-        the specification raises.
+        `before`: the job that it replaces, whose scene is taken where it is still there. Raises DatasetNotFound,
+        DatasetInvalid, SceneExists, SceneNotFound, SceneFileInvalid, StorageFull, StorageUnavailable and what `check`
+        of the specification raises.
         """
         self.require_dataset(specification)
         made = _named(specification, specification.makes_scene)
@@ -47,21 +52,29 @@ class Requirements:
         if name is None:
             specification.check(self._surroundings(None))
             return
-        if (old := _kept(name, before)) is not None:
-            path, header = old, read_header(old)
-        else:
-            path, header = self.scenes.path(name), self.scenes.header(name)
-        with storage_full("the scene of the job"):
-            specification.check(self._surroundings(header))
-            self._keep(path, name, folder)
+        with self._kept(name, before) as old:
+            if old is not None:
+                path, header = old, read_header(old)
+            else:
+                path, header = self.scenes.path(name), self.scenes.header(name)
+            with storage_full("the scene of the job"):
+                specification.check(self._surroundings(header))
+                try:
+                    self.files.keep_scene(path, name, job_id)
+                except FileNotFoundError:
+                    self.scenes.path(name)  # raises SceneNotFound where the scene has just gone
+                    raise
 
-    def taken(self, specification: Specification, before: JobFolder | None) -> list[tuple[Kind, str]]:
+    def taken(self, specification: Specification, before: str | None) -> list[tuple[Kind, str]]:
         """The dataset and the scene that `provide` takes; not a scene that the job replaced has kept."""
         dataset, scene = (
             _named(specification, one) for one in (specification.needs_dataset, specification.needs_scene)
         )
         found = [] if dataset is None else [(Kind.DATASET, dataset)]
-        return found if scene is None or _kept(scene, before) is not None else [*found, (Kind.SCENE, base_name(scene))]
+        if scene is None:
+            return found
+        with self._kept(scene, before) as kept:
+            return found if kept is not None else [*found, (Kind.SCENE, base_name(scene))]
 
     def require_dataset(self, specification: Specification) -> None:
         """Raises DatasetNotFound, DatasetInvalid where the job's dataset is not there."""
@@ -71,27 +84,23 @@ class Requirements:
     def _surroundings(self, scene: SceneHeader | None) -> Surroundings:
         return Surroundings(scene, self.artifact_folder, self.max_image_side)
 
-    def _keep(self, path: Path, name: str, folder: JobFolder) -> None:
-        folder.path.mkdir(parents=True, exist_ok=True)
-        sync(folder.path.parent)
-        kept = folder.path / f"{name}{SUFFIX}"
-        new = kept.with_name(f".{kept.name}")
-        try:
-            new.unlink(missing_ok=True)
-            link_or_copy(path, new)
-        except FileNotFoundError:
-            self.scenes.path(name)  # raises SceneNotFound where the scene has just gone
-            raise
-        new.replace(kept)  # a submission that failed may have left another scene
-        new.unlink(missing_ok=True)  # or the same: renaming one link of a file to another does nothing
-        sync(folder.path)
+    def _kept(self, scene: str, before: str | None) -> AbstractContextManager[Path | None]:
+        """The scene that was kept for the job that is replaced; None where it is not there."""
+        return nullcontext() if before is None else self.files.kept_scene(before, scene)
+
+
+def keep_in_folder(path: Path, scene: str, folder: JobFolder) -> None:
+    """Puts a scene, as it is now, into the folder of a job. Raises OSError."""
+    folder.path.mkdir(parents=True, exist_ok=True)
+    sync(folder.path.parent)
+    kept = folder.path / f"{scene}{SUFFIX}"
+    new = kept.with_name(f".{kept.name}")
+    new.unlink(missing_ok=True)
+    link_or_copy(path, new)
+    new.replace(kept)  # a submission that failed may have left another scene
+    new.unlink(missing_ok=True)  # or the same: renaming one link of a file to another does nothing
+    sync(folder.path)
 
 
 def _named(specification: Specification, field: str | None) -> Any:
     return None if field is None else getattr(specification, field)
-
-
-def _kept(scene: str, before: JobFolder | None) -> Path | None:
-    """The file of a scene in the folder of the job that is replaced; None where it is not there."""
-    kept = None if before is None else before.path / f"{scene}{SUFFIX}"
-    return kept if kept is not None and kept.is_file() else None

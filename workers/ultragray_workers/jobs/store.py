@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import hashlib
-import os
 import re
 import threading
 import uuid
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
@@ -36,12 +34,16 @@ from ..errors import (
     job_not_found,
 )
 from ..scenes import SceneStore
+from ..shared_claims import SharedClaims
+from ..storage.storage import Storage
 from ..store import OpenStore
+from .files import Artifact, read_log, size_of_log
 from .folder import JobFolder, Progress
 from .job import MAX_PRIORITY, PRIORITY_ZERO, STATUSES, Job, JobState, attribute, job_of_row, ownership_of
 from .kinds import Specification
 from .matching.offer import LivingWorker
 from .overview import JobsOverview, overview
+from .places import files_of_jobs
 from .publication import SCENES_FOLDER, give_name_back
 from .queue import attendance, database, runs, unfinished
 from .queue.attendance import Worker
@@ -53,7 +55,7 @@ from .queue.wishes import Wanted
 from .removal import remove_job
 from .requirements import Requirements
 from .shards.shares import batch_of, cancel_shares
-from .specification import from_dict, in_short, is_in_shards, to_dict, value_in
+from .specification import from_dict, in_short, to_dict, value_in
 from .tracing import TRACE, current_trace
 
 __all__ = ["SCENES_FOLDER", "Job", "JobState", "JobStore", "Progress"]
@@ -92,26 +94,32 @@ class JobStore:
         *,
         scenes: SceneStore | None = None,
         datasets: DatasetStore | None = None,
+        shared: Storage | None = None,
         max_image_side: int = MAX_IMAGE_SIDE,
     ) -> None:
         """`scenes`: those that jobs may need, and whose names they may not make. None: those that jobs made.
 
         `datasets`: those that jobs may need. None: those of the artifact folder.
 
+        `shared`: the storage in which several hosts have the files of jobs; None: they are in the artifact folder.
+
         `max_image_side`: of frames, pixels. Raises StartupFailed where the database cannot be reached.
         """
         self._artifact_folder = Path(artifact_folder)
         self._open = OpenStore(self._artifact_folder)
         try:
-            self.database = JobDatabase(self._artifact_folder, database_url)
+            self.database = JobDatabase(self._artifact_folder, database_url, shared)
         except BaseException:
             self._open.close()
             raise
         self._queue_limit = queue_limit
+        self._shared = shared
+        self.files = files_of_jobs(self._artifact_folder, shared)
         self._requirements = Requirements(
-            datasets=datasets or DatasetStore(self._artifact_folder),
+            datasets=datasets or DatasetStore(self._artifact_folder, shared),
             scenes=scenes or SceneStore(self._artifact_folder / SCENES_FOLDER),
-            artifact_folder=self._artifact_folder,
+            files=self.files,
+            artifact_folder=self._artifact_folder if shared is None else None,
             max_image_side=max_image_side,
         )
         self._submitting = threading.Lock()  # so that one service keeps the queue limit to the job
@@ -167,9 +175,8 @@ class JobStore:
             if unfinished.count_waiting(self.database) >= self._queue_limit:
                 raise JobQueueFull(f"{self._queue_limit} jobs wait already: try again later, or cancel some")
             most_running = admit(self)
-            before = None if retry_of is None else self._folder(retry_of)
-            self._requirements.provide(specification, self._folder(job_id), before)
-            used = self._requirements.taken(specification, before)
+            self._requirements.provide(specification, job_id, retry_of)
+            used = self._requirements.taken(specification, retry_of)
             private |= self._are_private(used, owner, by)
             options: EnqueueOptions = {
                 "workflow_name": specification.kind,
@@ -224,7 +231,7 @@ class JobStore:
                 self.database.client.cancel_workflow(job_id)
                 self.database.client.delete_workflows([job_id])
                 if made is not None:
-                    give_name_back(self.database, self._folder(job_id), made, owner)
+                    give_name_back(self.database, self._folder(job_id), made, owner, self._shared)
                 raise
         return self.get(job_id), True
 
@@ -285,7 +292,7 @@ class JobStore:
             page_token=page_token,
         )
         workers = self._workers_for(rows)
-        return [job_of_row(row, self._artifact_folder, workers) for row in rows], token
+        return [job_of_row(row, self.files, workers) for row in rows], token
 
     def ownership(self, job_id: str) -> Ownership:
         """Whose a job is. Raises JobNotFound."""
@@ -307,7 +314,7 @@ class JobStore:
             raise JobFinished(f"the job {job_id} has {job.state.value} already", field="job")
         made = value_in({**job.specification, "kind": job.kind}, "makes_scene")
         if made is not None:
-            give_name_back(self.database, self._folder(job_id), made, job.owner)
+            give_name_back(self.database, self._folder(job_id), made, job.owner, self._shared)
         return job
 
     def retry(self, job_id: str, *, by: str | None = None, admit: Admit = _admit_any) -> tuple[Job, bool]:
@@ -343,7 +350,7 @@ class JobStore:
             raise JobInUse(f"the job {job_id} is {job.state.value}: cancel it first", field="job")
         if (successor := unfinished.successor(self.database, job_id)) is not None:
             raise JobInUse(f"the job {successor} goes on from the job {job_id}", field="job")
-        remove_job(self.database, self._folder(job_id))
+        remove_job(self.database, self.files, job_id)
 
     def overview(self) -> JobsOverview:
         """The jobs in numbers."""
@@ -357,33 +364,27 @@ class JobStore:
         """How long the jobs of an owner ran since the day of `since` (UTC), s, by device: cpu, gpu."""
         return runs.usage_s(self.database.engine, owner, since)
 
-    def artifact_files_of(self, owner: str) -> Iterator[Path]:
+    def artifact_files_of(self, owner: str) -> Iterator[Artifact]:
         """The files that can be downloaded of an owner's jobs."""
         for job_id in ids_of_owner(self.database, owner):
-            for folder in (self._folder(job_id).artifacts, self._folder(job_id).batch):
-                with suppress(FileNotFoundError):
-                    yield from folder.iterdir()
+            yield from self.files.artifacts(job_id).values()
 
     def log_tail(self, job_id: str, bytes: int = _TAIL_BYTES) -> str:
         """The end of the log of a job's process; empty where there is none yet. Raises JobNotFound."""
         self._row(job_id)
-        try:
-            with self._folder(job_id).log.open("rb") as file:
-                file.seek(max(0, os.fstat(file.fileno()).st_size - bytes))
-                return file.read(bytes).decode("utf-8", "replace")
-        except FileNotFoundError:
-            return ""
+        log = self.files.log(job_id)
+        return read_log(log, max(0, size_of_log(log) - bytes), bytes).decode("utf-8", "replace")
 
-    def artifact(self, job_id: str, name: str) -> Path:
+    def artifact(self, job_id: str, name: str) -> Artifact:
         """The file of an artifact. Raises JobNotFound, ArtifactNotFound."""
         job = self.get(job_id)
-        in_shards = is_in_shards({**job.specification, "kind": job.kind})
-        folder = self._folder(job_id).batch if in_shards else self._folder(job_id).artifacts
-        path = folder / name
-        if not any(stands_for(one, name) for one in job.artifacts) or not path.is_file():
+        found = None
+        if any(stands_for(one, name) for one in job.artifacts):
+            found = self.files.artifact(job_id, name)
+        if found is None:
             known = ", ".join(job.artifacts) or "none"
             raise ArtifactNotFound(f"the job {job_id} has no artifact {name[:128]!r}; it has {known}", field="name")
-        return path
+        return found
 
     def workers(self, shown: Shown = _all_are_shown) -> tuple[Worker, ...]:
         """The workers of the queue, by name; a job at hand that is not `shown`, or gone again, is left out."""
@@ -416,11 +417,17 @@ class JobStore:
         """Forgets whose a scene was to be that nobody makes any more, such as an import of a service that died."""
         with self.database.engine.begin() as connection:
             holder = read_owner(connection, Kind.SCENE, scene)
-        if holder == NOBODYS or is_claimed(self._artifact_folder / SCENES_FOLDER / str(holder.claim)):
+        if holder == NOBODYS or self._is_claimed(str(holder.claim)):
             return
         if self.makes_scene(scene) is None and scene not in self._requirements.scenes.names():
             with self.database.engine.begin() as connection:
                 forget_owner(connection, Kind.SCENE, scene, holder)
+
+    def _is_claimed(self, claim: str) -> bool:
+        """Whether a service that lives imports the scene of a claim."""
+        if is_claimed(self._artifact_folder / SCENES_FOLDER / claim):
+            return True
+        return self._shared is not None and SharedClaims(self._shared).is_claimed(claim)
 
     def _unfinished(self, role: str, name: str, shown: Shown) -> str | None:
         job_id = unfinished.naming(self.database, role, name)
@@ -447,7 +454,7 @@ class JobStore:
         return row
 
     def _seen(self, row: WorkflowStatus) -> Job:
-        return job_of_row(row, self._artifact_folder, self._workers_for([row]))
+        return job_of_row(row, self.files, self._workers_for([row]))
 
     def _workers_for(self, rows: Sequence[WorkflowStatus]) -> Sequence[LivingWorker]:
         """The workers that live, if any of the jobs waits for one."""

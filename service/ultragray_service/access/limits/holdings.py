@@ -6,12 +6,13 @@ import os
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from datetime import datetime, time, timedelta, timezone
-from pathlib import Path
 
 from ultragray.errors import UltragrayError
 from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import UploadTooLarge
+from ultragray_workers.jobs.files import Artifact
 from ultragray_workers.jobs.queue.owners import Kind
+from ultragray_workers.jobs.shared.reading import SharedFile
 from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.scenes import SceneStore
 
@@ -103,10 +104,13 @@ class Holdings:
         return dataset_bytes + _bytes_of([*scenes, *jobs.artifact_files_of(owner)])
 
 
-def _bytes_of(files: Iterable[Path]) -> int:
+def _bytes_of(files: Iterable[Artifact]) -> int:
     """Of the files that are there; one of several names counts once, such as a scene and the artifact that it was."""
-    sizes: dict[tuple[int, int], int] = {}
+    sizes: dict[object, int] = {}
     for file in files:
+        if isinstance(file, SharedFile):
+            sizes[file.stored.key] = file.stored.bytes
+            continue
         with suppress(OSError):
             status = os.stat(file)
             sizes[status.st_dev, status.st_ino] = status.st_size

@@ -23,6 +23,7 @@ Where = Annotated[
 @contextmanager
 def opened_database(where: dict[str, Any]) -> Iterator[JobDatabase]:
     """The database that the options name. Raises InvalidArgument where there is no such installation, StartupFailed."""
+    from ultragray_workers.jobs.places import shared_storage
     from ultragray_workers.jobs.queue.database import JobDatabase
 
     settings = load_settings(**where)
@@ -32,7 +33,7 @@ def opened_database(where: dict[str, Any]) -> Iterator[JobDatabase]:
             "--data-folder",
             field="data_folder",
         )
-    database = JobDatabase(settings.working_folder, settings.database_url)
+    database = JobDatabase(settings.working_folder, settings.database_url, shared_storage(settings.artifacts))
     try:
         yield database
     finally:

@@ -7,9 +7,9 @@ from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 
-from ultragray_workers.errors import DatabaseUnavailable
+from ultragray_workers.errors import DatabaseUnavailable, StorageUnavailable
+from ultragray_workers.jobs.files import Log, size_of_log
 from ultragray_workers.jobs.store import Job
 
 from .log import GrowingLog
@@ -92,10 +92,10 @@ class JobWatch:
 class _Reader:
     """Reads one job for all of its watchers, until its final state or until nobody watches."""
 
-    def __init__(self, read: Callable[[], Job], log_path: Path, threads: Executor | None) -> None:
+    def __init__(self, read: Callable[[], Job], log: Log, threads: Executor | None) -> None:
         self._read = read
         self._threads = threads
-        self._log_path = log_path
+        self._log = log
         self._log_bytes = 0
         self._job: Job | None = None
         self.watches: set[JobWatch] = set()
@@ -115,7 +115,7 @@ class _Reader:
                     await asyncio.sleep(READ_INTERVAL_S)
                 try:
                     job, log_bytes = await asyncio.get_running_loop().run_in_executor(self._threads, self._look)
-                except DatabaseUnavailable:
+                except (DatabaseUnavailable, StorageUnavailable):
                     if self._job is None:
                         raise
                     continue  # it comes back, and the watchers have nothing else to do
@@ -133,22 +133,17 @@ class _Reader:
 
     def _look(self) -> tuple[Job, int]:
         job = self._read()  # first, so that the log of a finished job is whole
-        try:
-            return job, self._log_path.stat().st_size
-        except FileNotFoundError:
-            return job, 0
+        return job, size_of_log(self._log)
 
 
 class JobHub:
     """The watchers of all jobs. Belongs to one event loop."""
 
-    def __init__(
-        self, get: Callable[[str], Job], log_path: Callable[[str], Path], threads: Executor | None = None
-    ) -> None:
+    def __init__(self, get: Callable[[str], Job], log: Callable[[str], Log], threads: Executor | None = None) -> None:
         """`threads`: where jobs are read; None: the event loop's own."""
         self._get = get
         self._threads = threads
-        self._log_path = log_path
+        self._log = log
         self._readers: dict[str, _Reader] = {}
         self._closed = False
 
@@ -166,13 +161,13 @@ class JobHub:
         if reader is None or reader.task.done():
             await asyncio.get_running_loop().run_in_executor(self._threads, self._get, job_id)
             reader = self._readers.get(job_id)  # another watcher may have come in the meantime
-        log = GrowingLog(self._log_path(job_id), log_offset)
+        log = GrowingLog(self._log(job_id), log_offset)
         if self._closed:
             over = JobWatch(log, self._threads, lambda leaving: None)
             over.end()
             return over
         if reader is None or reader.task.done():
-            reader = _Reader(partial(self._get, job_id), self._log_path(job_id), self._threads)
+            reader = _Reader(partial(self._get, job_id), self._log(job_id), self._threads)
             self._readers[job_id] = reader
         watch = JobWatch(log, self._threads, partial(self._remove, job_id, reader))
         reader.add(watch)

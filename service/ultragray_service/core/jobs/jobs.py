@@ -10,7 +10,6 @@ from contextlib import contextmanager
 from contextvars import copy_context
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Concatenate, ParamSpec, TypeVar
 
 from sqlalchemy.exc import SQLAlchemyError
@@ -19,9 +18,10 @@ from ultragray.contract import described, under
 from ultragray.errors import DatasetInvalid, InvalidArgument, SceneFileInvalid, UltragrayError
 from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import DatabaseUnavailable, DatasetNotFound, NotReady, SceneExists, SceneNotFound
-from ultragray_workers.jobs.folder import JobFolder
+from ultragray_workers.jobs.files import JobFiles
 from ultragray_workers.jobs.kinds import Specification
 from ultragray_workers.jobs.overview import JobsOverview
+from ultragray_workers.jobs.places import shared_storage
 from ultragray_workers.jobs.queue.attendance import Worker
 from ultragray_workers.jobs.queue.database import JobDatabase
 from ultragray_workers.jobs.store import Admit, Job, JobState, JobStore
@@ -71,7 +71,7 @@ class Jobs:
         self._opened: JobStore | None = None
         # Of their own, so that a database that does not answer keeps nobody else waiting.
         self._threads = ThreadPoolExecutor(_THREADS, "jobs")
-        self.hub = JobHub(lambda job_id: self._store.get(job_id), self._log_path, self._threads)
+        self.hub = JobHub(lambda job_id: self._store.get(job_id), lambda job_id: self.files.log(job_id), self._threads)
         self.admit: Admit = lambda jobs: None
         self.overview = JobsOverview()  # as it was up to COUNT_INTERVAL_S ago
         self._counting: asyncio.Task[None] | None = None
@@ -92,6 +92,7 @@ class Jobs:
             settings.job_queue_limit,
             scenes=self._scenes,
             datasets=self._datasets,
+            shared=shared_storage(settings.artifacts, patience_s=_PATIENCE_S / 2),
             max_image_side=settings.max_image_side,
         )
 
@@ -104,6 +105,11 @@ class Jobs:
     def database(self) -> JobDatabase:
         """The opened database. Raises NotReady before `open`."""
         return self._store.database
+
+    @property
+    def files(self) -> JobFiles:
+        """The files of the jobs. Raises NotReady before `open`."""
+        return self._store.files
 
     def start(self) -> None:
         """Begins to count the jobs."""
@@ -196,9 +202,6 @@ class Jobs:
                 except (UltragrayError, SQLAlchemyError):
                     self.overview = JobsOverview()
             await asyncio.sleep(COUNT_INTERVAL_S)
-
-    def _log_path(self, job_id: str) -> Path:
-        return JobFolder(self._settings.working_folder, job_id).log
 
 
 @contextmanager

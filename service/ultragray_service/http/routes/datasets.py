@@ -115,7 +115,7 @@ async def put_dataset(
     return with_owner(service, record)
 
 
-@router.get("", responses=problems(401, 422))
+@router.get("", responses=problems(401, 422, 503))
 async def list_datasets(
     service: ServiceDep, page_size: PageSize = DEFAULT_PAGE_SIZE, page_token: PageToken = ""
 ) -> DatasetPage:
@@ -123,7 +123,7 @@ async def list_datasets(
     return await dataset_page(service, page_size, page_token)
 
 
-@router.get("/{dataset}", responses=problems(401, 404, 422))
+@router.get("/{dataset}", responses=problems(401, 404, 422, 503))
 async def get_dataset(service: ServiceDep, dataset: DatasetName) -> DatasetRecord:
     """Size, probe, split, and what the check warned of."""
     return await datasets.dataset(service, dataset)
@@ -132,14 +132,14 @@ async def get_dataset(service: ServiceDep, dataset: DatasetName) -> DatasetRecor
 @router.get(
     "/{dataset}/contact-sheet",
     response_class=Response,
-    responses=_PICTURE | problems(401, 404, 422),
+    responses=_PICTURE | problems(401, 404, 422, 503),
 )
 async def get_contact_sheet(service: ServiceDep, dataset: DatasetName) -> Response:
     """A picture of the dataset, PNG."""
     return Response(await contact_sheet(service.datasets, dataset), media_type=PNG)
 
 
-@router.delete("/{dataset}", status_code=204, responses=problems(401, 403, 404, 409, 422))
+@router.delete("/{dataset}", status_code=204, responses=problems(401, 403, 404, 409, 422, 503))
 async def delete_dataset(service: ServiceDep, dataset: DatasetName) -> None:
     """Deletes a dataset that no job needs, with the pictures and comparisons that were made of it."""
     await service.delete_dataset(dataset)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import asyncio
-import os
 
 import grpc
 
 from ultragray.errors import InvalidArgument
 from ultragray_proto.v1 import jobs_pb2
 from ultragray_workers.errors import Draining
+from ultragray_workers.jobs.shared.reading import opened
 from ultragray_workers.jobs.store import JobStore
 
 from ...core.catalog import DEFAULT_PAGE_SIZE
@@ -87,16 +87,16 @@ class JobService:
     async def DownloadArtifact(  # noqa: N802
         self, request: jobs_pb2.DownloadArtifactRequest, context: grpc.aio.ServicerContext
     ) -> None:
-        path = await self._service.jobs.do(JobStore.artifact, request.job, request.name)
-        with await asyncio.to_thread(path.open, "rb") as file:
-            file_bytes = os.fstat(file.fileno()).st_size
-            if not 0 <= request.offset <= file_bytes:
-                raise InvalidArgument(f"offset must be from 0 to {file_bytes}, got {request.offset}", field="offset")
-            file.seek(request.offset)
+        found = await self._service.jobs.do(JobStore.artifact, request.job, request.name)
+        with opened(found) as file:
+            if not 0 <= request.offset <= file.length:
+                raise InvalidArgument(f"offset must be from 0 to {file.length}, got {request.offset}", field="offset")
+            offset = request.offset
             while True:
-                data = await asyncio.to_thread(file.read, _CHUNK_BYTES)
-                await context.write(jobs_pb2.ArtifactChunk(data=data, file_bytes=file_bytes))
-                if not data or file.tell() >= file_bytes:
+                data = await asyncio.to_thread(file.read, offset, _CHUNK_BYTES)
+                await context.write(jobs_pb2.ArtifactChunk(data=data, file_bytes=file.length))
+                offset += len(data)
+                if not data or offset >= file.length:
                     return
 
     async def WatchJob(  # noqa: N802

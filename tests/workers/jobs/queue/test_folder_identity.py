@@ -7,10 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from ultragray_workers.errors import ArtifactFolderUnavailable, StartupFailed
+from ultragray_workers.errors import ArtifactFolderUnavailable, StartupFailed, StorageUnavailable
+from ultragray_workers.jobs.queue import folder_identity
 from ultragray_workers.jobs.queue.database import JobDatabase
 from ultragray_workers.jobs.queue.folder_identity import FILE
 from ultragray_workers.jobs.store import Job, JobState, JobStore
+from ultragray_workers.storage.local import LocalStorage
 
 from ....postgres import PostgresServer
 from ....waiting import wait_until
@@ -83,3 +85,35 @@ def test_a_share_that_vanishes_costs_no_job(
     away.rename(artifact_folder)
     done = [until(job) for job in (running, *waiting)]
     assert {job.state for job in done} == {JobState.SUCCEEDED}, done
+
+
+def test_a_storage_that_belongs_to_another_database_is_refused(
+    artifact_folder: Path, postgres: PostgresServer, tmp_path: Path
+) -> None:
+    first, storage = postgres.create_database(), LocalStorage(tmp_path / "bucket")
+    jobs = JobDatabase(artifact_folder, first, storage)
+    jobs.folder.check_writable()
+    assert [entry.key for entry in storage.entries()] == [FILE]
+    jobs.close()
+    JobDatabase(tmp_path / "another-host", first, storage).close()
+    with pytest.raises(StartupFailed, match=f"{FILE} holds no id"):
+        JobDatabase(artifact_folder, first, LocalStorage(tmp_path / "another-bucket"))
+
+
+def test_a_storage_that_is_another_now_or_away_is_not_worked_in(
+    artifact_folder: Path, database_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(folder_identity, "_ASKED_EVERY_S", 0.0)
+    storage = LocalStorage(tmp_path / "bucket")
+    jobs = JobDatabase(artifact_folder, database_url, storage)
+    storage.write(FILE, b"another")
+    with pytest.raises(ArtifactFolderUnavailable, match="another bucket or prefix"):
+        jobs.folder.check()
+
+    def away(key: str) -> bytes:
+        raise StorageUnavailable("it does not answer")
+
+    monkeypatch.setattr(storage, "read", away)
+    with pytest.raises(ArtifactFolderUnavailable, match="does not answer"):
+        jobs.folder.check()
+    jobs.close()

@@ -27,7 +27,7 @@ class Surroundings:
     """The surroundings of a job at its submission."""
 
     scene: SceneHeader | None  # the one that `needs_scene` names
-    artifact_folder: Path
+    artifact_folder: Path | None  # None: what jobs make is not written on this host
     max_image_side: int  # pixels
 
 

@@ -20,7 +20,6 @@ from ultragray.files.atomic import file_sha256
 from ultragray.scene import GaussianScene
 from ultragray.training.device import training_device
 
-from ...datasets.store import DatasetStore
 from ...scenes import SUFFIX
 from ..folder import Outcome, Progress
 from ..worker.job_run import JobRun, Stopped
@@ -38,7 +37,7 @@ def run(job_run: JobRun, job: EvaluateJob) -> Outcome:
     """
     device = training_device(job_run.request.device, "auto")
     path = job_run.folder.path / f"{job.scene}{SUFFIX}"
-    dataset = DatasetStore(job_run.folder.artifact_folder).load(job.dataset)
+    dataset = job_run.load_dataset(job.dataset)
     require_frames(dataset.val)
     scene = GaussianScene.load(path).to(device)
     warnings = check_same_origin(scene.info, dataset)

@@ -147,7 +147,8 @@ class RenderJob(FrameSettings, Specification):
                 require_confidence(assessor.assess(poses, probe=settings.probe), self.least_confidence)
         with under("display"):
             picture = self.file_format.shown(settings).picture
-        self._check_room(frames, picture, surroundings.artifact_folder)
+        if surroundings.artifact_folder is not None:
+            self.check_room(frames, picture, surroundings.artifact_folder)
 
     def _planned_frames(self, scene: SceneHeader) -> int:
         """The frames of a job in shards. Raises InvalidArgument where no shard could be made."""
@@ -180,7 +181,8 @@ class RenderJob(FrameSettings, Specification):
             raise InvalidArgument(f"sampler needs training poses, the scene {self.scene!r} has none", field="sampler")
         return training_poses
 
-    def _check_room(self, frames: int, picture: Picture, folder: Path) -> None:
+    def check_room(self, frames: int, picture: Picture, folder: Path) -> None:
+        """Raises StorageFull where the disk of a folder has no room for so many frames."""
         dtype = np.dtype(check_format(self.file_format.name, self.outputs, self.dtype))
         pixel_bytes = sum(1 if OUTPUTS[name].is_numbers else dtype.itemsize for name in self.outputs)
         frame_bytes = picture.height * picture.width * pixel_bytes

@@ -28,7 +28,7 @@ ASSESSED_AT_ONCE = 100_000  # poses times training poses, of about a tenth of a 
 def run(job_run: JobRun, job: RenderJob) -> Outcome:
     """Renders all poses into `frames` with the suffix of the format.
 
-    Raises Stopped, InvalidArgument, LowConfidence, InvalidProbe, FrameTooCostly, SceneFileInvalid,
+    Raises Stopped, InvalidArgument, LowConfidence, InvalidProbe, FrameTooCostly, SceneFileInvalid, StorageFull,
     ExtraMissing.
     """
     if job.is_sharded:
@@ -39,6 +39,8 @@ def run(job_run: JobRun, job: RenderJob) -> Outcome:
     settings = job.resolved(described.info, Encoding.FLOAT32)
     assess = _assessing(job_run, described, settings.probe)
     poses, extrapolations = job.assessed_poses(described.training_poses, settings.probe, assess)
+    if job_run.request.storage is not None:  # else the submission was refused
+        job.check_room(len(poses), job.file_format.shown(settings).picture, job_run.folder.path)
     scene = GaussianScene.load(path).to(device)
     size = f"{settings.height}x{settings.width}"
     sys.stderr.write(f"rendering {len(poses):,} frames of {size} of {job.scene} on {device}\n")

@@ -31,6 +31,7 @@ from ..worker.job_run import JobRun, Stopped
 from .render import RenderJob
 
 _RETRY_S = 2.0  # while the storage is away
+_PATIENCE_S = 600.0  # of a small request to it
 
 
 def run(job_run: JobRun, job: RenderJob) -> Outcome:
@@ -39,7 +40,8 @@ def run(job_run: JobRun, job: RenderJob) -> Outcome:
     Raises Stopped, what `BatchPlan.prepared` and `ShardRenderer` raise, and OSError.
     """
     assert job_run.channel is not None
-    batch, storage = batch_of(job_run.folder.job_id), open_storage(job_run.folder.artifact_folder)
+    batch = batch_of(job_run.folder.job_id)
+    storage = open_storage(job_run.request.storage or job_run.folder.artifact_folder, patience_s=_PATIENCE_S)
     is_batch = batch == job_run.folder.job_id
     scene_file = _scene_file(job_run, storage, batch, f"{job.scene}{SUFFIX}")
     plan = job.plan(read_header(scene_file), file_sha256(scene_file))

@@ -26,7 +26,6 @@ from ultragray.training import train as train_scene
 from ultragray.training.run import FITTING
 from ultragray.training.trainer import CHECKPOINT_FILE, CONFIG_FILE, JOURNAL_FILE
 
-from ...datasets.store import DatasetStore
 from ...scenes import SUFFIX
 from ..folder import JobFolder, Outcome, Progress
 from ..worker.job_run import JobRun, Stopped
@@ -45,7 +44,7 @@ def run(job_run: JobRun, job: TrainJob) -> Outcome:
     """
     device = job_run.request.device
     config = TrainingConfig.preset(job.preset, **job.settings)
-    dataset = DatasetStore(job_run.folder.artifact_folder).load(job.dataset)
+    dataset = job_run.load_dataset(job.dataset)
     _take_over_run(job_run)
     checkpoint = job_run.folder.run / CHECKPOINT_FILE
     resume = checkpoint.exists()

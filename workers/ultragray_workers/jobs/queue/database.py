@@ -15,10 +15,11 @@ from sqlalchemy.engine import ExceptionContext
 from sqlalchemy.exc import SQLAlchemyError
 
 from ...errors import DatabaseUnavailable, StartupFailed, StorageFull
+from ...storage.storage import Storage
 from ...store import PRIVATE_FILE, PRIVATE_FOLDER
 from ..matching.demand import Demand
 from . import runs, tables
-from .folder_identity import FolderIdentity, identify
+from .folder_identity import FolderIdentity, FolderPlace, StoragePlace, identify
 from .internals import SCHEMA, SQLITE_ISOLATION, SQLITE_SETTINGS, WORKFLOWS, put_back, take_back
 from .writable import WriteProbe
 
@@ -113,8 +114,10 @@ def _raise_as_ours(context: ExceptionContext) -> None:
 class JobDatabase:
     """A connection to the queue, its tables made where they are missing. Free for use from several threads."""
 
-    def __init__(self, artifact_folder: Path, database_url: str | None) -> None:
+    def __init__(self, artifact_folder: Path, database_url: str | None, shared: Storage | None = None) -> None:
         """Raises StartupFailed where the database cannot be used.
+
+        `shared`: the storage that belongs to the database; None: the artifact folder does.
 
         While a database that was there is away or read-only, every use that needs it raises DatabaseUnavailable;
         StorageFull where a SQLite file cannot grow.
@@ -139,7 +142,7 @@ class JobDatabase:
                     tables.require_known_queue(self.engine)
                     DBOS.migrate(self.url)
                     tables.migrate(self.engine)
-                    self.folder = self._identify(artifact_folder)
+                    self.folder = self._identify(artifact_folder, shared)
                 self._probe = WriteProbe(self.engine)
                 self.client = DBOSClient(
                     system_database_engine=engine,
@@ -159,10 +162,13 @@ class JobDatabase:
             ) from error
         sa.event.listen(engine, "handle_error", _raise_as_ours)
 
-    def _identify(self, artifact_folder: Path) -> FolderIdentity:
+    def _identify(self, artifact_folder: Path, shared: Storage | None) -> FolderIdentity:
+        if shared is not None:
+            with self.engine.begin() as connection:
+                return identify(connection, StoragePlace(shared), holds_database=False)
         holds_database = self.engine.url.database == str(artifact_folder.resolve() / SQLITE_FILE)
         with self.engine.begin() as connection:
-            return identify(connection, artifact_folder, holds_database=holds_database)
+            return identify(connection, FolderPlace(artifact_folder), holds_database=holds_database)
 
     def check(self) -> None:
         """Raises DatabaseUnavailable or StorageFull unless a row could be written now."""

@@ -21,10 +21,14 @@ from sqlalchemy.exc import SQLAlchemyError
 from ultragray.errors import UltragrayError
 
 from ...claims import DELETED_PREFIX, remove_whole
-from ...errors import JobInUse
+from ...datasets.shared_shelf import SharedShelf
+from ...datasets.store import FOLDER as DATASETS
+from ...errors import JobInUse, StorageUnavailable
 from ...rounds import Rounds
+from ...storage.storage import Storage
 from ..folder import FOLDER, JobFolder
 from ..kinds import KINDS
+from ..places import files_of_jobs
 from ..queue import database, unfinished
 from ..queue.database import JobDatabase
 from ..removal import remove_job
@@ -42,8 +46,12 @@ _log = logging.getLogger("ultragray.jobs")
 class Housekeeper:
     """Removes jobs that finished more than `retention_days` ago, every hour."""
 
-    def __init__(self, jobs: JobDatabase, artifact_folder: Path, retention_days: float) -> None:
-        self._database, self._artifact_folder = jobs, artifact_folder
+    def __init__(
+        self, jobs: JobDatabase, artifact_folder: Path, retention_days: float, shared: Storage | None = None
+    ) -> None:
+        """`shared`: the storage in which several hosts have the files; None: they are in the artifact folder."""
+        self._database, self._artifact_folder, self._shared = jobs, artifact_folder, shared
+        self._files = files_of_jobs(artifact_folder, shared)
         self._retention_s = retention_days * DAY_S
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="housekeeper", daemon=True)
@@ -63,9 +71,9 @@ class Housekeeper:
         while not self._stop.is_set() and (old := self._finished_long_ago(kept | unfinished.sources(self._database))):
             for job_id in old:
                 try:
-                    remove_job(self._database, JobFolder(self._artifact_folder, job_id))
+                    remove_job(self._database, self._files, job_id)
                     removed += 1
-                except (JobInUse, OSError):
+                except (JobInUse, StorageUnavailable, OSError):
                     kept.add(job_id)
             self._stop.wait(STEP_PAUSE_S)
         strays = self._stray_folders()
@@ -73,6 +81,23 @@ class Housekeeper:
             for folder in self._without_job(some):
                 remove_whole(folder)
                 removed += 1
+            self._stop.wait(STEP_PAUSE_S)
+        if self._shared is not None and not self._stop.is_set():
+            removed += self._remove_stray_objects(self._shared)
+        return removed
+
+    def _remove_stray_objects(self, shared: Storage) -> int:
+        """Removes what the storage holds of jobs that the queue does not know, and of uploads that were cut off."""
+        newest: dict[str, float] = {}
+        for entry in shared.entries(FOLDER):
+            job_id = entry.key.split("/")[1]
+            newest[job_id] = max(entry.modified, newest.get(job_id, 0.0))
+        old = iter([one for one, at in newest.items() if time.time() - at > DAY_S and _JOB_ID.fullmatch(one)])
+        removed = SharedShelf(shared, self._artifact_folder / DATASETS).remove_stray_files()
+        while not self._stop.is_set() and (some := list(islice(old, AT_ONCE))):
+            for job_id in set(some) - self._known(some):
+                with self._files.removed(job_id):
+                    removed += 1
             self._stop.wait(STEP_PAUSE_S)
         return removed
 
@@ -99,10 +124,13 @@ class Housekeeper:
                     yield path
 
     def _without_job(self, folders: list[Path]) -> list[Path]:
-        ids = [path.name for path in folders]
-        rows = self._database.client.list_workflows(workflow_ids=ids, load_input=False, load_output=False)
-        known = {row.workflow_id for row in rows}
+        known = self._known([path.name for path in folders])
         return [path for path in folders if path.name not in known]
+
+    def _known(self, ids: list[str]) -> set[str]:
+        """Those of the ids that are jobs of the queue."""
+        rows = self._database.client.list_workflows(workflow_ids=ids, load_input=False, load_output=False)
+        return {row.workflow_id for row in rows}
 
     def _run(self) -> None:
         rounds = Rounds("the removal of old jobs", _log)

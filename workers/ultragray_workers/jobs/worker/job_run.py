@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from typing import TYPE_CHECKING
 
+from ...datasets.opening import open_datasets
+from ...errors import StorageUnavailable
 from ..folder import JobFolder, Progress, Request
 from ..shards.channel import Channel
 
+if TYPE_CHECKING:
+    from ultragray.datasets import Dataset
+
 _PROGRESS_INTERVAL_S = 0.5
+_RETRY_S = 2.0  # while the storage of a dataset is away
 
 
 class Stopped(Exception):
@@ -26,6 +34,26 @@ class JobRun:
         self.folder, self.request, self.should_stop, self.channel = folder, request, should_stop, channel
         self.progress = folder.progress()
         self._reported_at = float("-inf")
+
+    def load_dataset(self, name: str) -> Dataset:
+        """A dataset of the service; waits for a storage that is away.
+
+        Raises Stopped, DatasetNotFound, DatasetInvalid.
+        """
+        request, is_away = self.request, False
+        datasets = open_datasets(self.folder.artifact_folder, request.storage, request.max_copies_bytes)
+        while True:
+            try:
+                return datasets.load(name)
+            except StorageUnavailable as error:
+                if not is_away:
+                    sys.stderr.write(f"waiting for the dataset {name}: {error.detail}\n")
+                is_away = True
+            with suppress(OSError):
+                self.folder.write_progress(self.progress)  # a sign of life to the worker
+            if self.should_stop():
+                raise Stopped
+            time.sleep(_RETRY_S)
 
     def report(self, progress: Progress) -> None:
         """Writes how far the job is, at most twice a second."""

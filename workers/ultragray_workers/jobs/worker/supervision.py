@@ -21,6 +21,7 @@ from opentelemetry.trace import Status, StatusCode
 from ultragray.errors import MemoryExceeded
 
 from ...claims import is_no_room
+from ...datasets.copies import DEFAULT_MAX_BYTES
 from ...errors import (
     ArtifactFolderUnavailable,
     DatabaseUnavailable,
@@ -30,6 +31,7 @@ from ...errors import (
     StorageFull,
 )
 from ...scenes import SUFFIX
+from ...storage.storage import Storage
 from ..folder import FOLDER, JobFolder, Outcome, Request
 from ..matching.demand import Demand
 from ..publication import give_name_back, publish_scene
@@ -37,6 +39,7 @@ from ..queue import database, runs
 from ..queue.database import JobDatabase
 from ..shards.desk import BatchOver, ShardDesk
 from ..shards.shares import SHARE_OF, cancel_shares
+from ..shared.record import Superseded
 from ..specification import has_checkpoints, is_in_shards, value_in
 from ..tracing import job_span
 from .device import DeviceLock
@@ -44,6 +47,7 @@ from .gate import Gate
 from .job_process import STOP_WAIT_S, end_process_of_another_worker, end_with_checkpoint, job_process
 from .run_job import STOPPED, STORAGE_FULL
 from .run_time import RunTime
+from .sharing import LAST_WAIT_S, InOneFolder, Sharing, ThroughStorage
 from .watchdog import Watchdog
 
 WATCH_INTERVAL_S = 0.25
@@ -66,6 +70,8 @@ class WorkerConfig:
 
     artifact_folder: Path
     executor: str  # name of the worker, the same after a restart
+    shared: Storage | None = None  # where several hosts have the files of jobs; None: in the artifact folder
+    max_copies_bytes: int = DEFAULT_MAX_BYTES  # of shared datasets on this host
     threads: int = 1
     nice: int = 10
     max_footprint_pixels: int | None = None  # of a frame of a render job; None: no limit
@@ -91,6 +97,7 @@ class Supervisor:
         self.is_draining = False  # an administrator wants the job at hand to go to another worker
         self.job_at_hand: str | None = None
         self._desk: ShardDesk | None = None  # of a job in shards
+        self._sharing: Sharing | None = None  # of the job at hand
 
     @property
     def is_stuck(self) -> bool:
@@ -109,7 +116,7 @@ class Supervisor:
         while time.monotonic() < self._stop_by_s and not hurry.is_set() and not self._idle.wait(_POLL_INTERVAL_S):
             pass
         self._stop_by_s = float("-inf")
-        if self._idle.wait(STOP_WAIT_S + 5.0) and job_id is not None:
+        if self._idle.wait(STOP_WAIT_S + LAST_WAIT_S + 5.0) and job_id is not None:
             self._wait_for_the_row(job_id)
 
     def _wait_for_the_row(self, job_id: str) -> None:
@@ -153,7 +160,13 @@ class Supervisor:
                 self._end_shares(job_id, request)
             _log.info(f"job {job_id} {'succeeded' if outcome.error is None else f'failed: {outcome.reason}'}")
             return outcome
+        except Superseded:
+            _log.info(f"another worker goes on with the job {job_id}")
+            raise Interrupted from None
         finally:
+            if self._sharing is not None:
+                self._sharing.forget()
+                self._sharing = None
             self._gate.close()
             self.job_at_hand = self._desk = None
             self._idle.set()
@@ -161,14 +174,20 @@ class Supervisor:
     def _outcome_of(self, row: WorkflowStatus, request: dict[str, Any], device: DeviceLock) -> Outcome:
         job_id, specification, attempt = row.workflow_id, request["specification"], row.recovery_attempts or 1
         folder = JobFolder(self._config.artifact_folder, job_id)
-        needed, made = (value_in(specification, role) for role in ("needs_scene", "makes_scene"))
+        made = value_in(specification, "makes_scene")
+        sharing = self._sharing = self._sharing_of(folder, request, attempt)
         try:
             end_process_of_another_worker(folder)
-            folder.begin(request.get("submission"), needed and f"{needed}{SUFFIX}")
+            sharing.take_over()
             kept = folder.outcome()  # of a process that finished as its worker died
-            outcome = self._work(folder, row, request, device) if kept is None else replace(kept, attempts=attempt)
+            if kept is None:
+                with sharing.telling():
+                    outcome = self._work(folder, row, request, device)
+            else:
+                outcome = replace(kept, attempts=attempt)
             if outcome.error is None and made is not None:
-                self._publish(folder, made)
+                sharing.end(outcome)  # first: a worker that goes on from here serves the scene
+                self._publish(folder, made, sharing)
                 folder.remove_checkpoints()
         except SceneExists as error:
             outcome = replace(outcome, error=error.reason, reason=error.detail)  # the scene can be downloaded
@@ -179,7 +198,32 @@ class Supervisor:
                 self._put_back(job_id, f"its folder could not be used: {error.strerror}")
             outcome = _failure_of_storage(error)
         folder.remove_leftovers()
+        sharing.end(outcome)
         return outcome
+
+    def _sharing_of(self, folder: JobFolder, request: dict[str, Any], attempt: int) -> Sharing:
+        needed = value_in(request["specification"], "needs_scene")
+        file, submission = needed and f"{needed}{SUFFIX}", request.get("submission")
+        if self._config.shared is None:
+            return InOneFolder(folder, submission, file)
+        return ThroughStorage(
+            self._config.shared,
+            folder,
+            submission=submission,
+            attempt=attempt,
+            needed=file,
+            retry_of=request["retry_of"],
+            watch=lambda: self._look_after(folder.job_id),
+            is_in_shards=is_in_shards(request["specification"]),
+        )
+
+    def _look_after(self, job_id: str) -> None:
+        """Keeps a job at hand whose files are on their way. Raises Interrupted where it is not ours any more."""
+        self._moved_at_s = time.monotonic()
+        if self._stop.is_set():
+            self._give_back(job_id)
+        with suppress(DatabaseUnavailable):
+            self._raise_unless_ours(job_id)
 
     @contextmanager
     def _device_for(self, job_id: str, specification: dict[str, Any]) -> Iterator[DeviceLock]:
@@ -222,6 +266,8 @@ class Supervisor:
                 threads=config.threads,
                 nice=config.nice,
                 max_footprint_pixels=config.max_footprint_pixels,
+                storage=None if config.shared is None else config.shared.location,
+                max_copies_bytes=config.max_copies_bytes,
             )
         )
         attempt = row.recovery_attempts or 1
@@ -335,7 +381,7 @@ class Supervisor:
                 self._give_back(folder.job_id)
         return process.returncode
 
-    def _publish(self, folder: JobFolder, scene: str) -> None:
+    def _publish(self, folder: JobFolder, scene: str, sharing: Sharing) -> None:
         """Serves the scene, unless the job was cancelled first: from here on it cannot be. Raises Interrupted."""
 
         def decide() -> bool:
@@ -346,14 +392,18 @@ class Supervisor:
             cancel = self._database.client.cancel_workflow  # again: whoever decided it may have died before
             self._until_the_database_answers(folder.job_id, lambda: cancel(folder.job_id))
             raise Interrupted
-        publish_scene(folder, scene)
+        shared = () if self._config.shared is None else (self._config.shared,)
+        sharing.patiently(lambda: publish_scene(folder, scene, *shared))
 
     def _give_name_back(self, row: WorkflowStatus, specification: dict[str, Any]) -> None:
         """Lets others have the name of the scene that a job was to make and did not."""
         if (scene := value_in(specification, "makes_scene")) is not None:
             folder = JobFolder(self._config.artifact_folder, row.workflow_id)
-            give = partial(give_name_back, self._database, folder, scene, row.authenticated_user)
-            self._until_the_database_answers(row.workflow_id, give)
+            user, shared = row.authenticated_user, self._config.shared
+            give = partial(give_name_back, self._database, folder, scene, user, shared)
+            give_at_last = partial(self._until_the_database_answers, row.workflow_id, give)
+            assert self._sharing is not None  # of the job whose end this is
+            self._sharing.patiently(give_at_last)
 
     def _require_folder(self, job_id: str) -> None:
         """Puts a job back that failed because its folder is gone. Raises Interrupted."""
@@ -371,10 +421,16 @@ class Supervisor:
     def _leave_to_others(self, job_id: str) -> NoReturn:
         """Puts the job at hand back into the queue. Raises Interrupted."""
         _log.info(f"the job {job_id} waits again: this worker is to rest")
+        self._tell_last()
         self._until_the_database_answers(job_id, lambda: self._database.put_back(job_id, self._config.executor))
         raise Interrupted
 
+    def _tell_last(self) -> None:
+        if self._sharing is not None:
+            self._sharing.tell_last()
+
     def _give_back(self, job_id: str) -> NoReturn:
+        self._tell_last()
         with suppress(DatabaseUnavailable, StorageFull):  # then the heartbeat of any worker puts it back
             self._database.put_back(job_id, self._config.executor)
         self._idle.set()

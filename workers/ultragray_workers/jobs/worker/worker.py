@@ -8,6 +8,7 @@ import itertools
 import logging
 import os
 import re
+import secrets
 import socket
 import threading
 from collections.abc import Callable, Iterator, Mapping
@@ -19,7 +20,10 @@ from dbos import DBOS, PortableWorkflowError, WorkflowSerializationFormat
 
 from ultragray.errors import InvalidArgument
 
+from ...datasets.copies import DEFAULT_MAX_BYTES
 from ...errors import StartupFailed
+from ...storage.local import LocalStorage
+from ...storage.storage import Storage
 from ...store import OpenStore
 from ..kinds import KINDS
 from ..matching.demand import check_labels
@@ -36,6 +40,7 @@ from .supervision import Interrupted, Supervisor, WorkerConfig
 
 POLLING_INTERVAL_S = 0.25
 _NAMES_FOLDER = "workers"
+_HOST_ID_FILE = "host_id"
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
 
 _log = logging.getLogger("ultragray.jobs")
@@ -46,6 +51,8 @@ def work(
     database_url: str | None,
     stop: threading.Event,
     *,
+    shared: Storage | None = None,
+    max_copies_bytes: int = DEFAULT_MAX_BYTES,
     hurry: threading.Event | None = None,
     name: str | None = None,
     device: str = "auto",
@@ -69,22 +76,29 @@ def work(
     `device`: auto (every GPU of the host, and its processor), cpu, cuda (every GPU) or cuda:N. Jobs that ask for
     another one, for more memory than it has, or for other labels than `labels` are left to other workers.
 
-    No other worker may have the `name` (None: that of the host, numbered); a worker that is started again under its
-    name goes on with its jobs at once. `threads` 0: all cores but one. A render job fails at a frame that costs more
-    than `max_footprint_pixels`, see ultragray.limits. Finished jobs are removed after `retention_days`; a job fails
-    whose process does not get on for `stall_timeout_s`, or that runs for `max_run_s` in all; 0: never. Threads of
-    DBOS are left behind: end the process by os._exit. Raises StartupFailed.
+    `shared` is the storage in which several hosts have datasets and the files of jobs; the artifact folder is this
+    host's own then, with copies of datasets of at most `max_copies_bytes`. No other worker may have the `name` (None:
+    that of the host, numbered); a worker that is started again under its name goes on with its jobs at once. `threads`
+    0: all cores but one. A render job fails at a frame that costs more than `max_footprint_pixels`, see
+    ultragray.limits. Finished jobs are removed after `retention_days`; a job fails whose process does not get on for
+    `stall_timeout_s`, or that runs for `max_run_s` in all; 0: never. Threads of DBOS are left behind: end the process
+    by os._exit. Raises StartupFailed.
     """
     try:
         check_labels(labels, "label")
     except InvalidArgument as error:
         raise StartupFailed(error.detail, field="label") from None
     devices = devices_of(device)
-    with contextlib.closing(OpenStore(artifact_folder)), claim_name(artifact_folder, name) as executor:
-        jobs = JobDatabase(artifact_folder, database_url)
+    with (
+        contextlib.closing(OpenStore(artifact_folder)),
+        claim_name(artifact_folder, name, host_of_its_own=shared is not None) as executor,
+    ):
+        jobs = JobDatabase(artifact_folder, database_url, shared)
         config = WorkerConfig(
             artifact_folder=artifact_folder.resolve(),
             executor=executor,
+            shared=shared,
+            max_copies_bytes=max_copies_bytes,
             threads=threads or max(1, (os.cpu_count() or 1) - 1),
             nice=nice,
             max_footprint_pixels=max_footprint_pixels,
@@ -112,7 +126,7 @@ def work(
         )
         unfinished.adopt_older(jobs)
         _launch(jobs.url, config, supervisor, gate)
-        housekeeper = Housekeeper(jobs, config.artifact_folder, retention_days)
+        housekeeper = Housekeeper(jobs, config.artifact_folder, retention_days, shared)
         if retention_days:
             housekeeper.start()
         fields = {"worker": executor, "threads": config.threads, "offer": str(gate.offer)}
@@ -154,10 +168,11 @@ def _launch(url: str, config: WorkerConfig, supervisor: Supervisor, gate: Gate) 
 
 
 @contextlib.contextmanager
-def claim_name(artifact_folder: Path, name: str | None) -> Iterator[str]:
+def claim_name(artifact_folder: Path, name: str | None, *, host_of_its_own: bool = False) -> Iterator[str]:
     """The worker's name for as long as it lives: the one given, or HOST-N with the first N that is free.
 
-    Raises StartupFailed where another worker has the name.
+    `host_of_its_own`: the workers of other hosts, whose names may be the same, do not see the folder; then it is
+    HOST-ID-N, with an id that the folder keeps. Raises StartupFailed where another worker has the name.
     """
     folder = artifact_folder / _NAMES_FOLDER
     folder.mkdir(parents=True, exist_ok=True)
@@ -167,6 +182,8 @@ def claim_name(artifact_folder: Path, name: str | None) -> Iterator[str]:
         candidates: Iterator[str] = iter([name])
     else:
         host = re.sub(r"[^A-Za-z0-9.-]", "-", socket.gethostname()).lstrip(".-")[:100] or "host"
+        if host_of_its_own:
+            host = f"{host}-{_host_id(folder)}"
         candidates = (f"{host}-{number}" for number in itertools.count())
     for candidate in candidates:
         with (folder / f"{candidate}.lock").open("a") as file:
@@ -177,3 +194,10 @@ def claim_name(artifact_folder: Path, name: str | None) -> Iterator[str]:
             yield candidate
             return
     raise StartupFailed(f"another worker is called {name!r}: give this one another name", field="name")
+
+
+def _host_id(folder: Path) -> str:
+    """The id of this host among those that share a storage, the same after a restart."""
+    kept = LocalStorage(folder)
+    kept.write(_HOST_ID_FILE, secrets.token_hex(3).encode(), if_absent=True)
+    return kept.read(_HOST_ID_FILE).decode("ascii")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from pathlib import PurePosixPath
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Header, Path, Query
@@ -13,6 +14,7 @@ from ultragray.contract import under
 from ultragray.errors import InvalidArgument
 from ultragray_workers.jobs.job import Job, JobState
 from ultragray_workers.jobs.kinds import KINDS
+from ultragray_workers.jobs.shared.reading import SharedFile
 from ultragray_workers.jobs.specification import from_dict
 from ultragray_workers.jobs.store import JobStore
 
@@ -25,6 +27,7 @@ from ...job_events import EVENTS_TYPE, JobEvents, LastEvent
 from ...reading.accept import NPZ, PNG
 from ...reading.bodies import SPECIFICATION, JobBody
 from ...reading.json_body import body_schema, read_json_body
+from .artifacts import shared_file_response
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 
@@ -161,11 +164,17 @@ async def get_job_log(service: ServiceDep, job: JobId, max_bytes: LogBytes = DEF
     responses=_FILE | problems(401, 404, 422, 503),
 )
 async def get_artifact(
-    service: ServiceDep, job: JobId, name: Annotated[str, Path(description="One of the job's artifacts.")]
-) -> FileResponse:
+    request: Request,
+    service: ServiceDep,
+    job: JobId,
+    name: Annotated[str, Path(description="One of the job's artifacts.")],
+) -> Response:
     """Downloads a file that the job made. Ranges are answered, so that a download can go on."""
-    path = await service.jobs.do(JobStore.artifact, job, name)
-    return FileResponse(path, media_type=MEDIA_TYPES.get(path.suffix, _ANY_FILE), filename=name)
+    found = await service.jobs.do(JobStore.artifact, job, name)
+    media_type = MEDIA_TYPES.get(PurePosixPath(name).suffix, _ANY_FILE)
+    if isinstance(found, SharedFile):
+        return shared_file_response(found, request.headers, media_type)
+    return FileResponse(found, media_type=media_type, filename=name)
 
 
 @router.get(

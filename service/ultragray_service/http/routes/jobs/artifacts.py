@@ -1,0 +1,56 @@
+"""A file of an object storage as an answer of HTTP: whole, or the range that was asked for."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+from collections.abc import AsyncIterator
+from urllib.parse import quote
+
+from starlette.datastructures import Headers
+from starlette.responses import Response, StreamingResponse
+
+from ultragray_workers.jobs.shared.reading import OpenFile, SharedFile, opened
+
+_CHUNK_BYTES = 2**20
+_RANGE = re.compile(r"bytes=(\d*)-(\d*)")
+
+
+def shared_file_response(file: SharedFile, asked: Headers, media_type: str) -> Response:
+    """The answer to a GET with these headers. Of several ranges none is answered, but the whole file."""
+    etag = f'"{file.stored.sha256}"'
+    headers = {
+        "accept-ranges": "bytes",
+        "content-disposition": f"attachment; filename*=utf-8''{quote(file.name)}",
+        "etag": etag,
+    }
+    start, end, status = 0, file.stored.bytes, 200
+    if (
+        asked.get("if-range", etag) == etag
+        and (found := _RANGE.fullmatch(asked.get("range", "")))
+        and any(found.groups())
+    ):
+        first, last = found.groups()
+        start = int(first) if first else max(0, end - int(last))
+        if first and last:
+            end = min(end, int(last) + 1)
+        if start >= end:
+            return Response(status_code=416, headers={"content-range": f"bytes */{file.stored.bytes}"})
+        status = 206
+        headers["content-range"] = f"bytes {start}-{end - 1}/{file.stored.bytes}"
+    headers["content-length"] = str(end - start)
+    return StreamingResponse(_bytes(file, start, end), status_code=status, headers=headers, media_type=media_type)
+
+
+async def _bytes(file: SharedFile, start: int, end: int) -> AsyncIterator[bytes]:
+    with opened(file) as source:
+        while start < end:
+            chunk = await asyncio.to_thread(_read, source, start, min(_CHUNK_BYTES, end - start))
+            start += len(chunk)
+            yield chunk
+
+
+def _read(source: OpenFile, start: int, length: int) -> bytes:
+    if not (chunk := source.read(start, length)):
+        raise OSError("the file is shorter than its record says")  # ends the connection: the client sees that
+    return chunk

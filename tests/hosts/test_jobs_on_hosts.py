@@ -1,0 +1,113 @@
+"""Datasets and jobs of several hosts over a bucket: each host sees all of them, and a job goes on elsewhere."""
+
+from __future__ import annotations
+
+import io
+import json
+import time
+import zipfile
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from ultragray.datasets.released import write_released
+from ultragray.datasets.source import load_dataset
+from ultragray.training import TrainingConfig, train
+
+from ..object_storage import FaultyProxy
+from ..waiting import wait_until
+from ..workers.jobs.conftest import tiny_dataset
+from .host import Host
+
+STEPS, SEED = 3000, 3
+SETTINGS = {"steps": STEPS, "seed": SEED, "max_gaussians": 40, "batch_size": 2}
+AWAY_S = 6.0
+
+NewHost = Callable[[str], Host]
+
+
+def released(folder: Path) -> bytes:
+    """The tiny dataset as an archive."""
+    write_released(tiny_dataset(), folder)
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w") as archive:
+        for path in sorted(folder.rglob("*")):
+            if path.is_file():
+                archive.write(path, path.relative_to(folder))
+    return packed.getvalue()
+
+
+def put_dataset(http: str, content: bytes) -> httpx.Response:
+    return httpx.put(
+        f"{http}/v1/datasets/tiny", content=content, headers={"Content-Type": "application/zip"}, timeout=300
+    )
+
+
+def get(http: str, path: str, **options: Any) -> httpx.Response:
+    return httpx.get(f"{http}/v1/{path}", timeout=60, **options)
+
+
+@pytest.mark.slow
+def test_a_training_goes_on_at_another_host_to_the_same_scene(
+    new_host: NewHost, object_proxy: FaultyProxy, tmp_path: Path
+) -> None:
+    one, two = new_host("one"), new_host("two")
+    (a, _), (b, _) = one.serve(), two.serve()
+    told = lambda: one.told() + two.told()  # noqa: E731
+
+    content = released(tmp_path / "released")
+    assert put_dataset(a, content).status_code == 201
+    assert [record["name"] for record in get(b, "datasets").json()["datasets"]] == ["tiny"]
+    assert put_dataset(b, content).status_code == 200  # it is there already
+    assert get(b, "datasets/tiny/contact-sheet").content.startswith(b"\x89PNG")
+    assert len(get(b, "datasets/tiny/poses").json()["train"]) == 6
+
+    worker = one.work()
+    body = {
+        "kind": "train",
+        "specification": {"dataset": "tiny", "scene": "made", "settings": SETTINGS, "device": "cpu"},
+    }
+    job = httpx.post(f"{b}/v1/jobs", json=body, timeout=60).json()["id"]
+
+    def progress(http: str = b) -> int:
+        return get(http, f"jobs/{job}").json()["progress"]["step"] or 0
+
+    wait_until(lambda: progress() > STEPS // 20, within_s=240, every_s=0.5)
+    object_proxy.away = True  # for a while the storage is away: the work goes on
+    time.sleep(AWAY_S)
+    assert worker.poll() is None, told()
+    object_proxy.away = False
+    before = progress()
+    wait_until(lambda: progress() > before, within_s=60, every_s=0.5)
+    worker.kill()
+    worker.wait()
+    assert progress() < STEPS, "it was not killed midway"
+    assert get(b, f"jobs/{job}/preview").content.startswith(b"\x89PNG")
+
+    two.work()
+    found = wait_until(
+        lambda: (one := get(a, f"jobs/{job}").json())["state"] in ("succeeded", "failed") and one,
+        within_s=400,
+        every_s=0.5,
+    )
+    assert found["state"] == "succeeded", (found, told())
+    assert (found["attempts"], found["progress"]["step"]) == (2, STEPS)
+    logs = [get(http, f"jobs/{job}/log").text for http in (a, b)]
+    assert logs[0] == logs[1]
+    assert logs[0].count("training made") == 2
+    assert "going on from a checkpoint" in logs[0]
+
+    dataset = replace(load_dataset(tmp_path / "released"), name="tiny")
+    undisturbed = train(dataset, TrainingConfig.preset("fast", **SETTINGS)).to_bytes()
+    for http in (a, b):
+        wait_until(lambda http=http: "made" in get(http, "scenes").text, within_s=60, every_s=0.5)
+        assert get(http, f"jobs/{job}/artifacts/made.ugr").content == undisturbed
+        rest = get(http, f"jobs/{job}/artifacts/made.ugr", headers={"Range": "bytes=100-"})
+        assert (rest.status_code, rest.content) == (206, undisturbed[100:])
+        journal = get(http, f"jobs/{job}/artifacts/metrics.jsonl").text.splitlines()
+        assert [json.loads(line)["step"] for line in journal] == list(range(1, STEPS + 1))
+        assert len(get(http, f"jobs/{job}/curve").json()["points"]) == 500
