@@ -8,10 +8,11 @@ import binascii
 import math
 import re
 from bisect import bisect_right
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from contextvars import copy_context
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 from ultragray.errors import InvalidArgument, SceneFileInvalid, UltragrayError
 from ultragray.scene_info import SceneHeader
@@ -22,9 +23,12 @@ from ultragray_workers.storage.local import FileVersion
 from ..views.scene_points import point_message
 from .own_thread import in_own_thread
 
+T = TypeVar("T")
+
 _FOLDERS = re.compile(r"^/.*/(?=[^/]+\.ugr\b)", re.DOTALL)
 DEFAULT_PAGE_SIZE = 100
 MAX_PAGE_SIZE = 1000
+_READ_AT_ONCE = 8  # headers of a page
 
 
 @dataclass(frozen=True)
@@ -47,13 +51,13 @@ class SceneCatalog:
         """The header of a scene. Raises SceneNotFound, SceneFileInvalid; both name the field `scene`."""
         with scene_to_blame():
             cached = self._store.cached_versioned_header(name)
-            return cached[1] if cached is not None else await asyncio.to_thread(self._store.header, name)
+            return cached[1] if cached is not None else await _fetched(self._store.header, name)
 
     async def versioned_header(self, name: str) -> tuple[FileVersion, SceneHeader]:
         """The same, with the version of the file that it is of."""
         with scene_to_blame():
             cached = self._store.cached_versioned_header(name)
-            return cached if cached is not None else await asyncio.to_thread(self._store.versioned_header, name)
+            return cached if cached is not None else await _fetched(self._store.versioned_header, name)
 
     async def version(self, name: str) -> FileVersion:
         """The version of the content that the file of a scene has now. Raises SceneNotFound, SceneFileInvalid."""
@@ -78,8 +82,14 @@ class SceneCatalog:
         Raises InvalidArgument for a page_size outside 1 to 1000 and for a token that no page gave.
         """
         chosen, next_page_token = page_of_names(await self.names(), page_size, page_token)
-        entries = [entry for name in chosen if (entry := await self._entry(name)) is not None]
-        return entries, next_page_token
+        at_once = asyncio.Semaphore(_READ_AT_ONCE)
+
+        async def read(name: str) -> CatalogEntry | None:
+            async with at_once:
+                return await self._entry(name)
+
+        read_entries = await asyncio.gather(*map(read, chosen))
+        return [entry for entry in read_entries if entry is not None], next_page_token
 
     async def _entry(self, name: str) -> CatalogEntry | None:
         try:
@@ -88,6 +98,12 @@ class SceneCatalog:
             return None
         except UltragrayError as error:
             return CatalogEntry(name, None, error)
+
+
+async def _fetched(read: Callable[[str], T], name: str) -> T:
+    """What may have to come from a bucket first, read in a thread of its own that knows who asks."""
+    context = copy_context()
+    return await in_own_thread(lambda: context.run(read, name))
 
 
 def page_of_names(names: list[str], page_size: int, page_token: str) -> tuple[list[str], str]:

@@ -127,6 +127,8 @@ class BucketShelf:
             return kept
         if (path := self.here(name)) is not None:
             header = read_header(path)
+        elif (problem := self.index.problem) is not None:
+            raise problem
         else:
             try:
                 header = fetch_header(self.index.storage, placed.key, placed.bytes, f"{name}{SUFFIX}")
@@ -167,6 +169,10 @@ class BucketShelf:
         return placed
 
     def _pin(self, placed: Placed) -> Pin:
+        if (problem := self.index.problem) is not None:  # a bucket that is away keeps nobody waiting
+            if (pin := self.cache.held(self._cache_name(placed))) is None:
+                raise problem
+            return pin
         return self.cache.pin(self.index.storage, placed.key, placed.version, placed.sha256)
 
     def _cache_name(self, placed: Placed) -> str:
