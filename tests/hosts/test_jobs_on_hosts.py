@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import tarfile
 import time
 import zipfile
 from collections.abc import Callable
@@ -11,12 +12,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import grpc
 import httpx
+import numpy as np
 import pytest
 
 from ultragray.datasets.released import write_released
 from ultragray.datasets.source import load_dataset
 from ultragray.training import TrainingConfig, train
+from ultragray_proto.v1 import jobs_pb2, jobs_pb2_grpc
+from ultragray_workers.storage.opening import open_storage
 
 from ..object_storage import FaultyProxy
 from ..waiting import wait_until
@@ -111,3 +116,34 @@ def test_a_training_goes_on_at_another_host_to_the_same_scene(
         journal = get(http, f"jobs/{job}/artifacts/metrics.jsonl").text.splitlines()
         assert [json.loads(line)["step"] for line in journal] == list(range(1, STEPS + 1))
         assert len(get(http, f"jobs/{job}/curve").json()["points"]) == 500
+
+
+@pytest.mark.slow
+def test_a_rendering_is_made_on_one_host_and_downloaded_from_another(new_host: NewHost, bucket: str) -> None:
+    one, two = new_host("one"), new_host("two")
+    http, rpc = one.serve()
+    two.work()
+    poses = np.tile(np.eye(4), (5, 1, 1)).tolist()
+    specification = {"scene": "demo", "poses": poses, "height": 48, "width": 40, "format": "tar"}
+    body = {"kind": "render", "specification": specification}
+    job = httpx.post(f"{http}/v1/jobs", json=body, timeout=60).json()["id"]
+
+    def ended() -> dict[str, Any] | None:
+        found: dict[str, Any] = get(http, f"jobs/{job}").json()
+        return found if found["state"] in ("succeeded", "failed") else None
+
+    found = wait_until(ended, within_s=240, every_s=0.5)
+    assert (found["state"], found["progress"]["frames_done"]) == ("succeeded", 5), (found, one.told(), two.told())
+    whole = get(http, f"jobs/{job}/artifacts/frames.tar").content
+    with tarfile.open(fileobj=io.BytesIO(whole)) as archive:
+        assert len(archive.getnames()) == 10
+    with grpc.insecure_channel(rpc) as channel:
+        stub = jobs_pb2_grpc.JobServiceStub(channel)
+        asked = jobs_pb2.DownloadArtifactRequest(job=job, name="frames.tar", offset=1000)
+        assert b"".join(chunk.data for chunk in stub.DownloadArtifact(asked, timeout=60)) == whole[1000:]
+
+    storage = open_storage(f"{bucket}/artifacts")
+    assert [entry.key for entry in storage.entries(f"jobs/{job}") if entry.key.endswith("demo.ugr")]
+    assert httpx.delete(f"{http}/v1/jobs/{job}", timeout=60).status_code == 204
+    assert list(storage.entries(f"jobs/{job}")) == []
+    assert not list(two.cache.rglob(job)), "the host of the worker keeps nothing of it"
