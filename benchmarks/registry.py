@@ -98,7 +98,17 @@ _FILES = (
             "benchmarks/libraries.py",
         ),
     ),
-    Figures("benchmarks/simulation.json", "simulation", ("benchmarks/scaling", "benchmarks/simulation.py")),
+    Figures(
+        "benchmarks/simulation.json",
+        "simulation",
+        (
+            "benchmarks/scaling",
+            ":(exclude)benchmarks/scaling/defaults.py",
+            ":(exclude)benchmarks/scaling/picture.py",
+            ":(exclude)benchmarks/scaling/tables.py",
+            "benchmarks/simulation.py",
+        ),
+    ),
     Figures("tests/long-run.json", "test-long", (*_PRODUCT, "tests", ":(exclude)tests/*-run.json")),
     Figures("tests/soak-run.json", "test-soak", (*_PRODUCT, "tests/soak")),
     Figures("tests/overload-run.json", "test-overload", (*_PRODUCT, "tests/overload")),
