@@ -98,7 +98,17 @@ _FILES = (
             "benchmarks/libraries.py",
         ),
     ),
-    Figures("benchmarks/simulation.json", "simulation", ("benchmarks/scaling", "benchmarks/simulation.py")),
+    Figures(
+        "benchmarks/simulation.json",
+        "simulation",
+        (
+            "benchmarks/scaling",
+            ":(exclude)benchmarks/scaling/defaults.py",
+            ":(exclude)benchmarks/scaling/picture.py",
+            ":(exclude)benchmarks/scaling/tables.py",
+            "benchmarks/simulation.py",
+        ),
+    ),
     Figures(
         "benchmarks/shards.json",
         "test-shards",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
 import tarfile
@@ -147,3 +148,38 @@ def test_a_rendering_is_made_on_one_host_and_downloaded_from_another(new_host: N
     assert httpx.delete(f"{http}/v1/jobs/{job}", timeout=60).status_code == 204
     assert list(storage.entries(f"jobs/{job}")) == []
     assert not list(two.cache.rglob(job)), "the host of the worker keeps nothing of it"
+
+
+@pytest.mark.slow
+def test_hosts_make_the_shards_of_a_batch_together(new_host: NewHost, bucket: str, object_proxy: FaultyProxy) -> None:
+    one, two = new_host("one"), new_host("two")
+    http, _ = one.serve()
+    workers = [one.work(), two.work()]
+    sampler = {"kind": "around", "count": 6_000, "seed": SEED}
+    specification = {"scene": "demo", "sampler": sampler, "height": 16, "width": 12, "shard_frames": 250}
+    job = httpx.post(f"{http}/v1/jobs", json={"kind": "render", "specification": specification}, timeout=60).json()
+    job = job["id"]
+    told = lambda: one.told() + two.told()  # noqa: E731
+
+    def found() -> dict[str, Any]:
+        return dict(get(http, f"jobs/{job}").json())
+
+    wait_until(lambda: found()["progress"]["frames_done"], within_s=240, every_s=0.2)
+    object_proxy.away = True
+    time.sleep(AWAY_S)
+    object_proxy.away = False
+    workers[0].kill()
+    ended = wait_until(lambda: (it := found())["state"] in ("succeeded", "failed") and it, within_s=400, every_s=0.5)
+    assert ended["state"] == "succeeded", (ended, told())
+    manifest = get(http, f"jobs/{job}/artifacts/manifest.json").json()
+    assert sum(shard["frames"] for shard in manifest["shards"]) == 6_000
+    keys: list[str] = []
+    for shard in manifest["shards"]:
+        content = get(http, f"jobs/{job}/artifacts/{shard['file']}").content
+        assert hashlib.sha256(content).hexdigest() == shard["sha256"]
+        with tarfile.open(fileobj=io.BytesIO(content)) as tar:
+            keys += [name.partition(".")[0] for name in tar.getnames() if name.endswith("bmode.npy")]
+    assert len(keys) == len(set(keys)) == 6_000
+    assert httpx.delete(f"{http}/v1/jobs/{job}", timeout=60).status_code == 204
+    left = [entry.key for entry in open_storage(f"{bucket}/artifacts").entries(f"jobs/{job}")]
+    assert left == []
