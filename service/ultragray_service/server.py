@@ -72,12 +72,13 @@ async def serve(settings: Settings) -> None:
         service.metrics.tell_certificate_expiry(lambda: certificates.current.not_after)
     await service.open()
     grpc_server = GrpcServer(service)
+    app = create_app(service)  # before any port is taken: who connects to one that does not answer yet would wait
     grpc_port = _bind_grpc(grpc_server, settings, certificates)
     igtl_server = IgtlServer(service)
     with contextlib.ExitStack() as sockets:
         http_socket = sockets.enter_context(listen(settings.host, settings.http_port, "HTTP", "http_port"))
         igtl = await _start_igtl(igtl_server, settings, sockets)
-        http_server = HttpServer(create_app(service), settings, service.metrics, certificates, _FLUSH_S)
+        http_server = HttpServer(app, settings, service.metrics, certificates, _FLUSH_S)
         await grpc_server.start()
         http_task = asyncio.ensure_future(http_server.serve([http_socket]))
         alive_task = asyncio.ensure_future(manager.tell_alive())
