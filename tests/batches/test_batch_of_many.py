@@ -36,6 +36,7 @@ from ultragray_service.bench.measured import measured
 from ultragray_workers.jobs.kinds import RenderJob
 from ultragray_workers.jobs.store import Job, JobState, JobStore
 
+from ..surroundings import ROOT
 from ..waiting import Deadline
 from ..workers.jobs.conftest import FINAL, RunningWorker
 
@@ -94,7 +95,7 @@ def figures(place: Path) -> Iterator[dict[str, Any]]:
         for engine in ("queue", "ray"):
             if engine in found:
                 found[engine]["share_of_kernel"] = found[engine]["frames_per_s"] / found["kernel_frames_per_s"]
-        write_whole(RECORD, json.dumps(found, indent=1) + "\n")
+        write_whole(ROOT / RECORD, json.dumps(found, indent=1) + "\n")
 
 
 def scene_of(place: Path) -> Path:
