@@ -1,0 +1,20 @@
+"""Envoy's configuration takes the values that the simulation decided."""
+
+from __future__ import annotations
+
+import yaml
+
+from ..scripts import benchmark
+from .envoy import FOLDER
+
+DEFAULTS = benchmark("scaling.defaults").DEFAULTS
+
+
+def test_rings_have_the_decided_size_and_bound() -> None:
+    document = yaml.safe_load((FOLDER / "envoy.yaml").read_text(encoding="utf-8"))
+    rings = [one for one in document["static_resources"]["clusters"] if one["lb_policy"] == "RING_HASH"]
+    assert len(rings) == 2
+    for ring in rings:
+        assert ring["ring_hash_lb_config"] == {"minimum_ring_size": DEFAULTS.minimum_ring_size}
+        bound = ring["common_lb_config"]["consistent_hashing_lb_config"]
+        assert bound == {"hash_balance_factor": DEFAULTS.hash_balance_factor}
