@@ -94,7 +94,9 @@ def test_a_service_that_leaves_is_not_ready_and_answers_until_it_stops(start_ser
         conversation = Conversation(rendering_pb2_grpc.RenderServiceStub(channel))
         conversation.send(settings=rendering_pb2.RenderSettings(scene="demo", **SMALL))
         health = health_pb2_grpc.HealthStub(channel)
-        assert health.Check(health_pb2.HealthCheckRequest()).status == health_pb2.HealthCheckResponse.SERVING
+        wait_until(
+            lambda: health.Check(health_pb2.HealthCheckRequest()).status == health_pb2.HealthCheckResponse.SERVING
+        )
         began = time.monotonic()
         service.process.send_signal(signal.SIGTERM)
         readiness = wait_until(lambda: not_ready(service, client), within_s=2)
