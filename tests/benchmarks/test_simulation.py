@@ -105,6 +105,14 @@ def test_a_scene_is_fetched_once_and_loaded_again_after_it_was_dropped() -> None
     assert sources == [(storage, 0.5), (storage, 1.5), (memory, 2.0), (storage, 3.5), (folder, 4.0), (folder, 5.0)]
 
 
+def test_the_file_that_was_least_recently_used_is_fetched_again() -> None:
+    sizes = caches.CacheSizes(memory=1, folder=2 * SMALL.file_bytes)  # the scene asked for last stays loaded
+    cache = caches.ReplicaCache(sizes, [SMALL] * 3, costs.Storage())
+    sources = [cache.ask(scene, 0.0)[0] for scene in (0, 1, 0, 2, 0, 1)]
+    folder, storage = caches.Source.FOLDER, caches.Source.STORAGE
+    assert sources == [storage, storage, folder, storage, folder, storage]
+
+
 def test_who_asks_during_a_fetch_waits_for_its_end() -> None:
     storage = costs.Storage(first_byte_s=2.0, bytes_per_s=math.inf)
     cache = caches.ReplicaCache(caches.CacheSizes(), [SMALL], storage)
