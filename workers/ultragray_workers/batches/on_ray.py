@@ -6,6 +6,7 @@ ultragray, and reach the place of the files: a folder that all have under one pa
 
 from __future__ import annotations
 
+import shutil
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 LOCAL, REMOTE = "ray", "ray://"
 MOST_TRIES = 20  # of one shard, whose worker died
 _AT_ONCE = 1_000  # tasks that the cluster is told of
+_MAKING = ".making-"  # begins the name of a folder in which a shard is made
 
 
 @dataclass(frozen=True)
@@ -84,6 +86,9 @@ class RayBatch:
         finally:
             ray.shutdown()
         place.finish()
+        if place.storage.local is not None:
+            for left in place.storage.local.glob(f"{_MAKING}*"):  # by workers that died
+                shutil.rmtree(left, ignore_errors=True)
 
 
 def check_address(address: str) -> None:
@@ -147,7 +152,7 @@ def _make_shard(
         renderer = _renderer(plan, scene, backend)
         if storage.local is not None:
             storage.local.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=storage.local, prefix=".", suffix=".tmp") as folder:
+        with tempfile.TemporaryDirectory(dir=storage.local, prefix=_MAKING) as folder:
             path = Path(folder) / plan.file_name(shard)
             place.keep(path, shard, renderer.render(shard, path))
     return len(plan.frames_of(shard))
