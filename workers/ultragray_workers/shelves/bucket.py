@@ -54,6 +54,7 @@ class BucketShelf:
 
     def follow(self) -> None:
         """From now on the list of the scenes is read every FRESH_S seconds, in a thread of its own."""
+        self.index.is_followed = True
         self._thread = threading.Thread(target=self._follow, name="scenes of a bucket", daemon=True)
         self._thread.start()
 

@@ -56,6 +56,7 @@ class SceneIndex:
         self._known: dict[str, Placed] = {}
         self._read_at_s: float | None = None  # time.monotonic()
         self._tried_at_s = 0.0
+        self.is_followed = False  # told by who reads it again and again: others need not, and are not kept waiting
         self._entries: dict[str, tuple[str, Placed]] = {}  # by name: the version of NAME.json, and what it said
         self._changes = 0  # by this process
         self._changing, self._reading = threading.Lock(), threading.Lock()
@@ -80,7 +81,7 @@ class SceneIndex:
         """The scenes as they are, or were at most `longest_stale_s` ago. Raises StorageUnavailable."""
         if self.age_s > self._longest_stale_s:
             self.read()
-        elif time.monotonic() - self._tried_at_s > _OLD_S and not self._reading.locked():
+        elif not self.is_followed and time.monotonic() - self._tried_at_s > _OLD_S:
             with contextlib.suppress(StorageUnavailable):
                 self.read()
         return self._known
@@ -108,7 +109,6 @@ class SceneIndex:
     def read(self) -> None:
         """Reads the list. Raises StorageUnavailable."""
         with self._reading:
-            self._tried_at_s = time.monotonic()
             try:
                 while not self._read():
                     pass
@@ -116,6 +116,8 @@ class SceneIndex:
                 self.problem = error
                 self.unavailable_total += 1
                 raise
+            finally:
+                self._tried_at_s = time.monotonic()
             self.problem = None
 
     def publish(self, file: Path, name: str) -> None:
