@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from ultragray.datasets.released import write_released
-from ultragray.training.trainer import CHECKPOINT_FILE, JOURNAL_FILE
-from ultragray_service.views import training as training_views
+from ultragray.training.trainer import CHECKPOINT_FILE, CONFIG_FILE, JOURNAL_FILE
 from ultragray_service.views.training import MAX_POINTS
+from ultragray_workers.jobs.files import CHECKPOINT_NAME, CONFIG_NAME, JOURNAL_NAME
 
 from ...waiting import wait_until
 from ..conftest import StartService
@@ -53,7 +53,7 @@ def train(http: httpx.Client, scene: str, **settings: Any) -> str:
 
 
 def test_the_names_of_the_files_of_a_run() -> None:
-    assert (training_views._JOURNAL, training_views._CHECKPOINT) == (JOURNAL_FILE, CHECKPOINT_FILE)
+    assert (JOURNAL_NAME, CHECKPOINT_NAME, CONFIG_NAME) == (JOURNAL_FILE, CHECKPOINT_FILE, CONFIG_FILE)
 
 
 def test_the_curve_of_a_finished_training_and_of_other_jobs(http: httpx.Client) -> None:

@@ -11,10 +11,8 @@ from .shared.reading import SharedFile, SharedLog
 
 Artifact: TypeAlias = Path | SharedFile
 Log: TypeAlias = Path | SharedLog
-JOURNAL_NAME, CHECKPOINT_NAME = (
-    "metrics.jsonl",
-    "checkpoint.safetensors",
-)  # of a run: `ultragray.training` imports torch
+# Of a run; `ultragray.training`, which writes them, imports torch.
+JOURNAL_NAME, CHECKPOINT_NAME, CONFIG_NAME = "metrics.jsonl", "checkpoint.safetensors", "config.json"
 
 
 def size_of_log(log: Log) -> int:

@@ -22,7 +22,7 @@ from ultragray.files.atomic import file_sha256
 
 from ...errors import StorageUnavailable
 from ...storage.storage import NotThere, Storage
-from ..files import CHECKPOINT_NAME, JOURNAL_NAME
+from ..files import CHECKPOINT_NAME, CONFIG_NAME, JOURNAL_NAME
 from ..folder import JobFolder, Outcome
 from ..shared.record import (
     JobRecord,
@@ -43,7 +43,7 @@ PIECE_BYTES = 256 * 1024  # of the log: the last piece is written again when it 
 MOST_LOG_BYTES = 4 * PIECE_BYTES  # of the log, told at once
 _RETRY_S, _LONGEST_RETRY_S = 0.5, 10.0
 _LOOK_S = 0.25
-_RUN_FILES = (CHECKPOINT_NAME, JOURNAL_NAME, "config.json")
+_RUN_FILES = (CHECKPOINT_NAME, JOURNAL_NAME, CONFIG_NAME)
 
 _log = logging.getLogger("ultragray.jobs")
 _T = TypeVar("_T")
