@@ -1,10 +1,11 @@
-"""Envoy's configuration takes the values that the simulation decided."""
+"""Envoy and the chart take the values that the simulation decided."""
 
 from __future__ import annotations
 
 import yaml
 
 from ..scripts import benchmark
+from ..surroundings import ROOT
 from .envoy import FOLDER
 
 DEFAULTS = benchmark("scaling.defaults").DEFAULTS
@@ -18,3 +19,8 @@ def test_rings_have_the_decided_size_and_bound() -> None:
         assert ring["ring_hash_lb_config"] == {"minimum_ring_size": DEFAULTS.minimum_ring_size}
         bound = ring["common_lb_config"]["consistent_hashing_lb_config"]
         assert bound == {"hash_balance_factor": DEFAULTS.hash_balance_factor}
+
+
+def test_replicas_are_added_at_the_decided_wait() -> None:
+    values = yaml.safe_load((ROOT / "docker/helm/values.yaml").read_text(encoding="utf-8"))
+    assert values["service"]["autoscaling"]["queueDelaySeconds"] == DEFAULTS.queue_p95_ms / 1000
