@@ -54,6 +54,11 @@ class SharedFiles:
             raise DatasetInvalid("the manifest of the dataset does not name the files of the dataset") from None
 
 
+def without_shared_files(document: dict[str, Any]) -> dict[str, Any]:
+    """A manifest as it is in a folder."""
+    return {key: value for key, value in document.items() if key != _SHARED}
+
+
 class SharedShelf:
     """The datasets of a storage, with copies on this host of those that were used last."""
 

@@ -18,8 +18,9 @@ from ultragray.files.atomic import file_sha256
 from ..errors import RestoreRefused, StorageUnavailable
 from .storage import NotThere, Storage
 
+ARTIFACTS = "artifacts"  # the artifact folder, below a data folder
 _SCENES = re.compile(
-    r"(artifacts/)?(scenes/(objects/)?)?[A-Za-z0-9][A-Za-z0-9._-]*\.ugr|(artifacts/)?scenes/[^./][^/]*\.json"
+    rf"({ARTIFACTS}/)?(scenes/(objects/)?)?[A-Za-z0-9][A-Za-z0-9._-]*\.ugr|({ARTIFACTS}/)?scenes/[^./][^/]*\.json"
 )
 
 
