@@ -57,7 +57,7 @@ def get(http: str, path: str, **options: Any) -> httpx.Response:
     return httpx.get(f"{http}/v1/{path}", timeout=60, **options)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_training_goes_on_at_another_host_to_the_same_scene(
     new_host: NewHost, object_proxy: FaultyProxy, tmp_path: Path
 ) -> None:
@@ -150,7 +150,7 @@ def test_a_rendering_is_made_on_one_host_and_downloaded_from_another(new_host: N
     assert not list(two.cache.rglob(job)), "the host of the worker keeps nothing of it"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_hosts_make_the_shards_of_a_batch_together(new_host: NewHost, bucket: str, object_proxy: FaultyProxy) -> None:
     one, two = new_host("one"), new_host("two")
     http, _ = one.serve()

@@ -18,6 +18,7 @@ from ultragray_service.core.helper_processes import HelperProcesses
 from ultragray_service.core.state import Service
 from ultragray_service.settings import load_settings
 from ultragray_workers.jobs.store import JobStore
+from ultragray_workers.shelves import folder
 
 
 @pytest.fixture
@@ -49,7 +50,7 @@ async def points(service: Service) -> None:
 LONG: dict[str, tuple[Any, str, Callable[[Service], Awaitable[None]]]] = {
     "the sync of an import": (scene_imports, "sync", receive),
     "a name asked of the database": (JobStore, "makes_scene", receive),
-    "the copy of an import": (scene_imports, "link_or_copy", publish),
+    "the copy of an import": (folder, "link_or_copy", publish),
     "points of a scene": (catalog, "point_message", points),
 }
 

@@ -104,12 +104,9 @@ class Cache:
             except FileNotFoundError:
                 return None
             fcntl.flock(file, fcntl.LOCK_SH)
-            try:
-                if os.path.samestat(os.fstat(file.fileno()), path.stat()):
-                    os.utime(file.fileno(), ns=(time.time_ns(), os.fstat(file.fileno()).st_mtime_ns))  # used last
-                    return Pin(path, file)
-            except FileNotFoundError:  # removed before it was locked
-                pass
+            if _is_at(file, path):  # else it was removed before it was locked
+                os.utime(file.fileno(), ns=(time.time_ns(), os.fstat(file.fileno()).st_mtime_ns))  # used last
+                return Pin(path, file)
             file.close()
 
     def count_hit(self) -> None:
@@ -216,7 +213,7 @@ class Cache:
             with self._lock_of_fetch(name) as lock:
                 fcntl.flock(lock, fcntl.LOCK_EX)
                 path = self._fetching / name
-                if not (path.exists() and os.path.samestat(os.fstat(lock.fileno()), path.stat())):
+                if not _is_at(lock, path):
                     continue  # the one before has removed it
                 try:
                     yield
@@ -243,6 +240,14 @@ def cache_name(storage: Storage, key: str, version: str, sha256: str | None) -> 
     """The name under which a cache keeps an object: by its content where that is known, with the suffix of its key."""
     content = sha256 or "v-" + hashlib.sha256(f"{storage.location}\n{key}\n{version}".encode()).hexdigest()
     return content + PurePosixPath(key).suffix
+
+
+def _is_at(file: IO[bytes], path: Path) -> bool:
+    """Whether the open file still is the one of a path, which others may remove at any moment."""
+    try:
+        return os.path.samestat(os.fstat(file.fileno()), path.stat())
+    except FileNotFoundError:
+        return False
 
 
 def _try_lock(file: IO[bytes]) -> bool:

@@ -129,7 +129,7 @@ def test_cancelling_ends_the_batch_and_its_shares(
     workers = [start_worker(name, host=name) for name in ("one", "two")]
     until(job, is_under_way)
     until(job, lambda _: all(worker.job_process() for worker in workers))
-    assert {worker.job for worker in store.workers()} == {job.id}
+    until(job, lambda _: {worker.job for worker in store.workers()} == {job.id})
     store.cancel(job.id)
     until(job, lambda _: not any(worker.job_process() for worker in workers), timeout_s=20)
     with store.database.engine.connect() as connection:
