@@ -105,6 +105,7 @@ def test_a_scene_is_imported_listed_pinned_and_deleted(
     wait_until(lambda: render(one, "liver").status_code == 404, within_s=WITHIN_S)
 
 
+@pytest.mark.long
 def test_what_is_cached_is_served_while_the_bucket_is_away(
     replicas: list[RunningService], proxy: FaultyProxy, tmp_path: Path
 ) -> None:

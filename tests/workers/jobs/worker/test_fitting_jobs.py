@@ -39,6 +39,7 @@ def is_there(store: JobStore, worker: str) -> Callable[[], bool]:
     return lambda: worker in {one.name for one in store.workers()}
 
 
+@pytest.mark.long
 def test_each_job_goes_to_a_worker_that_fits_it_and_holds_nobody_up(
     store: JobStore, start_worker: StartWorker, until: Until
 ) -> None:
