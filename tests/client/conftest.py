@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import inspect
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
@@ -22,6 +22,7 @@ from ..service.conftest import (
 )
 
 __all__ = ["data_folder", "demo_scene", "start_service", "start_shared_service"]
+from .proxy import Proxy
 
 KEY = "0123456789abcdef-client"
 MAX_POSES = 40
@@ -114,3 +115,17 @@ def make_client(request: pytest.FixtureRequest, event_loop_thread: asyncio.Abstr
 @pytest.fixture
 def client(make_client: Any, client_service: RunningService) -> Any:
     return make_client(client_service.grpc, api_key=KEY, timeout_s=60.0)
+
+
+@pytest.fixture
+def proxy(client_service: RunningService) -> Iterator[Proxy]:
+    """The way to the service, which a test cuts."""
+    proxy = Proxy(client_service.grpc)
+    yield proxy
+    proxy.close()
+
+
+@pytest.fixture
+def far_client(make_client: Callable[..., Any], proxy: Proxy) -> Any:
+    """A client that reaches the service by that way."""
+    return make_client(proxy.address, api_key=KEY, timeout_s=60.0)

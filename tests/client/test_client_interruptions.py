@@ -5,7 +5,7 @@ from __future__ import annotations
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
@@ -21,23 +21,9 @@ from ultragray_client.jobs import Watch
 from ultragray_client.sync.connection import Connection
 from ultragray_proto.v1 import jobs_pb2
 
-from ..service.conftest import RunningService
 from ..waiting import at_this_load
-from .conftest import KEY
 from .proxy import Proxy
 from .test_client_errors import FailedCall
-
-
-@pytest.fixture
-def proxy(client_service: RunningService) -> Iterator[Proxy]:
-    proxy = Proxy(client_service.grpc)
-    yield proxy
-    proxy.close()
-
-
-@pytest.fixture
-def far_client(make_client: Callable[..., Any], proxy: Proxy) -> Any:
-    return make_client(proxy.address, api_key=KEY, timeout_s=60.0)
 
 
 def test_a_batch_goes_on(far_client: Any, proxy: Proxy) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import threading
 from collections.abc import Iterator
 from concurrent import futures
@@ -59,5 +60,6 @@ if __name__ == "__main__":
     port = server.add_insecure_port("127.0.0.1:0")
     server.start()
     service_health.set("", health_pb2.HealthCheckResponse.SERVING)
-    print(http.server_address[1], port, flush=True)  # noqa: T201
+    sys.stdout.write(f"{http.server_address[1]} {port}\n")
+    sys.stdout.flush()
     server.wait_for_termination()

@@ -63,7 +63,9 @@ def test_a_training_goes_on_at_another_host_to_the_same_scene(
 ) -> None:
     one, two = new_host("one"), new_host("two")
     (a, _), (b, _) = one.serve(), two.serve()
-    told = lambda: one.told() + two.told()  # noqa: E731
+
+    def told() -> str:
+        return one.told() + two.told()
 
     content = released(tmp_path / "released")
     assert put_dataset(a, content).status_code == 201
@@ -159,7 +161,9 @@ def test_hosts_make_the_shards_of_a_batch_together(new_host: NewHost, bucket: st
     specification = {"scene": "demo", "sampler": sampler, "height": 16, "width": 12, "shard_frames": 250}
     job = httpx.post(f"{http}/v1/jobs", json={"kind": "render", "specification": specification}, timeout=60).json()
     job = job["id"]
-    told = lambda: one.told() + two.told()  # noqa: E731
+
+    def told() -> str:
+        return one.told() + two.told()
 
     def found() -> dict[str, Any]:
         return dict(get(http, f"jobs/{job}").json())
