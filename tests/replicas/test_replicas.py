@@ -1,6 +1,7 @@
-"""Replicas and workers of several hosts behind a real Envoy, killed and drained in turn, under clients of all kinds.
+"""Replicas and workers of several hosts over a bucket, behind a real Envoy, killed and drained in turn.
 
-No frame is wrong, none comes twice, no job is lost, streams go on within seconds, and a scene stays where it is loaded.
+Clients of all kinds ask them meanwhile: no frame is wrong, none comes twice, no job is lost, streams go on within
+seconds, and a scene stays where it is loaded.
 ULTRAGRAY_REPLICAS_CLIENTS, _SCENES, _HOSTS, _WORKERS and _SECONDS size the run; make test-replicas has the full one.
 """
 
@@ -12,7 +13,7 @@ import json
 import os
 import statistics
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,8 @@ from typing import Any
 import pytest
 
 from ultragray_service.bench.measured import measured
+from ultragray_workers.storage.copying import copy_scenes
+from ultragray_workers.storage.opening import open_storage
 
 from ..docker.envoy import Envoy, program, script
 from ..postgres import PostgresServer
@@ -54,19 +57,19 @@ DOORS = ("ordered", "latest", "http", "websocket")
 class Cluster:
     """All hosts, the proxy before them, and what was done to them."""
 
-    def __init__(self, folder: Path, postgres: PostgresServer, started: ExitStack) -> None:
-        data = folder / "storage" / "data"
-        data.mkdir(parents=True)
+    def __init__(self, folder: Path, bucket: str, postgres: PostgresServer, started: ExitStack) -> None:
+        made = folder / "made"
+        made.mkdir()
         self.expected: dict[str, Expected] = {}
         for number in range(SCENES):
-            path = data / f"scene{number}.ugr"
+            path = made / f"scene{number}.ugr"
             make_scene(seed=number, probe=DEMO_PROBE).save(path)
             self.expected[path.stem] = Expected.of(path)
-        database = postgres.create_database()
+        copy_scenes(open_storage(str(made)), open_storage(f"{bucket}/data"))
         shared = {
-            "ULTRAGRAY_DATA_FOLDER": str(data),
-            "ULTRAGRAY_ARTIFACT_FOLDER": str(folder / "storage" / "artifacts"),
-            "ULTRAGRAY_DATABASE_URL": database,
+            "ULTRAGRAY_DATA_FOLDER": f"{bucket}/data",
+            "ULTRAGRAY_ARTIFACT_FOLDER": f"{bucket}/artifacts",
+            "ULTRAGRAY_DATABASE_URL": postgres.create_database(),
         }
         self.hosts = []
         for number in range(HOSTS):
@@ -113,10 +116,10 @@ class Cluster:
 
 
 @pytest.fixture
-def cluster(tmp_path: Path, postgres: PostgresServer) -> Iterator[Cluster]:
+def cluster(tmp_path: Path, new_bucket: Callable[[], str], postgres: PostgresServer) -> Iterator[Cluster]:
     program()  # skips where there is none
     with ExitStack() as started:
-        yield Cluster(tmp_path, postgres, started)
+        yield Cluster(tmp_path, new_bucket(), postgres, started)
 
 
 async def _run(cluster: Cluster) -> tuple[Visitors, dict[str, Any]]:
