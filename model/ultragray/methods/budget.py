@@ -49,19 +49,29 @@ class Paces:
                 document = json.loads(path.read_text(encoding="utf-8"))
                 self._known = document if isinstance(document, dict) else {}
 
-    def get(self, name: str, measure: Callable[[], Pace]) -> Pace:
-        """What is known of a method, else what `measure` finds, which is kept."""
-        section = self._known.setdefault(self._section, {})
+    def known(self, name: str) -> Pace | None:
+        """What was measured of a method; None where nothing was."""
         try:
-            start_s, step_s = map(float, section[name])
+            start_s, step_s = map(float, self._known[self._section][name])
         except (KeyError, TypeError, ValueError):
-            pace = measure()
-            section[name] = [pace.start_s, pace.step_s]
-            if self._path is not None:
+            return None
+        return Pace(start_s, step_s)
+
+    def keep(self, name: str, pace: Pace) -> None:
+        """Keeps what was measured; in a place that cannot be written, for this process only."""
+        self._known.setdefault(self._section, {})[name] = [pace.start_s, pace.step_s]
+        if self._path is not None:
+            with contextlib.suppress(OSError):
                 self._path.parent.mkdir(parents=True, exist_ok=True)
                 write_whole(self._path, json.dumps(self._known, indent=1) + "\n")
-            return pace
-        return Pace(start_s, step_s)
+
+    def get(self, name: str, measure: Callable[[], Pace]) -> Pace:
+        """What is known of a method, else what `measure` finds, which is kept."""
+        pace = self.known(name)
+        if pace is None:
+            pace = measure()
+            self.keep(name, pace)
+        return pace
 
 
 @dataclass(frozen=True)
