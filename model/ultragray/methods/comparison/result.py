@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ...contract import to_dict
 from ...datasets.sweep import Dataset, IntArray
 from ...evaluation.baselines import nearest_frames
 from ...evaluation.metrics import FrameMetrics
@@ -48,7 +49,7 @@ class MethodResult:
         return {
             "name": self.name,
             "title": self.title,
-            "description": asdict(self.description),
+            "description": to_dict(self.description),
             "steps": self.steps,
             "of_steps": self.of_steps,
             "seconds": self.seconds,
