@@ -25,6 +25,7 @@ class Row:
     cells: list[tuple[str, bool]] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     failure: str | None = None
+    anchor: str = ""  # of what the page says of the method
 
 
 def metric_rows(evaluations: Mapping[str, Evaluation], notes: Mapping[str, list[str]] | None = None) -> list[Row]:
