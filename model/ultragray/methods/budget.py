@@ -50,21 +50,30 @@ class Paces:
                 document = json.loads(path.read_text(encoding="utf-8"))
                 self._known = document if isinstance(document, dict) else {}
 
-    def get(self, name: str, measure: Callable[[], Pace]) -> Pace:
-        """What is known of a method, else what `measure` finds, which is kept."""
+    def known(self, name: str) -> Pace | None:
+        """What was measured of a method; None where nothing was, or the file is another's."""
         try:
             start_s, step_s = map(float, self._known[self._section][name])
-            if start_s >= 0.0 and step_s > 0.0:
-                return Pace(start_s, step_s)
-        except (LookupError, TypeError, ValueError):  # another's file, or another version's: it is measured again
-            pass
-        pace = measure()
+        except (LookupError, TypeError, ValueError):
+            return None
+        return Pace(start_s, step_s)
+
+    def keep(self, name: str, pace: Pace) -> None:
+        """Keeps what was measured; in a place that cannot be written, for this process only."""
         section = self._known.get(self._section)
         known = section if isinstance(section, dict) else {}
         self._known[self._section] = {**known, name: [pace.start_s, pace.step_s]}
         if self._path is not None:
-            self._path.parent.mkdir(parents=True, exist_ok=True)
-            write_whole(self._path, json.dumps(self._known, indent=1) + "\n")
+            with contextlib.suppress(OSError):
+                self._path.parent.mkdir(parents=True, exist_ok=True)
+                write_whole(self._path, json.dumps(self._known, indent=1) + "\n")
+
+    def get(self, name: str, measure: Callable[[], Pace]) -> Pace:
+        """What is known of a method, else what `measure` finds, which is kept."""
+        pace = self.known(name)
+        if pace is None or not pace.step_s > 0.0:
+            pace = measure()
+            self.keep(name, pace)
         return pace
 
 
