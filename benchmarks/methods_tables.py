@@ -13,7 +13,7 @@ import json
 import logging
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +41,7 @@ class Run:
 
     name: str
     source: str
-    settings: ComparisonSettings = ComparisonSettings()
+    settings: ComparisonSettings = field(default_factory=ComparisonSettings)
 
 
 RUNS = (
