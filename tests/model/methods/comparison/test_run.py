@@ -15,7 +15,6 @@ from ultragray.errors import DatasetInvalid, InvalidArgument, TrainingStateInval
 from ultragray.evaluation.scoring import evaluate_frames
 from ultragray.methods.budget import Pace, Paces
 from ultragray.methods.classical import FromFrames
-from ultragray.methods.comparison.pictures import as_frames
 from ultragray.methods.comparison.place import frames_of
 from ultragray.methods.comparison.result import Comparison
 from ultragray.methods.comparison.run import (
@@ -57,7 +56,7 @@ def test_each_method_is_a_row_and_one_that_fails_says_why(
     assert {(state.number, state.of) for state in seen} == {(number, 5) for number in range(1, 6)}
     assert [state.fit.step for state in seen if state.fit and state.method == "level"] == list(range(1, 41))
     for name, evaluation in found.measured.items():
-        again = evaluate_frames(as_frames(frames_of(tmp_path / "run", name)), dataset.val)
+        again = evaluate_frames((frames_of(tmp_path / "run", name) / 255.0).astype(np.float32), dataset.val)
         assert again.mean.psnr_db == pytest.approx(evaluation.mean.psnr_db, abs=0.1)  # bytes, rounded
 
 
