@@ -19,6 +19,7 @@ from ultragray.errors import MemoryExceeded, TrainingDiverged
 from ultragray.evaluation.baselines import BASELINES, evaluate_baselines
 from ultragray.evaluation.reliability import measure_reliability
 from ultragray.evaluation.scoring import evaluate
+from ultragray.methods import gaussians
 from ultragray.report import study
 from ultragray.training import TrainingConfig, train
 from ultragray_service.cli.studies.compare import Method
@@ -141,6 +142,7 @@ def test_a_study_that_fails_does_not_take_the_report_with_it(
         raise TrainingDiverged("the loss is nan")
 
     monkeypatch.setattr(study, "train", train_or_fail)
+    monkeypatch.setattr(gaussians, "train", train_or_fail)
     monkeypatch.setattr(study, "study_tilt", study_tilt)
     page = tmp_path / "page.html"
     result = run("report", dataset, "-o", page, "--steps", 2, "--max-gaussians", 40, "--threads", 1)
