@@ -59,6 +59,8 @@ class UltraNerfLearner(Learner):
     Raises DatasetInvalid for frames that hold no such window.
     """
 
+    module: Field
+
     def __init__(self, dataset: Dataset, seed: int, device: torch.device, coordinates: Coordinates) -> None:
         height, width = dataset.train.height, dataset.train.width
         if min(height, width) < SIMILARITY.window:
