@@ -8,6 +8,7 @@ from ..errors import InvalidArgument
 from .classical import PAPER_VOXEL_MM, Compounding, FromFrames
 from .gaussians import SceneMethod
 from .method import Method
+from .ultranerf.method import VARIANTS as ULTRANERF
 
 ALL = "all"
 
@@ -19,6 +20,7 @@ METHODS: dict[str, Method] = {
         *(Compounding(fold, PAPER_VOXEL_MM) for fold in ("median", "mean", "maximum")),
         FromFrames("linear"),
         FromFrames("nearest"),
+        *ULTRANERF,
     )
 }
 
