@@ -7,7 +7,9 @@ from collections.abc import Sequence
 from ..errors import InvalidArgument
 from .classical import PAPER_VOXEL_MM, Compounding, FromFrames
 from .gaussians import SceneMethod
+from .implicitvol.method import ImplicitVol, RefinedImplicitVol
 from .method import Method
+from .rapidvol import RapidVol
 
 ALL = "all"
 
@@ -19,6 +21,9 @@ METHODS: dict[str, Method] = {
         *(Compounding(fold, PAPER_VOXEL_MM) for fold in ("median", "mean", "maximum")),
         FromFrames("linear"),
         FromFrames("nearest"),
+        ImplicitVol(),
+        RefinedImplicitVol(),
+        RapidVol(),
     )
 }
 
