@@ -25,6 +25,7 @@ SECTIONS: Mapping[str, tuple[str, ...]] = {
     ),
     "Concepts": (
         *("concepts/frame.md", "physics.md", "concepts/training.md", "confidence.md", "concepts/limits.md", "poses.md"),
+        "concepts/methods.md",
         "concepts/*.md",
     ),
     "Operation": ("operation.md", "scaling.md", "access.md", "tls.md", "backup.md"),

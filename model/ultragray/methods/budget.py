@@ -16,6 +16,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
+from typing import Any
 
 from ..errors import InvalidArgument
 from ..files.atomic import write_whole
@@ -43,7 +44,7 @@ class Paces:
         """`surroundings`: what a measurement holds for (machine, threads, dataset); another one's is not looked at."""
         self._path = path
         self._section = json.dumps(dict(surroundings or {}), sort_keys=True)
-        self._known: dict[str, dict[str, list[float]]] = {}
+        self._known: dict[str, Any] = {}
         if path is not None:
             with contextlib.suppress(OSError, ValueError):  # then it is measured again
                 document = json.loads(path.read_text(encoding="utf-8"))
@@ -51,17 +52,20 @@ class Paces:
 
     def get(self, name: str, measure: Callable[[], Pace]) -> Pace:
         """What is known of a method, else what `measure` finds, which is kept."""
-        section = self._known.setdefault(self._section, {})
         try:
-            start_s, step_s = map(float, section[name])
-        except (KeyError, TypeError, ValueError):
-            pace = measure()
-            section[name] = [pace.start_s, pace.step_s]
-            if self._path is not None:
-                self._path.parent.mkdir(parents=True, exist_ok=True)
-                write_whole(self._path, json.dumps(self._known, indent=1) + "\n")
-            return pace
-        return Pace(start_s, step_s)
+            start_s, step_s = map(float, self._known[self._section][name])
+            if start_s >= 0.0 and step_s > 0.0:
+                return Pace(start_s, step_s)
+        except (LookupError, TypeError, ValueError):  # another's file, or another version's: it is measured again
+            pass
+        pace = measure()
+        section = self._known.get(self._section)
+        known = section if isinstance(section, dict) else {}
+        self._known[self._section] = {**known, name: [pace.start_s, pace.step_s]}
+        if self._path is not None:
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            write_whole(self._path, json.dumps(self._known, indent=1) + "\n")
+        return pace
 
 
 @dataclass(frozen=True)

@@ -100,7 +100,8 @@ class Learner:
     def render(self, probe: Probe, poses: FloatArray, height: int, width: int) -> FrameArray:  # [C, H, W]
         with torch.no_grad():
             frames = [
-                self.frame(probe, pose, height, width).cpu() for pose in (check_poses(poses) if len(poses) else [])
+                self.frame(probe, pose, height, width).detach().cpu()
+                for pose in (check_poses(poses) if len(poses) else [])
             ]
         return torch.stack(frames).float().numpy() if frames else np.zeros((0, height, width), np.float32)
 
