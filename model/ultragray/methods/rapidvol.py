@@ -19,6 +19,7 @@ from .parts.space import Box
 RANK, CELLS = 16, 128  # features of a plane, and its nodes along each side
 HIDDEN = 64
 PLANE_SPREAD = 0.1  # features begin in 1 ± this
+FIRST_VALUE = 0.5  # the field begins near it: SSIM is 1 for an image's negative -I too, where a start below 0 leads
 PLANE_RATE, DECODER_RATE = 1e-2, 1e-3
 EPOCHS = 5_000
 PUBLISHED_FRAMES = 128  # of the example of ImplicitVol, by the same group
@@ -45,6 +46,10 @@ class TriPlanes(nn.Module):
                     bound = 1.0 / math.sqrt(layer.in_features)
                     for parameter in layer.parameters():
                         parameter.uniform_(-bound, bound, generator=generator)
+            last = self.decoder[-1]
+            assert isinstance(last, nn.Linear)
+            last.weight.div_(math.sqrt(HIDDEN))
+            last.bias.fill_(FIRST_VALUE)
 
     def products(self, points: Tensor) -> Tensor:  # [H, W, 3] -> [H, W, R]
         """The product of the three planes' features at points."""
@@ -103,6 +108,8 @@ class RapidVol(LearnedMethod):
                 "SSIM is ImplicitVol's: window 5, sigma 1.5, zeros around the image.",
                 "Each axis of the box around the training frames is scaled to [-1, 1] by its own half extent.",
                 "Features begin uniform in 1 ± 0.1, so that no product is near zero, where its gradient would vanish.",
+                "The field begins near 1/2 everywhere (bias of the last layer 1/2, its weights uniform in ±1/64): SSIM is 1 "
+                "for the image times -1 too, and fits that began below 0 ended there.",
                 "It starts from no atlas.",
             ),
             published_steps=EPOCHS * PUBLISHED_FRAMES,
