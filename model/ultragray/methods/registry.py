@@ -7,7 +7,9 @@ from collections.abc import Sequence
 from ..errors import InvalidArgument
 from .classical import PAPER_VOXEL_MM, Compounding, FromFrames
 from .gaussians import SceneMethod
+from .implicitvol.method import ImplicitVol, RefinedImplicitVol
 from .method import Method
+from .rapidvol import RapidVol
 from .ultranerf.method import VARIANTS as ULTRANERF
 
 ALL = "all"
@@ -21,6 +23,9 @@ METHODS: dict[str, Method] = {
         FromFrames("linear"),
         FromFrames("nearest"),
         *ULTRANERF,
+        ImplicitVol(),
+        RefinedImplicitVol(),
+        RapidVol(),
     )
 }
 
