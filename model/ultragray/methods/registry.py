@@ -8,6 +8,7 @@ from ..errors import InvalidArgument
 from .classical import PAPER_VOXEL_MM, Compounding, FromFrames
 from .gaussians import SceneMethod
 from .method import Method
+from .ultragauss.method import UltraGauss
 
 ALL = "all"
 
@@ -19,6 +20,8 @@ METHODS: dict[str, Method] = {
         *(Compounding(fold, PAPER_VOXEL_MM) for fold in ("median", "mean", "maximum")),
         FromFrames("linear"),
         FromFrames("nearest"),
+        UltraGauss(),
+        UltraGauss("ultragauss-shadow", casts_shadow=True),
     )
 }
 

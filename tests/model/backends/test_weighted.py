@@ -42,7 +42,7 @@ def gradients(kernel: str, scene: GaussianScene, probe: Probe, poses: Any, weigh
     """Of the sums, weighted [2, C, H, W], by raw parameter."""
     leaves = {name: tensor.clone().requires_grad_() for name, tensor in scene.splats.items()}
     drawn = torch.stack(sums(kernel, GaussianScene.from_splats(leaves, info=scene.info), probe, poses))
-    (drawn * weights.to(drawn)).sum().backward()
+    (drawn * weights.to(drawn)).sum().backward()  # type: ignore[no-untyped-call]
     return {name: leaf.grad.cpu().double().numpy() for name, leaf in leaves.items() if leaf.grad is not None}
 
 
