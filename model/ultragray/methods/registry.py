@@ -10,6 +10,7 @@ from .gaussians import SceneMethod
 from .implicitvol.method import ImplicitVol, RefinedImplicitVol
 from .method import Method
 from .rapidvol import RapidVol
+from .ultragauss.method import UltraGauss
 from .ultranerf.method import VARIANTS as ULTRANERF
 
 ALL = "all"
@@ -26,6 +27,8 @@ METHODS: dict[str, Method] = {
         ImplicitVol(),
         RefinedImplicitVol(),
         RapidVol(),
+        UltraGauss(),
+        UltraGauss("ultragauss-shadow", casts_shadow=True),
     )
 }
 
