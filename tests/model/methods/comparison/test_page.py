@@ -80,7 +80,7 @@ def test_the_page_has_every_method_and_needs_nothing_else(
             assert f"{row.evaluation.mean.psnr_db:.2f} ± {row.evaluation.std.psnr_db:.2f}" in text
     assert '<td class="failure" colspan="9">it needs 9 GB &amp; more</td>' in text
     assert "<td>40 of 1,000</td>" in text
-    assert "Short: 40 of 1,000 steps" in text
+    assert "Short: 40 of 1,000 steps of its author&#39;s recipe (4 %)." in text
     assert "B = g_0" in text
     assert "g from 0." in text
 
