@@ -140,4 +140,4 @@ def _facts(comparison: Comparison) -> dict[str, str]:
 def _short_text(result: MethodResult) -> str | None:
     if not result.is_short or result.of_steps is None:
         return None
-    return f"Short: {steps_text(result)} steps of its author's recipe ({result.steps / result.of_steps:.2g} of them)."
+    return f"Short: {steps_text(result)} steps of its author's recipe ({100.0 * result.steps / result.of_steps:.2g} %)."
