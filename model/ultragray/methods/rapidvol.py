@@ -108,8 +108,8 @@ class RapidVol(LearnedMethod):
                 "SSIM is ImplicitVol's: window 5, sigma 1.5, zeros around the image.",
                 "Each axis of the box around the training frames is scaled to [-1, 1] by its own half extent.",
                 "Features begin uniform in 1 ± 0.1, so that no product is near zero, where its gradient would vanish.",
-                "The field begins near 1/2 everywhere (bias of the last layer 1/2, its weights uniform in ±1/64): SSIM is 1 "
-                "for the image times -1 too, and fits that began below 0 ended there.",
+                "The field begins near 1/2 everywhere (bias of the last layer 1/2, its weights in ±1/64): SSIM is "
+                "1 for the image times -1 too, and fits that began below 0 ended there.",
                 "It starts from no atlas.",
             ),
             published_steps=EPOCHS * PUBLISHED_FRAMES,
