@@ -55,8 +55,8 @@ def psnr_db(got: np.ndarray, want: np.ndarray) -> float:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_one_frame_is_learned_above_30_db(variant: str) -> None:
-    dataset = ball(1, 40, 32)
+def test_frames_are_learned_above_30_db(variant: str) -> None:
+    dataset = ball(2, 40, 32)
     learner = small_learner(dataset, variant, count=600)
     for step in range(600):
         learner.take_step(step, 600)
