@@ -55,8 +55,8 @@ def psnr_db(got: np.ndarray, want: np.ndarray) -> float:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_one_frame_is_learned_above_30_db(variant: str) -> None:
-    dataset = ball(1, 40, 32)
+def test_frames_are_learned_above_30_db(variant: str) -> None:
+    dataset = ball(2, 40, 32)
     learner = small_learner(dataset, variant, count=600)
     for step in range(600):
         learner.take_step(step, 600)
@@ -90,7 +90,7 @@ def test_a_learner_takes_over_another_number_of_gaussians() -> None:
     dataset = ball(3, 20, 16)
     few, many = small_learner(dataset, "ultragauss", count=50), small_learner(dataset, "ultragauss", count=80)
     few.take_step(0, 10)
-    many.load(few.state())
+    many.load({name: tensor.clone() for name, tensor in few.state().items()})
     assert many.take_step(1, 10) == few.take_step(1, 10)
     assert all(torch.equal(tensor, few.model()[name]) for name, tensor in many.model().items())
 
@@ -102,7 +102,7 @@ def test_weights_that_vanish_are_resampled() -> None:
         learner.module.gaussians["transmittances"][:30] = -8.0
     for step in range(98, 101):
         learner.take_step(step, 300)
-    weights = learner.module.gaussians["transmittances"].sigmoid()
+    weights = learner.module.gaussians["transmittances"].detach().sigmoid()
     assert len(weights) == 120
     assert float(weights.min()) > 0.005
 

@@ -24,7 +24,8 @@ def sweep_along_elevation(probe: Probe) -> Dataset:
     poses = np.tile(np.eye(4), (10, 1, 1))
     poses[:, :3, 3] = (30.0, -20.0, 10.0)
     poses[:, 1, 3] += np.arange(10)
-    frames = Sweep(np.zeros((10, 16, 16), np.uint8), poses, probe, np.arange(10), "made up")
+    images = np.tile(np.arange(16, dtype=np.uint8), (10, 16, 1))
+    frames = Sweep(images, poses, probe, np.arange(10), "made up")
     return Dataset("made up", frames, frames.select([]))
 
 
