@@ -160,7 +160,7 @@ def test_the_rate_falls_as_published_over_the_steps_of_any_budget() -> None:
 
 @by_name
 def test_a_stopped_fit_ends_in_the_model_of_an_undisturbed_one(method: UltraNerf, tmp_path: Path) -> None:
-    of, steps = dataset(), 8
+    of, steps = dataset(), 6
     whole = method.fit(of, budget(method, steps))
     told: list[FitProgress] = []
     stopped = FitRun(folder=tmp_path, report=told.append, should_stop=lambda: len(told) == 3)
@@ -186,7 +186,7 @@ def test_frames_too_small_for_the_loss_are_refused() -> None:
 def test_the_mean_variant_learns_a_single_frame_by_heart() -> None:
     train = sweep(frames=2)
     same = replace(train, images=train.images[[0, 0]], poses=train.poses[[0, 0]])
-    method, steps = VARIANTS[2], 2500
+    method, steps = VARIANTS[2], 700
     fitted = method.fit(Dataset("one", same, same.select([])), budget(method, steps))
     assert fitted is not None
     frame = fitted.render(LINEAR, same.poses[:1], SIDE, SIDE)[0]
