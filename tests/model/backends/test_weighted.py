@@ -109,12 +109,16 @@ def test_weights_of_one_give_the_echo_of_a_scene_over_its_coverage(
     assert (got - want).abs().max() < 5e-3
 
 
-def test_a_prepared_scene_of_weights_is_kept_apart(random_scene: Callable[..., GaussianScene]) -> None:
-    scene, pose = random_scene(50, **WEIGHTS), np.eye(4)
-    before = render(scene, PROBES["linear"], pose, height=HEIGHT, width=WIDTH)
-    sums("auto", scene, PROBES["linear"], pose[None])
-    after = render(scene, PROBES["linear"], pose, height=HEIGHT, width=WIDTH)
-    assert torch.equal(before["bmode"], after["bmode"])
+@pytest.mark.parametrize("kernel", ["cuda", "auto"])
+def test_what_is_prepared_of_weights_is_kept_apart(
+    kernel: str, random_scene: Callable[..., GaussianScene], on_device: Callable[[GaussianScene], GaussianScene]
+) -> None:
+    """A scene that was drawn as absorbing Gaussians before gives the same sums as one that was not."""
+    scene, pose = random_scene(50, **WEIGHTS), np.eye(4)[None]
+    fresh = sums(kernel, random_scene(50, **WEIGHTS), PROBES["linear"], pose)
+    there = on_device(scene) if kernel == "cuda" else scene
+    render(there, PROBES["linear"], pose, height=HEIGHT, width=WIDTH, backend="cuda" if kernel == "cuda" else "cpu")
+    assert torch.equal(sums(kernel, there, PROBES["linear"], pose).weight, fresh.weight)
 
 
 def test_an_unknown_backend_is_refused(random_scene: Callable[..., GaussianScene]) -> None:

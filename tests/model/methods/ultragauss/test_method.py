@@ -66,15 +66,19 @@ def test_frames_are_learned_above_30_db(variant: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_a_killed_fit_ends_in_the_model_of_an_undisturbed_one(variant: str, tmp_path: Path) -> None:
-    """Killed right after Gaussians were resampled, and some of them before that had lost their weight."""
+def test_a_killed_fit_ends_in_the_model_of_an_undisturbed_one(
+    variant: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Killed between two resamplings, each of which finds Gaussians to replace."""
+    monkeypatch.setattr("ultragray.methods.ultragauss.resampling.LEAST_WEIGHT", 0.6)
+    monkeypatch.setattr("ultragray.training.data.geometry.MIN_GAUSSIANS", 300)
     dataset, method = ball(4, 20, 16, CONVEX), METHODS[variant]
-    budget, seen = budget_of(220, variant), []
+    budget, seen = budget_of(420, variant), []
 
     def note(progress: FitProgress) -> None:
         seen.append(progress.step)
 
-    killed = FitRun(folder=tmp_path / "killed", report=note, should_stop=lambda: seen[-1] == 105)
+    killed = FitRun(folder=tmp_path / "killed", report=note, should_stop=lambda: seen[-1] == 150)
     assert method.fit(dataset, budget, killed) is None
     resumed = method.fit(dataset, budget, FitRun(folder=tmp_path / "killed"))
     whole = method.fit(dataset, budget, FitRun(folder=tmp_path / "whole"))
