@@ -20,13 +20,18 @@ from ..output import check_file
 from ..progress import working
 from ..style import Force, Json, Threads, command_group, examples, output_option, tell
 from ..sweeps.source import SweepArgument, check_scene_fits, check_source, read_dataset, warn_about_dataset
-from .compare import VoxelMm
 
 if TYPE_CHECKING:
     from ultragray.datasets import Dataset
     from ultragray.training import Progress
 
 TILT = "growing tilt"
+VoxelMm = Annotated[
+    float | None,
+    typer.Option(
+        metavar="MM", help="Side of a voxel of compounding, mm.", show_default="0.5, or what fits into memory"
+    ),
+]
 Follow = Callable[["Progress"], None]
 
 
