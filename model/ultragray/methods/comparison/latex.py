@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from .metrics import METRICS
-from .ranks import by_mean_rank, rank
+from .ranks import METRICS, by_mean_rank, rank
 from .result import Comparison
-from .tables import COST_HEADINGS, Row, cost_texts, metric_rows
+from .tables import COST_HEADINGS, Row, budget_text, cost_texts, metric_rows
 
 _ESCAPES = {
     "\\": r"\textbackslash{}",
@@ -61,17 +60,8 @@ def _caption(comparison: Comparison) -> str:
     facts = comparison.dataset
     return (
         f"{facts.name}: mean ± standard deviation over {facts.val_frames} held-out frames; "
-        f"{budget_text(comparison)}; {comparison.machine}."
+        f"budget: {budget_text(comparison)}; {comparison.machine}."
     )
-
-
-def budget_text(comparison: Comparison) -> str:
-    """The budget in words."""
-    if comparison.budget == "author":
-        return "the author's recipe of each method"
-    if comparison.budget_s is None:
-        return "equal time"
-    return f"equal time, {comparison.budget_s * comparison.times:.0f} s"
 
 
 def _row(row: Row, title: str) -> str:

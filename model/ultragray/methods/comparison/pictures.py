@@ -20,7 +20,7 @@ DIFFERENCE = f"|difference| x {DIFFERENCE_GAIN:g}"
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """Frames [F, H, W] in [0, 1] under a title. `evaluation` is None for what is no prediction: it has no difference."""
+    """Frames [F, H, W] in [0, 1] under a title. What is no prediction has no `evaluation`, and no difference."""
 
     title: str
     frames: FrameArray

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -61,7 +62,7 @@ def plot_distances(evaluations: Mapping[str, Evaluation], distances: Distances) 
     return svg(drawn)
 
 
-def line_style(place: int) -> dict[str, object]:
+def line_style(place: int) -> dict[str, Any]:
     """The look of the line of a method, by its place; the first stands out."""
     if place == 0:
         return {"color": SCENE_COLOUR, "linewidth": 2.4, "zorder": 3}

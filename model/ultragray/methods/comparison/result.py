@@ -39,10 +39,14 @@ class MethodResult:
     failure: str | None = None
 
     @property
+    def is_short(self) -> bool:
+        """Whether it had fewer steps than its author's recipe."""
+        return Cost(self.seconds, self.steps, self.of_steps, self.model_bytes).is_short and self.failure is None
+
+    @property
     def title(self) -> str:
         """As tables show it: a shortened run does not bear the method's bare name."""
-        is_short = Cost(self.seconds, self.steps, self.of_steps, self.model_bytes).is_short
-        return self.description.title + (SHORT if is_short and self.failure is None else "")
+        return self.description.title + (SHORT if self.is_short else "")
 
     def to_dict(self) -> dict[str, Any]:
         """A JSON object."""

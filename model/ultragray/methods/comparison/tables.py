@@ -7,9 +7,9 @@ from dataclasses import astuple, dataclass, field
 
 from ...evaluation.scoring import Evaluation
 from ...evaluation.speckle import Speckle
-from .metrics import METRICS, shown_value
-from .ranks import rank
-from .result import MethodResult
+from ..budget import BudgetKind
+from .ranks import METRICS, rank, shown_value
+from .result import Comparison, MethodResult
 
 COST_HEADINGS = ("steps", "training", "ms a frame", "MB")
 
@@ -25,6 +25,7 @@ class Row:
     cells: list[tuple[str, bool]] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     failure: str | None = None
+    anchor: str = ""  # of what the page says of the method
 
 
 def metric_rows(evaluations: Mapping[str, Evaluation], notes: Mapping[str, list[str]] | None = None) -> list[Row]:
@@ -50,11 +51,8 @@ def rank_rows(evaluations: Mapping[str, Evaluation]) -> list[Row]:
     means = {name: f"{found.mean:.2f}" for name, found in ranks.items()}
     best = min(means.values(), key=float, default="")
     return [
-        Row(
-            name,
-            [*((str(place), place == 1) for place in found.by_metric.values()), (means[name], means[name] == best)],
-        )
-        for name, found in ranks.items()
+        Row(name, [*((str(place), place == 1) for place in places.by_metric.values()), (mean, mean == best)])
+        for (name, places), mean in zip(ranks.items(), means.values(), strict=True)
     ]
 
 
@@ -82,6 +80,16 @@ def duration_text(seconds: float) -> str:
     if seconds < 600.0:
         return f"{seconds:.0f} s"
     return f"{seconds / 60.0:.0f} min" if seconds < 36_000.0 else f"{seconds / 3600.0:.1f} h"
+
+
+def budget_text(comparison: Comparison) -> str:
+    """What each method could take, in words."""
+    if BudgetKind(comparison.budget) is BudgetKind.AUTHOR:
+        return "the steps of each author's recipe"
+    if comparison.budget_s is None:
+        return "none: no method here learns within a time"
+    times = "" if comparison.times == 1.0 else f", {comparison.times:g} times that of the scene's preset fast"
+    return f"equal time, {duration_text(comparison.budget_s * comparison.times)}{times}"
 
 
 def speckle_rows(evaluations: Mapping[str, Evaluation]) -> list[tuple[str, list[str]]]:
