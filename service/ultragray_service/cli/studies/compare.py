@@ -68,6 +68,7 @@ def compare(
     check_source(sweep)
     if output is not None:
         _check_output(output, force=force)
+        import ultragray.methods.comparison.files  # noqa: F401  # packages that it lacks are told before all the work
 
     from ultragray.evaluation.scoring import require_frames
     from ultragray.training.device import training_device
@@ -143,9 +144,8 @@ def _compare(
 
 def _write(comparison: Comparison, dataset: Dataset, run: Path, output: Path) -> list[Path]:
     """The page and what stands beside it, of the names that the output gives them."""
-    from ultragray.methods.comparison.files import write_comparison
-
     from ultragray.files.atomic import write_whole
+    from ultragray.methods.comparison.files import write_comparison
 
     written = []
     for made in write_comparison(comparison, dataset, run):
