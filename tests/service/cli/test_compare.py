@@ -115,12 +115,6 @@ def test_mistakes_give_one_line(sweep: Path, arguments: tuple[Any, ...], sentenc
     assert sentence in refused("compare", sweep, *arguments)
 
 
-def test_a_sweep_without_held_out_frames_is_refused(sweep: Path, tmp_path: Path) -> None:
-    whole = read_released(sweep)
-    write_released(Dataset("whole", whole.train, whole.val.select([])), tmp_path / "whole")
-    assert "hold some out" in refused("compare", tmp_path / "whole", *CLASSICAL)
-
-
 def test_help_needs_no_torch() -> None:
     program = "from ultragray_service.cli.app import app; app(standalone_mode=False); print('torch' in sys.modules)"
     answer = subprocess.run(python(program, "compare", "--help"), capture_output=True, text=True, check=True)
