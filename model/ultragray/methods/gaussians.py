@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import torch
@@ -88,6 +88,23 @@ class SceneMethod(Method):
 
     def _cost(self, scene: GaussianScene, seconds: float, size: int) -> Cost:
         return Cost(seconds, int(scene.info.training["steps"]), self.describe().published_steps, size)
+
+
+@dataclass(frozen=True, eq=False)
+class GivenScene(Method):
+    """A scene that is there already, to be measured beside others."""
+
+    scene: GaussianScene
+    seconds: float = 0.0  # that its training took, where that is known
+    name: str = SceneMethod.name
+    title: str = "this scene"
+
+    def describe(self) -> Description:
+        return replace(SceneMethod().describe(), title=self.title, choices=(), published_steps=None)
+
+    def fit(self, dataset: Dataset, budget: Budget, run: FitRun | None = None) -> SceneFit:
+        steps = int(self.scene.info.training.get("steps") or 0)
+        return SceneFit(self.scene, Cost(self.seconds, steps, None, len(self.scene.to_bytes())))
 
 
 @dataclass(frozen=True, eq=False)

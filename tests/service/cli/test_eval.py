@@ -18,6 +18,7 @@ from ultragray.datasets.released import read_released, write_released
 from ultragray.errors import MemoryExceeded, TrainingDiverged
 from ultragray.evaluation.reliability import measure_reliability
 from ultragray.evaluation.scoring import evaluate
+from ultragray.methods import gaussians
 from ultragray.report import study
 from ultragray.training import TrainingConfig, train
 
@@ -123,6 +124,7 @@ def test_a_study_that_fails_does_not_take_the_report_with_it(
         raise TrainingDiverged("the loss is nan")
 
     monkeypatch.setattr(study, "train", train_or_fail)
+    monkeypatch.setattr(gaussians, "train", train_or_fail)
     monkeypatch.setattr(study, "study_tilt", study_tilt)
     page = tmp_path / "page.html"
     result = run("report", dataset, "-o", page, "--steps", 2, "--max-gaussians", 40, "--threads", 1)

@@ -15,7 +15,7 @@ from ...evaluation.side_by_side import DIFFERENCE_GAIN
 from ...installation import __version__
 from ..gaussians import SceneMethod
 from ..method import Description
-from .pictures import FrameOfPage, Shown, as_frames, frames_of_page, telling_places
+from .pictures import FrameOfPage, Shown, frames_of_page, telling_places
 from .place import frames_of
 from .plots import plot_distances
 from .ranks import METRICS, by_mean_rank, rank
@@ -39,9 +39,6 @@ def render_comparison(comparison: Comparison, dataset: Dataset, folder: Path) ->
     titles = _titles(comparison)
     by_title = {titles[one.name]: one for one in comparison.results}
     evaluations = {titles[name]: comparison.measured[name] for name in by_mean_rank(comparison.measured)}
-    shown = [
-        Shown(title, as_frames(frames_of(folder, by_title[title].name)), found) for title, found in evaluations.items()
-    ]
     return (
         environment()
         .get_template("comparison.html")
@@ -51,8 +48,10 @@ def render_comparison(comparison: Comparison, dataset: Dataset, folder: Path) ->
             rows=_rows(evaluations, by_title),
             ranks=_with_anchors(rank_rows(evaluations), by_title),
             speckle=speckle_rows(evaluations),
-            pictures=_pictures(comparison, dataset, shown) if shown else [],
-            distance_plot=plot_distances(_scene_first(evaluations, titles), comparison.distances) if shown else None,
+            pictures=_pictures(evaluations, by_title, dataset, folder),
+            distance_plot=plot_distances(_scene_first(evaluations, titles), comparison.distances)
+            if evaluations
+            else None,
             methods=[
                 _Method(one.name, title, _anchor(one), one.description, _short_text(one))
                 for title, one in by_title.items()
@@ -99,12 +98,20 @@ def _rows(evaluations: dict[str, Evaluation], by_title: dict[str, MethodResult])
     return _with_anchors([*metric_rows(evaluations, notes), *failed], by_title)
 
 
-def _pictures(comparison: Comparison, dataset: Dataset, shown: list[Shown]) -> list[FrameOfPage]:
+def _pictures(
+    evaluations: dict[str, Evaluation], by_title: dict[str, MethodResult], dataset: Dataset, folder: Path
+) -> list[FrameOfPage]:
     """The frames that tell most of the scene, or of the best method where the scene was not measured."""
-    measured = comparison.measured
-    best = by_mean_rank(measured)[0]
-    telling = measured.get(SceneMethod.name, measured[best])
-    return frames_of_page(dataset.val, telling_places(telling), shown)
+    if not evaluations:
+        return []
+    best = next(iter(evaluations))
+    telling = next((title for title in evaluations if by_title[title].name == SceneMethod.name), best)
+    places = telling_places(evaluations[telling])
+    shown = [
+        Shown.prediction(title, frames_of(folder, by_title[title].name), evaluation, list(places))
+        for title, evaluation in evaluations.items()
+    ]
+    return frames_of_page(dataset.val.select(list(places)), list(places.values()), shown)
 
 
 def _scene_first(evaluations: dict[str, Evaluation], titles: dict[str, str]) -> dict[str, Evaluation]:
@@ -133,4 +140,4 @@ def _facts(comparison: Comparison) -> dict[str, str]:
 def _short_text(result: MethodResult) -> str | None:
     if not result.is_short or result.of_steps is None:
         return None
-    return f"Short: {steps_text(result)} steps of its author's recipe ({result.steps / result.of_steps:.2g} of them)."
+    return f"Short: {steps_text(result)} steps of its author's recipe ({100.0 * result.steps / result.of_steps:.2g} %)."

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,16 +15,21 @@ from ...evaluation.side_by_side import DIFFERENCE_GAIN, as_picture
 from ..method import FrameArray
 
 PICTURE_PIXELS = 240
-DIFFERENCE = f"|difference| x {DIFFERENCE_GAIN:g}"
 
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """Frames [F, H, W] in [0, 1] under a title. What is no prediction has no `evaluation`, and no difference."""
+    """Frames [F, H, W] in [0, 1] under a title. What is no prediction has no PSNR, and no difference."""
 
     title: str
     frames: FrameArray
-    evaluation: Evaluation | None = None
+    psnr_db: Sequence[float] | None = None  # of each frame
+
+    @classmethod
+    def prediction(cls, title: str, stored: ByteArray, evaluation: Evaluation, places: Sequence[int]) -> Shown:
+        """Of all frames [F, H, W] that a method expects, as a comparison keeps them, those at these places."""
+        frames = (stored[list(places)] / 255.0).astype(np.float32)
+        return cls(title, frames, [evaluation.frames[place].psnr_db for place in places])
 
 
 @dataclass(frozen=True)
@@ -46,24 +51,20 @@ class FrameOfPage:
     panels: tuple[Panel, ...]
 
 
-def frames_of_page(sweep: Sweep, places: Mapping[int, str], shown: Sequence[Shown]) -> list[FrameOfPage]:
-    """The frames at these places of the sweep, each named by its kind; `shown` holds the frames of the whole sweep."""
+def frames_of_page(chosen: Sweep, kinds: Sequence[str], shown: Sequence[Shown]) -> list[FrameOfPage]:
+    """Each frame of the chosen ones with its kind; all of `shown` hold as many frames."""
     found = []
-    for place, kind in places.items():
-        truth = (sweep.images[place] / 255.0).astype(np.float32)
-        panels = [Panel("truth", _address(truth, sweep), None, "")]
+    for row, kind in enumerate(kinds):
+        truth = (chosen.images[row] / 255.0).astype(np.float32)
+        panels = [Panel("truth", _address(truth, chosen), None, "")]
         for one in shown:
-            frame = one.frames[place]
-            off = np.minimum(np.abs(frame - truth) * DIFFERENCE_GAIN, 1.0)
-            panels.append(
-                Panel(
-                    one.title,
-                    _address(frame, sweep),
-                    None if one.evaluation is None else _address(off, sweep),
-                    "" if one.evaluation is None else f"{one.evaluation.frames[place].psnr_db:.2f} dB",
-                )
-            )
-        found.append(FrameOfPage(int(sweep.frame_numbers[place]), kind, tuple(panels)))
+            frame = one.frames[row]
+            difference, note = None, ""
+            if one.psnr_db is not None:
+                difference = _address(np.minimum(np.abs(frame - truth) * DIFFERENCE_GAIN, 1.0), chosen)
+                note = f"{one.psnr_db[row]:.2f} dB"
+            panels.append(Panel(one.title, _address(frame, chosen), difference, note))
+        found.append(FrameOfPage(int(chosen.frame_numbers[row]), kind, tuple(panels)))
     return found
 
 
@@ -71,11 +72,6 @@ def telling_places(evaluation: Evaluation) -> dict[int, str]:
     """The frames where a method does worst, as usual, and best by PSNR; perhaps fewer than three."""
     order = np.argsort([-frame.psnr_db for frame in evaluation.frames], kind="stable")
     return {int(order[-1]): "worst", int(order[len(order) // 2]): "typical", int(order[0]): "best"}
-
-
-def as_frames(stored: ByteArray) -> FrameArray:  # [F, H, W] uint8 -> in [0, 1]
-    """Frames as a comparison keeps them."""
-    return (stored / 255.0).astype(np.float32)
 
 
 def _address(frame: FrameArray, sweep: Sweep) -> str:  # [H, W]

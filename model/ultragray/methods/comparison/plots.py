@@ -19,7 +19,7 @@ from .result import Distances
 SCENE_COLOUR = "#0b6e99"
 COLOURS = ("#d97706", "#6d8f3c", "#7c4dbe", "#c2405a", "#2a9d8f", "#8a6d3b", "#4c6ef5", "#7c8a97")
 STYLES = ("-", "--", ":")  # where there are more methods than colours
-DISTANCE_BINS = 8
+DISTANCE_BINS, LEAST_IN_BIN = 8, 3  # frames in fewer bins where there are not many
 LEAST_TURN_DEG = 1.0  # held-out frames that differ less in their angle show nothing by it
 
 
@@ -33,7 +33,8 @@ class Binned:
 
 def binned_medians(distances: FloatArray, values: FloatArray) -> Binned:  # [F] both
     """In at most DISTANCE_BINS bins of about equally many frames; frames equally far are in one bin."""
-    edges = np.unique(np.quantile(distances, np.linspace(0.0, 1.0, min(DISTANCE_BINS, len(distances)) + 1)).round(9))
+    count = max(1, min(DISTANCE_BINS, len(distances) // LEAST_IN_BIN))
+    edges = np.unique(np.quantile(distances, np.linspace(0.0, 1.0, count + 1)).round(9))
     bins = np.searchsorted(edges[1:-1], distances.round(9), side="right")
     filled = [bins == number for number in np.unique(bins)]
     return Binned(

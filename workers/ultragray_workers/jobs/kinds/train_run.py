@@ -6,16 +6,17 @@ import json
 import math
 import shutil
 import sys
+import tempfile
 from dataclasses import replace
-
-import torch
+from pathlib import Path
 
 from ultragray.datasets.sweep import Dataset
-from ultragray.evaluation.scoring import evaluate
 from ultragray.evaluation.side_by_side import write_spread
-from ultragray.machine import processor_name
+from ultragray.methods.comparison.run import SCENE, compare_methods
+from ultragray.methods.comparison.settings import ComparisonSettings
+from ultragray.methods.gaussians import GivenScene
 from ultragray.report.page import ReportContent, render_page
-from ultragray.report.study import trained_of_journal
+from ultragray.report.study import scene_evaluation, trained_of_journal
 from ultragray.scene import GaussianScene
 from ultragray.training import Progress as TrainingProgress
 from ultragray.training import TrainingConfig
@@ -112,17 +113,25 @@ def _finish(job_run: JobRun, job: TrainJob, dataset: Dataset, scene: GaussianSce
         (folder / "metrics.json").write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
         if len(dataset.val):
             scene = scene.to(device)
-            evaluation = evaluate(scene, dataset.val)
-            write_spread(scene, dataset.val, evaluation, folder, PICTURES)
-            processor = f"{processor_name()}, {job_run.request.threads} threads"
-            content = ReportContent(
-                dataset=dataset,
-                scene=scene,
-                evaluation=evaluation,
-                machine=processor if device == "cpu" else torch.cuda.get_device_name(device),
-                scene_name=job.scene,
-                spread=REPORT_FRAMES,
-                trained=trained_of_journal(scene, evaluation, journal),
-            )
-            (folder / "report.html").write_text(render_page(content), encoding="utf-8")
+            _write_report(job, dataset, scene, device, folder)
     return Outcome(artifacts=job_run.folder.artifact_names(), metrics=metrics)
+
+
+def _write_report(job: TrainJob, dataset: Dataset, scene: GaussianScene, device: str, artifacts: Path) -> None:
+    """Pictures of some held-out frames, and the page of the scene alone: a comparison of one method."""
+    with tempfile.TemporaryDirectory(prefix="ultragray-report-") as folder:
+        methods = {SCENE: GivenScene(scene)}
+        comparison = compare_methods(dataset, methods, ComparisonSettings(), folder=Path(folder), device=device)
+        assert comparison is not None  # nothing tells it to stop
+        evaluation = scene_evaluation(comparison)
+        write_spread(scene, dataset.val, evaluation, artifacts, PICTURES)
+        content = ReportContent(
+            dataset,
+            scene,
+            comparison,
+            Path(folder),
+            scene_name=job.scene,
+            spread=REPORT_FRAMES,
+            trained=trained_of_journal(scene, evaluation, artifacts / JOURNAL_FILE),
+        )
+        (artifacts / "report.html").write_text(render_page(content), encoding="utf-8")
