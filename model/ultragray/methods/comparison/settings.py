@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 from ...contract import Contract, described
 from ..budget import BudgetKind
+from ..names import ALL, NAMES, chosen_names
 
-EVERY_METHOD = ("all",)
+EVERY_METHOD = (ALL,)
 
 
 @dataclass(frozen=True)
@@ -16,7 +17,7 @@ class ComparisonSettings(Contract):
 
     __topic__ = "Comparison"
     methods: tuple[str, ...] = described(
-        "Names of the methods to compare (docs/methods.md); all: each of them.", EVERY_METHOD
+        f"Methods to compare, some of {', '.join(NAMES)}; all: each of them.", EVERY_METHOD
     )
     budget: str = described(
         "equal: every method learns as long as the scene does with the preset fast on this machine; author: the steps "
@@ -31,7 +32,4 @@ class ComparisonSettings(Contract):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.methods != EVERY_METHOD:
-            from ..registry import chosen_methods  # which imports torch
-
-            chosen_methods(self.methods)
+        chosen_names(self.methods)

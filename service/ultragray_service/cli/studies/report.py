@@ -20,7 +20,6 @@ from ..options import FieldsOf, with_options
 from ..output import check_file
 from ..style import Force, Json, Threads, command_group, examples, output_option, tell
 from ..sweeps.source import SweepArgument, check_scene_fits, check_source, read_dataset, warn_about_dataset
-from .compare import VoxelMm
 
 if TYPE_CHECKING:
     from ultragray.datasets import Dataset
@@ -28,6 +27,12 @@ if TYPE_CHECKING:
     from ultragray.training import Progress
 
 TILT = "growing tilt"
+VoxelMm = Annotated[
+    float | None,
+    typer.Option(
+        metavar="MM", help="Side of a voxel of compounding, mm.", show_default="0.5, or what fits into memory"
+    ),
+]
 Follow = Callable[["Progress | FitProgress"], None]
 
 

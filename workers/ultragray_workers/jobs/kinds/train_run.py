@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 import math
 import shutil
 import sys
 import tempfile
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
 from ultragray.datasets.sweep import Dataset
-from ultragray.errors import TrainingStateInvalid
 from ultragray.evaluation.side_by_side import write_spread
 from ultragray.methods.comparison.run import SCENE, compare_methods
 from ultragray.methods.comparison.settings import ComparisonSettings
@@ -25,12 +22,13 @@ from ultragray.training import Progress as TrainingProgress
 from ultragray.training import TrainingConfig
 from ultragray.training import train as train_scene
 from ultragray.training.run import FITTING
-from ultragray.training.trainer import CHECKPOINT_FILE, CONFIG_FILE, JOURNAL_FILE
+from ultragray.training.trainer import CHECKPOINT_FILE, JOURNAL_FILE
 
 from ...scenes import SUFFIX
-from ..folder import JobFolder, Outcome, Progress
+from ..folder import Outcome, Progress
 from ..worker.job_run import JobRun, Stopped
 from .curve import draw_training_curve
+from .earlier_run import take_over_run
 from .train import TrainJob
 
 CHECKPOINT_INTERVAL_S = 10.0
@@ -46,7 +44,7 @@ def run(job_run: JobRun, job: TrainJob) -> Outcome:
     device = job_run.request.device
     config = TrainingConfig.preset(job.preset, **job.settings)
     dataset = job_run.load_dataset(job.dataset)
-    _take_over_run(job_run)
+    take_over_run(job_run, CHECKPOINT_FILE)
     checkpoint = job_run.folder.run / CHECKPOINT_FILE
     resume = checkpoint.exists()
     sys.stderr.write(
@@ -66,28 +64,6 @@ def run(job_run: JobRun, job: TrainJob) -> Outcome:
     if scene.info.training["step"] < scene.info.training["steps"]:
         raise Stopped
     return _finish(job_run, job, dataset, scene, device)
-
-
-def _take_over_run(job_run: JobRun) -> None:
-    """Puts the checkpoint of the job that this one replaces into the run's folder, unless there is a run already."""
-    before = job_run.request.retry_of
-    if before is None or job_run.folder.run.exists():
-        return
-    old = JobFolder(job_run.folder.artifact_folder, before)
-    if not (old.run / CHECKPOINT_FILE).exists():
-        return
-    outcome = old.outcome()
-    if outcome is not None and outcome.error == TrainingStateInvalid.reason:
-        return  # it cannot be resumed from: this job begins anew
-    partial = job_run.folder.path / "run.partial"
-    shutil.rmtree(partial, ignore_errors=True)
-    with suppress(FileNotFoundError), old.lock.open("a") as lock:  # it may be deleted meanwhile: then anew
-        fcntl.lockf(lock, fcntl.LOCK_EX)  # a process that was cancelled a moment ago may still write
-        partial.mkdir()
-        for name in (CHECKPOINT_FILE, JOURNAL_FILE, CONFIG_FILE):
-            if (old.run / name).exists():
-                shutil.copyfile(old.run / name, partial / name)
-        partial.rename(job_run.folder.run)
 
 
 def _report(job_run: JobRun, state: TrainingProgress) -> None:
