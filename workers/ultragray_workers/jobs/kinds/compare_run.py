@@ -8,7 +8,6 @@ import sys
 from dataclasses import replace
 
 from ultragray.methods.comparison.files import write_comparison
-
 from ultragray.methods.comparison.place import RUN_FILE
 from ultragray.methods.comparison.run import ComparisonProgress, compare
 
