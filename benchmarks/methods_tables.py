@@ -22,6 +22,7 @@ import torch
 from registry import FIGURES, ROOT, Document
 from ultragray.datasets.source import PHANTOM, load_dataset
 from ultragray.files.atomic import write_whole
+from ultragray.methods.budget import Paces
 from ultragray.methods.comparison.ranks import METRICS, by_mean_rank, rank, shown_value
 from ultragray.methods.comparison.result import Comparison
 from ultragray.methods.comparison.run import ComparisonProgress, compare
@@ -82,7 +83,8 @@ def measure(run: Run, data_folder: Path, folder: Path) -> Document:
     head = measured(torch.get_num_threads())
     dataset = load_dataset(run.source if run.source == PHANTOM else data_folder / run.source)
     place = folder / str(head["commit"]) / run.name
-    comparison = compare(dataset, run.settings, folder=place, report=_teller(run.name))
+    paces = Paces(place / "paces.json")  # not the user's, which may be of a busier hour
+    comparison = compare(dataset, run.settings, folder=place, paces=paces, report=_teller(run.name))
     assert comparison is not None  # nobody tells it to stop
     return {"measured": head, **_summary(comparison)}
 
