@@ -71,7 +71,6 @@ def print_comparison(comparison: Comparison) -> None:
 
 def print_speckle(evaluations: Mapping[str, Evaluation]) -> None:
     """A table of the statistics of speckle, means over the frames: the true frames, then one row a name."""
-    from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
 
@@ -87,4 +86,4 @@ def print_speckle(evaluations: Mapping[str, Evaluation]) -> None:
     for name, (speckle, distance) in rows.items():
         figures = ("–",) * 3 if speckle is None else [f"{value:.3f}" for value in astuple(speckle)]
         table.add_row(escape(name), *figures, distance)
-    Console().print(table)
+    wide_console().print(table)
