@@ -23,7 +23,7 @@ from ..scene_info import read_header
 from .plots import plot_counts, plot_frames, plot_tilt, plot_training
 from .study import GAUSSIAN_SHARES, Failed, TiltStudy, Trained
 
-PLOTTED = 4  # methods in the plot of frames: more lines hide each other
+NOT_PLOTTED = ("mean-", "maximum-")  # over the frames, where their lines would hide those of the median
 BESIDE = ("echo", "transmittance")  # what the rendering is made of
 
 
@@ -60,6 +60,8 @@ class ReportContent:
 def render_page(content: ReportContent) -> str:
     """The HTML text."""
     compared = {one.description.title: one.evaluation for one in content.compared if one.evaluation is not None}
+    hidden = {one.description.title for one in content.compared if one.name.startswith(NOT_PLOTTED)}
+    plotted = {title: evaluation for title, evaluation in compared.items() if title not in hidden}
     tilt = content.tilt if isinstance(content.tilt, TiltStudy) else None
     failed = [Row(one.description.title, failure=one.failure) for one in content.compared if one.failure is not None]
     is_alone = len(content.compared) == 1
@@ -74,7 +76,7 @@ def render_page(content: ReportContent) -> str:
             ranks=[] if is_alone else rank_rows(compared),
             speckle=speckle_rows(compared),
             scales=content.comparison.measured[SCENE].ms_ssim_scales,
-            frames_plot=plot_frames(dict(list(compared.items())[:PLOTTED])),
+            frames_plot=plot_frames(plotted),
             distance_plot=None if is_alone else plot_distances(compared, content.comparison.distances),
             training_plot=None if content.trained is None else plot_training(content.trained),
             pictures=_pictures(content),

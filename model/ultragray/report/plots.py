@@ -38,7 +38,7 @@ def plot_frames(evaluations: Mapping[str, Evaluation]) -> str:
                 **line_style(place),
             )
         axis.set(xlabel="frame", ylabel=label)
-    axes[0].legend(frameon=False, ncols=len(evaluations), loc="lower left", bbox_to_anchor=(0.0, 1.0))
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper left", frameon=False, ncols=len(evaluations))
     return svg(figure)
 
 

@@ -103,6 +103,7 @@ def test_a_killed_comparison_goes_on_and_repeats_nothing(
     assert [row.seconds for row in again.results] == [row.seconds for row in found.results]
 
 
+@pytest.mark.slow
 def test_a_comparison_that_is_told_to_stop_leaves_a_checkpoint_to_go_on_from(
     dataset: Dataset, methods: dict[str, Method], paces: Paces, tmp_path: Path
 ) -> None:
@@ -149,6 +150,7 @@ def test_methods_may_be_added_to_a_comparison_later(
     assert len(level.fits) == 1
 
 
+@pytest.mark.slow
 def test_the_scene_is_fitted_where_the_equal_time_is_not_known_and_only_there(
     dataset: Dataset, level: LevelMethod, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
