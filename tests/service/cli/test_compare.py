@@ -122,7 +122,7 @@ def test_help_needs_no_torch() -> None:
     assert answer.stdout.endswith("False\n")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_ctrl_c_stops_it_and_the_same_command_goes_on(sweep: Path, tmp_path: Path) -> None:
     page = tmp_path / "ball.html"
     arguments = ("compare", sweep, "--methods", "scene,nearest", "-o", page, "--threads", 1)

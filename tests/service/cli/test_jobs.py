@@ -129,6 +129,40 @@ def test_a_scene_is_trained_watched_and_served(server: RunningService, client: h
     assert json.loads(events.rpartition("\ndata: ")[2])["state"] == "succeeded"
 
 
+def test_methods_are_compared_and_their_page_is_shown_without_scripts(
+    server: RunningService, client: httpx.Client
+) -> None:
+    result = run(server, "submit", "compare", "tiny", "--methods", "median,nearest", "--device", "cpu", "--wait")
+    assert result.exit_code == 0, result.output
+    job = result.stdout.split()[0]
+    told = client.get(f"/v1/jobs/{job}").json()
+    assert told["specification"]["methods"] == ["median", "nearest"]
+    assert told["artifacts"] == ["comparison.html", "comparison.json", "comparison.tex"]
+    assert {"median_psnr_db", "nearest_gmsd"} < set(told["metrics"])
+    assert told["progress"]["method_number"] == told["progress"]["methods"] == 2
+    kept = client.get(f"/v1/jobs/{job}/artifacts/comparison.html")
+    shown = client.get(f"/v1/jobs/{job}/artifacts/comparison.html?show=true")
+    assert kept.headers["content-disposition"].startswith("attachment")
+    assert shown.headers["content-disposition"].startswith("inline")
+    assert "nearest training frame" in shown.text
+    for answer in (kept, shown):
+        assert answer.headers["content-type"] == "text/html; charset=utf-8"
+        assert answer.headers["content-security-policy"].startswith("sandbox; default-src 'none'")
+        assert answer.headers["x-content-type-options"] == "nosniff"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [(("--methods", "median,newest"), "got 'newest'"), (("--budget", "half"), "budget must be one of equal, author")],
+)
+def test_a_comparison_that_cannot_be_is_refused(
+    server: RunningService, client: httpx.Client, arguments: tuple[str, ...], sentence: str
+) -> None:
+    result = run(server, "submit", "compare", "tiny", *arguments)
+    assert result.exit_code == 2
+    assert sentence in " ".join(result.stderr.split())
+
+
 def test_poses_of_a_file_become_an_archive(server: RunningService, client: httpx.Client, tmp_path: Path) -> None:
     poses = np.tile(np.eye(4), (3, 1, 1))
     poses[:, 1, 3] = (0.5, 1.5, 2.5)

@@ -13,7 +13,7 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, Response
 from starlette.routing import Route
 
-from ultragray_service.http.routes.jobs.artifacts import shared_file_response
+from ultragray_service.http.routes.jobs.artifacts import SHOWN, shared_file_response
 from ultragray_workers.jobs.shared.reading import SharedFile
 from ultragray_workers.jobs.shared.record import StoredFile
 from ultragray_workers.storage.local import LocalStorage
@@ -32,11 +32,11 @@ def get(tmp_path: Path) -> Get:
     file = SharedFile(storage, "frames.npz", StoredFile("jobs/one/frames.npz", len(CONTENT), "ab" * 32))
 
     async def shared(request: Request) -> Response:
-        return shared_file_response(file, request.headers, "application/x-npz")
+        return shared_file_response(file, request.headers, "application/x-npz", SHOWN, "attachment")
 
     async def local(request: Request) -> Response:
         path = tmp_path / "jobs" / "one" / "frames.npz"
-        return FileResponse(path, media_type="application/x-npz", filename="frames.npz")
+        return FileResponse(path, media_type="application/x-npz", filename="frames.npz", headers=SHOWN)
 
     app = Starlette(routes=[Route("/shared", shared), Route("/local", local)])
 
@@ -60,7 +60,7 @@ def test_a_range_is_answered_as_of_a_file(get: Get, asked: str) -> None:
     assert shared.status_code == local.status_code
     if local.status_code != 416:
         assert shared.content == local.content
-        for name in ("content-length", "content-range", "content-type", "accept-ranges"):
+        for name in ("content-length", "content-range", "content-type", "accept-ranges", *SHOWN):
             assert shared.headers.get(name) == local.headers.get(name), name
 
 

@@ -40,6 +40,7 @@ MEDIA_TYPES = {
     ".npz": NPZ,
     ".png": PNG,
     ".tar": "application/x-tar",
+    ".tex": "application/x-tex",
     ".zip": "application/zip",
 }
 _ANY_FILE = "application/octet-stream"
