@@ -27,7 +27,7 @@ MINUTES ?= 30
 FRAMES ?= 100000
 
 .DEFAULT_GOAL := help
-.PHONY: ALWAYS help serve console test test-fast test-long test-console test-faults test-fuzz test-soak test-overload test-shards test-image test-replicas test-newcomer check check-lint check-types check-generated check-web check-figures format bench bench-record bench-console console-picture bench-cuda results ablations poses confidence libraries simulation figures demo-scene docs generate packages clean
+.PHONY: ALWAYS help serve console test test-fast test-long test-console test-faults test-fuzz test-soak test-overload test-shards test-image test-replicas test-newcomer check check-lint check-types check-generated check-web check-figures format bench bench-record bench-console console-picture bench-cuda results methods ablations poses confidence libraries simulation figures demo-scene docs generate packages clean
 
 help:  ## say what there is
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
@@ -154,11 +154,18 @@ bench-cuda: $(VENV)/installed  ## the same on a GPU, with the distance to what i
 	$(BIN)/ultragray bench --backend cuda --train --output $(FIGURES)/cuda_training.json $(ARGS)
 	$(KEEP) cuda cuda_training
 
-results: $(VENV)/installed-dev  ## train on every data set of DATA; prints the tables of docs/results.md (ARGS="--only liver_convex" for one)
+results: $(VENV)/installed-dev  ## train on every data set of DATA, then methods; prints the tables of docs/results.md (ARGS="--only liver_convex" for one training)
 	$(READY)
 	$(BIN)/python benchmarks/results_tables.py $(DATA) $(ARGS)
 	@$(BIN)/python benchmarks/documents.py --show results
 	$(KEEP) results_tables
+	$(if $(ARGS),,@$(MAKE) --no-print-directory methods)
+
+methods: $(VENV)/installed-dev  ## compare all methods on every data set of DATA at equal time; a killed run goes on; takes two hours (ARGS="--only liver_convex" for one)
+	$(READY)
+	$(BIN)/python benchmarks/methods_tables.py $(DATA) $(ARGS)
+	@$(BIN)/python benchmarks/documents.py --show methods
+	$(KEEP) methods_tables
 
 ablations: $(VENV)/installed-dev  ## train without each part of the training, three seeds each; takes an hour
 	$(READY)

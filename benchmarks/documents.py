@@ -19,6 +19,7 @@ from typing import Any, TypeAlias
 
 import ablations
 import confidence
+import methods_tables
 import performance
 import poses
 import results_tables
@@ -60,6 +61,7 @@ BLOCKS = {
     "shadows": Block("libraries", performance.shadows),
     "results": Block("results_tables", results_tables.tables),
     "results at a glance": Block("results_tables", results_tables.at_a_glance, results_tables.glanced_at),
+    "methods": Block("methods_tables", methods_tables.tables),
     "ablations": Block("ablations", ablations.tables),
     "poses": Block("poses", poses.table),
     "confidence": Block("confidence", confidence.tables),

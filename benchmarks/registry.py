@@ -80,6 +80,11 @@ _FILES = (
         "results",
         (*_TRAINED, "benchmarks/results_tables.py", "benchmarks/in_silico.py"),
     ),
+    Figures(
+        "benchmarks/methods_tables.json",
+        "methods",
+        (*_TRAINED, "model/ultragray/methods", "benchmarks/methods_tables.py"),
+    ),
     Figures("benchmarks/ablations.json", "ablations", (*_TRAINED, "benchmarks/ablations.py")),
     Figures("benchmarks/poses.json", "poses", (*_TRAINED, "benchmarks/poses.py")),
     Figures(

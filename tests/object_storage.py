@@ -20,7 +20,7 @@ import pytest
 
 from .waiting import Deadline
 
-AWAY_S = float(os.environ.get("ULTRAGRAY_AWAY_S", "6"))  # how long tests take the server away: make test-replicas, a minute
+AWAY_S = float(os.environ.get("ULTRAGRAY_AWAY_S", "6"))  # that tests take the server away; make test-replicas: a minute
 _START_TIMEOUT_S = 120.0
 _SLOW_DOWN = (
     b"<?xml version='1.0'?><Error><Code>SlowDown</Code><Message>Please reduce your request rate.</Message></Error>"

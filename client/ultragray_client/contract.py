@@ -13,6 +13,8 @@ from .geometry import PoseLike
 __all__ = [
     "AroundSampler",
     "Below",
+    "CompareJob",
+    "ComparisonSettings",
     "ConvexProbe",
     "CoveredSampler",
     "Dataset",
@@ -246,6 +248,45 @@ class Dataset:
 
 
 @dataclass(frozen=True)
+class ComparisonSettings:
+    """Settings of a comparison."""
+
+    methods: tuple[str, ...] = ("all",)
+    """Methods to compare, some of scene, median, mean, maximum, median-0.25mm, mean-0.25mm, maximum-0.25mm, linear,
+    nearest; all: each of them.
+    """
+    budget: str = "equal"
+    """equal: every method learns as long as the scene does with the preset fast on this machine; author: the steps
+    of each author's recipe, however long they take.
+    """
+    times: float = 1.0
+    """Factor on the equal time, for the methods other than the scene."""
+    seed: int = 0
+    """Of every random choice."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompareJob(ComparisonSettings):
+    """Methods are fitted to a dataset, each within the same budget, and scored on its held-out frames.
+
+    The means of each method are the metrics of the job, such as linear_psnr_db; comparison.html, comparison.json and
+    comparison.tex have the rest.
+    """
+
+    kind: Literal["compare"] = field(default="compare", repr=False, kw_only=True)
+    max_run_s: float | None = None
+    """Longest time that the job may run in all, s; then it fails, and a retry goes on. None: the service's longest."""
+    device: str = "auto"
+    """auto, cpu, cuda or cuda:N: what the worker must offer; auto: a GPU where it offers one, else its processor."""
+    min_memory_gb: int | None = None
+    """Least memory of the device, 10^9 bytes; of cpu: of the host."""
+    worker_labels: dict[str, str] = field(default_factory=dict)
+    """Labels that the worker must have, such as {"site": "lab1"}."""
+    dataset: str
+    """Name of an uploaded dataset, with held-out frames."""
+
+
+@dataclass(frozen=True)
 class EvaluateJob:
     """A scene is scored on the held-out frames of a dataset: PSNR, MS-SSIM, GMS and GMSD.
 
@@ -409,4 +450,4 @@ class TrainJob:
     """Labels that the worker must have, such as {"site": "lab1"}."""
 
 
-Specification: TypeAlias = EvaluateJob | RenderJob | TrainJob
+Specification: TypeAlias = CompareJob | EvaluateJob | RenderJob | TrainJob

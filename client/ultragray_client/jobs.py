@@ -47,6 +47,9 @@ class JobProgress:
     rate_per_s: float | None  # steps or frames
     seconds_left: float | None
     waits_for: str | None  # of a job that waits: what else it needs than its turn, such as a worker that fits it
+    method: str | None  # of a comparison: the method at hand
+    method_number: int | None  # its number among the methods, from 1
+    methods: int | None
 
 
 @dataclass(frozen=True)

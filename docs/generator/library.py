@@ -9,6 +9,7 @@ from typing import Any
 from ultragray.confidence import FIGURES
 from ultragray.contract import annotated_fields, limits_in_words, to_dict
 from ultragray.interchange.exports import FORMATS
+from ultragray.methods.registry import METHODS
 from ultragray.outputs import OUTPUTS
 from ultragray.samplers import Sampler
 from ultragray.training.config import PRESETS, TrainingConfig
@@ -62,6 +63,19 @@ def samplers() -> str:
         )
         rows.append((code(kind), ", ".join(keys), summary(cls)))
     return table(("Kind", "Keys with their defaults", "Poses"), rows)
+
+
+def methods() -> str:
+    """A section for each method, as it describes itself."""
+    sections = []
+    for name, method in METHODS.items():
+        told = method.describe()
+        recipe = "" if told.published_steps is None else f" Author's recipe: {told.published_steps:,} steps."
+        sections += [f"### {told.title}: {code(name)}", "", f"{told.summary} Source: {told.source}.{recipe}", ""]
+        if told.equations:
+            sections += ["```text", *told.equations, "```", ""]
+        sections += [*(f"- {choice}" for choice in told.choices), ""]
+    return "\n".join(sections).rstrip()
 
 
 def training_settings() -> str:

@@ -19,6 +19,7 @@ PARTS: dict[str, Callable[[], str]] = {
     "formats": library.formats,
     "npz": library.npz,
     "samplers": library.samplers,
+    "methods": library.methods,
     "training settings": library.training_settings,
     "scene metadata": partial(library.keys, SceneInfo),
     "display": partial(library.keys, Display, "Setting"),

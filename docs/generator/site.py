@@ -21,10 +21,11 @@ SECTIONS: Mapping[str, tuple[str, ...]] = {
     "Tutorial": ("tutorial.md",),
     "How-to": (
         *("howto/robotics.md", "howto/simulator.md", "howto/data-science.md", "howto/sonographer.md"),
-        *("howto/recording.md", "howto/operator.md", "howto/*.md"),
+        *("howto/recording.md", "howto/compare.md", "howto/operator.md", "howto/*.md"),
     ),
     "Concepts": (
         *("concepts/frame.md", "physics.md", "concepts/training.md", "confidence.md", "concepts/limits.md", "poses.md"),
+        "concepts/methods.md",
         "concepts/*.md",
     ),
     "Operation": ("operation.md", "scaling.md", "access.md", "tls.md", "backup.md"),

@@ -31,16 +31,16 @@ using BeamNumbers = std::array<double, 4>;  // of a Beam
 using FreeBeam = nb::ndarray<double, nb::shape<3>, nb::c_contig, nb::device::cpu>;
 using FreeCounts = nb::ndarray<int64_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 
-// B, E, T, coverage and S, each [C, H, W] or null.
-Outputs planes_of(const std::array<OptionalPlanes, 5>& arrays, size_t count, int height, int width) {
-    std::array<float*, 5> planes{};
+// B, E, T, coverage, S and the sum of I*w, each [C, H, W] or null.
+Outputs planes_of(const std::array<OptionalPlanes, 6>& arrays, size_t count, int height, int width) {
+    std::array<float*, 6> planes{};
     for (size_t k = 0; k < planes.size(); ++k) {
         if (!arrays[k]) continue;
         if (arrays[k]->shape(0) != count || arrays[k]->shape(1) != size_t(height) || arrays[k]->shape(2) != size_t(width))
             throw std::invalid_argument("an output's shape is not [C, height, width]");
         planes[k] = arrays[k]->data();
     }
-    return {planes[0], planes[1], planes[2], planes[3], planes[4]};
+    return {planes[0], planes[1], planes[2], planes[3], planes[4], planes[5]};
 }
 
 Beam beam_of(const BeamNumbers& numbers) { return {numbers[0], numbers[1], numbers[2], numbers[3]}; }
@@ -59,7 +59,8 @@ Limits limits_of(std::optional<int64_t> footprint_pixels, const std::optional<Fl
         nb::arg("far_cm"), nb::arg("cull_far_cm"), nb::arg("beam"), nb::arg("poses").noconvert(), nb::arg("height"), \
         nb::arg("width"), nb::arg("threads"), nb::arg("instruction_set"), nb::arg("bmode").noconvert().none(),       \
         nb::arg("echo").noconvert().none(), nb::arg("transmittance").noconvert().none(),                             \
-        nb::arg("coverage").noconvert().none()
+        nb::arg("coverage").noconvert().none(), nb::arg("weight_sum").noconvert().none(),                            \
+        nb::arg("intensity_sum").noconvert().none()
 
 }  // namespace
 
@@ -78,7 +79,7 @@ NB_MODULE(_cpu, m) {
         .def(
             "__init__",
             [](PreparedScene* self, Matrix means, Matrix scales, Matrix quats, Vector transmittances, Vector sh0, Matrix shn,
-               int sh_degree, bool sigmoid, bool sorted, int threads) {
+               int sh_degree, bool sigmoid, bool weighted, bool sorted, int threads) {
                 const int64_t n = means.shape(0);
                 const size_t rest = size_t(sh_degree + 1) * (sh_degree + 1) - 1;
                 if (sh_degree < 0 || sh_degree > 3 || means.shape(1) != 3 || scales.shape(0) != size_t(n) ||
@@ -94,13 +95,14 @@ NB_MODULE(_cpu, m) {
                                     shn.data(),
                                     n,
                                     sh_degree,
-                                    sigmoid ? Intensity::Sigmoid : Intensity::Released};
+                                    sigmoid ? Intensity::Sigmoid : Intensity::Released,
+                                    weighted};
                 nb::gil_scoped_release release;
                 new (self) PreparedScene(raw, sorted ? Order::Sorted : Order::AsGiven, threads);
             },
             nb::arg("means").noconvert(), nb::arg("scales").noconvert(), nb::arg("quats").noconvert(),
             nb::arg("transmittances").noconvert(), nb::arg("sh0").noconvert(), nb::arg("shn").noconvert(),
-            nb::arg("sh_degree"), nb::arg("sigmoid"), nb::arg("sorted"), nb::arg("threads"))
+            nb::arg("sh_degree"), nb::arg("sigmoid"), nb::arg("weighted"), nb::arg("sorted"), nb::arg("threads"))
         .def_prop_ro("bytes", &PreparedScene::bytes);
 
     m.def(
@@ -108,18 +110,18 @@ NB_MODULE(_cpu, m) {
         [](const PreparedScene& scene, bool fanned, bool wrap, double start, double span, double near_cm, double far_cm,
            double cull_far_cm, BeamNumbers beam, Poses poses, int height, int width, int threads,
            const std::string& instruction_set, OptionalPlanes bmode, OptionalPlanes echo, OptionalPlanes transmittance,
-           OptionalPlanes coverage, OptionalPlanes weight_sum, std::optional<int64_t> footprint_pixels,
-           std::optional<Flag> flag, int64_t number) {
+           OptionalPlanes coverage, OptionalPlanes weight_sum, OptionalPlanes intensity_sum,
+           std::optional<int64_t> footprint_pixels, std::optional<Flag> flag, int64_t number) {
             const Outputs outputs =
-                planes_of({bmode, echo, transmittance, coverage, weight_sum}, poses.shape(0), height, width);
+                planes_of({bmode, echo, transmittance, coverage, weight_sum, intensity_sum}, poses.shape(0), height, width);
             const ProbeGeometry probe{fanned, wrap, start, span, near_cm, far_cm, cull_far_cm, beam_of(beam)};
             const Limits limits = limits_of(footprint_pixels, flag, number);
             nb::gil_scoped_release release;
             render(scene, probe, poses.data(), int(poses.shape(0)), height, width, threads, instruction_set, outputs,
                    limits);
         },
-        RENDER_ARGUMENTS, nb::arg("weight_sum").noconvert().none() = nb::none(), nb::arg("footprint_pixels") = nb::none(),
-        nb::arg("flag").noconvert().none() = nb::none(), nb::arg("number") = 0);
+        RENDER_ARGUMENTS, nb::arg("footprint_pixels") = nb::none(), nb::arg("flag").noconvert().none() = nb::none(),
+        nb::arg("number") = 0);
 
     m.def(
         "footprints",
@@ -161,8 +163,10 @@ NB_MODULE(_cpu, m) {
             [](Recording* self, const PreparedScene& scene, bool fanned, bool wrap, double start, double span,
                double near_cm, double far_cm, double cull_far_cm, BeamNumbers beam, Poses poses, int height, int width,
                int threads, const std::string& instruction_set, OptionalPlanes bmode, OptionalPlanes echo,
-               OptionalPlanes transmittance, OptionalPlanes coverage) {
-                const Outputs outputs = planes_of({bmode, echo, transmittance, coverage, {}}, poses.shape(0), height, width);
+               OptionalPlanes transmittance, OptionalPlanes coverage, OptionalPlanes weight_sum,
+               OptionalPlanes intensity_sum) {
+                const Outputs outputs = planes_of({bmode, echo, transmittance, coverage, weight_sum, intensity_sum},
+                                                  poses.shape(0), height, width);
                 const ProbeGeometry probe{fanned, wrap, start, span, near_cm, far_cm, cull_far_cm, beam_of(beam)};
                 nb::gil_scoped_release release;
                 new (self) Recording(scene, probe, poses.data(), int(poses.shape(0)), height, width, threads,
@@ -172,10 +176,11 @@ NB_MODULE(_cpu, m) {
         .def(
             "differentiate",
             [](const Recording& self, int threads, OptionalPlanes bmode, OptionalPlanes echo, OptionalPlanes transmittance,
-               OptionalPlanes coverage, FreeMatrix means, FreeMatrix scales, FreeMatrix quats, FreeVector transmittances,
-               FreeVector sh0, FreeMatrix shn, std::optional<FreeViews> views, FreeBeam beam) {
-                const Outputs gradients =
-                    planes_of({bmode, echo, transmittance, coverage, {}}, self.count(), self.height(), self.width());
+               OptionalPlanes coverage, OptionalPlanes weight_sum, OptionalPlanes intensity_sum, FreeMatrix means,
+               FreeMatrix scales, FreeMatrix quats, FreeVector transmittances, FreeVector sh0, FreeMatrix shn,
+               std::optional<FreeViews> views, FreeBeam beam) {
+                const Outputs gradients = planes_of({bmode, echo, transmittance, coverage, weight_sum, intensity_sum},
+                                                    self.count(), self.height(), self.width());
                 const size_t n = self.gaussian_count(), rest = self.harmonics() - 1;
                 if (means.size() != 3 * n || scales.size() != 3 * n || quats.size() != 4 * n || transmittances.size() != n ||
                     sh0.size() != n || shn.size() != rest * n)
@@ -192,6 +197,7 @@ NB_MODULE(_cpu, m) {
             },
             nb::arg("threads"), nb::arg("bmode").noconvert().none(), nb::arg("echo").noconvert().none(),
             nb::arg("transmittance").noconvert().none(), nb::arg("coverage").noconvert().none(),
+            nb::arg("weight_sum").noconvert().none(), nb::arg("intensity_sum").noconvert().none(),
             nb::arg("means").noconvert(), nb::arg("scales").noconvert(), nb::arg("quats").noconvert(),
             nb::arg("transmittances").noconvert(), nb::arg("sh0").noconvert(), nb::arg("shn").noconvert(),
             nb::arg("views").noconvert().none(), nb::arg("beam").noconvert());

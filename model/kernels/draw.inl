@@ -74,6 +74,7 @@ enum class Profile {
     Thin,     // psi small: alpha by a short series
     Thick,    // any psi
     Clipped,  // the window may reach depth 0
+    None,     // nothing absorbs
 };
 
 // kLanes scan lines across one slice; depth is u, in standard deviations from s*.
@@ -124,14 +125,19 @@ inline void draw_rows(const Group& group, const Slice& s, const Strip& strip, in
         Floats r = exponential(-g.du * (u + 0.5f * g.du));
         const int stop = block + period < end ? block + period : end;
         for (int i = block; i < stop; ++i) {
-            const Floats shape = profile == Profile::Clipped ? clipped_profile(u, g.zero) : absorption_profile(u);
-            const Mask counted = simple ? within(g.first, u, g.last)
-                                        : either(less_equal(u * u, g.window2), less_equal(splat(kMinPsi), g.peak * shape));
+            Floats shape{};
+            if (profile != Profile::None)
+                shape = profile == Profile::Clipped ? clipped_profile(u, g.zero) : absorption_profile(u);
+            const Mask near = less_equal(u * u, g.window2);
+            const Mask counted = simple                     ? within(g.first, u, g.last)
+                                 : profile == Profile::None ? near
+                                                            : either(near, less_equal(splat(kMinPsi), g.peak * shape));
             const Floats weight = keep(counted, simple ? w : minimum(w, splat(kMaxWeight)));
             const int64_t at = i * stride;
             store(weights + at, load<Floats>(weights + at) + weight);
             store(intensities + at, load<Floats>(intensities + at) + intensity * weight);
-            store(local + at, load<Floats>(local + at) * passing<profile>(keep_product(counted, g.peak, shape), absorb));
+            if (profile != Profile::None)
+                store(local + at, load<Floats>(local + at) * passing<profile>(keep_product(counted, g.peak, shape), absorb));
             w *= r;
             r *= q;
             steps += 1.0f;
@@ -196,7 +202,7 @@ inline Group cross(const View& view, const Slice& s, const Course& course, int l
     g.window2 = float(kMaxM2) - g.m2;
     g.touched = both(g.touched, less_equal(Floats{}, g.window2));
     const Mask absorbs = both(g.touched, less_equal(g.m2, splat(kMaxM2Attenuation)));
-    g.peak = keep(absorbs, exponential(-0.5f * g.m2) * g.sigma);
+    g.peak = view.absorbs ? keep(absorbs, exponential(-0.5f * g.m2) * g.sigma) : Floats{};
     g.opaque = less_equal(splat(kMinPsi), g.peak * kFullG);
     const Floats window = square_root(maximum(g.window2, Floats{}));
     g.first = select(g.touched, -window, splat(1e9f));
@@ -249,6 +255,12 @@ inline void draw_group(const View& view, const Slice& s, const Course& course, c
     if (!any(g.touched)) return;
     const Extent extent = extent_of(view, g);
     const int top = extent.top, clear = extent.clear, end = extent.end;
+    if (!view.absorbs) {
+        if (top < end)
+            (extent.simple ? draw_rows<Profile::None, true> : draw_rows<Profile::None, false>)(g, s, strip, column, top,
+                                                                                               end);
+        return;
+    }
     if (top < clear) draw_rows<Profile::Clipped, false>(g, s, strip, column, top, clear);
     if (clear < end) {
         if (extent.thick)
@@ -332,6 +344,7 @@ void finish(const View& view, const Strip& strip, const FramePointers& frame, co
             put(frame.transmittance, row, column, transmittance);
             put(frame.coverage, row, column, coverage);
             put(frame.weight_sum, row, column, sum);
+            put(frame.intensity_sum, row, column, load<Floats>(strip.intensity + at));
             if (saved.weight == nullptr) continue;
             const int64_t kept = int64_t(row) * saved.stride + strip.first + column;
             store(saved.weight + kept, sum);

@@ -50,8 +50,9 @@ void differentiate(const View& view, int first, int lines, const SavedPlanes& sa
             const Floats by_coverage = take(gradients.coverage, row, line);
             below += by_log;
             const int64_t to = int64_t(row) * out.stride + line;
-            store(out.weight + to, by_echo * weighted * factor.slope + by_coverage * exponential(-sum));
-            store(out.intensity + to, by_echo * factor.value);
+            const Floats by_sum = by_echo * weighted * factor.slope + by_coverage * exponential(-sum);
+            store(out.weight + to, by_sum + take(gradients.weight_sum, row, line));
+            store(out.intensity + to, by_echo * factor.value + take(gradients.intensity_sum, row, line));
             store(out.log_transmittance + to, by_log);
             store(out.below + to, below);
         }
@@ -126,19 +127,15 @@ inline void gather_rows(const Group& g, const Slice& s, const PixelGradients& pi
         Floats r = exponential(-g.du * (u + 0.5f * g.du));
         const int stop = block + period < end ? block + period : end;
         for (int i = block; i < stop; ++i) {
-            ProfileSlopes shape;
+            const Mask near = less_equal(u * u, g.window2);
+            ProfileSlopes shape{};
+            Floats psi{}, alpha{};
             if (profile == Profile::Clipped)
                 shape = clipped_slopes(u, g.zero);
-            else
+            else if (profile != Profile::None)
                 shape = {absorption_profile(u), profile_slope(u), Floats{}};
-            const Floats psi = g.peak * shape.value;
-            const Mask counted = either(less_equal(u * u, g.window2), less_equal(splat(kMinPsi), psi));
-            Floats alpha;
-            if (profile == Profile::Thin)
-                alpha = psi * (1.0f - psi * (0.5f - psi * (1.0f / 6.0f)));
-            else
-                alpha = 1.0f - exponential(-psi);
-            const Floats capped = minimum(alpha, splat(kMaxWeight));
+            if (profile != Profile::None) psi = g.peak * shape.value;
+            const Mask counted = profile == Profile::None ? near : either(near, less_equal(splat(kMinPsi), psi));
 
             const int64_t at = int64_t(i) * pixels.stride + line;
             const Floats by_intensity = load<Floats>(pixels.intensity + at);
@@ -147,15 +144,25 @@ inline void gather_rows(const Group& g, const Slice& s, const PixelGradients& pi
             const Floats by_weight = load<Floats>(pixels.weight + at) + intensity * by_intensity;
             const Floats weighed = keep(less_equal(w, splat(kMaxWeight)), by_weight * weight);
             sums.weight += weighed;
-
-            const Floats by_factor = keep(counted, load<Floats>(pixels.log_transmittance + at) / (1.0f - absorb * capped));
-            sums.absorb -= by_factor * capped;
-            const Floats by_psi = keep(less_equal(alpha, splat(kMaxWeight)), -absorb * by_factor * (1.0f - alpha));
-            sums.psi += psi * by_psi;
-            const Floats by_u = by_psi * g.peak * shape.by_u - u * weighed;
-            sums.u += by_u;
-            sums.u_times_u += by_u * u;
-            if (profile == Profile::Clipped) sums.zero += by_psi * g.peak * shape.by_zero;
+            if (profile == Profile::None) {
+                sums.u -= u * weighed;
+                sums.u_times_u -= u * u * weighed;
+            } else {
+                if (profile == Profile::Thin)
+                    alpha = psi * (1.0f - psi * (0.5f - psi * (1.0f / 6.0f)));
+                else
+                    alpha = 1.0f - exponential(-psi);
+                const Floats capped = minimum(alpha, splat(kMaxWeight));
+                const Floats by_factor =
+                    keep(counted, load<Floats>(pixels.log_transmittance + at) / (1.0f - absorb * capped));
+                sums.absorb -= by_factor * capped;
+                const Floats by_psi = keep(less_equal(alpha, splat(kMaxWeight)), -absorb * by_factor * (1.0f - alpha));
+                sums.psi += psi * by_psi;
+                const Floats by_u = by_psi * g.peak * shape.by_u - u * weighed;
+                sums.u += by_u;
+                sums.u_times_u += by_u * u;
+                if (profile == Profile::Clipped) sums.zero += by_psi * g.peak * shape.by_zero;
+            }
             w *= r;
             r *= q;
             steps += 1.0f;
@@ -176,8 +183,9 @@ inline void gather_group(const View& view, const Slice& s, const Course& course,
     const Extent extent = extent_of(view, g);
     const int top = extent.top, clear = extent.clear, end = extent.end;
     LineSums sums;
-    if (top < clear) gather_rows<Profile::Clipped>(g, s, pixels, line, top, clear, sums);
-    if (clear < end) {
+    if (!view.absorbs && top < end) gather_rows<Profile::None>(g, s, pixels, line, top, end, sums);
+    if (view.absorbs && top < clear) gather_rows<Profile::Clipped>(g, s, pixels, line, top, clear, sums);
+    if (view.absorbs && clear < end) {
         if (extent.thick)
             gather_rows<Profile::Thick>(g, s, pixels, line, clear, end, sums);
         else
@@ -375,7 +383,7 @@ inline void differentiate_slices(const SceneView& scene, const View& view, const
         GaussianGradient& to = gradients[c.ids[k]];
         for (int d = 0; d < 3; ++d) to.mean[d] += float(by_mean[d][k]), to.log_scale[d] += float(by_log_scale[d][k]);
         for (int d = 0; d < 4; ++d) to.quat[d] += float(by_quat[d][k]);
-        to.absorb += by.absorb[k];
+        to.absorb += scene.weighted ? -2.0f * by.m2_plane[k] : by.absorb[k];
         float* sh = sh_gradients + c.ids[k] * terms;
         for (int t = 0; t < terms; ++t) sh[t] += harmonics.coefficients[t][k];
     }

@@ -20,7 +20,7 @@ struct Gaussian {
     float mean[3];   // cm
     float scale[3];  // cm
     float quat[4];   // unit, wxyz
-    float absorb;    // 1 - tau
+    float absorb;    // 1 - tau; of a weighted scene 1 - the Gaussian's weight
     float reach;     // distance beyond which the Gaussian has w and alpha under 1/255, cm
 };
 
@@ -39,6 +39,7 @@ struct SceneView {
     int64_t cluster_count;
     int sh_degree;
     Intensity intensity;
+    bool weighted;  // w of a Gaussian is multiplied by its weight, and it absorbs nothing
 };
 
 // The variance of the slice along elevation by depth s: at_focus + slope2 (s - focus)^2, and the most of it that is seen.
@@ -63,6 +64,7 @@ struct View {
     double near, cull_far, row_step;  // row i lies at near + row_step * (i + 1/2)
     double start, span;               // line j of W is at start + span * (j + 1/2) / W: cm along x, or radians from z
     bool wrap;                        // fanned all the way round: the first line follows the last
+    bool absorbs;                     // whether Gaussians do
     bool fanned;                      // the lines run from an apex at the origin, else side by side along z
     int height, lines;
     Beam beam;
@@ -73,7 +75,7 @@ struct Slice {
     double mean_x, mean_z;
     double cov_xx, cov_xz, cov_zz;
     double depth;         // of the mean along its scan line
-    float m2_plane;       // squared Mahalanobis distance of the plane from the mean
+    float m2_plane;       // squared Mahalanobis distance of the plane from the mean; -2 log(weight) is added
     float intensity;      // I
     float absorb;         // 1 - tau
     int32_t first, last;  // scan lines it may touch
@@ -98,9 +100,9 @@ class SliceList {
     int64_t size_ = 0, capacity_ = 0;
 };
 
-// The outputs of one pose, and S, each [H, W] or null where it was not asked for.
+// The outputs of one pose, S and the sum of I*w, each [H, W] or null where it was not asked for.
 struct FramePointers {
-    float *bmode, *echo, *transmittance, *coverage, *weight_sum;
+    float *bmode, *echo, *transmittance, *coverage, *weight_sum, *intensity_sum;
 };
 
 // What the backward pass needs of one pose, rows of `stride` floats; null where no gradient is wanted.
@@ -122,7 +124,7 @@ struct GaussianGradient {
     float mean[3];
     float log_scale[3];
     float quat[4];
-    float absorb;
+    float absorb;  // of a weighted scene, by the log of the weight
 };
 
 // The gradient with respect to a rigid motion of the view, in the scene's axes: a shift in cm, and a turn in radians about

@@ -44,7 +44,7 @@ struct ScanLines {
     }
 };
 
-View make_view(const ProbeGeometry& probe, const ScanLines& lines, const double* pose, int height, int width) {
+View make_view(const ProbeGeometry& probe, const ScanLines& lines, const double* pose, int height, int width, bool absorbs) {
     View view{};
     for (int axis = 0; axis < 3; ++axis) {
         for (int d = 0; d < 3; ++d) view.axes[axis][d] = pose[4 * d + axis];
@@ -58,6 +58,7 @@ View make_view(const ProbeGeometry& probe, const ScanLines& lines, const double*
     view.start = probe.start, view.span = probe.span, view.fanned = probe.fanned, view.wrap = probe.wrap;
     view.height = height, view.lines = width;
     view.beam = probe.beam;
+    view.absorbs = absorbs;
     return view;
 }
 
@@ -85,7 +86,8 @@ class StripBuffer {
 
 FramePointers frame_of(const Outputs& outputs, int64_t offset) {
     const auto at = [offset](float* plane) { return plane ? plane + offset : nullptr; };
-    return {at(outputs.bmode), at(outputs.echo), at(outputs.transmittance), at(outputs.coverage), at(outputs.weight_sum)};
+    return {at(outputs.bmode),    at(outputs.echo),       at(outputs.transmittance),
+            at(outputs.coverage), at(outputs.weight_sum), at(outputs.intensity_sum)};
 }
 
 // Some poses on their way from Gaussians to pixels.
@@ -94,7 +96,8 @@ class Batch {
     Batch(const PreparedScene& scene, const ProbeGeometry& probe, const double* poses, int count, int height, int width,
           const Kernels& kernels)
         : kernels_(kernels), scene_(scene.view()), lines_(probe, width) {
-        for (int c = 0; c < count; ++c) views_.push_back(make_view(probe, lines_, poses + 16 * c, height, width));
+        for (int c = 0; c < count; ++c)
+            views_.push_back(make_view(probe, lines_, poses + 16 * c, height, width, !scene_.weighted));
         slices_ = std::vector<SliceList>(int64_t(count) * parts());
     }
     Batch(const Batch&) = delete;
@@ -275,8 +278,8 @@ void render(const PreparedScene& scene, const ProbeGeometry& probe, const double
     for (int first = 0; first < count; first += kPosesAtOnce) {
         Batch batch(scene, probe, poses + 16 * first, std::min(kPosesAtOnce, count - first), height, width, kernels);
         const FramePointers from = frame_of(outputs, first * frame_size);
-        batch.render({from.bmode, from.echo, from.transmittance, from.coverage, from.weight_sum}, {}, threads, limits,
-                     first);
+        batch.render({from.bmode, from.echo, from.transmittance, from.coverage, from.weight_sum, from.intensity_sum}, {},
+                     threads, limits, first);
     }
 }
 

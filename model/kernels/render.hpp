@@ -18,9 +18,9 @@ struct ProbeGeometry {
     Beam beam;
 };
 
-// Planes of many poses, each [C, H, W] or null. S, the sum of w, has no gradient.
+// Planes of many poses, each [C, H, W] or null; the last two are S, the sum of w, and that of I*w.
 struct Outputs {
-    float *bmode, *echo, *transmittance, *coverage, *weight_sum;
+    float *bmode, *echo, *transmittance, *coverage, *weight_sum, *intensity_sum;
 };
 
 // Renders C poses [4, 4] (row-major, cm, probe to scene; columns 0 and 2 may be those of a plane that is sheared such that

@@ -86,7 +86,7 @@ Cluster enclose(const Gaussian* gaussians, int64_t count) {
 }  // namespace
 
 PreparedScene::PreparedScene(const RawSplats& raw, Order order, int threads)
-    : order_(order), sh_degree_(raw.sh_degree), intensity_(raw.intensity) {
+    : order_(order), sh_degree_(raw.sh_degree), intensity_(raw.intensity), weighted_(raw.weighted) {
     if (raw.count == 0) return;
     gaussians_.resize(raw.count);
     quat_norms_.resize(order == Order::AsGiven ? raw.count : 0);
@@ -142,7 +142,7 @@ void PreparedScene::to_raw(const GaussianGradient* gaussians, const float* sh, c
                     out.means[3 * i + d] = by.mean[d];
                     out.scales[3 * i + d] = by.log_scale[d];
                 }
-                out.transmittances[i] = -by.absorb * g.absorb * (1.0f - g.absorb);
+                out.transmittances[i] = weighted_ ? by.absorb * g.absorb : -by.absorb * g.absorb * (1.0f - g.absorb);
                 out.sh0[i] = sh[i * terms];
                 std::copy_n(sh + i * terms + 1, terms - 1, out.shn + i * (terms - 1));
             }
@@ -157,7 +157,8 @@ SceneView PreparedScene::view() const {
             static_cast<int64_t>(gaussians_.size()),
             static_cast<int64_t>(clusters_.size()),
             sh_degree_,
-            intensity_};
+            intensity_,
+            weighted_};
 }
 
 int64_t PreparedScene::bytes() const {

@@ -13,6 +13,7 @@ struct RawSplats {
     int64_t count;
     int sh_degree;
     Intensity intensity;
+    bool weighted;  // transmittances are the logits of weights
 };
 
 // Gradients with respect to them, of the same shapes.
@@ -41,6 +42,7 @@ class PreparedScene {
     std::vector<Cluster> clusters_;
     int sh_degree_;
     Intensity intensity_;
+    bool weighted_;
 };
 
 }  // namespace ultragray

@@ -178,11 +178,13 @@ inline Direction direction_of(const Doubles offset[3]) {
 template <bool thick>
 void slice_candidates(const SceneView& scene, const View& view, const Candidates& c, SliceList& out) {
     Placed p = place(scene, view, c);
-    Doubles lost{};  // what m2 grows by, as the beam's weight spreads
+    Doubles lost{};  // what m2 grows by, as the beam's weight spreads, and by a Gaussian's own weight
     if (thick) {
         const Spread spread = spread_along_elevation(view, p);
         for (int k = 0; k < c.count; ++k) lost[k] = __builtin_log(spread.ratio[k]);
     }
+    if (scene.weighted)
+        for (int k = 0; k < c.count; ++k) lost[k] -= 2.0 * __builtin_log(1.0 - scene.gaussians[c.ids[k]].absorb);
     const Doubles inverse_yy = 1.0 / p.yy, shift = -p.mu[1] * inverse_yy;  // condition on the plane, y = 0
     const Doubles m2 = p.mu[1] * p.mu[1] * inverse_yy + lost;
     const Doubles mean_x = p.mu[0] + p.xy * shift, mean_z = p.mu[2] + p.yz * shift;
@@ -209,7 +211,7 @@ void slice_candidates(const SceneView& scene, const View& view, const Candidates
         if (s.first > s.last && !view.wrap) continue;
         s.m2_plane = static_cast<float>(m2[k]);
         s.intensity = intensity[k];
-        s.absorb = scene.gaussians[c.ids[k]].absorb;
+        s.absorb = view.absorbs ? scene.gaussians[c.ids[k]].absorb : 0.0f;
         s.gaussian = static_cast<int32_t>(c.ids[k]);
         ++written;
         if (s.first <= s.last) {

@@ -13,6 +13,7 @@ class PreparedScene:
         shn: Any,
         sh_degree: int,
         sigmoid: bool,
+        weighted: bool,
         sorted: bool,
         threads: int,
     ) -> None: ...

@@ -22,7 +22,8 @@ if TYPE_CHECKING:
     from .scene_info import SceneInfo
 
 PLANES = ("bmode", "echo", "transmittance", "coverage")  # what a backend draws, in [0, 1], with gradients
-WEIGHT_SUM = "weight_sum"  # S of docs/physics.md §3, which backends draw too, without a gradient
+WEIGHT_SUM, INTENSITY_SUM = "weight_sum", "intensity_sum"  # S and ΣI·w of docs/physics.md §3
+SUMS = (WEIGHT_SUM, INTENSITY_SUM)  # which backends draw too, with gradients
 SPENT_BEAM = 1e-4  # a transmittance below it is noise: nothing can be said of what is taken from it
 _AMOUNTS, _NUMBERS = np.dtype("<f4"), np.dtype("u1")
 

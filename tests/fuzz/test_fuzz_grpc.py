@@ -62,6 +62,7 @@ VALID: tuple[Message, ...] = (
         priority=3,
     ),
     jobs_pb2.SubmitJobRequest(train=jobs_pb2.TrainJob(dataset="absent", scene="new", preset="fast")),
+    jobs_pb2.SubmitJobRequest(compare=jobs_pb2.CompareJob(dataset="absent", methods=["median"], times=2.0, seed=1)),
     jobs_pb2.SubmitJobRequest(evaluate=jobs_pb2.EvaluateJob(dataset="absent", scene="demo")),
     workers_pb2.PauseWorkerRequest(worker="absent-0"),
     datasets_pb2.UploadDatasetRequest(header=datasets_pb2.UploadHeader(dataset="new", archive=True)),

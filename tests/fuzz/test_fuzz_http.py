@@ -53,6 +53,7 @@ BODIES: tuple[tuple[str, Any], ...] = (
     ("/v1/probes:plane", {"probe": {"kind": "convex", "opening_angle_deg": 60.0, "near_mm": 10.0, "far_mm": 60.0}}),
     ("/v1/probes:plane", {"probe": {"kind": "radial", "near_mm": 1.0, "far_mm": 60.0}, "width": 16, "height": 16}),
     ("/v1/jobs", {"kind": "train", "dataset": "absent", "scene": "new", "settings": {"steps": 10}, "request_id": "a"}),
+    ("/v1/jobs", {"kind": "compare", "dataset": "absent", "methods": ["median", "linear"], "times": 2.0, "seed": 1}),
     ("/v1/jobs", {"kind": "evaluate", "dataset": "absent", "scene": "demo", "priority": 3}),
     (
         "/v1/jobs",

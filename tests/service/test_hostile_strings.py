@@ -36,8 +36,8 @@ def bodies(text: str) -> list[dict[str, Any]]:
     train = {"dataset": "tiny", "scene": "new", "settings": {"steps": 1}}
     evaluate = {"dataset": "tiny", "scene": "demo"}
     asked = [{"kind": "render", "specification": render, "request_id": text}, {"kind": text, "specification": render}]
-    for kind, whole in (("render", render), ("train", train), ("evaluate", evaluate)):
-        for name in {*whole, "scene", "dataset", "format", "dtype", "device", "preset"} - {"poses"}:
+    for kind, whole in (("render", render), ("train", train), ("evaluate", evaluate), ("compare", {"dataset": "tiny"})):
+        for name in {*whole, "scene", "dataset", "format", "dtype", "device", "preset", "budget"} - {"poses"}:
             asked.append({"kind": kind, "specification": {**whole, name: text}})
     asked.append({"kind": "render", "specification": render, "priority": text})
     asked.append({"kind": "train", "specification": {**train, "settings": {text: 1}}})

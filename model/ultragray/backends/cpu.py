@@ -15,10 +15,11 @@ from torch.autograd.function import once_differentiable
 from .. import _cpu
 from ..errors import BackendUnavailable
 from ..limits import UNLIMITED, GivenUp, Limits
-from ..outputs import PLANES, WEIGHT_SUM
+from ..outputs import PLANES, SUMS
 from ..probe import FloatArray, Probe
 from ..scene import PARAMETERS, GaussianScene
 from .beam import THIN, BeamVariance, Moments
+from .kind import Kind
 from .poses import ScenePoses, as_array, gradient_by_poses, want_gradient
 from .scan_lines import KernelLines
 
@@ -40,6 +41,7 @@ def render_outputs(
     limits: Limits = UNLIMITED,
     beam: Tensor | None = None,  # [3] cm, see `beam.beam_cm`
     *,
+    weighted: bool = False,  # see `weighted.weighted_sums`
     instruction_set: str = "auto",
 ) -> dict[str, Tensor]:
     """The outputs by name, each [C, H, W] float32; differentiable once by every parameter, by poses and by the beam.
@@ -56,7 +58,7 @@ def render_outputs(
     varied = [*scene.splats.values(), *([] if beam is None else [beam])]
     if want_gradient(poses_cm) or (torch.is_grad_enabled() and any(tensor.requires_grad for tensor in varied)):
         frames = _Render.apply(  # type: ignore[no-untyped-call]
-            scene.info.intensity,
+            Kind(scene.info.intensity, weighted),
             view,
             tuple(outputs),
             poses_cm,
@@ -65,13 +67,11 @@ def render_outputs(
         )
         return dict(zip(outputs, frames, strict=True))
     planes = _empty_planes(view, outputs)
-    weight_sum = planes[WEIGHT_SUM].numpy() if WEIGHT_SUM in planes else None
     try:
         _cpu.render(
-            _sorted(scene),
+            _sorted(scene, weighted),
             **view,
             **_arrays(planes),
-            weight_sum=weight_sum,
             footprint_pixels=limits.footprint_pixels,
             flag=limits.flag,
             number=limits.number,
@@ -133,9 +133,10 @@ def drawing_work(
     )
 
 
-def _sorted(scene: GaussianScene) -> _cpu.PreparedScene:
+def _sorted(scene: GaussianScene, weighted: bool = False) -> _cpu.PreparedScene:
     """The scene as the kernel takes it for many frames."""
-    return scene.prepared("cpu", lambda: _prepare(scene.splats, scene.info.intensity))
+    kind = Kind(scene.info.intensity, weighted)
+    return scene.prepared(kind.place("cpu"), lambda: _prepare(scene.splats, kind))
 
 
 def _view_arguments(probe: Probe, poses_cm: FloatArray, height: int, width: int, beam: Tensor | None) -> dict[str, Any]:
@@ -162,7 +163,7 @@ def _empty_planes(view: dict[str, Any], names: Sequence[str]) -> dict[str, Tenso
 
 
 def _arrays(planes: dict[str, Tensor]) -> dict[str, Any]:
-    return {name: planes[name].numpy() if name in planes else None for name in PLANES}
+    return {name: planes[name].numpy() if name in planes else None for name in (*PLANES, *SUMS)}
 
 
 class _Render(torch.autograd.Function):
@@ -171,7 +172,7 @@ class _Render(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any,
-        intensity: str,
+        kind: Kind,
         view: dict[str, Any],
         names: tuple[str, ...],
         poses: ScenePoses,
@@ -179,7 +180,7 @@ class _Render(torch.autograd.Function):
         *splats: Tensor,
     ) -> tuple[Tensor, ...]:
         planes = _empty_planes(view, names)
-        scene = _prepare(dict(zip(PARAMETERS, splats, strict=True)), intensity, as_given=True)
+        scene = _prepare(dict(zip(PARAMETERS, splats, strict=True)), kind, as_given=True)
         ctx.recording = _cpu.Recording(scene, **view, **_arrays(planes))
         ctx.names, ctx.poses = names, poses
         ctx.shapes = [tensor.shape for tensor in splats]
@@ -217,7 +218,7 @@ class _Render(torch.autograd.Function):
         return (None, None, None, by_poses, by_beam, means, scales, quats, transmittances, sh0, shn)
 
 
-def _prepare(splats: Mapping[str, Tensor], intensity: str, *, as_given: bool = False) -> _cpu.PreparedScene:
+def _prepare(splats: Mapping[str, Tensor], kind: Kind, *, as_given: bool = False) -> _cpu.PreparedScene:
     raw = {name: tensor.detach().to("cpu", torch.float32).contiguous() for name, tensor in splats.items()}
     return _cpu.PreparedScene(
         raw["means"].numpy(),
@@ -227,7 +228,8 @@ def _prepare(splats: Mapping[str, Tensor], intensity: str, *, as_given: bool = F
         raw["sh0"].reshape(-1).numpy(),
         raw["shN"].squeeze(-1).numpy(),
         sh_degree=math.isqrt(raw["shN"].shape[1] + 1) - 1,
-        sigmoid=intensity == "sigmoid",
+        sigmoid=kind.intensity == "sigmoid",
+        weighted=kind.weighted,
         sorted=not as_given,
         threads=torch.get_num_threads(),
     )

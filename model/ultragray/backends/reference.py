@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from ..limits import UNLIMITED, Limits
-from ..outputs import WEIGHT_SUM
+from ..outputs import INTENSITY_SUM, WEIGHT_SUM
 from ..probe import Probe
 from ..scene import GaussianScene
 from .cpu import footprint_pixels
@@ -47,18 +47,20 @@ def render_outputs(
     outputs: Sequence[str],
     limits: Limits = UNLIMITED,
     beam: Tensor | None = None,  # [3] cm, see `beam.beam_cm`
+    *,
+    weighted: bool = False,  # see `weighted.weighted_sums`
 ) -> dict[str, Tensor]:
     """The outputs by name, each [C, H, W] in the dtype of the scene's tensors. Raises FrameTooCostly and GivenUp."""
     if limits.footprint_pixels is not None:
         limits.check_costs(footprint_pixels(scene, probe, as_array(poses_cm), height, width, limits, beam))
     poses = torch.as_tensor(poses_cm).to(scene.means)
-    views = [combine(_render_pose(scene, probe, pose, height, width, limits, beam)) for pose in poses]
+    views = [combine(_render_pose(scene, probe, pose, height, width, limits, beam, weighted)) for pose in poses]
     empty = scene.means.new_zeros((0, height, width))
     return {name: torch.stack([view[name] for view in views]) if views else empty for name in outputs}
 
 
 def combine(fields: Fields) -> dict[str, Tensor]:
-    """B = E·T, E = γ·ΣI·w/(S + 1e-8), T, γ = 1 − exp(−S), and S."""
+    """B = E·T, E = γ·ΣI·w/(S + 1e-8), T, γ = 1 − exp(−S), S, and ΣI·w."""
     coverage = -torch.expm1(-fields.weight_sum)
     echo = coverage * fields.weighted_intensity / (fields.weight_sum + 1e-8)
     return {
@@ -67,19 +69,30 @@ def combine(fields: Fields) -> dict[str, Tensor]:
         "transmittance": fields.transmittance,
         "coverage": coverage,
         WEIGHT_SUM: fields.weight_sum,
+        INTENSITY_SUM: fields.weighted_intensity,
     }
 
 
 def _render_pose(
-    scene: GaussianScene, probe: Probe, pose: Tensor, height: int, width: int, limits: Limits, beam: Tensor | None
+    scene: GaussianScene,
+    probe: Probe,
+    pose: Tensor,
+    height: int,
+    width: int,
+    limits: Limits,
+    beam: Tensor | None,
+    weighted: bool,
 ) -> Fields:  # [H, W] each
     like = scene.means
     rotation, origin = pose[:3, :3], pose[:3, 3]
     means = (scene.means - origin) @ rotation  # [N, 3] probe frame
     inverse_root = _inverse_root_covariance(scene, rotation)  # [N, 3, 3]
-    spread = None  # [N] ln(|Σ'|/|Σ|)
+    lost = None  # [N] what m² grows by: ln(|Σ'|/|Σ|) of a beam, −2·ln(weight) of a weighted Gaussian
     if beam is not None:
-        inverse_root, spread = _spread_along_elevation(inverse_root, _beam_variance(beam.to(like), probe, means))
+        inverse_root, lost = _spread_along_elevation(inverse_root, _beam_variance(beam.to(like), probe, means))
+    if weighted:
+        by_weight = -2.0 * torch.nn.functional.logsigmoid(scene.transmittances)
+        lost = by_weight if lost is None else lost + by_weight
     intensities = intensity(scene, origin)  # [N]
     tau = torch.sigmoid(scene.transmittances)  # [N]
     origins, directions = (like.new_tensor(v) for v in probe.scan_lines(width))  # [W, 3] mm, [W, 3]
@@ -93,13 +106,15 @@ def _render_pose(
     (kept,) = torch.nonzero(torch.from_numpy(probe.cull(x_mm, z_mm, height)).to(like.device), as_tuple=True)
     for ids in torch.split(kept, max(1, ELEMENTS_PER_CHUNK // (9 * width))):
         rays = _intersect(means[ids], inverse_root[ids], origins, directions)  # [n, W]
-        if spread is not None:
-            rays = rays._replace(m2=rays.m2 + spread[ids][:, None])
+        if lost is not None:
+            rays = rays._replace(m2=rays.m2 + lost[ids][:, None])
         near_enough = (rays.m2 <= -2.0 * math.log(MIN_WEIGHT)).any(dim=1)  # else w and α are below 1/255
         (touching,) = torch.nonzero(near_enough, as_tuple=True)
         for part in torch.split(touching, max(1, ELEMENTS_PER_CHUNK // (height * width))):
             limits.check_flag()
             weight, alpha = _weight_and_alpha(Rays(*(r[part] for r in rays)), depths)  # [n, H, W]
+            if weighted:
+                alpha = torch.zeros_like(alpha)
             counted = (weight >= MIN_WEIGHT) | (alpha >= MIN_WEIGHT)
             weight = torch.where(counted, weight, 0.0)
             alpha = torch.where(counted, alpha, 0.0)

@@ -2,32 +2,30 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_svg import FigureCanvasSVG
-from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from ..evaluation.metrics import FrameMetrics
 from ..evaluation.reliability import Reliability
 from ..evaluation.scoring import Evaluation
+from ..methods.comparison.plots import figure as make_figure
+from ..methods.comparison.plots import line_style, svg
+from ..methods.comparison.ranks import LABELS
 from ..probe import FloatArray
 from .study import TiltStudy, Trained
 
 COLOURS = {"scene": "#0b6e99", "median": "#d97706", "nearest": "#7c8a97", "linear": "#6d8f3c"}
-LABELS = {"psnr_db": "PSNR, dB", "ms_ssim": "MS-SSIM", "gms": "GMS", "gmsd": "GMSD"}
 TILT_BINS = 6
 LOSS_POINTS = 300  # of the curve, however long the run
 
 
 def plot_frames(evaluations: Mapping[str, Evaluation]) -> str:
     """Each metric over the frame numbers, one line a method."""
-    figure, axes = _figure(len(LABELS), (11.0, 4.6), columns=2)
+    figure, axes = make_figure(len(LABELS), (11.0, 4.6), columns=2)
     for axis, (name, label) in zip(axes, LABELS.items(), strict=True):
-        for method, evaluation in evaluations.items():
+        for place, (method, evaluation) in enumerate(evaluations.items()):
             order = evaluation.frame_numbers.argsort()
             values = np.array([getattr(frame, name) for frame in evaluation.frames])
             axis.xaxis.set_major_locator(MaxNLocator(integer=True))
@@ -36,38 +34,37 @@ def plot_frames(evaluations: Mapping[str, Evaluation]) -> str:
                 values[order],
                 marker=".",
                 markersize=4,
-                linewidth=1.2,
-                color=COLOURS.get(method),
                 label=method,
+                **line_style(place),
             )
         axis.set(xlabel="frame", ylabel=label)
-    axes[0].legend(frameon=False, ncols=len(evaluations), loc="lower left", bbox_to_anchor=(0.0, 1.0))
-    return _svg(figure)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper left", frameon=False, ncols=len(evaluations))
+    return svg(figure)
 
 
 def plot_corrections(shift_mm: FloatArray, turn_deg: FloatArray) -> str:  # [P] both
     """How far each training frame's pose was corrected."""
-    figure, axes = _figure(2, (11.0, 2.6), columns=2)
+    figure, axes = make_figure(2, (11.0, 2.6), columns=2)
     for axis, values, label in zip(axes, (shift_mm, turn_deg), ("shift, mm", "turn, degrees"), strict=True):
         axis.plot(values, linewidth=1.2, color=COLOURS["scene"])
         axis.set(xlabel="training frame", ylabel=label)
-    return _svg(figure)
+    return svg(figure)
 
 
 def plot_reliability(reliability: Reliability) -> str:
     """Actual over expected deviation of pixels, in bins of the expected one; beside them the line where both agree."""
-    figure, axes = _figure(1, (4.4, 4.2), columns=1)
+    figure, axes = make_figure(1, (4.4, 4.2), columns=1)
     expected, actual = ([getattr(one, name) for one in reliability.bins] for name in ("expected", "actual"))
     most = max(*expected, *actual)
     axes[0].plot([0.0, most], [0.0, most], linewidth=1.0, color=COLOURS["nearest"])
     axes[0].plot(expected, actual, marker=".", linewidth=1.2, color=COLOURS["scene"])
     axes[0].set(xlabel="expected deviation of a pixel", ylabel="actual deviation", aspect="equal")
-    return _svg(figure)
+    return svg(figure)
 
 
 def plot_training(trained: Trained) -> str:
     """The loss of each step (means of neighbouring steps in a long run) and the held-out PSNR on the way."""
-    figure, axes = _figure(2, (11.0, 2.6), columns=2)
+    figure, axes = make_figure(2, (11.0, 2.6), columns=2)
     width = max(1, len(trained.losses) // LOSS_POINTS)
     count = len(trained.losses) // width
     means = np.array(trained.losses[: count * width]).reshape(count, width).mean(axis=1)
@@ -77,12 +74,12 @@ def plot_training(trained: Trained) -> str:
         list(trained.val_psnr_db), list(trained.val_psnr_db.values()), marker=".", color=COLOURS["scene"], linewidth=1.2
     )
     axes[1].set(xlabel="step", ylabel="held-out PSNR, dB")
-    return _svg(figure)
+    return svg(figure)
 
 
 def plot_tilt(study: TiltStudy) -> str:
     """PSNR and GMSD over the angle to the nearest training frame: every frame, and means of equally many."""
-    figure, axes = _figure(2, (11.0, 3.0), columns=2)
+    figure, axes = make_figure(2, (11.0, 3.0), columns=2)
     order = study.angles_deg.argsort()
     bins = np.array_split(order, min(TILT_BINS, len(order)))
     for axis, name in zip(axes, ("psnr_db", "gmsd"), strict=True):
@@ -94,35 +91,16 @@ def plot_tilt(study: TiltStudy) -> str:
             axis.plot(middles, [values[part].mean() for part in bins], color=colour, linewidth=1.6, label=method)
         axis.set(xlabel="angle to the nearest training frame, degrees", ylabel=LABELS[name])
     axes[0].legend(frameon=False, ncols=len(study.evaluations), loc="lower left", bbox_to_anchor=(0.0, 1.0))
-    return _svg(figure)
+    return svg(figure)
 
 
 def plot_counts(points: Mapping[int, FrameMetrics]) -> str:
     """PSNR and MS-SSIM over the number of Gaussians."""
-    figure, axes = _figure(2, (11.0, 2.6), columns=2)
+    figure, axes = make_figure(2, (11.0, 2.6), columns=2)
     counts = sorted(points)
     for axis, name in zip(axes, ("psnr_db", "ms_ssim"), strict=True):
         axis.plot(counts, [getattr(points[count], name) for count in counts], marker="o", color=COLOURS["scene"])
         axis.set(xlabel="Gaussians", ylabel=LABELS[name], xscale="log")
         axis.set_xticks(counts, [f"{count:,}" for count in counts])
         axis.minorticks_off()
-    return _svg(figure)
-
-
-def _figure(count: int, size: tuple[float, float], *, columns: int) -> tuple[Figure, list[Axes]]:
-    figure = Figure(figsize=size, layout="constrained")
-    grid = figure.subplots(count // columns, columns, squeeze=False)
-    axes: list[Axes] = list(grid.ravel())
-    for axis in axes:
-        axis.spines[["top", "right"]].set_visible(False)
-        axis.grid(axis="y", color="#e5e9ed", linewidth=0.8)
-        axis.tick_params(labelsize=9)
-    return figure, axes
-
-
-def _svg(figure: Figure) -> str:
-    text = io.StringIO()
-    FigureCanvasSVG(figure)
-    figure.savefig(text, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")), transparent=True)
-    written = text.getvalue()
-    return written[written.index("<svg") :]
+    return svg(figure)

@@ -12,10 +12,16 @@ from typing import TypeVar
 import numpy as np
 
 from ..datasets.sweep import Dataset, IntArray, Sweep
-from ..errors import UltragrayError
+from ..errors import DatasetInvalid, UltragrayError
 from ..evaluation.baselines import evaluate_baselines, nearest_frames
+from ..evaluation.compounding import METHODS as VOLUME_METHODS
 from ..evaluation.compounding import VOXEL_MM, mean_axes
 from ..evaluation.scoring import Evaluation, evaluate, require_frames
+from ..methods.classical import Compounding, FromFrames
+from ..methods.comparison.result import Comparison
+from ..methods.comparison.run import SCENE
+from ..methods.gaussians import SceneMethod
+from ..methods.method import Method
 from ..pose import rotation_angles_deg
 from ..probe import FloatArray
 from ..scene import GaussianScene
@@ -127,6 +133,29 @@ def ablations(config: TrainingConfig, gaussian_count: int) -> dict[str, Training
         "no out-of-plane sampling": replace(config, out_of_plane_mm=0.0),
         **{name: with_share_of_gaussians(share) for name, share in GAUSSIAN_SHARES.items()},
     }
+
+
+def baselines(voxel_mm: float) -> dict[str, Method]:
+    """The classical methods of a report by name, with voxels of one size."""
+    methods = (*(Compounding(fold, voxel_mm) for fold in VOLUME_METHODS), FromFrames("linear"), FromFrames("nearest"))
+    return {method.name: method for method in methods}
+
+
+def ablation_methods(config: TrainingConfig, gaussian_count: int) -> dict[str, Method]:
+    """The runs of `ablations` as methods, to be compared with the scene."""
+    return {
+        name: SceneMethod(name=name, title=name, settings=changed.to_dict())
+        for name, changed in ablations(config, gaussian_count).items()
+    }
+
+
+def scene_evaluation(comparison: Comparison) -> Evaluation:
+    """The scores of the scene among the methods of a comparison. Raises DatasetInvalid where it has none."""
+    if SCENE in comparison.failures:
+        raise DatasetInvalid(
+            f"{comparison.dataset.name}: the scene cannot be measured on it: {comparison.failures[SCENE]}"
+        )
+    return comparison.measured[SCENE]
 
 
 def frame_tilts_deg(sweep: Sweep) -> FloatArray:  # [F]

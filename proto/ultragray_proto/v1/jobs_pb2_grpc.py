@@ -114,8 +114,8 @@ class JobServiceServicer:
         raise NotImplementedError('Method not implemented!')
 
     def RetryJob(self, request, context):
-        """A new job in place of a failed or cancelled one; a training goes on from its last checkpoint. Asked again, it gives
-        the same job, whatever became of it. JOB_NOT_FOUND, JOB_NOT_FINISHED, JOB_QUEUE_FULL.
+        """A new job in place of a failed or cancelled one; a training or a comparison goes on from its last checkpoint. Asked
+        again, it gives the same job, whatever became of it. JOB_NOT_FOUND, JOB_NOT_FINISHED, JOB_QUEUE_FULL.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')

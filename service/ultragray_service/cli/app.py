@@ -27,7 +27,7 @@ class _Commands(LazyGroup):
         Entry("convert", "sweeps.convert", _SWEEPS, "Write a sweep in the layout of the released trainer."),
         Entry("train", "studies.train", _SWEEPS, "Train a scene from a tracked sweep."),
         Entry("eval", "studies.eval", _SWEEPS, "Measure a scene on the held-out frames of a sweep."),
-        Entry("compare", "studies.compare", _SWEEPS, "Measure compounding and interpolation on the same frames."),
+        Entry("compare", "studies.compare", _SWEEPS, "Compare this and other methods on the same frames."),
         Entry("report", "studies.report", _SWEEPS, "Train, measure and compare; write one HTML page."),
         Entry("bench", "studies.bench", _SWEEPS, "Measure the kernel and the service on this machine."),
         Entry("scenes", "remote.scenes", _REMOTE, "List, upload, download, delete and render scenes."),

@@ -5,17 +5,23 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from ultragray.datasets import Dataset
-from ultragray.evaluation.baselines import evaluate_baselines
 from ultragray.evaluation.metrics import FrameMetrics
 from ultragray.evaluation.scoring import Evaluation
+from ultragray.methods.comparison.result import Comparison, MethodResult
+from ultragray.methods.comparison.run import SCENE, compare_methods
+from ultragray.methods.comparison.settings import ComparisonSettings
+from ultragray.methods.comparison.tables import metric_rows
+from ultragray.methods.gaussians import GivenScene, SceneMethod
+from ultragray.methods.method import Method
 from ultragray.report import page as page_module
-from ultragray.report.page import ReportContent, metric_rows, render_page
-from ultragray.report.study import Failed, ablations, study_tilt, train_and_evaluate
+from ultragray.report.page import ReportContent, render_page
+from ultragray.report.study import Failed, ablation_methods, baselines, study_tilt, train_and_evaluate
 from ultragray.training import TrainingConfig
 from ultragray.training.config import VIEWS_BETWEEN
 from ultragray.training.data.geometry import Geometry
@@ -47,22 +53,34 @@ class Checked(HTMLParser):
 
 
 @pytest.fixture
-def content(turning_dataset: Dataset, small_config: TrainingConfig) -> ReportContent:
+def content(turning_dataset: Dataset, small_config: TrainingConfig, tmp_path: Path) -> ReportContent:
     trained = train_and_evaluate(turning_dataset, small_config)
+    ablated = ablation_methods(small_config, small_config.max_gaussians or 0)
+    methods = {SCENE: GivenScene(trained.scene, trained.seconds), **baselines(0.5), **ablated}
     return ReportContent(
         dataset=turning_dataset,
         scene=trained.scene,
-        evaluation=trained.evaluation,
-        baselines=evaluate_baselines(turning_dataset),
-        voxel_mm=0.5,
-        machine="a machine",
+        comparison=compared(turning_dataset, methods, tmp_path),
+        folder=tmp_path,
         trained=trained,
-        ablations={
-            name: train_and_evaluate(turning_dataset, config)
-            for name, config in ablations(small_config, small_config.max_gaussians or 0).items()
-        },
+        ablations=tuple(ablated),
         tilt=study_tilt(turning_dataset.train, small_config),
     )
+
+
+def compared(dataset: Dataset, methods: dict[str, Method], folder: Path) -> Comparison:
+    found = compare_methods(dataset, methods, ComparisonSettings(), folder=folder)
+    assert found is not None
+    return found
+
+
+def with_failures(content: ReportContent, reason: str, *names: str) -> ReportContent:
+    """The same where these methods failed."""
+    results = tuple(
+        MethodResult(one.name, one.description, failure=reason) if one.name in names else one
+        for one in content.comparison.results
+    )
+    return replace(content, comparison=replace(content.comparison, results=results))
 
 
 def test_the_page_is_whole_and_needs_nothing_else(content: ReportContent) -> None:
@@ -72,53 +90,56 @@ def test_the_page_is_whole_and_needs_nothing_else(content: ReportContent) -> Non
     assert all(address.startswith(("data:image/png;base64,", "#")) for address in page.addresses)
     assert "url(http" not in text
     assert "<script" not in text
-    assert text.count("<img ") == 3 * 6
-    assert text.count("<svg ") == 4
+    assert text.count("<img ") == 3 * (1 + 2 + 2 + 5 * 2)  # truth, the scene, what it is made of, the baselines
+    assert text.count("<svg ") == 5
     assert "turning &lt;sweep&gt;" in text
     assert "turning <sweep>" not in text
     for heading in ("Against the baselines", "Pictures", "Ablations", "Growing tilt", "Training"):
         assert f"<h2>{heading}</h2>" in text
     rows = re.findall(r'<th scope="row">(.*?)</th>', text)
-    assert rows == [
-        "this scene",
-        "median compounding",
-        "mean compounding",
-        "maximum compounding",
-        "linear interpolation between frames",
+    classical = [
+        "median compounding, 0.5 mm",
+        "mean compounding, 0.5 mm",
+        "maximum compounding, 0.5 mm",
+        "linear between frames",
         "nearest training frame",
-        "true frames",
-        "this scene",
-        "median compounding",
-        "mean compounding",
-        "maximum compounding",
-        "linear interpolation between frames",
-        "nearest training frame",
-        "full model",
-        *content.ablations,
-        "scene",
-        "median",
-        "nearest",
     ]
-    mean = content.evaluation.mean
+    assert rows == [
+        *("this scene", *classical),
+        *("this scene", *classical),  # their ranks
+        *("true frames", "this scene", *classical),
+        *("full model", *content.ablations),
+        *("scene", "median", "nearest"),
+    ]
+    mean = content.comparison.measured[SCENE].mean
     assert f"{mean.psnr_db:.2f} ±" in text
     assert f"{mean.gmsd:.3f} ±" in text
 
 
+def of_rows(content: ReportContent, *names: str) -> ReportContent:
+    results = tuple(one for one in content.comparison.results if one.name in names)
+    return replace(content, comparison=replace(content.comparison, results=results))
+
+
+def without_ablations(content: ReportContent) -> ReportContent:
+    return replace(of_rows(content, *(one.name for one in content.compared)), ablations=())
+
+
 def test_a_scene_from_a_file_without_ablations(content: ReportContent) -> None:
-    text = render_page(replace(content, trained=None, ablations={}, tilt=None))
+    text = render_page(replace(without_ablations(content), trained=None, tilt=None))
     assert Checked(text).open_tags == []
     assert re.findall(r"<h2>(.*?)</h2>", text) == ["Against the baselines", "Pictures"]
 
 
 def test_a_scene_alone_with_frames_from_end_to_end(content: ReportContent) -> None:
-    alone = replace(content, baselines={}, ablations={}, tilt=None, spread=2, scene_name="ball & <noise>")
+    alone = replace(of_rows(content, SCENE), ablations=(), tilt=None, spread=2, scene_name="ball & <noise>")
     text = render_page(alone)
     assert Checked(text).open_tags == []
     assert re.findall(r"<h2>(.*?)</h2>", text) == ["Held-out frames", "Pictures", "Training"]
     assert "<dt>Scene</dt><dd>ball &amp; &lt;noise&gt;</dd>" in text
     assert re.findall(r'<th scope="row">(.*?)</th>', text) == ["this scene", "true frames", "this scene"]
     first, last = content.dataset.val.frame_numbers[[0, -1]]
-    captions = re.findall(r"<figcaption>Frame (\d+): [\d.]+ dB</figcaption>", text)
+    captions = re.findall(r"<figcaption>Frame (\d+)</figcaption>", text)
     assert captions == [str(first), str(last)]
     assert text.count("<img ") == 2 * 5
     everything = render_page(replace(alone, spread=24))
@@ -127,16 +148,22 @@ def test_a_scene_alone_with_frames_from_end_to_end(content: ReportContent) -> No
 
 def test_a_study_that_failed_says_why_in_place_of_its_figures(content: ReportContent) -> None:
     name = "half of the Gaussians"
-    failed = Failed("it needs 9 GB & more")
-    text = render_page(replace(content, ablations={**content.ablations, name: failed}, tilt=Failed("<diverged>")))
+    reason = "it needs 9 GB & more"
+    text = render_page(replace(with_failures(content, reason, name), tilt=Failed("<diverged>")))
     assert Checked(text).open_tags == []
     assert f'<th scope="row">{name}</th><td class="failure" colspan="6">it needs 9 GB &amp; more</td></tr>' in text
     rows = re.findall(r'<th scope="row">(.*?)</th>', text)
-    assert rows[13:] == ["full model", *content.ablations]
+    assert rows[19:] == ["full model", *content.ablations]
     assert "This study could not be finished: &lt;diverged&gt;" in text
     assert "hardly turns" not in text
-    everything = render_page(replace(content, trained=None, ablations=dict.fromkeys(content.ablations, failed)))
+    everything = render_page(replace(with_failures(content, reason, *content.ablations), trained=None))
     assert everything.count('class="failure"') == len(content.ablations)
+
+
+def test_a_baseline_that_failed_is_a_row(content: ReportContent) -> None:
+    text = render_page(with_failures(content, "voxels too small", "linear"))
+    assert Checked(text).open_tags == []
+    assert '<th scope="row">linear between frames</th><td class="failure" colspan="4">voxels too small</td>' in text
 
 
 def test_the_plot_of_counts_holds_the_runs_that_differ_in_nothing_else(
@@ -144,38 +171,29 @@ def test_the_plot_of_counts_holds_the_runs_that_differ_in_nothing_else(
 ) -> None:
     plotted: list[int] = []
     monkeypatch.setattr(page_module, "plot_counts", lambda points: plotted.extend(points) or "<svg></svg>")
-    other = train_and_evaluate(content.dataset, TrainingConfig(steps=1, max_gaussians=77, transmittance=False))
-    render_page(replace(content, ablations={**content.ablations, "opaque Gaussians": other}))
+    other = SceneMethod("opaque", "opaque", TrainingConfig(steps=1, max_gaussians=77, transmittance=False).to_dict())
+    extra = compared(content.dataset, {"opaque": other}, content.folder)
+    comparison = replace(content.comparison, results=(*content.comparison.results, *extra.results))
+    render_page(replace(content, comparison=comparison, ablations=(*content.ablations, "opaque")))
     assert sorted(plotted) == [15, 30, 60, 120]
 
 
-def test_what_the_data_decides_is_told_as_it_was_decided(turning_dataset: Dataset) -> None:
+def test_what_the_data_decides_is_told_as_it_was_decided(turning_dataset: Dataset, tmp_path: Path) -> None:
     dataset = replace(turning_dataset, train=turning_dataset.train.select([3, 4]))
     trained = train_and_evaluate(dataset, TrainingConfig())
-    text = render_page(
-        ReportContent(
-            dataset=dataset,
-            scene=trained.scene,
-            evaluation=trained.evaluation,
-            baselines=evaluate_baselines(dataset, ("median",)),
-            voxel_mm=0.5,
-            machine="a machine",
-            trained=trained,
-        )
-    )
+    comparison = compared(dataset, {SCENE: GivenScene(trained.scene)}, tmp_path)
+    text = render_page(ReportContent(dataset, trained.scene, comparison, tmp_path, trained=trained))
     steps = Geometry.of(dataset).steps(VIEWS_BETWEEN)
     assert f"{steps:,} steps in " in text
     assert f"<code>steps = {steps}</code>" in text
     assert "= None" not in text.replace("memory_gb = None", "")
 
 
-def test_one_held_out_frame_is_shown_once(content: ReportContent) -> None:
-    val = content.dataset.val.select([0])
-    alone = Evaluation(content.evaluation.frames[:1], val.frame_numbers, 1, content.evaluation.frame_speckle[:1])
-    dataset = replace(content.dataset, val=val)
-    text = render_page(
-        replace(content, dataset=dataset, evaluation=alone, baselines=evaluate_baselines(dataset), ablations={})
-    )
+def test_one_held_out_frame_is_shown_once(content: ReportContent, tmp_path: Path) -> None:
+    dataset = replace(content.dataset, val=content.dataset.val.select([0]))
+    folder = tmp_path / "alone"
+    comparison = compared(dataset, {SCENE: GivenScene(content.scene), **baselines(0.5)}, folder)
+    text = render_page(replace(content, dataset=dataset, comparison=comparison, folder=folder, ablations=()))
     assert text.count("<figcaption>") == 1
 
 

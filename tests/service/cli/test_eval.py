@@ -1,4 +1,4 @@
-"""`ultragray eval`, `compare` and `report`: from a folder of frames to figures, pictures and a page."""
+"""`ultragray eval` and `report`: from a folder of frames to figures, pictures and a page."""
 
 from __future__ import annotations
 
@@ -16,12 +16,11 @@ from ultragray import ConvexProbe, GaussianScene, LinearProbe, Probe
 from ultragray.datasets import Dataset, Sweep
 from ultragray.datasets.released import read_released, write_released
 from ultragray.errors import MemoryExceeded, TrainingDiverged
-from ultragray.evaluation.baselines import BASELINES, evaluate_baselines
 from ultragray.evaluation.reliability import measure_reliability
 from ultragray.evaluation.scoring import evaluate
+from ultragray.methods import gaussians
 from ultragray.report import study
 from ultragray.training import TrainingConfig, train
-from ultragray_service.cli.studies.compare import Method
 
 from .command_line import refused, run
 
@@ -86,22 +85,6 @@ def test_eval_writes_pictures(dataset: Path, scene: Path, tmp_path: Path) -> Non
     assert (tmp_path / "pictures" / "uncertainty.svg").read_text().startswith("<svg")
 
 
-def test_compound_prints_what_the_library_measures(dataset: Path) -> None:
-    expected = evaluate_baselines(read_released(dataset), voxel_mm=0.7)
-    document = printed_json("compare", dataset, "--json", "--voxel-mm", 0.7)
-    assert document["voxel_mm"] == 0.7
-    assert document["methods"] == {name: evaluation.to_dict() for name, evaluation in expected.items()}
-    table = run("compare", dataset, "--voxel-mm", 0.7).stdout
-    for name, evaluation in expected.items():
-        assert re.search(rf"{name} +{evaluation.mean.psnr_db:.2f} ± ", table)
-
-
-def test_compound_by_one_method(dataset: Path) -> None:
-    document = printed_json("compare", dataset, "--json", "--method", "maximum")
-    assert list(document["methods"]) == ["maximum"]
-    assert document["voxel_mm"] == 0.5
-
-
 def test_report_of_a_scene(dataset: Path, scene: Path, tmp_path: Path) -> None:
     page = tmp_path / "page.html"
     result = run("report", dataset, "-o", page, "--scene", scene, "--no-ablations", "--threads", 1)
@@ -141,6 +124,7 @@ def test_a_study_that_fails_does_not_take_the_report_with_it(
         raise TrainingDiverged("the loss is nan")
 
     monkeypatch.setattr(study, "train", train_or_fail)
+    monkeypatch.setattr(gaussians, "train", train_or_fail)
     monkeypatch.setattr(study, "study_tilt", study_tilt)
     page = tmp_path / "page.html"
     result = run("report", dataset, "-o", page, "--steps", 2, "--max-gaussians", 40, "--threads", 1)
@@ -169,7 +153,6 @@ def test_mistakes(dataset: Path, scene: Path, tmp_path: Path) -> None:
     assert f"new or empty folder, {tmp_path} holds files" in refused("eval", scene, dataset, "-o", tmp_path)
     assert "no such file" in refused("eval", tmp_path / "none.ugr", dataset)
     assert "no such file or folder" in refused("compare", tmp_path / "none")
-    assert "voxel_mm must be" in refused("compare", dataset, "--voxel-mm", 0.001)
     assert "is a folder" in refused("report", dataset, "-o", tmp_path)
     assert "must end in .html, got 'page.pdf'" in refused("report", dataset, "-o", tmp_path / "page.pdf")
     assert "preset must be" in refused("report", dataset, "-o", tmp_path / "page.html", "--preset", "slow")
@@ -218,7 +201,3 @@ def test_a_dataset_without_held_out_frames_is_refused(dataset: Path, scene: Path
         ("report", tmp_path / "alone", "-o", tmp_path / "page.html"),
     ):
         assert "no frames to measure with" in refused(*arguments)
-
-
-def test_every_baseline_can_be_asked_for() -> None:
-    assert {method.value for method in Method} == {"all", *BASELINES}

@@ -16,7 +16,7 @@ from google.rpc.status_pb2 import Status
 
 from ultragray_proto.v1 import geometry_pb2, jobs_pb2, jobs_pb2_grpc, rendering_pb2
 from ultragray_service.rpc.messages import read_specification
-from ultragray_workers.jobs.kinds import TrainJob
+from ultragray_workers.jobs.kinds import CompareJob, TrainJob
 
 from ..conftest import RunningService, StartService
 
@@ -80,6 +80,7 @@ def test_a_render_job_comes_back_as_it_was_asked_for(jobs: jobs_pb2_grpc.JobServ
         ("train", jobs_pb2.TrainJob(dataset="liver", scene="liver")),
         ("render", jobs_pb2.RenderJob(scene="liver", sampler=jobs_pb2.PoseSampler(kind="training"))),
         ("evaluate", jobs_pb2.EvaluateJob(dataset="liver", scene="liver")),
+        ("compare", jobs_pb2.CompareJob(dataset="liver", methods=["median", "linear"])),
     ],
 )
 def test_what_a_job_asks_of_its_worker_is_read_from_the_messages_of_all_kinds(kind: str, named: Any) -> None:
@@ -88,6 +89,12 @@ def test_what_a_job_asks_of_its_worker_is_read_from_the_messages_of_all_kinds(ki
     assert field == kind
     assert (specification.device, specification.min_memory_gb) == ("cuda:1", 16)
     assert specification.worker_labels == {"site": "lab1", "rack": "4"}
+
+
+def test_what_a_comparison_leaves_out_is_every_method_at_equal_time() -> None:
+    specification, _ = read_specification(jobs_pb2.SubmitJobRequest(compare=jobs_pb2.CompareJob(dataset="liver")))
+    assert specification == CompareJob(dataset="liver")
+    assert (specification.methods, specification.budget, specification.times) == (("all",), "equal", 1.0)
 
 
 def test_a_demand_comes_back_with_what_the_job_waits_for(jobs: jobs_pb2_grpc.JobServiceStub) -> None:
@@ -126,6 +133,14 @@ def test_the_same_request_id_gives_the_same_job(jobs: jobs_pb2_grpc.JobServiceSt
         (
             jobs_pb2.SubmitJobRequest(evaluate=jobs_pb2.EvaluateJob(dataset="gone", scene="demo", baselines=True)),
             ("NOT_FOUND", "DATASET_NOT_FOUND", "evaluate.dataset"),
+        ),
+        (
+            jobs_pb2.SubmitJobRequest(compare=jobs_pb2.CompareJob(dataset="gone")),
+            ("NOT_FOUND", "DATASET_NOT_FOUND", "compare.dataset"),
+        ),
+        (
+            jobs_pb2.SubmitJobRequest(compare=jobs_pb2.CompareJob(dataset="gone", methods=["newest"])),
+            ("INVALID_ARGUMENT", "INVALID_ARGUMENT", "compare.methods"),
         ),
         (
             jobs_pb2.SubmitJobRequest(render=jobs_pb2.RenderJob(scene="demo")),

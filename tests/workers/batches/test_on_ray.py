@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -11,10 +16,11 @@ import torch
 
 from ultragray.batches import names_in
 from ultragray.batches.shard import ShardRenderer
-from ultragray.errors import InvalidArgument
+from ultragray.errors import BackendUnavailable, InvalidArgument
 from ultragray_workers.batches import on_ray
 from ultragray_workers.batches.on_ray import RayBatch
 
+from ...waiting import wait_until
 from .conftest import plan_of
 
 pytest.importorskip("ray", reason="Ray is not installed: pip install 'ultragray[ray]'")
@@ -71,3 +77,51 @@ def test_a_release_of_the_cluster_that_differs_is_told(
     monkeypatch.setattr(on_ray.ultragray, "__version__", "99.0")
     with pytest.raises(Exception, match=r"shard 0: the Ray cluster has ultragray .*, this is 99\.0"):
         RayBatch(plan_of(scene_file, 20, 20), scene_file, str(tmp_path / "made")).render("ray", lambda frames: None)
+
+
+@pytest.fixture
+def head(tmp_path: Path) -> Iterator[str]:
+    """The address of a cluster that runs by itself, as others' clusters do."""
+    with contextlib.ExitStack() as held:
+        free = [held.enter_context(socket.create_server(("127.0.0.1", 0))) for _ in range(2)]
+        port, client_port = (one.getsockname()[1] for one in free)
+    command = [str(Path(sys.executable).with_name("ray")), "start", "--head", "--block", "--include-dashboard=false"]
+    ports = [f"--port={port}", f"--ray-client-server-port={client_port}", "--node-ip-address=127.0.0.1"]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    with (tmp_path / "ray.log").open("wb") as log:
+        process = subprocess.Popen([*command, *ports, "--num-cpus=2"], stdout=log, stderr=log, env=environment)
+    try:
+        wait_until(lambda: _answers(client_port), within_s=120)
+        yield f"ray://127.0.0.1:{client_port}"
+    finally:
+        process.terminate()
+        process.wait(60)
+
+
+def _answers(port: int) -> bool:
+    with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", port), timeout=1):
+        return True
+    return False
+
+
+@pytest.mark.long
+def test_a_cluster_of_others_is_reached_by_its_address_and_goes_on_after_the_batch(
+    head: str, scene_file: Path, tmp_path: Path
+) -> None:
+    for number in (1, 2):
+        plan = plan_of(scene_file, 400, 100)
+        folder = tmp_path / f"made{number}"
+        told: list[int] = []
+        RayBatch(plan, scene_file, str(folder)).render(head, told.append)
+        assert told[-1] == 400
+        ShardRenderer(plan, scene_file, torch.device("cpu")).render(3, tmp_path / "shard.tar")
+        assert (tmp_path / "shard.tar").read_bytes() == (folder / plan.file_name(3)).read_bytes()
+
+
+def test_a_cluster_that_is_not_there_is_told_in_one_sentence(scene_file: Path, tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    with pytest.raises(BackendUnavailable, match=f"the Ray cluster ray://127.0.0.1:{port} cannot be used"):
+        RayBatch(plan_of(scene_file, 20, 20), scene_file, str(tmp_path / "made")).render(
+            f"ray://127.0.0.1:{port}", lambda frames: None
+        )

@@ -41,3 +41,8 @@ export function defaultsOf({ properties = {} }: Described): Record<string, unkno
 export function isSimple({ type, enum: choices }: Described): boolean {
   return choices !== undefined || ["number", "integer", "boolean", "string"].includes(type ?? "");
 }
+
+/** Whether a value is a list of words, which a person writes with commas between them. */
+export function isWordList({ type, items }: Described): boolean {
+  return type === "array" && items?.type === "string";
+}

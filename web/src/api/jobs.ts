@@ -49,6 +49,16 @@ export function artifactPath(job: string, name: string): string {
   return address("/v1/jobs/{job}/artifacts/{name}", { job, name });
 }
 
+/** A file that a browser shows instead of saving it. */
+export function shownPath(job: string, name: string): string {
+  return `${artifactPath(job, name)}?show=true`;
+}
+
+/** What a job is about: the scene that it makes or needs, else its dataset. */
+export function subjectOf({ specification }: Job): string {
+  return specification.scene ?? specification.dataset ?? "";
+}
+
 /** Who is told of a job; `event`: the id of the last event, from which a later stream can go on. */
 export interface JobListener {
   job: (job: Job) => void;

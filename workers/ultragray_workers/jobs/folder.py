@@ -3,7 +3,7 @@
 job.json        what is asked for: written by the worker before its process starts
 lock            held by the one process that works in the folder, whose number it says
 NAME.ugr        the scene that the job needs, as it was when the job was submitted
-run/            the trainer's folder: checkpoint, journal, configuration
+run/            the trainer's folder: checkpoint, journal, configuration; of a comparison one for each method within
 progress.json   how far it is
 log.txt         what the process said
 reserve         room on the disk, given back when the process has ended
@@ -36,7 +36,7 @@ class Progress:
 
     __pydantic_config__: ClassVar[dict[str, Any]] = {"json_schema_serialization_defaults_required": True}
 
-    step: int | None = described("Steps of a training that are done.", None)
+    step: int | None = described("Steps that are done of a training, or of the method at hand of a comparison.", None)
     steps: int | None = None
     loss: float | None = None
     val_psnr_db: float | None = described("On the held-out frames, the last time it was measured.", None)
@@ -48,6 +48,9 @@ class Progress:
     waits_for: str | None = described(
         "Of a job that waits: what else it needs than its turn, such as a worker that offers what it asks for.", None
     )
+    method: str | None = described("Of a comparison: the method at hand.", None)
+    method_number: int | None = described("Its number among the methods of the comparison, from 1.", None)
+    methods: int | None = None
 
     @classmethod
     def from_dict(cls, document: Mapping[str, Any]) -> Progress:
@@ -189,7 +192,7 @@ class JobFolder:
         return tuple(sorted(path.name for path in self.artifacts.iterdir()))
 
     def remove_checkpoints(self) -> None:
-        """Removes what only an unfinished training needs."""
+        """Removes what only an unfinished job needs."""
         shutil.rmtree(self.run, ignore_errors=True)
 
 

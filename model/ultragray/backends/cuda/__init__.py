@@ -37,6 +37,8 @@ def render_outputs(
     outputs: Sequence[str],
     limits: Limits = UNLIMITED,
     beam: Tensor | None = None,  # [3] cm, see `beam.beam_cm`
+    *,
+    weighted: bool = False,  # see `weighted.weighted_sums`
 ) -> dict[str, Tensor]:
     """The outputs by name, each [C, H, W] float32 on the scene's device; differentiable once by every parameter and
     by poses and the beam.
@@ -47,4 +49,4 @@ def render_outputs(
     """
     from .frames import render_frames
 
-    return render_frames(scene, probe, poses_cm, height, width, outputs, limits, beam)
+    return render_frames(scene, probe, poses_cm, height, width, outputs, limits, beam, weighted)

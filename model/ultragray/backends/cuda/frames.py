@@ -16,6 +16,7 @@ from ...limits import Limits
 from ...probe import Probe
 from ...scene import PARAMETERS, GaussianScene
 from ..beam import Moments
+from ..kind import Kind
 from ..poses import ScenePoses, as_array, gradient_by_poses, want_gradient
 from ..spatial_order import spatial_order
 from .device import upload
@@ -47,6 +48,7 @@ def render_frames(
     outputs: Sequence[str],
     limits: Limits,
     beam: Tensor | None,  # [3] cm
+    weighted: bool,
 ) -> dict[str, Tensor]:  # [C, H, W] each
     """See `ultragray.backends.cuda.render_outputs`."""
     geometry, device = Geometry.of(probe, height, width, beam), scene.means.device
@@ -55,13 +57,13 @@ def render_frames(
         varied = [*scene.splats.values(), *([] if beam is None else [beam])]
         by_scene = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in varied)
         if not by_scene and not want_gradient(poses_cm):
-            return _render(sorted_gaussians(scene), geometry, views, outputs, limits)
+            return _render(sorted_gaussians(scene, weighted), geometry, views, outputs, limits)
         if len(views) > MAX_POSES:
             raise TooManyPoses(
                 f"at most {MAX_POSES:,} poses can be differentiated together, got {len(views):,}", field="poses"
             )
         frames = _Render.apply(  # type: ignore[no-untyped-call]
-            scene.info.intensity,
+            Kind(scene.info.intensity, weighted),
             geometry,
             views,
             tuple(outputs),
@@ -98,7 +100,8 @@ def _render(
         if limits.footprint_pixels is not None:
             limits.check_costs(slices.footprints.sum(dim=1).tolist(), first)
             limits.check_flag()
-        draw(slices, geometry, {name: frame[some] for name, frame in frames.items()}, keep=False)
+        those = {name: frame[some] for name, frame in frames.items()}
+        draw(slices, geometry, those, keep=False, absorbs=not gaussians.kind.weighted)
     return frames
 
 
@@ -108,7 +111,7 @@ class _Render(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any,
-        intensity: str,
+        kind: Kind,
         geometry: Geometry,
         views: Tensor,
         names: tuple[str, ...],
@@ -116,13 +119,13 @@ class _Render(torch.autograd.Function):
         beam: Tensor | None,
         *splats: Tensor,
     ) -> tuple[Tensor, ...]:
-        gaussians = Gaussians.of(dict(zip(PARAMETERS, splats, strict=True)), intensity)
+        gaussians = Gaussians.of(dict(zip(PARAMETERS, splats, strict=True)), kind)
         slices = cut(gaussians, views, geometry, record=True)
         frames = empty_frames(names, len(views), geometry, views.device)
-        planes = draw(slices, geometry, frames, keep=True)
+        planes = draw(slices, geometry, frames, keep=True, absorbs=not kind.weighted)
         # Saved by torch: a parameter that changes before the backward pass is noticed, and all is freed after it.
         ctx.save_for_backward(*splats, views, *vars(slices).values(), *vars(planes).values())
-        ctx.intensity, ctx.geometry, ctx.names, ctx.poses = intensity, geometry, names, poses
+        ctx.kind, ctx.geometry, ctx.names, ctx.poses = kind, geometry, names, poses
         ctx.beam = beam.detach() if beam is not None and beam.requires_grad else None
         ctx.set_materialize_grads(False)
         return tuple(frames.values())
@@ -139,7 +142,7 @@ class _Render(torch.autograd.Function):
         splats, (views, *rest) = saved[: len(PARAMETERS)], saved[len(PARAMETERS) :]
         slices, planes = Slices(*rest[:_SLICES]), Planes(*rest[_SLICES:])
         with _on_device(views.device, f"the gradient of {len(views)} frames"):
-            gaussians = Gaussians.of(dict(zip(PARAMETERS, splats, strict=True)), ctx.intensity)
+            gaussians = Gaussians.of(dict(zip(PARAMETERS, splats, strict=True)), ctx.kind)
             by_views = _room_for_views(slices) if ctx.needs_input_grad[4] else None
             found, moments = differentiate(gaussians, views, ctx.geometry, slices, planes, given, by_views)
             by_beam = None if ctx.beam is None else Moments(*moments.tolist()).gradient(ctx.beam)
@@ -153,11 +156,12 @@ def _room_for_views(slices: Slices) -> Tensor:  # [C, B, 2, 3]
     return slices.slices.new_zeros((*slices.counts.shape, 2, 3), dtype=torch.float64)
 
 
-def sorted_gaussians(scene: GaussianScene) -> Gaussians:
+def sorted_gaussians(scene: GaussianScene, weighted: bool = False) -> Gaussians:
     """The scene's Gaussians along a space-filling curve, kept with the scene until one of its tensors changes."""
+    kind = Kind(scene.info.intensity, weighted)
 
     def sort() -> Gaussians:
         order = spatial_order(scene.means)
-        return Gaussians.of({name: t.detach()[order] for name, t in scene.splats.items()}, scene.info.intensity)
+        return Gaussians.of({name: t.detach()[order] for name, t in scene.splats.items()}, kind)
 
-    return scene.prepared("cuda", sort)
+    return scene.prepared(kind.place("cuda"), sort)

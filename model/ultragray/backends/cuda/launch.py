@@ -16,10 +16,11 @@ import torch
 import triton
 from torch import Tensor
 
-from ...outputs import PLANES, WEIGHT_SUM
+from ...outputs import INTENSITY_SUM, PLANES, SUMS, WEIGHT_SUM
 from ...probe import FloatArray, Probe
 from ...scene_info import expected_shapes
 from ..beam import THIN, BeamVariance
+from ..kind import Kind
 from ..scan_lines import KernelLines
 from .device import interpreted
 from .kernels import constants
@@ -122,22 +123,26 @@ class Gaussians:
     transmittances: Tensor
     sh0: Tensor
     shn: Tensor
-    sigmoid: bool
+    kind: Kind
 
     @classmethod
-    def of(cls, splats: Mapping[str, Tensor], intensity: str) -> Gaussians:
+    def of(cls, splats: Mapping[str, Tensor], kind: Kind) -> Gaussians:
         raw = {name: tensor.detach() for name, tensor in splats.items()}
         shn = raw.pop("shN").squeeze(-1)
         return cls(
             **{name: tensor.contiguous() for name, tensor in raw.items()},
             shn=shn if shn.stride(-1) == 1 else shn.contiguous(),
-            sigmoid=intensity == "sigmoid",
+            kind=kind,
         )
 
     @property
     def tensors(self) -> tuple[Tensor, ...]:
         """The six, in the order in which the kernels take them."""
         return self.means, self.scales, self.quats, self.transmittances, self.sh0, self.shn
+
+    @property
+    def sigmoid(self) -> bool:
+        return self.kind.intensity == "sigmoid"
 
     @property
     def degree(self) -> int:
@@ -204,6 +209,7 @@ def cut(gaussians: Gaussians, views: Tensor, geometry: Geometry, *, record: bool
             SIGMOID=gaussians.sigmoid,
             DEGREE=gaussians.degree,
             THICK=geometry.thick,
+            WEIGHTED=gaussians.kind.weighted,
             RECORD=record,
             BLOCK=how.block,
             num_warps=4,
@@ -216,13 +222,15 @@ def empty_frames(outputs: Sequence[str], poses: int, geometry: Geometry, device:
     return {name: torch.empty((poses, geometry.height, geometry.width), device=device) for name in outputs}
 
 
-def draw(slices: Slices, geometry: Geometry, frames: Mapping[str, Tensor], *, keep: bool) -> Planes:
+def draw(
+    slices: Slices, geometry: Geometry, frames: Mapping[str, Tensor], *, keep: bool, absorbs: bool = True
+) -> Planes:
     """Fills the outputs, each [C, H, W] contiguous; returns the planes beneath them, with T where it is to be kept."""
     how, device = shapes(), slices.slices.device
     poses, blocks = slices.counts.shape
     height, width = geometry.height, geometry.width
     weight, weighted, transmittance = (torch.empty((poses, height, width), device=device) for _ in range(3))
-    planes = Planes(frames.get(WEIGHT_SUM, weight), weighted, transmittance)
+    planes = Planes(frames.get(WEIGHT_SUM, weight), frames.get(INTENSITY_SUM, weighted), transmittance)
     if not poses:
         return planes
     tile_rows, tile_columns = -(-height // how.tile_rows), -(-width // how.tile_columns)
@@ -243,6 +251,7 @@ def draw(slices: Slices, geometry: Geometry, frames: Mapping[str, Tensor], *, ke
         geometry.row_cm,
         FANNED=geometry.fanned,
         WRAP=geometry.wrap,
+        ABSORBS=absorbs,
         BLOCK=how.block,
         S_LANES=how.slices_at_once,
         TILE_ROWS=how.tile_rows,
@@ -292,7 +301,7 @@ def differentiate(
         return found, by_beam.sum(dim=0)
     by_pixel = [torch.empty_like(planes.weight) for _ in range(4)]
     by_slice = torch.empty((poses * blocks * how.block, constants.GRADIENTS.value), device=device)
-    given = [gradients.get(name) for name in PLANES]
+    given = [gradients.get(name) for name in (*PLANES, *SUMS)]
     if poses:
         differentiate_pixels[(-(-width // how.pixel_columns), poses)](
             planes.weight,
@@ -320,6 +329,7 @@ def differentiate(
             geometry.row_cm,
             FANNED=geometry.fanned,
             WRAP=geometry.wrap,
+            ABSORBS=not gaussians.kind.weighted,
             BLOCK=how.block,
             S_LANES=how.slices_at_once,
             ROWS=how.gather_rows,
@@ -344,6 +354,7 @@ def differentiate(
         SIGMOID=gaussians.sigmoid,
         DEGREE=gaussians.degree,
         THICK=geometry.thick,
+        WEIGHTED=gaussians.kind.weighted,
         TERMS=max(2, triton.next_power_of_2(terms)),
         BY_VIEW=by_views is not None,
         BLOCK=how.block,

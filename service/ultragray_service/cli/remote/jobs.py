@@ -36,13 +36,14 @@ _SUBMITS = {
         "ultragray jobs submit train liver --scene liver --preset best --wait",
         "ultragray jobs submit train liver --scene liver --device cuda --min-memory-gb 16 --require site=lab1",
     ),
+    "compare": ("ultragray jobs submit compare liver --methods scene,median,linear --wait",),
     "evaluate": ("ultragray jobs submit evaluate liver --scene liver --wait",),
     "render": (
         "ultragray jobs submit render liver --format hdf5 --sampler around --count 5000 --translation-mm 3",
         "ultragray jobs submit render liver --sampler around --count 10000000 --height 64 --width 64 --wait",
     ),
 }
-_COLUMNS = ("id", "kind", "state", "scene", "progress", "created", "reason")
+_COLUMNS = ("id", "kind", "state", "scene or dataset", "progress", "created", "reason")
 
 
 @command_app.command(
@@ -258,5 +259,5 @@ def _print_jobs(jobs: list[dict[str, Any]]) -> None:
 
 def _row(job: dict[str, Any], progress: str) -> tuple[str, ...]:
     created = str(job["created_at"])[:19].replace("T", " ")
-    scene = str(job["specification"].get("scene", ""))
-    return (job["id"], job["kind"], job["state"], scene, progress, created, job["reason"] or "")
+    about = str(job["specification"].get("scene", job["specification"].get("dataset", "")))
+    return (job["id"], job["kind"], job["state"], about, progress, created, job["reason"] or "")

@@ -117,6 +117,8 @@ def figures(job: dict[str, Any]) -> str:
     parts = []
     if progress["waits_for"] is not None:
         parts.append(f"waits for {progress['waits_for']}")
+    if progress["method"] is not None:
+        parts.append(f"{progress['method']}, method {progress['method_number']} of {progress['methods']}")
     if progress["loss"] is not None:
         parts.append(f"loss {progress['loss']:.4f}")
     if progress["gaussians"] is not None:

@@ -1,68 +1,184 @@
-"""`ultragray compare`: what classical methods reach on the same held-out frames as a scene."""
+"""`ultragray compare`: methods side by side on the same held-out frames, each within the same budget."""
 
 from __future__ import annotations
 
-import enum
-from typing import Annotated
+import shutil
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from ultragray.datasets.source import SourceOptions
+from ultragray.errors import TrainingStateInvalid
+from ultragray.methods.comparison.settings import ComparisonSettings
 
+from ..group import INTERRUPTED
 from ..options import with_options
-from ..progress import working
-from ..style import Json, command_group, examples, to_json
+from ..output import check_file
+from ..stopping import stop_on_signal
+from ..style import COMPUTE, Json, Threads, command_group, examples, output_option, to_json
 from ..sweeps.source import SweepArgument, check_source, read_dataset
-from .tables import print_metrics, print_speckle
+from .tables import print_comparison, print_speckle
+
+if TYPE_CHECKING:
+    from ultragray.datasets import Dataset
+    from ultragray.methods.comparison.result import Comparison
+    from ultragray.methods.comparison.run import ComparisonProgress
+
+PAGE_SUFFIX, BESIDE_IT = ".html", (".json", ".tex")
 
 command_app = command_group()
 
-VoxelMm = Annotated[
-    float | None,
-    typer.Option(
-        metavar="MM", help="Side of a voxel of compounding, mm.", show_default="0.5, or what fits into memory"
-    ),
-]
 
-
-class Method(str, enum.Enum):
-    """One of ultragray.evaluation.baselines.BASELINES, or all of them."""
-
-    ALL = "all"
-    MEDIAN = "median"
-    MEAN = "mean"
-    MAXIMUM = "maximum"
-    LINEAR = "linear"
-    NEAREST = "nearest"
-
-
-@command_app.command(epilog=examples("ultragray compare sweep/", "ultragray compare sweep/ --method median --json"))
+@command_app.command(
+    epilog=examples(
+        "ultragray compare sweep/ --methods median,mean,linear,nearest  # seconds",
+        "ultragray compare sweep/ -o comparison.html  # every method, as long as a scene takes",
+        "ultragray compare sweep/ --methods scene,median --json | jq '.results[].name'",
+    )
+)
 @with_options
 def compare(
     sweep: SweepArgument,
+    output: Annotated[
+        Path | None,
+        output_option(
+            "Page to write (.html), with .json and .tex beside it. What each method learned is kept in OUTPUT.run: the "
+            "same command goes on from there, also with more methods.",
+            default="none, only the table",
+        ),
+    ] = None,
+    force: Annotated[
+        bool, typer.Option("--force", help="Replace what is there, and begin anew.", rich_help_panel="Output")
+    ] = False,
     json: Json = False,
-    method: Annotated[
-        Method,
-        typer.Option(help="Compounding by voxel, linear between enclosing frames, or the nearest frame as it is."),
-    ] = Method.ALL,
-    voxel_mm: VoxelMm = None,
+    device: Annotated[
+        str, typer.Option(help="cpu, or a GPU: cuda, or cuda:N for one of several.", rich_help_panel=COMPUTE)
+    ] = "cpu",
+    threads: Threads = 0,
     *,
+    settings: ComparisonSettings,
     source: SourceOptions,
 ) -> None:
-    """The figures are those of `ultragray eval`: what a scene must beat to be worth its training."""
+    """The figures are those of `ultragray eval`. Ctrl-C stops; with --output, the same command goes on."""
     check_source(sweep)
+    if output is not None:
+        _check_output(output, force=force)
+        import ultragray.methods.comparison.files  # noqa: F401  # packages that it lacks are told before all the work
 
-    from ultragray.evaluation.baselines import BASELINES, evaluate_baselines
-    from ultragray.evaluation.compounding import affordable_voxel_mm
+    from ultragray.evaluation.scoring import require_frames
+    from ultragray.training.device import training_device
 
+    training_device(device, "auto")  # refused before the sweep is read, which may take long
+    if threads:
+        import torch
+
+        torch.set_num_threads(threads)
     read = read_dataset(sweep, source)
-    voxel_mm = affordable_voxel_mm(read.train) if voxel_mm is None else voxel_mm
-    methods = BASELINES if method is Method.ALL else (method.value,)
-    with working(f"measuring {', '.join(methods)} on {len(read.val)} frames …"):
-        evaluations = evaluate_baselines(read, methods, voxel_mm)
-    if json:
-        found = {name: evaluation.to_dict() for name, evaluation in evaluations.items()}
-        typer.echo(to_json({"dataset": read.name, "voxel_mm": voxel_mm, "methods": found}))
-    else:
-        print_metrics(f"{read.name}, {len(read.val)} val frames, voxels of {voxel_mm:g} mm", evaluations)
-        print_speckle(evaluations)
+    require_frames(read.val)
+    if output is not None:
+        if force:
+            shutil.rmtree(run_folder(output), ignore_errors=True)
+        _compare(read, settings, device, run_folder(output), output, as_json=json)
+        return
+    with tempfile.TemporaryDirectory(prefix="ultragray-compare-") as folder:
+        _compare(read, settings, device, Path(folder), None, as_json=json)
+
+
+def run_folder(output: Path) -> Path:
+    """The folder of what each method of a comparison learned."""
+    return output.with_name(f"{output.name}.run")
+
+
+def _check_output(output: Path, *, force: bool) -> None:
+    """Raise InvalidArgument where the page or a file beside it cannot be written, or is not this comparison's to write.
+
+    TrainingStateInvalid where the folder of the run is another thing's: --force would remove it.
+    """
+    from ultragray.methods.comparison.place import RUN_FILE
+
+    run = run_folder(output)
+    is_a_run = (run / RUN_FILE).is_file()
+    if run.exists() and not is_a_run and not (run.is_dir() and next(run.iterdir(), None) is None):
+        raise TrainingStateInvalid(f"{run}: it is there, and holds no comparison: give another --output, or move it")
+    check_file(output, [PAGE_SUFFIX], force=force or is_a_run)
+    for suffix in BESIDE_IT:
+        check_file(output.with_suffix(suffix), force=force or is_a_run)
+
+
+def _compare(
+    dataset: Dataset, settings: ComparisonSettings, device: str, run: Path, output: Path | None, *, as_json: bool
+) -> None:
+    from ultragray.methods.comparison.run import compare as compare_methods
+
+    last: ComparisonProgress | None = None
+    with stop_on_signal() as should_stop, _progress_bar() as show:
+
+        def report(state: ComparisonProgress) -> None:
+            nonlocal last
+            last = state
+            show(state)
+
+        comparison = compare_methods(
+            dataset, settings, folder=run, device=device, report=report, should_stop=should_stop
+        )
+        written = [] if comparison is None or output is None else _write(comparison, dataset, run, output)
+    if comparison is None:
+        typer.echo(
+            f"{_where(last)}; {'nothing is kept' if output is None else 'go on with the same command'}", err=True
+        )
+        raise typer.Exit(INTERRUPTED)
+    if as_json:
+        typer.echo(to_json(comparison.to_dict() | {"written": [str(path) for path in written]}))
+        return
+    print_comparison(comparison)
+    if comparison.measured:
+        print_speckle({one.title: one.evaluation for one in comparison.results if one.evaluation is not None})
+    for path in written:
+        typer.echo(f"wrote {path}")
+
+
+def _write(comparison: Comparison, dataset: Dataset, run: Path, output: Path) -> list[Path]:
+    """The page and what stands beside it, of the names that the output gives them."""
+    from ultragray.files.atomic import write_whole
+    from ultragray.methods.comparison.files import write_comparison
+
+    written = []
+    for made in write_comparison(comparison, dataset, run):
+        written.append(output.with_suffix(made.suffix))
+        write_whole(written[-1], made.read_bytes())
+    return written
+
+
+def _where(state: ComparisonProgress | None) -> str:
+    """Where a comparison was stopped."""
+    if state is None:
+        return "stopped before the first method"
+    at = f"stopped at {state.method}, method {state.number} of {state.of}"
+    return at if state.fit is None else f"{at}, after step {state.fit.step:,} of {state.fit.steps:,}"
+
+
+@contextmanager
+def _progress_bar() -> Iterator[Callable[[ComparisonProgress], None]]:
+    """A bar a method on a terminal's stderr; elsewhere a line for each tenth of a fit."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    console = Console(stderr=True)
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bars:
+        task = bars.add_task("", total=None)
+
+        def show(state: ComparisonProgress) -> None:
+            named, fit = f"{state.method} ({state.number} of {state.of})", state.fit
+            if console.is_terminal:
+                done, of = (None, None) if fit is None else (fit.step, fit.steps)
+                bars.update(task, description=named, completed=done, total=of)
+            elif fit is not None and fit.step * 10 // fit.steps > (fit.step - 1) * 10 // fit.steps:
+                sys.stderr.write(f"{named}: step {fit.step:,} of {fit.steps:,}: loss {fit.loss:.4f}\n")
+
+        yield show

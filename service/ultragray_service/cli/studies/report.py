@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
@@ -17,17 +18,22 @@ from ultragray.training.config import PRESET_MEANINGS, TrainingConfig
 
 from ..options import FieldsOf, with_options
 from ..output import check_file
-from ..progress import working
 from ..style import Force, Json, Threads, command_group, examples, output_option, tell
 from ..sweeps.source import SweepArgument, check_scene_fits, check_source, read_dataset, warn_about_dataset
-from .compare import VoxelMm
 
 if TYPE_CHECKING:
     from ultragray.datasets import Dataset
+    from ultragray.methods.method import FitProgress
     from ultragray.training import Progress
 
 TILT = "growing tilt"
-Follow = Callable[["Progress"], None]
+VoxelMm = Annotated[
+    float | None,
+    typer.Option(
+        metavar="MM", help="Side of a voxel of compounding, mm.", show_default="0.5, or what fits into memory"
+    ),
+]
+Follow = Callable[["Progress | FitProgress"], None]
 
 
 @dataclass(frozen=True)
@@ -98,43 +104,57 @@ def report(
 
 def _write_report(dataset: Dataset, config: TrainingConfig, output: Path, options: ReportOptions) -> dict[str, str]:
     """The studies that could not be finished, and why; the page has the others."""
-    import torch
-
-    from ultragray.evaluation.baselines import evaluate_baselines
-    from ultragray.evaluation.scoring import evaluate
     from ultragray.files.atomic import write_whole
-    from ultragray.machine import processor_name
+    from ultragray.methods.comparison.run import SCENE, ComparisonProgress, compare_methods
+    from ultragray.methods.comparison.settings import ComparisonSettings
+    from ultragray.methods.gaussians import GivenScene
     from ultragray.report.page import ReportContent, render_page
-    from ultragray.report.study import Failed, ablations, attempt, study_tilt, train_and_evaluate
+    from ultragray.report.study import (
+        Failed,
+        ablation_methods,
+        attempt,
+        baselines,
+        scene_evaluation,
+        study_tilt,
+        train_and_evaluate,
+    )
     from ultragray.scene import GaussianScene
 
-    scene = None if options.scene is None else GaussianScene.load(options.scene)
-    if scene is not None:
-        check_scene_fits(scene.info, dataset)
-    with working("measuring the baselines …"):
-        baselines = evaluate_baselines(dataset, voxel_mm=options.voxel_mm)
-    with _following() as follow:
-        content: dict[str, Any] = {}
-        if scene is None:
-            trained = train_and_evaluate(dataset, config, report=follow("scene"))
-            content |= {"trained": trained, "scene": trained.scene, "evaluation": trained.evaluation}
-        else:
-            content |= {"scene": scene, "evaluation": evaluate(scene, dataset.val)}
+    given = None if options.scene is None else GaussianScene.load(options.scene)
+    if given is not None:
+        check_scene_fits(given.info, dataset)
+    with _following() as follow, tempfile.TemporaryDirectory(prefix="ultragray-report-") as folder:
+        trained = None if given is not None else train_and_evaluate(dataset, config, report=follow(SCENE))
+        scene = given if trained is None else trained.scene
+        assert scene is not None
+        ablated = ablation_methods(config, scene.gaussian_count) if options.ablations else {}
+        followed = {name: follow(name) for name in ablated}
+
+        def advance(state: ComparisonProgress) -> None:
+            if state.fit is not None:
+                followed[state.method](state.fit)
+
+        comparison = compare_methods(
+            dataset,
+            {
+                SCENE: GivenScene(scene, 0.0 if trained is None else trained.seconds),
+                **baselines(options.voxel_mm),
+                **ablated,
+            },
+            ComparisonSettings(seed=config.seed),
+            folder=Path(folder),
+            report=advance,
+        )
+        assert comparison is not None  # nothing tells it to stop
+        scene_evaluation(comparison)
+        tilt = None
         if options.ablations:
-            content["ablations"] = {
-                name: attempt(partial(train_and_evaluate, dataset, changed, report=follow(name)))
-                for name, changed in ablations(config, content["scene"].gaussian_count).items()
-            }
-            content["tilt"] = attempt(
-                partial(study_tilt, dataset.train, config, voxel_mm=options.voxel_mm, report=follow(TILT))
-            )
-    machine = f"{processor_name()}, {torch.get_num_threads()} threads"
-    page = render_page(
-        ReportContent(dataset=dataset, baselines=baselines, voxel_mm=options.voxel_mm, machine=machine, **content)
-    )
-    write_whole(output, page)
-    studies = {**content.get("ablations", {}), TILT: content.get("tilt")}
-    return {name: study.reason for name, study in studies.items() if isinstance(study, Failed)}
+            tilt = attempt(partial(study_tilt, dataset.train, config, voxel_mm=options.voxel_mm, report=follow(TILT)))
+        content = ReportContent(
+            dataset, scene, comparison, Path(folder), trained=trained, ablations=tuple(ablated), tilt=tilt
+        )
+        write_whole(output, render_page(content))
+    return {**comparison.failures, **({TILT: tilt.reason} if isinstance(tilt, Failed) else {})}
 
 
 @contextlib.contextmanager
@@ -151,7 +171,7 @@ def _following() -> Iterator[Callable[[str], Follow]]:
         def follow(name: str) -> Follow:
             task: list[TaskID] = []  # made by the first step: a study that is left out shows nothing
 
-            def advance(state: Progress) -> None:
+            def advance(state: Progress | FitProgress) -> None:
                 if not task:
                     task.append(bars.add_task(name))
                     if not console.is_terminal:

@@ -6,8 +6,11 @@ from collections.abc import Mapping
 from dataclasses import astuple
 from typing import TYPE_CHECKING
 
+from ..output import wide_console
+
 if TYPE_CHECKING:
     from ultragray.evaluation.scoring import Evaluation
+    from ultragray.methods.comparison.result import Comparison
 
 
 def print_metrics(title: str, evaluations: Mapping[str, Evaluation]) -> None:
@@ -34,9 +37,40 @@ def print_metrics(title: str, evaluations: Mapping[str, Evaluation]) -> None:
         console.print(f"MS-SSIM over {scales} of its 5 scales, which is what the image holds", style="dim")
 
 
+def print_comparison(comparison: Comparison) -> None:
+    """A table of the means of each method, its costs and its mean rank, and why a method has none."""
+    from rich.markup import escape
+    from rich.table import Table
+
+    from ultragray.methods.comparison.ranks import METRICS, rank, shown_value
+
+    table = Table(box=None, pad_edge=False)
+    heads = ("", *(metric.label for metric in METRICS), "training, s", "frame, ms", "MB", "mean rank")
+    for place, head in enumerate(heads):
+        table.add_column(head, justify="right" if place else "left", no_wrap=True)
+    ranks = rank(comparison.measured)
+    for one in comparison.results:
+        if one.evaluation is not None:
+            means = one.evaluation.mean.to_dict()
+            table.add_row(
+                escape(one.title),
+                *(shown_value(metric.name, means[metric.name]) for metric in METRICS),
+                f"{one.seconds:,.1f}",
+                f"{one.frame_ms:,.1f}",
+                f"{one.model_bytes / 1e6:,.2f}",
+                f"{ranks[one.name].mean:.2f}",
+            )
+    console, facts = wide_console(), comparison.dataset
+    head = f"{facts.name}, {facts.val_frames} val frames, {comparison.machine}"
+    console.print(head, highlight=False, markup=False, soft_wrap=True)
+    console.print(table)
+    for one in comparison.results:
+        if one.failure is not None:
+            console.print(f"{one.title} failed: {one.failure}", highlight=False, markup=False, soft_wrap=True)
+
+
 def print_speckle(evaluations: Mapping[str, Evaluation]) -> None:
     """A table of the statistics of speckle, means over the frames: the true frames, then one row a name."""
-    from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
 
@@ -52,4 +86,4 @@ def print_speckle(evaluations: Mapping[str, Evaluation]) -> None:
     for name, (speckle, distance) in rows.items():
         figures = ("–",) * 3 if speckle is None else [f"{value:.3f}" for value in astuple(speckle)]
         table.add_row(escape(name), *figures, distance)
-    Console().print(table)
+    wide_console().print(table)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json as json_text
-import signal
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -21,6 +20,7 @@ from ultragray.training.config import PRESET_MEANINGS, TrainingConfig, read_conf
 from ..group import INTERRUPTED
 from ..options import FieldsOf, parse_settings, with_options
 from ..output import SCENE_SUFFIX, check_file
+from ..stopping import stop_on_signal
 from ..style import COMPUTE, Backend, Force, Json, Threads, command_group, examples, output_option, tell
 from ..sweeps.source import SweepArgument, check_source, read_dataset, warn_about_dataset
 
@@ -207,7 +207,7 @@ def _train(dataset: Any, config: TrainingConfig, run: RunOptions, *, as_json: bo
 
     started = time.monotonic()
     last: Progress | None = None
-    with _stop_on_signal() as should_stop:
+    with stop_on_signal() as should_stop:
         try:
             with _progress_bar() as show:
 
@@ -278,19 +278,6 @@ def _cost(state: Progress) -> str:
     """The time of a step at the end, and the most memory of a GPU that was in use."""
     step = f"{1000.0 / state.steps_per_s:.1f} ms a step"
     return step if state.peak_memory_mb is None else f"{step}, at most {state.peak_memory_mb:,.0f} MB of the GPU"
-
-
-@contextlib.contextmanager
-def _stop_on_signal() -> Iterator[Callable[[], bool]]:
-    """A function that tells whether SIGINT or SIGTERM came; a process that is stopping ignores more of them."""
-    received: list[int] = []
-    numbers = (signal.SIGINT, signal.SIGTERM)
-    before = [signal.signal(number, lambda came, frame: received.append(came)) for number in numbers]
-    try:
-        yield lambda: bool(received)
-    finally:
-        for number, handler in zip(numbers, before, strict=True):
-            signal.signal(number, signal.SIG_IGN if received else handler)
 
 
 @contextlib.contextmanager

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from ultragray_workers.errors import StorageUnavailable
-from ultragray_workers.jobs.files import CHECKPOINT_NAME, JOURNAL_NAME
+from ultragray_workers.jobs.files import CHECKPOINT_NAME, CONFIG_NAME, JOURNAL_NAME
 from ultragray_workers.jobs.folder import JobFolder, Outcome, Progress
 from ultragray_workers.jobs.shared.files import SharedFiles
 from ultragray_workers.jobs.shared.reading import SharedLog, opened
@@ -225,3 +225,26 @@ def test_a_job_that_was_removed_is_not_brought_back(attempt: Attempt, storage: U
         pass
     one.tell_last()
     assert storage.entry(record_key(JOB)) is None
+
+
+def test_a_run_of_many_folders_goes_along_and_what_did_not_change_is_told_once(
+    attempt: Attempt, storage: Unsteady
+) -> None:
+    first, folder = attempt(1)
+    (folder.run / "scene").mkdir(parents=True)
+    (folder.run / "scene" / "model").write_bytes(b"learned")
+    (folder.run / "scene" / CONFIG_NAME).write_bytes(b"settings")
+    first.tell_last()
+    before = read_record(storage, JOB)
+    (folder.run / "tri" / "fit").parent.mkdir()
+    (folder.run / "tri" / "fit").write_bytes(b"step 3")
+    first._tell(is_last=True)
+    after = read_record(storage, JOB)
+    assert before is not None
+    assert after is not None
+    assert set(after.run) == {"scene/model", f"scene/{CONFIG_NAME}", "tri/fit"}
+    assert after.run["scene/model"] == before.run["scene/model"]
+    _, successor = attempt(2)
+    assert (successor.run / "scene" / "model").read_bytes() == b"learned"
+    assert (successor.run / "scene" / CONFIG_NAME).read_bytes() == b"settings"
+    assert (successor.run / "tri" / "fit").read_bytes() == b"step 3"

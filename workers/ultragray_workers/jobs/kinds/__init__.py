@@ -4,10 +4,11 @@ Modules that end in `_run` do the work of a kind and are imported in the job's p
 """
 
 from .base import Specification
+from .compare import CompareJob
 from .evaluate import EvaluateJob
 from .render import RenderJob
 from .train import TrainJob
 
-__all__ = ["KINDS", "EvaluateJob", "RenderJob", "Specification", "TrainJob"]
+__all__ = ["KINDS", "CompareJob", "EvaluateJob", "RenderJob", "Specification", "TrainJob"]
 
 KINDS = tuple(Specification.members)

@@ -2,34 +2,33 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 import math
 import shutil
 import sys
-from contextlib import suppress
+import tempfile
 from dataclasses import replace
-
-import torch
+from pathlib import Path
 
 from ultragray.datasets.sweep import Dataset
-from ultragray.errors import TrainingStateInvalid
-from ultragray.evaluation.scoring import evaluate
 from ultragray.evaluation.side_by_side import write_spread
-from ultragray.machine import processor_name
+from ultragray.methods.comparison.run import SCENE, compare_methods
+from ultragray.methods.comparison.settings import ComparisonSettings
+from ultragray.methods.gaussians import GivenScene
 from ultragray.report.page import ReportContent, render_page
-from ultragray.report.study import trained_of_journal
+from ultragray.report.study import scene_evaluation, trained_of_journal
 from ultragray.scene import GaussianScene
 from ultragray.training import Progress as TrainingProgress
 from ultragray.training import TrainingConfig
 from ultragray.training import train as train_scene
 from ultragray.training.run import FITTING
-from ultragray.training.trainer import CHECKPOINT_FILE, CONFIG_FILE, JOURNAL_FILE
+from ultragray.training.trainer import CHECKPOINT_FILE, JOURNAL_FILE
 
 from ...scenes import SUFFIX
-from ..folder import JobFolder, Outcome, Progress
+from ..folder import Outcome, Progress
 from ..worker.job_run import JobRun, Stopped
 from .curve import draw_training_curve
+from .earlier_run import take_over_run
 from .train import TrainJob
 
 CHECKPOINT_INTERVAL_S = 10.0
@@ -45,7 +44,7 @@ def run(job_run: JobRun, job: TrainJob) -> Outcome:
     device = job_run.request.device
     config = TrainingConfig.preset(job.preset, **job.settings)
     dataset = job_run.load_dataset(job.dataset)
-    _take_over_run(job_run)
+    take_over_run(job_run, CHECKPOINT_FILE)
     checkpoint = job_run.folder.run / CHECKPOINT_FILE
     resume = checkpoint.exists()
     sys.stderr.write(
@@ -65,28 +64,6 @@ def run(job_run: JobRun, job: TrainJob) -> Outcome:
     if scene.info.training["step"] < scene.info.training["steps"]:
         raise Stopped
     return _finish(job_run, job, dataset, scene, device)
-
-
-def _take_over_run(job_run: JobRun) -> None:
-    """Puts the checkpoint of the job that this one replaces into the run's folder, unless there is a run already."""
-    before = job_run.request.retry_of
-    if before is None or job_run.folder.run.exists():
-        return
-    old = JobFolder(job_run.folder.artifact_folder, before)
-    if not (old.run / CHECKPOINT_FILE).exists():
-        return
-    outcome = old.outcome()
-    if outcome is not None and outcome.error == TrainingStateInvalid.reason:
-        return  # it cannot be resumed from: this job begins anew
-    partial = job_run.folder.path / "run.partial"
-    shutil.rmtree(partial, ignore_errors=True)
-    with suppress(FileNotFoundError), old.lock.open("a") as lock:  # it may be deleted meanwhile: then anew
-        fcntl.lockf(lock, fcntl.LOCK_EX)  # a process that was cancelled a moment ago may still write
-        partial.mkdir()
-        for name in (CHECKPOINT_FILE, JOURNAL_FILE, CONFIG_FILE):
-            if (old.run / name).exists():
-                shutil.copyfile(old.run / name, partial / name)
-        partial.rename(job_run.folder.run)
 
 
 def _report(job_run: JobRun, state: TrainingProgress) -> None:
@@ -136,17 +113,25 @@ def _finish(job_run: JobRun, job: TrainJob, dataset: Dataset, scene: GaussianSce
         (folder / "metrics.json").write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
         if len(dataset.val):
             scene = scene.to(device)
-            evaluation = evaluate(scene, dataset.val)
-            write_spread(scene, dataset.val, evaluation, folder, PICTURES)
-            processor = f"{processor_name()}, {job_run.request.threads} threads"
-            content = ReportContent(
-                dataset=dataset,
-                scene=scene,
-                evaluation=evaluation,
-                machine=processor if device == "cpu" else torch.cuda.get_device_name(device),
-                scene_name=job.scene,
-                spread=REPORT_FRAMES,
-                trained=trained_of_journal(scene, evaluation, journal),
-            )
-            (folder / "report.html").write_text(render_page(content), encoding="utf-8")
+            _write_report(job, dataset, scene, device, folder)
     return Outcome(artifacts=job_run.folder.artifact_names(), metrics=metrics)
+
+
+def _write_report(job: TrainJob, dataset: Dataset, scene: GaussianScene, device: str, artifacts: Path) -> None:
+    """Pictures of some held-out frames, and the page of the scene alone: a comparison of one method."""
+    with tempfile.TemporaryDirectory(prefix="ultragray-report-") as folder:
+        methods = {SCENE: GivenScene(scene)}
+        comparison = compare_methods(dataset, methods, ComparisonSettings(), folder=Path(folder), device=device)
+        assert comparison is not None  # nothing tells it to stop
+        evaluation = scene_evaluation(comparison)
+        write_spread(scene, dataset.val, evaluation, artifacts, PICTURES)
+        content = ReportContent(
+            dataset,
+            scene,
+            comparison,
+            Path(folder),
+            scene_name=job.scene,
+            spread=REPORT_FRAMES,
+            trained=trained_of_journal(scene, evaluation, artifacts / JOURNAL_FILE),
+        )
+        (artifacts / "report.html").write_text(render_page(content), encoding="utf-8")

@@ -22,7 +22,6 @@ from ultragray.files.atomic import file_sha256
 
 from ...errors import StorageUnavailable
 from ...storage.storage import NotThere, Storage
-from ..files import CHECKPOINT_NAME, CONFIG_NAME, JOURNAL_NAME
 from ..folder import JobFolder, Outcome
 from ..shared.record import (
     JobRecord,
@@ -36,6 +35,7 @@ from ..shared.record import (
     read_record,
     record_key,
 )
+from ..shared.run_files import Version, copy_of, files_in, version_of
 
 TELL_INTERVAL_S = 1.0
 LAST_WAIT_S = 10.0  # for what a job leaves that goes on elsewhere
@@ -43,7 +43,6 @@ PIECE_BYTES = 256 * 1024  # of the log: the last piece is written again when it 
 MOST_LOG_BYTES = 4 * PIECE_BYTES  # of the log, told at once
 _RETRY_S, _LONGEST_RETRY_S = 0.5, 10.0
 _LOOK_S = 0.25
-_RUN_FILES = (CHECKPOINT_NAME, JOURNAL_NAME, CONFIG_NAME)
 
 _log = logging.getLogger("ultragray.jobs")
 _T = TypeVar("_T")
@@ -128,9 +127,10 @@ class ThroughStorage:
         self._thread: threading.Thread | None = None
         self._is_away = False
         self._own_log: list[LogPiece] = []
-        self._run_version: int | None = None  # of the checkpoint that was told last
+        self._run_version: Version = {}  # of the checkpoint that was told last
+        self._run_files: dict[str, StoredFile] = {}  # of that version, as far as this attempt has uploaded them
         self._runs = 0
-        self._uploading: Future[dict[str, StoredFile]] | None = None
+        self._uploading: Future[dict[str, StoredFile] | None] | None = None
 
     def take_over(self) -> None:
         """As `Sharing`; waits for a storage that is away."""
@@ -199,7 +199,7 @@ class ThroughStorage:
             if before and not (before.outcome and before.outcome.error == TrainingStateInvalid.reason):
                 self._fetch(before.run, folder.run)
         self._record = record
-        self._run_version = _version_of(folder.run / CHECKPOINT_NAME)
+        self._run_version = version_of(folder.run)
 
     def _fetch(self, files: Mapping[str, StoredFile], target: Path) -> None:
         """Copies files into a new folder, all of them or, where one is gone or damaged, none."""
@@ -207,6 +207,7 @@ class ThroughStorage:
         shutil.rmtree(partial, ignore_errors=True)
         partial.mkdir()
         for name, stored in files.items():
+            (partial / name).parent.mkdir(parents=True, exist_ok=True)
             try:
                 self._storage.download(stored.key, partial / name)
             except NotThere:
@@ -278,28 +279,30 @@ class ThroughStorage:
         if self._uploading is not None and (is_last or self._uploading.done()):
             uploading, self._uploading = self._uploading, None
             uploaded = uploading.result()
-        version = _version_of(self._folder.run / CHECKPOINT_NAME)
-        if self._uploading is None and version not in (None, self._run_version):
+        version = version_of(self._folder.run)
+        if self._uploading is None and version and version != self._run_version:
             if is_last:
                 return self._upload_run(version)
             self._uploading = _in_thread(lambda: self._upload_run(version))
         return uploaded
 
-    def _upload_run(self, version: int | None) -> dict[str, StoredFile]:
-        """Uploads the checkpoint as it is now: a link to it stays when the process replaces it."""
+    def _upload_run(self, version: Version) -> dict[str, StoredFile] | None:
+        """Uploads what is new of the checkpoint; None where it has changed already: then the next one is told."""
         self._runs += 1
         number, copies = self._runs, self._folder.path / f"sharing-{self._runs}"
         shutil.rmtree(copies, ignore_errors=True)
-        copies.mkdir()
         try:
-            (copies / CHECKPOINT_NAME).hardlink_to(self._folder.run / CHECKPOINT_NAME)
-            for name in _RUN_FILES:  # after the checkpoint: a journal that is ahead is cut where the training goes on
-                if name != CHECKPOINT_NAME and (self._folder.run / name).exists():
-                    shutil.copyfile(self._folder.run / name, copies / name)
-            stored = {path.name: self._upload(path, f"run-{number}/{path.name}") for path in sorted(copies.iterdir())}
+            if not copy_of(self._folder.run, version, copies):
+                return None
+            stored = {
+                name: self._run_files[name]
+                if name in self._run_files and version.get(name, 0) == self._run_version.get(name)
+                else self._upload(path, f"run-{number}/{name}")
+                for name, path in files_in(copies).items()
+            }
         finally:
             shutil.rmtree(copies, ignore_errors=True)
-        self._run_version = version
+        self._run_version, self._run_files = version, stored
         return stored
 
     def _upload(self, path: Path, name: str) -> StoredFile:
@@ -391,10 +394,3 @@ def _in_thread(work: Callable[[], _T]) -> Future[_T]:
 
     threading.Thread(target=run, name="sharing-work", daemon=True).start()
     return future
-
-
-def _version_of(checkpoint: Path) -> int | None:
-    try:
-        return checkpoint.stat().st_mtime_ns
-    except FileNotFoundError:
-        return None

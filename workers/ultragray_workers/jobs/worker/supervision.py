@@ -474,9 +474,10 @@ def _room_for_the_end(folder: JobFolder) -> Iterator[None]:
         folder.reserve.unlink(missing_ok=True)
 
 
-def _furthest(folder: JobFolder) -> int:
+def _furthest(folder: JobFolder) -> tuple[int, int]:
+    """How far the job is: the method at hand of a comparison, and the steps and frames that are done."""
     progress = folder.progress()
-    return (progress.step or 0) + (progress.frames_done or 0)
+    return progress.method_number or 0, (progress.step or 0) + (progress.frames_done or 0)
 
 
 def _memory_kills() -> int:

@@ -45,6 +45,7 @@ def draw_tiles(
     row_cm,
     FANNED: tl.constexpr,
     WRAP: tl.constexpr,
+    ABSORBS: tl.constexpr,
     BLOCK: tl.constexpr,
     S_LANES: tl.constexpr,
     TILE_ROWS: tl.constexpr,
@@ -95,6 +96,7 @@ def draw_tiles(
                         width,
                         FANNED,
                         WRAP,
+                        ABSORBS,
                         S_LANES,
                     )
                     picked = tl.min(tl.where(hits & (lane > picked), lane, NOTHING), 0)
@@ -120,6 +122,7 @@ def draw_tiles(
                         width,
                         FANNED,
                         WRAP,
+                        ABSORBS,
                         S_LANES,
                     )
             chosen = tl.min(tl.where(hit & (block > chosen), block, NOTHING), 0)
@@ -151,6 +154,7 @@ def add_slices(
     width,
     FANNED: tl.constexpr,
     WRAP: tl.constexpr,
+    ABSORBS: tl.constexpr,
     S_LANES: tl.constexpr,
 ):
     """The accumulators of a tile, with some slices added."""
@@ -178,7 +182,7 @@ def add_slices(
             own = own | (columns_at + width <= last)
         touched = touched & own
     scale = 1.0 / sigma
-    peak = peak_of(m2, sigma, touched) * -LOG2_E
+    peak = peak_of(m2, sigma, touched) * -LOG2_E if ABSORBS else 0.0 * sigma
     echo_peak = m2 * -HALF_LOG2_E
     window2 = tl.where(touched, MAX_M2 - m2, -1.0)  # u2 up to here has w >= 1/255
     u = down * (row_cm * scale) + past * scale  # [S, rows, columns]

@@ -11,7 +11,18 @@ from .constants import FIELDS, GRADIENTS, HALF_LOG2_E, LOG2_E, MAX_M2, MAX_WEIGH
 from .profile import cross, peak_of, profile_slopes, shortest_turn
 
 
-@triton.jit(do_not_specialize=["height", "width", "has_bmode", "has_echo", "has_transmittance", "has_coverage"])
+@triton.jit(
+    do_not_specialize=[
+        "height",
+        "width",
+        "has_bmode",
+        "has_echo",
+        "has_transmittance",
+        "has_coverage",
+        "has_sum",
+        "has_weighted_sum",
+    ]
+)
 def differentiate_pixels(
     weight,  # [C, H, W] S, the sum of I·w and T, as the forward pass left them
     weighted,
@@ -20,6 +31,8 @@ def differentiate_pixels(
     by_echo,
     by_transmittance,
     by_coverage,
+    by_sum,
+    by_weighted_sum,
     by_weight,  # [C, H, W] out: by S
     by_weighted,  # out: by the sum of I·w
     by_log,  # out: by log T
@@ -30,6 +43,8 @@ def differentiate_pixels(
     has_echo,
     has_transmittance,
     has_coverage,
+    has_sum,
+    has_weighted_sum,
     ROWS: tl.constexpr,
     COLUMNS: tl.constexpr,
 ):
@@ -48,6 +63,8 @@ def differentiate_pixels(
         on_echo = tl.load(by_echo + pixel, inside & (has_echo != 0), 0.0) + on_bmode * passed
         on_passed = tl.load(by_transmittance + pixel, inside & (has_transmittance != 0), 0.0)
         on_coverage = tl.load(by_coverage + pixel, inside & (has_coverage != 0), 0.0)
+        on_sum = tl.load(by_sum + pixel, inside & (has_sum != 0), 0.0)
+        on_weighted_sum = tl.load(by_weighted_sum + pixel, inside & (has_weighted_sum != 0), 0.0)
 
         # E = ratio * share * sum(I w), ratio = (1 - exp(-S)) / S, share = S / (S + 1e-8).
         left = tl.exp(-total)
@@ -70,8 +87,8 @@ def differentiate_pixels(
         on_log = (on_passed + on_bmode * factor * sum_iw) * passed
         suffix = tl.cumsum(on_log, 0, reverse=True) + below[None, :]
         below += tl.sum(on_log, 0)
-        tl.store(by_weight + pixel, on_echo * sum_iw * factor_slope + on_coverage * left, inside)
-        tl.store(by_weighted + pixel, on_echo * factor, inside)
+        tl.store(by_weight + pixel, on_echo * sum_iw * factor_slope + on_coverage * left + on_sum, inside)
+        tl.store(by_weighted + pixel, on_echo * factor + on_weighted_sum, inside)
         tl.store(by_log + pixel, on_log, inside)
         tl.store(by_below + pixel, suffix, inside)
 
@@ -99,6 +116,7 @@ def gather_slices(
     row_cm,
     FANNED: tl.constexpr,
     WRAP: tl.constexpr,
+    ABSORBS: tl.constexpr,
     BLOCK: tl.constexpr,
     S_LANES: tl.constexpr,
     ROWS: tl.constexpr,
@@ -141,7 +159,7 @@ def gather_slices(
             if WRAP:
                 columns = tl.where(columns >= width, columns - width, columns)
             scale = 1.0 / sigma
-            peak = peak_of(m2, sigma, touched)
+            peak = peak_of(m2, sigma, touched) if ABSORBS else 0.0 * sigma
             zero = -star * scale
             window2 = tl.where(touched, MAX_M2 - m2, -1.0)
 

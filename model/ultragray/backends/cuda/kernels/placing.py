@@ -71,6 +71,7 @@ def place_gradients(
     SIGMOID: tl.constexpr,
     DEGREE: tl.constexpr,
     THICK: tl.constexpr,
+    WEIGHTED: tl.constexpr,
     TERMS: tl.constexpr,  # coefficients, to the next power of two
     BY_VIEW: tl.constexpr,
     BLOCK: tl.constexpr,
@@ -197,7 +198,10 @@ def place_gradients(
             sum_mx += on_mx.to(tl.float32) + hx
             sum_my += on_my.to(tl.float32) + hy
             sum_mz += on_mz.to(tl.float32) + hz
-            sum_absorb += tl.load(g + 7, cut, 0.0)
+            if WEIGHTED:  # by the log of the weight, which moves m2 by -2
+                sum_absorb -= 2.0 * tl.load(g + 5, cut, 0.0)
+            else:
+                sum_absorb += tl.load(g + 7, cut, 0.0)
             if BY_VIEW:
                 # A turn of the probe about its origin changes no intensity.
                 tx = offset[1] * on_mz - offset[2] * on_my + 0.5 * (w * gx - x * gw + y * gz - z * gy)
@@ -219,7 +223,8 @@ def place_gradients(
     tl.store(to + 2, sum_qy, mask)
     tl.store(to + 3, sum_qz, mask)
     logit = tl.load(transmittances + index, mask, 0.0)
-    tl.store(by_transmittances + index, -sum_absorb * tl.sigmoid(logit) * tl.sigmoid(-logit), mask)
+    slope = tl.sigmoid(-logit) if WEIGHTED else -tl.sigmoid(logit) * tl.sigmoid(-logit)
+    tl.store(by_transmittances + index, sum_absorb * slope, mask)
     term = tl.arange(0, TERMS)[None, :]
     terms: tl.constexpr = (DEGREE + 1) * (DEGREE + 1)
     owned = mask[:, None]

@@ -178,6 +178,7 @@ def slice_gaussians(
     SIGMOID: tl.constexpr,
     DEGREE: tl.constexpr,
     THICK: tl.constexpr,
+    WEIGHTED: tl.constexpr,  # m2 grows by -2 log of a Gaussian's weight, and it absorbs nothing
     RECORD: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
@@ -204,11 +205,14 @@ def slice_gaussians(
         yy = a[1] * a[1] + b[1] * b[1] + c[1] * c[1]
         yz = a[1] * a[2] + b[1] * b[2] + c[1] * c[2]
         zz = a[2] * a[2] + b[2] * b[2] + c[2] * c[2]
-        lost = 0.0 * yy  # what m2 grows by, as the beam's weight spreads
+        lost = 0.0 * yy  # what m2 grows by, as the beam's weight spreads, and by a Gaussian's own weight
         if THICK:
             _, variance, _, ratio = spread_along_elevation(view, mean, a, b, c, s, FANNED)
             yy += variance
             lost = tl.log(ratio)
+        logit = tl.load(transmittances + index, candidate, 0.0)
+        if WEIGHTED:
+            lost -= 2.0 * tl.log(tl.sigmoid(logit)).to(tl.float64)
         # Condition on the plane, y = 0.
         inverse = 1.0 / yy
         shift = -mean[1] * inverse
@@ -275,6 +279,8 @@ def slice_gaussians(
 
         # Rows: down to where the echo is nothing and the absorption complete, that row included.
         opaque = (m2 <= MAX_M2_ATTENUATION) & (tl.exp(-0.5 * m2) * spread * FULL_PROFILE >= MIN_PSI)
+        if WEIGHTED:
+            opaque = m2 < 0.0  # none
         early = opaque & (spread > EARLY_SIGMA_CM)
         top = r - tl.sqrt(tl.maximum(room * rr, 0.0))
         below = tl.where(opaque, NEGLIGIBLE, MAX_M2) - m2
@@ -295,7 +301,7 @@ def slice_gaussians(
         vx, vy, vz = offset[0].to(tl.float32), offset[1].to(tl.float32), offset[2].to(tl.float32)
         value = harmonics(vx, vy, vz, sh0, shn, shn_stride, index, kept, DEGREE)
         intensity = activate(value, SIGMOID)
-        absorb = tl.sigmoid(-tl.load(transmittances + index, kept, 0.0))
+        absorb = tl.zeros([BLOCK], tl.float32) if WEIGHTED else tl.sigmoid(-logit)
 
         rank = tl.cumsum(kept.to(tl.int32), 0) - 1
         slot = group * BLOCK + rank

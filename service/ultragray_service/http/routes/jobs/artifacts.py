@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import re
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Mapping
 from urllib.parse import quote
 
 from starlette.datastructures import Headers
@@ -12,16 +12,28 @@ from starlette.responses import Response, StreamingResponse
 
 from ultragray_workers.jobs.shared.reading import OpenFile, SharedFile, opened
 
+# A page that a job made is shown without scripts, in an origin of its own, and fetches nothing.
+SHOWN = {
+    "content-security-policy": "sandbox; default-src 'none'; style-src 'unsafe-inline'; img-src data:; "
+    "frame-ancestors 'self'",
+    "x-content-type-options": "nosniff",
+}
 _CHUNK_BYTES = 2**20
 _RANGE = re.compile(r"bytes=(\d*)-(\d*)")
 
 
-def shared_file_response(file: SharedFile, asked: Headers, media_type: str) -> Response:
-    """The answer to a GET with these headers. Of several ranges none is answered, but the whole file."""
+def shared_file_response(
+    file: SharedFile, asked: Headers, media_type: str, beside: Mapping[str, str], disposition: str
+) -> Response:
+    """The answer to a GET with these headers. Of several ranges none is answered, but the whole file.
+
+    `beside`: further headers of the answer. `disposition`: inline or attachment.
+    """
     etag = f'"{file.stored.sha256}"'
     headers = {
+        **beside,
         "accept-ranges": "bytes",
-        "content-disposition": f"attachment; filename*=utf-8''{quote(file.name)}",
+        "content-disposition": f"{disposition}; filename*=utf-8''{quote(file.name)}",
         "etag": etag,
     }
     start, end, status = 0, file.stored.bytes, 200

@@ -27,7 +27,7 @@ from ...job_events import EVENTS_TYPE, JobEvents, LastEvent
 from ...reading.accept import NPZ, PNG
 from ...reading.bodies import SPECIFICATION, JobBody
 from ...reading.json_body import body_schema, read_json_body
-from .artifacts import shared_file_response
+from .artifacts import SHOWN, shared_file_response
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 
@@ -168,13 +168,17 @@ async def get_artifact(
     service: ServiceDep,
     job: JobId,
     name: Annotated[str, Path(description="One of the job's artifacts.")],
+    show: Annotated[bool, Query(description="A browser shows it instead of saving it; pages run no scripts.")] = False,
 ) -> Response:
     """Downloads a file that the job made. Ranges are answered, so that a download can go on."""
     found = await service.jobs.do(JobStore.artifact, job, name)
     media_type = MEDIA_TYPES.get(PurePosixPath(name).suffix, _ANY_FILE)
+    disposition = "inline" if show else "attachment"
     if isinstance(found, SharedFile):
-        return shared_file_response(found, request.headers, media_type)
-    return FileResponse(found, media_type=media_type, filename=name)
+        return shared_file_response(found, request.headers, media_type, SHOWN, disposition)
+    return FileResponse(
+        found, media_type=media_type, filename=name, headers=SHOWN, content_disposition_type=disposition
+    )
 
 
 @router.get(

@@ -1,0 +1,104 @@
+"""Budgets: how long each method may learn.
+
+- equal: as many seconds as the scene's preset `fast` took on the same machine. Before its first step a method is timed
+  for a moment, and gets as many steps as fit; its schedules are stretched to that number.
+- author: the steps that its author's recipe takes, however long that is.
+
+A number of steps that follows from a clock would differ from run to run, and the table with it. So `Paces` keeps what
+was measured: the same comparison on the same machine gets the same steps.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+from ..errors import InvalidArgument
+from ..files.atomic import write_whole
+
+
+class BudgetKind(str, Enum):
+    """The closed set of budgets."""
+
+    EQUAL = "equal"
+    AUTHOR = "author"
+
+
+@dataclass(frozen=True)
+class Pace:
+    """The speed of a method on a machine: seconds before its first step, and of each step."""
+
+    start_s: float
+    step_s: float
+
+
+class Paces:
+    """What was measured on this machine, by method; in a file where there is one, so that a later run gets the same."""
+
+    def __init__(self, path: Path | None = None, surroundings: Mapping[str, object] | None = None) -> None:
+        """`surroundings`: what a measurement holds for (machine, threads, dataset); another one's is not looked at."""
+        self._path = path
+        self._section = json.dumps(dict(surroundings or {}), sort_keys=True)
+        self._known: dict[str, Any] = {}
+        if path is not None:
+            with contextlib.suppress(OSError, ValueError):  # then it is measured again
+                document = json.loads(path.read_text(encoding="utf-8"))
+                self._known = document if isinstance(document, dict) else {}
+
+    def known(self, name: str) -> Pace | None:
+        """What was measured of a method; None where nothing was, or the file is another's."""
+        try:
+            start_s, step_s = map(float, self._known[self._section][name])
+        except (LookupError, TypeError, ValueError):
+            return None
+        return Pace(start_s, step_s)
+
+    def keep(self, name: str, pace: Pace) -> None:
+        """Keeps what was measured; in a place that cannot be written, for this process only."""
+        section = self._known.get(self._section)
+        known = section if isinstance(section, dict) else {}
+        self._known[self._section] = {**known, name: [pace.start_s, pace.step_s]}
+        if self._path is not None:
+            with contextlib.suppress(OSError):
+                self._path.parent.mkdir(parents=True, exist_ok=True)
+                write_whole(self._path, json.dumps(self._known, indent=1) + "\n")
+
+    def get(self, name: str, measure: Callable[[], Pace]) -> Pace:
+        """What is known of a method, else what `measure` finds, which is kept."""
+        pace = self.known(name)
+        if pace is None or not pace.step_s > 0.0:
+            pace = measure()
+            self.keep(name, pace)
+        return pace
+
+
+@dataclass(frozen=True)
+class Budget:
+    """What a fit may take. Raises InvalidArgument for an equal time that is not positive."""
+
+    kind: BudgetKind
+    seconds: float | None = None  # of an equal time
+    paces: Paces = field(default_factory=Paces, compare=False)
+
+    @classmethod
+    def equal(cls, seconds: float, paces: Paces | None = None) -> Budget:
+        if not 0.0 < seconds < float("inf"):
+            raise InvalidArgument(f"seconds of an equal time must be positive, got {seconds}", field="seconds")
+        return cls(BudgetKind.EQUAL, seconds, paces or Paces())
+
+    @classmethod
+    def author(cls) -> Budget:
+        return cls(BudgetKind.AUTHOR)
+
+    def steps(self, name: str, published: int, measure: Callable[[], Pace]) -> int:
+        """The steps of a method: those of its author, or those that fit into the time, one at least."""
+        if self.kind is BudgetKind.AUTHOR:
+            return published
+        assert self.seconds is not None
+        pace = self.paces.get(name, measure)
+        return max(1, int((self.seconds - pace.start_s) / pace.step_s))

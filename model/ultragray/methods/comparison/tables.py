@@ -1,0 +1,108 @@
+"""The rows of tables, as texts: metrics with the best of each column marked, costs, and speckle."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import astuple, dataclass, field
+
+from ...evaluation.scoring import Evaluation
+from ...evaluation.speckle import Speckle
+from ..budget import BudgetKind
+from .ranks import METRICS, rank, shown_value
+from .result import Comparison, MethodResult
+
+COST_HEADINGS = ("steps", "training", "ms a frame", "MB")
+
+
+@dataclass(frozen=True)
+class Row:
+    """A line of a table of metrics. `cells` pairs each text with whether it is the best of its column.
+
+    A line with a `failure` has that in their place.
+    """
+
+    name: str
+    cells: list[tuple[str, bool]] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+    failure: str | None = None
+    anchor: str = ""  # of what the page says of the method
+
+
+def metric_rows(evaluations: Mapping[str, Evaluation], notes: Mapping[str, list[str]] | None = None) -> list[Row]:
+    """One row a method with mean ± standard deviation, the best mean of each column marked."""
+    ranks = rank(evaluations)
+    rows = []
+    for name, evaluation in evaluations.items():
+        mean, std = evaluation.mean.to_dict(), evaluation.std.to_dict()
+        cells = [
+            (
+                f"{shown_value(metric.name, mean[metric.name])} ± {shown_value(metric.name, std[metric.name])}",
+                len(evaluations) > 1 and ranks[name].by_metric[metric.name] == 1,
+            )
+            for metric in METRICS
+        ]
+        rows.append(Row(name, cells, (notes or {}).get(name, [])))
+    return rows
+
+
+def rank_rows(evaluations: Mapping[str, Evaluation]) -> list[Row]:
+    """One row a method with its place by each metric, and the mean of them; the first of each column marked."""
+    ranks = rank(evaluations)
+    means = {name: f"{found.mean:.2f}" for name, found in ranks.items()}
+    best = min(means.values(), key=float, default="")
+    return [
+        Row(name, [*((str(place), place == 1) for place in places.by_metric.values()), (mean, mean == best)])
+        for (name, places), mean in zip(ranks.items(), means.values(), strict=True)
+    ]
+
+
+def cost_texts(result: MethodResult) -> list[str]:
+    """The steps, the time, a frame and the size of a method."""
+    return [
+        steps_text(result),
+        duration_text(result.seconds) if result.seconds > 0.0 else "–",
+        f"{result.frame_ms:,.1f}" if result.frame_ms < 100.0 else f"{result.frame_ms:,.0f}",
+        f"{result.model_bytes / 1e6:,.2f}" if result.model_bytes < 1e7 else f"{result.model_bytes / 1e6:,.0f}",
+    ]
+
+
+def steps_text(result: MethodResult) -> str:
+    """Such as "1,240 of 200,000"; a dash where nothing is learned by steps."""
+    if not result.steps:
+        return "–"
+    return f"{result.steps:,}" if result.of_steps is None else f"{result.steps:,} of {result.of_steps:,}"
+
+
+def duration_text(seconds: float) -> str:
+    """In the unit that reads best."""
+    if seconds < 10.0:
+        return f"{seconds:.1f} s"
+    if seconds < 600.0:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60.0:.0f} min" if seconds < 36_000.0 else f"{seconds / 3600.0:.1f} h"
+
+
+def budget_text(comparison: Comparison) -> str:
+    """What each method could take, in words."""
+    if BudgetKind(comparison.budget) is BudgetKind.AUTHOR:
+        return "the steps of each author's recipe"
+    if comparison.budget_s is None:
+        return "none: no method here learns within a time"
+    times = "" if comparison.times == 1.0 else f", {comparison.times:g} times that of the scene's preset fast"
+    return f"equal time, {duration_text(comparison.budget_s * comparison.times)}{times}"
+
+
+def speckle_rows(evaluations: Mapping[str, Evaluation]) -> list[tuple[str, list[str]]]:
+    """The statistics of speckle: the true frames, then one row a method, as texts."""
+    summaries = {name: evaluation.speckle for name, evaluation in evaluations.items()}
+    if not summaries:
+        return []
+    true = next(iter(summaries.values())).true
+    return [
+        ("true frames", [*_speckle_texts(true), ""]),
+        *((name, [*_speckle_texts(one.rendered), f"{one.histogram_distance:.4f}"]) for name, one in summaries.items()),
+    ]
+
+
+def _speckle_texts(speckle: Speckle | None) -> list[str]:
+    return ["–"] * 3 if speckle is None else [f"{value:.3f}" for value in astuple(speckle)]

@@ -1,0 +1,188 @@
+"""Ultra-NeRF as methods: its learner, and the variants of it that are compared."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ...datasets.sweep import Dataset, Sweep
+from ...errors import DatasetInvalid
+from ...probe import FloatArray, Probe
+from ..budget import Budget
+from ..learner import LearnedMethod, Learner
+from ..method import Description
+from ..parts.similarity import Similarity
+from ..parts.space import Box, as_tensor, pixel_points_mm
+from .field import Field
+from .renderer import Tissue, drawn_frame, expected_frame
+
+PUBLISHED_STEPS = 200_000
+RATE = 1e-4
+DECADES = PUBLISHED_STEPS / 250_000  # that the rate falls over all steps: it is 0.1^(step / 250,000) as published
+SIMILARITY_WEIGHT = 0.75  # λ
+SIMILARITY = Similarity(window=7, sigma=1.5, k1=0.01, k2=0.1)
+CHUNK_POINTS = 200_000  # of a frame that is rendered, at once
+
+
+@dataclass(frozen=True, eq=False)
+class Coordinates:
+    """What the field sees: points from an origin, in units of some mm."""
+
+    origin_mm: FloatArray | float  # [3] in the tracker's frame
+    unit_mm: float
+
+    @classmethod
+    def metres(cls, sweep: Sweep) -> Coordinates:
+        """Metres in the tracker's frame. The finest period of the encoding is 2π/512 m, or 12.3 mm."""
+        return cls(0.0, 1000.0)
+
+    @classmethod
+    def scaled(cls, sweep: Sweep) -> Coordinates:
+        """[-1, 1] over the longest side of the box of the training frames, the others in proportion."""
+        box = Box.of(sweep)
+        return cls(box.centre_mm, box.largest_half_mm)
+
+    def of(self, points_mm: FloatArray) -> FloatArray:  # [..., 3] -> [..., 3]
+        found: FloatArray = (points_mm - self.origin_mm) / self.unit_mm
+        return found
+
+
+class UltraNerfLearner(Learner):
+    """The field and its Adam. A step is one whole training frame, drawn uniformly with replacement.
+
+    The loss is λ (1 − MS-SSIM) + (1 − λ) MSE. MS-SSIM has five scales where the shorter side has 112 pixels or more;
+    a smaller frame has as many as hold its window of 7 pixels, their weights adding to 1.
+
+    Raises DatasetInvalid for frames that hold no such window.
+    """
+
+    module: Field
+
+    def __init__(self, dataset: Dataset, seed: int, device: torch.device, coordinates: Coordinates) -> None:
+        height, width = dataset.train.height, dataset.train.width
+        if min(height, width) < SIMILARITY.window:
+            raise DatasetInvalid(
+                f"{dataset.train.source}: Ultra-NeRF's loss needs frames of at least {SIMILARITY.window} pixels a "
+                f"side, got {height}x{width}"
+            )
+        super().__init__(dataset, seed, device)
+        self.coordinates = coordinates
+        self.module = Field(self.generator).to(device)
+        self.optimizers = {"adam": torch.optim.Adam(self.module.parameters(), lr=RATE)}
+
+    def loss(self, step: int, steps: int) -> Tensor:
+        for group in self.optimizers["adam"].param_groups:
+            group["lr"] = RATE * 0.1 ** (DECADES * step / steps)
+        place = int(torch.randint(len(self.images), (), generator=self.generator))
+        image, pose, probe = self.images[place], self.dataset.train.poses[place], self.dataset.probe
+        height, width = image.shape
+        raw = self.module(self._points(probe, pose, height, width)).view(height, width, -1)
+        frame = self.training_frame(Tissue.of(raw), self._spacing(probe, height))
+        similarity = SIMILARITY.ms_ssim(frame[None], image[None])
+        error = (frame - image).square().mean()
+        return SIMILARITY_WEIGHT * (1.0 - similarity) + (1.0 - SIMILARITY_WEIGHT) * error
+
+    def training_frame(self, tissue: Tissue, spacing: float) -> Tensor:  # -> [H, W]
+        """The frame that a step compares with the real one."""
+        return expected_frame(tissue, spacing)
+
+    def frame(self, probe: Probe, pose: FloatArray, height: int, width: int) -> Tensor:  # [H, W]
+        points = self._points(probe, pose, height, width)
+        raw = torch.cat([self.module(chunk) for chunk in torch.split(points, CHUNK_POINTS)]).view(height, width, -1)
+        return expected_frame(Tissue.of(raw), self._spacing(probe, height)).clamp(0.0, 1.0)
+
+    def _points(self, probe: Probe, pose: FloatArray, height: int, width: int) -> Tensor:  # [H·W, 3]
+        points = self.coordinates.of(pixel_points_mm(probe, pose, height, width))
+        return as_tensor(points.reshape(-1, 3), self.device)
+
+    def _spacing(self, probe: Probe, height: int) -> float:
+        return probe.scan_line_length_mm / height / self.coordinates.unit_mm
+
+
+class DrawingLearner(UltraNerfLearner):
+    """Draws borders and scatterers in training, from its own generator; what it renders is expected all the same."""
+
+    def training_frame(self, tissue: Tissue, spacing: float) -> Tensor:
+        return drawn_frame(tissue, spacing, self.generator)
+
+
+@dataclass(frozen=True)
+class UltraNerf(LearnedMethod):
+    """A variant: the coordinates that the field sees, and how a frame is made in training."""
+
+    name: str
+    variant: str
+    summary: str
+    coordinates: Callable[[Sweep], Coordinates]
+    learns: type[UltraNerfLearner]
+    choices: tuple[str, ...]
+
+    def describe(self) -> Description:
+        return Description(
+            title=f"Ultra-NeRF ({self.variant})",
+            source="Wysocki et al., MIDL 2023, arXiv 2301.10520",
+            summary=self.summary,
+            equations=EQUATIONS,
+            choices=(*self.choices, *CHOICES),
+            published_steps=PUBLISHED_STEPS,
+        )
+
+    def learner(self, dataset: Dataset, budget: Budget, seed: int, device: torch.device) -> UltraNerfLearner:
+        return self.learns(dataset, seed, device, self.coordinates(dataset.train))
+
+
+EQUATIONS = (
+    "α = |a|, β = σ(b), ρ_b = σ(p_b), ρ_s = σ(p_s), φ = σ(s), of the field's five numbers at each sample",
+    "G ~ Bernoulli(ρ_b), H ~ Bernoulli(ρ_s)",
+    "T(i) = Π_{j<i} exp(-α_j Δ) · Π_{j<i} (1 - β_j G_j)",
+    "I = T · β · (K * G) + T · (K * (H ⊙ φ)), K a Gaussian of 7x7, 1 pixel along depth and 2 across",
+    "L = 0.75 (1 - MS-SSIM) + 0.25 MSE",
+)
+CHOICES = (
+    "Held-out frames are rendered by their expectation, G = ρ_b and H = ρ_s, and clipped to [0, 1].",
+    "Samples lie at the centres of the frame's rows, not from 0 to the full depth with both ends included.",
+    "Δ, the distance between samples, is in the coordinates that the field sees, and so is 1/α.",
+    "Probes other than linear ones, which the paper leaves out: the same formulas along their scan lines, K in pixels "
+    "of range times angle.",
+    "λ is 0.75, as the released program has it (0.9 in the paper's appendix). MS-SSIM takes fewer than five scales "
+    "where the shorter side has less than 112 pixels.",
+    "The rate falls to 0.1^0.8 of 1e-4 over the steps of the budget, as it does over 200,000 steps.",
+    "Draws are new in each step, from the seed of the fit; Adam's constants are torch's.",
+)
+_METRES = "Coordinates are metres in the tracker's frame: the finest period of the encoding is 12.3 mm."
+_SCALED = (
+    "Coordinates are scaled so that the longest side of the training frames' box spans [-1, 1]: the finest period of "
+    "the encoding is 0.6% of that side. The released program takes metres."
+)
+_DRAWN = "Borders and scatterers are drawn in training, so that p_b and p_s get no gradient of their own."
+_MEAN = "The expectation takes the place of the draws in training too, so that p_b and p_s are learned."
+
+VARIANTS = (
+    UltraNerf(
+        name="ultranerf-released",
+        variant="released",
+        summary="A neural field of tissue parameters and a ray model with random borders and scatterers, in metres.",
+        coordinates=Coordinates.metres,
+        learns=DrawingLearner,
+        choices=(_METRES, _DRAWN),
+    ),
+    UltraNerf(
+        name="ultranerf-unit",
+        variant="unit",
+        summary="Ultra-NeRF as released, but for coordinates scaled to [-1, 1]: finer detail is within its encoding.",
+        coordinates=Coordinates.scaled,
+        learns=DrawingLearner,
+        choices=(_SCALED, _DRAWN),
+    ),
+    UltraNerf(
+        name="ultranerf-mean",
+        variant="mean",
+        summary="Ultra-NeRF in scaled coordinates that learns from the expected frame: all five maps get gradients.",
+        coordinates=Coordinates.scaled,
+        learns=UltraNerfLearner,
+        choices=(_SCALED, _MEAN),
+    ),
+)

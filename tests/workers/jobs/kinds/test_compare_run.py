@@ -1,0 +1,115 @@
+"""The work of comparisons, in this process, and by workers that die on the way."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+
+from ultragray.errors import InvalidArgument
+from ultragray.evaluation.baselines import evaluate_baselines
+from ultragray_workers.datasets.store import DatasetStore
+from ultragray_workers.errors import DatasetNotFound
+from ultragray_workers.jobs.folder import JobFolder, Outcome, Request
+from ultragray_workers.jobs.kinds import CompareJob, compare_run
+from ultragray_workers.jobs.specification import from_dict, to_dict
+from ultragray_workers.jobs.store import Job, JobState, JobStore
+from ultragray_workers.jobs.worker.job_run import JobRun, Stopped
+
+from ..conftest import RunningWorker
+
+JOB = CompareJob(dataset="tiny", methods=("median", "nearest"))
+
+
+@pytest.fixture
+def job_run(artifact_folder: Path) -> Callable[..., JobRun]:
+    """The run of a job."""
+    torch.set_num_threads(1)
+
+    def make(
+        job_id: str = "job", retry_of: str | None = None, should_stop: Callable[[], bool] = lambda: False
+    ) -> JobRun:
+        folder = JobFolder(artifact_folder, job_id)
+        folder.path.mkdir(parents=True, exist_ok=True)
+        return JobRun(folder, Request(to_dict(JOB), retry_of, None, "cpu", 1, 0), should_stop)
+
+    return make
+
+
+def test_scores_are_those_of_the_library(job_run: Callable[..., JobRun]) -> None:
+    asked = job_run()
+    outcome = from_dict(asked.request.specification).run(asked)
+    dataset = DatasetStore(asked.folder.artifact_folder).load("tiny")
+    expected = {
+        f"{name}_{metric}": value
+        for name, evaluation in evaluate_baselines(dataset, ("median", "nearest")).items()
+        for metric, value in evaluation.mean.to_dict().items()
+    }
+    assert outcome.metrics == pytest.approx(expected)
+    assert outcome.artifacts == ("comparison.html", "comparison.json", "comparison.tex")
+    document = json.loads((asked.folder.artifacts / "comparison.json").read_text())
+    assert [one["name"] for one in document["results"]] == ["median", "nearest"]
+    progress = asked.progress
+    assert (progress.method, progress.method_number, progress.methods) == ("nearest", 2, 2)
+
+
+def test_a_job_that_is_to_stop_goes_on_in_its_retry(job_run: Callable[..., JobRun], artifact_folder: Path) -> None:
+    first = job_run()
+    first.should_stop = lambda: (first.folder.run / "median" / "result.json").exists()
+    with pytest.raises(Stopped):
+        compare_run.run(first, JOB)
+    assert not first.folder.artifacts.exists()
+    kept = (first.folder.run / "median" / "result.json").read_bytes()
+    again = job_run("again", retry_of="job")
+    compare_run.run(again, JOB)
+    assert (again.folder.run / "median" / "result.json").read_bytes() == kept
+
+
+def test_a_retry_begins_anew_where_the_run_before_was_no_good(job_run: Callable[..., JobRun]) -> None:
+    first = job_run()
+    first.folder.run.mkdir()
+    (first.folder.run / "run.json").write_text("no JSON")
+    first.folder.write_outcome(Outcome(error="TRAINING_STATE_INVALID", reason="it is damaged"))
+    assert compare_run.run(job_run("again", retry_of="job"), JOB).metrics
+
+
+def test_what_cannot_be_is_refused_at_the_submission(artifact_folder: Path, store: JobStore) -> None:
+    with pytest.raises(InvalidArgument, match="got 'newest'"):
+        CompareJob(dataset="tiny", methods=("newest",))
+    with pytest.raises(InvalidArgument, match="budget must be"):
+        CompareJob(dataset="tiny", budget="half")
+    with pytest.raises(DatasetNotFound):
+        store.submit(CompareJob(dataset="gone"))
+    assert from_dict(to_dict(JOB)) == JOB
+
+
+def test_a_comparison_is_queued_without_torch() -> None:
+    program = (
+        f"import sys; sys.path[:] = {sys.path!r}; from ultragray_workers.jobs.kinds import CompareJob; "
+        "CompareJob(dataset='tiny', methods=('median',)); print('torch' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", program], capture_output=True, check=True).stdout == b"False\n"
+
+
+@pytest.mark.long
+def test_killed_comparison_goes_on_and_repeats_no_step(
+    store: JobStore, start_worker: Callable[..., RunningWorker], until: Callable[..., Job]
+) -> None:
+    job, _ = store.submit(CompareJob(dataset="tiny", methods=("scene", "nearest")))
+    worker = start_worker("one")
+    until(job, lambda job: "scene: step" in store.log_tail(job.id))
+    process = worker.job_process()
+    assert process is not None
+    os.kill(process, signal.SIGTERM)  # leaves a checkpoint
+    done = until(job)
+    assert (done.state, done.kind, done.attempts) == (JobState.SUCCEEDED, "compare", 2), done
+    assert {"scene_psnr_db", "nearest_gmsd"} < set(done.metrics)
+    lines = [line for line in store.log_tail(job.id).splitlines() if line.startswith("scene: step")]
+    assert len(lines) == len({line.partition(" of ")[0] for line in lines}) == 10, lines

@@ -1,0 +1,68 @@
+"""The work of a comparison: every method fitted and scored. Interrupted, it goes on with the method at hand."""
+
+from __future__ import annotations
+
+import math
+import shutil
+import sys
+from dataclasses import replace
+
+from ultragray.methods.comparison.files import write_comparison
+from ultragray.methods.comparison.place import RUN_FILE
+from ultragray.methods.comparison.run import ComparisonProgress, compare
+
+from ..folder import Outcome, Progress
+from ..worker.job_run import JobRun, Stopped
+from .compare import CompareJob
+from .earlier_run import take_over_run
+
+_LINES = 10  # of the log in a fit
+
+
+def run(job_run: JobRun, job: CompareJob) -> Outcome:
+    """Compares the methods, or goes on where an earlier process was, and completes the artifacts.
+
+    Raises Stopped, DatasetNotFound, DatasetInvalid also for a dataset without held-out frames, TrainingStateInvalid.
+    """
+    device = job_run.request.device
+    dataset = job_run.load_dataset(job.dataset)
+    take_over_run(job_run, RUN_FILE)
+    sys.stderr.write(
+        f"comparing {', '.join(job.methods)} on {job.dataset} on {device}, {job_run.request.threads} threads\n"
+    )
+    comparison = compare(
+        dataset,
+        job,
+        folder=job_run.folder.run,
+        device=device,
+        report=lambda state: _report(job_run, state),
+        should_stop=job_run.should_stop,
+    )
+    if comparison is None:
+        raise Stopped
+    for name, reason in comparison.failures.items():
+        sys.stderr.write(f"{name} failed: {reason}\n")
+    metrics = {
+        f"{name}_{metric}": value
+        for name, evaluation in comparison.measured.items()
+        for metric, value in evaluation.mean.to_dict().items()
+    }
+    with job_run.folder.new_artifacts() as folder:
+        for path in write_comparison(comparison, dataset, job_run.folder.run):
+            shutil.copyfile(path, folder / path.name)
+    return Outcome(artifacts=job_run.folder.artifact_names(), metrics=metrics)
+
+
+def _report(job_run: JobRun, state: ComparisonProgress) -> None:
+    fit = state.fit
+    at = Progress(method=state.method, method_number=state.number, methods=state.of)
+    if fit is None:
+        job_run.report(at)
+        sys.stderr.write(f"{state.method}, method {state.number} of {state.of}\n")
+    else:
+        left_s = fit.seconds_left if math.isfinite(fit.seconds_left) else None
+        job_run.report(replace(at, step=fit.step, steps=fit.steps, loss=fit.loss, seconds_left=left_s))
+        if fit.step * _LINES // fit.steps == (fit.step - 1) * _LINES // fit.steps:
+            return
+        sys.stderr.write(f"{state.method}: step {fit.step:,} of {fit.steps:,}: loss {fit.loss:.4f}\n")
+    sys.stderr.flush()

@@ -1,0 +1,35 @@
+"""The run of the job that a retry replaces: what it had reached is where the retry goes on."""
+
+from __future__ import annotations
+
+import fcntl
+import shutil
+from contextlib import suppress
+
+from ultragray.errors import TrainingStateInvalid
+from ultragray.files.atomic import TEMPORARY_SUFFIX
+
+from ..folder import JobFolder
+from ..worker.job_run import JobRun
+
+
+def take_over_run(job_run: JobRun, begun: str) -> None:
+    """Copies the run of the job that this one replaces, unless there is a run already, or that one never had `begun`.
+
+    `begun`: the file of a run that can be gone on from.
+    """
+    before = job_run.request.retry_of
+    if before is None or job_run.folder.run.exists():
+        return
+    old = JobFolder(job_run.folder.artifact_folder, before)
+    if not (old.run / begun).exists():
+        return
+    outcome = old.outcome()
+    if outcome is not None and outcome.error == TrainingStateInvalid.reason:
+        return  # it cannot be resumed from: this job begins anew
+    partial = job_run.folder.path / "run.partial"
+    shutil.rmtree(partial, ignore_errors=True)
+    with suppress(FileNotFoundError), old.lock.open("a") as lock:  # it may be deleted meanwhile: then anew
+        fcntl.lockf(lock, fcntl.LOCK_EX)  # a process that was cancelled a moment ago may still write
+        shutil.copytree(old.run, partial, ignore=shutil.ignore_patterns(f".*{TEMPORARY_SUFFIX}"))
+        partial.rename(job_run.folder.run)
