@@ -253,7 +253,8 @@ class ComparisonSettings:
 
     methods: tuple[str, ...] = ("all",)
     """Methods to compare, some of scene, median, mean, maximum, median-0.25mm, mean-0.25mm, maximum-0.25mm, linear,
-    nearest; all: each of them.
+    nearest, ultranerf-released, ultranerf-unit, ultranerf-mean, implicitvol, implicitvol-refined, rapidvol,
+    ultragauss, ultragauss-shadow; all: each of them.
     """
     budget: str = "equal"
     """equal: every method learns as long as the scene does with the preset fast on this machine; author: the steps

@@ -134,7 +134,13 @@ def _compare(
         raise typer.Exit(INTERRUPTED)
     if as_json:
         typer.echo(to_json(comparison.to_dict() | {"written": [str(path) for path in written]}))
-        return
+    else:
+        _print(comparison, written)
+    if not comparison.measured:
+        raise typer.Exit(1)
+
+
+def _print(comparison: Comparison, written: list[Path]) -> None:
     print_comparison(comparison)
     if comparison.measured:
         print_speckle({one.title: one.evaluation for one in comparison.results if one.evaluation is not None})
