@@ -26,7 +26,7 @@ FrameArray = npt.NDArray[np.float32]
 
 @dataclass(frozen=True)
 class Description:
-    """A method in words, for tables and pages. Texts are plain; `equations` are in the notation of docs/concepts/methods.md."""
+    """A method in words, for tables and pages. `equations` are plain text, in the notation of its concept page."""
 
     title: str
     source: str  # paper, with its identifier

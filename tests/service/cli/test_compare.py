@@ -84,6 +84,19 @@ def test_more_methods_are_added_and_those_that_are_there_are_kept(sweep: Path, t
     assert not (tmp_path / "ball.html.run" / "nearest").exists()
 
 
+def test_a_comparison_of_which_nothing_could_be_measured_ends_with_an_error(tmp_path: Path) -> None:
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    poses[:, 1, 3] = [0.0, 10_000.0, 20_000.0, 30_000.0]  # mm: no volume of voxels holds that
+    poses[:, 0, 3] = [0.0, 9_000.0, -9_000.0, 18_000.0]
+    images = np.random.default_rng(0).integers(0, 255, (4, 16, 16), dtype=np.uint8)
+    frames = Sweep(images, poses, LinearProbe(20.0, 0.0, 25.0), np.arange(4), "wide")
+    write_released(Dataset("wide", frames.select([0, 1, 3]), frames.select([2])), tmp_path / "wide")
+    result = run("compare", tmp_path / "wide", "--methods", "median-0.25mm")
+    assert result.exit_code == 1
+    assert "voxel" in result.stdout
+    assert run("compare", tmp_path / "wide", "--methods", "median-0.25mm,nearest").exit_code == 0
+
+
 def test_what_is_not_a_comparisons_is_not_replaced(sweep: Path, tmp_path: Path) -> None:
     page = tmp_path / "ball.html"
     (tmp_path / "ball.tex").write_text("a paper")
