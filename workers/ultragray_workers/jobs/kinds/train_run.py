@@ -113,13 +113,14 @@ def _finish(job_run: JobRun, job: TrainJob, dataset: Dataset, scene: GaussianSce
         (folder / "metrics.json").write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
         if len(dataset.val):
             scene = scene.to(device)
-            _write_report(job, dataset, scene, device, folder)
+            _write_report(job_run, job, dataset, scene, folder)
     return Outcome(artifacts=job_run.folder.artifact_names(), metrics=metrics)
 
 
-def _write_report(job: TrainJob, dataset: Dataset, scene: GaussianScene, device: str, artifacts: Path) -> None:
+def _write_report(job_run: JobRun, job: TrainJob, dataset: Dataset, scene: GaussianScene, artifacts: Path) -> None:
     """Pictures of some held-out frames, and the page of the scene alone: a comparison of one method."""
-    with tempfile.TemporaryDirectory(prefix="ultragray-report-") as folder:
+    device = job_run.request.device
+    with tempfile.TemporaryDirectory(prefix="report-", dir=job_run.folder.path) as folder:
         methods = {SCENE: GivenScene(scene)}
         comparison = compare_methods(dataset, methods, ComparisonSettings(), folder=Path(folder), device=device)
         assert comparison is not None  # nothing tells it to stop
