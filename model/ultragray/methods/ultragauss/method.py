@@ -37,8 +37,9 @@ class UltraGauss(LearnedMethod):
             equations=(average, shadow) if self.casts_shadow else (average,),
             choices=(
                 "From secondary sources: the paper's code was not found.",
-                "Equal time: as many Gaussians as this project's scene takes for the sweep, round, their standard "
-                "deviation (volume / N)^(1/3). Author's recipe: 300,000 with the published start.",
+                "Equal time: as many Gaussians as this project's scene takes for the sweep, their standard deviation "
+                "(volume / N)^(1/3), across the frames at least half the spacing of these. Author's recipe: 300,000 "
+                "with the published start.",
                 "Steps are not published: 30,000, one frame each. Rates not published: those of 3D Gaussian Splatting.",
                 "Loss weights not published: L1 and 1 - SSIM, half each.",
                 "Densify and resample every 100 steps within the first half: weights under 0.005 go, those that the "

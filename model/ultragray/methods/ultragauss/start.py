@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import torch
 from torch import Tensor
 
 from ...backends.spatial_order import spatial_order
 from ...datasets.sweep import Dataset
+from ...probe import FloatArray
 from ...probe.scan_lines import ParallelLines
 from ...training.data.geometry import Geometry
 from ..parts.space import Box
@@ -29,18 +28,26 @@ def wide_start(dataset: Dataset, count: int, generator: torch.Generator) -> dict
     values, axes = torch.linalg.eigh(precision)  # [N, 3], [N, 3, 3] with the axes as columns
     axes[:, :, 0] *= torch.linalg.det(axes)[:, None]  # no mirror
     unit_cm = Box.of(dataset.train).largest_half_mm / 10.0
-    return _start(dataset, (unit_cm * values.rsqrt()).log(), _quaternions(axes), generator)
+    points_mm, _ = _points(dataset, count, generator)
+    return _start(dataset, points_mm, (unit_cm * values.rsqrt()).log(), _quaternions(axes))
 
 
 def even_start(dataset: Dataset, count: int, generator: torch.Generator) -> dict[str, Tensor]:
-    """Round Gaussians whose standard deviation is the side of the cube that each has to itself: (volume / N)^(1/3)."""
-    deviation_cm = (_volume_mm3(dataset) / count) ** (1 / 3) / 10.0
-    scales = torch.full((count, 3), math.log(deviation_cm), dtype=torch.float64)
-    return _start(dataset, scales, torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(count, 4), generator)
+    """Gaussians whose standard deviation is the side of the cube that each has to itself: (volume / N)^(1/3).
+
+    Across the frames, along elevation, it is at least half the spacing of the frames: else there would be Gaussians
+    between them that no frame trains, and a plane in a gap would show those.
+    """
+    points_mm, rotations = _points(dataset, count, generator)
+    side_mm = (_volume_mm3(dataset) / count) ** (1 / 3)
+    deviations_mm = torch.tensor([side_mm, max(side_mm, _thickness_mm(dataset) / 2.0), side_mm], dtype=torch.float64)
+    return _start(
+        dataset, points_mm, (deviations_mm / 10.0).log().expand(count, 3), _quaternions(torch.from_numpy(rotations))
+    )
 
 
-def _start(dataset: Dataset, scales: Tensor, quats: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
-    means = torch.from_numpy(_points_mm(dataset, len(scales), generator) - dataset.centre_mm) / 10.0
+def _start(dataset: Dataset, points_mm: FloatArray, scales: Tensor, quats: Tensor) -> dict[str, Tensor]:
+    means = torch.from_numpy(points_mm - dataset.centre_mm) / 10.0
     parameters = {
         "means": means,
         "scales": scales,
@@ -65,8 +72,10 @@ def _volume_mm3(dataset: Dataset) -> float:
     return len(dataset.train) * _thickness_mm(dataset) * probe.scan_line_length_mm * breadth_mm
 
 
-def _points_mm(dataset: Dataset, count: int, generator: torch.Generator) -> np.ndarray:  # [N, 3] in the tracker's frame
-    """Points drawn uniformly in that space."""
+def _points(
+    dataset: Dataset, count: int, generator: torch.Generator
+) -> tuple[FloatArray, FloatArray]:  # [N, 3] mm in the tracker's frame, [N, 3, 3]
+    """Points drawn uniformly in that space, and the axes of the frame that each lies at."""
     sweep, probe = dataset.train, dataset.probe
     frames = torch.randint(len(sweep), (count,), generator=generator).numpy()
     deep, across, beside = torch.rand((3, count), generator=generator, dtype=torch.float64).numpy()
@@ -76,8 +85,7 @@ def _points_mm(dataset: Dataset, count: int, generator: torch.Generator) -> np.n
     points = probe.points_mm(deep, across)
     points[:, 1] += (beside - 0.5) * _thickness_mm(dataset)
     poses = sweep.poses[frames]
-    placed: np.ndarray = np.einsum("nij,nj->ni", poses[:, :3, :3], points) + poses[:, :3, 3]
-    return placed
+    return np.einsum("nij,nj->ni", poses[:, :3, :3], points) + poses[:, :3, 3], poses[:, :3, :3]
 
 
 def _quaternions(axes: Tensor) -> Tensor:  # [N, 3, 3] rotations -> [N, 4] wxyz

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -48,6 +49,21 @@ def test_even_gaussians_are_as_wide_as_their_share_of_the_volume() -> None:
     gaussians = even_start(sweep_along_elevation(LINEAR), 500, torch.Generator().manual_seed(0))
     volume_mm3 = 20.0 * 20.0 * 10.0
     assert torch.allclose(10.0 * gaussians["scales"].exp(), torch.tensor((volume_mm3 / 500) ** (1 / 3)))
+
+
+def test_even_gaussians_reach_over_the_gaps_between_frames_along_the_frames_own_elevation() -> None:
+    """Ten frames, 1 mm apart, turned by a quarter about the axis of depth: elevation lies along -x of the tracker."""
+    dataset = sweep_along_elevation(LINEAR)
+    turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    poses = dataset.train.poses.copy()
+    poses[:, :3, :3] = turn
+    poses[:, :3, 3] = poses[:, :3, 3] @ turn.T
+    turned = Dataset("turned", replace(dataset.train, poses=poses), dataset.val)
+    gaussians = even_start(turned, 50_000, torch.Generator().manual_seed(0))
+    side_mm = (20.0 * 20.0 * 10.0 / 50_000) ** (1 / 3)
+    assert torch.allclose(10.0 * gaussians["scales"][0].exp(), torch.tensor([side_mm, 0.5, side_mm]))
+    along = rotate(gaussians["quats"][:1], torch.tensor([[0.0, 1.0, 0.0]]))
+    assert torch.allclose(along, torch.tensor([[-1.0, 0.0, 0.0]]), atol=1e-6)
 
 
 def test_the_published_start_has_its_precision() -> None:
