@@ -157,7 +157,8 @@ def _table(name: str, run: Document) -> Iterator[str]:
         yield _row(methods[key], [methods[other]["mean"] for other in run["order"]])
     for one in methods.values():
         if one["failure"] is not None:
-            yield f"| {one['title']} | failed: {one['failure']} {'| ' * (len(COST_HEADINGS) + len(METRICS) + 1)}|"
+            reason = one["failure"].replace("|", "/")
+            yield f"| {one['title']} | failed: {reason} {'| ' * (len(COST_HEADINGS) + len(METRICS))}|"
     yield ""
 
 

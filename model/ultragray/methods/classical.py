@@ -6,6 +6,7 @@ import time
 from dataclasses import dataclass
 
 from ..datasets.sweep import Dataset, Sweep
+from ..errors import InvalidArgument
 from ..evaluation.baselines import FrameArray, predict
 from ..evaluation.compounding import Volume, affordable_voxel_mm, compound
 from ..probe import FloatArray, Probe
@@ -32,6 +33,7 @@ class Compounding(Method):
             title=f"{self.fold} compounding, {size}",
             source="Gobbi and Peters, 2002; docs/concepts/baselines.md",
             summary=f"Each voxel of {size} keeps the {self.fold} of the pixels that fall into it; gaps are filled.",
+            choices=() if self.voxel_mm else ("Voxels are larger where 0.5 mm would not fit into memory.",),
         )
 
     def fit(self, dataset: Dataset, budget: Budget, run: FitRun | None = None) -> _Compounded:
@@ -76,5 +78,8 @@ class _Frames(Fitted):
     cost: Cost
 
     def render(self, probe: Probe, poses: FloatArray, height: int, width: int) -> FrameArray:
-        """Of the sweep's own probe and image size."""
+        """Raises InvalidArgument for another probe or image size than the sweep's: its frames are shown as they are."""
+        own = self.sweep.probe, self.sweep.height, self.sweep.width
+        if (probe, height, width) != own:
+            raise InvalidArgument(f"{self.method} renders frames of its own sweep only, {own}", field="probe")
         return predict(self.sweep, poses, self.method)

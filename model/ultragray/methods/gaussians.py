@@ -16,6 +16,7 @@ from ..rendering import render
 from ..scene import GaussianScene
 from ..training import Progress, TrainingConfig, train
 from ..training.checkpointing import read_checkpoint_header
+from ..training.device import training_device
 from ..training.trainer import CHECKPOINT_FILE
 from .budget import Budget, BudgetKind
 from .method import Cost, Description, FitProgress, FitRun, Fitted, FrameArray, Method
@@ -50,7 +51,7 @@ class SceneMethod(Method):
         run = run or FitRun()
         folder = run.folder
         if folder is not None and (folder / SCENE_FILE).exists():
-            return self._fitted(GaussianScene.load(folder / SCENE_FILE), folder)
+            return self._fitted(GaussianScene.load(folder / SCENE_FILE), folder, run.device)
         seconds = -time.perf_counter()
 
         def follow(progress: Progress) -> None:
@@ -75,16 +76,19 @@ class SceneMethod(Method):
         if scene.info.training["step"] < scene.info.training["steps"]:
             return None
         seconds += time.perf_counter()
+        scene = replace(scene, info=replace(scene.info, dataset_sha256=dataset.sha256))  # with its held-out frames
         if folder is None:
-            return SceneFit(scene, self._cost(scene, seconds, len(scene.to_bytes())))
+            cost = self._cost(scene, seconds, len(scene.to_bytes()))
+            return SceneFit(scene.to(training_device(run.device, "auto")), cost)
         write_whole(folder / SECONDS_FILE, json.dumps(seconds) + "\n")
         scene.save(folder / SCENE_FILE)
         (folder / CHECKPOINT_FILE).unlink(missing_ok=True)
-        return self._fitted(scene, folder)
+        return self._fitted(scene, folder, run.device)
 
-    def _fitted(self, scene: GaussianScene, folder: Path) -> SceneFit:
+    def _fitted(self, scene: GaussianScene, folder: Path, device: str) -> SceneFit:
         seconds = float(json.loads((folder / SECONDS_FILE).read_text(encoding="utf-8")))
-        return SceneFit(scene, self._cost(scene, seconds, (folder / SCENE_FILE).stat().st_size))
+        cost = self._cost(scene, seconds, (folder / SCENE_FILE).stat().st_size)
+        return SceneFit(scene.to(training_device(device, "auto")), cost)
 
     def _cost(self, scene: GaussianScene, seconds: float, size: int) -> Cost:
         return Cost(seconds, int(scene.info.training["steps"]), self.describe().published_steps, size)

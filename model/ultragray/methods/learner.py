@@ -43,7 +43,11 @@ class Learner:
     def __init__(self, dataset: Dataset, seed: int, device: torch.device) -> None:
         self.dataset, self.device = dataset, device
         self.generator = torch.Generator().manual_seed(seed)  # on the CPU: the same draws on every device
-        self.images = torch.tensor(dataset.train.images, device=device).float().div_(255.0)  # [F, H, W]
+        self.images = torch.tensor(dataset.train.images, device=device)  # [F, H, W] uint8
+
+    def image(self, place: int) -> Tensor:  # [H, W] in [0, 1]
+        """A training frame."""
+        return self.images[place].float().div_(255.0)
 
     @abstractmethod
     def loss(self, step: int, steps: int) -> Tensor:

@@ -33,7 +33,7 @@ class _Image(Learner):
     def loss(self, step: int, steps: int) -> Tensor:
         place = int(torch.randint(len(self.images), (), generator=self.generator))
         noise = 0.01 * torch.rand(self.images.shape[1:], generator=self.generator)
-        return (self.module["image"] + noise - self.images[place]).square().mean()
+        return (self.module["image"] + noise - self.image(place)).square().mean()
 
     def frame(self, probe: Probe, pose: FloatArray, height: int, width: int) -> Tensor:
         image: Tensor = self.module["image"]

@@ -107,6 +107,6 @@ def test_a_damaged_state_is_refused_with_its_name(
 
 def test_a_fit_that_diverges_says_in_which_step(mean_image: MeanImage, make_dataset: Callable[..., Dataset]) -> None:
     learner = mean_image.learner(make_dataset(), AUTHOR, 0, torch.device("cpu"))
-    learner.images.fill_(float("inf"))
+    learner.module.get_parameter("image").data.fill_(float("inf"))
     with pytest.raises(TrainingDiverged, match="step 5: the loss is"):
         learner.take_step(4, 10)

@@ -77,7 +77,7 @@ def compared(dataset: Dataset, methods: dict[str, Method], folder: Path) -> Comp
 def with_failures(content: ReportContent, reason: str, *names: str) -> ReportContent:
     """The same where these methods failed."""
     results = tuple(
-        MethodResult(one.name, one.description, failure=reason) if one.name in names else one
+        MethodResult(one.name, one.description, one.machine, failure=reason) if one.name in names else one
         for one in content.comparison.results
     )
     return replace(content, comparison=replace(content.comparison, results=results))

@@ -50,7 +50,9 @@ def test_the_table_has_what_the_library_measures(sweep: Path, tmp_path: Path, mo
     for title, name in {"median compounding, 0.5 mm": "median", "linear between frames": "linear"}.items():
         mean = expected[name].mean
         figures = rf"{mean.psnr_db:.2f} +{mean.ms_ssim:.3f} +{mean.gms:.3f} +{mean.gmsd:.3f}"
-        assert re.search(rf"{title} +{figures} +\d+\.\d +\d+\.\d +\d+\.\d\d +\d\.\d\d\n", result.stdout), result.stdout
+        assert re.search(rf"{title} +{figures} +– +\d+\.\d +\d+\.\d +\d+\.\d\d +\d\.\d\d\n", result.stdout), (
+            result.stdout
+        )
     assert list(tmp_path.iterdir()) == []
 
 

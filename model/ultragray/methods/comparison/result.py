@@ -30,6 +30,7 @@ class MethodResult:
 
     name: str  # as the command line calls it
     description: Description
+    machine: str  # that measured it
     steps: int = 0  # 0: it learns nothing by steps
     of_steps: int | None = None  # of its author's recipe
     seconds: float = 0.0  # of the fit
@@ -54,6 +55,7 @@ class MethodResult:
             "name": self.name,
             "title": self.title,
             "description": to_dict(self.description),
+            "machine": self.machine,
             "steps": self.steps,
             "of_steps": self.of_steps,
             "seconds": self.seconds,
@@ -78,7 +80,7 @@ class MethodResult:
         )
 
 
-_PLAIN = ("steps", "of_steps", "seconds", "frame_ms", "model_bytes", "failure")
+_PLAIN = ("machine", "steps", "of_steps", "seconds", "frame_ms", "model_bytes", "failure")
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,9 @@ import numpy as np
 import torch
 
 from ...datasets.sweep import Dataset, Sweep, spread_places
-from ...errors import UltragrayError
+from ...errors import TrainingDiverged, UltragrayError
 from ...evaluation.scoring import evaluate_frames, require_frames
+from ...installation import __version__
 from ...machine import processor_name
 from ...training.device import training_device
 from ..budget import Budget, BudgetKind, Pace, Paces
@@ -92,7 +93,7 @@ def compare_methods(
             return None
         result: MethodResult | None
         if _learns_within_a_time(method) and kind is BudgetKind.EQUAL and seconds is None:
-            result = MethodResult(name, method.describe(), failure="there is no equal time, since the scene failed")
+            result = _failed(name, method, device, "there is no equal time, since the scene failed")
         else:
             own_s = seconds if seconds is None or name == SCENE else seconds * settings.times
             follow = _follower(report, name, number, len(methods))
@@ -108,7 +109,7 @@ def compare_methods(
             results.append(result)
     return Comparison(
         dataset=DatasetFacts.of(dataset),
-        machine=machine_in_words(device),
+        machine="; ".join(dict.fromkeys(one.machine for one in results)),
         budget=settings.budget,
         budget_s=seconds if needs_time else None,
         times=settings.times,
@@ -120,8 +121,13 @@ def compare_methods(
 
 def default_paces(dataset: Dataset, device: str = "cpu") -> Paces:
     """What earlier comparisons of this dataset on this machine measured, in the user's folder of caches."""
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    surroundings = {"machine": machine_in_words(device), "device": device, "dataset": dataset.sha256}
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser())
+    surroundings = {
+        "version": __version__,
+        "machine": machine_in_words(device),
+        "device": device,
+        "dataset": dataset.sha256,
+    }
     return Paces(cache / "ultragray" / "paces.json", surroundings)
 
 
@@ -161,20 +167,40 @@ def _measured(
         fitted = method.fit(dataset, budget, replace(run, folder=place.of_method(name)))
         if fitted is None:
             return None
-        result, frames = measure(name, method, fitted, dataset.val)
+        result, frames = measure(name, method, fitted, dataset.val, machine_in_words(run.device))
     except UltragrayError as error:
-        return MethodResult(name, method.describe(), failure=str(error))
+        return _failed(name, method, run.device, str(error))
+    except (MemoryError, RuntimeError) as error:
+        if not _is_out_of_memory(error):
+            raise
+        return _failed(name, method, run.device, "the memory of this machine did not suffice")
     place.write_result(result, frames)
     return result
 
 
-def measure(name: str, method: Method, fitted: Fitted, sweep: Sweep) -> tuple[MethodResult, FrameArray]:
-    """The row of a fitted method and the frames [F, H, W] that it expects, clipped to [0, 1]."""
-    frames = np.clip(fitted.render(sweep.probe, sweep.poses, sweep.height, sweep.width), 0.0, 1.0)
+def _failed(name: str, method: Method, device: str, reason: str) -> MethodResult:
+    return MethodResult(name, method.describe(), machine_in_words(device), failure=reason)
+
+
+def _is_out_of_memory(error: Exception) -> bool:
+    """Also on the CPU, where torch raises a plain RuntimeError."""
+    return isinstance(error, (MemoryError, torch.OutOfMemoryError)) or "DefaultCPUAllocator" in str(error)
+
+
+def measure(name: str, method: Method, fitted: Fitted, sweep: Sweep, machine: str) -> tuple[MethodResult, FrameArray]:
+    """The row of a fitted method and the frames [F, H, W] that it expects, clipped to [0, 1].
+
+    Raises TrainingDiverged where they are not finite.
+    """
+    frames = fitted.render(sweep.probe, sweep.poses, sweep.height, sweep.width)
+    if not np.isfinite(frames).all():
+        raise TrainingDiverged("frames that it expects are not finite")
+    frames = np.clip(frames, 0.0, 1.0)
     cost = fitted.cost
     result = MethodResult(
         name=name,
         description=method.describe(),
+        machine=machine,
         steps=cost.steps,
         of_steps=cost.of_steps,
         seconds=cost.seconds,

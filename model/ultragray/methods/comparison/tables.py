@@ -87,7 +87,7 @@ def budget_text(comparison: Comparison) -> str:
     if BudgetKind(comparison.budget) is BudgetKind.AUTHOR:
         return "the steps of each author's recipe"
     if comparison.budget_s is None:
-        return "none: no method here learns within a time"
+        return "none: no method here learns within an equal time"
     times = "" if comparison.times == 1.0 else f", {comparison.times:g} times that of the scene's preset fast"
     return f"equal time, {duration_text(comparison.budget_s * comparison.times)}{times}"
 

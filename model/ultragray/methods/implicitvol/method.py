@@ -25,6 +25,8 @@ FIELD_CHOICES = (
     "The paper's schedule over 10,001 epochs is stretched to the steps of the budget.",
     "Linear layers begin uniform in ±1/sqrt(inputs), which the paper leaves open.",
     "1 - SSIM in place of -SSIM: the same gradient, and a loss that ends at 0.",
+    "SSIM takes an image and its negative for the same; the paper does not say what keeps a fit from the negative, and "
+    "nothing does here.",
     "Values are cut off at 0 and 1 where a frame is rendered, not where it is learned.",
 )
 

@@ -45,7 +45,8 @@ class FramePoses(nn.Module):
 
     def common_motion(self) -> tuple[Tensor, Tensor]:  # [3, 3], [3]
         """Rotation and translation, in the field's coordinates, that carry tracked corners onto refined ones best."""
-        refined = torch.stack([self.points(place, self._corners_mm) for place in range(len(self.angles))])
+        centred = (self._corners_mm - self._middle_mm) / self._half_height_mm
+        refined = centred @ (self._axes @ rotation_of(self.angles)).mT + self.shifts[:, None]  # [F, K, 3]
         before, after = self._tracked_corners.reshape(-1, 3).double(), refined.reshape(-1, 3).double()
         mean_before, mean_after = before.mean(dim=0), after.mean(dim=0)
         left, _, right = torch.linalg.svd((after - mean_after).T @ (before - mean_before))
@@ -55,15 +56,15 @@ class FramePoses(nn.Module):
         return rotation.float(), (mean_after - rotation @ mean_before).float()
 
 
-def rotation_of(angles: Tensor) -> Tensor:  # [3] about x, y, z -> [3, 3]
+def rotation_of(angles: Tensor) -> Tensor:  # [..., 3] about x, y, z -> [..., 3, 3]
     """Rz Ry Rx."""
-    (cx, cy, cz), (sx, sy, sz) = angles.cos(), angles.sin()
+    (cx, cy, cz), (sx, sy, sz) = angles.cos().unbind(-1), angles.sin().unbind(-1)
     rows = (
-        torch.stack([cz * cy, cz * sy * sx - sz * cx, cz * sy * cx + sz * sx]),
-        torch.stack([sz * cy, sz * sy * sx + cz * cx, sz * sy * cx - cz * sx]),
-        torch.stack([-sy, cy * sx, cy * cx]),
+        torch.stack([cz * cy, cz * sy * sx - sz * cx, cz * sy * cx + sz * sx], dim=-1),
+        torch.stack([sz * cy, sz * sy * sx + cz * cx, sz * sy * cx - cz * sx], dim=-1),
+        torch.stack([-sy, cy * sx, cy * cx], dim=-1),
     )
-    return torch.stack(rows)
+    return torch.stack(rows, dim=-2)
 
 
 def angles_of(rotations: FloatArray) -> FloatArray:  # [F, 3, 3] -> [F, 3] about x, y, z

@@ -70,7 +70,7 @@ class SliceLearner(Learner):
         self.set_rates(step, steps)
         place = frame_of_step(step, len(self.images), self.seed)
         found = self.values(self.training_points(place))
-        return 1.0 - SIMILARITY.ssim(found[None], self.images[place][None])
+        return 1.0 - SIMILARITY.ssim(found[None], self.image(place)[None])
 
     def frame(self, probe: Probe, pose: FloatArray, height: int, width: int) -> Tensor:
         points = self.rendered_points(self.pixels_of(probe, height, width), pose)

@@ -18,6 +18,7 @@ from ...training.data.geometry import Geometry
 from ...training.steps.losses import SSIM_WINDOW, image_loss
 from ...training.steps.refinement import PullStatistics
 from ..learner import Learner
+from ..parts.slices import frame_of_step
 from .field import GAUSSIANS, Field
 from .resampling import follow, is_due, resample
 
@@ -88,17 +89,12 @@ class UltraGaussLearner(Learner):
     def loss(self, step: int, steps: int) -> Tensor:
         means = self.optimizers["adam"].param_groups[self._groups["means"]]
         means["lr"] = RATES["means"] * self._scale_cm * LAST_MEANS_RATE ** (step / steps)
-        place = self._frame_of(step)
+        place = frame_of_step(step, len(self.images), self._seed)
         rendered = self.frame(self.dataset.probe, self.dataset.train.poses[place], *self.images.shape[1:])
-        return image_loss(rendered[None], self.images[place][None], STRUCTURE)
-
-    def _frame_of(self, step: int) -> int:
-        """Each frame once, in an order drawn anew, before any is taken again."""
-        count = len(self.images)
-        order = torch.Generator().manual_seed(self._seed * 1_000_003 + step // count)
-        return int(torch.randperm(count, generator=order)[step % count])
+        return image_loss(rendered[None], self.image(place)[None], STRUCTURE)
 
     def after_step(self, step: int, steps: int) -> None:
+        self._scene = self.module.scene(self.dataset.centre_mm)  # a fused step is no change that a prepared one notices
         gradient = self.module.gaussians["means"].grad
         assert gradient is not None
         self._pull.add(gradient)

@@ -43,7 +43,7 @@ class UltraGauss(LearnedMethod):
                 "Steps are not published: 30,000, one frame each. Rates not published: those of 3D Gaussian Splatting.",
                 "Loss weights not published: L1 and 1 - SSIM, half each.",
                 "Densify and resample every 100 steps within the first half: weights under 0.005 go, those that the "
-                "images pull at most are split or duplicated in their place; never more Gaussians than at the start.",
+                "images pull most are split or duplicated in their place; never more Gaussians than at the start.",
                 "A from standard deviations and a rotation; L L' + beta, beta = 1e-6, is used for the published start.",
                 "a_BG starts at 0.1, c_BG at 0.05; both are learned.",
                 "A Gaussian counts where w is at least 1/255 (published: within 95% of its mass), w is at most 0.999, "

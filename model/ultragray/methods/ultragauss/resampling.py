@@ -31,7 +31,7 @@ def resample(
 ) -> tuple[dict[str, Tensor], Tensor]:
     """New Gaussians, `limit` at most, and the row of each before, −1 for a new one.
 
-    Weights under 0.005 go; then those that are pulled at most are split or duplicated, as many as there is room for.
+    Weights under 0.005 go; then those that are pulled most are split or duplicated, as many as there is room for.
     """
     (kept,) = torch.nonzero(gaussians["transmittances"].sigmoid() >= LEAST_WEIGHT, as_tuple=True)
     refined = refine(

@@ -77,7 +77,7 @@ class UltraNerfLearner(Learner):
         for group in self.optimizers["adam"].param_groups:
             group["lr"] = RATE * 0.1 ** (DECADES * step / steps)
         place = int(torch.randint(len(self.images), (), generator=self.generator))
-        image, pose, probe = self.images[place], self.dataset.train.poses[place], self.dataset.probe
+        image, pose, probe = self.image(place), self.dataset.train.poses[place], self.dataset.probe
         height, width = image.shape
         raw = self.module(self._points(probe, pose, height, width)).view(height, width, -1)
         frame = self.training_frame(Tissue.of(raw), self._spacing(probe, height))
@@ -143,12 +143,12 @@ EQUATIONS = (
 )
 CHOICES = (
     "Held-out frames are rendered by their expectation, G = ρ_b and H = ρ_s, and clipped to [0, 1].",
-    "Samples lie at the centres of the frame's rows, not from 0 to the full depth with both ends included.",
+    "Samples lie at the centres of the frame's pixels, along depth and across, not from end to end with both included.",
     "Δ, the distance between samples, is in the coordinates that the field sees, and so is 1/α.",
     "Probes other than linear ones, which the paper leaves out: the same formulas along their scan lines, K in pixels "
     "of range times angle.",
     "λ is 0.75, as the released program has it (0.9 in the paper's appendix). MS-SSIM takes fewer than five scales "
-    "where the shorter side has less than 112 pixels.",
+    "where the shorter side has less than 112 pixels; a scale of negative contrast counts as 1e-6.",
     "The rate falls to 0.1^0.8 of 1e-4 over the steps of the budget, as it does over 200,000 steps.",
     "Draws are new in each step, from the seed of the fit; Adam's constants are torch's.",
 )

@@ -21,7 +21,7 @@ from ..options import with_options
 from ..output import check_file
 from ..stopping import stop_on_signal
 from ..style import COMPUTE, Json, Threads, command_group, examples, output_option, to_json
-from ..sweeps.source import SweepArgument, check_source, read_dataset
+from ..sweeps.source import SweepArgument, check_source, read_dataset, warn_about_dataset
 from .tables import print_comparison, print_speckle
 
 if TYPE_CHECKING:
@@ -80,6 +80,7 @@ def compare(
         torch.set_num_threads(threads)
     read = read_dataset(sweep, source)
     require_frames(read.val)
+    warn_about_dataset(read)
     if output is not None:
         if force:
             shutil.rmtree(run_folder(output), ignore_errors=True)

@@ -43,9 +43,10 @@ def print_comparison(comparison: Comparison) -> None:
     from rich.table import Table
 
     from ultragray.methods.comparison.ranks import METRICS, rank, shown_value
+    from ultragray.methods.comparison.tables import budget_text, steps_text
 
     table = Table(box=None, pad_edge=False)
-    heads = ("", *(metric.label for metric in METRICS), "training, s", "frame, ms", "MB", "mean rank")
+    heads = ("", *(metric.label for metric in METRICS), "steps", "training, s", "frame, ms", "MB", "mean rank")
     for place, head in enumerate(heads):
         table.add_column(head, justify="right" if place else "left", no_wrap=True)
     ranks = rank(comparison.measured)
@@ -55,13 +56,14 @@ def print_comparison(comparison: Comparison) -> None:
             table.add_row(
                 escape(one.title),
                 *(shown_value(metric.name, means[metric.name]) for metric in METRICS),
+                steps_text(one),
                 f"{one.seconds:,.1f}",
                 f"{one.frame_ms:,.1f}",
                 f"{one.model_bytes / 1e6:,.2f}",
                 f"{ranks[one.name].mean:.2f}",
             )
     console, facts = wide_console(), comparison.dataset
-    head = f"{facts.name}, {facts.val_frames} val frames, {comparison.machine}"
+    head = f"{facts.name}, {facts.val_frames} val frames, {comparison.machine}; budget: {budget_text(comparison)}"
     console.print(head, highlight=False, markup=False, soft_wrap=True)
     console.print(table)
     for one in comparison.results:

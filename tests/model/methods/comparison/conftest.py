@@ -50,7 +50,7 @@ class OneLevel(Learner):
 
     def loss(self, step: int, steps: int) -> Tensor:
         place = torch.randint(len(self.images), (1,), generator=self.generator)
-        return (self.images[place] - self.level).square().mean()
+        return (self.image(int(place)) - self.level).square().mean()
 
     def frame(self, probe: Probe, pose: FloatArray, height: int, width: int) -> Tensor:
         return self.level.detach().expand(height, width)

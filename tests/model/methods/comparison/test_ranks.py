@@ -57,6 +57,7 @@ def test_the_latex_table_escapes_what_latex_would_read() -> None:
         MethodResult(
             name=name,
             description=Description(f"{name}_1 & co", "", "", published_steps=200_000),
+            machine="a machine",
             steps=1_240,
             of_steps=200_000,
             seconds=172.0,
@@ -64,7 +65,7 @@ def test_the_latex_table_escapes_what_latex_would_read() -> None:
         )
         for name, evaluation in EVALUATIONS.items()
     ]
-    failed = MethodResult("d", Description("100 % lost", "", ""), failure="it needs 9 GB & more")
+    failed = MethodResult("d", Description("100 % lost", "", ""), "a machine", failure="it needs 9 GB & more")
     comparison = Comparison(
         dataset=DatasetFacts("a_sweep", "0" * 64, "a probe", 3, 1, 20, 16, 0.1, 0.2),
         machine="a machine",

@@ -47,7 +47,7 @@ def test_a_field_that_shows_the_image_has_no_loss(name: str, monkeypatch: pytest
     place = frame_of_step(0, 3, seed=5)
 
     def image(points: torch.Tensor) -> torch.Tensor:
-        return learner.images[place] + 0.0 * points.sum(dim=-1)
+        return learner.image(place) + 0.0 * points.sum(dim=-1)
 
     monkeypatch.setattr(learner, "values", image)
     assert learner.loss(0, 10).item() == pytest.approx(0.0, abs=1e-5)
