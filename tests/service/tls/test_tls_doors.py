@@ -87,7 +87,7 @@ def test_both_doors_speak_tls_and_nothing_else(
         )
         assert float(told) == certificate.not_valid_after_utc.timestamp()
     stream = f"{serving.http.replace('https', 'wss')}/v1/scenes/demo/stream"
-    with connect(stream, ssl=mounted.context(), max_size=None) as connection:
+    with connect(stream, ssl=mounted.context(), max_size=None, open_timeout=60) as connection:
         connection.send('{"sequence": 7, "pose": {"matrix": [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}}')
         assert '"sequence":7' in str(connection.recv(timeout=60)).replace(" ", "")
     with grpc.secure_channel(serving.grpc, mounted.credentials()) as channel:

@@ -131,7 +131,9 @@ class Cache:
                 raise StorageUnavailable(f"{key} in {storage.location} is damaged: its SHA-256 is {got}")
             file = part.open("rb")
             fcntl.flock(file, fcntl.LOCK_SH)  # before others can see it
-            part.rename(self._files / name)
+            with self._room():  # else one who makes room could see neither the space nor the file
+                part.rename(self._files / name)
+                space.unlink()
             return Pin(self._files / name, file), entry.bytes
         finally:
             part.unlink(missing_ok=True)
