@@ -1,4 +1,4 @@
-"""A repository of its own for what asks git."""
+"""A repository of its own for what asks git, and a folder of data for what trains."""
 
 from __future__ import annotations
 
@@ -7,7 +7,12 @@ import subprocess
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import pytest
+
+from ultragray import LinearProbe
+from ultragray.datasets import Dataset, Sweep
+from ultragray.datasets.released import write_released
 
 from ..scripts import benchmark
 
@@ -55,3 +60,15 @@ def adopt(monkeypatch: pytest.MonkeyPatch, root: Path) -> None:
     for module in (benchmark("registry"), benchmark("age"), measured):
         monkeypatch.setattr(module, "ROOT", root)
     monkeypatch.setattr(benchmark("registry"), "STAGE", root / "build" / "bench")
+
+
+@pytest.fixture
+def data(tmp_path: Path) -> Path:
+    """A folder of data with one sweep in it, `ball`: six training and two held-out frames of noise, 1 mm apart."""
+    rng = np.random.default_rng(0)
+    poses = np.tile(np.eye(4), (8, 1, 1))
+    poses[:, 1, 3] = range(8)
+    images = rng.integers(0, 200, (8, 16, 14), dtype=np.uint8)
+    sweep = Sweep(images, poses, LinearProbe(20.0, 0.0, 25.0), np.arange(8), "ball")
+    write_released(Dataset("ball", sweep.select(range(6)), sweep.select([6, 7])), tmp_path / "ball")
+    return tmp_path

@@ -7,12 +7,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-import numpy as np
 import pytest
 
-from ultragray import LinearProbe
-from ultragray.datasets import Dataset, Sweep
-from ultragray.datasets.released import write_released
 from ultragray.methods.comparison.settings import ComparisonSettings
 
 from ..scripts import benchmark
@@ -25,17 +21,6 @@ def script(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     module = benchmark("methods_tables")
     monkeypatch.setattr(module, "RUNS", (module.Run("one", "ball", CLASSICAL), module.Run("two", "ball", CLASSICAL)))
     return module
-
-
-@pytest.fixture
-def data(tmp_path: Path) -> Path:
-    rng = np.random.default_rng(0)
-    poses = np.tile(np.eye(4), (8, 1, 1))
-    poses[:, 1, 3] = range(8)
-    images = rng.integers(0, 200, (8, 16, 14), dtype=np.uint8)
-    sweep = Sweep(images, poses, LinearProbe(20.0, 0.0, 25.0), np.arange(8), "ball")
-    write_released(Dataset("ball", sweep.select(range(6)), sweep.select([6, 7])), tmp_path / "ball")
-    return tmp_path
 
 
 def run(script: ModuleType, monkeypatch: pytest.MonkeyPatch, data: Path, *arguments: str) -> dict[str, Any]:
