@@ -1,4 +1,4 @@
-/** Numbers and times as people read them: web/src/text.ts without a browser. */
+/** Numbers and times as people read them: web/src/shared/text.ts without a browser. */
 
 import assert from "node:assert/strict";
 import { readFileSync } from "node:fs";
@@ -9,7 +9,7 @@ import { it } from "node:test";
 import { ROOT } from "./harness.mjs";
 
 const { transformSync } = createRequire(path.join(ROOT, "web/package.json"))("esbuild");
-const { code } = transformSync(readFileSync(path.join(ROOT, "web/src/text.ts"), "utf8"), { loader: "ts" });
+const { code } = transformSync(readFileSync(path.join(ROOT, "web/src/shared/text.ts"), "utf8"), { loader: "ts" });
 const { bytes, duration, nameOfFile } = await import(`data:text/javascript,${encodeURIComponent(code)}`);
 
 it("durations carry over from seconds to minutes to hours", () => {

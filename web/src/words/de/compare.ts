@@ -1,0 +1,5 @@
+/** compare: what it says in German. */
+
+import type { Words } from "../en/english";
+
+export const compare: Words["compare"] = {};

@@ -1,0 +1,5 @@
+/** connect: what it says in German. */
+
+import type { Words } from "../en/english";
+
+export const connect: Words["connect"] = {};

@@ -1,0 +1,16 @@
+/** The German catalogue. */
+
+import type { Words } from "../en/english";
+import { compare } from "./compare";
+import { connect } from "./connect";
+import { jobs } from "./jobs";
+import { maps } from "./maps";
+import { scan } from "./scan";
+import { scenes } from "./scenes";
+import { session } from "./session";
+import { shared } from "./shared";
+import { shell } from "./shell";
+import { space } from "./space";
+import { train } from "./train";
+
+export const german: Words = { compare, connect, jobs, maps, scan, scenes, session, shared, shell, space, train };

@@ -1,0 +1,5 @@
+/** scan: what it says in German. */
+
+import type { Words } from "../en/english";
+
+export const scan: Words["scan"] = {};

@@ -1,0 +1,5 @@
+/** scenes: what it says in German. */
+
+import type { Words } from "../en/english";
+
+export const scenes: Words["scenes"] = {};

@@ -1,0 +1,5 @@
+/** session: what it says in German. */
+
+import type { Words } from "../en/english";
+
+export const session: Words["session"] = {};

@@ -1,0 +1,5 @@
+/** train: what it says in German. */
+
+import type { Words } from "../en/english";
+
+export const train: Words["train"] = {};

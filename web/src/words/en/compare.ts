@@ -1,0 +1,3 @@
+/** compare: what it says in English. */
+
+export const compare = {};

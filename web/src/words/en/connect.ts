@@ -1,0 +1,3 @@
+/** connect: what it says in English. */
+
+export const connect = {};

@@ -1,0 +1,17 @@
+/** The English catalogue, which also says what every other one must have. */
+
+import { compare } from "./compare";
+import { connect } from "./connect";
+import { jobs } from "./jobs";
+import { maps } from "./maps";
+import { scan } from "./scan";
+import { scenes } from "./scenes";
+import { session } from "./session";
+import { shared } from "./shared";
+import { shell } from "./shell";
+import { space } from "./space";
+import { train } from "./train";
+
+export const english = { compare, connect, jobs, maps, scan, scenes, session, shared, shell, space, train };
+
+export type Words = typeof english;

@@ -1,0 +1,3 @@
+/** jobs: what it says in English. */
+
+export const jobs = {};

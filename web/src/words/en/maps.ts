@@ -1,0 +1,3 @@
+/** maps: what it says in English. */
+
+export const maps = {};

@@ -1,0 +1,3 @@
+/** scan: what it says in English. */
+
+export const scan = {};

@@ -1,0 +1,3 @@
+/** scenes: what it says in English. */
+
+export const scenes = {};

@@ -1,0 +1,3 @@
+/** session: what it says in English. */
+
+export const session = {};

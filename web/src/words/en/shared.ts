@@ -1,0 +1,3 @@
+/** shared: what it says in English. */
+
+export const shared = {};

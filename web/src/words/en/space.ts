@@ -1,0 +1,3 @@
+/** space: what it says in English. */
+
+export const space = {};

@@ -1,0 +1,3 @@
+/** train: what it says in English. */
+
+export const train = {};
