@@ -140,7 +140,7 @@ class DatasetInvalid(UltragrayError):
 
 
 class TrainingDiverged(UltragrayError):
-    """Loss or parameters of a training are no longer finite."""
+    """Loss or parameters of a training are no longer finite, or no method of a comparison came to its end."""
 
     reason = "TRAINING_DIVERGED"
     title = "Training diverged"

@@ -99,6 +99,14 @@ def test_a_comparison_of_which_nothing_could_be_measured_ends_with_an_error(tmp_
     assert run("compare", tmp_path / "wide", "--methods", "median-0.25mm,nearest").exit_code == 0
 
 
+def test_what_is_learned_without_an_output_is_told_to_be_lost(sweep: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ultragray.methods.comparison.run.compare", lambda *_, **__: None)  # as if stopped at once
+    result = run("compare", sweep, "--methods", "median,rapidvol")
+    assert "with --output PAGE.html" in result.stderr
+    assert "nothing is kept" in result.stderr
+    assert "--output" not in run("compare", sweep, *CLASSICAL).stderr
+
+
 def test_what_is_not_a_comparisons_is_not_replaced(sweep: Path, tmp_path: Path) -> None:
     page = tmp_path / "ball.html"
     (tmp_path / "ball.tex").write_text("a paper")

@@ -23,7 +23,7 @@ from ultragray.datasets import Dataset, Sweep
 from ultragray.datasets.released import write_released
 from ultragray.files.atomic import file_sha256
 from ultragray_service.cli.app import app
-from ultragray_service.cli.remote.watch import JOB_CANCELLED, JOB_FAILED
+from ultragray_service.cli.remote.watch import JOB_CANCELLED, JOB_FAILED, results
 
 from ..conftest import ROOT, SOURCE_FOLDERS, RunningService, StartService
 
@@ -286,3 +286,12 @@ def test_a_watch_outlives_a_restart_of_the_service(start_service: StartService, 
     finally:
         watching.kill()
         watching.communicate()
+
+
+def test_many_metrics_stand_in_lines_of_their_own() -> None:
+    few = {"metrics": {"psnr_db": 28.125}, "artifacts": ["scene.ugr"]}
+    assert results(few) == "; psnr_db 28.12; artifacts: scene.ugr"
+    many = {"metrics": {f"method_{number}_gms": 0.5 for number in range(7)}, "artifacts": ["comparison.html"]}
+    first, *lines = results(many).split("\n")
+    assert first == "; artifacts: comparison.html"
+    assert lines == [f"  method_{number}_gms 0.5" for number in range(7)]

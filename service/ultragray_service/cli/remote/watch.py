@@ -19,6 +19,7 @@ from ..style import tell
 JOB_FAILED = 3  # the exit code of a command that watched a job fail
 JOB_CANCELLED = 4
 _FINAL_STATES = ("succeeded", "failed", "cancelled")
+_METRICS_IN_A_LINE = 6
 _RETRY_S = 1.0
 _HELD_S = 5.0  # a connection that lasted so long was one to a service that works
 _GONE_S = 60.0  # a service that comes back within this time is asked again
@@ -36,7 +37,7 @@ def follow(jobs: Jobs, job_id: str, *, as_json: bool = False) -> None:
         typer.echo(f"job {job_id} goes on; `ultragray jobs cancel {job_id}` stops it", err=True)
         raise typer.Exit(INTERRUPTED) from None
     if job["state"] == "succeeded":
-        tell(f"{job_id} succeeded{_results(job)}", job, as_json=as_json)
+        tell(f"{job_id} succeeded{results(job)}", job, as_json=as_json)
         return
     if as_json:
         tell("", job, as_json=True)
@@ -133,8 +134,10 @@ def figures(job: dict[str, Any]) -> str:
     return " · ".join(parts)
 
 
-def _results(job: dict[str, Any]) -> str:
-    metrics = ", ".join(f"{name} {value:.4g}" for name, value in job["metrics"].items())
-    return "".join(
-        (f"; {metrics}" if metrics else "", f"; artifacts: {', '.join(job['artifacts'])}" if job["artifacts"] else "")
-    )
+def results(job: dict[str, Any]) -> str:
+    """Metrics and artifacts, for the end of a line; more metrics than one reads in a line stand below it."""
+    metrics = [f"{name} {value:.4g}" for name, value in job["metrics"].items()]
+    artifacts = f"; artifacts: {', '.join(job['artifacts'])}" if job["artifacts"] else ""
+    if len(metrics) > _METRICS_IN_A_LINE:
+        return "".join((artifacts, *(f"\n  {metric}" for metric in metrics)))
+    return f"; {', '.join(metrics)}{artifacts}" if metrics else artifacts

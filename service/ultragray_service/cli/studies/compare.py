@@ -71,6 +71,7 @@ def compare(
         import ultragray.methods.comparison.files  # noqa: F401  # packages that it lacks are told before all the work
 
     from ultragray.evaluation.scoring import require_frames
+    from ultragray.methods.registry import chosen_methods
     from ultragray.training.device import training_device
 
     training_device(device, "auto")  # refused before the sweep is read, which may take long
@@ -86,6 +87,8 @@ def compare(
             shutil.rmtree(run_folder(output), ignore_errors=True)
         _compare(read, settings, device, run_folder(output), output, as_json=json)
         return
+    if any(method.describe().published_steps is not None for method in chosen_methods(settings.methods).values()):
+        typer.echo("what the methods learn is not kept; with --output PAGE.html it is, and a page is written", err=True)
     with tempfile.TemporaryDirectory(prefix="ultragray-compare-") as folder:
         _compare(read, settings, device, Path(folder), None, as_json=json)
 

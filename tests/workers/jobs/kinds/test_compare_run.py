@@ -13,8 +13,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from ultragray.errors import InvalidArgument
+from ultragray.errors import InvalidArgument, MemoryExceeded, TrainingDiverged
 from ultragray.evaluation.baselines import evaluate_baselines
+from ultragray.methods.classical import Compounding, FromFrames
 from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import DatasetNotFound
 from ultragray_workers.jobs.folder import JobFolder, Outcome, Request
@@ -70,6 +71,18 @@ def test_a_job_that_is_to_stop_goes_on_in_its_retry(job_run: Callable[..., JobRu
     again = job_run("again", retry_of="job")
     compare_run.run(again, JOB)
     assert (again.folder.run / "median" / "result.json").read_bytes() == kept
+
+
+def test_a_comparison_of_which_every_method_fails_fails(
+    job_run: Callable[..., JobRun], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise MemoryExceeded("it needs 9 GB")
+
+    monkeypatch.setattr(Compounding, "fit", fail)
+    monkeypatch.setattr(FromFrames, "fit", fail)
+    with pytest.raises(TrainingDiverged, match="came to its end: median: it needs 9 GB; nearest: it needs 9 GB"):
+        compare_run.run(job_run(), JOB)
 
 
 def test_a_retry_begins_anew_where_the_run_before_was_no_good(job_run: Callable[..., JobRun]) -> None:

@@ -7,6 +7,7 @@ import shutil
 import sys
 from dataclasses import replace
 
+from ultragray.errors import TrainingDiverged
 from ultragray.methods.comparison.files import write_comparison
 from ultragray.methods.comparison.place import RUN_FILE
 from ultragray.methods.comparison.run import ComparisonProgress, compare
@@ -22,7 +23,8 @@ _LINES = 10  # of the log in a fit
 def run(job_run: JobRun, job: CompareJob) -> Outcome:
     """Compares the methods, or goes on where an earlier process was, and completes the artifacts.
 
-    Raises Stopped, DatasetNotFound, DatasetInvalid also for a dataset without held-out frames, TrainingStateInvalid.
+    A method that fails is a row that says why. Raises TrainingDiverged where none comes to its end, Stopped,
+    DatasetNotFound, DatasetInvalid also for a dataset without held-out frames, TrainingStateInvalid.
     """
     device = job_run.request.device
     dataset = job_run.load_dataset(job.dataset)
@@ -42,6 +44,9 @@ def run(job_run: JobRun, job: CompareJob) -> Outcome:
         raise Stopped
     for name, reason in comparison.failures.items():
         sys.stderr.write(f"{name} failed: {reason}\n")
+    if not comparison.measured:
+        reasons = "; ".join(f"{name}: {reason}" for name, reason in comparison.failures.items())
+        raise TrainingDiverged(f"no method came to its end: {reasons}")
     metrics = {
         f"{name}_{metric}": value
         for name, evaluation in comparison.measured.items()
