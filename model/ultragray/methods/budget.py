@@ -5,7 +5,8 @@
 - author: the steps that its author's recipe takes, however long that is.
 
 A number of steps that follows from a clock would differ from run to run, and the table with it. So `Paces` keeps what
-was measured: the same comparison on the same machine gets the same steps.
+was measured: the same comparison on the same machine gets the same steps. The moment may have been a busy one, and
+nobody is to lose by that: a fit that then takes a part of its time only is made again, with the pace that it showed.
 """
 
 from __future__ import annotations
@@ -13,13 +14,15 @@ from __future__ import annotations
 import contextlib
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field, replace
 from enum import Enum
 from pathlib import Path
 from typing import Any
 
 from ..errors import InvalidArgument
 from ..files.atomic import write_whole
+
+USED_SHARE = 0.8  # of an equal time: a fit that took less was promised too few steps
 
 
 class BudgetKind(str, Enum):
@@ -35,6 +38,7 @@ class Pace:
 
     start_s: float
     step_s: float
+    is_confirmed: bool = True  # by a whole fit; else it was taken in a moment
 
 
 class Paces:
@@ -53,20 +57,25 @@ class Paces:
     def known(self, name: str) -> Pace | None:
         """What was measured of a method; None where nothing was, or the file is another's."""
         try:
-            start_s, step_s = map(float, self._known[self._section][name])
+            start_s, step_s, is_confirmed = self._known[self._section][name]
+            return Pace(float(start_s), float(step_s), bool(is_confirmed))
         except (LookupError, TypeError, ValueError):
             return None
-        return Pace(start_s, step_s)
 
     def keep(self, name: str, pace: Pace) -> None:
         """Keeps what was measured; in a place that cannot be written, for this process only."""
         section = self._known.get(self._section)
         known = section if isinstance(section, dict) else {}
-        self._known[self._section] = {**known, name: [pace.start_s, pace.step_s]}
+        self._known[self._section] = {**known, name: astuple(pace)}
         if self._path is not None:
             with contextlib.suppress(OSError):
                 self._path.parent.mkdir(parents=True, exist_ok=True)
                 write_whole(self._path, json.dumps(self._known, indent=1) + "\n")
+
+    def confirm(self, name: str) -> None:
+        """Keeps a pace for good, where there is one."""
+        if (pace := self.known(name)) is not None and not pace.is_confirmed:
+            self.keep(name, replace(pace, is_confirmed=True))
 
     def get(self, name: str, measure: Callable[[], Pace]) -> Pace:
         """What is known of a method, else what `measure` finds, which is kept."""
@@ -102,3 +111,15 @@ class Budget:
         assert self.seconds is not None
         pace = self.paces.get(name, measure)
         return max(1, int((self.seconds - pace.start_s) / pace.step_s))
+
+    def shown_pace(self, name: str, steps: int, seconds: float) -> Pace | None:
+        """The pace of a fit that used a part of its time only, by its steps and seconds; None for any other.
+
+        Only of a pace that was taken in a moment: one that a fit has confirmed stays, for the same table.
+        """
+        pace = None if self.kind is BudgetKind.AUTHOR else self.paces.known(name)
+        if pace is None or pace.is_confirmed:
+            return None
+        assert self.seconds is not None
+        shown = Pace(pace.start_s, (seconds - pace.start_s) / steps)
+        return shown if seconds < USED_SHARE * self.seconds and shown.step_s < pace.step_s else None

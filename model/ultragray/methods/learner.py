@@ -152,7 +152,9 @@ class LearnedMethod(Method):
             steps = budget.steps(
                 self.name,
                 self.published_steps(dataset),
-                lambda: Pace(start_s, _seconds_of_step(self.learner(dataset, budget, run.seed, device))),
+                lambda: Pace(
+                    start_s, _seconds_of_step(self.learner(dataset, budget, run.seed, device)), is_confirmed=False
+                ),
             )
             elapsed_s = start_s
         saved_at = time.monotonic()
@@ -169,6 +171,11 @@ class LearnedMethod(Method):
                 saved_at = time.monotonic()
             if stop:
                 return None
+        if (shown := budget.shown_pace(self.name, steps, elapsed_s)) is not None:
+            saved.discard()
+            budget.paces.keep(self.name, shown)
+            return self._fit(dataset, budget, run, device)
+        budget.paces.confirm(self.name)
         saved.write_model(learner, steps, elapsed_s)
         published = self.published_steps(dataset)
         return Learned(learner, Cost(elapsed_s, steps, published, _bytes(learner.model())))
@@ -227,6 +234,11 @@ class _Saved:
         """The model, in place of the state."""
         if self.folder is not None and not (self.folder / MODEL_FILE).exists():
             self._write(MODEL_FILE, learner.model(), steps, steps, elapsed_s)
+            (self.folder / STATE_FILE).unlink(missing_ok=True)
+
+    def discard(self) -> None:
+        """Removes the state, for a fit that begins anew."""
+        if self.folder is not None:
             (self.folder / STATE_FILE).unlink(missing_ok=True)
 
     def _write(self, name: str, tensors: Mapping[str, Tensor], step: int, steps: int, elapsed_s: float) -> None:

@@ -42,7 +42,17 @@ def test_a_pace_is_measured_once_on_a_machine(tmp_path: Path) -> None:
     assert Budget.equal(10.0, Paces(path, elsewhere)).steps("any", 9, lambda: Pace(0.0, 0.2)) == 50
 
 
-@pytest.mark.parametrize("content", ["", "[]", '{"{}": {"any": ["x", 1]}}', '{"{}": {"any": [1]}}', '{"{}": 3}'])
+def test_a_fit_that_used_a_part_of_its_time_shows_its_pace() -> None:
+    budget = Budget.equal(10.0)
+    budget.steps("any", 9, lambda: Pace(1.0, 0.9, is_confirmed=False))
+    assert budget.shown_pace("any", 10, 9.0) is None  # as promised
+    assert budget.shown_pace("any", 10, 4.0) == Pace(1.0, 0.3)
+    budget.paces.confirm("any")
+    assert budget.shown_pace("any", 10, 4.0) is None  # the table stays
+    assert Budget.author().shown_pace("any", 10, 4.0) is None
+
+
+@pytest.mark.parametrize("content", ["", "[]", '{"{}": {"any": ["x", 1, true]}}', '{"{}": {"any": [1]}}', '{"{}": 3}'])
 def test_a_damaged_file_of_paces_is_measured_again(tmp_path: Path, content: str) -> None:
     path = tmp_path / "paces.json"
     path.write_text(content)

@@ -11,7 +11,7 @@ import torch
 
 from ultragray.datasets.sweep import Dataset
 from ultragray.errors import TrainingDiverged, TrainingStateInvalid
-from ultragray.methods.budget import Budget
+from ultragray.methods.budget import Budget, Pace
 from ultragray.methods.learner import MODEL_FILE, STATE_FILE
 from ultragray.methods.method import FitProgress, FitRun
 
@@ -73,6 +73,21 @@ def test_a_finished_fit_is_found_in_its_folder(
     np.testing.assert_array_equal(
         again.render(dataset.probe, poses, SIDE, SIDE), first.render(dataset.probe, poses, SIDE, SIDE)
     )
+
+
+@pytest.mark.parametrize("folder", [None, "fit"])
+def test_a_fit_that_was_timed_in_a_busy_moment_gets_its_time(
+    folder: str | None, mean_image: MeanImage, make_dataset: Callable[..., Dataset], tmp_path: Path
+) -> None:
+    budget = Budget.equal(0.5)
+    budget.paces.keep(mean_image.name, Pace(0.0, 0.1, is_confirmed=False))  # it takes a thousandth of that
+    run = FitRun(folder=None if folder is None else tmp_path / folder)
+    fitted = mean_image.fit(make_dataset(), budget, run)
+    assert fitted is not None
+    assert fitted.cost.steps > 10
+    again = mean_image.fit(make_dataset(), budget)
+    assert again is not None
+    assert again.cost.steps == fitted.cost.steps
 
 
 def test_the_seed_decides_what_is_drawn(mean_image: MeanImage, make_dataset: Callable[..., Dataset]) -> None:
