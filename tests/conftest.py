@@ -6,6 +6,7 @@ import json
 import math
 import os
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -186,14 +187,22 @@ _STARTING = {
 }
 
 
+@pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Tests marked `gpu` are skipped where there is none; tests that start processes are `slow`."""
+    """Tests marked `gpu` are skipped where there is none; tests that start processes are `slow`.
+
+    Files go to the test processes whole and in this order, which is that of pytest-randomly but for two things: those
+    with a test that takes minutes come first, then those with the most tests, so that none is left for the end.
+    """
     without_gpu = pytest.mark.skip(reason="there is no CUDA device")
     for item in items:
         if item.get_closest_marker("gpu") and not torch.cuda.is_available():
             item.add_marker(without_gpu)
         if _STARTING.intersection(getattr(item, "fixturenames", ())):
             item.add_marker(pytest.mark.slow)
+    tests_of = Counter(item.path for item in items)
+    lengthy = {item.path for item in items if item.get_closest_marker("lengthy")}
+    items.sort(key=lambda item: (item.path not in lengthy, -tests_of[item.path]))
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
