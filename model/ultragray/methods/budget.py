@@ -121,5 +121,5 @@ class Budget:
         if pace is None or pace.is_confirmed:
             return None
         assert self.seconds is not None
-        shown = Pace(pace.start_s, (seconds - pace.start_s) / steps)
+        shown = Pace(pace.start_s, (seconds - pace.start_s) / steps, is_confirmed=False)
         return shown if seconds < USED_SHARE * self.seconds and shown.step_s < pace.step_s else None

@@ -46,7 +46,7 @@ def test_a_fit_that_used_a_part_of_its_time_shows_its_pace() -> None:
     budget = Budget.equal(10.0)
     budget.steps("any", 9, lambda: Pace(1.0, 0.9, is_confirmed=False))
     assert budget.shown_pace("any", 10, 9.0) is None  # as promised
-    assert budget.shown_pace("any", 10, 4.0) == Pace(1.0, 0.3)
+    assert budget.shown_pace("any", 10, 4.0) == Pace(1.0, 0.3, is_confirmed=False)
     budget.paces.confirm("any")
     assert budget.shown_pace("any", 10, 4.0) is None  # the table stays
     assert Budget.author().shown_pace("any", 10, 4.0) is None
