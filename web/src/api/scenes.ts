@@ -5,10 +5,30 @@ import { address, getJson, request, type Schemas } from "./client";
 export type SceneEntry = Schemas["SceneEntry"];
 export type SceneDescription = Schemas["Scene"];
 
-/** The Gaussians of a scene as points: float32 [N, 6], x, y, z in mm, intensity, transmittance, mean sigma in mm. */
-export interface GaussianPoints {
-  count: number;
-  values: Float32Array;
+/** What is asked of each Gaussian: mm in the scene's frame; the quaternion turns its own axes into the scene's. */
+const FIELDS = [
+  "x", "y", "z", "intensity", "transmittance", "deviation_1_mm", "deviation_2_mm", "deviation_3_mm",
+  "qw", "qx", "qy", "qz", "label",
+] as const; // prettier-ignore
+type Field = (typeof FIELDS)[number];
+
+/** Some of the Gaussians of a scene. */
+export class Gaussians {
+  constructor(
+    readonly count: number,
+    /** Of the scene. */
+    readonly total: number,
+    /** One after another, `FIELDS` of each. */
+    readonly values: Float32Array<ArrayBuffer>,
+  ) {}
+
+  /** One field of all of them, as an array of its own. */
+  column(field: Field): Float32Array<ArrayBuffer> {
+    const column = new Float32Array(this.count);
+    const first = FIELDS.indexOf(field);
+    for (let i = 0; i < this.count; i++) column[i] = this.values[i * FIELDS.length + first]!;
+    return column;
+  }
 }
 
 /** Every scene of the service, by name. */
@@ -28,12 +48,13 @@ export function describeScene(scene: string): Promise<SceneDescription> {
 }
 
 /** An even selection of at most `limit` Gaussians. */
-export async function sceneGaussians(scene: string, limit: number): Promise<GaussianPoints> {
-  const response = await request(`${address("/v1/scenes/{scene}/gaussians", { scene })}?limit=${limit}`);
+export async function sceneGaussians(scene: string, limit: number): Promise<Gaussians> {
+  const fields = FIELDS.map((field) => `&fields=${field}`).join("");
+  const response = await request(`${address("/v1/scenes/{scene}/gaussians", { scene })}?limit=${limit}${fields}`);
   const buffer = await response.arrayBuffer();
   const length = new DataView(buffer).getUint32(0, true);
-  const { count } = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, length))) as { count: number };
-  return { count, values: new Float32Array(buffer, 4 + length, count * 6) };
+  const header = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, length))) as { count: number; total: number };
+  return new Gaussians(header.count, header.total, new Float32Array(buffer, 4 + length, header.count * FIELDS.length));
 }
 
 export type TrainingPoses = Schemas["ScenePoses"];
