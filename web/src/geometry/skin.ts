@@ -9,7 +9,7 @@ const MARGIN_MM = 15; // beyond the sweep the surface goes on
 const MOST_CELLS = 64; // each way
 const LEAST_CELL_MM = 1;
 const LEAST_AGREEMENT = 0.6; // of the axes of the views, 1 where all run alike: around a limb there is no height
-const SMOOTHED = 2; // times
+const SETTLED = 6; // times what lies between the faces is smoothed before all of it is, once
 const NEAR_CELLS = 3; // a cell so near to a face is shown
 const LEAST_SLOPE = 0.2; // of what runs into the surface: below, it would be met far away
 const STEPS = 12;
@@ -100,7 +100,11 @@ export function skinOf(views: readonly Pose[], { lines_mm }: ImagePlane): Skin |
   }
   const near = grown(counts, columns, rows, NEAR_CELLS);
   let heights = filled(sums, counts, columns, rows);
-  for (let time = 0; time < SMOOTHED; time++) heights = smoothed(heights, columns, rows);
+  for (let time = 0; time < SETTLED; time++) {
+    const settled = smoothed(heights, columns, rows);
+    heights = heights.map((height, cell) => (counts[cell]! > 0 ? height : settled[cell]!));
+  }
+  heights = smoothed(heights, columns, rows);
   const origin = plus(scaled(axes[0], low[0]!), scaled(axes[1], low[1]!));
   return new Skin(origin, axes, cell_mm, columns, rows, heights, near);
 }

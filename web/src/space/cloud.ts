@@ -20,7 +20,7 @@ import {
   type WebGLRenderer,
 } from "three";
 
-import type { Gaussians } from "../api/scenes";
+import type { Gaussians } from "../api/gaussians";
 import { USUAL, type Appearance } from "./appearance";
 import { cloudMaterial, cloudUniforms } from "./cloud_material";
 import { middleOf } from "./middle";

@@ -1,6 +1,6 @@
 /** The probe in space: a body that is dragged over the skin, and a gizmo that moves and turns it. */
 
-import { Group, Mesh, Plane, Vector3, type Camera } from "three";
+import { Group, Mesh, Plane, Vector3, type Camera, type Intersection, type Raycaster } from "three";
 import { TransformControls } from "three/examples/jsm/controls/TransformControls.js";
 
 import type { ImagePlane } from "../geometry/plane";
@@ -45,7 +45,6 @@ export class ProbeHandle {
     this.#gizmo.attach(this.object);
     this.#gizmo.addEventListener("change", events.changed);
     this.#gizmo.addEventListener("dragging-changed", ({ value }) => events.handled(value === true));
-    this.#gizmo.addEventListener("axis-changed", ({ value }) => (element.style.cursor = value ? "grab" : ""));
     this.#gizmo.addEventListener("objectChange", () => this.#report(this.#gizmo.axis?.includes("Z") ?? false));
     // before the controls of the view, which lie on the same element
     element.parentElement!.addEventListener("pointerdown", this.#take, { capture: true });
@@ -97,13 +96,24 @@ export class ProbeHandle {
     this.events.moved(translated(to, [0, 0, -lifted]));
   }
 
+  /** Where the body is pointed at. */
+  #hit(ray: Raycaster): Intersection | undefined {
+    return ray.intersectObject(this.object, true).find(({ object }) => object instanceof Mesh);
+  }
+
+  /** The pointer tells what can be dragged. */
+  #tell(event: PointerEvent): void {
+    const over = this.#held && this.#gizmo.axis === null && this.#hit(pointedAt(event, this.camera)) !== undefined;
+    this.element.style.cursor = this.#held && this.#gizmo.axis !== null ? "grab" : over ? "move" : "";
+  }
+
   #take = (event: PointerEvent): void => {
     if (!this.#held || event.target !== this.element || event.button !== 0 || !event.isPrimary) return;
     const { x, y } = placeOf(event);
     this.#gizmo.pointerHover({ x, y, button: event.button } as unknown as PointerEvent); // a finger has not hovered
     if (this.#gizmo.axis !== null) return; // a handle lies over the body
     const ray = pointedAt(event, this.camera);
-    const [hit] = ray.intersectObject(this.object, true).filter(({ object }) => "isMesh" in object);
+    const hit = this.#hit(ray);
     if (hit === undefined) return;
     const along = new Vector3(...axis(this.#pose, 2));
     const sight = ray.ray.direction;
@@ -117,6 +127,7 @@ export class ProbeHandle {
   };
 
   #drag = (event: PointerEvent): void => {
+    if (this.#taken === null && event.buttons === 0) this.#tell(event);
     if (this.#taken?.pointer !== event.pointerId) return;
     const at = pointedAt(event, this.camera).ray.intersectPlane(this.#taken.plane, new Vector3());
     if (at === null) return;

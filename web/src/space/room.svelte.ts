@@ -1,10 +1,12 @@
 /** The 3D view of a scene, kept while other views are shown: how it is looked at, and what is shown of it. */
 
-import { sceneGaussians, type Gaussians, type SceneDescription } from "../api/scenes";
-import { translated, withPosition, type Pose, type Vector } from "../geometry/pose";
+import type { Gaussians } from "../api/gaussians";
+import { sceneGaussians, type SceneDescription } from "../api/scenes";
+import { apply, axis, translated, withPosition, type Pose, type Vector } from "../geometry/pose";
 import { keptOn, putOn, skinOf } from "../geometry/skin";
 import { sessionOf, type Session } from "../session/session.svelte";
 import { USUAL, type Appearance, type ColourBy, type Cut } from "./appearance";
+import { recalled, remember } from "./memory";
 import { middleOf } from "./middle";
 import type { Gizmo } from "./probe_handle";
 import type { Look, Viewpoint } from "./viewpoints";
@@ -16,6 +18,9 @@ const VOLUME_BUDGET_MS = 2500;
 const MOST_VOXELS = 2_500_000;
 const BLOCKING = 128; // of 255: a voxel that lets less than half of the sound pass
 const BLOCKING_SHARES = [0.002, 0.6]; // of the voxels; between them there is bone, or what is like it
+
+/** Only of the scene that is shown last the Gaussians are kept. */
+let shown: Room | null = null;
 
 export class Room {
   appearance = $state.raw<Appearance>(USUAL);
@@ -35,14 +40,21 @@ export class Room {
   /** Whether the volume is still made, or made finer. */
   building = $state(false);
   readonly skin = $derived.by(() => skinOf(this.session.views, this.session.scenePlane));
+  /** How far the face is pressed into the skin, mm; less than 0 above it. */
+  readonly pressed_mm = $derived.by(() => {
+    const { pose, plane } = this.session;
+    return this.skin && -this.skin.distance(apply(pose, [0, 0, plane.pivot_depth_mm]), axis(pose, 2));
+  });
   /** Between which the intensities lie. */
   readonly intensities = $derived(this.gaussians === null ? null : middleOf(this.gaussians.column("intensity")));
   /** Whether it was decided what to show first. */
-  #begun = false;
+  begun = false;
   #of: SceneDescription | null = null;
   #worker: Worker | null = null;
 
   constructor(readonly session: Session) {
+    Object.assign(this, recalled(session.name));
+    addEventListener("pagehide", () => remember(session.name, this));
     session.constrain = (before, after) => this.#kept(before, after);
   }
 
@@ -77,6 +89,8 @@ export class Room {
     const { description } = this.session;
     if (description === null || description === this.#of) return;
     this.#of = description;
+    if (shown !== this) shown?.forget();
+    shown = this;
     try {
       const gaussians = await sceneGaussians(this.session.name, MOST_GAUSSIANS);
       if (this.#of !== description) return;
@@ -100,7 +114,7 @@ export class Room {
 
   #build({ count, total, values }: Gaussians): void {
     this.#worker?.terminate();
-    const isFirst = !this.#begun;
+    const isFirst = !this.begun;
     const worker = new Worker(new URL("./volume.worker.ts", import.meta.url), { type: "module" });
     this.#worker = worker;
     this.building = true;
@@ -123,7 +137,7 @@ export class Room {
 
   /** Shows first what reads as anatomy: bone, where there is some, else what is bright. */
   #begin({ voxels }: Volume): void {
-    this.#begun = true;
+    this.begun = true;
     let [filled, blocking] = [0, 0];
     for (let at = 0; at < voxels.length; at += 4) {
       if (voxels[at + 1]! > BLOCKING) filled += 1;
@@ -135,10 +149,9 @@ export class Room {
   }
 }
 
-let shown: Room | null = null;
 const rooms = new Map<string, Room>();
 
-/** What is kept of a scene; a session that was forgotten begins anew. Only of the scene shown last the Gaussians are kept. */
+/** What is kept of a scene; a session that was forgotten begins anew. */
 export function roomOf(scene: string): Room {
   const session = sessionOf(scene);
   let room = rooms.get(scene);
@@ -146,7 +159,5 @@ export function roomOf(scene: string): Room {
     $effect.root(() => void (room = new Room(session))); // what it derives outlives the view that asked first
     rooms.set(scene, room!);
   }
-  if (shown !== room) shown?.forget();
-  shown = room!;
   return room!;
 }

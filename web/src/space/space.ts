@@ -2,7 +2,7 @@
 
 import { AmbientLight, Color, DirectionalLight, Group, Mesh, Plane, Scene, Vector3, WebGLRenderer, type LineSegments } from "three";
 
-import type { Gaussians } from "../api/scenes";
+import type { Gaussians } from "../api/gaussians";
 import type { Frame } from "../api/stream";
 import type { Placed } from "../geometry/picture";
 import type { ImagePlane } from "../geometry/plane";

@@ -2,7 +2,7 @@
 
 import { BufferAttribute, BufferGeometry, DynamicDrawUsage, Points, type Camera, type Vector3 } from "three";
 
-import type { Gaussians } from "../api/scenes";
+import type { Gaussians } from "../api/gaussians";
 import type { Appearance } from "./appearance";
 import { cloudMaterial, type CloudUniforms } from "./cloud_material";
 import { byteAt, covariancesOf, type Volume } from "./volume";

@@ -1,6 +1,6 @@
 /** The scene as a grid of voxels: what its Gaussians add up to, as docs/physics.md §3 adds them, without the way of sound. */
 
-import type { Gaussians } from "../api/scenes";
+import type { Gaussians } from "../api/gaussians";
 import type { Vector } from "../geometry/pose";
 
 export interface Grid {

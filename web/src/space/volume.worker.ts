@@ -1,6 +1,6 @@
 /** Adds Gaussians up to a volume beside the page: coarsely at once, then as finely as there is time for. */
 
-import { Gaussians } from "../api/scenes";
+import { Gaussians } from "../api/gaussians";
 import { gridAround, voxelise, workOf, type Volume } from "./volume";
 
 export interface VolumeOrder {

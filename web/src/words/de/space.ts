@@ -11,6 +11,7 @@ export const space: Words["space"] = {
   turn: "Drehen",
   contact: "Kontakt",
   contactMeaning: "Die Sondenfläche bleibt auf der Haut. Bewegen entlang der Achse drückt.",
+  pressed: (depth_mm) => `${depth_mm.toFixed(1).replace(".", ",")} mm eingedrückt`,
   noSkin: "Die Aufnahmen dieser Szene blicken in viele Richtungen: Es gibt keine Haut, auf der die Sonde bleiben könnte.",
   options: "Optionen",
   close: "Optionen schließen",

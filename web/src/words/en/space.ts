@@ -37,6 +37,7 @@ export const space = {
   turn: "Turn",
   contact: "Contact",
   contactMeaning: "The face of the probe stays on the skin. Moving it along its axis presses.",
+  pressed: (depth_mm: number): string => `pressed ${depth_mm.toFixed(1)} mm`,
   noSkin: "The views of this scene look in many directions: there is no skin to stay on.",
   options: "Options",
   close: "Close the options",
