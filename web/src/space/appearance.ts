@@ -25,7 +25,7 @@ export const USUAL: Appearance = {
   solid: "echo",
   threshold: 0.55,
   opacity: 0.9,
-  size: 1,
+  size: 0.6,
   hidden: [],
 };
 

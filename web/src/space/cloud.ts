@@ -6,7 +6,6 @@ import {
   Color,
   DepthTexture,
   DoubleSide,
-  Matrix4,
   Mesh,
   MeshBasicMaterial,
   Scene,
@@ -17,6 +16,7 @@ import {
   type PerspectiveCamera,
   type Plane,
   type ShaderMaterial,
+  type Texture,
   type WebGLRenderer,
 } from "three";
 
@@ -43,13 +43,47 @@ uniform sampler2D picture;
 varying vec2 place;
 void main() { gl_FragColor = texture2D(picture, place); }`;
 
+/** From where the cloud is looked at, and what cuts and hides it. */
+export interface Sight {
+  renderer: WebGLRenderer;
+  scene: Scene;
+  camera: PerspectiveCamera;
+  plane: Plane;
+  /** Whether the face of the cut is painted. */
+  sliced: boolean;
+  /** Where the things are that hide parts of it. */
+  occludedBy: string;
+}
+
+/** Colours of the cloud, and the depths of the things around it. */
+class Picture {
+  readonly target = new WebGLRenderTarget(1, 1, { depthBuffer: false });
+  readonly occluders = new WebGLRenderTarget(1, 1, { depthTexture: new DepthTexture(1, 1, UnsignedIntType) });
+  /** What it shows; empty while it is drawn. */
+  of = "";
+
+  fit(width: number, height: number): void {
+    if (this.target.width === width && this.target.height === height) return;
+    this.target.setSize(width, height);
+    this.occluders.setSize(width, height);
+  }
+
+  dispose(): void {
+    this.occluders.depthTexture?.dispose();
+    this.occluders.dispose();
+    this.target.dispose();
+  }
+}
+
 export class Cloud {
   /** Lays the picture over what was drawn before. */
   readonly object: Mesh<BufferGeometry, ShaderMaterial>;
   #uniforms = cloudUniforms();
+  #laid: { value: Texture | null } = { value: null };
   #scene = new Scene();
-  #picture = new WebGLRenderTarget(1, 1, { depthBuffer: false });
-  #occluders = new WebGLRenderTarget(1, 1, { depthTexture: new DepthTexture(1, 1, UnsignedIntType) });
+  /** Drawn at once, and drawn band by band where there is time. */
+  #coarse = new Picture();
+  #fine = new Picture();
   #depthOnly = new MeshBasicMaterial({ colorWrite: false, side: DoubleSide });
   #appearance: Appearance = USUAL;
   #intensities: readonly [number, number] = [0, 1];
@@ -57,8 +91,6 @@ export class Cloud {
   #splats: Splats | null = null;
   #volumeData: Volume | null = null;
   #volume: VolumeLayer | null = null;
-  /** What the picture was drawn for. */
-  #drawnFor = "";
   #changes = 0;
   #towards = new Vector3();
   #sortedFor = new Vector3();
@@ -66,11 +98,10 @@ export class Cloud {
   constructor() {
     const geometry = new BufferGeometry();
     geometry.setAttribute("position", new BufferAttribute(new Float32Array([-1, -1, 0, 3, -1, 0, -1, 3, 0]), 3));
-    this.object = new Mesh(geometry, cloudMaterial(OVER, LAID, { picture: { value: this.#picture.texture } }));
+    this.object = new Mesh(geometry, cloudMaterial(OVER, LAID, { picture: this.#laid }));
     this.object.frustumCulled = false;
     this.object.renderOrder = 10;
     this.object.visible = false;
-    this.#uniforms.occluders.value = this.#occluders.depthTexture;
   }
 
   setGaussians(gaussians: Gaussians | null): void {
@@ -93,47 +124,43 @@ export class Cloud {
     this.#update();
   }
 
-  /** Draws the picture, if it is another one than it was: true then. `scale`: of the pixels of the screen, each way. */
-  draw(
-    renderer: WebGLRenderer,
-    scene: Scene,
-    camera: PerspectiveCamera,
-    { plane, sliced, occludedBy }: { plane: Plane; sliced: boolean; occludedBy: string },
-    scale: number,
-  ): boolean {
+  /** Draws the picture at a scale of the pixels of the screen, if it is another one than it was: true then. */
+  draw(at: Sight, scale: number): boolean {
     if (!this.object.visible) return false;
-    const size = renderer.getDrawingBufferSize(new Vector2()).multiplyScalar(scale).ceil();
-    const cut = [...plane.normal.toArray(), plane.constant] as const;
-    const numbers = [...camera.matrixWorld.elements, camera.aspect, camera.near, ...cut];
-    const wanted = [this.#changes, size.x, size.y, occludedBy, ...numbers].join();
-    if (wanted === this.#drawnFor) return false;
-    this.#drawnFor = wanted;
-    if (this.#picture.width !== size.x || this.#picture.height !== size.y) {
-      this.#picture.setSize(size.x, size.y);
-      this.#occluders.setSize(size.x, size.y);
-    }
-    this.#uniforms.view.value.copy(size);
-    this.#uniforms.cut.value.set(...cut);
-    this.#uniforms.toScene.value.copy(camera.matrixWorld).multiply(new Matrix4().copy(camera.projectionMatrixInverse));
-    this.#volume?.slice(sliced);
-    if (this.#splats?.object.visible) this.#sort(camera);
-    this.#drawOccluders(renderer, scene, camera);
-    const colour = renderer.getClearColor(new Color());
-    const alpha = renderer.getClearAlpha();
-    renderer.setClearColor(0x000000, 0);
-    renderer.setRenderTarget(this.#picture);
-    renderer.render(this.#scene, camera);
-    renderer.setRenderTarget(null);
-    renderer.setClearColor(colour, alpha);
+    const wanted = this.#wanted(at);
+    const known = [this.#fine, this.#coarse].find(({ of }) => of === wanted);
+    const picture = known ?? this.#coarse;
+    this.#laid.value = picture.target.texture;
+    if (known) return false;
+    this.#prepare(picture, at, scale);
+    this.#paint(picture, at);
+    picture.of = wanted;
+    return true;
+  }
+
+  /** Draws one of so many bands of the fine picture; with the last one it is shown. False: nothing is to be drawn. */
+  refine(at: Sight, band: number, bands: number): boolean {
+    const wanted = this.#wanted(at);
+    if (!this.object.visible || this.#fine.of === wanted) return false;
+    const picture = this.#fine;
+    if (band === 0) this.#prepare(picture, at, 1);
+    const { target } = picture;
+    const [from, to] = [band, band + 1].map((end) => Math.round((target.height * end) / bands)) as [number, number];
+    target.scissor.set(0, from, target.width, to - from);
+    target.scissorTest = true;
+    this.#paint(picture, at);
+    target.scissorTest = false;
+    if (band < bands - 1) return true;
+    picture.of = wanted;
+    this.#laid.value = target.texture;
     return true;
   }
 
   dispose(): void {
     this.#splats?.dispose();
     this.#volume?.dispose();
-    this.#picture.dispose();
-    this.#occluders.depthTexture?.dispose();
-    this.#occluders.dispose();
+    this.#coarse.dispose();
+    this.#fine.dispose();
     this.#depthOnly.dispose();
     this.#uniforms.palette.value.dispose();
     this.#uniforms.shown.value.dispose();
@@ -141,17 +168,45 @@ export class Cloud {
     this.object.material.dispose();
   }
 
-  #drawOccluders(renderer: WebGLRenderer, scene: Scene, camera: PerspectiveCamera): void {
+  /** What tells one picture from another. */
+  #wanted({ renderer, camera, plane, sliced, occludedBy }: Sight): string {
+    const size = renderer.getDrawingBufferSize(new Vector2());
+    const numbers = [...camera.matrixWorld.elements, camera.aspect, camera.near, ...plane.normal.toArray(), plane.constant];
+    return [this.#changes, size.x, size.y, sliced, occludedBy, ...numbers].join();
+  }
+
+  /** Fits the picture to the screen, and draws the depths of what hides parts of the cloud. */
+  #prepare(picture: Picture, { renderer, scene, camera, plane, sliced }: Sight, scale: number): void {
+    picture.of = "";
+    const size = renderer.getDrawingBufferSize(new Vector2()).multiplyScalar(scale).ceil();
+    picture.fit(size.x, size.y);
+    this.#uniforms.cut.value.set(...plane.normal.toArray(), plane.constant);
+    this.#uniforms.toScene.value.copy(camera.matrixWorld).multiply(camera.projectionMatrixInverse);
+    this.#volume?.slice(sliced);
+    if (this.#splats?.object.visible) this.#sort(camera);
     const { mask } = camera.layers;
     const { background } = scene;
     scene.background = null;
     scene.overrideMaterial = this.#depthOnly;
     camera.layers.set(OCCLUDERS);
-    renderer.setRenderTarget(this.#occluders);
+    renderer.setRenderTarget(picture.occluders);
     renderer.render(scene, camera);
+    renderer.setRenderTarget(null);
     camera.layers.mask = mask;
     scene.overrideMaterial = null;
     scene.background = background;
+  }
+
+  #paint({ target, occluders }: Picture, { renderer, camera }: Sight): void {
+    this.#uniforms.view.value.set(target.width, target.height);
+    this.#uniforms.occluders.value = occluders.depthTexture;
+    const colour = renderer.getClearColor(new Color());
+    const alpha = renderer.getClearAlpha();
+    renderer.setClearColor(0x000000, 0);
+    renderer.setRenderTarget(target);
+    renderer.render(this.#scene, camera);
+    renderer.setRenderTarget(null);
+    renderer.setClearColor(colour, alpha);
   }
 
   /** Only where the eye went round so far that the order would show. */

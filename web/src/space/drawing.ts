@@ -4,8 +4,7 @@ const BUSY_SHARE = 0.3; // of the time, at most, goes into drawing what the live
 const SOFTWARE_SHARE = 0.15; // where the processor draws
 const HANDLED_SHARE = 0.8; // while the person turns the view or drags
 const STILL_MS = 250; // after the last change it is drawn finely
-const MOVING_BUDGET_MS = { card: 25, software: 40 };
-const STILL_BUDGET_MS = { card: 120, software: 80 }; // a click that comes meanwhile waits so long
+const BUDGET_MS = { card: 25, software: 40 }; // of one drawing: a click waits for it, and so does the live image
 const SCALES = [0.2, 0.3, 0.4, 0.55, 0.75, 1]; // of the pixels, each way
 const FIRST_GUESS_MS = { card: 8, software: 250 }; // of the cloud at full size
 const TRUST = 0.5; // in the newest measurement
@@ -16,8 +15,9 @@ export class DrawingLoop {
   #request = 0;
   #fence: WebGLSync | null = null;
   #dirty: Cause | null = null;
-  /** Whether what is shown is as fine as there is time for. */
-  #fine = false;
+  /** Of the fine picture, how many bands are drawn; null: all of them. */
+  #band: number | null = 0;
+  #bands = 1;
   #touched_ms = 0;
   #started_ms = 0;
   #taken_ms = 0;
@@ -29,11 +29,15 @@ export class DrawingLoop {
   /** Whether the person turns the view, or drags the probe. */
   handled = false;
 
-  /** `draw`: draws at a scale of the pixels; true where that says what the cloud costs. */
+  /** `draw`: draws at a scale of the pixels; true where that says what the cloud costs.
+   *
+   * `refine`: draws one of so many bands of the fine picture, and shows it with the last; false: nothing is to be refined.
+   */
   constructor(
     private readonly context: WebGL2RenderingContext,
     readonly software: boolean,
     private readonly draw: (scale: number) => boolean,
+    private readonly refine: (band: number, bands: number) => boolean,
   ) {
     this.#kind = software ? "software" : "card";
     this.#cost_ms = FIRST_GUESS_MS[this.#kind];
@@ -43,7 +47,7 @@ export class DrawingLoop {
   touch(cause: Cause): void {
     if (this.#dirty !== "person") this.#dirty = cause;
     this.#touched_ms = performance.now();
-    this.#fine = false;
+    this.#band = 0;
     this.#ask();
   }
 
@@ -73,20 +77,32 @@ export class DrawingLoop {
     if (this.#dirty !== null) {
       const after_ms = this.#taken_ms / this.#share(this.#dirty);
       if (now < this.#started_ms + after_ms) return this.#ask();
-      this.#begin(MOVING_BUDGET_MS[this.#kind]);
-    } else if (!this.#fine) {
+      this.#drawNow();
+    } else if (this.#band !== null) {
       if (now < this.#touched_ms + STILL_MS || this.handled) return this.#ask();
-      this.#fine = true;
-      this.#begin(STILL_BUDGET_MS[this.#kind]);
+      this.#refineNow(this.#band);
     }
   };
 
-  #begin(budget_ms: number): void {
-    const fits = (scale: number): boolean => this.#cost_ms * scale ** 2 <= budget_ms;
-    this.#scale = SCALES.findLast(fits) ?? SCALES[0]!;
+  #drawNow(): void {
+    this.#scale = SCALES.findLast((scale) => this.#cost_ms * scale ** 2 <= BUDGET_MS[this.#kind]) ?? SCALES[0]!;
     this.#dirty = null;
     this.#started_ms = performance.now();
     this.#measures = this.draw(this.#scale);
+    this.#await();
+  }
+
+  /** The next band, so narrow that a click need not wait long. */
+  #refineNow(band: number): void {
+    if (band === 0) this.#bands = Math.max(1, Math.ceil(this.#cost_ms / BUDGET_MS[this.#kind]));
+    this.#started_ms = performance.now();
+    this.#measures = false;
+    const goesOn = this.refine(band, this.#bands);
+    this.#band = goesOn && band < this.#bands - 1 ? band + 1 : null;
+    if (goesOn) this.#await();
+  }
+
+  #await(): void {
     this.#fence = this.context.fenceSync(this.context.SYNC_GPU_COMMANDS_COMPLETE, 0);
     this.context.flush();
     this.#ask();

@@ -8,10 +8,10 @@ import type { Placed } from "../geometry/picture";
 import type { ImagePlane } from "../geometry/plane";
 import type { Pose, Vector } from "../geometry/pose";
 import type { Skin } from "../geometry/skin";
-import type { Appearance, Cut } from "./appearance";
+import type { Appearance, Cut, Form } from "./appearance";
 import { boxLines } from "./box_lines";
 import { Eye, SEEN_DEG } from "./camera";
-import { Cloud, OCCLUDERS } from "./cloud";
+import { Cloud, OCCLUDERS, type Sight } from "./cloud";
 import { placeCut } from "./cut";
 import { DrawingLoop, drawnBySoftware } from "./drawing";
 import { drop } from "./drop";
@@ -46,6 +46,7 @@ export class SpaceView {
   #cloud = new Cloud();
   #cutPlane = new Plane();
   #cut: Cut = { across: "image", at_mm: 0 };
+  #form: Form | null = null;
   #sweep: Group | null = null;
   #outline: LineSegments | null = null;
   #skin: Mesh | null = null;
@@ -63,7 +64,7 @@ export class SpaceView {
     const { domElement } = this.#renderer;
     container.append(domElement);
     const context = this.#renderer.getContext() as WebGL2RenderingContext;
-    this.#loop = new DrawingLoop(context, software, (scale) => this.#draw(scale));
+    this.#loop = new DrawingLoop(context, software, (scale) => this.#draw(scale), (band, bands) => this.#refine(band, bands));
     domElement.addEventListener("webglcontextrestored", this.#restored);
     domElement.addEventListener("dblclick", this.#pick);
     this.#eye = new Eye(domElement, {
@@ -139,11 +140,14 @@ export class SpaceView {
   }
 
   setVolume(volume: Volume | null): void {
+    this.#loop.forgetCost();
     this.#cloud.setVolume(volume);
     this.#acted();
   }
 
   setAppearance(appearance: Appearance): void {
+    if (appearance.form !== this.#form) this.#loop.forgetCost();
+    this.#form = appearance.form;
     this.#cloud.setAppearance(appearance);
     this.#acted();
   }
@@ -195,16 +199,26 @@ export class SpaceView {
   }
 
   #draw(scale: number): boolean {
+    const drew = this.#cloud.draw(this.#sight(), scale);
+    this.#renderer.render(this.#scene, this.#eye.camera);
+    return drew;
+  }
+
+  #refine(band: number, bands: number): boolean {
+    const drew = this.#cloud.refine(this.#sight(), band, bands);
+    if (drew && band === bands - 1) this.#renderer.render(this.#scene, this.#eye.camera);
+    return drew;
+  }
+
+  #sight(): Sight {
     const { camera } = this.#eye;
     camera.updateMatrixWorld();
     const image = this.#image.object.visible ? this.#imagePose : null;
     placeCut(this.#cutPlane, this.#cut, image, new Vector3().setFromMatrixPosition(camera.matrixWorld));
     const { position, quaternion } = this.#probe.object;
     const occludedBy = [...(image ?? []), ...position.toArray(), ...quaternion.toArray()].join();
-    const cut = { plane: this.#cutPlane, sliced: this.#cut.across !== "image", occludedBy };
-    const drew = this.#cloud.draw(this.#renderer, this.#scene, camera, cut, scale);
-    this.#renderer.render(this.#scene, camera);
-    return drew;
+    const sliced = this.#cut.across !== "image";
+    return { renderer: this.#renderer, scene: this.#scene, camera, plane: this.#cutPlane, sliced, occludedBy };
   }
 
   /** What the person does is shown at once. */

@@ -14,10 +14,8 @@ export const space: Words["space"] = {
   pressed: (depth_mm) => `${depth_mm.toFixed(1).replace(".", ",")} mm eingedrückt`,
   noSkin: "Die Aufnahmen dieser Szene blicken in viele Richtungen: Es gibt keine Haut, auf der die Sonde bleiben könnte.",
   options: "Optionen",
-  close: "Optionen schließen",
   viewpoint: "Blick von",
   viewpoints: { whole: "Ganz", behind: "Hinten", side: "Seite", top: "Oben" },
-  show: "Szene",
   form: "Gezeigt als",
   forms: {
     shaded: "Volumen, schattiert",
@@ -34,7 +32,6 @@ export const space: Words["space"] = {
   opacity: "Deckkraft",
   size: "Größe",
   sizeMeaning: "Größe der Splats",
-  cutTitle: "Aufschneiden",
   cut: "Schnitt",
   cuts: {
     none: "Kein Schnitt",
@@ -47,7 +44,6 @@ export const space: Words["space"] = {
     z: "Quer zu z der Szene",
   },
   cutAt: "Bei",
-  beside: "Außerdem",
   sweep: "Sweep",
   skin: "Haut",
   help: "Die Sonde am Gehäuse über die Haut ziehen; ein Doppelklick auf die Haut setzt sie dorthin.",
