@@ -150,11 +150,12 @@ describe("scan", () => {
       await until(async () => (await room.screenshot()).toString("base64") !== before, Boolean, `${what}: nothing changed`);
       await page.waitForTimeout(500);
     };
-    await changes(() => page.getByLabel("Cut").uncheck(), "the cut");
-    await changes(() => page.getByLabel("Colour of the Gaussians").selectOption("transmittance"), "the colours");
-    await picture(page, "scan-uncut");
-    await changes(() => page.getByLabel("Sweep", { exact: true }).uncheck(), "the sweep");
-    await page.getByLabel("Cut").check();
+    await page.getByRole("button", { name: "Options" }).click();
+    await changes(() => page.getByLabel("Cut", { exact: true }).selectOption("image"), "the cut");
+    await changes(() => page.getByLabel("Colour", { exact: true }).selectOption("transmittance"), "the colours");
+    await picture(page, "scan-cut");
+    await changes(() => page.getByLabel("Sweep", { exact: true }).check(), "the sweep");
+    await page.getByRole("button", { name: "Options" }).click();
     const pose = await poseOf(page);
     assert.ok(await dragProbe(page, room, pose), "there is no handle where the probe is");
     await picture(page, "scan");

@@ -123,11 +123,12 @@ describe("the scene in space", () => {
         return fence;
       };
     });
-    await page.getByLabel("Cut").uncheck();
+    await page.getByRole("button", { name: "Options" }).click();
+    await page.getByLabel("Cut", { exact: true }).selectOption("image");
     await page.evaluate(() => globalThis.restored);
     const drawn = async () => (await canvas.screenshot()).toString("base64");
     const before = await drawn();
-    await page.getByLabel("Sweep", { exact: true }).uncheck();
+    await page.getByLabel("Sweep", { exact: true }).check();
     await until(async () => (await drawn()) !== before, Boolean, "the view stays as it was");
   });
 

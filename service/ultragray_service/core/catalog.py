@@ -8,7 +8,7 @@ import binascii
 import math
 import re
 from bisect import bisect_right
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import copy_context
 from dataclasses import dataclass
@@ -64,13 +64,16 @@ class SceneCatalog:
         with scene_to_blame():
             return await asyncio.to_thread(self._store.version, name)
 
-    async def points(self, name: str, limit: int) -> bytes:
-        """At most `limit` Gaussians of a scene, as `point_message`. Raises SceneNotFound, SceneFileInvalid."""
+    async def points(self, name: str, limit: int, fields: Sequence[str]) -> bytes:
+        """At most `limit` Gaussians of a scene, as `point_message`.
+
+        Raises SceneNotFound, SceneFileInvalid, InvalidArgument for fields that there are not.
+        """
         header = await self.header(name)
         with scene_to_blame():
             path = await asyncio.to_thread(self._store.path, name)
             async with self._reading_points:  # all the Gaussians of one scene in memory are enough
-                return await in_own_thread(lambda: point_message(path, header.info, limit))
+                return await in_own_thread(lambda: point_message(path, header.info, limit, fields))
 
     async def names(self) -> list[str]:
         """The names of the scenes that the caller may see, sorted."""

@@ -75,6 +75,24 @@ def test_gaussians_as_points(http: httpx.Client, demo_scene: GaussianScene) -> N
     assert http.get("/v1/scenes/nobody/gaussians").json()["reason"] == "SCENE_NOT_FOUND"
 
 
+def test_the_shape_of_gaussians_is_told_where_it_is_asked_for(http: httpx.Client, demo_scene: GaussianScene) -> None:
+    fields = ["deviation_3_mm", "qw", "qx", "qy", "qz", "deviation_1_mm", "label", "x"]
+    answer = http.get("/v1/scenes/demo/gaussians", params={"fields": fields})
+    length = int.from_bytes(answer.content[:4], "little")
+    assert json.loads(answer.content[4 : 4 + length])["fields"] == fields
+    points = np.frombuffer(answer.content[4 + length :], "<f4").reshape(-1, len(fields))
+    scales_mm = 10 * demo_scene.scales.exp().numpy()
+    np.testing.assert_allclose(points[:, 0], scales_mm[:, 2], rtol=1e-5)
+    np.testing.assert_allclose(points[:, 5], scales_mm[:, 0], rtol=1e-5)
+    quaternions = demo_scene.quats / demo_scene.quats.norm(dim=1, keepdim=True)
+    np.testing.assert_allclose(points[:, 1:5], quaternions.numpy(), atol=1e-5)
+    labels = np.zeros(len(points)) if demo_scene.labels is None else demo_scene.labels.numpy()
+    np.testing.assert_array_equal(points[:, 6], labels)
+    np.testing.assert_allclose(points[:, 7], points_of(http.get("/v1/scenes/demo/gaussians"))[1][:, 0])
+    refused = http.get("/v1/scenes/demo/gaussians", params={"fields": ["x", "colour"]}).json()
+    assert (refused["reason"], refused["field"]) == ("INVALID_ARGUMENT", "fields")
+
+
 @pytest.mark.parametrize(("count", "limit"), [(0, 5), (3, 5), (5, 5), (1000, 7), (7, 1)])
 def test_an_even_selection(count: int, limit: int) -> None:
     chosen = even_selection(count, limit)

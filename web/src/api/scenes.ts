@@ -1,15 +1,10 @@
 /** Scenes: what there is, what they say about themselves, their Gaussians and training views. */
 
 import { address, getJson, request, type Schemas } from "./client";
+import { FIELDS, Gaussians } from "./gaussians";
 
 export type SceneEntry = Schemas["SceneEntry"];
 export type SceneDescription = Schemas["Scene"];
-
-/** The Gaussians of a scene as points: float32 [N, 6], x, y, z in mm, intensity, transmittance, mean sigma in mm. */
-export interface GaussianPoints {
-  count: number;
-  values: Float32Array;
-}
 
 /** Every scene of the service, by name. */
 export async function listScenes(): Promise<SceneEntry[]> {
@@ -28,12 +23,13 @@ export function describeScene(scene: string): Promise<SceneDescription> {
 }
 
 /** An even selection of at most `limit` Gaussians. */
-export async function sceneGaussians(scene: string, limit: number): Promise<GaussianPoints> {
-  const response = await request(`${address("/v1/scenes/{scene}/gaussians", { scene })}?limit=${limit}`);
+export async function sceneGaussians(scene: string, limit: number): Promise<Gaussians> {
+  const fields = FIELDS.map((field) => `&fields=${field}`).join("");
+  const response = await request(`${address("/v1/scenes/{scene}/gaussians", { scene })}?limit=${limit}${fields}`);
   const buffer = await response.arrayBuffer();
   const length = new DataView(buffer).getUint32(0, true);
-  const { count } = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, length))) as { count: number };
-  return { count, values: new Float32Array(buffer, 4 + length, count * 6) };
+  const header = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, length))) as { count: number; total: number };
+  return new Gaussians(header.count, header.total, new Float32Array(buffer, 4 + length, header.count * FIELDS.length));
 }
 
 export type TrainingPoses = Schemas["ScenePoses"];

@@ -83,6 +83,8 @@ export class Session {
   readonly probe = $derived(this.#held.probe);
   readonly plane = $derived(this.#held.plane);
   readonly home = $derived(this.views[Math.floor(this.views.length / 2)] ?? middleOf(this.description));
+  /** What becomes of a pose that the probe is slid or dragged to, from where it was: in contact its face stays on the skin. */
+  constrain: (before: Pose, after: Pose) => Pose = (_, after) => after;
   #placed = $state.raw<Pose | null>(null);
   /** Whether the probe is where the track last put it. */
   readonly onTrack = $derived(this.pose === this.#placed);
@@ -146,7 +148,7 @@ export class Session {
 
   /** Slides the probe along its own axes: lateral, elevation, axial. */
   moveBy(along_mm: Vector): void {
-    this.pose = translated(this.pose, along_mm);
+    this.pose = this.constrain(this.pose, translated(this.pose, along_mm));
   }
 
   /** Turns the probe about its own axes, its face staying where it is. */

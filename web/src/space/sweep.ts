@@ -21,8 +21,11 @@ import { planeShape } from "./shapes";
 const MOST_PLANES = 40; // more would only be a solid block
 const COLOUR = 0x3d9ac4;
 
-/** At most MOST_PLANES of the poses, evenly taken; `cut` leaves out what of the planes lies behind it. */
-export function sweepPlanes(poses: readonly Pose[], lines: readonly Line[], cut: Plane): Group {
+/** At most MOST_PLANES of the poses, evenly taken; `cut` leaves out what of the planes lies behind it.
+ *
+ * `filled`: whether they are more than outlines, which costs much where the processor draws.
+ */
+export function sweepPlanes(poses: readonly Pose[], lines: readonly Line[], cut: Plane, filled: boolean): Group {
   const step = Math.max(1, Math.ceil(poses.length / MOST_PLANES));
   const shown = poses.filter((_, index) => index % step === 0);
   const shape = planeShape(lines);
@@ -48,5 +51,6 @@ export function sweepPlanes(poses: readonly Pose[], lines: readonly Line[], cut:
   }
   const outlines = new BufferGeometry().setAttribute("position", new BufferAttribute(new Float32Array(ends), 3));
   const stroke = new LineBasicMaterial({ color: COLOUR, transparent: true, opacity: 0.28 });
+  planes.visible = filled;
   return new Group().add(planes, new LineSegments(outlines, stroke));
 }

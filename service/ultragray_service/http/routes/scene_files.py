@@ -24,7 +24,7 @@ from ...arrival import arrival
 from ...core.helper_processes import PATIENCE_S
 from ...core.scenes import Scene
 from ...errors import UnsupportedMediaType
-from ...views.scene_points import DEFAULT_POINTS, MAX_POINTS, MAX_POSES, even_selection
+from ...views.scene_points import ALL_FIELDS, DEFAULT_POINTS, FIELDS, MAX_POINTS, MAX_POSES, even_selection
 from ..deps import SceneName, ServiceDep, problems
 from ..disconnect import finish_or_abandon
 from ..reading.accept import RAW
@@ -44,12 +44,20 @@ class ScenePoses:
 router = APIRouter(prefix="/v1/scenes", tags=["scenes"])
 
 PointLimit = Annotated[int, Query(ge=1, le=MAX_POINTS, description="Gaussians at most.")]
+PointFields = Annotated[
+    list[str] | None,
+    Query(
+        max_length=len(ALL_FIELDS),
+        description=f"What is told of each, in the order asked for; the first {len(FIELDS)} where nothing is asked "
+        f"for: {', '.join(ALL_FIELDS)}.",
+    ),
+]
 _BINARY = {"schema": {"type": "string", "format": "binary"}}
 _Answers = dict[int | str, dict[str, Any]]
 _POINTS: _Answers = {
     200: {
         "description": "The length of the JSON that follows (uint32, little endian), the JSON with `count`, `fields` "
-        "and `total`, then float32 [count, 6] from a multiple of 8 bytes.",
+        "and `total`, then float32 [count, fields] from a multiple of 8 bytes.",
         "content": {RAW: _BINARY},
     },
     304: {"description": NOT_MODIFIED},
@@ -63,12 +71,12 @@ _IMPORT: dict[str, Any] = {
 
 @router.get("/{scene}/gaussians", response_class=Response, responses=_POINTS | problems(401, 404, 422))
 async def get_gaussians(
-    request: Request, service: ServiceDep, scene: SceneName, limit: PointLimit = DEFAULT_POINTS
+    request: Request, service: ServiceDep, scene: SceneName, limit: PointLimit = DEFAULT_POINTS, fields: PointFields = None
 ) -> Response:
-    """Gaussians as points: position, intensity, transmittance and size; an even selection, always the same."""
+    """Gaussians as points: position, intensity, transmittance and size, or `fields`; an even selection, always the same."""
 
     async def points() -> Response:
-        return Response(await service.catalog.points(scene, limit), media_type=RAW)
+        return Response(await service.catalog.points(scene, limit, fields or FIELDS), media_type=RAW)
 
     return await revalidated(request, (await service.catalog.version(scene)).tag, points)
 

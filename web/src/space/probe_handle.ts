@@ -1,0 +1,144 @@
+/** The probe in space: a body that is dragged over the skin, and a gizmo that moves and turns it. */
+
+import { Group, Mesh, Plane, Vector3, type Camera, type Intersection, type Raycaster } from "three";
+import { TransformControls } from "three/examples/jsm/controls/TransformControls.js";
+
+import type { ImagePlane } from "../geometry/plane";
+import { axis, fromPositionQuaternion, IDENTITY, position, translated, type Pose } from "../geometry/pose";
+import { dot, minus } from "../geometry/vector";
+import { OCCLUDERS } from "./cloud";
+import { drop } from "./drop";
+import { placeObject } from "./place";
+import { placeOf, pointedAt } from "./pointing";
+import { probeBody } from "./probe_body";
+
+export type Gizmo = "translate" | "rotate" | "none";
+
+const LEAST_SLOPE = 0.25; // of the line of sight to the plane that the body slides in; below, it slides across the view
+
+interface Events {
+  changed: () => void;
+  /** Whether the probe is dragged now. */
+  handled: (now: boolean) => void;
+  /** Where it is dragged to. */
+  moved: (pose: Pose) => void;
+}
+
+export class ProbeHandle {
+  /** Lies in the middle of the face, about which the probe is turned. */
+  readonly object = new Group();
+  readonly #gizmo: TransformControls;
+  #pose: Pose = IDENTITY;
+  #pivotDepth_mm = 0;
+  #held = false;
+  /** Where the body was taken, from its face, and the plane that it slides in. */
+  #taken: { offset: Vector3; plane: Plane; pointer: number } | null = null;
+
+  constructor(
+    private readonly camera: Camera,
+    private readonly element: HTMLElement,
+    private readonly events: Events,
+  ) {
+    this.#gizmo = new TransformControls(camera, element);
+    this.#gizmo.space = "local";
+    this.#gizmo.size = 0.7;
+    this.#gizmo.attach(this.object);
+    this.#gizmo.addEventListener("change", events.changed);
+    this.#gizmo.addEventListener("dragging-changed", ({ value }) => events.handled(value === true));
+    this.#gizmo.addEventListener("objectChange", () => this.#report(this.#gizmo.axis?.includes("Z") ?? false));
+    // before the controls of the view, which lie on the same element
+    element.parentElement!.addEventListener("pointerdown", this.#take, { capture: true });
+    element.addEventListener("pointermove", this.#drag);
+    element.addEventListener("pointerup", this.#letGo);
+    element.addEventListener("pointercancel", this.#letGo);
+  }
+
+  get helper(): ReturnType<TransformControls["getHelper"]> {
+    return this.#gizmo.getHelper();
+  }
+
+  setGizmo(gizmo: Gizmo): void {
+    this.#held = gizmo !== "none";
+    if (gizmo !== "none") this.#gizmo.setMode(gizmo);
+    this.#gizmo.enabled = this.#held;
+    this.helper.visible = this.#held;
+  }
+
+  setProbe(plane: ImagePlane): void {
+    for (const body of [...this.object.children]) drop(body);
+    this.#pivotDepth_mm = plane.pivot_depth_mm;
+    const body = probeBody(plane);
+    body.position.z = -this.#pivotDepth_mm;
+    body.traverse((part) => part instanceof Mesh && part.layers.enable(OCCLUDERS));
+    this.object.add(body);
+    this.setPose(this.#pose);
+  }
+
+  setPose(pose: Pose): void {
+    this.#pose = pose;
+    placeObject(this.object, translated(pose, [0, 0, this.#pivotDepth_mm]));
+  }
+
+  dispose(): void {
+    this.element.parentElement?.removeEventListener("pointerdown", this.#take, { capture: true });
+    this.#gizmo.dispose();
+    drop(this.object);
+  }
+
+  /** Tells where the probe was dragged to. Only a handle along its axis presses it: what a curved skin leaves is no press. */
+  #report(presses: boolean): void {
+    const { position: p, quaternion: q } = this.object;
+    const face = fromPositionQuaternion([p.x, p.y, p.z], [q.w, q.x, q.y, q.z]);
+    const to = translated(face, [0, 0, -this.#pivotDepth_mm]);
+    const turned = this.#gizmo.mode === "rotate" && this.#taken === null;
+    if (presses || turned) return this.events.moved(to);
+    const lifted = dot(minus(position(to), position(this.#pose)), axis(this.#pose, 2));
+    this.events.moved(translated(to, [0, 0, -lifted]));
+  }
+
+  /** Where the body is pointed at. */
+  #hit(ray: Raycaster): Intersection | undefined {
+    return ray.intersectObject(this.object, true).find(({ object }) => object instanceof Mesh);
+  }
+
+  /** The pointer tells what can be dragged. */
+  #tell(event: PointerEvent): void {
+    const over = this.#held && this.#gizmo.axis === null && this.#hit(pointedAt(event, this.camera)) !== undefined;
+    this.element.style.cursor = this.#held && this.#gizmo.axis !== null ? "grab" : over ? "move" : "";
+  }
+
+  #take = (event: PointerEvent): void => {
+    if (!this.#held || event.target !== this.element || event.button !== 0 || !event.isPrimary) return;
+    const { x, y } = placeOf(event);
+    this.#gizmo.pointerHover({ x, y, button: event.button } as unknown as PointerEvent); // a finger has not hovered
+    if (this.#gizmo.axis !== null) return; // a handle lies over the body
+    const ray = pointedAt(event, this.camera);
+    const hit = this.#hit(ray);
+    if (hit === undefined) return;
+    const along = new Vector3(...axis(this.#pose, 2));
+    const sight = ray.ray.direction;
+    const normal = Math.abs(along.dot(sight)) < LEAST_SLOPE ? sight.clone().negate() : along;
+    const plane = new Plane().setFromNormalAndCoplanarPoint(normal, hit.point);
+    this.#taken = { offset: this.object.position.clone().sub(hit.point), plane, pointer: event.pointerId };
+    this.element.setPointerCapture(event.pointerId);
+    this.element.style.cursor = "grabbing";
+    this.events.handled(true);
+    event.preventDefault();
+  };
+
+  #drag = (event: PointerEvent): void => {
+    if (this.#taken === null && event.buttons === 0) this.#tell(event);
+    if (this.#taken?.pointer !== event.pointerId) return;
+    const at = pointedAt(event, this.camera).ray.intersectPlane(this.#taken.plane, new Vector3());
+    if (at === null) return;
+    this.object.position.copy(at.add(this.#taken.offset));
+    this.#report(false);
+  };
+
+  #letGo = (event: PointerEvent): void => {
+    if (this.#taken?.pointer !== event.pointerId) return;
+    this.#taken = null;
+    this.element.style.cursor = "";
+    this.events.handled(false);
+  };
+}
