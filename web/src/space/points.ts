@@ -3,7 +3,7 @@
 import { BufferAttribute, BufferGeometry, Points, PointsMaterial, type Plane } from "three";
 
 import type { GaussianPoints } from "../api/scenes";
-import { ramp } from "../maps/colours";
+import { ramp } from "../shared/colours";
 
 export type PointColour = "intensity" | "transmittance";
 
