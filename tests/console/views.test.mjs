@@ -14,7 +14,7 @@ const VIEWS = {
   scan: ["#/scan/demo", (page) => until(() => canvasState(page, '[aria-label="Live image"]'), ({ mean }) => mean > 5, "no frame")],
   maps: ["#/maps/demo", (page) => until(() => canvasState(page, '[data-testid="map-echo"]'), ({ mean }) => mean > 1, "no map")],
   compare: ["#/compare/demo", (page) => page.getByRole("main").getByRole("heading").first().waitFor({ state: "attached" })],
-  train: ["#/train", (page) => page.getByText("Add a sweep").waitFor()],
+  train: ["#/train", (page) => page.getByText("Add a sweep", { exact: true }).waitFor()],
   scenes: ["#/scenes", (page) => page.getByTestId("frames-rendered").waitFor()],
 };
 const LARGE = { width: 1280, height: 800 };
