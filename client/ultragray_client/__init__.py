@@ -8,7 +8,7 @@ is told as one of `ultragray_client.errors`.
 from __future__ import annotations
 
 from . import contract, errors
-from .access import Me, Role
+from .access import AuditEntry, Me, Role
 from .aio.client import AsyncClient
 from .aio.stream import AsyncFrameStream
 from .calls.pose_exchange import StreamMode
@@ -26,6 +26,7 @@ from .workers import Worker, WorkerDevice, WorkerState
 __all__ = [
     "AsyncClient",
     "AsyncFrameStream",
+    "AuditEntry",
     "Client",
     "ClientError",
     "ConfidenceFit",

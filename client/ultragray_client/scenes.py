@@ -27,6 +27,9 @@ class SceneEntry:
     error: str | None  # why the file cannot be read
     owner: str | None  # None: nobody
     private: bool  # others do not see it
+    probe_kind: str | None  # of the probe it was trained with, such as "convex"
+    metrics: Mapping[str, float]  # of the training, on held-out frames
+    changed_at: str | None  # when its file was last written, ISO 8601, UTC
 
 
 @dataclass(frozen=True)

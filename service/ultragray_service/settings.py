@@ -288,6 +288,11 @@ class Settings(Contract):
     oidc_name_claim: str = described(
         "Claim that says whose a token is; its values must never go to somebody else.", "sub"
     )
+    oidc_client_id: str | None = described(
+        "Client id of the console at the issuer, a public client: people sign in with their browser; none: with keys.",
+        None,
+    )
+    oidc_scope: str = described("Scopes that the console asks the issuer for.", "openid profile")
     oidc_ca: Path | None = described(
         "PEM file of authorities that sign the issuer's certificate; none: those that the system trusts.", None
     )
@@ -346,6 +351,8 @@ class Settings(Contract):
             for name in ("oidc_audience", "oidc_roles"):
                 if not getattr(self, name):
                     raise InvalidArgument(f"{name} must be given too, beside oidc_issuer", field=name)
+        elif self.oidc_client_id is not None:
+            raise InvalidArgument("oidc_client_id needs oidc_issuer", field="oidc_client_id")
         if any(len(key) < LEAST_KEY_LENGTH for key in self.api_keys):
             raise InvalidArgument(f"api_keys must have at least {LEAST_KEY_LENGTH} characters each", field="api_keys")
         if not all(key.isascii() for key in self.api_keys):

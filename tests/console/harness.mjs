@@ -96,10 +96,11 @@ export function launch() {
 
 /** A page that remembers what went wrong in it: `page.faults` (errors, refused sources) and `page.foreign` (requests elsewhere).
  *
- * `init`: what runs in it before its own scripts.
+ * `init`: what runs in it before its own scripts; `touch`: whether it is worked with fingers.
  */
-export async function openPage({ browser, service }, hash, { width = 1280, height = 800, scheme = "light", init } = {}) {
-  const context = await browser.newContext({ viewport: { width, height }, colorScheme: scheme, acceptDownloads: true });
+export async function openPage({ browser, service }, hash, { width = 1280, height = 800, scheme = "light", touch = false, init } = {}) {
+  const viewed = { viewport: { width, height }, colorScheme: scheme, acceptDownloads: true };
+  const context = await browser.newContext({ ...viewed, hasTouch: touch, isMobile: touch });
   await context.grantPermissions(["clipboard-read", "clipboard-write"], { origin: service.url });
   const page = await context.newPage();
   page.setDefaultTimeout(TIMEOUT_MS);
@@ -128,13 +129,13 @@ export async function picture(page, name) {
   }
 }
 
-/** What axe finds that is serious or critical, one string a finding. */
+/** What axe finds that is moderate, serious or critical, one string a finding. */
 export async function seriousFindings(page) {
   const source = readFileSync(require.resolve("axe-core/axe.min.js"), "utf8");
   await page.evaluate(source); // not by a script element: the page's policy forbids it
   const { violations } = await page.evaluate(() => globalThis.axe.run());
   return violations
-    .filter(({ impact }) => impact === "serious" || impact === "critical")
+    .filter(({ impact }) => impact !== "minor")
     .map(({ id, nodes }) => `${id}: ${nodes.map((node) => node.target.join(" ")).join(", ")}`);
 }
 
@@ -174,6 +175,14 @@ export async function hold(page, addresses) {
     await route.continue();
   });
   return release;
+}
+
+/** Goes to another view by the header, as wide or narrow as the page is. */
+export async function goTo(page, view) {
+  const menu = page.getByRole("banner").getByRole("button", { name: /^Views:/ });
+  const link = page.getByRole("banner").getByRole("link", { name: view, exact: true });
+  if (await menu.isVisible()) await menu.click();
+  await link.click();
 }
 
 /** What has the focus: its label, else its text. */

@@ -4,7 +4,7 @@ import assert from "node:assert/strict";
 import { readFileSync } from "node:fs";
 import { describe, it } from "node:test";
 
-import { canvasState, openPage, picture, seriousFindings, until } from "./harness.mjs";
+import { canvasState, goTo, openPage, picture, seriousFindings, until } from "./harness.mjs";
 import { changed, IMAGE, openScan } from "./scan_page.mjs";
 import { put } from "./sweep.mjs";
 import { tested } from "./tested.mjs";
@@ -121,7 +121,7 @@ describe("a phone", () => {
     const { page } = await openScan(at, { scene: "refined", ...PHONE });
     assert.deepEqual(await tooWide(page), []);
     await picture(page, "scan-phone");
-    await page.getByRole("link", { name: "Maps", exact: true }).click();
+    await goTo(page, "Maps");
     await until(() => canvasState(page, UNCERTAINTY), ({ width }) => width === 256, "no uncertainty came");
     assert.deepEqual(await tooWide(page), []);
     await page.getByRole("img", { name: "Turn in °" }).click({ trial: true }); // nothing lies over it

@@ -7,7 +7,7 @@ from collections.abc import AsyncIterator, Iterable
 from ultragray_proto.codec import from_message
 from ultragray_proto.v1 import access_pb2, access_pb2_grpc, rendering_pb2, rendering_pb2_grpc
 
-from ..access import Me
+from ..access import AuditEntry, Me
 from ..calls.batch import Batch
 from ..calls.connection import DEFAULT_ADDRESS, DEFAULT_TIMEOUT_S, ApiKey
 from ..calls.pose_exchange import PoseExchange, StreamMode
@@ -114,6 +114,23 @@ class AsyncClient:
         """The name and the role that the key stands for."""
         request = access_pb2.WhoAmIRequest()
         return from_message(await self._connection.answer(self._access.WhoAmI, request, timeout_s), Me)
+
+    async def audit(
+        self,
+        *,
+        since_hours: float = 24.0,
+        who: str | None = None,
+        what: str | None = None,
+        limit: int = 1000,
+        timeout_s: float | None = None,
+    ) -> tuple[AuditEntry, ...]:
+        """The last entries of the audit log, oldest first; `what`: an operation such as scene.delete, or scene.
+
+        For admins alone. Raises PermissionDenied, InvalidArgument.
+        """
+        request = access_pb2.ListAuditEntriesRequest(since_hours=since_hours, who=who, what=what, limit=limit)
+        answer = await self._connection.answer(self._access.ListAuditEntries, request, timeout_s)
+        return tuple(from_message(entry, AuditEntry) for entry in answer.entries)
 
     async def close(self) -> None:
         """Ends all that is under way."""

@@ -22,21 +22,28 @@ _runtime_version.ValidateProtobufRuntimeVersion(
 _sym_db = _symbol_database.Default()
 
 
+from google.protobuf import struct_pb2 as google_dot_protobuf_dot_struct__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x19ultragray/v1/access.proto\x12\x0cultragray.v1\"\x0f\n\rWhoAmIRequest\"j\n\x0eWhoAmIResponse\x12\x0c\n\x04name\x18\x01 \x01(\t\x12 \n\x04role\x18\x02 \x01(\x0e\x32\x12.ultragray.v1.Role\x12\x12\n\nexpires_at\x18\x03 \x01(\t\x12\x14\n\x0ckey_required\x18\x04 \x01(\x08*P\n\x04Role\x12\x14\n\x10ROLE_UNSPECIFIED\x10\x00\x12\x0f\n\x0bROLE_READER\x10\x01\x12\x11\n\rROLE_OPERATOR\x10\x02\x12\x0e\n\nROLE_ADMIN\x10\x03\x32T\n\rAccessService\x12\x43\n\x06WhoAmI\x12\x1b.ultragray.v1.WhoAmIRequest\x1a\x1c.ultragray.v1.WhoAmIResponseb\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x19ultragray/v1/access.proto\x12\x0cultragray.v1\x1a\x1cgoogle/protobuf/struct.proto\"\x0f\n\rWhoAmIRequest\"j\n\x0eWhoAmIResponse\x12\x0c\n\x04name\x18\x01 \x01(\t\x12 \n\x04role\x18\x02 \x01(\x0e\x32\x12.ultragray.v1.Role\x12\x12\n\nexpires_at\x18\x03 \x01(\t\x12\x14\n\x0ckey_required\x18\x04 \x01(\x08\"X\n\x17ListAuditEntriesRequest\x12\x13\n\x0bsince_hours\x18\x01 \x01(\x01\x12\x0b\n\x03who\x18\x02 \x01(\t\x12\x0c\n\x04what\x18\x03 \x01(\t\x12\r\n\x05limit\x18\x04 \x01(\x05\"E\n\x18ListAuditEntriesResponse\x12)\n\x07\x65ntries\x18\x01 \x03(\x0b\x32\x18.ultragray.v1.AuditEntry\"\x8c\x01\n\nAuditEntry\x12\n\n\x02\x61t\x18\x01 \x01(\t\x12\x0b\n\x03who\x18\x02 \x01(\t\x12\x0f\n\x07\x61\x64\x64ress\x18\x03 \x01(\t\x12\x0c\n\x04what\x18\x04 \x01(\t\x12\x0e\n\x06target\x18\x05 \x01(\t\x12\x0e\n\x06result\x18\x06 \x01(\t\x12&\n\x05\x66\x61\x63ts\x18\x07 \x01(\x0b\x32\x17.google.protobuf.Struct*P\n\x04Role\x12\x14\n\x10ROLE_UNSPECIFIED\x10\x00\x12\x0f\n\x0bROLE_READER\x10\x01\x12\x11\n\rROLE_OPERATOR\x10\x02\x12\x0e\n\nROLE_ADMIN\x10\x03\x32\xb7\x01\n\rAccessService\x12\x43\n\x06WhoAmI\x12\x1b.ultragray.v1.WhoAmIRequest\x1a\x1c.ultragray.v1.WhoAmIResponse\x12\x61\n\x10ListAuditEntries\x12%.ultragray.v1.ListAuditEntriesRequest\x1a&.ultragray.v1.ListAuditEntriesResponseb\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
 _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'ultragray.v1.access_pb2', _globals)
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
-  _globals['_ROLE']._serialized_start=168
-  _globals['_ROLE']._serialized_end=248
-  _globals['_WHOAMIREQUEST']._serialized_start=43
-  _globals['_WHOAMIREQUEST']._serialized_end=58
-  _globals['_WHOAMIRESPONSE']._serialized_start=60
-  _globals['_WHOAMIRESPONSE']._serialized_end=166
-  _globals['_ACCESSSERVICE']._serialized_start=250
-  _globals['_ACCESSSERVICE']._serialized_end=334
+  _globals['_ROLE']._serialized_start=502
+  _globals['_ROLE']._serialized_end=582
+  _globals['_WHOAMIREQUEST']._serialized_start=73
+  _globals['_WHOAMIREQUEST']._serialized_end=88
+  _globals['_WHOAMIRESPONSE']._serialized_start=90
+  _globals['_WHOAMIRESPONSE']._serialized_end=196
+  _globals['_LISTAUDITENTRIESREQUEST']._serialized_start=198
+  _globals['_LISTAUDITENTRIESREQUEST']._serialized_end=286
+  _globals['_LISTAUDITENTRIESRESPONSE']._serialized_start=288
+  _globals['_LISTAUDITENTRIESRESPONSE']._serialized_end=357
+  _globals['_AUDITENTRY']._serialized_start=360
+  _globals['_AUDITENTRY']._serialized_end=500
+  _globals['_ACCESSSERVICE']._serialized_start=585
+  _globals['_ACCESSSERVICE']._serialized_end=768
 # @@protoc_insertion_point(module_scope)

@@ -40,6 +40,11 @@ class AccessServiceStub:
                 request_serializer=ultragray_dot_v1_dot_access__pb2.WhoAmIRequest.SerializeToString,
                 response_deserializer=ultragray_dot_v1_dot_access__pb2.WhoAmIResponse.FromString,
                 _registered_method=True)
+        self.ListAuditEntries = channel.unary_unary(
+                '/ultragray.v1.AccessService/ListAuditEntries',
+                request_serializer=ultragray_dot_v1_dot_access__pb2.ListAuditEntriesRequest.SerializeToString,
+                response_deserializer=ultragray_dot_v1_dot_access__pb2.ListAuditEntriesResponse.FromString,
+                _registered_method=True)
 
 
 class AccessServiceServicer:
@@ -53,6 +58,13 @@ class AccessServiceServicer:
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
+    def ListAuditEntries(self, request, context):
+        """Who did what: the last entries of the audit log. Admins only.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
 
 def add_AccessServiceServicer_to_server(servicer, server):
     rpc_method_handlers = {
@@ -60,6 +72,11 @@ def add_AccessServiceServicer_to_server(servicer, server):
                     servicer.WhoAmI,
                     request_deserializer=ultragray_dot_v1_dot_access__pb2.WhoAmIRequest.FromString,
                     response_serializer=ultragray_dot_v1_dot_access__pb2.WhoAmIResponse.SerializeToString,
+            ),
+            'ListAuditEntries': grpc.unary_unary_rpc_method_handler(
+                    servicer.ListAuditEntries,
+                    request_deserializer=ultragray_dot_v1_dot_access__pb2.ListAuditEntriesRequest.FromString,
+                    response_serializer=ultragray_dot_v1_dot_access__pb2.ListAuditEntriesResponse.SerializeToString,
             ),
     }
     generic_handler = grpc.method_handlers_generic_handler(
@@ -90,6 +107,33 @@ class AccessService:
             '/ultragray.v1.AccessService/WhoAmI',
             ultragray_dot_v1_dot_access__pb2.WhoAmIRequest.SerializeToString,
             ultragray_dot_v1_dot_access__pb2.WhoAmIResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def ListAuditEntries(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/ultragray.v1.AccessService/ListAuditEntries',
+            ultragray_dot_v1_dot_access__pb2.ListAuditEntriesRequest.SerializeToString,
+            ultragray_dot_v1_dot_access__pb2.ListAuditEntriesResponse.FromString,
             options,
             channel_credentials,
             insecure,

@@ -24,7 +24,14 @@ class ListScenesResponse(_message.Message):
     def __init__(self, scenes: _Optional[_Iterable[_Union[SceneEntry, _Mapping]]] = ..., next_page_token: _Optional[str] = ...) -> None: ...
 
 class SceneEntry(_message.Message):
-    __slots__ = ("name", "loaded", "gaussian_count", "image_height", "image_width", "file_bytes", "error", "owner", "private")
+    __slots__ = ("name", "loaded", "gaussian_count", "image_height", "image_width", "file_bytes", "error", "owner", "private", "probe_kind", "metrics", "changed_at")
+    class MetricsEntry(_message.Message):
+        __slots__ = ("key", "value")
+        KEY_FIELD_NUMBER: _ClassVar[int]
+        VALUE_FIELD_NUMBER: _ClassVar[int]
+        key: str
+        value: float
+        def __init__(self, key: _Optional[str] = ..., value: _Optional[float] = ...) -> None: ...
     NAME_FIELD_NUMBER: _ClassVar[int]
     LOADED_FIELD_NUMBER: _ClassVar[int]
     GAUSSIAN_COUNT_FIELD_NUMBER: _ClassVar[int]
@@ -34,6 +41,9 @@ class SceneEntry(_message.Message):
     ERROR_FIELD_NUMBER: _ClassVar[int]
     OWNER_FIELD_NUMBER: _ClassVar[int]
     PRIVATE_FIELD_NUMBER: _ClassVar[int]
+    PROBE_KIND_FIELD_NUMBER: _ClassVar[int]
+    METRICS_FIELD_NUMBER: _ClassVar[int]
+    CHANGED_AT_FIELD_NUMBER: _ClassVar[int]
     name: str
     loaded: bool
     gaussian_count: int
@@ -43,7 +53,10 @@ class SceneEntry(_message.Message):
     error: Error
     owner: str
     private: bool
-    def __init__(self, name: _Optional[str] = ..., loaded: _Optional[bool] = ..., gaussian_count: _Optional[int] = ..., image_height: _Optional[int] = ..., image_width: _Optional[int] = ..., file_bytes: _Optional[int] = ..., error: _Optional[_Union[Error, _Mapping]] = ..., owner: _Optional[str] = ..., private: _Optional[bool] = ...) -> None: ...
+    probe_kind: str
+    metrics: _containers.ScalarMap[str, float]
+    changed_at: str
+    def __init__(self, name: _Optional[str] = ..., loaded: _Optional[bool] = ..., gaussian_count: _Optional[int] = ..., image_height: _Optional[int] = ..., image_width: _Optional[int] = ..., file_bytes: _Optional[int] = ..., error: _Optional[_Union[Error, _Mapping]] = ..., owner: _Optional[str] = ..., private: _Optional[bool] = ..., probe_kind: _Optional[str] = ..., metrics: _Optional[_Mapping[str, float]] = ..., changed_at: _Optional[str] = ...) -> None: ...
 
 class GetSceneRequest(_message.Message):
     __slots__ = ("scene",)

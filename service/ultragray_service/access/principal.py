@@ -80,5 +80,9 @@ def me(key_required: bool) -> Me:
     """Whoever the running code works for."""
     principal = acting()
     at_s = principal.expires_at_s
-    expires_at = None if at_s is None else datetime.fromtimestamp(at_s, timezone.utc).isoformat(timespec="seconds")
-    return Me(principal.name, principal.role, expires_at, key_required)
+    return Me(principal.name, principal.role, None if at_s is None else iso_time(at_s), key_required)
+
+
+def iso_time(at_s: float) -> str:
+    """A time.time() as ISO 8601, UTC."""
+    return datetime.fromtimestamp(at_s, timezone.utc).isoformat(timespec="seconds")

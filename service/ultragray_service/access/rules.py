@@ -122,12 +122,14 @@ OPERATIONS = (
     Operation("worker.resume", _ADMIN, ("POST /v1/workers/{worker}:resume",), ("WorkerService/ResumeWorker",), _WORKER),
     Operation("service.watch", _READER, ("GET /v1/statistics", "GET /metrics")),
     Operation("me", _READER, ("GET /v1/me",), ("AccessService/WhoAmI",)),
+    Operation("audit.list", _ADMIN, ("GET /v1/audit",), ("AccessService/ListAuditEntries",)),
     Operation(
         "public",
         None,
         (
             "GET /v1/health/live",
             "GET /v1/health/ready",
+            "GET /v1/sign-in",
             "GET /docs",
             "GET /docs/static/{path:path}",
             "GET /openapi.json",

@@ -38,6 +38,7 @@ class CatalogEntry:
     name: str
     header: SceneHeader | None
     error: UltragrayError | None
+    changed_at_s: float | None = None  # when its file was last written, time.time(); None: it lies in a bucket alone
 
 
 class SceneCatalog:
@@ -96,7 +97,9 @@ class SceneCatalog:
 
     async def _entry(self, name: str) -> CatalogEntry | None:
         try:
-            return CatalogEntry(name, await self.header(name), None)
+            header = await self.header(name)
+            cached = self._store.cached_versioned_header(name)
+            return CatalogEntry(name, header, None, None if cached is None else cached[0].mtime_ns / 1e9)
         except SceneNotFound:  # deleted since the folder was read
             return None
         except UltragrayError as error:

@@ -12,6 +12,7 @@ from ultragray.scene_info import SceneHeader
 from ultragray_workers.jobs.queue.owners import Kind, Ownership
 from ultragray_workers.scene_names import base_name
 
+from ..access.principal import iso_time
 from ..errors import Refusal
 from .catalog import CatalogEntry, finite_metrics
 from .frames import OutputName
@@ -33,6 +34,9 @@ class SceneEntry:
     error: Refusal | None = None
     owner: str | None = described("Who imported or trained it; null: nobody.", None)
     private: bool = described("Whether others may not see it.", False)
+    probe_kind: str | None = described("Of the probe it was trained with, such as convex; null: not known.", None)
+    metrics: dict[str, float] = described("Of the training, on held-out frames.", factory=dict)
+    changed_at: str | None = described("When its file was last written, ISO 8601, UTC; null: not known.", None)
 
 
 @dataclass(frozen=True)
@@ -201,4 +205,7 @@ def _entry(entry: CatalogEntry, loaded: bool, removable: bool, ownership: Owners
         entry.header.file_bytes,
         owner=owner,
         private=private,
+        probe_kind=None if info.probe is None else info.probe.kind,
+        metrics=finite_metrics(entry.header),
+        changed_at=None if entry.changed_at_s is None else iso_time(entry.changed_at_s),
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from typing import Any
+from urllib.parse import urlsplit
 
 from fastapi import FastAPI
 from fastapi.exceptions import RequestValidationError
@@ -27,10 +28,10 @@ from .middleware import QUIET_PATHS, Authorize, CheckOrigin, LimitBody, RequestC
 from .reading.bodies import SPECIFICATIONS, JobBody, RenderBody, StreamMessage
 from .reading.json_body import adapter_of
 from .routes import (
+    access,
     comparison,
     datasets,
     health,
-    me,
     probes,
     render,
     scene_files,
@@ -72,7 +73,7 @@ _ROUTERS = (
     workers.router,
     statistics.router,
     health.router,
-    me.router,
+    access.router,
 )
 
 _READ: tuple[Any, ...] = (RenderBody, StreamMessage, JobBody, *SPECIFICATIONS, Probe)
@@ -94,7 +95,7 @@ def create_app(service: Service) -> FastAPI:
     for router in _ROUTERS:
         app.include_router(router)
     add_docs(app)
-    add_console(app)
+    add_console(app, token_origin=lambda: _token_origin(service))
     found = (*app.routes, *(route for router in _ROUTERS for route in router.routes))
     app.state.routes = [route for route in found if isinstance(route, Route)]
     rules = HttpRules()
@@ -115,6 +116,15 @@ def create_app(service: Service) -> FastAPI:
     app.add_middleware(CheckOrigin, guard=service.guard, origins=service.origins)
     app.add_middleware(RequestContext, metrics=service.metrics)
     return app
+
+
+def _token_origin(service: Service) -> str | None:
+    """Where the console gets people's tokens; None: they sign in with keys alone."""
+    endpoints = None if service.tokens is None else service.tokens.issuer.endpoints
+    if service.settings.oidc_client_id is None or endpoints is None:
+        return None
+    parts = urlsplit(endpoints.token)
+    return f"{parts.scheme}://{parts.netloc}"
 
 
 def _asked_for(routes: Iterable[BaseRoute]) -> Iterator[tuple[str, str]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from fastapi import FastAPI
@@ -57,21 +57,26 @@ client.</p>
 """
 
 
-def add_console(app: FastAPI, folder: Path = CONSOLE_FOLDER) -> None:
-    """Serves the console in `folder`, which may be built while the service runs; without it, a page that says how."""
+def add_console(
+    app: FastAPI, folder: Path = CONSOLE_FOLDER, *, token_origin: Callable[[], str | None] = lambda: None
+) -> None:
+    """Serves the console in `folder`, which may be built while the service runs; without it, a page that says how.
+
+    `token_origin`: the one other site that the page may ask, for the tokens of those who sign in there.
+    """
     app.mount(ASSETS_PATH, GZipMiddleware(_Assets(directory=folder / "assets", check_dir=False), minimum_size=1024))
 
     @app.api_route("/", methods=["GET", "HEAD"], include_in_schema=False)
     async def console(request: Request) -> Response:
         try:
-            return await _file(request, folder / _PAGE_NAME, "text/html")
+            return await _file(request, folder / _PAGE_NAME, "text/html", token_origin())
         except FileNotFoundError:
-            return HTMLResponse(_NOT_BUILT, headers=_headers(request))
+            return HTMLResponse(_NOT_BUILT, headers=_headers(request, token_origin()))
 
     async def beside(request: Request) -> Response:
         name = request.url.path[1:]
         try:
-            return await _file(request, folder / name, _BESIDE[name])
+            return await _file(request, folder / name, _BESIDE[name], None)
         except FileNotFoundError:
             raise RouteNotFound(f"there is no route /{name}: the console was not built") from None
 
@@ -79,22 +84,23 @@ def add_console(app: FastAPI, folder: Path = CONSOLE_FOLDER) -> None:
         app.add_api_route(f"/{name}", beside, methods=["GET", "HEAD"], include_in_schema=False)
 
 
-async def _file(request: Request, path: Path, media_type: str) -> Response:
+async def _file(request: Request, path: Path, media_type: str, token_origin: str | None) -> Response:
     """Raises FileNotFoundError."""
 
     async def whole() -> Response:
         return Response(await asyncio.to_thread(path.read_bytes), media_type=media_type)
 
     response = await revalidated(request, FileVersion.of(path).tag, whole)
-    response.headers.update(_headers(request))
+    response.headers.update(_headers(request, token_origin))
     return response
 
 
-def _headers(request: Request) -> Mapping[str, str]:
+def _headers(request: Request, token_origin: str | None) -> Mapping[str, str]:
     """'self' is no WebSocket to some browsers, so that those of this host are named."""
     host = request.headers.get("host", "")
     sockets = f" ws://{host} wss://{host}" if _HOST.fullmatch(host) else ""
-    policy = "; ".join((*_POLICY, f"connect-src 'self'{sockets}"))
+    tokens = "" if token_origin is None else f" {token_origin}"
+    policy = "; ".join((*_POLICY, f"connect-src 'self'{sockets}{tokens}"))
     return {**NOT_FRAMED, **_PAGE_HEADERS, "Content-Security-Policy": policy}
 
 

@@ -76,6 +76,8 @@ class ServiceStatistics:
     process_restarts: int
     memory_bytes: int = described("Of the service and its render processes.")
     loaded_scenes: int
+    version: str = described("Release of the service.")
+    renderer: str | None = described("Name, version and backend of what rendered last; null: nothing was rendered yet.")
     jobs: dict[str, int] = described("By state, counted every 10 s; empty where that is not known.")
 
 

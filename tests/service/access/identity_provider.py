@@ -27,6 +27,7 @@ class IdentityProvider:
     def __init__(self) -> None:
         self.up = True
         self.fetches = 0
+        self.endpoints: dict[str, str] = {}  # of the sign-in, as it publishes them
         self.published: list[dict[str, Any]] = []
         self.keys: dict[str, tuple[str, Any]] = {}
         provider = self
@@ -92,7 +93,7 @@ class IdentityProvider:
             request.send_error(503)
             return
         if request.path.endswith("/.well-known/openid-configuration"):
-            document: Any = {"issuer": self.url, "jwks_uri": f"{self.url}/certs"}
+            document: Any = {"issuer": self.url, "jwks_uri": f"{self.url}/certs", **self.endpoints}
         else:
             self.fetches += 1
             document = {"keys": self.published}

@@ -13,6 +13,8 @@ import pytest
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
+from ultragray_client import Client
+from ultragray_client.errors import InvalidArgument, PermissionDenied
 from ultragray_proto.v1 import geometry_pb2, jobs_pb2, jobs_pb2_grpc, rendering_pb2, rendering_pb2_grpc
 from ultragray_service.access import audit
 from ultragray_service.access.audit import MAX_WAITING, AuditLog, Entry, read_audit
@@ -95,6 +97,43 @@ def test_a_service_writes_who_did_what(
         "scene.list",
     }
     assert "scene.import" in run("audit", "--artifact-folder", tmp_path).stdout
+
+
+def test_admins_read_the_log_at_both_doors(start_service: StartService, tmp_path: Path, database: JobDatabase) -> None:
+    store = KeyStore(database.engine)
+    keys = {role: store.create(role.value, role, None)[1] for role in (Role.READER, Role.ADMIN)}
+    service = start_service(artifact_folder=tmp_path)
+
+    def read(role: Role, **query: object) -> httpx.Response:
+        headers = {"X-API-Key": keys[role]}
+        return httpx.get(f"{service.http}/v1/audit", params=query, headers=headers, timeout=60)
+
+    assert httpx.post(f"{service.http}/v1/scenes/demo:load", headers={"X-API-Key": keys[Role.ADMIN]}).is_success
+
+    def loads() -> list[dict[str, object]]:
+        found: list[dict[str, object]] = read(Role.ADMIN, what="scene.load", who="admin").json()["entries"]
+        return found
+
+    (entry,) = wait_until(loads)
+    assert [entry[part] for part in ("who", "address", "what", "target")] == [
+        "admin",
+        "127.0.0.1",
+        "scene.load",
+        "demo",
+    ]
+    assert (entry["result"], entry["facts"]) == ("OK", {})
+    assert str(entry["at"]).endswith("+00:00")
+    assert read(Role.READER).status_code == 403
+    for query in ({"limit": 0}, {"limit": 10_001}, {"since_hours": 0}):
+        refused = read(Role.ADMIN, **query)
+        assert (refused.status_code, refused.json()["field"]) == (422, next(iter(query)))
+    with Client(service.grpc, api_key=keys[Role.ADMIN], timeout_s=60.0) as client:
+        (told,) = client.audit(what="scene.load", who="admin")
+        assert (told.at, told.what, told.target, told.facts) == (entry["at"], "scene.load", "demo", {})
+        with pytest.raises(InvalidArgument, match="limit must be"):
+            client.audit(limit=10_001)
+    with Client(service.grpc, api_key=keys[Role.READER], timeout_s=60.0) as client, pytest.raises(PermissionDenied):
+        client.audit()
 
 
 def test_entries_wait_for_the_database_and_what_is_lost_is_counted(tmp_path: Path, postgres: PostgresServer) -> None:

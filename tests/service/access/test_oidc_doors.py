@@ -143,3 +143,39 @@ def test_a_rotation_of_keys_leaves_sessions_and_their_revocation_alone(
     finally:
         database.close()
         provider.close()
+
+
+def test_the_page_is_told_where_people_sign_in(start_service: StartService) -> None:
+    provider = IdentityProvider()
+    provider.add_key("one")
+    provider.endpoints = {
+        "authorization_endpoint": f"{provider.url}/auth",
+        "token_endpoint": "https://tokens.hospital.example:8443/token",
+    }
+    try:
+        service = start_service(**provider.settings(), oidc_client_id="console", oidc_scope="openid roles")
+        wait_until(lambda: identity_provider(service) == "available")
+        assert httpx.get(f"{service.http}/v1/sign-in", timeout=60).json() == {
+            "provider": {**provider.endpoints, "client_id": "console", "scope": "openid roles"}
+        }
+        policy = httpx.get(service.http, timeout=60).headers["content-security-policy"]
+        assert policy.endswith(" https://tokens.hospital.example:8443")
+    finally:
+        provider.close()
+
+
+def test_without_a_client_id_people_sign_in_with_keys(guarded: RunningService) -> None:
+    assert httpx.get(f"{guarded.http}/v1/sign-in", timeout=60).json() == {"provider": None}
+    assert "hospital" not in httpx.get(guarded.http, timeout=60).headers["content-security-policy"]
+
+
+def test_an_endpoint_without_encryption_is_not_taken(start_service: StartService) -> None:
+    provider = IdentityProvider()
+    provider.add_key("one")
+    provider.endpoints = {"authorization_endpoint": f"{provider.url}/auth", "token_endpoint": "http://hospital.example"}
+    try:
+        service = start_service(**provider.settings(), oidc_client_id="console", api_keys=KEY)
+        wait_until(lambda: any("token_endpoint must be a URL" in record["message"] for record in service.log()))
+        assert httpx.get(f"{service.http}/v1/sign-in", timeout=60).json() == {"provider": None}
+    finally:
+        provider.close()

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import re
+from datetime import datetime
 
 import httpx
 import pytest
@@ -15,13 +16,17 @@ def test_health(http: httpx.Client) -> None:
     assert http.get("/v1/health/ready").json()["status"] == "ready"
 
 
-def test_list_names_every_file_and_what_is_wrong_with_it(http: httpx.Client) -> None:
+def test_list_names_every_file_and_what_is_wrong_with_it(http: httpx.Client, service: RunningService) -> None:
     page = http.get("/v1/scenes").json()
     assert [entry["name"] for entry in page["scenes"]] == NAMES
     assert page["next_page_token"] == ""
     entries = {entry["name"]: entry for entry in page["scenes"]}
     demo = entries["demo"]
     assert (demo["gaussian_count"], demo["image_height"], demo["image_width"]) == (400, HEIGHT, WIDTH)
+    assert (demo["probe_kind"], demo["metrics"]) == ("linear", {"psnr": 20.5})
+    changed_s = datetime.fromisoformat(demo["changed_at"]).timestamp()
+    assert abs(changed_s - (service.data_folder / "demo.ugr").stat().st_mtime) <= 1
+    assert "probe_kind" not in entries["probeless"]
     assert "error" not in demo
     for name in ("empty", "foreign", "truncated"):
         assert entries[name]["error"]["reason"] == "SCENE_FILE_INVALID"

@@ -11,10 +11,16 @@ export function whoAmI(): Promise<Me> {
   return getJson("/v1/me", {});
 }
 
-/** Who may do an operation in place of `me`, in words; null: `me` may. `owner`: of what it is about. */
-export function barredFor(me: Me, operation: Operation, owner: string | null): string | null {
+/** Those who may do something. */
+export interface Allowed {
+  owner: string | null;
+  roles: readonly Me["role"][];
+}
+
+/** Who may do an operation in place of `me`; null: `me` may. `owner`: of what it is about. */
+export function barredFor(me: Me, operation: Operation, owner: string | null): Allowed | null {
   const { role, owned } = operations[operation];
-  if (roles.indexOf(me.role) < roles.indexOf(role)) return roles.slice(roles.indexOf(role)).map((one) => `${one}s`).join(" and ");
+  if (roles.indexOf(me.role) < roles.indexOf(role)) return { owner: null, roles: roles.slice(roles.indexOf(role)) };
   if (!owned || me.role === "admin" || me.name === owner) return null;
-  return owner === null ? "admins" : `${owner} and admins`;
+  return { owner, roles: ["admin"] };
 }

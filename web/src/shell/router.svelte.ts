@@ -2,6 +2,12 @@
 
 export const VIEWS = ["scan", "maps", "compare", "train", "scenes"] as const;
 export type ViewName = (typeof VIEWS)[number];
+const OF_SCENE: readonly ViewName[] = ["scan", "maps", "compare"];
+
+/** Whether the name in the address of a view is a scene's. */
+export function isOfScene(view: ViewName): boolean {
+  return OF_SCENE.includes(view);
+}
 
 export interface Route {
   view: ViewName;

@@ -1,13 +1,15 @@
-/** Light or dark: as the system has it until the switch says otherwise. */
+/** Light or dark: as the system has it until the person says otherwise. */
 
 const STORAGE = "ultragray.theme";
-export type Theme = "light" | "dark";
+export const THEMES = ["system", "light", "dark"] as const;
+/** What a person chooses. */
+export type ThemeChoice = (typeof THEMES)[number];
 
 const systemDark = matchMedia("(prefers-color-scheme: dark)");
 
 class ThemeState {
-  #chosen = $state<Theme | null>(stored());
-  #system = $state<Theme>(systemDark.matches ? "dark" : "light");
+  chosen = $state<ThemeChoice>(stored());
+  #system = $state<"light" | "dark">(systemDark.matches ? "dark" : "light");
 
   constructor() {
     systemDark.addEventListener("change", (event) => {
@@ -17,13 +19,13 @@ class ThemeState {
     this.#apply();
   }
 
-  get current(): Theme {
-    return this.#chosen ?? this.#system;
+  get current(): "light" | "dark" {
+    return this.chosen === "system" ? this.#system : this.chosen;
   }
 
-  toggle(): void {
-    this.#chosen = this.current === "dark" ? "light" : "dark";
-    localStorage.setItem(STORAGE, this.#chosen);
+  choose(choice: ThemeChoice): void {
+    this.chosen = choice;
+    localStorage.setItem(STORAGE, choice);
     this.#apply();
   }
 
@@ -32,9 +34,8 @@ class ThemeState {
   }
 }
 
-function stored(): Theme | null {
-  const value = localStorage.getItem(STORAGE);
-  return value === "light" || value === "dark" ? value : null;
+function stored(): ThemeChoice {
+  return THEMES.find((one) => one === localStorage.getItem(STORAGE)) ?? "system";
 }
 
 export const theme = new ThemeState();

@@ -1,6 +1,6 @@
 /** The colours of what is shown in space, and the values that they stand for. */
 
-import { labelColour, ramp, type Colour } from "../maps/colours";
+import { labelColour, ramp, type Colour } from "../shared/colours";
 import type { ColourBy } from "./appearance";
 
 /** Of a palette. */

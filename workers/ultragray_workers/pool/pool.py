@@ -85,6 +85,7 @@ class PoolStatistics:
     kills_total: int  # workers that hung, were killed and replaced
     stuck: int  # processes that have told nothing of their work for some seconds
     pids: tuple[int, ...]  # of the processes that are alive
+    renderer: str | None  # of the frame that was rendered last
 
 
 class RenderPool:
@@ -114,6 +115,7 @@ class RenderPool:
             self._waiting,
         )
         self._open: set[Ticket] = set()
+        self._renderer: str | None = None
         self._active = 0  # calls of render() under way
         self._all_answered = asyncio.Event()
         self._started = False
@@ -204,6 +206,7 @@ class RenderPool:
             stuck=sum(slot.stuck for slot in self._dispatcher.slots),
             restarts_total=sum(slot.replacements for slot in self._dispatcher.slots),
             pids=tuple(slot.pid for slot in self._dispatcher.slots if slot.pid is not None),
+            renderer=self._renderer,
         )
 
     async def drain(self, timeout_s: float) -> None:
@@ -248,6 +251,7 @@ class RenderPool:
             self._open.add(ticket)
             self._dispatcher.submit(ticket)
             rendered = await ticket.done
+            self._renderer = rendered.renderer
             place = None
             if request.destination is not None:
                 place = request.destination.put(ticket.reply_memory, rendered.size)

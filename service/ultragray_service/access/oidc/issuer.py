@@ -51,6 +51,14 @@ class SigningKey:
     algorithms: tuple[str, ...]
 
 
+@dataclass(frozen=True)
+class Endpoints:
+    """Where browsers sign people in, and get their tokens."""
+
+    authorization: str
+    token: str
+
+
 class Issuer:
     """An issuer and its keys as they were fetched last."""
 
@@ -71,6 +79,7 @@ class Issuer:
         self._absent: set[str | None] = set()
         self._wanted = asyncio.Event()
         self.keys: Mapping[str | None, SigningKey] = {}  # by their ids; another object when they change
+        self.endpoints: Endpoints | None = None  # None: not known yet, or it signs nobody in
         self.problem: str | None = "its keys were not fetched yet"  # for the log alone: it may name addresses
 
     def key(self, key_id: str | None) -> SigningKey:
@@ -122,6 +131,7 @@ class Issuer:
             discovered = self._get(self.url.rstrip("/") + DISCOVERY_PATH)
             if discovered["issuer"] != self.url:
                 return f"the issuer calls itself {discovered['issuer']!r}"
+            self.endpoints = _endpoints(discovered)
             published = self._get(check_url(discovered["jwks_uri"], "jwks_uri"))["keys"]
             if published != self._published:
                 keys = dict(found for one in published if (found := _usable(one)) is not None)
@@ -148,6 +158,14 @@ class _NoRedirects(urllib.request.HTTPRedirectHandler):
 
     def redirect_request(self, *_: Any) -> None:
         return None
+
+
+def _endpoints(discovered: Any) -> Endpoints | None:
+    """Those that an issuer publishes; None: it has none. Raises InvalidArgument for one that is not encrypted."""
+    names = ("authorization_endpoint", "token_endpoint")
+    if any(name not in discovered for name in names):
+        return None
+    return Endpoints(*(check_url(str(discovered[name]), name) for name in names))
 
 
 def _usable(published: Any) -> tuple[str | None, SigningKey] | None:

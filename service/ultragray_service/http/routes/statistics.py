@@ -8,6 +8,8 @@ from fastapi import APIRouter
 from prometheus_client import CONTENT_TYPE_LATEST
 from starlette.responses import Response
 
+from ultragray import __version__
+
 from ...telemetry.statistics import ServiceStatistics, memory_bytes
 from ..deps import ServiceDep, problems
 
@@ -26,6 +28,8 @@ async def get_statistics(service: ServiceDep) -> ServiceStatistics:
         process_restarts=pool.restarts_total,
         memory_bytes=await asyncio.to_thread(memory_bytes, pool.pids),
         loaded_scenes=len(service.pool.loaded()),
+        version=__version__,
+        renderer=pool.renderer,
         jobs={state.value: count for state, count in service.jobs.overview.counts.items()},
     )
 

@@ -9,6 +9,7 @@ from ultragray_proto.v1 import access_pb2
 
 from ...access.principal import me
 from ...core.state import Service
+from ...views.audited import DEFAULT_ENTRIES, DEFAULT_HOURS, audit_entries
 
 
 class AccessService:
@@ -21,3 +22,15 @@ class AccessService:
         self, request: access_pb2.WhoAmIRequest, context: grpc.aio.ServicerContext
     ) -> access_pb2.WhoAmIResponse:
         return to_message(me(self._service.guard.asks), access_pb2.WhoAmIResponse)
+
+    async def ListAuditEntries(  # noqa: N802
+        self, request: access_pb2.ListAuditEntriesRequest, context: grpc.aio.ServicerContext
+    ) -> access_pb2.ListAuditEntriesResponse:
+        entries = await audit_entries(
+            self._service.jobs.database.engine,
+            since_hours=request.since_hours or DEFAULT_HOURS,
+            who=request.who or None,
+            what=request.what or None,
+            limit=request.limit or DEFAULT_ENTRIES,
+        )
+        return to_message(entries, access_pb2.ListAuditEntriesResponse)

@@ -2,6 +2,8 @@
 
 import type { Words } from "../en/english";
 
+const PLURALS = { reader: "Leser", operator: "Bediener", admin: "Verwalter" };
+
 export const shell: Words["shell"] = {
   views: {
     scan: "Schallen",
@@ -21,13 +23,33 @@ export const shell: Words["shell"] = {
   viewsLabel: "Ansichten",
   scene: "Szene",
   noScene: "keine",
-  lightColours: "Helle Farben",
-  darkColours: "Dunkle Farben",
   language: "Sprache",
-  noScenes: "Noch keine Szenen.",
+  noScenes: "Noch keine Szenen",
+  noScenesMeans: "An eine Szene lässt sich hier ein Schallkopf halten. Sie wird aus einem getrackten Sweep trainiert oder aus einer Datei gelesen.",
   trainOne: "Eine aus einem Sweep trainieren",
-  or: "oder",
-  importOne: "eine Szenendatei einlesen",
+  importOne: "Eine Szenendatei einlesen",
+  toContent: "Zum Inhalt",
+  product: "UltraG-Ray",
+  settings: {
+    title: "Einstellungen",
+    colours: "Farben",
+    themes: { system: "Wie das System", light: "Hell", dark: "Dunkel" },
+    release: "Version",
+    renderer: "Gerendert von",
+    nothingYet: "noch nichts",
+    address: "Dienst",
+    docs: "Dokumentation der API",
+    licences: "Lizenzen",
+  },
+  login: {
+    at: (place) => `Anmelden bei ${place}`,
+    orKey: "oder mit einem Schlüssel",
+    failed: (why) => `Die Anmeldung ist gescheitert: ${why}`,
+    needsHttps: "Browser erlauben das nur Seiten, die über HTTPS kamen. Öffnen Sie die Konsole mit ihrer https://-Adresse, oder nehmen Sie einen Schlüssel.",
+    notAsked: "dieser Tab hat nicht darum gebeten. Bitte noch einmal versuchen.",
+    away: "die Anmeldung antwortet gerade nicht.",
+    noToken: "die Anmeldung gab kein Token aus.",
+  },
   serviceDown: "Der Dienst antwortet nicht. Jede Sekunde wird es wieder versucht.",
   notLoaded: "Dieser Teil der Konsole konnte nicht geladen werden.",
   tryAgain: "Noch einmal",
@@ -44,6 +66,8 @@ export const shell: Words["shell"] = {
     expires: "Läuft ab",
     never: "nie",
     another: "Einen anderen Schlüssel nehmen",
+    administer: "Worker und Protokoll",
+    allowed: (who, owner) => [...(owner === null ? [] : [owner]), ...who.map((role) => PLURALS[role])].join(" und "),
     roles: { reader: "Leser", operator: "Bediener", admin: "Verwalter" },
     may: {
       reader: "Sie dürfen ansehen, rendern und streamen.",

@@ -1,3 +1,99 @@
-/** scenes: what it says in English. */
+/** Scenes and service, in English. */
 
-export const scenes = {};
+import type { StageTimes } from "../../api/statistics";
+import type { Wish, WorkerState } from "../../api/workers";
+
+const stages: Record<keyof StageTimes, string> = { queue: "queue", render: "render", encode: "encode" };
+const states: Record<WorkerState, string> = {
+  idle: "idle", working: "working", pausing: "pausing", paused: "paused", draining: "draining", drained: "drained", lost: "lost",
+}; // prettier-ignore
+const wishes: Record<Wish, { label: string; means: string }> = {
+  pause: { label: "Pause", means: "It takes no more jobs, and ends the one at hand" },
+  drain: { label: "Drain", means: "As pause, but a training at hand goes on elsewhere from its checkpoint" },
+  resume: { label: "Resume", means: "It takes jobs again" },
+};
+
+export const scenes = {
+  title: "Scenes",
+  list: "List of scenes",
+  handle: "import, load and unload scenes",
+  isThere: (name: string): string => `${name} is there.`,
+  openIt: "Open it",
+  outOfDate: "The service does not answer. The list may be out of date.",
+  tryingAgain: "Trying again.",
+  none: "No scenes yet. Import a scene file above, or",
+  trainOne: "train one from a sweep",
+  loaded: "loaded",
+  gaussians: (count: string): string => `${count} Gaussians`,
+  metricsMean: "How like the frames that were held out of the training its renderings are",
+  compare: "Compare",
+  compareOne: (name: string): string => `Compare ${name}`,
+  load: "Load",
+  unload: "Unload",
+  download: "Download",
+  delete: "Delete",
+  deleteOne: (name: string): string => `Delete ${name}?`,
+  deletedBy: (who: string): string => `Only ${who} may delete it`,
+  import: {
+    title: "Import a scene",
+    hint: (suffix: string): string => `Drop or choose a scene file (${suffix})`,
+    name: "Name",
+    send: "Import",
+    discard: "Discard",
+    stop: "Stop",
+  },
+  service: {
+    title: "Service",
+    span: "the last ten minutes",
+    latencyShown: "Latency shown",
+    p50_ms: "Median",
+    p99_ms: "99th percentile",
+    frames: "Frames rendered",
+    waiting: "Waiting frames",
+    busy: "Busy processes",
+    ofAll: (some: number, all: number): string => `${some} of ${all}`,
+    memory: "Memory",
+    scenes: "Scenes loaded",
+    jobs: "Jobs waiting, running",
+    errors: "Errors",
+    restarts: "Restarts",
+    throughput: "Throughput",
+    perSecond: "frames/s",
+    framesKey: "frames",
+    time: "time",
+    latency: (which: string): string => `Latency, ${which.toLowerCase()}`,
+    stages,
+    now: "now",
+    minutes: (minutes: number): string => `${minutes} min`,
+  },
+  workers: {
+    title: "Workers",
+    list: "List of workers",
+    name: "Name",
+    state: "State",
+    devices: "Devices",
+    labels: "Labels",
+    job: "Job",
+    toDo: "What to do",
+    process: (host: string, pid: number, release: string): string => `Host ${host}, process ${pid}, release ${release}`,
+    states,
+    wishes,
+    privateOne: "a private one",
+    none: "No worker does jobs at the moment.",
+    handle: "pause, drain and resume workers",
+    rests: "A worker that is paused or drained rests until it is resumed, restarts included.",
+  },
+  audit: {
+    title: "Audit log",
+    list: "Entries of the audit log, the last first",
+    since: "Last",
+    span: (hours: number): string => (hours === 1 ? "hour" : hours === 24 ? "day" : `${hours / 24} days`),
+    who: "Who",
+    what: "What",
+    example: "scene.delete",
+    time: "Time",
+    target: "On",
+    result: "Result",
+    none: "Nothing of that kind in this time.",
+  },
+};

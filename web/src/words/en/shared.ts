@@ -1,3 +1,29 @@
-/** shared: what it says in English. */
+/** What parts that several views use say, in English. */
 
-export const shared = {};
+/** "from -3 to 5 mm", "at least 1", "a number". */
+function limits(least: number, most: number, unit: string): string {
+  const mm = unit && ` ${unit}`;
+  if (Number.isFinite(least) && Number.isFinite(most)) return `a number from ${least} to ${most}${mm}`;
+  if (Number.isFinite(least)) return `a number of at least ${least}${mm}`;
+  return Number.isFinite(most) ? `a number of at most ${most}${mm}` : "a number";
+}
+
+export const shared = {
+  slider: {
+    value: "value",
+    outside: (least: number, most: number, unit: string): string => `This takes ${limits(least, most, unit)}.`,
+    reset: (value: number, unit: string): string => `Double click: ${value}${unit && ` ${unit}`}`,
+  },
+  field: {
+    ofList: (label: string, place: number, count: number): string => `${label} ${place} of ${count}`,
+  },
+  only: (who: string, what: string): string => `Only ${who} may ${what}.`,
+  keep: "Keep",
+  fetching: "Fetching …",
+  loading: "Loading",
+  you: "you",
+  private: "private",
+  privateTo: (owner: string | null): string => `Only ${owner === null ? "" : `${owner} and `}admins see it`,
+  privateChoice: "Private",
+  privateMeans: "only you and admins see it",
+};

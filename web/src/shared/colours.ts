@@ -3,7 +3,7 @@
 export type Ramp = keyof typeof STOPS;
 export type Colour = readonly [number, number, number];
 
-/** From low to high; each is even in lightness, so that it can be read without colour. */
+/** From low to high; each grows lighter all the way, so that it can be read in grey and by those who see few colours. */
 const STOPS = {
   intensity: [
     [20, 16, 38],
@@ -22,12 +22,12 @@ const STOPS = {
     [250, 245, 170],
   ],
   coverage: [
-    [128, 28, 40],
-    [196, 88, 60],
-    [222, 160, 100],
-    [205, 205, 180],
-    [120, 178, 190],
-    [40, 120, 160],
+    [0, 32, 77],
+    [61, 78, 107],
+    [114, 117, 121],
+    [165, 156, 116],
+    [214, 200, 97],
+    [255, 234, 70],
   ],
   uncertainty: [
     [16, 20, 28],
@@ -71,6 +71,13 @@ export function ramp(name: Ramp, share: number): Colour {
   const [low, high] = [stops[index]!, stops[index + 1]!];
   const mix = (i: 0 | 1 | 2): number => Math.round(low[i] + (high[i] - low[i]) * (at - index));
   return [mix(0), mix(1), mix(2)];
+}
+
+/** The colour of a share of the way to the end of what a map shows. */
+export function shareColour(output: string, share: number): Colour {
+  if (isRamp(output)) return ramp(output, share);
+  const grey = Math.max(0, Math.min(255, Math.round(255 * share)));
+  return [grey, grey, grey];
 }
 
 export function labelColour(label: number): Colour {

@@ -1,0 +1,5 @@
+/** A pixel of the frame. */
+export interface Cursor {
+  column: number;
+  row: number;
+}

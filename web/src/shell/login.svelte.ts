@@ -1,0 +1,190 @@
+/** Signing in at the login of the hospital: OpenID Connect, an authorization code with PKCE (RFC 7636). */
+
+import { whoAmI } from "../api/access";
+import { apiKey, forgetApiKey, ServiceError, setApiKey } from "../api/client";
+import { signInProvider, type SignInProvider } from "../api/sign_in";
+import { words } from "../words/words.svelte";
+
+const ASKED = "ultragray.sign-in"; // in the storage of the tab, while the person is at the login
+const RENEWAL = "ultragray.renewal";
+const RENEWED_BEFORE_S = 30;
+const LEAST_S = 5;
+
+interface Asked {
+  state: string;
+  verifier: string;
+  /** What the person looked at. */
+  hash: string;
+}
+
+interface Renewal {
+  token: string;
+  /** Date.now() at which it is time. */
+  due_ms: number;
+}
+
+/** What the login answers with, as far as it is of use here. */
+interface Tokens {
+  access_token?: string;
+  id_token?: string;
+  refresh_token?: string;
+  expires_in?: number;
+}
+
+class Login {
+  /** null: people sign in with keys alone. */
+  provider = $state.raw<SignInProvider | null>(null);
+  /** Why signing in came to nothing. */
+  problem = $state<string | null>(null);
+  #timer: ReturnType<typeof setTimeout> | undefined;
+
+  /** Where the login is, for people. */
+  get place(): string {
+    return this.provider === null ? "" : new URL(this.provider.authorization_endpoint).host;
+  }
+
+  /** Asks how people sign in, and ends a signing-in that this page comes back from. */
+  async start(): Promise<void> {
+    const query = new URLSearchParams(location.search);
+    const isBack = query.has("state") && (query.has("code") || query.has("error"));
+    const asked = taken<Asked>(ASKED);
+    if (isBack) history.replaceState(null, "", location.pathname + (asked?.hash ?? location.hash));
+    const isRenewed = taken<Renewal>(RENEWAL, { keep: true }) !== null && apiKey() !== null;
+    if (!isBack && !isRenewed) return;
+    try {
+      this.provider = await signInProvider();
+      if (isBack) await this.#finish(query, asked);
+      else this.#renewLater();
+    } catch (error) {
+      this.problem = words.shell.login.failed(reasonOf(error));
+    }
+  }
+
+  /** Asks how people sign in, for the form that asks them to. */
+  async look(): Promise<void> {
+    try {
+      this.provider = await signInProvider();
+    } catch {
+      this.provider = null; // with a key it goes on all the same
+    }
+  }
+
+  /** Leaves for the login. */
+  async leaveFor(provider: SignInProvider): Promise<void> {
+    if (!globalThis.crypto?.subtle) {
+      this.problem = words.shell.login.needsHttps;
+      return;
+    }
+    const asked: Asked = { state: random(), verifier: random(), hash: location.hash };
+    sessionStorage.setItem(ASKED, JSON.stringify(asked));
+    const address = new URL(provider.authorization_endpoint);
+    const given = {
+      response_type: "code",
+      client_id: provider.client_id,
+      redirect_uri: here(),
+      scope: provider.scope,
+      state: asked.state,
+      code_challenge: await challenge(asked.verifier),
+      code_challenge_method: "S256",
+    };
+    for (const [name, value] of Object.entries(given)) address.searchParams.set(name, value);
+    location.assign(address);
+  }
+
+  /** Lets go of what renews the token. */
+  forget(): void {
+    clearTimeout(this.#timer);
+    sessionStorage.removeItem(RENEWAL);
+  }
+
+  async #finish(query: URLSearchParams, asked: Asked | null): Promise<void> {
+    const refusal = query.get("error_description") ?? query.get("error");
+    if (refusal !== null) throw new Error(refusal);
+    if (asked === null || asked.state !== query.get("state")) throw new Error(words.shell.login.notAsked);
+    await this.#take({ grant_type: "authorization_code", code: query.get("code")!, redirect_uri: here(), code_verifier: asked.verifier });
+  }
+
+  async #take(form: Record<string, string>): Promise<void> {
+    const { token_endpoint, client_id } = this.provider ?? (await this.#required());
+    const answer = await fetch(token_endpoint, { method: "POST", body: new URLSearchParams({ ...form, client_id }) });
+    const tokens = (await answer.json()) as Tokens & { error?: string; error_description?: string };
+    if (!answer.ok) throw new Error(tokens.error_description ?? tokens.error ?? String(answer.status));
+    await use(tokens);
+    if (tokens.refresh_token === undefined) return this.forget();
+    const lasts_s = Math.max(LEAST_S, (tokens.expires_in ?? 60) - RENEWED_BEFORE_S);
+    const renewal: Renewal = { token: tokens.refresh_token, due_ms: Date.now() + 1000 * lasts_s };
+    sessionStorage.setItem(RENEWAL, JSON.stringify(renewal));
+    this.#renewLater();
+  }
+
+  async #required(): Promise<SignInProvider> {
+    this.provider = await signInProvider();
+    if (this.provider === null) throw new Error(words.shell.login.away);
+    return this.provider;
+  }
+
+  #renewLater(): void {
+    const renewal = taken<Renewal>(RENEWAL, { keep: true });
+    if (renewal === null) return;
+    clearTimeout(this.#timer);
+    this.#timer = setTimeout(() => void this.#renew(renewal), Math.max(0, renewal.due_ms - Date.now()));
+  }
+
+  /** A token that cannot be renewed ends by itself; the service then asks again. */
+  async #renew({ token }: Renewal): Promise<void> {
+    try {
+      await this.#take({ grant_type: "refresh_token", refresh_token: token });
+    } catch {
+      this.forget();
+    }
+  }
+}
+
+/** Takes the token that the service takes: the one for services, or the one that says who somebody is. */
+async function use({ access_token, id_token }: Tokens): Promise<void> {
+  const before = apiKey();
+  let refusal: unknown = new Error(words.shell.login.noToken);
+  for (const token of [access_token, id_token]) {
+    if (token === undefined) continue;
+    setApiKey(token);
+    try {
+      await whoAmI();
+      return;
+    } catch (error) {
+      refusal = error;
+      if (!(error instanceof ServiceError && error.problem.status === 401)) break;
+    }
+  }
+  if (before === null) forgetApiKey();
+  else setApiKey(before);
+  throw refusal;
+}
+
+/** The address of this page as the login knows it. */
+function here(): string {
+  return location.origin + location.pathname;
+}
+
+function taken<Stored>(name: string, { keep = false } = {}): Stored | null {
+  const text = sessionStorage.getItem(name);
+  if (!keep) sessionStorage.removeItem(name);
+  return text === null ? null : (JSON.parse(text) as Stored);
+}
+
+function random(): string {
+  return base64url(crypto.getRandomValues(new Uint8Array(32)));
+}
+
+async function challenge(verifier: string): Promise<string> {
+  return base64url(new Uint8Array(await crypto.subtle.digest("SHA-256", new TextEncoder().encode(verifier))));
+}
+
+function base64url(bytes: Uint8Array): string {
+  return btoa(String.fromCharCode(...bytes)).replaceAll("+", "-").replaceAll("/", "_").replaceAll("=", "");
+}
+
+function reasonOf(error: unknown): string {
+  return error instanceof Error ? error.message : String(error);
+}
+
+export const login = new Login();
