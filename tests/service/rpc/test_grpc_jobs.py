@@ -103,7 +103,7 @@ def test_a_render_job_is_estimated_and_not_submitted(jobs: jobs_pb2_grpc.JobServ
     asked.render.height = asked.render.width = 16
     found = jobs.EstimateJob(asked)
     assert (found.height, found.width, found.files) == (16, 16, 1)
-    assert found.frames == len(found.poses) > 10
+    assert found.frames == len(found.poses) == 5
     assert found.bytes == found.frames * 16 * 16 * 4
     assert found.seconds > 0.0
     assert len(found.poses[0].matrix.values) == 16
