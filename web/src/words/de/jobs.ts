@@ -2,8 +2,10 @@
 
 import type { Words } from "../en/english";
 
+const kinds: Words["jobs"]["kinds"] = { train: "Training", render: "Datensatz", evaluate: "Auswertung", compare: "Vergleich" };
+
 export const jobs: Words["jobs"] = {
-  kinds: { train: "Training", render: "Datensatz", evaluate: "Auswertung", compare: "Vergleich" },
+  kinds,
   states: {
     queued: "wartet",
     running: "läuft",
@@ -47,7 +49,7 @@ export const jobs: Words["jobs"] = {
   asking: "Der Auftrag wird abgefragt …",
   waits: "Er wartet, bis er an der Reihe ist.",
   waitsFor: (what) => `Er wartet auf: ${what}.`,
-  label: (kind, subject) => `Auftrag ${kind}: ${subject}`,
+  label: (kind, subject) => `Auftrag ${kinds[kind]}: ${subject}`,
   tryingAgain: (problem) => `${problem} Wird wieder versucht.`,
   method: (name, number, of) => `${name}, Verfahren ${number} von ${of}`,
   step: (done, all) => `Schritt ${done} von ${all}`,

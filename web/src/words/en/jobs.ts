@@ -56,7 +56,7 @@ export const jobs = {
   asking: "Asking for the job …",
   waits: "It waits for its turn.",
   waitsFor: (what: string): string => `It waits for ${what}.`,
-  label: (kind: string, subject: string): string => `Job ${kind} of ${subject}`,
+  label: (kind: JobKind, subject: string): string => `Job ${kind} of ${subject}`,
   tryingAgain: (problem: string): string => `${problem} Trying again.`,
   method: (name: string, number: number, of: number): string => `${name}, method ${number} of ${of}`,
   step: (done: string, all: string): string => `Step ${done} of ${all}`,
