@@ -93,7 +93,8 @@ describe("a data set", () => {
     await estimate.getByText("400,000").waitFor();
     await estimate.getByText("in 80 files").waitFor();
     await page.getByRole("combobox", { name: "Poses" }).selectOption("fan");
-    await estimate.getByText("25", { exact: true }).waitFor();
+    const { poses } = await (await fetch(`${at.service.url}/v1/scenes/demo/training-poses`)).json();
+    await estimate.getByText((5 * poses.length).toLocaleString("en"), { exact: true }).waitFor(); // tilts of -10, -5, 0, 5, 10°
     const room = page.getByTestId("space").locator("canvas");
     await until(() => room.evaluate((canvas) => canvas.width), (width) => width > 200, "no planes in space");
     await page.getByRole("checkbox", { name: "Echo" }).check();

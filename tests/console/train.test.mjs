@@ -24,7 +24,7 @@ async function start(page, scene, { confidence = "yes", ...settings }) {
   const table = page.getByTestId("settings");
   await table.getByLabel("Search the settings").fill("confidence");
   await table.getByLabel("Confidence", { exact: true }).selectOption({ label: confidence });
-  const form = page.getByRole("region", { name: "Training" });
+  const form = page.getByRole("region", { name: "Training", exact: true });
   await form.getByLabel("Scene", { exact: true }).fill(scene);
   for (const [label, value] of Object.entries(settings)) await form.getByLabel(label).fill(value);
   await page.getByRole("button", { name: "Start the training" }).click();
@@ -92,7 +92,7 @@ describe("train", () => {
     await page.getByRole("region", { name: "Jobs" }).getByRole("link", { name: /made/ }).click();
     await page.getByRole("link", { name: "Repeat with changes" }).click();
     const table = page.getByTestId("settings");
-    const form = page.getByRole("region", { name: "Training" });
+    const form = page.getByRole("region", { name: "Training", exact: true });
     await form.getByText("With the settings of made").waitFor();
     assert.equal(await form.getByLabel("Steps").inputValue(), "60");
     const row = (name) => table.getByRole("row", { name });
