@@ -12,7 +12,7 @@ const at = tested();
 /** Parts of the page that are wider than what shows them. */
 function tooWide(page) {
   return page.evaluate(() => [...document.querySelectorAll("*")]
-    .filter((one) => getComputedStyle(one).overflowX === "hidden" || one === document.documentElement)
+    .filter((one) => ["auto", "scroll", "hidden"].includes(getComputedStyle(one).overflowX) || one === document.documentElement)
     .filter((one) => one.clientWidth > 1 && one.scrollWidth > one.clientWidth + 1 && getComputedStyle(one).textOverflow !== "ellipsis")
     .map((one) => one.className || one.localName));
 }

@@ -24,7 +24,8 @@ export function rangeOf(values: readonly number[], { fromZero = false, margin = 
 export function ticks({ low, high }: Range, most: number, whole = false): number[] {
   const rough = (high - low) / Math.max(1, most);
   const power = 10 ** Math.floor(Math.log10(rough));
-  const round = [1, 2, 5, 10].map((factor) => factor * power).find((one) => one >= rough * (1 - 1e-9)) ?? 10 * power;
+  const factors = whole ? [1, 2, 5, 10] : [1, 2, 2.5, 5, 10];
+  const round = factors.map((factor) => factor * power).find((one) => one >= rough * (1 - 1e-9)) ?? 10 * power;
   const step = whole ? Math.max(1, Math.round(round)) : round;
   const first = Math.ceil(low / step - 1e-9);
   const last = Math.floor(high / step + 1e-9);
