@@ -54,6 +54,8 @@ const texts = {
   "contract.ts": `import type { Described } from "../described";
 
 export const jobs: Record<string, Described> = ${JSON.stringify(jobKinds(schemas.JobBody.properties), null, 1)};
+export const trainingSettings: Described = ${JSON.stringify(described(schemas.TrainingConfig), null, 1)};
+export const trainingPresets: Record<string, Record<string, unknown>> = ${JSON.stringify(schemas.TrainingConfig["x-presets"], null, 1)};
 export const uploadOptions: Record<string, Described> = ${JSON.stringify(queryOf(document.paths["/v1/datasets/{dataset}"].put), null, 1)};
 export const settings: Described = ${JSON.stringify(described(schemas.RenderSettings), null, 1)};
 export const scene: Described = ${JSON.stringify(described(schemas.Scene), null, 1)};

@@ -25,6 +25,7 @@ __all__ = [
     "EvaluateJob",
     "FanSampler",
     "FrameSettings",
+    "ImageRegion",
     "LinearProbe",
     "PhasedProbe",
     "Probe",
@@ -212,6 +213,32 @@ class DatasetOptions:
 
 
 @dataclass(frozen=True)
+class ImageRegion:
+    """Where the frames of a sequence lie in its images, brought to columns lateral and rows in depth."""
+
+    image_width: int
+    """Of the stored image, pixels."""
+    image_height: int
+    """Of the stored image, pixels."""
+    left: int
+    """Column of the stored image at which the frames begin."""
+    top: int
+    """Row at which they begin."""
+    width: int
+    """Of the frames in the stored image, pixels, before they are resized."""
+    height: int
+    """Likewise."""
+    lateral_mm: float
+    """Distance of two columns of the stored image."""
+    axial_mm: float
+    """Distance of two rows of the stored image."""
+    image_to_probe: tuple[float, ...] = ()
+    """The calibration, from pixels (column, row, 0) of the stored image to the probe's mm: 16 numbers row by row;
+    empty where the file has none of that name.
+    """
+
+
+@dataclass(frozen=True)
 class Dataset:
     """An accepted dataset."""
 
@@ -241,6 +268,8 @@ class Dataset:
     """What looks wrong, for a person to decide."""
     options: dict[str, str]
     """How it was read: the query parameters of its upload."""
+    region: ImageRegion | None = None
+    """Of a sequence: where its frames lie in the stored images, and its calibration; null where that is not known."""
     owner: str | None = None
     """Who uploaded it; null: from before there were owners."""
     private: bool = False

@@ -45,11 +45,12 @@ class JobProgress:
     frames_done: int | None
     frames: int | None
     rate_per_s: float | None  # steps or frames
-    seconds_left: float | None
+    seconds_left: float | None  # until the end of the job, about
     waits_for: str | None  # of a job that waits: what else it needs than its turn, such as a worker that fits it
     method: str | None  # of a comparison: the method at hand
     method_number: int | None  # its number among the methods, from 1
     methods: int | None
+    phase: str | None  # of a training that runs: baselines, effort, training, evaluation, confidence or report
 
 
 @dataclass(frozen=True)

@@ -39,7 +39,7 @@ describe("a key", () => {
     await page.getByLabel("Add a sweep").setInputFiles(at.files.sweep);
     await page.getByRole("button", { name: "Upload and check" }).click();
     await page.getByText("28 to train from, 5 held out").waitFor();
-    await page.getByRole("img", { name: "Contact sheet of sweep" }).waitFor();
+    await page.getByRole("img", { name: "Frame 0 of sweep" }).waitFor();
     await page.getByRole("link", { name: "Scenes and service" }).click();
     const [download] = await Promise.all([
       page.waitForEvent("download"),

@@ -98,7 +98,6 @@ describe("an operator", () => {
     const choice = page.getByRole("region", { name: "Training" }).getByRole("checkbox", { name: /^Private/ });
     assert.equal(await choice.isChecked(), true, "a training of a private sweep is proposed as a public one");
     await page.getByLabel("Scene", { exact: true }).last().fill("secret");
-    await page.locator("summary", { hasText: /^Settings$/ }).click();
     await page.getByLabel("Steps").fill("1000000");
     await page.getByRole("button", { name: "Start the training" }).click();
     const job = page.getByRole("region", { name: "Job train of secret" });
@@ -130,7 +129,7 @@ describe("an operator", () => {
   });
 
   it("starts another job of the list as a private one", async () => {
-    const page = await pageOf(at, "alice", "#/train");
+    const page = await pageOf(at, "alice", "#/train?show=jobs");
     await page.locator("summary", { hasText: /^Other jobs$/ }).click();
     const form = page.locator("details", { hasText: "Other jobs" });
     await form.getByRole("checkbox", { name: /^Private/ }).check();

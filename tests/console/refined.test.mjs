@@ -53,9 +53,7 @@ describe("the slice", () => {
   });
 
   it("of a job can be left to the scene again after one was given", async () => {
-    const page = await openPage(at, "#/train");
-    await page.locator("summary", { hasText: "Other jobs" }).click();
-    await page.getByRole("combobox", { name: "Kind" }).selectOption("render");
+    const page = await openPage(at, "#/train?show=render");
     const number = page.getByLabel("Slice thickness, mm");
     for (const typed of ["2.5", ""]) {
       await number.fill(typed);

@@ -6,6 +6,8 @@ import { describe, it } from "node:test";
 import { canvasState, openPage, picture, seriousFindings, until } from "./harness.mjs";
 import { tested } from "./tested.mjs";
 
+const HELD_OUT = "Held-out PSNR in dB over step: validation, linear between frames, median compounding";
+
 const at = tested({
   environment: { ULTRAGRAY_EMBEDDED_WORKER: "true", ULTRAGRAY_TRAINING_THREADS: "1" },
   sweep: true,
@@ -17,10 +19,14 @@ async function upload(page, file, name) {
   await page.getByRole("button", { name: "Upload and check" }).click();
 }
 
-async function start(page, scene, settings) {
-  await page.getByLabel("Scene", { exact: true }).last().fill(scene);
-  await page.locator("summary", { hasText: /^Settings$/ }).click();
-  for (const [label, value] of Object.entries(settings)) await page.getByLabel(label).fill(value);
+async function start(page, scene, { confidence = "yes", ...settings }) {
+  await page.getByRole("link", { name: /^All settings/ }).click();
+  const table = page.getByTestId("settings");
+  await table.getByLabel("Search the settings").fill("confidence");
+  await table.getByLabel("Confidence", { exact: true }).selectOption({ label: confidence });
+  const form = page.getByRole("region", { name: "Training", exact: true });
+  await form.getByLabel("Scene", { exact: true }).fill(scene);
+  for (const [label, value] of Object.entries(settings)) await form.getByLabel(label).fill(value);
   await page.getByRole("button", { name: "Start the training" }).click();
 }
 
@@ -33,7 +39,6 @@ describe("train", () => {
     const page = await openPage(at, "#/train");
     await upload(page, at.files.sweep, "sweep");
     await page.getByText("28 to train from, 5 held out").waitFor();
-    await page.getByRole("img", { name: "Contact sheet of sweep" }).waitFor();
     const frame = page.getByRole("img", { name: "Frame 0 of sweep" });
     await frame.waitFor();
     const room = page.getByTestId("space").locator("canvas");
@@ -41,17 +46,32 @@ describe("train", () => {
     await page.getByRole("button", { name: "Held out" }).click();
     await page.getByLabel("Frame", { exact: true }).fill("4");
     await page.getByRole("img", { name: "Frame 4 of sweep" }).waitFor();
+    await page.getByRole("region", { name: "Contact sheet" }).getByRole("button", { name: "Frame 2" }).click();
+    await page.getByRole("img", { name: "Frame 2 of sweep" }).waitFor();
     assert.deepEqual(await seriousFindings(page), []);
     await picture(page, "train-sweep");
 
-    await start(page, "made", { Steps: "60", "Most Gaussians": "800", Others: "confidence = false" });
-    await until(() => state(page), (text) => text !== "queued", "nobody began");
+    await start(page, "made", { confidence: "no", Steps: "60", "Most Gaussians": "800" });
+    await until(() => state(page), (text) => text !== "waits", "nobody began");
+    await page.getByRole("list", { name: "What the training is at" }).getByText("Report and files").waitFor();
+    const now = page.locator("[aria-current=step]");
+    const told = await until(async () => {
+      const [phase, left] = await Promise.all([now, page.getByTestId("time-left")].map((one) => one.textContent({ timeout: 500 }).catch(() => "")));
+      return phase.includes("Report") ? left : null;
+    }, (left) => left !== null, "the finishing has no phase of its own");
+    assert.match(told, /left|almost done/, "its steps are done, and nobody says how long the rest takes");
     await until(() => state(page), (text) => text === "succeeded", "it did not succeed");
     await page.getByText("Step 60 of 60", { exact: true }).waitFor();
-    for (const [name, least] of [["Loss over step: training", 60], ["Held-out PSNR in dB over step: validation", 2]]) {
+    for (const [name, least] of [["Loss over step: training", 60], [HELD_OUT, 2]]) {
       const line = page.getByRole("img", { name }).locator("path.line");
       await until(() => line.getAttribute("d"), (d) => (d.match(/[ML]/g) ?? []).length >= least, `no curve: ${name}`);
     }
+    assert.equal(await page.getByRole("img", { name: HELD_OUT }).locator("path.level").count(), 2);
+    const learned = page.getByRole("region", { name: "How it learned" });
+    await learned.getByRole("img", { name: "The held-out frame" }).waitFor();
+    await learned.getByRole("slider", { name: "Validation" }).press("Home");
+    await learned.getByRole("img", { name: "Its rendering after step 3" }).waitFor();
+    await learned.getByText(/after step 3, \d+\.\d\d dB/).waitFor();
     await page.getByRole("img", { name: /^Held-out frame/ }).first().waitFor();
     const [download] = await Promise.all([
       page.waitForEvent("download"),
@@ -63,7 +83,39 @@ describe("train", () => {
 
     await page.getByRole("link", { name: "Open the scene" }).click();
     await until(() => canvasState(page, '[aria-label="Live image"]'), ({ mean }) => mean > 2, "the scene gives no frame");
-    assert.ok(page.url().endsWith("#/scan/made"));
+    assert.match(page.url(), /#\/scan\/made(\?|$)/);
+    assert.deepEqual([page.faults, page.foreign], [[], []]);
+  });
+
+  it("repeats a training with changes, which are marked, and lays the earlier curve over the new one", async () => {
+    const page = await openPage(at, "#/train?show=jobs");
+    await page.getByRole("region", { name: "Jobs" }).getByRole("link", { name: /made/ }).click();
+    await page.getByRole("link", { name: "Repeat with changes" }).click();
+    const table = page.getByTestId("settings");
+    const form = page.getByRole("region", { name: "Training", exact: true });
+    await form.getByText("With the settings of made").waitFor();
+    assert.equal(await form.getByLabel("Steps").inputValue(), "60");
+    const row = (name) => table.getByRole("row", { name });
+    await row(/max_gaussians/).getByText("changed").waitFor();
+    await table.getByLabel("Search the settings").fill("learning rate scales");
+    await table.getByLabel("Scales rate", { exact: true }).fill("2");
+    await table.getByLabel("Scales rate", { exact: true }).press("Tab");
+    await table.getByText("This must be at most 1.").waitFor();
+    await table.getByLabel("Scales rate", { exact: true }).fill("0.02");
+    await table.getByLabel("Scales rate", { exact: true }).press("Tab");
+    await row(/scales_rate/).getByText("was 0.01").waitFor();
+    await table.getByLabel("Search the settings").fill("");
+    assert.deepEqual(await seriousFindings(page), []);
+    await picture(page, "train-settings");
+    await form.getByLabel("Scene", { exact: true }).fill("again");
+    await page.getByRole("button", { name: "Start the training" }).click();
+    await until(() => state(page), (text) => text === "succeeded", "it did not succeed");
+    await page.getByText("Earlier runs of this sweep").click();
+    await page.getByRole("checkbox", { name: /^made/ }).check();
+    await page.getByRole("img", { name: "Loss over step: training, made" }).waitFor();
+    await picture(page, "train-earlier");
+    const jobs = (await (await fetch(`${at.service.url}/v1/jobs?kind=train`)).json()).jobs;
+    assert.deepEqual(jobs[0].specification.settings, { steps: 60, max_gaussians: 800, confidence: false, scales_rate: 0.02 });
     assert.deepEqual([page.faults, page.foreign], [[], []]);
   });
 

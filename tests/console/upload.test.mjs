@@ -29,13 +29,13 @@ async function asksBeforeClosing(page) {
 describe("an upload", () => {
   it("goes on while other views are looked at, and leaving the page asks first", async () => {
     const page = await openPage(at, "#/train");
-    await page.locator("summary", { hasText: /^Settings$/ }).click();
+    const section = (name) => page.getByRole("navigation", { name: "Sections" }).getByRole("link", { name });
     const scene = page.getByRole("textbox", { name: "Scene" });
     assert.equal(await scene.inputValue(), "sweep");
     await page.getByRole("button", { name: "Start the training" }).click();
     await page.getByText("It waits for its turn.").waitFor();
+    await section("Sweep and training").click();
     await until(() => scene.inputValue(), (name) => name === "sweep-2", "a name that a training has is proposed");
-    await page.getByRole("link", { name: "Look at sweep" }).click();
     await page.getByTestId("dataset").waitFor();
     await page.getByLabel("Steps").fill("77");
 
@@ -45,9 +45,11 @@ describe("an upload", () => {
     await page.getByRole("button", { name: "Upload and check" }).click();
     const progress = page.getByLabel("Upload", { exact: true });
     await progress.waitFor();
+    await section(/^Jobs/).click();
     await page.getByRole("region", { name: "Jobs" }).getByRole("link").click();
     await page.getByText("It waits for its turn.").waitFor();
-    assert.equal(await progress.count(), 1);
+    await section("Sweep and training").click();
+    await progress.waitFor();
     assert.equal(await page.getByLabel("Steps").inputValue(), "77");
     await page.getByRole("link", { name: "Scan", exact: true }).click();
     await page.getByLabel("Live image").waitFor();
@@ -100,7 +102,7 @@ describe("a dataset", () => {
 
 describe("a job of any kind", () => {
   it("is specified by what the service says of the kind, and followed", async () => {
-    const page = await openPage(at, "#/train");
+    const page = await openPage(at, "#/train?show=jobs");
     await page.getByText("Other jobs").click();
     await page.getByRole("combobox", { name: "Kind" }).selectOption("evaluate");
     await page.getByRole("combobox", { name: "Dataset" }).selectOption("sweep");
@@ -123,13 +125,13 @@ describe("a long training", () => {
     const job = (step, state) => ({
       id: "long", kind: "train", state, specification: { dataset: "sweep", scene: "long" },
       created_at: "2026-01-01T00:00:00Z", started_at: null, finished_at: null, reason: null, error: null, retry_of: null,
-      progress: { step, steps, loss: 1 / step, val_psnr_db: null, gaussians: 1, rate_per_s: 1, seconds_left: 119.7 },
+      progress: { phase: "training", step, steps, loss: 1 / step, val_psnr_db: null, gaussians: 1, rate_per_s: 1, seconds_left: 119.7 },
       artifacts: [], metrics: {},
     });
     const told = Array.from({ length: steps }, (_, i) => `event: progress\ndata: ${JSON.stringify(job(i + 1, "running"))}\n\n`);
     let asked = 0;
     await page.route(/\/jobs\/long\/events$/, (route) => route.fulfill({ contentType: "text/event-stream", body: told.join("") }));
-    await page.route(/\/jobs\/long\/curve$/, (route) => (++asked === 1 ? route.fulfill({ json: { points: [] } }) : route.abort()));
+    await page.route(/\/jobs\/long\/curve$/, (route) => (++asked === 1 ? route.fulfill({ json: { points: [], baselines: {} } }) : route.abort()));
     const broken = page.waitForEvent("requestfailed");
     await page.evaluate(() => (location.hash = "#/train/long"));
     await broken;

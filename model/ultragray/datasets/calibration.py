@@ -13,6 +13,7 @@ import numpy as np
 from ..errors import DatasetInvalid
 from ..probe import FloatArray, LinearProbe
 from .images import CropBox
+from .region import ImageRegion
 from .sweep import IntArray
 
 SCALE_TOLERANCE = 1e-3  # relative; trackers write six digits
@@ -51,3 +52,24 @@ def poses_from_image_transforms(
     poses[:, :3, 3] = (transforms @ top_centre)[:, :3]
     width_mm, depth_mm = (round(float(size), 9) for size in usual * (crop.width, crop.height))
     return poses, LinearProbe(width_mm=width_mm, near_mm=0.0, far_mm=depth_mm)
+
+
+def region_of(
+    size: tuple[int, ...],
+    box: CropBox,
+    transforms: FloatArray,  # [F, 4, 4] pixels → mm
+    calibration: FloatArray | None,  # [4, 4]
+) -> ImageRegion:
+    """The region of a crop in images of (rows, columns)."""
+    lateral_mm, axial_mm = np.median(np.linalg.norm(transforms[:, :3, :2], axis=1), axis=0).tolist()
+    return ImageRegion(
+        image_width=size[1],
+        image_height=size[0],
+        left=box.left,
+        top=box.top,
+        width=box.width,
+        height=box.height,
+        lateral_mm=lateral_mm,
+        axial_mm=axial_mm,
+        image_to_probe=() if calibration is None else tuple(calibration.ravel().tolist()),
+    )

@@ -18,6 +18,7 @@ from ..contract import to_dict
 from ..errors import DatasetInvalid, InvalidPose
 from ..pose import check_poses
 from ..probe import FloatArray, Probe
+from .region import ImageRegion
 
 ByteArray: TypeAlias = npt.NDArray[np.uint8]
 IntArray: TypeAlias = npt.NDArray[np.int64]
@@ -55,6 +56,7 @@ class Sweep:
     frame_numbers: IntArray  # [F] of each frame in its source
     source: str
     notes: tuple[str, ...] = ()  # what reading it left out or assumed, for a person
+    region: ImageRegion | None = None  # of the stored images; None: the images are stored as they are
 
     def __repr__(self) -> str:
         frames = f"{len(self.images):,} frames of {self.images.shape[1]}x{self.images.shape[2]}"

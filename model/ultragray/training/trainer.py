@@ -41,6 +41,7 @@ from .data.sampling import BatchSampler, out_of_plane_shift_mm, shift_out_of_pla
 from .data.shadows import Shadows
 from .device import forget_peak_memory, peak_memory_mb, training_device
 from .memory import check_comparison_memory, check_memory
+from .pictures import write_picture
 from .poses.refinement import PoseRefinement
 from .progress import Journal, Progress, StepTimer
 from .steps.beam import TrainedBeam
@@ -348,6 +349,10 @@ class Trainer:
         truth = torch.tensor(val.images, device=self._device).float().div_(255.0)
         with torch.no_grad():
             rendered = self._rendered(val.poses, self._schedule.sh_degree(self.step))["bmode"]
+            if self.folder is not None:
+                middle = len(val) // 2
+                picture = rendered[middle].clamp(0.0, 1.0).cpu().numpy()
+                write_picture(self.folder, self.step, val.select([middle]), picture)
             errors = (rendered - truth).square().mean(dim=(1, 2)).clamp(min=1e-10)
             return float((-10.0 * errors.log10()).mean())
 

@@ -52,7 +52,7 @@ class UploadDatasetResponse(_message.Message):
     def __init__(self, dataset: _Optional[_Union[Dataset, _Mapping]] = ..., created: _Optional[bool] = ...) -> None: ...
 
 class Dataset(_message.Message):
-    __slots__ = ("name", "kind", "sha256", "bytes", "created_at", "train_frames", "val_frames", "height", "width", "probe", "warnings", "options", "owner", "private")
+    __slots__ = ("name", "kind", "sha256", "bytes", "created_at", "train_frames", "val_frames", "height", "width", "probe", "warnings", "options", "owner", "private", "region")
     NAME_FIELD_NUMBER: _ClassVar[int]
     KIND_FIELD_NUMBER: _ClassVar[int]
     SHA256_FIELD_NUMBER: _ClassVar[int]
@@ -67,6 +67,7 @@ class Dataset(_message.Message):
     OPTIONS_FIELD_NUMBER: _ClassVar[int]
     OWNER_FIELD_NUMBER: _ClassVar[int]
     PRIVATE_FIELD_NUMBER: _ClassVar[int]
+    REGION_FIELD_NUMBER: _ClassVar[int]
     name: str
     kind: str
     sha256: str
@@ -81,7 +82,30 @@ class Dataset(_message.Message):
     options: DatasetOptions
     owner: str
     private: bool
-    def __init__(self, name: _Optional[str] = ..., kind: _Optional[str] = ..., sha256: _Optional[str] = ..., bytes: _Optional[int] = ..., created_at: _Optional[str] = ..., train_frames: _Optional[int] = ..., val_frames: _Optional[int] = ..., height: _Optional[int] = ..., width: _Optional[int] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., warnings: _Optional[_Iterable[str]] = ..., options: _Optional[_Union[DatasetOptions, _Mapping]] = ..., owner: _Optional[str] = ..., private: _Optional[bool] = ...) -> None: ...
+    region: ImageRegion
+    def __init__(self, name: _Optional[str] = ..., kind: _Optional[str] = ..., sha256: _Optional[str] = ..., bytes: _Optional[int] = ..., created_at: _Optional[str] = ..., train_frames: _Optional[int] = ..., val_frames: _Optional[int] = ..., height: _Optional[int] = ..., width: _Optional[int] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., warnings: _Optional[_Iterable[str]] = ..., options: _Optional[_Union[DatasetOptions, _Mapping]] = ..., owner: _Optional[str] = ..., private: _Optional[bool] = ..., region: _Optional[_Union[ImageRegion, _Mapping]] = ...) -> None: ...
+
+class ImageRegion(_message.Message):
+    __slots__ = ("image_width", "image_height", "left", "top", "width", "height", "lateral_mm", "axial_mm", "image_to_probe")
+    IMAGE_WIDTH_FIELD_NUMBER: _ClassVar[int]
+    IMAGE_HEIGHT_FIELD_NUMBER: _ClassVar[int]
+    LEFT_FIELD_NUMBER: _ClassVar[int]
+    TOP_FIELD_NUMBER: _ClassVar[int]
+    WIDTH_FIELD_NUMBER: _ClassVar[int]
+    HEIGHT_FIELD_NUMBER: _ClassVar[int]
+    LATERAL_MM_FIELD_NUMBER: _ClassVar[int]
+    AXIAL_MM_FIELD_NUMBER: _ClassVar[int]
+    IMAGE_TO_PROBE_FIELD_NUMBER: _ClassVar[int]
+    image_width: int
+    image_height: int
+    left: int
+    top: int
+    width: int
+    height: int
+    lateral_mm: float
+    axial_mm: float
+    image_to_probe: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, image_width: _Optional[int] = ..., image_height: _Optional[int] = ..., left: _Optional[int] = ..., top: _Optional[int] = ..., width: _Optional[int] = ..., height: _Optional[int] = ..., lateral_mm: _Optional[float] = ..., axial_mm: _Optional[float] = ..., image_to_probe: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class ListDatasetsRequest(_message.Message):
     __slots__ = ("page_size", "page_token")

@@ -215,6 +215,24 @@ class SubmitJobResponse(_message.Message):
     created: bool
     def __init__(self, job: _Optional[_Union[Job, _Mapping]] = ..., created: _Optional[bool] = ...) -> None: ...
 
+class JobEstimate(_message.Message):
+    __slots__ = ("frames", "files", "height", "width", "bytes", "seconds", "poses")
+    FRAMES_FIELD_NUMBER: _ClassVar[int]
+    FILES_FIELD_NUMBER: _ClassVar[int]
+    HEIGHT_FIELD_NUMBER: _ClassVar[int]
+    WIDTH_FIELD_NUMBER: _ClassVar[int]
+    BYTES_FIELD_NUMBER: _ClassVar[int]
+    SECONDS_FIELD_NUMBER: _ClassVar[int]
+    POSES_FIELD_NUMBER: _ClassVar[int]
+    frames: int
+    files: int
+    height: int
+    width: int
+    bytes: int
+    seconds: float
+    poses: _containers.RepeatedCompositeFieldContainer[_geometry_pb2.Pose]
+    def __init__(self, frames: _Optional[int] = ..., files: _Optional[int] = ..., height: _Optional[int] = ..., width: _Optional[int] = ..., bytes: _Optional[int] = ..., seconds: _Optional[float] = ..., poses: _Optional[_Iterable[_Union[_geometry_pb2.Pose, _Mapping]]] = ...) -> None: ...
+
 class ListJobsRequest(_message.Message):
     __slots__ = ("state", "kind", "page_size", "page_token")
     STATE_FIELD_NUMBER: _ClassVar[int]
@@ -365,7 +383,7 @@ class Job(_message.Message):
     def __init__(self, id: _Optional[str] = ..., kind: _Optional[_Union[JobKind, str]] = ..., state: _Optional[_Union[JobState, str]] = ..., request_id: _Optional[str] = ..., train: _Optional[_Union[TrainJob, _Mapping]] = ..., render: _Optional[_Union[RenderJob, _Mapping]] = ..., evaluate: _Optional[_Union[EvaluateJob, _Mapping]] = ..., compare: _Optional[_Union[CompareJob, _Mapping]] = ..., priority: _Optional[int] = ..., created_at: _Optional[str] = ..., started_at: _Optional[str] = ..., finished_at: _Optional[str] = ..., error: _Optional[_Union[_scenes_pb2.Error, _Mapping]] = ..., progress: _Optional[_Union[JobProgress, _Mapping]] = ..., artifacts: _Optional[_Iterable[str]] = ..., metrics: _Optional[_Mapping[str, float]] = ..., worker: _Optional[str] = ..., retry_of: _Optional[str] = ..., attempts: _Optional[int] = ..., owner: _Optional[str] = ..., private: _Optional[bool] = ...) -> None: ...
 
 class JobProgress(_message.Message):
-    __slots__ = ("step", "steps", "loss", "val_psnr_db", "gaussians", "frames_done", "frames", "rate_per_s", "seconds_left", "waits_for", "method", "method_number", "methods")
+    __slots__ = ("step", "steps", "loss", "val_psnr_db", "gaussians", "frames_done", "frames", "rate_per_s", "seconds_left", "waits_for", "method", "method_number", "methods", "phase")
     STEP_FIELD_NUMBER: _ClassVar[int]
     STEPS_FIELD_NUMBER: _ClassVar[int]
     LOSS_FIELD_NUMBER: _ClassVar[int]
@@ -379,6 +397,7 @@ class JobProgress(_message.Message):
     METHOD_FIELD_NUMBER: _ClassVar[int]
     METHOD_NUMBER_FIELD_NUMBER: _ClassVar[int]
     METHODS_FIELD_NUMBER: _ClassVar[int]
+    PHASE_FIELD_NUMBER: _ClassVar[int]
     step: int
     steps: int
     loss: float
@@ -392,4 +411,5 @@ class JobProgress(_message.Message):
     method: str
     method_number: int
     methods: int
-    def __init__(self, step: _Optional[int] = ..., steps: _Optional[int] = ..., loss: _Optional[float] = ..., val_psnr_db: _Optional[float] = ..., gaussians: _Optional[int] = ..., frames_done: _Optional[int] = ..., frames: _Optional[int] = ..., rate_per_s: _Optional[float] = ..., seconds_left: _Optional[float] = ..., waits_for: _Optional[str] = ..., method: _Optional[str] = ..., method_number: _Optional[int] = ..., methods: _Optional[int] = ...) -> None: ...
+    phase: str
+    def __init__(self, step: _Optional[int] = ..., steps: _Optional[int] = ..., loss: _Optional[float] = ..., val_psnr_db: _Optional[float] = ..., gaussians: _Optional[int] = ..., frames_done: _Optional[int] = ..., frames: _Optional[int] = ..., rate_per_s: _Optional[float] = ..., seconds_left: _Optional[float] = ..., waits_for: _Optional[str] = ..., method: _Optional[str] = ..., method_number: _Optional[int] = ..., methods: _Optional[int] = ..., phase: _Optional[str] = ...) -> None: ...

@@ -39,6 +39,11 @@ class JobServiceStub:
                 request_serializer=ultragray_dot_v1_dot_jobs__pb2.SubmitJobRequest.SerializeToString,
                 response_deserializer=ultragray_dot_v1_dot_jobs__pb2.SubmitJobResponse.FromString,
                 _registered_method=True)
+        self.EstimateJob = channel.unary_unary(
+                '/ultragray.v1.JobService/EstimateJob',
+                request_serializer=ultragray_dot_v1_dot_jobs__pb2.SubmitJobRequest.SerializeToString,
+                response_deserializer=ultragray_dot_v1_dot_jobs__pb2.JobEstimate.FromString,
+                _registered_method=True)
         self.ListJobs = channel.unary_unary(
                 '/ultragray.v1.JobService/ListJobs',
                 request_serializer=ultragray_dot_v1_dot_jobs__pb2.ListJobsRequest.SerializeToString,
@@ -87,6 +92,14 @@ class JobServiceServicer:
     def SubmitJob(self, request, context):
         """Puts a job into the queue. The same request_id with the same specification gives the same job, whatever its state;
         with another one: REQUEST_ID_CONFLICT. DATASET_NOT_FOUND, SCENE_NOT_FOUND, SCENE_EXISTS, JOB_QUEUE_FULL.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def EstimateJob(self, request, context):
+        """What a render job would make, and how long that may take: a frame of it is rendered. Nothing is submitted.
+        INVALID_ARGUMENT for a job of another kind, SCENE_NOT_FOUND.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -159,6 +172,11 @@ def add_JobServiceServicer_to_server(servicer, server):
                     request_deserializer=ultragray_dot_v1_dot_jobs__pb2.SubmitJobRequest.FromString,
                     response_serializer=ultragray_dot_v1_dot_jobs__pb2.SubmitJobResponse.SerializeToString,
             ),
+            'EstimateJob': grpc.unary_unary_rpc_method_handler(
+                    servicer.EstimateJob,
+                    request_deserializer=ultragray_dot_v1_dot_jobs__pb2.SubmitJobRequest.FromString,
+                    response_serializer=ultragray_dot_v1_dot_jobs__pb2.JobEstimate.SerializeToString,
+            ),
             'ListJobs': grpc.unary_unary_rpc_method_handler(
                     servicer.ListJobs,
                     request_deserializer=ultragray_dot_v1_dot_jobs__pb2.ListJobsRequest.FromString,
@@ -227,6 +245,33 @@ class JobService:
             '/ultragray.v1.JobService/SubmitJob',
             ultragray_dot_v1_dot_jobs__pb2.SubmitJobRequest.SerializeToString,
             ultragray_dot_v1_dot_jobs__pb2.SubmitJobResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def EstimateJob(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/ultragray.v1.JobService/EstimateJob',
+            ultragray_dot_v1_dot_jobs__pb2.SubmitJobRequest.SerializeToString,
+            ultragray_dot_v1_dot_jobs__pb2.JobEstimate.FromString,
             options,
             channel_credentials,
             insecure,

@@ -112,6 +112,7 @@ OPERATIONS = (
     Operation(
         "job.download", _READER, ("GET /v1/jobs/{job}/artifacts/{name}",), ("JobService/DownloadArtifact",), _JOB
     ),
+    Operation("job.estimate", _READER, ("POST /v1/jobs:estimate",), ("JobService/EstimateJob",)),
     Operation("job.submit", _OPERATOR, ("POST /v1/jobs",), ("JobService/SubmitJob",)),
     Operation("job.cancel", _OPERATOR, ("POST /v1/jobs/{job}:cancel",), ("JobService/CancelJob",), _JOB, owned=True),
     Operation("job.retry", _OPERATOR, ("POST /v1/jobs/{job}:retry",), ("JobService/RetryJob",), _JOB, owned=True),

@@ -17,6 +17,7 @@ from starlette.routing import BaseRoute, Mount, Route, WebSocketRoute
 from ultragray import __version__
 from ultragray.errors import UltragrayError
 from ultragray.probe import Probe
+from ultragray.training.config import PRESETS, TrainingConfig
 
 from ..access.rules import WEBSOCKET, HttpRules
 from ..core.state import Service
@@ -52,6 +53,7 @@ the frame of the sweep that the scene was trained from. Errors are `application/
 # What the OpenAPI document says of each operation beside what is standard.
 ROLE = "x-role"  # that it needs
 OWNED = "x-owned"  # whether what it names must be the caller's own, but for admins
+PRESETS_SET = "x-presets"  # the training settings that each preset sets otherwise
 
 _SECURITY_SCHEMES = {
     "Bearer": {"type": "http", "scheme": "bearer"},
@@ -76,7 +78,7 @@ _ROUTERS = (
     access.router,
 )
 
-_READ: tuple[Any, ...] = (RenderBody, StreamMessage, JobBody, *SPECIFICATIONS, Probe)
+_READ: tuple[Any, ...] = (RenderBody, StreamMessage, JobBody, *SPECIFICATIONS, TrainingConfig, Probe)
 _WRITTEN: tuple[Any, ...] = (problems.Problem, FrameMessage, RefusalMessage)
 
 
@@ -163,6 +165,7 @@ class _Application(FastAPI):
             schemas = document.setdefault("components", {}).setdefault("schemas", {})
             schemas.update({cls.__name__: schema for (cls, _), schema in found.items() if "$ref" not in schema})
             schemas.update(extra["$defs"])
+            schemas[TrainingConfig.__name__][PRESETS_SET] = PRESETS
             for method, path, operation in HttpRules().routes():
                 told = document["paths"].get(path, {}).get(method.lower())
                 if told is not None and operation.role is not None:

@@ -14,6 +14,7 @@ from ultragray.errors import TrainingStateInvalid
 from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import ArtifactNotFound
 from ultragray_workers.helpers.training_preview import PICTURES, draw_preview
+from ultragray_workers.jobs.files import BASELINES_NAME, JOURNAL_NAME
 from ultragray_workers.jobs.store import Job, JobStore
 
 from ..core.helper_processes import HelperProcesses
@@ -38,6 +39,10 @@ class TrainingCurve:
     """A training so far."""
 
     points: list[CurvePoint] = described(f"At most {MAX_POINTS}; none before the first step.")
+    baselines: dict[str, float] = described(
+        "PSNR in dB of classical methods on the frames of val_psnr_db, by name (linear: between the nearest frames; "
+        "median: compounded); empty where they were not measured."
+    )
 
 
 class TrainingViews(Prepared):
@@ -52,7 +57,8 @@ class TrainingViews(Prepared):
 
     async def curve(self, job_id: str) -> TrainingCurve:
         """The training so far. Raises JobNotFound."""
-        return TrainingCurve(_curve_of(await self._jobs.do(_journal, job_id)))
+        journal, baselines = await self._jobs.do(_texts, job_id)
+        return TrainingCurve(_curve_of(journal), json.loads(baselines or "{}"))
 
     async def preview_png(self, job_id: str) -> bytes:
         """Truth, and to its right the rendering, PNG.
@@ -84,8 +90,9 @@ class TrainingViews(Prepared):
         return ArtifactNotFound(f"the job {job.id} has no checkpoint to render (any more)", field="job")
 
 
-def _journal(jobs: JobStore, job_id: str) -> str | None:
-    return jobs.files.journal(jobs.get(job_id).id)
+def _texts(jobs: JobStore, job_id: str) -> tuple[str | None, str | None]:
+    known = jobs.get(job_id).id
+    return jobs.files.text_of_run(known, JOURNAL_NAME), jobs.files.text_of_run(known, BASELINES_NAME)
 
 
 def _curve_of(journal: str | None) -> list[CurvePoint]:

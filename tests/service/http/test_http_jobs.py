@@ -70,6 +70,46 @@ def test_a_job_that_no_worker_can_take_says_what_it_asks_for_when_it_is_submitte
     )
 
 
+def test_a_render_job_is_estimated_and_not_submitted(client: httpx.Client) -> None:
+    before = client.get("/v1/jobs").json()["jobs"]
+    sampler = {"kind": "around", "count": 300}
+    asked = {"scene": "demo", "sampler": sampler, "height": 32, "width": 16, "outputs": ["bmode", "echo"]}
+    found = client.post("/v1/jobs:estimate", json={"kind": "render", "specification": asked | {"dtype": "float32"}})
+    assert found.status_code == 200, found.text
+    told = found.json()
+    assert (told["frames"], told["files"], told["height"], told["width"]) == (300, 1, 32, 16)
+    assert told["bytes"] == 300 * 32 * 16 * (4 + 4)
+    assert len(told["poses"]) == 256
+    assert told["seconds"] > 0.0
+    assert client.get("/v1/jobs").json()["jobs"] == before
+
+
+def test_the_estimate_of_a_batch_in_shards_counts_its_files(client: httpx.Client) -> None:
+    sampler = {"kind": "around", "count": 250_000}
+    asked = {"scene": "demo", "sampler": sampler, "height": 16, "width": 16}
+    told = client.post("/v1/jobs:estimate", json={"kind": "render", "specification": asked}).json()
+    assert (told["frames"], told["files"], len(told["poses"])) == (250_000, 50, 256)
+    assert told["bytes"] == 250_000 * (16 * 16 + 2048)
+
+
+@pytest.mark.parametrize(
+    ("kind", "specification", "expected"),
+    [
+        ("train", {"dataset": "a", "scene": "b"}, (422, "INVALID_ARGUMENT", "kind")),
+        ("render", {"scene": "none", "sampler": {"kind": "training"}}, (404, "SCENE_NOT_FOUND", "specification.scene")),
+        (
+            "render",
+            {"scene": "demo", "sampler": {"kind": "fan", "tilt_deg": 90, "step_deg": 1e-3}},
+            (422, "INVALID_ARGUMENT", "specification.step_deg"),
+        ),
+    ],
+)
+def test_what_cannot_be_estimated(
+    client: httpx.Client, kind: str, specification: dict[str, Any], expected: tuple[int, str, str]
+) -> None:
+    assert problem(client.post("/v1/jobs:estimate", json={"kind": kind, "specification": specification})) == expected
+
+
 def test_poses_are_counted_not_repeated(client: httpx.Client) -> None:
     pose = [[1, 0, 0, 0], [0, 1, 0, 2.5], [0, 0, 1, 0], [0, 0, 0, 1]]
     job = submit(client, specification={"scene": "demo", "poses": [pose, pose], "height": 16, "width": 8})

@@ -97,6 +97,19 @@ def test_what_a_comparison_leaves_out_is_every_method_at_equal_time() -> None:
     assert (specification.methods, specification.budget, specification.times) == (("all",), "equal", 1.0)
 
 
+def test_a_render_job_is_estimated_and_not_submitted(jobs: jobs_pb2_grpc.JobServiceStub) -> None:
+    before = len(jobs.ListJobs(jobs_pb2.ListJobsRequest()).jobs)
+    asked = training_poses()
+    asked.render.height = asked.render.width = 16
+    found = jobs.EstimateJob(asked)
+    assert (found.height, found.width, found.files) == (16, 16, 1)
+    assert found.frames == len(found.poses) == 5
+    assert found.bytes == found.frames * 16 * 16 * 4
+    assert found.seconds > 0.0
+    assert len(found.poses[0].matrix.values) == 16
+    assert len(jobs.ListJobs(jobs_pb2.ListJobsRequest()).jobs) == before
+
+
 def test_a_demand_comes_back_with_what_the_job_waits_for(jobs: jobs_pb2_grpc.JobServiceStub) -> None:
     request = training_poses()
     request.render.MergeFrom(jobs_pb2.RenderJob(device="cpu", min_memory_gb=8, worker_labels={"site": "lab1"}))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -59,15 +60,43 @@ def test_the_names_of_the_files_of_a_run() -> None:
 def test_the_curve_of_a_finished_training_and_of_other_jobs(http: httpx.Client) -> None:
     job = train(http, "short", steps=30, max_gaussians=50, confidence=False)
     wait_until(lambda: http.get(f"/v1/jobs/{job}").json()["state"] == "succeeded")
-    points = http.get(f"/v1/jobs/{job}/curve").json()["points"]
+    curve = http.get(f"/v1/jobs/{job}/curve").json()
+    points = curve["points"]
     assert [point["step"] for point in points] == list(range(1, 31))
+    assert set(curve["baselines"]) == {"linear", "median"}
+    assert all(5.0 < psnr_db < 60.0 for psnr_db in curve["baselines"].values())
     assert any(point["val_psnr_db"] for point in points)
     assert http.get(f"/v1/jobs/{job}/preview").json()["reason"] == "ARTIFACT_NOT_FOUND"
     render = {"kind": "render", "specification": {"scene": "demo", "sampler": {"kind": "training"}}}
     other = http.post("/v1/jobs", json=render).json()["id"]
-    assert http.get(f"/v1/jobs/{other}/curve").json() == {"points": []}
+    assert http.get(f"/v1/jobs/{other}/curve").json() == {"points": [], "baselines": {}}
     assert http.get(f"/v1/jobs/{other}/preview").json()["reason"] == "ARTIFACT_NOT_FOUND"
     assert http.get("/v1/jobs/0123/curve").json()["reason"] == "JOB_NOT_FOUND"
+
+
+def test_a_training_keeps_a_picture_of_each_validation(http: httpx.Client) -> None:
+    job = train(http, "pictured", steps=30, max_gaussians=50, confidence=False)
+    artifacts = wait_until(lambda: (told := http.get(f"/v1/jobs/{job}").json())["state"] == "succeeded" and told)[
+        "artifacts"
+    ]
+    pictures = [name for name in artifacts if name.startswith("validation_")]
+    assert pictures == [*(f"validation_{step:08d}.png" for step in range(2, 31, 2)), "validation_truth.png"]
+    sizes = {http.get(f"/v1/jobs/{job}/artifacts/{name}").headers["content-type"] for name in pictures}
+    assert sizes == {"image/png"}
+
+
+def test_the_phases_of_a_training_and_the_time_left_until_its_end(http: httpx.Client) -> None:
+    job = train(http, "phased", steps=150, max_gaussians=50, confidence=False)
+    told: dict[str, float | None] = {}
+    with http.stream("GET", f"/v1/jobs/{job}/events") as answer:
+        for line in answer.iter_lines():
+            if line.startswith("data: {"):
+                progress = json.loads(line.removeprefix("data: "))["progress"]
+                told[progress["phase"]] = progress["seconds_left"]
+    assert told.keys() >= {"training", "report"}
+    assert told["report"] is not None  # it is not yet done when its steps are
+    assert told["report"] > 1.0
+    assert http.get(f"/v1/jobs/{job}").json()["progress"]["phase"] is None
 
 
 @pytest.mark.long

@@ -1,13 +1,22 @@
 /** Jobs: trainings above all, started and followed while they run. */
 
-import { address, getJson, postJson, request, type Schemas } from "./client";
+import { address, getJson, postJson, remove, request, type Schemas } from "./client";
 import type { Described } from "./described";
 import { jobs } from "./generated/contract";
 
 /** The specifications of jobs have these beside what their kind needs. */
-export type Job = Schemas["Job"] & { specification: { scene?: string; dataset?: string; preset?: string } };
+export type Job = Schemas["Job"] & {
+  specification: { scene?: string; dataset?: string; preset?: string; settings?: Record<string, unknown> };
+};
 export type JobState = Job["state"];
+export type JobKind = Job["kind"];
+export type Phase = NonNullable<Job["progress"]["phase"]>;
 export type CurvePoint = Schemas["CurvePoint"];
+export type TrainingCurve = Schemas["TrainingCurve"];
+/** What a render job would make. */
+export type JobEstimate = Schemas["JobEstimate"];
+
+export const STATES: readonly JobState[] = ["queued", "running", "succeeded", "failed", "cancelled"];
 
 const FINAL: readonly JobState[] = ["succeeded", "failed", "cancelled"];
 
@@ -18,9 +27,20 @@ export function isFinal(job: Job): boolean {
 /** What a job of each kind is specified by. */
 export const JOB_KINDS: ReadonlyMap<string, Described> = new Map(Object.entries(jobs));
 
-/** The newest jobs. */
-export async function listJobs(count: number): Promise<Job[]> {
-  return (await getJson("/v1/jobs", {}, { query: { page_size: String(count) } })).jobs as Job[];
+/** The jobs to list; what is empty passes all. */
+export interface JobFilter {
+  kind?: string;
+  state?: string;
+}
+
+/** The newest jobs, at most `count`, and whether there are more. */
+export async function listJobs(count: number, { kind = "", state = "" }: JobFilter = {}): Promise<{ jobs: Job[]; more: boolean }> {
+  const page = await getJson("/v1/jobs", {}, { query: { page_size: String(count), kind, state } });
+  return { jobs: page.jobs as Job[], more: page.next_page_token !== "" };
+}
+
+export function getJob(job: string): Promise<Job> {
+  return getJson("/v1/jobs/{job}", { job }) as Promise<Job>;
 }
 
 /** Others see neither a private job nor the scene that it makes. */
@@ -36,9 +56,21 @@ export function retryJob(job: string): Promise<Job> {
   return postJson("/v1/jobs/{job}:retry", { job }) as Promise<Job>;
 }
 
-/** The training so far, in a few hundred points. */
-export async function trainingCurve(job: string, signal: AbortSignal): Promise<CurvePoint[]> {
-  return (await getJson("/v1/jobs/{job}/curve", { job }, { signal })).points;
+/** Removes a job that has ended, and its files. */
+export function deleteJob(job: string): Promise<void> {
+  return remove("/v1/jobs/{job}", { job });
+}
+
+/** What a render job of this specification would make; nothing is started. */
+export async function estimateRendering(specification: Record<string, unknown>, signal: AbortSignal): Promise<JobEstimate> {
+  const body = JSON.stringify({ kind: "render", specification });
+  const headers = { "Content-Type": "application/json" };
+  return (await (await request("/v1/jobs:estimate", { method: "POST", body, headers, signal })).json()) as JobEstimate;
+}
+
+/** The training so far, in a few hundred points, and what classical methods reach on the same frames. */
+export function trainingCurve(job: string, signal: AbortSignal): Promise<TrainingCurve> {
+  return getJson("/v1/jobs/{job}/curve", { job }, { signal });
 }
 
 export function previewPath(job: string): string {

@@ -6,23 +6,33 @@ import { followJob, isFinal, trainingCurve, type CurvePoint, type Job } from "..
 const RETRY_MS = 1000;
 const LOG_KEPT = 20_000; // characters
 const POINTS_KEPT = 1500; // then the curve is asked for again, thinned
+const TICK_MS = 1000;
 
 export class FollowedJob {
   job = $state.raw<Job | null>(null);
   curve = $state.raw<CurvePoint[]>([]);
+  /** What classical methods reach, dB by method. */
+  baselines = $state.raw<Record<string, number>>({});
   log = $state("");
+  /** Until the end of the job, counted on between what the service tells; null: not known. */
+  secondsLeft = $state<number | null>(null);
   /** Why nothing is told at the moment. */
   problem = $state<string | null>(null);
   missing = $state(false);
   #last: string | null = null;
   #ending = new AbortController();
-  #thinning = false;
+  #asking = false;
+  #timer: ReturnType<typeof setInterval>;
 
   constructor(private readonly id: string) {
+    this.#timer = setInterval(() => {
+      if (this.secondsLeft !== null) this.secondsLeft = Math.max(0, this.secondsLeft - TICK_MS / 1000);
+    }, TICK_MS);
     void this.#follow();
   }
 
   close(): void {
+    clearInterval(this.#timer);
     this.#ending.abort();
   }
 
@@ -31,7 +41,7 @@ export class FollowedJob {
     while (!signal.aborted) {
       let pause_ms = RETRY_MS;
       try {
-        this.curve = await trainingCurve(this.id, signal);
+        await this.#askCurve();
         await followJob(
           this.id,
           this.#last,
@@ -44,7 +54,7 @@ export class FollowedJob {
         );
         this.problem = null;
         if (this.job && isFinal(this.job)) {
-          this.curve = await trainingCurve(this.id, signal);
+          await this.#askCurve();
           return;
         }
       } catch (error) {
@@ -58,25 +68,35 @@ export class FollowedJob {
     }
   }
 
+  async #askCurve(): Promise<void> {
+    const { points, baselines } = await trainingCurve(this.id, this.#ending.signal);
+    this.curve = points;
+    this.baselines = baselines ?? {};
+  }
+
   #take(job: Job): void {
+    const begins = job.progress.phase === "training" && this.job?.progress.phase !== "training";
     this.job = job;
     this.problem = null;
+    this.secondsLeft = isFinal(job) ? null : job.progress.seconds_left;
+    if (begins) void this.#askAgain(); // the classical methods have been measured by now
     const { step, loss, val_psnr_db } = job.progress;
     const last = this.curve.at(-1);
     if (step === null || loss === null || (last && step <= last.step)) return;
     const known = this.curve.findLast((point) => point.val_psnr_db !== null)?.val_psnr_db;
     this.curve = [...this.curve, { step, loss, val_psnr_db: val_psnr_db === known ? null : val_psnr_db }];
-    if (this.curve.length > POINTS_KEPT && !this.#thinning) void this.#thin();
+    if (this.curve.length > POINTS_KEPT) void this.#askAgain();
   }
 
-  async #thin(): Promise<void> {
-    this.#thinning = true;
+  async #askAgain(): Promise<void> {
+    if (this.#asking) return;
+    this.#asking = true;
     try {
-      this.curve = await trainingCurve(this.id, this.#ending.signal);
+      await this.#askCurve();
     } catch {
-      // the curve stays as long as it is until a later step asks again
+      // the curve stays as it is until a later step asks again
     } finally {
-      this.#thinning = false;
+      this.#asking = false;
     }
   }
 }

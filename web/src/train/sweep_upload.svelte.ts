@@ -3,7 +3,7 @@
 import { uploadDataset, type DatasetOptions } from "../api/datasets";
 import { nameOfFile } from "../shared/text";
 import { Sending } from "../shared/sending.svelte";
-import { training } from "./training.svelte";
+import { datasets } from "./datasets.svelte";
 
 class SweepUpload extends Sending {
   files = $state.raw<File[]>([]);
@@ -32,8 +32,8 @@ class SweepUpload extends Sending {
     );
     if (dataset === null) return;
     this.discard();
-    await training.refresh();
-    training.chosen = dataset.name;
+    await datasets.refresh();
+    datasets.chosen = dataset.name;
   }
 }
 

@@ -62,6 +62,7 @@ def check_files(files: Path, name: str, options: dict[str, str], contact_sheet: 
         probe=dataset.probe,
         warnings=report.labelled_warnings,
         options=options,
+        region=dataset.train.region,
     )
 
 

@@ -6,11 +6,12 @@ import contextlib
 import json
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import MISSING, dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ultragray.contract import Contract, described, from_dict, to_dict
+from ultragray.datasets.region import ImageRegion
 from ultragray.datasets.source import UPLOADED_FORMATS
 from ultragray.errors import DatasetInvalid, InvalidArgument, UltragrayError
 from ultragray.files.atomic import write_whole
@@ -53,6 +54,10 @@ class DatasetRecord(Contract):
     probe: Probe | None = described("The probe that recorded it.")
     warnings: tuple[str, ...] = described("What looks wrong, for a person to decide.")
     options: dict[str, str] = described("How it was read: the query parameters of its upload.")
+    region: ImageRegion | None = described(
+        "Of a sequence: where its frames lie in the stored images, and its calibration; null where that is not known.",
+        None,
+    )
     owner: str | None = described("Who uploaded it; null: from before there were owners.", None)
     private: bool = described("Whether others may not see it.", False)
 
@@ -61,7 +66,11 @@ class DatasetRecord(Contract):
         """The record of a manifest. Raises ValueError, KeyError or TypeError for anything else."""
         document: dict[str, Any] = json.loads(text)
         require_version(document.get("format_version", FORMAT_VERSION), FORMAT_VERSION)  # early ones have none
-        return from_dict(cls, {one.name: document[one.name] for one in fields(cls) if one.name not in _NOT_KEPT})
+        kept = [one for one in fields(cls) if one.name not in _NOT_KEPT]
+        later = {one.name for one in kept if one.default is not MISSING}  # than the first manifests
+        return from_dict(
+            cls, {one.name: document[one.name] for one in kept if one.name in document or one.name not in later}
+        )
 
 
 class DatasetStore:

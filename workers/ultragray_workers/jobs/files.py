@@ -11,8 +11,9 @@ from .shared.reading import SharedFile, SharedLog
 
 Artifact: TypeAlias = Path | SharedFile
 Log: TypeAlias = Path | SharedLog
-# Of a run; `ultragray.training`, which writes them, imports torch.
+# Of a run; `ultragray.training`, which writes all but the last, imports torch.
 JOURNAL_NAME, CHECKPOINT_NAME, CONFIG_NAME = "metrics.jsonl", "checkpoint.safetensors", "config.json"
+BASELINES_NAME = "baselines.json"  # what classical methods reach, PSNR in dB by their names
 
 
 def size_of_log(log: Log) -> int:
@@ -52,8 +53,11 @@ class JobFiles(Protocol):
     def artifact(self, job_id: str, name: str) -> Artifact | None:
         """One file to download, of the name that it is known to have; None where it has gone."""
 
-    def journal(self, job_id: str) -> str | None:
-        """The lines of the training so far; None before there are any. The last one may be half written."""
+    def text_of_run(self, job_id: str, name: str) -> str | None:
+        """A file of a training, as the run has it so far, then as an artifact; None before it is there.
+
+        The last line of the journal may be half written.
+        """
 
     def checkpoint(self, job_id: str) -> contextlib.AbstractContextManager[tuple[Path, str] | None]:
         """The newest checkpoint of the training on this host, and a word that tells it from the next; None without."""

@@ -28,6 +28,7 @@ from ultragray.files.atomic import remove_stale_temporaries, sync, write_whole
 from ..datasets.copies import DEFAULT_MAX_BYTES
 
 FOLDER, BATCH = "jobs", "batch"
+PHASES = ("baselines", "effort", "training", "evaluation", "confidence", "report")
 
 
 @dataclass(frozen=True)
@@ -44,13 +45,19 @@ class Progress:
     frames_done: int | None = described("Frames that are done, such as those of a render job in its archive.", None)
     frames: int | None = None
     rate_per_s: float | None = described("Steps or frames.", None)
-    seconds_left: float | None = None
+    seconds_left: float | None = described("Until the end of the job, of all that is still to be done; about.", None)
     waits_for: str | None = described(
         "Of a job that waits: what else it needs than its turn, such as a worker that offers what it asks for.", None
     )
     method: str | None = described("Of a comparison: the method at hand.", None)
     method_number: int | None = described("Its number among the methods of the comparison, from 1.", None)
     methods: int | None = None
+    phase: str | None = described(
+        "Of a training that runs: classical methods are measured, the effort is chosen, it trains, it is measured on "
+        "the held-out frames, its confidence is fitted, or its report is written.",
+        None,
+        choices=PHASES,
+    )
 
     @classmethod
     def from_dict(cls, document: Mapping[str, Any]) -> Progress:

@@ -11,7 +11,7 @@ from ..scenes import SUFFIX
 from ..storage.location import Location
 from ..storage.opening import PATIENCE_S, open_storage
 from ..storage.storage import Storage
-from .files import CHECKPOINT_NAME, JOURNAL_NAME, Artifact, JobFiles, Log
+from .files import CHECKPOINT_NAME, Artifact, JobFiles, Log
 from .folder import JobFolder, Progress
 from .removal import locked
 from .requirements import keep_in_folder
@@ -44,12 +44,12 @@ class FolderFiles:
         """As `JobFiles`."""
         return next((path for folder in self._places(job_id) if (path := folder / name).is_file()), None)
 
-    def journal(self, job_id: str) -> str | None:
+    def text_of_run(self, job_id: str, name: str) -> str | None:
         """As `JobFiles`."""
         folder = self._folder(job_id)
         for place in (folder.artifacts, folder.run):
             with contextlib.suppress(FileNotFoundError):
-                return (place / JOURNAL_NAME).read_text(encoding="utf-8")
+                return (place / name).read_text(encoding="utf-8")
         return None
 
     @contextlib.contextmanager

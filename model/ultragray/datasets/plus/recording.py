@@ -14,7 +14,7 @@ import numpy as np
 from ...errors import DatasetInvalid, InvalidPose
 from ...pose import check_poses
 from ...probe import FloatArray
-from ..calibration import poses_from_image_transforms
+from ..calibration import poses_from_image_transforms, region_of
 from ..images import grey_frames, parse_crop
 from ..splits import parse_frame_ranges
 from ..sweep import Sweep
@@ -58,9 +58,18 @@ def read_plus_sweep(
         probe=probe,
         frame_numbers=numbers,
         source=str(path),
+        region=region_of(images.shape[1:], box, transforms, _calibration(stored, fixed)),
         notes=_notes(orientation, crop, images.shape[1:], sorted(set(chosen) - set(numbers.tolist()))),
     )
     return sweep, frame_count
+
+
+def _calibration(stored: StoredSequence, fixed: Mapping[TransformName, FloatArray]) -> FloatArray | None:  # [4, 4]
+    """ImageToProbe as it was used, of the first frame where the sequence has it."""
+    if (matrix := fixed.get((IMAGE, "Probe"))) is not None:
+        return matrix
+    text = next((fields[key] for fields in stored.frame_fields if (key := f"{IMAGE}ToProbe{_TRANSFORM}") in fields), "")
+    return parse_matrix(text, f"{stored.path}: {IMAGE}ToProbe") if text else None
 
 
 def _field(stored: StoredSequence, name: str) -> str:

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import asyncio
+from dataclasses import replace
 
 import grpc
 
 from ultragray.errors import InvalidArgument
-from ultragray_proto.v1 import jobs_pb2
+from ultragray_proto.codec import to_message
+from ultragray_proto.v1 import geometry_pb2, jobs_pb2
 from ultragray_workers.errors import Draining
 from ultragray_workers.jobs.shared.reading import opened
 from ultragray_workers.jobs.store import JobStore
 
 from ...core.catalog import DEFAULT_PAGE_SIZE
+from ...core.jobs.estimates import estimate
 from ...core.jobs.log import DEFAULT_LOG_BYTES, MAX_LOG_BYTES
 from ...core.state import Service
 from ..messages import job_message, read_specification, read_word
@@ -40,6 +43,15 @@ class JobService:
             private=request.private,
         )
         return jobs_pb2.SubmitJobResponse(job=job_message(job), created=is_new)
+
+    async def EstimateJob(  # noqa: N802
+        self, request: jobs_pb2.SubmitJobRequest, context: grpc.aio.ServicerContext
+    ) -> jobs_pb2.JobEstimate:
+        self._service.require_serving()
+        specification, field = await asyncio.to_thread(read_specification, request)
+        found = await estimate(self._service, specification, field=field)
+        poses = [geometry_pb2.Pose(matrix=geometry_pb2.Matrix(values=pose)) for pose in found.poses]
+        return to_message(replace(found, poses=[]), jobs_pb2.JobEstimate, poses=poses)
 
     async def ListJobs(  # noqa: N802
         self, request: jobs_pb2.ListJobsRequest, context: grpc.aio.ServicerContext

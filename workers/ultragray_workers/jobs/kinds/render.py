@@ -9,8 +9,10 @@ from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 
 from ultragray.batches import BatchPlan
+from ultragray.batches.plan import SHARD_FRAMES
 from ultragray.confidence import Assessor, Extrapolation, require_confidence
 from ultragray.contract import described, kind_field, shown, under
 from ultragray.errors import InvalidArgument
@@ -29,7 +31,7 @@ from ultragray.samplers import (
 )
 from ultragray.samplers.confident import require_drawn
 from ultragray.scene_info import SceneHeader
-from ultragray.settings import Encoding, FrameSettings
+from ultragray.settings import Encoding, FrameSettings, Resolved
 
 from ...errors import StorageFull
 from .base import Specification, Surroundings
@@ -150,6 +152,32 @@ class RenderJob(FrameSettings, Specification):
         if surroundings.artifact_folder is not None:
             self.check_room(frames, picture, surroundings.artifact_folder)
 
+    def outlook(self, scene: SceneHeader, settings: Resolved, most: int) -> tuple[int, FloatArray]:
+        """The number of its frames, whatever their confidence, and at most `most` poses [C, 4, 4], evenly spread.
+
+        Of a batch that is drawn in shards, they are of its first block. Raises InvalidArgument as the job would.
+        """
+        if not self.is_sharded:
+            poses = self.poses_of(scene.training_poses, settings.probe)
+            return len(poses), poses[_spread(len(poses), most)]
+        first = self.sampler.block(0) if isinstance(self.sampler, DrawnSampler) else self.sampler
+        base = self._base(scene.training_poses)
+        poses = base if first is None else first.poses(base, settings.probe)
+        return self._planned_frames(scene), poses[_spread(len(poses), most)]
+
+    def file_count(self, frames: int) -> int:
+        """The number of files that so many frames become, the manifest of shards not counted."""
+        return -(-frames // (self.shard_frames or SHARD_FRAMES)) if self.is_sharded else 1
+
+    def file_bytes(self, frames: int, picture: Picture) -> int:
+        """The most that so many frames take: their pixels, not compressed."""
+        dtype = np.dtype(check_format(self.file_format.name, self.outputs, self.dtype))
+        pixel_bytes = sum(1 if OUTPUTS[name].is_numbers else dtype.itemsize for name in self.outputs)
+        frame_bytes = picture.height * picture.width * pixel_bytes
+        if self.is_sharded:  # blocks of the tar around the pixels, pose and figures of each frame
+            frame_bytes += _MEMBER_BYTES * (1 + len(self.outputs))
+        return frames * frame_bytes
+
     def _planned_frames(self, scene: SceneHeader) -> int:
         """The frames of a job in shards. Raises InvalidArgument where no shard could be made."""
         self._base(scene.training_poses)
@@ -183,18 +211,17 @@ class RenderJob(FrameSettings, Specification):
 
     def check_room(self, frames: int, picture: Picture, folder: Path) -> None:
         """Raises StorageFull where the disk of a folder has no room for so many frames."""
-        dtype = np.dtype(check_format(self.file_format.name, self.outputs, self.dtype))
-        pixel_bytes = sum(1 if OUTPUTS[name].is_numbers else dtype.itemsize for name in self.outputs)
-        frame_bytes = picture.height * picture.width * pixel_bytes
-        if self.is_sharded:  # blocks of the tar around the pixels, pose and figures of each frame
-            frame_bytes += _MEMBER_BYTES * (1 + len(self.outputs))
-        needed, free = frames * frame_bytes, shutil.disk_usage(folder).free
+        needed, free = self.file_bytes(frames, picture), shutil.disk_usage(folder).free
         if needed > free:
             raise StorageFull(
                 f"{frames:,} frames of {picture.height}x{picture.width} take up to {_size(needed)}, the artifact "
                 f"folder has {_size(free)} left",
                 field="poses" if self.sampler is None else "sampler",
             )
+
+
+def _spread(count: int, most: int) -> npt.NDArray[np.int64]:
+    return np.linspace(0, count - 1, min(count, most)).round().astype(np.int64)
 
 
 def _size(size_bytes: int) -> str:

@@ -21,18 +21,21 @@ from ultragray.scene import GaussianScene
 from ultragray.training import Progress as TrainingProgress
 from ultragray.training import TrainingConfig
 from ultragray.training import train as train_scene
+from ultragray.training.pictures import pictures_in
 from ultragray.training.run import FITTING
 from ultragray.training.trainer import CHECKPOINT_FILE, JOURNAL_FILE
 
 from ...scenes import SUFFIX
+from ..files import BASELINES_NAME
 from ..folder import Outcome, Progress
 from ..worker.job_run import JobRun, Stopped
 from .curve import draw_training_curve
 from .earlier_run import take_over_run
 from .train import TrainJob
+from .training.baselines import write_baselines
+from .training.remaining import PICTURES, REPORT_FRAMES, Finishing
 
 CHECKPOINT_INTERVAL_S = 10.0
-PICTURES, REPORT_FRAMES = 4, 24  # held-out frames, evenly spread
 _LINES = 20  # of the log in a run
 
 
@@ -51,27 +54,35 @@ def run(job_run: JobRun, job: TrainJob) -> Outcome:
         f"training {job.scene} from {job.dataset} on {device}, {job_run.request.threads} threads"
         f"{', going on from a checkpoint' if resume else ''}\n"
     )
+    if not resume:
+        job_run.report(Progress(phase="baselines"))
+        write_baselines(dataset, job_run.folder.run / BASELINES_NAME, job_run.should_stop)
+    finishing = Finishing(dataset, config)
     scene = train_scene(
         dataset,
         config,
         folder=job_run.folder.run,
         resume=resume,
-        report=lambda state: _report(job_run, state),
+        report=lambda state: _report(job_run, state, finishing),
         should_stop=job_run.should_stop,
         device=device,
         checkpoint_interval_s=CHECKPOINT_INTERVAL_S,
     )
     if scene.info.training["step"] < scene.info.training["steps"]:
         raise Stopped
-    return _finish(job_run, job, dataset, scene, device)
+    return _finish(job_run, job, dataset, scene, device, finishing)
 
 
-def _report(job_run: JobRun, state: TrainingProgress) -> None:
-    known_s = state.seconds_left if math.isfinite(state.seconds_left) else None
+def _report(job_run: JobRun, state: TrainingProgress, finishing: Finishing) -> None:
     if state.beside == FITTING:  # what the run itself has reached stands
-        job_run.report(replace(job_run.progress, seconds_left=known_s))
+        left_s = _known(state.seconds_left + finishing.seconds_from("confidence"))
+        job_run.report(replace(job_run.progress, phase="confidence", seconds_left=left_s))
+    elif state.beside is not None:
+        job_run.report(_told(state, "effort", None))
     else:
-        job_run.report(_told(state, known_s if state.beside is None else None))
+        finishing.observe(state.steps_per_s)
+        phase = "training" if state.step < state.steps else "evaluation"
+        job_run.report(_told(state, phase, _known(state.seconds_left + finishing.seconds_from("evaluation"))))
     if state.step * _LINES // state.steps > (state.step - 1) * _LINES // state.steps:
         held_out = "" if state.val_psnr_db is None else f", held out {state.val_psnr_db:.2f} dB"
         sys.stderr.write(
@@ -82,8 +93,13 @@ def _report(job_run: JobRun, state: TrainingProgress) -> None:
         sys.stderr.flush()
 
 
-def _told(state: TrainingProgress, seconds_left: float | None) -> Progress:
+def _known(seconds: float) -> float | None:
+    return seconds if math.isfinite(seconds) else None
+
+
+def _told(state: TrainingProgress, phase: str, seconds_left: float | None) -> Progress:
     return Progress(
+        phase=phase,
         step=state.step,
         steps=state.steps,
         loss=state.loss,
@@ -94,14 +110,19 @@ def _told(state: TrainingProgress, seconds_left: float | None) -> Progress:
     )
 
 
-def _finish(job_run: JobRun, job: TrainJob, dataset: Dataset, scene: GaussianScene, device: str) -> Outcome:
+def _finish(
+    job_run: JobRun, job: TrainJob, dataset: Dataset, scene: GaussianScene, device: str, finishing: Finishing
+) -> Outcome:
     step, steps = scene.info.training["step"], scene.info.training["steps"]
-    job_run.progress = replace(job_run.progress, step=step, steps=steps, seconds_left=0.0)
+    left_s = finishing.seconds_from("report")
+    job_run.report(replace(job_run.progress, phase="report", step=step, steps=steps, seconds_left=left_s))
     metrics = {name: float(value) for name, value in scene.info.metrics.items()}
     with job_run.folder.new_artifacts() as folder:
         scene.save(folder / f"{job.scene}{SUFFIX}")
         journal = job_run.folder.run / JOURNAL_FILE
-        shutil.copyfile(journal, folder / JOURNAL_FILE)
+        beside = (job_run.folder.run / BASELINES_NAME, *pictures_in(job_run.folder.run))
+        for path in (journal, *(one for one in beside if one.exists())):
+            shutil.copyfile(path, folder / path.name)
         draw_training_curve(journal, folder / "training_curve.png")
         document = {
             "scene": job.scene,
@@ -114,6 +135,7 @@ def _finish(job_run: JobRun, job: TrainJob, dataset: Dataset, scene: GaussianSce
         if len(dataset.val):
             scene = scene.to(device)
             _write_report(job_run, job, dataset, scene, folder)
+    job_run.progress = replace(job_run.progress, phase=None, seconds_left=0.0)
     return Outcome(artifacts=job_run.folder.artifact_names(), metrics=metrics)
 
 

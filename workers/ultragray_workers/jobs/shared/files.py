@@ -10,7 +10,7 @@ from pathlib import Path
 from ...errors import StorageUnavailable
 from ...scenes import SUFFIX
 from ...storage.storage import Entry, NotThere, Storage
-from ..files import CHECKPOINT_NAME, JOURNAL_NAME, Artifact, Log
+from ..files import CHECKPOINT_NAME, Artifact, Log
 from ..folder import Progress
 from .reading import SharedFile, SharedLog
 from .record import StoredFile, batch_prefix_of, prefix_of, read_record, record_key
@@ -49,11 +49,11 @@ class SharedFiles:
             stored = _whole(entry)
         return None if stored is None else SharedFile(self._storage, name, stored)
 
-    def journal(self, job_id: str) -> str | None:
+    def text_of_run(self, job_id: str, name: str) -> str | None:
         """As `JobFiles`: as long as the training runs, as its last checkpoint has it."""
         record = read_record(self._storage, job_id)
         for files in () if record is None else (record.artifacts, record.run):
-            if (stored := files.get(JOURNAL_NAME)) is not None:
+            if (stored := files.get(name)) is not None:
                 with contextlib.suppress(NotThere):  # the next checkpoint has taken its place
                     return self._storage.read(stored.key).decode("utf-8", "replace")
         return None

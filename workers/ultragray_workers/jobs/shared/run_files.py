@@ -9,9 +9,11 @@ from pathlib import Path
 
 from ultragray.files.atomic import TEMPORARY_SUFFIX
 
-from ..files import CONFIG_NAME, JOURNAL_NAME
+from ..files import BASELINES_NAME, CONFIG_NAME, JOURNAL_NAME
 
-_BESIDE = (JOURNAL_NAME, CONFIG_NAME)  # a checkpoint: they say nothing without it, and a journal grows all the time
+# A checkpoint: they say nothing without it, and a journal grows all the time.
+_BESIDE = (JOURNAL_NAME, CONFIG_NAME, BASELINES_NAME)
+_PICTURE = ".png"  # of a validation: likewise
 
 Version = Mapping[str, int]  # the time of each file that is replaced whole, by its path within the run
 
@@ -20,7 +22,7 @@ def version_of(run: Path) -> Version:
     """The version of a run; empty where there is nothing to go on from."""
     found = {}
     for path in _files(run):
-        if path.name not in _BESIDE:
+        if not _is_beside(path):
             with contextlib.suppress(FileNotFoundError):  # replaced or removed meanwhile
                 found[path.relative_to(run).as_posix()] = path.stat().st_mtime_ns
     return found
@@ -37,7 +39,7 @@ def copy_of(run: Path, version: Version, target: Path) -> bool:
         for name in version:
             _place(target, name).hardlink_to(run / name)
         for path in _files(run):
-            if path.name in _BESIDE:
+            if _is_beside(path):
                 shutil.copyfile(path, _place(target, path.relative_to(run).as_posix()))
     except FileNotFoundError:
         return False
@@ -47,6 +49,10 @@ def copy_of(run: Path, version: Version, target: Path) -> bool:
 def files_in(folder: Path) -> dict[str, Path]:
     """The files of a copy by their paths within it, sorted."""
     return {path.relative_to(folder).as_posix(): path for path in sorted(_files(folder))}
+
+
+def _is_beside(path: Path) -> bool:
+    return path.name in _BESIDE or path.suffix == _PICTURE
 
 
 def _place(target: Path, name: str) -> Path:

@@ -56,9 +56,9 @@ class JobRun:
             time.sleep(_RETRY_S)
 
     def report(self, progress: Progress) -> None:
-        """Writes how far the job is, at most twice a second."""
-        self.progress = progress
-        if time.monotonic() - self._reported_at >= _PROGRESS_INTERVAL_S:
+        """Writes how far the job is, at most twice a second, but the begin of each phase at once."""
+        begins, self.progress = progress.phase != self.progress.phase, progress
+        if begins or time.monotonic() - self._reported_at >= _PROGRESS_INTERVAL_S:
             with suppress(OSError):  # where there is no room, the work itself will say so
                 self.folder.write_progress(progress)
             self._reported_at = time.monotonic()

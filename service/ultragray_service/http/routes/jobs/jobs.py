@@ -13,12 +13,13 @@ from starlette.responses import FileResponse, PlainTextResponse, Response, Strea
 from ultragray.contract import under
 from ultragray.errors import InvalidArgument
 from ultragray_workers.jobs.job import Job, JobState
-from ultragray_workers.jobs.kinds import KINDS
+from ultragray_workers.jobs.kinds import KINDS, Specification
 from ultragray_workers.jobs.shared.reading import SharedFile
 from ultragray_workers.jobs.specification import from_dict
 from ultragray_workers.jobs.store import JobStore
 
 from ....core.catalog import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE
+from ....core.jobs.estimates import JobEstimate, estimate
 from ....core.jobs.jobs import JobPage
 from ....core.jobs.log import DEFAULT_LOG_BYTES, MAX_LOG_BYTES
 from ...deps import ServiceDep, problems
@@ -89,13 +90,8 @@ async def submit_job(request: Request, response: Response, service: ServiceDep) 
     """Puts a job into the queue. The same request_id with the same body gives the same job, whatever its state."""
     service.require_serving()
     body = await read_json_body(request, JobBody, SPECIFICATION)
-    with under(SPECIFICATION.key):
-        if "kind" in body.specification:
-            raise InvalidArgument("kind stands beside the specification, not in it", field="kind")
-        # in a thread: there may be many poses
-        specification = await asyncio.to_thread(from_dict, {"kind": body.kind, **body.specification})
     job, is_new = await service.jobs.submit(
-        specification,
+        await _specification(body),
         field=SPECIFICATION.key,
         request_id=body.request_id,
         priority=body.priority,
@@ -103,6 +99,19 @@ async def submit_job(request: Request, response: Response, service: ServiceDep) 
     )
     response.status_code = 201 if is_new else 200
     return job
+
+
+@router.post(
+    ":estimate",
+    response_model=JobEstimate,
+    openapi_extra=_SUBMIT,
+    responses=problems(401, 404, 413, 415, 422, 429, 503),
+)
+async def estimate_job(request: Request, service: ServiceDep) -> JobEstimate:
+    """What a render job would make, and how long that may take: a frame of it is rendered. Nothing is submitted."""
+    service.require_serving()
+    body = await read_json_body(request, JobBody, SPECIFICATION)
+    return await estimate(service, await _specification(body), field=SPECIFICATION.key)
 
 
 @router.get("", responses=problems(401, 422, 503))
@@ -115,6 +124,14 @@ async def list_jobs(
 ) -> JobPage:
     """The jobs, newest first."""
     return await service.jobs.page(state=state, kind=kind, page_size=page_size, page_token=page_token)
+
+
+async def _specification(body: JobBody) -> Specification:
+    with under(SPECIFICATION.key):
+        if "kind" in body.specification:
+            raise InvalidArgument("kind stands beside the specification, not in it", field="kind")
+        # in a thread: there may be many poses
+        return await asyncio.to_thread(from_dict, {"kind": body.kind, **body.specification})
 
 
 @router.get("/{job}", responses=problems(401, 404, 422, 503))

@@ -1,0 +1,52 @@
+/** Curves of earlier trainings of a dataset, laid over that of a job: the person chooses which. */
+
+import { SvelteMap } from "svelte/reactivity";
+
+import { explain } from "../api/client";
+import { listJobs, trainingCurve, type CurvePoint, type Job } from "../api/jobs";
+
+const LISTED = 100;
+export const MOST_SHOWN = 4; // as many colours are left
+
+export class EarlierRuns {
+  /** Newest first; null: not asked for yet. */
+  runs = $state.raw<Job[] | null>(null);
+  problem = $state<string | null>(null);
+  readonly curves = new SvelteMap<string, CurvePoint[]>();
+  #ending = new AbortController();
+
+  constructor(
+    private readonly id: string,
+    private readonly dataset: string,
+  ) {
+    void this.#list();
+  }
+
+  close(): void {
+    this.#ending.abort();
+  }
+
+  /** Lays a run over the curve, or takes it away. */
+  async toggle(run: string): Promise<void> {
+    if (this.curves.delete(run) || this.curves.size >= MOST_SHOWN) return;
+    this.curves.set(run, []);
+    try {
+      const { points } = await trainingCurve(run, this.#ending.signal);
+      if (this.curves.has(run)) this.curves.set(run, points);
+    } catch (error) {
+      this.curves.delete(run);
+      if (!this.#ending.signal.aborted) this.problem = explain(error);
+    }
+  }
+
+  async #list(): Promise<void> {
+    try {
+      const { jobs } = await listJobs(LISTED, { kind: "train" });
+      this.runs = jobs.filter(
+        ({ id, specification, started_at }) => id !== this.id && specification.dataset === this.dataset && started_at !== null,
+      );
+    } catch (error) {
+      this.problem = explain(error);
+    }
+  }
+}
