@@ -129,6 +129,7 @@ def test_a_call_of_grpc_is_watched_too(service: RunningService, http: httpx.Clie
 
         def requests() -> Iterator[rendering_pb2.RenderStreamRequest]:
             yield rendering_pb2.RenderStreamRequest(sequence=1, settings=settings, pose=identity)
+            wait_until(lambda: named(http, "arm")["frames"] == 1)
             with watching(service, named(http, "arm")["id"]) as watcher:
                 wait_until(lambda: named(http, "arm")["watchers"] == 1)
                 yield rendering_pb2.RenderStreamRequest(sequence=2, pose=identity)
