@@ -53,7 +53,8 @@ export function snippet(language: Language, target: Target, asked: Asked): strin
 
 function curl({ origin, scene, keyRequired }: Target, { pose, settings }: Asked): string {
   const key = keyRequired ? ` -H 'X-API-Key: ${KEY}'` : "";
-  const body = JSON.stringify({ pose: placement(pose), ...known(settings) }, null, 1).replace(/\n\s*/g, " ");
+  const parts = Object.entries({ pose: placement(pose), ...known(settings) });
+  const body = `{\n${parts.map(([name, value]) => `    ${JSON.stringify(name)}: ${JSON.stringify(value)}`).join(",\n")}\n  }`;
   return `curl -sS --fail-with-body ${origin}/v1/scenes/${encodeURIComponent(scene)}/render${key} \\
   -H 'Content-Type: application/json' -H 'Accept: image/png' -o frame.png \\
   -d '${body}'

@@ -17,7 +17,8 @@ export function poseOfMatrix(numbers: readonly number[], where: Where = {}): Pos
   const pose = numbers.length === 12 ? [...numbers, 0, 0, 0, 1] : numbers;
   if (pose.length !== 16) throw fault({ kind: "count", found: numbers.length, expected: "12, 16" }, where);
   const last = [0, 0, 0, 1].some((expected, column) => Math.abs(entry(pose, 3, column) - expected) > ROTATION_TOLERANCE);
-  if (last || rotationError(pose) > ROTATION_TOLERANCE) throw fault({ kind: "rotation", mirrors: false }, where);
+  if (last) throw fault({ kind: "lastRow" }, where);
+  if (rotationError(pose) > ROTATION_TOLERANCE) throw fault({ kind: "rotation", mirrors: false }, where);
   if (determinant(pose) < 0) throw fault({ kind: "rotation", mirrors: true }, where);
   return fromPositionQuaternion(position(pose), quaternion(pose));
 }

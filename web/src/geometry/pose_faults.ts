@@ -2,6 +2,7 @@
 
 export type PoseFault =
   | { kind: "json"; problem: string }
+  | { kind: "jsonNumbers"; key: string; names: string[] }
   | { kind: "empty" }
   | { kind: "tooMany"; count: number; most: number }
   | { kind: "suffix"; suffix: string }
@@ -9,6 +10,7 @@ export type PoseFault =
   | { kind: "number"; text: string }
   | { kind: "quaternion"; length: number }
   | { kind: "rotation"; mirrors: boolean }
+  | { kind: "lastRow" }
   | { kind: "ros"; missing: string }
   | { kind: "npy"; problem: "magic" | "short" }
   | { kind: "npyType"; type: string }

@@ -76,7 +76,7 @@ function numbersOf(given: Record<string, unknown>, key: string, names: string[],
   const value = given[key];
   const numbers = names.map((name) => (isObject(value) ? value[name] : undefined));
   if (!numbers.every((number) => typeof number === "number" && Number.isFinite(number)))
-    throw fault({ kind: "json", problem: `${key}: ${names.join(", ")}` }, where);
+    throw fault({ kind: "jsonNumbers", key, names }, where);
   return numbers as number[];
 }
 

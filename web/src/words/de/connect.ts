@@ -9,6 +9,8 @@ function fault({ fault: found }: PoseError): string {
   switch (found.kind) {
     case "json":
       return `Das ist kein JSON, das die Konsole kennt: Eine Lage ist ein Objekt mit position_mm und quaternion oder mit matrix (${found.problem}).`;
+    case "jsonNumbers":
+      return `${found.key} braucht die Zahlen ${found.names.join(", ")}.`;
     case "empty":
       return "Darin sind keine Lagen.";
     case "tooMany":
@@ -24,7 +26,9 @@ function fault({ fault: found }: PoseError): string {
     case "rotation":
       return found.mirrors
         ? "Die Matrix muss eine Drehung enthalten; diese spiegelt."
-        : "Die Matrix muss eine Drehung enthalten: Achsen der Länge 1 im rechten Winkel, und 0 0 0 1 als letzte Zeile.";
+        : "Die Matrix muss eine Drehung enthalten: Achsen der Länge 1 im rechten Winkel.";
+    case "lastRow":
+      return "Die Matrix muss mit der Zeile 0 0 0 1 enden; die Verschiebung ist ihre letzte Spalte.";
     case "ros":
       return `Eine Lage in ROS hat position und orientation; ${found.missing} fehlt.`;
     case "npy":
@@ -78,7 +82,7 @@ export const connect: Words["connect"] = {
     blackMeans: "Pixel mit einer Abdeckung unter 0,3 sind schwarz",
     noModel: "Diese Szene wurde ohne Verlässlichkeit trainiert",
     hatch: "Schraffiert, wo nichts belegt ist",
-    hatchMeans: "Pixel mit einer Abdeckung unter 0,3 bekommen schräge Linien",
+    hatchMeans: "In geratenen Bildern: Pixel mit einer Abdeckung unter 0,3 bekommen schräge Linien. In Bildern des Sweeps sind sie Flüssigkeit oder Schatten",
     uncertainty: "Unsicherheit zeigen",
     uncertaintyMeans: "Der zu erwartende Fehler jedes Pixels, von keinem bis zu einem Viertel des Wegs von Schwarz nach Weiß",
     noUncertainty: "Diese Szene kennt die Unsicherheit ihrer Pixel nicht",

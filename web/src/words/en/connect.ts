@@ -58,6 +58,8 @@ function fault({ fault: found }: PoseError): string {
   switch (found.kind) {
     case "json":
       return `This is not JSON that the console knows: a pose is an object of position_mm and quaternion, or of matrix (${found.problem}).`;
+    case "jsonNumbers":
+      return `${found.key} needs the numbers ${found.names.join(", ")}.`;
     case "empty":
       return "There are no poses in it.";
     case "tooMany":
@@ -73,7 +75,9 @@ function fault({ fault: found }: PoseError): string {
     case "rotation":
       return found.mirrors
         ? "The matrix must hold a rotation; this one mirrors."
-        : "The matrix must hold a rotation: axes of length 1 at right angles, and 0 0 0 1 as its last row.";
+        : "The matrix must hold a rotation: axes of length 1 at right angles.";
+    case "lastRow":
+      return "The matrix must end in the row 0 0 0 1; the translation is its last column.";
     case "ros":
       return `A pose of ROS has a position and an orientation; ${found.missing} was not found.`;
     case "npy":
@@ -83,7 +87,7 @@ function fault({ fault: found }: PoseError): string {
     case "npyShape":
       return `The array has the shape ${found.shape}; (N, 4, 4) was expected, also (N, 3, 4), (N, 12) or (N, 16).`;
     case "csvHeader":
-      return `the columns ${found.missing.join(", ")} are missing.`;
+      return `The columns ${found.missing.join(", ")} are missing.`;
     case "plusHeader":
       return "There are no transforms of frames in it (lines such as Seq_Frame0000_ProbeToReferenceTransform).";
     case "plusTransforms":
@@ -96,7 +100,7 @@ function poseError(error: PoseError): string {
   const said = fault(error);
   if (error.line !== null) return `Line ${error.line}: ${said}`;
   if (error.pose !== null) return `Pose ${error.pose}: ${said}`;
-  return said.charAt(0).toUpperCase() + said.slice(1);
+  return said;
 }
 
 export const connect = {
@@ -124,7 +128,7 @@ export const connect = {
     blackMeans: "Pixels with coverage below 0.3 are black",
     noModel: "This scene was trained without confidence",
     hatch: "Hatch where nothing supports it",
-    hatchMeans: "Pixels with coverage below 0.3 get diagonal lines",
+    hatchMeans: "Of a guess: pixels with coverage below 0.3 get diagonal lines. In a view that the sweep shows, they are fluid or shadow",
     uncertainty: "Show uncertainty",
     uncertaintyMeans: "The error to expect of each pixel, from none to a quarter of the way from black to white",
     noUncertainty: "This scene does not know the uncertainty of its pixels",
