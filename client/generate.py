@@ -52,6 +52,7 @@ NOT_OVER_GRPC = {  # reasons of other doors, and of jobs that failed
     "ROUTE_NOT_FOUND",
     "METHOD_NOT_ALLOWED",
     "SCENE_READ_ONLY",
+    "STREAM_NOT_FOUND",
     "IGTL_MESSAGE_INVALID",
     "CHECKPOINT_INVALID",
     "TRAINING_DIVERGED",

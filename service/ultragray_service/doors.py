@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from ultragray.contract import described
 from ultragray.installation import __version__
 
 from .access.addresses import is_loopback
@@ -12,6 +13,18 @@ from .settings import Settings
 
 _ANY = ("0.0.0.0", "::")  # not addresses that a browser can open
 _LABEL_WIDTH = 12
+
+
+@dataclass(frozen=True, kw_only=True)
+class ServiceInfo:
+    """What a service is, and the ports that it answers on beside this one."""
+
+    version: str
+    tls: bool = described("Whether HTTP and gRPC speak TLS. A proxy in front may add it.")
+    grpc_port: int = described("As the service has it; a proxy in front may have another.")
+    igtl_port: int | None = described("Of OpenIGTLink; null: off.")
+    igtl_is_local: bool = described("Whether OpenIGTLink answers programs on the service's own machine alone.")
+    key_required: bool = described("Whether HTTP and gRPC ask for an API key or a token.")
 
 
 @dataclass(frozen=True)
@@ -29,6 +42,17 @@ class Doors:
         scheme = "https" if settings.tls_certificate is not None else "http"
         http = f"{scheme}://{authority(settings.host, http_port)}"
         return cls(settings, http, authority(settings.host, grpc_port), igtl)
+
+    def info(self, *, key_required: bool) -> ServiceInfo:
+        """The doors as pages need them, which know by themselves at which host they found the service."""
+        return ServiceInfo(
+            version=__version__,
+            tls=self.settings.tls_certificate is not None,
+            grpc_port=_port_of(self.grpc),
+            igtl_port=None if self.igtl is None else _port_of(self.igtl),
+            igtl_is_local=is_loopback(self.settings.host) or not self.settings.igtl_allow,
+            key_required=key_required,
+        )
 
     def fields(self) -> dict[str, str]:
         """The addresses for a program."""
@@ -65,3 +89,7 @@ class Doors:
         return (
             "not needed: this machine alone is served" if is_loopback(self.settings.host) else "NOT NEEDED BY ANYBODY"
         )
+
+
+def _port_of(address: str) -> int:
+    return int(address.rpartition(":")[2])

@@ -134,6 +134,13 @@ class MethodNotAllowed(UltragrayError):
     title = "Method not allowed"
 
 
+class StreamNotFound(UltragrayError):
+    """No open stream of that id that the key may watch: it has ended, or is at another service of the same address."""
+
+    reason = "STREAM_NOT_FOUND"
+    title = "No such open stream"
+
+
 class SceneReadOnly(UltragrayError):
     """A scene of the data folder cannot be deleted over HTTP."""
 
@@ -217,6 +224,7 @@ STATUSES = {  # by the reason of the error
     "JOB_QUEUE_FULL": Statuses(429, "RESOURCE_EXHAUSTED", retry_after_s=10),
     "WORKER_NOT_FOUND": Statuses(404, "NOT_FOUND"),
     "ARTIFACT_NOT_FOUND": Statuses(404, "NOT_FOUND"),
+    "STREAM_NOT_FOUND": Statuses(404, "NOT_FOUND"),
     "SCENE_TOO_LARGE": Statuses(507, "RESOURCE_EXHAUSTED"),
     "BACKEND_UNAVAILABLE": Statuses(501, "UNIMPLEMENTED"),
     "EXTRA_MISSING": Statuses(501, "UNIMPLEMENTED"),

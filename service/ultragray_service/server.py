@@ -78,6 +78,7 @@ async def serve(settings: Settings) -> None:
     with contextlib.ExitStack() as sockets:
         http_socket = sockets.enter_context(listen(settings.host, settings.http_port, "HTTP", "http_port"))
         igtl = await _start_igtl(igtl_server, settings, sockets)
+        service.doors = Doors.of(settings, http_socket.getsockname()[1], grpc_port, igtl)
         http_server = HttpServer(app, settings, service.metrics, certificates, _FLUSH_S)
         await grpc_server.start()
         http_task = asyncio.ensure_future(http_server.serve([http_socket]))
@@ -94,7 +95,7 @@ async def serve(settings: Settings) -> None:
             if await signals.unless_stopped(service.start()):
                 worker.start()
                 gc.freeze()  # what lives this long is never garbage: shorter pauses
-                _tell_where(Doors.of(settings, http_socket.getsockname()[1], grpc_port, igtl), service.guard.asks)
+                _tell_where(service.doors, service.guard.asks)
                 manager.tell(READY)
                 await signals.stop.wait()
             manager.tell(STOPPING)

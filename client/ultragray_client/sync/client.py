@@ -13,9 +13,10 @@ from ..calls.batch import Batch
 from ..calls.connection import DEFAULT_ADDRESS, DEFAULT_TIMEOUT_S, ApiKey
 from ..calls.pose_exchange import PoseExchange, StreamMode
 from ..calls.tls import Tls
-from ..contract import RenderSettings
-from ..frames import Frame, frame_from_message, settings_message
-from ..geometry import PoseLike, pose_message
+from ..contract import Probe, RenderSettings
+from ..frames import Extrapolation, Frame, frame_from_message, settings_message
+from ..geometry import PoseLike, pose_message, pose_messages
+from ..messages import message_of
 from .connection import Connection
 from .datasets import Datasets
 from .jobs import Jobs
@@ -110,6 +111,20 @@ class Client:
         exchange = PoseExchange(settings_message(scene, settings), mode, shared_memory=shared_memory)
         call = self._connection.pose_call(self._calls.RenderStream, exchange, timeout_s, reconnect_s)
         return FrameStream(exchange, call)
+
+    def assess_poses(
+        self, scene: str, poses: Iterable[PoseLike], probe: Probe | None = None, *, timeout_s: float | None = None
+    ) -> tuple[Extrapolation, ...]:
+        """How far frames at these poses of a probe (None: the scene's own) would extrapolate, without rendering any.
+
+        `supported_share` is None: only a rendered frame tells it. Raises SceneNotFound, InvalidPose, InvalidProbe,
+        TooManyPoses.
+        """
+        request = message_of(
+            {"probe": probe}, rendering_pb2.AssessPosesRequest, scene=scene, poses=list(pose_messages(poses))
+        )
+        answer = self._connection.answer(self._calls.AssessPoses, request, timeout_s)
+        return tuple(from_message(one, Extrapolation) for one in answer.extrapolations)
 
     def who_am_i(self, *, timeout_s: float | None = None) -> Me:
         """The name and the role that the key stands for."""

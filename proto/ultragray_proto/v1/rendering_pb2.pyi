@@ -95,6 +95,22 @@ class Extrapolation(_message.Message):
     supported_share: float
     def __init__(self, distance_mm: _Optional[float] = ..., angle_deg: _Optional[float] = ..., confidence: _Optional[float] = ..., supported_share: _Optional[float] = ...) -> None: ...
 
+class AssessPosesRequest(_message.Message):
+    __slots__ = ("scene", "poses", "probe")
+    SCENE_FIELD_NUMBER: _ClassVar[int]
+    POSES_FIELD_NUMBER: _ClassVar[int]
+    PROBE_FIELD_NUMBER: _ClassVar[int]
+    scene: str
+    poses: _containers.RepeatedCompositeFieldContainer[_geometry_pb2.Pose]
+    probe: _geometry_pb2.Probe
+    def __init__(self, scene: _Optional[str] = ..., poses: _Optional[_Iterable[_Union[_geometry_pb2.Pose, _Mapping]]] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ...) -> None: ...
+
+class AssessPosesResponse(_message.Message):
+    __slots__ = ("extrapolations",)
+    EXTRAPOLATIONS_FIELD_NUMBER: _ClassVar[int]
+    extrapolations: _containers.RepeatedCompositeFieldContainer[Extrapolation]
+    def __init__(self, extrapolations: _Optional[_Iterable[_Union[Extrapolation, _Mapping]]] = ...) -> None: ...
+
 class Display(_message.Message):
     __slots__ = ("gain_db", "dynamic_range_db", "tgc_db", "depth_mm", "flip", "pixel_mm", "edge")
     GAIN_DB_FIELD_NUMBER: _ClassVar[int]

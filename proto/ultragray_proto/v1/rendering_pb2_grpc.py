@@ -44,6 +44,11 @@ class RenderServiceStub:
                 request_serializer=ultragray_dot_v1_dot_rendering__pb2.RenderBatchRequest.SerializeToString,
                 response_deserializer=ultragray_dot_v1_dot_rendering__pb2.Frame.FromString,
                 _registered_method=True)
+        self.AssessPoses = channel.unary_unary(
+                '/ultragray.v1.RenderService/AssessPoses',
+                request_serializer=ultragray_dot_v1_dot_rendering__pb2.AssessPosesRequest.SerializeToString,
+                response_deserializer=ultragray_dot_v1_dot_rendering__pb2.AssessPosesResponse.FromString,
+                _registered_method=True)
         self.RenderStream = channel.stream_stream(
                 '/ultragray.v1.RenderService/RenderStream',
                 request_serializer=ultragray_dot_v1_dot_rendering__pb2.RenderStreamRequest.SerializeToString,
@@ -66,6 +71,13 @@ class RenderServiceServicer:
         interactive callers. All poses are checked before the first frame is rendered, but for their confidence. A full queue refuses the call at its
         start (QUEUE_FULL); once frames flow, the call waits for room instead. A service that stops ends the call with DRAINING
         after the frames in flight; ask another one for the poses from the first sequence that is missing.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def AssessPoses(self, request, context):
+        """How far frames at these poses would extrapolate, and how far to trust them, without rendering any.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -100,6 +112,11 @@ def add_RenderServiceServicer_to_server(servicer, server):
                     servicer.RenderBatch,
                     request_deserializer=ultragray_dot_v1_dot_rendering__pb2.RenderBatchRequest.FromString,
                     response_serializer=ultragray_dot_v1_dot_rendering__pb2.Frame.SerializeToString,
+            ),
+            'AssessPoses': grpc.unary_unary_rpc_method_handler(
+                    servicer.AssessPoses,
+                    request_deserializer=ultragray_dot_v1_dot_rendering__pb2.AssessPosesRequest.FromString,
+                    response_serializer=ultragray_dot_v1_dot_rendering__pb2.AssessPosesResponse.SerializeToString,
             ),
             'RenderStream': grpc.stream_stream_rpc_method_handler(
                     servicer.RenderStream,
@@ -161,6 +178,33 @@ class RenderService:
             '/ultragray.v1.RenderService/RenderBatch',
             ultragray_dot_v1_dot_rendering__pb2.RenderBatchRequest.SerializeToString,
             ultragray_dot_v1_dot_rendering__pb2.Frame.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def AssessPoses(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/ultragray.v1.RenderService/AssessPoses',
+            ultragray_dot_v1_dot_rendering__pb2.AssessPosesRequest.SerializeToString,
+            ultragray_dot_v1_dot_rendering__pb2.AssessPosesResponse.FromString,
             options,
             channel_credentials,
             insecure,

@@ -15,6 +15,7 @@ from ultragray_workers.jobs.queue.owners import Kind
 from .principal import Role
 
 STREAM = "stream"  # the operation of poses in, frames out
+WATCH = "stream.watch"  # of somebody's stream
 WEBSOCKET = "WEBSOCKET"  # in place of the method, of a route that is one
 
 
@@ -36,7 +37,7 @@ class Operation:
     @property
     def lasts(self) -> bool:
         """Whether its begin and its end stand in the audit log."""
-        return self.name == STREAM
+        return self.name in (STREAM, WATCH)
 
     @property
     def changes(self) -> bool:
@@ -51,6 +52,8 @@ OPERATIONS = (
     Operation("render", _READER, ("POST /v1/scenes/{scene}/render",), ("RenderService/Render",), _SCENE),
     Operation("render.batch", _READER, (), ("RenderService/RenderBatch",), _SCENE),
     Operation(STREAM, _READER, (f"{WEBSOCKET} /v1/scenes/{{scene}}/stream",), ("RenderService/RenderStream",), _SCENE),
+    Operation("stream.list", _READER, ("GET /v1/streams",)),
+    Operation(WATCH, _READER, (f"{WEBSOCKET} /v1/streams/{{stream}}/watch",)),
     Operation("probe.plane", _READER, ("POST /v1/probes:plane",)),
     Operation("scene.list", _READER, ("GET /v1/scenes",), ("SceneService/ListScenes",)),
     Operation(
@@ -60,10 +63,11 @@ OPERATIONS = (
             "GET /v1/scenes/{scene}",
             "GET /v1/scenes/{scene}/gaussians",
             "GET /v1/scenes/{scene}/training-poses",
+            "POST /v1/scenes/{scene}:assess",
             "GET /v1/scenes/{scene}/comparison",
             "GET /v1/scenes/{scene}/comparison/{index}/{what}.png",
         ),
-        ("SceneService/GetScene",),
+        ("SceneService/GetScene", "RenderService/AssessPoses"),
         _SCENE,
     ),
     Operation("scene.download", _READER, ("GET /v1/scenes/{scene}/file",), (), _SCENE),
@@ -122,6 +126,7 @@ OPERATIONS = (
     Operation("worker.drain", _ADMIN, ("POST /v1/workers/{worker}:drain",), ("WorkerService/DrainWorker",), _WORKER),
     Operation("worker.resume", _ADMIN, ("POST /v1/workers/{worker}:resume",), ("WorkerService/ResumeWorker",), _WORKER),
     Operation("service.watch", _READER, ("GET /v1/statistics", "GET /metrics")),
+    Operation("service.get", _READER, ("GET /v1/service",)),
     Operation("me", _READER, ("GET /v1/me",), ("AccessService/WhoAmI",)),
     Operation("audit.list", _ADMIN, ("GET /v1/audit",), ("AccessService/ListAuditEntries",)),
     Operation(

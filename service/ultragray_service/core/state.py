@@ -34,9 +34,11 @@ from ..access.principal import Principal, act_as, caller
 from ..access.rules import Operation
 from ..access.sessions import Sessions
 from ..access.snapshot import Snapshot
+from ..doors import Doors
 from ..settings import Settings
 from ..telemetry.metrics import Metrics
 from ..telemetry.tracing import start_tracing
+from ..views.assessments import Assessing
 from ..views.comparisons import Comparisons
 from ..views.datasets import DatasetViews
 from ..views.training import TrainingViews
@@ -48,6 +50,7 @@ from .readiness.readiness import Readiness
 from .requests import Plan, RequestPlanner
 from .scene_imports import SceneImports
 from .scene_places import ScenePlaces
+from .streams.open_streams import OpenStreams
 
 
 class Phase(Enum):
@@ -114,12 +117,14 @@ class Service:
         store.hides = partial(self.owners.hides, Kind.SCENE)
         self.datasets.hides = partial(self.owners.hides, Kind.DATASET)
         self.metrics = Metrics(self.pool, lambda: self.jobs.overview, self.places)
+        self.streams = OpenStreams()
         self.limits = Limits(settings.allowance, self.metrics.count_limited)
         holdings = Holdings(self.limits, self.owners, self.datasets, store, self.jobs)
         self.jobs.admit = holdings.admit_job
         self.tracing = start_tracing("service")
         self.pool.on_rendered = self._observe
         self.phase = Phase.STARTING
+        self.doors = Doors.of(settings, settings.http_port, settings.grpc_port, None)  # until they are open
         self.draining = asyncio.Event()
         # Each process may take all the memory that settings allow to one: one checks at a time, and one makes pictures.
         checks, pictures = (HelperProcesses(settings.dataset_memory_mb << 20) for _ in range(2))
@@ -130,6 +135,7 @@ class Service:
         )
         self.dataset_views = DatasetViews(self.datasets, settings, pictures)
         self.comparisons = Comparisons(store, self.catalog, self.datasets, settings, pictures)
+        self.assessing = Assessing(self.catalog)
         self.training_views = TrainingViews(self.jobs, self.datasets, settings, pictures)
         self._prepared = (self.dataset_views, self.comparisons, self.training_views)
 

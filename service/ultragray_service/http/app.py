@@ -26,7 +26,7 @@ from . import problems
 from .console import add_console
 from .docs import add_docs
 from .middleware import QUIET_PATHS, Authorize, CheckOrigin, LimitBody, RequestContext
-from .reading.bodies import SPECIFICATIONS, JobBody, RenderBody, StreamMessage
+from .reading.bodies import SPECIFICATIONS, AssessBody, JobBody, RenderBody, StreamMessage
 from .reading.json_body import adapter_of
 from .routes import (
     access,
@@ -37,8 +37,10 @@ from .routes import (
     render,
     scene_files,
     scenes,
+    service_info,
     statistics,
     stream,
+    streams,
 )
 from .routes.jobs import jobs, training, workers
 from .stream_messages import FrameMessage, RefusalMessage
@@ -73,12 +75,22 @@ _ROUTERS = (
     jobs.router,
     training.router,
     workers.router,
+    streams.router,
     statistics.router,
+    service_info.router,
     health.router,
     access.router,
 )
 
-_READ: tuple[Any, ...] = (RenderBody, StreamMessage, JobBody, *SPECIFICATIONS, TrainingConfig, Probe)
+_READ: tuple[Any, ...] = (
+    RenderBody,
+    AssessBody,
+    StreamMessage,
+    JobBody,
+    *SPECIFICATIONS,
+    TrainingConfig,
+    Probe,
+)
 _WRITTEN: tuple[Any, ...] = (problems.Problem, FrameMessage, RefusalMessage)
 
 

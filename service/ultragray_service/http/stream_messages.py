@@ -8,7 +8,7 @@ from ultragray.contract import described
 from ultragray.errors import UltragrayError
 
 from ..core.frames import FrameHeader, settings_used
-from ..core.streams.pose_stream import Answered
+from ..core.streams.answers import Answered
 from ..errors import Refusal
 from .reading.json_body import adapter_of
 

@@ -11,9 +11,12 @@ from dataclasses import replace
 from typing import Protocol
 
 from ultragray.errors import UltragrayError
+from ultragray_workers.pool.types import RenderResult
 
 from ..core.state import Service
+from ..core.streams.answers import Answered
 from ..core.streams.buffers import hold_little
+from ..core.streams.open_streams import OpenStream
 from ..core.streams.unread import Unread
 from ..errors import IgtlMessageInvalid
 from .contents import (
@@ -66,6 +69,8 @@ class Connection:
         writer: asyncio.StreamWriter,
     ) -> None:
         self.feed = Feed(self._turn, self._send)
+        self.noted = OpenStream("openigtlink")
+        self._answers = 0
         self._service = service
         self._scenes = scenes
         self._frames = frames
@@ -187,6 +192,7 @@ class Connection:
             named = [tool for tool in tools if await self._scenes.named(tool.name) is not None]
             poses = [(tool.name, tool.pose) for tool in named or tools[:1]]
         for device_name, pose in poses:
+            self.noted.asked()
             posed = PoseMessage(replace(message, device_name=device_name), pose, arrived)
             if self._poses.put(posed, self._service.planner.deadline(None)):
                 self._service.metrics.count_dropped()
@@ -210,6 +216,7 @@ class Connection:
         try:
             frame = await self._maker.render(underway)
         except UltragrayError as error:
+            self._note(underway.posed, error)
             await self._refuse(underway.posed.message, error, underway.posed.arrived)
         except Exception:
             _log.exception("unexpected error at a pose")
@@ -217,9 +224,16 @@ class Connection:
             await self._refuse(underway.posed.message, unexpected, underway.posed.arrived)
         else:
             self._frames.publish(frame, self)
+            self._note(frame.posed, frame.result)
             asked = frame.posed.message
             await self._send(frame.message("IMAGE", asked.version, asked.message_id))
             self._count(asked.type_name, "OK", frame.posed.arrived)
+
+    def _note(self, posed: PoseMessage, outcome: RenderResult | UltragrayError) -> None:
+        """Shows an answer to those who watch."""
+        self.noted.name = posed.message.device_name
+        self._answers += 1
+        self.noted.answered(Answered(self._answers, None, outcome, posed.replaced))
 
     async def _refuse(self, about: Message, error: UltragrayError, arrived: float) -> None:
         self._service.metrics.count_frame_error(error)

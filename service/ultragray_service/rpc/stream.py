@@ -11,7 +11,8 @@ from ultragray.probe import FloatArray
 from ultragray_proto.codec import to_message
 from ultragray_proto.v1 import rendering_pb2, scenes_pb2
 
-from ..core.streams.pose_stream import MAX_WINDOW, Answered, StreamMode
+from ..core.streams.answers import Answered
+from ..core.streams.pose_stream import MAX_WINDOW, StreamMode
 from ..core.streams.stream import SceneSettings, checked_s
 from ..errors import Refusal
 from .messages import frame_message, read_pose, read_settings, read_word

@@ -57,7 +57,7 @@ def things(keyed: Keyed, scene_bytes: bytes, dataset_bytes: bytes) -> dict[str, 
     assert job.status_code == 201, job.text
     assert keyed.http("alice", "PUT", "/v1/scenes/hers", content=scene_bytes).status_code in (201, 409)
     assert keyed.http("alice", "PUT", "/v1/datasets/hers", content=dataset_bytes).status_code in (200, 201)
-    return {"scene": "hers", "dataset": "hers", "job": job.json()["id"], "worker": "absent"}
+    return {"scene": "hers", "dataset": "hers", "job": job.json()["id"], "worker": "absent", "stream": "absent"}
 
 
 def ask(keyed: Keyed, who: str, method: str, path: str) -> tuple[int, str | None]:

@@ -87,11 +87,9 @@ export class FrameStream {
   }
 
   #open(): void {
-    const key = apiKey();
-    const protocols = key === null ? [] : ["ultragray.v1", `ultragray.key.${base64url(key)}`];
-    const address = new URL(`/v1/scenes/${encodeURIComponent(this.scene)}/stream`, location.href);
-    address.protocol = address.protocol === "https:" ? "wss:" : "ws:";
-    const socket = new WebSocket(address, protocols);
+    const address = socketAddress(`/v1/scenes/${encodeURIComponent(this.scene)}/stream`);
+    address.searchParams.set("name", `console ${PAGE}`);
+    const socket = new WebSocket(address, subprotocols(apiKey()));
     socket.binaryType = "arraybuffer";
     socket.onopen = () => {
       this.#delay_ms = RECONNECT_MS.first;
@@ -210,6 +208,9 @@ export class FrameStream {
   }
 }
 
+/** Of this page, so that it does not take its own stream for somebody else's. */
+export const PAGE = Math.random().toString(36).slice(2, 8);
+
 const decoder = new TextDecoder();
 
 /** A binary message of the stream: the length of the JSON header (uint32, little endian), the header, the pixels. */
@@ -226,6 +227,18 @@ export function outputPixels({ header, pixels }: Frame, output: Output): Uint8Ar
   if (index < 0) return undefined;
   const count = header.height * header.width;
   return pixels.subarray(index * count, (index + 1) * count);
+}
+
+/** The address of a WebSocket of the service. */
+export function socketAddress(path: string): URL {
+  const address = new URL(path, location.href);
+  address.protocol = address.protocol === "https:" ? "wss:" : "ws:";
+  return address;
+}
+
+/** How a page, which cannot set headers, tells its key. */
+export function subprotocols(key: string | null): string[] {
+  return key === null ? [] : ["ultragray.v1", `ultragray.key.${base64url(key)}`];
 }
 
 function base64url(text: string): string {

@@ -6,6 +6,7 @@ export type Vector = readonly [number, number, number];
 export type Quaternion = readonly [number, number, number, number];
 
 const DEGREES = 180 / Math.PI;
+const UPRIGHT = 1 - 1e-10; // sine of a rock at which tilt and rotation are one turn, told as rotation
 
 export const IDENTITY: Pose = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1];
 
@@ -116,6 +117,8 @@ function aboutAxis([x, y, z]: Vector, angle_deg: number): Quaternion {
 export function anglesFrom(home: Pose, pose: Pose): Vector {
   const r = fromPositionQuaternion([0, 0, 0], multiply(conjugate(quaternion(home)), quaternion(pose)));
   // r = Rz(rotation) Ry(rock) Rx(tilt)
+  const rock = -entry(r, 2, 0);
+  if (Math.abs(rock) > UPRIGHT) return [0, Math.sign(rock) * 90, Math.atan2(-entry(r, 0, 1), entry(r, 1, 1)) * DEGREES];
   return [
     Math.atan2(entry(r, 2, 1), entry(r, 2, 2)) * DEGREES,
     Math.asin(Math.max(-1, Math.min(1, -entry(r, 2, 0)))) * DEGREES,

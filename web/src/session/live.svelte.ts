@@ -1,7 +1,10 @@
 /** The live frames of a session: at most one a screen refresh, the newest, with the rates they come at. */
 
 import { FrameStream, type Frame, type Refusal, type StreamSettings } from "../api/stream";
+import type { StreamSummary } from "../api/streams";
 import { service } from "../shell/service.svelte";
+import { Following } from "./following.svelte";
+import { Latency, type LatencyFigures } from "./latency";
 import type { Session } from "./session.svelte";
 
 const RATES_EVERY_MS = 500;
@@ -23,8 +26,15 @@ export class LiveView {
   /** Why the newest pose got no frame. */
   refusal = $state.raw<Refusal | null>(null);
   rates = $state.raw<Rates>({ perSecond: 0, roundTrip_ms: 0, render_ms: 0 });
+  latency = $state.raw<LatencyFigures | null>(null);
+  /** The stream of another program whose frames are shown in place of the page's own. */
+  following = $state.raw<Following | null>(null);
+  /** The one that was followed last, and why it is not any more. */
+  unfollowed = $state.raw<{ stream: StreamSummary; why: "ended" | "steered" } | null>(null);
+  #latency = new Latency();
   #stream: FrameStream;
   #arrived: Frame | null = null;
+  #arrived_ms = 0;
   #request = 0;
   #shown = 0;
   #since_ms = performance.now();
@@ -36,7 +46,9 @@ export class LiveView {
     private readonly onshow: (frame: Frame) => void = () => undefined,
   ) {
     this.#stream = new FrameStream(session.name, {
-      frame: (frame) => this.#take(frame),
+      frame: (frame) => {
+        if (this.following === null || this.following.renderedHere) this.#take(frame);
+      },
       refused: (refusal) => (this.refusal = refusal),
       connected: (yes) => {
         this.connected = yes;
@@ -56,15 +68,41 @@ export class LiveView {
       this.#failures = 0;
       this.#stream.reconnect();
     });
+    $effect(() => {
+      if (this.following?.wasSteered(session.pose)) this.unfollow("steered");
+    });
     $effect(() => () => this.#close());
   }
 
-  /** Asks for the frame of where the probe is now. */
+  /** Asks for the frame of where the probe is now; not while another program's frames are shown. */
   ask(settings: StreamSettings): void {
-    this.#stream.ask(this.session.pose, settings);
+    if (this.following === null) this.#stream.ask(this.session.pose, settings);
+  }
+
+  /** Shows the frames of another program's stream, and puts the probe where they are. */
+  follow(stream: StreamSummary): void {
+    this.following?.close();
+    this.unfollowed = null;
+    this.#latency = new Latency();
+    this.following = new Following(stream, this.session, {
+      frame: (frame) => this.#take(frame),
+      render: (pose, settings) => this.#stream.ask(pose, settings),
+      refused: (refusal) => (this.refusal = refusal),
+      ended: () => this.unfollow("ended"),
+    });
+  }
+
+  /** The page's own frames again; `why`: if not because the person said so. */
+  unfollow(why: "ended" | "steered" | null = null): void {
+    if (this.following === null) return;
+    this.unfollowed = why && { stream: this.following.stream, why };
+    this.following.close();
+    this.following = this.refusal = null;
+    this.#latency = new Latency();
   }
 
   #close(): void {
+    this.following?.close();
     this.#stream.close();
     clearInterval(this.#timer);
     cancelAnimationFrame(this.#request);
@@ -72,6 +110,7 @@ export class LiveView {
 
   #take(frame: Frame): void {
     this.#arrived = frame;
+    this.#arrived_ms = performance.now();
     this.refusal = null;
     this.session.rendered(frame.header.scene_sha256);
     if (this.#request === 0) this.#request = requestAnimationFrame(() => this.#show());
@@ -80,14 +119,18 @@ export class LiveView {
   #show(): void {
     this.#request = 0;
     if (this.#arrived === null) return;
-    this.frame = this.#arrived;
+    const { header, roundTrip_ms } = (this.frame = this.#arrived);
     this.#shown += 1;
+    const took_ms = this.following === null ? roundTrip_ms : header.queue_ms + header.render_ms + header.encode_ms;
+    this.#latency.shown(took_ms + performance.now() - this.#arrived_ms, header.dropped, performance.now());
+    this.following?.shown(this.#arrived);
     this.onshow(this.#arrived);
     this.#arrived = null;
   }
 
   #measure(): void {
     const now = performance.now();
+    this.latency = this.#latency.figures(now);
     const perSecond = (this.#shown * 1000) / (now - this.#since_ms);
     const { perSecond: before } = this.rates;
     this.#shown = 0;

@@ -19,6 +19,8 @@ from ultragray_workers.pool.waiting import Turn
 
 from ..requests import Plan
 from ..state import Service
+from .answers import Answered
+from .open_streams import OpenStream
 
 MAX_FRAMES_IN_FLIGHT = 8  # of an ordered stream; then it stops reading
 MAX_BYTES_IN_FLIGHT = 32 * 2**20  # of their frames, if there is more than one
@@ -43,16 +45,6 @@ class Asked:
     plan: Plan  # the same object until the client sends other settings
     pose: FloatArray  # [4, 4] mm, exact
     deadline: float  # time.monotonic() in seconds
-
-
-@dataclass(frozen=True, eq=False)
-class Answered:
-    """A frame, or why there is none."""
-
-    sequence: int
-    client_time: float | None
-    outcome: RenderResult | UltragrayError
-    dropped: int = 0  # poses that were replaced since the answer before
 
 
 Write = Callable[[Answered], Awaitable[None]]
@@ -129,10 +121,12 @@ class _Window:
 class PoseStream:
     """One stream of one client."""
 
-    def __init__(self, service: Service) -> None:
+    def __init__(self, service: Service, noted: OpenStream | None = None) -> None:
+        """`noted`: where others may see what is asked and answered."""
         self.mode = StreamMode.ORDERED  # to be set before the first pose, likewise:
         self.destination: Destination | None = None  # of its frames
         self._service = service
+        self._noted = noted or OpenStream()
         self._room = _Room()
         self._answers: asyncio.Queue[_Underway | None] = asyncio.Queue()
         self._started: set[asyncio.Task[Answered]] = set()
@@ -179,6 +173,7 @@ class PoseStream:
 
     async def ask(self, asked: Asked) -> None:
         """Takes a pose. An ordered stream waits while too many frames are in flight."""
+        self._noted.asked()
         if self.mode is StreamMode.ORDERED:
             settings = asked.plan.settings
             size = settings.pixels * settings.encoding.pixel_type.itemsize
@@ -223,8 +218,10 @@ class PoseStream:
         while (underway := await self._answers.get()) is not None:
             answered = await underway.work
             dropped, self._dropped = self._dropped, 0
+            answered = replace(answered, dropped=dropped)
+            self._noted.answered(answered)
             write = send if self.mode is StreamMode.ORDERED or self._window.is_open else hand_over
-            await write(replace(answered, dropped=dropped))
+            await write(answered)
             underway.sent()
 
     def _start(self, work: Coroutine[Any, Any, Answered], sent: Callable[[], None]) -> None:

@@ -11,7 +11,9 @@ from ultragray_workers.pool.types import Destination
 
 from ..requests import Plan
 from ..state import Service
-from .pose_stream import Answered, Asked, PoseStream, StreamMode, unexpected
+from .answers import Answered
+from .open_streams import OpenStream
+from .pose_stream import Asked, PoseStream, StreamMode, unexpected
 
 MAX_TIMEOUT_MS = 3_600_000.0
 
@@ -75,12 +77,18 @@ class FrameStream:
     A client whose first settings are refused gets no frames with settings that it did not ask for.
     """
 
-    def __init__(self, service: Service, transport: Transport, unset: SceneSettings | None = None) -> None:
+    def __init__(
+        self,
+        service: Service,
+        transport: Transport,
+        unset: SceneSettings | None = None,
+        noted: OpenStream | None = None,
+    ) -> None:
         self._service = service
         self._transport = transport
         self._unset = unset
         self._plan: Plan | None = None
-        self._poses = PoseStream(service)
+        self._poses = PoseStream(service, noted)
 
     async def run(self) -> None:
         """Answers until the client has sent its last message and got its last frame.

@@ -11,6 +11,7 @@ import numpy as np
 
 from ultragray.contract import Contract, annotated_fields, described
 from ultragray.errors import InvalidArgument, InvalidPose
+from ultragray.probe import Probe
 from ultragray.settings import FrameSettings, RenderSettings
 from ultragray_workers.jobs.job import MAX_PRIORITY
 from ultragray_workers.jobs.kinds import KINDS, Specification
@@ -21,6 +22,29 @@ from ...core.streams.stream import MAX_TIMEOUT_MS
 from .large_json import INLINE_BYTES, Apart
 
 _POSE_BYTES = 1024  # with room for indentation
+
+
+def _many_poses(limit: int) -> Apart:
+    """The part of a body that may be large."""
+    return Apart(
+        "poses",
+        list,
+        Pose,
+        InvalidPose,
+        lambda count: check_pose_count(count, limit),
+        max_bytes=INLINE_BYTES + limit * _POSE_BYTES,
+        max_values=math.inf,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class AssessBody(Contract):
+    """The poses to assess."""
+
+    poses: list[Pose] = described("At least one.", factory=list, error=InvalidPose)
+    probe: Probe | None = described("Whose poses they are. Default: the scene's own.", None)
+
+    many_poses = staticmethod(_many_poses)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,18 +67,7 @@ class RenderBody(FrameSettings):
         high=MAX_TIMEOUT_MS,
     )
 
-    @classmethod
-    def many_poses(cls, limit: int) -> Apart:
-        """The part of a body that may be large."""
-        return Apart(
-            "poses",
-            list,
-            Pose,
-            InvalidPose,
-            lambda count: check_pose_count(count, limit),
-            max_bytes=INLINE_BYTES + limit * _POSE_BYTES,
-            max_values=math.inf,
-        )
+    many_poses = staticmethod(_many_poses)
 
     def poses_by_path(self, limit: int) -> Sequence[tuple[str, Pose]]:
         """The poses, each with its path in the body. Raises InvalidArgument, TooManyPoses."""

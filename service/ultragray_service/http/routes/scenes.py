@@ -5,11 +5,16 @@ from __future__ import annotations
 from typing import Annotated
 
 from fastapi import APIRouter, Query
+from starlette.requests import Request
 
 from ...core import scenes
 from ...core.catalog import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE
+from ...core.poses import check_pose_count, exact_poses
 from ...core.scenes import Scene, SceneLoaded, ScenePage
+from ...views.assessments import Assessments
 from ..deps import SceneName, ServiceDep, problems
+from ..reading.bodies import AssessBody
+from ..reading.json_body import body_schema, read_json_body
 
 router = APIRouter(prefix="/v1/scenes", tags=["scenes"])
 
@@ -29,6 +34,16 @@ async def list_scenes(
 async def get_scene(service: ServiceDep, scene: SceneName) -> Scene:
     """Probe, bounds, centre, training poses and metrics; mm, in the frame of the training sweep."""
     return await scenes.scene(service, scene)
+
+
+@router.post("/{scene}:assess", openapi_extra=body_schema(AssessBody), responses=problems(401, 404, 413, 415, 422))
+async def assess_poses(request: Request, service: ServiceDep, scene: SceneName) -> Assessments:
+    """How far frames at these poses would extrapolate, and how far to trust them, without rendering any."""
+    most = service.planner.max_poses
+    body = await read_json_body(request, AssessBody, AssessBody.many_poses(most))
+    check_pose_count(len(body.poses), most)
+    poses = await exact_poses(len(body.poses), lambda index: body.poses[index].exact(f"poses[{index}]"))
+    return await service.assessing.assess(scene, poses, body.probe)
 
 
 @router.post("/{scene}:load", responses=problems(401, 403, 404, 422, 503, 507))

@@ -8,7 +8,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Annotated, Any
 
-from fastapi import APIRouter, WebSocket, WebSocketDisconnect
+from fastapi import APIRouter, Query, WebSocket, WebSocketDisconnect
 from pydantic import Field, FiniteFloat, TypeAdapter
 
 from ultragray.errors import InvalidArgument, UltragrayError
@@ -18,7 +18,8 @@ from ultragray_workers.errors import Draining
 
 from ...access.credentials import STREAM_PROTOCOL
 from ...core.state import Service
-from ...core.streams.pose_stream import Answered, StreamMode
+from ...core.streams.answers import Answered
+from ...core.streams.pose_stream import StreamMode
 from ...core.streams.stream import FrameStream, Message, SceneSettings
 from ...errors import statuses_of
 from ..deps import SceneName
@@ -33,18 +34,23 @@ router = APIRouter(prefix="/v1/scenes", tags=["render"])
 _ROUTE = "/v1/scenes/{scene}/stream"
 _SERVICE_RESTART = 1012  # RFC 6455's registry of close codes
 
+StreamName = Annotated[str, Query(description="Of the stream, for those who watch it.")]
+
 
 @router.websocket("/{scene}/stream")
-async def stream(websocket: WebSocket, scene: SceneName) -> None:
+async def stream(websocket: WebSocket, scene: SceneName, name: StreamName = "") -> None:
     """Poses in, frames out, in the order of the poses."""
     service: Service = websocket.app.state.service
     started = time.perf_counter()
     place = ExitStack()
     try:
-        _check_subprotocols(websocket.scope["subprotocols"])
+        check_subprotocols(websocket.scope["subprotocols"])
         service.require_serving()
         await service.catalog.header(scene)
         place.enter_context(service.limits.stream())
+        noted = place.enter_context(
+            service.streams.opened("websocket", name or websocket.headers.get("user-agent", ""))
+        )
     except UltragrayError as error:
         await websocket.send_denial_response(problem_response(error))
         service.metrics.count_request("websocket", _ROUTE, str(statuses_of(error).http), time.perf_counter() - started)
@@ -53,7 +59,7 @@ async def stream(websocket: WebSocket, scene: SceneName) -> None:
     try:
         with place:
             await websocket.accept(STREAM_PROTOCOL if STREAM_PROTOCOL in websocket.scope["subprotocols"] else None)
-            await FrameStream(service, _WebSocketTransport(websocket, scene), (scene, RenderSettings())).run()
+            await FrameStream(service, _WebSocketTransport(websocket, scene), (scene, RenderSettings()), noted).run()
     except WebSocketDisconnect:
         pass
     except Draining as error:
@@ -63,7 +69,7 @@ async def stream(websocket: WebSocket, scene: SceneName) -> None:
         service.metrics.count_request("websocket", _ROUTE, status, time.perf_counter() - started)
 
 
-def _check_subprotocols(offered: list[str]) -> None:
+def check_subprotocols(offered: list[str]) -> None:
     """Raises InvalidArgument for an offer without the one that is spoken: browsers hang up without it."""
     if offered and STREAM_PROTOCOL not in offered:
         raise InvalidArgument(

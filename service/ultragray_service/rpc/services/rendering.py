@@ -6,11 +6,13 @@ import asyncio
 import time
 from collections import deque
 from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
 
 import grpc
 
 from ultragray.errors import FrameTooCostly, InvalidArgument, LowConfidence
-from ultragray.probe import FloatArray
+from ultragray.probe import FloatArray, Probe
+from ultragray_proto.codec import to_message
 from ultragray_proto.v1 import rendering_pb2
 from ultragray_workers.errors import QueueFull
 from ultragray_workers.pool.types import Priority, RenderResult
@@ -19,10 +21,18 @@ from ...core.poses import check_pose_count, exact_poses
 from ...core.requests import Plan
 from ...core.state import Service
 from ...core.streams.stream import FrameStream, checked_s
-from ..messages import frame_message, read_pose, read_settings
+from ..messages import frame_message, read, read_pose, read_settings
 from ..stream import CallTransport
 
 _RETRY_S = 0.02
+_STREAM_NAME = "x-ultragray-stream-name"  # metadata
+
+
+@dataclass(frozen=True)
+class _OfProbe:
+    """The part of a request that says whose poses it has."""
+
+    probe: Probe | None = None
 
 
 class RenderService:
@@ -78,8 +88,20 @@ class RenderService:
     async def RenderStream(  # noqa: N802
         self, messages: object, context: grpc.aio.ServicerContext
     ) -> None:
-        with self._service.limits.stream(), CallTransport(context) as transport:
-            await FrameStream(self._service, transport).run()
+        told = {key: value for key, value in context.invocation_metadata() or () if isinstance(value, str)}
+        name = told.get(_STREAM_NAME) or told.get("user-agent", "")
+        streams = self._service.streams
+        with self._service.limits.stream(), streams.opened("grpc", name) as noted, CallTransport(context) as transport:
+            await FrameStream(self._service, transport, noted=noted).run()
+
+    async def AssessPoses(  # noqa: N802
+        self, request: rendering_pb2.AssessPosesRequest, context: grpc.aio.ServicerContext
+    ) -> rendering_pb2.AssessPosesResponse:
+        check_pose_count(len(request.poses), self._service.planner.max_poses)
+        probe = read(request, _OfProbe).probe
+        poses = await exact_poses(len(request.poses), lambda index: read_pose(request.poses[index], f"poses[{index}]"))
+        found = await self._service.assessing.assess(request.scene, poses, probe)
+        return to_message(found, rendering_pb2.AssessPosesResponse)
 
     async def _plan(self, request: rendering_pb2.RenderRequest | rendering_pb2.RenderBatchRequest) -> Plan:
         """The plan of a request. Raises what RequestPlanner.plan raises; the field is a path."""

@@ -1,0 +1,205 @@
+/** Connect: the examples run as they stand, and another program's stream is followed as that program sees it. */
+
+import assert from "node:assert/strict";
+import { execFileSync, spawn } from "node:child_process";
+import { mkdtempSync, readFileSync, rmSync, writeFileSync } from "node:fs";
+import { tmpdir } from "node:os";
+import path from "node:path";
+import { createInterface } from "node:readline";
+import { after, before, describe, it } from "node:test";
+
+import { canvasState, picture, PYTHON, ROOT, seriousFindings, SOURCES, until } from "./harness.mjs";
+import { enterPose, IMAGE, openScan, poseOf } from "./scan_page.mjs";
+import { tested } from "./tested.mjs";
+
+const ENVIRONMENT = { ...process.env, PYTHONPATH: `${SOURCES}:${path.join(ROOT, "client")}` };
+const SEEN_WITHIN_MS = 1000; // by a browser that draws in software; the service passes on within 200, see test_watching.py
+/** ROS's modules, as far as the example uses them: a subscription is called once, and what is published is kept. */
+const ROS = `
+import json, sys, types
+
+class Message:
+    def __init__(self, **values):
+        self.__dict__.update(values)
+
+class Node:
+    def __init__(self, name): pass
+    def get_logger(self): return types.SimpleNamespace(warning=print)
+    def create_publisher(self, kind, topic, depth): return types.SimpleNamespace(publish=self.published.append)
+    def create_subscription(self, kind, topic, callback, depth): self.callback = callback
+    published = []
+
+def spin(node):
+    place = types.SimpleNamespace(x=0.001, y=0.019, z=0.0)
+    turn = types.SimpleNamespace(w=1.0, x=0.0, y=0.0, z=0.0)
+    node.callback(Message(header="as it came", pose=types.SimpleNamespace(position=place, orientation=turn)))
+    image = node.published[0]
+    print(json.dumps([image.height, image.width, image.encoding, len(image.data), image.header]))
+
+for name, members in {
+    "rclpy": {"init": lambda: None, "spin": spin}, "rclpy.node": {"Node": Node},
+    "geometry_msgs": {}, "geometry_msgs.msg": {"PoseStamped": Message}, "sensor_msgs": {}, "sensor_msgs.msg": {"Image": Message},
+}.items():
+    module = types.ModuleType(name)
+    module.__dict__.update(members)
+    sys.modules[name] = module
+exec(open(sys.argv[1]).read())
+`;
+/** What grpcurl does: reads the request as JSON, and calls the method. */
+const GRPCURL = `
+import shlex, sys, grpc
+from google.protobuf import json_format
+from ultragray_proto.v1 import rendering_pb2, rendering_pb2_grpc
+words = shlex.split(open(sys.argv[1]).read().replace("\\\\\\n", " "))
+assert words[0] == "grpcurl" and words[-1] == "ultragray.v1.RenderService/Render", words
+request = json_format.Parse(words[words.index("-d") + 1], rendering_pb2.RenderRequest())
+with grpc.insecure_channel(words[-2], options=[("grpc.max_receive_message_length", -1)]) as channel:
+    frame = rendering_pb2_grpc.RenderServiceStub(channel).Render(request, timeout=60)
+print(frame.height, frame.width, len(frame.data))
+`;
+
+const at = tested({ environment: { ULTRAGRAY_IGTL_PORT: "0" } });
+let folder;
+before(() => (folder = mkdtempSync(path.join(tmpdir(), "ultragray-connect-"))));
+after(() => rmSync(folder, { recursive: true, force: true }));
+
+async function program(page, language) {
+  await page.getByLabel("Language of the example").selectOption(language);
+  await page.getByRole("button", { name: /^Copy the example in/ }).click();
+  const text = await page.getByTestId("snippet").inputValue();
+  assert.equal(await page.evaluate(() => navigator.clipboard.readText()), text);
+  return text;
+}
+
+function run(command, ...words) {
+  return execFileSync(command, words, { cwd: folder, env: ENVIRONMENT, encoding: "utf8", timeout: 120_000 });
+}
+
+function written(name, text) {
+  const file = path.join(folder, name);
+  writeFileSync(file, text);
+  return file;
+}
+
+/** A program that streams; `say` tells it what to do, `next` is its next answer. */
+function startRobot(name, settings = { height: 120, width: 100 }) {
+  const address = `${at.service.url.replace("http", "ws")}/v1/scenes/demo/stream?name=${name}`;
+  const child = spawn(PYTHON, [path.join(ROOT, "tests/console/robot.py"), address, JSON.stringify(settings)], {
+    env: ENVIRONMENT,
+    stdio: ["pipe", "pipe", "inherit"],
+  });
+  const lines = createInterface({ input: child.stdout })[Symbol.asyncIterator]();
+  return {
+    say: (line) => child.stdin.write(`${line}\n`),
+    next: async () => (await lines.next()).value.split(" ").map(Number),
+    stop: () => child.kill("SIGTERM"),
+  };
+}
+
+async function follow(page, name) {
+  await page.getByText("Open streams").click();
+  await page.getByRole("button", { name: `Follow ${name}` }).click();
+  await page.getByTestId("following").getByText(`Following ${name}`).waitFor();
+}
+
+describe("connect", () => {
+  it("gives programs that run as they stand: curl, Python, gRPC, WebSocket, OpenIGTLink, ROS 2", async () => {
+    const { page } = await openScan(at);
+    await page.getByLabel("Gain", { exact: true }).fill("6");
+    await page.getByRole("combobox", { name: "Probe" }).selectOption("convex");
+    await until(() => canvasState(page, IMAGE), ({ width }) => width === 640, "no sector came");
+    run("bash", written("ask.sh", await program(page, "curl")));
+    const { width, height } = await canvasState(page, IMAGE);
+    const png = readFileSync(path.join(folder, "frame.png"));
+    assert.deepEqual([png.readUInt32BE(16), png.readUInt32BE(20)], [width, height]);
+    assert.match(run(PYTHON, written("ask.py", await program(page, "python"))), new RegExp(`bmode ${height}x${width}`));
+    const call = written("grpcurl.sh", await program(page, "grpc"));
+    assert.equal(run(PYTHON, "-c", GRPCURL, call).trim(), `${height} ${width} ${height * width}`);
+    const streamed = run(PYTHON, written("stream.py", await program(page, "websocket"))).trim().split("\n");
+    assert.equal(streamed.length, 50);
+    assert.match(streamed[49], new RegExp(`^49 \\(1, ${height}, ${width}\\)`));
+    assert.match(run(PYTHON, written("igtl.py", await program(page, "igtl"))), /\(1, 256, 256\)/);
+    const image = JSON.parse(run(PYTHON, "-c", ROS, written("ros.py", await program(page, "ros"))));
+    assert.deepEqual(image, [height, width, "mono8", height * width, "as it came"]);
+    await picture(page, "connect");
+    assert.deepEqual(page.faults, []);
+  });
+
+  it("follows another program: its frames, its pose, its probe, until the person moves", async () => {
+    const robot = startRobot("UR5", { height: 120, width: 100, probe: { kind: "linear", width_mm: 30, near_mm: 0, far_mm: 40 } });
+    try {
+      await robot.next();
+      const { page } = await openScan(at, { width: 1920, height: 1080 });
+      await follow(page, "UR5");
+      robot.say("x 3");
+      await robot.next();
+      await until(() => canvasState(page, IMAGE), (state) => state.width === 100 && state.height === 120, "its frames do not come");
+      const late = [];
+      for (const x of [1, 2, 4, 5, 6]) {
+        const seen = page.waitForFunction(
+          (wanted) => JSON.parse(document.querySelector('textarea[aria-label^="Pose as JSON"]').value).position_mm.x === wanted && Date.now(),
+          x,
+          { polling: "raf" },
+        );
+        robot.say(`x ${x}`);
+        const [, rendered_ms] = await robot.next();
+        late.push((await (await seen).jsonValue()) - rendered_ms);
+      }
+      late.sort((a, b) => a - b);
+      assert.ok(late[2] < SEEN_WITHIN_MS, `seen after ${late} ms`);
+      await page.getByLabel("Latency on the image").check();
+      await page.getByTestId("latency").getByText("rendered in").waitFor();
+      await picture(page, "connect-following");
+      await page.locator(`${IMAGE} .steer`).focus();
+      await page.keyboard.press("ArrowRight");
+      await page.getByTestId("unfollowed").getByText("You moved the probe: no longer following UR5.").waitFor();
+      robot.say("x 9");
+      await robot.next();
+      await page.waitForTimeout(400);
+      assert.ok((await poseOf(page)).position_mm.x < 9, "it still follows");
+      await page.getByTestId("latency").getByText(/latency \d+ ms/).waitFor();
+      assert.deepEqual([page.faults, page.foreign], [[], []]);
+    } finally {
+      robot.stop();
+    }
+  });
+
+  it("renders by itself what no page can show, and tells when the program has gone", async () => {
+    const robot = startRobot("planner", { height: 90, width: 80, encoding: "float32", outputs: ["coverage"] });
+    try {
+      await robot.next();
+      const { page } = await openScan(at);
+      await follow(page, "planner");
+      robot.say("x 2");
+      await page.getByTestId("following").getByText("the same poses are rendered here").waitFor();
+      await until(() => canvasState(page, IMAGE), (state) => state.width === 80 && state.height === 90 && state.mean > 1, "nothing is rendered");
+      robot.stop();
+      await page.getByTestId("unfollowed").getByText("planner has closed its stream.").waitFor();
+      await until(() => canvasState(page, IMAGE), ({ width }) => width === 256, "the page's own image did not come back");
+    } finally {
+      robot.stop();
+    }
+  });
+
+  it("does not list the page's own stream, and knows other pages of the console", async () => {
+    const { page } = await openScan(at);
+    await page.getByText("Open streams").click();
+    await page.getByText("No other program has a stream open on this scene.").waitFor();
+    const { page: other } = await openScan(at);
+    await page.getByRole("button", { name: "Follow Another page of the console" }).click();
+    await enterPose(other, '{"position_mm": {"x": 5, "y": 1, "z": 0}, "quaternion": {"w": 1, "x": 0, "y": 0, "z": 0}}');
+    await until(() => poseOf(page), ({ position_mm }) => position_mm.x === 5 && position_mm.y === 1, "it does not follow");
+    assert.deepEqual(await seriousFindings(page), []);
+  });
+
+  it("tells version, renderer and documentation, and latency on the image only when asked", async () => {
+    const { page } = await openScan(at);
+    assert.match(await page.getByTestId("service-version").textContent(), /^\d+\.\d+/);
+    await until(() => page.getByTestId("service-renderer").textContent(), (text) => /^ultragray\/.* cpu/.test(text), "no renderer");
+    assert.equal(await page.getByRole("link", { name: "API documentation" }).getAttribute("href"), "/docs");
+    assert.equal(await page.getByTestId("latency").count(), 0);
+    await page.getByLabel("Latency on the image").check();
+    await page.getByTestId("latency").getByText(/latency \d+ ms, 99 % below \d+ ms/).waitFor();
+    await page.getByTestId("latency").getByText(/age of the image/).waitFor();
+  });
+});

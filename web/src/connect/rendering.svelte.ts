@@ -1,0 +1,60 @@
+/** A path that becomes a data set: a job of the service, from its start to its files. */
+
+import { cancelJob, followJob, isFinal, startJob, type Job } from "../api/jobs";
+import { explain, untilAnswered } from "../api/client";
+import type { Pose } from "../geometry/pose";
+import type { Session } from "../session/session.svelte";
+
+export class Rendering {
+  job = $state.raw<Job | null>(null);
+  problem = $state<string | null>(null);
+  readonly isUnderWay = $derived(this.job !== null && !isFinal(this.job));
+  #stopped = new AbortController();
+
+  /** Renders poses with the image settings of a session. */
+  async start(session: Session, poses: readonly Pose[], format: string): Promise<void> {
+    this.problem = null;
+    const { height, width, probe, display, slice_thickness_mm } = session.settings(["bmode"]);
+    const specification = { scene: session.name, poses: inBase64(poses), format, height, width, probe, display, slice_thickness_mm };
+    try {
+      this.job = await startJob("render", specification, false);
+      await this.#follow(this.job.id);
+    } catch (error) {
+      if (!this.#stopped.signal.aborted) this.problem = explain(error);
+    }
+  }
+
+  async cancel(): Promise<void> {
+    try {
+      if (this.job !== null) await cancelJob(this.job.id);
+    } catch (error) {
+      this.problem = explain(error);
+    }
+  }
+
+  /** Leaves the job to the service. */
+  leave(): void {
+    this.#stopped.abort();
+  }
+
+  async #follow(id: string): Promise<void> {
+    let last: string | null = null;
+    const told = {
+      job: (job: Job) => (this.job = job),
+      log: () => undefined,
+      event: (event: string) => (last = event),
+    };
+    const { signal } = this.#stopped;
+    while (this.isUnderWay && !signal.aborted)
+      await untilAnswered(() => followJob(id, last, told, signal), () => undefined, signal);
+  }
+}
+
+/** Row by row as float64, the low byte first. */
+function inBase64(poses: readonly Pose[]): string {
+  const bytes = new Uint8Array(new Float64Array(poses.flat()).buffer);
+  const pieces: string[] = [];
+  for (let start = 0; start < bytes.length; start += 0x8000)
+    pieces.push(String.fromCharCode(...bytes.subarray(start, start + 0x8000)));
+  return btoa(pieces.join(""));
+}

@@ -1,0 +1,253 @@
+/** The frame of now as programs in other languages ask for it: whole programs, which run as they stand. */
+
+import type { StreamSettings } from "../api/stream";
+import { entry, position, quaternion, type Pose } from "../geometry/pose";
+
+export const LANGUAGES = ["curl", "python", "grpc", "websocket", "igtl", "ros"] as const;
+export type Language = (typeof LANGUAGES)[number];
+
+/** Where the service is. */
+export interface Target {
+  /** As the page found it: https://host:port */
+  origin: string;
+  host: string;
+  grpcPort: number;
+  /** null: off. */
+  igtlPort: number | null;
+  igtlIsLocal: boolean;
+  keyRequired: boolean;
+  scene: string;
+}
+
+/** What is asked for. */
+export interface Asked {
+  pose: Pose;
+  /** Of the probe that the scene was trained with, which OpenIGTLink takes. */
+  trainedPose: Pose;
+  settings: StreamSettings;
+}
+
+type Given = Record<string, unknown>;
+
+const KEY = "YOUR_KEY";
+const MOST_DEVICE_NAME = 20; // letters, in OpenIGTLink
+const LARGEST_MESSAGE = 64 * 2 ** 20;
+
+/** The program; null where the service has no such door. */
+export function snippet(language: Language, target: Target, asked: Asked): string | null {
+  switch (language) {
+    case "curl":
+      return curl(target, asked);
+    case "python":
+      return python(target, asked);
+    case "grpc":
+      return grpc(target, asked);
+    case "websocket":
+      return websocket(target, asked);
+    case "igtl":
+      return target.igtlPort === null ? null : igtl(target, asked, target.igtlPort);
+    case "ros":
+      return ros(target, asked);
+  }
+}
+
+function curl({ origin, scene, keyRequired }: Target, { pose, settings }: Asked): string {
+  const key = keyRequired ? ` -H 'X-API-Key: ${KEY}'` : "";
+  const parts = Object.entries({ pose: placement(pose), ...known(settings) });
+  const body = `{\n${parts.map(([name, value]) => `    ${JSON.stringify(name)}: ${JSON.stringify(value)}`).join(",\n")}\n  }`;
+  return `curl -sS --fail-with-body ${origin}/v1/scenes/${encodeURIComponent(scene)}/render${key} \\
+  -H 'Content-Type: application/json' -H 'Accept: image/png' -o frame.png \\
+  -d '${body}'
+`;
+}
+
+function python(target: Target, { pose, settings }: Asked): string {
+  const { probe, display, ...plain } = known(settings) as Given & { probe?: Given; display?: Given };
+  const parts = Object.entries(plain).map(([name, value]) => `${name}=${literal(value)}`);
+  const classes = ["Client", "RenderSettings"];
+  if (display !== undefined) {
+    classes.push("Display");
+    parts.push(`display=Display(${keywords(display)})`);
+  }
+  if (probe !== undefined) {
+    const { kind, ...numbers } = probe;
+    const name = `${capital(String(kind))}Probe`;
+    classes.push(name);
+    parts.push(`probe=${name}(${keywords(numbers)})`);
+  }
+  const options = [isSecure(target) ? ", tls=Tls()" : "", target.keyRequired ? `, api_key="${KEY}"` : ""].join("");
+  if (isSecure(target)) classes.push("Tls");
+  return `import numpy as np
+from ultragray_client import ${classes.sort().join(", ")}
+
+pose = ${matrix(pose)}
+settings = RenderSettings(${parts.join(", ")})
+with Client("${target.host}:${target.grpcPort}"${options}) as client:
+    frame = client.render("${target.scene}", pose, settings)
+print(frame, frame.extrapolation)
+np.save("frame.npy", frame["bmode"])
+`;
+}
+
+function grpc(target: Target, { pose, settings }: Asked): string {
+  const { probe, outputs, below_min_confidence, ...plain } = known(settings) as Given & { probe?: Given; outputs?: string[] };
+  const message: Given = { scene: target.scene, ...plain };
+  if (outputs !== undefined) message.outputs = outputs.map((output) => `OUTPUT_${output.toUpperCase()}`);
+  if (below_min_confidence !== undefined)
+    message.below_min_confidence = `BELOW_CONFIDENCE_${String(below_min_confidence).toUpperCase()}`;
+  if (probe !== undefined) {
+    const { kind, ...numbers } = probe;
+    message.probe = { [String(kind)]: numbers };
+  }
+  const request = JSON.stringify({ settings: message, pose: { matrix: { values: pose.map(short) } } });
+  const key = target.keyRequired ? ` -H 'x-api-key: ${KEY}'` : "";
+  return `grpcurl${isSecure(target) ? "" : " -plaintext"} -max-msg-sz ${LARGEST_MESSAGE}${key} \\
+  -d '${request}' \\
+  ${target.host}:${target.grpcPort} ultragray.v1.RenderService/Render
+`;
+}
+
+function websocket(target: Target, { pose, settings }: Asked): string {
+  return `import json
+import struct
+
+import numpy as np
+from websockets.sync.client import connect
+
+pose = ${literal(placement(pose))}
+settings = ${literal(known(settings))}
+with connect(${streamAddress(target, "example")}) as stream:
+    for step in range(50):
+        pose["position_mm"]["y"] += 0.1  # read your tracker here
+        message = {"sequence": step, "mode": "latest", "pose": pose}
+        if step == 0:
+            message["settings"] = settings
+        stream.send(json.dumps(message))
+        answer = stream.recv()
+        if isinstance(answer, str):
+            print(json.loads(answer)["error"]["detail"])
+            continue
+        (length,) = struct.unpack_from("<I", answer)
+        header = json.loads(answer[4 : 4 + length])
+        pixels = np.frombuffer(answer, np.uint8, offset=4 + length).reshape(-1, header["height"], header["width"])
+        print(header["sequence"], pixels.shape, header["extrapolation"])
+`;
+}
+
+function igtl({ scene, host, igtlIsLocal }: Target, { trainedPose }: Asked, port: number): string {
+  const device = scene.length > MOST_DEVICE_NAME ? "ProbeToReference" : scene;
+  const image = scene.length > MOST_DEVICE_NAME ? "Image_Reference" : `Image_${scene}`.slice(0, MOST_DEVICE_NAME);
+  return `import numpy as np
+import pyigtl
+
+pose = ${matrix(trainedPose)}
+client = pyigtl.OpenIGTLinkClient("${igtlIsLocal ? "127.0.0.1" : host}", ${port})
+client.send_message(pyigtl.TransformMessage(pose, device_name="${device}"))
+image = client.wait_for_message("${image}", timeout=30)
+print(image.image.shape, image.ijk_to_world_matrix)
+client.stop()
+`;
+}
+
+function ros(target: Target, { pose, settings }: Asked): string {
+  const [x, y, z] = position(pose).map((value) => short(value / 1000));
+  const [w, i, j, k] = quaternion(pose).map(short);
+  const now = `{pose: {position: {x: ${x}, y: ${y}, z: ${z}}, orientation: {x: ${i}, y: ${j}, z: ${k}, w: ${w}}}}`;
+  return `# The pose of now: ros2 topic pub --once /probe_pose geometry_msgs/msg/PoseStamped "${now}"
+import json
+import struct
+
+import rclpy
+from geometry_msgs.msg import PoseStamped
+from rclpy.node import Node
+from sensor_msgs.msg import Image
+from websockets.sync.client import connect
+
+SETTINGS = ${literal(known(settings))}
+
+
+class Ultrasound(Node):
+    """Poses of the probe in the scene's frame, in metres, become images."""
+
+    def __init__(self):
+        super().__init__("ultrasound")
+        self.stream = connect(${streamAddress(target, "ros")})
+        self.images = self.create_publisher(Image, "ultrasound", 1)
+        self.create_subscription(PoseStamped, "probe_pose", self.render, 1)
+
+    def render(self, stamped):
+        p, q = stamped.pose.position, stamped.pose.orientation
+        pose = {
+            "position_mm": {"x": 1000 * p.x, "y": 1000 * p.y, "z": 1000 * p.z},
+            "quaternion": {"w": q.w, "x": q.x, "y": q.y, "z": q.z},
+        }
+        self.stream.send(json.dumps({"pose": pose, "settings": SETTINGS}))
+        answer = self.stream.recv()
+        if isinstance(answer, str):
+            self.get_logger().warning(json.loads(answer)["error"]["detail"])
+            return
+        (length,) = struct.unpack_from("<I", answer)
+        header = json.loads(answer[4 : 4 + length])
+        image = Image(height=header["height"], width=header["width"], encoding="mono8", step=header["width"])
+        image.header = stamped.header
+        image.data = answer[4 + length : 4 + length + header["height"] * header["width"]]
+        self.images.publish(image)
+
+
+rclpy.init()
+rclpy.spin(Ultrasound())
+`;
+}
+
+function streamAddress(target: Target, name: string): string {
+  const base = target.origin.replace(/^http/, "ws");
+  const address = `"${base}/v1/scenes/${encodeURIComponent(target.scene)}/stream?name=${name}"`;
+  return `${address}, max_size=None${target.keyRequired ? `, additional_headers={"X-API-Key": "${KEY}"}` : ""}`;
+}
+
+function isSecure({ origin }: Target): boolean {
+  return origin.startsWith("https:");
+}
+
+/** Settings without those that are left to the scene. */
+function known(settings: StreamSettings): Given {
+  const { display, ...others } = settings as Given & { display?: Given | null };
+  const given = Object.fromEntries(Object.entries(others).filter(([, value]) => value !== null));
+  if (given.min_confidence === undefined) delete given.below_min_confidence;
+  const shown = Object.entries(display ?? {}).filter(([, value]) => value !== null);
+  return shown.length > 0 ? { ...given, display: Object.fromEntries(shown) } : given;
+}
+
+function placement(pose: Pose): Given {
+  const [x, y, z] = position(pose).map(short);
+  const [w, i, j, k] = quaternion(pose).map(short);
+  return { position_mm: { x, y, z }, quaternion: { w, x: i, y: j, z: k } };
+}
+
+function matrix(pose: Pose): string {
+  const rows = [0, 1, 2, 3].map((row) => `[${[0, 1, 2, 3].map((column) => short(entry(pose, row, column))).join(", ")}]`);
+  return `np.array([${rows.join(", ")}], dtype=float)`;
+}
+
+/** Seven digits are enough for a rotation to be taken as one, and for nanometres. */
+function short(value: number): number {
+  return Number(value.toFixed(7)) + 0;
+}
+
+function keywords(values: Given): string {
+  return Object.entries(values).map(([name, value]) => `${name}=${literal(value)}`).join(", ");
+}
+
+/** A value as Python writes it. */
+function literal(value: unknown): string {
+  if (value === null) return "None";
+  if (typeof value === "boolean") return value ? "True" : "False";
+  if (Array.isArray(value)) return `[${value.map(literal).join(", ")}]`;
+  if (typeof value === "object")
+    return `{${Object.entries(value as Given).map(([name, one]) => `${JSON.stringify(name)}: ${literal(one)}`).join(", ")}}`;
+  return JSON.stringify(value);
+}
+
+function capital(word: string): string {
+  return word.charAt(0).toUpperCase() + word.slice(1);
+}

@@ -1,0 +1,60 @@
+/** How poses are told in a session: against what, in which form. */
+
+import { fromPositionQuaternion, position, quaternion, withPosition, type Pose } from "../geometry/pose";
+import { placeIn, withPlaceIn, type Place, type Reference } from "../geometry/pose_frames";
+import type { PoseForm } from "../geometry/pose_text";
+import type { Session } from "../session/session.svelte";
+
+export const MOST_MM = 10_000; // beyond, a typed position is a slip
+
+export class PoseTelling {
+  reference = $state<Reference>("absolute");
+  form = $state<PoseForm>("json");
+  /** Whether relative poses are told against the mark; else against Home. */
+  fromMark = $state(false);
+  mark = $state.raw<Pose | null>(null);
+  readonly other = $derived.by(() => (this.fromMark && this.mark ? this.mark : this.session.held(this.session.home)));
+
+  constructor(private readonly session: Session) {}
+
+  setMark(pose: Pose): void {
+    this.mark = pose;
+    this.fromMark = true;
+    if (this.reference === "absolute") this.reference = "relativeProbe";
+  }
+
+  place(pose: Pose): Place {
+    return placeIn(pose, this.reference, this.other);
+  }
+
+  /** Moves the probe along one axis of what is told. */
+  setPosition(index: number, value_mm: number): void {
+    const place = this.place(this.session.pose);
+    const moved = withPlaceIn({ ...place, position_mm: replaced(place.position_mm, index, value_mm) }, this.reference, this.other);
+    const turn = fromPositionQuaternion([0, 0, 0], quaternion(this.session.pose)); // its digits stay as they are
+    this.session.pose = withPosition(turn, position(moved));
+  }
+
+  /** Turns the probe about its face. */
+  setAngle(index: number, value_deg: number): void {
+    const place = this.place(this.session.pose);
+    const turned = withPlaceIn({ ...place, angles_deg: replaced(place.angles_deg, index, value_deg) }, this.reference, this.other);
+    this.session.turnTo(quaternion(turned));
+  }
+}
+
+function replaced(vector: Place["position_mm"], index: number, value: number): Place["position_mm"] {
+  return vector.map((before, i) => (i === index ? value : before)) as unknown as Place["position_mm"];
+}
+
+const known = new WeakMap<Session, PoseTelling>();
+
+/** That of a session; the same for every view. */
+export function tellingOf(session: Session): PoseTelling {
+  const before = known.get(session);
+  if (before !== undefined) return before;
+  let begun!: PoseTelling;
+  $effect.root(() => void (begun = new PoseTelling(session)));
+  known.set(session, begun);
+  return begun;
+}

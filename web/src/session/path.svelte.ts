@@ -1,0 +1,111 @@
+/** The path of the probe in a session: poses of a file or a recording, with their times. */
+
+import { distance_mm, type Pose } from "../geometry/pose";
+import { MOST_BYTES, readPoses } from "../geometry/pose_files/read";
+import type { Chosen, PoseFile } from "../geometry/pose_files/pose_file";
+import { words } from "../words/words.svelte";
+import { PoseError } from "../geometry/pose_faults";
+import { explain } from "../api/client";
+import type { Session } from "./session.svelte";
+
+const EVERY_MS = 33;
+const MOST_RECORDED = 100_000;
+
+export class Path {
+  /** The file that is played, as it was read. */
+  file = $state.raw<PoseFile | null>(null);
+  times_s = $state.raw<number[] | null>(null);
+  /** Why a file is not played, in words. */
+  problem = $state<string | null>(null);
+  recording = $state(false);
+  /** Whether the recording ended by itself. */
+  isFull = $state(false);
+  recorded = $state({ count: 0, seconds: 0 });
+  readonly poses = $derived.by(() => this.session.trajectory?.poses ?? []);
+  readonly length_mm = $derived(this.poses.reduce((sum, pose, i) => sum + (i > 0 ? distance_mm(pose, this.poses[i - 1]!) : 0), 0));
+  #source: { name: string; buffer: ArrayBuffer } | null = null;
+  #timer: ReturnType<typeof setInterval> | undefined;
+  #taken: { pose: Pose; time_s: number }[] = [];
+  #number = 0;
+
+  constructor(private readonly session: Session) {}
+
+  /** Reads a file and plays it. */
+  async load(file: File): Promise<void> {
+    const isSequence = /\.mh[ad]$/i.test(file.name); // images follow its poses
+    if (file.size > MOST_BYTES && !isSequence) {
+      this.problem = words.connect.path.wrong(file.name, words.connect.path.tooLarge);
+      return;
+    }
+    this.#source = { name: file.name, buffer: await file.slice(0, MOST_BYTES).arrayBuffer() };
+    this.choose({});
+  }
+
+  /** Reads the file again, another way. */
+  choose(chosen: Chosen): void {
+    if (this.#source === null) return;
+    const { name, buffer } = this.#source;
+    this.problem = null;
+    try {
+      const file = readPoses(name, buffer, { ...(this.file?.unitIsKnown === false && { unit: this.file.unit }), ...chosen });
+      this.#play(name, file.poses, file.times_s);
+      this.file = file;
+    } catch (error) {
+      const reason = error instanceof PoseError ? words.connect.poseError(error) : explain(error);
+      this.problem = words.connect.path.wrong(name, reason);
+    }
+  }
+
+  /** The training sweep again. */
+  leave(): void {
+    this.problem = null;
+    this.#source = this.file = this.times_s = null;
+    this.session.follow(null);
+  }
+
+  /** Takes down what the probe does, until `stop`. */
+  record(): void {
+    this.#taken = [];
+    this.isFull = false;
+    this.recording = true;
+    const begun_ms = performance.now();
+    const take = (): void => {
+      const time_s = (performance.now() - begun_ms) / 1000;
+      this.#taken.push({ pose: this.session.trainedPose, time_s });
+      this.recorded = { count: this.#taken.length, seconds: time_s };
+      if (this.#taken.length >= MOST_RECORDED) {
+        this.isFull = true;
+        this.stop();
+      }
+    };
+    take();
+    this.#timer = setInterval(take, EVERY_MS);
+  }
+
+  /** Ends the recording, which is then what is played. */
+  stop(): void {
+    clearInterval(this.#timer);
+    this.recording = false;
+    this.#number += 1;
+    this.#source = this.file = null;
+    const poses = this.#taken.map(({ pose }) => pose);
+    this.#play(words.connect.path.recorded(this.#number), poses, this.#taken.map(({ time_s }) => time_s));
+  }
+
+  #play(name: string, poses: Pose[], times_s: number[] | null): void {
+    this.session.follow({ name, poses });
+    this.times_s = times_s;
+  }
+}
+
+const known = new WeakMap<Session, Path>();
+
+/** That of a session; the same for every view. */
+export function pathOf(session: Session): Path {
+  const before = known.get(session);
+  if (before !== undefined) return before;
+  let begun!: Path;
+  $effect.root(() => void (begun = new Path(session))); // what it derives outlives the view that asked first
+  known.set(session, begun);
+  return begun;
+}
