@@ -156,6 +156,9 @@ describe("the list of jobs", () => {
     const page = await openPage(at, "#/train?show=jobs");
     const row = page.getByRole("region", { name: "Jobs" }).getByRole("listitem").first();
     await row.waitFor();
+    await page.waitForResponse(/\/v1\/datasets\?/);
+    await page.waitForResponse(/\/v1\/jobs\?/);
+    await page.waitForTimeout(200);
     await page.evaluate(() => {
       globalThis.changes = 0;
       new MutationObserver((found) => (globalThis.changes += found.length)).observe(document.querySelector(".side"), { subtree: true, childList: true, characterData: true, attributes: true });
