@@ -36,7 +36,7 @@ const GOES_ON: readonly Command[] = ["previousFrame", "nextFrame", "undo", "redo
 export function commandOf(event: KeyboardEvent, singleKeys: boolean): Command | undefined {
   const target = event.target as HTMLElement;
   if (takesText(target) || event.altKey || document.querySelector("dialog[open]") !== null) return undefined;
-  if (event.key === " " && target.closest("button, a, input, summary, [role=button]")) return undefined;
+  if (event.key === " " && target.closest("button, a, input:not([type=range]), summary, [role=button]")) return undefined;
   const isControlled = event.ctrlKey || event.metaKey;
   if (!isControlled && !singleKeys && event.key !== "Escape") return undefined;
   const shift = isControlled && event.shiftKey ? "shift+" : ""; // the sign of a key alone has Shift in it

@@ -23,7 +23,7 @@ const KEYS = [
 
 /** A pose as a value of an address. */
 export function poseValue(pose: Pose): string {
-  const numbers = [...position(pose).map((value) => value.toFixed(4)), ...quaternion(pose).map((value) => value.toFixed(7))];
+  const numbers = [...position(pose).map((value) => value.toFixed(6)), ...quaternion(pose).map((value) => value.toFixed(9))];
   return numbers.map((text) => String(Number(text))).join(BETWEEN);
 }
 

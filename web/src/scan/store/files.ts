@@ -5,6 +5,8 @@ import type { Page, Sheet } from "./sheet";
 
 const VIDEO_TYPES = ["video/mp4;codecs=avc1.640028", "video/webm;codecs=vp9", "video/webm;codecs=vp8", "video/webm"];
 const BITS_PER_SECOND = 8e6;
+const PIECE_MS = 200;
+const LATE_MS = 5000; // a busy machine may take so long to encode its first picture
 
 /** Throws where the browser cannot make a PNG of that size. */
 export async function pngOf(sheet: Sheet, page: Page): Promise<Blob> {
@@ -31,20 +33,32 @@ export async function videoOf(
   sheet.draw(pages[0]!);
   const recorder = new MediaRecorder(sheet.canvas.captureStream(perSecond), { mimeType, videoBitsPerSecond: BITS_PER_SECOND });
   const parts: Blob[] = [];
-  recorder.ondataavailable = ({ data }) => parts.push(data);
-  const ended = new Promise<void>((resolve, reject) => {
-    recorder.onstop = () => resolve();
-    recorder.onerror = () => reject(new Error(words.scan.store.noVideo));
-  });
-  recorder.start();
+  recorder.ondataavailable = ({ data }) => data.size > 0 && parts.push(data);
+  recorder.start(PIECE_MS);
+  await happened(recorder, "start");
   const began_ms = performance.now();
   for (const [index, page] of pages.entries()) {
     sheet.draw(page);
     told(index + 1);
-    const due_ms = began_ms + ((index + 1) * 1000) / perSecond;
-    await new Promise((resolve) => setTimeout(resolve, Math.max(0, due_ms - performance.now())));
+    await pause(began_ms + ((index + 1) * 1000) / perSecond - performance.now());
+  }
+  for (let waited_ms = 0; parts.length === 0 && waited_ms < LATE_MS; waited_ms += PIECE_MS) {
+    sheet.draw(pages.at(-1)!);
+    await pause(PIECE_MS);
   }
   recorder.stop();
-  await ended;
+  await happened(recorder, "stop");
+  if (parts.length === 0) throw new Error(words.scan.store.noVideo);
   return { blob: new Blob(parts, { type: mimeType }), suffix: mimeType.startsWith("video/mp4") ? "mp4" : "webm" };
+}
+
+function happened(recorder: MediaRecorder, type: "start" | "stop"): Promise<void> {
+  return new Promise((resolve, reject) => {
+    recorder.addEventListener(type, () => resolve(), { once: true });
+    recorder.addEventListener("error", () => reject(new Error(words.scan.store.noVideo)), { once: true });
+  });
+}
+
+function pause(for_ms: number): Promise<void> {
+  return new Promise((resolve) => setTimeout(resolve, Math.max(0, for_ms)));
 }

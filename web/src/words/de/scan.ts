@@ -28,7 +28,7 @@ export const scan: Words["scan"] = {
       angle: "Einen Winkel messen (A)",
       text: "Auf das Bild schreiben (T)",
     },
-    removeAll: "Messungen entfernen",
+    removeAll: "Alles entfernen",
     undo: "Rückgängig",
     undoHint: "Rückgängig (Strg+Z)",
     redo: "Wiederholen",

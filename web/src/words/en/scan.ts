@@ -88,7 +88,7 @@ export const scan = {
     freezeHint: "Freeze or unfreeze (F)",
     kinds,
     kindHints,
-    removeAll: "Remove the measurements",
+    removeAll: "Remove all",
     undo: "Undo",
     undoHint: "Undo (Ctrl+Z)",
     redo: "Redo",
