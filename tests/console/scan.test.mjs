@@ -1,14 +1,11 @@
 /** Scan: frames come, follow the probe and the controls, and what stands in the way is said. */
 
 import assert from "node:assert/strict";
-import { readFileSync } from "node:fs";
 import { describe, it } from "node:test";
 
 import { canvasState, openPage, picture, seriousFindings, until } from "./harness.mjs";
 import { changed, dragProbe, enterPose, IMAGE, openScan, poseOf } from "./scan_page.mjs";
 import { tested } from "./tested.mjs";
-
-const PROBE_WIDTH_MM = 60; // of the demo scene
 
 const at = tested();
 
@@ -73,42 +70,6 @@ describe("scan", () => {
     await until(() => canvasState(page, IMAGE), ({ width }) => width === 512, "no scan lines came");
   });
 
-  it("freezes, goes through the cine loop, measures and saves", async () => {
-    const { page, first } = await openScan(at);
-    await page.getByLabel("Position Y", { exact: true }).fill("0");
-    const second = await changed(page, first.print);
-    await page.getByRole("button", { name: "Freeze" }).click();
-    await page.getByLabel("Position Y", { exact: true }).fill("5");
-    await page.waitForTimeout(400);
-    assert.equal((await canvasState(page, IMAGE)).print, second.print, "the image moved while frozen");
-    const place = page.getByTestId("cine-place");
-    await until(() => place.textContent(), (text) => /^(\d+) \/ \1$/.test(text), "the newest frame is not the one shown");
-    await page.getByLabel("Frame of the cine loop").fill("0");
-    await until(() => canvasState(page, IMAGE), ({ print }) => print === first.print, "the first frame is not kept");
-
-    await page.getByRole("button", { name: "Measure" }).click();
-    const box = await page.locator(`${IMAGE} canvas`).boundingBox();
-    await page.mouse.move(box.x + box.width * 0.25, box.y + box.height * 0.5);
-    await page.mouse.down();
-    await page.mouse.move(box.x + box.width * 0.75, box.y + box.height * 0.5, { steps: 4 });
-    await page.mouse.up();
-    const length = parseFloat(await page.getByTestId("calliper-length").textContent());
-    assert.ok(Math.abs(length - PROBE_WIDTH_MM / 2) < 0.4, `${length} mm`);
-    const end = page.getByLabel("Calliper 1, end B");
-    await end.focus();
-    for (let press = 0; press < 10; press++) await page.keyboard.press("ArrowRight");
-    const longer = parseFloat(await page.getByTestId("calliper-length").textContent());
-    assert.ok(Math.abs(longer - length - (10 * PROBE_WIDTH_MM) / box.width) < 0.2, `${longer} after ${length} mm`);
-
-    const [download] = await Promise.all([page.waitForEvent("download"), page.getByRole("button", { name: "Save" }).click()]);
-    assert.equal(download.suggestedFilename(), "demo.png");
-    assert.equal(readFileSync(await download.path()).subarray(1, 4).toString(), "PNG");
-    await picture(page, "scan-frozen");
-    await page.getByRole("button", { name: "Freeze" }).click();
-    await changed(page, first.print);
-    assert.deepEqual(page.faults, []);
-  });
-
   it("snaps to training views, plays them, and says how far the view is from them", async () => {
     const { page, first } = await openScan(at);
     const confidence = page.getByTestId("confidence");
@@ -142,7 +103,7 @@ describe("scan", () => {
     const { page } = await openScan(at);
     const room = page.getByTestId("room");
     await room.locator("canvas").waitFor();
-    await until(() => room.locator("canvas").evaluate((canvas) => canvas.width), (width) => width > 300, "no 3D view");
+    await until(() => room.locator("canvas").evaluate((canvas) => canvas.width), (width) => width > 200, "no 3D view");
     await page.waitForTimeout(1500); // the Gaussians are on their way
     const changes = async (change, what) => {
       const before = (await room.screenshot()).toString("base64");

@@ -99,26 +99,6 @@ describe("poses", () => {
 });
 
 describe("the image", () => {
-  it("is measured by keyboard, and by two clicks", async () => {
-    const { page } = await openScan(at);
-    const lengths = () => page.getByTestId("calliper-length").allTextContents();
-    await page.getByRole("button", { name: "Measure" }).focus();
-    await page.keyboard.press("Enter");
-    await until(lengths, (all) => all.join() === "10.0 mm", "no calliper of a centimetre");
-    const focused = () => page.evaluate(() => document.activeElement?.getAttribute("aria-label") ?? "");
-    await until(focused, (label) => label.startsWith("Calliper 1, end B"), "its end has no focus");
-    await page.keyboard.press("Shift+ArrowRight");
-    await until(lengths, ([one]) => parseFloat(one) > 10.5, "its end does not move");
-    await page.getByLabel("Remove the measurements").click();
-    const box = await page.locator(`${IMAGE} canvas`).boundingBox();
-    await page.mouse.click(box.x + box.width * 0.25, box.y + box.height * 0.5);
-    await page.mouse.click(box.x + box.width * 0.75, box.y + box.height * 0.5);
-    await until(lengths, (all) => all.length === 1 && Math.abs(parseFloat(all[0]) - 30) < 0.4, "two clicks are no distance");
-    await page.mouse.click(box.x + box.width * 0.3, box.y + box.height * 0.7);
-    await page.keyboard.press("Escape");
-    await until(lengths, (all) => all.length === 1, "a measurement that was not ended stays");
-  });
-
   it("goes back to its full depth by the slider where that is no whole number", async () => {
     const { page } = await openScan(at);
     await page.route(/\/v1\/scenes\/demo$/, async (route) => {

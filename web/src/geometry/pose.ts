@@ -170,3 +170,21 @@ export function nearest(poses: readonly Pose[], pose: Pose): number {
   }
   return best;
 }
+
+/** Where a pose lies on a track, in its poses and between them too; null where it is beside it. */
+export function placeOn(track: readonly Pose[], pose: Pose): number | null {
+  const index = nearest(track, pose);
+  for (const start of [index - 1, index]) {
+    const [from, to] = [track[start], track[start + 1]];
+    if (from === undefined || to === undefined) continue;
+    const whole_mm = distance_mm(from, to);
+    const share = whole_mm === 0 ? 0 : Math.min(1, distance_mm(from, pose) / whole_mm);
+    if (isSame(between(from, to, share), pose)) return start + share;
+  }
+  return index >= 0 && isSame(track[index]!, pose) ? index : null;
+}
+
+/** Whether two poses differ by no more than what is lost in writing them. */
+function isSame(a: Pose, b: Pose): boolean {
+  return distance_mm(a, b) < 0.01 && angle_deg(a, b) < 0.01;
+}

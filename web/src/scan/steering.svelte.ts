@@ -2,6 +2,8 @@
 
 import type { Vector } from "../geometry/pose";
 import type { Session } from "../session/session.svelte";
+import type { Commands } from "./commands";
+import { scanSettings } from "./settings.svelte";
 
 const SPEED_MM_S = 25;
 const SPEED_DEG_S = 30;
@@ -30,6 +32,10 @@ const TURNS: Record<string, Vector> = {
   PageDown: [0, 1, 0],
 };
 
+type PadCommands = Pick<Commands, "freeze" | "snap" | "store" | "home">;
+/** Buttons of a gamepad in the standard layout. */
+const PAD_BUTTONS: readonly (readonly [number, keyof PadCommands])[] = [[0, "freeze"], [1, "snap"], [2, "store"], [3, "home"]];
+
 export class Steering {
   playing = $state(false);
   gamepad = $state<string | null>(null);
@@ -37,8 +43,13 @@ export class Steering {
   #request = 0;
   #last_ms = 0;
   #direction = 1;
+  #pressed: boolean[] = [];
 
-  constructor(private readonly session: Session) {
+  constructor(
+    private readonly session: Session,
+    /** What the buttons of a gamepad do. */
+    private readonly commands: Partial<PadCommands> = {},
+  ) {
     addEventListener("gamepadconnected", this.#connected);
     addEventListener("gamepaddisconnected", this.#connected);
     addEventListener("blur", this.#release);
@@ -65,7 +76,17 @@ export class Steering {
     this.#held.delete(event.key);
   }
 
+  /** Stops what moves the probe by itself. */
+  halt(): void {
+    this.playing = false;
+    this.#held.clear();
+  }
+
   togglePlaying(): void {
+    if (this.session.frozen) {
+      this.session.refusals += 1;
+      return;
+    }
     this.playing = !this.playing;
     if (this.playing && !this.session.onTrack) this.session.returnToTrack();
     this.#run();
@@ -88,11 +109,20 @@ export class Steering {
     const seconds = Math.min(0.1, Math.max(0, (now_ms - this.#last_ms) / 1000));
     this.#last_ms = now_ms;
     for (const [key, { shift, fine }] of this.#held) this.#step(key, shift, fine, seconds);
-    if (this.gamepad !== null) this.#move(gamepadMotion(), seconds);
+    if (this.gamepad !== null) this.#followPad(seconds);
     if (this.playing) this.#play(seconds);
     const goesOn = this.#held.size > 0 || this.playing || this.gamepad !== null;
     this.#request = goesOn ? requestAnimationFrame(this.#tick) : 0;
   };
+
+  #followPad(seconds: number): void {
+    const pad = connectedPad();
+    if (pad === undefined) return;
+    this.#move(motionOf(pad), seconds);
+    const pressed = pad.buttons.map((button) => button.pressed);
+    for (const [button, command] of PAD_BUTTONS) if (pressed[button] && !this.#pressed[button]) this.commands[command]?.();
+    this.#pressed = pressed;
+  }
 
   #play(seconds: number): void {
     const last = this.session.track.length - 1;
@@ -109,6 +139,7 @@ export class Steering {
   }
 
   #move({ along, turn }: Motion, seconds: number): void {
+    seconds *= scanSettings.speed;
     const scaled = (vector: Vector, factor: number): Vector => [vector[0] * factor, vector[1] * factor, vector[2] * factor];
     if (along.some((value) => value !== 0)) this.session.moveBy(scaled(along, SPEED_MM_S * seconds));
     if (turn.some((value) => value !== 0)) this.session.turnBy(scaled(turn, SPEED_DEG_S * seconds));
@@ -116,13 +147,12 @@ export class Steering {
 }
 
 /** Left stick: slide; right stick: rotate and tilt; triggers: axial; shoulder buttons: rock. */
-function gamepadMotion(): Motion {
-  const pad = connectedPad();
+function motionOf(pad: Gamepad): Motion {
   const stick = (index: number): number => {
-    const value = pad?.axes[index] ?? 0;
+    const value = pad.axes[index] ?? 0;
     return Math.abs(value) < DEAD_ZONE ? 0 : value;
   };
-  const button = (index: number): number => pad?.buttons[index]?.value ?? 0;
+  const button = (index: number): number => pad.buttons[index]?.value ?? 0;
   return {
     along: [stick(0), stick(1), button(7) - button(6)],
     turn: [stick(3), button(5) - button(4), stick(2)],

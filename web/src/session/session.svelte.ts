@@ -13,12 +13,14 @@ import {
   IDENTITY,
   nearest,
   pivoted,
+  placeOn,
   rotated,
   translated,
   type Pose,
   type Quaternion,
   type Vector,
 } from "../geometry/pose";
+import { History } from "./history.svelte";
 import { planes } from "./planes.svelte";
 
 /** A probe with its image plane. */
@@ -33,8 +35,10 @@ export interface Trajectory {
   poses: Pose[];
 }
 
+/** Depth samples and scan lines that are offered, beside those of the training. */
+export const SIZES = [128, 256, 384, 512, 768];
 export const DISPLAY = settings.properties!.display!;
-const AS_RENDERED = defaultsOf(DISPLAY) as Display;
+export const AS_RENDERED = defaultsOf(DISPLAY) as Display;
 const MOST_PICTURE_PIXELS = 640; // on the longer side of a scan-converted fan
 /** In place of the own probe of a scene that has none. */
 const SUBSTITUTE = exampleProbe([...PROBE_KINDS.keys()][0]!, 50);
@@ -53,7 +57,14 @@ export class Session {
   views = $state.raw<Pose[]>([]);
   /** How far each was corrected in the training; null: none was. */
   corrections = $state.raw<Pick<TrainingPoses, "shift_mm" | "turn_deg"> | null>(null);
-  pose = $state.raw<Pose>(IDENTITY);
+  #pose = $state.raw<Pose>(IDENTITY);
+  /** Whether the image stands: the pose is that of the frame shown, and nothing steers the probe. */
+  frozen = $state(false);
+  /** How often the probe was to be steered while the image stood. */
+  refusals = $state(0);
+  /** How often the probe went elsewhere at once, so that a person may want to go back. */
+  jumps = $state(0);
+  readonly history = new History();
   /** What is played in place of the training sweep. */
   trajectory = $state.raw<Trajectory | null>(null);
   /** Where the probe was put last on the track, in its poses; between them too. */
@@ -86,8 +97,8 @@ export class Session {
   /** What becomes of a pose that the probe is slid or dragged to, from where it was: in contact its face stays on the skin. */
   constrain: (before: Pose, after: Pose) => Pose = (_, after) => after;
   #placed = $state.raw<Pose | null>(null);
-  /** Whether the probe is where the track last put it. */
-  readonly onTrack = $derived(this.pose === this.#placed);
+  /** Whether the probe is at `place`. */
+  readonly onTrack = $derived(this.#pose === this.#placed);
   #asking = false;
   #choices = 0;
   #sha256: string | null = null;
@@ -146,6 +157,38 @@ export class Session {
     };
   }
 
+  /** Where the probe is held. Setting it steers, which is refused while the image stands. */
+  get pose(): Pose {
+    return this.#pose;
+  }
+
+  set pose(pose: Pose) {
+    this.#steer(pose, "steering");
+  }
+
+  /** Puts the probe elsewhere at once. */
+  jumpTo(pose: Pose): void {
+    this.#jump(() => this.#steer(pose) && this.#put(pose));
+  }
+
+  /** Lets the image stand, at the pose of the frame that is shown. */
+  freeze(pose: Pose): void {
+    this.frozen = true;
+    this.refusals = 0;
+    this.#put(pose);
+  }
+
+  /** Takes the pose of another frame while the image stands. */
+  lookAt(pose: Pose): void {
+    if (this.frozen) this.#put(pose);
+  }
+
+  /** Lets the probe be steered again, from where it is unless another pose is given. */
+  unfreeze(pose: Pose = this.#pose): void {
+    this.frozen = false;
+    if (pose !== this.#pose) this.#put(pose);
+  }
+
   /** Slides the probe along its own axes: lateral, elevation, axial. */
   moveBy(along_mm: Vector): void {
     this.pose = this.constrain(this.pose, translated(this.pose, along_mm));
@@ -163,16 +206,12 @@ export class Session {
 
   /** To the middle of the sweep. */
   goHome(): void {
-    if (this.trajectory === null && this.views.length > 0) this.goTo(Math.floor(this.views.length / 2));
-    else this.pose = this.held(this.home);
+    this.#jump(() => this.#toView(Math.floor(this.views.length / 2), this.home));
   }
 
   /** To a place of the track, in its poses. */
   goTo(place: number): void {
-    this.place = Math.max(0, Math.min(this.track.length - 1, place));
-    const before = this.track[Math.floor(this.place)];
-    const after = this.track[Math.ceil(this.place)];
-    if (before && after) this.pose = this.#placed = this.held(between(before, after, this.place % 1));
+    this.#follow(place, "steering");
   }
 
   /** To the pose of the track that is nearest. */
@@ -184,7 +223,7 @@ export class Session {
   follow(trajectory: Trajectory | null): void {
     this.trajectory = trajectory;
     if (trajectory === null) this.goHome();
-    else this.goTo(0);
+    else this.#jump(() => this.#follow(0));
   }
 
   /** The pose that puts the face of the probe in use where that of the scene's own probe was. */
@@ -194,15 +233,13 @@ export class Session {
 
   /** The pose of the scene's own probe with its face where that of the probe in use is. */
   get trainedPose(): Pose {
-    return translated(this.pose, [0, 0, this.plane.pivot_depth_mm - this.scenePlane.pivot_depth_mm]);
+    return this.#trained(this.#pose);
   }
 
   /** To the nearest training view. */
   snap(): void {
     const index = nearest(this.views, this.trainedPose);
-    if (index < 0) return;
-    if (this.trajectory === null) this.goTo(index);
-    else this.pose = this.held(this.views[index]!);
+    if (index >= 0) this.#jump(() => this.#toView(index, this.views[index]!));
   }
 
   /** Takes another probe, its face where that of the one before was. Throws ServiceError for one that cannot be. */
@@ -214,8 +251,8 @@ export class Session {
     this.#chosen = chosen;
     this.display = { ...this.display, depth_mm: null };
     const { onTrack } = this;
-    this.pose = translated(this.pose, [0, 0, before - this.plane.pivot_depth_mm]);
-    if (onTrack) this.#placed = this.pose;
+    this.#pose = translated(this.#pose, [0, 0, before - this.plane.pivot_depth_mm]);
+    if (onTrack) this.#placed = this.#pose;
   }
 
   resetDisplay(): void {
@@ -223,12 +260,64 @@ export class Session {
     this.sliceThickness_mm = null;
   }
 
+  /** Moves the probe as a step that can be undone; false where the image stands. Changes of one `run` are one step. */
+  #steer(pose: Pose, run: string | null = null): boolean {
+    if (this.frozen) {
+      this.refusals += 1;
+      return false;
+    }
+    // Steps remember where the face was, which another probe does not change.
+    this.history.change((trained) => this.#put(this.held(trained)), this.trainedPose, this.#trained(pose), { run });
+    this.#pose = pose;
+    return true;
+  }
+
+  /** Puts the probe somewhere, and finds that place on the track if it is on it. */
+  #put(pose: Pose): void {
+    this.#pose = pose;
+    const place = placeOn(this.track, this.#trained(pose));
+    if (place === null) return;
+    this.place = place;
+    this.#placed = pose;
+  }
+
+  #jump(move: () => unknown): void {
+    const before = this.#pose;
+    move();
+    if (this.#pose !== before) this.jumps += 1;
+  }
+
+  /** To a training view, which is on the track unless other poses are played. */
+  #toView(index: number, view: Pose): void {
+    if (this.trajectory === null && this.views.length > 0) this.#follow(index);
+    else this.#steer(this.held(view));
+  }
+
+  /** To a place of the track. */
+  #follow(place: number, run: string | null = null): void {
+    const kept = Math.max(0, Math.min(this.track.length - 1, place));
+    const before = this.track[Math.floor(kept)];
+    const after = this.track[Math.ceil(kept)];
+    if (!before || !after) return;
+    const pose = this.held(between(before, after, kept % 1));
+    if (!this.#steer(pose, run)) return;
+    this.place = kept;
+    this.#placed = pose;
+  }
+
+  /** The inverse of `held`. */
+  #trained(pose: Pose): Pose {
+    return translated(pose, [0, 0, this.plane.pivot_depth_mm - this.scenePlane.pivot_depth_mm]);
+  }
+
   /** What was chosen for another scene of that name does not fit this one. */
   #beginAnew(): void {
+    this.frozen = false;
     this.#choices += 1;
     this.#chosen = this.trajectory = this.samples = this.sliceThickness_mm = null;
     this.display = { ...this.display, depth_mm: null };
     this.goHome();
+    this.history.clear();
   }
 }
 

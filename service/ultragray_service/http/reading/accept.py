@@ -13,10 +13,11 @@ PNG = "image/png"
 JPEG = "image/jpeg"
 RAW = "application/octet-stream"
 NPZ = "application/x-npz"
-MEDIA_TYPES = (PNG, JPEG, RAW, NPZ)
+DICOM = "application/dicom"
+MEDIA_TYPES = (PNG, JPEG, RAW, NPZ, DICOM)
 
 RAW_ENCODINGS = {"uint8": Encoding.UINT8, "float32": Encoding.FLOAT32}
-_IMAGE_ENCODINGS = {PNG: Encoding.PNG, JPEG: Encoding.JPEG, NPZ: Encoding.NPZ}
+_ENCODINGS = {PNG: Encoding.PNG, JPEG: Encoding.JPEG, NPZ: Encoding.NPZ, DICOM: Encoding.UINT8}
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,7 @@ def choose(accept: str, *, frames: int, outputs: int, dtype: str | None, lossles
     Raises NotAcceptable, saying which types can hold the request.
     """
     single = frames == 1 and outputs == 1
-    able: Sequence[str] = (PNG, JPEG, RAW, NPZ) if single else (NPZ, RAW)
+    able: Sequence[str] = (PNG, JPEG, RAW, NPZ, DICOM) if single else (NPZ, RAW, DICOM) if outputs == 1 else (NPZ, RAW)
     if lossless:
         able = tuple(media_type for media_type in able if media_type != JPEG)
     if dtype is not None:  # only raw pixels have one
@@ -99,4 +100,4 @@ def choose(accept: str, *, frames: int, outputs: int, dtype: str | None, lossles
     _, media_type, chosen = best
     if media_type == RAW:
         return Choice(RAW, RAW_ENCODINGS[chosen.dtype or dtype or "uint8"])
-    return Choice(media_type, _IMAGE_ENCODINGS[media_type])
+    return Choice(media_type, _ENCODINGS[media_type])

@@ -1,17 +1,22 @@
-"""Frames for poses. The Accept header chooses the form; the workers encode: no pixel is touched here."""
+"""Frames for poses. The Accept header chooses the form; the workers encode, but for DICOM, which wraps their pixels."""
 
 from __future__ import annotations
 
+import asyncio
 import json
 from dataclasses import asdict
 from functools import lru_cache
 from typing import Any
 
+import numpy as np
 from fastapi import APIRouter
 from starlette.requests import Request
 from starlette.responses import Response
 
 from ultragray.contract import to_dict
+from ultragray.interchange.exports.exporter import ExportHeader
+from ultragray.interchange.exports.formats import FORMATS, check_format, exporter_class
+from ultragray.interchange.exports.whole import export_bytes
 from ultragray.outputs import OUTPUTS
 from ultragray.settings import Resolved
 from ultragray_workers.pool.types import Priority, RenderResult
@@ -23,7 +28,7 @@ from ...telemetry.statistics import STAGES
 from ..deps import SCENE_NAME, problems
 from ..disconnect import finish_or_abandon
 from ..examples import RENDER_EXAMPLES
-from ..reading.accept import JPEG, NPZ, PNG, RAW, choose
+from ..reading.accept import DICOM, JPEG, NPZ, PNG, RAW, choose
 from ..reading.bodies import RenderBody
 from ..reading.json_body import body_schema, read_json_body
 
@@ -60,8 +65,9 @@ _ANSWER: dict[int | str, dict[str, Any]] = {
         "description": "The frames. image/png and image/jpeg: one pose, one output. application/octet-stream "
         "(parameter dtype=uint8 or float32): the outputs one after another, each [C, H, W]. application/x-npz "
         "holds one float32 array [C, H, W] per output, `poses` [C, 4, 4], and the strings scene, scene_sha256 and "
-        "renderer. `*/*` gives PNG where it can hold the request, else npz.",
-        "content": {PNG: _BINARY, JPEG: _BINARY, RAW: _BINARY, NPZ: _BINARY},
+        "renderer. application/dicom: a multi-frame ultrasound image of bmode, true to scale (fans are scan-converted). "
+        "`*/*` gives PNG where it can hold the request, else npz.",
+        "content": {PNG: _BINARY, JPEG: _BINARY, RAW: _BINARY, NPZ: _BINARY, DICOM: _BINARY},
         "headers": {name: {"description": text, "schema": {"type": "string"}} for name, text in RENDER_HEADERS.items()},
     }
 }
@@ -71,7 +77,7 @@ _ANSWER: dict[int | str, dict[str, Any]] = {
     "/{scene}/render",
     response_class=Response,
     openapi_extra=_OPENAPI,
-    responses=_ANSWER | problems(401, 404, 406, 413, 415, 422, 429, 500, 503, 504, 507),
+    responses=_ANSWER | problems(401, 404, 406, 413, 415, 422, 429, 500, 501, 503, 504, 507),
 )
 async def render(request: Request) -> Response:
     """One frame per pose and output. Poses: probe to scene, in mm, in the frame of the training sweep."""
@@ -90,9 +96,15 @@ async def render(request: Request) -> Response:
         dtype=body.dtype,
         lossless=any(OUTPUTS[name].is_numbers for name in body.outputs),
     )
-    plan = await planner.plan(
-        scene, body, choice.encoding, complete=lambda settings: planner.check_pixels(settings, len(poses))
-    )
+    is_dicom = choice.media_type == DICOM
+    if is_dicom:
+        check_format("dicom", body.outputs, body.dtype)
+        await asyncio.to_thread(exporter_class, "dicom")  # refused before anything is rendered
+
+    def complete(settings: Resolved) -> Resolved:
+        return planner.check_pixels(FORMATS["dicom"].shown(settings) if is_dicom else settings, len(poses))
+
+    plan = await planner.plan(scene, body, choice.encoding, complete=complete)
     exact = await exact_poses(len(poses), lambda index: poses[index][1].exact(poses[index][0]))
     priority = Priority.INTERACTIVE if body.poses is None else Priority.BATCH
 
@@ -101,7 +113,15 @@ async def render(request: Request) -> Response:
         return await service.render(plan, exact, priority=priority, deadline=deadline, begin_by=begin_by)
 
     result = await finish_or_abandon(rendered(), request.receive, deadline)
-    return Response(result.data, 200, render_headers(result), choice.media_type)
+    data = await asyncio.to_thread(_dicom_of, result) if is_dicom else result.data
+    return Response(data, 200, render_headers(result), choice.media_type)
+
+
+def _dicom_of(result: RenderResult) -> bytes:
+    settings = result.settings
+    header = ExportHeader(settings, "uint8", result.poses, result.scene, result.scene_sha256, result.renderer)
+    frames = {"bmode": np.frombuffer(result.data, np.uint8).reshape(header.shape)}
+    return export_bytes("dicom", header, frames, result.extrapolations)
 
 
 def render_headers(result: RenderResult) -> dict[str, str]:

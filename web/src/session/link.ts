@@ -1,0 +1,157 @@
+/** What the address of Scan tells: pose, probe and settings, as far as they differ from what the scene begins with. */
+
+import { explain } from "../api/client";
+import { type Described } from "../api/described";
+import { exampleProbe, PROBE_KINDS, type Probe } from "../api/probes";
+import { settings } from "../api/generated/contract";
+import type { Display } from "../api/stream";
+import { fromPositionQuaternion, position, quaternion, type Pose, type Quaternion, type Vector } from "../geometry/pose";
+import type { Kept } from "../shell/router.svelte";
+import { words } from "../words/words.svelte";
+import { AS_RENDERED, DISPLAY, SIZES, type Session } from "./session.svelte";
+
+const BETWEEN = "_"; // stands in addresses as it is
+const SLICE = settings.properties!.slice_thickness_mm!;
+/** What a person sets of the display; the size of a pixel follows from the probe. */
+const DISPLAY_FIELDS = Object.entries(DISPLAY.properties!).filter(([name]) => name !== "pixel_mm") as [keyof Display, Described][];
+const PROBE_NUMBERS = [...new Set([...PROBE_KINDS.values()].flatMap(numbersOf))];
+const KEYS = [
+  ...["pose", "probe", "samples", "slice_mm", "lines", "unsupported"],
+  ...PROBE_NUMBERS.map((name) => `probe.${name}`),
+  ...DISPLAY_FIELDS.map(([name]) => name),
+];
+
+/** A pose as a value of an address. */
+export function poseValue(pose: Pose): string {
+  const numbers = [...position(pose).map((value) => value.toFixed(6)), ...quaternion(pose).map((value) => value.toFixed(9))];
+  return numbers.map((text) => String(Number(text))).join(BETWEEN);
+}
+
+/** The values of a session by key; null: as the scene begins. */
+export function linkOf(session: Session): Record<string, string | null> {
+  const { pose, chosenProbe: probe, display } = session;
+  const differing = (value: string, usual: string): string | null => (value === usual ? null : value);
+  const link: Record<string, string | null> = Object.fromEntries(KEYS.map((key) => [key, null]));
+  link.pose = differing(poseValue(pose), poseValue(session.held(session.home)));
+  if (probe !== null) {
+    const { kind, ...numbers } = probe;
+    link.probe = kind;
+    for (const [name, value] of Object.entries(numbers)) link[`probe.${name}`] = String(value);
+  }
+  for (const [name] of DISPLAY_FIELDS) link[name] = differing(written(display[name]), written(AS_RENDERED[name]));
+  link.samples = session.samples === null ? null : String(session.samples);
+  link.slice_mm = session.sliceThickness_mm === null ? null : String(session.sliceThickness_mm);
+  link.lines = session.scanConverted ? null : "stored";
+  link.unsupported = session.hidesUnsupported ? "black" : null;
+  return link;
+}
+
+/** Whether an address tells anything of that. */
+export function isLink(kept: Kept): boolean {
+  return KEYS.some((key) => key in kept);
+}
+
+/** Whether a session is as an address tells it. */
+export function isAsLinked(session: Session, kept: Kept): boolean {
+  return Object.entries(linkOf(session)).every(([key, value]) => (kept[key] ?? null) === value);
+}
+
+/** Brings a session to what an address tells; answers with what of it cannot be used, in words. */
+export async function followLink(session: Session, kept: Kept): Promise<string[]> {
+  const reader = new Reader(kept);
+  const probe = reader.read("probe", readProbe);
+  const display = Object.fromEntries(
+    DISPLAY_FIELDS.map(([name, field]) => [name, reader.read(name, (text) => readField(field, text)) ?? AS_RENDERED[name]]),
+  ) as unknown as Display;
+  const pose = reader.read("pose", readPose);
+  const samples = reader.read("samples", readSamples);
+  const thickness_mm = reader.read("slice_mm", (text) => numberWithin(SLICE, text));
+  const stored = reader.read("lines", (text) => oneOf(["stored"], text));
+  const unsupported = reader.read("unsupported", (text) => oneOf(["black"], text));
+  if (probe !== null || session.chosenProbe !== null) await reader.attempt("probe", () => session.chooseProbe(probe));
+  session.display = { ...AS_RENDERED, ...display };
+  session.samples = samples;
+  session.sliceThickness_mm = thickness_mm;
+  session.scanConverted = stored === null;
+  session.hidesUnsupported = unsupported !== null;
+  session.jumpTo(pose ?? session.held(session.home));
+  return reader.refused;
+}
+
+/** Reads values of an address, and notes those that cannot be used. */
+class Reader {
+  refused: string[] = [];
+  constructor(private readonly kept: Kept) {}
+
+  /** null where it is not there, or cannot be used. */
+  read<T>(key: string, reader: (text: string, kept: Kept) => T): T | null {
+    const text = this.kept[key];
+    if (text === undefined) return null;
+    try {
+      return reader(text, this.kept);
+    } catch (error) {
+      this.#refuse(key, error);
+      return null;
+    }
+  }
+
+  async attempt(key: string, change: () => Promise<void>): Promise<void> {
+    try {
+      await change();
+    } catch (error) {
+      this.#refuse(key, error);
+    }
+  }
+
+  #refuse(key: string, error: unknown): void {
+    this.refused.push(`${key}=${this.kept[key] ?? ""} (${explain(error)})`);
+  }
+}
+
+function readPose(text: string): Pose {
+  const numbers = text.split(BETWEEN).map(Number);
+  if (numbers.length !== 7 || text.split(BETWEEN).includes("") || !numbers.every(Number.isFinite))
+    throw new Error(words.session.link.pose);
+  const [x, y, z, ...rest] = numbers as [number, number, number, ...number[]];
+  if (Math.abs(Math.hypot(...rest) - 1) > 1e-2) throw new Error(words.session.link.quaternion);
+  return fromPositionQuaternion([x, y, z] as Vector, rest as unknown as Quaternion);
+}
+
+function readProbe(kind: string, kept: Kept): Probe {
+  const described = PROBE_KINDS.get(oneOf([...PROBE_KINDS.keys()], kind))!;
+  const given = numbersOf(described)
+    .filter((name) => kept[`probe.${name}`] !== undefined)
+    .map((name) => [name, numberWithin(described.properties![name]!, kept[`probe.${name}`]!)] as const);
+  return { ...exampleProbe(kind, 50), ...Object.fromEntries(given) };
+}
+
+function readSamples(text: string): number {
+  return Number(oneOf(SIZES.map(String), text));
+}
+
+function readField(field: Described, text: string): unknown {
+  if (field.type === "boolean") return oneOf(["true", "false"], text) === "true";
+  if (field.type === "array") return text.split(BETWEEN).map((one) => numberWithin(field.items!, one));
+  if (field.enum) return oneOf(field.enum, text);
+  return numberWithin(field, text);
+}
+
+function numberWithin({ minimum = -Infinity, maximum = Infinity }: Described, text: string): number {
+  const number = Number(text);
+  if (text.trim() === "" || !Number.isFinite(number)) throw new Error(words.session.link.number);
+  if (number < minimum || number > maximum) throw new Error(words.session.link.within(minimum, maximum));
+  return number;
+}
+
+function oneOf(choices: readonly string[], text: string): string {
+  if (!choices.includes(text)) throw new Error(words.session.link.oneOf(choices));
+  return text;
+}
+
+function numbersOf({ properties = {} }: Described): string[] {
+  return Object.keys(properties).filter((name) => name !== "kind");
+}
+
+function written(value: unknown): string {
+  return Array.isArray(value) ? value.join(BETWEEN) : String(value);
+}
