@@ -118,7 +118,7 @@ const options = async (page) => {
 };
 const shownAs = async (page, form) => {
   await options(page);
-  await page.getByLabel("Shown as").selectOption(form);
+  await page.getByLabel("Show", { exact: true }).selectOption(form);
 };
 
 describe("left and right", () => {
@@ -205,7 +205,7 @@ describe("the scene", () => {
     await page.mouse.up();
     await rest(page);
     const chosen = async () => ({
-      form: await page.getByLabel("Shown as").inputValue(),
+      form: await page.getByLabel("Show", { exact: true }).inputValue(),
       turn: await page.getByRole("button", { name: "Turn", exact: true }).getAttribute("aria-pressed"),
       views: await page.getByRole("group", { name: "Look from" }).locator("[aria-pressed=true]").count(),
     });
@@ -281,6 +281,7 @@ describe("contact", () => {
     await page.keyboard.up("PageDown");
     await until(height, (z) => z > start.position_mm.z + 1, "it is not pressed");
     await page.getByTestId("pressed").waitFor();
+    await page.waitForTimeout(1000);
     const pressed = await height();
     await page.keyboard.down("ArrowRight");
     await page.waitForTimeout(500);

@@ -2,7 +2,7 @@
 
 import type { Room } from "./room.svelte";
 
-const KEPT = ["appearance", "cut", "gizmo", "viewpoint", "look", "showSweep", "showSkin", "contact", "begun"] as const;
+const KEPT = ["appearance", "cut", "gizmo", "viewpoint", "look", "showSweep", "showSkin", "contact", "open", "begun"] as const;
 type Kept = Partial<Pick<Room, (typeof KEPT)[number]>>;
 
 /** Of another version of the console nothing is taken. */

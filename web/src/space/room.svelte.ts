@@ -10,7 +10,7 @@ import { recalled, remember } from "./memory";
 import { middleOf } from "./middle";
 import type { Gizmo } from "./probe_handle";
 import type { Look, Viewpoint } from "./viewpoints";
-import type { Volume } from "./volume";
+import { brightestOf, type Volume } from "./volume";
 import type { VolumeDelivery, VolumeOrder } from "./volume.worker";
 
 const MOST_GAUSSIANS = 200_000; // that the service tells of
@@ -45,8 +45,11 @@ export class Room {
     const { pose, plane } = this.session;
     return this.skin && -this.skin.distance(apply(pose, [0, 0, plane.pivot_depth_mm]), axis(pose, 2));
   });
-  /** Between which the intensities lie. */
-  readonly intensities = $derived(this.gaussians === null ? null : middleOf(this.gaussians.column("intensity")));
+  /** Between which the intensities lie that the colours stand for. */
+  readonly intensities = $derived.by((): [number, number] => {
+    if (this.appearance.form !== "splats") return [0, this.volume === null ? 1 : brightestOf(this.volume)];
+    return this.gaussians === null ? [0, 1] : middleOf(this.gaussians.column("intensity"));
+  });
   /** Whether it was decided what to show first. */
   begun = false;
   #of: SceneDescription | null = null;

@@ -18,6 +18,7 @@ export interface Volume {
 
 const REACH = 3; // standard deviations, as far as Gaussians count
 const KEPT_SHARE = 0.001; // of the Gaussians may lie beside the box on each side: strays would make it coarse
+const PASSING_SHARE = 0.004; // of the voxels are brighter than the end of the colours
 const BLUR = 0.5; // standard deviation of a voxel, in voxels: none falls between their centres
 const EXPONENTIALS = Float32Array.from({ length: 1024 }, (_, i) => Math.exp((-0.5 * REACH ** 2 * (i + 0.5)) / 1024));
 const PER_Q = 1024 / REACH ** 2;
@@ -104,6 +105,17 @@ export function voxelise(gaussians: Gaussians, grid: Grid): Volume {
     voxels[4 * voxel + 3] = labels[voxel]!;
   }
   return { grid, voxels };
+}
+
+/** The echo that only a few voxels pass, as a share: where the colours end. */
+export function brightestOf({ voxels }: Volume): number {
+  const counts = new Uint32Array(256);
+  for (let at = 0; at < voxels.length; at += 4) counts[voxels[at]!]! += 1;
+  counts[0] = 0;
+  const all = counts.reduce((sum, count) => sum + count, 0);
+  let above = 0;
+  for (let value = 255; value > 0; value--) if ((above += counts[value]!) > PASSING_SHARE * all) return value / 255;
+  return 1;
 }
 
 /** The byte of a channel of the voxel that holds a point; 0 outside. */

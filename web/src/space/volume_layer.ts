@@ -13,7 +13,7 @@ import {
 
 import type { Appearance, ColourBy, Form, SolidBy } from "./appearance";
 import { cloudMaterial, type CloudUniforms } from "./cloud_material";
-import type { Volume } from "./volume";
+import { brightestOf, type Volume } from "./volume";
 
 const COLOURS: Record<ColourBy, number> = { intensity: 0, coverage: 1, transmittance: 2, label: 3 };
 const SOLIDS: Record<SolidBy, number> = { echo: 0, shadow: 1 };
@@ -123,7 +123,8 @@ export class VolumeLayer {
   #texture: Data3DTexture;
   #uniforms;
 
-  constructor({ grid, voxels }: Volume, shared: CloudUniforms) {
+  constructor(volume: Volume, shared: CloudUniforms) {
+    const { grid, voxels } = volume;
     this.#texture = new Data3DTexture(voxels, ...grid.size);
     this.#texture.format = RGBAFormat;
     this.#texture.minFilter = this.#texture.magFilter = LinearFilter;
@@ -135,7 +136,7 @@ export class VolumeLayer {
       low: { value: low },
       high: { value: high },
       stride: { value: grid.voxel_mm },
-      brightest: { value: brightestOf(voxels) },
+      brightest: { value: brightestOf(volume) },
       colourBy: { value: 0 },
       solidBy: { value: 0 },
       maximum: { value: false },
@@ -164,15 +165,4 @@ export class VolumeLayer {
     this.object.material.dispose();
     this.object.removeFromParent();
   }
-}
-
-/** The echo that is at most passed by one voxel in fifty, as a share. */
-function brightestOf(voxels: Uint8Array): number {
-  const counts = new Uint32Array(256);
-  for (let at = 0; at < voxels.length; at += 4) counts[voxels[at]!]! += 1;
-  counts[0] = 0;
-  const all = counts.reduce((sum, count) => sum + count, 0);
-  let above = 0;
-  for (let value = 255; value > 0; value--) if ((above += counts[value]!) > all / 50) return value / 255;
-  return 1;
 }

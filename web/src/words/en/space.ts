@@ -5,9 +5,9 @@ import type { Viewpoint } from "../../space/viewpoints";
 
 const viewpoints: Record<Viewpoint, string> = { whole: "Whole", behind: "Behind", side: "Side", top: "Top" };
 const forms: Record<Form, string> = {
-  shaded: "Volume, shaded",
-  maximum: "Volume, brightest",
-  splats: "Gaussians as splats",
+  shaded: "Shaded volume",
+  maximum: "Brightest of volume",
+  splats: "Splats",
   none: "Nothing",
 };
 const colours: Record<ColourBy, string> = {
@@ -16,7 +16,7 @@ const colours: Record<ColourBy, string> = {
   transmittance: "Transmittance",
   coverage: "Coverage",
 };
-const solids: Record<SolidBy, string> = { echo: "Bright echoes", shadow: "What casts shadows" };
+const solids: Record<SolidBy, string> = { echo: "Bright echo", shadow: "Casts shadow" };
 const cuts: Record<CutAcross, string> = {
   none: "Uncut",
   image: "At the image",
@@ -42,7 +42,7 @@ export const space = {
   options: "Options",
   viewpoint: "Look from",
   viewpoints,
-  form: "Shown as",
+  form: "Show",
   forms,
   colour: "Colour",
   colours,
