@@ -51,7 +51,8 @@ def robot(service: RunningService) -> Iterator[ClientConnection]:
 
 
 def named(http: httpx.Client, name: str) -> dict[str, Any]:
-    return wait_until(lambda: next((one for one in streams(http) if one["name"] == name), None))
+    """The newest stream of a name: that of the test before may still be closing."""
+    return wait_until(lambda: next((one for one in reversed(streams(http)) if one["name"] == name), None))
 
 
 def step(robot: ClientConnection, sequence: int, x: float, **others: Any) -> tuple[dict[str, Any], bytes]:

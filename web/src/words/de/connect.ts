@@ -91,7 +91,7 @@ export const connect: Words["connect"] = {
     stripUnknown: "Verlässlichkeit entlang der Lagen nicht bekannt",
   },
   pose: {
-    title: "Lage der Sonde",
+    title: "Lage",
     home: "Mitte",
     homeMeans: "Zur Mitte des Sweeps",
     snap: "Zum nächsten",
