@@ -5,10 +5,14 @@ from __future__ import annotations
 import asyncio
 import json
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Literal
 
 from ultragray.contract import described
+from ultragray.datasets.source import PHANTOM
+from ultragray.demo import DEMO_FILE
+from ultragray.scene_info import read_header
 from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import ArtifactNotFound, DatasetNotFound
 from ultragray_workers.helpers.comparison import FRAMES_NAME, compare
@@ -17,18 +21,24 @@ from ultragray_workers.scenes import SceneStore
 from ..core.catalog import SceneCatalog
 from ..core.helper_processes import HelperProcesses
 from ..core.own_thread import in_own_thread
+from ..core.poses import MatrixRows
 from ..settings import Settings
 from .prepared import Preparation, Prepared
 
-_FORMAT = 2  # of what is kept of a comparison
+_FORMAT = 3  # of what is kept of a comparison
 
 
 @dataclass(frozen=True, kw_only=True)
 class ComparedFrame:
-    """How near the scene, and median compounding, come to a held-out frame."""
+    """How near the scene, and the classical ways (median compounding, linear between frames, the nearest frame), come.
+
+    To a held-out frame.
+    """
 
     index: int
     frame_number: int = described("As the dataset numbers it.")
+    pose: MatrixRows = described("Probe to scene, in mm.")
+    confidence: float | None = described("Expected MS-SSIM; null where the scene was trained without confidence.")
     psnr_db: float
     ms_ssim: float
     gms: float
@@ -39,6 +49,16 @@ class ComparedFrame:
     median_gms: float
     median_gmsd: float
     median_histogram_distance: float
+    linear_psnr_db: float
+    linear_ms_ssim: float
+    linear_gms: float
+    linear_gmsd: float
+    linear_histogram_distance: float
+    nearest_psnr_db: float
+    nearest_ms_ssim: float
+    nearest_gms: float
+    nearest_gmsd: float
+    nearest_histogram_distance: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,7 +67,7 @@ class Comparison:
 
     state: Literal["running", "ready", "failed"] = described("A failed one is tried again after a minute.")
     progress: float = described("0 to 1.")
-    dataset: str
+    dataset: str = described(f"Its name; {PHANTOM}: the built-in phantom, simulated for the demo scene.")
     frames: list[ComparedFrame] = described("Empty until it is ready.")
     reason: str | None = described("Why it failed: one sentence.")
     error: str | None = described("Why it failed: the stable reason, such as DATASET_INVALID.")
@@ -89,7 +109,7 @@ class Comparisons(Prepared):
         return Comparison(
             state=preparation.state,
             progress=preparation.progress,
-            dataset=dataset,
+            dataset=dataset or PHANTOM,
             frames=frames,
             reason=reason,
             error=error,
@@ -108,12 +128,12 @@ class Comparisons(Prepared):
             raise ArtifactNotFound(f"the comparison is not ready, or has no frame {index}", field="index")
         return png
 
-    async def _wanted(self, scene: str) -> tuple[str, str, Path]:
-        """The key, the name of the dataset, the file of the scene."""
+    async def _wanted(self, scene: str) -> tuple[str, str | None, Path]:
+        """The key, the name of the dataset (None: the built-in phantom), the file of the scene."""
         header = await self._catalog.header(scene)
         wanted = header.info.dataset_sha256
         present = await asyncio.to_thread(self._datasets.names_by_content)
-        if wanted not in present:
+        if wanted not in present and wanted != await asyncio.to_thread(_sha256_of_demo):
             trained_from = header.info.dataset_name
             named = "" if trained_from is None else f" ({str(trained_from)[:128]!r})"
             raise DatasetNotFound(
@@ -122,4 +142,10 @@ class Comparisons(Prepared):
             )
         path = await asyncio.to_thread(self._scenes.path, scene)
         scene_sha256 = await in_own_thread(lambda: self._scenes.sha256(scene))
-        return f"{_FORMAT}-{scene_sha256}-{wanted}", present[wanted], path
+        return f"{_FORMAT}-{scene_sha256}-{wanted}", present.get(str(wanted)), path
+
+
+@cache
+def _sha256_of_demo() -> str | None:
+    """Of the dataset that the demo scene was trained from. The service needs no upload of it: it can be simulated."""
+    return read_header(DEMO_FILE).info.dataset_sha256

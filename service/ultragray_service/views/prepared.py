@@ -70,7 +70,7 @@ class Prepared:
         self._failures: dict[str, tuple[float, UltragrayError]] = {}
         self._ended = False
 
-    async def prepare(self, key: str, **arguments: str) -> Preparation:
+    async def prepare(self, key: str, **arguments: str | None) -> Preparation:
         """Begin to make the folder unless it is there, or failed a minute ago; how far it is. Raises Draining."""
         if await asyncio.to_thread(self._touch, key):
             return Preparation("ready", 1.0)
@@ -79,7 +79,7 @@ class Prepared:
         self._task(key, arguments)
         return Preparation("running", await asyncio.to_thread(self._progress, key))
 
-    async def path(self, key: str, **arguments: str) -> Path:
+    async def path(self, key: str, **arguments: str | None) -> Path:
         """The folder, made first where it is not there.
 
         Raises what the helper process raises, also where it did so a minute ago, DeadlineExceeded, MemoryExceeded,
@@ -141,7 +141,7 @@ class Prepared:
         """Remove what services that died while they made a folder left."""
         await in_own_thread(lambda: remove_abandoned(self.folder, _PREFIX))
 
-    def _task(self, key: str, arguments: dict[str, str]) -> asyncio.Task[UltragrayError | None]:
+    def _task(self, key: str, arguments: dict[str, str | None]) -> asyncio.Task[UltragrayError | None]:
         if self._ended:
             raise Draining("the service is stopping")
         task = self._tasks.get(key)
@@ -150,7 +150,7 @@ class Prepared:
             task.add_done_callback(lambda _: self._tasks.pop(key, None))
         return task
 
-    async def _make(self, key: str, arguments: dict[str, str]) -> UltragrayError | None:
+    async def _make(self, key: str, arguments: dict[str, str | None]) -> UltragrayError | None:
         """Make the folder; None, or why that failed."""
         claim = ExitStack()
         error: UltragrayError | None = None

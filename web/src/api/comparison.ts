@@ -4,6 +4,7 @@ import { address, getJson, type Schemas } from "./client";
 import type { paths } from "./generated/schema";
 
 export type Comparison = Schemas["Comparison"];
+export type ComparedFrame = Schemas["ComparedFrame"];
 type MetricOf<Field> = Field extends `median_${infer Name}` ? Name : never;
 export type Metric = MetricOf<keyof Schemas["ComparedFrame"]>;
 export type ComparedPicture =

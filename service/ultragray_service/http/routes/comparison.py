@@ -46,7 +46,7 @@ async def get_compared_picture(
     service: ServiceDep,
     scene: SceneName,
     index: FrameIndex,
-    what: Literal["truth", "rendering", "median", "difference"],
+    what: Literal["truth", "rendering", "median", "linear", "nearest", "difference"],
 ) -> Response:
     """A picture of a held-out frame; difference: three times the absolute one between truth and rendering."""
     key = await service.comparisons.key(scene)

@@ -1,5 +1,61 @@
-/** compare: what it says in German. */
+/** Compare, in German. */
 
 import type { Words } from "../en/english";
 
-export const compare: Words["compare"] = {};
+export const compare: Words["compare"] = {
+  asking: "Der Vergleich wird erfragt …",
+  running: (dataset) =>
+    `Die zurückgehaltenen Bilder von ${dataset} werden vorhergesagt und vermessen. Das geschieht einmal und dauert ein, zwei Minuten.`,
+  progress: "Vergleich",
+  anew: "Nach einer Minute beginnt der Dienst von vorn.",
+  tryAgain: "Noch einmal",
+  noDataset: {
+    title: "Der Sweep dieser Szene ist nicht hier",
+    detail: "Ein Vergleich zeigt die Szene neben echten Bildern, die sie nie gesehen hat. Sie stehen in dem Sweep, aus dem die Szene trainiert wurde, mit denselben zurückgehaltenen Bildern.",
+    upload: "Den Sweep hochladen",
+  },
+  truth: { title: "Wirklichkeit", meaning: "wie aufgenommen; kein Verfahren kennt das Bild" },
+  pictures: {
+    rendering: { title: "Simulation", meaning: "der Szene an der Lage des Bildes" },
+    median: { title: "Median-Compounding", meaning: "der Median dessen, was die Trainingsbilder dort zeigen" },
+    linear: { title: "Linear zwischen Bildern", meaning: "überblendet aus den Trainingsbildern auf beiden Seiten" },
+    nearest: { title: "Nächstes Bild", meaning: "das Trainingsbild, das am nächsten liegt" },
+  },
+  scene: (name) => `Szene ${name}`,
+  otherScene: "aus einer anderen Szene desselben Sweeps simuliert",
+  difference: { title: "Unterschied", meaning: "orange: heller als die Wirklichkeit, blau: dunkler" },
+  similarity: { title: "Ähnlichkeit", meaning: "SSIM jedes Pixels der gezeigten Bilder; hell: gleich" },
+  pictureOf: (title, frame) => `${title} zu Bild ${frame}`,
+  toolbar: "Wie Bilder verglichen werden",
+  against: "Wirklichkeit vergleichen mit",
+  mode: "Art des Vergleichs",
+  modes: { side: "Nebeneinander", wipe: "Schieber", flicker: "Wechsel" },
+  wipe: "Wo die Wirklichkeit endet und das andere beginnt",
+  flicker: { shown: (title) => `Zu sehen: ${title}`, pause: "Anhalten (X tauscht)", play: "Wechseln" },
+  zoom: { in: "Vergrößern", out: "Verkleinern", reset: "Das ganze Bild", hint: "Mausrad oder +, − und 0: alle Bilder vergrößern; Ziehen verschiebt sie." },
+  cursor: (truth, other) => `Wirklichkeit ${truth}, anderes ${other} von 255`,
+  noCursor: "Auf ein Bild zeigen, um Werte zu lesen",
+  frame: "Bild",
+  frameNumber: (number) => `Bild ${number}`,
+  place: (place, count, dataset) => `${place} von ${count} zurückgehaltenen, ${dataset}`,
+  before: "Bild davor",
+  next: "Nächstes Bild",
+  order: "Reihenfolge",
+  orders: { sweep: "Wie aufgenommen", worst: "Schlechteste zuerst" },
+  worst: "Schlechtestes",
+  typical: "Mittleres",
+  best: "Bestes",
+  inScan: "Diese Lage in Schallen öffnen",
+  csv: "Als CSV speichern",
+  table: { frame: "Dieses Bild", mean: "Mittel aller" },
+  metric: "Maß",
+  chart: { x: "zurückgehaltenes Bild", hint: (better) => `${better}; ein Klick geht zum Bild` },
+  confidence: {
+    title: "Erwartete und gemessene Ähnlichkeit",
+    expected: "erwartete MS-SSIM (Verlässlichkeit)",
+    measured: "gemessene MS-SSIM",
+    r: (value) => `Korrelation ${value}`,
+    none: "Die Szene wurde ohne Verlässlichkeit trainiert.",
+    point: (frame) => `Bild ${frame}`,
+  },
+};

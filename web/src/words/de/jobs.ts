@@ -5,6 +5,7 @@ import type { Words } from "../en/english";
 const kinds: Words["jobs"]["kinds"] = { train: "Training", render: "Datensatz", evaluate: "Auswertung", compare: "Vergleich" };
 
 export const jobs: Words["jobs"] = {
+  methodColumn: "Verfahren",
   kinds,
   states: {
     queued: "wartet",

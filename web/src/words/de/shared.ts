@@ -10,6 +10,8 @@ function limits(least: number, most: number, unit: string): string {
 }
 
 export const shared: Words["shared"] = {
+  metrics: "Maße",
+  better: (higher: boolean): string => (higher ? "höher ist besser" : "niedriger ist besser"),
   slider: {
     value: "Wert",
     outside: (least, most, unit) => `Hier passt nur ${limits(least, most, unit)}.`,

@@ -1,3 +1,61 @@
-/** compare: what it says in English. */
+/** Compare, in English. */
 
-export const compare = {};
+const pictures = {
+  rendering: { title: "Rendering", meaning: "of the scene at the frame's pose" },
+  median: { title: "Median compounding", meaning: "the median of what the training frames show there" },
+  linear: { title: "Linear between frames", meaning: "blended from the training frames on both sides" },
+  nearest: { title: "Nearest frame", meaning: "the training frame that lies nearest" },
+};
+
+export const compare = {
+  asking: "Asking for the comparison …",
+  running: (dataset: string): string =>
+    `The held-out frames of ${dataset} are predicted and measured. This is done once and takes a minute or two.`,
+  progress: "Comparison",
+  anew: "The service begins anew once a minute has passed.",
+  tryAgain: "Try again",
+  noDataset: {
+    title: "The sweep of this scene is not here",
+    detail: "A comparison shows the scene beside real frames that it has not seen. They are in the sweep that it was trained from, with the same frames held out.",
+    upload: "Upload the sweep",
+  },
+  truth: { title: "Truth", meaning: "as it was recorded; no method has seen it" },
+  pictures,
+  scene: (name: string): string => `Scene ${name}`,
+  otherScene: "rendered from another scene of the same sweep",
+  difference: { title: "Difference", meaning: "orange: brighter than the truth, blue: darker" },
+  similarity: { title: "Similarity", meaning: "SSIM of each pixel of the pictures as shown; light: alike" },
+  pictureOf: (title: string, frame: number): string => `${title} of frame ${frame}`,
+  toolbar: "How pictures are compared",
+  against: "Compare the truth with",
+  mode: "Way of looking",
+  modes: { side: "Side by side", wipe: "Wipe", flicker: "Flicker" },
+  wipe: "Where the truth ends and the other begins",
+  flicker: { shown: (title: string): string => `Shown: ${title}`, pause: "Hold (X swaps)", play: "Flicker" },
+  zoom: { in: "Zoom in", out: "Zoom out", reset: "All of the picture", hint: "Wheel or +, − and 0: zoom of all pictures; dragging moves them." },
+  cursor: (truth: number, other: number): string => `truth ${truth}, other ${other} of 255`,
+  noCursor: "Point at a picture to read its values",
+  frame: "Frame",
+  frameNumber: (number: number): string => `Frame ${number}`,
+  place: (place: number, count: number, dataset: string): string => `${place} of ${count} held out, ${dataset}`,
+  before: "Frame before",
+  next: "Next frame",
+  order: "Order",
+  orders: { sweep: "As recorded", worst: "Worst first" },
+  worst: "Worst",
+  typical: "Typical",
+  best: "Best",
+  inScan: "Open this pose in Scan",
+  csv: "Save as CSV",
+  table: { frame: "This frame", mean: "Mean of all" },
+  metric: "Metric",
+  chart: { x: "held-out frame", hint: (better: string): string => `${better}; a click goes to the frame` },
+  confidence: {
+    title: "Expected and measured similarity",
+    expected: "expected MS-SSIM (confidence)",
+    measured: "measured MS-SSIM",
+    r: (value: string): string => `correlation ${value}`,
+    none: "The scene was trained without confidence.",
+    point: (frame: number): string => `Frame ${frame}`,
+  },
+};

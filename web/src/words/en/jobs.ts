@@ -25,6 +25,7 @@ const phases: Record<Phase, string> = {
 };
 
 export const jobs = {
+  methodColumn: "Method",
   kinds,
   states,
   phases,

@@ -9,6 +9,8 @@ function limits(least: number, most: number, unit: string): string {
 }
 
 export const shared = {
+  metrics: "Metrics",
+  better: (higher: boolean): string => (higher ? "higher is better" : "lower is better"),
   slider: {
     value: "value",
     outside: (least: number, most: number, unit: string): string => `This takes ${limits(least, most, unit)}.`,

@@ -1,0 +1,112 @@
+/** What Compare looks at: the frame, what it is compared with, how, and where the pictures are enlarged. */
+
+import { comparisonOf, type ComparedFrame, type Comparison, type Metric } from "../api/comparison";
+import { explain, ServiceError, untilAnswered } from "../api/client";
+import { METRICS } from "../shared/metrics";
+import { router } from "../shell/router.svelte";
+import { CLASSICAL, worstFirst, type Measured } from "./statistics";
+
+export const MODES = ["side", "wipe", "flicker"] as const;
+export type Mode = (typeof MODES)[number];
+export const ORDERS = ["sweep", "worst"] as const;
+export type Order = (typeof ORDERS)[number];
+
+/** What stands beside the truth: a measured way by its name, or the rendering of another scene. */
+export type Against = { way: Measured } | { scene: string };
+
+const POLL_MS = 700;
+const SCENE = "scene:";
+
+export class Bench {
+  comparison = $state.raw<Comparison | null>(null);
+  problem = $state<string | null>(null);
+  /** Whether the service has not the sweep of the scene. */
+  withoutDataset = $state(false);
+  index = $state(0);
+  metric = $state<Metric>("psnr_db");
+  against = $state.raw<Against>({ way: "rendering" });
+  mode = $state<Mode>("side");
+  order = $state<Order>("sweep");
+  #attempts = $state(0);
+  readonly frames = $derived<readonly ComparedFrame[]>(this.comparison?.frames ?? []);
+  readonly frame = $derived(this.frames[this.index]);
+  /** The way whose metrics decide what is worst; another scene has the rendering's. */
+  readonly way = $derived<Measured>("way" in this.against ? this.against.way : "rendering");
+  readonly ranked = $derived(worstFirst(this.frames, this.way, this.metric));
+  /** The places of the frames, as one steps through them. */
+  readonly sequence = $derived(this.order === "worst" ? this.ranked : this.frames.map((_, place) => place));
+  readonly place = $derived(this.sequence.indexOf(this.index));
+
+  /** Must be made while a component is being made; ends with it. */
+  constructor(private readonly scene: string) {
+    $effect(() => {
+      void this.#attempts;
+      const ending = new AbortController();
+      const tell = (error: unknown): void => {
+        if (ending.signal.aborted) return;
+        this.withoutDataset = error instanceof ServiceError && error.reason === "DATASET_NOT_FOUND";
+        this.problem = explain(error);
+      };
+      this.#follow(tell, ending.signal).catch(tell);
+      return () => ending.abort();
+    });
+    $effect(() => {
+      void router.arrivals;
+      this.#read();
+    });
+  }
+
+  tryAgain(): void {
+    this.comparison = this.problem = null;
+    this.withoutDataset = false;
+    this.#attempts += 1;
+  }
+
+  /** To a frame, by its place among the held-out ones. */
+  goTo(index: number): void {
+    this.index = Math.max(0, Math.min(this.frames.length - 1, index));
+    this.#keep();
+  }
+
+  /** Frames on in the order that is chosen. */
+  step(by: number): void {
+    const place = Math.max(0, Math.min(this.sequence.length - 1, this.place + by));
+    this.goTo(this.sequence[place] ?? 0);
+  }
+
+  choose(chosen: Partial<Pick<Bench, "metric" | "against" | "mode" | "order">>): void {
+    Object.assign(this, chosen);
+    this.#keep();
+  }
+
+  /** Asks until the comparison is there, or failed. */
+  async #follow(tell: (error: unknown) => void, signal: AbortSignal): Promise<void> {
+    for (;;) {
+      this.comparison = await untilAnswered(() => comparisonOf(this.scene, signal), tell, signal);
+      this.problem = null;
+      if (this.comparison.state !== "running") return;
+      await new Promise((resolve) => setTimeout(resolve, POLL_MS));
+    }
+  }
+
+  #keep(): void {
+    router.keep({
+      frame: this.index === 0 ? null : String(this.index),
+      metric: this.metric === "psnr_db" ? null : this.metric,
+      with: "scene" in this.against ? SCENE + this.against.scene : this.way === "rendering" ? null : this.way,
+      look: this.mode === "side" ? null : this.mode,
+      order: this.order === "sweep" ? null : this.order,
+    });
+  }
+
+  #read(): void {
+    const { frame, metric, with: other = "", look, order } = router.kept;
+    const index = Number(frame ?? 0);
+    this.index = Number.isInteger(index) && index >= 0 ? index : 0;
+    this.metric = METRICS.find((one) => one === metric) ?? "psnr_db";
+    this.mode = MODES.find((one) => one === look) ?? "side";
+    this.order = ORDERS.find((one) => one === order) ?? "sweep";
+    const way = CLASSICAL.find((one) => one === other);
+    this.against = other.startsWith(SCENE) ? { scene: other.slice(SCENE.length) } : { way: way ?? "rendering" };
+  }
+}
