@@ -180,3 +180,23 @@ describe("the workers", () => {
     assert.deepEqual([page.faults, other.faults], [[], []]);
   });
 });
+
+describe("the audit log", () => {
+  it("is read by admins, by name and by operation, and by nobody else", async () => {
+    await askAs(at, "alice", "POST", "/v1/scenes/demo:load");
+    const page = await pageOf(at, "admin", "#/scenes");
+    const log = page.getByTestId("audit");
+    await log.getByLabel("What").fill("scene.load");
+    await log.getByRole("cell", { name: "scene.load" }).first().waitFor();
+    await log.getByLabel("Who").fill("alice");
+    await log.getByRole("row", { name: /alice scene\.load demo OK/ }).first().waitFor();
+    await log.getByLabel("Who").fill("nobody-of-that-name");
+    await log.getByText("Nothing of that kind in this time.").waitFor();
+    assert.deepEqual(await seriousFindings(page), []);
+    await picture(page, "audit");
+    const other = await pageOf(at, "bob", "#/scenes");
+    await other.getByTestId("frames-rendered").waitFor();
+    assert.equal(await other.getByTestId("audit").count(), 0);
+    assert.deepEqual([page.faults, other.faults], [[], []]);
+  });
+});
