@@ -151,6 +151,8 @@ describe("an operator", () => {
 
 describe("the workers", () => {
   it("are paused, drained and resumed by admins; what is private is busy to others", async () => {
+    const { jobs } = await askAs(at, "admin", "GET", "/v1/jobs");
+    for (const job of jobs.filter(({ state }) => ["queued", "running"].includes(state))) await askAs(at, "admin", "POST", `/v1/jobs/${job.id}:cancel`);
     const { id } = await train("alice", "quiet", true);
     const page = await pageOf(at, "admin", "#/scenes");
     const row = page.getByTestId(/^worker-/);
