@@ -51,7 +51,7 @@ test-long: $(VENV)/installed-dev  ## those that make test leaves out (RECORD=1: 
 	$(PYTEST) -m long --record-in $(FIGURES)/long-run.json $(ARGS)
 	$(KEEP) long-run
 
-test-console: $(VENV)/installed-dev $(CONSOLE)  ## the console in Debian's Chromium against a real service; leaves screenshots in build
+test-console: $(VENV)/installed-dev $(CONSOLE)  ## the console in Debian's Chromium and Firefox (apt-get install chromium firefox-esr) against a real service; leaves screenshots in build
 	node --test --test-concurrency=1 tests/console/*.test.mjs
 
 test-faults: $(VENV)/installed-dev  ## processes killed at random: render workers under load, then everything while jobs run

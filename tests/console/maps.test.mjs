@@ -1,9 +1,12 @@
 /** Maps: every output of one view side by side, with one cursor and the values that the service gives. */
 
 import assert from "node:assert/strict";
+import { readFileSync } from "node:fs";
+import { createRequire } from "node:module";
+import path from "node:path";
 import { describe, it } from "node:test";
 
-import { canvasState, openPage, picture, seriousFindings, until } from "./harness.mjs";
+import { canvasState, openPage, picture, ROOT, seriousFindings, until } from "./harness.mjs";
 import { openScan } from "./scan_page.mjs";
 import { tested } from "./tested.mjs";
 
@@ -98,5 +101,62 @@ describe("maps", () => {
     await until(() => canvasState(page, '[data-testid="map-bmode"]'), ({ print }) => print !== first.print, "it stood still");
     await page.getByRole("link", { name: "Scan", exact: true }).click();
     await page.getByText("view 11 of").waitFor();
+  });
+
+  it("keeps the large map, the cursor and the pose in the address and over other views", async () => {
+    const page = await openMaps();
+    await page.getByRole("button", { name: "Coverage, show large" }).click();
+    await page.getByRole("heading", { name: "Coverage" }).waitFor();
+    const box = await page.locator('[data-testid="map-coverage"] canvas').boundingBox();
+    assert.ok(box.width > 400, `the large map is ${box.width} px wide`);
+    await page.mouse.move(box.x + (60.5 / SIDE) * box.width, box.y + (180.5 / SIDE) * box.height);
+    await page.getByText("60, 180").waitFor();
+    await page.getByLabel("Place in the training sweep").fill("10");
+    await page.getByText("view 11 of").waitFor();
+    const value = await page.getByTestId("value-echo").textContent();
+    await until(() => page.url(), (url) => /map=coverage/.test(url) && /cursor=-15\.82_/.test(url) && /pose=/.test(url), "the address tells less");
+    await page.getByRole("link", { name: "Scan", exact: true }).click();
+    await page.getByRole("link", { name: "Maps", exact: true }).click();
+    await page.getByRole("heading", { name: "Coverage" }).waitFor();
+    await page.getByText("60, 180").waitFor();
+    await until(() => page.url(), (url) => /map=coverage/.test(url), "the address forgot");
+    await page.reload();
+    await page.getByRole("heading", { name: "Coverage" }).waitFor();
+    await page.getByText("60, 180").waitFor();
+    await until(() => page.getByTestId("place").innerText(), (text) => text !== "view 106 of 211", "the pose is lost");
+    assert.ok(value.length > 1);
+    assert.deepEqual(page.faults, []);
+  });
+
+  it("shows nothing beside a fan, told from a value of 0 by hatching", async () => {
+    const { page } = await openScan(at);
+    await page.getByRole("combobox", { name: "Probe" }).selectOption("convex");
+    await page.getByRole("link", { name: "Maps", exact: true }).click();
+    await page.getByRole("button", { name: "Coverage, show large" }).click();
+    const map = '[data-testid="map-coverage"]';
+    await until(() => canvasState(page, map), ({ width, mean }) => width === 640 && mean > 5, "no fan came");
+    await picture(page, "maps-fan");
+    const box = await page.locator(`${map} canvas`).boundingBox();
+    const shot = await page.screenshot({ clip: { x: box.x + 4, y: box.y + 4, width: 24, height: 24 } });
+    const colours = await page.evaluate(async (bytes) => {
+      const bitmap = await createImageBitmap(new Blob([new Uint8Array(bytes)]));
+      const context = new OffscreenCanvas(bitmap.width, bitmap.height).getContext("2d");
+      context.drawImage(bitmap, 0, 0);
+      const { data } = context.getImageData(0, 0, bitmap.width, bitmap.height);
+      return new Set(Array.from({ length: data.length / 4 }, (_, i) => data.slice(4 * i, 4 * i + 3).join())).size;
+    }, [...shot]);
+    assert.ok(colours >= 2, "the corner beside the fan is of one colour, as a value would be");
+  });
+});
+
+describe("the colours of maps", () => {
+  it("grow lighter all the way, so that grey is enough to read them", async () => {
+    const { transformSync } = createRequire(path.join(ROOT, "web/package.json"))("esbuild");
+    const { code } = transformSync(readFileSync(path.join(ROOT, "web/src/shared/colours.ts"), "utf8"), { loader: "ts" });
+    const { shareColour } = await import(`data:text/javascript,${encodeURIComponent(code)}`);
+    for (const output of outputs.filter((one) => one !== "labels")) {
+      const grey = Array.from({ length: 33 }, (_, i) => shareColour(output, i / 32)).map(([r, g, b]) => 0.2126 * r + 0.7152 * g + 0.0722 * b);
+      grey.slice(1).forEach((value, i) => assert.ok(value > grey[i] + 0.5, `${output} is not lighter at ${i + 1} of 32`));
+    }
   });
 });

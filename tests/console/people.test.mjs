@@ -150,6 +150,8 @@ describe("an operator", () => {
 
 describe("the workers", () => {
   it("are paused, drained and resumed by admins; what is private is busy to others", async () => {
+    const { jobs } = await askAs(at, "admin", "GET", "/v1/jobs");
+    for (const job of jobs.filter(({ state }) => ["queued", "running"].includes(state))) await askAs(at, "admin", "POST", `/v1/jobs/${job.id}:cancel`);
     const { id } = await train("alice", "quiet", true);
     const page = await pageOf(at, "admin", "#/scenes");
     const row = page.getByTestId(/^worker-/);
@@ -176,6 +178,26 @@ describe("the workers", () => {
     await row.getByText("paused").waitFor();
     await row.getByRole("button", { name: "Resume" }).click();
     await row.getByText("idle").waitFor();
+    assert.deepEqual([page.faults, other.faults], [[], []]);
+  });
+});
+
+describe("the audit log", () => {
+  it("is read by admins, by name and by operation, and by nobody else", async () => {
+    await askAs(at, "alice", "POST", "/v1/scenes/demo:load");
+    const page = await pageOf(at, "admin", "#/scenes");
+    const log = page.getByTestId("audit");
+    await log.getByLabel("What").fill("scene.load");
+    await log.getByRole("cell", { name: "scene.load" }).first().waitFor();
+    await log.getByLabel("Who").fill("alice");
+    await log.getByRole("row", { name: /alice scene\.load demo OK/ }).first().waitFor();
+    await log.getByLabel("Who").fill("nobody-of-that-name");
+    await log.getByText("Nothing of that kind in this time.").waitFor();
+    assert.deepEqual(await seriousFindings(page), []);
+    await picture(page, "audit");
+    const other = await pageOf(at, "bob", "#/scenes");
+    await other.getByTestId("frames-rendered").waitFor();
+    assert.equal(await other.getByTestId("audit").count(), 0);
     assert.deepEqual([page.faults, other.faults], [[], []]);
   });
 });

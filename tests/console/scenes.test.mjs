@@ -46,6 +46,24 @@ describe("scenes and service", () => {
     assert.deepEqual([page.faults, page.foreign], [[], []]);
   });
 
+  it("shows of each scene a frame, its probe, its figures and its date, and leads to Compare", async () => {
+    const page = await openPage(at, "#/scenes");
+    const row = page.getByTestId("scene-demo");
+    const seen = row.locator("img");
+    await seen.waitFor();
+    assert.ok(await seen.evaluate((image) => image.decode().then(() => image.naturalWidth >= 96)), "no frame");
+    for (const text of ["Linear", "256 × 256", "50,000 Gaussians", "23.9 dB", "0.934", String(new Date().getFullYear())])
+      await row.getByText(text).first().waitFor();
+    await put(at.service, "/v1/scenes/resting", readFileSync(at.files.compared), "application/octet-stream");
+    const resting = page.getByTestId("scene-resting");
+    await resting.waitFor();
+    await page.waitForTimeout(1500);
+    assert.equal(await resting.locator("img").count(), 0, "a scene was loaded for its picture");
+    assert.equal(await resting.getByText("loaded", { exact: true }).count(), 0);
+    await row.getByRole("link", { name: "Compare demo" }).click();
+    await until(() => page.url(), (url) => url.endsWith("#/compare/demo"), "it leads elsewhere");
+  });
+
   it("begins anew with a scene that takes the place of a deleted one", async () => {
     const scene = readFileSync(at.files.compared);
     await put(at.service, "/v1/scenes/again", scene, "application/octet-stream");
@@ -92,6 +110,8 @@ describe("scenes and service", () => {
   it("shows frames, times and errors of the last minutes", async () => {
     const page = await openPage(at, "#/scenes");
     const frames = page.getByTestId("frames-rendered");
+    await page.locator("[data-testid=scene-demo] img").waitFor(); // a frame, too
+    await page.waitForTimeout(2500); // until it is counted
     const before = Number(await frames.textContent());
     const matrix = [[1, 0, 0, 0], [0, 1, 0, 5], [0, 0, 1, 0], [0, 0, 0, 1]];
     const headers = { "Content-Type": "application/json" };

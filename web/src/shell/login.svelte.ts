@@ -48,7 +48,8 @@ class Login {
     const query = new URLSearchParams(location.search);
     const isBack = query.has("state") && (query.has("code") || query.has("error"));
     const asked = taken<Asked>(ASKED);
-    if (isBack) history.replaceState(null, "", location.pathname + (asked?.hash ?? location.hash));
+    if (isBack) history.replaceState(null, "", location.pathname + location.hash);
+    if (isBack && asked !== null && asked.hash !== "") location.replace(asked.hash);
     const isRenewed = taken<Renewal>(RENEWAL, { keep: true }) !== null && apiKey() !== null;
     if (!isBack && !isRenewed) return;
     try {

@@ -40,7 +40,9 @@ class Router {
 
   /** Keeps values in the address of the view that is shown; null removes one. `entry`: a step that Back undoes. */
   keep(values: Record<string, string | null>, { entry = false } = {}): void {
-    const kept = { ...this.#address.kept, ...values };
+    const before = this.#address.kept;
+    if (Object.entries(values).every(([key, value]) => (before[key] ?? null) === value)) return;
+    const kept = { ...before, ...values };
     const present = Object.fromEntries(Object.entries(kept).filter(([, value]) => value !== null)) as Kept;
     if (entry) this.#write();
     this.#address = { ...this.#address, kept: present };
