@@ -144,6 +144,7 @@ export const scan: Words["scan"] = {
     ],
   },
   tgc: {
+    short: "TGC",
     label: "Tiefenausgleich (TGC)",
     hint: "Tiefenausgleich: Verstärkung je Tiefe. Rastet bei 0 ein; ein Doppelklick setzt 0.",
     slider: (index, count) => `Tiefenausgleich ${index} von ${count}, dB`,

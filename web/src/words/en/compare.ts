@@ -1,10 +1,10 @@
 /** Compare, in English. */
 
 const pictures = {
-  rendering: { title: "Rendering", meaning: "of the scene at the frame's pose" },
-  median: { title: "Median compounding", meaning: "the median of what the training frames show there" },
-  linear: { title: "Linear between frames", meaning: "blended from the training frames on both sides" },
-  nearest: { title: "Nearest frame", meaning: "the training frame that lies nearest" },
+  rendering: { short: "Rendering", title: "Rendering", meaning: "of the scene at the frame's pose" },
+  median: { short: "Median", title: "Median compounding", meaning: "the median of what the training frames show there" },
+  linear: { short: "Linear", title: "Linear between frames", meaning: "blended from the training frames on both sides" },
+  nearest: { short: "Nearest", title: "Nearest frame", meaning: "the training frame that lies nearest" },
 };
 
 export const compare = {

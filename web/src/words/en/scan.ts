@@ -155,6 +155,7 @@ export const scan = {
     steering,
   },
   tgc: {
+    short: "TGC",
     label: "Time-gain compensation",
     hint: "Time-gain compensation: gain at each depth. Catches at 0; a double click sets 0.",
     slider: (index: number, count: number): string => `Time-gain compensation ${index} of ${count}, dB`,

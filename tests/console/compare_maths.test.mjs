@@ -1,0 +1,67 @@
+/** What Compare computes, without a browser: differences, similarity, correlation. */
+
+import assert from "node:assert/strict";
+import { createRequire } from "node:module";
+import path from "node:path";
+import { describe, it } from "node:test";
+
+import { ROOT } from "./harness.mjs";
+
+const { buildSync } = createRequire(path.join(ROOT, "web/package.json"))("esbuild");
+const { outputFiles } = buildSync({
+  stdin: { contents: 'export * from "./picture"; export * from "./statistics";', resolveDir: path.join(ROOT, "web/src/compare"), loader: "ts" },
+  bundle: true,
+  write: false,
+  format: "esm",
+});
+const { difference, similarity, valueAt, correlation, worstFirst } = await import(
+  `data:text/javascript;base64,${Buffer.from(outputFiles[0].contents).toString("base64")}`
+);
+
+const grey = (width, height, value) => ({
+  width,
+  height,
+  values: Uint8Array.from({ length: width * height }, (_, i) => value(i % width, Math.floor(i / width))),
+});
+
+describe("pictures", () => {
+  it("differ with a sign: brighter than the truth is positive", () => {
+    const found = difference(grey(2, 1, () => 100), grey(2, 1, (x) => (x === 0 ? 130 : 60)));
+    assert.deepEqual([...found], [30, -40]);
+    assert.equal(difference(grey(2, 1, () => 0), grey(1, 2, () => 0)), null);
+  });
+
+  it("are as similar as the formula of SSIM says", () => {
+    const noise = grey(32, 32, (x, y) => (x * 37 + y * 91 + x * y * 13) % 256);
+    assert.ok(similarity(noise, noise).every((one) => Math.abs(one - 1) < 1e-4));
+    // Two even pictures: no variance, and the means decide.
+    const [a, b, c1] = [100, 150, (0.01 * 255) ** 2];
+    const even = similarity(grey(16, 16, () => a), grey(16, 16, () => b));
+    const expected = (2 * a * b + c1) / (a * a + b * b + c1);
+    assert.ok(even.every((one) => Math.abs(one - expected) < 1e-3), `${even[0]} and not ${expected}`);
+    const inverted = { ...noise, values: noise.values.map((value) => 255 - value) };
+    assert.ok(similarity(noise, inverted).reduce((sum, one) => sum + one, 0) < 0, "opposites are alike");
+  });
+
+  it("tell the value under the pointer, and none beside", () => {
+    const picture = grey(4, 2, (x, y) => 10 * x + y);
+    assert.equal(valueAt(picture, 0.99, 0.99), 31);
+    assert.equal(valueAt(picture, 1, 0.5), null);
+    assert.equal(valueAt(picture, -0.01, 0.5), null);
+  });
+});
+
+describe("statistics", () => {
+  it("put the worst first, whichever way a metric is better", () => {
+    const frames = [{ psnr_db: 20, gmsd: 0.2 }, { psnr_db: 30, gmsd: 0.1 }, { psnr_db: 10, gmsd: 0.3 }];
+    assert.deepEqual(worstFirst(frames, "rendering", "psnr_db"), [2, 0, 1]);
+    assert.deepEqual(worstFirst(frames, "rendering", "gmsd"), [2, 0, 1]);
+  });
+
+  it("correlate as Pearson does", () => {
+    assert.ok(Math.abs(correlation([[1, 2], [2, 4], [3, 6]]) - 1) < 1e-12);
+    assert.ok(Math.abs(correlation([[1, 1], [2, 3], [3, 2]]) - 0.5) < 1e-12);
+    assert.equal(correlation([[1, 1], [1, 3], [1, 2]]), null);
+    assert.equal(correlation([[1, 1], [2, 3]]), null);
+  });
+});
