@@ -123,7 +123,7 @@ describe("a slow service", () => {
     await page.clock.install();
     let slow = false;
     const late = [];
-    await page.routeWebSocket(/\/stream$/, (socket) => {
+    await page.routeWebSocket(/\/stream(\?|$)/, (socket) => {
       const there = socket.connectToServer();
       socket.onMessage((message) => {
         const isPose = "pose" in JSON.parse(message); // not the acknowledgement of a frame
@@ -175,7 +175,7 @@ describe("a refused pose", () => {
   for (const reason of ["QUEUE_FULL", "RATE_LIMITED"]) it(`is asked for again where the refusal may pass: ${reason}`, async () => {
     const page = await openPage(at, "#/scenes");
     let full = false;
-    await page.routeWebSocket(/\/stream$/, (socket) => {
+    await page.routeWebSocket(/\/stream(\?|$)/, (socket) => {
       const there = socket.connectToServer();
       socket.onMessage((message) => {
         const { sequence } = JSON.parse(message);

@@ -1,6 +1,7 @@
 """A program that streams poses to the demo scene, as it is told on its standard input.
 
-`x Y`: a pose with its place at Y mm along the scene's x. `run HZ`: a pose along y, HZ times a second, until the next line.
+`x Y`: a pose with its place at Y mm along the scene's x.
+`run HZ`: a pose along y, HZ times a second, until the next line.
 Each answer is told as a line: the sequence, the time in milliseconds since 1970, and the x that was rendered.
 """
 
@@ -16,6 +17,11 @@ address, settings = sys.argv[1], json.loads(sys.argv[2])
 pose = {"position_mm": {"x": 0.0, "y": 0.0, "z": 0.0}, "quaternion": {"w": 1, "x": 0, "y": 0, "z": 0}}
 
 
+def tell(*facts):
+    sys.stdout.write(" ".join(map(str, facts)) + "\n")
+    sys.stdout.flush()
+
+
 def ask(stream, sequence):
     message = {"sequence": sequence, "mode": "latest", "pose": pose}
     if sequence == 0:
@@ -23,11 +29,11 @@ def ask(stream, sequence):
     stream.send(json.dumps(message))
     answer = stream.recv()
     if isinstance(answer, str):
-        print("refused", answer, flush=True)
+        tell("refused", answer)
         return
     (length,) = struct.unpack_from("<I", answer)
     header = json.loads(answer[4 : 4 + length])
-    print(header["sequence"], round(1000 * time.time()), header["pose"][0][3], flush=True)
+    tell(header["sequence"], round(1000 * time.time()), header["pose"][0][3])
 
 
 with connect(address, max_size=None) as stream:

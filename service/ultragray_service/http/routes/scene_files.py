@@ -77,7 +77,10 @@ async def get_gaussians(
     limit: PointLimit = DEFAULT_POINTS,
     fields: PointFields = None,
 ) -> Response:
-    """Gaussians as points: position, intensity, transmittance and size, or `fields`; an even selection, always the same."""
+    """Gaussians as points: position, intensity, transmittance and size, or `fields`.
+
+    An even selection, always the same.
+    """
 
     async def points() -> Response:
         return Response(await service.catalog.points(scene, limit, fields or FIELDS), media_type=RAW)
