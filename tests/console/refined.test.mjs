@@ -107,7 +107,7 @@ describe("corrected poses", () => {
       assert.ok(box.y + box.height <= 900 && box.x + box.width <= 1440, `${title} is out of sight`);
     }
     await panel.getByText("training view 106").first().waitFor(); // as the bar of the sweep says
-    await panel.getByText("1.05").waitFor();
+    await panel.getByText("1.05", { exact: true }).waitFor();
     await page.getByLabel("Place in the training sweep").fill("10");
     await panel.getByText("training view 11").first().waitFor();
     const chart = panel.getByRole("img", { name: "Shift in mm" });

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import time
 
+import numpy as np
+
 from ultragray.datasets.sweep import Dataset
 from ultragray.evaluation.scoring import evaluate_frames
 from ultragray.training import TrainingConfig
@@ -52,5 +54,5 @@ def _scoring_s(dataset: Dataset) -> float:
     """The seconds of scoring a frame: measured on one."""
     frame = dataset.train.select([0])
     started = time.perf_counter()
-    evaluate_frames(frame.images.astype("float32") / 255.0, frame)
+    evaluate_frames((frame.images / 255.0).astype(np.float32), frame)
     return time.perf_counter() - started
