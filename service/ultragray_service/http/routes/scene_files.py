@@ -71,9 +71,13 @@ _IMPORT: dict[str, Any] = {
 
 @router.get("/{scene}/gaussians", response_class=Response, responses=_POINTS | problems(401, 404, 422))
 async def get_gaussians(
-    request: Request, service: ServiceDep, scene: SceneName, limit: PointLimit = DEFAULT_POINTS, fields: PointFields = None
+    request: Request,
+    service: ServiceDep,
+    scene: SceneName,
+    limit: PointLimit = DEFAULT_POINTS,
+    fields: PointFields = None,
 ) -> Response:
-    """Gaussians as points: position, intensity, transmittance and size, or `fields`; an even selection, always the same."""
+    """Gaussians as points: position, intensity, transmittance and size, or `fields`; always the same even selection."""
 
     async def points() -> Response:
         return Response(await service.catalog.points(scene, limit, fields or FIELDS), media_type=RAW)
