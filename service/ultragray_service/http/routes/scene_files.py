@@ -77,10 +77,7 @@ async def get_gaussians(
     limit: PointLimit = DEFAULT_POINTS,
     fields: PointFields = None,
 ) -> Response:
-    """Gaussians as points: position, intensity, transmittance and size, or `fields`.
-
-    An even selection, always the same.
-    """
+    """Gaussians as points: position, intensity, transmittance and size, or `fields`; always the same even selection."""
 
     async def points() -> Response:
         return Response(await service.catalog.points(scene, limit, fields or FIELDS), media_type=RAW)
