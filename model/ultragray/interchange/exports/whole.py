@@ -24,7 +24,9 @@ def export_bytes(
         path = Path(folder, "export")
         exporter = make(path, header)
         try:
-            exporter.add({name: stored_pixels(frames[name], header.pixel_type(name)) for name in frames}, extrapolations)
+            exporter.add(
+                {name: stored_pixels(frames[name], header.pixel_type(name)) for name in frames}, extrapolations
+            )
         except BaseException:
             exporter.abandon()
             raise
