@@ -1,11 +1,47 @@
 /** What the Scan view does at a key, and which key that is. */
 
+import type { ScanState } from "./scan.svelte";
+import { scanSettings } from "./settings.svelte";
+import type { Steering } from "./steering.svelte";
+import type { Store } from "./store/store.svelte";
+
 export const COMMANDS = [
   "freeze", "distance", "ellipse", "angle", "text", "leave", "store", "play", "previousFrame", "nextFrame",
   "home", "snap", "undo", "redo", "slower", "faster", "large", "keys",
 ] as const; // prettier-ignore
 export type Command = (typeof COMMANDS)[number];
 export type Commands = Readonly<Record<Command, () => void>>;
+
+interface Parts {
+  scan: ScanState;
+  store: Store;
+  steering: () => Steering;
+  openKeys: () => void;
+}
+
+export function commandsFor({ scan, store, steering, openKeys }: Parts): Commands {
+  const { session, cine, marks } = scan;
+  return {
+    freeze: () => scan.toggleFrozen(),
+    distance: () => scan.toggleTool("distance"),
+    ellipse: () => scan.toggleTool("ellipse"),
+    angle: () => scan.toggleTool("angle"),
+    text: () => scan.toggleTool("text"),
+    leave: () => marks.leave(),
+    store: () => void store.picture(),
+    play: () => (session.frozen ? cine.togglePlaying() : steering().togglePlaying()),
+    previousFrame: () => session.frozen && cine.step(-1),
+    nextFrame: () => session.frozen && cine.step(1),
+    home: () => session.goHome(),
+    snap: () => session.snap(),
+    undo: () => session.history.undo(),
+    redo: () => session.history.redo(),
+    slower: () => scanSettings.changeSpeed(-1),
+    faster: () => scanSettings.changeSpeed(1),
+    large: () => (scanSettings.large = !scanSettings.large),
+    keys: openKeys,
+  };
+}
 
 /** Keys as `KeyboardEvent.key` has them, in lower case; Ctrl stands for Command, too. */
 export const KEYS: Readonly<Record<Command, readonly string[]>> = {

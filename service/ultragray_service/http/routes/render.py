@@ -65,7 +65,7 @@ _ANSWER: dict[int | str, dict[str, Any]] = {
         "description": "The frames. image/png and image/jpeg: one pose, one output. application/octet-stream "
         "(parameter dtype=uint8 or float32): the outputs one after another, each [C, H, W]. application/x-npz "
         "holds one float32 array [C, H, W] per output, `poses` [C, 4, 4], and the strings scene, scene_sha256 and "
-        "renderer. application/dicom: a multi-frame ultrasound image of bmode, true to scale. "
+        "renderer. application/dicom: a multi-frame ultrasound image of bmode, true to scale: fans are scan-converted. "
         "`*/*` gives PNG where it can hold the request, else npz.",
         "content": {PNG: _BINARY, JPEG: _BINARY, RAW: _BINARY, NPZ: _BINARY, DICOM: _BINARY},
         "headers": {name: {"description": text, "schema": {"type": "string"}} for name, text in RENDER_HEADERS.items()},
