@@ -5,7 +5,7 @@ import { mkdirSync } from "node:fs";
 import path from "node:path";
 import { after, before, describe, it } from "node:test";
 
-import { launchFirefox, missing, openInFirefox, resize, stateInFirefox } from "./firefox.mjs";
+import { launchFirefox, missing, openInFirefox, OWN_FONT, resize, stateInFirefox } from "./firefox.mjs";
 import { SCREENSHOTS, Service, until } from "./harness.mjs";
 
 const IMAGE = '[aria-label="Live image"]';
@@ -33,7 +33,7 @@ describe("in Firefox", { skip: missing ?? false }, () => {
   /** What the policy kept out, but for a font of Firefox's own style sheet for HTML. */
   async function refusedSources(page) {
     const refused = await page.evaluate(() => globalThis.refusedSources);
-    return refused.filter((source) => !source.startsWith("data:font/"));
+    return refused.filter((source) => !OWN_FONT.test(source));
   }
 
   async function photograph(page, name) {
