@@ -2,7 +2,7 @@
 
 import type { ScanState } from "./scan.svelte";
 import { scanSettings } from "./settings.svelte";
-import type { Steering } from "./steering.svelte";
+import type { Steering } from "../session/steering.svelte";
 import type { Store } from "./store/store.svelte";
 
 export const COMMANDS = [

@@ -5,7 +5,7 @@ import { ellipseOf, type EllipsePoints } from "../../geometry/measure";
 import { depthTicks, extent_mm, pixelAt, type Placed } from "../../geometry/picture";
 import type { PlanePoint } from "../../geometry/plane";
 import { poseJson } from "../../geometry/pose_json";
-import { toneOf } from "../../session/familiar";
+import { confidenceWords } from "../../session/familiar";
 import { GREYS } from "../../shared/FrameCanvas.svelte";
 import { words } from "../../words/words.svelte";
 import type { Mark, Marks } from "../marks.svelte";
@@ -118,11 +118,10 @@ export class Sheet {
   }
 
   #drawConfidence({ header }: Frame): void {
-    const tone = toneOf(header.extrapolation);
-    if (tone === null) return;
-    const { confidence } = header.extrapolation;
-    const text = words.session.confidence[tone] + (confidence === null ? "" : `, ${(confidence * 100).toFixed(0)} %`);
-    this.#context.fillStyle = TONES[tone];
+    const told = confidenceWords(header, null);
+    if (told === null) return;
+    const text = `${told.title}, ${told.detail}`;
+    this.#context.fillStyle = TONES[told.tone];
     const middle = MARGINS.left + (this.#width - this.#context.measureText(text).width) / 2;
     this.#context.fillText(text, middle, MARGINS.top / 2 + 4.5);
   }

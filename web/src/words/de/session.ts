@@ -3,7 +3,6 @@
 import type { Words } from "../en/english";
 
 export const session: Words["session"] = {
-  confidence: { good: "Gut gestützt", warn: "Teils geraten", bad: "Geraten" },
   link: {
     refused: (values) =>
       `Die Adresse enthält ${values.length === 1 ? "einen Wert, der nicht verwendbar ist" : "Werte, die nicht verwendbar sind"}; ohne sie geöffnet: ${values.join(", ")}.`,

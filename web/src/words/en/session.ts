@@ -1,11 +1,6 @@
 /** A scene as it is scanned: what stands in its way, what an address tells, in English. */
 
-import type { Tone } from "../../session/familiar";
-
-const confidence: Record<Tone, string> = { good: "Well supported", warn: "Partly a guess", bad: "A guess" };
-
 export const session = {
-  confidence,
   link: {
     refused: (values: readonly string[]): string =>
       `The address holds ${values.length === 1 ? "a value" : "values"} that cannot be used, and the view opened without: ${values.join(", ")}.`,

@@ -1,9 +1,7 @@
 /** What moves the probe by itself while it is held: keys, a gamepad, the playback of a track. */
 
 import type { Vector } from "../geometry/pose";
-import type { Session } from "../session/session.svelte";
-import type { Commands } from "./commands";
-import { scanSettings } from "./settings.svelte";
+import type { Session } from "./session.svelte";
 
 const SPEED_MM_S = 25;
 const SPEED_DEG_S = 30;
@@ -32,7 +30,7 @@ const TURNS: Record<string, Vector> = {
   PageDown: [0, 1, 0],
 };
 
-type PadCommands = Pick<Commands, "freeze" | "snap" | "store" | "home">;
+type PadCommands = Record<"freeze" | "snap" | "store" | "home", () => void>;
 /** Buttons of a gamepad in the standard layout. */
 const PAD_BUTTONS: readonly (readonly [number, keyof PadCommands])[] = [[0, "freeze"], [1, "snap"], [2, "store"], [3, "home"]];
 
@@ -49,6 +47,8 @@ export class Steering {
     private readonly session: Session,
     /** What the buttons of a gamepad do. */
     private readonly commands: Partial<PadCommands> = {},
+    /** How many times as fast as usual. */
+    private readonly speed: () => number = () => 1,
   ) {
     addEventListener("gamepadconnected", this.#connected);
     addEventListener("gamepaddisconnected", this.#connected);
@@ -139,7 +139,7 @@ export class Steering {
   }
 
   #move({ along, turn }: Motion, seconds: number): void {
-    seconds *= scanSettings.speed;
+    seconds *= this.speed();
     const scaled = (vector: Vector, factor: number): Vector => [vector[0] * factor, vector[1] * factor, vector[2] * factor];
     if (along.some((value) => value !== 0)) this.session.moveBy(scaled(along, SPEED_MM_S * seconds));
     if (turn.some((value) => value !== 0)) this.session.turnBy(scaled(turn, SPEED_DEG_S * seconds));
