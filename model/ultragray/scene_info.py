@@ -190,7 +190,7 @@ def check_header_size(start: bytes) -> None:
     """Raises InvalidArgument where a bundle that starts so has a larger header than that of a scene may be."""
     size = int.from_bytes(start[:_LENGTH_BYTES], "little")
     if size > MAX_HEADER_BYTES:
-        raise InvalidArgument(f"the header of a scene file may have {MAX_HEADER_BYTES} bytes, it says {size}")
+        raise InvalidArgument("it does not begin as a scene file does: it is damaged, or a file of another kind")
 
 
 def check_training_pose_count(count: int) -> None:
