@@ -31,6 +31,7 @@ INTENSITIES = ("released", "sigmoid")
 MAX_SH_DEGREE = 3
 MAX_LABEL = 255
 MAX_HEADER_BYTES = 4 * 2**20  # of the bundle: names and shapes of tensors, and the metadata
+_NO_HEADER_BYTES = 1 << 40  # a number of bytes beyond is none: other files begin so
 MAX_TRAINING_POSES = 100_000
 MAX_METRICS = 1000
 LABELS_TENSOR = "labels"
@@ -189,8 +190,10 @@ def check_corrections(corrections: Any, count: int) -> FloatArray:  # [P, 4, 4] 
 def check_header_size(start: bytes) -> None:
     """Raises InvalidArgument where a bundle that starts so has a larger header than that of a scene may be."""
     size = int.from_bytes(start[:_LENGTH_BYTES], "little")
-    if size > MAX_HEADER_BYTES:
+    if size > _NO_HEADER_BYTES:
         raise InvalidArgument("it does not begin as a scene file does: it is damaged, or a file of another kind")
+    if size > MAX_HEADER_BYTES:
+        raise InvalidArgument(f"the header of a scene file may have {MAX_HEADER_BYTES} bytes, it says {size}")
 
 
 def check_training_pose_count(count: int) -> None:

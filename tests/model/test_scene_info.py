@@ -138,6 +138,13 @@ def write_without_gaussians(path: Path, poses: int, **more_metadata: str) -> Non
     save_file(tensors, path, {"ultragray": info_to_json(SceneInfo()), **more_metadata})
 
 
+def test_a_file_of_another_kind_is_told_to_be_one(tmp_path: Path) -> None:
+    path = tmp_path / "thesis.ugr"
+    path.write_bytes(b"%PDF-1.7\n and so on")
+    with pytest.raises(SceneFileInvalid, match="it does not begin as a scene file does: it is damaged, or a file of"):
+        read_header(path)
+
+
 def test_a_description_has_limits(tmp_path: Path) -> None:
     path = tmp_path / "large.ugr"
     write_without_gaussians(path, MAX_TRAINING_POSES)
@@ -146,7 +153,7 @@ def test_a_description_has_limits(tmp_path: Path) -> None:
     with pytest.raises(SceneFileInvalid, match="training_poses must be at most 100000, got 100001"):
         read_header(path)
     write_without_gaussians(path, 1, more="x" * MAX_HEADER_BYTES)
-    with pytest.raises(SceneFileInvalid, match="it does not begin as a scene file does"):
+    with pytest.raises(SceneFileInvalid, match="may have 4194304 bytes, it says 419"):
         read_header(path)
     with pytest.raises(InvalidArgument, match="at most 1000 entries, got 1001"):
         SceneInfo(metrics={str(number): 1.0 for number in range(1001)})
