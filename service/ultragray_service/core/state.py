@@ -39,7 +39,7 @@ from ..settings import Settings
 from ..telemetry.metrics import Metrics
 from ..telemetry.tracing import start_tracing
 from ..views.assessments import Assessing
-from ..views.comparisons import Comparisons
+from ..views.comparisons import Comparisons, simulated_sha256
 from ..views.datasets import DatasetViews
 from ..views.training import TrainingViews
 from .catalog import SceneCatalog, scene_to_blame
@@ -223,7 +223,7 @@ class Service:
         await self.imports.remove_stale()
         for prepared in self._prepared:
             await prepared.remove_stale()
-        present = await asyncio.to_thread(self.datasets.names_by_content)
+        present = {*await asyncio.to_thread(self.datasets.names_by_content), await asyncio.to_thread(simulated_sha256)}
         await self._forget(lambda key: key.rpartition("-")[2] not in present)
         await self.training_views.forget(lambda key: True)  # a training that goes on has new ones
         self.jobs.start()

@@ -133,7 +133,7 @@ class Comparisons(Prepared):
         header = await self._catalog.header(scene)
         wanted = header.info.dataset_sha256
         present = await asyncio.to_thread(self._datasets.names_by_content)
-        if wanted not in present and wanted != await asyncio.to_thread(_sha256_of_demo):
+        if wanted not in present and wanted != await asyncio.to_thread(simulated_sha256):
             trained_from = header.info.dataset_name
             named = "" if trained_from is None else f" ({str(trained_from)[:128]!r})"
             raise DatasetNotFound(
@@ -146,6 +146,6 @@ class Comparisons(Prepared):
 
 
 @cache
-def _sha256_of_demo() -> str | None:
-    """Of the dataset that the demo scene was trained from. The service needs no upload of it: it can be simulated."""
+def simulated_sha256() -> str | None:
+    """Of the dataset that the demo scene was trained from: it needs no upload, since it can be simulated."""
     return read_header(DEMO_FILE).info.dataset_sha256

@@ -20,6 +20,8 @@ import pytest
 from ultragray import GaussianScene, LinearProbe
 from ultragray.datasets import Dataset, Sweep
 from ultragray.datasets.released import write_released
+from ultragray.demo import DEMO_FILE
+from ultragray.scene_info import read_header
 from ultragray_proto.v1 import datasets_pb2, datasets_pb2_grpc
 from ultragray_workers.helpers.comparison import PICTURES
 from ultragray_workers.helpers.helper import PROGRESS_NAME
@@ -214,3 +216,15 @@ def test_a_service_that_stops_or_dies_while_it_lays_a_dataset_out(start_service:
         assert left()
         start_service(artifact_folder=tmp_path / "artifacts")
         assert not left()
+
+
+def test_what_was_made_of_the_demo_scene_outlives_a_restart(start_service: StartService, tmp_path: Path) -> None:
+    demo, gone = (
+        tmp_path / "artifacts" / "comparisons" / f"3-{'0' * 64}-{sha256}"
+        for sha256 in (read_header(DEMO_FILE).info.dataset_sha256, "f" * 64)
+    )
+    for folder in (demo, gone):
+        folder.mkdir(parents=True)
+    start_service(artifact_folder=tmp_path / "artifacts")
+    assert demo.is_dir()  # its dataset is simulated: nobody uploads it
+    assert not gone.exists()

@@ -63,7 +63,8 @@ def compare(
     predicted["rendering"] = render_sweep(scene, held_out, backend="cpu")
     write_progress(filled, 0.7)
     measured = {name: evaluate_frames(frames, held_out) for name, frames in predicted.items()}
-    trusted = Assessor(scene.info, scene.training_poses).assess(held_out.poses, held_out.probe)
+    coverage = render_sweep(scene, held_out, backend="cpu", output="coverage")
+    trusted = Assessor(scene.info, scene.training_poses).assess(held_out.poses, held_out.probe, coverage=coverage)
     write_progress(filled, 0.9)
     truth = (held_out.images / 255.0).astype(np.float32)
     difference = np.minimum(np.abs(predicted["rendering"] - truth) * DIFFERENCE_GAIN, 1.0)
