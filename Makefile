@@ -144,7 +144,7 @@ bench-console: $(VENV)/installed-dev $(CONSOLE)  ## frames a second, memory and 
 	node tests/console/measure.mjs > $(FIGURES)/console.json
 	$(KEEP) console
 
-console-picture: $(VENV)/installed-dev $(CONSOLE)  ## take the README's picture of the console
+console-picture: $(VENV)/installed-dev $(CONSOLE)  ## take the documents' pictures of the console
 	node tests/console/picture.mjs
 
 bench-cuda: $(VENV)/installed  ## the same on a GPU, with the distance to what it can do at most

@@ -1,11 +1,11 @@
-/** Draws docs/images/console.png, the README's picture of the console: a steered array on the demo scene. */
+/** Draws the documents' pictures of the console, on the demo scene: console.png (a steered array) and maps.png. */
 
 import path from "node:path";
 
-import { ROOT, Service, canvasState, launch, until } from "./harness.mjs";
+import { ROOT, Service, canvasState, launch, openPage, until } from "./harness.mjs";
 import { changed, IMAGE, openScan } from "./scan_page.mjs";
 
-const PICTURE = path.join(ROOT, "docs/images/console.png");
+const PICTURES = path.join(ROOT, "docs/images");
 const SETTLED_MS = 3_000; // the room's points and the last frame have come by then
 
 const service = await Service.start();
@@ -17,7 +17,11 @@ try {
   await page.getByRole("combobox", { name: "Probe" }).selectOption("steered");
   await changed(page, print);
   await page.waitForTimeout(SETTLED_MS);
-  await page.screenshot({ path: PICTURE });
+  await page.screenshot({ path: path.join(PICTURES, "console.png") });
+  const maps = await openPage({ browser, service }, "#/maps/demo");
+  await until(() => canvasState(maps, '[data-testid="map-echo"]'), ({ mean }) => mean > 1, "no map came");
+  await maps.waitForTimeout(SETTLED_MS);
+  await maps.screenshot({ path: path.join(PICTURES, "maps.png") });
 } finally {
   await browser.close();
   await service.stop();

@@ -44,7 +44,7 @@ async def publish(service: Service) -> None:
 
 
 async def points(service: Service) -> None:
-    await service.catalog.points("demo", 10)
+    await service.catalog.points("demo", 10, None)
 
 
 LONG: dict[str, tuple[Any, str, Callable[[Service], Awaitable[None]]]] = {

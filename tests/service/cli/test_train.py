@@ -75,7 +75,10 @@ def test_trains_a_scene(dataset: Path, tmp_path: Path) -> None:
     assert re.search(rf"wrote {output}: 60 Gaussians, 24 steps, \d+ s \(\d+\.\d ms a step\)\n", result.stdout)
     assert sum(line.startswith("step ") for line in result.stderr.splitlines()) == 10
     folder = tmp_path / "scene.ugr.run"
-    assert sorted(path.name for path in folder.iterdir()) == ["config.json", "metrics.jsonl"]
+    assert sorted(path.name for path in folder.iterdir() if path.suffix != ".png") == ["config.json", "metrics.jsonl"]
+    pictures = sorted(path.name for path in folder.glob("*.png"))
+    assert pictures[0] == "validation_00000002.png"
+    assert pictures[-2:] == ["validation_00000024.png", "validation_truth.png"]
     assert len((folder / "metrics.jsonl").read_text().splitlines()) == 24
     assert "the run is finished, all 24 steps are done" in refused(dataset, "-o", output, "--resume")
 

@@ -212,7 +212,7 @@ def test_what_changes_is_told_meanwhile(
     with one.telling():
         write_run(first, 2)
         wait_until(lambda: files.progress(JOB).step == 2)
-        wait_until(lambda: (files.journal(JOB) or "").count("\n") == 2)
+        wait_until(lambda: (files.text_of_run(JOB, JOURNAL_NAME) or "").count("\n") == 2)
         storage.failures = 3  # a while away: what was missed is told later
         write_run(first, 4)
         wait_until(lambda: files.progress(JOB).step == 4)

@@ -33,8 +33,8 @@ import sys, time
 if "ultragray_workers.jobs.worker.run_job" in sys.orig_argv:
     from ultragray_workers.jobs.kinds import train_run
     report = train_run._report
-    def sleep(job_run, state):
-        report(job_run, state)
+    def sleep(job_run, *told):
+        report(job_run, *told)
         if job_run.request.specification["scene"] == "sleeps":
             time.sleep(3600)
     train_run._report = sleep
