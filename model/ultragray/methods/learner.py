@@ -28,6 +28,7 @@ from ..probe import FloatArray, Probe
 from ..training.device import training_device
 from .budget import Budget, Pace
 from .method import Cost, FitProgress, FitRun, Fitted, FrameArray, Method
+from .parts.subnormals import without_subnormals
 
 STATE_FILE, MODEL_FILE = "fit.safetensors", "model.safetensors"
 METADATA_KEY = "ultragray-method"
@@ -118,7 +119,7 @@ class Learned(Fitted):
     cost: Cost
 
     def render(self, probe: Probe, poses: FloatArray, height: int, width: int) -> FrameArray:
-        return self.learner.render(probe, poses, height, width)
+        return without_subnormals(lambda: self.learner.render(probe, poses, height, width))
 
 
 class LearnedMethod(Method):
@@ -138,7 +139,7 @@ class LearnedMethod(Method):
         run = run or FitRun()
         device = training_device(run.device, "auto")
         try:
-            return self._fit(dataset, budget, run, device)
+            return without_subnormals(lambda: self._fit(dataset, budget, run, device))
         except torch.OutOfMemoryError as error:
             raise MemoryExceeded(f"the memory of {device} did not suffice for {self.name}") from error
 
