@@ -117,6 +117,7 @@ describe("measuring", () => {
     await drag(page, [0.25, 0.5], [0.75, 0.5]);
     const [length] = await results(page);
     assert.ok(Math.abs(parseFloat(length) - PROBE_WIDTH_MM / 2) < 0.4, length);
+    assert.equal(await page.getByTestId("frozen-notice").count(), 0, "what measures is said to steer");
     await page.keyboard.press("f");
     assert.deepEqual(await results(page), []);
     assert.equal(await page.getByTestId("mark-letter").count(), 0);

@@ -26,18 +26,20 @@ interface Grip {
   angle_deg: number;
 }
 
-/** Follows the pointers on an element; what it answers with ends that. */
-export function steerByDragging(element: HTMLElement, { session, acrossPerPixel_mm }: Options): () => void {
+type Listener = (event: PointerEvent & { currentTarget: HTMLElement }) => void;
+
+/** What an element does with its pointers. What lies on it and takes a press for itself stops it on its way. */
+export function steeringByDragging({ session, acrossPerPixel_mm }: Options): Record<"press" | "move" | "letGo", Listener> {
   const held = new Map<number, Place>();
   let grip: (Grip & { depth_mm: number; pinching: boolean; twisting: boolean }) | null = null;
   let turns = false;
 
-  function press(event: PointerEvent): void {
+  function press(event: PointerEvent & { currentTarget: HTMLElement }): void {
     if ((event.target as HTMLElement).closest("button, a, input")) return;
     if (event.pointerType === "mouse" && event.button === 1) return;
     turns = event.button === 2 || event.shiftKey;
     held.set(event.pointerId, placeOf(event));
-    element.setPointerCapture(event.pointerId);
+    event.currentTarget.setPointerCapture(event.pointerId);
     grip = held.size === 2 ? { ...gripOf(held), depth_mm: depthOf(session), pinching: false, twisting: false } : null;
   }
 
@@ -75,12 +77,7 @@ export function steerByDragging(element: HTMLElement, { session, acrossPerPixel_
     if (held.size < 2) grip = null;
   }
 
-  const noMenu = (event: Event): void => event.preventDefault();
-  const listeners = { pointerdown: press, pointermove: move, pointerup: letGo, pointercancel: letGo, contextmenu: noMenu };
-  for (const [type, listener] of Object.entries(listeners)) element.addEventListener(type, listener as EventListener);
-  return () => {
-    for (const [type, listener] of Object.entries(listeners)) element.removeEventListener(type, listener as EventListener);
-  };
+  return { press, move, letGo };
 }
 
 function placeOf({ clientX, clientY }: PointerEvent): Place {
@@ -101,12 +98,12 @@ function fullDepth_mm({ probe, plane }: Session): number {
 }
 
 function depthOf(session: Session): number {
-  return session.display.depth_mm ?? fullDepth_mm(session);
+  return session.image.display.depth_mm ?? fullDepth_mm(session);
 }
 
 /** Whole millimetres; the full depth of the probe is none of its own. */
 function setDepth(session: Session, depth_mm: number): void {
   const whole_mm = Math.max(LEAST_DEPTH_MM, Math.round(depth_mm));
   const next = whole_mm >= fullDepth_mm(session) ? null : whole_mm;
-  if (next !== session.display.depth_mm) session.display = { ...session.display, depth_mm: next };
+  if (next !== session.image.display.depth_mm) session.image.display = { ...session.image.display, depth_mm: next };
 }

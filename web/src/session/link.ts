@@ -8,7 +8,8 @@ import type { Display } from "../api/stream";
 import { fromPositionQuaternion, position, quaternion, type Pose, type Quaternion, type Vector } from "../geometry/pose";
 import type { Kept } from "../shell/router.svelte";
 import { words } from "../words/words.svelte";
-import { AS_RENDERED, DISPLAY, SIZES, type Session } from "./session.svelte";
+import { AS_RENDERED, DISPLAY, SIZES } from "./image_settings.svelte";
+import type { Session } from "./session.svelte";
 
 const BETWEEN = "_"; // stands in addresses as it is
 const SLICE = settings.properties!.slice_thickness_mm!;
@@ -29,7 +30,7 @@ export function poseValue(pose: Pose): string {
 
 /** The values of a session by key; null: as the scene begins. */
 export function linkOf(session: Session): Record<string, string | null> {
-  const { pose, chosenProbe: probe, display } = session;
+  const { pose, chosenProbe: probe, image } = session;
   const differing = (value: string, usual: string): string | null => (value === usual ? null : value);
   const link: Record<string, string | null> = Object.fromEntries(KEYS.map((key) => [key, null]));
   link.pose = differing(poseValue(pose), poseValue(session.held(session.home)));
@@ -38,11 +39,11 @@ export function linkOf(session: Session): Record<string, string | null> {
     link.probe = kind;
     for (const [name, value] of Object.entries(numbers)) link[`probe.${name}`] = String(value);
   }
-  for (const [name] of DISPLAY_FIELDS) link[name] = differing(written(display[name]), written(AS_RENDERED[name]));
-  link.samples = session.samples === null ? null : String(session.samples);
-  link.slice_mm = session.sliceThickness_mm === null ? null : String(session.sliceThickness_mm);
-  link.lines = session.scanConverted ? null : "stored";
-  link.unsupported = session.hidesUnsupported ? "black" : null;
+  for (const [name] of DISPLAY_FIELDS) link[name] = differing(written(image.display[name]), written(AS_RENDERED[name]));
+  link.samples = image.samples === null ? null : String(image.samples);
+  link.slice_mm = image.sliceThickness_mm === null ? null : String(image.sliceThickness_mm);
+  link.lines = image.scanConverted ? null : "stored";
+  link.unsupported = image.hidesUnsupported ? "black" : null;
   return link;
 }
 
@@ -69,11 +70,11 @@ export async function followLink(session: Session, kept: Kept): Promise<string[]
   const stored = reader.read("lines", (text) => oneOf(["stored"], text));
   const unsupported = reader.read("unsupported", (text) => oneOf(["black"], text));
   if (probe !== null || session.chosenProbe !== null) await reader.attempt("probe", () => session.chooseProbe(probe));
-  session.display = { ...AS_RENDERED, ...display };
-  session.samples = samples;
-  session.sliceThickness_mm = thickness_mm;
-  session.scanConverted = stored === null;
-  session.hidesUnsupported = unsupported !== null;
+  session.image.display = { ...AS_RENDERED, ...display };
+  session.image.samples = samples;
+  session.image.sliceThickness_mm = thickness_mm;
+  session.image.scanConverted = stored === null;
+  session.image.hidesUnsupported = unsupported !== null;
   session.jumpTo(pose ?? session.held(session.home));
   return reader.refused;
 }

@@ -1,13 +1,11 @@
 /** One scene as it is scanned: its description, the probe, where it is held and how its frames are shown. */
 
 import { explain, mayPass, ServiceError, Unreachable } from "../api/client";
-import { defaultsOf } from "../api/described";
-import { settings } from "../api/generated/contract";
 import type { Output } from "../api/outputs";
 import { exampleProbe, PROBE_KINDS, type Probe } from "../api/probes";
 import { describeScene, trainingPoses, type SceneDescription, type TrainingPoses } from "../api/scenes";
-import type { Display, StreamSettings } from "../api/stream";
-import { areUpright, boxOf, type ImagePlane } from "../geometry/plane";
+import type { StreamSettings } from "../api/stream";
+import type { ImagePlane } from "../geometry/plane";
 import {
   between,
   IDENTITY,
@@ -21,6 +19,7 @@ import {
   type Vector,
 } from "../geometry/pose";
 import { History } from "./history.svelte";
+import { ImageSettings } from "./image_settings.svelte";
 import { planes } from "./planes.svelte";
 
 /** A probe with its image plane. */
@@ -35,11 +34,6 @@ export interface Trajectory {
   poses: Pose[];
 }
 
-/** Depth samples and scan lines that are offered, beside those of the training. */
-export const SIZES = [128, 256, 384, 512, 768];
-export const DISPLAY = settings.properties!.display!;
-export const AS_RENDERED = defaultsOf(DISPLAY) as Display;
-const MOST_PICTURE_PIXELS = 640; // on the longer side of a scan-converted fan
 /** In place of the own probe of a scene that has none. */
 const SUBSTITUTE = exampleProbe([...PROBE_KINDS.keys()][0]!, 50);
 /** Until a scene is known. */
@@ -65,20 +59,11 @@ export class Session {
   /** How often the probe went elsewhere at once, so that a person may want to go back. */
   jumps = $state(0);
   readonly history = new History();
+  readonly image = new ImageSettings();
   /** What is played in place of the training sweep. */
   trajectory = $state.raw<Trajectory | null>(null);
   /** Where the probe was put last on the track, in its poses; between them too. */
   place = $state(0);
-  /** How frames are shown, but for the scan conversion. */
-  display = $state.raw<Display>(AS_RENDERED);
-  scanConverted = $state(true);
-  /** Depth samples and scan lines; null: as trained. */
-  samples = $state<number | null>(null);
-  /** Thickness along elevation, at the focus of the scene's beam; 0: a plane; null: as trained. */
-  sliceThickness_mm = $state<number | null>(null);
-  /** Whether what no Gaussians support is black. */
-  hidesUnsupported = $state(false);
-
   /** Whether frames have come from another file since the description was asked for. */
   outdated = $state(false);
 
@@ -141,18 +126,15 @@ export class Session {
 
   /** What to ask the stream for; `plain`: without what changes the values of pixels. */
   settings(outputs: Output[], { plain = false } = {}): StreamSettings {
-    const { depth_mm, flip } = this.display;
+    const { samples, sliceThickness_mm, hidesUnsupported } = this.image;
     return {
-      height: this.samples,
-      width: this.samples,
+      height: samples,
+      width: samples,
       probe: this.description?.probe ? this.chosenProbe : this.probe,
-      display: {
-        ...(plain ? { ...AS_RENDERED, depth_mm, flip } : this.display),
-        pixel_mm: this.scanConverted ? squarePixel_mm(this.plane) : null,
-      },
+      display: this.image.displayIn(this.plane, plain),
       outputs,
-      slice_thickness_mm: this.sliceThickness_mm,
-      min_confidence: this.hidesUnsupported && this.description?.confidence ? 1 : null,
+      slice_thickness_mm: sliceThickness_mm,
+      min_confidence: hidesUnsupported && this.description?.confidence ? 1 : null,
       below_min_confidence: "mask",
     };
   }
@@ -249,15 +231,10 @@ export class Session {
     if (choice !== this.#choices) return; // another one was chosen meanwhile
     const before = this.plane.pivot_depth_mm;
     this.#chosen = chosen;
-    this.display = { ...this.display, depth_mm: null };
+    this.image.forgetDepth();
     const { onTrack } = this;
     this.#pose = translated(this.#pose, [0, 0, before - this.plane.pivot_depth_mm]);
     if (onTrack) this.#placed = this.#pose;
-  }
-
-  resetDisplay(): void {
-    this.display = AS_RENDERED;
-    this.sliceThickness_mm = null;
   }
 
   /** Moves the probe as a step that can be undone; false where the image stands. Changes of one `run` are one step. */
@@ -314,8 +291,8 @@ export class Session {
   #beginAnew(): void {
     this.frozen = false;
     this.#choices += 1;
-    this.#chosen = this.trajectory = this.samples = this.sliceThickness_mm = null;
-    this.display = { ...this.display, depth_mm: null };
+    this.#chosen = this.trajectory = null;
+    this.image.beginAnew();
     this.goHome();
     this.history.clear();
   }
@@ -338,13 +315,6 @@ async function viewsOf(scene: string): Promise<TrainingPoses | null> {
 
 function middleOf(description: SceneDescription | null): Pose {
   return description?.training_poses.middle?.matrix.flat() ?? IDENTITY;
-}
-
-/** The pixel of a scan-converted picture; null for probes whose frames are pictures already. */
-function squarePixel_mm({ lines_mm }: ImagePlane): number | null {
-  if (areUpright(lines_mm)) return null;
-  const { left, right, top, bottom } = boxOf(lines_mm);
-  return Math.max(right - left, bottom - top) / MOST_PICTURE_PIXELS;
 }
 
 const sessions = new Map<string, Session>();
