@@ -109,7 +109,7 @@ export async function openPage({ browser, service }, hash, { width = 1280, heigh
   if (init !== undefined) await page.addInitScript(init);
   page.on("pageerror", (error) => page.faults.push(error.message));
   page.on("console", (message) => {
-    if (message.type() === "error") page.faults.push(message.text());
+    if (message.type() === "error") page.faults.push(`${message.text()} (${message.location().url})`);
   });
   page.on("request", (request) => {
     const { origin, protocol } = new URL(request.url());
