@@ -6,7 +6,13 @@ import { jobs } from "./generated/contract";
 
 /** The specifications of jobs have these beside what their kind needs. */
 export type Job = Schemas["Job"] & {
-  specification: { scene?: string; dataset?: string; preset?: string; settings?: Record<string, unknown> };
+  specification: {
+    scene?: string;
+    dataset?: string;
+    preset?: string;
+    settings?: Record<string, unknown>;
+    pose_count?: number | null;
+  };
 };
 export type JobState = Job["state"];
 export type JobKind = Job["kind"];

@@ -22,13 +22,15 @@ export class Bench {
   problem = $state<string | null>(null);
   /** Whether the service has not the sweep of the scene. */
   withoutDataset = $state(false);
-  index = $state(0);
+  /** Of the address; there may be fewer frames since. */
+  #wanted = $state(0);
   metric = $state<Metric>("psnr_db");
   against = $state.raw<Against>({ way: "rendering" });
   mode = $state<Mode>("side");
   order = $state<Order>("sweep");
   #attempts = $state(0);
   readonly frames = $derived<readonly ComparedFrame[]>(this.comparison?.frames ?? []);
+  readonly index = $derived(Math.max(0, Math.min(this.frames.length - 1, this.#wanted)));
   readonly frame = $derived(this.frames[this.index]);
   /** The way whose metrics decide what is worst; another scene has the rendering's. */
   readonly way = $derived<Measured>("way" in this.against ? this.against.way : "rendering");
@@ -64,7 +66,7 @@ export class Bench {
 
   /** To a frame, by its place among the held-out ones. */
   goTo(index: number): void {
-    this.index = Math.max(0, Math.min(this.frames.length - 1, index));
+    this.#wanted = Math.max(0, Math.min(this.frames.length - 1, index));
     this.#keep();
   }
 
@@ -102,7 +104,7 @@ export class Bench {
   #read(): void {
     const { frame, metric, with: other = "", look, order } = router.kept;
     const index = Number(frame ?? 0);
-    this.index = Number.isInteger(index) && index >= 0 ? index : 0;
+    this.#wanted = Number.isInteger(index) && index >= 0 ? index : 0;
     this.metric = METRICS.find((one) => one === metric) ?? "psnr_db";
     this.mode = MODES.find((one) => one === look) ?? "side";
     this.order = ORDERS.find((one) => one === order) ?? "sweep";

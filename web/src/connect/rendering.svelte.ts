@@ -8,19 +8,24 @@ import type { Session } from "../session/session.svelte";
 export class Rendering {
   job = $state.raw<Job | null>(null);
   problem = $state<string | null>(null);
-  readonly isUnderWay = $derived(this.job !== null && !isFinal(this.job));
+  #sending = $state(false);
+  readonly isUnderWay = $derived(this.#sending || (this.job !== null && !isFinal(this.job)));
   #stopped = new AbortController();
 
   /** Renders poses with the image settings of a session. */
   async start(session: Session, poses: readonly Pose[], format: string): Promise<void> {
     this.problem = null;
+    this.#sending = true;
     const { height, width, probe, display, slice_thickness_mm } = session.settings(["bmode"]);
     const specification = { scene: session.name, poses: inBase64(poses), format, height, width, probe, display, slice_thickness_mm };
     try {
       this.job = await startJob("render", specification, false);
+      this.#sending = false;
       await this.#follow(this.job.id);
     } catch (error) {
       if (!this.#stopped.signal.aborted) this.problem = explain(error);
+    } finally {
+      this.#sending = false;
     }
   }
 

@@ -22,14 +22,19 @@ export function writeCrop({ left, right, top, bottom }: Crop): string {
   return `${left}:${right},${top}:${bottom}`;
 }
 
-/** The crop that a person wrote, as the service reads it; null where it is none of an image of this size. */
-export function readCrop(text: string, size: Size): Crop | null {
+/** The edges that a person wrote, wherever they lie; null where they are not written as a crop is. */
+export function readEdges(text: string, size: Size): Crop | null {
   const match = /^\s*(\d*):(\d*)\s*,\s*(\d*):(\d*)\s*$/.exec(text);
   if (match === null) return null;
   const numbers = [0, size.width, 0, size.height].map((otherwise, i) => (match[i + 1] === "" ? otherwise : Number(match[i + 1])));
   const [left, right, top, bottom] = numbers as [number, number, number, number];
-  const crop = { left, right, top, bottom };
-  return holds(crop, size) ? crop : null;
+  return { left, right, top, bottom };
+}
+
+/** The crop that a person wrote, as the service reads it; null where it is none of an image of this size. */
+export function readCrop(text: string, size: Size): Crop | null {
+  const crop = readEdges(text, size);
+  return crop !== null && holds(crop, size) ? crop : null;
 }
 
 /** Whether a crop lies in the image and holds a pixel. */

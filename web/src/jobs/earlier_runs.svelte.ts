@@ -12,7 +12,8 @@ export class EarlierRuns {
   /** Newest first; null: not asked for yet. */
   runs = $state.raw<Job[] | null>(null);
   problem = $state<string | null>(null);
-  readonly curves = new SvelteMap<string, CurvePoint[]>();
+  /** By run; `place` is free for another once it is taken away. */
+  readonly curves = new SvelteMap<string, { points: CurvePoint[]; place: number }>();
   #ending = new AbortController();
 
   constructor(
@@ -29,10 +30,12 @@ export class EarlierRuns {
   /** Lays a run over the curve, or takes it away. */
   async toggle(run: string): Promise<void> {
     if (this.curves.delete(run) || this.curves.size >= MOST_SHOWN) return;
-    this.curves.set(run, []);
+    const taken = [...this.curves.values()].map(({ place }) => place);
+    const place = Array.from({ length: MOST_SHOWN }, (_, index) => index).find((index) => !taken.includes(index))!;
+    this.curves.set(run, { points: [], place });
     try {
       const { points } = await trainingCurve(run, this.#ending.signal);
-      if (this.curves.has(run)) this.curves.set(run, points);
+      if (this.curves.has(run)) this.curves.set(run, { points, place });
     } catch (error) {
       this.curves.delete(run);
       if (!this.#ending.signal.aborted) this.problem = explain(error);

@@ -14,7 +14,8 @@ export class JobList {
   state = $state("");
   more = $state(false);
   problem = $state<string | null>(null);
-  readonly unfinished = $derived((this.jobs ?? []).filter((job) => !isFinal(job)).length);
+  /** Those under way, whatever is listed. */
+  unfinished = $state.raw<Job[]>([]);
   #length = PAGE;
   #asked = 0;
   /** The newest request whose answer was taken: those to older ones come too late. */
@@ -44,8 +45,11 @@ export class JobList {
   async #ask(): Promise<void> {
     const asked = ++this.#asked;
     try {
-      const { jobs, more } = await listJobs(this.#length, { kind: this.kind, state: this.state });
+      const listed = listJobs(this.#length, { kind: this.kind, state: this.state });
+      const others = this.kind === "" && this.state === "" ? [] : [listJobs(PAGE, { kind: "", state: "" })];
+      const [{ jobs, more }, newest] = await Promise.all([listed, ...others]);
       if (asked < this.#taken) return;
+      this.unfinished = (newest?.jobs ?? jobs).filter((job) => !isFinal(job));
       this.#taken = asked;
       this.jobs = jobs.map((job) => this.#known(job));
       this.more = more;

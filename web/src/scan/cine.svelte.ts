@@ -92,6 +92,6 @@ export class CineLoop {
 }
 
 function settingsOf({ header }: Frame): string {
-  const { scene_sha256, probe, slice_thickness_mm, display, height, width, outputs } = header;
-  return JSON.stringify([scene_sha256, probe, slice_thickness_mm, display, height, width, outputs]);
+  const { scene_sha256, probe, slice_thickness_mm, display, height, width } = header;
+  return JSON.stringify([scene_sha256, probe, slice_thickness_mm, display, height, width]);
 }

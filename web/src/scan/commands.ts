@@ -71,7 +71,7 @@ const GOES_ON: readonly Command[] = ["previousFrame", "nextFrame", "undo", "redo
 /** The command of a key that was pressed; undefined where it is none, or belongs to where the focus is. */
 export function commandOf(event: KeyboardEvent, singleKeys: boolean): Command | undefined {
   const target = event.target as HTMLElement;
-  if (takesText(target) || event.altKey || document.querySelector("dialog[open]") !== null) return undefined;
+  if (takesText(target) || event.altKey || document.querySelector("dialog[open], :popover-open") !== null) return undefined;
   if (event.key === " " && target.closest("button, a, input:not([type=range]), summary, [role=button]")) return undefined;
   const isControlled = event.ctrlKey || event.metaKey;
   if (!isControlled && !singleKeys && event.key !== "Escape") return undefined;

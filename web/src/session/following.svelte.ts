@@ -15,7 +15,8 @@ export interface FollowEvents {
 }
 
 export class Following {
-  connected = $state(false);
+  /** Whether the connection was lost, and is tried again: what is shown is old. */
+  lost = $state(false);
   /** Whether the frames are rendered for the page. */
   renderedHere = $state(false);
   /** The scene that the program asks for in place of this one. */
@@ -32,7 +33,7 @@ export class Following {
     this.#watch = new WatchStream(stream.id, {
       frame: (frame) => this.#take(frame),
       refused: (refusal) => this.events.refused(refusal),
-      connected: (yes) => (this.connected = yes),
+      connected: (yes) => (this.lost = !yes),
       ended: () => this.events.ended(),
     });
   }
@@ -41,14 +42,15 @@ export class Following {
     this.#watch.close();
   }
 
-  /** Whether the probe was moved since by somebody else than the program. */
+  /** Whether the probe was moved since by somebody else than the program. An image that stands moves nothing. */
   wasSteered(pose: Pose): boolean {
+    if (this.session.frozen) this.#pose = null; // the first frame after that places the probe again
     return !this.#choosing && this.#pose !== null && pose !== this.#pose;
   }
 
-  /** Puts the probe where the frame on the screen has it. */
+  /** Puts the probe where the frame on the screen has it, unless the image stands. */
   shown({ header }: Frame): void {
-    if (this.otherScene !== null) return;
+    if (this.otherScene !== null || this.session.frozen) return;
     this.#place(header.pose.flat());
     if (sameProbe(header.probe, this.session.probe) || this.#choosing) return;
     this.#choosing = true;

@@ -17,11 +17,15 @@ export class Latency {
   #dropped = 0;
 
   /** A frame that was asked for so long ago is on the screen now. */
-  shown(took_ms: number, dropped: number, now_ms: number): void {
+  shown(took_ms: number, now_ms: number): void {
     this.#times_ms.push(took_ms);
     if (this.#times_ms.length > KEPT) this.#times_ms.shift();
     this.#asked_ms = now_ms - took_ms;
-    this.#dropped += dropped;
+  }
+
+  /** So many poses were replaced before a frame that has come. */
+  dropped(poses: number): void {
+    this.#dropped += poses;
   }
 
   /** null before the first frame. */

@@ -1,4 +1,4 @@
-/** The live frames of a session: at most one a screen refresh, the newest, with the rates they come at. */
+/** The live frames of a session: at most one a screen refresh, the newest, with the rate they come at. */
 
 import { FrameStream, type Frame, type Refusal, type StreamSettings } from "../api/stream";
 import type { StreamSummary } from "../api/streams";
@@ -11,12 +11,6 @@ const RATES_EVERY_MS = 500;
 const SCENE_ASKED_AGAIN_MS = 3000;
 const FAILURES_SAID = 5; // in a row; by then the state of the service is known
 
-export interface Rates {
-  perSecond: number;
-  roundTrip_ms: number;
-  render_ms: number;
-}
-
 export class LiveView {
   frame = $state.raw<Frame | null>(null);
   connected = $state(false);
@@ -25,7 +19,7 @@ export class LiveView {
   readonly barred = $derived(this.#failures >= FAILURES_SAID && service.status === "ready");
   /** Why the newest pose got no frame. */
   refusal = $state.raw<Refusal | null>(null);
-  rates = $state.raw<Rates>({ perSecond: 0, roundTrip_ms: 0, render_ms: 0 });
+  framesPerSecond = $state(0);
   latency = $state.raw<LatencyFigures | null>(null);
   /** The stream of another program whose frames are shown in place of the page's own. */
   following = $state.raw<Following | null>(null);
@@ -113,6 +107,7 @@ export class LiveView {
     this.#arrived_ms = performance.now();
     this.refusal = null;
     this.session.rendered(frame.header.scene_sha256);
+    this.#latency.dropped(frame.header.dropped); // also those of a frame that another one replaces before it is shown
     if (this.#request === 0) this.#request = requestAnimationFrame(() => this.#show());
   }
 
@@ -122,7 +117,7 @@ export class LiveView {
     const { header, roundTrip_ms } = (this.frame = this.#arrived);
     this.#shown += 1;
     const took_ms = this.following === null ? roundTrip_ms : header.queue_ms + header.render_ms + header.encode_ms;
-    this.#latency.shown(took_ms + performance.now() - this.#arrived_ms, header.dropped, performance.now());
+    this.#latency.shown(took_ms + performance.now() - this.#arrived_ms, performance.now());
     this.following?.shown(this.#arrived);
     this.onshow(this.#arrived);
     this.#arrived = null;
@@ -131,15 +126,8 @@ export class LiveView {
   #measure(): void {
     const now = performance.now();
     this.latency = this.#latency.figures(now);
-    const perSecond = (this.#shown * 1000) / (now - this.#since_ms);
-    const { perSecond: before } = this.rates;
+    this.framesPerSecond = (this.#shown * 1000) / (now - this.#since_ms);
     this.#shown = 0;
     this.#since_ms = now;
-    if (perSecond === 0 && before === 0) return;
-    this.rates = {
-      perSecond,
-      roundTrip_ms: this.frame?.roundTrip_ms ?? 0,
-      render_ms: this.frame?.header.render_ms ?? 0,
-    };
   }
 }

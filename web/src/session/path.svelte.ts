@@ -37,17 +37,26 @@ export class Path {
       this.problem = words.connect.path.wrong(file.name, words.connect.path.tooLarge);
       return;
     }
-    this.#source = { name: file.name, buffer: await file.slice(0, MOST_BYTES).arrayBuffer() };
-    this.choose({});
+    try {
+      this.#source = { name: file.name, buffer: await file.slice(0, MOST_BYTES).arrayBuffer() };
+    } catch (error) {
+      this.problem = words.connect.path.wrong(file.name, explain(error)); // it has changed on the disk, or is a folder
+      return;
+    }
+    this.#read({});
   }
 
   /** Reads the file again, another way. */
   choose(chosen: Chosen): void {
+    this.#read({ ...(this.file?.unitIsKnown === false && { unit: this.file.unit }), ...chosen });
+  }
+
+  #read(chosen: Chosen): void {
     if (this.#source === null) return;
     const { name, buffer } = this.#source;
     this.problem = null;
     try {
-      const file = readPoses(name, buffer, { ...(this.file?.unitIsKnown === false && { unit: this.file.unit }), ...chosen });
+      const file = readPoses(name, buffer, chosen);
       this.#play(name, file.poses, file.times_s);
       this.file = file;
     } catch (error) {

@@ -6,6 +6,8 @@ export interface Point {
 }
 
 export interface Series {
+  /** What tells it from others of the same label; else the label does. */
+  id?: string;
   label: string;
   /** 1 to 6: which colour of the charts. */
   colour: 1 | 2 | 3 | 4 | 5 | 6;

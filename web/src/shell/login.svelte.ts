@@ -9,6 +9,7 @@ const ASKED = "ultragray.sign-in"; // in the storage of the tab, while the perso
 const RENEWAL = "ultragray.renewal";
 const RENEWED_BEFORE_S = 30;
 const LEAST_S = 5;
+const TRIED_AGAIN_S = 15;
 
 interface Asked {
   state: string;
@@ -30,6 +31,9 @@ interface Tokens {
   refresh_token?: string;
   expires_in?: number;
 }
+
+/** The login does not renew or give a token, and will not. */
+class Refused extends Error {}
 
 class Login {
   /** null: people sign in with keys alone. */
@@ -99,9 +103,9 @@ class Login {
   }
 
   async #finish(query: URLSearchParams, asked: Asked | null): Promise<void> {
+    if (asked === null || asked.state !== query.get("state")) throw new Error(words.shell.login.notAsked);
     const refusal = query.get("error_description") ?? query.get("error");
     if (refusal !== null) throw new Error(refusal);
-    if (asked === null || asked.state !== query.get("state")) throw new Error(words.shell.login.notAsked);
     await this.#take({ grant_type: "authorization_code", code: query.get("code")!, redirect_uri: here(), code_verifier: asked.verifier });
   }
 
@@ -109,13 +113,20 @@ class Login {
     const { token_endpoint, client_id } = this.provider ?? (await this.#required());
     const answer = await fetch(token_endpoint, { method: "POST", body: new URLSearchParams({ ...form, client_id }) });
     const tokens = (await answer.json()) as Tokens & { error?: string; error_description?: string };
-    if (!answer.ok) throw new Error(tokens.error_description ?? tokens.error ?? String(answer.status));
+    if (!answer.ok) {
+      const reason = tokens.error_description ?? tokens.error ?? String(answer.status);
+      throw answer.status < 500 ? new Refused(reason) : new Error(reason);
+    }
+    this.#keep(tokens); // first of all: the one before may be used up
     await use(tokens);
+    this.#renewLater();
+  }
+
+  #keep(tokens: Tokens): void {
     if (tokens.refresh_token === undefined) return this.forget();
     const lasts_s = Math.max(LEAST_S, (tokens.expires_in ?? 60) - RENEWED_BEFORE_S);
     const renewal: Renewal = { token: tokens.refresh_token, due_ms: Date.now() + 1000 * lasts_s };
     sessionStorage.setItem(RENEWAL, JSON.stringify(renewal));
-    this.#renewLater();
   }
 
   async #required(): Promise<SignInProvider> {
@@ -124,19 +135,20 @@ class Login {
     return this.provider;
   }
 
-  #renewLater(): void {
+  #renewLater(least_s = 0): void {
+    clearTimeout(this.#timer);
     const renewal = taken<Renewal>(RENEWAL, { keep: true });
     if (renewal === null) return;
-    clearTimeout(this.#timer);
-    this.#timer = setTimeout(() => void this.#renew(renewal), Math.max(0, renewal.due_ms - Date.now()));
+    this.#timer = setTimeout(() => void this.#renew(renewal), Math.max(1000 * least_s, renewal.due_ms - Date.now()));
   }
 
-  /** A token that cannot be renewed ends by itself; the service then asks again. */
+  /** A token that is refused ends by itself; the service then asks again. What does not answer is asked again. */
   async #renew({ token }: Renewal): Promise<void> {
     try {
       await this.#take({ grant_type: "refresh_token", refresh_token: token });
-    } catch {
-      this.forget();
+    } catch (error) {
+      if (error instanceof Refused || (error instanceof ServiceError && error.problem.status === 401)) this.forget();
+      else this.#renewLater(TRIED_AGAIN_S);
     }
   }
 }

@@ -168,6 +168,11 @@ export class Cloud {
     this.object.material.dispose();
   }
 
+  /** Draws everything anew: the graphics card has lost its pictures. */
+  forget(): void {
+    this.#changes += 1;
+  }
+
   /** What tells one picture from another. */
   #wanted({ renderer, camera, plane, sliced, occludedBy }: Sight): string {
     const size = renderer.getDrawingBufferSize(new Vector2());

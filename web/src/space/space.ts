@@ -229,5 +229,8 @@ export class SpaceView {
     if (hit) this.events.picked(hit.point.toArray());
   };
 
-  #restored = (): void => this.#loop.restart();
+  #restored = (): void => {
+    this.#cloud.forget();
+    this.#loop.restart();
+  };
 }

@@ -1,6 +1,6 @@
 /** The crop that is drawn on a frame of the sweep that was chosen, before it is sent. */
 
-import { readCrop, whole, writeCrop, type Crop } from "../geometry/crop";
+import { holds, readEdges, whole, writeCrop, type Crop } from "../geometry/crop";
 import { Sequence, type SequenceFrame } from "./sequence";
 import { sweepUpload } from "./sweep_upload.svelte";
 
@@ -14,12 +14,14 @@ class CropDrawing {
   #sequence: Sequence | null = null;
   #asked = 0;
 
-  /** As it is written among the options; null: that is no crop of this image. */
-  readonly crop = $derived.by<Crop | null>(() => {
+  /** The edges as they are written among the options, also outside of the image; null: no edges are written there. */
+  readonly edges = $derived.by<Crop | null>(() => {
     if (this.frame === null) return null;
     const written = sweepUpload.options.crop ?? "";
-    return written.trim() === "" ? whole(this.frame) : readCrop(written, this.frame);
+    return written.trim() === "" ? whole(this.frame) : readEdges(written, this.frame);
   });
+  /** null: what is written is no crop of this image. */
+  readonly crop = $derived(this.frame !== null && this.edges !== null && holds(this.edges, this.frame) ? this.edges : null);
 
   /** Looks into files that were chosen. */
   async look(files: readonly File[]): Promise<void> {

@@ -42,6 +42,8 @@ class TrainingPlan {
   set(name: string, value: Value): void {
     const { [name]: _, ...others } = this.settings;
     this.settings = Object.is(value, this.defaultOf(name)) ? others : { ...others, [name]: value };
+    const { [name]: __, ...problems } = this.problems;
+    this.problems = problems;
   }
 
   /** Begins with what an earlier training was specified by. */

@@ -34,6 +34,7 @@ export function posesFromPlus(text: string, chosen: Chosen): PoseFile {
     times_s: times.includes(null) ? null : (times as number[]),
     unit: "mm",
     unitIsKnown: true,
+    takesUnit: false,
     transforms: rigid,
     transform,
     skipped: frames.length - used.length,

@@ -13,6 +13,8 @@ export interface PoseFile {
   unit: Unit;
   /** Whether the format, or the file, says so; else it is a guess. */
   unitIsKnown: boolean;
+  /** Whether another unit can be chosen: the format does not fix it. */
+  takesUnit: boolean;
   /** The transforms that a file with several of them holds, and the one that was read. */
   transforms: string[];
   transform: string | null;
@@ -26,7 +28,7 @@ export interface Chosen {
   transform?: string;
 }
 
-export const PLAIN = { transforms: [], transform: null, skipped: 0 };
+export const PLAIN = { takesUnit: true, transforms: [], transform: null, skipped: 0 };
 
 /** Poses whose lengths are in `unit`, in mm. */
 export function inMillimetres(poses: Pose[], unit: Unit): Pose[] {

@@ -18,7 +18,7 @@ export function readPoses(name: string, buffer: ArrayBuffer, chosen: Chosen = {}
   const text = (): string => new TextDecoder("utf-8").decode(buffer);
   switch (suffix) {
     case ".json":
-      return { ...PLAIN, poses: posesFromJson(text()), times_s: timesFromJson(text()), unit: "mm", unitIsKnown: true };
+      return { ...PLAIN, poses: posesFromJson(text()), times_s: timesFromJson(text()), unit: "mm", unitIsKnown: true, takesUnit: false };
     case ".npy":
       return posesFromNpy(buffer, chosen);
     case ".csv":

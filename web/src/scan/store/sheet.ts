@@ -1,5 +1,6 @@
 /** A frame drawn for keeping: square pixels, a centimetre scale, what was set on it, and lines that say what it is. */
 
+import type { SceneDescription } from "../../api/scenes";
 import { outputPixels, type Frame } from "../../api/stream";
 import { ellipseOf, type EllipsePoints } from "../../geometry/measure";
 import { depthTicks, extent_mm, pixelAt, type Placed } from "../../geometry/picture";
@@ -19,6 +20,7 @@ const TEXT = "#c8d0d8";
 const MEASURED = "#ffd84d";
 const MARKER = "#5bbde4";
 const TONES = { good: "#63c690", warn: "#e3b04b", bad: "#f28b82" };
+const FRAME = 3;
 const GAP = "   ";
 
 /** A frame with the marks that lie on it. */
@@ -39,6 +41,7 @@ export class Sheet {
   constructor(
     private readonly placed: Placed,
     private readonly marks: Marks,
+    private readonly description: SceneDescription | null,
     pages: readonly Page[],
   ) {
     const context = this.canvas.getContext("2d");
@@ -72,7 +75,8 @@ export class Sheet {
 
   #lines({ frame, marks }: Page): string[] {
     const { scene, slice_thickness_mm, pose } = frame.header;
-    const told = [words.scan.store.simulated, scene, new Date().toISOString(), words.scan.store.slice(slice_thickness_mm), words.scan.store.depthInCm];
+    const warning = confidenceWords(frame.header, this.description)?.warning ?? "";
+    const told = [words.scan.store.simulated, ...(warning === "" ? [] : [`${warning}.`]), scene, new Date().toISOString(), words.scan.store.slice(slice_thickness_mm), words.scan.store.depthInCm];
     const measured = marks.filter(({ kind }) => kind !== "text").map((mark) => `${this.marks.letterOf(mark.id)}  ${resultOf(mark)}`);
     return [
       ...this.#wrapped(measured, GAP),
@@ -118,12 +122,21 @@ export class Sheet {
   }
 
   #drawConfidence({ header }: Frame): void {
-    const told = confidenceWords(header, null);
+    const told = confidenceWords(header, this.description);
     if (told === null) return;
     const text = `${told.title}, ${told.detail}`;
     this.#context.fillStyle = TONES[told.tone];
     const middle = MARGINS.left + (this.#width - this.#context.measureText(text).width) / 2;
     this.#context.fillText(text, middle, MARGINS.top / 2 + 4.5);
+    if (told.tone !== "good") this.#drawFrame(TONES[told.tone]);
+  }
+
+  /** Around the picture, as around the live image of a guess. */
+  #drawFrame(colour: string): void {
+    this.#context.strokeStyle = colour;
+    this.#context.lineWidth = FRAME;
+    this.#context.strokeRect(MARGINS.left - FRAME / 2, MARGINS.top - FRAME / 2, this.#width + FRAME, this.#height + FRAME);
+    this.#context.lineWidth = 1;
   }
 
   /** On the side of the probe's mark, as above the live image. */

@@ -15,7 +15,6 @@ export const train: Words["train"] = {
   startTrainings: "Trainings starten",
   startJobs: "Aufträge starten",
   existing: "Vorhandene Sweeps",
-  noSweep: "Noch kein Sweep: fügen Sie oben einen hinzu, Bilder mit aufgezeichneten Lagen.",
   firstSweep: "Noch kein Sweep",
   firstSweepHint: "Ein Sweep ist eine Folge von B-Bildern mit der aufgezeichneten Lage jedes Bildes: eine Sequenz von PLUS oder 3D Slicer (.mha, .nrrd) mit ihrer Gerätedatei, eine DICOM-Schleife mit ihren Lagen oder ein Ordner mit conf.json.",
   chooseFiles: "Einen hochladen",
@@ -133,7 +132,6 @@ export const train: Words["train"] = {
   render: {
     title: "Datensatz berechnen",
     hint: "Bilder einer trainierten Szene an vielen Lagen, mit allem, was der Simulator über sie weiß.",
-    noScene: "Noch keine Szene: trainieren Sie zuerst eine.",
     poses: "Lagen",
     samplers: {
       around: "Zufällig um den Sweep",
@@ -145,7 +143,6 @@ export const train: Words["train"] = {
     outputs: "Bilder je Lage",
     files: "Dateien",
     more: "Mehr",
-    formats: "Format",
     begin: "Berechnung starten",
     preview: "Lagen, die berechnet werden",
     previewHint: (shown, all) => `${shown} von ${all}`,

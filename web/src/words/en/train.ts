@@ -13,7 +13,6 @@ export const train = {
   startTrainings: "start trainings",
   startJobs: "start jobs",
   existing: "Existing sweeps",
-  noSweep: "No sweep yet: add one above, images with tracked poses.",
   firstSweep: "No sweep yet",
   firstSweepHint: "A sweep is a series of B-mode images with the tracked pose of each: a PLUS or 3D Slicer sequence (.mha, .nrrd) with its device set, a DICOM cine loop with its poses, or a folder with conf.json.",
   chooseFiles: "Upload one",
@@ -132,7 +131,6 @@ export const train = {
   render: {
     title: "Render a data set",
     hint: "Frames of a trained scene at many poses, with what the simulator knows of them.",
-    noScene: "No scene yet: train one first.",
     poses: "Poses",
     samplers: {
       around: "Around the sweep, at random",
@@ -144,7 +142,6 @@ export const train = {
     outputs: "Pictures of each frame",
     files: "Files",
     more: "More",
-    formats: "Format",
     begin: "Start rendering",
     preview: "Poses that will be rendered",
     previewHint: (shown: number, all: string): string => `${shown} of ${all}`,
