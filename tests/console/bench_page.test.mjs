@@ -133,7 +133,7 @@ describe("the list of jobs", () => {
     await list.getByLabel("Kind of job").selectOption("evaluate");
     await until(() => rows.count(), (count) => count === 1, "it is not filtered");
     await list.getByLabel("State").selectOption("failed");
-    await list.getByText("No jobs of these.").waitFor();
+    await list.getByText("No matching jobs.").waitFor();
     await list.getByRole("button", { name: "Show all" }).click();
     await rows.filter({ hasText: "data set" }).first().getByRole("link").click();
     await page.getByRole("link", { name: "Repeat with changes" }).click();

@@ -38,7 +38,7 @@ describe("the pose panel", () => {
     const { position_mm } = await until(() => poseOf(page), ({ position_mm: p }) => p.x !== 4, "it did not move");
     assert.ok(Math.abs(position_mm.x - (4 + 10 * Math.cos(Math.PI / 18))) < 0.02, JSON.stringify(position_mm));
     assert.ok(Math.abs(position_mm.y - (10 + 10 * Math.sin(Math.PI / 18))) < 0.02, JSON.stringify(position_mm));
-    await panel.getByLabel("Told").selectOption("relativeScene");
+    await panel.getByLabel("Shown as").selectOption("relativeScene");
     await until(() => page.getByLabel("Position X, mm").inputValue(), (value) => value === "9.8", "not along the scene's axes");
     await panel.getByLabel("from", { exact: true }).selectOption({ label: "Home" });
     await panel.getByText("Way from Home").waitFor();

@@ -122,4 +122,4 @@ class Budget:
             return None
         assert self.seconds is not None
         shown = Pace(pace.start_s, (seconds - pace.start_s) / steps, is_confirmed=False)
-        return shown if seconds < USED_SHARE * self.seconds and shown.step_s < pace.step_s else None
+        return shown if seconds < USED_SHARE * self.seconds and 0.0 < shown.step_s < pace.step_s else None

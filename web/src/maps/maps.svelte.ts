@@ -3,15 +3,14 @@
 import { untrack } from "svelte";
 
 import { OUTPUTS, type Output } from "../api/outputs";
-import { position, quaternion, fromPositionQuaternion, type Pose } from "../geometry/pose";
 import type { PlanePoint } from "../geometry/plane";
 import { Calm } from "../shared/calm.svelte";
 import { router, type Kept } from "../shell/router.svelte";
+import { poseOrNull, poseValue } from "../session/link";
 import type { Session } from "../session/session.svelte";
 
 const BETWEEN = "_"; // stands in addresses as it is
 const FIRST: Output = "bmode";
-const POSE_NUMBERS = 7;
 
 export class MapsState {
   large = $state<Output>(FIRST);
@@ -37,8 +36,8 @@ export class MapsState {
     });
     $effect(() => {
       if (!this.session.known) return;
-      const written = valueOf(pose.value);
-      const home = valueOf(this.session.held(this.session.home));
+      const written = poseValue(pose.value);
+      const home = poseValue(this.session.held(this.session.home));
       const { cursor, large } = this;
       untrack(() => {
         const { view, name } = router.route;
@@ -56,15 +55,10 @@ export class MapsState {
     this.large = kept.map !== undefined && kept.map in OUTPUTS ? (kept.map as Output) : FIRST;
     const [x_mm, z_mm] = numbersOf(kept.cursor, 2) ?? [];
     this.cursor = x_mm === undefined || z_mm === undefined ? null : { x_mm, z_mm };
-    const numbers = numbersOf(kept.pose, POSE_NUMBERS) as [number, number, number, number, number, number, number] | null;
-    const [x, y, z, ...turn] = numbers ?? [];
-    if (x !== undefined && y !== undefined && z !== undefined) this.session.pose = fromPositionQuaternion([x, y, z], turn as [number, number, number, number]);
-    else if (valueOf(this.session.pose) !== valueOf(this.session.held(this.session.home))) this.session.goHome();
+    const pose = poseOrNull(kept.pose);
+    if (pose !== null) this.session.pose = pose;
+    else if (poseValue(this.session.pose) !== poseValue(this.session.held(this.session.home))) this.session.goHome();
   }
-}
-
-function valueOf(pose: Pose): string {
-  return `${joined(position(pose), 4)}${BETWEEN}${joined(quaternion(pose), 7)}`;
 }
 
 function joined(numbers: readonly number[], digits: number): string {

@@ -28,6 +28,15 @@ export function poseValue(pose: Pose): string {
   return numbers.map((text) => String(Number(text))).join(BETWEEN);
 }
 
+/** The pose that a value of an address tells; null where it tells none. */
+export function poseOrNull(text: string | undefined): Pose | null {
+  try {
+    return text === undefined ? null : readPose(text);
+  } catch {
+    return null;
+  }
+}
+
 /** The values of a session by key; null: as the scene begins. */
 export function linkOf(session: Session): Record<string, string | null> {
   const { pose, chosenProbe: probe, image } = session;

@@ -1,4 +1,4 @@
-/** Numbers and times as people read them. */
+/** Amounts, times and names as people read and write them, in any language. */
 
 const UNITS = ["B", "KB", "MB", "GB", "TB"];
 
@@ -6,10 +6,6 @@ export function bytes(count: number): string {
   const power = Math.min(UNITS.length - 1, Math.floor(Math.log10(Math.max(1, count)) / 3));
   const value = count / 1000 ** power;
   return `${value.toFixed(power === 0 || value >= 100 ? 0 : 1)} ${UNITS[power]}`;
-}
-
-export function count(value: number): string {
-  return value.toLocaleString("en");
 }
 
 export function duration(seconds: number): string {
@@ -20,10 +16,6 @@ export function duration(seconds: number): string {
   return `${Math.floor(whole_min / 60)} h ${whole_min % 60} min`;
 }
 
-export function localTime(iso: string): string {
-  return new Date(iso).toLocaleString([], { dateStyle: "short", timeStyle: "medium" });
-}
-
 /** A name that scenes and datasets may have, made of a file's. */
 export function nameOfFile(file: string): string {
   const stem = file.replace(/(\.igs)?\.[A-Za-z0-9]+$/, "").replace(/\.tar$/, "");
@@ -31,22 +23,3 @@ export function nameOfFile(file: string): string {
 }
 
 export const NAME_PATTERN = "[A-Za-z0-9][A-Za-z0-9._\\-]{0,127}";
-
-/** `name = value` a line, the values as JSON, or as text where they are none. Throws an Error in words. */
-export function namedValues(lines: string): Record<string, unknown> {
-  const values: Record<string, unknown> = {};
-  for (const line of lines.split("\n").filter((one) => one.trim() !== "")) {
-    const [name = "", ...value] = line.split("=");
-    if (value.length === 0) throw new Error(`"${line.trim()}" must be written as name = value.`);
-    values[name.trim()] = readValue(value.join("=").trim());
-  }
-  return values;
-}
-
-function readValue(text: string): unknown {
-  try {
-    return JSON.parse(text) as unknown;
-  } catch {
-    return text;
-  }
-}

@@ -4,7 +4,7 @@ import { explain, pauseAfter, mayPass } from "../api/client";
 import { defaultsOf, type Described } from "../api/described";
 import { estimateRendering, JOB_KINDS, startJob, type Job, type JobEstimate } from "../api/jobs";
 import { describeScene, type SceneDescription } from "../api/scenes";
-import { namedValues } from "../shared/text";
+import { namedValues } from "../shared/local";
 
 const SETTLE_MS = 350; // after the last change
 

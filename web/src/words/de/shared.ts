@@ -11,6 +11,7 @@ function limits(least: number, most: number, unit: string): string {
 
 export const shared: Words["shared"] = {
   chart: (title, unit, x, series) => `${title}${unit && ` in ${unit}`} über ${x}: ${series.join(", ")}`,
+  nameValue: (line) => `„${line}“ muss als Name = Wert geschrieben sein.`,
   metrics: "Maße",
   better: (higher: boolean): string => (higher ? "höher ist besser" : "niedriger ist besser"),
   slider: {

@@ -11,6 +11,7 @@ function limits(least: number, most: number, unit: string): string {
 export const shared = {
   chart: (title: string, unit: string, x: string, series: string[]): string =>
     `${title}${unit && ` in ${unit}`} over ${x}: ${series.join(", ")}`,
+  nameValue: (line: string): string => `"${line}" must be written as name = value.`,
   metrics: "Metrics",
   better: (higher: boolean): string => (higher ? "higher is better" : "lower is better"),
   slider: {

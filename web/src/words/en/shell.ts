@@ -22,7 +22,7 @@ const roles: Record<Me["role"], string> = { reader: "reader", operator: "operato
 const may: Record<Me["role"], string> = {
   reader: "You may look, render and stream.",
   operator: "You may also start jobs, add sweeps and scenes, and delete what is yours.",
-  admin: "You may do everything, with everybody's.",
+  admin: "You may do everything, also with what belongs to others.",
 };
 
 export const shell = {
@@ -34,7 +34,7 @@ export const shell = {
   noScene: "none",
   language: "Language",
   noScenes: "No scenes yet",
-  noScenesMeans: "A scene is what a probe can be held at here. It is trained from a tracked sweep, or read from a file.",
+  noScenesMeans: "A scene is what you scan here. It is trained from a tracked sweep, or read from a file.",
   trainOne: "Train one from a sweep",
   importOne: "Import a scene file",
   toContent: "To the content",

@@ -98,7 +98,7 @@ export const train = {
     begin: "Start the training",
     needsSweep: "A training begins with a sweep: images with tracked poses.",
     repeats: (scene: string): string => `With the settings of ${scene}: what you change is marked.`,
-    forget: "Begin anew",
+    forget: "Start over",
   },
   settings: {
     title: "Settings of the training",
@@ -118,7 +118,7 @@ export const train = {
     from: (low: string): string => `from ${low}`,
     above: (low: string): string => `above ${low}`,
     to: (high: string): string => `to ${high}`,
-    nothing: "No setting has to do with that.",
+    nothing: "No setting matches.",
     close: "Back to the sweep",
     count: (count: number): string => `${count} settings`,
     number: "This must be a number.",
@@ -126,7 +126,7 @@ export const train = {
     least: (low: string): string => `This must be at least ${low}.`,
     aboveProblem: (low: string): string => `This must be above ${low}.`,
     most: (high: string): string => `This must be at most ${high}.`,
-    unsound: "A setting holds what cannot be meant: see All settings.",
+    unsound: "A setting has an invalid value: see All settings.",
   },
   render: {
     title: "Render a data set",

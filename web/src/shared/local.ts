@@ -1,0 +1,30 @@
+/** Numbers and times in the language of the person, and what is typed as names with values. */
+
+import { language, words } from "../words/words.svelte";
+
+export function count(value: number): string {
+  return value.toLocaleString(language.current);
+}
+
+export function localTime(iso: string): string {
+  return new Date(iso).toLocaleString(language.current, { dateStyle: "short", timeStyle: "medium" });
+}
+
+/** `name = value` a line, the values as JSON, or as text where they are none. Throws an Error in words. */
+export function namedValues(lines: string): Record<string, unknown> {
+  const values: Record<string, unknown> = {};
+  for (const line of lines.split("\n").filter((one) => one.trim() !== "")) {
+    const [name = "", ...value] = line.split("=");
+    if (value.length === 0) throw new Error(words.shared.nameValue(line.trim()));
+    values[name.trim()] = readValue(value.join("=").trim());
+  }
+  return values;
+}
+
+function readValue(text: string): unknown {
+  try {
+    return JSON.parse(text) as unknown;
+  } catch {
+    return text;
+  }
+}
