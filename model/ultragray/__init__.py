@@ -22,6 +22,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 if TYPE_CHECKING:
     from .errors import UltragrayError
+    from .localization import Localization, localize
     from .pose import check_poses, pose_from_position_quaternion, quaternion_from_pose
     from .probe import ConvexProbe, ElevationBeam, LinearProbe, PhasedProbe, Probe, RadialProbe, SteeredProbe
     from .rendering import Frames, render
@@ -34,6 +35,7 @@ __all__ = [
     "Frames",
     "GaussianScene",
     "LinearProbe",
+    "Localization",
     "PhasedProbe",
     "Probe",
     "RadialProbe",
@@ -42,6 +44,7 @@ __all__ = [
     "SteeredProbe",
     "UltragrayError",
     "check_poses",
+    "localize",
     "pose_from_position_quaternion",
     "quaternion_from_pose",
     "read_header",
@@ -50,6 +53,7 @@ __all__ = [
 
 _MODULES = {
     "errors": ("UltragrayError",),
+    "localization": ("Localization", "localize"),
     "pose": ("check_poses", "pose_from_position_quaternion", "quaternion_from_pose"),
     "probe": ("ConvexProbe", "ElevationBeam", "LinearProbe", "PhasedProbe", "Probe", "RadialProbe", "SteeredProbe"),
     "rendering": ("Frames", "render"),
