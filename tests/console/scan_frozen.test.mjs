@@ -261,7 +261,8 @@ describe("an address", () => {
   it("of a frozen frame opens at its pose", async () => {
     const { page } = await openFrozen();
     const pose = await poseOf(page);
-    await until(() => page.url(), (url) => url.includes("pose="), "the address tells no pose");
+    const told = (url) => Number(/pose=([^&]*)/.exec(url)?.[1].split("_")[1]);
+    await until(() => page.url(), (url) => Math.abs(told(url) - pose.position_mm.y) < 1e-3, "the address tells another pose");
     await page.reload();
     await until(() => canvasState(page, IMAGE), ({ mean }) => mean > 5, "no frame came");
     assert.deepEqual(await poseOf(page), pose);
