@@ -27,6 +27,7 @@ from ultragray.demo import DEMO_FILE
 from ultragray.display import Display
 from ultragray.display.frames import show
 from ultragray.samplers import AroundSampler
+from ultragray.settings import Contact
 
 IMAGES = Path(__file__).resolve().parent / "images"
 Floats = npt.NDArray[np.float64]
@@ -43,6 +44,7 @@ def main() -> None:
     draw_display_settings(scene, IMAGES / "display_settings.png")
     draw_confidence(scene, IMAGES / "confidence_off_the_sweep.png")
     draw_augmentation(scene, IMAGES / "augmentation.png")
+    draw_contact(scene, IMAGES / "contact.png")
     for folder in sys.argv[1:]:
         shrink(Path(folder) / "sweep.png", IMAGES / "tutorial_sweep.png", width=1000)
         shrink(Path(folder) / "pictures" / "frame_00007.png", IMAGES / "tutorial_eval.png", width=1000)
@@ -143,6 +145,33 @@ def draw_augmentation(scene: GaussianScene, path: Path) -> None:
         panels[number].imshow(frames["bmode"][number].numpy(), cmap="gray", vmin=0.0, vmax=1.0, extent=EXTENT_MM)
         draw_labels(panels[number + len(poses)], labels[number], scene.info.label_names)
     save(figure, path)
+
+
+def draw_contact(scene: GaussianScene, path: Path) -> None:
+    """A probe on the skin, tilted, lifted and pressed in, with the share of contact of each frame."""
+    poses = {"on the skin": along_spine(OVER_CANAL_MM)}
+    poses["tilted by 10°"] = _tilted(poses["on the skin"], 10.0)
+    for caption, lifted_mm in (("lifted by 2 mm", 2.0), ("lifted by 6 mm", 6.0), ("pressed in by 8 mm", -8.0)):
+        poses[caption] = poses["on the skin"].copy()
+        poses[caption][2, 3] -= lifted_mm
+    stacked = np.stack(list(poses.values()))
+    size = {"height": SIDE, "width": SIDE, "outputs": ("bmode",)}
+    rows = [render(scene, None, stacked, **size, contact=contact) for contact in (None, Contact.PRESSURE)]
+    figure, panels = panel_row(rows=2, columns=len(poses))
+    for row, frames in enumerate(rows):
+        for column, (caption, image) in enumerate(zip(poses, frames["bmode"].numpy(), strict=True)):
+            panel = panels[row * len(poses) + column]
+            panel.imshow(image, cmap="gray", vmin=0.0, vmax=1.0, extent=EXTENT_MM)
+            told = caption if frames.touch is None else f"contact {frames.touch.shares[column]:.0%}"
+            panel.set_title(told, fontsize=8)
+    save(figure, path)
+
+
+def _tilted(pose: Floats, angle_deg: float) -> Floats:  # [4, 4] -> [4, 4]
+    """Turned about the elevation."""
+    angle, turn = np.radians(angle_deg), np.eye(4)
+    turn[:3, :3] = [[np.cos(angle), 0.0, -np.sin(angle)], [0.0, 1.0, 0.0], [np.sin(angle), 0.0, np.cos(angle)]]
+    return pose @ turn
 
 
 def panel_row(*, rows: int, columns: int) -> tuple[Figure, Sequence[Axes]]:
