@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -16,8 +17,9 @@ from .skin import COUPLING_MM, Skin
 class Touch:
     """Where the W scan lines of C poses meet the skin. Made by `Touch.of`."""
 
-    gaps_mm: FloatArray  # [C, W]: from the face to the skin at rest along the line; below 0: pressed; infinite: no skin
-    pressed_mm: FloatArray  # [C]: beyond the innermost training face, a mean over the lines with contact
+    skin: Skin
+    faces: FloatArray  # [C, W, 3] mm: where the lines leave the face
+    directions: FloatArray  # [C, W, 3]
 
     @classmethod
     def of(cls, skin: Skin, probe: Probe, poses: FloatArray, width: int) -> Touch:  # [C, 4, 4] or [4, 4] mm
@@ -26,11 +28,19 @@ class Touch:
         origins, directions = probe.scan_lines(width)
         turned = exact[:, :3, :3].transpose(0, 2, 1)
         faces = (origins + probe.face_depth_mm * directions) @ turned + exact[:, None, :3, 3]  # [C, W, 3]
-        ways = directions @ turned
-        gaps = skin.gaps_mm(faces, ways)
-        touching = gaps <= COUPLING_MM
-        pressed = np.where(touching, skin.pressed_mm(faces, ways), 0.0).sum(axis=1)
-        return cls(gaps, pressed / np.maximum(touching.sum(axis=1), 1))
+        return cls(skin, faces, directions @ turned)
+
+    @cached_property
+    def gaps_mm(self) -> FloatArray:  # [C, W]
+        """From the face to the skin at rest along the line; below 0: it is pressed, infinite: no skin is known."""
+        return self.skin.gaps_mm(self.faces, self.directions)
+
+    @cached_property
+    def pressed_mm(self) -> FloatArray:  # [C]
+        """How far the face lies beyond the innermost training face, a mean over the lines with contact; at least 0."""
+        pressed = np.where(self.lines, self.skin.pressed_mm(self.faces, self.directions), 0.0).sum(axis=1)
+        mean: FloatArray = pressed / np.maximum(self.lines.sum(axis=1), 1)
+        return mean
 
     @property
     def lines(self) -> npt.NDArray[np.bool_]:  # [C, W]

@@ -152,6 +152,7 @@ export class Session {
       },
       outputs,
       slice_thickness_mm: this.sliceThickness_mm,
+      contact: null,
       min_confidence: this.hidesUnsupported && this.description?.confidence ? 1 : null,
       below_min_confidence: "mask",
     };
