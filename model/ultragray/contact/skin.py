@@ -30,7 +30,7 @@ _LEAST_CELL_MM = 1.0
 _MOST_CELLS = 256  # each way
 _MOST_VIEWS = 4096  # of more, every second one is taken, or every third
 _SETTLED = 8  # times what lies between the faces is smoothed
-_STEPS = 6  # of Newton's method towards the surface: slopes of 30° are met within a hundredth of a mm
+_STEPS, _MET_MM = 6, 1e-3  # of Newton's method towards the surface, at most, and until it moves no farther
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +90,10 @@ class Skin:
         along = np.zeros(place.shape[:-1])
         for _ in range(_STEPS):
             at = place + along[..., None] * way
-            along -= (at[..., 2] - self._height(heights, at)) / fall
+            step = (at[..., 2] - self._height(heights, at)) / fall
+            along -= step
+            if np.abs(step).max(initial=0.0) < _MET_MM:
+                break
         at = place + along[..., None] * way
         column, row = (np.rint(at[..., axis] / self.cell_mm).astype(np.intp) for axis in (0, 1))
         rows, columns = self.known.shape
