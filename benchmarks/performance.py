@@ -180,27 +180,20 @@ def console(measured: Document) -> Iterator[str]:
 
 
 def environment(measured: Document) -> Iterator[str]:
-    """Steps a second of a random policy, by size, contact and threads."""
-    threads = sorted({row["threads"] for row in measured["rows"]})
-    by_case: dict[tuple[int, str], dict[int, Document]] = {}
-    for row in measured["rows"]:
-        by_case.setdefault((row["side"], row["contact"] or "assumed"), {})[row["threads"]] = row
+    """Steps a second of a random policy, by size and contact."""
     yield from _table(
-        ["Frame", "Contact", *(f"Steps/s, {_threads(count)}" for count in threads), "p50 ms", "p99 ms"],
+        ["Frame", "Contact", "Steps/s", "p50 ms", "p99 ms"],
         (
             [
-                f"{side}x{side}",
-                contact,
-                *(f"{found[count]['steps_per_s']:.0f}" for count in threads),
-                *(f"{found[threads[-1]][f'{part}_ms']:.2f}" for part in ("p50", "p99")),
+                f"{row['side']}x{row['side']}",
+                row["contact"] or "assumed",
+                f"{row['steps_per_s']:.0f}",
+                f"{row['p50_ms']:.2f}",
+                f"{row['p99_ms']:.2f}",
             ]
-            for (side, contact), found in by_case.items()
+            for row in measured["rows"]
         ),
     )
-
-
-def _threads(count: int) -> str:
-    return "1 thread" if count == 1 else f"{count} threads"
 
 
 def imports(measured: Document) -> Iterator[str]:
