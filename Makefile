@@ -27,7 +27,7 @@ MINUTES ?= 30
 FRAMES ?= 100000
 
 .DEFAULT_GOAL := help
-.PHONY: ALWAYS help serve console test test-fast test-long test-console test-faults test-fuzz test-soak test-overload test-shards test-image test-replicas test-newcomer check check-lint check-types check-generated check-web check-figures format bench bench-record bench-console console-picture bench-cuda results methods ablations poses confidence libraries simulation figures demo-scene docs generate packages clean
+.PHONY: ALWAYS help serve console test test-fast test-long test-console test-faults test-fuzz test-soak test-overload test-shards test-image test-replicas test-newcomer check check-lint check-types check-generated check-web check-figures format bench bench-record bench-console console-picture bench-cuda results methods ablations poses confidence libraries environment simulation figures demo-scene docs generate packages clean
 
 help:  ## say what there is
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
@@ -190,6 +190,12 @@ libraries: $(VENV)/installed-dev  ## the image processing here beside scikit-ima
 	$(BIN)/python benchmarks/libraries.py
 	@$(BIN)/python benchmarks/documents.py --show libraries
 	$(KEEP) libraries
+
+environment: $(VENV)/installed-dev  ## steps a second of the gymnasium environment with a random policy
+	$(READY)
+	$(BIN)/python benchmarks/environment.py
+	@$(BIN)/python benchmarks/documents.py --show environment
+	$(KEEP) environment
 
 simulation: $(VENV)/installed-dev  ## simulate 1,000 replicas behind Envoy, for docs/scaling.md; takes some minutes (ARGS="--only load" for one study)
 	$(READY)

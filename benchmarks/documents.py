@@ -56,6 +56,7 @@ BLOCKS = {
     "jobs": Block("jobs", performance.jobs),
     "shards": Block("shards", performance.shards),
     "console": Block("console", performance.console),
+    "environment": Block("environment", performance.environment),
     "imports": Block("libraries", performance.imports),
     "beside scikit-image": Block("libraries", performance.beside_scikit_image),
     "shadows": Block("libraries", performance.shadows),

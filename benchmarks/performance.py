@@ -179,6 +179,23 @@ def console(measured: Document) -> Iterator[str]:
     )
 
 
+def environment(measured: Document) -> Iterator[str]:
+    """Steps a second of a random policy, by size and contact."""
+    yield from _table(
+        ["Frame", "Contact", "Steps/s", "p50 ms", "p99 ms"],
+        (
+            [
+                f"{row['side']}x{row['side']}",
+                row["contact"] or "assumed",
+                f"{row['steps_per_s']:.0f}",
+                f"{row['p50_ms']:.2f}",
+                f"{row['p99_ms']:.2f}",
+            ]
+            for row in measured["rows"]
+        ),
+    )
+
+
 def imports(measured: Document) -> Iterator[str]:
     """What scikit-image takes to install, and to import."""
     sizes = measured["installed_mb"]

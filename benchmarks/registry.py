@@ -104,6 +104,11 @@ _FILES = (
         ),
     ),
     Figures(
+        "benchmarks/environment.json",
+        "environment",
+        (*_KERNEL, "model/ultragray/contact", "model/ultragray/gym", "benchmarks/environment.py"),
+    ),
+    Figures(
         "benchmarks/simulation.json",
         "simulation",
         (

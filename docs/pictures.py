@@ -6,6 +6,7 @@ The README's pictures come from `make demo-scene` and `make console-picture`.
 
 from __future__ import annotations
 
+import runpy
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -26,14 +27,18 @@ from ultragray.confidence import Assessor, supported
 from ultragray.demo import DEMO_FILE
 from ultragray.display import Display
 from ultragray.display.frames import show
+from ultragray.gym import StandardPlaneEnv
 from ultragray.samplers import AroundSampler
+from ultragray.settings import Contact
 
 IMAGES = Path(__file__).resolve().parent / "images"
+EXAMPLES = IMAGES.parents[1] / "examples"
 Floats = npt.NDArray[np.float64]
 
 SIDE = 256
 EXTENT_MM = (-30.0, 30.0, 60.0, 0.0)  # of the demo scene's probe: left, right, bottom, top
 OVER_CANAL_MM = 19.0  # along the spine: bone to both sides, the canal between them
+MOST_AGENT_STEPS = 1000
 LABEL_COLOURS = {"bone": "#f4d58d", "muscle": "#d1495b", "fat": "#edae49", "vessel": "#30a0e0"}
 
 
@@ -43,6 +48,8 @@ def main() -> None:
     draw_display_settings(scene, IMAGES / "display_settings.png")
     draw_confidence(scene, IMAGES / "confidence_off_the_sweep.png")
     draw_augmentation(scene, IMAGES / "augmentation.png")
+    draw_contact(scene, IMAGES / "contact.png")
+    draw_standard_plane(scene, IMAGES / "standard_plane.png")
     for folder in sys.argv[1:]:
         shrink(Path(folder) / "sweep.png", IMAGES / "tutorial_sweep.png", width=1000)
         shrink(Path(folder) / "pictures" / "frame_00007.png", IMAGES / "tutorial_eval.png", width=1000)
@@ -143,6 +150,59 @@ def draw_augmentation(scene: GaussianScene, path: Path) -> None:
         panels[number].imshow(frames["bmode"][number].numpy(), cmap="gray", vmin=0.0, vmax=1.0, extent=EXTENT_MM)
         draw_labels(panels[number + len(poses)], labels[number], scene.info.label_names)
     save(figure, path)
+
+
+def draw_contact(scene: GaussianScene, path: Path) -> None:
+    """A probe on the skin, tilted, lifted and pressed in, with the share of contact of each frame."""
+    poses = {"on the skin": along_spine(OVER_CANAL_MM)}
+    poses["tilted by 10°"] = _tilted(poses["on the skin"], 10.0)
+    for caption, lifted_mm in (("lifted by 2 mm", 2.0), ("lifted by 6 mm", 6.0), ("pressed in by 8 mm", -8.0)):
+        poses[caption] = poses["on the skin"].copy()
+        poses[caption][2, 3] -= lifted_mm
+    stacked = np.stack(list(poses.values()))
+    size = {"height": SIDE, "width": SIDE, "outputs": ("bmode",)}
+    rows = [render(scene, None, stacked, **size, contact=contact) for contact in (None, Contact.PRESSURE)]
+    figure, panels = panel_row(rows=2, columns=len(poses))
+    for row, frames in enumerate(rows):
+        for column, (caption, image) in enumerate(zip(poses, frames["bmode"].numpy(), strict=True)):
+            panel = panels[row * len(poses) + column]
+            panel.imshow(image, cmap="gray", vmin=0.0, vmax=1.0, extent=EXTENT_MM)
+            told = caption if frames.touch is None else f"contact {frames.touch.shares[column]:.0%}"
+            panel.set_title(told, fontsize=8)
+    save(figure, path)
+
+
+def draw_standard_plane(scene: GaussianScene, path: Path) -> None:
+    """Frames of an episode of the agent in examples/, and the goal."""
+    agent = runpy.run_path(str(EXAMPLES / "standard_plane.py"))["Climber"](np.random.default_rng(0))
+    env = StandardPlaneEnv(scene, height=SIDE, width=SIDE, start_mm=6.0, start_deg=6.0)
+    frame, told = env.reset(seed=3)
+    seen, reward = [(0, frame, told)], -np.inf
+    reached = False
+    while not reached and len(seen) < MOST_AGENT_STEPS:
+        frame, reward, reached, _, told = env.step(agent.act(reward))
+        seen.append((len(seen), frame, told))
+    best = np.maximum.accumulate([told["similarity"] for _, _, told in seen])
+    wanted = np.linspace(best[0], best[-1], 4)
+    shown = [seen[int(np.argmax(best >= level))] for level in wanted]
+    figure, panels = panel_row(rows=1, columns=len(shown) + 1)
+    for panel, (step, image, one) in zip(panels, shown, strict=False):
+        panel.imshow(image, cmap="gray", vmin=0, vmax=255, extent=EXTENT_MM)
+        caption = (
+            f"step {step}: {one['distance_mm']:.1f} mm, {one['angle_deg']:.1f}°, similarity {one['similarity']:.2f}"
+        )
+        panel.set_title(caption, fontsize=7)
+    goal = render(scene, None, env.goal, height=SIDE, width=SIDE, outputs=("bmode",))["bmode"][0].numpy()
+    panels[-1].imshow(goal, cmap="gray", vmin=0.0, vmax=1.0, extent=EXTENT_MM)
+    panels[-1].set_title("goal", fontsize=7)
+    save(figure, path)
+
+
+def _tilted(pose: Floats, angle_deg: float) -> Floats:  # [4, 4] -> [4, 4]
+    """Turned about the elevation."""
+    angle, turn = np.radians(angle_deg), np.eye(4)
+    turn[:3, :3] = [[np.cos(angle), 0.0, -np.sin(angle)], [0.0, 1.0, 0.0], [np.sin(angle), 0.0, np.cos(angle)]]
+    return pose @ turn
 
 
 def panel_row(*, rows: int, columns: int) -> tuple[Figure, Sequence[Axes]]:

@@ -15,6 +15,7 @@ __all__ = [
     "Below",
     "CompareJob",
     "ComparisonSettings",
+    "Contact",
     "ConvexProbe",
     "CoveredSampler",
     "Dataset",
@@ -117,6 +118,13 @@ class Below(str, Enum):
     MASK = "mask"
 
 
+class Contact(str, Enum):
+    """What a frame shows of the probe's contact with the skin (`ultragray.contact`)."""
+
+    AIR = "air"
+    PRESSURE = "pressure"
+
+
 @dataclass(frozen=True)
 class Display:
     """Settings of a display. The defaults show frames as they are.
@@ -156,6 +164,10 @@ class FrameSettings:
     """mask: pixels of such frames that Gaussians do not support are 0."""
     slice_thickness_mm: float | None = None
     """Full width at half maximum along elevation at the focus of the scene's beam; 0: a plane. Default: as trained."""
+    contact: Contact | None = None
+    """air: scan lines whose face is off the skin are dark. pressure: and a face that is pressed in compresses the
+    tissue. Default: contact is assumed.
+    """
     display: Display | None = None
     """Gain, depth, scan conversion ...; default: as rendered."""
     outputs: tuple[str, ...] = ("bmode",)

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from ultragray_proto.codec import from_message, words
 from ultragray_proto.v1 import rendering_pb2
 
-from .contract import Display, Encoding, Probe, RenderSettings
+from .contract import Contact, Display, Encoding, Probe, RenderSettings
 from .errors import InvalidArgument
 from .geometry import FloatArray
 from .messages import message_of
@@ -44,6 +44,7 @@ class Extrapolation:
     angle_deg: float | None  # likewise
     confidence: float | None  # the MS-SSIM, 0 to 1, that a real frame is expected to have with this one
     supported_share: float | None  # of the pixels, by Gaussians
+    contact_share: float | None = None  # of the scan lines, with the skin; None: `contact` was not asked for
 
 
 @dataclass(frozen=True)
@@ -98,6 +99,7 @@ class Frame:
     rendered_height: int  # depth samples, before `display` was applied
     rendered_width: int  # scan lines, likewise
     slice_thickness_mm: float = 0.0  # as used, at the focus of the scene's beam; 0: a plane
+    contact: Contact | None = None  # as used; None: it was assumed
     display: Display | None = None  # as used; None: none was asked for
     dropped: int = 0  # in a stream: poses that newer ones replaced since the frame before
     latency_ms: float | None = None  # in a stream: from `measured_ns` of the pose to the arrival of the frame here

@@ -7,6 +7,7 @@ from functools import partial
 
 from ultragray.confidence import Extrapolation
 from ultragray.display.settings import Display
+from ultragray.gym.settings import StandardPlaneSettings
 from ultragray.scene_info import SceneInfo
 from ultragray.settings import RenderSettings
 from ultragray_service.http.reading.bodies import RenderBody, StreamMessage
@@ -23,6 +24,7 @@ PARTS: dict[str, Callable[[], str]] = {
     "training settings": library.training_settings,
     "scene metadata": partial(library.keys, SceneInfo),
     "display": partial(library.keys, Display, "Setting"),
+    "standard plane": partial(library.keys, StandardPlaneSettings, "Argument"),
     "confidence": partial(library.told, Extrapolation, "Figure"),
     "render body": partial(library.keys, RenderBody),
     "stream messages": partial(library.keys, StreamMessage),

@@ -21,7 +21,14 @@ SECTIONS: Mapping[str, tuple[str, ...]] = {
     "Tutorial": ("tutorial.md",),
     "How-to": (
         *("howto/robotics.md", "howto/simulator.md", "howto/data-science.md", "howto/sonographer.md"),
-        *("howto/recording.md", "howto/compare.md", "howto/operator.md", "howto/*.md"),
+        *(
+            "howto/recording.md",
+            "howto/compare.md",
+            "howto/contact.md",
+            "howto/gymnasium.md",
+            "howto/operator.md",
+            "howto/*.md",
+        ),
     ),
     "Concepts": (
         *("concepts/frame.md", "physics.md", "concepts/training.md", "confidence.md", "concepts/limits.md", "poses.md"),

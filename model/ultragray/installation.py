@@ -18,6 +18,7 @@ MODULES_OF_EXTRAS = {
     ),
     "train": ("jinja2", "matplotlib"),
     "dicom": ("pydicom",),
+    "gym": ("gymnasium",),
     "hdf5": ("h5py",),
     "ray": ("ray",),
     "storage": ("obstore",),

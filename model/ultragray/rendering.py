@@ -6,18 +6,24 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from .backends import cpu, cuda, reference
 from .backends.beam import beam_cm
 from .backends.poses import ScenePoses, as_array, scene_poses
+from .contact.compression import at_rest
+from .contact.skin import Skin
+from .contact.touch import Touch
 from .errors import BackendUnavailable
 from .image_size import check_image_size
 from .installation import __version__
 from .limits import UNLIMITED, Limits
 from .outputs import OUTPUTS, PLANES, check_available, check_outputs
 from .probe import ElevationBeam, FloatArray, Probe
+from .probe.probe import BoolArray
 from .scene import GaussianScene
+from .settings import Contact
 
 Backend = Callable[
     [GaussianScene, Probe, ScenePoses, int, int, Sequence[str], Limits, Tensor | None], dict[str, Tensor]
@@ -31,8 +37,10 @@ class Frames(Mapping[str, Tensor]):
     tells the meaning, 0 where there is none.
     """
 
-    def __init__(self, outputs: Mapping[str, Tensor]) -> None:
+    def __init__(self, outputs: Mapping[str, Tensor], touch: Touch | None = None) -> None:
         self._outputs = dict(outputs)
+        self.touch = touch
+        """The contact of each pose with the skin; None where it was assumed."""
 
     def __getitem__(self, name: str) -> Tensor:
         return self._outputs[name]
@@ -53,6 +61,10 @@ class Frames(Mapping[str, Tensor]):
         return f"Frames({count:,} of {height}x{width}: {', '.join(self._outputs)})"
 
 
+View = tuple[Probe, ScenePoses, int, int]  # poses [C, 4, 4] in cm about the scene's centre; height and width
+ENDED_BY_AIR = ("bmode", "transmittance")  # planes that are 0 along a scan line without contact: no beam gets out
+
+
 class Drawing:
     """Views of a scene by one backend: the planes that outputs are derived from."""
 
@@ -60,14 +72,16 @@ class Drawing:
         self,
         draw: Backend,
         scene: GaussianScene,
-        view: tuple[Probe, ScenePoses, int, int],
+        view: View,
         limits: Limits,
         beam: Tensor | None,
+        touching: BoolArray | None = None,
     ) -> None:
-        """`view`: probe, poses [C, 4, 4] in cm about the scene's centre, height and width; `beam`: [3] in cm."""
+        """`beam`: [3] in cm; `touching`: [C, W], whether scan lines have contact, None: all have."""
         self.scene = scene
         self.shape = (len(view[1]), view[2], view[3])
         self._draw, self._view, self._limits, self._beam = draw, view, limits, beam
+        self._touching = touching
         self._planes: dict[str, Tensor] = {}
 
     @property
@@ -85,6 +99,10 @@ class Drawing:
         """Draws planes of the whole scene at once."""
         if planes:
             self._planes = self._draw(self.scene, *self._view, planes, self._limits, self._beam)
+        if self._touching is not None and not self._touching.all():
+            for name in set(ENDED_BY_AIR) & set(planes):
+                plane = self._planes[name]
+                self._planes[name] = plane * torch.from_numpy(self._touching).to(plane)[:, None]
 
     def plane(self, name: str) -> Tensor:  # [C, H, W]
         """One of the planes that were drawn."""
@@ -106,6 +124,7 @@ def render(
     backend: str = "auto",
     limits: Limits = UNLIMITED,
     beam: ElevationBeam | Tensor | None = None,
+    contact: Contact | None = None,
 ) -> Frames:
     """Frames [C, height, width] of a scene seen by `probe` (None: the probe the scene was trained with) from `poses`.
 
@@ -116,10 +135,13 @@ def render(
     that are a torch tensor (`cpu` and `cuda` once), labels apart; the gradients are the true ones (docs/physics.md §4).
     `beam` is how thick a slice the frames show, instead of the scene's own (None); a thickness of 0 mm is an infinitely
     thin one. A tensor [3] of its thickness, focus and depth of field in mm is differentiable too.
+    `contact` makes scan lines off the skin dark, and compresses tissue under pressure (`ultragray.contact`); the
+    result's `touch` tells where. It follows from the poses alone, has no gradient, and is the same on every backend.
     `limits` bound the cost of each frame and can end the rendering (`ultragray.limits`), but for frames with gradients:
     FrameTooCostly, GivenUp.
     Raises InvalidPose, InvalidProbe, InvalidImageSize, UnknownOutput (also for labels of a scene that carries none),
-    BackendUnavailable, and MemoryExceeded where the GPU's memory does not suffice.
+    BackendUnavailable, MemoryExceeded where the GPU's memory does not suffice, and InvalidArgument where contact is
+    asked for and the scene knows no skin.
     """
     chosen = check_outputs(outputs)
     check_available(chosen, scene.info)
@@ -131,9 +153,44 @@ def render(
         int(width),
     )
     draw = _BACKENDS[choose_backend(backend, scene)]
-    drawing = Drawing(draw, scene, view, limits, beam_cm(scene.info.beam if beam is None else beam, view[0]))
-    drawing.draw(list(dict.fromkeys(plane for name in chosen for plane in OUTPUTS[name].planes)))
-    return Frames({name: OUTPUTS[name].derive(drawing) for name in chosen})
+    planes = list(dict.fromkeys(plane for name in chosen for plane in OUTPUTS[name].planes))
+    touch = touch_of(scene, view[0], poses, view[3]) if contact is not None else None
+    drawn = []
+    for first, seen, touching in _views(view, touch, compressed=contact is Contact.PRESSURE):
+        shown = beam_cm(scene.info.beam if beam is None else beam, seen[0])
+        drawing = Drawing(draw, scene, seen, limits.after(first), shown, touching)
+        drawing.draw(planes)
+        drawn.append({name: OUTPUTS[name].derive(drawing) for name in chosen})
+    whole = drawn[0] if len(drawn) == 1 else {name: torch.cat([one[name] for one in drawn]) for name in chosen}
+    return Frames(whole, touch)
+
+
+def touch_of(scene: GaussianScene, probe: Probe, poses: Any, width: int) -> Touch:  # [C, 4, 4] or [4, 4] mm
+    """The contact of a probe with the skin under the scene's training views.
+
+    Raises InvalidPose, and InvalidArgument where the scene knows no skin.
+    """
+    skin = scene.prepared("skin", lambda: Skin.under(scene.training_poses, scene.info.probe))
+    return Touch.of(skin, probe, poses, width)
+
+
+def _views(
+    view: View, touch: Touch | None, *, compressed: bool
+) -> Iterator[tuple[int, View, BoolArray | None]]:  # first pose, view, [C, W]
+    """What is drawn at once, in order: all poses, or each alone where pressure makes the probe of each another one."""
+    if touch is None:
+        yield 0, view, None
+    elif not compressed or not touch.pressed_mm.any():
+        yield 0, view, touch.lines
+    else:
+        probe, poses, height, width = view
+        for place, pressed_mm in enumerate(touch.pressed_mm.tolist()):
+            longer, motion_mm = at_rest(probe, pressed_mm)
+            motion_cm = motion_mm.copy()
+            motion_cm[:3, 3] /= 10.0
+            one = poses[place : place + 1]
+            moved = one @ (torch.from_numpy(motion_cm) if isinstance(one, Tensor) else motion_cm)
+            yield place, (longer, moved, height, width), touch.lines[place : place + 1]
 
 
 def footprint_pixels(

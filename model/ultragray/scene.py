@@ -76,6 +76,10 @@ class GaussianScene:
         name = "" if self.info.dataset_name is None else f"{self.info.dataset_name!r}, "
         return f"GaussianScene({name}{len(self.means):,} Gaussians, {self.info.probe or 'no probe'})"
 
+    def __getstate__(self) -> dict[str, Any]:
+        """For copies and other processes, which prepare themselves anew."""
+        return {**vars(self), "_prepared": {}}
+
     @classmethod
     def from_splats(
         cls,

@@ -53,6 +53,13 @@ class Below(str, Enum):
     MASK = "mask"
 
 
+class Contact(str, Enum):
+    """What a frame shows of the probe's contact with the skin (`ultragray.contact`)."""
+
+    AIR = "air"
+    PRESSURE = "pressure"
+
+
 @dataclass(frozen=True, kw_only=True)
 class FrameSettings(Contract):
     """Settings of what is rendered, but for the scene and the poses. None: as the scene has it.
@@ -79,6 +86,11 @@ class FrameSettings(Contract):
         None,
         low=0.0,
         high=MAX_THICKNESS_MM,
+    )
+    contact: Contact | None = described(
+        "air: scan lines whose face is off the skin are dark. pressure: and a face that is pressed in compresses the "
+        "tissue. Default: contact is assumed.",
+        None,
     )
     display: Display | None = described("Gain, depth, scan conversion ...; default: as rendered.", None)
     outputs: tuple[str, ...] = described(f"Some of {', '.join(OUTPUTS)}.", ("bmode",), error=UnknownOutput)
@@ -118,6 +130,7 @@ class FrameSettings(Contract):
             display=self.display or AS_RENDERED,
             min_confidence=self.min_confidence,
             below_min_confidence=self.below_min_confidence,
+            contact=self.contact,
         )
 
 
@@ -148,6 +161,7 @@ class Resolved:
     display: Display = AS_RENDERED
     min_confidence: float | None = None
     below_min_confidence: Below = Below.REFUSE
+    contact: Contact | None = None
 
     @cached_property
     def picture(self) -> Picture:
@@ -157,7 +171,7 @@ class Resolved:
     @cached_property
     def view(self) -> tuple[Any, ...]:
         """All but outputs and encoding: frames that agree in this can be rendered together."""
-        asked = (self.display, self.min_confidence, self.below_min_confidence)
+        asked = (self.display, self.min_confidence, self.below_min_confidence, self.contact)
         return (self.probe, self.beam, self.height, self.width, *asked)
 
     @property

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import json
 import os
 import pickle
 import struct
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -38,6 +40,14 @@ def splats(count: int = 4, sh_degree: int = 1) -> dict[str, torch.Tensor]:
 def test_the_degree_follows_from_the_coefficients(degree: int) -> None:
     scene = GaussianScene.from_splats(splats(sh_degree=degree))
     assert (scene.sh_degree, scene.gaussian_count) == (degree, 4)
+
+
+def test_a_copy_is_the_same_scene_and_prepares_itself_anew() -> None:
+    scene = GaussianScene.from_splats(splats(), training_poses=np.eye(4)[None])
+    scene.prepared("lock", threading.Lock)  # as backends keep what cannot be copied
+    for copied in (copy.deepcopy(scene), pickle.loads(pickle.dumps(scene))):
+        assert copied.to_bytes() == scene.to_bytes()
+        assert copied.prepared("lock", lambda: "anew") == "anew"
 
 
 def test_shn_may_be_left_out() -> None:

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..confidence import FIGURES, Extrapolation
+from ..confidence import Extrapolation
 from ..display.pixels import PixelArray
 from ..errors import InvalidArgument
 from ..probe import FloatArray
@@ -52,7 +52,7 @@ class ShardTar:
             for name, pixels in frames.items():
                 data = pixels[place].data.cast("B")
                 parts += _member(f"{key}.{name}.npy", heads[name], data)
-            document = {"pose": pose, **dict(zip(FIGURES, map(_rounded, _values(figure)), strict=True))}
+            document = {"pose": pose, **{name: _rounded(value) for name, value in figure.figures().items()}}
             parts += _member(f"{key}.json", json.dumps(document).encode())
         self._write(b"".join(parts))
 
@@ -108,10 +108,6 @@ def _header(name: str, size: int) -> bytes:
     if len(written) > 100 or size > _MAX_MEMBER:
         raise InvalidArgument(f"a shard holds no member of {size:,} bytes called {name}", field="outputs")
     return _fields(written, octal, b"%06o\0 " % (_EMPTY_SUM + sum(written) + sum(octal)))
-
-
-def _values(figure: Extrapolation) -> tuple[float | None, ...]:
-    return tuple(getattr(figure, name) for name in FIGURES)
 
 
 def _rounded(value: float | None) -> float | None:

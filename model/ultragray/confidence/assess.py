@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -29,14 +29,25 @@ class Extrapolation:
         "The MS-SSIM that a real frame at this pose is expected to have with the rendered one, 0 to 1."
     )
     supported_share: float | None = described("Share of the pixels that Gaussians support: coverage of at least 0.3.")
+    contact_share: float | None = described(
+        "Share of the scan lines that have contact with the skin; none where contact is assumed.", None
+    )
+
+    def figures(self) -> dict[str, float | None]:
+        """FIGURES, and the share of contact where it was judged: what files hold of a frame."""
+        told = {name: getattr(self, name) for name in FIGURES}
+        return told if self.contact_share is None else told | {CONTACT_SHARE: self.contact_share}
 
 
-FIGURES = tuple(figure.name for figure in fields(Extrapolation))
+CONTACT_SHARE = "contact_share"
+FIGURES = tuple(figure.name for figure in fields(Extrapolation) if figure.name != CONTACT_SHARE)
 
 
 def figure_arrays(extrapolations: Sequence[Extrapolation]) -> dict[str, npt.NDArray[np.float32]]:
-    """Each of FIGURES as [C], NaN where it is not known."""
-    return {name: np.array([getattr(one, name) for one in extrapolations], dtype=np.float32) for name in FIGURES}
+    """Each of FIGURES, and the share of contact where it was judged, as [C]; NaN where one is not known."""
+    judged = any(one.contact_share is not None for one in extrapolations)
+    names = (*FIGURES, CONTACT_SHARE) if judged else FIGURES
+    return {name: np.array([getattr(one, name) for one in extrapolations], dtype=np.float32) for name in names}
 
 
 class Trained(Protocol):
@@ -88,7 +99,7 @@ class Assessor:
         if self._model is not None and None not in confidences:
             confidences = self._model.limited(np.array(confidences), np.array(shares)).tolist()
         return [
-            Extrapolation(one.distance_mm, one.angle_deg, confidence, share)
+            replace(one, confidence=confidence, supported_share=share)
             for one, confidence, share in zip(extrapolations, confidences, shares, strict=True)
         ]
 

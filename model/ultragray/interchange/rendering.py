@@ -106,14 +106,14 @@ def render_portions(
                 backend=backend,
                 limits=limits.after(first),
                 beam=settings.beam,
+                contact=settings.contact,
             )
             assert frames.coverage is not None
             watch = SupportWatch(masked[places])
-            blackened = watch.look(frames.coverage)
+            blackened = watch.look(frames.coverage, frames.touch)
             asked = {name: getattr(frames, name) for name in settings.outputs}
             shown = show(asked, settings.probe, settings.display, blackened)
-            shares = watch.shares(0, len(frames.coverage))
-        figures = assessor.with_support(extrapolations[places], shares)
+            figures = watch.completed(assessor, extrapolations[places], 0)
         yield {name: pixels.cpu().numpy() for name, pixels in shown.items()}, figures
     if before_portion is not None:
         before_portion(len(poses))

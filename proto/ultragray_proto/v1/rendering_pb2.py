@@ -26,47 +26,49 @@ from ultragray_proto.v1 import geometry_pb2 as ultragray_dot_v1_dot_geometry__pb
 from ultragray_proto.v1 import scenes_pb2 as ultragray_dot_v1_dot_scenes__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1cultragray/v1/rendering.proto\x12\x0cultragray.v1\x1a\x1bultragray/v1/geometry.proto\x1a\x19ultragray/v1/scenes.proto\"\x9f\x03\n\x0eRenderSettings\x12\r\n\x05scene\x18\x01 \x01(\t\x12\x13\n\x06height\x18\x02 \x01(\x05H\x00\x88\x01\x01\x12\x12\n\x05width\x18\x03 \x01(\x05H\x01\x88\x01\x01\x12%\n\x07outputs\x18\x04 \x03(\x0e\x32\x14.ultragray.v1.Output\x12(\n\x08\x65ncoding\x18\x05 \x01(\x0e\x32\x16.ultragray.v1.Encoding\x12\"\n\x05probe\x18\x06 \x01(\x0b\x32\x13.ultragray.v1.Probe\x12&\n\x07\x64isplay\x18\x07 \x01(\x0b\x32\x15.ultragray.v1.Display\x12\x1b\n\x0emin_confidence\x18\x08 \x01(\x01H\x02\x88\x01\x01\x12;\n\x14\x62\x65low_min_confidence\x18\t \x01(\x0e\x32\x1d.ultragray.v1.BelowConfidence\x12\x1f\n\x12slice_thickness_mm\x18\n \x01(\x01H\x03\x88\x01\x01\x42\t\n\x07_heightB\x08\n\x06_widthB\x11\n\x0f_min_confidenceB\x15\n\x13_slice_thickness_mm\"\xb9\x01\n\rExtrapolation\x12\x18\n\x0b\x64istance_mm\x18\x01 \x01(\x01H\x00\x88\x01\x01\x12\x16\n\tangle_deg\x18\x02 \x01(\x01H\x01\x88\x01\x01\x12\x17\n\nconfidence\x18\x03 \x01(\x01H\x02\x88\x01\x01\x12\x1c\n\x0fsupported_share\x18\x04 \x01(\x01H\x03\x88\x01\x01\x42\x0e\n\x0c_distance_mmB\x0c\n\n_angle_degB\r\n\x0b_confidenceB\x12\n\x10_supported_share\"j\n\x12\x41ssessPosesRequest\x12\r\n\x05scene\x18\x01 \x01(\t\x12!\n\x05poses\x18\x02 \x03(\x0b\x32\x12.ultragray.v1.Pose\x12\"\n\x05probe\x18\x03 \x01(\x0b\x32\x13.ultragray.v1.Probe\"J\n\x13\x41ssessPosesResponse\x12\x33\n\x0e\x65xtrapolations\x18\x01 \x03(\x0b\x32\x1b.ultragray.v1.Extrapolation\"\xc2\x01\n\x07\x44isplay\x12\x0f\n\x07gain_db\x18\x01 \x01(\x01\x12\x1d\n\x10\x64ynamic_range_db\x18\x02 \x01(\x01H\x00\x88\x01\x01\x12\x0e\n\x06tgc_db\x18\x03 \x03(\x01\x12\x15\n\x08\x64\x65pth_mm\x18\x04 \x01(\x01H\x01\x88\x01\x01\x12\x0c\n\x04\x66lip\x18\x05 \x01(\x08\x12\x15\n\x08pixel_mm\x18\x06 \x01(\x01H\x02\x88\x01\x01\x12\x0c\n\x04\x65\x64ge\x18\x07 \x01(\x01\x42\x13\n\x11_dynamic_range_dbB\x0b\n\t_depth_mmB\x0b\n\t_pixel_mm\"t\n\x07Picture\x12\x13\n\x0b\x63olumn_unit\x18\x01 \x01(\t\x12\x14\n\x0c\x66irst_column\x18\x02 \x01(\x01\x12\x14\n\x0c\x66irst_row_mm\x18\x03 \x01(\x01\x12\x13\n\x0b\x63olumn_step\x18\x04 \x01(\x01\x12\x13\n\x0brow_step_mm\x18\x05 \x01(\x01\"\x8d\x01\n\rRenderRequest\x12.\n\x08settings\x18\x01 \x01(\x0b\x32\x1c.ultragray.v1.RenderSettings\x12 \n\x04pose\x18\x02 \x01(\x0b\x32\x12.ultragray.v1.Pose\x12\x19\n\x0cmax_queue_ms\x18\x03 \x01(\x01H\x00\x88\x01\x01\x42\x0f\n\r_max_queue_ms\"g\n\x12RenderBatchRequest\x12.\n\x08settings\x18\x01 \x01(\x0b\x32\x1c.ultragray.v1.RenderSettings\x12!\n\x05poses\x18\x02 \x03(\x0b\x32\x12.ultragray.v1.Pose\"N\n\x0cSharedMemory\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\r\n\x05token\x18\x02 \x01(\x0c\x12\r\n\x05slots\x18\x03 \x01(\r\x12\x12\n\nslot_bytes\x18\x04 \x01(\r\"\xe8\x02\n\x13RenderStreamRequest\x12\x10\n\x08sequence\x18\x01 \x01(\x04\x12.\n\x08settings\x18\x02 \x01(\x0b\x32\x1c.ultragray.v1.RenderSettings\x12 \n\x04pose\x18\x03 \x01(\x0b\x32\x12.ultragray.v1.Pose\x12&\n\x04mode\x18\x04 \x01(\x0e\x32\x18.ultragray.v1.StreamMode\x12\x17\n\ntimeout_ms\x18\x05 \x01(\x01H\x00\x88\x01\x01\x12\x1b\n\x0e\x63lient_time_ns\x18\x06 \x01(\x03H\x01\x88\x01\x01\x12\x0e\n\x06window\x18\x07 \x01(\r\x12\x19\n\x0c\x61\x63knowledged\x18\x08 \x01(\x04H\x02\x88\x01\x01\x12\x31\n\rshared_memory\x18\t \x01(\x0b\x32\x1a.ultragray.v1.SharedMemoryB\r\n\x0b_timeout_msB\x11\n\x0f_client_time_nsB\x0f\n\r_acknowledged\"\xa3\x05\n\x05\x46rame\x12\x10\n\x08sequence\x18\x01 \x01(\x04\x12\r\n\x05scene\x18\x02 \x01(\t\x12\x14\n\x0cscene_sha256\x18\x03 \x01(\t\x12\x10\n\x08renderer\x18\x04 \x01(\t\x12\"\n\x04pose\x18\x05 \x01(\x0b\x32\x14.ultragray.v1.Matrix\x12\"\n\x05probe\x18\x06 \x01(\x0b\x32\x13.ultragray.v1.Probe\x12\x1a\n\x12slice_thickness_mm\x18\x15 \x01(\x01\x12\x0e\n\x06height\x18\x07 \x01(\x05\x12\r\n\x05width\x18\x08 \x01(\x05\x12%\n\x07outputs\x18\t \x03(\x0e\x32\x14.ultragray.v1.Output\x12(\n\x08\x65ncoding\x18\n \x01(\x0e\x32\x16.ultragray.v1.Encoding\x12\x0c\n\x04\x64\x61ta\x18\x0b \x01(\x0c\x12-\n\x0bshared_data\x18\x16 \x01(\x0b\x32\x18.ultragray.v1.SharedData\x12&\n\x07timings\x18\x0c \x01(\x0b\x32\x15.ultragray.v1.Timings\x12\"\n\x05\x65rror\x18\r \x01(\x0b\x32\x13.ultragray.v1.Error\x12\x0f\n\x07\x64ropped\x18\x0e \x01(\x04\x12\x32\n\rextrapolation\x18\x14 \x01(\x0b\x32\x1b.ultragray.v1.Extrapolation\x12&\n\x07\x64isplay\x18\x10 \x01(\x0b\x32\x15.ultragray.v1.Display\x12&\n\x07picture\x18\x11 \x01(\x0b\x32\x15.ultragray.v1.Picture\x12\x17\n\x0frendered_height\x18\x12 \x01(\x05\x12\x16\n\x0erendered_width\x18\x13 \x01(\x05\x12\x1b\n\x0e\x63lient_time_ns\x18\x0f \x01(\x03H\x00\x88\x01\x01\x42\x11\n\x0f_client_time_ns\")\n\nSharedData\x12\x0c\n\x04slot\x18\x01 \x01(\r\x12\r\n\x05\x62ytes\x18\x02 \x01(\r\"A\n\x07Timings\x12\x10\n\x08queue_ms\x18\x01 \x01(\x01\x12\x11\n\trender_ms\x18\x02 \x01(\x01\x12\x11\n\tencode_ms\x18\x03 \x01(\x01*\xb5\x01\n\x06Output\x12\x16\n\x12OUTPUT_UNSPECIFIED\x10\x00\x12\x10\n\x0cOUTPUT_BMODE\x10\x01\x12\x0f\n\x0bOUTPUT_ECHO\x10\x02\x12\x18\n\x14OUTPUT_TRANSMITTANCE\x10\x03\x12\x13\n\x0fOUTPUT_COVERAGE\x10\x04\x12\x11\n\rOUTPUT_LABELS\x10\x05\x12\x16\n\x12OUTPUT_ATTENUATION\x10\x06\x12\x16\n\x12OUTPUT_UNCERTAINTY\x10\x07*s\n\x08\x45ncoding\x12\x18\n\x14\x45NCODING_UNSPECIFIED\x10\x00\x12\x12\n\x0e\x45NCODING_UINT8\x10\x01\x12\x14\n\x10\x45NCODING_FLOAT32\x10\x02\x12\x10\n\x0c\x45NCODING_PNG\x10\x03\x12\x11\n\rENCODING_JPEG\x10\x04*k\n\x0f\x42\x65lowConfidence\x12 \n\x1c\x42\x45LOW_CONFIDENCE_UNSPECIFIED\x10\x00\x12\x1b\n\x17\x42\x45LOW_CONFIDENCE_REFUSE\x10\x01\x12\x19\n\x15\x42\x45LOW_CONFIDENCE_MASK\x10\x02*Z\n\nStreamMode\x12\x1b\n\x17STREAM_MODE_UNSPECIFIED\x10\x00\x12\x17\n\x13STREAM_MODE_ORDERED\x10\x01\x12\x16\n\x12STREAM_MODE_LATEST\x10\x02\x32\xb3\x02\n\rRenderService\x12:\n\x06Render\x12\x1b.ultragray.v1.RenderRequest\x1a\x13.ultragray.v1.Frame\x12\x46\n\x0bRenderBatch\x12 .ultragray.v1.RenderBatchRequest\x1a\x13.ultragray.v1.Frame0\x01\x12R\n\x0b\x41ssessPoses\x12 .ultragray.v1.AssessPosesRequest\x1a!.ultragray.v1.AssessPosesResponse\x12J\n\x0cRenderStream\x12!.ultragray.v1.RenderStreamRequest\x1a\x13.ultragray.v1.Frame(\x01\x30\x01\x62\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1cultragray/v1/rendering.proto\x12\x0cultragray.v1\x1a\x1bultragray/v1/geometry.proto\x1a\x19ultragray/v1/scenes.proto\"\xc7\x03\n\x0eRenderSettings\x12\r\n\x05scene\x18\x01 \x01(\t\x12\x13\n\x06height\x18\x02 \x01(\x05H\x00\x88\x01\x01\x12\x12\n\x05width\x18\x03 \x01(\x05H\x01\x88\x01\x01\x12%\n\x07outputs\x18\x04 \x03(\x0e\x32\x14.ultragray.v1.Output\x12(\n\x08\x65ncoding\x18\x05 \x01(\x0e\x32\x16.ultragray.v1.Encoding\x12\"\n\x05probe\x18\x06 \x01(\x0b\x32\x13.ultragray.v1.Probe\x12&\n\x07\x64isplay\x18\x07 \x01(\x0b\x32\x15.ultragray.v1.Display\x12\x1b\n\x0emin_confidence\x18\x08 \x01(\x01H\x02\x88\x01\x01\x12;\n\x14\x62\x65low_min_confidence\x18\t \x01(\x0e\x32\x1d.ultragray.v1.BelowConfidence\x12\x1f\n\x12slice_thickness_mm\x18\n \x01(\x01H\x03\x88\x01\x01\x12&\n\x07\x63ontact\x18\x0b \x01(\x0e\x32\x15.ultragray.v1.ContactB\t\n\x07_heightB\x08\n\x06_widthB\x11\n\x0f_min_confidenceB\x15\n\x13_slice_thickness_mm\"\xe7\x01\n\rExtrapolation\x12\x18\n\x0b\x64istance_mm\x18\x01 \x01(\x01H\x00\x88\x01\x01\x12\x16\n\tangle_deg\x18\x02 \x01(\x01H\x01\x88\x01\x01\x12\x17\n\nconfidence\x18\x03 \x01(\x01H\x02\x88\x01\x01\x12\x1c\n\x0fsupported_share\x18\x04 \x01(\x01H\x03\x88\x01\x01\x12\x1a\n\rcontact_share\x18\x05 \x01(\x01H\x04\x88\x01\x01\x42\x0e\n\x0c_distance_mmB\x0c\n\n_angle_degB\r\n\x0b_confidenceB\x12\n\x10_supported_shareB\x10\n\x0e_contact_share\"j\n\x12\x41ssessPosesRequest\x12\r\n\x05scene\x18\x01 \x01(\t\x12!\n\x05poses\x18\x02 \x03(\x0b\x32\x12.ultragray.v1.Pose\x12\"\n\x05probe\x18\x03 \x01(\x0b\x32\x13.ultragray.v1.Probe\"J\n\x13\x41ssessPosesResponse\x12\x33\n\x0e\x65xtrapolations\x18\x01 \x03(\x0b\x32\x1b.ultragray.v1.Extrapolation\"\xc2\x01\n\x07\x44isplay\x12\x0f\n\x07gain_db\x18\x01 \x01(\x01\x12\x1d\n\x10\x64ynamic_range_db\x18\x02 \x01(\x01H\x00\x88\x01\x01\x12\x0e\n\x06tgc_db\x18\x03 \x03(\x01\x12\x15\n\x08\x64\x65pth_mm\x18\x04 \x01(\x01H\x01\x88\x01\x01\x12\x0c\n\x04\x66lip\x18\x05 \x01(\x08\x12\x15\n\x08pixel_mm\x18\x06 \x01(\x01H\x02\x88\x01\x01\x12\x0c\n\x04\x65\x64ge\x18\x07 \x01(\x01\x42\x13\n\x11_dynamic_range_dbB\x0b\n\t_depth_mmB\x0b\n\t_pixel_mm\"t\n\x07Picture\x12\x13\n\x0b\x63olumn_unit\x18\x01 \x01(\t\x12\x14\n\x0c\x66irst_column\x18\x02 \x01(\x01\x12\x14\n\x0c\x66irst_row_mm\x18\x03 \x01(\x01\x12\x13\n\x0b\x63olumn_step\x18\x04 \x01(\x01\x12\x13\n\x0brow_step_mm\x18\x05 \x01(\x01\"\x8d\x01\n\rRenderRequest\x12.\n\x08settings\x18\x01 \x01(\x0b\x32\x1c.ultragray.v1.RenderSettings\x12 \n\x04pose\x18\x02 \x01(\x0b\x32\x12.ultragray.v1.Pose\x12\x19\n\x0cmax_queue_ms\x18\x03 \x01(\x01H\x00\x88\x01\x01\x42\x0f\n\r_max_queue_ms\"g\n\x12RenderBatchRequest\x12.\n\x08settings\x18\x01 \x01(\x0b\x32\x1c.ultragray.v1.RenderSettings\x12!\n\x05poses\x18\x02 \x03(\x0b\x32\x12.ultragray.v1.Pose\"N\n\x0cSharedMemory\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\r\n\x05token\x18\x02 \x01(\x0c\x12\r\n\x05slots\x18\x03 \x01(\r\x12\x12\n\nslot_bytes\x18\x04 \x01(\r\"\xe8\x02\n\x13RenderStreamRequest\x12\x10\n\x08sequence\x18\x01 \x01(\x04\x12.\n\x08settings\x18\x02 \x01(\x0b\x32\x1c.ultragray.v1.RenderSettings\x12 \n\x04pose\x18\x03 \x01(\x0b\x32\x12.ultragray.v1.Pose\x12&\n\x04mode\x18\x04 \x01(\x0e\x32\x18.ultragray.v1.StreamMode\x12\x17\n\ntimeout_ms\x18\x05 \x01(\x01H\x00\x88\x01\x01\x12\x1b\n\x0e\x63lient_time_ns\x18\x06 \x01(\x03H\x01\x88\x01\x01\x12\x0e\n\x06window\x18\x07 \x01(\r\x12\x19\n\x0c\x61\x63knowledged\x18\x08 \x01(\x04H\x02\x88\x01\x01\x12\x31\n\rshared_memory\x18\t \x01(\x0b\x32\x1a.ultragray.v1.SharedMemoryB\r\n\x0b_timeout_msB\x11\n\x0f_client_time_nsB\x0f\n\r_acknowledged\"\xcb\x05\n\x05\x46rame\x12\x10\n\x08sequence\x18\x01 \x01(\x04\x12\r\n\x05scene\x18\x02 \x01(\t\x12\x14\n\x0cscene_sha256\x18\x03 \x01(\t\x12\x10\n\x08renderer\x18\x04 \x01(\t\x12\"\n\x04pose\x18\x05 \x01(\x0b\x32\x14.ultragray.v1.Matrix\x12\"\n\x05probe\x18\x06 \x01(\x0b\x32\x13.ultragray.v1.Probe\x12\x1a\n\x12slice_thickness_mm\x18\x15 \x01(\x01\x12&\n\x07\x63ontact\x18\x17 \x01(\x0e\x32\x15.ultragray.v1.Contact\x12\x0e\n\x06height\x18\x07 \x01(\x05\x12\r\n\x05width\x18\x08 \x01(\x05\x12%\n\x07outputs\x18\t \x03(\x0e\x32\x14.ultragray.v1.Output\x12(\n\x08\x65ncoding\x18\n \x01(\x0e\x32\x16.ultragray.v1.Encoding\x12\x0c\n\x04\x64\x61ta\x18\x0b \x01(\x0c\x12-\n\x0bshared_data\x18\x16 \x01(\x0b\x32\x18.ultragray.v1.SharedData\x12&\n\x07timings\x18\x0c \x01(\x0b\x32\x15.ultragray.v1.Timings\x12\"\n\x05\x65rror\x18\r \x01(\x0b\x32\x13.ultragray.v1.Error\x12\x0f\n\x07\x64ropped\x18\x0e \x01(\x04\x12\x32\n\rextrapolation\x18\x14 \x01(\x0b\x32\x1b.ultragray.v1.Extrapolation\x12&\n\x07\x64isplay\x18\x10 \x01(\x0b\x32\x15.ultragray.v1.Display\x12&\n\x07picture\x18\x11 \x01(\x0b\x32\x15.ultragray.v1.Picture\x12\x17\n\x0frendered_height\x18\x12 \x01(\x05\x12\x16\n\x0erendered_width\x18\x13 \x01(\x05\x12\x1b\n\x0e\x63lient_time_ns\x18\x0f \x01(\x03H\x00\x88\x01\x01\x42\x11\n\x0f_client_time_ns\")\n\nSharedData\x12\x0c\n\x04slot\x18\x01 \x01(\r\x12\r\n\x05\x62ytes\x18\x02 \x01(\r\"A\n\x07Timings\x12\x10\n\x08queue_ms\x18\x01 \x01(\x01\x12\x11\n\trender_ms\x18\x02 \x01(\x01\x12\x11\n\tencode_ms\x18\x03 \x01(\x01*\xb5\x01\n\x06Output\x12\x16\n\x12OUTPUT_UNSPECIFIED\x10\x00\x12\x10\n\x0cOUTPUT_BMODE\x10\x01\x12\x0f\n\x0bOUTPUT_ECHO\x10\x02\x12\x18\n\x14OUTPUT_TRANSMITTANCE\x10\x03\x12\x13\n\x0fOUTPUT_COVERAGE\x10\x04\x12\x11\n\rOUTPUT_LABELS\x10\x05\x12\x16\n\x12OUTPUT_ATTENUATION\x10\x06\x12\x16\n\x12OUTPUT_UNCERTAINTY\x10\x07*s\n\x08\x45ncoding\x12\x18\n\x14\x45NCODING_UNSPECIFIED\x10\x00\x12\x12\n\x0e\x45NCODING_UINT8\x10\x01\x12\x14\n\x10\x45NCODING_FLOAT32\x10\x02\x12\x10\n\x0c\x45NCODING_PNG\x10\x03\x12\x11\n\rENCODING_JPEG\x10\x04*I\n\x07\x43ontact\x12\x17\n\x13\x43ONTACT_UNSPECIFIED\x10\x00\x12\x0f\n\x0b\x43ONTACT_AIR\x10\x01\x12\x14\n\x10\x43ONTACT_PRESSURE\x10\x02*k\n\x0f\x42\x65lowConfidence\x12 \n\x1c\x42\x45LOW_CONFIDENCE_UNSPECIFIED\x10\x00\x12\x1b\n\x17\x42\x45LOW_CONFIDENCE_REFUSE\x10\x01\x12\x19\n\x15\x42\x45LOW_CONFIDENCE_MASK\x10\x02*Z\n\nStreamMode\x12\x1b\n\x17STREAM_MODE_UNSPECIFIED\x10\x00\x12\x17\n\x13STREAM_MODE_ORDERED\x10\x01\x12\x16\n\x12STREAM_MODE_LATEST\x10\x02\x32\xb3\x02\n\rRenderService\x12:\n\x06Render\x12\x1b.ultragray.v1.RenderRequest\x1a\x13.ultragray.v1.Frame\x12\x46\n\x0bRenderBatch\x12 .ultragray.v1.RenderBatchRequest\x1a\x13.ultragray.v1.Frame0\x01\x12R\n\x0b\x41ssessPoses\x12 .ultragray.v1.AssessPosesRequest\x1a!.ultragray.v1.AssessPosesResponse\x12J\n\x0cRenderStream\x12!.ultragray.v1.RenderStreamRequest\x1a\x13.ultragray.v1.Frame(\x01\x30\x01\x62\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
 _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'ultragray.v1.rendering_pb2', _globals)
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
-  _globals['_OUTPUT']._serialized_start=2688
-  _globals['_OUTPUT']._serialized_end=2869
-  _globals['_ENCODING']._serialized_start=2871
-  _globals['_ENCODING']._serialized_end=2986
-  _globals['_BELOWCONFIDENCE']._serialized_start=2988
-  _globals['_BELOWCONFIDENCE']._serialized_end=3095
-  _globals['_STREAMMODE']._serialized_start=3097
-  _globals['_STREAMMODE']._serialized_end=3187
+  _globals['_OUTPUT']._serialized_start=2814
+  _globals['_OUTPUT']._serialized_end=2995
+  _globals['_ENCODING']._serialized_start=2997
+  _globals['_ENCODING']._serialized_end=3112
+  _globals['_CONTACT']._serialized_start=3114
+  _globals['_CONTACT']._serialized_end=3187
+  _globals['_BELOWCONFIDENCE']._serialized_start=3189
+  _globals['_BELOWCONFIDENCE']._serialized_end=3296
+  _globals['_STREAMMODE']._serialized_start=3298
+  _globals['_STREAMMODE']._serialized_end=3388
   _globals['_RENDERSETTINGS']._serialized_start=103
-  _globals['_RENDERSETTINGS']._serialized_end=518
-  _globals['_EXTRAPOLATION']._serialized_start=521
-  _globals['_EXTRAPOLATION']._serialized_end=706
-  _globals['_ASSESSPOSESREQUEST']._serialized_start=708
-  _globals['_ASSESSPOSESREQUEST']._serialized_end=814
-  _globals['_ASSESSPOSESRESPONSE']._serialized_start=816
-  _globals['_ASSESSPOSESRESPONSE']._serialized_end=890
-  _globals['_DISPLAY']._serialized_start=893
-  _globals['_DISPLAY']._serialized_end=1087
-  _globals['_PICTURE']._serialized_start=1089
-  _globals['_PICTURE']._serialized_end=1205
-  _globals['_RENDERREQUEST']._serialized_start=1208
-  _globals['_RENDERREQUEST']._serialized_end=1349
-  _globals['_RENDERBATCHREQUEST']._serialized_start=1351
-  _globals['_RENDERBATCHREQUEST']._serialized_end=1454
-  _globals['_SHAREDMEMORY']._serialized_start=1456
-  _globals['_SHAREDMEMORY']._serialized_end=1534
-  _globals['_RENDERSTREAMREQUEST']._serialized_start=1537
-  _globals['_RENDERSTREAMREQUEST']._serialized_end=1897
-  _globals['_FRAME']._serialized_start=1900
-  _globals['_FRAME']._serialized_end=2575
-  _globals['_SHAREDDATA']._serialized_start=2577
-  _globals['_SHAREDDATA']._serialized_end=2618
-  _globals['_TIMINGS']._serialized_start=2620
-  _globals['_TIMINGS']._serialized_end=2685
-  _globals['_RENDERSERVICE']._serialized_start=3190
-  _globals['_RENDERSERVICE']._serialized_end=3497
+  _globals['_RENDERSETTINGS']._serialized_end=558
+  _globals['_EXTRAPOLATION']._serialized_start=561
+  _globals['_EXTRAPOLATION']._serialized_end=792
+  _globals['_ASSESSPOSESREQUEST']._serialized_start=794
+  _globals['_ASSESSPOSESREQUEST']._serialized_end=900
+  _globals['_ASSESSPOSESRESPONSE']._serialized_start=902
+  _globals['_ASSESSPOSESRESPONSE']._serialized_end=976
+  _globals['_DISPLAY']._serialized_start=979
+  _globals['_DISPLAY']._serialized_end=1173
+  _globals['_PICTURE']._serialized_start=1175
+  _globals['_PICTURE']._serialized_end=1291
+  _globals['_RENDERREQUEST']._serialized_start=1294
+  _globals['_RENDERREQUEST']._serialized_end=1435
+  _globals['_RENDERBATCHREQUEST']._serialized_start=1437
+  _globals['_RENDERBATCHREQUEST']._serialized_end=1540
+  _globals['_SHAREDMEMORY']._serialized_start=1542
+  _globals['_SHAREDMEMORY']._serialized_end=1620
+  _globals['_RENDERSTREAMREQUEST']._serialized_start=1623
+  _globals['_RENDERSTREAMREQUEST']._serialized_end=1983
+  _globals['_FRAME']._serialized_start=1986
+  _globals['_FRAME']._serialized_end=2701
+  _globals['_SHAREDDATA']._serialized_start=2703
+  _globals['_SHAREDDATA']._serialized_end=2744
+  _globals['_TIMINGS']._serialized_start=2746
+  _globals['_TIMINGS']._serialized_end=2811
+  _globals['_RENDERSERVICE']._serialized_start=3391
+  _globals['_RENDERSERVICE']._serialized_end=3698
 # @@protoc_insertion_point(module_scope)

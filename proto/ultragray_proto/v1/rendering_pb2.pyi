@@ -28,6 +28,12 @@ class Encoding(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     ENCODING_PNG: _ClassVar[Encoding]
     ENCODING_JPEG: _ClassVar[Encoding]
 
+class Contact(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    CONTACT_UNSPECIFIED: _ClassVar[Contact]
+    CONTACT_AIR: _ClassVar[Contact]
+    CONTACT_PRESSURE: _ClassVar[Contact]
+
 class BelowConfidence(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
     BELOW_CONFIDENCE_UNSPECIFIED: _ClassVar[BelowConfidence]
@@ -52,6 +58,9 @@ ENCODING_UINT8: Encoding
 ENCODING_FLOAT32: Encoding
 ENCODING_PNG: Encoding
 ENCODING_JPEG: Encoding
+CONTACT_UNSPECIFIED: Contact
+CONTACT_AIR: Contact
+CONTACT_PRESSURE: Contact
 BELOW_CONFIDENCE_UNSPECIFIED: BelowConfidence
 BELOW_CONFIDENCE_REFUSE: BelowConfidence
 BELOW_CONFIDENCE_MASK: BelowConfidence
@@ -60,7 +69,7 @@ STREAM_MODE_ORDERED: StreamMode
 STREAM_MODE_LATEST: StreamMode
 
 class RenderSettings(_message.Message):
-    __slots__ = ("scene", "height", "width", "outputs", "encoding", "probe", "display", "min_confidence", "below_min_confidence", "slice_thickness_mm")
+    __slots__ = ("scene", "height", "width", "outputs", "encoding", "probe", "display", "min_confidence", "below_min_confidence", "slice_thickness_mm", "contact")
     SCENE_FIELD_NUMBER: _ClassVar[int]
     HEIGHT_FIELD_NUMBER: _ClassVar[int]
     WIDTH_FIELD_NUMBER: _ClassVar[int]
@@ -71,6 +80,7 @@ class RenderSettings(_message.Message):
     MIN_CONFIDENCE_FIELD_NUMBER: _ClassVar[int]
     BELOW_MIN_CONFIDENCE_FIELD_NUMBER: _ClassVar[int]
     SLICE_THICKNESS_MM_FIELD_NUMBER: _ClassVar[int]
+    CONTACT_FIELD_NUMBER: _ClassVar[int]
     scene: str
     height: int
     width: int
@@ -81,19 +91,22 @@ class RenderSettings(_message.Message):
     min_confidence: float
     below_min_confidence: BelowConfidence
     slice_thickness_mm: float
-    def __init__(self, scene: _Optional[str] = ..., height: _Optional[int] = ..., width: _Optional[int] = ..., outputs: _Optional[_Iterable[_Union[Output, str]]] = ..., encoding: _Optional[_Union[Encoding, str]] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., display: _Optional[_Union[Display, _Mapping]] = ..., min_confidence: _Optional[float] = ..., below_min_confidence: _Optional[_Union[BelowConfidence, str]] = ..., slice_thickness_mm: _Optional[float] = ...) -> None: ...
+    contact: Contact
+    def __init__(self, scene: _Optional[str] = ..., height: _Optional[int] = ..., width: _Optional[int] = ..., outputs: _Optional[_Iterable[_Union[Output, str]]] = ..., encoding: _Optional[_Union[Encoding, str]] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., display: _Optional[_Union[Display, _Mapping]] = ..., min_confidence: _Optional[float] = ..., below_min_confidence: _Optional[_Union[BelowConfidence, str]] = ..., slice_thickness_mm: _Optional[float] = ..., contact: _Optional[_Union[Contact, str]] = ...) -> None: ...
 
 class Extrapolation(_message.Message):
-    __slots__ = ("distance_mm", "angle_deg", "confidence", "supported_share")
+    __slots__ = ("distance_mm", "angle_deg", "confidence", "supported_share", "contact_share")
     DISTANCE_MM_FIELD_NUMBER: _ClassVar[int]
     ANGLE_DEG_FIELD_NUMBER: _ClassVar[int]
     CONFIDENCE_FIELD_NUMBER: _ClassVar[int]
     SUPPORTED_SHARE_FIELD_NUMBER: _ClassVar[int]
+    CONTACT_SHARE_FIELD_NUMBER: _ClassVar[int]
     distance_mm: float
     angle_deg: float
     confidence: float
     supported_share: float
-    def __init__(self, distance_mm: _Optional[float] = ..., angle_deg: _Optional[float] = ..., confidence: _Optional[float] = ..., supported_share: _Optional[float] = ...) -> None: ...
+    contact_share: float
+    def __init__(self, distance_mm: _Optional[float] = ..., angle_deg: _Optional[float] = ..., confidence: _Optional[float] = ..., supported_share: _Optional[float] = ..., contact_share: _Optional[float] = ...) -> None: ...
 
 class AssessPosesRequest(_message.Message):
     __slots__ = ("scene", "poses", "probe")
@@ -196,7 +209,7 @@ class RenderStreamRequest(_message.Message):
     def __init__(self, sequence: _Optional[int] = ..., settings: _Optional[_Union[RenderSettings, _Mapping]] = ..., pose: _Optional[_Union[_geometry_pb2.Pose, _Mapping]] = ..., mode: _Optional[_Union[StreamMode, str]] = ..., timeout_ms: _Optional[float] = ..., client_time_ns: _Optional[int] = ..., window: _Optional[int] = ..., acknowledged: _Optional[int] = ..., shared_memory: _Optional[_Union[SharedMemory, _Mapping]] = ...) -> None: ...
 
 class Frame(_message.Message):
-    __slots__ = ("sequence", "scene", "scene_sha256", "renderer", "pose", "probe", "slice_thickness_mm", "height", "width", "outputs", "encoding", "data", "shared_data", "timings", "error", "dropped", "extrapolation", "display", "picture", "rendered_height", "rendered_width", "client_time_ns")
+    __slots__ = ("sequence", "scene", "scene_sha256", "renderer", "pose", "probe", "slice_thickness_mm", "contact", "height", "width", "outputs", "encoding", "data", "shared_data", "timings", "error", "dropped", "extrapolation", "display", "picture", "rendered_height", "rendered_width", "client_time_ns")
     SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     SCENE_FIELD_NUMBER: _ClassVar[int]
     SCENE_SHA256_FIELD_NUMBER: _ClassVar[int]
@@ -204,6 +217,7 @@ class Frame(_message.Message):
     POSE_FIELD_NUMBER: _ClassVar[int]
     PROBE_FIELD_NUMBER: _ClassVar[int]
     SLICE_THICKNESS_MM_FIELD_NUMBER: _ClassVar[int]
+    CONTACT_FIELD_NUMBER: _ClassVar[int]
     HEIGHT_FIELD_NUMBER: _ClassVar[int]
     WIDTH_FIELD_NUMBER: _ClassVar[int]
     OUTPUTS_FIELD_NUMBER: _ClassVar[int]
@@ -226,6 +240,7 @@ class Frame(_message.Message):
     pose: _geometry_pb2.Matrix
     probe: _geometry_pb2.Probe
     slice_thickness_mm: float
+    contact: Contact
     height: int
     width: int
     outputs: _containers.RepeatedScalarFieldContainer[Output]
@@ -241,7 +256,7 @@ class Frame(_message.Message):
     rendered_height: int
     rendered_width: int
     client_time_ns: int
-    def __init__(self, sequence: _Optional[int] = ..., scene: _Optional[str] = ..., scene_sha256: _Optional[str] = ..., renderer: _Optional[str] = ..., pose: _Optional[_Union[_geometry_pb2.Matrix, _Mapping]] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., slice_thickness_mm: _Optional[float] = ..., height: _Optional[int] = ..., width: _Optional[int] = ..., outputs: _Optional[_Iterable[_Union[Output, str]]] = ..., encoding: _Optional[_Union[Encoding, str]] = ..., data: _Optional[bytes] = ..., shared_data: _Optional[_Union[SharedData, _Mapping]] = ..., timings: _Optional[_Union[Timings, _Mapping]] = ..., error: _Optional[_Union[_scenes_pb2.Error, _Mapping]] = ..., dropped: _Optional[int] = ..., extrapolation: _Optional[_Union[Extrapolation, _Mapping]] = ..., display: _Optional[_Union[Display, _Mapping]] = ..., picture: _Optional[_Union[Picture, _Mapping]] = ..., rendered_height: _Optional[int] = ..., rendered_width: _Optional[int] = ..., client_time_ns: _Optional[int] = ...) -> None: ...
+    def __init__(self, sequence: _Optional[int] = ..., scene: _Optional[str] = ..., scene_sha256: _Optional[str] = ..., renderer: _Optional[str] = ..., pose: _Optional[_Union[_geometry_pb2.Matrix, _Mapping]] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., slice_thickness_mm: _Optional[float] = ..., contact: _Optional[_Union[Contact, str]] = ..., height: _Optional[int] = ..., width: _Optional[int] = ..., outputs: _Optional[_Iterable[_Union[Output, str]]] = ..., encoding: _Optional[_Union[Encoding, str]] = ..., data: _Optional[bytes] = ..., shared_data: _Optional[_Union[SharedData, _Mapping]] = ..., timings: _Optional[_Union[Timings, _Mapping]] = ..., error: _Optional[_Union[_scenes_pb2.Error, _Mapping]] = ..., dropped: _Optional[int] = ..., extrapolation: _Optional[_Union[Extrapolation, _Mapping]] = ..., display: _Optional[_Union[Display, _Mapping]] = ..., picture: _Optional[_Union[Picture, _Mapping]] = ..., rendered_height: _Optional[int] = ..., rendered_width: _Optional[int] = ..., client_time_ns: _Optional[int] = ...) -> None: ...
 
 class SharedData(_message.Message):
     __slots__ = ("slot", "bytes")

@@ -14,7 +14,7 @@ from ultragray.contract import described
 from ultragray.display.settings import AS_RENDERED, Display
 from ultragray.outputs import OUTPUTS
 from ultragray.probe import Picture, Probe
-from ultragray.settings import Encoding, Resolved
+from ultragray.settings import Contact, Encoding, Resolved
 from ultragray_workers.pool.types import RenderResult
 
 from .poses import MatrixRows
@@ -72,6 +72,7 @@ class SettingsUsed:
 
     probe: Probe = described("As used.")
     slice_thickness_mm: float = described("As used: at the focus of the scene's beam; 0: a plane.")
+    contact: Contact | None = described("As used; none: it was assumed.", None)
     rendered_height: int = described("Depth samples, before the display settings were applied.")
     rendered_width: int = described("Scan lines, likewise.")
     display: Display = described("As used.", AS_RENDERED)
@@ -127,6 +128,7 @@ def settings_used(settings: Resolved) -> SettingsUsed:
     return SettingsUsed(
         probe=settings.probe,
         slice_thickness_mm=settings.beam.thickness_mm,
+        contact=settings.contact,
         rendered_height=settings.height,
         rendered_width=settings.width,
         display=settings.display,

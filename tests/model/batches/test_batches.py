@@ -112,7 +112,7 @@ def test_a_shard_is_the_same_bytes_each_time_and_tells_pose_and_figures(scene_fi
     header = read_header(scene_file)
     coverage = np.load(io.BytesIO(found["000080.coverage.npy"]))[None]
     expected = Assessor(header.info, header.training_poses).assess(pose, coverage=coverage)[0]
-    assert told == {name: value if value is None else round(value, 6) for name, value in vars(expected).items()}
+    assert told == {name: value if value is None else round(value, 6) for name, value in expected.figures().items()}
 
 
 def test_the_tar_is_one_that_tarfile_reads_and_would_write(tmp_path: Path) -> None:

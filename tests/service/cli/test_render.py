@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ from ultragray.display.scan_conversion import scan_convert, scan_convert_labels
 from ultragray.files.atomic import file_sha256
 from ultragray.interchange import rendering
 from ultragray.samplers import FanSampler
+from ultragray.settings import Contact
 
 from .command_line import refused, run
 
@@ -125,7 +126,7 @@ def test_render_tells_and_stores_how_far_frames_extrapolate(
     told = json.loads((tmp_path / "pictures" / "frames.json").read_text())
     assert [one["frame"] for one in told] == [0, 1, 2, 3, 4]
     for one, extrapolation, pose in zip(told, expected, scene.training_poses, strict=True):
-        assert {name: one[name] for name in FIGURES} == pytest.approx(asdict(extrapolation))
+        assert {name: one[name] for name in FIGURES} == pytest.approx(extrapolation.figures())
         assert one["pose"] == pose.tolist()
 
     assert run("render", scene_file, "-o", tmp_path / "f.npz").output.endswith(f" s; {share}\n")
@@ -133,6 +134,25 @@ def test_render_tells_and_stores_how_far_frames_extrapolate(
         np.testing.assert_allclose(frames["supported_share"], figures["supported_share"])
         np.testing.assert_allclose(frames["angle_deg"], figures["angle_deg"], rtol=1e-6)
         assert np.isnan(frames["confidence"]).all()
+
+
+def test_render_tells_how_much_of_the_probe_touches_the_skin(scene_file: Path, tmp_path: Path) -> None:
+    scene = GaussianScene.load(scene_file)
+    lifted = scene.training_poses.copy()
+    lifted[0, :3, 3] -= 5.0 * lifted[0, :3, 2]
+    np.save(tmp_path / "poses.npy", lifted[:2])
+    arguments = ("render", scene_file, "--poses", tmp_path / "poses.npy", "-o", tmp_path / "f.npz")
+    expected = render(scene, None, lifted[:2], height=24, width=20, outputs=("bmode",), contact=Contact.AIR)
+    assert expected.touch is not None
+    off, on = expected.touch.shares
+    assert off < 0.5 < on
+    words = f", {expected.touch.shares.astype(np.float32).mean():.0%} of the scan lines have contact\n"
+    assert run(*arguments, "--contact", "air").output.endswith(words)
+    with np.load(tmp_path / "f.npz") as frames:
+        np.testing.assert_allclose(frames["contact_share"], expected.touch.shares)
+        np.testing.assert_allclose(frames["bmode"], expected["bmode"].numpy(), atol=1e-6)
+        assert str(frames["contact"]) == "air"
+    assert run(*arguments, "--force", "--contact", "gel").exit_code == 2
 
 
 def test_render_keeps_to_a_least_confidence(knowing_file: Path, scene_file: Path, tmp_path: Path) -> None:

@@ -84,7 +84,8 @@ function isShowable({ header, pixels }: Frame): boolean {
 }
 
 /** What renders a frame again, as B-mode. */
-function settingsOf({ rendered_height, rendered_width, probe, display, slice_thickness_mm }: FrameHeader): StreamSettings {
+function settingsOf(header: FrameHeader): StreamSettings {
+  const { rendered_height, rendered_width, probe, display, slice_thickness_mm, contact } = header;
   return {
     height: rendered_height,
     width: rendered_width,
@@ -92,6 +93,7 @@ function settingsOf({ rendered_height, rendered_width, probe, display, slice_thi
     display,
     outputs: ["bmode"],
     slice_thickness_mm,
+    contact,
     min_confidence: null,
     below_min_confidence: "mask",
   };

@@ -136,6 +136,7 @@ export class Session {
       slice_thickness_mm: sliceThickness_mm,
       min_confidence: hidesUnsupported && this.description?.confidence ? 1 : null,
       below_min_confidence: "mask",
+      contact: null,
     };
   }
 

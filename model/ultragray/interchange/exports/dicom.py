@@ -5,7 +5,8 @@ whole image; its physical values are the probe frame in cm: x lateral, y depth. 
 and no person. The UIDs are 2.25 and a UUID (PS3.5 B.2) made of what the frames are made of: that of the study, of the
 scene's hash; those of the series and the image, also of the renderer, the probe, the size and the poses. So the same
 frames have the same UIDs wherever they are rendered. Of the creator ULTRAGRAY are the private elements (0019,1001), OD:
-the poses [C, 4, 4], mm, and (0019,1002), OF: the figures [C, 4] of each frame in the order of `confidence.FIGURES`, NaN
+the poses [C, 4, 4], mm, and (0019,1002), OF: the figures [C, 4] of each frame in the order of `confidence.FIGURES`
+(and a fifth, the share of contact, where that was asked for), NaN
 where one is not known, and (0019,1003), UT: the origin as JSON, probe and display settings included.
 """
 

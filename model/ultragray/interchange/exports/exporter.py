@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
@@ -46,8 +47,9 @@ class ExportHeader:
     def origin(self) -> dict[str, Any]:
         """The origin of the frames and their display, as JSON holds it.
 
-        `picture` has the fields of `ultragray.probe.Picture`.
+        `picture` has the fields of `ultragray.probe.Picture`; `contact` is there where it was judged.
         """
+        contact = self.settings.contact
         return {
             "scene": self.scene,
             "scene_sha256": self.scene_sha256,
@@ -56,6 +58,7 @@ class ExportHeader:
             "slice_thickness_mm": self.settings.beam.thickness_mm,
             "display": to_dict(self.settings.display),
             "picture": to_dict(self.settings.picture),
+            **({} if contact is None else {"contact": contact.value}),
         }
 
 
@@ -104,7 +107,9 @@ class Exporter(ABC):
     def _figures(self) -> dict[str, npt.NDArray[np.float32]]:
         """The figures of all frames by name, [C]; NaN where one is not known, or the frame is still to come."""
         missing = len(self._header.poses) - len(self._extrapolations)
-        return figure_arrays([*self._extrapolations, *[Extrapolation(None, None, None, None)] * missing])
+        judged = None if self._header.settings.contact is None else math.nan
+        unknown = Extrapolation(None, None, None, None, contact_share=judged)
+        return figure_arrays([*self._extrapolations, *[unknown] * missing])
 
     @abstractmethod
     def _open(self) -> None:

@@ -22,6 +22,7 @@ FIELDS = {
     "angle_deg": "UltraGRayAngleDeg",
     "confidence": "UltraGRayConfidence",
     "supported_share": "UltraGRaySupportedShare",
+    "contact_share": "UltraGRayContactShare",
 }
 FIGURE_WIDTH = 12  # of any number from 0 on, so that those found later take the place of these
 
@@ -74,6 +75,7 @@ class PlusExporter(Exporter):
             "UltraGRayProbe": json.dumps(origin["probe"]),
             "UltraGRaySliceThicknessMm": json.dumps(origin["slice_thickness_mm"]),
             "UltraGRayDisplay": json.dumps(origin["display"]),
+            **({"UltraGRayContact": origin["contact"]} if "contact" in origin else {}),
         }
 
     def _line(self, key: str, value: str) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +29,7 @@ def export_pngs(folder: Path, header: ExportHeader) -> Iterator[Add]:
             for name in header.settings.outputs:
                 data = image_file(frames[name][place], ".png")
                 (folder / f"frame_{number:05d}_{name}.png").write_bytes(data.tobytes())
-            documents.append({"frame": number, "pose": header.poses[number].tolist(), **asdict(extrapolation)})
+            documents.append({"frame": number, "pose": header.poses[number].tolist(), **extrapolation.figures()})
 
     yield add
     with atomic_path(folder / FRAMES_FILE) as temporary:

@@ -6,7 +6,6 @@ import io
 import json
 import tarfile
 from collections.abc import Mapping
-from dataclasses import asdict
 
 import numpy as np
 
@@ -29,7 +28,7 @@ class TarExporter(Exporter):
                     ("png", image_file(frame, ".png").tobytes()) if frame.dtype == np.uint8 else ("npy", _npy(frame))
                 )
                 self._member(f"{number:06d}.{name}.{suffix}", data)
-            figures = asdict(self._extrapolations[number])
+            figures = self._extrapolations[number].figures()
             document = {"pose": self._header.poses[number].tolist(), **figures, **self._header.origin()}
             self._member(f"{number:06d}.json", json.dumps(document).encode())
 

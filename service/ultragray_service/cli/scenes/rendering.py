@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ultragray.confidence import Assessor, Extrapolation, figure_arrays
+from ultragray.confidence import CONTACT_SHARE, Assessor, Extrapolation, figure_arrays
 from ultragray.errors import InvalidArgument, InvalidProbe
 from ultragray.files.atomic import file_sha256
 from ultragray.files.poses import load_poses
@@ -81,6 +81,7 @@ class Rendered:
             "confidence_min": float(confidence.min()) if known else None,
             "confidence_max": float(confidence.max()) if known else None,
             "supported_share": float(figures["supported_share"].mean()),
+            **({CONTACT_SHARE: float(figures[CONTACT_SHARE].mean())} if CONTACT_SHARE in figures else {}),
         }
 
 
@@ -123,6 +124,8 @@ def _trust(found: Sequence[Extrapolation]) -> str:
     figures = figure_arrays(found)
     confidence = figures["confidence"]
     words = [f"Gaussians support {figures['supported_share'].mean():.0%} of the pixels"]
+    if CONTACT_SHARE in figures:
+        words.append(f"{figures[CONTACT_SHARE].mean():.0%} of the scan lines have contact")
     if np.isfinite(confidence).all():
         words.insert(0, f"confidence {confidence.min():.2f} to {confidence.max():.2f}")
     return ", ".join(words)

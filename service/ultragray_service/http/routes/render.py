@@ -44,9 +44,10 @@ RENDER_HEADERS = {
     "X-Ultragray-Pose": "One pose only: the 4x4 matrix that was used, JSON. Of many, npz holds `poses`.",
     "X-Ultragray-Probe": "The probe that was used, JSON.",
     "X-Ultragray-Slice-Thickness-Mm": "As used: at the focus of the scene's beam; 0: a plane.",
+    "X-Ultragray-Contact": "As used, air or pressure; absent where contact was assumed.",
     "X-Ultragray-Confidence": "Of each pose, with commas; empty where the scene cannot tell.",
-    "X-Ultragray-Extrapolation": "One pose only: distance_mm, angle_deg, confidence, supported_share, JSON. "
-    "Of many, npz holds them.",
+    "X-Ultragray-Extrapolation": "One pose only: distance_mm, angle_deg, confidence, supported_share, contact_share, "
+    "JSON. Of many, npz holds them.",
     "X-Ultragray-Picture": "Where the pixels lie in the image plane, JSON: column_unit, first, step.",
     "X-Ultragray-Queue-Ms": "Waiting time.",
     "X-Ultragray-Render-Ms": "Render time of the batch that the poses were in.",
@@ -149,7 +150,8 @@ def render_headers(result: RenderResult) -> dict[str, str]:
 def _settings_headers(settings: Resolved) -> dict[str, str]:
     """The headers that settings alone decide."""
     used = settings_used(settings)
-    return {
+    contact = {} if used.contact is None else {"X-Ultragray-Contact": used.contact.value}
+    return contact | {
         "X-Ultragray-Dtype": settings.encoding.pixel_type.name,
         "X-Ultragray-Outputs": ",".join(settings.outputs),
         "X-Ultragray-Probe": json.dumps(to_dict(used.probe)),

@@ -8,13 +8,14 @@ import tarfile
 import threading
 import time
 import zipfile
-from dataclasses import asdict
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import cv2
 import h5py
 import numpy as np
+import pydicom
 import pytest
 import zarr
 from zarr.storage import ZipStore
@@ -27,7 +28,7 @@ from ultragray.installation import install_advice
 from ultragray.interchange.exports import FORMATS, ExportHeader, check_format, export_to
 from ultragray.interchange.exports.exporter import stored_pixels
 from ultragray.interchange.exports.npz import NpzExporter
-from ultragray.settings import Resolved
+from ultragray.settings import Contact, Resolved
 
 PROBE = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)
 POSES = np.tile(np.eye(4), (5, 1, 1))
@@ -87,6 +88,34 @@ def test_npz(tmp_path: Path, dtype: str) -> None:
         assert {entry.compress_type for entry in archive.infolist()} == {zipfile.ZIP_STORED}
 
 
+def test_the_share_of_contact_is_there_where_it_was_asked_for(tmp_path: Path) -> None:
+    judged = replace(header(("bmode",)), settings=replace(header(("bmode",)).settings, contact=Contact.AIR))
+    told = [replace(one, contact_share=number / 4) for number, one in enumerate(TOLD)]
+    dtypes = {"npz": "float32", "hdf5": "float32", "tar": "uint8", "dicom": "uint8", "plus": "uint8"}
+    for format, dtype in dtypes.items():
+        asked = replace(judged, dtype=dtype)
+        path = tmp_path / f"frames{FORMATS[format].suffix}"
+        pixels = {"bmode": stored_pixels(rendered(("bmode",))["bmode"], np.dtype("u1" if dtype == "uint8" else "<f4"))}
+        with export_to(path, format, asked) as add:
+            add(pixels, told)
+    shares = [one.contact_share for one in told]
+    with np.load(tmp_path / "frames.npz") as archive:
+        assert archive["contact_share"].tolist() == shares
+        assert str(archive["contact"]) == "air"
+    with h5py.File(tmp_path / "frames.h5") as file:
+        assert file["contact_share"][:].tolist() == shares
+    with tarfile.open(tmp_path / "frames.tar") as tar:
+        file = tar.extractfile("000003.json")
+        assert file is not None
+        assert json.load(file)["contact_share"] == 0.75
+    data = pydicom.dcmread(tmp_path / "frames.dcm")
+    figures = np.frombuffer(data.private_block(0x0019, "ULTRAGRAY")[0x02].value, "<f4").reshape(5, -1)
+    assert figures[:, 4].tolist() == shares
+    sequence = (tmp_path / "frames.igs.mha").read_bytes()
+    assert b"UltraGRayContact = air" in sequence
+    assert b"Seq_Frame0002_UltraGRayContactShare = 5.000000e-01" in sequence
+
+
 def test_tar_loads_with_the_standard_library(tmp_path: Path) -> None:
     expected = export(tmp_path / "frames.tar", "tar", header(dtype="uint8"))
     with tarfile.open(tmp_path / "frames.tar") as tar:
@@ -101,7 +130,7 @@ def test_tar_loads_with_the_standard_library(tmp_path: Path) -> None:
         assert file is not None
         told = json.load(file)
     assert told["pose"] == POSES[2].tolist()
-    assert {name: told[name] for name in FIGURES} == asdict(TOLD[2])
+    assert {name: told[name] for name in FIGURES} == TOLD[2].figures()
     assert told["probe"] == to_dict(PROBE)
 
 
@@ -117,7 +146,7 @@ def test_what_is_not_known(tmp_path: Path) -> None:
         file = tar.extractfile("000004.json")
         assert file is not None
         told = json.load(file)
-    assert {name: told[name] for name in FIGURES} == asdict(UNKNOWN)
+    assert {name: told[name] for name in FIGURES} == UNKNOWN.figures()
 
 
 def test_tar_of_floats(tmp_path: Path) -> None:

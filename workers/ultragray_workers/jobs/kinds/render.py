@@ -14,6 +14,7 @@ import numpy.typing as npt
 from ultragray.batches import BatchPlan
 from ultragray.batches.plan import SHARD_FRAMES
 from ultragray.confidence import Assessor, Extrapolation, require_confidence
+from ultragray.contact.skin import way_in
 from ultragray.contract import described, kind_field, shown, under
 from ultragray.errors import InvalidArgument
 from ultragray.interchange.exports import FORMATS, Format, check_format
@@ -132,12 +133,14 @@ class RenderJob(FrameSettings, Specification):
 
     def check(self, surroundings: Surroundings) -> None:
         """Raises UnknownOutput, InvalidProbe, InvalidImageSize; InvalidArgument for a sampler without use for the poses
-        or a `min_confidence` that the scene cannot tell; LowConfidence for a given pose below it, unless there are too
-        many to look at each; StorageFull for more pixels than the disk has room for.
+        or a `min_confidence` or `contact` that the scene cannot tell; LowConfidence for a given pose below it, unless
+        there are too many to look at each; StorageFull for more pixels than the disk has room for.
         """
         scene = surroundings.scene
         assert scene is not None
         settings = self.resolved(scene.info, Encoding.FLOAT32, max_image_side=surroundings.max_image_side)
+        if self.contact is not None:
+            way_in(scene.training_poses, scene.info.probe)
         if self.is_sharded:
             frames = self._planned_frames(scene)
         else:

@@ -239,10 +239,11 @@ class _Worker:
                 backend=self._backend,
                 limits=limits.after(shot),
                 beam=view.beam,
+                contact=view.contact,
             )
             shot += len(some)
             assert frames.coverage is not None
-            blackened = support.look(frames.coverage)
+            blackened = support.look(frames.coverage, frames.touch)
             rendered = {name: frames[name] for name in outputs}
             if view.display == AS_RENDERED and blackened is None:
                 return rendered
@@ -280,7 +281,7 @@ def _supported(
     assessor: Assessor, extrapolations: Sequence[Extrapolation], support: SupportWatch, first: int
 ) -> tuple[Extrapolation, ...]:
     """The extrapolations of the frames from `first` on, with what was seen of their support."""
-    return tuple(assessor.with_support(extrapolations, support.shares(first, len(extrapolations))))
+    return tuple(support.completed(assessor, extrapolations, first))
 
 
 def _write_part(

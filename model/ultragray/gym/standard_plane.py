@@ -1,0 +1,219 @@
+"""StandardPlane-v0: find the view of a goal, by looking at the frames and moving the probe."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import numpy.typing as npt
+import torch
+from gymnasium import spaces
+
+from ..display.pixels import to_uint8
+from ..errors import InvalidArgument
+from ..pose import check_poses, position_distances_mm, rotation_angles_deg
+from ..probe import FloatArray, Probe
+from ..rendering import render, touch_of
+from ..scene import GaussianScene
+from ..settings import Contact
+from .motion import moved, random_motion
+from .settings import StandardPlaneSettings
+from .similarity import ByteImage, Target
+
+Observation = Any  # uint8 [H, W, 1], or a dict with `frame` and `pose`
+START_CONTACT = 0.5  # the least share of contact at a start
+REACHED_CONTACT = 0.9  # of the contact that the goal has, without which it is not reached
+_MOST_STARTS = 200  # drawn for one that has it
+_POSE_NUMBERS = 12
+
+
+class StandardPlaneEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
+    """Scan to a standard plane.
+
+    Observation: the frame, uint8 [H, W, 1]; with `with_pose` a dict of `frame` and `pose`, float32 [12]: position in mm
+    and rotation, row by row, of the probe in its own frame at the start of the episode, as odometry tells it.
+    Action: float32 [6], clipped to −1 to 1: a shift along the probe's lateral, elevation and axial axis, in
+    `step_mm`, and a turn about them through the middle of the face, in `step_deg`.
+    Reward: (similarity − 1) + (share of contact − 1), at most 0: similarity of the frame to that of the goal, from −1
+    to 1, and the share of scan lines that have contact.
+    An episode ends within `reached_mm` and `reached_deg` of the goal, with REACHED_CONTACT of its contact. A step that
+    would leave `reach_mm` or `reach_deg` of the goal is not made.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 25}  # noqa: RUF012  # as gymnasium declares it
+
+    def __init__(
+        self,
+        scene: GaussianScene | str | Path,
+        goal: Any = None,  # [4, 4] mm, or the number of a training view
+        *,
+        probe: Probe | None = None,
+        render_mode: str | None = None,
+        **settings: Any,
+    ) -> None:
+        """`scene`: or its file. `goal` None: the training view in the middle of the sweep. `probe` None: the scene's.
+
+        `settings` are the fields of StandardPlaneSettings. Raises InvalidArgument, InvalidPose, InvalidProbe,
+        SceneFileInvalid.
+        """
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise InvalidArgument(f"render_mode must be rgb_array or None, got {render_mode!r}", field="render_mode")
+        self.render_mode = render_mode
+        self.settings = StandardPlaneSettings(**settings)
+        self._scene = scene if isinstance(scene, GaussianScene) else GaussianScene.load(scene)
+        self._probe = self._scene.info.probe_or(probe)
+        self.goal = _goal_of(self._scene, goal)
+        self._goal_frame, _ = self._frame(self.goal, contact=None)
+        _, self._goal_contact = self._frame(self.goal, contact=self.settings.contact)
+        self._target = Target(self._goal_frame)
+        self.action_space = spaces.Box(-1.0, 1.0, (6,), np.float32)
+        self.observation_space = self._space()
+        self._start = self._pose = self.goal
+        self._shown = self._goal_frame
+
+    def _space(self) -> spaces.Space[Any]:
+        frame = spaces.Box(0, 255, (self.settings.height, self.settings.width, 1), np.uint8)
+        if not self.settings.with_pose:
+            return frame
+        most = np.ones(_POSE_NUMBERS, np.float32)
+        most[:3] = self.settings.start_mm + self.settings.reach_mm + 2.0 * abs(self._probe.pivot_depth_mm)
+        return spaces.Dict({"frame": frame, "pose": spaces.Box(-most, most)})
+
+    def reset(
+        self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Begins an episode at a random pose around the goal, or at `options["pose"]`, [4, 4] mm.
+
+        Where contact is judged, starts are drawn until one has START_CONTACT. Raises InvalidPose.
+        """
+        super().reset(seed=seed)
+        given = (options or {}).get("pose")
+        self._start = self._pose = self._random_start() if given is None else _one_pose(given, "options.pose")
+        observation, info = self._look()
+        return observation, info
+
+    def step(self, action: npt.NDArray[np.float32]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Moves the probe. Raises InvalidArgument for an action that is not six finite numbers."""
+        given = np.asarray(action, np.float64)
+        if given.shape != self.action_space.shape or not np.isfinite(given).all():
+            raise InvalidArgument(
+                f"an action must be 6 finite numbers from -1 to 1, got {given.ravel().tolist()}", field="action"
+            )
+        shift, turn = np.split(np.clip(given, -1.0, 1.0), 2)
+        pivot_mm = self._probe.pivot_depth_mm
+        asked = moved(self._pose, shift * self.settings.step_mm, turn * self.settings.step_deg, pivot_mm)
+        away_mm, turned_deg = self._off_goal(asked)
+        if away_mm <= self.settings.reach_mm and turned_deg <= self.settings.reach_deg:
+            self._pose = check_poses(asked)[0]  # rounding does not add up
+        observation, info = self._look()
+        reward = (info["similarity"] - 1.0) + (info["contact_share"] - 1.0)
+        return observation, reward, self._is_reached(info), False, info
+
+    def _is_reached(self, info: Mapping[str, Any]) -> bool:
+        near = info["distance_mm"] <= self.settings.reached_mm and info["angle_deg"] <= self.settings.reached_deg
+        return bool(near and info["contact_share"] >= REACHED_CONTACT * self._goal_contact)
+
+    def render(self) -> ByteImage | None:  # [H, 2·W, 3]
+        """The frame, and beside it that of the goal."""
+        if self.render_mode is None:
+            return None
+        pair = np.concatenate([self._shown, self._goal_frame], axis=1)
+        return np.repeat(pair[..., None], 3, axis=2)
+
+    def _random_start(self) -> FloatArray:  # [4, 4]
+        """Of all that were drawn, the first with enough contact, else the one with the most."""
+        best, most = self.goal, -1.0
+        for _ in range(_MOST_STARTS):
+            pose = random_motion(
+                self.np_random,
+                self.goal,
+                self.settings.start_mm,
+                self.settings.start_deg,
+                self._probe.pivot_depth_mm,
+            )
+            if self.settings.contact is None:
+                return pose
+            share = float(touch_of(self._scene, self._probe, pose, self.settings.width).shares[0])
+            if share > most:
+                best, most = pose, share
+            if share >= START_CONTACT:
+                break
+        return best
+
+    def _look(self) -> tuple[Observation, dict[str, Any]]:
+        """The observation at the pose, and what is known beside it."""
+        self._shown, contact_share = self._frame(self._pose, contact=self.settings.contact)
+        distance_mm, angle_deg = self._off_goal(self._pose)
+        info = {
+            "similarity": self._target.similarity(self._shown),
+            "contact_share": contact_share,
+            "distance_mm": distance_mm,
+            "angle_deg": angle_deg,
+            "pose": self._pose.copy(),
+        }
+        frame = self._shown[..., None]
+        if not self.settings.with_pose:
+            return frame, info
+        moved_by = np.linalg.inv(self._start) @ self._pose
+        pose = np.concatenate([moved_by[:3, 3], moved_by[:3, :3].ravel()])
+        return {"frame": frame, "pose": np.clip(pose, -self._limits, self._limits).astype(np.float32)}, info
+
+    @property
+    def _limits(self) -> FloatArray:  # [12]
+        space: Any = self.observation_space
+        return np.asarray(space["pose"].high, np.float64)
+
+    def _frame(self, pose: FloatArray, *, contact: Contact | None) -> tuple[ByteImage, float]:  # [4, 4] -> [H, W]
+        with torch.no_grad():
+            frames = render(
+                self._scene,
+                self._probe,
+                pose,
+                height=self.settings.height,
+                width=self.settings.width,
+                outputs=("bmode",),
+                contact=contact,
+            )
+        share = 1.0 if frames.touch is None else float(frames.touch.shares[0])
+        return to_uint8(frames["bmode"][0].cpu().numpy()), share
+
+    def _off_goal(self, pose: FloatArray) -> tuple[float, float]:
+        """Distance of the middle of the face from that of the goal, mm, and the angle of the turn, degrees."""
+        faces = [one @ _pivot(self._probe) for one in (pose, self.goal)]
+        distance = position_distances_mm(faces[0][None], faces[1][None])[0, 0]
+        return float(distance), float(rotation_angles_deg(pose[None], self.goal[None])[0, 0])
+
+
+def _pivot(probe: Probe) -> FloatArray:  # [4, 4]
+    """Of the middle of the face in the probe's frame."""
+    pivot = np.eye(4)
+    pivot[2, 3] = probe.pivot_depth_mm
+    return pivot
+
+
+def _goal_of(scene: GaussianScene, goal: Any) -> FloatArray:  # [4, 4]
+    """The pose of a goal. Raises InvalidArgument, InvalidPose."""
+    views = scene.training_poses
+    if goal is not None and not isinstance(goal, (int, np.integer)):
+        return _one_pose(goal, "goal")
+    if not len(views):
+        raise InvalidArgument("goal must be a pose: the scene holds no training poses", field="goal")
+    number = len(views) // 2 if goal is None else int(goal)
+    if not 0 <= number < len(views):
+        raise InvalidArgument(
+            f"goal must be a pose, or the number of a training view, 0 to {len(views) - 1}, got {number}", field="goal"
+        )
+    found: FloatArray = views[number].copy()
+    return found
+
+
+def _one_pose(pose: Any, field: str) -> FloatArray:  # [4, 4]
+    """Raises InvalidPose."""
+    exact = check_poses(np.asarray(pose, np.float64), field=field)
+    if len(exact) != 1:
+        raise InvalidArgument(f"{field} must be one pose [4, 4], got {len(exact)}", field=field)
+    one: FloatArray = exact[0]
+    return one
