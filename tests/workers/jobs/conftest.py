@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 import os
 import signal
+import sqlite3
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +22,7 @@ from ultragray.datasets.released import write_released
 from ultragray.datasets.sweep import Dataset, Sweep
 from ultragray_workers.datasets.store import FILES_NAME, DatasetRecord, write_manifest
 from ultragray_workers.jobs.kinds import TrainJob
-from ultragray_workers.jobs.queue.database import JobDatabase
+from ultragray_workers.jobs.queue.database import SQLITE_FILE, JobDatabase
 from ultragray_workers.jobs.store import Job, JobState, JobStore
 
 from ...waiting import Deadline
@@ -99,6 +101,7 @@ class RunningWorker:
     def __init__(
         self, artifact_folder: Path, database_url: str | None, name: str, log: Path, options: dict[str, Any]
     ) -> None:
+        self._artifact_folder, self._database_url = artifact_folder, database_url
         with log.open("ab") as file:
             self.process = subprocess.Popen(
                 [sys.executable, "-c", PROGRAM, str(artifact_folder), name, json.dumps(options)],
@@ -110,6 +113,16 @@ class RunningWorker:
                 stdout=file,
                 stderr=file,
             )
+
+    def suspend(self) -> None:
+        """Stops it, but not while it writes: a SQLite file stays locked by who is stopped."""
+        with ExitStack() as stack:
+            if self._database_url is None:
+                database = stack.enter_context(
+                    closing(sqlite3.connect(self._artifact_folder / SQLITE_FILE, timeout=60))
+                )
+                database.execute("BEGIN IMMEDIATE")  # once nobody else writes
+            self.process.send_signal(signal.SIGSTOP)
 
     def kill(self) -> None:
         """As a loss of power to the worker would."""

@@ -127,7 +127,7 @@ def test_a_stopped_worker_loses_its_job_and_its_device(
     job, _ = store.submit(train_job("one", steps=600))
     until(job, is_training)
     process = one.job_process()
-    one.process.send_signal(signal.SIGSTOP)
+    one.suspend()
     start_worker("two")
     job = until(job)
     assert (job.state, job.worker, job.attempts) == (JobState.SUCCEEDED, "two", 2), job
@@ -149,7 +149,7 @@ def test_a_worker_that_comes_back_after_its_job_was_taken_over_leaves_it_alone(
     until(job, is_training)
     process = one.job_process()
     assert process is not None
-    one.process.send_signal(signal.SIGSTOP)
+    one.suspend()
     two = start_worker("two")
     job = until(job, lambda job: job.worker == "two" and is_training(job))
     # Of this host in truth, where two processes of one folder never are. Its stopped parent has not seen its end.
