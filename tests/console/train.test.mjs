@@ -3,7 +3,7 @@
 import assert from "node:assert/strict";
 import { describe, it } from "node:test";
 
-import { canvasState, openPage, picture, seriousFindings, until } from "./harness.mjs";
+import { CHECK_TIMEOUT_MS, canvasState, openPage, picture, seriousFindings, until } from "./harness.mjs";
 import { tested } from "./tested.mjs";
 
 const HELD_OUT = "Held-out PSNR in dB over step: validation, linear between frames, median compounding";
@@ -38,7 +38,7 @@ describe("train", () => {
   it("takes a sweep in, shows it, trains, tells how far it is, and opens the scene", async () => {
     const page = await openPage(at, "#/train");
     await upload(page, at.files.sweep, "sweep");
-    await page.getByText("28 to train from, 5 held out").waitFor();
+    await page.getByText("28 to train from, 5 held out").waitFor({ timeout: CHECK_TIMEOUT_MS });
     const frame = page.getByRole("img", { name: "Frame 0 of sweep" });
     await frame.waitFor();
     const room = page.getByTestId("space").locator("canvas");
@@ -121,7 +121,7 @@ describe("train", () => {
 
   it("shows the rendering as it is, keeps on after the service was down, and cancels", async () => {
     const page = await openPage(at, "#/train", { scheme: "dark" });
-    await page.getByText("28 to train from, 5 held out").waitFor();
+    await page.getByText("28 to train from, 5 held out").waitFor({ timeout: CHECK_TIMEOUT_MS });
     await start(page, "long", { Steps: "100000", "Most Gaussians": "800" });
     const preview = page.getByRole("img", { name: "A held-out frame and its rendering" });
     await preview.waitFor({ timeout: 180_000 }); // a training and its picture take turns on a busy machine

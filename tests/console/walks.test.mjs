@@ -6,7 +6,19 @@ import { mkdirSync } from "node:fs";
 import path from "node:path";
 import { after, before, describe, it } from "node:test";
 
-import { canvasState, goTo, launch, openPage, PYTHON, ROOT, SCREENSHOTS, Service, SOURCES, until } from "./harness.mjs";
+import {
+  CHECK_TIMEOUT_MS,
+  canvasState,
+  goTo,
+  launch,
+  openPage,
+  PYTHON,
+  ROOT,
+  SCREENSHOTS,
+  Service,
+  SOURCES,
+  until,
+} from "./harness.mjs";
 import { changed, IMAGE, poseOf } from "./scan_page.mjs";
 import { makeSweep } from "./sweep.mjs";
 
@@ -187,7 +199,7 @@ describe("a machine learning engineer", () => {
     await page.getByLabel("Add a sweep").setInputFiles(at.files.sweep);
     await page.getByLabel("Name", { exact: true }).fill("sweep");
     await page.getByRole("button", { name: "Upload and check" }).click();
-    await page.getByText("28 to train from, 5 held out").waitFor();
+    await page.getByText("28 to train from, 5 held out").waitFor({ timeout: CHECK_TIMEOUT_MS });
     await page.getByRole("img", { name: "Frame 0 of sweep" }).waitFor();
     await seen("uploads");
 
