@@ -54,14 +54,19 @@ def poses_from_image_transforms(
     return poses, LinearProbe(width_mm=width_mm, near_mm=0.0, far_mm=depth_mm)
 
 
+def pixel_size_mm(transforms: FloatArray) -> tuple[float, float]:  # [F, 4, 4] pixels → mm
+    """Lateral and axial size of a pixel."""
+    lateral_mm, axial_mm = np.median(np.linalg.norm(transforms[:, :3, :2], axis=1), axis=0).tolist()
+    return lateral_mm, axial_mm
+
+
 def region_of(
     size: tuple[int, ...],
     box: CropBox,
-    transforms: FloatArray,  # [F, 4, 4] pixels → mm
+    pixel_mm: tuple[float, float],  # lateral, axial
     calibration: FloatArray | None,  # [4, 4]
 ) -> ImageRegion:
     """The region of a crop in images of (rows, columns)."""
-    lateral_mm, axial_mm = np.median(np.linalg.norm(transforms[:, :3, :2], axis=1), axis=0).tolist()
     return ImageRegion(
         image_width=size[1],
         image_height=size[0],
@@ -69,7 +74,7 @@ def region_of(
         top=box.top,
         width=box.width,
         height=box.height,
-        lateral_mm=lateral_mm,
-        axial_mm=axial_mm,
+        lateral_mm=pixel_mm[0],
+        axial_mm=pixel_mm[1],
         image_to_probe=() if calibration is None else tuple(calibration.ravel().tolist()),
     )

@@ -21,7 +21,7 @@ from ..errors import DatasetInvalid, InvalidPose
 from ..files.poses import load_poses
 from ..installation import missing_extra
 from ..probe import FloatArray
-from .calibration import poses_from_image_transforms, region_of
+from .calibration import pixel_size_mm, poses_from_image_transforms, region_of
 from .images import MAX_PIXEL_BYTES, CropBox, parse_crop
 from .splits import parse_frame_ranges
 from .sweep import ByteArray, IntArray, Sweep
@@ -59,7 +59,7 @@ def read_dicom_sweep(path: Path, *, frames: str | None = None, crop: str | None 
     box_poses, probe = poses_from_image_transforms(poses[chosen] @ image_to_probe, box, chosen, path)
     images = _read_frames(path, header, shape, chosen)[:, box.top : box.bottom, box.left : box.right]
     notes = () if "TransducerType" in header else ("the file does not name its transducer: taken as a linear one",)
-    shown = region_of(shape[1:], box, poses[:1] @ image_to_probe, image_to_probe)
+    shown = region_of(shape[1:], box, pixel_size_mm(poses[:1] @ image_to_probe), image_to_probe)
     sweep = Sweep(np.ascontiguousarray(images), box_poses, probe, chosen, str(path), notes, shown)
     return sweep, shape[0]
 

@@ -36,6 +36,14 @@ class SourceOptions(Contract):
         "Region of a sequence's image that shows ultrasound: columns,rows, such as 188:632,12:600 (ends left out).",
         None,
     )
+    fan: str | None = described(
+        "Fan on the screen, of a sequence of a convex or phased probe: opening angle (degrees), radius of the face and "
+        "of the end (mm), column and row of the apex, such as 60,40,90,319.5,-120.",
+        None,
+    )
+    transform: str | None = described(
+        "Tracked transform of a sequence to take, such as ProbeToTracker, where there are several.", None
+    )
     image_size: str | None = described("Resize the frames: WIDTHxHEIGHT, such as 192x256.", None)
 
     def __post_init__(self) -> None:
@@ -148,7 +156,14 @@ def _load_plus(source: str, options: SourceOptions) -> Dataset:
     from .plus import read_plus_sweep
 
     path = Path(source)
-    read = read_plus_sweep(path, device_set=options.device_set, frames=options.frames, crop=options.crop)
+    read = read_plus_sweep(
+        path,
+        device_set=options.device_set,
+        frames=options.frames,
+        crop=options.crop,
+        fan=options.fan,
+        transform=options.transform,
+    )
     return _split_sequence(path, options, *read)
 
 
@@ -185,7 +200,7 @@ FORMATS: Mapping[str, DatasetFormat] = {
             is_source=lambda source: source.lower().endswith(PLUS_SUFFIXES),
             load=_load_plus,
             files=tuple(f"*{suffix}" for suffix in PLUS_SUFFIXES),
-            options=("frames", "device_set", "crop"),
+            options=("frames", "device_set", "crop", "fan", "transform"),
             beside=(".raw", ".zraw", ".raw.gz"),
             companions={"device_set": "*.xml"},
         ),

@@ -30,18 +30,22 @@ class UploadHeader(_message.Message):
     def __init__(self, dataset: _Optional[str] = ..., options: _Optional[_Union[DatasetOptions, _Mapping]] = ..., archive: _Optional[bool] = ..., private: _Optional[bool] = ...) -> None: ...
 
 class DatasetOptions(_message.Message):
-    __slots__ = ("crop", "image_size", "frames", "train_frames", "val_frames")
+    __slots__ = ("crop", "image_size", "frames", "train_frames", "val_frames", "fan", "transform")
     CROP_FIELD_NUMBER: _ClassVar[int]
     IMAGE_SIZE_FIELD_NUMBER: _ClassVar[int]
     FRAMES_FIELD_NUMBER: _ClassVar[int]
     TRAIN_FRAMES_FIELD_NUMBER: _ClassVar[int]
     VAL_FRAMES_FIELD_NUMBER: _ClassVar[int]
+    FAN_FIELD_NUMBER: _ClassVar[int]
+    TRANSFORM_FIELD_NUMBER: _ClassVar[int]
     crop: str
     image_size: str
     frames: str
     train_frames: str
     val_frames: str
-    def __init__(self, crop: _Optional[str] = ..., image_size: _Optional[str] = ..., frames: _Optional[str] = ..., train_frames: _Optional[str] = ..., val_frames: _Optional[str] = ...) -> None: ...
+    fan: str
+    transform: str
+    def __init__(self, crop: _Optional[str] = ..., image_size: _Optional[str] = ..., frames: _Optional[str] = ..., train_frames: _Optional[str] = ..., val_frames: _Optional[str] = ..., fan: _Optional[str] = ..., transform: _Optional[str] = ...) -> None: ...
 
 class UploadDatasetResponse(_message.Message):
     __slots__ = ("dataset", "created")

@@ -5,11 +5,22 @@ from __future__ import annotations
 from pathlib import Path
 
 from ...errors import DatasetInvalid
-from .sequence import StoredSequence, header_lines, pixel_shape, read_payload, split_fields, whole_numbers
+from .sequence import (
+    StoredSequence,
+    header_lines,
+    pixel_shape,
+    read_payload,
+    read_wide_payload,
+    split_fields,
+    whole_numbers,
+)
+
+_DTYPES = {"MET_UCHAR": "u1", "MET_USHORT": "u2", "MET_SHORT": "i2"}
+_MOST_SIGNIFICANT_FIRST = ("BinaryDataByteOrderMSB", "ElementByteOrderMSB")
 
 
 def read_meta_image(path: Path) -> StoredSequence:
-    """The sequence in a MetaImage file of 8-bit pixels. Raises DatasetInvalid, naming the file and the reason."""
+    """The sequence in a MetaImage file of 8 or 16 bits a pixel. Raises DatasetInvalid, naming file and reason."""
     with path.open("rb") as file:
         entries: dict[str, str] = {}
         for line in header_lines(file, path):
@@ -22,9 +33,11 @@ def read_meta_image(path: Path) -> StoredSequence:
         else:
             raise DatasetInvalid(f"{path}: not a MetaImage file, or truncated: its header has no ElementDataFile")
         offset = file.tell()
-    if entries.get("ElementType") != "MET_UCHAR" or entries.get("BinaryData", "True").lower() != "true":
+    dtype = _DTYPES.get(entries.get("ElementType", ""))
+    if dtype is None or entries.get("BinaryData", "True").lower() != "true":
         raise DatasetInvalid(
-            f"{path}: pixels must be binary MET_UCHAR (8 bits), got ElementType {entries.get('ElementType', 'missing')}"
+            f"{path}: pixels must be binary {', '.join(_DTYPES)}, got ElementType "
+            f"{entries.get('ElementType', 'missing')}"
         )
     sizes = whole_numbers(path, "DimSize", entries.get("DimSize", ""))
     channels = whole_numbers(path, "ElementNumberOfChannels", entries.get("ElementNumberOfChannels", "1"))[0]
@@ -32,11 +45,10 @@ def read_meta_image(path: Path) -> StoredSequence:
     fields, frame_fields = split_fields(path, entries, shape[0])
     local = entries["ElementDataFile"].upper() == "LOCAL"
     header_size = whole_numbers(path, "HeaderSize", entries.get("HeaderSize", "0"))[0]
-    pixels = read_payload(
-        path,
-        None if local else entries["ElementDataFile"],
-        offset if local else header_size,
-        shape,
-        deflated=entries.get("CompressedData", "False").lower() == "true",
-    )
-    return StoredSequence(path, pixels, fields, frame_fields)
+    place = (None if local else entries["ElementDataFile"], offset if local else header_size, shape)
+    deflated = entries.get("CompressedData", "False").lower() == "true"
+    if dtype == "u1":
+        return StoredSequence(path, read_payload(path, *place, deflated=deflated), fields, frame_fields)
+    most_first = any(entries.get(key, "False").lower() == "true" for key in _MOST_SIGNIFICANT_FIRST)
+    pixels, note = read_wide_payload(path, *place, (">" if most_first else "<") + dtype, deflated=deflated)
+    return StoredSequence(path, pixels, fields, frame_fields, (note,))

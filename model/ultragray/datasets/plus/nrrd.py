@@ -6,20 +6,33 @@ from pathlib import Path
 from typing import BinaryIO
 
 from ...errors import DatasetInvalid
-from .sequence import StoredSequence, header_lines, pixel_shape, read_payload, split_fields, whole_numbers
+from .sequence import (
+    StoredSequence,
+    header_lines,
+    pixel_shape,
+    read_payload,
+    read_wide_payload,
+    split_fields,
+    whole_numbers,
+)
 
-_BYTE_TYPES = ("uchar", "unsigned char", "uint8", "uint8_t")
+_DTYPES = {
+    **dict.fromkeys(("uchar", "unsigned char", "uint8", "uint8_t"), "u1"),
+    **dict.fromkeys(("ushort", "unsigned short", "unsigned short int", "uint16", "uint16_t"), "u2"),
+    **dict.fromkeys(("short", "short int", "signed short", "signed short int", "int16", "int16_t"), "i2"),
+}
 _TIME_KINDS = ("list", "time")
 _COLOUR_KINDS = ("vector", "rgb-color", "rgba-color", "3-color", "4-color", "3-vector", "4-vector")
 
 
 def read_nrrd(path: Path) -> StoredSequence:
-    """The sequence in an NRRD file of 8-bit pixels. Raises DatasetInvalid, naming the file and the reason."""
+    """The sequence in an NRRD file of 8 or 16 bits a pixel. Raises DatasetInvalid, naming file and reason."""
     with path.open("rb") as file:
         fields, own = _read_header(file, path)
         offset = file.tell()
-    if fields.get("type", "").lower() not in _BYTE_TYPES:
-        raise DatasetInvalid(f"{path}: pixels must be 8 bits (uchar), got type {fields.get('type', 'missing')}")
+    dtype = _DTYPES.get(fields.get("type", "").lower())
+    if dtype is None:
+        raise DatasetInvalid(f"{path}: pixels must be uchar, ushort or short, got type {fields.get('type', 'missing')}")
     encoding = fields.get("encoding", "").lower()
     if encoding not in ("raw", "gzip", "gz"):
         raise DatasetInvalid(f"{path}: encoding must be raw or gzip, got {encoding or 'none'}")
@@ -28,8 +41,12 @@ def read_nrrd(path: Path) -> StoredSequence:
     shape = _shape(path, fields)
     file_fields, frame_fields = split_fields(path, own, shape[0])
     data_file = fields.get("data file", fields.get("datafile"))
-    pixels = read_payload(path, data_file, 0 if data_file else offset, shape, deflated=encoding != "raw")
-    return StoredSequence(path, pixels, file_fields, frame_fields)
+    place, deflated = (data_file, 0 if data_file else offset, shape), encoding != "raw"
+    if dtype == "u1":
+        return StoredSequence(path, read_payload(path, *place, deflated=deflated), file_fields, frame_fields)
+    order = ">" if fields.get("endian", "little").lower() == "big" else "<"
+    pixels, note = read_wide_payload(path, *place, order + dtype, deflated=deflated)
+    return StoredSequence(path, pixels, file_fields, frame_fields, (note,))
 
 
 def _read_header(file: BinaryIO, path: Path) -> tuple[dict[str, str], dict[str, str]]:

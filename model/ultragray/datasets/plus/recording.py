@@ -11,13 +11,14 @@ from pathlib import Path
 
 import numpy as np
 
-from ...errors import DatasetInvalid, InvalidPose
+from ...errors import DatasetInvalid, InvalidArgument, InvalidPose
 from ...pose import check_poses
-from ...probe import FloatArray
-from ..calibration import poses_from_image_transforms, region_of
+from ...probe import FloatArray, Probe
+from ..calibration import pixel_size_mm, poses_from_image_transforms, region_of
 from ..images import grey_frames, parse_crop
 from ..splits import parse_frame_ranges
 from ..sweep import Sweep
+from .fan import FanGeometry, FanLines, fan_of_device_set, parse_fan, poses_of_fan
 from .meta_image import read_meta_image
 from .nrrd import read_nrrd
 from .orientation import UNKNOWN, orient_frames
@@ -31,35 +32,61 @@ _IMAGE_STATUSES = ("ImageStatus", "Status")  # as MetaImage and NRRD sequences c
 
 
 def read_plus_sweep(
-    path: Path, *, device_set: Path | None = None, frames: str | None = None, crop: str | None = None
+    path: Path,
+    *,
+    device_set: Path | None = None,
+    frames: str | None = None,
+    crop: str | None = None,
+    fan: str | None = None,
+    transform: str | None = None,
 ) -> tuple[Sweep, int]:
     """The frames of a sequence that have a valid pose, and the number of frames in the file.
 
     `frames` (ranges, `parse_frame_ranges`) chooses among them, `crop` is "columns,rows" of the image after it was
-    brought to x lateral, y depth. Transforms of the device set go before those of the same name in the sequence.
-    Frames whose status is not OK are left out, and the sweep's notes say so; a sequence without statuses is taken to
-    be valid. Raises DatasetInvalid, naming the file, the frame and the reason; InvalidArgument for `frames` and
-    `crop` that do not fit.
+    brought to x lateral, y depth. `fan` (`parse_fan`), or without `crop` the fan of the device set, says that the
+    images are those of a convex or phased probe on a screen: the frames are its scan lines, the poses have their
+    origin at the apex. `transform` names the tracked transform to take, such as ProbeToTracker, where there are
+    several trackers: poses are then in the frame that it leads to. Transforms of the device set go before those of
+    the same name in the sequence. Frames whose status is not OK are left out, and the sweep's notes say so; a
+    sequence without statuses is taken to be valid. Raises DatasetInvalid, naming the file, the frame and the reason;
+    InvalidArgument for options that do not fit.
     """
+    if fan is not None and crop is not None:
+        raise InvalidArgument("fan must be given without crop: it says where the image lies", field="fan")
     stored = _READERS[path.suffix.lower()](path)
     frame_count = len(stored.pixels)
     chosen = range(frame_count) if frames is None else parse_frame_ranges(frames, frame_count, option="frames")
     _check_image_type(stored)
     orientation = _field(stored, "UltrasoundImageOrientation").upper()
-    fixed = {} if device_set is None else read_device_set(device_set)
-    way = _way_to_world(stored, fixed, device_set)
+    known = None if device_set is None else read_device_set(device_set)
+    fixed = {} if known is None else known.transforms
+    way = _way_to_world(stored, fixed, device_set, transform)
     numbers, transforms = _image_transforms(stored, chosen, way, fixed)
     images = orient_frames(grey_frames(stored.pixels, str(path)), orientation, path)
-    box = parse_crop(crop, *images.shape[1:])
-    poses, probe = poses_from_image_transforms(transforms, box, numbers, path)
+    size = images.shape[1], images.shape[2]
+    box = parse_crop(crop, *size)
+    poses, linear = poses_from_image_transforms(transforms, box, numbers, path)
+    probe: Probe = linear
+    pixel_mm = pixel_size_mm(transforms)
+    whole = crop is None and fan is None
+    geometry = parse_fan(fan) if fan else fan_of_device_set(known, pixel_mm) if whole and known else None
+    if geometry is None:
+        shown = images[numbers, box.top : box.bottom, box.left : box.right]
+        fan_notes = []
+    else:
+        lines = FanLines(geometry, size, pixel_mm)
+        shown, box, probe = lines.frames(images[numbers]), lines.box, geometry.probe()
+        poses = poses_of_fan(poses, geometry, size[1], pixel_mm)
+        fan_notes = _fan_notes(geometry, lines, given=fan is not None)
+    left_out = sorted(set(chosen) - set(numbers.tolist()))
     sweep = Sweep(
-        images=np.ascontiguousarray(images[numbers, box.top : box.bottom, box.left : box.right]),
+        images=np.ascontiguousarray(shown),
         poses=poses,
         probe=probe,
         frame_numbers=numbers,
         source=str(path),
-        region=region_of(images.shape[1:], box, transforms, _calibration(stored, fixed)),
-        notes=_notes(orientation, crop, images.shape[1:], sorted(set(chosen) - set(numbers.tolist()))),
+        region=region_of(size, box, pixel_mm, _calibration(stored, fixed)),
+        notes=(*stored.notes, *_notes(orientation, size if whole and geometry is None else None, left_out), *fan_notes),
     )
     return sweep, frame_count
 
@@ -87,7 +114,10 @@ def _check_image_type(stored: StoredSequence) -> None:
 
 
 def _way_to_world(
-    stored: StoredSequence, fixed: Mapping[TransformName, FloatArray], device_set: Path | None
+    stored: StoredSequence,
+    fixed: Mapping[TransformName, FloatArray],
+    device_set: Path | None,
+    transform: str | None,
 ) -> list[tuple[TransformName, bool]]:
     """The transforms from Image to the frame that poses are given in, by name: the same for every frame."""
     names = {
@@ -96,11 +126,24 @@ def _way_to_world(
         for key in fields
         if key.endswith(_TRANSFORM) and (name := transform_name(key.removesuffix(_TRANSFORM)))
     }
+    known = ", ".join(sorted("To".join(name) for name in {*names, *fixed})) or "none"
+    if transform is not None:
+        wanted = transform_name(transform)
+        if wanted is None or wanted not in {*names, *fixed}:
+            raise InvalidArgument(
+                f"transform must be one of the sequence, such as ProbeToTracker; there are {known}, got "
+                f"{transform[:80]!r}",
+                field="transform",
+            )
+        others = {*names, *fixed} - {wanted}
+        before = find_path(others, IMAGE, wanted[0])
+        if before is None:
+            raise DatasetInvalid(f"{stored.path}: no transforms lead from {IMAGE} to {wanted[0]}; there are {known}")
+        return [*before, (wanted, False)]
     for world in WORLDS:
         way = find_path([*names, *fixed], IMAGE, world)
         if way is not None:
             return way
-    known = ", ".join(sorted("To".join(name) for name in {*names, *fixed})) or "none"
     hint = "" if device_set else " (give the device set that holds ImageToProbe)"
     raise DatasetInvalid(
         f"{stored.path}: no transforms lead from {IMAGE} to {', '.join(WORLDS[:-1])} or {WORLDS[-1]}; there are {known}"
@@ -157,13 +200,21 @@ def _tracked(way: list[tuple[TransformName, bool]], fixed: Mapping[TransformName
     return " and ".join("To".join(name) for name, _ in way if name not in fixed) or "image"
 
 
-def _notes(orientation: str, crop: str | None, size: tuple[int, ...], left_out: list[int]) -> tuple[str, ...]:
+def _fan_notes(fan: FanGeometry, lines: FanLines, *, given: bool) -> list[str]:
+    notes = [] if given else [f"the fan of the device set was taken: {fan.words}"]
+    if lines.share < 1.0 - 1e-3:
+        notes.append(f"{1.0 - lines.share:.1%} of the fan lies beyond the image and is black")
+    return notes
+
+
+def _notes(orientation: str, whole: tuple[int, int] | None, left_out: list[int]) -> list[str]:
+    """`whole`: rows and columns of images that were neither cropped nor brought back from a fan."""
     notes = []
     if left_out:
         listed = ", ".join(map(str, left_out[:10])) + (", …" if len(left_out) > 10 else "")
         notes.append(f"frames without a valid pose or image were left out: {listed} ({len(left_out)} in all)")
     if orientation in UNKNOWN:
         notes.append("the file does not say how its images are oriented: taken as MF, columns lateral, rows depth")
-    if crop is None:
-        notes.append(f"no crop was given: the whole image of {size[1]} x {size[0]} pixels is taken as ultrasound")
-    return tuple(notes)
+    if whole is not None:
+        notes.append(f"no crop was given: the whole image of {whole[1]} x {whole[0]} pixels is taken as ultrasound")
+    return notes

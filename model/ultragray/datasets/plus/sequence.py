@@ -33,6 +33,7 @@ class StoredSequence:
     pixels: ByteArray  # [F, rows, columns] or [F, rows, columns, 3]
     fields: Mapping[str, str]  # of the file
     frame_fields: tuple[Mapping[str, str], ...]  # [F]
+    notes: tuple[str, ...] = ()  # what reading the pixels changed
 
 
 def header_lines(file: BinaryIO, path: Path) -> Iterator[str]:
@@ -111,6 +112,24 @@ def read_payload(
         pixels = _inflate(file.read(deflated_limit), path, expected)
     _require_size(path, header, len(pixels), expected)
     return np.frombuffer(pixels, np.uint8).reshape(shape)
+
+
+def read_wide_payload(
+    header: Path, file_name: str | None, offset: int, shape: tuple[int, ...], dtype: str, *, deflated: bool
+) -> tuple[ByteArray, str]:
+    """Pixels of 16 bits (a numpy dtype such as ">i2") as uint8 of `shape`, and a note that says how.
+
+    The power of two above the largest value of the file becomes 256, so that sequences of one scanner are scaled
+    alike. Raises what `read_payload` raises, and DatasetInvalid for values below 0.
+    """
+    stored = read_payload(header, file_name, offset, (*shape, 2), deflated=deflated).view(dtype)[..., 0]
+    if int(stored.min()) < 0:
+        raise DatasetInvalid(f"{header}: 16-bit pixels must not be below 0, the smallest is {stored.min()}")
+    surplus = max(0, int(stored.max()).bit_length() - 8)
+    pixels = np.empty(shape, np.uint8)
+    for frame, out in zip(stored, pixels, strict=True):
+        out[:] = frame >> surplus
+    return pixels, f"pixels of 16 bits were made 8: {(256 << surplus) - 1} became 255"
 
 
 def _inflate(data: bytes, path: Path, expected: int) -> bytes:

@@ -6,7 +6,8 @@ p_Tracker = ProbeToTracker · p_Probe, [4, 4], mm; coordinates of `Image` are pi
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -41,11 +42,17 @@ def parse_matrix(text: str, where: str) -> FloatArray:  # [4, 4]
     return matrix
 
 
-def read_device_set(path: Path) -> dict[TransformName, FloatArray]:
-    """The transforms under CoordinateDefinitions of a PLUS device set (XML).
+@dataclass(frozen=True)
+class DeviceSet:
+    """A PLUS device set (XML)."""
 
-    Raises DatasetInvalid, naming the file, where it cannot be read or holds none.
-    """
+    path: Path
+    root: ElementTree.Element
+    transforms: Mapping[TransformName, FloatArray]  # under CoordinateDefinitions
+
+
+def read_device_set(path: Path) -> DeviceSet:
+    """Raises DatasetInvalid, naming the file, where it cannot be read or holds no transforms."""
     if not path.is_file():
         raise DatasetInvalid(f"{path}: no such file")
     if path.stat().st_size > MAX_DEVICE_SET_BYTES:
@@ -64,7 +71,7 @@ def read_device_set(path: Path) -> dict[TransformName, FloatArray]:
             transforms[origin, target] = parse_matrix(matrix, f"{path}: {origin}To{target}")
     if not transforms:
         raise DatasetInvalid(f"{path}: it has no Transform under CoordinateDefinitions")
-    return transforms
+    return DeviceSet(path, root, transforms)
 
 
 def find_path(names: Iterable[TransformName], start: str, goal: str) -> list[tuple[TransformName, bool]] | None:

@@ -37,7 +37,7 @@ def test_colour_and_four_sizes(tmp_path: Path, plus_files: SimpleNamespace) -> N
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"ElementType": "MET_USHORT"}, "8 bits.*MET_USHORT"),
+        ({"ElementType": "MET_FLOAT"}, "MET_UCHAR, MET_USHORT, MET_SHORT.*MET_FLOAT"),
         ({"BinaryData": "False"}, "must be binary"),
         ({"DimSize": "7 5"}, "columns x rows x frames, got 7 x 5"),
         ({"DimSize": "7 5 4 3"}, "columns x rows x frames"),

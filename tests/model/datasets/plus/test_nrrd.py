@@ -38,7 +38,7 @@ def test_colour_and_four_sizes(tmp_path: Path, plus_files: SimpleNamespace) -> N
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"type": "float"}, "8 bits .*float"),
+        ({"type": "float"}, "uchar, ushort or short, got type float"),
         ({"encoding": "bzip2"}, "raw or gzip, got bzip2"),
         ({"sizes": "7 5"}, "columns x rows x frames"),
         ({"sizes": "7 5 x"}, "sizes must be whole numbers"),

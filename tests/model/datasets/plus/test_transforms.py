@@ -78,6 +78,6 @@ def test_a_missing_device_set_is_named(tmp_path: Path) -> None:
 
 
 def test_a_device_set(device_set: Path) -> None:
-    transforms = read_device_set(device_set)
+    transforms = read_device_set(device_set).transforms
     assert list(transforms) == [("Image", "Probe")]
     np.testing.assert_allclose(np.linalg.norm(transforms["Image", "Probe"][:3, :2], axis=0), [0.2, 0.1])

@@ -1,0 +1,162 @@
+"""Images of convex and phased probes on a screen, read as scan lines."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from ultragray import ConvexProbe, PhasedProbe
+from ultragray.datasets.plus import read_plus_sweep
+from ultragray.datasets.source import SourceOptions, load_dataset
+from ultragray.errors import DatasetInvalid, InvalidArgument
+
+ROWS, COLUMNS = 240, 300
+PIXEL_MM = (0.2, 0.1)  # lateral, axial: as the device set of the tests says
+OPENING_DEG, NEAR_MM, FAR_MM = 60.0, 10.0, 26.0
+APEX = (149.5, -40.0)  # column, row
+FAN = "60,10,26,149.5,-40"
+
+
+def screen(
+    value: Callable[[np.ndarray, np.ndarray], np.ndarray], apex: tuple[float, float] = APEX
+) -> np.ndarray:  # [rows, columns]
+    """An image whose pixels hold a value of the angle in degrees and the radius in mm; 7 beyond the fan."""
+    row, column = np.indices((ROWS, COLUMNS))
+    x, z = (column - apex[0]) * PIXEL_MM[0], (row - apex[1]) * PIXEL_MM[1]
+    angle, radius = np.degrees(np.arctan2(x, z)), np.hypot(x, z)
+    within = (np.abs(angle) <= OPENING_DEG / 2 + 1) & (radius >= NEAR_MM - 0.5) & (radius <= FAR_MM + 0.5)
+    return np.where(within, np.rint(value(angle, radius)), 7).astype(np.uint8)
+
+
+def of_both(angle: np.ndarray, radius: np.ndarray) -> np.ndarray:
+    return 70 + 2 * angle + 3 * (radius - NEAR_MM)
+
+
+def test_a_fan_becomes_scan_lines(tmp_path: Path, plus_files: SimpleNamespace, device_set: Path) -> None:
+    path = plus_files.write_mha(tmp_path / "s.mha", np.stack([screen(of_both)] * 2), plus_files.tracked_fields(2))
+    sweep, _ = read_plus_sweep(path, device_set=device_set, fan=FAN)
+    assert sweep.probe == ConvexProbe(OPENING_DEG, NEAR_MM, FAR_MM)
+    _, rows, lines = sweep.images.shape
+    assert (rows, lines) == (160, 94)  # 16 mm of .1 mm; 60° of the radius 18 mm are 18.8 mm of .2 mm
+    radius = NEAR_MM + (np.arange(rows) + 0.5) / rows * (FAR_MM - NEAR_MM)
+    angle = -OPENING_DEG / 2 + (np.arange(lines) + 0.5) / lines * OPENING_DEG
+    expected = of_both(angle[None, :], radius[:, None])
+    np.testing.assert_allclose(sweep.images[1], expected, atol=1.1)  # one grey value of rounding, twice
+
+
+def test_its_pose_is_that_of_the_apex(tmp_path: Path, plus_files: SimpleNamespace, device_set: Path) -> None:
+    """A point of the image is where the probe's own geometry has it, also in a fan that leans."""
+    stored, fields = np.stack([screen(of_both)] * 2), plus_files.tracked_fields(2)
+    path = plus_files.write_mha(tmp_path / "s.mha", stored, fields)
+    leaning = tmp_path / "leaning.xml"
+    scan_conversion = (
+        '<ScanConversion TransducerGeometry="CURVILINEAR" RadiusStartMm="10" RadiusStopMm="26" ThetaStartDeg="-20" '
+        'ThetaStopDeg="40" TransducerCenterPixel="149.5 60"/>'
+    )
+    leaning.write_text(device_set.read_text().replace("</PlusConfiguration>", f"{scan_conversion}</PlusConfiguration>"))
+    sweep, _ = read_plus_sweep(path, device_set=leaning)
+    assert sweep.probe == ConvexProbe(60.0, 10.0, 26.0)
+    assert any("fan of the device set was taken: -20 to 40°" in note for note in sweep.notes)
+    plain, _ = read_plus_sweep(path, device_set=device_set)
+    for row, line in ((0, 0), (80, 50), (159, 93)):
+        radius = 10.0 + (row + 0.5) / 160 * 16.0
+        along = np.radians(-20 + (line + 0.5) / 94 * 60)
+        column, image_row = APEX[0] + radius * np.sin(along) / 0.2, APEX[1] + radius * np.cos(along) / 0.1
+        top_centre = ((column - (COLUMNS - 1) / 2) * 0.2, 0.0, (image_row + 0.5) * 0.1, 1.0)
+        on_scan_line = np.radians(-30 + (line + 0.5) / 94 * 60)
+        in_probe = (radius * np.sin(on_scan_line), 0.0, radius * np.cos(on_scan_line), 1.0)
+        np.testing.assert_allclose(sweep.poses[0] @ in_probe, plain.poses[0] @ top_centre, atol=1e-9)
+
+
+def test_a_fan_from_a_point_is_a_phased_probe(tmp_path: Path, plus_files: SimpleNamespace, device_set: Path) -> None:
+    path = plus_files.write_mha(tmp_path / "s.mha", np.stack([screen(of_both)] * 2), plus_files.tracked_fields(2))
+    dataset = load_dataset(path, SourceOptions(device_set=device_set, fan="60,0,20,149.5,0"))
+    assert dataset.probe == PhasedProbe(60.0, 20.0)
+
+
+def test_the_fan_that_plus_clips_to(tmp_path: Path, plus_files: SimpleNamespace, device_set: Path) -> None:
+    path = plus_files.write_mha(tmp_path / "s.mha", np.stack([screen(of_both)] * 2), plus_files.tracked_fields(2))
+    clip = (
+        '<VolumeReconstruction FanAnglesDeg="-30 30" FanOriginPixel="149.5 -40" FanRadiusStartPixel="100" '
+        'FanRadiusStopPixel="260"/></PlusConfiguration>'
+    )
+    clipping = tmp_path / "clipping.xml"
+    clipping.write_text(device_set.read_text().replace("</PlusConfiguration>", clip))
+    with pytest.raises(DatasetInvalid, match=r"clipping\.xml: .* pixels, which must be square: they are 0\.2 x 0\.1"):
+        read_plus_sweep(path, device_set=clipping)
+    cropped, _ = read_plus_sweep(path, device_set=clipping, crop="0:300,0:240")  # who crops wants no fan
+    assert cropped.images.shape[1:] == (ROWS, COLUMNS)
+    matrix = plus_files.image_to_probe @ np.diag([0.5, 1.0, 1.0, 1.0])  # 0.1 x 0.1 mm
+    clipping.write_text(
+        clipping.read_text().replace(plus_files.numbers(plus_files.image_to_probe), plus_files.numbers(matrix))
+    )
+    clipped, _ = read_plus_sweep(path, device_set=clipping)
+    assert clipped.probe == ConvexProbe(60.0, 10.0, 26.0)
+
+
+@pytest.mark.parametrize(
+    ("fan", "message"),
+    [
+        ("60,10,26,149.5", "fan must be opening angle .* such as 60,40,90"),
+        ("60,10,26,149.5,nan", "must be finite"),
+        ("200,10,26,149.5,-40", "at most 175°, got 200"),
+        ("60,30,26,149.5,-40", "the end beyond the face, got 30 and 26 mm"),
+        ("60,10,26,1490,-40", "fan must lie in the image of 300 x 240 pixels"),
+    ],
+)
+def test_fans_that_cannot_be_are_refused(
+    tmp_path: Path, plus_files: SimpleNamespace, device_set: Path, fan: str, message: str
+) -> None:
+    path = plus_files.write_mha(tmp_path / "s.mha", np.stack([screen(of_both)] * 2), plus_files.tracked_fields(2))
+    with pytest.raises(InvalidArgument, match=message):
+        read_plus_sweep(path, device_set=device_set, fan=fan)
+
+
+def test_a_crop_and_a_fan_exclude_each_other(tmp_path: Path, plus_files: SimpleNamespace, device_set: Path) -> None:
+    path = plus_files.write_mha(tmp_path / "s.mha", np.stack([screen(of_both)] * 2), plus_files.tracked_fields(2))
+    with pytest.raises(InvalidArgument, match="fan must be given without crop"):
+        read_plus_sweep(path, device_set=device_set, fan=FAN, crop="0:10,0:10")
+
+
+def test_a_tracker_is_chosen_among_several(tmp_path: Path, plus_files: SimpleNamespace, device_set: Path) -> None:
+    stored, fields = plus_files.speckle(3, 30, 20), plus_files.tracked_fields(3)
+    other = np.eye(4)
+    for frame in range(3):
+        other[:3, 3] = (0, 10 * frame, 0)
+        fields[f"Seq_Frame{frame:04d}_ProbeToCameraTransform"] = plus_files.numbers(other)
+        fields[f"Seq_Frame{frame:04d}_ProbeToCameraTransformStatus"] = "OK"
+    path = plus_files.write_mha(tmp_path / "s.mha", stored, fields)
+    usual, _ = read_plus_sweep(path, device_set=device_set)
+    camera, _ = read_plus_sweep(path, device_set=device_set, transform="ProbeToCamera")
+    assert np.ptp(usual.poses[:, 1, 3]) < np.ptp(camera.poses[:, 1, 3]) == pytest.approx(20.0)
+    with pytest.raises(InvalidArgument, match="there are ImageToProbe, ProbeToCamera, ProbeToTracker, got 'ProbeToNo'"):
+        read_plus_sweep(path, device_set=device_set, transform="ProbeToNo")
+
+
+@pytest.mark.parametrize("most_first", [False, True])
+def test_sixteen_bits_become_eight(
+    tmp_path: Path, plus_files: SimpleNamespace, device_set: Path, most_first: bool
+) -> None:
+    stored = np.arange(2 * 30 * 20).reshape(2, 30, 20)  # up to 1199: 11 bits
+    order = ">" if most_first else "<"
+    wide = np.frombuffer(stored.astype(f"{order}u2").tobytes(), np.uint8).reshape(2, 30, 40)
+    fields = plus_files.tracked_fields(2) | {"ElementType": "MET_USHORT", "DimSize": "20 30 2"}
+    path = plus_files.write_mha(tmp_path / "s.mha", wide, fields | {"BinaryDataByteOrderMSB": str(most_first)})
+    sweep, _ = read_plus_sweep(path, device_set=device_set)
+    np.testing.assert_array_equal(sweep.images, stored >> 3)
+    assert "pixels of 16 bits were made 8: 2047 became 255" in sweep.notes
+    changes = {"type": "uint16", "sizes": "20 30 2", "endian": "big" if most_first else "little"}
+    nrrd = plus_files.write_nrrd(tmp_path / "s.nrrd", wide, plus_files.tracked_fields(2), **changes)
+    np.testing.assert_array_equal(read_plus_sweep(nrrd, device_set=device_set)[0].images, stored >> 3)
+
+
+def test_values_below_zero_are_refused(tmp_path: Path, plus_files: SimpleNamespace, device_set: Path) -> None:
+    stored = np.full((2, 30, 20), -1, "<i2")
+    wide = np.frombuffer(stored.tobytes(), np.uint8).reshape(2, 30, 40)
+    fields = plus_files.tracked_fields(2) | {"ElementType": "MET_SHORT", "DimSize": "20 30 2"}
+    with pytest.raises(DatasetInvalid, match="16-bit pixels must not be below 0, the smallest is -1"):
+        read_plus_sweep(plus_files.write_mha(tmp_path / "s.mha", wide, fields), device_set=device_set)
