@@ -19,6 +19,7 @@ import numpy.typing as npt
 mpl.use("Agg")
 import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
+from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
@@ -30,6 +31,9 @@ from ultragray.display.frames import show
 from ultragray.gym import StandardPlaneEnv
 from ultragray.samplers import AroundSampler
 from ultragray.settings import Contact
+from ultragray.volumes.fields import sample_slice
+from ultragray.volumes.grid import VolumeGrid
+from ultragray.volumes.names import VOLUME_FIELDS
 
 IMAGES = Path(__file__).resolve().parent / "images"
 EXAMPLES = IMAGES.parents[1] / "examples"
@@ -50,6 +54,7 @@ def main() -> None:
     draw_augmentation(scene, IMAGES / "augmentation.png")
     draw_contact(scene, IMAGES / "contact.png")
     draw_standard_plane(scene, IMAGES / "standard_plane.png")
+    draw_slices(scene, IMAGES / "volume_slices.png")
     for folder in sys.argv[1:]:
         shrink(Path(folder) / "sweep.png", IMAGES / "tutorial_sweep.png", width=1000)
         shrink(Path(folder) / "pictures" / "frame_00007.png", IMAGES / "tutorial_eval.png", width=1000)
@@ -203,6 +208,27 @@ def _tilted(pose: Floats, angle_deg: float) -> Floats:  # [4, 4] -> [4, 4]
     angle, turn = np.radians(angle_deg), np.eye(4)
     turn[:3, :3] = [[np.cos(angle), 0.0, -np.sin(angle)], [0.0, 1.0, 0.0], [np.sin(angle), 0.0, np.cos(angle)]]
     return pose @ turn
+
+
+def draw_slices(scene: GaussianScene, path: Path) -> None:
+    """The fields of a volume on one coronal plane, which no probe on the skin could show."""
+    low, high = (np.array(bound) for bound in (scene.info.bounds_min_mm, scene.info.bounds_max_mm))
+    middle = float(low[2] + 0.45 * (high[2] - low[2]))
+    size = (high - low)[:2]
+    grid = VolumeGrid.on_plane((low[0], low[1], middle), (1, 0, 0), (0, 1, 0), size, 0.25)
+    extent = (low[0], high[0], high[1], low[1])
+    figure, panels = panel_row(rows=1, columns=4)
+    for panel, field in zip(panels, VOLUME_FIELDS, strict=True):
+        values = sample_slice(scene, field, grid)
+        if field == "labels":
+            panel.imshow(np.zeros((*values.shape, 3)), extent=extent)
+            for label, name in scene.info.label_names.items():
+                mask = np.ma.masked_where(values != label, values)
+                panel.imshow(mask, cmap=ListedColormap([LABEL_COLOURS[name]]), extent=extent)
+        else:
+            panel.imshow(values, cmap="gray", vmin=0, extent=extent)
+        panel.set_title(field, fontsize=9)
+    save(figure, path)
 
 
 def panel_row(*, rows: int, columns: int) -> tuple[Figure, Sequence[Axes]]:

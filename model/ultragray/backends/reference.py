@@ -86,7 +86,7 @@ def _render_pose(
     like = scene.means
     rotation, origin = pose[:3, :3], pose[:3, 3]
     means = (scene.means - origin) @ rotation  # [N, 3] probe frame
-    inverse_root = _inverse_root_covariance(scene, rotation)  # [N, 3, 3]
+    inverse_root = inverse_root_covariance(scene, rotation)  # [N, 3, 3]
     lost = None  # [N] what m² grows by: ln(|Σ'|/|Σ|) of a beam, −2·ln(weight) of a weighted Gaussian
     if beam is not None:
         inverse_root, lost = _spread_along_elevation(inverse_root, _beam_variance(beam.to(like), probe, means))
@@ -126,7 +126,7 @@ def _render_pose(
     return Fields(weight_sum, weighted_intensity, transmittance)
 
 
-def _inverse_root_covariance(scene: GaussianScene, rotation: Tensor) -> Tensor:  # [N, 3, 3]
+def inverse_root_covariance(scene: GaussianScene, rotation: Tensor) -> Tensor:  # [N, 3, 3]
     """L with LᵀL = A = Σ⁻¹ in the probe frame: rotate into the Gaussian's own axes, divide by its scales."""
     w, x, y, z = (scene.quats / scene.quats.norm(dim=-1, keepdim=True)).unbind(-1)
     axes = torch.stack(

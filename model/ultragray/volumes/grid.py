@@ -1,0 +1,150 @@
+"""VolumeGrid: where the voxels of a volume, or the pixels of a slice, lie in the scene's frame.
+
+Convention. Voxel (i, j, k) has its centre at origin_mm + spacing_mm · (i·axes[0] + j·axes[1] + k·axes[2]), in mm of the
+frame of the training sweep, the frame of every pose (docs/poses.md).
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..errors import InvalidArgument
+from ..probe import FloatArray
+
+MAX_VOXELS = 1 << 28
+MAX_SIDE = 32767  # NIfTI-1 counts voxels along an axis in 16 bits
+SMALLEST_SPACING_MM = 1e-3
+RIGHT_ANGLE_TOLERANCE = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class VolumeGrid:
+    """A regular grid of points. Made by `over_box` or `on_plane`, which check what they are given."""
+
+    origin_mm: FloatArray  # [3] centre of voxel (0, 0, 0)
+    axes: FloatArray  # [3, 3] a unit vector a row, at right angles
+    spacing_mm: float
+    shape: tuple[int, int, int]  # voxels along each axis
+
+    @classmethod
+    def over_box(cls, low_mm: Sequence[float], high_mm: Sequence[float], spacing_mm: float) -> VolumeGrid:
+        """Voxels that fill a box along the axes of the scene's frame, from its lower corner on.
+
+        Raises InvalidArgument, naming `spacing_mm` or `box_mm`, for a box without extent and for too many voxels.
+        """
+        low, high = _vector(low_mm, "box_mm"), _vector(high_mm, "box_mm")
+        _check_spacing(spacing_mm)
+        if not (high > low).all():
+            raise InvalidArgument(
+                f"box_mm must extend along each axis, got {_words(low)} to {_words(high)}", field="box_mm"
+            )
+        shape = _counts(high - low, spacing_mm)
+        return cls(low + spacing_mm / 2, np.eye(3), float(spacing_mm), (shape[0], shape[1], shape[2]))
+
+    @classmethod
+    def on_plane(
+        cls,
+        origin_mm: Sequence[float],
+        right: Sequence[float],
+        down: Sequence[float],
+        size_mm: Sequence[float],
+        spacing_mm: float,
+    ) -> VolumeGrid:
+        """The pixels of a slice: the first one's edge is at `origin_mm`, columns go along `right`, rows along `down`.
+
+        The directions may have any length and must be at a right angle. `size_mm`: width and height. Raises
+        InvalidArgument, naming the argument.
+        """
+        origin = _vector(origin_mm, "origin_mm")
+        axes = np.stack([_direction(right, "right"), _direction(down, "down")])
+        if abs(float(axes[0] @ axes[1])) > RIGHT_ANGLE_TOLERANCE:
+            angle = math.degrees(math.acos(float(np.clip(axes[0] @ axes[1], -1, 1))))
+            raise InvalidArgument(f"down must be at a right angle to right, the angle is {angle:.2f}°", field="down")
+        axes[1] -= (axes[0] @ axes[1]) * axes[0]
+        axes[1] /= np.linalg.norm(axes[1])
+        size = _vector(size_mm, "size_mm", 2)
+        _check_spacing(spacing_mm)
+        if not (size > 0).all():
+            raise InvalidArgument(f"size_mm must be a width and a height above 0, got {_words(size)}", field="size_mm")
+        columns, rows = _counts(size, spacing_mm)
+        first = origin + spacing_mm / 2 * (axes[0] + axes[1])
+        return cls(first, np.stack([*axes, np.cross(*axes)]), float(spacing_mm), (columns, rows, 1))
+
+    @property
+    def affine(self) -> FloatArray:  # [4, 4]
+        """From voxel (i, j, k, 1) to mm in the scene's frame."""
+        matrix = np.eye(4)
+        matrix[:3, :3] = self.axes.T * self.spacing_mm
+        matrix[:3, 3] = self.origin_mm
+        return matrix
+
+
+def parse_numbers(text: str, count: int, field: str) -> tuple[float, ...]:
+    """`"1,2.5,-3"`: that many numbers. Raises InvalidArgument."""
+    try:
+        numbers = tuple(float(word) for word in text.split(","))
+    except ValueError:
+        numbers = ()
+    if len(numbers) != count:
+        raise InvalidArgument(f"{field} must be {count} numbers with commas between, got {text[:80]!r}", field=field)
+    return numbers
+
+
+def parse_box(text: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """`"-20:20,0:30,-5:45"`: the ranges of x, y and z as lower and upper corner. Raises InvalidArgument."""
+    ranges = [re.fullmatch(r"\s*([^:]+):([^:]+)\s*", part) for part in text.split(",")]
+    try:
+        corners = [(float(one[1]), float(one[2])) for one in ranges if one]
+    except ValueError:
+        corners = []
+    if len(corners) != 3 or len(ranges) != 3:
+        raise InvalidArgument(
+            f"box_mm must be ranges of x, y and z such as -20:20,0:30,-5:45, got {text[:80]!r}", field="box_mm"
+        )
+    return tuple(low for low, _ in corners), tuple(high for _, high in corners)
+
+
+def _vector(values: Sequence[float], field: str, count: int = 3) -> FloatArray:
+    vector = np.asarray(values, np.float64)
+    if vector.shape != (count,) or not np.isfinite(vector).all():
+        raise InvalidArgument(f"{field} must hold {count} finite numbers, got {values}", field=field)
+    return vector
+
+
+def _direction(values: Sequence[float], field: str) -> FloatArray:
+    vector = _vector(values, field)
+    length = float(np.linalg.norm(vector))
+    if length == 0.0:
+        raise InvalidArgument(f"{field} must be a direction, got {_words(vector)}", field=field)
+    unit: FloatArray = vector / length
+    return unit
+
+
+def _check_spacing(spacing_mm: float) -> None:
+    if not SMALLEST_SPACING_MM <= spacing_mm < math.inf:
+        raise InvalidArgument(
+            f"spacing_mm must be {SMALLEST_SPACING_MM:g} mm or more, got {spacing_mm:g}", field="spacing_mm"
+        )
+
+
+def _counts(extent_mm: FloatArray, spacing_mm: float) -> list[int]:
+    """Voxels along each axis. Raises InvalidArgument, saying which spacing would do, where they are too many."""
+    counts = [max(1, math.ceil(float(extent) / spacing_mm - 1e-9)) for extent in extent_mm]
+    voxels = math.prod(counts)
+    if voxels > MAX_VOXELS or max(counts) > MAX_SIDE:
+        enough = spacing_mm * max((voxels / MAX_VOXELS) ** (1 / len(counts)), max(counts) / MAX_SIDE)
+        raise InvalidArgument(
+            f"spacing_mm {spacing_mm:g} gives {' x '.join(map(str, counts))} voxels, the limit is {MAX_VOXELS:,} and "
+            f"{MAX_SIDE:,} along an axis: take about {enough * 1.02:.3g} mm, or a smaller box",
+            field="spacing_mm",
+        )
+    return counts
+
+
+def _words(vector: FloatArray) -> str:
+    return "(" + ", ".join(f"{value:g}" for value in vector) + ")"

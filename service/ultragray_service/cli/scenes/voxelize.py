@@ -1,0 +1,85 @@
+"""`ultragray voxelize`: a scene's fields as a volume, or as a slice."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ultragray.errors import InvalidArgument
+from ultragray.scene_info import read_header
+from ultragray.volumes.names import SLICE_SUFFIXES, VOLUME_FIELDS, VOLUME_SUFFIXES
+
+from ..output import check_file
+from ..progress import working
+from ..style import Force, Json, SceneFile, command_group, examples, output_option, tell
+
+command_app = command_group()
+
+
+@command_app.command(
+    epilog=examples(
+        "ultragray voxelize liver.ugr -o liver.nii.gz --spacing-mm 0.5",
+        "ultragray voxelize liver.ugr -o bone.nrrd --field attenuation --box-mm=-20:20,-30:30,0:60",
+        "ultragray voxelize liver.ugr -o cut.png --plane-mm=-20,0,0 --right 1,0,0 --down 0,0,1 --size-mm 40,60",
+    )
+)
+def voxelize(
+    scene: SceneFile,
+    output: Annotated[
+        Path,
+        output_option(
+            "A volume: .nii.gz, .nii or .nrrd. A slice (--plane-mm): .png, .npy, or a volume of one layer of voxels."
+        ),
+    ],
+    field: Annotated[str, typer.Option(help=f"One of: {', '.join(VOLUME_FIELDS)}; attenuation is per mm.")] = "echo",
+    spacing_mm: Annotated[float, typer.Option(help="Distance of two voxels along each axis.")] = 0.5,
+    box_mm: Annotated[
+        str | None,
+        typer.Option(
+            help="Ranges of x, y and z in the scene's frame, such as -20:20,0:30,-5:45. Default: the bounds of "
+            "the Gaussians.",
+            show_default=False,
+        ),
+    ] = None,
+    plane_mm: Annotated[
+        str | None, typer.Option(help="Corner x,y,z of a slice, instead of a volume.", show_default=False)
+    ] = None,
+    right: Annotated[str, typer.Option(help="Direction of the rows of the slice.")] = "1,0,0",
+    down: Annotated[str, typer.Option(help="Direction of its columns.")] = "0,0,1",
+    size_mm: Annotated[str | None, typer.Option(help="Its width,height.", show_default=False)] = None,
+    force: Force = False,
+    json: Json = False,
+) -> None:
+    """The scene without a probe, in its own frame, sampled on a regular grid."""
+    check_file(output, VOLUME_SUFFIXES if plane_mm is None else (*SLICE_SUFFIXES, *VOLUME_SUFFIXES), force=force)
+    info = read_header(scene).info
+
+    from ultragray import GaussianScene
+    from ultragray.volumes.files import write_slice, write_volume
+    from ultragray.volumes.grid import VolumeGrid, parse_box, parse_numbers
+
+    if plane_mm is None:
+        if size_mm is not None:
+            raise InvalidArgument("size_mm is for a slice: give plane_mm, too", field="size_mm")
+        low, high = (info.bounds_min_mm, info.bounds_max_mm) if box_mm is None else parse_box(box_mm)
+        grid = VolumeGrid.over_box(low, high, spacing_mm)
+    else:
+        if size_mm is None or box_mm is not None:
+            raise InvalidArgument("a slice needs size_mm, its width,height, and takes no box_mm", field="size_mm")
+        directions = parse_numbers(right, 3, "right"), parse_numbers(down, 3, "down")
+        size = parse_numbers(size_mm, 2, "size_mm")
+        grid = VolumeGrid.on_plane(parse_numbers(plane_mm, 3, "plane_mm"), *directions, size, spacing_mm)
+    with working(f"sampling {' x '.join(map(str, grid.shape))} points …"):
+        loaded = GaussianScene.load(scene)
+        (write_slice if output.name.endswith(SLICE_SUFFIXES) else write_volume)(output, loaded, field, grid)
+    document = {
+        "file": str(output),
+        "field": field,
+        "shape": list(grid.shape),
+        "spacing_mm": spacing_mm,
+        "affine": grid.affine.tolist(),
+        "label_names": {str(number): name for number, name in info.label_names.items()} if field == "labels" else {},
+    }
+    tell(f"wrote {output}: {field}, {' x '.join(map(str, grid.shape))} at {spacing_mm:g} mm", document, as_json=json)
