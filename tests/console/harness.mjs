@@ -19,7 +19,7 @@ const CHROMIUM_FLAGS = ["--headless", "--no-sandbox", "--disable-gpu", "--disabl
 const START_TIMEOUT_MS = 90_000;
 export const SCREENSHOTS = path.join(ROOT, "build/console-screenshots");
 export const TIMEOUT_MS = 30_000; // of what a page should show: the machine may be busy
-export const CHECK_TIMEOUT_MS = 180_000; // of the check of a sweep: a process of low priority, last on a busy machine
+export const BACKGROUND_TIMEOUT_MS = 180_000; // of jobs and checks of sweeps: their processes come last on a busy machine
 
 /** A free port, below those that the system gives to connections: the service must come back on the same one. */
 function freePort() {
@@ -156,8 +156,8 @@ export function canvasState(page, selector) {
 }
 
 /** Waits until `read` answers something that `accept` takes, and returns it. */
-export async function until(read, accept, what) {
-  const end = Date.now() + TIMEOUT_MS;
+export async function until(read, accept, what, timeoutMs = TIMEOUT_MS) {
+  const end = Date.now() + timeoutMs;
   let last;
   while (Date.now() < end) {
     last = await read();

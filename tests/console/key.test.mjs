@@ -5,7 +5,7 @@ import { readFileSync } from "node:fs";
 import path from "node:path";
 import { describe, it } from "node:test";
 
-import { CHECK_TIMEOUT_MS, canvasState, openPage, picture, seriousFindings, until } from "./harness.mjs";
+import { BACKGROUND_TIMEOUT_MS, canvasState, openPage, picture, seriousFindings, until } from "./harness.mjs";
 import { tested } from "./tested.mjs";
 
 const KEY = "a-key-of-the-tests";
@@ -38,7 +38,7 @@ describe("a key", () => {
     await page.getByRole("button", { name: "Open" }).click();
     await page.getByLabel("Add a sweep").setInputFiles(at.files.sweep);
     await page.getByRole("button", { name: "Upload and check" }).click();
-    await page.getByText("28 to train from, 5 held out").waitFor({ timeout: CHECK_TIMEOUT_MS });
+    await page.getByText("28 to train from, 5 held out").waitFor({ timeout: BACKGROUND_TIMEOUT_MS });
     await page.getByRole("img", { name: "Frame 0 of sweep" }).waitFor();
     await page.getByRole("link", { name: "Scenes and service" }).click();
     const [download] = await Promise.all([

@@ -3,7 +3,7 @@
 import assert from "node:assert/strict";
 import { describe, it } from "node:test";
 
-import { CHECK_TIMEOUT_MS, canvasState, openPage, picture, seriousFindings, until } from "./harness.mjs";
+import { BACKGROUND_TIMEOUT_MS, canvasState, openPage, picture, seriousFindings, until } from "./harness.mjs";
 import { tested } from "./tested.mjs";
 
 const HELD_OUT = "Held-out PSNR in dB over step: validation, linear between frames, median compounding";
@@ -38,7 +38,7 @@ describe("train", () => {
   it("takes a sweep in, shows it, trains, tells how far it is, and opens the scene", async () => {
     const page = await openPage(at, "#/train");
     await upload(page, at.files.sweep, "sweep");
-    await page.getByText("28 to train from, 5 held out").waitFor({ timeout: CHECK_TIMEOUT_MS });
+    await page.getByText("28 to train from, 5 held out").waitFor({ timeout: BACKGROUND_TIMEOUT_MS });
     const frame = page.getByRole("img", { name: "Frame 0 of sweep" });
     await frame.waitFor();
     const room = page.getByTestId("space").locator("canvas");
@@ -52,7 +52,7 @@ describe("train", () => {
     await picture(page, "train-sweep");
 
     await start(page, "made", { confidence: "no", Steps: "60", "Most Gaussians": "800" });
-    await until(() => state(page), (text) => text !== "waits", "nobody began");
+    await until(() => state(page), (text) => text !== "waits", "nobody began", BACKGROUND_TIMEOUT_MS);
     await page.getByRole("list", { name: "Phases of the training" }).getByText("Report and files").waitFor();
     const now = page.locator("[aria-current=step]");
     const told = await until(async () => {
@@ -60,7 +60,7 @@ describe("train", () => {
       return phase.includes("Report") ? left : null;
     }, (left) => left !== null, "the finishing has no phase of its own");
     assert.match(told, /left|almost done/, "its steps are done, and nobody says how long the rest takes");
-    await until(() => state(page), (text) => text === "succeeded", "it did not succeed");
+    await until(() => state(page), (text) => text === "succeeded", "it did not succeed", BACKGROUND_TIMEOUT_MS);
     await page.getByText("Step 60 of 60", { exact: true }).waitFor();
     for (const [name, least] of [["Loss over step: training", 60], [HELD_OUT, 2]]) {
       const line = page.getByRole("img", { name }).locator("path.line");
@@ -109,7 +109,7 @@ describe("train", () => {
     await picture(page, "train-settings");
     await form.getByLabel("Scene", { exact: true }).fill("again");
     await page.getByRole("button", { name: "Start the training" }).click();
-    await until(() => state(page), (text) => text === "succeeded", "it did not succeed");
+    await until(() => state(page), (text) => text === "succeeded", "it did not succeed", BACKGROUND_TIMEOUT_MS);
     await page.getByText("Earlier runs of this sweep").click();
     await page.getByRole("checkbox", { name: /^made/ }).check();
     await page.getByRole("img", { name: "Loss over step: training, made" }).waitFor();
@@ -121,10 +121,10 @@ describe("train", () => {
 
   it("shows the rendering as it is, keeps on after the service was down, and cancels", async () => {
     const page = await openPage(at, "#/train", { scheme: "dark" });
-    await page.getByText("28 to train from, 5 held out").waitFor({ timeout: CHECK_TIMEOUT_MS });
+    await page.getByText("28 to train from, 5 held out").waitFor({ timeout: BACKGROUND_TIMEOUT_MS });
     await start(page, "long", { Steps: "100000", "Most Gaussians": "800" });
     const preview = page.getByRole("img", { name: "A held-out frame and its rendering" });
-    await preview.waitFor({ timeout: 180_000 }); // a training and its picture take turns on a busy machine
+    await preview.waitFor({ timeout: BACKGROUND_TIMEOUT_MS });
     await picture(page, "train-running");
     const steps = page.getByText(/^Step [\d,]+ of 100,000$/);
     const stepNow = async () => Number((await steps.textContent()).split(" ")[1].replaceAll(",", ""));
@@ -132,9 +132,9 @@ describe("train", () => {
     await page.getByText("The service does not answer. Trying again.").waitFor();
     const before = await stepNow();
     await at.service.up();
-    await until(stepNow, (step) => step > before, "it did not go on");
+    await until(stepNow, (step) => step > before, "it did not go on", BACKGROUND_TIMEOUT_MS);
     await page.getByRole("button", { name: "Cancel" }).click();
-    await until(() => state(page), (text) => text === "cancelled", "it was not cancelled");
+    await until(() => state(page), (text) => text === "cancelled", "it was not cancelled", BACKGROUND_TIMEOUT_MS);
     await page.getByRole("button", { name: "Go on from the last checkpoint" }).waitFor();
   });
 
@@ -167,7 +167,7 @@ describe("train", () => {
     assert.deepEqual(await seriousFindings(page), []);
     await picture(page, "train-waits");
     await page.getByRole("button", { name: "Cancel" }).click();
-    await until(() => state(page), (text) => text === "cancelled", "it was not cancelled");
+    await until(() => state(page), (text) => text === "cancelled", "it was not cancelled", BACKGROUND_TIMEOUT_MS);
   });
 
   it("says that a job is gone", async () => {

@@ -7,7 +7,7 @@ import path from "node:path";
 import { after, before, describe, it } from "node:test";
 
 import {
-  CHECK_TIMEOUT_MS,
+  BACKGROUND_TIMEOUT_MS,
   canvasState,
   goTo,
   launch,
@@ -199,7 +199,7 @@ describe("a machine learning engineer", () => {
     await page.getByLabel("Add a sweep").setInputFiles(at.files.sweep);
     await page.getByLabel("Name", { exact: true }).fill("sweep");
     await page.getByRole("button", { name: "Upload and check" }).click();
-    await page.getByText("28 to train from, 5 held out").waitFor({ timeout: CHECK_TIMEOUT_MS });
+    await page.getByText("28 to train from, 5 held out").waitFor({ timeout: BACKGROUND_TIMEOUT_MS });
     await page.getByRole("img", { name: "Frame 0 of sweep" }).waitFor();
     await seen("uploads");
 
