@@ -86,11 +86,11 @@ def measure(run: Run, data_folder: Path, folder: Path) -> Document:
     paces = Paces(place / "paces.json")  # not the user's, which may be of a busier hour
     comparison = compare(dataset, run.settings, folder=place, paces=paces, report=_teller(run.name))
     assert comparison is not None  # nobody tells it to stop
-    return {"measured": head, **_summary(comparison)}
+    return {"measured": head, **_summary(comparison, data_folder)}
 
 
-def _summary(comparison: Comparison) -> Document:
-    """What the tables say, without the figures of each frame."""
+def _summary(comparison: Comparison, data_folder: Path) -> Document:
+    """What the tables say, without the figures of each frame and without the place of the data on this machine."""
     ranks = rank(comparison.measured)
     return {
         "train_frames": comparison.dataset.train_frames,
@@ -102,7 +102,7 @@ def _summary(comparison: Comparison) -> Document:
         "methods": {
             result.name: {
                 "title": result.title,
-                "failure": result.failure,
+                "failure": result.failure and result.failure.replace(f"{data_folder.resolve()}/", ""),
                 "cost": dict(zip(COST_HEADINGS, cost_texts(result), strict=True)),
                 "seconds": result.seconds,
                 "frame_ms": result.frame_ms,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import subprocess
 from datetime import datetime
@@ -18,6 +19,7 @@ registry = benchmark("registry")
 FIGURES = registry.FIGURES
 TARGETS = sorted({file.target for file in FIGURES.values()})
 MAKES_OWN = ("MAKEFLAGS", "MFLAGS", "MAKELEVEL")
+ABSOLUTE_PATH = re.compile(r"(?<![\w.:/])/[\w.-]+/[\w.-]+")
 NOT_MEASURED_YET = {"benchmarks/cuda.json", "benchmarks/cuda_training.json"}
 
 
@@ -36,6 +38,11 @@ def test_a_file_says_commit_date_and_machine(name: str) -> None:
         assert "dirty" not in head["commit"]
         assert datetime.fromisoformat(head["date"]).tzinfo is not None
         assert head["machine"]["processor"]
+
+
+@pytest.mark.parametrize("name", [name for name, file in FIGURES.items() if file.path not in NOT_MEASURED_YET])
+def test_a_file_names_no_place_on_the_machine_it_was_measured_on(name: str) -> None:
+    assert ABSOLUTE_PATH.findall(FIGURES[name].kept.read_text(encoding="utf-8")) == []
 
 
 def test_what_is_measured_is_there() -> None:
