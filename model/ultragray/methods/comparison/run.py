@@ -133,7 +133,8 @@ def default_paces(dataset: Dataset, device: str = "cpu") -> Paces:
 
 def machine_in_words(device: str = "cpu") -> str:
     """The processor, the threads, and the GPU where one is used."""
-    words = f"{processor_name()}, {torch.get_num_threads()} threads"
+    threads = torch.get_num_threads()
+    words = f"{processor_name()}, {threads} thread{'' if threads == 1 else 's'}"
     on = training_device(device, "auto")
     return words if on.type == "cpu" else f"{words}, {torch.cuda.get_device_name(on)}"
 
