@@ -49,6 +49,9 @@ class Drawing(Protocol):
     def plane_of(self, part: GaussianScene, name: str) -> Tensor:  # [C, H, W]
         """A plane of some of the scene's Gaussians alone."""
 
+    def mark_tools(self, labels: Tensor) -> None:
+        """Puts the labels of tools into labels [C, H, W], where they are."""
+
 
 @dataclass(frozen=True)
 class Output:
@@ -64,6 +67,8 @@ class Output:
     """float32: amounts in [0, 1]. uint8: numbers that stand for something, which nothing may interpolate or scale."""
     is_toned: bool = False
     """Whether gain, dynamic range and time-gain compensation change it."""
+    shows_tools_alone: bool = False
+    """Whether a scene that does not give it gives it of tools."""
     tells_support: bool = False
     """Whether it keeps its values where pixels without support are blackened."""
     lacks: Callable[[SceneInfo], str | None] = lambda _: None
@@ -88,7 +93,9 @@ def _register(name: str, meaning: str, **properties: Any) -> Output:
 def _labels(drawing: Drawing) -> Tensor:
     from .backends.labels import render_labels  # needs torch
 
-    return render_labels(drawing.scene, drawing.shape, lambda part: drawing.plane_of(part, WEIGHT_SUM))
+    labels = render_labels(drawing.scene, drawing.shape, lambda part: drawing.plane_of(part, WEIGHT_SUM))
+    drawing.mark_tools(labels)
+    return labels
 
 
 def _attenuation(drawing: Drawing) -> Tensor:
@@ -129,6 +136,7 @@ LABELS = _register(
     planes=(),
     derive=_labels,
     dtype=_NUMBERS,
+    shows_tools_alone=True,
     lacks=_lacks_labels,
 )
 UNCERTAINTY = _register(
@@ -152,8 +160,12 @@ def check_outputs(outputs: Sequence[str], *, field: str = "outputs") -> tuple[st
     return tuple(dict.fromkeys(names))
 
 
-def check_available(outputs: Sequence[str], info: SceneInfo, *, field: str = "outputs") -> None:
+def check_available(
+    outputs: Sequence[str], info: SceneInfo, *, with_tools: bool = False, field: str = "outputs"
+) -> None:
     """Raises UnknownOutput for outputs that a scene cannot give."""
     for name in outputs:
+        if with_tools and OUTPUTS[name].shows_tools_alone:
+            continue
         if (lacking := OUTPUTS[name].lacks(info)) is not None:
             raise UnknownOutput(f"{field} may name {name} only for a scene {lacking}", field=field)

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from .backends import cpu, cuda, reference
 from .backends.beam import beam_cm
+from .backends.ghost import GHOST_PLANES, add_ghosts
 from .backends.poses import ScenePoses, as_array, scene_poses
 from .contact.compression import at_rest
 from .contact.skin import Skin
@@ -24,6 +25,8 @@ from .probe import ElevationBeam, FloatArray, Probe
 from .probe.probe import BoolArray
 from .scene import GaussianScene
 from .settings import Contact
+from .tools import ScanView, Tool
+from .tools.drawing import ToolsInView
 
 Backend = Callable[
     [GaussianScene, Probe, ScenePoses, int, int, Sequence[str], Limits, Tensor | None], dict[str, Tensor]
@@ -76,12 +79,14 @@ class Drawing:
         limits: Limits,
         beam: Tensor | None,
         touching: BoolArray | None = None,
+        tools: ToolsInView | None = None,
+        ghost: float = 0.0,
     ) -> None:
         """`beam`: [3] in cm; `touching`: [C, W], whether scan lines have contact, None: all have."""
         self.scene = scene
         self.shape = (len(view[1]), view[2], view[3])
         self._draw, self._view, self._limits, self._beam = draw, view, limits, beam
-        self._touching = touching
+        self._touching, self._tools, self._ghost = touching, tools, ghost
         self._planes: dict[str, Tensor] = {}
 
     @property
@@ -91,18 +96,29 @@ class Drawing:
     @property
     def poses_mm(self) -> FloatArray:
         """[C, 4, 4] mm, in the frame of the sweep that the scene was trained from."""
-        poses = as_array(self._view[1]).copy()
-        poses[:, :3, 3] = 10.0 * poses[:, :3, 3] + np.asarray(self.scene.info.centre_mm)
-        return poses
+        return _in_mm(self.scene, self._view[1])
 
     def draw(self, planes: Sequence[str]) -> None:
         """Draws planes of the whole scene at once."""
         if planes:
-            self._planes = self._draw(self.scene, *self._view, planes, self._limits, self._beam)
+            drawn = self._draw(self.scene, *self._view, self._needed(planes), self._limits, self._beam)
+            self._planes = dict(drawn)
+        if self._tools is not None:
+            self._tools.draw(self._planes, self.shape[1], self.scene.means)
         if self._touching is not None and not self._touching.all():
-            for name in set(ENDED_BY_AIR) & set(planes):
+            for name in set(ENDED_BY_AIR) & set(self._planes):
                 plane = self._planes[name]
                 self._planes[name] = plane * torch.from_numpy(self._touching).to(plane)[:, None]
+        if self._ghost and "bmode" in self._planes:
+            add_ghosts(self._planes, self.probe, self._ghost)
+
+    def _needed(self, planes: Sequence[str]) -> Sequence[str]:
+        """The planes to draw for these: those with them that tools and ghosts follow from."""
+        if self._ghost and set(GHOST_PLANES) & set(planes):
+            return tuple(dict.fromkeys((*planes, *GHOST_PLANES)))
+        if self._tools is not None and "bmode" in planes:
+            return tuple(dict.fromkeys((*planes, "transmittance")))
+        return planes
 
     def plane(self, name: str) -> Tensor:  # [C, H, W]
         """One of the planes that were drawn."""
@@ -111,6 +127,11 @@ class Drawing:
     def plane_of(self, part: GaussianScene, name: str) -> Tensor:  # [C, H, W]
         """A plane of some of the scene's Gaussians alone."""
         return self._draw(part, *self._view, (name,), self._limits, self._beam)[name]
+
+    def mark_tools(self, labels: Tensor) -> None:
+        """Puts the labels of tools into labels [C, H, W], where they are."""
+        if self._tools is not None:
+            self._tools.mark(labels)
 
 
 def render(
@@ -125,6 +146,8 @@ def render(
     limits: Limits = UNLIMITED,
     beam: ElevationBeam | Tensor | None = None,
     contact: Contact | None = None,
+    tools: Sequence[Tool] = (),
+    ghost: float = 0.0,
 ) -> Frames:
     """Frames [C, height, width] of a scene seen by `probe` (None: the probe the scene was trained with) from `poses`.
 
@@ -137,6 +160,9 @@ def render(
     thin one. A tensor [3] of its thickness, focus and depth of field in mm is differentiable too.
     `contact` makes scan lines off the skin dark, and compresses tissue under pressure (`ultragray.contact`); the
     result's `touch` tells where. It follows from the poses alone, has no gradient, and is the same on every backend.
+    `tools`, such as needles, are drawn into the frames (`ultragray.tools`); labels then are there for every scene.
+    `ghost`, 0 to 1, is the share that a mirror image has of what is heard beyond the first strong interface
+    (`ultragray.backends.ghost`). Both are the same on every backend, have no gradient, and let that of the planes pass.
     `limits` bound the cost of each frame and can end the rendering (`ultragray.limits`), but for frames with gradients:
     FrameTooCostly, GivenUp.
     Raises InvalidPose, InvalidProbe, InvalidImageSize, UnknownOutput (also for labels of a scene that carries none),
@@ -144,7 +170,7 @@ def render(
     asked for and the scene knows no skin.
     """
     chosen = check_outputs(outputs)
-    check_available(chosen, scene.info)
+    check_available(chosen, scene.info, with_tools=bool(tools))
     check_image_size(height, width)
     view = (
         scene.info.probe_or(probe),
@@ -158,11 +184,33 @@ def render(
     drawn = []
     for first, seen, touching in _views(view, touch, compressed=contact is Contact.PRESSURE):
         shown = beam_cm(scene.info.beam if beam is None else beam, seen[0])
-        drawing = Drawing(draw, scene, seen, limits.after(first), shown, touching)
+        sight = _tools_in_view(tools, view, slice(first, first + len(seen[1])), scene, shown)
+        drawing = Drawing(draw, scene, seen, limits.after(first), shown, touching, sight, ghost)
         drawing.draw(planes)
         drawn.append({name: OUTPUTS[name].derive(drawing) for name in chosen})
     whole = drawn[0] if len(drawn) == 1 else {name: torch.cat([one[name] for one in drawn]) for name in chosen}
     return Frames(whole, touch)
+
+
+def _tools_in_view(
+    tools: Sequence[Tool], view: View, places: slice, scene: GaussianScene, beam: Tensor | None
+) -> ToolsInView | None:
+    """Tools as some poses of a view see them: rigid, where they are, whatever pressure does to the tissue."""
+    if not tools:
+        return None
+    probe, poses, _, width = view
+    poses_mm = _in_mm(scene, poses)[places]
+    if beam is None:
+        return ToolsInView(tools, ScanView(probe, poses_mm, width))
+    sigma, focus, rayleigh = (10.0 * beam.detach()).tolist()
+    return ToolsInView(tools, ScanView(probe, poses_mm, width, (sigma, focus, rayleigh)))
+
+
+def _in_mm(scene: GaussianScene, poses: ScenePoses) -> FloatArray:  # [C, 4, 4] cm -> [C, 4, 4] mm
+    """Poses of the scene's frame in that of the sweep that it was trained from."""
+    moved = as_array(poses).copy()
+    moved[:, :3, 3] = 10.0 * moved[:, :3, 3] + np.asarray(scene.info.centre_mm)
+    return moved
 
 
 def touch_of(scene: GaussianScene, probe: Probe, poses: Any, width: int) -> Touch:  # [C, 4, 4] or [4, 4] mm

@@ -1,0 +1,138 @@
+"""Tools drawn into the planes of frames: echo, comet tail, shadow and labels (docs/howto/tools.md)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from .crossing import Crossing, ScanView
+from .tool import Tool
+
+PULSE_SIGMA_MM = 0.15  # of the echo of a surface along the line
+HEAD_ON_SIGMA_DEG = 20.0  # by which the mirror's share of an echo falls off with the angle
+LEAST = 1.0 / 255.0  # what is below it is not seen
+LABELLED = 0.25  # the share of a pixel that a tool has to fill: a thin needle leaves no gaps
+_LEAST_BEAM = 1e-6
+
+
+class ToolsInView:
+    """Tools before the scan lines of a view, in the order in which they are drawn."""
+
+    def __init__(self, tools: Sequence[Tool], view: ScanView) -> None:
+        self._tools, self._view = tools, view
+        self._marks: list[_Drawn] = []
+
+    def draw(self, planes: dict[str, Tensor], height: int, like: Tensor) -> None:
+        """Draws them into planes [C, H, W] by name, B-mode only beside transmittance: it stays E·T.
+
+        `like` has the device and the type of the planes, of which there may be none: the labels are known then.
+        """
+        found = (_Drawn.of(tool, self._view, height, like) for tool in self._tools)
+        self._marks = [one for one in found if one is not None]
+        for one in self._marks:
+            one.draw(planes)
+
+    def mark(self, labels: Tensor) -> None:
+        """Puts their labels into labels [C, H, W], where they are; that of the last one where they meet."""
+        for one in self._marks:
+            labels[:, :, one.columns].masked_fill_(one.labelled, one.label)
+
+
+@dataclass(frozen=True, eq=False)
+class _Drawn:
+    """What a tool is to the pixels of the columns that it touches: each [C, H, w]."""
+
+    label: int
+    columns: slice
+    labelled: Tensor  # bool: whether its body is there
+    body: Tensor  # share of the tissue's echo that gives way to it
+    echo: Tensor  # that of its surface, by this share
+    passed: Tensor  # share of the beam that it lets through
+    tail: Tensor  # share of the beam before it that comes back later
+
+    @classmethod
+    def of(cls, tool: Tool, view: ScanView, height: int, like: Tensor) -> _Drawn | None:
+        """The tool in frames of a height; None where no line meets it."""
+        crossing = tool.crossing(view)
+        met = np.flatnonzero(crossing.cover.max(axis=(0, 1), initial=0.0) >= LEAST)
+        if not met.size:
+            return None
+        columns = slice(int(met[0]), int(met[-1]) + 1)
+        depth = torch.as_tensor(view.probe.depths_mm(height)).to(like)[:, None]  # [H, 1]
+        half_row = 0.5 * view.probe.scan_line_length_mm / height
+        shape = (6, len(view.poses), height, columns.stop - columns.start)
+        filled, body, echo, stopped, tail, one_tail = torch.zeros(shape, dtype=like.dtype, device=like.device)
+        for layer in range(len(crossing.cover)):
+            cover, first, last, way, path, slant, stops = (
+                torch.as_tensor(getattr(crossing, one.name)[layer, :, None, columns]).to(like)  # [C, 1, w]
+                for one in fields(Crossing)
+            )
+            mirrored = _mirrored(tool, slant)
+            beyond = _beyond(depth, first - half_row, last + half_row)
+            inside = _beyond(depth, first - half_row, last + half_row + way)
+            filled += cover * (inside == 0.0)
+            body += cover * _pulse(inside)
+            echo += cover * _pulse(beyond) * (tool.brightness * tool.roughness + mirrored)
+            stopped += cover * (1.0 - (1.0 - stops) ** ((depth - last) / path).clamp(0.0, 1.0))
+            strength, later_mm = mirrored * tool.reverberation, tool.thickness_mm
+            one_tail.zero_()
+            while float(strength.max()) >= LEAST:
+                later = _beyond(depth - later_mm, first - half_row, last + half_row)
+                torch.maximum(one_tail, strength * _pulse(later), out=one_tail)
+                strength, later_mm = strength * tool.reverberation, later_mm + tool.thickness_mm
+            tail += cover * one_tail
+        return cls(
+            label=tool.label,
+            columns=columns,
+            labelled=filled >= LABELLED,
+            body=body.clamp(max=1.0),
+            echo=echo.clamp(max=1.0),
+            passed=(1.0 - stopped).clamp(0.0, 1.0),
+            tail=tail.clamp(max=1.0),
+        )
+
+    def draw(self, planes: dict[str, Tensor]) -> None:
+        """Draws it into planes [C, H, W]; gradients pass to them.
+
+        Of the beam T before it a share `passed` goes on through the tissue behind it, and of what is then heard a share
+        `tail` is the tool once more: T' = T·((1 − tail)·passed + tail), and E' is the mean of both echoes by their
+        beams.
+        """
+        before = {name: plane[:, :, self.columns] for name, plane in planes.items()}
+        through = (1.0 - self.tail) * self.passed
+        heard = through + self.tail
+        if "bmode" in before:
+            surface = (1.0 - self.body) * before["bmode"] + self.echo * before["transmittance"]
+            self._put(planes, "bmode", through * surface + self.tail * before["transmittance"])
+        if "echo" in before:
+            surface = (1.0 - self.body) * before["echo"] + self.echo
+            self._put(planes, "echo", (through * surface + self.tail) / heard.clamp(min=_LEAST_BEAM))
+        if "transmittance" in before:
+            self._put(planes, "transmittance", before["transmittance"] * heard)
+        if "coverage" in before:
+            self._put(planes, "coverage", torch.maximum(before["coverage"], self.body))
+
+    def _put(self, planes: dict[str, Tensor], name: str, part: Tensor) -> None:
+        plane = planes[name]
+        before, after = plane[:, :, : self.columns.start], plane[:, :, self.columns.stop :]
+        planes[name] = torch.cat([before, part, after], dim=2)
+
+
+def _beyond(depth: Tensor, first: Tensor, last: Tensor) -> Tensor:  # [H, 1], [C, 1, w] -> [C, H, w]
+    """The distance of depths from the range between two others, 0 within it."""
+    return torch.maximum(first - depth, depth - last).clamp(min=0.0)
+
+
+def _pulse(beyond: Tensor) -> Tensor:  # [...] -> [...]
+    """The echo of a surface at a distance from it."""
+    return torch.exp(-0.5 * (beyond / PULSE_SIGMA_MM) ** 2)
+
+
+def _mirrored(tool: Tool, slant: Tensor) -> Tensor:  # [...] -> [...]
+    """The echo of a surface as of a mirror, by the sine of the angle at which it is met."""
+    angle_deg = torch.rad2deg(torch.asin(slant))
+    return tool.brightness * (1.0 - tool.roughness) * torch.exp(-0.5 * (angle_deg / HEAD_ON_SIGMA_DEG) ** 2)
