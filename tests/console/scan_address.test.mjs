@@ -23,6 +23,20 @@ function touch(page, steps) {
   }, steps);
 }
 
+/** Pairs of texts on the image of which one lies on the other. */
+function overlapping(page) {
+  return page.locator(IMAGE).evaluate((image) => {
+    const texts = [...image.querySelectorAll("svg text, [data-testid=confidence-badge] > *")].map((one) => {
+      const range = document.createRange();
+      range.selectNodeContents(one);
+      return { text: one.textContent, box: range.getBoundingClientRect() };
+    });
+    const lieOver = (a, b) => a.left < b.right - 1 && b.left < a.right - 1 && a.top < b.bottom - 1 && b.top < a.bottom - 1;
+    const after = (index) => texts.slice(index + 1);
+    return texts.flatMap((one, index) => after(index).filter((other) => lieOver(one.box, other.box)).map((other) => [one.text, other.text]));
+  });
+}
+
 /** Without it, pointers that a script makes up cannot be captured. */
 function withoutCapture() {
   Element.prototype.setPointerCapture = () => undefined;
@@ -197,11 +211,23 @@ describe("the window", () => {
     await page.keyboard.press("l");
     const box = await until(() => page.locator(`${IMAGE} canvas`).boundingBox(), ({ height }) => height > 600, "it is not large");
     assert.ok(Math.max(box.width, box.height) >= 700, `${box.width} x ${box.height}`);
+    assert.deepEqual(await overlapping(page), []);
     await page.getByTestId("room").waitFor();
     await picture(page, "scan-large");
     assert.deepEqual(await seriousFindings(page), []);
     await page.keyboard.press("l");
     await until(() => page.locator(`${IMAGE} canvas`).boundingBox(), ({ height }) => height < 600, "it stays large");
+  });
+
+  it("of a tablet has room for the image, and no text of the image lies on another", async () => {
+    const { page } = await openScan(at, { width: 1024, height: 768, touch: true });
+    const box = await page.locator(`${IMAGE} canvas`).boundingBox();
+    assert.ok(Math.min(box.width, box.height) >= 320, `${box.width} x ${box.height}`);
+    assert.deepEqual(await overlapping(page), []);
+    await picture(page, "scan-tablet");
+    await enterPose(page, JSON.stringify({ position_mm: { x: 0, y: -19, z: 0 }, quaternion: { w: 0.866, x: 0.5, y: 0, z: 0 } }));
+    await page.getByTestId("confidence-frame").waitFor();
+    assert.deepEqual(await overlapping(page), [], "where it is a guess");
   });
 
   it("of any size shows all without sideways scrolling, and groups close", async () => {
@@ -216,6 +242,7 @@ describe("the window", () => {
         return [scan.scrollWidth > scan.clientWidth, cut.map((one) => one.ariaLabel ?? one.textContent)];
       });
       assert.deepEqual(wider, [false, []], `at ${width} pixels`);
+      assert.deepEqual(await overlapping(page), [], `at ${width} pixels`);
       await picture(page, `scan-${width}`);
       await page.context().close();
     }

@@ -196,6 +196,7 @@ describe("a text", () => {
     await until(async () => Number(await text.getAttribute("x")), (now) => Math.abs(now - x - 10) < 0.5, "it does not move");
     await page.keyboard.press("Escape");
     await picture(page, "scan-annotated");
+    assert.deepEqual(page.faults, []);
   });
 });
 

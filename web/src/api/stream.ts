@@ -6,6 +6,7 @@ import type { Output } from "./outputs";
 
 export type StreamSettings = Omit<Schemas["RenderSettings"], "encoding">;
 export type Display = Schemas["FrameMessage"]["display"];
+export type Contact = Schemas["Contact"];
 export type FrameHeader = Schemas["FrameMessage"];
 export type Extrapolation = FrameHeader["extrapolation"];
 /** Why a pose got no frame. */

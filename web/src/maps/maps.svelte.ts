@@ -25,7 +25,7 @@ export class MapsState {
     const pose = new Calm(() => this.session.pose);
     const startsAt = untrack(() => router.kept);
     $effect(() => {
-      if (!this.session.known) return;
+      if (!this.session.scene.known) return;
       void router.arrivals;
       untrack(() => {
         // An address that tells nothing is the way back from another view, unless one came to it within this one.
@@ -35,9 +35,9 @@ export class MapsState {
       });
     });
     $effect(() => {
-      if (!this.session.known) return;
+      if (!this.session.scene.known) return;
       const written = poseValue(pose.value);
-      const home = poseValue(this.session.held(this.session.home));
+      const home = poseValue(this.session.held(this.session.scene.home));
       const { cursor, large } = this;
       untrack(() => {
         const { view, name } = router.route;
@@ -57,7 +57,7 @@ export class MapsState {
     this.cursor = x_mm === undefined || z_mm === undefined ? null : { x_mm, z_mm };
     const pose = poseOrNull(kept.pose);
     if (pose !== null) this.session.pose = pose;
-    else if (poseValue(this.session.pose) !== poseValue(this.session.held(this.session.home))) this.session.goHome();
+    else if (poseValue(this.session.pose) !== poseValue(this.session.held(this.session.scene.home))) this.session.goHome();
   }
 }
 

@@ -24,12 +24,12 @@ export class Address {
   constructor(private readonly scan: ScanState) {
     const { session } = scan;
     $effect(() => {
-      if (!session.known) return;
+      if (!session.scene.known) return;
       const { arrivals } = router;
       untrack(() => void this.#take(arrivals));
     });
     $effect(() => {
-      if (!session.known || !this.#taken) return;
+      if (!session.scene.known || !this.#taken) return;
       const [values, jumps] = [linkOf(session), session.jumps];
       untrack(() => this.#note(values, jumps));
     });

@@ -13,7 +13,7 @@ export class PoseTelling {
   /** Whether relative poses are told against the mark; else against Home. */
   fromMark = $state(false);
   mark = $state.raw<Pose | null>(null);
-  readonly other = $derived.by(() => (this.fromMark && this.mark ? this.mark : this.session.held(this.session.home)));
+  readonly other = $derived.by(() => (this.fromMark && this.mark ? this.mark : this.session.held(this.session.scene.home)));
 
   constructor(private readonly session: Session) {}
 

@@ -27,7 +27,7 @@ export interface ConfidenceWords {
   tone: Tone;
   /** "A guess" */
   title: string;
-  /** "expected similarity 43 %, mean error 8 points"; without a model the way to the training views. */
+  /** "expected similarity 43 %, mean error 8 points"; without a model the way to the training views; then the contact. */
   detail: string;
   /** Why to be careful; empty where the view is well supported. */
   warning: string;
@@ -41,17 +41,18 @@ export function confidenceWords(
   const tone = toneOf(extrapolation);
   if (tone === null) return null;
   const said = words.connect.confidence;
-  const { confidence, distance_mm, angle_deg } = extrapolation;
+  const { confidence, distance_mm, angle_deg, contact_share } = extrapolation;
+  const touch = contact_share === null ? "" : `, ${said.contact(percent(contact_share))}`;
   const fit = description?.confidence ?? null;
   const title = said.tones[tone];
   const warning = said.warnings[tone];
   if (confidence === null) {
     const detail = said.away((distance_mm ?? 0).toFixed(1), (angle_deg ?? 0).toFixed(1));
-    return { tone, title, detail, warning };
+    return { tone, title, detail: detail + touch, warning };
   }
   const similarity = percent(confidence);
   const detail = fit === null ? said.expected(similarity) : said.withError(similarity, percent(fit.error));
-  return { tone, title, detail, warning };
+  return { tone, title, detail: detail + touch, warning };
 }
 
 /** A share as a whole number of percent; so are differences of shares as points. */

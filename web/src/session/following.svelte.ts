@@ -54,7 +54,7 @@ export class Following {
     this.#place(header.pose.flat());
     if (sameProbe(header.probe, this.session.probe) || this.#choosing) return;
     this.#choosing = true;
-    const chosen = sameProbe(header.probe, this.session.sceneProbe) ? null : header.probe;
+    const chosen = sameProbe(header.probe, this.session.scene.own.probe) ? null : header.probe;
     void this.session
       .chooseProbe(chosen)
       .catch(() => undefined)

@@ -2,12 +2,13 @@
 
 import { defaultsOf } from "../api/described";
 import { settings } from "../api/generated/contract";
-import type { Display } from "../api/stream";
+import type { Contact, Display } from "../api/stream";
 import { areUpright, boxOf, type ImagePlane } from "../geometry/plane";
 
 /** Depth samples and scan lines that are offered, beside those of the training. */
 export const SIZES = [128, 256, 384, 512, 768];
 export const DISPLAY = settings.properties!.display!;
+export const CONTACTS = settings.properties!.contact!.enum as Contact[];
 export const AS_RENDERED = defaultsOf(DISPLAY) as Display;
 const MOST_PICTURE_PIXELS = 640; // on the longer side of a scan-converted fan
 
@@ -19,6 +20,8 @@ export class ImageSettings {
   samples = $state<number | null>(null);
   /** Thickness along elevation, at the focus of the scene's beam; 0: a plane; null: as trained. */
   sliceThickness_mm = $state<number | null>(null);
+  /** What is shown of the probe's contact with the skin; null: it is assumed. */
+  contact = $state<Contact | null>(null);
   /** Whether what no Gaussians support is black. */
   hidesUnsupported = $state(false);
 
@@ -35,6 +38,7 @@ export class ImageSettings {
   reset(): void {
     this.display = AS_RENDERED;
     this.sliceThickness_mm = null;
+    this.contact = null;
   }
 
   /** What fits any probe is kept, the depth of another one is not. */
@@ -44,7 +48,7 @@ export class ImageSettings {
 
   /** What was chosen for another scene does not fit this one. */
   beginAnew(): void {
-    this.samples = this.sliceThickness_mm = null;
+    this.samples = this.sliceThickness_mm = this.contact = null;
     this.forgetDepth();
   }
 }

@@ -8,7 +8,7 @@ import type { Display } from "../api/stream";
 import { fromPositionQuaternion, position, quaternion, type Pose, type Quaternion, type Vector } from "../geometry/pose";
 import type { Kept } from "../shell/router.svelte";
 import { words } from "../words/words.svelte";
-import { AS_RENDERED, DISPLAY, SIZES } from "./image_settings.svelte";
+import { AS_RENDERED, CONTACTS, DISPLAY, SIZES } from "./image_settings.svelte";
 import type { Session } from "./session.svelte";
 
 const BETWEEN = "_"; // stands in addresses as it is
@@ -17,7 +17,7 @@ const SLICE = settings.properties!.slice_thickness_mm!;
 const DISPLAY_FIELDS = Object.entries(DISPLAY.properties!).filter(([name]) => name !== "pixel_mm") as [keyof Display, Described][];
 const PROBE_NUMBERS = [...new Set([...PROBE_KINDS.values()].flatMap(numbersOf))];
 const KEYS = [
-  ...["pose", "probe", "samples", "slice_mm", "lines", "unsupported"],
+  ...["pose", "probe", "samples", "slice_mm", "contact", "lines", "unsupported"],
   ...PROBE_NUMBERS.map((name) => `probe.${name}`),
   ...DISPLAY_FIELDS.map(([name]) => name),
 ];
@@ -42,7 +42,7 @@ export function linkOf(session: Session): Record<string, string | null> {
   const { pose, chosenProbe: probe, image } = session;
   const differing = (value: string, usual: string): string | null => (value === usual ? null : value);
   const link: Record<string, string | null> = Object.fromEntries(KEYS.map((key) => [key, null]));
-  link.pose = differing(poseValue(pose), poseValue(session.held(session.home)));
+  link.pose = differing(poseValue(pose), poseValue(session.held(session.scene.home)));
   if (probe !== null) {
     const { kind, ...numbers } = probe;
     link.probe = kind;
@@ -51,6 +51,7 @@ export function linkOf(session: Session): Record<string, string | null> {
   for (const [name] of DISPLAY_FIELDS) link[name] = differing(written(image.display[name]), written(AS_RENDERED[name]));
   link.samples = image.samples === null ? null : String(image.samples);
   link.slice_mm = image.sliceThickness_mm === null ? null : String(image.sliceThickness_mm);
+  link.contact = image.contact;
   link.lines = image.scanConverted ? null : "stored";
   link.unsupported = image.hidesUnsupported ? "black" : null;
   return link;
@@ -76,15 +77,17 @@ export async function followLink(session: Session, kept: Kept): Promise<string[]
   const pose = reader.read("pose", readPose);
   const samples = reader.read("samples", readSamples);
   const thickness_mm = reader.read("slice_mm", (text) => numberWithin(SLICE, text));
+  const contact = reader.read("contact", (text) => oneOf(CONTACTS, text));
   const stored = reader.read("lines", (text) => oneOf(["stored"], text));
   const unsupported = reader.read("unsupported", (text) => oneOf(["black"], text));
   if (probe !== null || session.chosenProbe !== null) await reader.attempt("probe", () => session.chooseProbe(probe));
   session.image.display = { ...AS_RENDERED, ...display };
   session.image.samples = samples;
   session.image.sliceThickness_mm = thickness_mm;
+  session.image.contact = contact;
   session.image.scanConverted = stored === null;
   session.image.hidesUnsupported = unsupported !== null;
-  session.jumpTo(pose ?? session.held(session.home));
+  session.jumpTo(pose ?? session.held(session.scene.home));
   return reader.refused;
 }
 
@@ -153,9 +156,13 @@ function numberWithin({ minimum = -Infinity, maximum = Infinity }: Described, te
   return number;
 }
 
-function oneOf(choices: readonly string[], text: string): string {
-  if (!choices.includes(text)) throw new Error(words.session.link.oneOf(choices));
+function oneOf<T extends string>(choices: readonly T[], text: string): T {
+  if (!isAmong(choices, text)) throw new Error(words.session.link.oneOf(choices));
   return text;
+}
+
+function isAmong<T extends string>(choices: readonly T[], text: string): text is T {
+  return (choices as readonly string[]).includes(text);
 }
 
 function numbersOf({ properties = {} }: Described): string[] {

@@ -52,9 +52,9 @@ export class LiveView {
     this.#timer = setInterval(() => this.#measure(), RATES_EVERY_MS);
     // Until the scene is known as it is now, and while the stream is lost, the service is asked what is the matter.
     $effect(() => {
-      if (session.known && !session.outdated && this.connected) return;
-      void session.load();
-      const timer = setInterval(() => void session.load(), SCENE_ASKED_AGAIN_MS);
+      if (session.scene.known && !session.scene.outdated && this.connected) return;
+      void session.scene.load();
+      const timer = setInterval(() => void session.scene.load(), SCENE_ASKED_AGAIN_MS);
       return () => clearInterval(timer);
     });
     $effect(() => {
@@ -106,7 +106,7 @@ export class LiveView {
     this.#arrived = frame;
     this.#arrived_ms = performance.now();
     this.refusal = null;
-    this.session.rendered(frame.header.scene_sha256);
+    this.session.scene.rendered(frame.header.scene_sha256);
     this.#latency.dropped(frame.header.dropped); // also those of a frame that another one replaces before it is shown
     if (this.#request === 0) this.#request = requestAnimationFrame(() => this.#show());
   }

@@ -18,7 +18,7 @@ export class Overlays {
   constructor(private readonly session: Session) {}
 
   get knowsUncertainty(): boolean {
-    return this.session.description?.outputs.includes("uncertainty") ?? false;
+    return this.session.scene.description?.outputs.includes("uncertainty") ?? false;
   }
 
   /** What must come beside the image: coverage only while there is something to hatch. */

@@ -1,11 +1,8 @@
-/** One scene as it is scanned: its description, the probe, where it is held and how its frames are shown. */
+/** One scene as it is scanned: the probe, where it is held and how its frames are shown. */
 
-import { explain, mayPass, ServiceError, Unreachable } from "../api/client";
 import type { Output } from "../api/outputs";
-import { exampleProbe, PROBE_KINDS, type Probe } from "../api/probes";
-import { describeScene, trainingPoses, type SceneDescription, type TrainingPoses } from "../api/scenes";
+import type { Probe } from "../api/probes";
 import type { StreamSettings } from "../api/stream";
-import type { ImagePlane } from "../geometry/plane";
 import {
   between,
   IDENTITY,
@@ -20,13 +17,8 @@ import {
 } from "../geometry/pose";
 import { History } from "./history.svelte";
 import { ImageSettings } from "./image_settings.svelte";
+import { KnownScene, type Held } from "./known_scene.svelte";
 import { planes } from "./planes.svelte";
-
-/** A probe with its image plane. */
-interface Held {
-  probe: Probe;
-  plane: ImagePlane;
-}
 
 /** Poses to play, of the scene's own probe. */
 export interface Trajectory {
@@ -34,23 +26,8 @@ export interface Trajectory {
   poses: Pose[];
 }
 
-/** In place of the own probe of a scene that has none. */
-const SUBSTITUTE = exampleProbe([...PROBE_KINDS.keys()][0]!, 50);
-/** Until a scene is known. */
-const NOTHING: Held = {
-  probe: SUBSTITUTE,
-  plane: { face_depth_mm: 0, pivot_depth_mm: 0, lines_mm: [[-20, 0, -20, 50], [20, 0, 20, 50]] }, // prettier-ignore
-};
-
 export class Session {
-  description = $state.raw<SceneDescription | null>(null);
-  /** Why there is no description. */
-  problem = $state<string | null>(null);
-  missing = $state(false);
-  /** The views that the scene was trained from. */
-  views = $state.raw<Pose[]>([]);
-  /** How far each was corrected in the training; null: none was. */
-  corrections = $state.raw<Pick<TrainingPoses, "shift_mm" | "turn_deg"> | null>(null);
+  readonly scene: KnownScene;
   #pose = $state.raw<Pose>(IDENTITY);
   /** Whether the image stands: the pose is that of the frame shown, and nothing steers the probe. */
   frozen = $state(false);
@@ -64,79 +41,38 @@ export class Session {
   trajectory = $state.raw<Trajectory | null>(null);
   /** Where the probe was put last on the track, in its poses; between them too. */
   place = $state(0);
-  /** Whether frames have come from another file since the description was asked for. */
-  outdated = $state(false);
 
-  readonly known = $derived(this.description !== null);
-  readonly track = $derived(this.trajectory?.poses ?? this.views);
-  #own = $state.raw<Held>(NOTHING);
+  readonly track = $derived.by(() => this.trajectory?.poses ?? this.scene.views);
   /** null: the scene's own. */
   #chosen = $state.raw<Held | null>(null);
-  readonly #held = $derived(this.#chosen ?? this.#own);
+  readonly #held = $derived.by(() => this.#chosen ?? this.scene.own);
   readonly chosenProbe = $derived(this.#chosen?.probe ?? null);
-  readonly sceneProbe = $derived(this.#own.probe);
-  readonly scenePlane = $derived(this.#own.plane);
   readonly probe = $derived(this.#held.probe);
   readonly plane = $derived(this.#held.plane);
-  readonly home = $derived(this.views[Math.floor(this.views.length / 2)] ?? middleOf(this.description));
   /** What becomes of a pose that the probe is slid or dragged to, from where it was: in contact its face stays on the skin. */
   constrain: (before: Pose, after: Pose) => Pose = (_, after) => after;
   #placed = $state.raw<Pose | null>(null);
   /** Whether the probe is at `place`. */
   readonly onTrack = $derived(this.#pose === this.#placed);
-  #asking = false;
   #choices = 0;
-  #sha256: string | null = null;
 
-  constructor(readonly name: string) {}
-
-  /** Asks the service about the scene. */
-  async load(): Promise<void> {
-    if (this.#asking) return;
-    this.#asking = true;
-    const sha256 = this.#sha256;
-    try {
-      const description = await describeScene(this.name);
-      if (!sameScene(this.description, description)) {
-        const probe = description.probe ?? SUBSTITUTE;
-        const plane = await planes.get(probe);
-        const known = description.training_poses.count > 0 ? await viewsOf(this.name) : null;
-        this.views = known?.poses ?? [];
-        this.corrections = known?.shift_mm ? known : null;
-        this.description = description;
-        this.#own = { probe, plane };
-        this.#beginAnew();
-      }
-      if (sha256 === this.#sha256) this.outdated = false;
-      this.problem = null;
-      this.missing = false;
-    } catch (error) {
-      this.problem = error instanceof Unreachable ? null : explain(error);
-      this.missing = error instanceof ServiceError && error.reason === "SCENE_NOT_FOUND";
-    } finally {
-      this.#asking = false;
-    }
-  }
-
-  /** Takes note of the file that a frame came from. */
-  rendered(sha256: string): void {
-    if (this.#sha256 !== null && this.#sha256 !== sha256) this.outdated = true;
-    this.#sha256 = sha256;
+  constructor(readonly name: string) {
+    this.scene = new KnownScene(name, () => this.#beginAnew());
   }
 
   /** What to ask the stream for; `plain`: without what changes the values of pixels. */
   settings(outputs: Output[], { plain = false } = {}): StreamSettings {
-    const { samples, sliceThickness_mm, hidesUnsupported } = this.image;
+    const { samples, sliceThickness_mm, contact, hidesUnsupported } = this.image;
     return {
       height: samples,
       width: samples,
-      probe: this.description?.probe ? this.chosenProbe : this.probe,
+      probe: this.scene.description?.probe ? this.chosenProbe : this.probe,
       display: this.image.displayIn(this.plane, plain),
       outputs,
       slice_thickness_mm: sliceThickness_mm,
-      min_confidence: hidesUnsupported && this.description?.confidence ? 1 : null,
+      min_confidence: hidesUnsupported && this.scene.description?.confidence ? 1 : null,
       below_min_confidence: "mask",
-      contact: null,
+      contact,
     };
   }
 
@@ -189,7 +125,7 @@ export class Session {
 
   /** To the middle of the sweep. */
   goHome(): void {
-    this.#jump(() => this.#toView(Math.floor(this.views.length / 2), this.home));
+    this.#jump(() => this.#toView(Math.floor(this.scene.views.length / 2), this.scene.home));
   }
 
   /** To a place of the track, in its poses. */
@@ -211,7 +147,7 @@ export class Session {
 
   /** The pose that puts the face of the probe in use where that of the scene's own probe was. */
   held(view: Pose): Pose {
-    return translated(view, [0, 0, this.scenePlane.pivot_depth_mm - this.plane.pivot_depth_mm]);
+    return translated(view, [0, 0, this.scene.own.plane.pivot_depth_mm - this.plane.pivot_depth_mm]);
   }
 
   /** The pose of the scene's own probe with its face where that of the probe in use is. */
@@ -221,8 +157,8 @@ export class Session {
 
   /** To the nearest training view. */
   snap(): void {
-    const index = nearest(this.views, this.trainedPose);
-    if (index >= 0) this.#jump(() => this.#toView(index, this.views[index]!));
+    const index = nearest(this.scene.views, this.trainedPose);
+    if (index >= 0) this.#jump(() => this.#toView(index, this.scene.views[index]!));
   }
 
   /** Takes another probe, its face where that of the one before was. Throws ServiceError for one that cannot be. */
@@ -267,7 +203,7 @@ export class Session {
 
   /** To a training view, which is on the track unless other poses are played. */
   #toView(index: number, view: Pose): void {
-    if (this.trajectory === null && this.views.length > 0) this.#follow(index);
+    if (this.trajectory === null && this.scene.views.length > 0) this.#follow(index);
     else this.#steer(this.held(view));
   }
 
@@ -285,7 +221,7 @@ export class Session {
 
   /** The inverse of `held`. */
   #trained(pose: Pose): Pose {
-    return translated(pose, [0, 0, this.plane.pivot_depth_mm - this.scenePlane.pivot_depth_mm]);
+    return translated(pose, [0, 0, this.plane.pivot_depth_mm - this.scene.own.plane.pivot_depth_mm]);
   }
 
   /** What was chosen for another scene of that name does not fit this one. */
@@ -297,25 +233,6 @@ export class Session {
     this.goHome();
     this.history.clear();
   }
-}
-
-/** Whether both tell of one scene file. */
-function sameScene(before: SceneDescription | null, now: SceneDescription): boolean {
-  const lasting = (scene: SceneDescription): string => JSON.stringify({ ...scene, loaded: null, loaded_processes: null });
-  return before !== null && lasting(before) === lasting(now);
-}
-
-async function viewsOf(scene: string): Promise<TrainingPoses | null> {
-  try {
-    return await trainingPoses(scene);
-  } catch (error) {
-    if (mayPass(error)) throw error;
-    return null;
-  }
-}
-
-function middleOf(description: SceneDescription | null): Pose {
-  return description?.training_poses.middle?.matrix.flat() ?? IDENTITY;
 }
 
 const sessions = new Map<string, Session>();

@@ -16,8 +16,8 @@ export class SweepConfidence {
   /** Must be made while a component is being made. */
   constructor(session: Session) {
     $effect(() => {
-      const { track, chosenProbe, description } = session;
-      if (description === null || track.length < 2 || service.status !== "ready") return;
+      const { track, chosenProbe, scene } = session;
+      if (!scene.known || track.length < 2 || service.status !== "ready") return;
       const count = Math.min(MOST_PLACES, (track.length - 1) * MOST_BETWEEN + 1);
       const poses = Array.from({ length: count }, (_, index) => {
         const place = (index / (count - 1)) * (track.length - 1);

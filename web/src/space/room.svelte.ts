@@ -3,7 +3,7 @@
 import type { Gaussians } from "../api/gaussians";
 import { sceneGaussians, type SceneDescription } from "../api/scenes";
 import { apply, axis, translated, withPosition, type Pose, type Vector } from "../geometry/pose";
-import { keptOn, putOn, skinOf } from "../geometry/skin";
+import { keptOn, putOn } from "../geometry/skin";
 import { sessionOf, type Session } from "../session/session.svelte";
 import { USUAL, type Appearance, type ColourBy, type Cut } from "./appearance";
 import { recalled, remember } from "./memory";
@@ -39,11 +39,10 @@ export class Room {
   volume = $state.raw<Volume | null>(null);
   /** Whether the volume is still made, or made finer. */
   building = $state(false);
-  readonly skin = $derived.by(() => skinOf(this.session.views, this.session.scenePlane));
   /** How far the face is pressed into the skin, mm; less than 0 above it. */
   readonly pressed_mm = $derived.by(() => {
-    const { pose, plane } = this.session;
-    return this.skin && -this.skin.distance(apply(pose, [0, 0, plane.pivot_depth_mm]), axis(pose, 2));
+    const { pose, plane, scene } = this.session;
+    return scene.skin && -scene.skin.distance(apply(pose, [0, 0, plane.pivot_depth_mm]), axis(pose, 2));
   });
   /** Between which the intensities lie that the colours stand for. */
   readonly intensities = $derived.by((): [number, number] => {
@@ -63,7 +62,7 @@ export class Room {
 
   /** What Gaussians can be coloured by. */
   readonly colours = $derived.by((): ColourBy[] => {
-    const labelled = Object.keys(this.session.description?.label_names ?? {}).length > 0;
+    const labelled = Object.keys(this.session.scene.description?.label_names ?? {}).length > 0;
     return [...(labelled ? (["label"] as const) : []), "intensity", "transmittance", "coverage"];
   });
 
@@ -84,12 +83,13 @@ export class Room {
   }
 
   #putOn(pose: Pose): void {
-    if (this.skin) this.session.pose = putOn(this.skin, pose, this.session.plane.pivot_depth_mm);
+    const { scene, plane } = this.session;
+    if (scene.skin) this.session.pose = putOn(scene.skin, pose, plane.pivot_depth_mm);
   }
 
   /** Asks for the Gaussians of the scene, where they are not there yet, and makes the volume of them. */
   async load(): Promise<void> {
-    const { description } = this.session;
+    const { description } = this.session.scene;
     if (description === null || description === this.#of) return;
     this.#of = description;
     if (shown !== this) shown?.forget();
@@ -112,7 +112,8 @@ export class Room {
   }
 
   #kept(before: Pose, after: Pose): Pose {
-    return this.contact && this.skin ? keptOn(this.skin, before, after, this.session.plane.pivot_depth_mm) : after;
+    const { scene, plane } = this.session;
+    return this.contact && scene.skin ? keptOn(scene.skin, before, after, plane.pivot_depth_mm) : after;
   }
 
   #build({ count, total, values }: Gaussians): void {

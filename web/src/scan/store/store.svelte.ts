@@ -64,7 +64,7 @@ export class Store {
   #sheet(pages: readonly Page[]): Sheet {
     const placed = pages[0] && planes.placed(pages[0].frame.header);
     if (!placed) throw new Error(words.scan.store.nothing);
-    return new Sheet(placed, this.scan.marks, this.scan.session.description, pages);
+    return new Sheet(placed, this.scan.marks, this.scan.session.scene.description, pages);
   }
 
   #asDicom(frames: readonly Frame[]): Promise<Blob> {

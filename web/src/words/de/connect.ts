@@ -72,6 +72,9 @@ export const connect: Words["connect"] = {
     distance: "Zu den Trainingsbildern",
     support: "Belegte Pixel",
     supportMeans: "Pixel, für die die Szene Gewebe hat (Abdeckung von mindestens 0,3)",
+    touch: "Kontakt mit der Haut",
+    touchMeans: "Anteil der Scanlinien, deren Fläche auf der Haut liegt; die anderen sind dunkel",
+    contact: (percent: number) => `Kontakt ${percent} %`,
     expected: (percent: number) => `erwartete Ähnlichkeit ${percent} %`,
     withError: (percent: number, points: number) =>
       `erwartete Ähnlichkeit ${percent} %, mittlerer Fehler ${points} ${points === 1 ? "Punkt" : "Punkte"}`,

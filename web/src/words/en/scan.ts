@@ -1,5 +1,6 @@
 /** The Scan view in English. */
 
+import type { Contact } from "../../api/stream";
 import type { Command } from "../../scan/commands";
 import type { MarkKind } from "../../scan/marks.svelte";
 
@@ -63,6 +64,7 @@ const steering: { title: string; lines: [string, string][] }[] = [
     ],
   },
 ];
+const contacts: Record<Contact, string> = { air: "Dark", pressure: "Dark; pressed tissue gives way" };
 /** Of the kinds of probes, and of the settings of the display; English takes the words of the service. */
 const probes: Record<string, string> = {};
 const fields: Record<string, string | undefined> = { dynamic_range_db: "Range", tgc_db: "Time-gain compensation" };
@@ -169,6 +171,11 @@ export const scan = {
     slice: "Slice",
     sliceThickness: "Slice thickness",
     trained: (thickness_mm: number): string => `As trained: ${thickness_mm.toFixed(1)} mm.`,
+    contact: "Off the skin",
+    contactMeans: "What is shown where the face of the probe is not on the skin, which the training sweep tells",
+    contactAssumed: "As in contact",
+    contacts,
+    noSkin: "The training sweep does not tell where the skin is",
     samples: "Samples",
     asTrained: "As trained",
     geometry: "Geometry",
