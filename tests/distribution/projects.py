@@ -1,4 +1,4 @@
-"""The three projects of this repository, as their pyproject.toml say."""
+"""The four projects of this repository, as their pyproject.toml say."""
 
 from __future__ import annotations
 
@@ -12,7 +12,12 @@ from packaging.utils import canonicalize_name
 
 from ..surroundings import ROOT
 
-FOLDERS = {"ultragray": ROOT, "ultragray-client": ROOT / "client", "ultragray-proto": ROOT / "proto"}
+FOLDERS = {
+    "ultragray": ROOT,
+    "ultragray-client": ROOT / "client",
+    "ultragray-proto": ROOT / "proto",
+    "ultragray-ros": ROOT / "ros",
+}
 
 
 def pyproject(name: str) -> dict[str, Any]:

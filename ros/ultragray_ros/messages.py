@@ -1,0 +1,113 @@
+"""Between messages of ROS and those of the client: the one place where metres become millimetres, and back.
+
+Convention. A pose takes points of the probe's frame (x lateral, y elevation, z depth) to the scene's. Worked value: the
+position (0, 0, 0.01) m is (0, 0, 10) mm; orientations are x, y, z, w in ROS and named here.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+from array import array
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from geometry_msgs.msg import PoseStamped, TransformStamped
+from PIL import Image as Picture
+from sensor_msgs.msg import CompressedImage, Image
+from std_msgs.msg import Header, String
+
+from ultragray_client import Frame, Placement, Quaternion
+from ultragray_client.errors import InvalidArgument
+
+MM_PER_M = 1000.0
+JPEG_QUALITY = 95
+ENCODING = "mono8"
+
+Pixels = npt.NDArray[np.uint8]
+
+
+def placement(stamped: PoseStamped) -> Placement:
+    """The pose of the probe, in mm; the service checks it."""
+    position, turn = stamped.pose.position, stamped.pose.orientation
+    return Placement(
+        (MM_PER_M * position.x, MM_PER_M * position.y, MM_PER_M * position.z),
+        Quaternion(w=turn.w, x=turn.x, y=turn.y, z=turn.z),
+    )
+
+
+def stamped_pose(transform: TransformStamped) -> PoseStamped:
+    """The pose of the child's frame in the parent's, with the transform's stamp."""
+    pose = PoseStamped(header=transform.header)
+    moved, position = transform.transform.translation, pose.pose.position
+    position.x, position.y, position.z = moved.x, moved.y, moved.z
+    pose.pose.orientation = transform.transform.rotation
+    return pose
+
+
+def image(pixels: Pixels, header: Header) -> Image:  # [H, W]
+    """The pixels as they are, 8-bit grey."""
+    height, width = pixels.shape
+    data = array("B", pixels.tobytes())  # rclpy copies an array at once, and checks other sequences byte by byte
+    return Image(header=header, height=height, width=width, encoding=ENCODING, is_bigendian=0, step=width, data=data)
+
+
+def compressed_image(pixels: Pixels, header: Header) -> CompressedImage:  # [H, W]
+    """The pixels as a JPEG file, which changes them a little."""
+    file = io.BytesIO()
+    Picture.fromarray(pixels).save(file, "JPEG", quality=JPEG_QUALITY)
+    return CompressedImage(header=header, format=f"{ENCODING}; jpeg compressed ", data=array("B", file.getvalue()))
+
+
+def confidence(frame: Frame, header: Header, *, least: float | None, replaced: int) -> DiagnosticArray:
+    """How far a frame can be trusted: WARN where its confidence is not known, or below `least`.
+
+    The values are the confidence figures of the frame, its latency in ms, and the poses that it replaced; those that
+    are not known are missing.
+    """
+    told = frame.extrapolation
+    known = told.confidence is not None
+    is_fine = told.confidence is not None and (least is None or told.confidence >= least)
+    values = {**asdict(told), "latency_ms": frame.latency_ms, "replaced_poses": replaced}
+    status = DiagnosticStatus(
+        level=DiagnosticStatus.OK if is_fine else DiagnosticStatus.WARN,
+        name=f"ultragray: {frame.scene}",
+        message=f"confidence {told.confidence:.2f}" if known else "the scene cannot tell its confidence",
+        hardware_id=frame.scene_sha256,
+        values=[KeyValue(key=key, value=f"{value:g}") for key, value in values.items() if value is not None],
+    )
+    return DiagnosticArray(header=header, status=[status])
+
+
+def geometry(frame: Frame, frame_id: str) -> String:
+    """JSON: where the pixels lie in the frame of the probe, and what was rendered.
+
+    `pixel_to_probe_m` [4, 4] takes (column, row, k, 1) to metres, k metres against the elevation y; null where columns
+    are scan lines of a fan. `picture` describes the pixels in either case, in mm and degrees.
+    """
+    height, width = next(iter(frame.arrays.values())).shape
+    document = {
+        "frame_id": frame_id,
+        "height": height,
+        "width": width,
+        "pixel_to_probe_m": _pixel_to_probe_m(frame),
+        "picture": asdict(frame.picture),
+        "probe": asdict(frame.probe),
+        "slice_thickness_mm": frame.slice_thickness_mm,
+        "scene": frame.scene,
+        "scene_sha256": frame.scene_sha256,
+        "renderer": frame.renderer,
+    }
+    return String(data=json.dumps(document))
+
+
+def _pixel_to_probe_m(frame: Frame) -> Any:
+    try:
+        matrix = frame.picture.pixel_to_probe()
+    except InvalidArgument:  # columns are angles
+        return None
+    matrix[:3, [0, 1, 3]] /= MM_PER_M  # the third column is a direction, of metres as of mm
+    return matrix.tolist()

@@ -1,0 +1,246 @@
+"""The node: a lifecycle node whose parameters are the settings of its frames.
+
+    ultragray-ros --ros-args -p scene:=liver -p display.gain_db:=6.0
+
+Configuring makes the topics, activating takes poses. A pose that is refused, a service that is away, a frame that comes
+too late or a scene that does not exist is logged; nothing is published for it, and the node goes on.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from typing import Any
+
+import rclpy
+from geometry_msgs.msg import PoseStamped
+from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
+from rclpy.executors import ExternalShutdownException
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from std_msgs.msg import Header
+
+from ultragray_client import Client, Frame, RenderSettings, Tls
+from ultragray_client.errors import (
+    ClientError,
+    InvalidArgument,
+    InvalidPose,
+    LowConfidence,
+    NotFound,
+    PermissionDenied,
+    Unauthenticated,
+    Unimplemented,
+)
+
+from . import messages, parameters
+from .newest import NewestFrames
+from .problems import Problems
+from .publishers import Publishers
+from .transforms import TransformedPoses
+
+API_KEY = "ULTRAGRAY_API_KEY"  # parameters are read by everybody on the network, the environment is not
+NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)  # fits publishers of either reliability
+CHECK_TIMEOUT_S = 2.0
+OWN_PARAMETERS: dict[str, tuple[Any, str]] = {
+    "address": ("localhost:50051", "HOST:PORT of the service's gRPC"),
+    "tls": (False, "whether the connection is encrypted"),
+    "root_certificates": ("", "PEM file of the authority to trust; empty: those of the system"),
+    "source": ("pose", "where poses come from: pose (the topic ~/probe_pose) or tf"),
+    "rate_hz": (60.0, "of the look-ups, with source tf"),
+    "scene_frame": ("scene", "frame of the scene, in which poses are given"),
+    "probe_frame": ("probe", "frame of the probe, in which images lie"),
+    "timeout_s": (1.0, "frames that are further behind their pose are not published"),
+    "autostart": (True, "whether the node configures and activates itself"),
+}
+SCENE = ("demo", "name of the scene")
+_ABOUT_SETTINGS = (InvalidArgument, NotFound, PermissionDenied, Unauthenticated, Unimplemented)
+_ABOUT_THE_POSE = (InvalidPose, LowConfidence)
+
+
+class UltrasoundNode(LifecycleNode):  # type: ignore[misc]
+    """Poses of a probe in, images of an UltraG-Ray service out."""
+
+    def __init__(self) -> None:
+        super().__init__("ultragray")
+        for name, (default, meaning) in OWN_PARAMETERS.items():
+            self.declare_parameter(name, default, ParameterDescriptor(description=meaning, read_only=True))
+        self.declare_parameter("scene", SCENE[0], ParameterDescriptor(description=SCENE[1]))
+        for name, default in parameters.defaults().items():
+            meaning = f"{name} of the render settings; -1 or empty, where that is the default: as the scene has it"
+            self.declare_parameter(name, default, ParameterDescriptor(description=meaning))
+        self._problems = Problems(self.get_logger().warning)
+        self._client: Client | None = None
+        self._topics: Publishers | None = None
+        self._frames: NewestFrames[Header] | None = None
+        self._poses: TransformedPoses | None = None
+        self._subscription: Any = None
+        self._last_pose: PoseStamped | None = None
+        self._settings = RenderSettings()
+        self.add_on_set_parameters_callback(self._check_parameters)
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Make the connection, which asks for nothing yet, and the topics."""
+        try:
+            self._settings = parameters.settings_of(self._values())
+            self._client = self._connected()
+        except ClientError as error:
+            self.get_logger().error(str(error))
+            return TransitionCallbackReturn.FAILURE
+        self._topics = Publishers(self, self._value("probe_frame"))
+        self._topics.offer(self._settings.outputs)
+        return super().on_configure(state)
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Take poses."""
+        assert self._client is not None
+        self._frames = NewestFrames(
+            self._client,
+            self._value("scene"),
+            self._settings,
+            timeout_s=self._value("timeout_s"),
+            take=self._publish,
+            tell=lambda error: self._problems.tell(error.reason, error.detail),
+        )
+        try:
+            self._take_poses()
+        except ClientError as error:
+            self.get_logger().error(str(error))
+            self._stop()
+            return TransitionCallbackReturn.FAILURE
+        return super().on_activate(state)
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Take no more poses."""
+        self._stop()
+        return super().on_deactivate(state)
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Give up connection and topics."""
+        self.close()
+        return super().on_cleanup(state)
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Give up everything."""
+        self.close()
+        return super().on_shutdown(state)
+
+    def close(self) -> None:
+        """End the rendering, and give up connection and topics."""
+        self._stop()
+        if self._topics is not None:
+            self._topics.close()
+        if self._client is not None:
+            self._client.close()
+        self._topics = self._client = None
+
+    def _stop(self) -> None:
+        if self._poses is not None:
+            self._poses.close()
+        if self._subscription is not None:
+            self.destroy_subscription(self._subscription)
+        if self._frames is not None:
+            self._frames.close()
+        self._poses = self._subscription = self._frames = None
+
+    def _value(self, name: str) -> Any:
+        return self.get_parameter(name).value
+
+    def _values(self) -> dict[str, Any]:
+        return {name: self._value(name) for name in parameters.defaults()}
+
+    def _connected(self) -> Client:
+        tls = Tls(root_certificates=self._value("root_certificates") or None) if self._value("tls") else None
+        return Client(self._value("address"), api_key=os.environ.get(API_KEY) or None, tls=tls)
+
+    def _take_poses(self) -> None:
+        """Begin to take poses. Raises InvalidArgument for a source that does not exist, or not here."""
+        match self._value("source"):
+            case "pose":
+                self._subscription = self.create_subscription(PoseStamped, "~/probe_pose", self._take, NEWEST)
+            case "tf":
+                self._poses = TransformedPoses(
+                    self,
+                    self._value("scene_frame"),
+                    self._value("probe_frame"),
+                    rate_hz=self._value("rate_hz"),
+                    take=self._take,
+                    problems=self._problems,
+                )
+            case other:
+                raise InvalidArgument(f"source must be pose or tf, got {other!r}", field="source")
+
+    def _take(self, pose: PoseStamped) -> None:
+        """A pose came. One that names another frame than the scene's would be taken for what it is not."""
+        scene_frame = self._value("scene_frame")
+        if pose.header.frame_id not in ("", scene_frame):
+            self._problems.tell(
+                "FRAME_REFUSED",
+                f"poses must be given in the frame {scene_frame!r}, got one in {pose.header.frame_id!r}: transform it, "
+                "or run the node with source tf",
+            )
+            return
+        self._last_pose = pose
+        if self._frames is not None:
+            self._frames.render(messages.placement(pose), pose.header)
+
+    def _publish(self, frame: Frame, header: Header, replaced: int) -> None:
+        assert self._topics is not None
+        self._topics.publish(frame, header, least_confidence=self._settings.min_confidence, replaced=replaced)
+
+    def _check_parameters(self, changed: list[Parameter]) -> SetParametersResult:
+        """Take over other settings, unless the service refuses them."""
+        values = {"scene": self._value("scene"), **self._values()}
+        given = {parameter.name: parameter.value for parameter in changed if parameter.name in values}
+        if self._client is None or not given:  # what is set before the node is configured is used then
+            return SetParametersResult(successful=True)
+        values |= given
+        try:
+            settings = parameters.settings_of(values)
+            self._ask_service(self._client, values["scene"], settings)
+        except ClientError as error:
+            return SetParametersResult(successful=False, reason=error.detail)
+        assert self._topics is not None
+        self._topics.offer(settings.outputs)
+        self._settings = settings
+        if self._frames is not None:
+            self._frames.change(values["scene"], settings)
+        return SetParametersResult(successful=True)
+
+    def _ask_service(self, client: Client, scene: str, settings: RenderSettings) -> None:
+        """Render one frame with other settings. Raises ClientError where it is refused for their sake."""
+        pose = messages.placement(self._last_pose or PoseStamped())
+        try:
+            client.render(scene, pose, settings, timeout_s=CHECK_TIMEOUT_S)
+        except _ABOUT_THE_POSE:
+            return
+        except _ABOUT_SETTINGS:
+            raise
+        except ClientError as error:
+            self._problems.tell(error.reason, f"settings were taken over unchecked: {error.detail}")
+
+
+def main() -> None:
+    """Run the node until it is told to stop: the command `ultragray-ros`."""
+    rclpy.init()
+    node = UltrasoundNode()
+    try:
+        if node.get_parameter("autostart").value and not _started(node):
+            sys.exit(1)
+        rclpy.spin(node)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    finally:
+        node.close()
+        node.destroy_node()
+        rclpy.try_shutdown()
+
+
+def _started(node: UltrasoundNode) -> bool:
+    """Configure and activate; the log says why it failed."""
+    done = TransitionCallbackReturn.SUCCESS
+    return all(transition() == done for transition in (node.trigger_configure, node.trigger_activate))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,98 @@
+"""The settings of a frame as ROS parameters: one for each field of RenderSettings, `display.` before those of Display.
+
+A parameter of ROS is never None: −1 and the empty text leave a setting to the scene, and [0.0] stands for no numbers. A
+probe is written as JSON, such as `{"kind": "convex", "opening_angle_deg": 60, "near_mm": 40, "far_mm": 95}`.
+Free of ROS.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import MISSING, Field, fields, is_dataclass
+from enum import Enum
+from types import NoneType
+from typing import Any, TypeAlias, get_args, get_origin, get_type_hints
+
+from ultragray_client import Display, RenderSettings
+from ultragray_client.errors import InvalidArgument
+
+Value: TypeAlias = bool | int | float | str | list[str] | list[float]
+
+DISPLAY = "display."
+NEVER = "encoding"  # images are mono8
+NO_NUMBERS = [0.0]  # for an empty list of numbers: of one that is empty ROS cannot tell the type
+_LEFT_OPEN: dict[Any, Value] = {int: -1, float: -1.0}  # for what may be None; of all other kinds the empty text
+
+
+def defaults() -> dict[str, Value]:
+    """The parameters by their names, with the values that leave everything as the scene has it."""
+    return {name: _default(item, kind) for name, item, kind in _entries()}
+
+
+def settings_of(values: Mapping[str, Any]) -> RenderSettings:
+    """The settings that parameters stand for; others among them are passed over.
+
+    Raises InvalidArgument for a word or a probe that does not exist; the service checks the rest.
+    """
+    found = {name: _read(name, kind, values[name]) for name, _, kind in _entries()}
+    display = Display(**{name.removeprefix(DISPLAY): found.pop(name) for name in tuple(found) if DISPLAY in name})
+    return RenderSettings(**found, display=None if display == Display() else display)
+
+
+def _entries() -> Iterator[tuple[str, Field[Any], Any]]:
+    """Name, field and type of each parameter."""
+    for prefix, cls, left_out in (("", RenderSettings, (NEVER, "display")), (DISPLAY, Display, ())):
+        hints = get_type_hints(cls)
+        for item in fields(cls):
+            if item.name not in left_out:
+                yield prefix + item.name, item, hints[item.name]
+
+
+def _default(item: Field[Any], kind: Any) -> Value:
+    value = item.default
+    if value is MISSING or value is None:
+        return _left_open(kind)
+    if isinstance(value, Enum):
+        return str(value.value)
+    if isinstance(value, tuple):
+        return list(value) or NO_NUMBERS
+    return value  # type: ignore[no-any-return]
+
+
+def _left_open(kind: Any) -> Value:
+    return _LEFT_OPEN.get(get_args(kind)[0], "")
+
+
+def _read(name: str, kind: Any, value: Any) -> Any:
+    inner = [one for one in get_args(kind) if one is not NoneType] or [kind]
+    if NoneType in get_args(kind) and value == _left_open(kind):
+        return None
+    if is_dataclass(inner[0]):
+        return _probe(name, inner, value)
+    if isinstance(inner[0], type) and issubclass(inner[0], Enum):
+        return _word(name, inner[0], value)
+    if get_origin(kind) is tuple:
+        return () if list(value) == NO_NUMBERS else tuple(value)
+    return value
+
+
+def _word(name: str, kind: type[Enum], value: Any) -> Enum:
+    try:
+        return kind(value)
+    except ValueError:
+        words = ", ".join(str(one.value) for one in kind)
+        raise InvalidArgument(f"{name} must be one of {words}, got {value!r}", field=name) from None
+
+
+def _probe(name: str, kinds: list[Any], text: str) -> Any:
+    by_kind = {cls.kind: cls for cls in kinds}
+    try:
+        given = json.loads(text)
+        return by_kind[given.pop("kind")](**given)
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        raise InvalidArgument(
+            f'{name} must be JSON such as {{"kind": "linear", "width_mm": 40, "near_mm": 0, "far_mm": 60}} of a kind '
+            f"{', '.join(by_kind)}, got {text!r:.200} ({error})",
+            field=name,
+        ) from None

@@ -1,0 +1,214 @@
+"""The node between a real service and a real publisher and subscriber."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image as Picture
+
+from ultragray_client import Client, Display, RenderSettings
+
+from ..client.proxy import Proxy
+from ..service.conftest import RunningService
+from ..waiting import wait_until
+from .conftest import Peer, RunningNode
+
+pytestmark = pytest.mark.slow
+
+CONFIGURE, CLEANUP, ACTIVATE, DEACTIVATE = 1, 2, 3, 4
+Start = Callable[..., RunningNode]
+
+
+def pixels(image: Any) -> np.ndarray:
+    return np.frombuffer(image.data, np.uint8).reshape(image.height, image.step)
+
+
+def rendered(service: RunningService, y_mm: float, settings: RenderSettings | None = None) -> np.ndarray:
+    pose = np.eye(4)
+    pose[1, 3] = y_mm
+    with Client(service.grpc) as client:
+        return client.render("demo", pose, settings)["bmode"]
+
+
+def test_a_pose_becomes_an_image_with_its_stamp_its_confidence_and_its_geometry(
+    start_node: Start, peer: Peer, ros_service: RunningService
+) -> None:
+    from diagnostic_msgs.msg import DiagnosticArray
+    from rclpy.qos import DurabilityPolicy, QoSProfile
+    from sensor_msgs.msg import CompressedImage, Image
+    from std_msgs.msg import String
+
+    node = start_node(address=ros_service.grpc)
+    images = peer.listen(Image, "bmode")
+    told = peer.listen(DiagnosticArray, "confidence")
+    files = peer.listen(CompressedImage, "bmode/compressed")
+    image = peer.frame(images, 100, y_m=0.002)
+    assert (image.header.frame_id, image.encoding, image.step) == ("probe", "mono8", image.width)
+    expected = rendered(ros_service, 2.0)
+    np.testing.assert_array_equal(pixels(image), expected)
+
+    file = peer.frame(files, 101, y_m=0.002)
+    decoded = np.asarray(Picture.open(io.BytesIO(bytes(file.data))), np.float64)
+    assert np.abs(decoded - expected).mean() < 3.0
+    assert file.format.startswith("mono8; jpeg")
+
+    status = peer.frame(told, 102, y_m=0.002).status[0]
+    values = {one.key: float(one.value) for one in status.values}
+    with Client(ros_service.grpc) as client:
+        frame = client.render("demo", np.eye(4))
+    assert values["supported_share"] > 0.0
+    assert values["latency_ms"] > 0.0
+    assert status.hardware_id == frame.scene_sha256
+
+    late = peer.listen(String, "geometry", QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL))
+    geometry = json.loads(wait_until(lambda: late and late[-1].data))
+    matrix_mm = frame.picture.pixel_to_probe()
+    column_row = np.array([3.0, 5.0, 0.0, 1.0])
+    metres = np.array(geometry["pixel_to_probe_m"]) @ column_row
+    np.testing.assert_allclose(metres[:3] * 1000.0, (matrix_mm @ column_row)[:3])
+    assert (geometry["height"], geometry["width"]) == expected.shape
+    assert node.stop() == 0
+
+
+def test_settings_are_parameters_which_the_service_checks(
+    start_node: Start, peer: Peer, ros_service: RunningService
+) -> None:
+    from sensor_msgs.msg import Image
+
+    start_node(address=ros_service.grpc, width="40")
+    images = peer.listen(Image, "bmode")
+    assert peer.frame(images, 1).width == 40
+    assert peer.set("display.gain_db", 12.0) is None
+    brighter = RenderSettings(width=40, display=Display(gain_db=12.0))
+    np.testing.assert_array_equal(pixels(peer.frame(images, 2)), rendered(ros_service, 0.0, brighter))
+    refused = peer.set("display.gain_db", 5000.0)
+    assert refused is not None
+    assert "display.gain_db must be a finite number from -100 to 100" in refused
+    assert "absent" in (peer.set("scene", "absent") or "")
+    assert "below_min_confidence must be one of refuse, mask" in (peer.set("below_min_confidence", "hide") or "")
+    assert "kind" in (peer.set("probe", "{}") or "")
+    assert peer.set("probe", '{"kind": "convex", "opening_angle_deg": 60, "near_mm": 10, "far_mm": 50}') is None
+    assert peer.set("display.pixel_mm", 0.5) is None
+    assert peer.set("address", "elsewhere:1") is not None
+    image = peer.frame(images, 3)
+    assert image.width > 40, "a fan, scan-converted"
+    assert peer.set("outputs", ["bmode", "transmittance"]) is None
+    assert peer.frame(peer.listen(Image, "transmittance"), 4).width == image.width
+
+
+def test_what_cannot_be_rendered_is_logged_and_the_node_goes_on(
+    start_node: Start, peer: Peer, ros_service: RunningService
+) -> None:
+    from sensor_msgs.msg import Image
+
+    node = start_node(address=ros_service.grpc)
+    images = peer.listen(Image, "bmode")
+    peer.frame(images, 1)
+    peer.pose(2, w=0.0)
+    wait_until(lambda: "INVALID_POSE: " in node.log())
+    peer.pose(3, frame="base_link")
+    wait_until(lambda: "poses must be given in the frame 'scene', got one in 'base_link'" in node.log())
+    for stamp in range(10, 30):
+        peer.pose(stamp, w=0.0)
+    peer.frame(images, 4)
+    assert {image.header.stamp.sec for image in images} == {1, 4}
+    assert node.log().count("INVALID_POSE") == 1, "the log is throttled"
+
+
+def test_a_scene_that_does_not_exist_is_logged_until_another_is_named(
+    start_node: Start, peer: Peer, ros_service: RunningService
+) -> None:
+    from sensor_msgs.msg import Image
+
+    node = start_node(address=ros_service.grpc, scene="absent")
+    images = peer.listen(Image, "bmode")
+    peer.pose(1)
+    wait_until(lambda: "SCENE_NOT_FOUND" in node.log())
+    assert peer.set("scene", "demo") is None
+    peer.frame(images, 2)
+    assert {image.header.stamp.sec for image in images} == {2}
+
+
+def test_a_service_that_is_away_is_logged_and_found_again(
+    start_node: Start, peer: Peer, ros_service: RunningService
+) -> None:
+    from sensor_msgs.msg import Image
+
+    proxy = Proxy("127.0.0.1:1")
+    node = start_node(address=proxy.address)
+    images = peer.listen(Image, "bmode")
+    peer.pose(1)
+    wait_until(lambda: "UNREACHABLE" in node.log())
+    proxy.lead_to(ros_service.grpc)
+    peer.frame(images, 2)
+    proxy.cut_after(100)
+    peer.frame(images, 3)
+    peer.frame(images, 4)
+    assert proxy.cuts == 1
+    proxy.close()
+
+
+def test_of_poses_that_come_too_fast_the_newest_gets_the_image(
+    start_node: Start, peer: Peer, ros_service: RunningService
+) -> None:
+    from diagnostic_msgs.msg import DiagnosticArray
+
+    start_node(address=ros_service.grpc, height="1024", width="1024", timeout_s="60.0")
+    told = peer.listen(DiagnosticArray, "confidence")
+    peer.frame(told, 1)
+    for stamp in range(100, 400):
+        peer.pose(stamp)
+    wait_until(lambda: told[-1].header.stamp.sec == 399)
+    stamps = [one.header.stamp.sec for one in told]
+    assert stamps == sorted(stamps)
+    assert len(stamps) < 250
+
+
+def test_a_frame_that_is_too_far_behind_its_pose_is_not_published(
+    start_node: Start, peer: Peer, ros_service: RunningService
+) -> None:
+    from sensor_msgs.msg import Image
+
+    node = start_node(address=ros_service.grpc, timeout_s="0.000001")
+    images = peer.listen(Image, "bmode")
+    peer.pose(1)
+    wait_until(lambda: "DEADLINE_EXCEEDED" in node.log())
+    assert images == []
+
+
+def test_the_node_is_a_lifecycle_node(start_node: Start, peer: Peer, ros_service: RunningService) -> None:
+    from sensor_msgs.msg import Image
+
+    start_node(address=ros_service.grpc, autostart="false")
+    assert peer.transition(CONFIGURE)
+    images = peer.listen(Image, "bmode")
+    assert peer.node.count_subscribers("/ultragray/probe_pose") == 0
+    assert peer.transition(ACTIVATE)
+    peer.frame(images, 1)
+    assert peer.transition(DEACTIVATE)
+    wait_until(lambda: peer.node.count_subscribers("/ultragray/probe_pose") == 0)
+    assert peer.transition(ACTIVATE)
+    peer.frame(images, 2)
+    assert peer.transition(DEACTIVATE)
+    assert peer.transition(CLEANUP)
+    wait_until(lambda: peer.node.count_publishers("/ultragray/bmode") == 0)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "told"),
+    [
+        ({"source": "radio"}, "source must be pose or tf, got 'radio'"),
+        ({"source": "tf"}, "source must be pose where tf2_ros is not installed"),
+        ({"probe": "'{}'"}, "probe must be JSON such as"),
+    ],
+)
+def test_a_node_that_cannot_start_says_why(start_node: Start, parameters: dict[str, str], told: str) -> None:
+    node = start_node(**parameters)
+    assert node.process.wait(60) == 1
+    assert told in node.log()
+    assert "Traceback" not in node.log()
