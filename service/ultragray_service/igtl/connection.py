@@ -11,6 +11,7 @@ from dataclasses import replace
 from typing import Protocol
 
 from ultragray.errors import UltragrayError
+from ultragray.settings import FrameSettings
 from ultragray_workers.pool.types import RenderResult
 
 from ..core.state import Service
@@ -19,6 +20,8 @@ from ..core.streams.buffers import hold_little
 from ..core.streams.open_streams import OpenStream
 from ..core.streams.unread import Unread
 from ..errors import IgtlMessageInvalid
+from .commands.answer import answer
+from .commands.scanner import Scanner
 from .contents import (
     Status,
     pack_capability,
@@ -30,7 +33,7 @@ from .contents import (
 )
 from .feed import Feed
 from .frames import Frame, FrameMaker
-from .kinds import CAPABILITY, HEARD, KINDS, POSE_TYPES, UNDERSTOOD
+from .kinds import CAPABILITY, COMMAND_TYPES, HEARD, KINDS, POSE_TYPES, UNDERSTOOD
 from .messages import HEADER_BYTES, Header, Message, pack_message, unpack_header, unpack_message
 from .routes import SceneChooser
 from .states import OK, state_of
@@ -74,7 +77,9 @@ class Connection:
         self._service = service
         self._scenes = scenes
         self._frames = frames
-        self._maker = FrameMaker(service, scenes)
+        thickness_mm = service.settings.igtl_slice_thickness_mm
+        self._scanner = Scanner(scenes, FrameSettings(slice_thickness_mm=thickness_mm))
+        self._maker = FrameMaker(service, scenes, self._scanner)
         self._reader = reader
         self._writer = writer
         self._sending = asyncio.Lock()
@@ -161,6 +166,8 @@ class Connection:
         prefix, suffix = message.type_name[:4], message.type_name[4:]
         if message.type_name in POSE_TYPES:
             await self._take_poses(message, arrived)
+        elif message.type_name in COMMAND_TYPES:
+            await self._send(await answer(self._scanner, message))
         elif message.type_name == "GET_CAPABIL":
             await self._send(_reply("CAPABILITY", message, pack_capability(CAPABILITY)))
         elif message.type_name == "GET_STATUS":

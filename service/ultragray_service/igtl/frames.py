@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
-from ultragray.display.settings import true_to_scale
-from ultragray.settings import Encoding, FrameSettings, Resolved
+from ultragray.contract import to_dict
+from ultragray.display.settings import Display, true_to_scale
+from ultragray.settings import Encoding, Resolved
 from ultragray_workers.jobs.queue.owners import Kind, Ownership
 from ultragray_workers.pool.types import RenderResult
 
 from ..core.state import Service
+from .commands.scanner import Scanner
 from .contents import Image, Tool, pack_image, pack_position, pack_tools, pack_transform
 from .messages import Message
 from .routes import SceneChooser, image_name
@@ -54,6 +58,7 @@ class Frame:
             "scene_sha256": result.scene_sha256,
             "renderer": result.renderer,
             "slice_thickness_mm": repr(result.settings.beam.thickness_mm),
+            "display": _display_text(result.settings.display),
             "replaced_poses": str(self.posed.replaced),
             **{name: f"{value:.3f}" for name, value in asdict(result.extrapolations[0]).items() if value is not None},
             "queue_ms": f"{result.queue_ms:.3f}",
@@ -64,15 +69,14 @@ class Frame:
 class FrameMaker:
     """Renders poses of devices."""
 
-    def __init__(self, service: Service, scenes: SceneChooser) -> None:
+    def __init__(self, service: Service, scenes: SceneChooser, scanner: Scanner) -> None:
         self._service = service
         self._scenes = scenes
-        self._settings = FrameSettings(slice_thickness_mm=service.settings.igtl_slice_thickness_mm)
+        self._scanner = scanner
 
     async def render(self, underway: Underway) -> Frame:
-        """The frame of a pose, or of one that took its turn; probe and size are those the scene was trained with.
-
-        Its thickness is that of the service's setting, else that of the scene's beam.
+        """The frame of a pose, or of one that took its turn, as the scanner is set; else probe and size are those the
+        scene was trained with, and its thickness is that of the service's setting, else that of the scene's beam.
 
         Raises SceneNotFound, and what RequestPlanner.plan and Service.render raise.
         """
@@ -80,7 +84,7 @@ class FrameMaker:
         scene = await self._scenes.choose(underway.posed.message.device_name)
         ownership = self._service.owners.known(Kind.SCENE, scene)
         planner = self._service.planner
-        plan = await planner.plan(scene, self._settings, Encoding.UINT8, complete=self._true_to_scale)
+        plan = await planner.plan(scene, self._scanner.settings, Encoding.UINT8, complete=self._true_to_scale)
         result = await self._service.render(
             plan, underway.posed.pose[None], deadline=planner.deadline(None), turn=underway.turn
         )
@@ -88,7 +92,14 @@ class FrameMaker:
 
     def _true_to_scale(self, settings: Resolved) -> Resolved:
         side = self._service.settings.max_image_side
-        return replace(settings, display=true_to_scale(settings.probe, settings.height, side))
+        pixel_mm = true_to_scale(settings.probe, settings.height, side).pixel_mm
+        return replace(settings, display=replace(settings.display, pixel_mm=pixel_mm))
+
+
+@lru_cache(maxsize=256)
+def _display_text(display: Display) -> str:
+    """Settings of a display as JSON."""
+    return json.dumps(to_dict(display, with_none=False), separators=(",", ":"))
 
 
 def image_of(result: RenderResult) -> Image:

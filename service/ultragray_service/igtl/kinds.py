@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 POSE_TYPES = ("TRANSFORM", "POSITION", "TDATA", "QTDATA")
+COMMAND_TYPES = ("COMMAND", "STRING")
 
 KINDS: Mapping[str, str] = {  # by what stands behind GET_, STT_ and STP_: a type has at most 12 letters
     "IMAGE": "IMAGE",
@@ -18,6 +19,7 @@ KINDS: Mapping[str, str] = {  # by what stands behind GET_, STT_ and STP_: a typ
 _PREFIXES = ("GET_", "STT_", "STP_")
 CAPABILITY = (
     *POSE_TYPES,
+    *COMMAND_TYPES,
     "GET_CAPABIL",
     "GET_STATUS",
     *(f"{prefix}{suffix}" for suffix in KINDS if suffix != "TRANS" for prefix in _PREFIXES),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import time
 
+from ultragray.contract import shown
 from ultragray_workers.errors import SceneNotFound
 
 from ..core.catalog import SceneCatalog
@@ -38,6 +39,12 @@ class SceneChooser:
         """The scene of that name, or of the name of the frame that the device's poses lead to."""
         names = await self._known()
         return next((name for name in (device_name, frame_of(device_name)) if name in names), None)
+
+    async def prefer(self, scene: str) -> None:
+        """From now on the scene of devices that name none. Raises SceneNotFound."""
+        if scene not in await self._known():
+            raise SceneNotFound(f"there is no scene {shown(scene)}", field="scene")
+        self._default = scene
 
     async def choose(self, device_name: str) -> str:
         """The scene that the device names, else the default, else the only one. Raises SceneNotFound."""

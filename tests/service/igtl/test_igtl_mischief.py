@@ -40,7 +40,7 @@ def still_serves(peer: Peer) -> None:
         ("POSITION", bytes(152), 12, "IGTL_MESSAGE_INVALI", "12 or 24 or 28 bytes, got 152"),  # as of pyigtl
         ("QTDATA", bytes(49), 12, "IGTL_MESSAGE_INVALI", "50 bytes for each"),
         ("TRANSFORM", bytes(70_000), 12, "IGTL_MESSAGE_INVALI", "at most 65536 bytes"),
-        ("STRING", bytes(5), 12, "IGTL_MESSAGE_INVALI", "got 'STRING'"),
+        ("SENSOR", bytes(5), 12, "IGTL_MESSAGE_INVALI", "got 'SENSOR'"),
         ("POLYDATA", bytes(3_000_000), 12, "IGTL_MESSAGE_INVALI", "got 'POLYDATA'"),
         ("STT_QTDATA", bytes(2), 12, "IGTL_MESSAGE_INVALI", "4 bytes, got 2"),
     ],
