@@ -176,8 +176,7 @@ def _parameter(
     if item.name == "poses":
         meaning = f"{meaning.rstrip('.')}: .npy or .json, [P, 4, 4] or [P, 3, 4]."
     if item.name == "tools":
-        kinds = "; ".join(map(_signature, Tool.members.values()))
-        meaning = f"{meaning.rstrip('.')}: a .json file with a list of them, each a kind with its numbers: {kinds}."
+        meaning = f"{meaning} A .json file with a list of them: {', '.join(Tool.members)}, each with its numbers."
     limits = range_of(item).strip().removeprefix("of ")
     meaning += f" {limits[:1].upper()}{limits[1:]}." if limits else ""
     is_enum = isinstance(kind, type) and issubclass(kind, Enum)
