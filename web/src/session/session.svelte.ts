@@ -137,6 +137,8 @@ export class Session {
       min_confidence: hidesUnsupported && this.description?.confidence ? 1 : null,
       below_min_confidence: "mask",
       contact: null,
+      tools: null,
+      ghost: null,
     };
   }
 
