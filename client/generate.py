@@ -219,7 +219,8 @@ def _enum_source(cls: type[Enum]) -> str:
 def _dataclass_source(cls: Any, name: str, bases: list[Any]) -> str:
     families = [base for base in cls.__bases__ if Family in base.__bases__]  # their members have their fields
     names = {name for one in (cls, *families) for name in inspect.get_annotations(one)} - LEFT_OUT
-    own = sorted((item for item, _ in annotated_fields(cls) if item.name in names), key=lambda item: item.kw_only)
+    given = [item for item, _ in annotated_fields(cls) if item.name in names and item.metadata]  # not a base's `kind`
+    own = sorted(given, key=lambda item: item.kw_only)
     is_kw_only = all(item.kw_only for item in own)
     options = "frozen=True, kw_only=True" if is_kw_only else "frozen=True"
     head = f"class {name}" + (f"({', '.join(base.__name__ for base in bases)})" if bases else "")

@@ -9,6 +9,7 @@ from __future__ import annotations
 import runpy
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -31,6 +32,7 @@ from ultragray.display.frames import show
 from ultragray.gym import StandardPlaneEnv
 from ultragray.samplers import AroundSampler
 from ultragray.settings import Contact
+from ultragray.tools import DEFAULT_LABEL, Box, Cylinder, Needle, Tool, ToolFrame
 from ultragray.volumes.fields import sample_slice
 from ultragray.volumes.grid import VolumeGrid
 from ultragray.volumes.names import VOLUME_FIELDS
@@ -43,7 +45,7 @@ SIDE = 256
 EXTENT_MM = (-30.0, 30.0, 60.0, 0.0)  # of the demo scene's probe: left, right, bottom, top
 OVER_CANAL_MM = 19.0  # along the spine: bone to both sides, the canal between them
 MOST_AGENT_STEPS = 1000
-LABEL_COLOURS = {"bone": "#f4d58d", "muscle": "#d1495b", "fat": "#edae49", "vessel": "#30a0e0"}
+LABEL_COLOURS = {"bone": "#f4d58d", "muscle": "#d1495b", "fat": "#edae49", "vessel": "#30a0e0", "tool": "#ffffff"}
 
 
 def main() -> None:
@@ -53,6 +55,7 @@ def main() -> None:
     draw_confidence(scene, IMAGES / "confidence_off_the_sweep.png")
     draw_augmentation(scene, IMAGES / "augmentation.png")
     draw_contact(scene, IMAGES / "contact.png")
+    draw_tools(scene, IMAGES / "tools.png")
     draw_standard_plane(scene, IMAGES / "standard_plane.png")
     draw_slices(scene, IMAGES / "volume_slices.png")
     for folder in sys.argv[1:]:
@@ -174,6 +177,37 @@ def draw_contact(scene: GaussianScene, path: Path) -> None:
             panel.imshow(image, cmap="gray", vmin=0.0, vmax=1.0, extent=EXTENT_MM)
             told = caption if frames.touch is None else f"contact {frames.touch.shares[column]:.0%}"
             panel.set_title(told, fontsize=8)
+    save(figure, path)
+
+
+def draw_tools(scene: GaussianScene, path: Path) -> None:
+    """Needles at angles, a rod, a plate, their labels, and the ghosts beyond an interface."""
+    steep = Needle(tip_mm=(4.0, 0.0, 31.0), hub_mm=(-24.0, 0.0, 2.0), frame=ToolFrame.PROBE)
+    flat = replace(steep, tip_mm=(8.0, 0.0, 20.0), hub_mm=(-30.0, 0.0, 14.0))
+    opaque = replace(flat, diameter_mm=1.6, opacity=0.95, reverberation=0.6)
+    rod = Cylinder(tip_mm=(2.0, -15.0, 22.0), hub_mm=(2.0, 15.0, 22.0), diameter_mm=6.0, frame=ToolFrame.PROBE)
+    plate = Box(
+        centre_mm=(-10.0, 0.0, 20.0),
+        size_mm=(18.0, 10.0, 2.5),
+        quaternion=(0.990, 0.0, 0.141, 0.0),
+        frame=ToolFrame.PROBE,
+    )
+    shown: dict[str, tuple[tuple[Tool, ...], float]] = {
+        "needle at 46°": ((steep,), 0.0),
+        "needle at 9°": ((flat,), 0.0),
+        "thick, opaque: comet tail": ((opaque,), 0.0),
+        "cylinder across the plane": ((rod,), 0.0),
+        "box, turned by 16°": ((plate,), 0.0),
+        "ghost 0.5, no tool": ((), 0.5),
+    }
+    figure, panels = panel_row(rows=2, columns=len(shown))
+    names = {**scene.info.label_names, DEFAULT_LABEL: "tool"}
+    for number, (caption, (tools, ghost)) in enumerate(shown.items()):
+        size = {"height": SIDE, "width": SIDE, "outputs": ("bmode", "labels")}
+        frames = render(scene, None, along_spine(OVER_CANAL_MM), **size, tools=tools, ghost=ghost)
+        panels[number].imshow(frames["bmode"][0].numpy(), cmap="gray", vmin=0.0, vmax=1.0, extent=EXTENT_MM)
+        panels[number].set_title(caption, fontsize=8)
+        draw_labels(panels[number + len(shown)], frames["labels"][0].numpy(), names)
     save(figure, path)
 
 

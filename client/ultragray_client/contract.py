@@ -13,11 +13,13 @@ from .geometry import PoseLike
 __all__ = [
     "AroundSampler",
     "Below",
+    "Box",
     "CompareJob",
     "ComparisonSettings",
     "Contact",
     "ConvexProbe",
     "CoveredSampler",
+    "Cylinder",
     "Dataset",
     "DatasetOptions",
     "Display",
@@ -28,15 +30,19 @@ __all__ = [
     "FrameSettings",
     "ImageRegion",
     "LinearProbe",
+    "Needle",
     "PhasedProbe",
     "Probe",
     "RadialProbe",
     "RenderJob",
     "RenderSettings",
     "Sampler",
+    "Shaft",
     "Specification",
     "SplineSampler",
     "SteeredProbe",
+    "Tool",
+    "ToolFrame",
     "TrainJob",
     "TrainingSampler",
 ]
@@ -125,6 +131,79 @@ class Contact(str, Enum):
     PRESSURE = "pressure"
 
 
+class ToolFrame(str, Enum):
+    """The frame that the points of a tool are in."""
+
+    SCENE = "scene"
+    PROBE = "probe"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Box:
+    """A solid box about a point, turned about it."""
+
+    kind: Literal["box"] = field(default="box", repr=False, kw_only=True)
+    frame: ToolFrame = ToolFrame.SCENE
+    """Of its points; probe: it moves with the probe."""
+    brightness: float = 1.0
+    """Echo where a scan line meets it head on."""
+    roughness: float = 0.25
+    """Share of the brightness that is left at any angle."""
+    reverberation: float = 0.4
+    """Strength of the first echo of its comet tail, of which each further one has the same share; 0: no tail."""
+    opacity: float = 0.6
+    """Share of the beam that it stops where it is met head on."""
+    label: int = 255
+    """Of its pixels in the output labels."""
+    centre_mm: tuple[float, float, float]
+    """x, y and z of its middle."""
+    quaternion: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+    """w, x, y and z of the rotation from the box to its frame."""
+    size_mm: tuple[float, float, float]
+    """Lengths along its own x, y and z."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shaft:
+    """A round shaft from its tip to its hub."""
+
+    frame: ToolFrame = ToolFrame.SCENE
+    """Of its points; probe: it moves with the probe."""
+    brightness: float = 1.0
+    """Echo where a scan line meets it head on."""
+    roughness: float = 0.25
+    """Share of the brightness that is left at any angle."""
+    reverberation: float = 0.4
+    """Strength of the first echo of its comet tail, of which each further one has the same share; 0: no tail."""
+    opacity: float = 0.6
+    """Share of the beam that it stops where it is met head on."""
+    label: int = 255
+    """Of its pixels in the output labels."""
+    tip_mm: tuple[float, float, float]
+    """x, y and z of the tip."""
+    hub_mm: tuple[float, float, float]
+    """x, y and z of the other end."""
+    diameter_mm: float = 0.7
+    """Diameter; 0.7 is 22 gauge."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cylinder(Shaft):
+    """A solid cylinder with flat ends, thicker than the beam: its near side is seen. What is thinner is a needle."""
+
+    kind: Literal["cylinder"] = field(default="cylinder", repr=False, kw_only=True)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Needle(Shaft):
+    """A straight needle. Its echo lies on the line from tip to hub, so that the tip is where it is said to be."""
+
+    kind: Literal["needle"] = field(default="needle", repr=False, kw_only=True)
+
+
+Tool: TypeAlias = Box | Cylinder | Needle
+
+
 @dataclass(frozen=True)
 class Display:
     """Settings of a display. The defaults show frames as they are.
@@ -167,6 +246,12 @@ class FrameSettings:
     contact: Contact | None = None
     """air: scan lines whose face is off the skin are dark. pressure: and a face that is pressed in compresses the
     tissue. Default: contact is assumed.
+    """
+    tools: tuple[Tool, ...] | None = None
+    """Needles and the like in the image; labels then are there for every scene."""
+    ghost: float | None = None
+    """Second echo: share of what is heard beyond the first strong interface that is the mirror image of what lies
+    before it. Default: 0.
     """
     display: Display | None = None
     """Gain, depth, scan conversion ...; default: as rendered."""

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from ultragray_proto.codec import from_message, words
 from ultragray_proto.v1 import rendering_pb2
 
-from .contract import Contact, Display, Encoding, Probe, RenderSettings
+from .contract import Contact, Display, Encoding, Probe, RenderSettings, Tool
 from .errors import InvalidArgument
 from .geometry import FloatArray
 from .messages import message_of
@@ -100,6 +100,8 @@ class Frame:
     rendered_width: int  # scan lines, likewise
     slice_thickness_mm: float = 0.0  # as used, at the focus of the scene's beam; 0: a plane
     contact: Contact | None = None  # as used; None: it was assumed
+    tools: tuple[Tool, ...] = ()  # as used
+    ghost: float = 0.0  # as used; 0: none
     display: Display | None = None  # as used; None: none was asked for
     dropped: int = 0  # in a stream: poses that newer ones replaced since the frame before
     latency_ms: float | None = None  # in a stream: from `measured_ns` of the pose to the arrival of the frame here

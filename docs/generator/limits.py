@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from ultragray import image_size, pose, scene_info
 from ultragray.probe import fan, probe
+from ultragray.tools import MAX_TOOLS
 from ultragray_service.core import catalog, dataset_uploads
 from ultragray_service.core.streams import pose_stream
 from ultragray_service.errors import STATUSES
@@ -30,6 +31,7 @@ def fixed() -> str:
         ("Deviation from a rotation that is corrected", f"{pose.ROTATION_TOLERANCE:g}"),
         ("Coordinate of a pose", f"{pose.MAX_POSITION_MM:,.0f} mm"),
         ("Length of a probe", f"{probe.MAX_LENGTH_MM:,.0f} mm"),
+        ("Tools of a frame", f"{MAX_TOOLS}"),
         ("Opening angle of a fan", f"{fan.LARGEST_OPENING_DEG:g}°"),
         ("Height and width of a frame (library)", f"{image_size.MAX_IMAGE_SIDE:,}"),
         ("Height and width if the scene does not know them", f"{image_size.DEFAULT_IMAGE_SIDE:,}"),

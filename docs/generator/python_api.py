@@ -22,7 +22,7 @@ LIBRARY_MODULES = (
     *("ultragray.datasets.pictures", "ultragray.training", "ultragray.evaluation.metrics"),
     *("ultragray.evaluation.scoring", "ultragray.evaluation.speckle", "ultragray.evaluation.side_by_side"),
     *("ultragray.evaluation.compounding", "ultragray.evaluation.baselines", "ultragray.confidence"),
-    *("ultragray.contact", "ultragray.gym"),
+    *("ultragray.contact", "ultragray.gym", "ultragray.tools"),
     *("ultragray.volumes.grid", "ultragray.volumes.fields", "ultragray.volumes.files"),
     *("ultragray.samplers", "ultragray.contract", "ultragray.pose", "ultragray.rendering", "ultragray.demo"),
     *("ultragray.display.settings", "ultragray.display.frames", "ultragray.display.scan_conversion"),

@@ -25,6 +25,7 @@ SECTIONS: Mapping[str, tuple[str, ...]] = {
             "howto/recording.md",
             "howto/compare.md",
             "howto/contact.md",
+            "howto/tools.md",
             "howto/gymnasium.md",
             "howto/operator.md",
             "howto/*.md",

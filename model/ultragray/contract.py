@@ -72,7 +72,7 @@ def _schema(**limits: Any) -> dict[str, Any]:
     schema = {word: limits[name] for name, word in words.items() if limits[name] is not None}
     if limits["most"] is None:
         return schema
-    return {"maxItems": limits["most"], "items": {"type": "number", **schema}}
+    return {"maxItems": limits["most"], **({"items": {"type": "number", **schema}} if schema else {})}
 
 
 class Contract:
@@ -279,7 +279,18 @@ def _read(value: Any, annotation: Any) -> Any:
     kind, _ = optional_of(annotation)
     if value is not None and isinstance(kind, type) and (is_dataclass(kind) or issubclass(kind, Family)):
         return from_dict(kind, value)
+    if get_origin(kind) is tuple and isinstance(value, (list, tuple)) and _is_contract(get_args(kind)[0]):
+        return tuple(_read_in_list(place, one, get_args(kind)[0]) for place, one in enumerate(value))
     return value
+
+
+def _is_contract(kind: Any) -> bool:
+    return isinstance(kind, type) and issubclass(kind, Contract)
+
+
+def _read_in_list(place: int, value: Any, kind: Any) -> Any:
+    with under(f"[{place}]"):
+        return from_dict(kind, value)
 
 
 _Check = Callable[[Any], Any]  # the value in its own type; raises InvalidArgument
@@ -312,7 +323,7 @@ def _check_of_kind(kind: Any, item: Field[Any]) -> _Check:
     if get_origin(kind) is tuple:
         elements = get_args(kind)
         count = None if Ellipsis in elements else len(elements)
-        return partial(_list, _check_of(elements[0], item), given("most"), count)
+        return partial(_list, _check_of_kind(elements[0], item), given("most"), count)
     if get_origin(kind) is dict:
         return partial(_object, given("most"))
     if not isinstance(kind, type):

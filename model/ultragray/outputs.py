@@ -132,7 +132,7 @@ ATTENUATION = _register(
 )
 LABELS = _register(
     "labels",
-    "the label that weighs most, 0: none; of a scene with label_names",
+    "the label that weighs most, 0: none; of a scene with label_names, or of frames with tools",
     planes=(),
     derive=_labels,
     dtype=_NUMBERS,

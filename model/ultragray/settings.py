@@ -20,6 +20,7 @@ from .outputs import OUTPUTS, check_available, check_outputs
 from .probe import ElevationBeam, Picture, Probe
 from .probe.elevation import MAX_THICKNESS_MM, PLANE
 from .scene_info import SceneInfo
+from .tools import MAX_TOOLS, Tool
 
 
 class Encoding(str, Enum):
@@ -92,6 +93,16 @@ class FrameSettings(Contract):
         "tissue. Default: contact is assumed.",
         None,
     )
+    tools: tuple[Tool, ...] | None = described(
+        "Needles and the like in the image; labels then are there for every scene.", None, most=MAX_TOOLS
+    )
+    ghost: float | None = described(
+        "Second echo: share of what is heard beyond the first strong interface that is the mirror image of what lies "
+        "before it. Default: 0.",
+        None,
+        low=0.0,
+        high=1.0,
+    )
     display: Display | None = described("Gain, depth, scan conversion ...; default: as rendered.", None)
     outputs: tuple[str, ...] = described(f"Some of {', '.join(OUTPUTS)}.", ("bmode",), error=UnknownOutput)
 
@@ -111,7 +122,7 @@ class FrameSettings(Contract):
         for outputs that the scene cannot give, InvalidArgument for a confidence that it cannot tell and for an encoding
         that cannot hold the outputs.
         """
-        check_available(self.outputs, info)
+        check_available(self.outputs, info, with_tools=bool(self.tools))
         height, width = info.image_size_or(self.height, self.width)
         check_image_size(height, width, limit=max_image_side)
         _check_encoding(encoding, self.outputs)
@@ -131,6 +142,8 @@ class FrameSettings(Contract):
             min_confidence=self.min_confidence,
             below_min_confidence=self.below_min_confidence,
             contact=self.contact,
+            tools=self.tools or (),
+            ghost=self.ghost or 0.0,
         )
 
 
@@ -162,6 +175,8 @@ class Resolved:
     min_confidence: float | None = None
     below_min_confidence: Below = Below.REFUSE
     contact: Contact | None = None
+    tools: tuple[Tool, ...] = ()
+    ghost: float = 0.0
 
     @cached_property
     def picture(self) -> Picture:
@@ -172,7 +187,7 @@ class Resolved:
     def view(self) -> tuple[Any, ...]:
         """All but outputs and encoding: frames that agree in this can be rendered together."""
         asked = (self.display, self.min_confidence, self.below_min_confidence, self.contact)
-        return (self.probe, self.beam, self.height, self.width, *asked)
+        return (self.probe, self.beam, self.height, self.width, *asked, self.tools, self.ghost)
 
     @property
     def pixels(self) -> int:

@@ -393,5 +393,5 @@ def _members(kind: Any) -> Mapping[str, Any] | None:
     """The classes of a family by their kinds."""
     if get_origin(kind) in (Union, UnionType):
         return {one.kind: one for one in get_args(kind)}
-    members = None if "kind" in getattr(kind, "__dataclass_fields__", ()) else getattr(kind, "members", None)
+    members = None if isinstance(getattr(kind, "kind", None), str) else getattr(kind, "members", None)
     return members if isinstance(members, dict) else None

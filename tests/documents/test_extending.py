@@ -13,13 +13,14 @@ from ultragray.display import Display
 from ultragray.interchange.exports.exporter import Exporter
 from ultragray.interchange.exports.formats import Format
 from ultragray.probe import Probe
+from ultragray.tools import Tool
 from ultragray.training.config import PRESETS, TrainingConfig
 from ultragray_service.errors import STATUSES
 from ultragray_workers.jobs.kinds import Specification
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "extending.md"
 TEXT = PAGE.read_text(encoding="utf-8")
-CLASSES = (Contract, Family, DatasetFormat, Display, Exporter, Format, Probe, TrainingConfig, Specification)
+CLASSES = (Contract, Family, DatasetFormat, Display, Exporter, Format, Probe, Tool, TrainingConfig, Specification)
 NAMED = {cls.__name__: cls for cls in CLASSES} | {"described": described, "PRESETS": PRESETS, "STATUSES": STATUSES}
 
 
@@ -30,5 +31,5 @@ def test_names_of_the_code_are_those_of_the_page(name: str) -> None:
 
 def test_every_closed_set_has_its_section() -> None:
     sections = re.findall(r"^## (.+)$", TEXT, flags=re.MULTILINE)
-    assert {"An output", "A probe", "A dataset format", "A job kind", "A display setting"} <= set(sections)
+    assert {"An output", "A probe", "A tool", "A dataset format", "A job kind", "A display setting"} <= set(sections)
     assert {"An exporter", "A training setting"} <= set(sections)

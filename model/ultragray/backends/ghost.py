@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
+from torch.nn.functional import avg_pool1d
 
 from ..probe import Probe
 
@@ -45,12 +46,12 @@ def _interfaces(bmode: Tensor, probe: Probe) -> Tensor:  # [C, H, W] -> [C, W]
     height, width = bmode.shape[1:]
     deep = torch.from_numpy(probe.depths_mm(height) - probe.face_depth_mm >= LEAST_DEPTH_MM).to(bmode.device)
     beside = round(width * SMOOTHED_SHARE / 2.0)
-    strong = (_windows(bmode, beside).mean(dim=-1) >= STRONG_BMODE) & deep[:, None]
+    averaged = avg_pool1d(_padded(bmode, beside), 2 * beside + 1, stride=1)
+    strong = (averaged >= STRONG_BMODE) & deep[:, None]
     first = torch.where(strong.any(dim=1), strong.int().argmax(dim=1), height)
-    return _windows(first, beside).median(dim=-1).values
+    return _padded(first, beside).unfold(-1, 2 * beside + 1, 1).median(dim=-1).values
 
 
-def _windows(values: Tensor, beside: int) -> Tensor:  # [..., W] -> [..., W, 2·beside + 1]
-    """Each value with those beside it; the outermost ones are repeated."""
-    padded = torch.cat([values[..., :1]] * beside + [values] + [values[..., -1:]] * beside, dim=-1)
-    return padded.unfold(-1, 2 * beside + 1, 1)
+def _padded(values: Tensor, beside: int) -> Tensor:  # [..., W] -> [..., beside + W + beside]
+    """The outermost values are repeated."""
+    return torch.cat([values[..., :1]] * beside + [values] + [values[..., -1:]] * beside, dim=-1)

@@ -107,6 +107,8 @@ def render_portions(
                 limits=limits.after(first),
                 beam=settings.beam,
                 contact=settings.contact,
+                tools=settings.tools,
+                ghost=settings.ghost,
             )
             assert frames.coverage is not None
             watch = SupportWatch(masked[places])

@@ -69,7 +69,9 @@ class Crossing:
     cover: FloatArray  # share of the line's width and of the slice that meets the tool, 0 to 1
     first_mm: FloatArray  # depths between which the side that is met first lies
     last_mm: FloatArray
-    filled_mm: FloatArray  # length of the line behind it that shows the tool's inside
+    filled_mm: FloatArray  # length of the line behind it that shows the tool's inside, not tissue
+    own_first_mm: FloatArray  # depths between which pixels have the tool's label
+    own_last_mm: FloatArray
     path_mm: FloatArray  # length of the way through the tool, above 0
     slant: FloatArray  # sine of the angle between the line and the normal of the side: 0 head on, 1 along it
     stopped: FloatArray  # share of the beam that the tool stops

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
@@ -64,31 +65,28 @@ class _Drawn:
         columns = slice(int(met[0]), int(met[-1]) + 1)
         depth = torch.as_tensor(view.probe.depths_mm(height)).to(like)[:, None]  # [H, 1]
         half_row = 0.5 * view.probe.scan_line_length_mm / height
-        shape = (6, len(view.poses), height, columns.stop - columns.start)
-        filled, body, echo, stopped, tail, one_tail = torch.zeros(shape, dtype=like.dtype, device=like.device)
+        shape = (5, len(view.poses), height, columns.stop - columns.start)
+        own, body, echo, stopped, tail = torch.zeros(shape, dtype=like.dtype, device=like.device)
         for layer in range(len(crossing.cover)):
-            cover, first, last, way, path, slant, stops = (
+            cover, first, last, way, own_first, own_last, path, slant, stops = (
                 torch.as_tensor(getattr(crossing, one.name)[layer, :, None, columns]).to(like)  # [C, 1, w]
                 for one in fields(Crossing)
             )
+            top, bottom = first - half_row, last + half_row
             mirrored = _mirrored(tool, slant)
-            beyond = _beyond(depth, first - half_row, last + half_row)
-            inside = _beyond(depth, first - half_row, last + half_row + way)
-            filled += cover * (inside == 0.0)
-            body += cover * _pulse(inside)
-            echo += cover * _pulse(beyond) * (tool.brightness * tool.roughness + mirrored)
-            stopped += cover * (1.0 - (1.0 - stops) ** ((depth - last) / path).clamp(0.0, 1.0))
-            strength, later_mm = mirrored * tool.reverberation, tool.thickness_mm
-            one_tail.zero_()
-            while float(strength.max()) >= LEAST:
-                later = _beyond(depth - later_mm, first - half_row, last + half_row)
-                torch.maximum(one_tail, strength * _pulse(later), out=one_tail)
-                strength, later_mm = strength * tool.reverberation, later_mm + tool.thickness_mm
-            tail += cover * one_tail
+            surface = _pulse(_beyond(depth, top, bottom))
+            own += cover * (_beyond(depth, torch.minimum(own_first, top), torch.maximum(own_last, bottom)) == 0.0)
+            body += cover * _pulse(_beyond(depth, top, bottom + way))
+            echo += cover * (tool.brightness * tool.roughness + mirrored) * surface
+            stopped += cover * -torch.expm1(torch.log1p(-stops) * ((depth - last) / path).clamp(0.0, 1.0))
+            if tool.reverberation:
+                number = ((depth - 0.5 * (top + bottom)) / tool.thickness_mm).round().clamp(min=1.0)
+                later = _beyond(depth - number * tool.thickness_mm, top, bottom)
+                tail += cover * mirrored * _pulse(later, number * math.log(tool.reverberation))
         return cls(
             label=tool.label,
             columns=columns,
-            labelled=filled >= LABELLED,
+            labelled=own >= LABELLED,
             body=body.clamp(max=1.0),
             echo=echo.clamp(max=1.0),
             passed=(1.0 - stopped).clamp(0.0, 1.0),
@@ -127,9 +125,9 @@ def _beyond(depth: Tensor, first: Tensor, last: Tensor) -> Tensor:  # [H, 1], [C
     return torch.maximum(first - depth, depth - last).clamp(min=0.0)
 
 
-def _pulse(beyond: Tensor) -> Tensor:  # [...] -> [...]
+def _pulse(beyond: Tensor, log_strength: Tensor | float = 0.0) -> Tensor:  # [...] -> [...]
     """The echo of a surface at a distance from it."""
-    return torch.exp(-0.5 * (beyond / PULSE_SIGMA_MM) ** 2)
+    return torch.exp(log_strength - (0.5 / PULSE_SIGMA_MM**2) * beyond * beyond)
 
 
 def _mirrored(tool: Tool, slant: Tensor) -> Tensor:  # [...] -> [...]

@@ -74,12 +74,19 @@ class Needle(Shaft):
         first_q = np.minimum(np.maximum(first_q, q - reach), q)
         last_q = np.maximum(np.minimum(last_q, q + reach), q)
         ends = depth + deeper * first_q, depth + deeper * last_q
+        first, last = np.minimum(*ends), np.maximum(*ends)
         path = np.minimum(self.diameter_mm / np.sqrt(np.maximum(1.0 - deeper**2, _LEAST)), length + self.diameter_mm)
+        # The shaft's own thickness along the line, but not beyond its ends.
+        at = depth + deeper * q
+        to_tip, to_hub = (way / np.maximum(np.abs(deeper), _LEAST) for way in (q, length - q))
+        above, below = np.where(deeper >= 0.0, to_tip, to_hub), np.where(deeper >= 0.0, to_hub, to_tip)
         return Crossing(
             cover=np.where(low <= high, cover, 0.0)[None],
-            first_mm=np.minimum(*ends)[None],
-            last_mm=np.maximum(*ends)[None],
+            first_mm=first[None],
+            last_mm=last[None],
             filled_mm=np.zeros_like(path)[None],
+            own_first_mm=np.maximum(np.minimum(first, at - np.minimum(0.5 * path, above)), face)[None],
+            own_last_mm=np.maximum(last, at + np.minimum(0.5 * path, below))[None],
             path_mm=path[None],
             slant=np.minimum(np.abs(deeper), 1.0)[None],
             stopped=self.stopped(path)[None],

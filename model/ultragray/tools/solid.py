@@ -83,6 +83,8 @@ def crossing_of_solid(tool: Tool, view: ScanView, placed: FloatArray, span_of: S
         first_mm=np.maximum(enters - rise, face),
         last_mm=enters + rise,
         filled_mm=np.maximum(path - rise, 0.0),
+        own_first_mm=np.maximum(enters - rise, face),
+        own_last_mm=np.maximum(enters + rise, enters + path),
         path_mm=path,
         slant=slant,
         stopped=tool.stopped(path),

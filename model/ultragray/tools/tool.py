@@ -17,6 +17,7 @@ from .crossing import Crossing, ScanView
 MAX_TOOLS = 8  # of one frame
 DEFAULT_LABEL = 255
 LEAST_THICKNESS_MM = 0.05
+_MOST_STOPPED = 1.0 - 1e-6
 
 
 class ToolFrame(str, Enum):
@@ -61,8 +62,8 @@ class Tool(Family):
         raise NotImplementedError
 
     def stopped(self, path_mm: FloatArray) -> FloatArray:  # [...] -> [...]
-        """The share of the beam that a way through it stops."""
-        return 1.0 - (1.0 - self.opacity) ** (path_mm / self.thickness_mm)
+        """The share of the beam that a way through it stops, less than 1."""
+        return np.minimum(1.0 - (1.0 - self.opacity) ** (path_mm / self.thickness_mm), _MOST_STOPPED)
 
     def seen_by(self, view: ScanView, points: Sequence[Sequence[float]]) -> FloatArray:  # [N, 3] -> [C, N, 3]
         """Points of the tool in the probe frame of each pose, mm."""

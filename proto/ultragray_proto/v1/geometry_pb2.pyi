@@ -1,10 +1,20 @@
 from google.protobuf.internal import containers as _containers
+from google.protobuf.internal import enum_type_wrapper as _enum_type_wrapper
 from google.protobuf import descriptor as _descriptor
 from google.protobuf import message as _message
 from collections.abc import Iterable as _Iterable, Mapping as _Mapping
 from typing import ClassVar as _ClassVar, Optional as _Optional, Union as _Union
 
 DESCRIPTOR: _descriptor.FileDescriptor
+
+class ToolFrame(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    TOOL_FRAME_UNSPECIFIED: _ClassVar[ToolFrame]
+    TOOL_FRAME_SCENE: _ClassVar[ToolFrame]
+    TOOL_FRAME_PROBE: _ClassVar[ToolFrame]
+TOOL_FRAME_UNSPECIFIED: ToolFrame
+TOOL_FRAME_SCENE: ToolFrame
+TOOL_FRAME_PROBE: ToolFrame
 
 class Position(_message.Message):
     __slots__ = ("x", "y", "z")
@@ -121,3 +131,89 @@ class Probe(_message.Message):
     radial: RadialProbe
     steered: SteeredProbe
     def __init__(self, linear: _Optional[_Union[LinearProbe, _Mapping]] = ..., convex: _Optional[_Union[ConvexProbe, _Mapping]] = ..., phased: _Optional[_Union[PhasedProbe, _Mapping]] = ..., radial: _Optional[_Union[RadialProbe, _Mapping]] = ..., steered: _Optional[_Union[SteeredProbe, _Mapping]] = ...) -> None: ...
+
+class Needle(_message.Message):
+    __slots__ = ("tip_mm", "hub_mm", "diameter_mm", "frame", "brightness", "roughness", "reverberation", "opacity", "label")
+    TIP_MM_FIELD_NUMBER: _ClassVar[int]
+    HUB_MM_FIELD_NUMBER: _ClassVar[int]
+    DIAMETER_MM_FIELD_NUMBER: _ClassVar[int]
+    FRAME_FIELD_NUMBER: _ClassVar[int]
+    BRIGHTNESS_FIELD_NUMBER: _ClassVar[int]
+    ROUGHNESS_FIELD_NUMBER: _ClassVar[int]
+    REVERBERATION_FIELD_NUMBER: _ClassVar[int]
+    OPACITY_FIELD_NUMBER: _ClassVar[int]
+    LABEL_FIELD_NUMBER: _ClassVar[int]
+    tip_mm: Position
+    hub_mm: Position
+    diameter_mm: float
+    frame: ToolFrame
+    brightness: float
+    roughness: float
+    reverberation: float
+    opacity: float
+    label: int
+    def __init__(self, tip_mm: _Optional[_Union[Position, _Mapping]] = ..., hub_mm: _Optional[_Union[Position, _Mapping]] = ..., diameter_mm: _Optional[float] = ..., frame: _Optional[_Union[ToolFrame, str]] = ..., brightness: _Optional[float] = ..., roughness: _Optional[float] = ..., reverberation: _Optional[float] = ..., opacity: _Optional[float] = ..., label: _Optional[int] = ...) -> None: ...
+
+class Cylinder(_message.Message):
+    __slots__ = ("tip_mm", "hub_mm", "diameter_mm", "frame", "brightness", "roughness", "reverberation", "opacity", "label")
+    TIP_MM_FIELD_NUMBER: _ClassVar[int]
+    HUB_MM_FIELD_NUMBER: _ClassVar[int]
+    DIAMETER_MM_FIELD_NUMBER: _ClassVar[int]
+    FRAME_FIELD_NUMBER: _ClassVar[int]
+    BRIGHTNESS_FIELD_NUMBER: _ClassVar[int]
+    ROUGHNESS_FIELD_NUMBER: _ClassVar[int]
+    REVERBERATION_FIELD_NUMBER: _ClassVar[int]
+    OPACITY_FIELD_NUMBER: _ClassVar[int]
+    LABEL_FIELD_NUMBER: _ClassVar[int]
+    tip_mm: Position
+    hub_mm: Position
+    diameter_mm: float
+    frame: ToolFrame
+    brightness: float
+    roughness: float
+    reverberation: float
+    opacity: float
+    label: int
+    def __init__(self, tip_mm: _Optional[_Union[Position, _Mapping]] = ..., hub_mm: _Optional[_Union[Position, _Mapping]] = ..., diameter_mm: _Optional[float] = ..., frame: _Optional[_Union[ToolFrame, str]] = ..., brightness: _Optional[float] = ..., roughness: _Optional[float] = ..., reverberation: _Optional[float] = ..., opacity: _Optional[float] = ..., label: _Optional[int] = ...) -> None: ...
+
+class Box(_message.Message):
+    __slots__ = ("centre_mm", "quaternion", "size_mm", "frame", "brightness", "roughness", "reverberation", "opacity", "label")
+    CENTRE_MM_FIELD_NUMBER: _ClassVar[int]
+    QUATERNION_FIELD_NUMBER: _ClassVar[int]
+    SIZE_MM_FIELD_NUMBER: _ClassVar[int]
+    FRAME_FIELD_NUMBER: _ClassVar[int]
+    BRIGHTNESS_FIELD_NUMBER: _ClassVar[int]
+    ROUGHNESS_FIELD_NUMBER: _ClassVar[int]
+    REVERBERATION_FIELD_NUMBER: _ClassVar[int]
+    OPACITY_FIELD_NUMBER: _ClassVar[int]
+    LABEL_FIELD_NUMBER: _ClassVar[int]
+    centre_mm: Position
+    quaternion: Quaternion
+    size_mm: Size
+    frame: ToolFrame
+    brightness: float
+    roughness: float
+    reverberation: float
+    opacity: float
+    label: int
+    def __init__(self, centre_mm: _Optional[_Union[Position, _Mapping]] = ..., quaternion: _Optional[_Union[Quaternion, _Mapping]] = ..., size_mm: _Optional[_Union[Size, _Mapping]] = ..., frame: _Optional[_Union[ToolFrame, str]] = ..., brightness: _Optional[float] = ..., roughness: _Optional[float] = ..., reverberation: _Optional[float] = ..., opacity: _Optional[float] = ..., label: _Optional[int] = ...) -> None: ...
+
+class Size(_message.Message):
+    __slots__ = ("x", "y", "z")
+    X_FIELD_NUMBER: _ClassVar[int]
+    Y_FIELD_NUMBER: _ClassVar[int]
+    Z_FIELD_NUMBER: _ClassVar[int]
+    x: float
+    y: float
+    z: float
+    def __init__(self, x: _Optional[float] = ..., y: _Optional[float] = ..., z: _Optional[float] = ...) -> None: ...
+
+class Tool(_message.Message):
+    __slots__ = ("needle", "cylinder", "box")
+    NEEDLE_FIELD_NUMBER: _ClassVar[int]
+    CYLINDER_FIELD_NUMBER: _ClassVar[int]
+    BOX_FIELD_NUMBER: _ClassVar[int]
+    needle: Needle
+    cylinder: Cylinder
+    box: Box
+    def __init__(self, needle: _Optional[_Union[Needle, _Mapping]] = ..., cylinder: _Optional[_Union[Cylinder, _Mapping]] = ..., box: _Optional[_Union[Box, _Mapping]] = ...) -> None: ...

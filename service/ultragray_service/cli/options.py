@@ -6,7 +6,7 @@
 
 A parameter whose type is a contract dataclass becomes an option for each of its fields, those of dataclasses within it
 included. Of a sampler it becomes `--sampler KIND` and the fields of all kinds; other families are written as JSON, and
-lists with commas. What is not given keeps its default.
+lists with commas; poses and tools are files. What is not given keeps its default.
 
     def train(settings: Annotated[dict[str, Any], FieldsOf(TrainingConfig)]) -> None:
 
@@ -31,6 +31,7 @@ from ultragray.contract import Contract, Family, annotated_fields, from_dict, fr
 from ultragray.errors import InvalidArgument
 from ultragray.files.poses import load_poses
 from ultragray.samplers import Sampler
+from ultragray.tools import Tool, load_tools
 
 FLAGS = {
     "settings": ("--set",),
@@ -42,6 +43,7 @@ FLAGS = {
 }
 _WITH_AN_OPTION_A_FIELD = (Sampler,)  # of all families
 _PARSED = (bool, int, float, Path)
+_FILES = ("poses", "tools")  # fields that are read from a file
 
 
 class FieldsOf:
@@ -173,6 +175,8 @@ def _parameter(
         meaning = f"{', '.join(takers)}: {meaning[:1].lower()}{meaning[1:]}"
     if item.name == "poses":
         meaning = f"{meaning.rstrip('.')}: .npy or .json, [P, 4, 4] or [P, 3, 4]."
+    if item.name == "tools":
+        meaning = f"{meaning} A .json file with a list of them: {', '.join(Tool.members)}, each with its numbers."
     limits = range_of(item).strip().removeprefix("of ")
     meaning += f" {limits[:1].upper()}{limits[1:]}." if limits else ""
     is_enum = isinstance(kind, type) and issubclass(kind, Enum)
@@ -181,7 +185,7 @@ def _parameter(
     if isinstance(kind, type) and issubclass(kind, Family):
         meaning += f" As JSON, a kind with its numbers: {'; '.join(map(_signature, kind.members.values()))}."
     is_switch, is_table = kind is bool, get_origin(kind) is dict
-    parsed: Any = list[str] if is_table else Path if item.name == "poses" else kind if kind in _PARSED else str
+    parsed: Any = list[str] if is_table else Path if item.name in _FILES else kind if kind in _PARSED else str
     flags = FLAGS.get(item.name, (_flag(f"no_{item.name}" if item.default is True else item.name),))
     shown = not is_switch and _shown_default(item)
     option = typer.Option(
@@ -247,13 +251,15 @@ def _part(cls: Any, name: str, given: Mapping[str, Any]) -> Any:
 
 def _read(value: Any, kind: Any, name: str) -> Any:
     """The value of an option in the type of its field."""
+    if name in _FILES:
+        return load_poses(value) if name == "poses" else load_tools(value)
     if get_origin(kind) is tuple:
         return from_text(value, kind)
     if get_origin(kind) is dict:
         return pairs_of(value, FLAGS[name][0]) if get_args(kind)[1] is str else parse_settings(value)
     if isinstance(kind, type) and issubclass(kind, Family):
         return from_dict(kind, _parsed_json(value, name))
-    return load_poses(value) if name == "poses" else value
+    return value
 
 
 def _parsed_json(text: str, name: str) -> Any:

@@ -15,6 +15,7 @@ from ultragray.display.settings import AS_RENDERED, Display
 from ultragray.outputs import OUTPUTS
 from ultragray.probe import Picture, Probe
 from ultragray.settings import Contact, Encoding, Resolved
+from ultragray.tools import Tool
 from ultragray_workers.pool.types import RenderResult
 
 from .poses import MatrixRows
@@ -73,6 +74,8 @@ class SettingsUsed:
     probe: Probe = described("As used.")
     slice_thickness_mm: float = described("As used: at the focus of the scene's beam; 0: a plane.")
     contact: Contact | None = described("As used; none: it was assumed.", None)
+    tools: tuple[Tool, ...] = described("As used.", ())
+    ghost: float = described("As used; 0: none.", 0.0)
     rendered_height: int = described("Depth samples, before the display settings were applied.")
     rendered_width: int = described("Scan lines, likewise.")
     display: Display = described("As used.", AS_RENDERED)
@@ -129,6 +132,8 @@ def settings_used(settings: Resolved) -> SettingsUsed:
         probe=settings.probe,
         slice_thickness_mm=settings.beam.thickness_mm,
         contact=settings.contact,
+        tools=settings.tools,
+        ghost=settings.ghost,
         rendered_height=settings.height,
         rendered_width=settings.width,
         display=settings.display,

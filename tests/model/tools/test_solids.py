@@ -127,6 +127,15 @@ def test_a_face_within_a_box_sees_nothing_else() -> None:
     assert crossing.cover.sum(axis=0) == pytest.approx(1.0)
 
 
+def test_a_long_way_through_an_opaque_box_leaves_no_beam_and_the_beam_before_it_whole(
+    empty_scene: GaussianScene,
+) -> None:
+    plate = Box(centre_mm=(0.0, 0.0, 25.0), size_mm=(1.0, 10.0, 30.0), opacity=0.999, reverberation=0.0)
+    passed = shown(empty_scene, plate)["transmittance"][0, :, SIDE // 2].numpy()
+    assert (passed[DEPTHS < 9.8] == 1.0).all()
+    assert passed[-1] < 1e-5
+
+
 def test_a_box_that_is_not_turned_rightly_is_refused() -> None:
     with pytest.raises(InvalidArgument, match=r"quaternion must have norm 1 within 0\.001, got norm 0\.5") as told:
         Box(centre_mm=(0.0, 0.0, 0.0), size_mm=(1.0, 1.0, 1.0), quaternion=(0.5, 0.0, 0.0, 0.0))

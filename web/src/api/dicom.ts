@@ -7,7 +7,8 @@ export const MOST_DICOM_FRAMES = 100; // of one file: the service lets so many w
 
 /** Frames of one setting and one scene file. `settings`: as they were asked for, where the frames do not tell. */
 export async function framesAsDicom(headers: readonly FrameHeader[], settings: StreamSettings): Promise<Blob> {
-  const { scene, scene_sha256, probe, display, rendered_height, rendered_width, slice_thickness_mm, contact } = headers[0]!;
+  const { scene, scene_sha256, probe, display, rendered_height, rendered_width, slice_thickness_mm } = headers[0]!;
+  const { contact, tools, ghost } = headers[0]!;
   const body = {
     poses: headers.map(({ pose }) => ({ matrix: pose })),
     height: rendered_height,
@@ -16,6 +17,8 @@ export async function framesAsDicom(headers: readonly FrameHeader[], settings: S
     display,
     slice_thickness_mm,
     contact,
+    tools,
+    ghost,
     min_confidence: settings.min_confidence,
     below_min_confidence: settings.below_min_confidence,
   };

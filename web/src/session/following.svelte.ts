@@ -85,7 +85,7 @@ function isShowable({ header, pixels }: Frame): boolean {
 
 /** What renders a frame again, as B-mode. */
 function settingsOf(header: FrameHeader): StreamSettings {
-  const { rendered_height, rendered_width, probe, display, slice_thickness_mm, contact } = header;
+  const { rendered_height, rendered_width, probe, display, slice_thickness_mm, contact, tools, ghost } = header;
   return {
     height: rendered_height,
     width: rendered_width,
@@ -94,6 +94,8 @@ function settingsOf(header: FrameHeader): StreamSettings {
     outputs: ["bmode"],
     slice_thickness_mm,
     contact,
+    tools,
+    ghost,
     min_confidence: null,
     below_min_confidence: "mask",
   };

@@ -73,6 +73,8 @@ export class Session {
       min_confidence: hidesUnsupported && this.scene.description?.confidence ? 1 : null,
       below_min_confidence: "mask",
       contact,
+      tools: null,
+      ghost: null,
     };
   }
 

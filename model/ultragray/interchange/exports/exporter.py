@@ -47,9 +47,10 @@ class ExportHeader:
     def origin(self) -> dict[str, Any]:
         """The origin of the frames and their display, as JSON holds it.
 
-        `picture` has the fields of `ultragray.probe.Picture`; `contact` is there where it was judged.
+        `picture` has the fields of `ultragray.probe.Picture`; `contact` is there where it was judged, `tools` and
+        `ghost` where there were any.
         """
-        contact = self.settings.contact
+        contact, tools, ghost = self.settings.contact, self.settings.tools, self.settings.ghost
         return {
             "scene": self.scene,
             "scene_sha256": self.scene_sha256,
@@ -59,6 +60,8 @@ class ExportHeader:
             "display": to_dict(self.settings.display),
             "picture": to_dict(self.settings.picture),
             **({} if contact is None else {"contact": contact.value}),
+            **({"tools": to_dict(tools)} if tools else {}),
+            **({"ghost": ghost} if ghost else {}),
         }
 
 

@@ -76,6 +76,8 @@ class PlusExporter(Exporter):
             "UltraGRaySliceThicknessMm": json.dumps(origin["slice_thickness_mm"]),
             "UltraGRayDisplay": json.dumps(origin["display"]),
             **({"UltraGRayContact": origin["contact"]} if "contact" in origin else {}),
+            **({"UltraGRayTools": json.dumps(origin["tools"])} if "tools" in origin else {}),
+            **({"UltraGRayGhost": json.dumps(origin["ghost"])} if "ghost" in origin else {}),
         }
 
     def _line(self, key: str, value: str) -> None:

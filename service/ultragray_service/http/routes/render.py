@@ -45,6 +45,8 @@ RENDER_HEADERS = {
     "X-Ultragray-Probe": "The probe that was used, JSON.",
     "X-Ultragray-Slice-Thickness-Mm": "As used: at the focus of the scene's beam; 0: a plane.",
     "X-Ultragray-Contact": "As used, air or pressure; absent where contact was assumed.",
+    "X-Ultragray-Tools": "As used, JSON; absent where there were none.",
+    "X-Ultragray-Ghost": "As used; absent where there was none.",
     "X-Ultragray-Confidence": "Of each pose, with commas; empty where the scene cannot tell.",
     "X-Ultragray-Extrapolation": "One pose only: distance_mm, angle_deg, confidence, supported_share, contact_share, "
     "JSON. Of many, npz holds them.",
@@ -150,8 +152,12 @@ def render_headers(result: RenderResult) -> dict[str, str]:
 def _settings_headers(settings: Resolved) -> dict[str, str]:
     """The headers that settings alone decide."""
     used = settings_used(settings)
-    contact = {} if used.contact is None else {"X-Ultragray-Contact": used.contact.value}
-    return contact | {
+    asked = {} if used.contact is None else {"X-Ultragray-Contact": used.contact.value}
+    if used.tools:
+        asked["X-Ultragray-Tools"] = json.dumps(to_dict(used.tools))
+    if used.ghost:
+        asked["X-Ultragray-Ghost"] = repr(used.ghost)
+    return asked | {
         "X-Ultragray-Dtype": settings.encoding.pixel_type.name,
         "X-Ultragray-Outputs": ",".join(settings.outputs),
         "X-Ultragray-Probe": json.dumps(to_dict(used.probe)),

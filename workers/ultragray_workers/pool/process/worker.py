@@ -240,6 +240,8 @@ class _Worker:
                 limits=limits.after(shot),
                 beam=view.beam,
                 contact=view.contact,
+                tools=view.tools,
+                ghost=view.ghost,
             )
             shot += len(some)
             assert frames.coverage is not None
