@@ -9,16 +9,16 @@ import numpy as np
 
 from ..errors import InvalidPose
 from ..installation import missing_extra
+from ..interchange.ros_messages import POSE, pose_of_message
 from ..probe import FloatArray
 
-KIND = "geometry_msgs/msg/PoseStamped"
 PREFERRED = "/probe_pose"  # the end of the topic of the ROS 2 node
 
 
 def read_mcap_poses(path: Path) -> FloatArray:  # [P, 4, 4]
     """The poses of the one topic of PoseStamped, by their time, mm; of several that whose name ends in /probe_pose.
 
-    Raises ValueError with the reason for a file that cannot be read, ExtraMissing, InvalidPose, OSError.
+    Raises ValueError with the reason for a file that cannot be read, ExtraMissing, OSError.
     """
     try:
         from mcap.reader import make_reader
@@ -34,7 +34,11 @@ def read_mcap_poses(path: Path) -> FloatArray:  # [P, 4, 4]
             raise
         except Exception as error:  # the library has many kinds for a file that is not whole
             raise ValueError(f"it is no whole MCAP file ({error or type(error).__name__})") from error
-    return np.array([_pose(message, place) for place, message in enumerate(messages)]).reshape(-1, 4, 4)
+    try:
+        poses = [pose_of_message(message, field=f"poses[{place}]") for place, message in enumerate(messages)]
+    except InvalidPose as error:
+        raise ValueError(error.detail) from error
+    return np.array(poses).reshape(-1, 4, 4)
 
 
 def _topic(summary: Any) -> str:
@@ -43,18 +47,9 @@ def _topic(summary: Any) -> str:
         raise ValueError("it has no summary: its writing was not finished")
     kinds = {number: schema.name for number, schema in summary.schemas.items()}
     channels = {channel.topic: kinds.get(channel.schema_id) for channel in summary.channels.values()}
-    topics = sorted(topic for topic, kind in channels.items() if kind == KIND)
+    topics = sorted(topic for topic, kind in channels.items() if kind == POSE)
     chosen = topics if len(topics) == 1 else [topic for topic in topics if topic.endswith(PREFERRED)]
     if len(chosen) != 1:
         others = ", ".join(topics) or ", ".join(f"{topic} ({kind})" for topic, kind in sorted(channels.items()))
-        raise ValueError(f"one topic of {KIND} is needed, or one that ends in {PREFERRED}; it has: {others or 'none'}")
-    return chosen[0]
-
-
-def _pose(message: Any, place: int) -> FloatArray:  # [4, 4]
-    from ..interchange.ros_messages import pose_of_message
-
-    try:
-        return pose_of_message(message)
-    except InvalidPose as error:
-        raise InvalidPose(f"poses[{place}]: {error.detail}", field="poses") from error
+        raise ValueError(f"one topic of {POSE} is needed, or one that ends in {PREFERRED}; it has: {others or 'none'}")
+    return str(chosen[0])

@@ -18,7 +18,7 @@ MM_PER_M = 1000.0
 NS_PER_S = 1_000_000_000
 SCENE_FRAME, PROBE_FRAME = "scene", "probe"
 ENCODINGS = {"u1": "mono8", "f4": "32FC1"}  # of sensor_msgs/Image, by pixel type
-OK, WARN = b"\0", b"\1"  # levels of DiagnosticStatus
+OK, WARN = 0, 1  # levels of DiagnosticStatus
 
 IMAGE = "sensor_msgs/msg/Image"
 POSE = "geometry_msgs/msg/PoseStamped"
@@ -87,11 +87,11 @@ def pose_message(pose: FloatArray, time_ns: int) -> dict[str, Any]:  # [4, 4] mm
     }
 
 
-def pose_of_message(message: Any) -> FloatArray:  # [4, 4] mm
+def pose_of_message(message: Any, *, field: str) -> FloatArray:  # [4, 4] mm
     """The pose of a geometry_msgs/PoseStamped with attributes. Raises InvalidPose."""
     position, turn = message.pose.position, message.pose.orientation
     x, y, z = MM_PER_M * np.array([position.x, position.y, position.z])
-    return pose_from_position_quaternion((x, y, z), (turn.w, turn.x, turn.y, turn.z))
+    return pose_from_position_quaternion((x, y, z), (turn.w, turn.x, turn.y, turn.z), field=field)
 
 
 def figures_message(

@@ -172,7 +172,7 @@ def _parameter(
     if takers:
         meaning = f"{', '.join(takers)}: {meaning[:1].lower()}{meaning[1:]}"
     if item.name == "poses":
-        meaning = f"{meaning.rstrip('.')}: .npy or .json, [P, 4, 4] or [P, 3, 4]."
+        meaning = f"{meaning.rstrip('.')}: .npy or .json, [P, 4, 4] or [P, 3, 4], or .mcap."
     limits = range_of(item).strip().removeprefix("of ")
     meaning += f" {limits[:1].upper()}{limits[1:]}." if limits else ""
     is_enum = isinstance(kind, type) and issubclass(kind, Enum)
@@ -203,7 +203,7 @@ def _parameter(
 def poses_option(*, default: str) -> Any:
     """`--poses FILE`; `default`: the words for the poses that are taken without it."""
     return typer.Option(
-        help="Poses in mm: .npy or .json, [P, 4, 4] or [P, 3, 4].",
+        help="Poses: .npy or .json, [P, 4, 4] or [P, 3, 4], in mm, or .mcap of ROS 2.",
         show_default=default,
         rich_help_panel=Sampler.__topic__,
     )

@@ -16,14 +16,16 @@ METADATA = "ultragray"  # the record of the origin: its objects as JSON
 
 
 class McapExporter(Exporter):
-    """A writer of /ultragray/OUTPUT, /ultragray/probe_pose and /ultragray/confidence, 25 frames a second from time 0."""
+    """A writer of /ultragray/OUTPUT, /ultragray/probe_pose and /ultragray/confidence, 25 a second from time 0."""
 
     def _open(self) -> None:
         file = self._held.enter_context(self._path.open("wb"))
         self._writer = writer = Writer(file)
         self._schemas = {name: writer.register_msgdef(name, text) for name, text in ros.DEFINITIONS.items()}
         origin = self._header.origin()
-        writer.add_metadata(METADATA, {key: one if isinstance(one, str) else json.dumps(one) for key, one in origin.items()})
+        writer.add_metadata(
+            METADATA, {key: one if isinstance(one, str) else json.dumps(one) for key, one in origin.items()}
+        )
 
     def _write(self, frames: Mapping[str, PixelArray], count: int) -> None:
         header = self._header
