@@ -57,6 +57,7 @@ BLOCKS = {
     "shards": Block("shards", performance.shards),
     "console": Block("console", performance.console),
     "environment": Block("environment", performance.environment),
+    "ros": Block("ros", performance.ros),
     "imports": Block("libraries", performance.imports),
     "beside scikit-image": Block("libraries", performance.beside_scikit_image),
     "shadows": Block("libraries", performance.shadows),

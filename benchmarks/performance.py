@@ -196,6 +196,17 @@ def environment(measured: Document) -> Iterator[str]:
     )
 
 
+def ros(measured: Document) -> Iterator[str]:
+    """From a pose to its image, through the ROS 2 node and without it."""
+    yield from _table(
+        ["Frame", "Way", "p50 ms", "p99 ms"],
+        (
+            [f"{row['side']}x{row['side']}", row["way"], f"{row['p50_ms']:.1f}", f"{row['p99_ms']:.1f}"]
+            for row in measured["rows"]
+        ),
+    )
+
+
 def imports(measured: Document) -> Iterator[str]:
     """What scikit-image takes to install, and to import."""
     sizes = measured["installed_mb"]

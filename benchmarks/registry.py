@@ -60,7 +60,7 @@ _TRAINED = (
 )
 _JOBS = ("workers/ultragray_workers/jobs", "workers/ultragray_workers/claims.py")
 _GPU = ("model/ultragray/backends/cuda", "model/ultragray/rendering.py", f"{_BENCH}/cuda")
-_PRODUCT = ("model", "workers", "service", "proto", "client")
+_PRODUCT = ("model", "workers", "service", "proto", "client", "ros")
 
 _FILES = (
     Figures("benchmarks/results.json", "bench", (*_SERVED, f"{_BENCH}/frames.py")),
@@ -108,6 +108,7 @@ _FILES = (
         "environment",
         (*_KERNEL, "model/ultragray/contact", "model/ultragray/gym", "benchmarks/environment.py"),
     ),
+    Figures("benchmarks/ros.json", "ros", (*_SERVED, "client/ultragray_client", "ros", "benchmarks/ros.py")),
     Figures(
         "benchmarks/simulation.json",
         "simulation",

@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import runpy
 import sys
+import tempfile
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import matplotlib as mpl
@@ -23,6 +25,8 @@ from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
 
 from ultragray import GaussianScene, read_header, render
 from ultragray.confidence import Assessor, supported
@@ -30,8 +34,9 @@ from ultragray.demo import DEMO_FILE
 from ultragray.display import Display
 from ultragray.display.frames import show
 from ultragray.gym import StandardPlaneEnv
+from ultragray.interchange.rendering import render_to_file
 from ultragray.samplers import AroundSampler
-from ultragray.settings import Contact
+from ultragray.settings import Contact, Encoding, FrameSettings
 from ultragray.tools import DEFAULT_LABEL, Box, Cylinder, Needle, Tool, ToolFrame
 from ultragray.volumes.fields import sample_slice
 from ultragray.volumes.grid import VolumeGrid
@@ -58,6 +63,7 @@ def main() -> None:
     draw_tools(scene, IMAGES / "tools.png")
     draw_standard_plane(scene, IMAGES / "standard_plane.png")
     draw_slices(scene, IMAGES / "volume_slices.png")
+    draw_recording(scene, IMAGES / "mcap_recording.png")
     for folder in sys.argv[1:]:
         shrink(Path(folder) / "sweep.png", IMAGES / "tutorial_sweep.png", width=1000)
         shrink(Path(folder) / "pictures" / "frame_00007.png", IMAGES / "tutorial_eval.png", width=1000)
@@ -263,6 +269,43 @@ def draw_slices(scene: GaussianScene, path: Path) -> None:
             panel.imshow(values, cmap="gray", vmin=0, extent=extent)
         panel.set_title(field, fontsize=9)
     save(figure, path)
+
+
+def draw_recording(scene: GaussianScene, path: Path) -> None:
+    """An MCAP file as its own reader reads it: some images, and confidence and position over the time of the stamps."""
+    poses = np.stack([along_spine(y) for y in np.linspace(0.0, 48.0, 97)])
+    settings = FrameSettings(height=SIDE, width=SIDE).resolved(scene.info, Encoding.UINT8)
+    told = Assessor(scene.info, scene.training_poses).assess(poses)
+    heard: dict[str, list[Any]] = {}
+    with tempfile.TemporaryDirectory() as folder:
+        recording = Path(folder, "sweep.mcap")
+        render_to_file(recording, "mcap", scene, settings, poses, told, scene_name="demo", scene_sha256="")
+        with recording.open("rb") as file:
+            for found in make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages():
+                heard.setdefault(found.channel.topic.rpartition("/")[2], []).append(found.decoded_message)
+    shown = heard["bmode"][::24]
+    figure = plt.figure(figsize=(2.4 * len(shown), 4.2), layout="constrained")
+    grid = figure.add_gridspec(2, len(shown), height_ratios=(3, 2))
+    for column, image in enumerate(shown):
+        panel = figure.add_subplot(grid[0, column], xticks=[], yticks=[])
+        pixels = np.frombuffer(image.data, np.uint8).reshape(image.height, image.width)
+        panel.imshow(pixels, cmap="gray", extent=EXTENT_MM)
+        panel.set_title(f"/ultragray/bmode at {_seconds(image):.2f} s", fontsize=8)
+    times_s = [_seconds(one) for one in heard["confidence"]]
+    values = [{pair.key: float(pair.value) for pair in one.status[0].values} for one in heard["confidence"]]
+    below = figure.add_subplot(grid[1, :], xlabel="time of the stamp, s", ylabel="confidence")
+    below.plot(times_s, [one["confidence"] for one in values], color="#d1495b", label="/ultragray/confidence")
+    beside = below.twinx()
+    beside.plot(times_s, [one.pose.position.y for one in heard["probe_pose"]], color="#30a0e0")
+    beside.set_ylabel("y of the probe, m")
+    below.plot([], [], color="#30a0e0", label="/ultragray/probe_pose")  # both curves in one legend
+    below.legend(loc="center left", fontsize=8)
+    save(figure, path)
+
+
+def _seconds(message: Any) -> float:
+    """The stamp of a message of ROS 2."""
+    return float(message.header.stamp.sec + message.header.stamp.nanosec / 1e9)
 
 
 def panel_row(*, rows: int, columns: int) -> tuple[Figure, Sequence[Axes]]:

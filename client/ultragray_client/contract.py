@@ -540,7 +540,9 @@ class RenderJob(FrameSettings):
     sampler: Sampler | None = None
     """Makes poses of the given ones, else of the scene's training poses."""
     format: str | None = None
-    """tar: WebDataset; dicom and plus (.igs.mha): bmode in uint8, true to scale. Default: npz; in shards tar."""
+    """tar: WebDataset; mcap: messages of ROS 2; dicom and plus (.igs.mha): bmode in uint8, true to scale. Default:
+    npz; in shards tar.
+    """
     dtype: str | None = None
     """Default: the format's own."""
     shard_frames: int | None = None

@@ -20,7 +20,7 @@ SECTIONS: Mapping[str, tuple[str, ...]] = {
     "Home": ("index.md",),
     "Tutorial": ("tutorial.md",),
     "How-to": (
-        *("howto/robotics.md", "howto/simulator.md", "howto/data-science.md", "howto/sonographer.md"),
+        *("howto/robotics.md", "howto/ros.md", "howto/simulator.md", "howto/data-science.md", "howto/sonographer.md"),
         *(
             "howto/recording.md",
             "howto/compare.md",

@@ -20,6 +20,7 @@ MODULES_OF_EXTRAS = {
     "dicom": ("pydicom",),
     "gym": ("gymnasium",),
     "hdf5": ("h5py",),
+    "mcap": ("mcap", "mcap_ros2"),
     "ray": ("ray",),
     "storage": ("obstore",),
     "tensorboard": ("tensorboard",),

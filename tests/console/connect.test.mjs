@@ -12,38 +12,25 @@ import { canvasState, picture, PYTHON, ROOT, seriousFindings, SOURCES, until } f
 import { enterPose, IMAGE, openScan, poseOf } from "./scan_page.mjs";
 import { tested } from "./tested.mjs";
 
-const ENVIRONMENT = { ...process.env, PYTHONPATH: `${SOURCES}:${path.join(ROOT, "client")}` };
+const ENVIRONMENT = { ...process.env, PYTHONPATH: `${SOURCES}:${path.join(ROOT, "client")}:${path.join(ROOT, "ros")}` };
 const SEEN_WITHIN_MS = 1000; // by a browser that draws in software; the service passes on within 200, see test_watching.py
-/** ROS's modules, as far as the example uses them: a subscription is called once, and what is published is kept. */
+/** What the ROS 2 node does with the command: its parameters as ROS reads them, and the pose that the example publishes. */
 const ROS = `
-import json, sys, types
-
-class Message:
-    def __init__(self, **values):
-        self.__dict__.update(values)
-
-class Node:
-    def __init__(self, name): pass
-    def get_logger(self): return types.SimpleNamespace(warning=print)
-    def create_publisher(self, kind, topic, depth): return types.SimpleNamespace(publish=self.published.append)
-    def create_subscription(self, kind, topic, callback, depth): self.callback = callback
-    published = []
-
-def spin(node):
-    place = types.SimpleNamespace(x=0.001, y=0.019, z=0.0)
-    turn = types.SimpleNamespace(w=1.0, x=0.0, y=0.0, z=0.0)
-    node.callback(Message(header="as it came", pose=types.SimpleNamespace(position=place, orientation=turn)))
-    image = node.published[0]
-    print(json.dumps([image.height, image.width, image.encoding, len(image.data), image.header]))
-
-for name, members in {
-    "rclpy": {"init": lambda: None, "spin": spin}, "rclpy.node": {"Node": Node},
-    "geometry_msgs": {}, "geometry_msgs.msg": {"PoseStamped": Message}, "sensor_msgs": {}, "sensor_msgs.msg": {"Image": Message},
-}.items():
-    module = types.ModuleType(name)
-    module.__dict__.update(members)
-    sys.modules[name] = module
-exec(open(sys.argv[1]).read())
+import json, shlex, sys, yaml
+from ultragray_client import Client, Placement, Quaternion
+from ultragray_ros.parameters import defaults, settings_of
+comment, command = open(sys.argv[1]).read().split("ultragray-ros", 1)
+words = shlex.split(command.replace("\\\n", " "))
+assert words[0] == "--ros-args" and set(words[1::2]) == {"-p"}, words
+given = {name: yaml.safe_load(value) for name, _, value in (word.partition(":=") for word in words[2::2])}
+known = {"address": "", "scene": "", **defaults()}
+assert {name: type(value) for name, value in given.items()} == {name: type(known[name]) for name in given}, given
+stamped = yaml.safe_load(shlex.split(comment, comments=False)[-1])
+place, turn = stamped["pose"]["position"], stamped["pose"]["orientation"]
+pose = Placement(tuple(1000 * place[axis] for axis in "xyz"), Quaternion(**turn))
+with Client(given["address"]) as client:
+    frame = client.render(given["scene"], pose, settings_of({**known, **given}))
+print(json.dumps([*frame["bmode"].shape, frame.display.gain_db, frame.probe.kind]))
 `;
 /** What grpcurl does: reads the request as JSON, and calls the method. */
 const GRPCURL = `
@@ -119,8 +106,8 @@ describe("connect", () => {
     assert.equal(streamed.length, 50);
     assert.match(streamed[49], new RegExp(`^49 \\(1, ${height}, ${width}\\)`));
     assert.match(run(PYTHON, written("igtl.py", await program(page, "igtl"))), /\(1, 256, 256\)/);
-    const image = JSON.parse(run(PYTHON, "-c", ROS, written("ros.py", await program(page, "ros"))));
-    assert.deepEqual(image, [height, width, "mono8", height * width, "as it came"]);
+    const image = JSON.parse(run(PYTHON, "-c", ROS, written("node.sh", await program(page, "ros"))));
+    assert.deepEqual(image, [height, width, 6, "convex"]);
     await picture(page, "connect");
     assert.deepEqual(page.faults, []);
   });

@@ -87,13 +87,20 @@ class Peer:
         self._poses.publish(message)
 
     def frame(self, heard: list[Any], stamp: int, **pose: Any) -> Any:
-        """What comes for a pose; it is published again until then, as nothing is kept of what came before a
-        subscription was known to the other side.
+        """What comes for a pose."""
+        return self.pose_until(
+            lambda: next((one for one in list(heard) if one.header.stamp.sec == stamp), None), stamp, **pose
+        )
+
+    def pose_until(self, condition: Callable[[], Any], stamp: int, **pose: Any) -> Any:
+        """The first true answer of `condition`. The pose is published again until then, as what comes before both sides
+        know of each other is lost.
         """
 
         def answer() -> Any:
-            self.pose(stamp, **pose)
-            return next((one for one in list(heard) if one.header.stamp.sec == stamp), None)
+            if not (found := condition()):
+                self.pose(stamp, **pose)
+            return found
 
         return wait_until(answer, every_s=0.1)
 

@@ -109,10 +109,9 @@ def test_what_cannot_be_rendered_is_logged_and_the_node_goes_on(
     node = start_node(address=ros_service.grpc)
     images = peer.listen(Image, "bmode")
     peer.frame(images, 1)
-    peer.pose(2, w=0.0)
-    wait_until(lambda: "INVALID_POSE: " in node.log())
-    peer.pose(3, frame="base_link")
-    wait_until(lambda: "poses must be given in the frame 'scene', got one in 'base_link'" in node.log())
+    peer.pose_until(lambda: "INVALID_POSE: " in node.log(), 2, w=0.0)
+    told = "poses must be given in the frame 'scene', got one in 'base_link'"
+    peer.pose_until(lambda: told in node.log(), 3, frame="base_link")
     for stamp in range(10, 30):
         peer.pose(stamp, w=0.0)
     peer.frame(images, 4)
@@ -127,8 +126,7 @@ def test_a_scene_that_does_not_exist_is_logged_until_another_is_named(
 
     node = start_node(address=ros_service.grpc, scene="absent")
     images = peer.listen(Image, "bmode")
-    peer.pose(1)
-    wait_until(lambda: "SCENE_NOT_FOUND" in node.log())
+    peer.pose_until(lambda: "SCENE_NOT_FOUND" in node.log(), 1)
     assert peer.set("scene", "demo") is None
     peer.frame(images, 2)
     assert {image.header.stamp.sec for image in images} == {2}
@@ -142,8 +140,7 @@ def test_a_service_that_is_away_is_logged_and_found_again(
     proxy = Proxy("127.0.0.1:1")
     node = start_node(address=proxy.address)
     images = peer.listen(Image, "bmode")
-    peer.pose(1)
-    wait_until(lambda: "UNREACHABLE" in node.log())
+    peer.pose_until(lambda: "UNREACHABLE" in node.log(), 1)
     proxy.lead_to(ros_service.grpc)
     peer.frame(images, 2)
     proxy.cut_after(100)
@@ -176,8 +173,7 @@ def test_a_frame_that_is_too_far_behind_its_pose_is_not_published(
 
     node = start_node(address=ros_service.grpc, timeout_s="0.000001")
     images = peer.listen(Image, "bmode")
-    peer.pose(1)
-    wait_until(lambda: "DEADLINE_EXCEEDED" in node.log())
+    peer.pose_until(lambda: "DEADLINE_EXCEEDED" in node.log(), 1)
     assert images == []
 
 

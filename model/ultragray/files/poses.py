@@ -1,4 +1,4 @@
-"""Poses in files: `.npy` arrays or `.json` lists, probe→scene (camera-to-world), millimetres."""
+"""Poses in files, probe→scene (camera-to-world): `.npy` arrays or `.json` lists in mm, `.mcap` of ROS 2 in metres."""
 
 from __future__ import annotations
 
@@ -12,14 +12,16 @@ import numpy.typing as npt
 from ..errors import InvalidPose
 from ..pose import check_poses
 from ..probe import FloatArray
+from .mcap_poses import read_mcap_poses
 from .npy import map_npy
 
 
 def load_poses(path: str | Path) -> FloatArray:  # [P, 4, 4]
-    """The poses of a `.npy` or `.json` file as exact float64 [P, 4, 4], mm.
+    """The poses of a `.npy`, `.json` or `.mcap` file as exact float64 [P, 4, 4], mm.
 
-    The file holds [P, 4, 4], [P, 3, 4], or one pose [4, 4] or [3, 4]; a missing last row is 0 0 0 1. Raises
-    InvalidPose, naming the file, the pose and what was expected; never runs code from the file.
+    An array is [P, 4, 4], [P, 3, 4], or one pose [4, 4] or [3, 4]; a missing last row is 0 0 0 1. An `.mcap` file has
+    one topic of geometry_msgs/PoseStamped, in metres. Raises InvalidPose, naming the file, the pose and what was
+    expected, and ExtraMissing; never runs code from the file.
     """
     path = Path(path)
     array = read_pose_array(path)
@@ -33,7 +35,7 @@ def load_poses(path: str | Path) -> FloatArray:  # [P, 4, 4]
 
 
 def read_pose_array(path: str | Path) -> npt.NDArray[Any]:
-    """The array of a `.npy` or `.json` file, the last row completed, not yet checked for being poses.
+    """The array of a `.npy`, `.json` or `.mcap` file, the last row completed, not yet checked for being poses.
 
     For a caller that checks them itself, frame by frame. Raises InvalidPose, naming a file that cannot be read.
     """
@@ -51,7 +53,9 @@ def _read(path: Path) -> Any:
         return json.loads(path.read_text(encoding="utf-8"))
     if path.suffix == ".npy":
         return map_npy(path)
-    raise ValueError("poses are read from .npy and .json files")
+    if path.suffix == ".mcap":
+        return read_mcap_poses(path)
+    raise ValueError("poses are read from .npy, .json and .mcap files")
 
 
 def _with_last_row(poses: Any) -> npt.NDArray[Any]:

@@ -174,7 +174,7 @@ def _parameter(
     if takers:
         meaning = f"{', '.join(takers)}: {meaning[:1].lower()}{meaning[1:]}"
     if item.name == "poses":
-        meaning = f"{meaning.rstrip('.')}: .npy or .json, [P, 4, 4] or [P, 3, 4]."
+        meaning = f"{meaning.rstrip('.')}: .npy or .json, [P, 4, 4] or [P, 3, 4], or .mcap."
     if item.name == "tools":
         meaning = f"{meaning} A .json file with a list of them: {', '.join(Tool.members)}, each with its numbers."
     limits = range_of(item).strip().removeprefix("of ")
@@ -207,7 +207,7 @@ def _parameter(
 def poses_option(*, default: str) -> Any:
     """`--poses FILE`; `default`: the words for the poses that are taken without it."""
     return typer.Option(
-        help="Poses in mm: .npy or .json, [P, 4, 4] or [P, 3, 4].",
+        help="Poses: .npy or .json, [P, 4, 4] or [P, 3, 4], in mm, or .mcap of ROS 2.",
         show_default=default,
         rich_help_panel=Sampler.__topic__,
     )

@@ -32,6 +32,7 @@ type Given = Record<string, unknown>;
 const KEY = "YOUR_KEY";
 const MOST_DEVICE_NAME = 20; // letters, in OpenIGTLink
 const LARGEST_MESSAGE = 64 * 2 ** 20;
+const WHOLE_PARAMETERS = ["height", "width"]; // of the ROS 2 node
 
 /** The program; null where the service has no such door. */
 export function snippet(language: Language, target: Target, asked: Asked): string | null {
@@ -149,54 +150,29 @@ client.stop()
 `;
 }
 
+/** The command of the node, and the pose of now for it. */
 function ros(target: Target, { pose, settings }: Asked): string {
   const [x, y, z] = position(pose).map((value) => short(value / 1000));
   const [w, i, j, k] = quaternion(pose).map(short);
-  const now = `{pose: {position: {x: ${x}, y: ${y}, z: ${z}}, orientation: {x: ${i}, y: ${j}, z: ${k}, w: ${w}}}}`;
-  return `# The pose of now: ros2 topic pub --once /probe_pose geometry_msgs/msg/PoseStamped "${now}"
-import json
-import struct
-
-import rclpy
-from geometry_msgs.msg import PoseStamped
-from rclpy.node import Node
-from sensor_msgs.msg import Image
-from websockets.sync.client import connect
-
-SETTINGS = ${literal(known(settings))}
-
-
-class Ultrasound(Node):
-    """Poses of the probe in the scene's frame, in metres, become images."""
-
-    def __init__(self):
-        super().__init__("ultrasound")
-        self.stream = connect(${streamAddress(target, "ros")})
-        self.images = self.create_publisher(Image, "ultrasound", 1)
-        self.create_subscription(PoseStamped, "probe_pose", self.render, 1)
-
-    def render(self, stamped):
-        p, q = stamped.pose.position, stamped.pose.orientation
-        pose = {
-            "position_mm": {"x": 1000 * p.x, "y": 1000 * p.y, "z": 1000 * p.z},
-            "quaternion": {"w": q.w, "x": q.x, "y": q.y, "z": q.z},
-        }
-        self.stream.send(json.dumps({"pose": pose, "settings": SETTINGS}))
-        answer = self.stream.recv()
-        if isinstance(answer, str):
-            self.get_logger().warning(json.loads(answer)["error"]["detail"])
-            return
-        (length,) = struct.unpack_from("<I", answer)
-        header = json.loads(answer[4 : 4 + length])
-        image = Image(height=header["height"], width=header["width"], encoding="mono8", step=header["width"])
-        image.header = stamped.header
-        image.data = answer[4 + length : 4 + length + header["height"] * header["width"]]
-        self.images.publish(image)
-
-
-rclpy.init()
-rclpy.spin(Ultrasound())
+  const place = `position: {x: ${x}, y: ${y}, z: ${z}}, orientation: {x: ${i}, y: ${j}, z: ${k}, w: ${w}}`;
+  const { display, probe, encoding: _, ...plain } = known(settings) as Given & { display?: Given; probe?: Given };
+  const given: Given = { address: `${target.host}:${target.grpcPort}`, scene: target.scene, ...plain };
+  if (isSecure(target)) given.tls = true;
+  if (probe !== undefined) given.probe = JSON.stringify(probe);
+  for (const [name, value] of Object.entries(display ?? {})) given[`display.${name}`] = value;
+  const parameters = Object.entries(given)
+    .filter(([, value]) => !(Array.isArray(value) && value.length === 0))
+    .map(([name, value]) => ` \\\n  -p '${name}:=${parameter(name, value).replaceAll("'", "'\\''")}'`);
+  return `# Then publish the pose of now: ros2 topic pub --once /ultragray/probe_pose geometry_msgs/msg/PoseStamped '{header: {frame_id: scene}, pose: {${place}}}'
+${target.keyRequired ? `ULTRAGRAY_API_KEY=${KEY} ` : ""}ultragray-ros --ros-args${parameters.join("")}
 `;
+}
+
+/** A value of a parameter as YAML, of which JSON is a part; ROS tells numbers with decimals from whole ones. */
+function parameter(name: string, value: unknown): string {
+  if (Array.isArray(value)) return `[${value.map((one) => parameter(name, one)).join(", ")}]`;
+  const isWhole = WHOLE_PARAMETERS.includes(name);
+  return typeof value === "number" && Number.isInteger(value) && !isWhole ? value.toFixed(1) : JSON.stringify(value);
 }
 
 function streamAddress(target: Target, name: string): string {

@@ -87,6 +87,14 @@ _ALL = (
         bmode_only=True,
         in_mm=True,
     ),
+    Format(
+        "mcap",
+        ".mcap",
+        "MCAP, messages of ROS 2: a topic of images for each output, poses in metres, figures; origin as metadata",
+        "mcap_file",
+        dtypes=("uint8", "float32"),
+        package="mcap_ros2",
+    ),
 )
 FORMATS: dict[str, Format] = {format.name: format for format in _ALL}
 

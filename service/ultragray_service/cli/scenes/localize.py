@@ -39,7 +39,8 @@ def localize(
         ),
     ],
     start: Annotated[
-        Path, typer.Option(help="A pose that is about right, in mm: .npy or .json, 4x4 or 3x4.", show_default=False)
+        Path,
+        typer.Option(help="A pose that is about right: .npy or .json, 4x4 or 3x4, in mm; .mcap.", show_default=False),
     ],
     within_mm: Annotated[float, typer.Option(help="How far the start may be off.")] = 3.0,
     within_deg: Annotated[float, typer.Option(help="By which angle.")] = 5.0,

@@ -336,7 +336,7 @@ def test_pixels_are_rounded_and_held_below_256() -> None:
 @pytest.mark.parametrize(
     ("format", "outputs", "dtype", "field", "told"),
     [
-        ("zip", ("bmode",), None, "format", "one of npz, tar, zarr, hdf5, dicom, plus"),
+        ("zip", ("bmode",), None, "format", "one of npz, tar, zarr, hdf5, dicom, plus, mcap"),
         (["npz"], ("bmode",), None, "format", "one of"),
         ("npz", ("bmode",), "int8", "dtype", "float32, uint8"),
         ("npz", ("bmode",), 8, "dtype", "float32, uint8"),
@@ -360,11 +360,14 @@ def test_default_types() -> None:
         "hdf5": "float32",
         "dicom": "uint8",
         "plus": "uint8",
+        "mcap": "uint8",
     }
     assert check_format("npz", OUTPUTS, "uint8") == "uint8"
 
 
-@pytest.mark.parametrize(("format", "package"), [("zarr", "zarr"), ("hdf5", "h5py"), ("dicom", "pydicom")])
+@pytest.mark.parametrize(
+    ("format", "package"), [("zarr", "zarr"), ("hdf5", "h5py"), ("dicom", "pydicom"), ("mcap", "mcap_ros2")]
+)
 def test_a_missing_package_is_named_with_its_extra(tmp_path: Path, format: str, package: str) -> None:
     program = (
         f"import sys; sys.path[:] = {sys.path!r}; sys.modules[{package!r}] = None\n"

@@ -213,7 +213,7 @@ export const connect: Words["connect"] = {
       grpc: "Braucht grpcurl. Der Dienst beschreibt seine Nachrichten selbst.",
       websocket: "Braucht die Pakete websockets und numpy. Für Livebilder einer bewegten Sonde.",
       igtl: "Braucht das Paket pyigtl. Ein Gerät mit dem Namen der Szene bekommt deren Bilder.",
-      ros: "Braucht ROS 2 und die Pakete websockets und numpy. Lagen kommen auf /probe_pose herein, Bilder gehen auf /ultrasound hinaus.",
+      ros: "Braucht ROS 2 und das Paket ultragray-ros. Lagen kommen auf /ultragray/probe_pose herein, in Metern, Bilder gehen auf /ultragray/bmode hinaus.",
     },
     intro: "Das Bild von jetzt, von einem Programm angefordert:",
     copy: (language: string) => `Beispiel in ${language} kopieren`,

@@ -50,7 +50,7 @@ const needs: Record<Language, string> = {
   grpc: "Needs grpcurl. The service describes its own messages.",
   websocket: "Needs the packages websockets and numpy. For live images from a moving probe.",
   igtl: "Needs the package pyigtl. A device named after the scene gets its images back.",
-  ros: "Needs ROS 2 and the packages websockets and numpy. Poses come in on /probe_pose, images go out on /ultrasound.",
+  ros: "Needs ROS 2 and the package ultragray-ros. Poses come in on /ultragray/probe_pose, in metres, images go out on /ultragray/bmode.",
 };
 const doors: Record<StreamSummary["door"], string> = { websocket: "WebSocket", grpc: "gRPC", openigtlink: "OpenIGTLink" };
 

@@ -58,7 +58,8 @@ class RenderJob(FrameSettings, Specification):
     poses: Poses | None = described("4x4 matrices, mm, probe to scene.", None)
     sampler: Sampler | None = described("Makes poses of the given ones, else of the scene's training poses.", None)
     format: str | None = described(
-        "tar: WebDataset; dicom and plus (.igs.mha): bmode in uint8, true to scale. Default: npz; in shards tar.",
+        "tar: WebDataset; mcap: messages of ROS 2; dicom and plus (.igs.mha): bmode in uint8, true to scale. "
+        "Default: npz; in shards tar.",
         None,
         choices=tuple(FORMATS),
     )
