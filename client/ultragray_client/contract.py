@@ -242,8 +242,8 @@ class DatasetOptions:
     crop: str | None = None
     """Region of a sequence's image that shows ultrasound: columns,rows, such as 188:632,12:600 (ends left out)."""
     fan: str | None = None
-    """Fan on the screen, of a sequence of a convex or phased probe: opening angle (degrees), radius of the face and
-    of the end (mm), column and row of the apex, such as 60,40,90,319.5,-120.
+    """Fan on the screen, of a recording with a convex or phased probe: opening angle (degrees), radius of the face
+    and of the end (mm), column and row of the apex, such as 60,40,90,319.5,-120.
     """
     transform: str | None = None
     """Tracked transform of a sequence to take, such as ProbeToTracker, where there are several."""
