@@ -26,6 +26,7 @@ from ultragray.datasets.source import SourceOptions
 from ultragray.errors import error_classes
 from ultragray.probe import ElevationBeam
 from ultragray.settings import RenderSettings
+from ultragray.volumes.plane import SliceSettings
 from ultragray_service.errors import STATUSES
 from ultragray_workers.datasets.store import DatasetRecord
 from ultragray_workers.jobs.kinds import Specification
@@ -36,6 +37,7 @@ MODULES = ("client", "connection", "datasets", "jobs", "scenes", "stream", "work
 # The classes that callers fill in or get, each with all that it is made of, and the names that the client gives them.
 ROOTS = {
     "RenderSettings": RenderSettings,
+    "SliceSettings": SliceSettings,
     "ElevationBeam": ElevationBeam,
     "DatasetOptions": SourceOptions,
     "Dataset": DatasetRecord,
@@ -85,7 +87,8 @@ _CONTRACT_HEADER = '''# Generated from the dataclasses of ultragray by client/ge
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from dataclasses import field as field_of
 from enum import Enum
 from typing import Any, Literal, TypeAlias
 
@@ -230,17 +233,17 @@ def _dataclass_source(cls: Any, name: str, bases: list[Any]) -> str:
 
 def _field_source(item: Field[Any], *, kw_only: bool) -> str:
     if str(item.type).startswith("Literal"):  # what tells a member of a family apart
-        return f"    kind: Literal[{item.default!r}] = field(default={item.default!r}, repr=False, kw_only=True)"
+        return f"    kind: Literal[{item.default!r}] = field_of(default={item.default!r}, repr=False, kw_only=True)"
     default = ""
     if item.default is not MISSING:
         default = f" = {item.default if isinstance(item.default, Enum) else repr(item.default)}"
     elif item.default_factory is not MISSING:
-        default = f" = field(default_factory={item.default_factory.__name__})"
+        default = f" = field_of(default_factory={item.default_factory.__name__})"
     if kw_only:
         given = f"default={item.default!r}"
         if item.default_factory is not MISSING:
             given = f"default_factory={item.default_factory.__name__}"
-        default = f" = field({given}, kw_only=True)"
+        default = f" = field_of({given}, kw_only=True)"
     annotation = re.sub(r"\w+", lambda word: OWN_TYPES.get(word[0], word[0]), str(item.type))
     return f"    {item.name}: {annotation}{default}\n    {_quoted(_wrapped(item.metadata['description']))}"
 

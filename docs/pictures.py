@@ -11,6 +11,7 @@ import sys
 import tempfile
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,8 @@ import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
-from matplotlib.patches import Patch
+from matplotlib.patches import Patch, Polygon
+from matplotlib.transforms import Affine2D
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
@@ -50,6 +52,7 @@ SIDE = 256
 EXTENT_MM = (-30.0, 30.0, 60.0, 0.0)  # of the demo scene's probe: left, right, bottom, top
 OVER_CANAL_MM = 19.0  # along the spine: bone to both sides, the canal between them
 MOST_AGENT_STEPS = 1000
+_TO_PAPER = np.array([[1.0, 0.55, 0.0], [0.0, -0.4, 1.0]])  # cabinet projection: x to the right, z down, y away
 LABEL_COLOURS = {"bone": "#f4d58d", "muscle": "#d1495b", "fat": "#edae49", "vessel": "#30a0e0", "tool": "#ffffff"}
 
 
@@ -64,6 +67,7 @@ def main() -> None:
     draw_standard_plane(scene, IMAGES / "standard_plane.png")
     draw_slices(scene, IMAGES / "volume_slices.png")
     draw_recording(scene, IMAGES / "mcap_recording.png")
+    draw_live_in_volume(scene, IMAGES / "slicer.png")
     for folder in sys.argv[1:]:
         shrink(Path(folder) / "sweep.png", IMAGES / "tutorial_sweep.png", width=1000)
         shrink(Path(folder) / "pictures" / "frame_00007.png", IMAGES / "tutorial_eval.png", width=1000)
@@ -306,6 +310,69 @@ def draw_recording(scene: GaussianScene, path: Path) -> None:
 def _seconds(message: Any) -> float:
     """The stamp of a message of ROS 2."""
     return float(message.header.stamp.sec + message.header.stamp.nanosec / 1e9)
+
+
+def draw_live_in_volume(scene: GaussianScene, path: Path) -> None:
+    """A live image in the volume of its scene, as a program that has both shows them, and the volume in its plane."""
+    pose = along_spine(OVER_CANAL_MM) @ _about_depth(25.0)
+    probe = scene.info.probe
+    assert probe is not None
+    right, down = pose[:3, 0], pose[:3, 2]
+    width, depth = probe.box_mm.right - probe.box_mm.left, probe.far_mm
+    corner = pose[:3, 3] - width / 2 * right
+    live = render(scene, None, pose, height=SIDE, width=SIDE).bmode[0].numpy()
+    in_plane = sample_slice(scene, "echo", VolumeGrid.on_plane(corner, right, down, (width, depth), 0.25))
+    low, high = np.array([-width / 2, OVER_CANAL_MM - 22.0, 0.0]), np.array([width / 2, OVER_CANAL_MM + 22.0, depth])
+    size, (x, y, z) = high - low, np.eye(3)
+    walls = (  # corner, directions and size of those behind and below the image
+        ((low[0], high[1], low[2]), x, z, (size[0], size[2])),
+        ((low[0], low[1], low[2]), y, z, (size[1], size[2])),
+        ((low[0], low[1], high[2]), x, y, (size[0], size[1])),
+    )
+    figure = plt.figure(figsize=(9.6, 3.6), layout="constrained")
+    view, image, cut = figure.subplots(1, 3, width_ratios=(1.35, 1, 1))
+    for origin, along, across, extent in walls:
+        values = sample_slice(scene, "echo", VolumeGrid.on_plane(origin, along, across, extent, 0.5))
+        _draw_in_space(view, values, np.array(origin), (along, across), extent, "0.6", layer=0)
+    _draw_in_space(view, live, corner, (right, down), (width, depth), "tab:orange", layer=1)
+    corners = [_TO_PAPER @ np.array(one) for one in product(*zip(low, high, strict=True))]
+    (left, top), (right_end, bottom) = np.min(corners, axis=0) - 1.0, np.max(corners, axis=0) + 1.0
+    view.set(xlim=(left, right_end), ylim=(bottom, top), aspect="equal")
+    view.axis("off")
+    view.set_title("the volume, and the live image in it", fontsize=9)
+    for panel, pixels, title in ((image, live, "Image_demo: B-mode"), (cut, in_plane, "the volume in the same plane")):
+        panel.imshow(pixels, cmap="gray", vmin=0, extent=(0, width, depth, 0))
+        panel.set_xticks([])
+        panel.set_yticks([])
+        panel.set_title(title, fontsize=9)
+    save(figure, path)
+
+
+def _about_depth(angle_deg: float) -> Floats:  # [4, 4]
+    turn = np.eye(4)
+    cosine, sine = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
+    turn[:2, :2] = [[cosine, -sine], [sine, cosine]]
+    return turn
+
+
+def _draw_in_space(
+    panel: Axes,
+    pixels: Floats,
+    corner: Floats,  # [3] mm
+    along_and_across: tuple[Floats, Floats],  # [3] each, of the rows and columns of pixels
+    size_mm: tuple[float, float],
+    edge: str,
+    *,
+    layer: int,  # higher ones cover lower ones
+) -> None:
+    """Draws a plane of space."""
+    start, (along, across) = _TO_PAPER @ corner, (_TO_PAPER @ direction for direction in along_and_across)
+    place = Affine2D(np.array([[along[0], across[0], start[0]], [along[1], across[1], start[1]], [0, 0, 1]]))
+    width, height = size_mm
+    extent = (0, width, height, 0)
+    panel.imshow(pixels, cmap="gray", vmin=0, extent=extent, transform=place + panel.transData, zorder=layer)
+    border = place.transform([(0, 0), (width, 0), (width, height), (0, height)])
+    panel.add_patch(Polygon(border, fill=False, edgecolor=edge, linewidth=1.2, zorder=layer + 0.5))
 
 
 def panel_row(*, rows: int, columns: int) -> tuple[Figure, Sequence[Axes]]:

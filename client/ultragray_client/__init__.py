@@ -15,7 +15,7 @@ from .calls.pose_exchange import StreamMode
 from .calls.tls import Tls
 from .contract import *  # noqa: F403
 from .errors import ClientError
-from .frames import Extrapolation, Frame, Picture, Timings
+from .frames import Extrapolation, Frame, Picture, Slice, Timings
 from .geometry import Placement, PoseLike, Quaternion
 from .jobs import Job, JobError, JobEvent, JobProgress, JobState
 from .scenes import ConfidenceFit, Scene, SceneEntry
@@ -46,6 +46,7 @@ __all__ = [
     "Role",
     "Scene",
     "SceneEntry",
+    "Slice",
     "StreamMode",
     "Timings",
     "Tls",

@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from dataclasses import field as field_of
 from enum import Enum
 from typing import Any, Literal, TypeAlias
 
@@ -38,6 +39,7 @@ __all__ = [
     "RenderSettings",
     "Sampler",
     "Shaft",
+    "SliceSettings",
     "Specification",
     "SplineSampler",
     "SteeredProbe",
@@ -45,6 +47,7 @@ __all__ = [
     "ToolFrame",
     "TrainJob",
     "TrainingSampler",
+    "VoxelizeJob",
 ]
 
 
@@ -58,7 +61,7 @@ class ConvexProbe:
     """Radius of the face: distance from the apex at which the image begins."""
     far_mm: float
     """Distance from the apex at which the image ends, beyond `near_mm`."""
-    kind: Literal["convex"] = field(default="convex", repr=False, kw_only=True)
+    kind: Literal["convex"] = field_of(default="convex", repr=False, kw_only=True)
 
 
 @dataclass(frozen=True)
@@ -71,7 +74,7 @@ class LinearProbe:
     """Depth at which the image begins."""
     far_mm: float
     """Depth at which the image ends, beyond `near_mm`."""
-    kind: Literal["linear"] = field(default="linear", repr=False, kw_only=True)
+    kind: Literal["linear"] = field_of(default="linear", repr=False, kw_only=True)
 
 
 @dataclass(frozen=True)
@@ -82,7 +85,7 @@ class PhasedProbe:
     """Full angle of the fan."""
     far_mm: float
     """Depth at which the image ends."""
-    kind: Literal["phased"] = field(default="phased", repr=False, kw_only=True)
+    kind: Literal["phased"] = field_of(default="phased", repr=False, kw_only=True)
 
 
 @dataclass(frozen=True)
@@ -96,7 +99,7 @@ class RadialProbe:
     """Radius of the ring: distance from the centre at which the image begins."""
     far_mm: float
     """Distance from the centre at which the image ends, beyond `near_mm`."""
-    kind: Literal["radial"] = field(default="radial", repr=False, kw_only=True)
+    kind: Literal["radial"] = field_of(default="radial", repr=False, kw_only=True)
 
 
 @dataclass(frozen=True)
@@ -111,7 +114,7 @@ class SteeredProbe:
     """Depth along the scan lines at which the image begins."""
     far_mm: float
     """Depth along the scan lines at which the image ends, beyond `near_mm`."""
-    kind: Literal["steered"] = field(default="steered", repr=False, kw_only=True)
+    kind: Literal["steered"] = field_of(default="steered", repr=False, kw_only=True)
 
 
 Probe: TypeAlias = ConvexProbe | LinearProbe | PhasedProbe | RadialProbe | SteeredProbe
@@ -142,7 +145,7 @@ class ToolFrame(str, Enum):
 class Box:
     """A solid box about a point, turned about it."""
 
-    kind: Literal["box"] = field(default="box", repr=False, kw_only=True)
+    kind: Literal["box"] = field_of(default="box", repr=False, kw_only=True)
     frame: ToolFrame = ToolFrame.SCENE
     """Of its points; probe: it moves with the probe."""
     brightness: float = 1.0
@@ -191,14 +194,14 @@ class Shaft:
 class Cylinder(Shaft):
     """A solid cylinder with flat ends, thicker than the beam: its near side is seen. What is thinner is a needle."""
 
-    kind: Literal["cylinder"] = field(default="cylinder", repr=False, kw_only=True)
+    kind: Literal["cylinder"] = field_of(default="cylinder", repr=False, kw_only=True)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Needle(Shaft):
     """A straight needle. Its echo lies on the line from tip to hub, so that the tip is where it is said to be."""
 
-    kind: Literal["needle"] = field(default="needle", repr=False, kw_only=True)
+    kind: Literal["needle"] = field_of(default="needle", repr=False, kw_only=True)
 
 
 Tool: TypeAlias = Box | Cylinder | Needle
@@ -277,6 +280,24 @@ class RenderSettings(FrameSettings):
     """Form of the pixels."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class SliceSettings:
+    """A slice through a scene, on any plane: no probe is involved."""
+
+    field: str = "echo"
+    """At each point. attenuation: per mm."""
+    origin_mm: tuple[float, float, float]
+    """Corner of the first pixel, in the scene's frame."""
+    right: tuple[float, float, float] = (1.0, 0.0, 0.0)
+    """Direction of the rows, of any length."""
+    down: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    """Direction of the columns, at a right angle."""
+    size_mm: tuple[float, float]
+    """Width and height."""
+    spacing_mm: float = 0.5
+    """Distance of two pixels."""
+
+
 @dataclass(frozen=True)
 class ElevationBeam:
     """A Gaussian beam across the image plane, with a focus (docs/physics.md §3).
@@ -306,8 +327,8 @@ class DatasetOptions:
     crop: str | None = None
     """Region of a sequence's image that shows ultrasound: columns,rows, such as 188:632,12:600 (ends left out)."""
     fan: str | None = None
-    """Fan on the screen, of a sequence of a convex or phased probe: opening angle (degrees), radius of the face and
-    of the end (mm), column and row of the apex, such as 60,40,90,319.5,-120.
+    """Fan on the screen, of a recording with a convex or phased probe: opening angle (degrees), radius of the face
+    and of the end (mm), column and row of the apex, such as 60,40,90,319.5,-120.
     """
     transform: str | None = None
     """Tracked transform of a sequence to take, such as ProbeToTracker, where there are several."""
@@ -406,14 +427,14 @@ class CompareJob(ComparisonSettings):
     comparison.tex have the rest.
     """
 
-    kind: Literal["compare"] = field(default="compare", repr=False, kw_only=True)
+    kind: Literal["compare"] = field_of(default="compare", repr=False, kw_only=True)
     max_run_s: float | None = None
     """Longest time that the job may run in all, s; then it fails, and a retry goes on. None: the service's longest."""
     device: str = "auto"
     """auto, cpu, cuda or cuda:N: what the worker must offer; auto: a GPU where it offers one, else its processor."""
     min_memory_gb: int | None = None
     """Least memory of the device, 10^9 bytes; of cpu: of the host."""
-    worker_labels: dict[str, str] = field(default_factory=dict)
+    worker_labels: dict[str, str] = field_of(default_factory=dict)
     """Labels that the worker must have, such as {"site": "lab1"}."""
     dataset: str
     """Name of an uploaded dataset, with held-out frames."""
@@ -432,14 +453,14 @@ class EvaluateJob:
     """Name of a scene."""
     baselines: bool = False
     """Also score compounding of the training frames: the classical way."""
-    kind: Literal["evaluate"] = field(default="evaluate", repr=False, kw_only=True)
-    max_run_s: float | None = field(default=None, kw_only=True)
+    kind: Literal["evaluate"] = field_of(default="evaluate", repr=False, kw_only=True)
+    max_run_s: float | None = field_of(default=None, kw_only=True)
     """Longest time that the job may run in all, s; then it fails, and a retry goes on. None: the service's longest."""
-    device: str = field(default="auto", kw_only=True)
+    device: str = field_of(default="auto", kw_only=True)
     """auto, cpu, cuda or cuda:N: what the worker must offer; auto: a GPU where it offers one, else its processor."""
-    min_memory_gb: int | None = field(default=None, kw_only=True)
+    min_memory_gb: int | None = field_of(default=None, kw_only=True)
     """Least memory of the device, 10^9 bytes; of cpu: of the host."""
-    worker_labels: dict[str, str] = field(default_factory=dict, kw_only=True)
+    worker_labels: dict[str, str] = field_of(default_factory=dict, kw_only=True)
     """Labels that the worker must have, such as {"site": "lab1"}."""
 
 
@@ -459,7 +480,7 @@ class AroundSampler:
     """Standard deviation of the angle."""
     seed: int = 0
     """Of the random choices."""
-    kind: Literal["around"] = field(default="around", repr=False, kw_only=True)
+    kind: Literal["around"] = field_of(default="around", repr=False, kw_only=True)
 
 
 @dataclass(frozen=True)
@@ -478,7 +499,7 @@ class CoveredSampler:
     """How many poses."""
     seed: int = 0
     """Of the random choices."""
-    kind: Literal["covered"] = field(default="covered", repr=False, kw_only=True)
+    kind: Literal["covered"] = field_of(default="covered", repr=False, kw_only=True)
 
 
 @dataclass(frozen=True)
@@ -494,7 +515,7 @@ class FanSampler:
     """The largest tilt, to both sides."""
     step_deg: float
     """Between two tilts."""
-    kind: Literal["fan"] = field(default="fan", repr=False, kw_only=True)
+    kind: Literal["fan"] = field_of(default="fan", repr=False, kw_only=True)
 
 
 @dataclass(frozen=True)
@@ -511,14 +532,14 @@ class SplineSampler:
     """How many poses."""
     spacing_mm: float | None = None
     """Instead of count: distance along the path."""
-    kind: Literal["spline"] = field(default="spline", repr=False, kw_only=True)
+    kind: Literal["spline"] = field_of(default="spline", repr=False, kw_only=True)
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingSampler:
     """The training poses of the scene as they are, in order."""
 
-    kind: Literal["training"] = field(default="training", repr=False, kw_only=True)
+    kind: Literal["training"] = field_of(default="training", repr=False, kw_only=True)
 
 
 Sampler: TypeAlias = AroundSampler | CoveredSampler | FanSampler | SplineSampler | TrainingSampler
@@ -549,14 +570,14 @@ class RenderJob(FrameSettings):
     """Frames of a file: the job becomes many files, which all workers make. Default: one file, above 100,000 frames
     5,000 in each.
     """
-    kind: Literal["render"] = field(default="render", repr=False, kw_only=True)
-    max_run_s: float | None = field(default=None, kw_only=True)
+    kind: Literal["render"] = field_of(default="render", repr=False, kw_only=True)
+    max_run_s: float | None = field_of(default=None, kw_only=True)
     """Longest time that the job may run in all, s; then it fails, and a retry goes on. None: the service's longest."""
-    device: str = field(default="auto", kw_only=True)
+    device: str = field_of(default="auto", kw_only=True)
     """auto, cpu, cuda or cuda:N: what the worker must offer; auto: a GPU where it offers one, else its processor."""
-    min_memory_gb: int | None = field(default=None, kw_only=True)
+    min_memory_gb: int | None = field_of(default=None, kw_only=True)
     """Least memory of the device, 10^9 bytes; of cpu: of the host."""
-    worker_labels: dict[str, str] = field(default_factory=dict, kw_only=True)
+    worker_labels: dict[str, str] = field_of(default_factory=dict, kw_only=True)
     """Labels that the worker must have, such as {"site": "lab1"}."""
 
 
@@ -572,17 +593,45 @@ class TrainJob:
     """fast: minutes on two cores; best: fast, with the effort that frames left out ask for, in half an hour; paper:
     the released recipe.
     """
-    settings: dict[str, Any] = field(default_factory=dict)
+    settings: dict[str, Any] = field_of(default_factory=dict)
     """Any training settings instead of the preset's."""
-    kind: Literal["train"] = field(default="train", repr=False, kw_only=True)
-    max_run_s: float | None = field(default=None, kw_only=True)
+    kind: Literal["train"] = field_of(default="train", repr=False, kw_only=True)
+    max_run_s: float | None = field_of(default=None, kw_only=True)
     """Longest time that the job may run in all, s; then it fails, and a retry goes on. None: the service's longest."""
-    device: str = field(default="auto", kw_only=True)
+    device: str = field_of(default="auto", kw_only=True)
     """auto, cpu, cuda or cuda:N: what the worker must offer; auto: a GPU where it offers one, else its processor."""
-    min_memory_gb: int | None = field(default=None, kw_only=True)
+    min_memory_gb: int | None = field_of(default=None, kw_only=True)
     """Least memory of the device, 10^9 bytes; of cpu: of the host."""
-    worker_labels: dict[str, str] = field(default_factory=dict, kw_only=True)
+    worker_labels: dict[str, str] = field_of(default_factory=dict, kw_only=True)
     """Labels that the worker must have, such as {"site": "lab1"}."""
 
 
-Specification: TypeAlias = CompareJob | EvaluateJob | RenderJob | TrainJob
+@dataclass(frozen=True)
+class VoxelizeJob:
+    """A field of a scene becomes a volume, such as echo.nii.gz; no probe is involved.
+
+    volume.json says where its voxels lie.
+    """
+
+    scene: str
+    """Name of a scene; NAME@SHA256, or NAME@ and 12 digits of it: with that content alone."""
+    field: str = "echo"
+    """At each point. attenuation: per mm."""
+    spacing_mm: float = 0.5
+    """Distance of two voxels along each axis."""
+    box_mm: str | None = None
+    """Ranges of x, y and z in the scene's frame, such as -20:20,0:30,-5:45. Default: the bounds of the Gaussians."""
+    format: str = "nii.gz"
+    """Of the file."""
+    kind: Literal["voxelize"] = field_of(default="voxelize", repr=False, kw_only=True)
+    max_run_s: float | None = field_of(default=None, kw_only=True)
+    """Longest time that the job may run in all, s; then it fails, and a retry goes on. None: the service's longest."""
+    device: str = field_of(default="auto", kw_only=True)
+    """auto, cpu, cuda or cuda:N: what the worker must offer; auto: a GPU where it offers one, else its processor."""
+    min_memory_gb: int | None = field_of(default=None, kw_only=True)
+    """Least memory of the device, 10^9 bytes; of cpu: of the host."""
+    worker_labels: dict[str, str] = field_of(default_factory=dict, kw_only=True)
+    """Labels that the worker must have, such as {"site": "lab1"}."""
+
+
+Specification: TypeAlias = CompareJob | EvaluateJob | RenderJob | TrainJob | VoxelizeJob

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
+from dataclasses import field as field_of
 from types import MappingProxyType
 from typing import Any
 
@@ -122,6 +123,24 @@ class Frame:
         with `Display(pixel_mm=...)`.
         """
         return self.pose @ self.picture.pixel_to_probe()
+
+
+@dataclass(frozen=True, eq=False)
+class Slice:
+    """A field of a scene on a plane. `slice.pixels[row, column]` is one of its values."""
+
+    pixels: npt.NDArray[Any] = field_of(repr=False)  # [H, W], read-only: float32, of labels uint8
+    field: str
+    pixel_to_scene: FloatArray  # [4, 4]: takes (column, row, k, 1), counted from 0 at pixels' centres, to mm
+    scene: str
+    scene_sha256: str  # of the scene file
+    timings: Timings
+
+
+def slice_from_message(message: rendering_pb2.Slice) -> Slice:
+    """The slice; its pixels are a read-only view of the message's own."""
+    pixels = np.frombuffer(message.data, _PIXEL_TYPES[_ENCODINGS[message.encoding]])
+    return from_message(message, Slice, pixels=pixels.reshape(message.height, message.width))
 
 
 def settings_message(scene: str, settings: RenderSettings | None) -> rendering_pb2.RenderSettings:

@@ -10,6 +10,7 @@ from ultragray.display.settings import Display
 from ultragray.gym.settings import StandardPlaneSettings
 from ultragray.scene_info import SceneInfo
 from ultragray.settings import RenderSettings
+from ultragray.volumes.plane import SliceSettings
 from ultragray_service.http.reading.bodies import RenderBody, StreamMessage
 from ultragray_service.http.stream_messages import FrameMessage
 
@@ -27,6 +28,7 @@ PARTS: dict[str, Callable[[], str]] = {
     "standard plane": partial(library.keys, StandardPlaneSettings, "Argument"),
     "confidence": partial(library.told, Extrapolation, "Figure"),
     "render body": partial(library.keys, RenderBody),
+    "slice body": partial(library.keys, SliceSettings),
     "stream messages": partial(library.keys, StreamMessage),
     "stream settings": partial(library.keys, RenderSettings),
     "stream frames": partial(library.told, FrameMessage),

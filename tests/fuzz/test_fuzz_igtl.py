@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import strategies as st
 
+from ultragray_service.igtl.commands.contents import Command, pack_command
 from ultragray_service.igtl.contents import Tool, pack_position, pack_tools, pack_transform
 from ultragray_service.igtl.messages import HEADER_BYTES, Message, pack_message, unpack_header
 
@@ -23,6 +24,7 @@ GROUP = 20  # messages on one connection
 TIMEOUT_S = 60.0
 LAST = 2**33 + 77  # the time stamp of the question that must be answered after them
 TOOL = Tool("demo", np.eye(4))
+COMMAND = '<Command Name="SetUsParameter"><Parameter Name="DepthMm" Value="20"/></Command>'
 VALID = (
     ("TRANSFORM", pack_transform(np.eye(4))),
     ("POSITION", pack_position(np.eye(4))),
@@ -36,9 +38,20 @@ VALID = (
     ("STT_QTDATA", struct.pack(">I", 20) + bytes(20)),
     ("STATUS", bytes(30)),
     ("STRING", b"\0\3\0\5hello"),
+    ("COMMAND", pack_command(Command(1, "SetUsParameter", COMMAND))),
     ("IMAGE", bytes(72)),
 )
-DEVICES = ("demo", "second", "probeless", "absent", "", "x" * 20, "ä" * 10, *(text for text in TEXTS if text.isascii()))
+DEVICES = (
+    "demo",
+    "CMD_1",
+    "second",
+    "probeless",
+    "absent",
+    "",
+    "x" * 20,
+    "ä" * 10,
+    *(text for text in TEXTS if text.isascii()),
+)
 
 
 def messages() -> Strategy:

@@ -13,8 +13,8 @@ from ..calls.batch import Batch
 from ..calls.connection import DEFAULT_ADDRESS, DEFAULT_TIMEOUT_S, ApiKey
 from ..calls.pose_exchange import PoseExchange, StreamMode
 from ..calls.tls import Tls
-from ..contract import Probe, RenderSettings
-from ..frames import Extrapolation, Frame, frame_from_message, settings_message
+from ..contract import Probe, RenderSettings, SliceSettings
+from ..frames import Extrapolation, Frame, Slice, frame_from_message, settings_message, slice_from_message
 from ..geometry import PoseLike, pose_message, pose_messages
 from ..messages import message_of
 from .connection import Connection
@@ -111,6 +111,14 @@ class Client:
         exchange = PoseExchange(settings_message(scene, settings), mode, shared_memory=shared_memory)
         call = self._connection.pose_call(self._calls.RenderStream, exchange, timeout_s, reconnect_s)
         return FrameStream(exchange, call)
+
+    def render_slice(self, scene: str, plane: SliceSettings, *, timeout_s: float | None = None) -> Slice:
+        """A field of a scene on any plane, without a probe. It waits and counts as a frame does.
+
+        Raises SceneNotFound, InvalidArgument and its kinds, QueueFull, DeadlineExceeded, Unavailable.
+        """
+        request = rendering_pb2.RenderSliceRequest(scene=scene, slice=message_of(plane, rendering_pb2.SliceSettings))
+        return slice_from_message(self._connection.answer(self._calls.RenderSlice, request, timeout_s))
 
     def assess_poses(
         self, scene: str, poses: Iterable[PoseLike], probe: Probe | None = None, *, timeout_s: float | None = None

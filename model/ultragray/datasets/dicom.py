@@ -1,9 +1,10 @@
-"""DICOM cine loops: a multi-frame ultrasound image (.dcm) of a linear probe, and the poses of its frames beside it.
+"""DICOM cine loops: a multi-frame ultrasound image (.dcm), and the poses of its frames beside it.
 
 `sweep.dcm` goes with `sweep.poses.npy` or `sweep.poses.json`: one pose for each frame, probe→tracker, mm, whose origin
 is the top centre of the region that shows the image (SequenceOfUltrasoundRegions, PS3.3 C.8.5.5), x along its rows of
-pixels, z down its columns. Where a file has no regions, the whole image is the region and PixelSpacing its scale. The
-extra `dicom`.
+pixels, z down its columns. Of a convex or phased probe, whose fan on the screen is said in words, the origin is the
+apex, z the middle of the fan. Where a file has no regions, the whole image is the region and PixelSpacing its scale.
+The extra `dicom`.
 """
 
 from __future__ import annotations
@@ -17,12 +18,13 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import DatasetInvalid, InvalidPose
+from ..errors import DatasetInvalid, InvalidArgument, InvalidPose
 from ..files.poses import load_poses
 from ..installation import missing_extra
 from ..probe import FloatArray
 from .calibration import pixel_size_mm, poses_from_image_transforms, region_of
-from .images import MAX_PIXEL_BYTES, CropBox, parse_crop
+from .images import MAX_PIXEL_BYTES, CropBox, grey_frames, parse_crop
+from .plus.fan import FanGeometry, FanLines, parse_fan
 from .splits import parse_frame_ranges
 from .sweep import ByteArray, IntArray, Sweep
 
@@ -30,22 +32,32 @@ POSE_SUFFIXES = (".poses.npy", ".poses.json")
 MAX_HEADER_BYTES = 16 << 20  # of all that stands before the pixels
 DEFLATED = "1.2.840.10008.1.2.1.99"  # the whole data set is compressed: it could inflate without bounds
 CENTIMETRES, TISSUE_2D = 3, 1
+INTERPRETATIONS = {"MONOCHROME2": 1, "RGB": 3, "YBR_FULL": 3, "YBR_FULL_422": 3}  # samples of a pixel
 SMALLEST_PIXEL_MM, LARGEST_PIXEL_MM = 1e-4, 10.0
 
 
-def read_dicom_sweep(path: Path, *, frames: str | None = None, crop: str | None = None) -> tuple[Sweep, int]:
+def read_dicom_sweep(
+    path: Path, *, frames: str | None = None, crop: str | None = None, fan: str | None = None
+) -> tuple[Sweep, int]:
     """The frames of a cine loop, and their number in the file.
 
     `frames` (ranges, `parse_frame_ranges`) chooses among them; `crop` is "columns,rows" of the stored image, default:
-    the region. Raises DatasetInvalid, naming the file, the frame and the reason; InvalidArgument for `frames` and
-    `crop` that do not fit; ExtraMissing without pydicom.
+    the region. `fan` (`parse_fan`) says that the image is that of a convex or phased probe: the frames are its scan
+    lines. Colour becomes luma. Raises DatasetInvalid, naming the file, the frame and the reason; InvalidArgument for
+    options that do not fit; ExtraMissing without pydicom.
     """
+    if fan is not None and crop is not None:
+        raise InvalidArgument("fan must be given without crop: it says where the image lies", field="fan")
     header = _read_header(path)
-    shape = _shape(path, header)
+    shape = _shape(path, header, is_fan=fan is not None)
     region, pixel_mm = _region(path, header, shape)
     poses = _read_poses(path, shape[0])
     ranges = range(shape[0]) if frames is None else parse_frame_ranges(frames, shape[0], option="frames")
     chosen = np.array(ranges, np.int64)
+    stored = _read_frames(path, header, shape, chosen)
+    notes = () if "TransducerType" in header else ("the file does not name its transducer: taken as a linear one",)
+    if fan is not None:
+        return _fan_sweep(path, stored, poses[chosen], parse_fan(fan), pixel_mm, chosen), shape[0]
     box = region if crop is None else parse_crop(crop, *shape[1:])
     lateral_mm, axial_mm = pixel_mm
     image_to_probe = np.array(
@@ -57,11 +69,33 @@ def read_dicom_sweep(path: Path, *, frames: str | None = None, crop: str | None 
         ]
     )
     box_poses, probe = poses_from_image_transforms(poses[chosen] @ image_to_probe, box, chosen, path)
-    images = _read_frames(path, header, shape, chosen)[:, box.top : box.bottom, box.left : box.right]
-    notes = () if "TransducerType" in header else ("the file does not name its transducer: taken as a linear one",)
+    images = stored[:, box.top : box.bottom, box.left : box.right]
     shown = region_of(shape[1:], box, pixel_size_mm(poses[:1] @ image_to_probe), image_to_probe)
     sweep = Sweep(np.ascontiguousarray(images), box_poses, probe, chosen, str(path), notes, shown)
     return sweep, shape[0]
+
+
+def _fan_sweep(
+    path: Path,
+    stored: ByteArray,  # [F, rows, columns]
+    poses: FloatArray,  # [F, 4, 4]
+    geometry: FanGeometry,
+    pixel_mm: tuple[float, float],
+    numbers: IntArray,
+) -> Sweep:
+    """The scan lines of a fan on the screen. Raises InvalidArgument for one that does not lie in the image."""
+    size, (lateral_mm, axial_mm) = (stored.shape[1], stored.shape[2]), pixel_mm
+    lines = FanLines(geometry, size, pixel_mm)
+    image_to_probe = np.array(
+        [
+            [lateral_mm, 0.0, 0.0, -lateral_mm * geometry.apex_column],
+            [0.0, 0.0, 1.0, 0.0],
+            [0.0, axial_mm, 0.0, -axial_mm * geometry.apex_row],
+            [0.0, 0.0, 0.0, 1.0],
+        ]
+    )
+    region = region_of(size, lines.box, pixel_mm, image_to_probe)
+    return Sweep(lines.frames(stored), poses, geometry.probe(), numbers, str(path), (), region)
 
 
 @contextmanager
@@ -113,26 +147,29 @@ def _value(path: Path, header: Any, name: str) -> Any:
     return value
 
 
-def _shape(path: Path, header: Any) -> tuple[int, int, int]:  # frames, rows, columns
-    """The size of the frames. Raises DatasetInvalid for what is no grey cine loop of 8 bits of a linear probe."""
-    expected = {
-        "SamplesPerPixel": (1, "frames must be grey"),
-        "PhotometricInterpretation": ("MONOCHROME2", "frames must be grey, 0 black"),
-        "BitsAllocated": (8, "pixels must have 8 bits"),
-    }
-    for name, (wanted, why) in expected.items():
-        if (given := _value(path, header, name)) != wanted:
-            raise DatasetInvalid(f"{path}: {why} ({name} {wanted}), got {str(given)[:40]}")
+def _shape(path: Path, header: Any, *, is_fan: bool) -> tuple[int, int, int]:  # frames, rows, columns
+    """The size of the frames. Raises DatasetInvalid for what is no cine loop of 8 bits in grey or colour, and for a
+    probe that is not linear unless its fan is known."""
+    if (bits := _value(path, header, "BitsAllocated")) != 8:
+        raise DatasetInvalid(f"{path}: pixels must have 8 bits (BitsAllocated 8), got {str(bits)[:40]}")
+    interpretation = str(_value(path, header, "PhotometricInterpretation"))
+    samples = _value(path, header, "SamplesPerPixel")
+    if INTERPRETATIONS.get(interpretation) != samples:
+        raise DatasetInvalid(
+            f"{path}: PhotometricInterpretation must be {', '.join(INTERPRETATIONS)} with SamplesPerPixel 1 or 3, got "
+            f"{interpretation[:40]} with {str(samples)[:40]}"
+        )
     with _in_our_words(path):
         transducer = str(header.get("TransducerType", "LINEAR"))
-    if transducer not in ("LINEAR", ""):
+    if transducer not in ("LINEAR", "") and not is_fan:
         raise DatasetInvalid(
-            f"{path}: the probe must be linear, TransducerType is {transducer[:40]}: a fan on a screen"
+            f"{path}: the probe is not linear, TransducerType is {transducer[:40]}: say with fan where it lies on the "
+            "screen"
         )
     names = ("NumberOfFrames", "Rows", "Columns")
     with _in_our_words(path):
         frames, rows, columns = (int(_value(path, header, name)) for name in names)
-    if min(frames, rows, columns) < 1 or frames * rows * columns > MAX_PIXEL_BYTES:
+    if min(frames, rows, columns) < 1 or frames * rows * columns * int(samples) > MAX_PIXEL_BYTES:
         raise DatasetInvalid(
             f"{path}: it must have 1 to {MAX_PIXEL_BYTES:,} pixels, its header says {frames} x {rows} x {columns}"
         )
@@ -192,7 +229,7 @@ def _read_poses(path: Path, count: int) -> FloatArray:  # [F, 4, 4]
 
 
 def _read_frames(path: Path, header: Any, shape: tuple[int, int, int], chosen: IntArray) -> ByteArray:
-    """The chosen frames [C, rows, columns], decoded one at a time."""
+    """The chosen frames [C, rows, columns], decoded one at a time; colours become their luma."""
     frames = np.empty((len(chosen), *shape[1:]), np.uint8)
     with _in_our_words(path):
         from pydicom.pixels import get_decoder, iter_pixels
@@ -207,13 +244,16 @@ def _read_frames(path: Path, header: Any, shape: tuple[int, int, int], chosen: I
             raise DatasetInvalid(
                 f"{path}: pixels compressed as {syntax.name} cannot be read without a decoder: {needed}"
             )
-        pixels = iter_pixels(path, indices=[int(number) for number in chosen], raw=True)
+        is_colour = INTERPRETATIONS[str(header.PhotometricInterpretation)] == 3
+        # Not raw: YBR becomes RGB.
+        pixels = iter_pixels(path, indices=[int(number) for number in chosen], raw=not is_colour)
         for number, out in zip(chosen, frames, strict=True):
             with _in_our_words(f"{path}: frame {number}"):
                 frame = next(pixels)
-            if frame.shape != out.shape or frame.dtype != out.dtype:
+            expected = (*out.shape, 3) if is_colour else out.shape
+            if frame.shape != expected or frame.dtype != out.dtype:
                 raise DatasetInvalid(
-                    f"{path}: frame {number} must be uint8 {list(out.shape)}, got {frame.dtype} {list(frame.shape)}"
+                    f"{path}: frame {number} must be uint8 {list(expected)}, got {frame.dtype} {list(frame.shape)}"
                 )
-            out[:] = frame
+            out[:] = grey_frames(frame[None], str(path))[0]
     return frames

@@ -37,8 +37,8 @@ class SourceOptions(Contract):
         None,
     )
     fan: str | None = described(
-        "Fan on the screen, of a sequence of a convex or phased probe: opening angle (degrees), radius of the face and "
-        "of the end (mm), column and row of the apex, such as 60,40,90,319.5,-120.",
+        "Fan on the screen, of a recording with a convex or phased probe: opening angle (degrees), radius of the face "
+        "and of the end (mm), column and row of the apex, such as 60,40,90,319.5,-120.",
         None,
     )
     transform: str | None = described(
@@ -177,7 +177,8 @@ def _load_dicom(source: str, options: SourceOptions) -> Dataset:
     from .dicom import read_dicom_sweep
 
     path = Path(source)
-    return _split_sequence(path, options, *read_dicom_sweep(path, frames=options.frames, crop=options.crop))
+    read = read_dicom_sweep(path, frames=options.frames, crop=options.crop, fan=options.fan)
+    return _split_sequence(path, options, *read)
 
 
 PLUS_SUFFIXES = (".mha", ".mhd", ".nrrd", ".nhdr")
@@ -211,7 +212,7 @@ FORMATS: Mapping[str, DatasetFormat] = {
             is_source=lambda source: source.lower().endswith(".dcm"),
             load=_load_dicom,
             files=("*.dcm",),
-            options=("frames", "crop"),
+            options=("frames", "crop", "fan"),
             beside=(".poses.npy", ".poses.json"),
         ),
         DatasetFormat(

@@ -23,11 +23,11 @@ import torch
 
 from ..backends.labels import MIN_WEIGHT_SUM
 from ..backends.reference import MAX_WEIGHT, MIN_WEIGHT, intensity, inverse_root_covariance
-from ..errors import InvalidArgument
+from ..limits import UNLIMITED, Limits
 from ..probe import FloatArray
 from ..scene import GaussianScene
 from .grid import VolumeGrid
-from .names import VOLUME_FIELDS
+from .names import check_field
 
 POINTS_AT_ONCE = 1 << 21  # voxels of a slab, and pairs of voxel and Gaussian: some 250 MB
 _RADIUS = math.sqrt(-2.0 * math.log(MIN_WEIGHT))
@@ -67,38 +67,49 @@ def sample_volume(scene: GaussianScene, field: str, grid: VolumeGrid) -> Iterato
     What is held at once does not grow with the grid. Raises InvalidArgument for a field that is none of VOLUME_FIELDS,
     and for labels of a scene that has none.
     """
-    if field not in VOLUME_FIELDS:
-        raise InvalidArgument(f"field must be {', '.join(VOLUME_FIELDS)}, got {field[:40]!r}", field="field")
-    if field == "labels" and scene.labels is None:
-        raise InvalidArgument("labels are for scenes whose Gaussians carry them, this one's carry none", field="field")
-    return _slabs(scene, field, grid)
+    check_field(field, has_labels=scene.labels is not None)
+    return _slabs(scene, field, grid, UNLIMITED)
 
 
-def sample_slice(scene: GaussianScene, field: str, grid: VolumeGrid) -> npt.NDArray[np.generic]:  # [J, I]
-    """A field on a plane (`VolumeGrid.on_plane`). Raises what `sample_volume` raises."""
-    layer: npt.NDArray[np.generic] = np.concatenate(list(sample_volume(scene, field, grid)))[0]
+def sample_slice(
+    scene: GaussianScene, field: str, grid: VolumeGrid, limits: Limits = UNLIMITED
+) -> npt.NDArray[np.generic]:  # [J, I]
+    """A field on a plane (`VolumeGrid.on_plane`). Raises what `sample_volume` raises, and FrameTooCostly and GivenUp by
+    `limits`: footprint pixels are those of the boxes around Gaussians."""
+    check_field(field, has_labels=scene.labels is not None)
+    layer: npt.NDArray[np.generic] = np.concatenate(list(_slabs(scene, field, grid, limits)))[0]
     return layer
 
 
-def _slabs(scene: GaussianScene, field: str, grid: VolumeGrid) -> Iterator[npt.NDArray[np.generic]]:
+def _slabs(scene: GaussianScene, field: str, grid: VolumeGrid, limits: Limits) -> Iterator[npt.NDArray[np.generic]]:
     ellipsoids = _Ellipsoids.of(scene, grid)
     columns, rows, depth = grid.shape
     thickness = max(1, POINTS_AT_ONCE // (columns * rows))
     for first in range(0, depth, thickness):
-        slab = _Slab(ellipsoids, (columns, rows, min(thickness, depth - first)), first)
+        slab = _Slab(ellipsoids, (columns, rows, min(thickness, depth - first)), first, limits)
+        limits.check_costs([slab.footprint])
         yield slab.values(field).reshape(slab.shape[::-1])
 
 
 class _Slab:
     """The voxels of a grid from one number of its last axis on."""
 
-    def __init__(self, ellipsoids: _Ellipsoids, shape: tuple[int, int, int], first: int) -> None:
-        self.ellipsoids, self.shape = ellipsoids, shape
+    def __init__(self, ellipsoids: _Ellipsoids, shape: tuple[int, int, int], first: int, limits: Limits) -> None:
+        self.ellipsoids, self.shape, self._limits = ellipsoids, shape, limits
         self._offset = np.array([0, 0, first])
         means = ellipsoids.means - self._offset
         self._low = np.maximum(np.ceil(means - ellipsoids.reach), 0).astype(np.int64)
         self._high = np.minimum(np.floor(means + ellipsoids.reach), np.array(shape) - 1).astype(np.int64)
         self._touching = np.flatnonzero((self._high >= self._low).all(axis=1))
+
+    @property
+    def footprint(self) -> int:
+        """Pairs of a Gaussian and a voxel of the box around it."""
+        return int(self._box_voxels(self._touching).sum())
+
+    def _box_voxels(self, ids: IndexArray) -> IndexArray:
+        voxels: IndexArray = (self._high[ids] - self._low[ids] + 1).prod(axis=1)
+        return voxels
 
     def values(self, field: str) -> npt.NDArray[np.generic]:  # [voxels]
         ellipsoids = self.ellipsoids
@@ -125,10 +136,11 @@ class _Slab:
     def _sum(self, chosen: IndexArray, factors: FloatArray | None) -> FloatArray:  # [n], [N] -> [voxels]
         """Σ factor·w of the chosen Gaussians at each voxel; without factors Σ w."""
         total = np.zeros(math.prod(self.shape))
-        counts = (self._high[chosen] - self._low[chosen] + 1).prod(axis=1)
+        counts = self._box_voxels(chosen)
         ends = np.cumsum(counts)
         start = 0
         while start < len(chosen):
+            self._limits.check_flag()
             before = ends[start - 1] if start else 0
             stop = max(start + 1, int(np.searchsorted(ends, before + POINTS_AT_ONCE, side="right")))
             ids = chosen[start:stop]

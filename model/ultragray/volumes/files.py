@@ -14,7 +14,7 @@ import io
 import struct
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 import numpy.typing as npt
@@ -23,6 +23,7 @@ from ..display.pixels import image_file
 from ..errors import InvalidArgument
 from ..files.atomic import atomic_path, write_whole
 from ..scene import GaussianScene
+from ..scene_info import SceneInfo
 from .fields import sample_slice, sample_volume
 from .grid import VolumeGrid
 from .names import SLICE_SUFFIXES, VOLUME_SUFFIXES
@@ -78,9 +79,19 @@ def write_slice(path: str | Path, scene: GaussianScene, field: str, grid: Volume
         np.save(data, pixels)
         write_whole(path, data.getvalue())
         return
-    if field == "attenuation" and pixels.any():
-        pixels = pixels / pixels.max()
-    write_whole(path, image_file(pixels, ".png").tobytes())
+    write_whole(path, image_file(as_grey(pixels, field), ".png").tobytes())
+
+
+def as_grey(pixels: npt.NDArray[Any], field: str) -> npt.NDArray[Any]:  # [J, I] -> [J, I]
+    """A slice as a picture shows it: white is 1, of attenuation its largest value; labels keep their numbers."""
+    return pixels / pixels.max() if field == "attenuation" and pixels.any() else pixels
+
+
+def volume_facts(info: SceneInfo, field: str, grid: VolumeGrid) -> dict[str, Any]:
+    """The place of a volume or a slice and the meaning of its values, for JSON."""
+    names = {str(number): name for number, name in info.label_names.items()} if field == "labels" else {}
+    shape, affine = list(grid.shape), grid.affine.tolist()
+    return {"field": field, "shape": shape, "spacing_mm": grid.spacing_mm, "affine": affine, "label_names": names}
 
 
 def _write_compressed(

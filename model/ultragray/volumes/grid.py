@@ -15,6 +15,7 @@ import numpy as np
 
 from ..errors import InvalidArgument
 from ..probe import FloatArray
+from ..scene_info import SceneInfo
 
 MAX_VOXELS = 1 << 28
 MAX_SIDE = 32767  # NIfTI-1 counts voxels along an axis in 16 bits
@@ -45,6 +46,15 @@ class VolumeGrid:
             )
         shape = _counts(high - low, spacing_mm)
         return cls(low + spacing_mm / 2, np.eye(3), float(spacing_mm), (shape[0], shape[1], shape[2]))
+
+    @classmethod
+    def over_scene(cls, info: SceneInfo, box_mm: str | None, spacing_mm: float) -> VolumeGrid:
+        """Voxels that fill a box (`parse_box`), without one the bounds of the scene's Gaussians.
+
+        Raises what `parse_box` and `over_box` raise.
+        """
+        low, high = (info.bounds_min_mm, info.bounds_max_mm) if box_mm is None else parse_box(box_mm)
+        return cls.over_box(low, high, spacing_mm)
 
     @classmethod
     def on_plane(

@@ -18,6 +18,7 @@ class JobKind(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     JOB_KIND_RENDER: _ClassVar[JobKind]
     JOB_KIND_EVALUATE: _ClassVar[JobKind]
     JOB_KIND_COMPARE: _ClassVar[JobKind]
+    JOB_KIND_VOXELIZE: _ClassVar[JobKind]
 
 class JobState(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
@@ -32,6 +33,7 @@ JOB_KIND_TRAIN: JobKind
 JOB_KIND_RENDER: JobKind
 JOB_KIND_EVALUATE: JobKind
 JOB_KIND_COMPARE: JobKind
+JOB_KIND_VOXELIZE: JobKind
 JOB_STATE_UNSPECIFIED: JobState
 JOB_STATE_QUEUED: JobState
 JOB_STATE_RUNNING: JobState
@@ -175,6 +177,35 @@ class CompareJob(_message.Message):
     worker_labels: _containers.ScalarMap[str, str]
     def __init__(self, dataset: _Optional[str] = ..., methods: _Optional[_Iterable[str]] = ..., budget: _Optional[str] = ..., times: _Optional[float] = ..., seed: _Optional[int] = ..., max_run_s: _Optional[float] = ..., device: _Optional[str] = ..., min_memory_gb: _Optional[int] = ..., worker_labels: _Optional[_Mapping[str, str]] = ...) -> None: ...
 
+class VoxelizeJob(_message.Message):
+    __slots__ = ("scene", "field", "spacing_mm", "box_mm", "format", "max_run_s", "device", "min_memory_gb", "worker_labels")
+    class WorkerLabelsEntry(_message.Message):
+        __slots__ = ("key", "value")
+        KEY_FIELD_NUMBER: _ClassVar[int]
+        VALUE_FIELD_NUMBER: _ClassVar[int]
+        key: str
+        value: str
+        def __init__(self, key: _Optional[str] = ..., value: _Optional[str] = ...) -> None: ...
+    SCENE_FIELD_NUMBER: _ClassVar[int]
+    FIELD_FIELD_NUMBER: _ClassVar[int]
+    SPACING_MM_FIELD_NUMBER: _ClassVar[int]
+    BOX_MM_FIELD_NUMBER: _ClassVar[int]
+    FORMAT_FIELD_NUMBER: _ClassVar[int]
+    MAX_RUN_S_FIELD_NUMBER: _ClassVar[int]
+    DEVICE_FIELD_NUMBER: _ClassVar[int]
+    MIN_MEMORY_GB_FIELD_NUMBER: _ClassVar[int]
+    WORKER_LABELS_FIELD_NUMBER: _ClassVar[int]
+    scene: str
+    field: str
+    spacing_mm: float
+    box_mm: str
+    format: str
+    max_run_s: float
+    device: str
+    min_memory_gb: int
+    worker_labels: _containers.ScalarMap[str, str]
+    def __init__(self, scene: _Optional[str] = ..., field: _Optional[str] = ..., spacing_mm: _Optional[float] = ..., box_mm: _Optional[str] = ..., format: _Optional[str] = ..., max_run_s: _Optional[float] = ..., device: _Optional[str] = ..., min_memory_gb: _Optional[int] = ..., worker_labels: _Optional[_Mapping[str, str]] = ...) -> None: ...
+
 class PoseSampler(_message.Message):
     __slots__ = ("kind", "count", "translation_mm", "rotation_deg", "seed", "spacing_mm", "tilt_deg", "step_deg")
     KIND_FIELD_NUMBER: _ClassVar[int]
@@ -196,11 +227,12 @@ class PoseSampler(_message.Message):
     def __init__(self, kind: _Optional[str] = ..., count: _Optional[int] = ..., translation_mm: _Optional[float] = ..., rotation_deg: _Optional[float] = ..., seed: _Optional[int] = ..., spacing_mm: _Optional[float] = ..., tilt_deg: _Optional[float] = ..., step_deg: _Optional[float] = ...) -> None: ...
 
 class SubmitJobRequest(_message.Message):
-    __slots__ = ("train", "render", "evaluate", "compare", "request_id", "priority", "private")
+    __slots__ = ("train", "render", "evaluate", "compare", "voxelize", "request_id", "priority", "private")
     TRAIN_FIELD_NUMBER: _ClassVar[int]
     RENDER_FIELD_NUMBER: _ClassVar[int]
     EVALUATE_FIELD_NUMBER: _ClassVar[int]
     COMPARE_FIELD_NUMBER: _ClassVar[int]
+    VOXELIZE_FIELD_NUMBER: _ClassVar[int]
     REQUEST_ID_FIELD_NUMBER: _ClassVar[int]
     PRIORITY_FIELD_NUMBER: _ClassVar[int]
     PRIVATE_FIELD_NUMBER: _ClassVar[int]
@@ -208,10 +240,11 @@ class SubmitJobRequest(_message.Message):
     render: RenderJob
     evaluate: EvaluateJob
     compare: CompareJob
+    voxelize: VoxelizeJob
     request_id: str
     priority: int
     private: bool
-    def __init__(self, train: _Optional[_Union[TrainJob, _Mapping]] = ..., render: _Optional[_Union[RenderJob, _Mapping]] = ..., evaluate: _Optional[_Union[EvaluateJob, _Mapping]] = ..., compare: _Optional[_Union[CompareJob, _Mapping]] = ..., request_id: _Optional[str] = ..., priority: _Optional[int] = ..., private: _Optional[bool] = ...) -> None: ...
+    def __init__(self, train: _Optional[_Union[TrainJob, _Mapping]] = ..., render: _Optional[_Union[RenderJob, _Mapping]] = ..., evaluate: _Optional[_Union[EvaluateJob, _Mapping]] = ..., compare: _Optional[_Union[CompareJob, _Mapping]] = ..., voxelize: _Optional[_Union[VoxelizeJob, _Mapping]] = ..., request_id: _Optional[str] = ..., priority: _Optional[int] = ..., private: _Optional[bool] = ...) -> None: ...
 
 class SubmitJobResponse(_message.Message):
     __slots__ = ("job", "created")
@@ -336,7 +369,7 @@ class JobEvent(_message.Message):
     def __init__(self, job: _Optional[_Union[Job, _Mapping]] = ..., log: _Optional[str] = ...) -> None: ...
 
 class Job(_message.Message):
-    __slots__ = ("id", "kind", "state", "request_id", "train", "render", "evaluate", "compare", "priority", "created_at", "started_at", "finished_at", "error", "progress", "artifacts", "metrics", "worker", "retry_of", "attempts", "owner", "private")
+    __slots__ = ("id", "kind", "state", "request_id", "train", "render", "evaluate", "compare", "voxelize", "priority", "created_at", "started_at", "finished_at", "error", "progress", "artifacts", "metrics", "worker", "retry_of", "attempts", "owner", "private")
     class MetricsEntry(_message.Message):
         __slots__ = ("key", "value")
         KEY_FIELD_NUMBER: _ClassVar[int]
@@ -352,6 +385,7 @@ class Job(_message.Message):
     RENDER_FIELD_NUMBER: _ClassVar[int]
     EVALUATE_FIELD_NUMBER: _ClassVar[int]
     COMPARE_FIELD_NUMBER: _ClassVar[int]
+    VOXELIZE_FIELD_NUMBER: _ClassVar[int]
     PRIORITY_FIELD_NUMBER: _ClassVar[int]
     CREATED_AT_FIELD_NUMBER: _ClassVar[int]
     STARTED_AT_FIELD_NUMBER: _ClassVar[int]
@@ -373,6 +407,7 @@ class Job(_message.Message):
     render: RenderJob
     evaluate: EvaluateJob
     compare: CompareJob
+    voxelize: VoxelizeJob
     priority: int
     created_at: str
     started_at: str
@@ -386,7 +421,7 @@ class Job(_message.Message):
     attempts: int
     owner: str
     private: bool
-    def __init__(self, id: _Optional[str] = ..., kind: _Optional[_Union[JobKind, str]] = ..., state: _Optional[_Union[JobState, str]] = ..., request_id: _Optional[str] = ..., train: _Optional[_Union[TrainJob, _Mapping]] = ..., render: _Optional[_Union[RenderJob, _Mapping]] = ..., evaluate: _Optional[_Union[EvaluateJob, _Mapping]] = ..., compare: _Optional[_Union[CompareJob, _Mapping]] = ..., priority: _Optional[int] = ..., created_at: _Optional[str] = ..., started_at: _Optional[str] = ..., finished_at: _Optional[str] = ..., error: _Optional[_Union[_scenes_pb2.Error, _Mapping]] = ..., progress: _Optional[_Union[JobProgress, _Mapping]] = ..., artifacts: _Optional[_Iterable[str]] = ..., metrics: _Optional[_Mapping[str, float]] = ..., worker: _Optional[str] = ..., retry_of: _Optional[str] = ..., attempts: _Optional[int] = ..., owner: _Optional[str] = ..., private: _Optional[bool] = ...) -> None: ...
+    def __init__(self, id: _Optional[str] = ..., kind: _Optional[_Union[JobKind, str]] = ..., state: _Optional[_Union[JobState, str]] = ..., request_id: _Optional[str] = ..., train: _Optional[_Union[TrainJob, _Mapping]] = ..., render: _Optional[_Union[RenderJob, _Mapping]] = ..., evaluate: _Optional[_Union[EvaluateJob, _Mapping]] = ..., compare: _Optional[_Union[CompareJob, _Mapping]] = ..., voxelize: _Optional[_Union[VoxelizeJob, _Mapping]] = ..., priority: _Optional[int] = ..., created_at: _Optional[str] = ..., started_at: _Optional[str] = ..., finished_at: _Optional[str] = ..., error: _Optional[_Union[_scenes_pb2.Error, _Mapping]] = ..., progress: _Optional[_Union[JobProgress, _Mapping]] = ..., artifacts: _Optional[_Iterable[str]] = ..., metrics: _Optional[_Mapping[str, float]] = ..., worker: _Optional[str] = ..., retry_of: _Optional[str] = ..., attempts: _Optional[int] = ..., owner: _Optional[str] = ..., private: _Optional[bool] = ...) -> None: ...
 
 class JobProgress(_message.Message):
     __slots__ = ("step", "steps", "loss", "val_psnr_db", "gaussians", "frames_done", "frames", "rate_per_s", "seconds_left", "waits_for", "method", "method_number", "methods", "phase")

@@ -178,6 +178,70 @@ class RenderBatchRequest(_message.Message):
     poses: _containers.RepeatedCompositeFieldContainer[_geometry_pb2.Pose]
     def __init__(self, settings: _Optional[_Union[RenderSettings, _Mapping]] = ..., poses: _Optional[_Iterable[_Union[_geometry_pb2.Pose, _Mapping]]] = ...) -> None: ...
 
+class RenderSliceRequest(_message.Message):
+    __slots__ = ("scene", "slice")
+    SCENE_FIELD_NUMBER: _ClassVar[int]
+    SLICE_FIELD_NUMBER: _ClassVar[int]
+    scene: str
+    slice: SliceSettings
+    def __init__(self, scene: _Optional[str] = ..., slice: _Optional[_Union[SliceSettings, _Mapping]] = ...) -> None: ...
+
+class SliceSettings(_message.Message):
+    __slots__ = ("field", "origin_mm", "right", "down", "size_mm", "spacing_mm")
+    FIELD_FIELD_NUMBER: _ClassVar[int]
+    ORIGIN_MM_FIELD_NUMBER: _ClassVar[int]
+    RIGHT_FIELD_NUMBER: _ClassVar[int]
+    DOWN_FIELD_NUMBER: _ClassVar[int]
+    SIZE_MM_FIELD_NUMBER: _ClassVar[int]
+    SPACING_MM_FIELD_NUMBER: _ClassVar[int]
+    field: str
+    origin_mm: _geometry_pb2.Position
+    right: Direction
+    down: Direction
+    size_mm: SliceSize
+    spacing_mm: float
+    def __init__(self, field: _Optional[str] = ..., origin_mm: _Optional[_Union[_geometry_pb2.Position, _Mapping]] = ..., right: _Optional[_Union[Direction, _Mapping]] = ..., down: _Optional[_Union[Direction, _Mapping]] = ..., size_mm: _Optional[_Union[SliceSize, _Mapping]] = ..., spacing_mm: _Optional[float] = ...) -> None: ...
+
+class Direction(_message.Message):
+    __slots__ = ("x", "y", "z")
+    X_FIELD_NUMBER: _ClassVar[int]
+    Y_FIELD_NUMBER: _ClassVar[int]
+    Z_FIELD_NUMBER: _ClassVar[int]
+    x: float
+    y: float
+    z: float
+    def __init__(self, x: _Optional[float] = ..., y: _Optional[float] = ..., z: _Optional[float] = ...) -> None: ...
+
+class SliceSize(_message.Message):
+    __slots__ = ("width", "height")
+    WIDTH_FIELD_NUMBER: _ClassVar[int]
+    HEIGHT_FIELD_NUMBER: _ClassVar[int]
+    width: float
+    height: float
+    def __init__(self, width: _Optional[float] = ..., height: _Optional[float] = ...) -> None: ...
+
+class Slice(_message.Message):
+    __slots__ = ("scene", "scene_sha256", "field", "height", "width", "encoding", "data", "pixel_to_scene", "timings")
+    SCENE_FIELD_NUMBER: _ClassVar[int]
+    SCENE_SHA256_FIELD_NUMBER: _ClassVar[int]
+    FIELD_FIELD_NUMBER: _ClassVar[int]
+    HEIGHT_FIELD_NUMBER: _ClassVar[int]
+    WIDTH_FIELD_NUMBER: _ClassVar[int]
+    ENCODING_FIELD_NUMBER: _ClassVar[int]
+    DATA_FIELD_NUMBER: _ClassVar[int]
+    PIXEL_TO_SCENE_FIELD_NUMBER: _ClassVar[int]
+    TIMINGS_FIELD_NUMBER: _ClassVar[int]
+    scene: str
+    scene_sha256: str
+    field: str
+    height: int
+    width: int
+    encoding: Encoding
+    data: bytes
+    pixel_to_scene: _geometry_pb2.Matrix
+    timings: Timings
+    def __init__(self, scene: _Optional[str] = ..., scene_sha256: _Optional[str] = ..., field: _Optional[str] = ..., height: _Optional[int] = ..., width: _Optional[int] = ..., encoding: _Optional[_Union[Encoding, str]] = ..., data: _Optional[bytes] = ..., pixel_to_scene: _Optional[_Union[_geometry_pb2.Matrix, _Mapping]] = ..., timings: _Optional[_Union[Timings, _Mapping]] = ...) -> None: ...
+
 class SharedMemory(_message.Message):
     __slots__ = ("name", "token", "slots", "slot_bytes")
     NAME_FIELD_NUMBER: _ClassVar[int]

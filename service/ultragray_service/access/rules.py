@@ -50,6 +50,7 @@ _SCENE, _DATASET, _JOB, _WORKER = Kind.SCENE, Kind.DATASET, Kind.JOB, Kind.WORKE
 OPERATIONS = (
     # Frames come first: their route is the one that must be found fast.
     Operation("render", _READER, ("POST /v1/scenes/{scene}/render",), ("RenderService/Render",), _SCENE),
+    Operation("slice", _READER, ("POST /v1/scenes/{scene}:slice",), ("RenderService/RenderSlice",), _SCENE),
     Operation("render.batch", _READER, (), ("RenderService/RenderBatch",), _SCENE),
     Operation(STREAM, _READER, (f"{WEBSOCKET} /v1/scenes/{{scene}}/stream",), ("RenderService/RenderStream",), _SCENE),
     Operation("stream.list", _READER, ("GET /v1/streams",)),

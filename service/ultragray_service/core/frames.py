@@ -1,4 +1,4 @@
-"""A rendered frame as all front doors tell it: what renders it again, and what it cost."""
+"""A rendered frame, or slice, as all front doors tell it: what renders it again, and what it cost."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ from ultragray.confidence import Extrapolation
 from ultragray.contract import described
 from ultragray.display.settings import AS_RENDERED, Display
 from ultragray.outputs import OUTPUTS
-from ultragray.probe import Picture, Probe
+from ultragray.probe import FloatArray, Picture, Probe
 from ultragray.settings import Contact, Encoding, Resolved
 from ultragray.tools import Tool
+from ultragray.volumes.plane import SliceView
 from ultragray_workers.pool.types import RenderResult
 
 from .poses import MatrixRows
@@ -123,6 +124,44 @@ class FrameFacts:
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FrameHeader(SettingsUsed, FrameFacts):
     """All that is needed to render a frame again, and what it cost."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SliceFacts:
+    """A slice but for its pixels."""
+
+    scene: str
+    scene_sha256: str
+    field: str
+    height: int
+    width: int
+    encoding: Encoding
+    pixel_to_scene: FloatArray  # [4, 4] mm
+    queue_ms: float
+    render_ms: float
+    encode_ms: float
+
+    @classmethod
+    def of(cls, result: RenderResult[SliceView]) -> SliceFacts:
+        """The facts of a result of one slice."""
+        view = result.settings
+        return cls(
+            scene=result.scene,
+            scene_sha256=result.scene_sha256,
+            field=view.field,
+            height=view.height,
+            width=view.width,
+            encoding=view.encoding,
+            pixel_to_scene=view.grid(result.poses[0]).affine,
+            queue_ms=round(result.queue_ms, 3),
+            render_ms=round(result.render_ms, 3),
+            encode_ms=round(result.encode_ms, 3),
+        )
+
+    @property
+    def timings(self) -> SliceFacts:
+        """Itself: gRPC has the three times in a message of their own."""
+        return self
 
 
 @lru_cache(maxsize=256)

@@ -6,11 +6,15 @@ import time
 from collections.abc import Callable
 from contextlib import nullcontext
 from functools import lru_cache
+from typing import Generic
 
-from ultragray.contract import under
+from ultragray.contract import join, under
 from ultragray.errors import InvalidImageSize, TooManyPoses
 from ultragray.scene_info import SceneInfo
 from ultragray.settings import Encoding, FrameSettings, Resolved
+from ultragray.volumes.names import check_field
+from ultragray.volumes.plane import SliceSettings, SliceView
+from ultragray_workers.pool.types import S
 from ultragray_workers.scene_names import base_name
 from ultragray_workers.storage.local import FileVersion
 
@@ -18,7 +22,7 @@ from ..settings import Settings
 from .catalog import SceneCatalog
 
 
-class Plan:
+class Plan(Generic[S]):
     """What a client wants of a scene: its settings, with nothing left open as the scene is now.
 
     A frame is rendered for the version of the scene's file that they are for. Where the file has another by then, they
@@ -26,10 +30,10 @@ class Plan:
     that content.
     """
 
-    settings: Resolved
+    settings: S
     version: FileVersion
 
-    def __init__(self, catalog: SceneCatalog, scene: str, resolve: Callable[[SceneInfo], Resolved], path: str) -> None:
+    def __init__(self, catalog: SceneCatalog, scene: str, resolve: Callable[[SceneInfo], S], path: str) -> None:
         """`path`: the place of the settings in the client's message, for errors. To be renewed before it is used."""
         self.scene = base_name(scene)
         self._asked = scene
@@ -81,6 +85,31 @@ class RequestPlanner:
         `complete` raises; `path` is the place of the settings in the client's message.
         """
         plan = Plan(self._catalog, scene, lambda info: complete(self._resolved(info, asked, encoding)), path)
+        await plan.renew()
+        return plan
+
+    async def plan_slice(
+        self, scene: str, asked: SliceSettings, encoding: Encoding, *, path: str = ""
+    ) -> Plan[SliceView]:
+        """The settings of a slice for a scene; `path` is their place in the client's message.
+
+        Raises SceneNotFound, SceneFileInvalid; InvalidArgument for labels of a scene without them, InvalidImageSize.
+        """
+        view = asked.view(encoding)
+        side, pixels = max(view.height, view.width), view.height * view.width
+        if side > self._settings.max_image_side or pixels > self._settings.max_request_pixels:
+            raise InvalidImageSize(
+                f"a slice may have at most {self._settings.max_image_side} pixels on a side and "
+                f"{self._settings.max_request_pixels} in all, size_mm and spacing_mm give {view.height}x{view.width}",
+                field=join(path, "spacing_mm"),
+            )
+
+        def resolve(info: SceneInfo) -> SliceView:
+            with under(path) if path else nullcontext():
+                check_field(asked.field, has_labels=bool(info.label_names))
+            return view
+
+        plan = Plan(self._catalog, scene, resolve, "")
         await plan.renew()
         return plan
 

@@ -7,6 +7,7 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from enum import Enum
 from functools import partial
+from typing import Any
 
 from ultragray.errors import RenderFailed, UltragrayError
 from ultragray.probe import FloatArray
@@ -16,7 +17,7 @@ from ultragray_workers.jobs.places import shared_storage
 from ultragray_workers.jobs.queue.owners import Kind
 from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.pool.pool import MAX_SCENE_CHANGES, PoolConfig, RenderPool
-from ultragray_workers.pool.types import Destination, Priority, RenderRequest, RenderResult, SceneChangedError
+from ultragray_workers.pool.types import Destination, Priority, RenderRequest, RenderResult, S, SceneChangedError
 from ultragray_workers.pool.waiting import Turn
 from ultragray_workers.scenes import SceneStore
 
@@ -239,7 +240,7 @@ class Service:
 
     async def render(
         self,
-        plan: Plan,
+        plan: Plan[S],
         poses: FloatArray,  # [C, 4, 4] mm, exact
         *,
         deadline: float | None,  # time.monotonic() in seconds
@@ -247,7 +248,7 @@ class Service:
         turn: Turn | None = None,
         begin_by: float | None = None,  # time.monotonic() in seconds; else it is refused
         destination: Destination | None = None,
-    ) -> RenderResult:
+    ) -> RenderResult[S]:
         """Renders, with the settings as they are for the scene that is there when it is rendered.
 
         Raises what RenderPool.render and Plan.renew raise; cancelling drops a request that still waits.
@@ -304,7 +305,7 @@ class Service:
         await self.jobs.do(JobStore.delete, job_id)
         await self.training_views.forget_job(job_id)
 
-    def _observe(self, result: RenderResult) -> None:
+    def _observe(self, result: RenderResult[Any]) -> None:
         self.metrics.observe_result(result)
         if self.tracing is not None:
             self.tracing.observe_result(result)

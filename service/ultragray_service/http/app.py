@@ -18,6 +18,7 @@ from ultragray import __version__
 from ultragray.errors import UltragrayError
 from ultragray.probe import Probe
 from ultragray.training.config import PRESETS, TrainingConfig
+from ultragray.volumes.plane import SliceSettings
 
 from ..access.rules import WEBSOCKET, HttpRules
 from ..core.state import Service
@@ -34,7 +35,6 @@ from .routes import (
     datasets,
     health,
     probes,
-    render,
     scene_files,
     scenes,
     service_info,
@@ -43,6 +43,7 @@ from .routes import (
     streams,
 )
 from .routes.jobs import jobs, training, workers
+from .routes.rendering import render, slices
 from .stream_messages import FrameMessage, RefusalMessage
 
 _DESCRIPTION = """B-mode frames from trained 3D-Gaussian ultrasound scenes.
@@ -66,6 +67,7 @@ _SECURITY_SCHEMES = {
 # render comes first: its route is the one that must be found fast
 _ROUTERS = (
     render.router,
+    slices.router,
     stream.router,
     scenes.router,
     scene_files.router,
@@ -84,6 +86,7 @@ _ROUTERS = (
 
 _READ: tuple[Any, ...] = (
     RenderBody,
+    SliceSettings,
     AssessBody,
     StreamMessage,
     JobBody,
@@ -125,7 +128,7 @@ def create_app(service: Service) -> FastAPI:
             allow_origins=list(service.settings.cors_origins),
             allow_methods=["GET", "POST", "PUT", "DELETE"],
             allow_headers=["*"],
-            expose_headers=["Retry-After", *render.RENDER_HEADERS],
+            expose_headers=["Retry-After", *{**render.RENDER_HEADERS, **slices.SLICE_HEADERS}],
         )
     app.add_middleware(CheckOrigin, guard=service.guard, origins=service.origins)
     app.add_middleware(RequestContext, metrics=service.metrics)

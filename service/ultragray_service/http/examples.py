@@ -73,3 +73,10 @@ JOB_EXAMPLES: dict[str, Any] = {
         },
     },
 }
+
+SLICE_EXAMPLES: dict[str, Any] = {
+    "a plane parallel to the skin": {
+        "summary": "10 mm deep, 50 x 40 mm (image/png by default)",
+        "value": {"origin_mm": [-25, -20, 10], "right": [1, 0, 0], "down": [0, 1, 0], "size_mm": [50, 40]},
+    },
+}

@@ -26,6 +26,15 @@ def image_name(device_name: str) -> str:
     return pack_text(f"Image_{frame_of(device_name)}", DEVICE_NAME_BYTES).decode()
 
 
+def device_of(scene: str) -> str:
+    """A device name whose poses are of a scene: ProbeToliver; ProbeToReference, of the default scene, for a name that
+    is too long."""
+    for name in (f"ProbeTo{scene}", scene):
+        if len(name.encode()) <= DEVICE_NAME_BYTES and scene in (name, frame_of(name)):
+            return name
+    return "ProbeToReference"
+
+
 class SceneChooser:
     """Chooses scenes by the names of devices; knows the scenes as they were at most a second ago."""
 

@@ -15,13 +15,14 @@ from ultragray.errors import InvalidArgument, InvalidPose, UltragrayError
 from ultragray.pose import check_poses, pose_from_position_quaternion
 from ultragray.probe import FloatArray
 from ultragray.settings import RenderSettings, Resolved
+from ultragray.volumes.plane import SliceView
 from ultragray_proto.codec import MessageInvalid, from_message, to_message, words
 from ultragray_proto.v1 import geometry_pb2, jobs_pb2, rendering_pb2, scenes_pb2
 from ultragray_workers.jobs.job import Job
 from ultragray_workers.jobs.kinds import KINDS, Specification
 from ultragray_workers.pool.types import RenderResult
 
-from ..core.frames import FrameFacts, settings_used
+from ..core.frames import FrameFacts, SliceFacts, settings_used
 from ..core.poses import exact_pose
 
 
@@ -101,6 +102,11 @@ def frame_message(result: RenderResult, sequence: int, **others: Any) -> renderi
 def _settings_message(settings: Resolved) -> rendering_pb2.Frame:
     """The part of a frame that is the same for all frames of a stream."""
     return to_message(settings_used(settings), rendering_pb2.Frame)
+
+
+def slice_message(result: RenderResult[SliceView]) -> rendering_pb2.Slice:
+    """The slice of a result of one."""
+    return to_message(SliceFacts.of(result), rendering_pb2.Slice, data=result.data)
 
 
 def read_specification(message: jobs_pb2.SubmitJobRequest) -> tuple[Specification, str]:

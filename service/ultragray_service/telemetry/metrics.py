@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from datetime import datetime
 from functools import partial
+from typing import Any
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, ProcessCollector, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
@@ -186,7 +187,7 @@ class Metrics:
         """One refusal by a limit of a key."""
         self._limited.labels(limit, _role()).inc()
 
-    def observe_result(self, result: RenderResult) -> None:
+    def observe_result(self, result: RenderResult[Any]) -> None:
         """One rendered request of the pool."""
         self._frames.labels(self._label_of(result.scene), _role()).inc(len(result.poses))
         self._queue.observe(result.queue_ms / 1000)

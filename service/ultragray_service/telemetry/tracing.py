@@ -10,6 +10,7 @@ import os
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from typing import Any
 
 from opentelemetry import propagate, trace
 
@@ -61,7 +62,7 @@ class Tracing:
         ) as span:
             yield span
 
-    def observe_result(self, result: RenderResult) -> None:
+    def observe_result(self, result: RenderResult[Any]) -> None:
         """Spans of a rendered request, made from the times that the pool measured: rendering pays nothing for them."""
         if not trace.get_current_span().is_recording():
             return

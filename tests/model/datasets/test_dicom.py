@@ -9,15 +9,18 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pydicom
 import pytest
 from pydicom.encaps import encapsulate
+from pydicom.pixels import convert_color_space
 from pydicom.uid import UID, DeflatedExplicitVRLittleEndian, JPEG2000Lossless, JPEGBaseline8Bit, RLELossless
 
-from ultragray import LinearProbe
+from ultragray import ConvexProbe, LinearProbe
 from ultragray.datasets import dicom
 from ultragray.datasets.source import SourceOptions, load_dataset
+from ultragray.display.scan_conversion import scan_convert
 from ultragray.errors import DatasetInvalid, ExtraMissing, InvalidArgument
 
 from ...dicom_files import FRAMES, POSES, region, write_cine
@@ -64,6 +67,47 @@ def test_compressed_frames_are_read_where_there_is_a_decoder(write: Write) -> No
     np.testing.assert_array_equal(load_dataset(path).val.images, FRAMES[[2, 7], 2:22, 4:24])
 
 
+@pytest.mark.parametrize("interpretation", ["RGB", "YBR_FULL"])
+def test_colours_become_their_luma(write: Write, interpretation: str) -> None:
+    colours = np.random.default_rng(5).integers(0, 256, (*FRAMES.shape, 3), dtype=np.uint8)
+    stored = colours if interpretation == "RGB" else convert_color_space(colours, "RGB", interpretation)
+    path = write(
+        SamplesPerPixel=3, PhotometricInterpretation=interpretation, PlanarConfiguration=0, data=stored.tobytes()
+    )
+    luma = colours @ [0.299, 0.587, 0.114]
+    found = load_dataset(path).val.images
+    assert np.abs(found - luma[[2, 7], 2:22, 4:24]).max() <= 2  # YBR rounds on the way
+
+
+def test_the_fan_of_a_convex_probe_becomes_scan_lines(write: Write) -> None:
+    """What a scanner would store of a known image in range and angle comes back, with the poses as they are."""
+    probe, pixel_mm = ConvexProbe(opening_angle_deg=50.0, near_mm=10.0, far_mm=30.0), 0.1
+    rows, lines = np.meshgrid(np.linspace(0.2, 0.9, 200), np.linspace(0.3, 1.0, 160), indexing="ij")
+    truth = (rows * lines).astype(np.float32)
+    screen = np.rint(255 * scan_convert(truth, probe, pixel_mm)).astype(np.uint8)
+    height, width = screen.shape
+    picture = probe.picture(pixel_mm)
+    apex = (-picture.first[0] / pixel_mm, -picture.first[1] / pixel_mm)
+    path = write(
+        TransducerType="CURVED LINEAR",
+        Rows=height,
+        Columns=width,
+        SequenceOfUltrasoundRegions=None,
+        PixelSpacing=[pixel_mm, pixel_mm],
+        data=np.stack([screen] * len(FRAMES)).tobytes(),
+    )
+    options = SourceOptions(fan=f"50,10,30,{apex[0]!r},{apex[1]!r}")
+    dataset = load_dataset(path, options)
+    assert dataset.probe == probe
+    np.testing.assert_array_equal(dataset.val.poses, POSES[[2, 7]])
+    found = dataset.val.images[0] / 255.0
+    expected = cv2.resize(truth, found.shape[::-1], interpolation=cv2.INTER_LINEAR)
+    inner = np.s_[3:-3, 3:-3]  # at the rim the screen is black beside the fan
+    assert np.abs(found - expected)[inner].max() < 0.02
+    with pytest.raises(InvalidArgument, match="fan must be given without crop"):
+        load_dataset(path, SourceOptions(fan=options.fan, crop="0:9,0:9"))
+
+
 COMPRESSED = encapsulate([b"\xff\xd8\xff\xd9"] * len(FRAMES))
 
 
@@ -73,10 +117,10 @@ COMPRESSED = encapsulate([b"\xff\xd8\xff\xd9"] * len(FRAMES))
         ({"poses": None}, r"must lie beside it in sweep\.poses\.npy or sweep\.poses\.json, found 0"),
         ({"poses": POSES[:7]}, r"sweep\.dcm holds 10 frames, but .*sweep\.poses\.npy 7 poses"),
         ({"poses": POSES * 2.0}, r"sweep\.poses\.npy: poses\[0\] must end in the row"),
-        ({"SamplesPerPixel": 3}, r"frames must be grey \(SamplesPerPixel 1\), got 3"),
-        ({"PhotometricInterpretation": "MONOCHROME1"}, r"0 black .*got MONOCHROME1"),
+        ({"SamplesPerPixel": 3}, r"with SamplesPerPixel 1 or 3, got MONOCHROME2 with 3"),
+        ({"PhotometricInterpretation": "MONOCHROME1"}, r"must be MONOCHROME2, RGB, .* got MONOCHROME1 with 1"),
         ({"BitsAllocated": 16}, r"pixels must have 8 bits \(BitsAllocated 8\), got 16"),
-        ({"TransducerType": "CURVED LINEAR"}, r"must be linear, TransducerType is CURVED LINEAR"),
+        ({"TransducerType": "CURVED LINEAR"}, r"TransducerType is CURVED LINEAR: say with fan"),
         ({"NumberOfFrames": None}, r"it lacks NumberOfFrames"),
         ({"NumberOfFrames": 2_000_000_000}, r"its header says 2000000000 x 24 x 32"),
         (

@@ -12,8 +12,10 @@ import time
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import httpx
+import nibabel
 import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
@@ -178,6 +180,16 @@ def test_poses_of_a_file_become_an_archive(server: RunningService, client: httpx
     listed = json.loads(done(server, "list", "--kind", "render", "--json"))
     assert job in {entry["id"] for entry in listed}
     assert job in done(server, "list", "--state", "succeeded")
+
+
+def test_a_field_of_a_scene_becomes_a_volume(server: RunningService, client: httpx.Client, tmp_path: Path) -> None:
+    options = ("--field", "coverage", "--spacing-mm", 2, "--box-mm=-10:10,-2:2,10:30", "--format", "nii", "--wait")
+    job = done(server, "submit", "voxelize", "demo", *options).splitlines()[0]
+    assert client.get(f"/v1/jobs/{job}").json()["artifacts"] == ["coverage.nii", "volume.json"]
+    done(server, "download", job, "coverage.nii", "-o", tmp_path / "coverage.nii")
+    image: Any = nibabel.load(tmp_path / "coverage.nii")
+    assert image.shape == (10, 2, 10)
+    assert np.asarray(image.dataobj).max() > 0.5
 
 
 def test_shards_are_downloaded_by_one_name_those_that_are_missing(

@@ -7,7 +7,7 @@ import pytest
 
 from ultragray_service.core.catalog import SceneCatalog
 from ultragray_service.igtl import routes
-from ultragray_service.igtl.routes import SceneChooser, frame_of, image_name
+from ultragray_service.igtl.routes import SceneChooser, device_of, frame_of, image_name
 from ultragray_workers.errors import SceneNotFound
 from ultragray_workers.scenes import SceneStore
 
@@ -28,6 +28,22 @@ from ultragray_workers.scenes import SceneStore
 )
 def test_names(device: str, frame: str, image: str) -> None:
     assert (frame_of(device), image_name(device)) == (frame, image)
+
+
+@pytest.mark.parametrize(
+    ("scene", "device"),
+    [
+        ("liver", "ProbeToliver"),
+        ("exactly-13-by", "ProbeToexactly-13-by"),
+        ("fourteen-bytes", "fourteen-bytes"),
+        ("aTo3", "aTo3"),  # ProbeToaTo3 would be of a scene called 3
+        ("a-name-of-20-letters", "a-name-of-20-letters"),
+        ("a-name-of-twenty-one-b", "ProbeToReference"),
+    ],
+)
+def test_a_scene_has_a_device_that_names_it(scene: str, device: str) -> None:
+    assert device_of(scene) == device
+    assert device == "ProbeToReference" or scene in (device, frame_of(device))
 
 
 def chooser(folder: Path, *names: str, default: str | None = None) -> SceneChooser:

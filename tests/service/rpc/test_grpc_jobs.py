@@ -81,6 +81,7 @@ def test_a_render_job_comes_back_as_it_was_asked_for(jobs: jobs_pb2_grpc.JobServ
         ("render", jobs_pb2.RenderJob(scene="liver", sampler=jobs_pb2.PoseSampler(kind="training"))),
         ("evaluate", jobs_pb2.EvaluateJob(dataset="liver", scene="liver")),
         ("compare", jobs_pb2.CompareJob(dataset="liver", methods=["median", "linear"])),
+        ("voxelize", jobs_pb2.VoxelizeJob(scene="liver", field="labels", spacing_mm=1.0)),
     ],
 )
 def test_what_a_job_asks_of_its_worker_is_read_from_the_messages_of_all_kinds(kind: str, named: Any) -> None:

@@ -42,7 +42,9 @@ class Progress:
     loss: float | None = None
     val_psnr_db: float | None = described("On the held-out frames, the last time it was measured.", None)
     gaussians: int | None = None
-    frames_done: int | None = described("Frames that are done, such as those of a render job in its archive.", None)
+    frames_done: int | None = described(
+        "Frames that are done, such as those of a render job in its archive; of a volume: layers of voxels.", None
+    )
     frames: int | None = None
     rate_per_s: float | None = described("Steps or frames.", None)
     seconds_left: float | None = described("Until the end of the job, of all that is still to be done; about.", None)

@@ -8,14 +8,27 @@ import os
 import time
 from collections.abc import Awaitable, Iterable
 from dataclasses import replace
+from typing import Any
 
 from ultragray.confidence import Extrapolation
 from ultragray.errors import RenderFailed, UltragrayError
+from ultragray.volumes.plane import SliceView
 
 from ..rounds import Rounds
 from .launcher import Launcher
 from .memory import MemoryPool
-from .messages import Answer, ForkWorker, LoadTask, Outdated, PackTask, Rendered, RenderPart, RenderTask, UnloadTask
+from .messages import (
+    Answer,
+    ForkWorker,
+    LoadTask,
+    Outdated,
+    PackTask,
+    Rendered,
+    RenderPart,
+    RenderTask,
+    SliceTask,
+    UnloadTask,
+)
 from .slot import Assignment, Command, Slot
 from .types import SceneChangedError
 from .waiting import Packing, Part, Step, Ticket, WaitingQueue
@@ -123,7 +136,7 @@ class Dispatcher:
         assignment = Assignment(steps=dict(enumerate(batch)), batch=tuple(batch))
         ticket = batch[0].ticket
         if parts:
-            slot.assign(_render_task(ticket, parts), assignment, _descriptors(part.ticket.memory for part in parts))
+            slot.assign(_task(ticket, parts), assignment, _descriptors(part.ticket.memory for part in parts))
         else:
             if ticket.archive is None:
                 ticket.archive = self._memories.acquire()
@@ -233,22 +246,20 @@ def _extrapolations(steps: Iterable[Rendered]) -> tuple[Extrapolation, ...]:
     return tuple(one for step in sorted(steps, key=lambda step: step.first) for one in step.extrapolations)
 
 
-def _render_task(ticket: Ticket, parts: list[Part]) -> RenderTask:
-    return RenderTask(
-        scene=ticket.request.scene,
-        path=ticket.path,
-        version=ticket.request.version,
-        parts=tuple(
-            RenderPart(
-                settings=part.ticket.request.settings,
-                poses=part.ticket.request.poses[part.first : part.stop],
-                first=part.first,
-                total=len(part.ticket.request.poses),
-                deadline=part.ticket.request.deadline,
-            )
-            for part in parts
-        ),
+def _task(ticket: Ticket, parts: list[Part]) -> RenderTask | SliceTask:
+    found: tuple[RenderPart[Any], ...] = tuple(
+        RenderPart(
+            settings=part.ticket.request.settings,
+            poses=part.ticket.request.poses[part.first : part.stop],
+            first=part.first,
+            total=len(part.ticket.request.poses),
+            deadline=part.ticket.request.deadline,
+        )
+        for part in parts
     )
+    request = ticket.request
+    task = SliceTask if isinstance(request.settings, SliceView) else RenderTask
+    return task(scene=request.scene, path=ticket.path, version=request.version, parts=found)
 
 
 def _pack_task(ticket: Ticket) -> PackTask:

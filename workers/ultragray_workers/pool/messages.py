@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Generic
 
 from ultragray.confidence import Extrapolation
 from ultragray.errors import UltragrayError
 from ultragray.probe import FloatArray
 from ultragray.settings import Resolved
+from ultragray.volumes.plane import SliceView
 
 from ..storage.local import FileVersion
+from .types import S
 
 
 @dataclass(frozen=True)
@@ -39,10 +42,10 @@ class Hello:
 
 
 @dataclass(frozen=True, eq=False)
-class RenderPart:
+class RenderPart(Generic[S]):
     """Some poses of one request, of `total`, starting with its pose number `first`."""
 
-    settings: Resolved
+    settings: S
     poses: FloatArray  # [C, 4, 4] mm
     first: int
     total: int
@@ -71,6 +74,16 @@ class RenderTask:
 
 
 @dataclass(frozen=True, eq=False)
+class SliceTask:
+    """Sample parts of slices. As of a RenderTask, a memory descriptor goes along and an Answer comes back for each."""
+
+    scene: str
+    path: str
+    version: FileVersion | None
+    parts: tuple[RenderPart[SliceView], ...]
+
+
+@dataclass(frozen=True, eq=False)
 class PackTask:
     """Make an .npz of rendered frames. The memory that holds them and the memory for it go along."""
 
@@ -93,7 +106,7 @@ class UnloadTask:
     scene: str
 
 
-Task = RenderTask | PackTask | LoadTask | UnloadTask
+Task = RenderTask | SliceTask | PackTask | LoadTask | UnloadTask
 
 
 @dataclass(frozen=True)

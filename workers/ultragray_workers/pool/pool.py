@@ -14,6 +14,7 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from ultragray.contract import Contract, described
 from ultragray.errors import InvalidArgument, RenderFailed
@@ -26,7 +27,7 @@ from .dispatcher import Dispatcher
 from .launcher import Launcher
 from .memory import read_start
 from .messages import ForkWorker, LoadTask, UnloadTask
-from .types import RenderRequest, RenderResult, SceneChangedError
+from .types import RenderRequest, RenderResult, S, SceneChangedError
 from .waiting import Expiry, Ticket, Turn, WaitingQueue
 from .watchdog import Patience
 
@@ -92,7 +93,7 @@ class RenderPool:
     """Worker processes and the queue before them. All its methods belong to one event loop."""
 
     def __init__(self, store: SceneStore, config: PoolConfig) -> None:
-        self.on_rendered: Callable[[RenderResult], None] | None = None
+        self.on_rendered: Callable[[RenderResult[Any]], None] | None = None
         self._store = store
         self._waiting = WaitingQueue(
             config.queue_limit_frames,
@@ -140,7 +141,7 @@ class RenderPool:
             raise
         self._started = True
 
-    async def render(self, request: RenderRequest, turn: Turn | None = None) -> RenderResult:
+    async def render(self, request: RenderRequest[S], turn: Turn | None = None) -> RenderResult[S]:
         """Renders the request as soon as its turn comes; cancelling the caller, and its deadline, end the rendering.
 
         With `turn` its poses can be replaced by newer ones as long as they wait. Raises NotReady, Draining, QueueFull,
@@ -237,14 +238,14 @@ class RenderPool:
         if not self._started:
             raise NotReady("the service is starting; try again in a few seconds")
 
-    async def _render(self, request: RenderRequest, turn: Turn) -> RenderResult:
+    async def _render(self, request: RenderRequest[S], turn: Turn) -> RenderResult[S]:
         with self._store.hold(request.scene) as path:
             if path is not None:
                 return await self._render_file(request, turn, path)
         await asyncio.to_thread(self._store.path, request.scene)  # fetches it, or raises that there is none
         raise SceneChangedError
 
-    async def _render_file(self, request: RenderRequest, turn: Turn, path: Path) -> RenderResult:
+    async def _render_file(self, request: RenderRequest[S], turn: Turn, path: Path) -> RenderResult[S]:
         turn.ticket = ticket = self._ticket(request, path)
         turn.expiry = Expiry(ticket, self._waiting)
         try:
@@ -275,7 +276,7 @@ class RenderPool:
             place=place,
         )
 
-    def _ticket(self, request: RenderRequest, path: Path) -> Ticket:
+    def _ticket(self, request: RenderRequest[S], path: Path) -> Ticket:
         """Raises InvalidArgument for a request that no reply can hold."""
         settings, poses = request.settings, len(request.poses)
         if poses == 0:

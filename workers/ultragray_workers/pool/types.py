@@ -4,14 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Protocol
+from typing import Generic, Protocol
+
+from typing_extensions import TypeVar
 
 from ultragray.confidence import Extrapolation
 from ultragray.probe import FloatArray
 from ultragray.settings import Resolved
+from ultragray.volumes.plane import SliceView
 
 from ..storage.local import FileVersion
 from .fairness.turns import UNKNOWN_CALLER, Caller
+
+S = TypeVar("S", bound=Resolved | SliceView, default=Resolved)  # settings of a frame, or of a slice
 
 
 class Priority(IntEnum):
@@ -37,11 +42,11 @@ class Destination(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class RenderRequest:
-    """Frames of one scene for some poses; everything but the scene has been checked by the caller."""
+class RenderRequest(Generic[S]):
+    """Frames, or slices, of one scene for some poses; everything but the scene has been checked by the caller."""
 
     scene: str
-    settings: Resolved
+    settings: S
     poses: FloatArray  # [C, 4, 4] mm, probe→scene, exact (check_poses was applied)
     priority: Priority = Priority.INTERACTIVE
     deadline: float | None = None  # time.monotonic() in seconds; past it the request is given up
@@ -56,8 +61,8 @@ class SceneChangedError(Exception):
 
 
 @dataclass(frozen=True, eq=False)
-class RenderResult:
-    """Frames, and all it takes to render them again. H and W are those of the picture.
+class RenderResult(Generic[S]):
+    """Frames or slices, and all it takes to render them again. H and W are those of the picture.
 
     `data` holds, by encoding: uint8 (round(255·x)) and float32: the outputs one after another, each
     [C, H, W] in C order, little endian; png and jpeg: one image file [H, W]; npz: an archive with one array
@@ -68,13 +73,13 @@ class RenderResult:
     scene: str
     scene_sha256: str
     renderer: str  # such as "ultragray/0.1.0 cpu-avx512"
-    settings: Resolved
+    settings: S
     poses: FloatArray  # [C, 4, 4] mm, as used
     data: bytes  # empty where the destination of the request took them
     queue_ms: float  # from the call to the start of its rendering
     render_ms: float  # of the batch it was rendered in
     encode_ms: float
-    extrapolations: tuple[Extrapolation, ...]  # [C]
+    extrapolations: tuple[Extrapolation, ...]  # [C]; none of slices
     batch_size: int  # poses rendered together
     place: Place | None = None  # of the data in that destination
 

@@ -11,7 +11,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from ultragray.probe import FloatArray
-from ultragray.settings import Encoding
+from ultragray.settings import Encoding, Resolved
+from ultragray.volumes.plane import SliceView
 
 from ..errors import DeadlineExceeded, QueueFull
 from .fairness.forecast import Forecast
@@ -31,7 +32,7 @@ _LEAST_RETRY_S = 0.1
 class Ticket:
     """A request that waits or is rendered, and how far it has come."""
 
-    request: RenderRequest
+    request: RenderRequest[Any]
     path: str  # of the scene's file
     done: asyncio.Future[Rendered]
     submitted: float  # time.monotonic() in seconds
@@ -358,7 +359,7 @@ class WaitingQueue:
     def _poses_together(self, ticket: Ticket) -> int:
         """The number of poses in a full batch: fewer for images of more than 512x512 pixels, and for slow ones."""
         share = _BATCH_PRIORITY_SHARE if ticket.request.priority is Priority.BATCH else 1
-        settings = ticket.request.settings
+        settings: Resolved | SliceView = ticket.request.settings
         pixels = settings.height * settings.width * len(settings.outputs)
         fitting = self._max_batch_poses * _FULL_BATCH_PIXELS_PER_POSE // pixels
         if (frame_s := self._forecast.frame_s(ticket.batch_key)) > 0.0:

@@ -1,13 +1,15 @@
 """Fans on a screen: the images of convex and phased probes, brought back to scan lines (range × angle).
 
 The geometry is given in words, or is that of the device set: `ScanConversion` of a CURVILINEAR transducer (mm), or the
-fan that `VolumeReconstruction` clips to (pixels). Angles are counted from the image's depth axis towards its columns.
+fan that `VolumeReconstruction` clips to (pixels). Sequences of our own exporter say it themselves. Angles are counted
+from the image's depth axis towards its columns.
 """
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from xml.etree.ElementTree import Element
@@ -15,10 +17,12 @@ from xml.etree.ElementTree import Element
 import cv2
 import numpy as np
 
+from ...contract import from_dict
+from ...display.settings import Display
 from ...errors import DatasetInvalid, InvalidArgument
 from ...image_size import MAX_IMAGE_SIDE
-from ...probe import ConvexProbe, FloatArray, PhasedProbe
-from ...probe.fan import LARGEST_OPENING_DEG
+from ...probe import ConvexProbe, FloatArray, PhasedProbe, Probe
+from ...probe.fan import LARGEST_OPENING_DEG, Fan
 from ..images import CropBox
 from ..sweep import ByteArray
 from .transforms import DeviceSet
@@ -114,6 +118,28 @@ def fan_of_device_set(device_set: DeviceSet, pixel_mm: tuple[float, float]) -> F
             raise DatasetInvalid(f"{path}: its fan cannot be: {problem}")
         return fan
     return None
+
+
+def fan_of_export(
+    fields: Mapping[str, str], image_to_probe: FloatArray | None, path: Path
+) -> FanGeometry | None:  # [4, 4] pixels -> mm
+    """The fan of a sequence that our own exporter wrote, by its probe; None of a linear one and of other sequences.
+
+    Raises DatasetInvalid, naming the file, for a probe that cannot be.
+    """
+    if image_to_probe is None or "UltraGRayProbe" not in fields:
+        return None
+    try:
+        probe = from_dict(Probe, json.loads(fields["UltraGRayProbe"]))
+        depth_mm = from_dict(Display, json.loads(fields.get("UltraGRayDisplay", "{}"))).depth_mm
+    except (ValueError, RecursionError) as error:
+        raise DatasetInvalid(f"{path}: its UltraGRayProbe or UltraGRayDisplay cannot be read: {error}") from error
+    if not isinstance(probe, Fan):
+        return None
+    far_mm = probe.far_mm if depth_mm is None else min(probe.far_mm, probe.face_depth_mm + depth_mm)
+    column, row = -image_to_probe[0, 3] / image_to_probe[0, 0], -image_to_probe[2, 3] / image_to_probe[2, 1]
+    half_deg = probe.opening_angle_deg / 2
+    return FanGeometry(-half_deg, half_deg, probe.near_mm, far_mm, float(column), float(row))
 
 
 def _reader(element: Element, path: Path) -> Callable[[str, int], tuple[float, ...]]:

@@ -18,7 +18,7 @@ from ..calibration import pixel_size_mm, poses_from_image_transforms, region_of
 from ..images import grey_frames, parse_crop
 from ..splits import parse_frame_ranges
 from ..sweep import Sweep
-from .fan import FanGeometry, FanLines, fan_of_device_set, parse_fan, poses_of_fan
+from .fan import FanGeometry, FanLines, fan_of_device_set, fan_of_export, parse_fan, poses_of_fan
 from .meta_image import read_meta_image
 from .nrrd import read_nrrd
 from .orientation import UNKNOWN, orient_frames
@@ -43,11 +43,11 @@ def read_plus_sweep(
     """The frames of a sequence that have a valid pose, and the number of frames in the file.
 
     `frames` (ranges, `parse_frame_ranges`) chooses among them, `crop` is "columns,rows" of the image after it was
-    brought to x lateral, y depth. `fan` (`parse_fan`), or without `crop` the fan of the device set, says that the
-    images are those of a convex or phased probe on a screen: the frames are its scan lines, the poses have their
-    origin at the apex. `transform` names the tracked transform to take, such as ProbeToTracker, where there are
-    several trackers: poses are then in the frame that it leads to. Transforms of the device set go before those of
-    the same name in the sequence. Frames whose status is not OK are left out, and the sweep's notes say so; a
+    brought to x lateral, y depth. `fan` (`parse_fan`), or without `crop` the fan of the device set or of our own
+    export, says that the images are those of a convex or phased probe on a screen: the frames are its scan lines, the
+    poses have their origin at the apex. `transform` names the tracked transform to take, such as ProbeToTracker, where
+    there are several trackers: poses are then in the frame that it leads to. Transforms of the device set go before
+    those of the same name in the sequence. Frames whose status is not OK are left out, and the sweep's notes say so; a
     sequence without statuses is taken to be valid. Raises DatasetInvalid, naming the file, the frame and the reason;
     InvalidArgument for options that do not fit.
     """
@@ -68,8 +68,13 @@ def read_plus_sweep(
     poses, linear = poses_from_image_transforms(transforms, box, numbers, path)
     probe: Probe = linear
     pixel_mm = pixel_size_mm(transforms)
+    calibration = _calibration(stored, fixed)
     whole = crop is None and fan is None
-    geometry = parse_fan(fan) if fan else fan_of_device_set(known, pixel_mm) if whole and known else None
+    geometry, origin = None if fan is None else parse_fan(fan), ""
+    if whole and known is not None:
+        geometry, origin = fan_of_device_set(known, pixel_mm), "device set"
+    if whole and geometry is None:
+        geometry, origin = fan_of_export(stored.fields, calibration, path), "file"
     if geometry is None:
         shown = images[numbers, box.top : box.bottom, box.left : box.right]
         fan_notes = []
@@ -77,7 +82,7 @@ def read_plus_sweep(
         lines = FanLines(geometry, size, pixel_mm)
         shown, box, probe = lines.frames(images[numbers]), lines.box, geometry.probe()
         poses = poses_of_fan(poses, geometry, size[1], pixel_mm)
-        fan_notes = _fan_notes(geometry, lines, given=fan is not None)
+        fan_notes = _fan_notes(geometry, lines, origin)
     left_out = sorted(set(chosen) - set(numbers.tolist()))
     sweep = Sweep(
         images=np.ascontiguousarray(shown),
@@ -85,7 +90,7 @@ def read_plus_sweep(
         probe=probe,
         frame_numbers=numbers,
         source=str(path),
-        region=region_of(size, box, pixel_mm, _calibration(stored, fixed)),
+        region=region_of(size, box, pixel_mm, calibration),
         notes=(*stored.notes, *_notes(orientation, size if whole and geometry is None else None, left_out), *fan_notes),
     )
     return sweep, frame_count
@@ -200,8 +205,9 @@ def _tracked(way: list[tuple[TransformName, bool]], fixed: Mapping[TransformName
     return " and ".join("To".join(name) for name, _ in way if name not in fixed) or "image"
 
 
-def _fan_notes(fan: FanGeometry, lines: FanLines, *, given: bool) -> list[str]:
-    notes = [] if given else [f"the fan of the device set was taken: {fan.words}"]
+def _fan_notes(fan: FanGeometry, lines: FanLines, origin: str) -> list[str]:
+    """`origin`: where the fan was found; empty: it was given."""
+    notes = [f"the fan of the {origin} was taken: {fan.words}"] if origin else []
     if lines.share < 1.0 - 1e-3:
         notes.append(f"{1.0 - lines.share:.1%} of the fan lies beyond the image and is black")
     return notes

@@ -3,7 +3,8 @@
 `ImageToProbe` takes pixels (column, row) to mm in the probe frame (docs/reference/frames.md), `ProbeToTracker` is the
 pose; the third column of `ImageToProbe` makes it right-handed. Every frame has the status OK, times 25 a second, and
 its figures as `UltraGRayConfidence` and the like, nan where one is not known.
-`read_plus_sweep` gives back the same frames; of a linear probe also the poses, moved by `near_mm` along the axial axis.
+`read_plus_sweep` gives back the same frames, those of a fan as scan lines again. Poses of a linear probe come back
+moved by `near_mm` along the axial axis.
 """
 
 from __future__ import annotations

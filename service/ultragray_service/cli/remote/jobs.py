@@ -42,6 +42,7 @@ _SUBMITS = {
         "ultragray jobs submit render liver --format hdf5 --sampler around --count 5000 --translation-mm 3",
         "ultragray jobs submit render liver --sampler around --count 10000000 --height 64 --width 64 --wait",
     ),
+    "voxelize": ("ultragray jobs submit voxelize liver --field labels --format nrrd --spacing-mm 0.5 --wait",),
 }
 _COLUMNS = ("id", "kind", "state", "scene or dataset", "progress", "created", "reason")
 

@@ -57,14 +57,13 @@ def voxelize(
     info = read_header(scene).info
 
     from ultragray import GaussianScene
-    from ultragray.volumes.files import write_slice, write_volume
-    from ultragray.volumes.grid import VolumeGrid, parse_box, parse_numbers
+    from ultragray.volumes.files import volume_facts, write_slice, write_volume
+    from ultragray.volumes.grid import VolumeGrid, parse_numbers
 
     if plane_mm is None:
         if size_mm is not None:
             raise InvalidArgument("size_mm is for a slice: give plane_mm, too", field="size_mm")
-        low, high = (info.bounds_min_mm, info.bounds_max_mm) if box_mm is None else parse_box(box_mm)
-        grid = VolumeGrid.over_box(low, high, spacing_mm)
+        grid = VolumeGrid.over_scene(info, box_mm, spacing_mm)
     else:
         if size_mm is None or box_mm is not None:
             raise InvalidArgument("a slice needs size_mm, its width,height, and takes no box_mm", field="size_mm")
@@ -74,12 +73,5 @@ def voxelize(
     with working(f"sampling {' x '.join(map(str, grid.shape))} points …"):
         loaded = GaussianScene.load(scene)
         (write_slice if output.name.endswith(SLICE_SUFFIXES) else write_volume)(output, loaded, field, grid)
-    document = {
-        "file": str(output),
-        "field": field,
-        "shape": list(grid.shape),
-        "spacing_mm": spacing_mm,
-        "affine": grid.affine.tolist(),
-        "label_names": {str(number): name for number, name in info.label_names.items()} if field == "labels" else {},
-    }
+    document = {"file": str(output), **volume_facts(info, field, grid)}
     tell(f"wrote {output}: {field}, {' x '.join(map(str, grid.shape))} at {spacing_mm:g} mm", document, as_json=json)

@@ -14,7 +14,9 @@ JPEG = "image/jpeg"
 RAW = "application/octet-stream"
 NPZ = "application/x-npz"
 DICOM = "application/dicom"
+NPY = "application/x-npy"
 MEDIA_TYPES = (PNG, JPEG, RAW, NPZ, DICOM)
+SLICE_TYPES = (PNG, NPY, RAW)
 
 RAW_ENCODINGS = {"uint8": Encoding.UINT8, "float32": Encoding.FLOAT32}
 _ENCODINGS = {PNG: Encoding.PNG, JPEG: Encoding.JPEG, NPZ: Encoding.NPZ, DICOM: Encoding.UINT8}
@@ -81,6 +83,19 @@ def choose(accept: str, *, frames: int, outputs: int, dtype: str | None, lossles
         able = tuple(media_type for media_type in able if media_type != JPEG)
     if dtype is not None:  # only raw pixels have one
         able = (RAW, *(media_type for media_type in able if media_type != RAW))
+    media_type, chosen = _best(accept, able, f"{frames} frame(s) of {outputs} output(s)")
+    if media_type == RAW:
+        return Choice(RAW, RAW_ENCODINGS[chosen.dtype or dtype or "uint8"])
+    return Choice(media_type, _ENCODINGS[media_type])
+
+
+def choose_of_slice(accept: str) -> str:
+    """The media type of a slice: PNG, npy or raw numbers. Raises NotAcceptable."""
+    return _best(accept, SLICE_TYPES, "a slice")[0]
+
+
+def _best(accept: str, able: Sequence[str], what: str) -> tuple[str, MediaRange]:
+    """The media type that an Accept header likes best, the first of those alike, and the range that names it."""
     ranges = parse_accept(accept) if accept.strip() else [MediaRange("*", "*", None, 1.0)]
     best: tuple[float, str, MediaRange] | None = None
     for media_type in able:
@@ -93,11 +108,8 @@ def choose(accept: str, *, frames: int, outputs: int, dtype: str | None, lossles
             best = (chosen.quality, media_type, chosen)
     if best is None:
         raise NotAcceptable(
-            f"Accept must allow a type that can hold {frames} frame(s) of {outputs} output(s): "
-            f"{', '.join(able)}; got {accept!r}",
+            f"Accept must allow a type that can hold {what}: {', '.join(able)}; got {accept!r}",
             field="Accept",
         )
     _, media_type, chosen = best
-    if media_type == RAW:
-        return Choice(RAW, RAW_ENCODINGS[chosen.dtype or dtype or "uint8"])
-    return Choice(media_type, _ENCODINGS[media_type])
+    return media_type, chosen

@@ -10,8 +10,10 @@ from dataclasses import dataclass
 
 import grpc
 
+from ultragray.contract import under
 from ultragray.errors import FrameTooCostly, InvalidArgument, LowConfidence
 from ultragray.probe import FloatArray, Probe
+from ultragray.volumes.plane import SliceSettings
 from ultragray_proto.codec import to_message
 from ultragray_proto.v1 import rendering_pb2
 from ultragray_workers.errors import QueueFull
@@ -21,7 +23,7 @@ from ...core.poses import check_pose_count, exact_poses
 from ...core.requests import Plan
 from ...core.state import Service
 from ...core.streams.stream import FrameStream, checked_s
-from ..messages import frame_message, read, read_pose, read_settings
+from ..messages import frame_message, read, read_pose, read_settings, slice_message
 from ..stream import CallTransport
 
 _RETRY_S = 0.02
@@ -102,6 +104,19 @@ class RenderService:
         poses = await exact_poses(len(request.poses), lambda index: read_pose(request.poses[index], f"poses[{index}]"))
         found = await self._service.assessing.assess(request.scene, poses, probe)
         return to_message(found, rendering_pb2.AssessPosesResponse)
+
+    async def RenderSlice(  # noqa: N802
+        self, request: rendering_pb2.RenderSliceRequest, context: grpc.aio.ServicerContext
+    ) -> rendering_pb2.Slice:
+        deadline = self._service.planner.deadline(context.time_remaining())
+        if not request.HasField("slice"):
+            raise InvalidArgument("slice is required", field="slice")
+        with under("slice"):
+            asked = read(request.slice, SliceSettings)
+        plan = await self._service.planner.plan_slice(request.scene, asked, asked.numbers, path="slice")
+        await self._service.limits.take_frames(1, deadline)
+        result = await self._service.render(plan, asked.pose()[None], deadline=deadline)
+        return slice_message(result)
 
     async def _plan(self, request: rendering_pb2.RenderRequest | rendering_pb2.RenderBatchRequest) -> Plan:
         """The plan of a request. Raises what RequestPlanner.plan raises; the field is a path."""

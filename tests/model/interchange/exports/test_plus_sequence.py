@@ -3,17 +3,20 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
 
-from ultragray import ConvexProbe, LinearProbe
+from ultragray import ConvexProbe, LinearProbe, PhasedProbe
 from ultragray.confidence import Extrapolation
 from ultragray.datasets.plus import read_plus_sweep
 from ultragray.datasets.plus.meta_image import read_meta_image
 from ultragray.datasets.plus.transforms import parse_matrix
+from ultragray.display import Display
 from ultragray.display.frames import show
 from ultragray.display.scan_conversion import scan_convert
+from ultragray.errors import DatasetInvalid
 from ultragray.interchange.exports import FORMATS, ExportHeader, export_to
 from ultragray.pose import pose_from_position_quaternion
 from ultragray.probe import Probe
@@ -106,6 +109,47 @@ def test_a_fan_is_scan_converted(tmp_path: Path) -> None:
     top = image @ [(columns - 1) / 2, -0.5, 0, 1]
     np.testing.assert_allclose(top, [0, 0, 20 * np.cos(np.pi / 6), 1], atol=1e-12)
     np.testing.assert_allclose(image[:3, 0] + image[:3, 1], [2, 0, 2])
+
+
+@pytest.mark.parametrize(
+    ("probe", "display"),
+    [
+        (ConvexProbe(opening_angle_deg=60.0, near_mm=20.0, far_mm=60.0), Display()),
+        (PhasedProbe(opening_angle_deg=80.0, far_mm=45.0), Display()),
+        (ConvexProbe(opening_angle_deg=60.0, near_mm=20.0, far_mm=60.0), Display(depth_mm=30.0, flip=True)),
+    ],
+)
+def test_our_reader_brings_a_fan_back_to_scan_lines(tmp_path: Path, probe: Probe, display: Display) -> None:
+    """Probe and poses are those of the export; the frames are the same but for two resamplings of a smooth image."""
+    height, width = 200, 160
+    rows, lines = np.meshgrid(np.linspace(0.2, 0.9, height), np.linspace(0.3, 1.0, width), indexing="ij")
+    smooth = np.broadcast_to((rows * lines).astype(np.float32), (12, height, width))
+    settings = FORMATS["plus"].shown(Resolved(probe, height, width, display=display))
+    header = ExportHeader(settings, "uint8", poses(12), "one", "0" * 64, "ultragray/0 cpu")
+    shown = show({"bmode": torch.from_numpy(smooth.copy())}, probe, settings.display)["bmode"].numpy()
+    with export_to(tmp_path / "sweep.igs.mha", "plus", header) as add:
+        add({"bmode": shown}, TOLD)
+    sweep, _ = read_plus_sweep(tmp_path / "sweep.igs.mha")
+    depth = display.depth_mm
+    assert sweep.probe == (probe if depth is None else probe.ending_at(probe.face_depth_mm + depth))
+    expected_poses = header.poses @ np.diag([-1.0, -1.0, 1.0, 1.0]) if display.flip else header.poses
+    np.testing.assert_allclose(sweep.poses, expected_poses, rtol=1e-9, atol=1e-9)
+    truth = smooth[0][: display.rows_shown(probe, height), :: -1 if display.flip else 1]
+    found = sweep.images[3] / 255.0
+    expected = cv2.resize(truth, found.shape[::-1], interpolation=cv2.INTER_LINEAR)
+    near = len(found) // 4 if probe.near_mm == 0.0 else 3  # scan lines meet in the apex of a phased array
+    assert np.abs(found - expected)[near:-3, 3:-3].max() < 0.02
+    assert any("fan of the file was taken" in note for note in sweep.notes)
+    cropped, _ = read_plus_sweep(tmp_path / "sweep.igs.mha", crop="100:150,80:130")  # who crops wants no fan
+    assert cropped.images.shape == (12, 50, 50)
+
+
+def test_a_probe_of_an_export_that_cannot_be_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "sweep.igs.mha"
+    export(path, ConvexProbe(opening_angle_deg=60.0, near_mm=20.0, far_mm=60.0))
+    path.write_bytes(path.read_bytes().replace(b'"opening_angle_deg": 60.0', b'"opening_angle_deg": -9.0'))
+    with pytest.raises(DatasetInvalid, match=r"sweep\.igs\.mha: its UltraGRayProbe or UltraGRayDisplay cannot be read"):
+        read_plus_sweep(path)
 
 
 def test_ten_thousand_frames_keep_their_order(tmp_path: Path) -> None:

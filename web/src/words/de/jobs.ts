@@ -2,7 +2,7 @@
 
 import type { Words } from "../en/english";
 
-const kinds: Words["jobs"]["kinds"] = { train: "Training", render: "Datensatz", evaluate: "Auswertung", compare: "Vergleich" };
+const kinds: Words["jobs"]["kinds"] = { train: "Training", render: "Datensatz", evaluate: "Auswertung", compare: "Vergleich", voxelize: "Volumen" };
 
 export const jobs: Words["jobs"] = {
   methodColumn: "Verfahren",

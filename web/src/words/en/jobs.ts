@@ -7,6 +7,7 @@ const kinds: Record<JobKind, string> = {
   render: "data set",
   evaluate: "evaluation",
   compare: "comparison",
+  voxelize: "volume",
 };
 const states: Record<JobState, string> = {
   queued: "waits",

@@ -8,7 +8,8 @@ from .compare import CompareJob
 from .evaluate import EvaluateJob
 from .render import RenderJob
 from .train import TrainJob
+from .volumes.voxelize import VoxelizeJob
 
-__all__ = ["KINDS", "CompareJob", "EvaluateJob", "RenderJob", "Specification", "TrainJob"]
+__all__ = ["KINDS", "CompareJob", "EvaluateJob", "RenderJob", "Specification", "TrainJob", "VoxelizeJob"]
 
 KINDS = tuple(Specification.members)

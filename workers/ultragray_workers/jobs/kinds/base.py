@@ -63,7 +63,7 @@ class Specification(Family):
     worker_labels: dict[str, str] = described(
         'Labels that the worker must have, such as {"site": "lab1"}.', factory=dict, topic=TOPIC, kw_only=True
     )
-    run_module: ClassVar[str]  # of this folder: its `run(job_run, specification)` does the work
+    run_module: ClassVar[str]  # below this folder: its `run(job_run, specification)` does the work
     needs_dataset: ClassVar[str | None] = None  # field: the dataset stays while the job waits or runs
     needs_scene: ClassVar[str | None] = None  # field: the scene is kept for the job as it is at the submission
     has_checkpoints: ClassVar[bool] = False  # interrupted, it goes on from where it was; others begin anew

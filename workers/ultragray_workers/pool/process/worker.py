@@ -46,12 +46,14 @@ from ..messages import (
     Rendered,
     RenderPart,
     RenderTask,
+    SliceTask,
     Task,
     UnloadTask,
 )
 from .encoding import encode_image, encode_pixels, write_npz
 from .placement import render_device
 from .scene_cache import LoadedScene, SceneCache
+from .slices import write_slices
 from .support import below_limit, refusal
 from .transfer import CHUNK_POSES, Arriving, Wanted, render_to_host
 
@@ -119,13 +121,18 @@ class _Worker:
         self._board.taken[0] = self._tasks
         try:
             if isinstance(task, RenderTask):
-                for index, outcome in enumerate(self._render_parts(task, descriptors)):
-                    self._answer(index, outcome, last=index == len(task.parts) - 1)
+                self._answer_all(self._render_parts(task, descriptors), len(task.parts))
+            elif isinstance(task, SliceTask):
+                self._answer_all(self._slice_parts(task, descriptors), len(task.parts))
             else:
                 self._answer(0, self._do_other(task, descriptors), last=True)
         finally:
             for descriptor in descriptors:
                 os.close(descriptor)
+
+    def _answer_all(self, outcomes: Iterator[Rendered | Outdated | UltragrayError], parts: int) -> None:
+        for part, outcome in enumerate(outcomes):
+            self._answer(part, outcome, last=part == parts - 1)
 
     def _answer(self, part: int, outcome: Rendered | Outdated | UltragrayError | None, *, last: bool) -> None:
         self._channel.send(Answer(part=part, outcome=outcome, last=last, resident=self._scenes.names()))
@@ -215,6 +222,32 @@ class _Worker:
             else:
                 yield _write_part(task.scene, part, frames, begin, memory, rendered, assessed)
             begin = end
+
+    def _slice_parts(self, task: SliceTask, memories: Sequence[int]) -> Iterator[Rendered | Outdated | UltragrayError]:
+        """One outcome per part, each as soon as its slices are written."""
+        for part, memory in zip(task.parts, memories, strict=True):
+            try:
+                loaded = self._loaded(task.scene, task.path)
+                if task.version not in (None, loaded.version):
+                    yield Outdated()
+                    continue
+                started = time.monotonic()
+                limits = Limits(self._max_footprint_pixels, self._board.given_up, self._tasks, lambda _: "spacing_mm")
+                size = write_slices(loaded.scene, part, memory, limits)
+            except GivenUp:
+                yield RenderFailed("the service gave up this slice: nobody waited for it any more")
+            except Exception as error:
+                yield _as_reported(error)
+            else:
+                yield Rendered(
+                    size=size,
+                    scene_sha256=loaded.sha256,
+                    renderer=renderer_name(self._backend, loaded.scene),
+                    started=started,
+                    render_ms=_since_ms(started),
+                    encode_ms=0.0,
+                    first=part.first,
+                )
 
     def _render(
         self,

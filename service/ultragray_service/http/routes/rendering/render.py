@@ -21,16 +21,16 @@ from ultragray.outputs import OUTPUTS
 from ultragray.settings import Resolved
 from ultragray_workers.pool.types import Priority, RenderResult
 
-from ...core.frames import settings_used
-from ...core.poses import exact_poses
-from ...core.state import Service
-from ...telemetry.statistics import STAGES
-from ..deps import SCENE_NAME, problems
-from ..disconnect import finish_or_abandon
-from ..examples import RENDER_EXAMPLES
-from ..reading.accept import DICOM, JPEG, NPZ, PNG, RAW, choose
-from ..reading.bodies import RenderBody
-from ..reading.json_body import body_schema, read_json_body
+from ....core.frames import settings_used
+from ....core.poses import exact_poses
+from ....core.state import Service
+from ....telemetry.statistics import STAGES
+from ...deps import SCENE_NAME, problems
+from ...disconnect import finish_or_abandon
+from ...examples import RENDER_EXAMPLES
+from ...reading.accept import DICOM, JPEG, NPZ, PNG, RAW, choose
+from ...reading.bodies import RenderBody
+from ...reading.json_body import body_schema, read_json_body
 
 router = APIRouter(prefix="/v1/scenes", tags=["render"])
 

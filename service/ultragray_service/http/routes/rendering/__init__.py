@@ -1,0 +1,1 @@
+"""Frames and slices of scenes, one by one."""

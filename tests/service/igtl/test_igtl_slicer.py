@@ -1,0 +1,185 @@
+"""3D Slicer as a peer: the scene file that `ultragray slicer` writes, and the messages that its connector exchanges.
+
+3D Slicer itself is not run. Its connector is played by pyigtl, by what the scene file says: on connecting it sends a
+STATUS with metadata, so that headers of version 2 are understood, then the nodes to push, then commands.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import nibabel
+import numpy as np
+import numpy.typing as npt
+import pyigtl
+import pytest
+
+from ultragray.pose import check_poses
+from ultragray.scene_info import read_header
+
+from ..cli.command_line import refused, run
+from ..conftest import DEMO_PROBE, HEIGHT, WIDTH, RunningService, make_scene
+from .conftest import Peer, address_of, moved, pyigtl_client
+from .test_igtl_commands import _CommandMessage, command
+from .test_igtl_server import over_grpc
+
+
+@dataclass(frozen=True)
+class Opened:
+    """A scene file as 3D Slicer reads it: its nodes by id, each with the name of its element."""
+
+    nodes: dict[str, tuple[str, dict[str, str]]]
+
+    def node(self, tag: str) -> dict[str, str]:
+        [found] = [values for name, values in self.nodes.values() if name == tag]
+        return found
+
+    def references(self, tag: str) -> dict[str, list[str]]:
+        text = self.node(tag).get("references", "")
+        return {role: ids.split() for role, ids in (one.split(":") for one in text.split(";") if one)}
+
+    def attributes(self, tag: str) -> dict[str, str]:
+        return dict(one.split(":", 1) for one in self.node(tag)["attributes"].split(";"))
+
+    @property
+    def pose(self) -> npt.NDArray[np.float64]:
+        numbers = self.node("LinearTransform")["matrixTransformToParent"].split()
+        return np.array(numbers, np.float64).reshape(4, 4)
+
+
+def open_scene(path: Path) -> Opened:
+    root = ElementTree.fromstring(path.read_text(encoding="utf-8"))
+    assert root.tag == "MRML"
+    nodes = {node.get("id", ""): (node.tag, dict(node.attrib)) for node in root}
+    assert len(nodes) == len(root)
+    return Opened(nodes)
+
+
+@pytest.fixture
+def written(igtl_service: RunningService, igtl_folder: Path, tmp_path: Path) -> Opened:
+    """What `ultragray slicer` writes for the scene `demo` and the running service."""
+    arguments = ("slicer", igtl_folder / "demo.ugr", "-o", tmp_path / "demo.mrml", "--spacing-mm", 2)
+    result = run(*arguments, "--igtl-address", address_of(igtl_service), "--json")
+    assert result.exit_code == 0, result.output
+    document = json.loads(result.stdout)
+    assert (document["device"], document["image"]) == ("ProbeTodemo", "Image_demo")
+    return open_scene(tmp_path / "demo.mrml")
+
+
+def test_every_node_is_one_that_slicer_knows_and_refers_to_others(written: Opened) -> None:
+    classes = {
+        "LinearTransform": "LinearTransform",
+        "IGTLConnector": "IGTLConnector",
+        "VolumeDisplay": "ScalarVolumeDisplay",
+        "VolumeArchetypeStorage": "VolumeArchetypeStorage",
+        "Volume": "ScalarVolume",
+    }
+    for node_id, (tag, _) in written.nodes.items():
+        assert re.fullmatch(rf"vtkMRML{classes[tag]}Node\d+", node_id)
+        for ids in written.references(tag).values():
+            assert set(ids) <= written.nodes.keys()
+    assert written.references("IGTLConnector").keys() == {"outgoing"}
+    assert written.references("Volume").keys() == {"display", "storage"}
+
+
+def test_the_connector_resumes_and_pushes_the_pose_of_a_training_view(
+    written: Opened, igtl_service: RunningService, igtl_folder: Path
+) -> None:
+    connector = written.node("IGTLConnector")
+    assert (connector["connectorType"], connector["persistent"], connector["state"]) == ("CLIENT", "1", "1")
+    assert f"{connector['serverHostname']}:{connector['serverPort']}" == address_of(igtl_service)
+    assert written.attributes("LinearTransform")["OpenIGTLinkIF.pushOnConnect"] == "true"
+    poses = read_header(igtl_folder / "demo.ugr").training_poses
+    np.testing.assert_array_equal(written.pose, poses[len(poses) // 2])
+
+
+def test_the_volume_lies_where_the_images_will(written: Opened, tmp_path: Path, igtl_folder: Path) -> None:
+    image: Any = nibabel.load(tmp_path / written.node("VolumeArchetypeStorage")["fileName"])
+    info = read_header(igtl_folder / "demo.ugr").info
+    low, high = (image.affine @ (*index, 1) for index in ((-0.5,) * 3, np.array(image.shape) - 0.5))
+    np.testing.assert_allclose(low[:3], info.bounds_min_mm, atol=1e-4)
+    assert (high[:3] >= np.array(info.bounds_max_mm) - 1e-4).all()
+
+
+class _Plain(pyigtl.messages.MessageBase):  # type: ignore[misc]
+    """A message of a type that pyigtl has no class for."""
+
+    def __init__(self, type_name: str, device_name: str, content: bytes = b"", **metadata: str) -> None:
+        super().__init__(device_name=device_name)
+        self._message_type, self._content, self._valid_message = type_name, content, True
+        self.metadata, self.header_version = metadata, 2 if metadata else 1
+
+    def _pack_content(self) -> bytes:
+        return self._content
+
+
+def test_a_connector_of_slicer_sees_the_scene_live(
+    written: Opened, monkeypatch: pytest.MonkeyPatch, igtl_service: RunningService
+) -> None:
+    monkeypatch.setitem(pyigtl.messages.message_type_to_class_constructor, "RTS_COMMAND", _CommandMessage)
+    connector, device = written.node("IGTLConnector"), written.node("LinearTransform")["name"]
+    with pyigtl_client(f"{connector['serverHostname']}:{connector['serverPort']}") as client:
+        status = struct.pack(">Hq20s", 1, 0, b"") + b"\0"
+        client.send_message(_Plain("STATUS", "", status, dummy="dummy"))  # as on every connection
+        push(client, device, written.pose)
+        image = client.wait_for_message("Image_demo", timeout=60)
+        assert image.header_version == 2
+        assert np.array_equal(image.image[0], over_grpc(igtl_service, "demo", written.pose))
+        # Where the image lies, the volume node does: its corners are those of the probe at the pose.
+        edges = np.array([(i, j, 0, 1) for j in (-0.5, HEIGHT - 0.5) for i in (-0.5, WIDTH - 0.5)])
+        corners = np.c_[DEMO_PROBE.corners_mm(), np.ones(4)] @ check_poses(written.pose)[0].T
+        assert edges @ image.ijk_to_world_matrix.T == pytest.approx(corners, abs=1e-4)
+
+        push(client, device, written.pose @ moved(3))  # the transform is dragged
+        dragged = client.wait_for_message("Image_demo", timeout=60)
+        assert np.array_equal(dragged.image[0], over_grpc(igtl_service, "demo", written.pose @ moved(3)))
+
+        asked = _CommandMessage(device_name="Scanner")  # as its command console sends it
+        asked.number, asked.name, asked.text = 1, "SetUsParameter", command("SetUsParameter", ("DepthMm", "20"))
+        client.send_message(asked)
+        assert client.wait_for_message("Scanner", timeout=60).metadata["Status"] == "SUCCESS"
+        push(client, device, written.pose)
+        assert len(client.wait_for_message("Image_demo", timeout=60).image[0]) == HEIGHT // 2
+
+
+def push(client: pyigtl.OpenIGTLinkClient, device: str, pose: npt.NDArray[Any]) -> None:
+    message = pyigtl.TransformMessage(pose, device_name=device)
+    message.header_version = 2
+    client.send_message(message)
+
+
+def test_the_queries_of_slicer_are_answered_in_their_order(peer: Peer, connect: Callable[..., Peer]) -> None:
+    """As its query nodes send them: GET_CAPABIL, GET_IMAGE, STT_TDATA, and STP_TDATA at the end."""
+    viewer = connect()
+    assert viewer.ask("GET_CAPABIL", "").type_name == "CAPABILITY"
+    peer.send_pose(np.eye(4), "ProbeTodemo")
+    peer.image()
+    assert viewer.ask("GET_IMAGE", "Image_demo").type_name == "IMAGE"
+    receipt = viewer.ask("STT_TDATA", "", struct.pack(">I32s", 50, b""))
+    assert (receipt.type_name, receipt.content) == ("RTS_TDATA", b"\0")
+    peer.send_pose(moved(1), "ProbeTodemo")
+    peer.image()
+    assert viewer.receive().type_name == "TDATA"
+    assert viewer.ask("STP_TDATA", "").type_name == "RTS_TDATA"
+
+
+def test_what_cannot_be_written_is_told_before_the_work(tmp_path: Path) -> None:
+    make_scene(20).save(tmp_path / "one.ugr")
+    scene, output = tmp_path / "one.ugr", tmp_path / "one.mrml"
+    assert "must end in .mrml" in refused("slicer", scene, "-o", tmp_path / "one.xml")
+    for address in ("host", "host:0", "host:99999", "a b:1", ":18944"):
+        told = refused("slicer", scene, "-o", output, "--igtl-address", address)
+        assert "must be HOST:PORT such as 127.0.0.1:18944" in told
+    (tmp_path / "one-echo.nii.gz").touch()
+    assert "--force" in refused("slicer", scene, "-o", output)
+    assert not output.exists()
+    assert run("slicer", scene, "-o", output, "--igtl-address", "[::1]:18944", "--force").exit_code == 0
+    assert open_scene(output).node("IGTLConnector")["serverHostname"] == "::1"
+    assert open_scene(output).pose.tolist() == make_scene(20).training_poses[2].tolist()
