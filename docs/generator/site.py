@@ -26,6 +26,7 @@ SECTIONS: Mapping[str, tuple[str, ...]] = {
             "howto/compare.md",
             "howto/contact.md",
             "howto/gymnasium.md",
+            "howto/notebooks.md",
             "howto/operator.md",
             "howto/*.md",
         ),

@@ -14,12 +14,6 @@ notebooks = loaded(ROOT / "docs" / "notebooks.py")
 NAMES = [path.stem for path in notebooks.notebooks()]
 SHORT = {"visual_servoing"}  # the others train for minutes
 
-pytestmark = pytest.mark.filterwarnings(
-    # Of the packages that talk to the kernel.
-    "ignore::DeprecationWarning:jupyter_client",
-    "ignore::ResourceWarning",
-)
-
 
 @pytest.mark.parametrize("name", NAMES)
 def test_its_file_is_in_the_form_that_the_formatter_gives(name: str) -> None:
@@ -46,6 +40,7 @@ def test_outputs_and_names_of_cells_leave_no_trace_in_the_form() -> None:
 )
 def test_it_runs_from_top_to_bottom(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")  # other tests run beside it
     notebook = notebooks.executed(notebooks.FOLDER / f"{name}.ipynb")
     assert notebooks.picture_of(notebook).startswith(b"\x89PNG")
     told = [output for cell in notebook.cells for output in cell.get("outputs", ()) if output.get("name") == "stderr"]
