@@ -27,7 +27,7 @@ MINUTES ?= 30
 FRAMES ?= 100000
 
 .DEFAULT_GOAL := help
-.PHONY: ALWAYS help serve console test test-fast test-long test-console test-faults test-fuzz test-soak test-overload test-shards test-image test-replicas test-ros test-newcomer check check-lint check-types check-generated check-web check-figures format bench bench-record bench-console console-picture bench-cuda results methods ablations poses confidence libraries environment ros simulation figures demo-scene docs generate packages clean
+.PHONY: ALWAYS help serve console test test-fast test-long test-notebooks test-console test-faults test-fuzz test-soak test-overload test-shards test-image test-replicas test-ros test-newcomer check check-lint check-types check-generated check-web check-figures format bench bench-record bench-console console-picture bench-cuda results methods ablations poses confidence libraries environment ros simulation figures demo-scene docs generate packages clean
 
 help:  ## say what there is
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
@@ -50,6 +50,9 @@ test-long: $(VENV)/installed-dev  ## those that make test leaves out (RECORD=1: 
 	@$(CONSOLE_IF_POSSIBLE)
 	$(PYTEST) -m long --record-in $(FIGURES)/long-run.json $(ARGS)
 	$(KEEP) long-run
+
+test-notebooks: $(VENV)/installed-dev  ## run every notebook of examples/notebooks from top to bottom; takes ten minutes
+	$(BIN)/pytest tests/examples/test_notebooks.py $(ARGS)
 
 test-console: $(VENV)/installed-dev $(CONSOLE)  ## the console in Debian's Chromium and Firefox (apt-get install chromium firefox-esr) against a real service; leaves screenshots in build
 	node --test --test-concurrency=1 tests/console/*.test.mjs
@@ -123,6 +126,7 @@ figures: $(VENV)/python  ## list the measured figures: commit, date, machine, an
 	@$(BIN)/python benchmarks/age.py
 
 format: $(VENV)/installed-dev  ## rewrite the sources in the project's format
+	$(BIN)/python docs/notebooks.py
 	$(BIN)/ruff check --fix $(PYTHON_SOURCES)
 	$(BIN)/ruff format $(PYTHON_SOURCES)
 	$(BIN)/clang-format -i model/kernels/*.[ch]pp model/kernels/*.inl

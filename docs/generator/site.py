@@ -27,6 +27,7 @@ SECTIONS: Mapping[str, tuple[str, ...]] = {
             "howto/contact.md",
             "howto/tools.md",
             "howto/gymnasium.md",
+            "howto/notebooks.md",
             "howto/operator.md",
             "howto/*.md",
         ),

@@ -67,7 +67,12 @@ class SceneInfo(Contract):
         super().__post_init__()
 
     def probe_or(self, asked: Probe | None) -> Probe:
-        """The probe asked for, else the one the scene was trained with. Raises InvalidProbe where neither is known."""
+        """The probe asked for, else the one the scene was trained with.
+
+        Raises InvalidProbe where neither is known, and for what is no Probe.
+        """
+        if asked is not None and not isinstance(asked, Probe):
+            raise InvalidProbe(f"probe must be a Probe, such as LinearProbe(…), got {asked!r}", field="probe")
         probe = asked or self.probe
         if probe is None:
             raise InvalidProbe(

@@ -28,7 +28,7 @@ BROUGHT_BY = {  # modules that are used with, and come with, what is required
     "uvloop": "uvicorn",
     "websockets": "uvicorn",
 }
-NO_FEATURES = {"all", "dev", "docs", "envoy"}
+NO_FEATURES = {"all", "dev", "docs", "envoy", "notebooks"}
 NOT_IN_ALL = {"ray"}  # 260 MB, for those who have a cluster
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ..datasets.phantom import Tissue, load_phantom, tissue_at
+from ..datasets.phantom import load_phantom, tissue_at
 from ..datasets.phantom.shadow import BoneShadow
 from ..datasets.sweep import Dataset
 from ..display import true_to_scale
@@ -28,6 +28,7 @@ from ..rendering import render
 from ..scene import GaussianScene
 from ..training import Progress, TrainingConfig, train
 from . import DEMO_FILE
+from .labels import LABEL_NAMES, labels_of
 
 DATASET_NAME = "demo lumbar spine (in silico)"
 MAX_GAUSSIANS = 50_000  # 3 MB, small enough to come with the code
@@ -36,12 +37,6 @@ PICTURE_SIDE = 512
 PARAMEDIAN_MM = 12.0  # from the midline, across the laminae
 CATHETER_MM = (12.0, 0.0, 22.0)  # within the muscle, beside the vessel
 SECONDS_PER_LINE = 10.0
-LABELS: dict[int, tuple[str, tuple[Tissue, ...]]] = {
-    1: ("bone", (Tissue.BONE,)),
-    2: ("muscle", (Tissue.MUSCLE,)),
-    3: ("fat", (Tissue.FAT,)),
-    4: ("vessel", (Tissue.BLOOD,)),
-}
 
 log = logging.getLogger("demo")
 
@@ -71,12 +66,8 @@ def make_scene(dataset: Dataset, config: TrainingConfig) -> GaussianScene:
 def labelled(scene: GaussianScene) -> GaussianScene:
     """The scene with the label of the phantom's tissue at each mean; other tissues than those of LABELS have none."""
     means_mm = np.asarray(scene.info.centre_mm) + 10.0 * scene.means.detach().cpu().double().numpy()
-    by_tissue = np.zeros(max(Tissue) + 1, np.uint8)
-    for label, (_, tissues) in LABELS.items():
-        by_tissue[list(tissues)] = label
-    labels = torch.from_numpy(by_tissue[tissue_at(means_mm)]).to(scene.means.device)
-    names = {label: name for label, (name, _) in LABELS.items()}
-    return replace(scene, info=replace(scene.info, label_names=names), labels=labels)
+    labels = torch.from_numpy(labels_of(tissue_at(means_mm))).to(scene.means.device)
+    return replace(scene, info=replace(scene.info, label_names=LABEL_NAMES), labels=labels)
 
 
 def _progress_logger() -> Callable[[Progress], None]:

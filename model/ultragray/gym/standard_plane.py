@@ -68,6 +68,11 @@ class StandardPlaneEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
         self.goal = _goal_of(self._scene, goal)
         self._goal_frame, _ = self._frame(self.goal, contact=None)
         _, self._goal_contact = self._frame(self.goal, contact=self.settings.contact)
+        if self._goal_frame.min() == self._goal_frame.max():
+            raise InvalidArgument(
+                "goal must be a pose, in mm, from which the scene shows something: its frame is black all over",
+                field="goal",
+            )
         self._target = Target(self._goal_frame)
         self.action_space = spaces.Box(-1.0, 1.0, (6,), np.float32)
         self.observation_space = self._space()
@@ -87,26 +92,40 @@ class StandardPlaneEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
     ) -> tuple[Observation, dict[str, Any]]:
         """Begins an episode at a random pose around the goal, or at `options["pose"]`, [4, 4] mm.
 
-        Where contact is judged, starts are drawn until one has START_CONTACT. Raises InvalidPose.
+        Where contact is judged, starts are drawn until one has START_CONTACT. Raises InvalidPose, and InvalidArgument
+        for another option and for a pose out of the reach of the goal.
         """
         super().reset(seed=seed)
-        given = (options or {}).get("pose")
-        self._start = self._pose = self._random_start() if given is None else _one_pose(given, "options.pose")
+        given = dict(options or {})
+        asked = given.pop("pose", None)
+        if given:
+            raise InvalidArgument(f"options may hold pose alone, got {', '.join(map(str, given))}", field="options")
+        self._start = self._pose = self._random_start() if asked is None else self._start_at(asked)
         observation, info = self._look()
         return observation, info
 
+    def _start_at(self, asked: Any) -> FloatArray:  # [4, 4]
+        pose = _one_pose(asked, "options.pose")
+        away_mm, turned_deg = self._off_goal(pose)
+        if not self._is_in_reach(away_mm, turned_deg):
+            raise InvalidArgument(
+                f"options.pose must be within {self.settings.reach_mm:g} mm and {self.settings.reach_deg:g}° of the "
+                f"goal, got {away_mm:.1f} mm and {turned_deg:.1f}°: with a larger start_mm or start_deg it may be "
+                "farther off",
+                field="options.pose",
+            )
+        return pose
+
+    def _is_in_reach(self, away_mm: float, turned_deg: float) -> bool:
+        return away_mm <= self.settings.reach_mm and turned_deg <= self.settings.reach_deg
+
     def step(self, action: npt.NDArray[np.float32]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Moves the probe. Raises InvalidArgument for an action that is not six finite numbers."""
-        given = np.asarray(action, np.float64)
-        if given.shape != self.action_space.shape or not np.isfinite(given).all():
-            raise InvalidArgument(
-                f"an action must be 6 finite numbers from -1 to 1, got {given.ravel().tolist()}", field="action"
-            )
+        given = _six_numbers(action)
         shift, turn = np.split(np.clip(given, -1.0, 1.0), 2)
         pivot_mm = self._probe.pivot_depth_mm
         asked = moved(self._pose, shift * self.settings.step_mm, turn * self.settings.step_deg, pivot_mm)
-        away_mm, turned_deg = self._off_goal(asked)
-        if away_mm <= self.settings.reach_mm and turned_deg <= self.settings.reach_deg:
+        if self._is_in_reach(*self._off_goal(asked)):
             self._pose = check_poses(asked)[0]  # rounding does not add up
         observation, info = self._look()
         reward = (info["similarity"] - 1.0) + (info["contact_share"] - 1.0)
@@ -187,6 +206,17 @@ class StandardPlaneEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
         return float(distance), float(rotation_angles_deg(pose[None], self.goal[None])[0, 0])
 
 
+def _six_numbers(action: Any) -> FloatArray:  # [6]
+    """Raises InvalidArgument."""
+    try:
+        given = np.asarray(action, np.float64)
+    except (TypeError, ValueError):
+        given = np.zeros(0)
+    if given.shape != (6,) or not np.isfinite(given).all():
+        raise InvalidArgument(f"an action must be 6 finite numbers from -1 to 1, got {action!r}", field="action")
+    return given
+
+
 def _pivot(probe: Probe) -> FloatArray:  # [4, 4]
     """Of the middle of the face in the probe's frame."""
     pivot = np.eye(4)
@@ -197,7 +227,7 @@ def _pivot(probe: Probe) -> FloatArray:  # [4, 4]
 def _goal_of(scene: GaussianScene, goal: Any) -> FloatArray:  # [4, 4]
     """The pose of a goal. Raises InvalidArgument, InvalidPose."""
     views = scene.training_poses
-    if goal is not None and not isinstance(goal, (int, np.integer)):
+    if goal is not None and (isinstance(goal, bool) or not isinstance(goal, (int, np.integer))):
         return _one_pose(goal, "goal")
     if not len(views):
         raise InvalidArgument("goal must be a pose: the scene holds no training poses", field="goal")
@@ -212,7 +242,7 @@ def _goal_of(scene: GaussianScene, goal: Any) -> FloatArray:  # [4, 4]
 
 def _one_pose(pose: Any, field: str) -> FloatArray:  # [4, 4]
     """Raises InvalidPose."""
-    exact = check_poses(np.asarray(pose, np.float64), field=field)
+    exact = check_poses(pose, field=field)
     if len(exact) != 1:
         raise InvalidArgument(f"{field} must be one pose [4, 4], got {len(exact)}", field=field)
     one: FloatArray = exact[0]

@@ -9,11 +9,11 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from ultragray import LinearProbe
-from ultragray.datasets.phantom import Tissue, anatomy, bone, bone_attenuation_db, imaging, simulate, tissue_at
+from ultragray import ConvexProbe, LinearProbe
+from ultragray.datasets.phantom import Tissue, anatomy, bone, bone_attenuation_db, imaging, simulate, tissue_at, tissues
 from ultragray.datasets.phantom.acoustics import ACOUSTICS, FREQUENCY_MHZ
 from ultragray.datasets.phantom.scatterers import NOTHING, PER_MM3, ScattererField, Scatterers
-from ultragray.errors import InvalidPose
+from ultragray.errors import InvalidPose, InvalidProbe
 
 PROBE = LinearProbe(width_mm=24.0, near_mm=0.0, far_mm=50.0)
 HEIGHT, WIDTH = 214, 102  # about the phantom's own pixels
@@ -154,7 +154,7 @@ def test_a_probe_that_looks_away_sees_nothing_and_a_mirror_is_refused() -> None:
     away[2, 3] = -5.0
     assert simulate(away, **SIZE).max() == 0
     assert simulate(np.zeros((0, 4, 4)), **SIZE).shape == (0, HEIGHT, WIDTH)
-    for function in (simulate, bone_attenuation_db):
+    for function in (simulate, bone_attenuation_db, tissues):
         with pytest.raises(InvalidPose):
             function(np.diag([-1.0, 1.0, 1.0, 1.0]), **SIZE)
 
@@ -181,3 +181,25 @@ def test_a_point_shows_the_beam_and_the_pulse() -> None:
     assert down * 50.0 / HEIGHT == pytest.approx(root_pi * 0.17, rel=0.3)
     beside = imaging._power(cast(ScattererField, OneScatterer(0.6)), grid, np.eye(4))
     assert beside.max() / power.max() == pytest.approx(np.exp(-1.0), rel=0.01)
+
+
+def test_tissues_are_those_in_the_middle_of_each_pixel() -> None:
+    probe, height, width = LinearProbe(width_mm=24.0, near_mm=3.0, far_mm=50.0), 40, 21
+    poses = np.stack([at(), at(20.0, 7.0, 25.0)])
+    found = tissues(poses, probe=probe, height=height, width=width)
+    assert found.shape == (2, height, width)
+    for pose, labels in zip(poses, found, strict=True):
+        for row, column in ((0, 0), (17, 3), (25, 10), (39, 20)):
+            x, z = ((column + 0.5) / width - 0.5) * 24.0, 3.0 + (row + 0.5) / height * 47.0
+            point = (pose @ np.array([x, 0.0, z, 1.0]))[None, :3]
+            assert labels[row, column] == tissue_at(point)[0], (row, column)
+    assert {Tissue.BONE, Tissue.MUSCLE, Tissue.FAT} <= {Tissue(value) for value in np.unique(found)}
+
+
+def test_tissues_of_scan_lines_that_are_not_upright_are_refused() -> None:
+    with pytest.raises(InvalidProbe, match="upright"):
+        tissues(at(), probe=ConvexProbe(opening_angle_deg=60.0, near_mm=40.0, far_mm=95.0), height=8, width=8)
+
+
+def test_frames_made_one_by_one_are_those_made_together(frames: Image) -> None:
+    np.testing.assert_array_equal(simulate(at(20.0, 0.3), **SIZE)[0], frames[NEXT])

@@ -25,6 +25,8 @@ LINEAR = LinearProbe(width_mm=30.0, near_mm=0.0, far_mm=40.0)
 CONVEX = ConvexProbe(opening_angle_deg=50.0, near_mm=20.0, far_mm=60.0)
 SMALL = {"height": 24, "width": 20, "start_mm": 4.0, "start_deg": 5.0}
 GOAL = 4  # of nine training views
+FAR_AWAY = np.eye(4)
+FAR_AWAY[1, 3] = 5000.0
 
 
 @pytest.fixture(scope="module", params=[LINEAR, CONVEX], ids=["linear", "convex"])
@@ -201,6 +203,10 @@ def test_a_scene_without_skin_is_scanned_with_assumed_contact(random_scene: Call
     [
         ({"goal": 9}, InvalidArgument, "0 to 8, got 9"),
         ({"goal": np.eye(3)}, InvalidPose, "goal must have shape"),
+        ({"goal": "middle"}, InvalidPose, "goal must hold real numbers"),
+        ({"goal": True}, InvalidPose, "goal must hold real numbers, got bool"),
+        ({"goal": FAR_AWAY}, InvalidArgument, "goal must be a pose, in mm, from which the scene shows something"),
+        ({"probe": {"kind": "linear"}}, InvalidProbe, "probe must be a Probe, such as LinearProbe"),
         ({"render_mode": "human"}, InvalidArgument, "render_mode must be rgb_array or None, got 'human'"),
         ({"step_mm": 0.0}, InvalidArgument, "step_mm must be a finite number above 0"),
         ({"contact": "gel"}, InvalidArgument, "contact must be one of air, pressure, got 'gel'"),
@@ -214,9 +220,20 @@ def test_mistakes_are_told(scene: GaussianScene, given: dict[str, Any], error: t
 
 def test_an_action_must_be_six_numbers(env: StandardPlaneEnv) -> None:
     env.reset(seed=0)
-    for action in (np.zeros(5), np.full(6, np.nan)):
+    for action in (np.zeros(5), np.full(6, np.nan), "up", ["a"] * 6, [[0, 0, 0], [0, 0]], None):
         with pytest.raises(InvalidArgument, match="an action must be 6 finite numbers"):
             env.step(action)
+
+
+def test_a_start_must_be_one_from_which_the_goal_can_be_reached(env: StandardPlaneEnv) -> None:
+    with pytest.raises(
+        InvalidArgument, match=r"options\.pose must be within 18 mm and 20° of the goal, got 5000\.0 mm"
+    ):
+        env.reset(options={"pose": FAR_AWAY})
+    with pytest.raises(InvalidPose, match=r"options\.pose must hold real numbers"):
+        env.reset(options={"pose": "here"})
+    with pytest.raises(InvalidArgument, match="options may hold pose alone, got poes"):
+        env.reset(options={"poes": env.goal})
 
 
 def test_a_scene_without_a_probe_needs_one(random_scene: Callable[..., GaussianScene]) -> None:

@@ -8,7 +8,7 @@ the middle vertebra. The vertebrae are 35 mm apart, without end along y.
 """
 
 from .anatomy import Tissue, tissue_at
-from .imaging import bone_attenuation_db, simulate
+from .imaging import bone_attenuation_db, simulate, tissues
 from .sweeps import PHANTOM_IMAGE_SIDE, PHANTOM_PROBE, freehand_poses, load_phantom
 
 __all__ = [
@@ -20,4 +20,5 @@ __all__ = [
     "load_phantom",
     "simulate",
     "tissue_at",
+    "tissues",
 ]

@@ -59,6 +59,19 @@ def bone_attenuation_db(poses: npt.ArrayLike, *, probe: Probe, height: int, widt
     return maps
 
 
+def tissues(poses: npt.ArrayLike, *, probe: Probe, height: int, width: int) -> ByteArray:  # [F, H, W]
+    """The `Tissue` in the middle of each pixel: the truth that a segmentation of `simulate`'s frames is held against.
+
+    Raises InvalidPose for poses that are not rigid, and InvalidProbe for a probe of lines that are not upright.
+    """
+    grid = Grid.of(probe, height, width)
+    checked = check_poses(poses)
+    maps = np.zeros((len(checked), height, width), dtype=np.uint8)
+    for labels, pose in zip(maps, checked, strict=True):
+        labels[:] = grid.tissue_of_pixels(pose)
+    return maps
+
+
 @dataclass(frozen=True)
 class Grid:
     """Two cells a pixel, one above the other, and a margin around the image: R rows of depth, C scan lines."""
@@ -106,9 +119,15 @@ class Grid:
 
     def tissue(self, pose: FloatArray) -> npt.NDArray[np.uint8]:  # [R, C]
         """The tissue in the middle of each cell."""
-        across = pose[:3, 3] + self.laterals_mm[:, None] * pose[:3, 0]
-        middles = across + self.depths_mm[:, None, None] * pose[:3, 2]  # [R, C, 3]
-        return tissue_at(middles.reshape(-1, 3).astype(np.float32)).reshape(self.shape)
+        return _tissue(pose, self.depths_mm, self.laterals_mm)
+
+    def tissue_of_pixels(self, pose: FloatArray) -> npt.NDArray[np.uint8]:  # [H, W]
+        """The tissue in the middle of each pixel, which is the edge of two cells."""
+        top, left = self.margins
+        first = top + CELLS_PER_ROW // 2
+        edges_mm = self.depths_mm - 0.5 * self.cell_mm[0]
+        rows = edges_mm[first : first + CELLS_PER_ROW * self.height : CELLS_PER_ROW]
+        return _tissue(pose, rows, self.laterals_mm[left : left + self.width])
 
     def above(self, per_mm: FloatArray) -> FloatArray:  # [R, C] -> [R, C]
         """The sum of something over each scan line, from the probe's face down to the middle of each cell."""
@@ -121,6 +140,12 @@ class Grid:
         image = values[top : top + CELLS_PER_ROW * self.height, left : left + self.width]
         mean: Floats = image.reshape(self.height, CELLS_PER_ROW, self.width).mean(axis=1)
         return mean
+
+
+def _tissue(pose: FloatArray, depths_mm: Floats, laterals_mm: Floats) -> npt.NDArray[np.uint8]:  # [R], [C] -> [R, C]
+    across = pose[:3, 3] + laterals_mm[:, None] * pose[:3, 0]
+    points = across + depths_mm[:, None, None] * pose[:3, 2]  # [R, C, 3]
+    return tissue_at(points.reshape(-1, 3).astype(np.float32)).reshape(len(depths_mm), len(laterals_mm))
 
 
 def _power(field: ScattererField, grid: Grid, pose: FloatArray) -> Floats:  # [H, W]

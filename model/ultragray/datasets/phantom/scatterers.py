@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +22,7 @@ Float32Array = npt.NDArray[np.float32]
 
 BLOCK_MM = 8.0
 PER_MM3 = 8.0  # about five in a cell of the beam's resolution: speckle is fully developed
+LAST_BLOCKS = 256  # kept for who simulates frame by frame, about 20 MB: neighbouring frames share most of some hundred
 BAND_MM = 0.4  # scatterers this near to an interface are repeated on it
 FASCICLES_DB = 9.0  # by which bundles of muscle fibres are brighter or darker
 _SEED = 20261121
@@ -98,6 +100,7 @@ def _blocks_near(pose: FloatArray, low_mm: FloatArray, high_mm: FloatArray) -> I
     return ((int(i), int(j), int(k)) for i, j, k in indices[touching & (indices[:, 2] >= 0)])
 
 
+@lru_cache(maxsize=LAST_BLOCKS)
 def _made(index: tuple[int, int, int]) -> Scatterers:
     rng = np.random.default_rng([_SEED, *(i + _OFFSET for i in index)])
     count = round(PER_MM3 * BLOCK_MM**3)

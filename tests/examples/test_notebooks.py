@@ -1,0 +1,49 @@
+"""The notebooks: each runs from top to bottom in a kernel of its own, and their files are in one form."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import nbformat
+import pytest
+
+from ..scripts import loaded
+from .conftest import ROOT
+
+notebooks = loaded(ROOT / "docs" / "notebooks.py")
+NAMES = [path.stem for path in notebooks.notebooks()]
+SHORT = {"visual_servoing"}  # the others train for minutes
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_its_file_is_in_the_form_that_the_formatter_gives(name: str) -> None:
+    path = notebooks.FOLDER / f"{name}.ipynb"
+    text = path.read_text(encoding="utf-8")
+    assert notebooks.in_form(nbformat.reads(text, as_version=4)) == text, "run: make format"
+
+
+def test_outputs_and_names_of_cells_leave_no_trace_in_the_form() -> None:
+    path = notebooks.FOLDER / "visual_servoing.ipynb"
+    notebook = nbformat.read(path, as_version=4)
+    notebook.metadata["kernelspec"]["name"] = "mine"
+    for cell in notebook.cells:
+        cell.id = f"other-{cell.id}"
+        if cell.cell_type == "code":
+            cell.execution_count = 3
+            cell.outputs = [nbformat.v4.new_output("stream", text="told\n")]
+    assert notebooks.in_form(notebook) == path.read_text(encoding="utf-8")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "name", [name if name in SHORT else pytest.param(name, marks=pytest.mark.long) for name in NAMES]
+)
+def test_it_runs_from_top_to_bottom(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")  # other tests run beside it
+    notebook = notebooks.executed(notebooks.FOLDER / f"{name}.ipynb")
+    assert notebooks.picture_of(notebook).startswith(b"\x89PNG")
+    told = [output for cell in notebook.cells for output in cell.get("outputs", ()) if output.get("name") == "stderr"]
+    assert not told, "it warns"
+    if name == "visual_servoing":
+        assert "found in 13 of 13 frames" in str(notebook)
