@@ -159,7 +159,7 @@ export const scan: Words["scan"] = {
     sliceThickness: "Schichtdicke",
     trained: (thickness_mm) => `Wie trainiert: ${thickness_mm.toFixed(1)} mm.`,
     contact: "Abseits der Haut",
-    contactMeans: "Was gezeigt wird, wo die Fläche der Sonde nicht auf der Haut liegt, wie der Sweep sie zeigt",
+    contactMeans: "Was gezeigt wird, wo die Fläche des Schallkopfs nicht auf der Haut liegt, wie der Sweep sie zeigt",
     contactAssumed: "Wie in Kontakt",
     contacts: { air: "Dunkel", pressure: "Dunkel; gedrücktes Gewebe gibt nach" },
     noSkin: "Der Trainings-Sweep sagt nicht, wo die Haut ist",
@@ -169,13 +169,6 @@ export const scan: Words["scan"] = {
     sector: "Sektor",
     scanLines: "Scanlinien",
     probe: "Schallkopf",
-    probes: {
-      convex: "Konvex",
-      linear: "Linear",
-      phased: "Phased Array",
-      radial: "Radial",
-      steered: "Linear, geschwenkt",
-    },
     fields: {
       gain_db: "Gain",
       dynamic_range_db: "Dynamik",
