@@ -160,7 +160,7 @@ export const scan: Words["scan"] = {
     trained: (thickness_mm) => `Wie trainiert: ${thickness_mm.toFixed(1)} mm.`,
     contact: "Abseits der Haut",
     contactMeans: "Was gezeigt wird, wo die Fläche des Schallkopfs nicht auf der Haut liegt, wie der Sweep sie zeigt",
-    contactAssumed: "Wie in Kontakt",
+    contactAssumed: "Wie auf ihr",
     contacts: { air: "Dunkel", pressure: "Dunkel; gedrücktes Gewebe gibt nach" },
     noSkin: "Der Trainings-Sweep sagt nicht, wo die Haut ist",
     samples: "Abtastung",

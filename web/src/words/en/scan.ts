@@ -172,7 +172,7 @@ export const scan = {
     trained: (thickness_mm: number): string => `As trained: ${thickness_mm.toFixed(1)} mm.`,
     contact: "Off the skin",
     contactMeans: "What is shown where the face of the probe is not on the skin, which the training sweep tells",
-    contactAssumed: "As in contact",
+    contactAssumed: "As on it",
     contacts,
     noSkin: "The training sweep does not tell where the skin is",
     samples: "Samples",
