@@ -24,6 +24,7 @@ const labels: Words["shared"]["field"]["labels"] = {
   far_mm: "Ende",
   format: "Format",
   frames: "Bilder",
+  histogram_distance: "Histogramm-Abstand",
   height: "Tiefenpunkte",
   image_size: "Bildgröße",
   kind: "Art",
