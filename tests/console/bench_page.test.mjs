@@ -120,6 +120,20 @@ describe("a data set", () => {
   });
 });
 
+describe("what is written as name = value", () => {
+  it("is asked for by the names that the service takes", async () => {
+    const page = await openPage(at, "#/train?show=render");
+    await page.getByText("More", { exact: true }).click();
+    await page.getByLabel(/worker_labels, probe, display: one name = value a line/).fill('worker_labels = {"site": "nowhere"}');
+    await page.getByLabel("Count").fill("3");
+    await page.getByRole("button", { name: "Start rendering" }).click();
+    await page.getByText("nowhere").first().waitFor();
+    const { jobs } = await (await fetch(`${at.service.url}/v1/jobs`)).json();
+    assert.deepEqual(jobs[0].specification.worker_labels, { site: "nowhere" });
+    await fetch(`${at.service.url}/v1/jobs/${jobs[0].id}:cancel`, { method: "POST" });
+  });
+});
+
 describe("the list of jobs", () => {
   it("holds all kinds, is filtered, and its jobs are cancelled, repeated and deleted", async () => {
     const submit = (kind, specification) =>
@@ -139,7 +153,7 @@ describe("the list of jobs", () => {
     await page.getByRole("link", { name: "Repeat with changes" }).click();
     assert.equal(await page.getByRole("combobox", { name: "Poses" }).inputValue(), "covered");
     assert.deepEqual([await page.getByLabel("Count").inputValue(), await page.getByLabel("Seed").inputValue()], ["7", "3"]);
-    assert.deepEqual([await page.getByLabel("Height").inputValue(), await page.getByLabel("Format").inputValue()], ["32", "hdf5"]);
+    assert.deepEqual([await page.getByLabel("Depth samples").inputValue(), await page.getByLabel("Format").inputValue()], ["32", "hdf5"]);
     await page.goBack();
     await page.getByTestId("job").waitFor();
     const before = (await jobsOfService()).length;
@@ -185,9 +199,11 @@ describe("on a phone and enlarged", () => {
 describe("in German", () => {
   it("speaks German in every section", async () => {
     const page = await openPage(at, "#/train", { init: 'localStorage.setItem("ultragray.language", "de")' });
-    await page.getByRole("button", { name: "Hochladen und prüfen" }).or(page.getByRole("button", { name: "Training starten" })).first().waitFor();
+    await page.getByText("Sweep hinzufügen", { exact: true }).waitFor();
     await page.getByRole("link", { name: "Datensatz berechnen" }).click();
     await page.getByRole("button", { name: "Berechnung starten" }).waitFor();
+    for (const label of ["Anzahl", "Drehung, °", "Schichtdicke, mm", "Kleinste Konfidenz", "Tiefenpunkte", "Abdeckung"])
+      await page.getByLabel(label, { exact: true }).waitFor();
     await picture(page, "train-german");
   });
 });

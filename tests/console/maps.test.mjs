@@ -71,6 +71,9 @@ describe("maps", () => {
     await page.keyboard.press("Shift+ArrowDown");
     await page.getByText(`${SIDE / 2 + 1}, ${SIDE / 2 + 10}`).waitFor();
     assert.deepEqual(await seriousFindings(page), []);
+    const names = page.locator('[data-testid^="map-"] header button');
+    const cut = await names.evaluateAll((all) => all.filter((one) => one.scrollWidth > one.clientWidth).map((one) => one.textContent));
+    assert.deepEqual(cut, [], "names of maps are cut");
     await picture(page, "maps-1024");
   });
 

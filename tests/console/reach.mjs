@@ -19,6 +19,10 @@ export function cut(page) {
       while (above && !scrolls(above)) above = above.parentElement;
       if (!above) found.push(named(one));
     }
+    for (const text of document.querySelectorAll("svg text")) {
+      const [box, drawing] = [text, text.ownerSVGElement].map((one) => one.getBoundingClientRect());
+      if (text.checkVisibility() && (box.right > drawing.right + 1 || box.left < drawing.left - 1)) found.push(`the text ${text.textContent}`);
+    }
     return found;
   });
 }

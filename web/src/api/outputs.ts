@@ -1,14 +1,11 @@
 /** What can be rendered of a scene, as the service describes it. */
 
-import { labelOf } from "./described";
 import { scene } from "./generated/contract";
 import type { Schemas } from "./client";
 
 export type Output = Schemas["Scene"]["outputs"][number];
 
 interface DescribedOutput {
-  title: string;
-  meaning: string;
   /** Whether its pixels are numbers that stand for something; else they are shares. */
   isNumbers: boolean;
 }
@@ -16,6 +13,6 @@ interface DescribedOutput {
 export const OUTPUTS = Object.fromEntries(
   (scene.properties?.outputs?.items?.oneOf ?? []).map((one) => [
     one.const,
-    { title: labelOf(one.const!).label, meaning: one.description ?? "", isNumbers: one["x-numbers"] ?? false },
+    { isNumbers: one["x-numbers"] ?? false },
   ]),
 ) as Record<Output, DescribedOutput>;

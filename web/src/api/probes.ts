@@ -1,7 +1,7 @@
 /** Probes: what the service knows of their kinds, and where the scan lines of one run. */
 
 import { postJson, type Schemas } from "./client";
-import { labelOf, type Described } from "./described";
+import type { Described } from "./described";
 import { settings } from "./generated/contract";
 
 export type Probe = NonNullable<Schemas["DatasetRecord"]["probe"]>;
@@ -22,13 +22,4 @@ export function exampleProbe(kind: string, depth_mm: number): Probe {
 /** Throws ServiceError for a probe that cannot be. */
 export function imagePlane(probe: Probe): Promise<ImagePlane> {
   return postJson("/v1/probes:plane", {}, probe);
-}
-
-/** A probe in words: "convex, opening angle 60.0°, near 40.0 mm, far 90.0 mm". */
-export function wordsOf({ kind, ...numbers }: Probe): string {
-  const words = Object.entries(numbers).map(([name, value]) => {
-    const { label, unit } = labelOf(name);
-    return `${label.toLowerCase()} ${value.toFixed(1)}${unit === "°" ? "" : " "}${unit}`;
-  });
-  return [kind, ...words].join(", ");
 }

@@ -4,6 +4,7 @@ import { angleAt_deg, area_mm2, circumference_mm, ellipseOf, type EllipsePoints 
 import { placeLabels, type Box } from "../geometry/labels";
 import { distanceBetween_mm } from "../geometry/picture";
 import type { PlanePoint } from "../geometry/plane";
+import { fixed } from "../shared/local";
 import { words } from "../words/words.svelte";
 import type { Mark, Marks } from "./marks.svelte";
 
@@ -13,15 +14,15 @@ const LETTER = { width: 11, height: 15 }; // at 13 pixels, of one
 export function resultOf({ kind, points, text }: Mark): string {
   switch (kind) {
     case "distance":
-      return `${distanceBetween_mm(points[0]!, points[1]!).toFixed(1)} mm`;
+      return `${fixed(distanceBetween_mm(points[0]!, points[1]!), 1)} mm`;
     case "angle":
-      return `${angleAt_deg(points as EllipsePoints).toFixed(1)}°`;
+      return `${fixed(angleAt_deg(points as EllipsePoints), 1)}°`;
     case "ellipse": {
       const ellipse = ellipseOf(points as EllipsePoints);
       return words.scan.results.ellipse({
-        axes: `${(2 * ellipse.first_mm).toFixed(1)} × ${(2 * ellipse.second_mm).toFixed(1)} mm`,
-        circumference: `${circumference_mm(ellipse).toFixed(1)} mm`,
-        area: `${(area_mm2(ellipse) / 100).toFixed(2)} cm²`,
+        axes: `${fixed(2 * ellipse.first_mm, 1)} × ${fixed(2 * ellipse.second_mm, 1)} mm`,
+        circumference: `${fixed(circumference_mm(ellipse), 1)} mm`,
+        area: `${fixed(area_mm2(ellipse) / 100, 2)} cm²`,
       });
     }
     case "text":

@@ -2,6 +2,7 @@
 
 import type { SceneDescription } from "../api/scenes";
 import type { Extrapolation } from "../api/stream";
+import { fixed } from "../shared/local";
 import { words } from "../words/words.svelte";
 
 export type Tone = "good" | "warn" | "bad";
@@ -47,7 +48,7 @@ export function confidenceWords(
   const title = said.tones[tone];
   const warning = said.warnings[tone];
   if (confidence === null) {
-    const detail = said.away((distance_mm ?? 0).toFixed(1), (angle_deg ?? 0).toFixed(1));
+    const detail = said.away(fixed(distance_mm ?? 0, 1), fixed(angle_deg ?? 0, 1));
     return { tone, title, detail: detail + touch, warning };
   }
   const similarity = percent(confidence);

@@ -6,6 +6,11 @@ export function count(value: number): string {
   return value.toLocaleString(language.current);
 }
 
+/** With so many digits after the point. */
+export function fixed(value: number, digits: number): string {
+  return value.toLocaleString(language.current, { minimumFractionDigits: digits, maximumFractionDigits: digits, useGrouping: false });
+}
+
 export function localTime(iso: string): string {
   return new Date(iso).toLocaleString(language.current, { dateStyle: "short", timeStyle: "medium" });
 }

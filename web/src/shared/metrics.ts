@@ -1,4 +1,4 @@
-/** The metrics of images as people read them. */
+/** The metrics of images: their names, units and digits. */
 
 import type { Metric } from "../api/comparison";
 
@@ -10,9 +10,3 @@ export const LABELS: Record<Metric, { title: string; unit: string; digits: numbe
   histogram_distance: { title: "Histogram distance", unit: "", digits: 4, higherIsBetter: false },
 };
 export const METRICS = Object.keys(LABELS) as Metric[];
-
-/** Title and unit of a metric. */
-export function metricLabel(metric: Metric): string {
-  const { title, unit } = LABELS[metric];
-  return unit === "" ? title : `${title}, ${unit}`;
-}

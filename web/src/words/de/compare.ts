@@ -52,7 +52,7 @@ export const compare: Words["compare"] = {
   chart: { x: "zurückgehaltenes Bild", hint: (better) => `${better}; ein Klick geht zum Bild` },
   confidence: {
     title: "Erwartete und gemessene Ähnlichkeit",
-    expected: "erwartete MS-SSIM (Verlässlichkeit)",
+    expected: "erwartete MS-SSIM",
     measured: "gemessene MS-SSIM",
     r: (value) => `Korrelation ${value}`,
     none: "Die Szene wurde ohne Verlässlichkeit trainiert.",

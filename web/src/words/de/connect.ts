@@ -42,7 +42,7 @@ function fault({ fault: found }: PoseError): string {
     case "plusHeader":
       return "Darin sind keine Transformationen von Bildern (Zeilen wie Seq_Frame0000_ProbeToReferenceTransform).";
     case "plusTransforms":
-      return `Keine der Transformationen kann die Lage einer Sonde sein: ${found.found.join(", ")} enthalten die Größe der Pixel oder wurden nie erfasst.`;
+      return `Keine der Transformationen kann die Lage eines Schallkopfs sein: ${found.found.join(", ")} enthalten die Größe der Pixel oder wurden nie erfasst.`;
   }
 }
 
@@ -101,12 +101,12 @@ export const connect: Words["connect"] = {
     mark: "Merken",
     markMeans: "Diese Lage merken, um andere dagegen anzugeben",
     frozen: "des Standbilds",
-    frozenMeans: "Das Bild steht. Um die Sonde zu bewegen, das Standbild aufheben.",
+    frozenMeans: "Das Bild steht. Um den Schallkopf zu bewegen, das Standbild aufheben.",
     told: "Angegeben",
     references: {
       absolute: "Absolut, in der Szene",
       relativeScene: "Relativ, entlang der Achsen der Szene",
-      relativeProbe: "Relativ, entlang der Achsen der Sonde",
+      relativeProbe: "Relativ, entlang der Achsen des Schallkopfs",
     },
     against: "von",
     againstHome: "der Mitte",
@@ -139,10 +139,10 @@ export const connect: Words["connect"] = {
     },
     formUnits: {
       json: "Wie die API sie nimmt, mm",
-      matrix: "Sonde zu Szene, Zeile für Zeile, mm",
+      matrix: "Schallkopf zu Szene, Zeile für Zeile, mm",
       quaternion: "x y z in mm, dann w x y z",
       euler: "x y z in mm, dann Kippen, Wippen und Drehen in Grad, gegen die Achsen der Szene",
-      numpy: "Sonde zu Szene, mm",
+      numpy: "Schallkopf zu Szene, mm",
       ros: "geometry_msgs/Pose, Meter",
     },
     textLabel: (form: string) => `Lage als ${form}, Eingabe übernimmt`,
@@ -162,7 +162,7 @@ export const connect: Words["connect"] = {
   },
   poseError,
   path: {
-    title: "Weg der Sonde",
+    title: "Weg des Schallkopfs",
     playback: "Abspielen",
     play: "Sweep abspielen",
     pause: "Sweep anhalten",
@@ -190,7 +190,7 @@ export const connect: Words["connect"] = {
     recording: (seconds: string, count: number) => `${seconds} s, ${count} Lagen`,
     full: "Die Aufzeichnung hat ihre Grenze von 100 000 Lagen erreicht und wurde beendet.",
     recorded: (number: number) => `Aufzeichnung ${number}`,
-    none: "Zeichnen Sie auf, was die Sonde tut, oder laden Sie Lagen. Sie lassen sich dann abspielen, speichern und als Datensatz rendern.",
+    none: "Zeichnen Sie auf, was der Schallkopf tut, oder laden Sie Lagen. Sie lassen sich dann abspielen, speichern und als Datensatz rendern.",
     summary: (count: number, seconds: string | null, mm: string) =>
       `${count} Lagen, ${mm} mm lang${seconds === null ? "" : `, ${seconds} s`}`,
     save: "Lagen speichern",
@@ -211,7 +211,7 @@ export const connect: Words["connect"] = {
       curl: "Speichert ein Bild als frame.png.",
       python: "Braucht das Paket ultragray-client.",
       grpc: "Braucht grpcurl. Der Dienst beschreibt seine Nachrichten selbst.",
-      websocket: "Braucht die Pakete websockets und numpy. Für Livebilder einer bewegten Sonde.",
+      websocket: "Braucht die Pakete websockets und numpy. Für Livebilder eines bewegten Schallkopfs.",
       igtl: "Braucht das Paket pyigtl. Ein Gerät mit dem Namen der Szene bekommt deren Bilder.",
       ros: "Braucht ROS 2 und das Paket ultragray-ros. Lagen kommen auf /ultragray/probe_pose herein, in Metern, Bilder gehen auf /ultragray/bmode hinaus.",
     },
@@ -232,12 +232,12 @@ export const connect: Words["connect"] = {
     followOf: (name: string) => `${name} folgen`,
     unfollow: "Nicht mehr folgen",
     following: (name: string) => `Folgt ${name}`,
-    followed: "Bild, Sonde und Lage sind die, die dieses Programm anfordert. Wer die Sonde selbst bewegt, beendet das.",
+    followed: "Bild, Schallkopf und Lage sind die, die dieses Programm anfordert. Wer den Schallkopf selbst bewegt, beendet das.",
     renderedHere: "Die Bilder dieses Programms kann keine Seite zeigen: Dieselben Lagen werden hier gerendert.",
     elsewhere: (scene: string) => `Es fordert jetzt eine andere Szene an: ${scene}.`,
     ended: (name: string) => `${name} hat den Stream geschlossen.`,
     lost: "Die Verbindung zum Stream ist verloren. Sie wird wieder versucht.",
-    steered: (name: string) => `Sie haben die Sonde bewegt: ${name} wird nicht mehr gefolgt.`,
+    steered: (name: string) => `Sie haben den Schallkopf bewegt: ${name} wird nicht mehr gefolgt.`,
     unnamed: "Ein Programm",
     page: "Eine andere Seite der Konsole",
     door: { websocket: "WebSocket", grpc: "gRPC", openigtlink: "OpenIGTLink" },

@@ -26,7 +26,7 @@ export const maps: Words["maps"] = {
     hint: "Zeigen Sie auf eine Karte, oder bewegen Sie das Fadenkreuz mit den Pfeiltasten. Ein Klick auf eine kleine Karte macht sie groß. Schraffiert: neben dem Bild, dort ist nichts bekannt.",
   },
   corrections: {
-    title: "Korrigierte Posen",
+    title: "Korrigierte Lagen",
     meaning: "Wie weit das Training den Schallkopf von dort verschob und drehte, wo der Tracker ihn sah. Ein Klick geht zum Bild.",
     shift: "Verschiebung",
     turn: "Drehung",

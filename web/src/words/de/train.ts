@@ -142,6 +142,7 @@ export const train: Words["train"] = {
     },
     outputs: "Bilder je Lage",
     files: "Dateien",
+    usual: "wie üblich",
     more: "Mehr",
     begin: "Berechnung starten",
     preview: "Lagen, die berechnet werden",

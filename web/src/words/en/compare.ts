@@ -52,7 +52,7 @@ export const compare = {
   chart: { x: "held-out frame", hint: (better: string): string => `${better}; a click goes to the frame` },
   confidence: {
     title: "Expected and measured similarity",
-    expected: "expected MS-SSIM (confidence)",
+    expected: "expected MS-SSIM",
     measured: "measured MS-SSIM",
     r: (value: string): string => `correlation ${value}`,
     none: "The scene was trained without confidence.",

@@ -65,8 +65,7 @@ const steering: { title: string; lines: [string, string][] }[] = [
   },
 ];
 const contacts: Record<Contact, string> = { air: "Dark", pressure: "Dark; pressed tissue gives way" };
-/** Of the kinds of probes, and of the settings of the display; English takes the words of the service. */
-const probes: Record<string, string> = {};
+/** Of the settings of the display; English takes the words of the service where it names none. */
 const fields: Record<string, string | undefined> = { dynamic_range_db: "Range", tgc_db: "Time-gain compensation" };
 
 export const scan = {
@@ -173,7 +172,7 @@ export const scan = {
     trained: (thickness_mm: number): string => `As trained: ${thickness_mm.toFixed(1)} mm.`,
     contact: "Off the skin",
     contactMeans: "What is shown where the face of the probe is not on the skin, which the training sweep tells",
-    contactAssumed: "As in contact",
+    contactAssumed: "As on it",
     contacts,
     noSkin: "The training sweep does not tell where the skin is",
     samples: "Samples",
@@ -182,7 +181,6 @@ export const scan = {
     sector: "Sector",
     scanLines: "Scan lines",
     probe: "Probe",
-    probes,
     fields,
   },
 };

@@ -8,6 +8,17 @@ function limits(least: number, most: number, unit: string): string {
   return Number.isFinite(most) ? `a number of at most ${most}${mm}` : "a number";
 }
 
+/** Of fields whose own names are not plain words; others are called as the service calls them. */
+const labels: Record<string, string | undefined> = {
+  below_min_confidence: "Below that",
+  contact: "Off the skin",
+  dtype: "Numbers as",
+  height: "Depth samples",
+  min_confidence: "Least confidence",
+  shard_frames: "Frames in a file",
+  width: "Scan lines",
+};
+
 export const shared = {
   chart: (title: string, unit: string, x: string, series: string[]): string =>
     `${title}${unit && ` in ${unit}`} over ${x}: ${series.join(", ")}`,
@@ -21,6 +32,7 @@ export const shared = {
   },
   field: {
     ofList: (label: string, place: number, count: number): string => `${label} ${place} of ${count}`,
+    labels,
   },
   only: (who: string, what: string): string => `Only ${who} may ${what}.`,
   keep: "Keep",

@@ -141,6 +141,7 @@ export const train = {
     } as Record<string, string>,
     outputs: "Pictures of each frame",
     files: "Files",
+    usual: "as usual",
     more: "More",
     begin: "Start rendering",
     preview: "Poses that will be rendered",
