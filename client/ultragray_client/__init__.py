@@ -18,6 +18,7 @@ from .errors import ClientError
 from .frames import Extrapolation, Frame, Picture, Timings
 from .geometry import Placement, PoseLike, Quaternion
 from .jobs import Job, JobError, JobEvent, JobProgress, JobState
+from .localization import Localization
 from .scenes import ConfidenceFit, Scene, SceneEntry
 from .sync.client import Client
 from .sync.stream import FrameStream
@@ -38,6 +39,7 @@ __all__ = [
     "JobEvent",
     "JobProgress",
     "JobState",
+    "Localization",
     "Me",
     "Picture",
     "Placement",

@@ -5,6 +5,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 
+import numpy.typing as npt
+
 from ultragray_proto.codec import from_message
 from ultragray_proto.v1 import access_pb2, access_pb2_grpc, rendering_pb2, rendering_pb2_grpc
 
@@ -16,6 +18,7 @@ from ..calls.tls import Tls
 from ..contract import Probe, RenderSettings
 from ..frames import Extrapolation, Frame, frame_from_message, settings_message
 from ..geometry import PoseLike, pose_message, pose_messages
+from ..localization import Localization, localize_message
 from ..messages import message_of
 from .connection import Connection
 from .datasets import Datasets
@@ -125,6 +128,27 @@ class Client:
         )
         answer = self._connection.answer(self._calls.AssessPoses, request, timeout_s)
         return tuple(from_message(one, Extrapolation) for one in answer.extrapolations)
+
+    def localize(
+        self,
+        scene: str,
+        image: npt.ArrayLike | bytes,
+        start: PoseLike,
+        *,
+        probe: Probe | None = None,
+        within_mm: float = 3.0,
+        within_deg: float = 5.0,
+        timeout_s: float | None = None,
+    ) -> Localization:
+        """Where in a scene a real frame was taken, looked for about `start`, which may be off by the two `within`.
+
+        `image`: grey values [H, W], uint8 or in [0, 1], or the bytes of a PNG file; rows along depth, columns across
+        scan lines, not scan-converted. `probe` took it (None: the scene's own). `is_found` of the answer says whether
+        its pose can be used. Raises SceneNotFound, InvalidArgument and its kinds, QueueFull, DeadlineExceeded.
+        """
+        request = localize_message(scene, image, start, probe, within_mm, within_deg)
+        answer = self._connection.answer(self._calls.Localize, request, timeout_s)
+        return from_message(answer, Localization)
 
     def who_am_i(self, *, timeout_s: float | None = None) -> Me:
         """The name and the role that the key stands for."""

@@ -21,14 +21,13 @@ from ..errors import InvalidArgument
 from ..image_size import check_image_size
 from ..limits import UNLIMITED, Limits
 from ..pose import check_poses
-from ..probe import FloatArray, Probe
+from ..probe import Probe
 from ..rendering import render
 from ..scene import GaussianScene
 from .appearance import Scale
 from .motion import Motions
+from .settings import NEAR_DEG, NEAR_MM, Localization, LocalizationSettings
 
-NEAR_MM, NEAR_DEG = 3.0, 5.0
-MOST_MM, MOST_DEG = 20.0, 30.0
 FOUND_SIMILARITY = 0.5
 SEED = 0
 BLOCKS = (8, 6)  # of the image, along depth and across, that err independently of each other
@@ -61,24 +60,6 @@ SHOWN_SIGMAS = 4.0  # of a Gaussian: what is farther from a plane does not show 
 SHORT_STEP = 0.02  # of the smoothing: a stage whose steps are shorter has arrived
 
 
-@dataclass(frozen=True, eq=False)
-class Localization:
-    """Where a frame was taken, and how certain that is.
-
-    `similarity` is the correlation of the frame's structures with the scene's, from -1 to 1; `is_found` says whether it
-    is as high as only the right place has it. The standard deviations follow from how much the image changes with the
-    pose, and from what is left unexplained; they hold where `is_found` does.
-    """
-
-    pose: FloatArray  # [4, 4] mm, probe→scene
-    similarity: float
-    is_found: bool
-    position_std_mm: tuple[float, float, float]  # along the probe's lateral, elevation and axial axis
-    angle_std_deg: tuple[float, float, float]  # about them, through the middle of the image
-    shift_mm: float  # of the middle of the image from the start
-    turn_deg: float
-
-
 def localize(
     scene: GaussianScene,
     image: Any,
@@ -100,8 +81,7 @@ def localize(
     what render() raises.
     """
     frame = _checked_image(image)
-    _check_within(within_mm, "within_mm", MOST_MM)
-    _check_within(within_deg, "within_deg", MOST_DEG)
+    LocalizationSettings(within_mm=within_mm, within_deg=within_deg)
     first = torch.from_numpy(check_poses(start, field="start"))
     if len(first) != 1:
         raise InvalidArgument(f"start must be one pose, got {len(first)}", field="start")
@@ -267,11 +247,6 @@ def _checked_image(image: Any) -> Tensor:  # [H, W] in [0, 1], float32
     if not np.isfinite(grey).all() or grey.min() < 0.0 or grey.max() > 1.0:
         raise InvalidArgument("image must hold finite values in [0, 1], or uint8", field="image")
     return torch.from_numpy(grey)
-
-
-def _check_within(value: float, field: str, most: float) -> None:
-    if not 0.0 < value <= most:
-        raise InvalidArgument(f"{field} must be above 0 and at most {most:g}, got {value}", field=field)
 
 
 def _deviations(left: Tensor, changes: Tensor) -> Tensor:  # [H, W], [6, H, W] per mm -> [6] mm

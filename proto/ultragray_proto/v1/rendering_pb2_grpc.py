@@ -49,6 +49,11 @@ class RenderServiceStub:
                 request_serializer=ultragray_dot_v1_dot_rendering__pb2.AssessPosesRequest.SerializeToString,
                 response_deserializer=ultragray_dot_v1_dot_rendering__pb2.AssessPosesResponse.FromString,
                 _registered_method=True)
+        self.Localize = channel.unary_unary(
+                '/ultragray.v1.RenderService/Localize',
+                request_serializer=ultragray_dot_v1_dot_rendering__pb2.LocalizeRequest.SerializeToString,
+                response_deserializer=ultragray_dot_v1_dot_rendering__pb2.LocalizeResponse.FromString,
+                _registered_method=True)
         self.RenderStream = channel.stream_stream(
                 '/ultragray.v1.RenderService/RenderStream',
                 request_serializer=ultragray_dot_v1_dot_rendering__pb2.RenderStreamRequest.SerializeToString,
@@ -78,6 +83,14 @@ class RenderServiceServicer:
 
     def AssessPoses(self, request, context):
         """How far frames at these poses would extrapolate, and how far to trust them, without rendering any.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def Localize(self, request, context):
+        """Where in a scene a real frame was taken: its pose, looked for about one that is about right. It waits behind frames of
+        interactive callers, and counts as 100 frames of the key's limit.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -117,6 +130,11 @@ def add_RenderServiceServicer_to_server(servicer, server):
                     servicer.AssessPoses,
                     request_deserializer=ultragray_dot_v1_dot_rendering__pb2.AssessPosesRequest.FromString,
                     response_serializer=ultragray_dot_v1_dot_rendering__pb2.AssessPosesResponse.SerializeToString,
+            ),
+            'Localize': grpc.unary_unary_rpc_method_handler(
+                    servicer.Localize,
+                    request_deserializer=ultragray_dot_v1_dot_rendering__pb2.LocalizeRequest.FromString,
+                    response_serializer=ultragray_dot_v1_dot_rendering__pb2.LocalizeResponse.SerializeToString,
             ),
             'RenderStream': grpc.stream_stream_rpc_method_handler(
                     servicer.RenderStream,
@@ -205,6 +223,33 @@ class RenderService:
             '/ultragray.v1.RenderService/AssessPoses',
             ultragray_dot_v1_dot_rendering__pb2.AssessPosesRequest.SerializeToString,
             ultragray_dot_v1_dot_rendering__pb2.AssessPosesResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def Localize(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/ultragray.v1.RenderService/Localize',
+            ultragray_dot_v1_dot_rendering__pb2.LocalizeRequest.SerializeToString,
+            ultragray_dot_v1_dot_rendering__pb2.LocalizeResponse.FromString,
             options,
             channel_credentials,
             insecure,

@@ -51,6 +51,7 @@ OPERATIONS = (
     # Frames come first: their route is the one that must be found fast.
     Operation("render", _READER, ("POST /v1/scenes/{scene}/render",), ("RenderService/Render",), _SCENE),
     Operation("render.batch", _READER, (), ("RenderService/RenderBatch",), _SCENE),
+    Operation("scene.localize", _READER, ("POST /v1/scenes/{scene}:localize",), ("RenderService/Localize",), _SCENE),
     Operation(STREAM, _READER, (f"{WEBSOCKET} /v1/scenes/{{scene}}/stream",), ("RenderService/RenderStream",), _SCENE),
     Operation("stream.list", _READER, ("GET /v1/streams",)),
     Operation(WATCH, _READER, (f"{WEBSOCKET} /v1/streams/{{stream}}/watch",)),

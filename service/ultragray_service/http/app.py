@@ -26,7 +26,7 @@ from . import problems
 from .console import add_console
 from .docs import add_docs
 from .middleware import QUIET_PATHS, Authorize, CheckOrigin, LimitBody, RequestContext
-from .reading.bodies import SPECIFICATIONS, AssessBody, JobBody, RenderBody, StreamMessage
+from .reading.bodies import SPECIFICATIONS, AssessBody, JobBody, LocalizeBody, RenderBody, StreamMessage
 from .reading.json_body import adapter_of
 from .routes import (
     access,
@@ -85,6 +85,7 @@ _ROUTERS = (
 _READ: tuple[Any, ...] = (
     RenderBody,
     AssessBody,
+    LocalizeBody,
     StreamMessage,
     JobBody,
     *SPECIFICATIONS,

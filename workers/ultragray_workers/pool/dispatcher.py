@@ -14,10 +14,21 @@ from ultragray.errors import RenderFailed, UltragrayError
 
 from ..rounds import Rounds
 from .launcher import Launcher
-from .memory import MemoryPool
-from .messages import Answer, ForkWorker, LoadTask, Outdated, PackTask, Rendered, RenderPart, RenderTask, UnloadTask
+from .memory import MemoryPool, write_at
+from .messages import (
+    Answer,
+    ForkWorker,
+    LoadTask,
+    LocalizeTask,
+    Outdated,
+    PackTask,
+    Rendered,
+    RenderPart,
+    RenderTask,
+    UnloadTask,
+)
 from .slot import Assignment, Command, Slot
-from .types import SceneChangedError
+from .types import SceneChangedError, Sought
 from .waiting import Packing, Part, Step, Ticket, WaitingQueue
 from .watchdog import Patience
 
@@ -120,9 +131,13 @@ class Dispatcher:
             step.ticket.batch_size = max(step.ticket.batch_size, sum(part.frames for part in parts))
             if step.ticket.memory is None:
                 step.ticket.memory = self._memories.acquire()
+                if (sought := step.ticket.request.sought) is not None:
+                    write_at(step.ticket.memory, memoryview(sought.image), 0)
         assignment = Assignment(steps=dict(enumerate(batch)), batch=tuple(batch))
         ticket = batch[0].ticket
-        if parts:
+        if parts and ticket.request.sought is not None:
+            slot.assign(_localize_task(ticket, ticket.request.sought), assignment, _descriptors([ticket.memory]))
+        elif parts:
             slot.assign(_render_task(ticket, parts), assignment, _descriptors(part.ticket.memory for part in parts))
         else:
             if ticket.archive is None:
@@ -225,6 +240,7 @@ def _summary(steps: list[Rendered]) -> Rendered:
         render_ms=sum(step.render_ms for step in steps),
         encode_ms=sum(step.encode_ms for step in steps),
         extrapolations=_extrapolations(steps),
+        found=steps[-1].found,
     )
 
 
@@ -248,6 +264,19 @@ def _render_task(ticket: Ticket, parts: list[Part]) -> RenderTask:
             )
             for part in parts
         ),
+    )
+
+
+def _localize_task(ticket: Ticket, sought: Sought) -> LocalizeTask:
+    request = ticket.request
+    return LocalizeTask(
+        scene=request.scene,
+        path=ticket.path,
+        version=request.version,
+        start=request.poses[0],
+        image_bytes=len(sought.image),
+        size=sought.size,
+        settings=sought.settings,
     )
 
 

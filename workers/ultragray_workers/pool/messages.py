@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from ultragray.confidence import Extrapolation
 from ultragray.errors import UltragrayError
+from ultragray.localization.settings import Localization, LocalizationSettings
 from ultragray.probe import FloatArray
 from ultragray.settings import Resolved
 
@@ -71,6 +72,19 @@ class RenderTask:
 
 
 @dataclass(frozen=True, eq=False)
+class LocalizeTask:
+    """Look for a real frame. The memory that holds it goes along."""
+
+    scene: str
+    path: str
+    version: FileVersion | None  # that the scene's file must have; None: any
+    start: FloatArray  # [4, 4] mm
+    image_bytes: int
+    size: tuple[int, int] | None  # height and width of grey pixels; None: it is a PNG file
+    settings: LocalizationSettings
+
+
+@dataclass(frozen=True, eq=False)
 class PackTask:
     """Make an .npz of rendered frames. The memory that holds them and the memory for it go along."""
 
@@ -93,7 +107,7 @@ class UnloadTask:
     scene: str
 
 
-Task = RenderTask | PackTask | LoadTask | UnloadTask
+Task = RenderTask | LocalizeTask | PackTask | LoadTask | UnloadTask
 
 
 @dataclass(frozen=True)
@@ -108,6 +122,7 @@ class Rendered:
     encode_ms: float
     first: int = 0  # pose of the request that the part begins with
     extrapolations: tuple[Extrapolation, ...] = ()  # of the part's poses
+    found: Localization | None = None  # of a frame that was looked for
 
 
 @dataclass(frozen=True)

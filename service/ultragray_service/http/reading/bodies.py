@@ -10,7 +10,9 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from ultragray.contract import Contract, annotated_fields, described
-from ultragray.errors import InvalidArgument, InvalidPose
+from ultragray.errors import InvalidArgument, InvalidImageSize, InvalidPose
+from ultragray.image_size import MAX_IMAGE_SIDE
+from ultragray.localization.settings import LocalizationSettings
 from ultragray.probe import Probe
 from ultragray.settings import FrameSettings, RenderSettings
 from ultragray_workers.jobs.job import MAX_PRIORITY
@@ -45,6 +47,25 @@ class AssessBody(Contract):
     probe: Probe | None = described("Whose poses they are. Default: the scene's own.", None)
 
     many_poses = staticmethod(_many_poses)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LocalizeBody(LocalizationSettings):
+    """A real frame, and about where it was taken."""
+
+    image: str = described(
+        "The frame in base64, rows along depth, columns across scan lines, not scan-converted: a PNG file, or, with "
+        "image_height and image_width, grey pixels of 8 bits, row by row.",
+    )
+    image_height: int | None = described("Of grey pixels.", None, low=1, high=MAX_IMAGE_SIDE, error=InvalidImageSize)
+    image_width: int | None = described("Of grey pixels.", None, low=1, high=MAX_IMAGE_SIDE, error=InvalidImageSize)
+    start: Pose = described("A pose that is about right.", error=InvalidPose)
+    timeout_ms: float | None = described(
+        "A search that has not ended by then is given up (504).", None, above=0, high=MAX_TIMEOUT_MS
+    )
+
+
+LARGE_IMAGE = Apart("image", str)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import grpc
 
 from ultragray.errors import FrameTooCostly, InvalidArgument, LowConfidence
+from ultragray.localization.settings import LocalizationSettings
 from ultragray.probe import FloatArray, Probe
 from ultragray_proto.codec import to_message
 from ultragray_proto.v1 import rendering_pb2
@@ -21,6 +22,7 @@ from ...core.poses import check_pose_count, exact_poses
 from ...core.requests import Plan
 from ...core.state import Service
 from ...core.streams.stream import FrameStream, checked_s
+from ...views.localizing import locate, sought_frame
 from ..messages import frame_message, read, read_pose, read_settings
 from ..stream import CallTransport
 
@@ -102,6 +104,21 @@ class RenderService:
         poses = await exact_poses(len(request.poses), lambda index: read_pose(request.poses[index], f"poses[{index}]"))
         found = await self._service.assessing.assess(request.scene, poses, probe)
         return to_message(found, rendering_pb2.AssessPosesResponse)
+
+    async def Localize(  # noqa: N802
+        self, request: rendering_pb2.LocalizeRequest, context: grpc.aio.ServicerContext
+    ) -> rendering_pb2.LocalizeResponse:
+        deadline = self._service.planner.deadline(context.time_remaining())
+        asked = read(request, LocalizationSettings)
+        height, width = (
+            getattr(request, side) if request.HasField(side) else None for side in ("image_height", "image_width")
+        )
+        if not request.HasField("start"):
+            raise InvalidArgument("start is required", field="start")
+        start = read_pose(request.start, "start")
+        sought = sought_frame(request.image, height, width, asked)
+        found = await locate(self._service, request.scene, sought, start, deadline)
+        return to_message(found, rendering_pb2.LocalizeResponse)
 
     async def _plan(self, request: rendering_pb2.RenderRequest | rendering_pb2.RenderBatchRequest) -> Plan:
         """The plan of a request. Raises what RequestPlanner.plan raises; the field is a path."""
