@@ -1,8 +1,10 @@
-"""Real frames as callers give them: PNG files, or grey pixels row by row. Free of torch."""
+"""Real frames as callers give them: files, the bytes of a PNG file, or grey pixels row by row. Free of torch."""
 
 from __future__ import annotations
 
 import struct
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -10,8 +12,20 @@ from ..display.pixels import ByteArray
 from ..errors import InvalidArgument
 from ..image_size import check_image_size
 
+SUFFIXES = (".png", ".npy")
 _PNG = b"\x89PNG\r\n\x1a\n"
 _SIZE_AT = 16  # bytes of a PNG file, where width and height stand
+
+
+def read_frame(path: Path) -> Any:  # [H, W]
+    """The frame of a `.png` file, or the array of a `.npy` one. Raises InvalidArgument, naming the file."""
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise InvalidArgument(f"a frame must end in {' or '.join(SUFFIXES)}, got {path.name!r}", field="image")
+    try:
+        return np.load(path, allow_pickle=False) if suffix == ".npy" else read_png(path.read_bytes())
+    except (OSError, EOFError, ValueError) as error:
+        raise InvalidArgument(f"{path} cannot be read as a frame: {error}", field="image") from None
 
 
 def read_png(data: bytes) -> ByteArray:  # [H, W]
