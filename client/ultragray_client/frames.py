@@ -100,6 +100,7 @@ class Frame:
     rendered_width: int  # scan lines, likewise
     slice_thickness_mm: float = 0.0  # as used, at the focus of the scene's beam; 0: a plane
     contact: Contact | None = None  # as used; None: it was assumed
+    registration: str | None = None  # that led the pose into the scene; None: none, it was sent as it is
     display: Display | None = None  # as used; None: none was asked for
     dropped: int = 0  # in a stream: poses that newer ones replaced since the frame before
     latency_ms: float | None = None  # in a stream: from `measured_ns` of the pose to the arrival of the frame here

@@ -134,11 +134,21 @@ class FrameSettings(Contract):
         )
 
 
+def registration_field() -> Any:
+    """The field that names a registration, of what poses come with."""
+    return described(
+        "Name of the registration by which the poses lead into the scene: they are then flange to base, or marker to "
+        "tracker. Default: they are probe to scene.",
+        None,
+    )
+
+
 @dataclass(frozen=True, kw_only=True)
 class RenderSettings(FrameSettings):
     """Settings with an encoding, for doors where neither an Accept header nor a file format decides it."""
 
     encoding: Encoding = described("Form of the pixels.", Encoding.UINT8, choices=tuple(FRAME_ENCODINGS))
+    registration: str | None = registration_field()
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -162,6 +172,7 @@ class Resolved:
     min_confidence: float | None = None
     below_min_confidence: Below = Below.REFUSE
     contact: Contact | None = None
+    registration: str | None = None  # that led the poses into the scene
 
     @cached_property
     def picture(self) -> Picture:
@@ -170,7 +181,7 @@ class Resolved:
 
     @cached_property
     def view(self) -> tuple[Any, ...]:
-        """All but outputs and encoding: frames that agree in this can be rendered together."""
+        """All that shows but outputs and encoding: frames that agree in this can be rendered together."""
         asked = (self.display, self.min_confidence, self.below_min_confidence, self.contact)
         return (self.probe, self.beam, self.height, self.width, *asked)
 

@@ -12,16 +12,17 @@ from ultragray_proto.v1 import access_pb2, access_pb2_grpc, rendering_pb2, rende
 from ..access import AuditEntry, Me
 from ..calls.batch import Batch
 from ..calls.connection import DEFAULT_ADDRESS, DEFAULT_TIMEOUT_S, ApiKey
+from ..calls.localization import Localization, localize_message
 from ..calls.pose_exchange import PoseExchange, StreamMode
 from ..calls.tls import Tls
 from ..contract import Probe, RenderSettings
 from ..frames import Extrapolation, Frame, frame_from_message, settings_message
 from ..geometry import PoseLike, pose_message, pose_messages
-from ..localization import Localization, localize_message
 from ..messages import message_of
 from .connection import AsyncConnection
 from .datasets import AsyncDatasets
 from .jobs import AsyncJobs
+from .registrations import AsyncRegistrations
 from .scenes import AsyncScenes
 from .stream import AsyncFrameStream
 from .workers import AsyncWorkers
@@ -57,6 +58,7 @@ class AsyncClient:
         self.datasets = AsyncDatasets(self._connection)
         self.jobs = AsyncJobs(self._connection)
         self.workers = AsyncWorkers(self._connection)
+        self.registrations = AsyncRegistrations(self._connection)
 
     async def render(
         self, scene: str, pose: PoseLike, settings: RenderSettings | None = None, *, timeout_s: float | None = None
@@ -115,15 +117,26 @@ class AsyncClient:
         return AsyncFrameStream(exchange, call)
 
     async def assess_poses(
-        self, scene: str, poses: Iterable[PoseLike], probe: Probe | None = None, *, timeout_s: float | None = None
+        self,
+        scene: str,
+        poses: Iterable[PoseLike],
+        probe: Probe | None = None,
+        *,
+        registration: str | None = None,
+        timeout_s: float | None = None,
     ) -> tuple[Extrapolation, ...]:
         """How far frames at these poses of a probe (None: the scene's own) would extrapolate, without rendering any.
+
+        With a `registration` they are poses of the flange in its base.
 
         `supported_share` is None: only a rendered frame tells it. Raises SceneNotFound, InvalidPose, InvalidProbe,
         TooManyPoses.
         """
         request = message_of(
-            {"probe": probe}, rendering_pb2.AssessPosesRequest, scene=scene, poses=list(pose_messages(poses))
+            {"probe": probe, "registration": registration},
+            rendering_pb2.AssessPosesRequest,
+            scene=scene,
+            poses=list(pose_messages(poses)),
         )
         answer = await self._connection.answer(self._calls.AssessPoses, request, timeout_s)
         return tuple(from_message(one, Extrapolation) for one in answer.extrapolations)

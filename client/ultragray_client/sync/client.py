@@ -13,16 +13,17 @@ from ultragray_proto.v1 import access_pb2, access_pb2_grpc, rendering_pb2, rende
 from ..access import AuditEntry, Me
 from ..calls.batch import Batch
 from ..calls.connection import DEFAULT_ADDRESS, DEFAULT_TIMEOUT_S, ApiKey
+from ..calls.localization import Localization, localize_message
 from ..calls.pose_exchange import PoseExchange, StreamMode
 from ..calls.tls import Tls
 from ..contract import Probe, RenderSettings
 from ..frames import Extrapolation, Frame, frame_from_message, settings_message
 from ..geometry import PoseLike, pose_message, pose_messages
-from ..localization import Localization, localize_message
 from ..messages import message_of
 from .connection import Connection
 from .datasets import Datasets
 from .jobs import Jobs
+from .registrations import Registrations
 from .scenes import Scenes
 from .stream import FrameStream
 from .workers import Workers
@@ -58,6 +59,7 @@ class Client:
         self.datasets = Datasets(self._connection)
         self.jobs = Jobs(self._connection)
         self.workers = Workers(self._connection)
+        self.registrations = Registrations(self._connection)
 
     def render(
         self, scene: str, pose: PoseLike, settings: RenderSettings | None = None, *, timeout_s: float | None = None
@@ -116,15 +118,26 @@ class Client:
         return FrameStream(exchange, call)
 
     def assess_poses(
-        self, scene: str, poses: Iterable[PoseLike], probe: Probe | None = None, *, timeout_s: float | None = None
+        self,
+        scene: str,
+        poses: Iterable[PoseLike],
+        probe: Probe | None = None,
+        *,
+        registration: str | None = None,
+        timeout_s: float | None = None,
     ) -> tuple[Extrapolation, ...]:
         """How far frames at these poses of a probe (None: the scene's own) would extrapolate, without rendering any.
+
+        With a `registration` they are poses of the flange in its base.
 
         `supported_share` is None: only a rendered frame tells it. Raises SceneNotFound, InvalidPose, InvalidProbe,
         TooManyPoses.
         """
         request = message_of(
-            {"probe": probe}, rendering_pb2.AssessPosesRequest, scene=scene, poses=list(pose_messages(poses))
+            {"probe": probe, "registration": registration},
+            rendering_pb2.AssessPosesRequest,
+            scene=scene,
+            poses=list(pose_messages(poses)),
         )
         answer = self._connection.answer(self._calls.AssessPoses, request, timeout_s)
         return tuple(from_message(one, Extrapolation) for one in answer.extrapolations)

@@ -69,7 +69,7 @@ STREAM_MODE_ORDERED: StreamMode
 STREAM_MODE_LATEST: StreamMode
 
 class RenderSettings(_message.Message):
-    __slots__ = ("scene", "height", "width", "outputs", "encoding", "probe", "display", "min_confidence", "below_min_confidence", "slice_thickness_mm", "contact")
+    __slots__ = ("scene", "height", "width", "outputs", "encoding", "probe", "display", "min_confidence", "below_min_confidence", "slice_thickness_mm", "contact", "registration")
     SCENE_FIELD_NUMBER: _ClassVar[int]
     HEIGHT_FIELD_NUMBER: _ClassVar[int]
     WIDTH_FIELD_NUMBER: _ClassVar[int]
@@ -81,6 +81,7 @@ class RenderSettings(_message.Message):
     BELOW_MIN_CONFIDENCE_FIELD_NUMBER: _ClassVar[int]
     SLICE_THICKNESS_MM_FIELD_NUMBER: _ClassVar[int]
     CONTACT_FIELD_NUMBER: _ClassVar[int]
+    REGISTRATION_FIELD_NUMBER: _ClassVar[int]
     scene: str
     height: int
     width: int
@@ -92,7 +93,8 @@ class RenderSettings(_message.Message):
     below_min_confidence: BelowConfidence
     slice_thickness_mm: float
     contact: Contact
-    def __init__(self, scene: _Optional[str] = ..., height: _Optional[int] = ..., width: _Optional[int] = ..., outputs: _Optional[_Iterable[_Union[Output, str]]] = ..., encoding: _Optional[_Union[Encoding, str]] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., display: _Optional[_Union[Display, _Mapping]] = ..., min_confidence: _Optional[float] = ..., below_min_confidence: _Optional[_Union[BelowConfidence, str]] = ..., slice_thickness_mm: _Optional[float] = ..., contact: _Optional[_Union[Contact, str]] = ...) -> None: ...
+    registration: str
+    def __init__(self, scene: _Optional[str] = ..., height: _Optional[int] = ..., width: _Optional[int] = ..., outputs: _Optional[_Iterable[_Union[Output, str]]] = ..., encoding: _Optional[_Union[Encoding, str]] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., display: _Optional[_Union[Display, _Mapping]] = ..., min_confidence: _Optional[float] = ..., below_min_confidence: _Optional[_Union[BelowConfidence, str]] = ..., slice_thickness_mm: _Optional[float] = ..., contact: _Optional[_Union[Contact, str]] = ..., registration: _Optional[str] = ...) -> None: ...
 
 class Extrapolation(_message.Message):
     __slots__ = ("distance_mm", "angle_deg", "confidence", "supported_share", "contact_share")
@@ -109,14 +111,16 @@ class Extrapolation(_message.Message):
     def __init__(self, distance_mm: _Optional[float] = ..., angle_deg: _Optional[float] = ..., confidence: _Optional[float] = ..., supported_share: _Optional[float] = ..., contact_share: _Optional[float] = ...) -> None: ...
 
 class AssessPosesRequest(_message.Message):
-    __slots__ = ("scene", "poses", "probe")
+    __slots__ = ("scene", "poses", "probe", "registration")
     SCENE_FIELD_NUMBER: _ClassVar[int]
     POSES_FIELD_NUMBER: _ClassVar[int]
     PROBE_FIELD_NUMBER: _ClassVar[int]
+    REGISTRATION_FIELD_NUMBER: _ClassVar[int]
     scene: str
     poses: _containers.RepeatedCompositeFieldContainer[_geometry_pb2.Pose]
     probe: _geometry_pb2.Probe
-    def __init__(self, scene: _Optional[str] = ..., poses: _Optional[_Iterable[_Union[_geometry_pb2.Pose, _Mapping]]] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ...) -> None: ...
+    registration: str
+    def __init__(self, scene: _Optional[str] = ..., poses: _Optional[_Iterable[_Union[_geometry_pb2.Pose, _Mapping]]] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., registration: _Optional[str] = ...) -> None: ...
 
 class AssessPosesResponse(_message.Message):
     __slots__ = ("extrapolations",)
@@ -267,7 +271,7 @@ class RenderStreamRequest(_message.Message):
     def __init__(self, sequence: _Optional[int] = ..., settings: _Optional[_Union[RenderSettings, _Mapping]] = ..., pose: _Optional[_Union[_geometry_pb2.Pose, _Mapping]] = ..., mode: _Optional[_Union[StreamMode, str]] = ..., timeout_ms: _Optional[float] = ..., client_time_ns: _Optional[int] = ..., window: _Optional[int] = ..., acknowledged: _Optional[int] = ..., shared_memory: _Optional[_Union[SharedMemory, _Mapping]] = ...) -> None: ...
 
 class Frame(_message.Message):
-    __slots__ = ("sequence", "scene", "scene_sha256", "renderer", "pose", "probe", "slice_thickness_mm", "contact", "height", "width", "outputs", "encoding", "data", "shared_data", "timings", "error", "dropped", "extrapolation", "display", "picture", "rendered_height", "rendered_width", "client_time_ns")
+    __slots__ = ("sequence", "scene", "scene_sha256", "renderer", "pose", "probe", "slice_thickness_mm", "contact", "registration", "height", "width", "outputs", "encoding", "data", "shared_data", "timings", "error", "dropped", "extrapolation", "display", "picture", "rendered_height", "rendered_width", "client_time_ns")
     SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     SCENE_FIELD_NUMBER: _ClassVar[int]
     SCENE_SHA256_FIELD_NUMBER: _ClassVar[int]
@@ -276,6 +280,7 @@ class Frame(_message.Message):
     PROBE_FIELD_NUMBER: _ClassVar[int]
     SLICE_THICKNESS_MM_FIELD_NUMBER: _ClassVar[int]
     CONTACT_FIELD_NUMBER: _ClassVar[int]
+    REGISTRATION_FIELD_NUMBER: _ClassVar[int]
     HEIGHT_FIELD_NUMBER: _ClassVar[int]
     WIDTH_FIELD_NUMBER: _ClassVar[int]
     OUTPUTS_FIELD_NUMBER: _ClassVar[int]
@@ -299,6 +304,7 @@ class Frame(_message.Message):
     probe: _geometry_pb2.Probe
     slice_thickness_mm: float
     contact: Contact
+    registration: str
     height: int
     width: int
     outputs: _containers.RepeatedScalarFieldContainer[Output]
@@ -314,7 +320,7 @@ class Frame(_message.Message):
     rendered_height: int
     rendered_width: int
     client_time_ns: int
-    def __init__(self, sequence: _Optional[int] = ..., scene: _Optional[str] = ..., scene_sha256: _Optional[str] = ..., renderer: _Optional[str] = ..., pose: _Optional[_Union[_geometry_pb2.Matrix, _Mapping]] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., slice_thickness_mm: _Optional[float] = ..., contact: _Optional[_Union[Contact, str]] = ..., height: _Optional[int] = ..., width: _Optional[int] = ..., outputs: _Optional[_Iterable[_Union[Output, str]]] = ..., encoding: _Optional[_Union[Encoding, str]] = ..., data: _Optional[bytes] = ..., shared_data: _Optional[_Union[SharedData, _Mapping]] = ..., timings: _Optional[_Union[Timings, _Mapping]] = ..., error: _Optional[_Union[_scenes_pb2.Error, _Mapping]] = ..., dropped: _Optional[int] = ..., extrapolation: _Optional[_Union[Extrapolation, _Mapping]] = ..., display: _Optional[_Union[Display, _Mapping]] = ..., picture: _Optional[_Union[Picture, _Mapping]] = ..., rendered_height: _Optional[int] = ..., rendered_width: _Optional[int] = ..., client_time_ns: _Optional[int] = ...) -> None: ...
+    def __init__(self, sequence: _Optional[int] = ..., scene: _Optional[str] = ..., scene_sha256: _Optional[str] = ..., renderer: _Optional[str] = ..., pose: _Optional[_Union[_geometry_pb2.Matrix, _Mapping]] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., slice_thickness_mm: _Optional[float] = ..., contact: _Optional[_Union[Contact, str]] = ..., registration: _Optional[str] = ..., height: _Optional[int] = ..., width: _Optional[int] = ..., outputs: _Optional[_Iterable[_Union[Output, str]]] = ..., encoding: _Optional[_Union[Encoding, str]] = ..., data: _Optional[bytes] = ..., shared_data: _Optional[_Union[SharedData, _Mapping]] = ..., timings: _Optional[_Union[Timings, _Mapping]] = ..., error: _Optional[_Union[_scenes_pb2.Error, _Mapping]] = ..., dropped: _Optional[int] = ..., extrapolation: _Optional[_Union[Extrapolation, _Mapping]] = ..., display: _Optional[_Union[Display, _Mapping]] = ..., picture: _Optional[_Union[Picture, _Mapping]] = ..., rendered_height: _Optional[int] = ..., rendered_width: _Optional[int] = ..., client_time_ns: _Optional[int] = ...) -> None: ...
 
 class SharedData(_message.Message):
     __slots__ = ("slot", "bytes")

@@ -46,6 +46,7 @@ class Operation:
 
 _READER, _OPERATOR, _ADMIN = Role.READER, Role.OPERATOR, Role.ADMIN
 _SCENE, _DATASET, _JOB, _WORKER = Kind.SCENE, Kind.DATASET, Kind.JOB, Kind.WORKER
+_REGISTRATION = Kind.REGISTRATION
 
 OPERATIONS = (
     # Frames come first: their route is the one that must be found fast.
@@ -76,6 +77,28 @@ OPERATIONS = (
     Operation("scene.unload", _OPERATOR, ("POST /v1/scenes/{scene}:unload",), ("SceneService/UnloadScene",), _SCENE),
     Operation("scene.import", _OPERATOR, ("PUT /v1/scenes/{scene}",), (), _SCENE),
     Operation("scene.delete", _OPERATOR, ("DELETE /v1/scenes/{scene}",), (), _SCENE, owned=True),
+    Operation("registration.list", _READER, ("GET /v1/registrations",), ("RegistrationService/ListRegistrations",)),
+    Operation(
+        "registration.get",
+        _READER,
+        ("GET /v1/registrations/{registration}",),
+        ("RegistrationService/GetRegistration",),
+        _REGISTRATION,
+    ),
+    Operation(
+        "registration.put",
+        _OPERATOR,
+        ("PUT /v1/registrations/{registration}",),
+        ("RegistrationService/PutRegistration",),
+        _REGISTRATION,
+    ),
+    Operation(
+        "registration.delete",
+        _OPERATOR,
+        ("DELETE /v1/registrations/{registration}",),
+        ("RegistrationService/DeleteRegistration",),
+        _REGISTRATION,
+    ),
     Operation("dataset.list", _READER, ("GET /v1/datasets",), ("DatasetService/ListDatasets",)),
     Operation(
         "dataset.get",

@@ -73,6 +73,7 @@ class SettingsUsed:
     probe: Probe = described("As used.")
     slice_thickness_mm: float = described("As used: at the focus of the scene's beam; 0: a plane.")
     contact: Contact | None = described("As used; none: it was assumed.", None)
+    registration: str | None = described("That led the pose into the scene; null: none, it was sent as it is.", None)
     rendered_height: int = described("Depth samples, before the display settings were applied.")
     rendered_width: int = described("Scan lines, likewise.")
     display: Display = described("As used.", AS_RENDERED)
@@ -129,6 +130,7 @@ def settings_used(settings: Resolved) -> SettingsUsed:
         probe=settings.probe,
         slice_thickness_mm=settings.beam.thickness_mm,
         contact=settings.contact,
+        registration=settings.registration,
         rendered_height=settings.height,
         rendered_width=settings.width,
         display=settings.display,

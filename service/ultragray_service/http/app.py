@@ -26,14 +26,21 @@ from . import problems
 from .console import add_console
 from .docs import add_docs
 from .middleware import QUIET_PATHS, Authorize, CheckOrigin, LimitBody, RequestContext
-from .reading.bodies import SPECIFICATIONS, AssessBody, JobBody, LocalizeBody, RenderBody, StreamMessage
+from .reading.bodies import (
+    SPECIFICATIONS,
+    AssessBody,
+    JobBody,
+    LocalizeBody,
+    RegistrationBody,
+    RenderBody,
+    StreamMessage,
+)
 from .reading.json_body import adapter_of
 from .routes import (
     access,
     comparison,
     datasets,
     health,
-    probes,
     render,
     scene_files,
     scenes,
@@ -42,6 +49,7 @@ from .routes import (
     stream,
     streams,
 )
+from .routes.geometry import probes, registrations
 from .routes.jobs import jobs, training, workers
 from .stream_messages import FrameMessage, RefusalMessage
 
@@ -70,6 +78,7 @@ _ROUTERS = (
     scenes.router,
     scene_files.router,
     probes.router,
+    registrations.router,
     datasets.router,
     comparison.router,
     jobs.router,
@@ -86,6 +95,7 @@ _READ: tuple[Any, ...] = (
     RenderBody,
     AssessBody,
     LocalizeBody,
+    RegistrationBody,
     StreamMessage,
     JobBody,
     *SPECIFICATIONS,

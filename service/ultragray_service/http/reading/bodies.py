@@ -14,7 +14,8 @@ from ultragray.errors import InvalidArgument, InvalidImageSize, InvalidPose
 from ultragray.image_size import MAX_IMAGE_SIDE
 from ultragray.localization.settings import LocalizationSettings
 from ultragray.probe import Probe
-from ultragray.settings import FrameSettings, RenderSettings
+from ultragray.registration.registration import Registration
+from ultragray.settings import FrameSettings, RenderSettings, registration_field
 from ultragray_workers.jobs.job import MAX_PRIORITY
 from ultragray_workers.jobs.kinds import KINDS, Specification
 
@@ -45,6 +46,7 @@ class AssessBody(Contract):
 
     poses: list[Pose] = described("At least one.", factory=list, error=InvalidPose)
     probe: Probe | None = described("Whose poses they are. Default: the scene's own.", None)
+    registration: str | None = registration_field()
 
     many_poses = staticmethod(_many_poses)
 
@@ -74,6 +76,7 @@ class RenderBody(FrameSettings):
 
     pose: Pose | None = described("One pose; rendered before frames of `poses` that wait.", None, error=InvalidPose)
     poses: list[Pose] | None = described("Many poses, answered together, in order.", None, error=InvalidPose)
+    registration: str | None = registration_field()
     dtype: Literal["uint8", "float32"] | None = described(
         "Of application/octet-stream; a dtype in the Accept header goes first. Default: uint8.", None
     )
@@ -124,6 +127,13 @@ class StreamMessage(Contract):
         low=0,
         high=2**64 - 1,
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class RegistrationBody(Registration):
+    """A registration, and the scene that its poses lead into."""
+
+    scene: str = described("Its name.")
 
 
 def _body_of(kind: str) -> type[Any]:

@@ -45,6 +45,7 @@ RENDER_HEADERS = {
     "X-Ultragray-Probe": "The probe that was used, JSON.",
     "X-Ultragray-Slice-Thickness-Mm": "As used: at the focus of the scene's beam; 0: a plane.",
     "X-Ultragray-Contact": "As used, air or pressure; absent where contact was assumed.",
+    "X-Ultragray-Registration": "That led the poses into the scene; absent where they were sent as they are.",
     "X-Ultragray-Confidence": "Of each pose, with commas; empty where the scene cannot tell.",
     "X-Ultragray-Extrapolation": "One pose only: distance_mm, angle_deg, confidence, supported_share, contact_share, "
     "JSON. Of many, npz holds them.",
@@ -105,8 +106,9 @@ async def render(request: Request) -> Response:
     def complete(settings: Resolved) -> Resolved:
         return planner.check_pixels(FORMATS["dicom"].shown(settings) if is_dicom else settings, len(poses))
 
-    plan = await planner.plan(scene, body, choice.encoding, complete=complete)
-    exact = await exact_poses(len(poses), lambda index: poses[index][1].exact(poses[index][0]))
+    plan = await planner.plan(scene, body, choice.encoding, registration=body.registration, complete=complete)
+    sent = await exact_poses(len(poses), lambda index: poses[index][1].exact(poses[index][0]))
+    exact = plan.placed(sent)
     priority = Priority.INTERACTIVE if body.poses is None else Priority.BATCH
 
     async def rendered() -> RenderResult:
@@ -151,10 +153,15 @@ def _settings_headers(settings: Resolved) -> dict[str, str]:
     """The headers that settings alone decide."""
     used = settings_used(settings)
     contact = {} if used.contact is None else {"X-Ultragray-Contact": used.contact.value}
-    return contact | {
-        "X-Ultragray-Dtype": settings.encoding.pixel_type.name,
-        "X-Ultragray-Outputs": ",".join(settings.outputs),
-        "X-Ultragray-Probe": json.dumps(to_dict(used.probe)),
-        "X-Ultragray-Slice-Thickness-Mm": repr(used.slice_thickness_mm),
-        "X-Ultragray-Picture": json.dumps(to_dict(used.picture)),
-    }
+    registration = {} if used.registration is None else {"X-Ultragray-Registration": used.registration}
+    return (
+        contact
+        | registration
+        | {
+            "X-Ultragray-Dtype": settings.encoding.pixel_type.name,
+            "X-Ultragray-Outputs": ",".join(settings.outputs),
+            "X-Ultragray-Probe": json.dumps(to_dict(used.probe)),
+            "X-Ultragray-Slice-Thickness-Mm": repr(used.slice_thickness_mm),
+            "X-Ultragray-Picture": json.dumps(to_dict(used.picture)),
+        }
+    )

@@ -50,7 +50,7 @@ async def assess_poses(request: Request, service: ServiceDep, scene: SceneName) 
     body = await read_json_body(request, AssessBody, AssessBody.many_poses(most))
     check_pose_count(len(body.poses), most)
     poses = await exact_poses(len(body.poses), lambda index: body.poses[index].exact(f"poses[{index}]"))
-    return await service.assessing.assess(scene, poses, body.probe)
+    return await service.assessing.assess(scene, poses, body.probe, body.registration)
 
 
 @router.post(

@@ -9,10 +9,10 @@ import numpy.typing as npt
 
 from ultragray_proto.v1 import rendering_pb2
 
-from .contract import Probe
-from .errors import InvalidArgument
-from .geometry import FloatArray, PoseLike, pose_message
-from .messages import message_of
+from ..contract import Probe
+from ..errors import InvalidArgument
+from ..geometry import FloatArray, PoseLike, pose_message
+from ..messages import message_of
 
 
 @dataclass(frozen=True, eq=False)
