@@ -32,7 +32,7 @@ from ultragray_workers.datasets.store import DatasetRecord
 from ultragray_workers.jobs.kinds import Specification
 
 PACKAGE = Path(__file__).resolve().parent / "ultragray_client"
-MODULES = ("client", "connection", "datasets", "jobs", "scenes", "stream", "workers")
+MODULES = ("client", "connection", "datasets", "jobs", "registrations", "scenes", "stream", "workers")
 
 # The classes that callers fill in or get, each with all that it is made of, and the names that the client gives them.
 ROOTS = {

@@ -11,6 +11,7 @@ from . import contract, errors
 from .access import AuditEntry, Me, Role
 from .aio.client import AsyncClient
 from .aio.stream import AsyncFrameStream
+from .calls.localization import Localization
 from .calls.pose_exchange import StreamMode
 from .calls.tls import Tls
 from .contract import *  # noqa: F403
@@ -18,6 +19,7 @@ from .errors import ClientError
 from .frames import Extrapolation, Frame, Picture, Slice, Timings
 from .geometry import Placement, PoseLike, Quaternion
 from .jobs import Job, JobError, JobEvent, JobProgress, JobState
+from .registrations import Registration
 from .scenes import ConfidenceFit, Scene, SceneEntry
 from .sync.client import Client
 from .sync.stream import FrameStream
@@ -38,11 +40,13 @@ __all__ = [
     "JobEvent",
     "JobProgress",
     "JobState",
+    "Localization",
     "Me",
     "Picture",
     "Placement",
     "PoseLike",
     "Quaternion",
+    "Registration",
     "Role",
     "Scene",
     "SceneEntry",

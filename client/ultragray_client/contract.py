@@ -278,6 +278,10 @@ class RenderSettings(FrameSettings):
 
     encoding: Encoding = Encoding.UINT8
     """Form of the pixels."""
+    registration: str | None = None
+    """Name of the registration by which the poses lead into the scene: they are then flange to base, or marker to
+    tracker. Default: they are probe to scene.
+    """
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -32,6 +32,7 @@ ClientError
 │   └── JobTimeExceeded
 ├── NotFound
 │   ├── SceneNotFound
+│   ├── RegistrationNotFound
 │   ├── DatasetNotFound
 │   ├── JobNotFound
 │   ├── WorkerNotFound
@@ -256,6 +257,12 @@ class SceneNotFound(NotFound):
     """No scene of that name."""
 
     reason = "SCENE_NOT_FOUND"
+
+
+class RegistrationNotFound(NotFound):
+    """No registration of that name."""
+
+    reason = "REGISTRATION_NOT_FOUND"
 
 
 class DatasetNotFound(NotFound):
@@ -484,6 +491,7 @@ ERRORS = (
     JobTimeExceeded,
     NotFound,
     SceneNotFound,
+    RegistrationNotFound,
     DatasetNotFound,
     JobNotFound,
     WorkerNotFound,

@@ -103,6 +103,7 @@ class Frame:
     contact: Contact | None = None  # as used; None: it was assumed
     tools: tuple[Tool, ...] = ()  # as used
     ghost: float = 0.0  # as used; 0: none
+    registration: str | None = None  # that led the pose into the scene; None: none, it was sent as it is
     display: Display | None = None  # as used; None: none was asked for
     dropped: int = 0  # in a stream: poses that newer ones replaced since the frame before
     latency_ms: float | None = None  # in a stream: from `measured_ns` of the pose to the arrival of the frame here

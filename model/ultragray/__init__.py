@@ -22,7 +22,8 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 if TYPE_CHECKING:
     from .errors import UltragrayError
-    from .localization import Localization, localize
+    from .localization.search import localize
+    from .localization.settings import Localization
     from .pose import check_poses, pose_from_position_quaternion, quaternion_from_pose
     from .probe import ConvexProbe, ElevationBeam, LinearProbe, PhasedProbe, Probe, RadialProbe, SteeredProbe
     from .rendering import Frames, render
@@ -53,7 +54,8 @@ __all__ = [
 
 _MODULES = {
     "errors": ("UltragrayError",),
-    "localization": ("Localization", "localize"),
+    "localization.search": ("localize",),
+    "localization.settings": ("Localization",),
     "pose": ("check_poses", "pose_from_position_quaternion", "quaternion_from_pose"),
     "probe": ("ConvexProbe", "ElevationBeam", "LinearProbe", "PhasedProbe", "Probe", "RadialProbe", "SteeredProbe"),
     "rendering": ("Frames", "render"),

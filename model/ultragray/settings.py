@@ -147,11 +147,21 @@ class FrameSettings(Contract):
         )
 
 
+def registration_field() -> Any:
+    """The field that names a registration, of what poses come with."""
+    return described(
+        "Name of the registration by which the poses lead into the scene: they are then flange to base, or marker to "
+        "tracker. Default: they are probe to scene.",
+        None,
+    )
+
+
 @dataclass(frozen=True, kw_only=True)
 class RenderSettings(FrameSettings):
     """Settings with an encoding, for doors where neither an Accept header nor a file format decides it."""
 
     encoding: Encoding = described("Form of the pixels.", Encoding.UINT8, choices=tuple(FRAME_ENCODINGS))
+    registration: str | None = registration_field()
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -177,6 +187,7 @@ class Resolved:
     contact: Contact | None = None
     tools: tuple[Tool, ...] = ()
     ghost: float = 0.0
+    registration: str | None = None  # that led the poses into the scene
 
     @cached_property
     def picture(self) -> Picture:
@@ -185,7 +196,7 @@ class Resolved:
 
     @cached_property
     def view(self) -> tuple[Any, ...]:
-        """All but outputs and encoding: frames that agree in this can be rendered together."""
+        """All that shows but outputs and encoding: frames that agree in this can be rendered together."""
         asked = (self.display, self.min_confidence, self.below_min_confidence, self.contact)
         return (self.probe, self.beam, self.height, self.width, *asked, self.tools, self.ghost)
 

@@ -11,7 +11,16 @@ from google.protobuf.descriptor_pb2 import DescriptorProto, FileDescriptorProto,
 from google.protobuf.descriptor_pool import DescriptorPool
 from grpc_tools import protoc
 
-from ultragray_proto.v1 import access_pb2, datasets_pb2, geometry_pb2, jobs_pb2, rendering_pb2, scenes_pb2, workers_pb2
+from ultragray_proto.v1 import (
+    access_pb2,
+    datasets_pb2,
+    geometry_pb2,
+    jobs_pb2,
+    registrations_pb2,
+    rendering_pb2,
+    scenes_pb2,
+    workers_pb2,
+)
 
 from ..scripts import loaded
 
@@ -54,7 +63,16 @@ def test_descriptors_are_current(tmp_path: Path) -> None:
     pool = DescriptorPool()
     for file in FileDescriptorSet.FromString(output.read_bytes()).file:  # dependencies come first
         pool.AddSerializedFile(file.SerializeToString())
-    modules = (geometry_pb2, scenes_pb2, rendering_pb2, access_pb2, datasets_pb2, jobs_pb2, workers_pb2)
+    modules = (
+        geometry_pb2,
+        scenes_pb2,
+        rendering_pb2,
+        access_pb2,
+        datasets_pb2,
+        jobs_pb2,
+        workers_pb2,
+        registrations_pb2,
+    )
     assert len(modules) == len(sources)
     for module in modules:
         committed, expected = FileDescriptorProto(), FileDescriptorProto()

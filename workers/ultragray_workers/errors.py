@@ -16,6 +16,13 @@ class SceneNotFound(UltragrayError):
     title = "No such scene"
 
 
+class RegistrationNotFound(UltragrayError):
+    """No registration of that name."""
+
+    reason = "REGISTRATION_NOT_FOUND"
+    title = "No such registration"
+
+
 class DatasetNotFound(UltragrayError):
     """No dataset of that name."""
 

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import AsyncIterator, Iterable
 
+import numpy.typing as npt
+
 from ultragray_proto.codec import from_message
 from ultragray_proto.v1 import access_pb2, access_pb2_grpc, rendering_pb2, rendering_pb2_grpc
 
 from ..access import AuditEntry, Me
 from ..calls.batch import Batch
 from ..calls.connection import DEFAULT_ADDRESS, DEFAULT_TIMEOUT_S, ApiKey
+from ..calls.localization import Localization, localize_message
 from ..calls.pose_exchange import PoseExchange, StreamMode
 from ..calls.tls import Tls
 from ..contract import Probe, RenderSettings, SliceSettings
@@ -19,6 +22,7 @@ from ..messages import message_of
 from .connection import AsyncConnection
 from .datasets import AsyncDatasets
 from .jobs import AsyncJobs
+from .registrations import AsyncRegistrations
 from .scenes import AsyncScenes
 from .stream import AsyncFrameStream
 from .workers import AsyncWorkers
@@ -54,6 +58,7 @@ class AsyncClient:
         self.datasets = AsyncDatasets(self._connection)
         self.jobs = AsyncJobs(self._connection)
         self.workers = AsyncWorkers(self._connection)
+        self.registrations = AsyncRegistrations(self._connection)
 
     async def render(
         self, scene: str, pose: PoseLike, settings: RenderSettings | None = None, *, timeout_s: float | None = None
@@ -120,18 +125,50 @@ class AsyncClient:
         return slice_from_message(await self._connection.answer(self._calls.RenderSlice, request, timeout_s))
 
     async def assess_poses(
-        self, scene: str, poses: Iterable[PoseLike], probe: Probe | None = None, *, timeout_s: float | None = None
+        self,
+        scene: str,
+        poses: Iterable[PoseLike],
+        probe: Probe | None = None,
+        *,
+        registration: str | None = None,
+        timeout_s: float | None = None,
     ) -> tuple[Extrapolation, ...]:
         """How far frames at these poses of a probe (None: the scene's own) would extrapolate, without rendering any.
+
+        With a `registration` they are poses of the flange in its base.
 
         `supported_share` is None: only a rendered frame tells it. Raises SceneNotFound, InvalidPose, InvalidProbe,
         TooManyPoses.
         """
         request = message_of(
-            {"probe": probe}, rendering_pb2.AssessPosesRequest, scene=scene, poses=list(pose_messages(poses))
+            {"probe": probe, "registration": registration},
+            rendering_pb2.AssessPosesRequest,
+            scene=scene,
+            poses=list(pose_messages(poses)),
         )
         answer = await self._connection.answer(self._calls.AssessPoses, request, timeout_s)
         return tuple(from_message(one, Extrapolation) for one in answer.extrapolations)
+
+    async def localize(
+        self,
+        scene: str,
+        image: npt.ArrayLike | bytes,
+        start: PoseLike,
+        *,
+        probe: Probe | None = None,
+        within_mm: float = 3.0,
+        within_deg: float = 5.0,
+        timeout_s: float | None = None,
+    ) -> Localization:
+        """Where in a scene a real frame was taken, looked for about `start`, which may be off by the two `within`.
+
+        `image`: grey values [H, W], uint8 or in [0, 1], or the bytes of a PNG file; rows along depth, columns across
+        scan lines, not scan-converted. `probe` took it (None: the scene's own). `is_found` of the answer says whether
+        its pose can be used. Raises SceneNotFound, InvalidArgument and its kinds, QueueFull, DeadlineExceeded.
+        """
+        request = localize_message(scene, image, start, probe, within_mm, within_deg)
+        answer = await self._connection.answer(self._calls.Localize, request, timeout_s)
+        return from_message(answer, Localization)
 
     async def who_am_i(self, *, timeout_s: float | None = None) -> Me:
         """The name and the role that the key stands for."""

@@ -1,7 +1,9 @@
 """localize(): the pose at which a scene looks like a real frame, by Levenberg and Marquardt from coarse to fine.
 
-How each pixel changes with the pose comes from small frames on either side of it, twelve for a step. (On one side only
-they mislead: of ten frames of a liver three were found in place of ten.) A backward pass would tell how one number
+How each pixel changes with the pose comes from small frames on either side of it, twelve of them. (On one side only
+they mislead: of ten frames of a liver three were found in place of ten.) The steps that follow bring one frame each,
+which corrects the changes along the step (Broyden 1965); they are taken anew where such a step fails or has arrived,
+and after a few: of coarse frames, where the place is far, after each. A backward pass would tell how one number
 changes, the sum of all squares; to get on with that alone takes many times as many steps.
 """
 
@@ -21,14 +23,13 @@ from ..errors import InvalidArgument
 from ..image_size import check_image_size
 from ..limits import UNLIMITED, Limits
 from ..pose import check_poses
-from ..probe import FloatArray, Probe
+from ..probe import Probe
 from ..rendering import render
 from ..scene import GaussianScene
 from .appearance import Scale
 from .motion import Motions
+from .settings import NEAR_DEG, NEAR_MM, Localization, LocalizationSettings
 
-NEAR_MM, NEAR_DEG = 3.0, 5.0
-MOST_MM, MOST_DEG = 20.0, 30.0
 FOUND_SIMILARITY = 0.5
 SEED = 0
 BLOCKS = (8, 6)  # of the image, along depth and across, that err independently of each other
@@ -37,46 +38,34 @@ LEAST_PIXELS = 32  # of a side of a frame that can be found
 
 @dataclass(frozen=True)
 class Stage:
-    """At most so many steps at one scale. `probing_mm` is how far the frames on either side are taken from a pose."""
+    """At most so many steps at one scale.
+
+    `probing_mm` is how far the frames on either side are taken from a pose, and `corrected` how many steps may follow
+    before they are taken anew.
+    """
 
     rows: int
     columns: int
     smoothing_mm: float
     steps: int
     probing_mm: float
+    corrected: int
     kept: int  # of the poses that it begins with
 
 
-COARSE = Stage(64, 48, 3.0, 6, 1.0, 2)
+COARSE = Stage(64, 48, 3.0, 6, 1.0, 1, 2)
 FINER = (
-    Stage(64, 48, 1.5, 6, 0.6, 1),
-    Stage(128, 96, 0.8, 6, 0.3, 1),
-    Stage(128, 96, 0.5, 4, 0.2, 1),
+    Stage(64, 48, 1.5, 6, 0.6, 2, 1),
+    Stage(128, 96, 0.8, 8, 0.3, 4, 1),
+    Stage(128, 96, 0.5, 8, 0.2, 4, 1),
 )
 MOST_BEGUN = 6  # poses at the coarse stage
 MOST_TRIED = 64  # poses that are looked at before, where the start is less certain
 START_DAMPING, MORE_DAMPING, LESS_DAMPING = 1e-2, 6.0, 3.0
 LONGEST_STEP_MM = 4.0
 SHOWN_SIGMAS = 4.0  # of a Gaussian: what is farther from a plane does not show in it
-SHORT_STEP = 0.02  # of the smoothing: a stage whose steps are shorter has arrived
-
-
-@dataclass(frozen=True, eq=False)
-class Localization:
-    """Where a frame was taken, and how certain that is.
-
-    `similarity` is the correlation of the frame's structures with the scene's, from -1 to 1; `is_found` says whether it
-    is as high as only the right place has it. The standard deviations follow from how much the image changes with the
-    pose, and from what is left unexplained; they hold where `is_found` does.
-    """
-
-    pose: FloatArray  # [4, 4] mm, probe→scene
-    similarity: float
-    is_found: bool
-    position_std_mm: tuple[float, float, float]  # along the probe's lateral, elevation and axial axis
-    angle_std_deg: tuple[float, float, float]  # about them, through the middle of the image
-    shift_mm: float  # of the middle of the image from the start
-    turn_deg: float
+SHORT_STEP = 0.1  # of the smoothing: a stage whose steps are shorter has arrived
+SHORT_LAST_STEP = 0.02  # likewise, of the last stage
 
 
 def localize(
@@ -100,8 +89,7 @@ def localize(
     what render() raises.
     """
     frame = _checked_image(image)
-    _check_within(within_mm, "within_mm", MOST_MM)
-    _check_within(within_deg, "within_deg", MOST_DEG)
+    LocalizationSettings(within_mm=within_mm, within_deg=within_deg)
     first = torch.from_numpy(check_poses(start, field="start"))
     if len(first) != 1:
         raise InvalidArgument(f"start must be one pose, got {len(first)}", field="start")
@@ -124,19 +112,41 @@ def localize(
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """How well poses fit at a stage: mean squares of what is left, their slopes and curvatures by the six numbers."""
+    """How well poses fit at a stage."""
 
-    error: Tensor  # [K]
-    slope: Tensor  # [K, 6]
-    curvature: Tensor  # [K, 6, 6], Gauss and Newton's
+    poses: Tensor  # [K, 4, 4]
+    left: Tensor  # [K, pixels], of the frame
+    changes: Tensor  # [K, 6, pixels] per mm, of what is left by the six numbers
+    corrections: Tensor  # [K], of the changes since they were taken
 
-    def better_of(self, other: _Fit) -> tuple[Tensor, _Fit]:
-        """Where this one is better than another, [K], and the better of each."""
-        better = self.error < other.error
+    @property
+    def error(self) -> Tensor:  # [K]
+        """Mean squares of what is left."""
+        return self.left.square().mean(dim=1)
+
+    def after(self, steps: Tensor, poses: Tensor, left: Tensor) -> tuple[Tensor, _Fit]:  # [K, 6] mm
+        """Where steps led to something better, [K], and the fit at the better poses, its changes corrected."""
+        missed = left - self.left - (steps[:, None] @ self.changes)[:, 0]
+        along = steps / steps.square().sum(dim=1, keepdim=True).clamp(min=torch.finfo(torch.float64).tiny)
+        better = left.square().mean(dim=1) < self.error
         return better, _Fit(
-            torch.where(better, self.error, other.error),
-            torch.where(better[:, None], self.slope, other.slope),
-            torch.where(better[:, None, None], self.curvature, other.curvature),
+            torch.where(better[:, None, None], poses, self.poses),
+            torch.where(better[:, None], left, self.left),
+            self.changes + along[..., None] * missed[:, None],
+            self.corrections + 1,
+        )
+
+    def replaced(self, which: Tensor, other: _Fit) -> _Fit:  # [K], of poses that the other has
+        """The fit, some of whose poses have been taken anew."""
+
+        def placed(old: Tensor, new: Tensor) -> Tensor:
+            return old.index_put((which,), new)
+
+        return _Fit(
+            self.poses,
+            placed(self.left, other.left),
+            placed(self.changes, other.changes),
+            placed(self.corrections, other.corrections),
         )
 
 
@@ -159,24 +169,30 @@ class _Search:
     def improve(self, poses: Tensor, stage: Stage) -> Tensor:  # [K, 4, 4] -> the best `kept`
         """Steps of Levenberg and Marquardt for all poses at once."""
         scale, target = self._at(stage)
-        fit = self._fit(poses, stage, scale, target)
+        fit = self._linearised(poses, stage, scale, target)
         damping = torch.full((len(poses),), START_DAMPING, dtype=torch.float64)
+        short_mm = stage.smoothing_mm * (SHORT_LAST_STEP if stage is FINER[-1] else SHORT_STEP)
         for _ in range(stage.steps):
             steps = _step(fit, damping)
-            if float(steps.norm(dim=1).max()) < SHORT_STEP * stage.smoothing_mm:
+            has_arrived = steps.norm(dim=1) < short_mm
+            was_fresh = fit.corrections == 0
+            if bool((has_arrived & was_fresh).all()):
                 break
-            tried = self._motions.moved(poses, steps)
-            better, fit = self._fit(tried, stage, scale, target).better_of(fit)
-            poses = torch.where(better[:, None, None], tried, poses)
-            damping = torch.where(better, damping / LESS_DAMPING, damping * MORE_DAMPING)
-        return poses[fit.error.argsort(stable=True)[: stage.kept]]
+            tried = self._motions.moved(fit.poses, steps)
+            better, fit = fit.after(steps, tried, self._left(tried, scale, target))
+            is_misled = ~better & ~was_fresh
+            damping = torch.where(better, damping / LESS_DAMPING, damping * torch.where(is_misled, 1.0, MORE_DAMPING))
+            doubtful = is_misled | (has_arrived & ~was_fresh) | (better & (fit.corrections >= stage.corrected))
+            if doubtful.any():
+                fit = fit.replaced(doubtful, self._linearised(fit.poses[doubtful], stage, scale, target))
+        return fit.poses[fit.error.argsort(stable=True)[: stage.kept]]
 
     def result(self, pose: Tensor, start: Tensor) -> Localization:
         """What is told of the best pose, by the last stage."""
         scale, target = self._at(FINER[-1])
-        left, changes = self._linearised(pose[None], FINER[-1], scale, target)
-        similarity = _correlation(left[0] + target.reshape(-1), target.reshape(-1))
-        deviations = _deviations(left[0].reshape(target.shape), changes[0].reshape(6, *target.shape))
+        fit = self._linearised(pose[None], FINER[-1], scale, target)
+        similarity = _correlation(fit.left[0] + target.reshape(-1), target.reshape(-1))
+        deviations = _deviations(fit.left[0].reshape(target.shape), fit.changes[0].reshape(6, *target.shape))
         shift_mm, turn_deg = self._motions.step_between(start, pose)
         return Localization(
             pose=pose.numpy(),
@@ -198,27 +214,25 @@ class _Search:
         frames = self._rendered(poses, scale.rows, scale.columns)
         return (scale.appearance(frames) - target).reshape(len(poses), -1).double()
 
-    def _fit(self, poses: Tensor, stage: Stage, scale: Scale, target: Tensor) -> _Fit:
-        left, changes = self._linearised(poses, stage, scale, target)
-        pixels = left.shape[-1]
-        slope = (changes @ left[..., None])[..., 0] / pixels
-        return _Fit(left.square().mean(dim=1), slope, changes @ changes.mT / pixels)
-
-    def _linearised(self, poses: Tensor, stage: Stage, scale: Scale, target: Tensor) -> tuple[Tensor, Tensor]:
-        """What is left of the frame at poses, [K, pixels], and how the six numbers change it, [K, 6, pixels] per mm."""
+    def _linearised(self, poses: Tensor, stage: Stage, scale: Scale, target: Tensor) -> _Fit:  # [K, 4, 4]
+        """The fit at poses."""
         beside = stage.probing_mm * torch.eye(6, dtype=torch.float64)
         steps = torch.cat([torch.zeros(1, 6, dtype=torch.float64), beside, -beside])
         around = self._motions.moved(poses[:, None].expand(-1, len(steps), -1, -1), steps.expand(len(poses), -1, -1))
         left = self._left(around.reshape(-1, 4, 4), scale, target).reshape(len(poses), len(steps), -1)
-        return left[:, 0], (left[:, 1:7] - left[:, 7:]) / (2.0 * stage.probing_mm)
+        changes = (left[:, 1:7] - left[:, 7:]) / (2.0 * stage.probing_mm)
+        return _Fit(poses, left[:, 0], changes, torch.zeros(len(poses), dtype=torch.int64))
 
 
 def _step(fit: _Fit, damping: Tensor) -> Tensor:  # [K] -> [K, 6] mm
     """Downhill, damped by the curvature of each number, and not too far."""
-    own = fit.curvature.diagonal(dim1=1, dim2=2)
+    pixels = fit.left.shape[-1]
+    slope = (fit.changes @ fit.left[..., None]) / pixels
+    curvature = fit.changes @ fit.changes.mT / pixels  # Gauss and Newton's
+    own = curvature.diagonal(dim1=1, dim2=2)
     floor = 1e-2 * own.mean(dim=1, keepdim=True) + torch.finfo(torch.float64).tiny
-    damped = fit.curvature + torch.diag_embed(damping[:, None] * (own + floor) + 1e-9 * floor)
-    downhill: Tensor = -torch.linalg.lstsq(damped, fit.slope[..., None]).solution[..., 0]
+    damped = curvature + torch.diag_embed(damping[:, None] * (own + floor) + 1e-9 * floor)
+    downhill: Tensor = -torch.linalg.lstsq(damped, slope).solution[..., 0]
     shortened: Tensor = downhill * (LONGEST_STEP_MM / downhill.norm(dim=1, keepdim=True).clamp(min=LONGEST_STEP_MM))
     return shortened
 
@@ -267,11 +281,6 @@ def _checked_image(image: Any) -> Tensor:  # [H, W] in [0, 1], float32
     if not np.isfinite(grey).all() or grey.min() < 0.0 or grey.max() > 1.0:
         raise InvalidArgument("image must hold finite values in [0, 1], or uint8", field="image")
     return torch.from_numpy(grey)
-
-
-def _check_within(value: float, field: str, most: float) -> None:
-    if not 0.0 < value <= most:
-        raise InvalidArgument(f"{field} must be above 0 and at most {most:g}, got {value}", field=field)
 
 
 def _deviations(left: Tensor, changes: Tensor) -> Tensor:  # [H, W], [6, H, W] per mm -> [6] mm

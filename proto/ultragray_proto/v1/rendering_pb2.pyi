@@ -69,7 +69,7 @@ STREAM_MODE_ORDERED: StreamMode
 STREAM_MODE_LATEST: StreamMode
 
 class RenderSettings(_message.Message):
-    __slots__ = ("scene", "height", "width", "outputs", "encoding", "probe", "display", "min_confidence", "below_min_confidence", "slice_thickness_mm", "contact", "tools", "ghost")
+    __slots__ = ("scene", "height", "width", "outputs", "encoding", "probe", "display", "min_confidence", "below_min_confidence", "slice_thickness_mm", "contact", "tools", "ghost", "registration")
     SCENE_FIELD_NUMBER: _ClassVar[int]
     HEIGHT_FIELD_NUMBER: _ClassVar[int]
     WIDTH_FIELD_NUMBER: _ClassVar[int]
@@ -83,6 +83,7 @@ class RenderSettings(_message.Message):
     CONTACT_FIELD_NUMBER: _ClassVar[int]
     TOOLS_FIELD_NUMBER: _ClassVar[int]
     GHOST_FIELD_NUMBER: _ClassVar[int]
+    REGISTRATION_FIELD_NUMBER: _ClassVar[int]
     scene: str
     height: int
     width: int
@@ -96,7 +97,8 @@ class RenderSettings(_message.Message):
     contact: Contact
     tools: _containers.RepeatedCompositeFieldContainer[_geometry_pb2.Tool]
     ghost: float
-    def __init__(self, scene: _Optional[str] = ..., height: _Optional[int] = ..., width: _Optional[int] = ..., outputs: _Optional[_Iterable[_Union[Output, str]]] = ..., encoding: _Optional[_Union[Encoding, str]] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., display: _Optional[_Union[Display, _Mapping]] = ..., min_confidence: _Optional[float] = ..., below_min_confidence: _Optional[_Union[BelowConfidence, str]] = ..., slice_thickness_mm: _Optional[float] = ..., contact: _Optional[_Union[Contact, str]] = ..., tools: _Optional[_Iterable[_Union[_geometry_pb2.Tool, _Mapping]]] = ..., ghost: _Optional[float] = ...) -> None: ...
+    registration: str
+    def __init__(self, scene: _Optional[str] = ..., height: _Optional[int] = ..., width: _Optional[int] = ..., outputs: _Optional[_Iterable[_Union[Output, str]]] = ..., encoding: _Optional[_Union[Encoding, str]] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., display: _Optional[_Union[Display, _Mapping]] = ..., min_confidence: _Optional[float] = ..., below_min_confidence: _Optional[_Union[BelowConfidence, str]] = ..., slice_thickness_mm: _Optional[float] = ..., contact: _Optional[_Union[Contact, str]] = ..., tools: _Optional[_Iterable[_Union[_geometry_pb2.Tool, _Mapping]]] = ..., ghost: _Optional[float] = ..., registration: _Optional[str] = ...) -> None: ...
 
 class Extrapolation(_message.Message):
     __slots__ = ("distance_mm", "angle_deg", "confidence", "supported_share", "contact_share")
@@ -113,20 +115,80 @@ class Extrapolation(_message.Message):
     def __init__(self, distance_mm: _Optional[float] = ..., angle_deg: _Optional[float] = ..., confidence: _Optional[float] = ..., supported_share: _Optional[float] = ..., contact_share: _Optional[float] = ...) -> None: ...
 
 class AssessPosesRequest(_message.Message):
-    __slots__ = ("scene", "poses", "probe")
+    __slots__ = ("scene", "poses", "probe", "registration")
     SCENE_FIELD_NUMBER: _ClassVar[int]
     POSES_FIELD_NUMBER: _ClassVar[int]
     PROBE_FIELD_NUMBER: _ClassVar[int]
+    REGISTRATION_FIELD_NUMBER: _ClassVar[int]
     scene: str
     poses: _containers.RepeatedCompositeFieldContainer[_geometry_pb2.Pose]
     probe: _geometry_pb2.Probe
-    def __init__(self, scene: _Optional[str] = ..., poses: _Optional[_Iterable[_Union[_geometry_pb2.Pose, _Mapping]]] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ...) -> None: ...
+    registration: str
+    def __init__(self, scene: _Optional[str] = ..., poses: _Optional[_Iterable[_Union[_geometry_pb2.Pose, _Mapping]]] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., registration: _Optional[str] = ...) -> None: ...
 
 class AssessPosesResponse(_message.Message):
     __slots__ = ("extrapolations",)
     EXTRAPOLATIONS_FIELD_NUMBER: _ClassVar[int]
     extrapolations: _containers.RepeatedCompositeFieldContainer[Extrapolation]
     def __init__(self, extrapolations: _Optional[_Iterable[_Union[Extrapolation, _Mapping]]] = ...) -> None: ...
+
+class LocalizeRequest(_message.Message):
+    __slots__ = ("scene", "image", "image_height", "image_width", "start", "probe", "within_mm", "within_deg")
+    SCENE_FIELD_NUMBER: _ClassVar[int]
+    IMAGE_FIELD_NUMBER: _ClassVar[int]
+    IMAGE_HEIGHT_FIELD_NUMBER: _ClassVar[int]
+    IMAGE_WIDTH_FIELD_NUMBER: _ClassVar[int]
+    START_FIELD_NUMBER: _ClassVar[int]
+    PROBE_FIELD_NUMBER: _ClassVar[int]
+    WITHIN_MM_FIELD_NUMBER: _ClassVar[int]
+    WITHIN_DEG_FIELD_NUMBER: _ClassVar[int]
+    scene: str
+    image: bytes
+    image_height: int
+    image_width: int
+    start: _geometry_pb2.Pose
+    probe: _geometry_pb2.Probe
+    within_mm: float
+    within_deg: float
+    def __init__(self, scene: _Optional[str] = ..., image: _Optional[bytes] = ..., image_height: _Optional[int] = ..., image_width: _Optional[int] = ..., start: _Optional[_Union[_geometry_pb2.Pose, _Mapping]] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., within_mm: _Optional[float] = ..., within_deg: _Optional[float] = ...) -> None: ...
+
+class AlongAxes(_message.Message):
+    __slots__ = ("lateral", "elevation", "axial")
+    LATERAL_FIELD_NUMBER: _ClassVar[int]
+    ELEVATION_FIELD_NUMBER: _ClassVar[int]
+    AXIAL_FIELD_NUMBER: _ClassVar[int]
+    lateral: float
+    elevation: float
+    axial: float
+    def __init__(self, lateral: _Optional[float] = ..., elevation: _Optional[float] = ..., axial: _Optional[float] = ...) -> None: ...
+
+class LocalizeResponse(_message.Message):
+    __slots__ = ("scene", "scene_sha256", "renderer", "pose", "similarity", "is_found", "position_std_mm", "angle_std_deg", "shift_mm", "turn_deg", "queue_ms", "search_ms")
+    SCENE_FIELD_NUMBER: _ClassVar[int]
+    SCENE_SHA256_FIELD_NUMBER: _ClassVar[int]
+    RENDERER_FIELD_NUMBER: _ClassVar[int]
+    POSE_FIELD_NUMBER: _ClassVar[int]
+    SIMILARITY_FIELD_NUMBER: _ClassVar[int]
+    IS_FOUND_FIELD_NUMBER: _ClassVar[int]
+    POSITION_STD_MM_FIELD_NUMBER: _ClassVar[int]
+    ANGLE_STD_DEG_FIELD_NUMBER: _ClassVar[int]
+    SHIFT_MM_FIELD_NUMBER: _ClassVar[int]
+    TURN_DEG_FIELD_NUMBER: _ClassVar[int]
+    QUEUE_MS_FIELD_NUMBER: _ClassVar[int]
+    SEARCH_MS_FIELD_NUMBER: _ClassVar[int]
+    scene: str
+    scene_sha256: str
+    renderer: str
+    pose: _geometry_pb2.Matrix
+    similarity: float
+    is_found: bool
+    position_std_mm: AlongAxes
+    angle_std_deg: AlongAxes
+    shift_mm: float
+    turn_deg: float
+    queue_ms: float
+    search_ms: float
+    def __init__(self, scene: _Optional[str] = ..., scene_sha256: _Optional[str] = ..., renderer: _Optional[str] = ..., pose: _Optional[_Union[_geometry_pb2.Matrix, _Mapping]] = ..., similarity: _Optional[float] = ..., is_found: _Optional[bool] = ..., position_std_mm: _Optional[_Union[AlongAxes, _Mapping]] = ..., angle_std_deg: _Optional[_Union[AlongAxes, _Mapping]] = ..., shift_mm: _Optional[float] = ..., turn_deg: _Optional[float] = ..., queue_ms: _Optional[float] = ..., search_ms: _Optional[float] = ...) -> None: ...
 
 class Display(_message.Message):
     __slots__ = ("gain_db", "dynamic_range_db", "tgc_db", "depth_mm", "flip", "pixel_mm", "edge")
@@ -277,7 +339,7 @@ class RenderStreamRequest(_message.Message):
     def __init__(self, sequence: _Optional[int] = ..., settings: _Optional[_Union[RenderSettings, _Mapping]] = ..., pose: _Optional[_Union[_geometry_pb2.Pose, _Mapping]] = ..., mode: _Optional[_Union[StreamMode, str]] = ..., timeout_ms: _Optional[float] = ..., client_time_ns: _Optional[int] = ..., window: _Optional[int] = ..., acknowledged: _Optional[int] = ..., shared_memory: _Optional[_Union[SharedMemory, _Mapping]] = ...) -> None: ...
 
 class Frame(_message.Message):
-    __slots__ = ("sequence", "scene", "scene_sha256", "renderer", "pose", "probe", "slice_thickness_mm", "contact", "tools", "ghost", "height", "width", "outputs", "encoding", "data", "shared_data", "timings", "error", "dropped", "extrapolation", "display", "picture", "rendered_height", "rendered_width", "client_time_ns")
+    __slots__ = ("sequence", "scene", "scene_sha256", "renderer", "pose", "probe", "slice_thickness_mm", "contact", "tools", "ghost", "registration", "height", "width", "outputs", "encoding", "data", "shared_data", "timings", "error", "dropped", "extrapolation", "display", "picture", "rendered_height", "rendered_width", "client_time_ns")
     SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     SCENE_FIELD_NUMBER: _ClassVar[int]
     SCENE_SHA256_FIELD_NUMBER: _ClassVar[int]
@@ -288,6 +350,7 @@ class Frame(_message.Message):
     CONTACT_FIELD_NUMBER: _ClassVar[int]
     TOOLS_FIELD_NUMBER: _ClassVar[int]
     GHOST_FIELD_NUMBER: _ClassVar[int]
+    REGISTRATION_FIELD_NUMBER: _ClassVar[int]
     HEIGHT_FIELD_NUMBER: _ClassVar[int]
     WIDTH_FIELD_NUMBER: _ClassVar[int]
     OUTPUTS_FIELD_NUMBER: _ClassVar[int]
@@ -313,6 +376,7 @@ class Frame(_message.Message):
     contact: Contact
     tools: _containers.RepeatedCompositeFieldContainer[_geometry_pb2.Tool]
     ghost: float
+    registration: str
     height: int
     width: int
     outputs: _containers.RepeatedScalarFieldContainer[Output]
@@ -328,7 +392,7 @@ class Frame(_message.Message):
     rendered_height: int
     rendered_width: int
     client_time_ns: int
-    def __init__(self, sequence: _Optional[int] = ..., scene: _Optional[str] = ..., scene_sha256: _Optional[str] = ..., renderer: _Optional[str] = ..., pose: _Optional[_Union[_geometry_pb2.Matrix, _Mapping]] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., slice_thickness_mm: _Optional[float] = ..., contact: _Optional[_Union[Contact, str]] = ..., tools: _Optional[_Iterable[_Union[_geometry_pb2.Tool, _Mapping]]] = ..., ghost: _Optional[float] = ..., height: _Optional[int] = ..., width: _Optional[int] = ..., outputs: _Optional[_Iterable[_Union[Output, str]]] = ..., encoding: _Optional[_Union[Encoding, str]] = ..., data: _Optional[bytes] = ..., shared_data: _Optional[_Union[SharedData, _Mapping]] = ..., timings: _Optional[_Union[Timings, _Mapping]] = ..., error: _Optional[_Union[_scenes_pb2.Error, _Mapping]] = ..., dropped: _Optional[int] = ..., extrapolation: _Optional[_Union[Extrapolation, _Mapping]] = ..., display: _Optional[_Union[Display, _Mapping]] = ..., picture: _Optional[_Union[Picture, _Mapping]] = ..., rendered_height: _Optional[int] = ..., rendered_width: _Optional[int] = ..., client_time_ns: _Optional[int] = ...) -> None: ...
+    def __init__(self, sequence: _Optional[int] = ..., scene: _Optional[str] = ..., scene_sha256: _Optional[str] = ..., renderer: _Optional[str] = ..., pose: _Optional[_Union[_geometry_pb2.Matrix, _Mapping]] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., slice_thickness_mm: _Optional[float] = ..., contact: _Optional[_Union[Contact, str]] = ..., tools: _Optional[_Iterable[_Union[_geometry_pb2.Tool, _Mapping]]] = ..., ghost: _Optional[float] = ..., registration: _Optional[str] = ..., height: _Optional[int] = ..., width: _Optional[int] = ..., outputs: _Optional[_Iterable[_Union[Output, str]]] = ..., encoding: _Optional[_Union[Encoding, str]] = ..., data: _Optional[bytes] = ..., shared_data: _Optional[_Union[SharedData, _Mapping]] = ..., timings: _Optional[_Union[Timings, _Mapping]] = ..., error: _Optional[_Union[_scenes_pb2.Error, _Mapping]] = ..., dropped: _Optional[int] = ..., extrapolation: _Optional[_Union[Extrapolation, _Mapping]] = ..., display: _Optional[_Union[Display, _Mapping]] = ..., picture: _Optional[_Union[Picture, _Mapping]] = ..., rendered_height: _Optional[int] = ..., rendered_width: _Optional[int] = ..., client_time_ns: _Optional[int] = ...) -> None: ...
 
 class SharedData(_message.Message):
     __slots__ = ("slot", "bytes")

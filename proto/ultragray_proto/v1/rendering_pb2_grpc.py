@@ -54,6 +54,11 @@ class RenderServiceStub:
                 request_serializer=ultragray_dot_v1_dot_rendering__pb2.RenderSliceRequest.SerializeToString,
                 response_deserializer=ultragray_dot_v1_dot_rendering__pb2.Slice.FromString,
                 _registered_method=True)
+        self.Localize = channel.unary_unary(
+                '/ultragray.v1.RenderService/Localize',
+                request_serializer=ultragray_dot_v1_dot_rendering__pb2.LocalizeRequest.SerializeToString,
+                response_deserializer=ultragray_dot_v1_dot_rendering__pb2.LocalizeResponse.FromString,
+                _registered_method=True)
         self.RenderStream = channel.stream_stream(
                 '/ultragray.v1.RenderService/RenderStream',
                 request_serializer=ultragray_dot_v1_dot_rendering__pb2.RenderStreamRequest.SerializeToString,
@@ -91,6 +96,14 @@ class RenderServiceServicer:
     def RenderSlice(self, request, context):
         """A field of a scene on any plane, without a probe. It waits and counts as a frame does. SCENE_NOT_FOUND,
         INVALID_ARGUMENT, INVALID_IMAGE_SIZE, FRAME_TOO_COSTLY, QUEUE_FULL.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def Localize(self, request, context):
+        """Where in a scene a real frame was taken: its pose, looked for about one that is about right. It waits behind frames of
+        interactive callers, and counts as 100 frames of the key's limit.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -135,6 +148,11 @@ def add_RenderServiceServicer_to_server(servicer, server):
                     servicer.RenderSlice,
                     request_deserializer=ultragray_dot_v1_dot_rendering__pb2.RenderSliceRequest.FromString,
                     response_serializer=ultragray_dot_v1_dot_rendering__pb2.Slice.SerializeToString,
+            ),
+            'Localize': grpc.unary_unary_rpc_method_handler(
+                    servicer.Localize,
+                    request_deserializer=ultragray_dot_v1_dot_rendering__pb2.LocalizeRequest.FromString,
+                    response_serializer=ultragray_dot_v1_dot_rendering__pb2.LocalizeResponse.SerializeToString,
             ),
             'RenderStream': grpc.stream_stream_rpc_method_handler(
                     servicer.RenderStream,
@@ -250,6 +268,33 @@ class RenderService:
             '/ultragray.v1.RenderService/RenderSlice',
             ultragray_dot_v1_dot_rendering__pb2.RenderSliceRequest.SerializeToString,
             ultragray_dot_v1_dot_rendering__pb2.Slice.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def Localize(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/ultragray.v1.RenderService/Localize',
+            ultragray_dot_v1_dot_rendering__pb2.LocalizeRequest.SerializeToString,
+            ultragray_dot_v1_dot_rendering__pb2.LocalizeResponse.FromString,
             options,
             channel_credentials,
             insecure,

@@ -46,12 +46,14 @@ class Operation:
 
 _READER, _OPERATOR, _ADMIN = Role.READER, Role.OPERATOR, Role.ADMIN
 _SCENE, _DATASET, _JOB, _WORKER = Kind.SCENE, Kind.DATASET, Kind.JOB, Kind.WORKER
+_REGISTRATION = Kind.REGISTRATION
 
 OPERATIONS = (
     # Frames come first: their route is the one that must be found fast.
     Operation("render", _READER, ("POST /v1/scenes/{scene}/render",), ("RenderService/Render",), _SCENE),
     Operation("slice", _READER, ("POST /v1/scenes/{scene}:slice",), ("RenderService/RenderSlice",), _SCENE),
     Operation("render.batch", _READER, (), ("RenderService/RenderBatch",), _SCENE),
+    Operation("scene.localize", _READER, ("POST /v1/scenes/{scene}:localize",), ("RenderService/Localize",), _SCENE),
     Operation(STREAM, _READER, (f"{WEBSOCKET} /v1/scenes/{{scene}}/stream",), ("RenderService/RenderStream",), _SCENE),
     Operation("stream.list", _READER, ("GET /v1/streams",)),
     Operation(WATCH, _READER, (f"{WEBSOCKET} /v1/streams/{{stream}}/watch",)),
@@ -76,6 +78,28 @@ OPERATIONS = (
     Operation("scene.unload", _OPERATOR, ("POST /v1/scenes/{scene}:unload",), ("SceneService/UnloadScene",), _SCENE),
     Operation("scene.import", _OPERATOR, ("PUT /v1/scenes/{scene}",), (), _SCENE),
     Operation("scene.delete", _OPERATOR, ("DELETE /v1/scenes/{scene}",), (), _SCENE, owned=True),
+    Operation("registration.list", _READER, ("GET /v1/registrations",), ("RegistrationService/ListRegistrations",)),
+    Operation(
+        "registration.get",
+        _READER,
+        ("GET /v1/registrations/{registration}",),
+        ("RegistrationService/GetRegistration",),
+        _REGISTRATION,
+    ),
+    Operation(
+        "registration.put",
+        _OPERATOR,
+        ("PUT /v1/registrations/{registration}",),
+        ("RegistrationService/PutRegistration",),
+        _REGISTRATION,
+    ),
+    Operation(
+        "registration.delete",
+        _OPERATOR,
+        ("DELETE /v1/registrations/{registration}",),
+        ("RegistrationService/DeleteRegistration",),
+        _REGISTRATION,
+    ),
     Operation("dataset.list", _READER, ("GET /v1/datasets",), ("DatasetService/ListDatasets",)),
     Operation(
         "dataset.get",

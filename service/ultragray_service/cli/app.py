@@ -22,6 +22,7 @@ class _Commands(LazyGroup):
         Entry("render", "scenes.render", _SCENES, "Render frames from poses into one file or a folder of PNGs."),
         Entry("export", "scenes.export", _SCENES, "Write a scene as PLY or as a checkpoint of the released code."),
         Entry("localize", "scenes.localize", _SCENES, "Find the pose of a real frame in a scene."),
+        Entry("calibrate", "scenes.calibrate", _SCENES, "Register a robot or tracker to a scene."),
         Entry("voxelize", "scenes.voxelize", _SCENES, "Sample a scene on a grid: a NIfTI or NRRD volume, or a slice."),
         Entry("slicer", "scenes.slicer", _SCENES, "Write a scene file of 3D Slicer that shows a served scene live."),
         Entry("import", "scenes.importing", _SCENES, "Turn a PLY file or a released checkpoint into a scene file."),

@@ -77,6 +77,7 @@ class SettingsUsed:
     contact: Contact | None = described("As used; none: it was assumed.", None)
     tools: tuple[Tool, ...] = described("As used.", ())
     ghost: float = described("As used; 0: none.", 0.0)
+    registration: str | None = described("That led the pose into the scene; null: none, it was sent as it is.", None)
     rendered_height: int = described("Depth samples, before the display settings were applied.")
     rendered_width: int = described("Scan lines, likewise.")
     display: Display = described("As used.", AS_RENDERED)
@@ -173,6 +174,7 @@ def settings_used(settings: Resolved) -> SettingsUsed:
         contact=settings.contact,
         tools=settings.tools,
         ghost=settings.ghost,
+        registration=settings.registration,
         rendered_height=settings.height,
         rendered_width=settings.width,
         display=settings.display,

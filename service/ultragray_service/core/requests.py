@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from contextlib import nullcontext
+from dataclasses import replace
 from functools import lru_cache
 from typing import Generic
 
 from ultragray.contract import join, under
 from ultragray.errors import InvalidImageSize, TooManyPoses
+from ultragray.probe import FloatArray
+from ultragray.registration.registration import Registration
 from ultragray.scene_info import SceneInfo
 from ultragray.settings import Encoding, FrameSettings, Resolved
 from ultragray.volumes.names import check_field
@@ -33,13 +36,25 @@ class Plan(Generic[S]):
     settings: S
     version: FileVersion
 
-    def __init__(self, catalog: SceneCatalog, scene: str, resolve: Callable[[SceneInfo], S], path: str) -> None:
+    def __init__(
+        self,
+        catalog: SceneCatalog,
+        scene: str,
+        resolve: Callable[[SceneInfo], S],
+        path: str,
+        registration: Registration | None = None,
+    ) -> None:
         """`path`: the place of the settings in the client's message, for errors. To be renewed before it is used."""
         self.scene = base_name(scene)
         self._asked = scene
         self._catalog = catalog
         self._resolve = resolve
         self._path = path
+        self._registration = registration
+
+    def placed(self, poses: FloatArray) -> FloatArray:  # [..., 4, 4] mm, exact, both
+        """The poses probe→scene of those that the client sent."""
+        return poses if self._registration is None else self._registration.probe_to_scene(poses)
 
     async def renew(self) -> None:
         """Resolves the settings for the scene as it is now. Raises what RequestPlanner.plan raises."""
@@ -56,9 +71,16 @@ def as_resolved(settings: Resolved) -> Resolved:
 class RequestPlanner:
     """Checks requests against the scenes and the limits of the service."""
 
-    def __init__(self, settings: Settings, catalog: SceneCatalog) -> None:
+    def __init__(
+        self,
+        settings: Settings,
+        catalog: SceneCatalog,
+        registration: Callable[[str, str], Awaitable[Registration]],
+    ) -> None:
+        """`registration`: finds that of a name, for a scene."""
         self._settings = settings
         self._catalog = catalog
+        self._registration = registration
 
     @property
     def max_poses(self) -> int:
@@ -77,14 +99,24 @@ class RequestPlanner:
         encoding: Encoding,
         *,
         path: str = "",
+        registration: str | None = None,
         complete: Callable[[Resolved], Resolved] = as_resolved,
     ) -> Plan:
         """The settings for a scene, with nothing left open; `complete` checks or adds what only the door knows.
 
-        Raises SceneNotFound, SceneFileInvalid, InvalidProbe, InvalidImageSize, UnknownOutput, InvalidArgument, and what
-        `complete` raises; `path` is the place of the settings in the client's message.
+        Raises SceneNotFound, SceneFileInvalid, InvalidProbe, InvalidImageSize, UnknownOutput, InvalidArgument,
+        RegistrationNotFound, and what `complete` raises; `path` is the place of the settings in the client's message.
         """
-        plan = Plan(self._catalog, scene, lambda info: complete(self._resolved(info, asked, encoding)), path)
+        found = None
+        if registration is not None:
+            with under(path) if path else nullcontext():
+                await self._catalog.header(scene)
+                found = await self._registration(registration, scene)
+
+        def resolved(info: SceneInfo) -> Resolved:
+            return complete(self._resolved(info, asked, encoding, registration))
+
+        plan = Plan(self._catalog, scene, resolved, path, found)
         await plan.renew()
         return plan
 
@@ -113,8 +145,11 @@ class RequestPlanner:
         await plan.renew()
         return plan
 
-    def _resolved(self, info: SceneInfo, asked: FrameSettings, encoding: Encoding) -> Resolved:
-        settings = _the_same(asked.resolved(info, encoding, max_image_side=self._settings.max_image_side))
+    def _resolved(
+        self, info: SceneInfo, asked: FrameSettings, encoding: Encoding, registration: str | None
+    ) -> Resolved:
+        resolved = asked.resolved(info, encoding, max_image_side=self._settings.max_image_side)
+        settings = _the_same(resolved if registration is None else replace(resolved, registration=registration))
         with under("display"):
             pixels = settings.pixels
         if pixels > self._settings.max_request_pixels:

@@ -36,6 +36,7 @@ from ..access.rules import Operation
 from ..access.sessions import Sessions
 from ..access.snapshot import Snapshot
 from ..doors import Doors
+from ..registrations.registrations import Registrations
 from ..settings import Settings
 from ..telemetry.metrics import Metrics
 from ..telemetry.tracing import start_tracing
@@ -72,7 +73,6 @@ class Service:
         self.settings = settings
         self.scenes = store
         self.catalog = SceneCatalog(store)
-        self.planner = RequestPlanner(settings, self.catalog)
         self._keys = KnownKeys()
         self.tokens = OidcTokens.of(settings)
         sources: list[Authenticator] = [self._keys, EnvironmentKeys(settings.api_keys)]
@@ -115,6 +115,8 @@ class Service:
             lambda job_id: self.jobs.do(JobStore.ownership, job_id),
             {Kind.SCENE: store.require, Kind.DATASET: self.datasets.get},
         )
+        self.registrations = Registrations(self.catalog, self.owners)
+        self.planner = RequestPlanner(settings, self.catalog, self.registrations.of_scene)
         store.hides = partial(self.owners.hides, Kind.SCENE)
         self.datasets.hides = partial(self.owners.hides, Kind.DATASET)
         self.metrics = Metrics(self.pool, lambda: self.jobs.overview, self.places)
@@ -136,7 +138,7 @@ class Service:
         )
         self.dataset_views = DatasetViews(self.datasets, settings, pictures)
         self.comparisons = Comparisons(store, self.catalog, self.datasets, settings, pictures)
-        self.assessing = Assessing(self.catalog)
+        self.assessing = Assessing(self.catalog, self.registrations)
         self.training_views = TrainingViews(self.jobs, self.datasets, settings, pictures)
         self._prepared = (self.dataset_views, self.comparisons, self.training_views)
 
@@ -187,6 +189,7 @@ class Service:
         await self.jobs.open()
         self._snapshot = await asyncio.to_thread(Snapshot, self.jobs.database.engine, self._keys, self.owners)
         self.owners.open(self.jobs.database.engine, self.jobs.threads)
+        self.registrations.open(self.jobs.database.engine, self.jobs.threads)
         self.audit.open(self.jobs.database.engine)
         self._following_sessions = asyncio.create_task(self.sessions.follow())
         if self.tokens is not None:

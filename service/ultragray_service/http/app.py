@@ -27,14 +27,21 @@ from . import problems
 from .console import add_console
 from .docs import add_docs
 from .middleware import QUIET_PATHS, Authorize, CheckOrigin, LimitBody, RequestContext
-from .reading.bodies import SPECIFICATIONS, AssessBody, JobBody, RenderBody, StreamMessage
+from .reading.bodies import (
+    SPECIFICATIONS,
+    AssessBody,
+    JobBody,
+    LocalizeBody,
+    RegistrationBody,
+    RenderBody,
+    StreamMessage,
+)
 from .reading.json_body import adapter_of
 from .routes import (
     access,
     comparison,
     datasets,
     health,
-    probes,
     scene_files,
     scenes,
     service_info,
@@ -42,6 +49,7 @@ from .routes import (
     stream,
     streams,
 )
+from .routes.geometry import probes, registrations
 from .routes.jobs import jobs, training, workers
 from .routes.rendering import render, slices
 from .stream_messages import FrameMessage, RefusalMessage
@@ -72,6 +80,7 @@ _ROUTERS = (
     scenes.router,
     scene_files.router,
     probes.router,
+    registrations.router,
     datasets.router,
     comparison.router,
     jobs.router,
@@ -88,6 +97,8 @@ _READ: tuple[Any, ...] = (
     RenderBody,
     SliceSettings,
     AssessBody,
+    LocalizeBody,
+    RegistrationBody,
     StreamMessage,
     JobBody,
     *SPECIFICATIONS,

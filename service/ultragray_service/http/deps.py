@@ -46,8 +46,8 @@ _MEANINGS = {
     401: "No API key, or an unknown one (UNAUTHENTICATED), where the service asks for one.",
     403: "The role of the key does not allow it, or it is somebody else's (PERMISSION_DENIED); the scene lies in the "
     "data folder, which is not the service's (SCENE_READ_ONLY).",
-    404: "No such scene, dataset, job, artifact or worker (SCENE_NOT_FOUND, DATASET_NOT_FOUND, JOB_NOT_FOUND, "
-    "ARTIFACT_NOT_FOUND, WORKER_NOT_FOUND).",
+    404: "No such scene, dataset, job, artifact, worker or registration (SCENE_NOT_FOUND, DATASET_NOT_FOUND, "
+    "JOB_NOT_FOUND, ARTIFACT_NOT_FOUND, WORKER_NOT_FOUND, REGISTRATION_NOT_FOUND).",
     406: "The Accept header allows no type that can hold the request (NOT_ACCEPTABLE).",
     409: "What is there already, or its state, does not allow it (DATASET_EXISTS, DATASET_IN_USE, SCENE_EXISTS, "
     "REQUEST_ID_CONFLICT, JOB_FINISHED, JOB_NOT_FINISHED, JOB_IN_USE).",

@@ -15,6 +15,8 @@ from ultragray_proto.v1 import (
     datasets_pb2_grpc,
     jobs_pb2,
     jobs_pb2_grpc,
+    registrations_pb2,
+    registrations_pb2_grpc,
     rendering_pb2,
     rendering_pb2_grpc,
     scenes_pb2,
@@ -34,6 +36,7 @@ from .interceptor import CallContext
 from .services.access import AccessService
 from .services.datasets import DatasetService
 from .services.jobs import JobService
+from .services.registrations import RegistrationService
 from .services.rendering import RenderService
 from .services.scenes import SceneService
 from .services.workers import WorkerService
@@ -50,12 +53,13 @@ _DATASETS = datasets_pb2.DESCRIPTOR.services_by_name["DatasetService"].full_name
 _JOBS = jobs_pb2.DESCRIPTOR.services_by_name["JobService"].full_name
 _ACCESS = access_pb2.DESCRIPTOR.services_by_name["AccessService"].full_name
 _WORKERS = workers_pb2.DESCRIPTOR.services_by_name["WorkerService"].full_name
-SERVICE_NAMES = (_SCENES, _RENDERING, _DATASETS, _JOBS, _ACCESS, _WORKERS)
+_REGISTRATIONS = registrations_pb2.DESCRIPTOR.services_by_name["RegistrationService"].full_name
+SERVICE_NAMES = (_SCENES, _RENDERING, _DATASETS, _JOBS, _ACCESS, _WORKERS, _REGISTRATIONS)
 
 
 def _methods() -> Iterator[str]:
     """Every method of our services, as calls name them."""
-    for file in (scenes_pb2, rendering_pb2, datasets_pb2, jobs_pb2, access_pb2, workers_pb2):
+    for file in (scenes_pb2, rendering_pb2, datasets_pb2, jobs_pb2, access_pb2, workers_pb2, registrations_pb2):
         for service in file.DESCRIPTOR.services_by_name.values():
             yield from (f"/{service.full_name}/{method.name}" for method in service.methods)
 
@@ -89,6 +93,7 @@ class GrpcServer:
         jobs_pb2_grpc.add_JobServiceServicer_to_server(JobService(service), self._server)
         access_pb2_grpc.add_AccessServiceServicer_to_server(AccessService(service), self._server)
         workers_pb2_grpc.add_WorkerServiceServicer_to_server(WorkerService(service), self._server)
+        registrations_pb2_grpc.add_RegistrationServiceServicer_to_server(RegistrationService(service), self._server)
         health_pb2_grpc.add_HealthServicer_to_server(self._health, self._server)
         reflection.enable_server_reflection(
             (*SERVICE_NAMES, health.SERVICE_NAME, reflection.SERVICE_NAME), self._server
@@ -118,6 +123,7 @@ class GrpcServer:
             _JOBS: parts.jobs.ready and parts.artifacts.ready,
             _WORKERS: parts.jobs.ready,
             _ACCESS: True,
+            _REGISTRATIONS: parts.jobs.ready,
         }
         for name, is_serving in serving.items():
             if self._told[name] is not is_serving:

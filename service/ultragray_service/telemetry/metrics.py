@@ -14,7 +14,7 @@ from prometheus_client.registry import Collector
 from ultragray.errors import UltragrayError
 from ultragray_workers.jobs.overview import JobsOverview
 from ultragray_workers.pool.pool import RenderPool
-from ultragray_workers.pool.types import RenderResult
+from ultragray_workers.pool.types import LocalizeResult, RenderResult
 
 from ..access.principal import acting
 from ..core.scene_places import ScenePlaces
@@ -148,6 +148,10 @@ class Metrics:
         self._render = seconds("ultragray_render_seconds", "Render time of the batch that a request was in.")
         self._encode = seconds("ultragray_encode_seconds", "Encoding time of a request's frames.")
         self._batch = histogram("ultragray_batch_poses", "Poses rendered together.", buckets=_POSES)
+        self._searches = counter(
+            "ultragray_searches", "Frames looked for in a scene, and whether they were found.", ["scene", "found"]
+        )
+        self._search = seconds("ultragray_search_seconds", "Time that looking for a frame took, without its wait.")
         self.registry.register(_PoolCollector(pool))
         self.registry.register(_JobsCollector(jobs))
         self.registry.register(_ScenesCollector(scenes))
@@ -195,6 +199,11 @@ class Metrics:
         self._encode.observe(result.encode_ms / 1000)
         self._batch.observe(result.batch_size)
         self.statistics.observe(len(result.poses), result.queue_ms, result.render_ms, result.encode_ms)
+
+    def observe_search(self, result: LocalizeResult) -> None:
+        """One frame that was looked for."""
+        self._searches.labels(self._label_of(result.scene), str(result.found.is_found).lower()).inc()
+        self._search.observe(result.search_ms / 1000)
 
     def _label_of(self, scene: str) -> str:
         """The name of a scene; OTHER_SCENES once so many had a label that more would fill the memory."""

@@ -11,6 +11,7 @@ from ultragray.probe import FloatArray, Probe
 from ultragray.scene_info import SceneHeader
 
 from ..core.catalog import SceneCatalog
+from ..registrations.registrations import Registrations
 
 
 @dataclass(frozen=True)
@@ -23,16 +24,24 @@ class Assessments:
 class Assessing:
     """Assesses the poses of one caller at a time, beside the event loop."""
 
-    def __init__(self, catalog: SceneCatalog) -> None:
-        self._catalog = catalog
+    def __init__(self, catalog: SceneCatalog, registrations: Registrations) -> None:
+        self._catalog, self._registrations = catalog, registrations
         self._turn = asyncio.Lock()
 
-    async def assess(self, scene: str, poses: FloatArray, probe: Probe | None) -> Assessments:  # [C, 4, 4] mm, exact
-        """The extrapolation of each pose of a probe (None: the scene's own).
+    async def assess(
+        self,
+        scene: str,
+        poses: FloatArray,  # [C, 4, 4] mm, exact
+        probe: Probe | None,
+        registration: str | None,
+    ) -> Assessments:
+        """The extrapolation of each pose of a probe (None: the scene's own), led into the scene by a registration.
 
-        Raises SceneNotFound, SceneFileInvalid, and InvalidProbe where no probe is known.
+        Raises SceneNotFound, SceneFileInvalid, RegistrationNotFound, and InvalidProbe where no probe is known.
         """
         header = await self._catalog.header(scene)
+        if registration is not None:
+            poses = (await self._registrations.of_scene(registration, scene)).probe_to_scene(poses)
         async with self._turn:
             return Assessments(await asyncio.to_thread(_assess, header, poses, probe))
 

@@ -14,7 +14,15 @@ from google.protobuf.message_factory import GetMessageClass
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
-from ultragray_proto.v1 import access_pb2, datasets_pb2, jobs_pb2, rendering_pb2, scenes_pb2, workers_pb2
+from ultragray_proto.v1 import (
+    access_pb2,
+    datasets_pb2,
+    jobs_pb2,
+    registrations_pb2,
+    rendering_pb2,
+    scenes_pb2,
+    workers_pb2,
+)
 from ultragray_service.access.principal import Role
 from ultragray_service.access.rules import GRPC_OPERATIONS, WEBSOCKET, HttpRules, Operation, require_all_methods
 from ultragray_service.core.state import Service
@@ -28,7 +36,7 @@ from .conftest import ROLES, Keyed
 STRANGERS = ("nobody", "wrong", "expired", "revoked")
 METHODS: dict[str, MethodDescriptor] = {
     f"/{service.full_name}/{method.name}": method
-    for module in (scenes_pb2, rendering_pb2, datasets_pb2, jobs_pb2, access_pb2, workers_pb2)
+    for module in (scenes_pb2, rendering_pb2, datasets_pb2, jobs_pb2, access_pb2, workers_pb2, registrations_pb2)
     for service in module.DESCRIPTOR.services_by_name.values()
     for method in service.methods
 }

@@ -57,6 +57,6 @@ def test_mistakes_are_told_in_one_line(tmp_path: Path) -> None:
     (tmp_path / "frame.dcm").touch()
     assert "must hold one pose, got 3" in refused("localize", DEMO_FILE, tmp_path / "text.png", "--start", start)
     np.save(start, demo_poses(1))
-    assert "it is no picture" in refused("localize", DEMO_FILE, tmp_path / "text.png", "--start", start)
+    assert "image must be a PNG file" in refused("localize", DEMO_FILE, tmp_path / "text.png", "--start", start)
     assert "must end in .png or .npy" in refused("localize", DEMO_FILE, tmp_path / "frame.dcm", "--start", start)
     assert "No such file" in refused("localize", DEMO_FILE, tmp_path / "gone.png", "--start", start)

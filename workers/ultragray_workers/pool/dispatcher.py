@@ -16,11 +16,12 @@ from ultragray.volumes.plane import SliceView
 
 from ..rounds import Rounds
 from .launcher import Launcher
-from .memory import MemoryPool
+from .memory import MemoryPool, write_at
 from .messages import (
     Answer,
     ForkWorker,
     LoadTask,
+    LocalizeTask,
     Outdated,
     PackTask,
     Rendered,
@@ -30,7 +31,7 @@ from .messages import (
     UnloadTask,
 )
 from .slot import Assignment, Command, Slot
-from .types import SceneChangedError
+from .types import SceneChangedError, Sought
 from .waiting import Packing, Part, Step, Ticket, WaitingQueue
 from .watchdog import Patience
 
@@ -133,9 +134,13 @@ class Dispatcher:
             step.ticket.batch_size = max(step.ticket.batch_size, sum(part.frames for part in parts))
             if step.ticket.memory is None:
                 step.ticket.memory = self._memories.acquire()
+                if (sought := step.ticket.request.sought) is not None:
+                    write_at(step.ticket.memory, memoryview(sought.image), 0)
         assignment = Assignment(steps=dict(enumerate(batch)), batch=tuple(batch))
         ticket = batch[0].ticket
-        if parts:
+        if parts and ticket.request.sought is not None:
+            slot.assign(_localize_task(ticket, ticket.request.sought), assignment, _descriptors([ticket.memory]))
+        elif parts:
             slot.assign(_task(ticket, parts), assignment, _descriptors(part.ticket.memory for part in parts))
         else:
             if ticket.archive is None:
@@ -238,6 +243,7 @@ def _summary(steps: list[Rendered]) -> Rendered:
         render_ms=sum(step.render_ms for step in steps),
         encode_ms=sum(step.encode_ms for step in steps),
         extrapolations=_extrapolations(steps),
+        found=steps[-1].found,
     )
 
 
@@ -260,6 +266,19 @@ def _task(ticket: Ticket, parts: list[Part]) -> RenderTask | SliceTask:
     request = ticket.request
     task = SliceTask if isinstance(request.settings, SliceView) else RenderTask
     return task(scene=request.scene, path=ticket.path, version=request.version, parts=found)
+
+
+def _localize_task(ticket: Ticket, sought: Sought) -> LocalizeTask:
+    request = ticket.request
+    return LocalizeTask(
+        scene=request.scene,
+        path=ticket.path,
+        version=request.version,
+        start=request.poses[0],
+        image_bytes=len(sought.image),
+        size=sought.size,
+        settings=sought.settings,
+    )
 
 
 def _pack_task(ticket: Ticket) -> PackTask:

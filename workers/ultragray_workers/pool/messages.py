@@ -7,6 +7,7 @@ from typing import Generic
 
 from ultragray.confidence import Extrapolation
 from ultragray.errors import UltragrayError
+from ultragray.localization.settings import Localization, LocalizationSettings
 from ultragray.probe import FloatArray
 from ultragray.settings import Resolved
 from ultragray.volumes.plane import SliceView
@@ -84,6 +85,19 @@ class SliceTask:
 
 
 @dataclass(frozen=True, eq=False)
+class LocalizeTask:
+    """Look for a real frame. The memory that holds it goes along."""
+
+    scene: str
+    path: str
+    version: FileVersion | None  # that the scene's file must have; None: any
+    start: FloatArray  # [4, 4] mm
+    image_bytes: int
+    size: tuple[int, int] | None  # height and width of grey pixels; None: it is a PNG file
+    settings: LocalizationSettings
+
+
+@dataclass(frozen=True, eq=False)
 class PackTask:
     """Make an .npz of rendered frames. The memory that holds them and the memory for it go along."""
 
@@ -106,7 +120,7 @@ class UnloadTask:
     scene: str
 
 
-Task = RenderTask | SliceTask | PackTask | LoadTask | UnloadTask
+Task = RenderTask | SliceTask | LocalizeTask | PackTask | LoadTask | UnloadTask
 
 
 @dataclass(frozen=True)
@@ -121,6 +135,7 @@ class Rendered:
     encode_ms: float
     first: int = 0  # pose of the request that the part begins with
     extrapolations: tuple[Extrapolation, ...] = ()  # of the part's poses
+    found: Localization | None = None  # of a frame that was looked for
 
 
 @dataclass(frozen=True)

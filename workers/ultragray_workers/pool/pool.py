@@ -11,10 +11,10 @@ import asyncio
 import logging
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from ultragray.contract import Contract, described
 from ultragray.errors import InvalidArgument, RenderFailed
@@ -26,12 +26,14 @@ from .channel import MAX_DESCRIPTORS
 from .dispatcher import Dispatcher
 from .launcher import Launcher
 from .memory import read_start
-from .messages import ForkWorker, LoadTask, UnloadTask
-from .types import RenderRequest, RenderResult, S, SceneChangedError
+from .messages import ForkWorker, LoadTask, Rendered, UnloadTask
+from .types import LocalizeResult, RenderRequest, RenderResult, S, SceneChangedError
 from .waiting import Expiry, Ticket, Turn, WaitingQueue
 from .watchdog import Patience
 
 logger = logging.getLogger(__name__)
+
+R = TypeVar("R")
 
 MAX_BATCH_POSES = MAX_DESCRIPTORS  # the memory of each part goes along with the task
 MAX_REPLY_BYTES = 2**31 - 2**20
@@ -148,23 +150,34 @@ class RenderPool:
         DeadlineExceeded, InvalidArgument, FrameTooCostly, SceneNotFound, SceneFileInvalid, SceneTooLarge,
         MemoryExceeded, RenderFailed; SceneChangedError where the request is for another version of the scene's file.
         """
+        result = await self._answered(request, turn or Turn(), _frames)
+        if self.on_rendered is not None:
+            self.on_rendered(result)
+        return result
+
+    async def localize(self, request: RenderRequest) -> LocalizeResult:
+        """Looks for the frame that the request has `sought`; its turn comes, and it ends, as that of a rendering does.
+
+        Raises what `render` raises; InvalidArgument and InvalidImageSize also for pixels that are no frame.
+        """
+        return await self._answered(request, Turn(), _place_found)
+
+    async def _answered(
+        self, request: RenderRequest[S], turn: Turn, read: Callable[[Ticket, Rendered], Awaitable[R]]
+    ) -> R:
+        """What `read` makes of the answer to a request, while the memory of the answer is there."""
         self._check_accepting()
         self._active += 1
         self._all_answered.clear()
-        turn = turn or Turn()
         try:
             for _ in range(MAX_SCENE_CHANGES):
                 try:
-                    result = await self._render(request, turn)
+                    return await self._answer(request, turn, read)
                 except SceneChangedError:
                     if request.version is not None:
                         raise
                     if turn.ticket is not None:
                         request = turn.ticket.request  # perhaps with newer poses
-                    continue
-                if self.on_rendered is not None:
-                    self.on_rendered(result)
-                return result
             raise RenderFailed(f"scene {request.scene!r} kept changing while it was being rendered", field="scene")
         finally:
             self._active -= 1
@@ -238,14 +251,18 @@ class RenderPool:
         if not self._started:
             raise NotReady("the service is starting; try again in a few seconds")
 
-    async def _render(self, request: RenderRequest[S], turn: Turn) -> RenderResult[S]:
+    async def _answer(
+        self, request: RenderRequest[S], turn: Turn, read: Callable[[Ticket, Rendered], Awaitable[R]]
+    ) -> R:
         with self._store.hold(request.scene) as path:
             if path is not None:
-                return await self._render_file(request, turn, path)
+                return await self._answer_of_file(request, turn, path, read)
         await asyncio.to_thread(self._store.path, request.scene)  # fetches it, or raises that there is none
         raise SceneChangedError
 
-    async def _render_file(self, request: RenderRequest[S], turn: Turn, path: Path) -> RenderResult[S]:
+    async def _answer_of_file(
+        self, request: RenderRequest[S], turn: Turn, path: Path, read: Callable[[Ticket, Rendered], Awaitable[R]]
+    ) -> R:
         turn.ticket = ticket = self._ticket(request, path)
         turn.expiry = Expiry(ticket, self._waiting)
         try:
@@ -253,28 +270,11 @@ class RenderPool:
             self._dispatcher.submit(ticket)
             rendered = await ticket.done
             self._renderer = rendered.renderer
-            place = None
-            if request.destination is not None:
-                place = request.destination.put(ticket.reply_memory, rendered.size)
-            data = b"" if place is not None else await _read(ticket.reply_memory, rendered.size)
+            return await read(ticket, rendered)
         finally:
             turn.expiry.cancel()
             self._open.discard(ticket)
             self._dispatcher.discard(ticket)
-        return RenderResult(
-            scene=request.scene,
-            scene_sha256=rendered.scene_sha256,
-            renderer=rendered.renderer,
-            settings=request.settings,
-            poses=ticket.request.poses,
-            data=data,
-            queue_ms=max(0.0, rendered.started - ticket.submitted) * 1000.0,
-            render_ms=rendered.render_ms,
-            encode_ms=rendered.encode_ms,
-            extrapolations=rendered.extrapolations,
-            batch_size=ticket.batch_size,
-            place=place,
-        )
 
     def _ticket(self, request: RenderRequest[S], path: Path) -> Ticket:
         """Raises InvalidArgument for a request that no reply can hold."""
@@ -298,6 +298,45 @@ class RenderPool:
             done=asyncio.get_running_loop().create_future(),
             submitted=time.monotonic(),
         )
+
+
+async def _frames(ticket: Ticket, rendered: Rendered) -> RenderResult[Any]:
+    """The frames of a request, taken from its memory."""
+    request, place = ticket.request, None
+    if request.destination is not None:
+        place = request.destination.put(ticket.reply_memory, rendered.size)
+    data = b"" if place is not None else await _read(ticket.reply_memory, rendered.size)
+    return RenderResult(
+        scene=request.scene,
+        scene_sha256=rendered.scene_sha256,
+        renderer=rendered.renderer,
+        settings=request.settings,
+        poses=request.poses,
+        data=data,
+        queue_ms=_queue_ms(ticket, rendered),
+        render_ms=rendered.render_ms,
+        encode_ms=rendered.encode_ms,
+        extrapolations=rendered.extrapolations,
+        batch_size=ticket.batch_size,
+        place=place,
+    )
+
+
+async def _place_found(ticket: Ticket, rendered: Rendered) -> LocalizeResult:
+    """Where the frame of a request was found."""
+    assert rendered.found is not None
+    return LocalizeResult(
+        scene=ticket.request.scene,
+        scene_sha256=rendered.scene_sha256,
+        renderer=rendered.renderer,
+        found=rendered.found,
+        queue_ms=_queue_ms(ticket, rendered),
+        search_ms=rendered.render_ms,
+    )
+
+
+def _queue_ms(ticket: Ticket, rendered: Rendered) -> float:
+    return max(0.0, rendered.started - ticket.submitted) * 1000.0
 
 
 async def _read(memory: int, size: int) -> bytes:

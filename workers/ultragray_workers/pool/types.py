@@ -9,6 +9,7 @@ from typing import Generic, Protocol
 from typing_extensions import TypeVar
 
 from ultragray.confidence import Extrapolation
+from ultragray.localization.settings import Localization, LocalizationSettings
 from ultragray.probe import FloatArray
 from ultragray.settings import Resolved
 from ultragray.volumes.plane import SliceView
@@ -42,8 +43,20 @@ class Destination(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
+class Sought:
+    """A real frame that is looked for in a scene. Its pixels are read, and checked, where it is looked for."""
+
+    image: bytes  # a PNG file, or uint8 row by row where there is a size
+    size: tuple[int, int] | None  # height and width
+    settings: LocalizationSettings
+
+
+@dataclass(frozen=True, eq=False)
 class RenderRequest(Generic[S]):
-    """Frames, or slices, of one scene for some poses; everything but the scene has been checked by the caller."""
+    """Frames, or slices, of one scene for some poses; everything but the scene has been checked by the caller.
+
+    With `sought` nothing is rendered for the one pose: it is where the search for that frame starts.
+    """
 
     scene: str
     settings: S
@@ -54,6 +67,7 @@ class RenderRequest(Generic[S]):
     caller: Caller = UNKNOWN_CALLER
     begin_by: float | None = None  # time.monotonic() in seconds; it is given up where none of it has begun by then
     destination: Destination | None = None  # of the reply; None: RenderResult.data
+    sought: Sought | None = None
 
 
 class SceneChangedError(Exception):
@@ -92,3 +106,15 @@ class RenderResult(Generic[S]):
     def width(self) -> int:
         """W of the frames."""
         return self.settings.picture.width
+
+
+@dataclass(frozen=True, eq=False)
+class LocalizeResult:
+    """Where a frame was found, and what the search took."""
+
+    scene: str
+    scene_sha256: str
+    renderer: str
+    found: Localization
+    queue_ms: float  # from the call to the start of the search
+    search_ms: float

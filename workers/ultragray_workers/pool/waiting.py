@@ -47,7 +47,9 @@ class Ticket:
     @property
     def batch_key(self) -> tuple[Any, ...]:
         """Requests that agree in this can be rendered together."""
-        return (self.request.scene, self.request.version, *self.request.settings.view)
+        sought = self.request.sought
+        view = self.request.settings.view if sought is None else (sought.settings,)
+        return (self.request.scene, self.request.version, *view)
 
     @property
     def give_up_at(self) -> float:
@@ -324,7 +326,7 @@ class WaitingQueue:
             self._turns[request.priority].leave(request.caller, ticket, frames, work_s)
 
     def _take_company(self, first: Part) -> list[Part]:
-        if first.suspect:
+        if first.suspect or first.ticket.request.sought is not None:
             return []
         room = self._poses_together(first.ticket) - first.frames
         company: list[Part] = []

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from ultragray.errors import InvalidArgument
 from ultragray.files.poses import load_poses
+from ultragray.localization.pixels import read_frame
 from ultragray.scene_info import read_header
 
 from ..output import check_file
@@ -56,7 +57,7 @@ def localize(
     poses = load_poses(start)
     if len(poses) != 1:
         raise InvalidArgument(f"{start} must hold one pose, got {len(poses)}", field="start")
-    pixels = _read_frame(image)
+    pixels = read_frame(image)
 
     from ultragray import GaussianScene
     from ultragray import localize as search
@@ -70,23 +71,6 @@ def localize(
     tell(_in_words(found, output), document, as_json=json)
     if not found.is_found:
         raise typer.Exit(1)
-
-
-def _read_frame(path: Path) -> Any:  # [H, W]
-    import cv2
-    import numpy as np
-
-    if path.suffix.lower() not in (".png", ".npy"):
-        raise InvalidArgument(f"a frame must end in .png or .npy, got {path.name!r}", field="image")
-    try:
-        if path.suffix.lower() == ".npy":
-            return np.load(path, allow_pickle=False)
-        pixels = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_GRAYSCALE)
-    except (OSError, EOFError, ValueError, cv2.error) as error:
-        raise InvalidArgument(f"{path} cannot be read as a frame: {error}", field="image") from None
-    if pixels is None:
-        raise InvalidArgument(f"{path} cannot be read as a frame: it is no picture", field="image")
-    return pixels
 
 
 def _write_pose(path: Path, found: Localization) -> None:

@@ -127,7 +127,7 @@ class FrameStream:
             if self._unset is None:
                 raise InvalidArgument("settings must be given, and accepted, before the first pose", field="settings")
             self._plan = await self._resolve(self._unset)
-        pose, deadline = message.pose(), self._service.planner.deadline(message.timeout_s())
+        pose, deadline = self._plan.placed(message.pose()), self._service.planner.deadline(message.timeout_s())
         return Asked(message.sequence, message.client_time, self._plan, pose, deadline)
 
     async def _change_settings(self, message: Message) -> None:
@@ -140,7 +140,9 @@ class FrameStream:
 
     async def _resolve(self, settings: SceneSettings) -> Plan:
         scene, asked = settings
-        return await self._service.planner.plan(scene, asked, asked.encoding, path="settings")
+        return await self._service.planner.plan(
+            scene, asked, asked.encoding, path="settings", registration=asked.registration
+        )
 
 
 def checked_s(name: str, milliseconds: float) -> float:

@@ -10,9 +10,12 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from ultragray.contract import Contract, annotated_fields, described
-from ultragray.errors import InvalidArgument, InvalidPose
+from ultragray.errors import InvalidArgument, InvalidImageSize, InvalidPose
+from ultragray.image_size import MAX_IMAGE_SIDE
+from ultragray.localization.settings import LocalizationSettings
 from ultragray.probe import Probe
-from ultragray.settings import FrameSettings, RenderSettings
+from ultragray.registration.registration import Registration
+from ultragray.settings import FrameSettings, RenderSettings, registration_field
 from ultragray_workers.jobs.job import MAX_PRIORITY
 from ultragray_workers.jobs.kinds import KINDS, Specification
 
@@ -43,8 +46,28 @@ class AssessBody(Contract):
 
     poses: list[Pose] = described("At least one.", factory=list, error=InvalidPose)
     probe: Probe | None = described("Whose poses they are. Default: the scene's own.", None)
+    registration: str | None = registration_field()
 
     many_poses = staticmethod(_many_poses)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LocalizeBody(LocalizationSettings):
+    """A real frame, and about where it was taken."""
+
+    image: str = described(
+        "The frame in base64, rows along depth, columns across scan lines, not scan-converted: a PNG file, or, with "
+        "image_height and image_width, grey pixels of 8 bits, row by row.",
+    )
+    image_height: int | None = described("Of grey pixels.", None, low=1, high=MAX_IMAGE_SIDE, error=InvalidImageSize)
+    image_width: int | None = described("Of grey pixels.", None, low=1, high=MAX_IMAGE_SIDE, error=InvalidImageSize)
+    start: Pose = described("A pose that is about right.", error=InvalidPose)
+    timeout_ms: float | None = described(
+        "A search that has not ended by then is given up (504).", None, above=0, high=MAX_TIMEOUT_MS
+    )
+
+
+LARGE_IMAGE = Apart("image", str)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,6 +76,7 @@ class RenderBody(FrameSettings):
 
     pose: Pose | None = described("One pose; rendered before frames of `poses` that wait.", None, error=InvalidPose)
     poses: list[Pose] | None = described("Many poses, answered together, in order.", None, error=InvalidPose)
+    registration: str | None = registration_field()
     dtype: Literal["uint8", "float32"] | None = described(
         "Of application/octet-stream; a dtype in the Accept header goes first. Default: uint8.", None
     )
@@ -103,6 +127,13 @@ class StreamMessage(Contract):
         low=0,
         high=2**64 - 1,
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class RegistrationBody(Registration):
+    """A registration, and the scene that its poses lead into."""
+
+    scene: str = described("Its name.")
 
 
 def _body_of(kind: str) -> type[Any]:

@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+import asyncio
+import base64
 from typing import Annotated
 
 from fastapi import APIRouter, Query
 from starlette.requests import Request
+
+from ultragray.errors import InvalidArgument
+from ultragray.localization.settings import LocalizationSettings
 
 from ...core import scenes
 from ...core.catalog import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE
 from ...core.poses import check_pose_count, exact_poses
 from ...core.scenes import Scene, SceneLoaded, ScenePage
 from ...views.assessments import Assessments
+from ...views.localizing import Located, locate, sought_frame
 from ..deps import SceneName, ServiceDep, problems
-from ..reading.bodies import AssessBody
+from ..disconnect import finish_or_abandon
+from ..reading.bodies import LARGE_IMAGE, AssessBody, LocalizeBody
 from ..reading.json_body import body_schema, read_json_body
 
 router = APIRouter(prefix="/v1/scenes", tags=["scenes"])
@@ -43,7 +50,30 @@ async def assess_poses(request: Request, service: ServiceDep, scene: SceneName) 
     body = await read_json_body(request, AssessBody, AssessBody.many_poses(most))
     check_pose_count(len(body.poses), most)
     poses = await exact_poses(len(body.poses), lambda index: body.poses[index].exact(f"poses[{index}]"))
-    return await service.assessing.assess(scene, poses, body.probe)
+    return await service.assessing.assess(scene, poses, body.probe, body.registration)
+
+
+@router.post(
+    "/{scene}:localize",
+    openapi_extra=body_schema(LocalizeBody),
+    responses=problems(401, 404, 413, 415, 422, 429, 500, 503, 504, 507),
+)
+async def localize(request: Request, service: ServiceDep, scene: SceneName) -> Located:
+    """Where in the scene a real frame was taken, looked for about `start`."""
+    body = await read_json_body(request, LocalizeBody, LARGE_IMAGE)
+    deadline = service.planner.deadline(None if body.timeout_ms is None else body.timeout_ms / 1000)
+    asked = LocalizationSettings(probe=body.probe, within_mm=body.within_mm, within_deg=body.within_deg)
+    image = await asyncio.to_thread(_bytes_of, body.image)
+    sought = sought_frame(image, body.image_height, body.image_width, asked)
+    work = locate(service, scene, sought, body.start.exact("start"), deadline)
+    return await finish_or_abandon(work, request.receive, deadline)
+
+
+def _bytes_of(text: str) -> bytes:
+    try:
+        return base64.b64decode(text, validate=True)
+    except ValueError:
+        raise InvalidArgument("image must be base64", field="image") from None
 
 
 @router.post("/{scene}:load", responses=problems(401, 403, 404, 422, 503, 507))

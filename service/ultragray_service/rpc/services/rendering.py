@@ -12,6 +12,7 @@ import grpc
 
 from ultragray.contract import under
 from ultragray.errors import FrameTooCostly, InvalidArgument, LowConfidence
+from ultragray.localization.settings import LocalizationSettings
 from ultragray.probe import FloatArray, Probe
 from ultragray.volumes.plane import SliceSettings
 from ultragray_proto.codec import to_message
@@ -23,6 +24,7 @@ from ...core.poses import check_pose_count, exact_poses
 from ...core.requests import Plan
 from ...core.state import Service
 from ...core.streams.stream import FrameStream, checked_s
+from ...views.localizing import locate, sought_frame
 from ..messages import frame_message, read, read_pose, read_settings, slice_message
 from ..stream import CallTransport
 
@@ -32,9 +34,10 @@ _STREAM_NAME = "x-ultragray-stream-name"  # metadata
 
 @dataclass(frozen=True)
 class _OfProbe:
-    """The part of a request that says whose poses it has."""
+    """The part of a request that says whose poses it has, and in which frame."""
 
     probe: Probe | None = None
+    registration: str | None = None
 
 
 class RenderService:
@@ -53,7 +56,7 @@ class RenderService:
         plan = await self._plan(request)
         if not request.HasField("pose"):
             raise InvalidArgument("pose is required", field="pose")
-        pose = read_pose(request.pose, "pose")
+        pose = plan.placed(read_pose(request.pose, "pose"))
         await self._service.limits.take_frames(1, deadline)
         result = await self._service.render(plan, pose[None], deadline=deadline, begin_by=begin_by)
         return frame_message(result, 0)
@@ -64,7 +67,8 @@ class RenderService:
         planner = self._service.planner
         check_pose_count(len(request.poses), planner.max_poses)
         plan = await self._plan(request)
-        poses = await exact_poses(len(request.poses), lambda index: read_pose(request.poses[index], f"poses[{index}]"))
+        sent = await exact_poses(len(request.poses), lambda index: read_pose(request.poses[index], f"poses[{index}]"))
+        poses = plan.placed(sent)
         window = min(2 * self._service.settings.max_batch_poses, self._service.settings.queue_limit_frames)
         in_flight: deque[asyncio.Task[RenderResult]] = deque()
         started = 0
@@ -100,9 +104,9 @@ class RenderService:
         self, request: rendering_pb2.AssessPosesRequest, context: grpc.aio.ServicerContext
     ) -> rendering_pb2.AssessPosesResponse:
         check_pose_count(len(request.poses), self._service.planner.max_poses)
-        probe = read(request, _OfProbe).probe
+        whose = read(request, _OfProbe)
         poses = await exact_poses(len(request.poses), lambda index: read_pose(request.poses[index], f"poses[{index}]"))
-        found = await self._service.assessing.assess(request.scene, poses, probe)
+        found = await self._service.assessing.assess(request.scene, poses, whose.probe, whose.registration)
         return to_message(found, rendering_pb2.AssessPosesResponse)
 
     async def RenderSlice(  # noqa: N802
@@ -118,10 +122,27 @@ class RenderService:
         result = await self._service.render(plan, asked.pose()[None], deadline=deadline)
         return slice_message(result)
 
+    async def Localize(  # noqa: N802
+        self, request: rendering_pb2.LocalizeRequest, context: grpc.aio.ServicerContext
+    ) -> rendering_pb2.LocalizeResponse:
+        deadline = self._service.planner.deadline(context.time_remaining())
+        asked = read(request, LocalizationSettings)
+        height, width = (
+            getattr(request, side) if request.HasField(side) else None for side in ("image_height", "image_width")
+        )
+        if not request.HasField("start"):
+            raise InvalidArgument("start is required", field="start")
+        start = read_pose(request.start, "start")
+        sought = sought_frame(request.image, height, width, asked)
+        found = await locate(self._service, request.scene, sought, start, deadline)
+        return to_message(found, rendering_pb2.LocalizeResponse)
+
     async def _plan(self, request: rendering_pb2.RenderRequest | rendering_pb2.RenderBatchRequest) -> Plan:
         """The plan of a request. Raises what RequestPlanner.plan raises; the field is a path."""
         scene, asked = read_settings(request)
-        return await self._service.planner.plan(scene, asked, asked.encoding, path="settings")
+        return await self._service.planner.plan(
+            scene, asked, asked.encoding, path="settings", registration=asked.registration
+        )
 
     async def _in_turn(
         self,

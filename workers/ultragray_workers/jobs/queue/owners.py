@@ -12,12 +12,13 @@ from .tables import CHANGES, OWNERS
 
 
 class Kind(str, Enum):
-    """Things that requests name. All but workers have an owner."""
+    """Things that requests name. All but workers have an owner; registrations keep theirs with their row."""
 
     SCENE = "scene"
     DATASET = "dataset"
     JOB = "job"
     WORKER = "worker"
+    REGISTRATION = "registration"
 
 
 @dataclass(frozen=True)

@@ -96,6 +96,15 @@ SHARDS = sa.Table(  # of render jobs in shards; see jobs.shards.claims
     sa.Column("error", sa.Text),  # why it cannot be made; NULL: it can
     sa.Column("reason", sa.Text),
 )
+REGISTRATIONS = sa.Table(  # of robots and trackers to scenes
+    "ultragray_registrations",
+    TABLES,
+    sa.Column("name", sa.Text, primary_key=True),
+    sa.Column("scene", sa.Text, nullable=False),
+    sa.Column("owner", sa.Text, nullable=False),
+    sa.Column("changed_at_s", sa.Double, nullable=False),
+    sa.Column("document", sa.Text, nullable=False),  # JSON of an ultragray.registration.registration.Registration
+)
 SCHEMA_VERSION = sa.Table("ultragray_schema", TABLES, sa.Column("version", sa.Integer, nullable=False))
 
 _LOCK_NUMBER = 0x756C7472  # of PostgreSQL's advisory locks
@@ -215,6 +224,21 @@ def _to_version_8(connection: sa.Connection) -> None:
     made.create_all(connection, checkfirst=False)
 
 
+def _to_version_9(connection: sa.Connection) -> None:
+    """The registrations of robots and trackers."""
+    made = sa.MetaData(schema=SCHEMA)
+    sa.Table(
+        "ultragray_registrations",
+        made,
+        sa.Column("name", sa.Text, primary_key=True),
+        sa.Column("scene", sa.Text, nullable=False),
+        sa.Column("owner", sa.Text, nullable=False),
+        sa.Column("changed_at_s", sa.Double, nullable=False),
+        sa.Column("document", sa.Text, nullable=False),
+    )
+    made.create_all(connection, checkfirst=False)
+
+
 def _add_columns(connection: sa.Connection, table: str, types: dict[str, str]) -> None:
     place = table if connection.dialect.name == "sqlite" else f"{SCHEMA}.{table}"
     for name, kind in types.items():
@@ -232,6 +256,7 @@ STEPS: tuple[Callable[[sa.Connection], None], ...] = (
     _to_version_6,
     _to_version_7,
     _to_version_8,
+    _to_version_9,
 )
 VERSION = len(STEPS)
 

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ultragray import GaussianScene, Probe, render
+from ultragray import GaussianScene, Probe, localize, render
 from ultragray.backends import cuda
 from ultragray.confidence import Assessor, Extrapolation
 from ultragray.confidence.support import SupportWatch
@@ -27,6 +27,7 @@ from ultragray.display.pixels import ByteArray, to_uint8
 from ultragray.display.settings import AS_RENDERED
 from ultragray.errors import MemoryExceeded, RenderFailed, UltragrayError
 from ultragray.limits import UNLIMITED, GivenUp, Limits
+from ultragray.localization.pixels import read_grey, read_png
 from ultragray.probe import FloatArray
 from ultragray.rendering import renderer_name
 from ultragray.settings import Encoding, Resolved
@@ -34,13 +35,14 @@ from ultragray.settings import Encoding, Resolved
 from ...errors import DeadlineExceeded
 from ..board import Board
 from ..channel import Channel
-from ..memory import write_at
+from ..memory import read_start, write_at
 from ..messages import (
     Answer,
     ForkWorker,
     Hello,
     Loading,
     LoadTask,
+    LocalizeTask,
     Outdated,
     PackTask,
     Rendered,
@@ -138,18 +140,49 @@ class _Worker:
         self._channel.send(Answer(part=part, outcome=outcome, last=last, resident=self._scenes.names()))
 
     def _do_other(
-        self, task: PackTask | LoadTask | UnloadTask, descriptors: list[int]
-    ) -> Rendered | UltragrayError | None:
+        self, task: LocalizeTask | PackTask | LoadTask | UnloadTask, descriptors: list[int]
+    ) -> Rendered | Outdated | UltragrayError | None:
         try:
+            if isinstance(task, LocalizeTask):
+                return self._localize(task, *descriptors)
             if isinstance(task, PackTask):
                 return _pack(task, *descriptors)
             if isinstance(task, LoadTask):
                 self._loaded(task.scene, task.path)
             else:
                 self._scenes.drop(task.scene)
+        except GivenUp:
+            return _given_up()
         except Exception as error:
             return _as_reported(error)
         return None
+
+    def _localize(self, task: LocalizeTask, memory: int) -> Rendered | Outdated:
+        """Looks for the frame in the memory. Raises what reading it and localize() raise, and GivenUp."""
+        loaded = self._loaded(task.scene, task.path)
+        if task.version not in (None, loaded.version):
+            return Outdated()
+        started, asked = time.monotonic(), task.settings
+        data = read_start(memory, task.image_bytes)
+        found = localize(
+            loaded.scene,
+            read_png(data) if task.size is None else read_grey(data, *task.size),
+            task.start,
+            probe=asked.probe,
+            within_mm=asked.within_mm,
+            within_deg=asked.within_deg,
+            backend=self._backend,
+            limits=Limits(self._max_footprint_pixels, self._board.given_up, self._tasks, lambda _: "start"),
+        )
+        return Rendered(
+            size=0,
+            scene_sha256=loaded.sha256,
+            renderer=renderer_name(self._backend, loaded.scene),
+            started=started,
+            render_ms=_since_ms(started),
+            encode_ms=0.0,
+            found=found,
+        )
 
     def _loaded(self, name: str, path: str) -> LoadedScene:
         """A scene, ready for its first frame. Raises SceneFileInvalid, SceneTooLarge, MemoryExceeded."""
@@ -193,9 +226,7 @@ class _Worker:
             if refused is None:
                 frames = self._render(loaded.scene, task.view, poses, wanted, support, limits)
         except GivenUp:
-            yield from [RenderFailed("the service gave up this rendering: nobody waited for it any more")] * len(
-                task.parts
-            )
+            yield from [_given_up()] * len(task.parts)
             return
         except Exception as error:
             if len(task.parts) == 1:
@@ -399,6 +430,10 @@ def _pack(task: PackTask, pixels_memory: int, archive_memory: int) -> Rendered:
         render_ms=0.0,
         encode_ms=_since_ms(started),
     )
+
+
+def _given_up() -> RenderFailed:
+    return RenderFailed("the service gave up this rendering: nobody waited for it any more")
 
 
 def _as_reported(error: Exception) -> UltragrayError:

@@ -47,6 +47,7 @@ RENDER_HEADERS = {
     "X-Ultragray-Contact": "As used, air or pressure; absent where contact was assumed.",
     "X-Ultragray-Tools": "As used, JSON; absent where there were none.",
     "X-Ultragray-Ghost": "As used; absent where there was none.",
+    "X-Ultragray-Registration": "That led the poses into the scene; absent where they were sent as they are.",
     "X-Ultragray-Confidence": "Of each pose, with commas; empty where the scene cannot tell.",
     "X-Ultragray-Extrapolation": "One pose only: distance_mm, angle_deg, confidence, supported_share, contact_share, "
     "JSON. Of many, npz holds them.",
@@ -107,8 +108,9 @@ async def render(request: Request) -> Response:
     def complete(settings: Resolved) -> Resolved:
         return planner.check_pixels(FORMATS["dicom"].shown(settings) if is_dicom else settings, len(poses))
 
-    plan = await planner.plan(scene, body, choice.encoding, complete=complete)
-    exact = await exact_poses(len(poses), lambda index: poses[index][1].exact(poses[index][0]))
+    plan = await planner.plan(scene, body, choice.encoding, registration=body.registration, complete=complete)
+    sent = await exact_poses(len(poses), lambda index: poses[index][1].exact(poses[index][0]))
+    exact = plan.placed(sent)
     priority = Priority.INTERACTIVE if body.poses is None else Priority.BATCH
 
     async def rendered() -> RenderResult:
@@ -157,6 +159,8 @@ def _settings_headers(settings: Resolved) -> dict[str, str]:
         asked["X-Ultragray-Tools"] = json.dumps(to_dict(used.tools))
     if used.ghost:
         asked["X-Ultragray-Ghost"] = repr(used.ghost)
+    if used.registration is not None:
+        asked["X-Ultragray-Registration"] = used.registration
     return asked | {
         "X-Ultragray-Dtype": settings.encoding.pixel_type.name,
         "X-Ultragray-Outputs": ",".join(settings.outputs),

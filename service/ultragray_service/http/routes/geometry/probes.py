@@ -11,8 +11,8 @@ from starlette.requests import Request
 from ultragray.contract import described
 from ultragray.probe import Probe
 
-from ..deps import problems
-from ..reading.json_body import body_schema, read_json_body
+from ...deps import problems
+from ...reading.json_body import body_schema, read_json_body
 
 router = APIRouter(prefix="/v1/probes", tags=["probes"])
 

@@ -1,0 +1,1 @@
+"""Where probes see, and how robots lie to scenes."""

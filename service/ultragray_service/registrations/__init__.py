@@ -1,0 +1,1 @@
+"""Registrations of robots and trackers to scenes, kept by name in the installation's database."""

@@ -1,0 +1,66 @@
+"""The table of registrations. Its functions block, and each is one transaction."""
+
+from __future__ import annotations
+
+import json
+import time
+
+import sqlalchemy as sa
+from sqlalchemy.dialects import postgresql, sqlite
+
+from ultragray.contract import from_dict, to_dict
+from ultragray.registration.registration import Registration
+from ultragray_workers.jobs.queue.tables import REGISTRATIONS
+
+from ..access.principal import Principal, Role, iso_time
+from .named import NamedRegistration
+
+_COLUMNS = REGISTRATIONS.c
+
+
+def read_registration(engine: sa.Engine, name: str) -> NamedRegistration | None:
+    """The registration of a name; None where there is none."""
+    with engine.connect() as connection:
+        row = connection.execute(sa.select(REGISTRATIONS).where(_COLUMNS.name == name)).one_or_none()
+    return None if row is None else _named(row)
+
+
+def read_scenes(engine: sa.Engine) -> dict[str, str]:
+    """The scenes of all registrations, by the names of these."""
+    with engine.connect() as connection:
+        return {row.name: row.scene for row in connection.execute(sa.select(_COLUMNS.name, _COLUMNS.scene))}
+
+
+def write_registration(
+    engine: sa.Engine, name: str, scene: str, registration: Registration, writer: Principal
+) -> NamedRegistration | None:
+    """The registration as it is kept from now on, its owner as before; None where it is another's than the writer's."""
+    values = {
+        "scene": scene,
+        "changed_at_s": time.time(),
+        "document": json.dumps(to_dict(registration), allow_nan=False),
+    }
+    with engine.begin() as connection:
+        insert = (sqlite if connection.dialect.name == "sqlite" else postgresql).insert(REGISTRATIONS)
+        kept = insert.values(name=name, owner=writer.name, **values).on_conflict_do_update(
+            index_elements=[_COLUMNS.name], set_=values, where=_may_change(writer)
+        )
+        row = connection.execute(kept.returning(*_COLUMNS)).one_or_none()
+    return None if row is None else _named(row)
+
+
+def delete_registration(engine: sa.Engine, name: str, remover: Principal) -> bool:
+    """Whether it was there and the remover's to delete."""
+    with engine.begin() as connection:
+        gone = sa.delete(REGISTRATIONS).where(_COLUMNS.name == name, _may_change(remover))
+        return connection.execute(gone).rowcount > 0
+
+
+def _may_change(principal: Principal) -> sa.ColumnElement[bool]:
+    return sa.true() if principal.role is Role.ADMIN else _COLUMNS.owner == principal.name
+
+
+def _named(row: sa.Row[tuple[object, ...]]) -> NamedRegistration:
+    kept = from_dict(Registration, json.loads(row.document))
+    facts = {"name": row.name, "scene": row.scene, "owner": row.owner, "changed_at": iso_time(row.changed_at_s)}
+    return NamedRegistration(**to_dict(kept), **facts)

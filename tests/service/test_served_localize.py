@@ -1,0 +1,195 @@
+"""A real frame is found in a scene through HTTP, gRPC and the client, and what is wrong with it is told."""
+
+from __future__ import annotations
+
+import base64
+import shutil
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import grpc
+import httpx
+import numpy as np
+import pytest
+
+from ultragray import render
+from ultragray.demo import DEMO_FILE, demo_poses, load_demo_scene
+from ultragray.display.pixels import image_file, to_uint8
+from ultragray.probe import FloatArray
+from ultragray_client import Client
+from ultragray_proto.v1 import rendering_pb2, rendering_pb2_grpc
+
+from ..waiting import Deadline
+from .conftest import RunningService, StartService
+
+SIDE = 128
+POSE: FloatArray = demo_poses(3)[1]  # [4, 4] mm
+KEY = "0123456789abcdef-limited"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    made = tmp_path_factory.mktemp("phantom")
+    shutil.copy(DEMO_FILE, made / "spine.ugr")
+    return made
+
+
+@pytest.fixture(scope="module")
+def phantom(start_service: StartService, folder: Path, tmp_path_factory: pytest.TempPathFactory) -> RunningService:
+    return start_service(data_folder=folder, artifact_folder=tmp_path_factory.mktemp("artifacts"))
+
+
+@pytest.fixture(scope="module")
+def http(phantom: RunningService) -> Iterator[httpx.Client]:
+    with httpx.Client(base_url=phantom.http, timeout=120.0) as client:
+        yield client
+
+
+@pytest.fixture(scope="module")
+def pixels() -> Any:  # [SIDE, SIDE] uint8
+    frame = render(load_demo_scene(), None, POSE, height=SIDE, width=SIDE, outputs=("bmode",))["bmode"][0]
+    return to_uint8(frame.detach().numpy())
+
+
+@pytest.fixture(scope="module")
+def png(pixels: Any) -> bytes:
+    return image_file(pixels, ".png").tobytes()
+
+
+def start() -> FloatArray:
+    pose: FloatArray = POSE.copy()
+    pose[:3, 3] += (1.5, -1.0, 1.0)
+    return pose
+
+
+def body(image: bytes, **fields: Any) -> dict[str, Any]:
+    return {"image": base64.b64encode(image).decode(), "start": {"matrix": start().tolist()}, **fields}
+
+
+def test_a_png_file_is_found_over_http(http: httpx.Client, png: bytes) -> None:
+    answer = http.post("/v1/scenes/spine:localize", json=body(png))
+    assert answer.status_code == 200, answer.text
+    found = answer.json()
+    assert found["is_found"]
+    assert found["similarity"] > 0.9
+    np.testing.assert_allclose(found["pose"], POSE, atol=0.2)
+    assert all(0.0 < one < 0.5 for one in found["position_std_mm"])
+    assert found["shift_mm"] == pytest.approx(np.linalg.norm((1.5, -1.0, 1.0)), abs=0.3)
+    assert found["scene"] == "spine"
+    assert found["search_ms"] > 0.0
+
+
+def test_grey_pixels_are_found_over_grpc(phantom: RunningService, pixels: Any) -> None:
+    asked = rendering_pb2.LocalizeRequest(
+        scene="spine", image=pixels.tobytes(), image_height=SIDE, image_width=SIDE, within_mm=2.5
+    )
+    asked.start.matrix.values.extend(start().ravel().tolist())
+    with grpc.insecure_channel(phantom.grpc) as channel:
+        found = rendering_pb2_grpc.RenderServiceStub(channel).Localize(asked, timeout=120.0)
+    assert found.is_found
+    np.testing.assert_allclose(np.reshape(found.pose.values, (4, 4)), POSE, atol=0.2)
+    assert 0.0 < found.angle_std_deg.axial < 1.0
+
+
+def test_arrays_and_files_are_found_by_the_client(phantom: RunningService, pixels: Any, png: bytes) -> None:
+    with Client(phantom.grpc, timeout_s=120.0) as client:
+        of_array = client.localize("spine", pixels / np.float32(255.0), start())
+        of_file = client.localize("spine", png, start())
+    assert of_array.is_found
+    np.testing.assert_allclose(of_array.pose, POSE, atol=0.2)
+    np.testing.assert_allclose(of_array.pose, of_file.pose, atol=1e-9)
+    assert len(of_array.position_std_mm) == 3
+
+
+def test_a_frame_of_something_else_is_told_as_not_found(http: httpx.Client) -> None:
+    noise = np.random.default_rng(0).integers(0, 256, (SIDE, SIDE), dtype=np.uint8)
+    asked = body(noise.tobytes(), image_height=SIDE, image_width=SIDE)
+    assert not http.post("/v1/scenes/spine:localize", json=asked).json()["is_found"]
+    text = http.get("/metrics").text
+    assert 'ultragray_searches_total{found="false",scene="spine"} 1.0' in text
+
+
+@pytest.mark.parametrize(
+    ("change", "field", "told"),
+    [
+        ({"image": "no base64!"}, "image", "image must be base64"),
+        ({"image": base64.b64encode(b"GIF89a").decode()}, "image", "image must be a PNG file"),
+        ({"image_height": 64}, "image_width", "go together"),
+        ({"image_height": 64, "image_width": 64}, "image", "must hold image_height x image_width = 4096 bytes"),
+        ({"image_height": 5000, "image_width": 64}, "image_height", "from 1 to 4096"),
+        ({"start": {"matrix": np.ones((4, 4)).tolist()}}, "start.matrix", "row 0 0 0 1"),
+        ({"within_mm": 21}, "within_mm", "above 0 and at most 20"),
+        ({"probe": {"kind": "linear", "width_mm": -1, "near_mm": 0, "far_mm": 40}}, "probe.width_mm", "above 0"),
+    ],
+)
+def test_each_mistake_gets_one_error(
+    http: httpx.Client, png: bytes, change: dict[str, Any], field: str, told: str
+) -> None:
+    answer = http.post("/v1/scenes/spine:localize", json=body(png) | change)
+    assert answer.status_code == 422, answer.text
+    problem = answer.json()
+    assert problem["field"] == field
+    assert told in problem["detail"]
+
+
+def test_a_picture_that_says_it_is_huge_takes_no_memory(http: httpx.Client, png: bytes) -> None:
+    huge = png[:16] + (60_000).to_bytes(4, "big") * 2 + png[24:]
+    answer = http.post("/v1/scenes/spine:localize", json=body(huge))
+    assert answer.status_code == 422
+    assert "from 1 to 4096" in answer.json()["detail"]
+    damaged = http.post("/v1/scenes/spine:localize", json=body(png[:200]))
+    assert "damaged PNG" in damaged.json()["detail"]
+
+
+def test_a_scene_that_is_not_there_is_not_found(http: httpx.Client, png: bytes) -> None:
+    assert http.post("/v1/scenes/nowhere:localize", json=body(png)).status_code == 404
+
+
+def test_a_large_body_is_read_as_a_small_one(http: httpx.Client) -> None:
+    scene = load_demo_scene()
+    frame = render(scene, None, POSE, height=384, width=384, outputs=("bmode",))["bmode"][0]
+    asked = body(to_uint8(frame.detach().numpy()).tobytes(), image_height=384, image_width=384)
+    assert http.post("/v1/scenes/spine:localize", json=asked).json()["is_found"]
+
+
+def test_a_search_ends_at_its_deadline_and_with_its_caller(http: httpx.Client, png: bytes) -> None:
+    late = http.post("/v1/scenes/spine:localize", json=body(png, timeout_ms=1))
+    assert late.status_code == 504
+    asked = body(png, within_mm=20, within_deg=30)
+    with pytest.raises(httpx.ReadTimeout):
+        http.post("/v1/scenes/spine:localize", json=asked, timeout=0.05)
+    end = Deadline(60.0)
+    while http.get("/v1/statistics").json()["busy_processes"]:
+        assert not end.passed
+
+
+def test_a_search_counts_as_many_frames_of_the_key(
+    start_service: StartService, folder: Path, png: bytes, tmp_path: Path
+) -> None:
+    service = start_service(data_folder=folder, artifact_folder=tmp_path, api_keys=KEY, key_frames_per_s=20)
+    headers = {"X-API-Key": KEY}
+    with httpx.Client(base_url=service.http, timeout=120.0, headers=headers) as client:
+        answer = client.post("/v1/scenes/spine:localize", json=body(png, timeout_ms=3000))
+        assert answer.status_code == 422, answer.text
+        assert "frames_per_s" in answer.json()["detail"]
+        assert httpx.post(f"{service.http}/v1/scenes/spine:localize", json=body(png)).status_code == 401
+
+
+def test_frames_are_rendered_between_searches(phantom: RunningService, png: bytes) -> None:
+    """One process serves both: a frame waits for at most one search."""
+    asked = body(png)
+
+    def search() -> None:
+        httpx.post(f"{phantom.http}/v1/scenes/spine:localize", json=asked, timeout=120.0)
+
+    searches = [threading.Thread(target=search) for _ in range(4)]
+    for thread in searches:
+        thread.start()
+    with Client(phantom.grpc, timeout_s=120.0) as client:
+        client.render("spine", POSE)
+    waiting = sum(thread.is_alive() for thread in searches)
+    for thread in searches:
+        thread.join()
+    assert waiting >= 1
