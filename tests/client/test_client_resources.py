@@ -14,6 +14,7 @@ import pytest
 from ultragray.machine import memory_bytes
 from ultragray_client import (
     AroundSampler,
+    Box,
     ConvexProbe,
     CoveredSampler,
     DatasetOptions,
@@ -21,9 +22,11 @@ from ultragray_client import (
     FanSampler,
     JobState,
     LinearProbe,
+    Needle,
     RenderJob,
     Sampler,
     SplineSampler,
+    ToolFrame,
     TrainingSampler,
     TrainJob,
     WorkerState,
@@ -145,7 +148,17 @@ def test_a_batch_of_frames_as_a_job(client: Any, tmp_path: Path) -> None:
     with np.load(tmp_path / "frames.npz") as frames:
         assert frames["echo"].shape == (3, 8, 6)
     shown = RenderJob(
-        scene="demo", poses=poses, height=8, width=6, probe=ConvexProbe(60.0, 5.0, 40.0), display=Display(pixel_mm=0.5)
+        scene="demo",
+        poses=poses,
+        height=8,
+        width=6,
+        probe=ConvexProbe(60.0, 5.0, 40.0),
+        display=Display(pixel_mm=0.5),
+        tools=(
+            Needle(tip_mm=(1.0, 0.0, 20.0), hub_mm=(-9.0, 0.0, 5.0), frame=ToolFrame.PROBE, opacity=0.0),
+            Box(centre_mm=(0.0, 0.0, 30.0), size_mm=(4.0, 4.0, 2.0), label=4),
+        ),
+        ghost=0.5,
     )
     again = client.jobs.submit(shown)
     assert again.specification == replace(shown, poses=None, format="npz")

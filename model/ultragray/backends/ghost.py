@@ -46,12 +46,15 @@ def _interfaces(bmode: Tensor, probe: Probe) -> Tensor:  # [C, H, W] -> [C, W]
     height, width = bmode.shape[1:]
     deep = torch.from_numpy(probe.depths_mm(height) - probe.face_depth_mm >= LEAST_DEPTH_MM).to(bmode.device)
     beside = round(width * SMOOTHED_SHARE / 2.0)
-    averaged = avg_pool1d(_padded(bmode, beside), 2 * beside + 1, stride=1)
+    wrap = probe.lines.wrap
+    averaged = avg_pool1d(_padded(bmode, beside, wrap=wrap), 2 * beside + 1, stride=1)
     strong = (averaged >= STRONG_BMODE) & deep[:, None]
     first = torch.where(strong.any(dim=1), strong.int().argmax(dim=1), height)
-    return _padded(first, beside).unfold(-1, 2 * beside + 1, 1).median(dim=-1).values
+    return _padded(first, beside, wrap=wrap).unfold(-1, 2 * beside + 1, 1).median(dim=-1).values
 
 
-def _padded(values: Tensor, beside: int) -> Tensor:  # [..., W] -> [..., beside + W + beside]
-    """The outermost values are repeated."""
-    return torch.cat([values[..., :1]] * beside + [values] + [values[..., -1:]] * beside, dim=-1)
+def _padded(values: Tensor, beside: int, *, wrap: bool) -> Tensor:  # [..., W] -> [..., beside + W + beside]
+    """With more values on either side: those that follow where lines go all the way round, else the outermost one."""
+    width = values.shape[-1]
+    places = torch.arange(-beside, width + beside, device=values.device)
+    return values[..., places % width if wrap else places.clamp(0, width - 1)]

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from ultragray import GaussianScene, LinearProbe, render
+from ultragray import GaussianScene, LinearProbe, RadialProbe, render
 from ultragray.backends.ghost import LEAST_DEPTH_MM, add_ghosts
 from ultragray.tools import Needle
 
@@ -64,6 +64,21 @@ def test_an_interface_runs_on_through_its_gaps() -> None:
     add_ghosts(planes, PROBE, 0.5)
     add_ghosts(whole, PROBE, 0.5)
     assert torch.equal(planes["bmode"][:, INTERFACE + 1 :], whole["bmode"][:, INTERFACE + 1 :])
+
+
+@pytest.mark.parametrize(("bright_lines", "mirrors"), [(3, False), (6, True)])
+def test_lines_that_go_all_the_way_round_have_no_outermost_one(bright_lines: int, mirrors: bool) -> None:
+    turned = []
+    for first in (0, 50, 97):
+        planes = tissue(interface=0.2)
+        bright = (first + np.arange(bright_lines)) % SIDE
+        planes["echo"][:, INTERFACE, bright] = planes["bmode"][:, INTERFACE, bright] = 0.95
+        planes["echo"][:, TARGET] = planes["bmode"][:, TARGET] = 0.5
+        add_ghosts(planes, RadialProbe(near_mm=0.0, far_mm=50.0), 0.5)
+        turned.append(planes["bmode"].roll(-first, dims=2))
+    assert torch.equal(turned[0], turned[1])
+    assert torch.equal(turned[0], turned[2])
+    assert bool((turned[0][0, 2 * INTERFACE - TARGET] > 0.2).any()) is mirrors
 
 
 def test_a_needle_has_a_ghost_below_bone_and_the_frame_without_ghosts_is_as_it_was(

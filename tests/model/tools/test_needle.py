@@ -167,7 +167,7 @@ def test_a_needle_of_the_probe_frame_moves_with_the_probe(
     for name in OUTPUTS:
         assert torch.equal(frames[name][0], frames[name][1])
         assert torch.equal(frames[name][0], frames[name][2])
-    assert frames["bmode"].max() > 0.3
+    assert frames["bmode"].max() > 0.2
 
 
 def test_a_needle_around_a_catheter_is_seen_on_both_sides_of_its_first_line(empty_scene: GaussianScene) -> None:

@@ -89,6 +89,21 @@ def test_backends_agree(
         assert_agrees(fast, {name: reference[name].numpy() for name in PLANES}, tolerance=5e-4)
 
 
+@pytest.mark.slow
+def test_the_cuda_backend_draws_the_same(
+    random_scene: Callable[..., GaussianScene],
+    on_device: Callable[[GaussianScene], GaussianScene],
+    assert_agrees: Callable[..., None],
+) -> None:
+    pytest.importorskip("triton", reason="the package triton is not installed, which runs these kernels")
+    small = random_scene(40, sigma_cm=(0.05, 0.3))
+    asked = {"height": 24, "width": 20, "outputs": (*PLANES, "labels"), "tools": tools_of(LINEAR), "ghost": 0.5}
+    expected = render(small, LINEAR, np.eye(4), **asked, backend="reference")
+    found = render(on_device(small), LINEAR, np.eye(4), **asked, backend="cuda")
+    assert_agrees(found, {name: expected[name].numpy() for name in PLANES}, tolerance=5e-4)
+    assert torch.equal(found["labels"].cpu(), expected["labels"])
+
+
 @pytest.mark.parametrize("backend", ["reference", "cpu"])
 def test_gradients_reach_the_scene_and_the_pose(scene: GaussianScene, backend: str) -> None:
     pose = torch.eye(4, dtype=torch.float64)[None].requires_grad_()

@@ -18,12 +18,14 @@ import ultragray
 from ultragray import ConvexProbe, GaussianScene, LinearProbe, PhasedProbe, SceneInfo, render
 from ultragray.backends import cpu
 from ultragray.confidence import FIGURES, Assessor, ConfidenceModel, figure_arrays
+from ultragray.contract import to_dict
 from ultragray.datasets.plus import read_plus_sweep
 from ultragray.display.scan_conversion import scan_convert, scan_convert_labels
 from ultragray.files.atomic import file_sha256
 from ultragray.interchange import rendering
 from ultragray.samplers import FanSampler
 from ultragray.settings import Contact
+from ultragray.tools import Needle, ToolFrame
 
 from .command_line import refused, run
 
@@ -153,6 +155,26 @@ def test_render_tells_how_much_of_the_probe_touches_the_skin(scene_file: Path, t
         np.testing.assert_allclose(frames["bmode"], expected["bmode"].numpy(), atol=1e-6)
         assert str(frames["contact"]) == "air"
     assert run(*arguments, "--force", "--contact", "gel").exit_code == 2
+
+
+def test_render_draws_the_tools_of_a_file(scene_file: Path, tmp_path: Path) -> None:
+    scene = GaussianScene.load(scene_file)
+    needle = Needle(tip_mm=(5.0, 0.0, 25.0), hub_mm=(-12.0, 0.0, 8.0), frame=ToolFrame.PROBE)
+    file, output = tmp_path / "tools.json", tmp_path / "f.npz"
+    file.write_text(json.dumps(to_dict((needle,))))
+    arguments = ("render", scene_file, "-o", output, "--outputs", "bmode,labels", "--tools", file)
+    assert run(*arguments, "--ghost", 0.5).exit_code == 0
+    size = {"height": 24, "width": 20, "outputs": ("bmode", "labels")}
+    expected = render(scene, None, scene.training_poses, **size, tools=(needle,), ghost=0.5)
+    with np.load(output) as frames:
+        np.testing.assert_allclose(frames["bmode"], expected["bmode"].numpy(), atol=1e-6)
+        np.testing.assert_array_equal(frames["labels"], expected["labels"].numpy())
+        assert json.loads(str(frames["tools"])) == to_dict((needle,))
+    file.write_text('[{"kind": "needle", "tip_mm": [0, 0, 1]}]')
+    told = refused(*arguments, "--force")
+    assert f"{file}: tools[0].hub_mm is required by kind needle" in told
+    file.write_text(json.dumps(to_dict((needle,) * 9)))
+    assert "tools must be a list of at most 8 values, got 9" in refused(*arguments, "--force")
 
 
 def test_render_keeps_to_a_least_confidence(knowing_file: Path, scene_file: Path, tmp_path: Path) -> None:

@@ -22,9 +22,10 @@ from ultragray.errors import ExtraMissing, FrameTooCostly, InvalidArgument, Inva
 from ultragray.interchange import rendering
 from ultragray.samplers import AroundSampler, CoveredSampler, FanSampler, SplineSampler, TrainingSampler
 from ultragray.settings import Below
+from ultragray.tools import Cylinder, Needle, ToolFrame
 from ultragray_workers.jobs.folder import JobFolder, Request
 from ultragray_workers.jobs.kinds import RenderJob, render_run
-from ultragray_workers.jobs.specification import to_dict
+from ultragray_workers.jobs.specification import from_dict, to_dict
 from ultragray_workers.jobs.worker.job_run import JobRun, Stopped
 
 PROBE = LinearProbe(width_mm=30.0, near_mm=0.0, far_mm=40.0)
@@ -72,6 +73,25 @@ def test_poses_of_the_sampler_are_rendered_and_in_the_archive(work: Callable[...
         for name in job.outputs:
             assert archive[name].dtype == np.uint8
             np.testing.assert_array_equal(archive[name], np.rint(getattr(frames, name).numpy() * 255))
+
+
+def test_tools_are_in_the_frames_with_their_labels(work: Callable[..., JobRun]) -> None:
+    tools = (
+        Needle(tip_mm=(5.0, 0.0, 25.0), hub_mm=(-12.0, 0.0, 8.0), frame=ToolFrame.PROBE, label=7),
+        Cylinder(tip_mm=(8.0, -9.0, 30.0), hub_mm=(8.0, 9.0, 30.0), diameter_mm=4.0),
+    )
+    job = RenderJob(scene="one", sampler=TrainingSampler(), outputs=("bmode", "labels"), tools=tools, ghost=0.5)
+    asked = work(job)
+    assert from_dict(to_dict(job)) == job
+    assert render_run.run(asked, job).artifacts == ("frames.npz",)
+    scene = GaussianScene.load(asked.folder.path / "one.ugr")
+    with np.load(asked.folder.artifacts / "frames.npz") as archive:
+        frames = render(scene, None, archive["poses"], height=24, width=20, outputs=job.outputs, tools=tools, ghost=0.5)
+        np.testing.assert_allclose(archive["bmode"], frames["bmode"].numpy(), atol=1e-6)
+        np.testing.assert_array_equal(archive["labels"], frames["labels"].numpy())
+        assert {7, 255} <= set(np.unique(archive["labels"]).tolist())
+        assert json.loads(str(archive["tools"])) == to_json(tools)
+        assert float(archive["ghost"]) == 0.5
 
 
 def test_dicom_of_given_poses_in_a_fan(work: Callable[..., JobRun]) -> None:
