@@ -185,7 +185,8 @@ class UltrasoundNode(LifecycleNode):  # type: ignore[misc]
             self._frames.render(messages.placement(pose), pose.header)
 
     def _publish(self, frame: Frame, header: Header, replaced: int) -> None:
-        assert self._topics is not None
+        if self._topics is None or not self.context.ok():  # told to stop while a frame was under way
+            return
         self._topics.publish(frame, header, least_confidence=self._settings.min_confidence, replaced=replaced)
 
     def _check_parameters(self, changed: list[Parameter]) -> SetParametersResult:
