@@ -33,7 +33,7 @@ from ultragray_service.bench.served import running_server
 OUTPUT = FIGURES["ros"].staged
 SCENE = "demo"
 SIDES = (256, 512)
-FRAMES, UNCOUNTED, ROUNDS = 500, 50, 3
+FRAMES, UNCOUNTED, ROUNDS = 200, 20, 3
 TIMEOUT_S = 60.0
 SURROUNDINGS = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_DOMAIN_ID": "88"}
 

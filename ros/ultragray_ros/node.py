@@ -84,11 +84,12 @@ class UltrasoundNode(LifecycleNode):  # type: ignore[misc]
         try:
             self._settings = parameters.settings_of(self._values())
             self._client = self._connected()
+            self._topics = Publishers(self, self._value("probe_frame"))
+            self._topics.offer(self._settings.outputs)
         except ClientError as error:
             self.get_logger().error(str(error))
+            self.close()
             return TransitionCallbackReturn.FAILURE
-        self._topics = Publishers(self, self._value("probe_frame"))
-        self._topics.offer(self._settings.outputs)
         return super().on_configure(state)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -185,7 +186,8 @@ class UltrasoundNode(LifecycleNode):  # type: ignore[misc]
             self._frames.render(messages.placement(pose), pose.header)
 
     def _publish(self, frame: Frame, header: Header, replaced: int) -> None:
-        assert self._topics is not None
+        if self._topics is None or not self.context.ok():  # told to stop while a frame was under way
+            return
         self._topics.publish(frame, header, least_confidence=self._settings.min_confidence, replaced=replaced)
 
     def _check_parameters(self, changed: list[Parameter]) -> SetParametersResult:
@@ -198,10 +200,10 @@ class UltrasoundNode(LifecycleNode):  # type: ignore[misc]
         try:
             settings = parameters.settings_of(values)
             self._ask_service(self._client, values["scene"], settings)
+            assert self._topics is not None
+            self._topics.offer(settings.outputs)
         except ClientError as error:
             return SetParametersResult(successful=False, reason=error.detail)
-        assert self._topics is not None
-        self._topics.offer(settings.outputs)
         self._settings = settings
         if self._frames is not None:
             self._frames.change(values["scene"], settings)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.exceptions import InvalidTopicNameException
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
@@ -10,6 +11,7 @@ from sensor_msgs.msg import CompressedImage, Image
 from std_msgs.msg import Header, String
 
 from ultragray_client import Frame
+from ultragray_client.errors import UnknownOutput
 
 from . import messages
 
@@ -29,13 +31,17 @@ class Publishers:
         self._told_geometry: String | None = None
 
     def offer(self, outputs: tuple[str, ...]) -> None:
-        """Have topics for these outputs, beside those of before."""
+        """Have topics for these outputs, beside those of before. Raises UnknownOutput for one that cannot be a name."""
         for output in outputs:
-            if output not in self._images:
+            if output in self._images:
+                continue
+            try:
                 self._images[output] = (
                     self._node.create_publisher(Image, f"~/{output}", qos_profile_sensor_data),
                     self._node.create_publisher(CompressedImage, f"~/{output}/compressed", qos_profile_sensor_data),
                 )
+            except InvalidTopicNameException:
+                raise UnknownOutput(f"outputs must be words such as bmode, got {output!r}", field="outputs") from None
 
     def publish(self, frame: Frame, pose_header: Header, *, least_confidence: float | None, replaced: int) -> None:
         """Publish a frame; pixels only where somebody subscribes to them."""

@@ -181,6 +181,7 @@ def test_a_batch_of_frames_as_a_job(client: Any, tmp_path: Path) -> None:
         (SplineSampler(spacing_mm=2.0), "zarr", "float32"),
         (FanSampler(tilt_deg=4.0, step_deg=2.0), "hdf5", "uint8"),
         (CoveredSampler(count=2, seed=5), "plus", "uint8"),
+        (CoveredSampler(count=2, seed=6), "mcap", "float32"),
     ],
 )
 def test_every_sampler_is_taken(client: Any, sampler: Sampler, format: str, dtype: str) -> None:

@@ -20,7 +20,7 @@ import json, shlex, sys, yaml
 from ultragray_client import Client, Placement, Quaternion
 from ultragray_ros.parameters import defaults, settings_of
 comment, command = open(sys.argv[1]).read().split("ultragray-ros", 1)
-words = shlex.split(command.replace("\\\n", " "))
+words = shlex.split(command.replace("\\\\\\n", " "))
 assert words[0] == "--ros-args" and set(words[1::2]) == {"-p"}, words
 given = {name: yaml.safe_load(value) for name, _, value in (word.partition(":=") for word in words[2::2])}
 known = {"address": "", "scene": "", **defaults()}

@@ -51,7 +51,7 @@ def succeeds(command: list[object], cwd: Path, **environment: str) -> str:
 
 @pytest.fixture(scope="module")
 def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the sdists and wheels of all three projects, each wheel built from its sdist."""
+    """A folder with the sdists and wheels of all four projects, each wheel built from its sdist."""
     if not (ROOT / CONSOLE_PAGE).is_file():
         pytest.skip("a wheel holds the console, and that is not built: make console")
     output = tmp_path_factory.mktemp("dist")
@@ -176,10 +176,14 @@ def test_removing_one_leaves_the_other_working(
     wheels = [wheel_of(built, name) for name in FOLDERS]
     environment.install(*wheels)
     environment.uninstall("ultragray-client")
-    assert environment.ours() == {*packages("ultragray"), *packages("ultragray-proto")}
+    assert environment.ours() == {*packages("ultragray"), *packages("ultragray-proto"), *packages("ultragray-ros")}
     with serving(environment, working_folder) as (_, grpc):
         client = Environment(tmp_path / "client", libraries)
         client.install(*wheels)
         client.uninstall("ultragray")
-        assert client.ours() == {*packages("ultragray-client"), *packages("ultragray-proto")}
+        assert client.ours() == {
+            *packages("ultragray-client"),
+            *packages("ultragray-proto"),
+            *packages("ultragray-ros"),
+        }
         assert succeeds([client.python, "-c", RENDERING, grpc], tmp_path) == "(256, 256)\n"

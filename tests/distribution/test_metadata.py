@@ -1,4 +1,4 @@
-"""What the three projects say about themselves, and which of them owns which package."""
+"""What the four projects say about themselves, and which of them owns which package."""
 
 from __future__ import annotations
 

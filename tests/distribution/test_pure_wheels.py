@@ -1,4 +1,4 @@
-"""The wheels and sdists of client and messages: each holds its own package and nothing else."""
+"""The wheels and sdists of client, messages and node: each holds its own package, and what ROS looks for."""
 
 from __future__ import annotations
 
@@ -13,7 +13,12 @@ import pytest
 from ..surroundings import ROOT
 from .projects import unpacked
 
-PACKAGES = {"client": "ultragray_client", "proto": "ultragray_proto"}
+PACKAGES = {"client": "ultragray_client", "proto": "ultragray_proto", "ros": "ultragray_ros"}
+FOR_ROS = {
+    "share/ament_index/resource_index/packages/ultragray_ros",
+    "share/ultragray_ros/launch/ultragray.launch.xml",
+    "share/ultragray_ros/package.xml",
+}
 
 
 def sources(folder: Path) -> set[str]:
@@ -30,7 +35,7 @@ def build(folder: Path, target: str, output: Path) -> Path:
 @pytest.mark.parametrize("project", PACKAGES)
 def test_a_wheel_holds_its_package_and_the_licence(project: str, tmp_path: Path) -> None:
     with zipfile.ZipFile(build(ROOT / project, "wheel", tmp_path)) as wheel:
-        about = {name for name in wheel.namelist() if ".dist-info/" in name}
+        about = {name for name in wheel.namelist() if ".dist-info/" in name or ".data/data/" in name}
         (licence,) = (wheel.read(name) for name in about if name.endswith("/licenses/LICENSE"))
         assert set(wheel.namelist()) - about == sources(ROOT / project / PACKAGES[project])
     assert licence == (ROOT / "LICENSE").read_bytes()
@@ -40,8 +45,15 @@ def test_a_wheel_holds_its_package_and_the_licence(project: str, tmp_path: Path)
 def test_a_wheel_of_the_sdist_is_the_same(project: str, tmp_path: Path) -> None:
     source = unpacked(build(ROOT / project, "sdist", tmp_path / "sdist"), tmp_path / "source")
     with zipfile.ZipFile(build(source, "wheel", tmp_path / "wheel")) as wheel:
-        files = {name for name in wheel.namelist() if ".dist-info/" not in name}
+        files = {name for name in wheel.namelist() if ".dist-info/" not in name and ".data/data/" not in name}
     assert files == sources(ROOT / project / PACKAGES[project])
+
+
+@pytest.mark.parametrize("project", PACKAGES)
+def test_the_wheel_of_the_node_holds_what_ros_looks_for(project: str, tmp_path: Path) -> None:
+    with zipfile.ZipFile(build(ROOT / project, "wheel", tmp_path)) as wheel:
+        installed = {name.partition(".data/data/")[2] for name in wheel.namelist() if ".data/data/" in name}
+    assert installed == (FOR_ROS if project == "ros" else set())
 
 
 def test_the_sdist_of_the_messages_has_what_other_languages_generate_stubs_from(tmp_path: Path) -> None:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import io
 import json
+import re
 from collections.abc import Callable
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -15,6 +17,7 @@ from ultragray_client import Client, Display, RenderSettings
 
 from ..client.proxy import Proxy
 from ..service.conftest import RunningService
+from ..surroundings import ROOT
 from ..waiting import wait_until
 from .conftest import Peer, RunningNode
 
@@ -73,6 +76,21 @@ def test_a_pose_becomes_an_image_with_its_stamp_its_confidence_and_its_geometry(
     np.testing.assert_allclose(metres[:3] * 1000.0, (matrix_mm @ column_row)[:3])
     assert (geometry["height"], geometry["width"]) == expected.shape
     assert node.stop() == 0
+
+
+def test_the_command_of_the_launch_file_starts_the_node(
+    start_node: Start, peer: Peer, ros_service: RunningService
+) -> None:
+    from sensor_msgs.msg import Image
+
+    launch = ElementTree.parse(ROOT / "ros/launch/ultragray.launch.xml").getroot()
+    values = {one.attrib["name"]: one.attrib["default"] for one in launch.iter("arg")}
+    values |= {"address": ros_service.grpc, "probe_frame": "transducer"}
+    (executable,) = launch.iter("executable")
+    program, flag, *words = re.sub(r"\$\(var (\w+)\)", lambda found: values[found[1]], executable.attrib["cmd"]).split()
+    assert (program, flag) == ("ultragray-ros", "--ros-args")
+    start_node(**dict(word.split(":=") for word in words[1::2]))
+    assert peer.frame(peer.listen(Image, "bmode"), 1).header.frame_id == "transducer"
 
 
 def test_settings_are_parameters_which_the_service_checks(
@@ -201,6 +219,8 @@ def test_the_node_is_a_lifecycle_node(start_node: Start, peer: Peer, ros_service
         ({"source": "radio"}, "source must be pose or tf, got 'radio'"),
         ({"source": "tf"}, "source must be pose where tf2_ros is not installed"),
         ({"probe": "'{}'"}, "probe must be JSON such as"),
+        ({"outputs": "['b mode']"}, "outputs must be words such as bmode, got 'b mode'"),
+        ({"tls": "true", "root_certificates": "absent.pem"}, "absent.pem cannot be read"),
     ],
 )
 def test_a_node_that_cannot_start_says_why(start_node: Start, parameters: dict[str, str], told: str) -> None:

@@ -311,7 +311,7 @@ def test_poses_may_be_rows_of_three_or_json(dataset: Dataset, tmp_path: Path) ->
         ("p.json", b'{"poses": []}', "real numbers"),
         ("p.json", b"[" * 200_000, "nests too deeply"),
         ("p.json", b"[]", "poses must have shape"),
-        ("p.txt", b"1 0 0 0", r"\.npy and \.json"),
+        ("p.txt", b"1 0 0 0", r"\.npy, \.json and \.mcap"),
         ("p.npy", np.zeros((0, 4, 4)), "no poses"),
         ("p.npy", np.full((2, 4, 4), np.nan), r"poses\[0\] must be finite"),
         ("p.npy", np.stack([np.eye(4), np.diag([1.0, 1, -1, 1])]), r"poses\[1\] .*mirrored"),

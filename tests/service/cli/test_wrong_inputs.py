@@ -78,7 +78,7 @@ WRONG = {  # the command line, and a part of the line that it gives
     "render notes.ugr -o a.npz": "notes.ugr: not a scene file",
     "render . -o a.npz": ".: ",
     "render scene.ugr -o a.npz --poses none.npy": "none.npy: no such file",
-    "render scene.ugr -o a.npz --poses notes.txt": "poses are read from .npy and .json files",
+    "render scene.ugr -o a.npz --poses notes.txt": "poses are read from .npy, .json and .mcap files",
     "show none.ugr": "none.ugr: no such file",
     "show notes.txt": "notes.txt: a dataset is",
     "show scene.ugr --crop 1:2,3:4": "options of sweeps are not for scene.ugr",

@@ -19,6 +19,7 @@ from ultragray.datasets.plus import read_plus_sweep
 from ultragray.display import Display
 from ultragray.display.frames import show
 from ultragray.errors import ExtraMissing, FrameTooCostly, InvalidArgument, InvalidProbe, LowConfidence
+from ultragray.files.poses import load_poses
 from ultragray.interchange import rendering
 from ultragray.samplers import AroundSampler, CoveredSampler, FanSampler, SplineSampler, TrainingSampler
 from ultragray.settings import Below
@@ -113,6 +114,14 @@ def test_plus_sequence_of_the_spline(work: Callable[..., JobRun]) -> None:
     sweep, count = read_plus_sweep(asked.folder.artifacts / "frames.igs.mha")
     assert (count, sweep.probe) == (11, PROBE)
     np.testing.assert_allclose(sweep.poses[:, 1, 3], np.arange(11) / 2, atol=1e-9)
+
+
+def test_messages_of_ros_whose_poses_are_read_back(work: Callable[..., JobRun]) -> None:
+    job = RenderJob(scene="one", sampler=SplineSampler(spacing_mm=0.5), format="mcap")
+    asked = work(job)
+    assert render_run.run(asked, job).artifacts == ("frames.mcap",)
+    poses = load_poses(asked.folder.artifacts / "frames.mcap")
+    np.testing.assert_allclose(poses, SplineSampler(spacing_mm=0.5).poses(TRAINING, PROBE), atol=1e-9)
 
 
 def test_figures_of_each_frame_are_in_the_archive(work: Callable[..., JobRun], monkeypatch: pytest.MonkeyPatch) -> None:
