@@ -119,6 +119,27 @@ describe("a job of any kind", () => {
   });
 });
 
+describe("a volume of a scene", () => {
+  it("is a job like others", async () => {
+    const page = await openPage(at, "#/train?show=jobs");
+    await page.getByText("Other jobs").click();
+    await page.getByRole("combobox", { name: "Kind", exact: true }).selectOption("voxelize");
+    await page.getByRole("combobox", { name: "Field" }).selectOption("labels");
+    await page.getByLabel("Spacing, mm").fill("2");
+    await page.getByLabel("Box, mm").fill("-10:10,-2:2,10:30");
+    await page.getByRole("combobox", { name: "Format" }).selectOption("nrrd");
+    await page.getByRole("button", { name: "Start the job" }).click();
+    await page.getByText(/^It waits for/).waitFor();
+    const [job] = (await (await fetch(`${at.service.url}/v1/jobs?kind=voxelize`)).json()).jobs;
+    const { scene, field, spacing_mm, box_mm, format } = job.specification;
+    assert.deepEqual(
+      { scene, field, spacing_mm, box_mm, format },
+      { scene: "demo", field: "labels", spacing_mm: 2, box_mm: "-10:10,-2:2,10:30", format: "nrrd" },
+    );
+    assert.deepEqual(page.faults, []);
+  });
+});
+
 describe("a long training", () => {
   it("asks for a thinner curve once, and goes on where that fails", async () => {
     const page = await openPage(at, "#/scenes");

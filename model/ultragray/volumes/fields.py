@@ -114,28 +114,31 @@ class _Slab:
     def values(self, field: str) -> npt.NDArray[np.generic]:  # [voxels]
         ellipsoids = self.ellipsoids
         if field == "attenuation":
-            return self._sum(self._touching, ellipsoids.absorbed).astype(np.float32)
+            return self._sums(self._touching, ellipsoids.absorbed)[0].astype(np.float32)
         if field == "labels":
             return self._labels()
-        weight = self._sum(self._touching, None)
-        coverage = -np.expm1(-weight)
-        if field == "echo":
-            weighted = self._sum(self._touching, ellipsoids.intensities)
-            return (coverage * weighted / (weight + 1e-8)).astype(np.float32)
-        return coverage.astype(np.float32)
+        if field == "coverage":
+            return self._coverage(self._sums(self._touching, None)[0]).astype(np.float32)
+        weight, weighted = self._sums(self._touching, None, ellipsoids.intensities)
+        return (self._coverage(weight) * weighted / (weight + 1e-8)).astype(np.float32)
+
+    @staticmethod
+    def _coverage(weight: FloatArray) -> FloatArray:
+        coverage: FloatArray = -np.expm1(-weight)
+        return coverage
 
     def _labels(self) -> npt.NDArray[np.uint8]:
         found, heaviest = np.zeros(math.prod(self.shape), np.uint8), np.zeros(math.prod(self.shape))
         labels = self.ellipsoids.labels[self._touching]
         for label in np.unique(labels):
-            weight = self._sum(self._touching[labels == label], None)
+            (weight,) = self._sums(self._touching[labels == label], None)
             heavier = (weight > heaviest) & (weight >= MIN_WEIGHT_SUM)
             found[heavier], heaviest[heavier] = label, weight[heavier]
         return found
 
-    def _sum(self, chosen: IndexArray, factors: FloatArray | None) -> FloatArray:  # [n], [N] -> [voxels]
-        """Σ factor·w of the chosen Gaussians at each voxel; without factors Σ w."""
-        total = np.zeros(math.prod(self.shape))
+    def _sums(self, chosen: IndexArray, *wanted: FloatArray | None) -> list[FloatArray]:  # [n], [N]s -> [voxels]s
+        """Σ factor·w of the chosen Gaussians at each voxel, for each of the wanted factors; for None Σ w."""
+        totals = [np.zeros(math.prod(self.shape)) for _ in wanted]
         counts = self._box_voxels(chosen)
         ends = np.cumsum(counts)
         start = 0
@@ -145,11 +148,11 @@ class _Slab:
             stop = max(start + 1, int(np.searchsorted(ends, before + POINTS_AT_ONCE, side="right")))
             ids = chosen[start:stop]
             owner, voxels, weight = self._weights(ids, counts[start:stop])
-            if factors is not None:
-                weight = weight * factors[ids][owner]
-            total += np.bincount(voxels, weight, minlength=len(total))
+            for total, factors in zip(totals, wanted, strict=True):
+                term = weight if factors is None else weight * factors[ids][owner]
+                total += np.bincount(voxels, term, minlength=len(total))
             start = stop
-        return total
+        return totals
 
     def _weights(self, ids: IndexArray, counts: IndexArray) -> tuple[IndexArray, IndexArray, FloatArray]:
         """Each pair of a Gaussian and a voxel of its box: the place in `ids`, the voxel's number, and w."""

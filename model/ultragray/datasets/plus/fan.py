@@ -28,6 +28,7 @@ from ..sweep import ByteArray
 from .transforms import DeviceSet
 
 SQUARE_TOLERANCE = 0.01
+SMALLEST_PIXEL_MM = 1e-6
 SMALLEST_SHARE = 0.5  # of the fan that must lie in the image
 EXPECTED = "fan must be opening angle (degrees), radius of the face, radius of the end (mm), column, row of the apex"
 
@@ -125,7 +126,7 @@ def fan_of_export(
 ) -> FanGeometry | None:  # [4, 4] pixels -> mm
     """The fan of a sequence that our own exporter wrote, by its probe; None of a linear one and of other sequences.
 
-    Raises DatasetInvalid, naming the file, for a probe that cannot be.
+    Raises DatasetInvalid, naming the file, for a probe that cannot be, and for one that does not go with ImageToProbe.
     """
     if image_to_probe is None or "UltraGRayProbe" not in fields:
         return None
@@ -137,7 +138,12 @@ def fan_of_export(
     if not isinstance(probe, Fan):
         return None
     far_mm = probe.far_mm if depth_mm is None else min(probe.far_mm, probe.face_depth_mm + depth_mm)
-    column, row = -image_to_probe[0, 3] / image_to_probe[0, 0], -image_to_probe[2, 3] / image_to_probe[2, 1]
+    lateral_mm, axial_mm = float(image_to_probe[0, 0]), float(image_to_probe[2, 1])
+    if min(abs(lateral_mm), abs(axial_mm)) < SMALLEST_PIXEL_MM:
+        raise DatasetInvalid(
+            f"{path}: its ImageToProbe must take columns to x and rows to z, as its UltraGRayProbe has it"
+        )
+    column, row = -image_to_probe[0, 3] / lateral_mm, -image_to_probe[2, 3] / axial_mm
     half_deg = probe.opening_angle_deg / 2
     return FanGeometry(-half_deg, half_deg, probe.near_mm, far_mm, float(column), float(row))
 

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from pathlib import Path
 
 import cv2
@@ -142,6 +143,15 @@ def test_our_reader_brings_a_fan_back_to_scan_lines(tmp_path: Path, probe: Probe
     assert any("fan of the file was taken" in note for note in sweep.notes)
     cropped, _ = read_plus_sweep(tmp_path / "sweep.igs.mha", crop="100:150,80:130")  # who crops wants no fan
     assert cropped.images.shape == (12, 50, 50)
+
+
+def test_a_calibration_that_does_not_go_with_the_probe_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "sweep.igs.mha"
+    export(path, ConvexProbe(opening_angle_deg=60.0, near_mm=20.0, far_mm=60.0))
+    turned = b"ImageToProbeTransform = 0 2 0 0 0 0 1 0 2 0 0 0 0 0 0 1"
+    path.write_bytes(re.sub(rb"ImageToProbeTransform = .*", turned, path.read_bytes()))
+    with pytest.raises(DatasetInvalid, match="must take columns to x and rows to z"):
+        read_plus_sweep(path)
 
 
 def test_a_probe_of_an_export_that_cannot_be_is_named(tmp_path: Path) -> None:
