@@ -265,7 +265,8 @@ def _checked_image(image: Any) -> Tensor:  # [H, W] in [0, 1], float32
         )
     grey = array.astype(np.float32) / (255.0 if array.dtype == np.uint8 else 1.0)
     if not np.isfinite(grey).all() or grey.min() < 0.0 or grey.max() > 1.0:
-        raise InvalidArgument("image must hold finite values in [0, 1], or uint8", field="image")
+        got = f"{array.dtype} from {grey.min():g} to {grey.max():g}"
+        raise InvalidArgument(f"image must hold finite values in [0, 1], or uint8, got {got}", field="image")
     return torch.from_numpy(grey)
 
 

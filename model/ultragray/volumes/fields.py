@@ -68,7 +68,7 @@ def sample_volume(scene: GaussianScene, field: str, grid: VolumeGrid) -> Iterato
     and for labels of a scene that has none.
     """
     if field not in VOLUME_FIELDS:
-        raise InvalidArgument(f"field must be {', '.join(VOLUME_FIELDS)}, got {field[:40]!r}", field="field")
+        raise InvalidArgument(f"field must be one of {', '.join(VOLUME_FIELDS)}, got {field[:40]!r}", field="field")
     if field == "labels" and scene.labels is None:
         raise InvalidArgument("labels are for scenes whose Gaussians carry them, this one's carry none", field="field")
     return _slabs(scene, field, grid)

@@ -75,13 +75,15 @@ def _read_frame(path: Path) -> Any:  # [H, W]
     import cv2
     import numpy as np
 
+    from ultragray.files.npy import map_npy
+
     if path.suffix.lower() not in (".png", ".npy"):
-        raise InvalidArgument(f"a frame must end in .png or .npy, got {path.name!r}", field="image")
+        raise InvalidArgument(f"a frame must end in .png or .npy, got {str(path)!r}", field="image")
     try:
         if path.suffix.lower() == ".npy":
-            return np.load(path, allow_pickle=False)
+            return map_npy(path)
         pixels = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_GRAYSCALE)
-    except (OSError, EOFError, ValueError, cv2.error) as error:
+    except (OSError, ValueError, cv2.error) as error:
         raise InvalidArgument(f"{path} cannot be read as a frame: {error}", field="image") from None
     if pixels is None:
         raise InvalidArgument(f"{path} cannot be read as a frame: it is no picture", field="image")
