@@ -16,7 +16,7 @@ from .backends.poses import ScenePoses, as_array, scene_poses
 from .contact.compression import at_rest
 from .contact.skin import Skin
 from .contact.touch import Touch
-from .errors import BackendUnavailable
+from .errors import BackendUnavailable, InvalidArgument
 from .image_size import check_image_size
 from .installation import __version__
 from .limits import UNLIMITED, Limits
@@ -166,8 +166,8 @@ def render(
     `limits` bound the cost of each frame and can end the rendering (`ultragray.limits`), but for frames with gradients:
     FrameTooCostly, GivenUp.
     Raises InvalidPose, InvalidProbe, InvalidImageSize, UnknownOutput (also for labels of a scene that carries none),
-    BackendUnavailable, MemoryExceeded where the GPU's memory does not suffice, and InvalidArgument where contact is
-    asked for and the scene knows no skin.
+    BackendUnavailable, MemoryExceeded where the GPU's memory does not suffice, and InvalidArgument for a contact that
+    is none, and where contact is asked for and the scene knows no skin.
     """
     chosen = check_outputs(outputs)
     check_available(chosen, scene.info, with_tools=bool(tools))
@@ -179,6 +179,7 @@ def render(
         int(width),
     )
     draw = _BACKENDS[choose_backend(backend, scene)]
+    contact = _checked_contact(contact)
     planes = list(dict.fromkeys(plane for name in chosen for plane in OUTPUTS[name].planes))
     touch = touch_of(scene, view[0], poses, view[3]) if contact is not None else None
     drawn = []
@@ -211,6 +212,17 @@ def _in_mm(scene: GaussianScene, poses: ScenePoses) -> FloatArray:  # [C, 4, 4] 
     moved = as_array(poses).copy()
     moved[:, :3, 3] = 10.0 * moved[:, :3, 3] + np.asarray(scene.info.centre_mm)
     return moved
+
+
+def _checked_contact(contact: Any) -> Contact | None:
+    """A Contact also by its word."""
+    if contact is None:
+        return None
+    try:
+        return Contact(contact)
+    except ValueError:
+        words = ", ".join(one.value for one in Contact)
+        raise InvalidArgument(f"contact must be one of {words}, or None, got {contact!r}", field="contact") from None
 
 
 def touch_of(scene: GaussianScene, probe: Probe, poses: Any, width: int) -> Touch:  # [C, 4, 4] or [4, 4] mm

@@ -50,7 +50,13 @@ def _read(path: Path) -> Any:
     if not path.is_file():  # a pipe or a device would never end
         raise FileNotFoundError
     if path.suffix == ".json":
-        return json.loads(path.read_text(encoding="utf-8"))
+        document = json.loads(path.read_text(encoding="utf-8"))
+        if not isinstance(document, list):
+            raise ValueError(
+                "it must hold a list of lists of numbers, one pose [4, 4] or [3, 4], or P of them, not "
+                f"{json.dumps(document)[:60]}"
+            )
+        return document
     if path.suffix == ".npy":
         return map_npy(path)
     if path.suffix == ".mcap":

@@ -10,6 +10,7 @@ import numpy as np
 
 from ..display.pixels import ByteArray
 from ..errors import InvalidArgument
+from ..files.npy import map_npy
 from ..image_size import check_image_size
 
 SUFFIXES = (".png", ".npy")
@@ -21,10 +22,10 @@ def read_frame(path: Path) -> Any:  # [H, W]
     """The frame of a `.png` file, or the array of a `.npy` one. Raises InvalidArgument, naming the file."""
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
-        raise InvalidArgument(f"a frame must end in {' or '.join(SUFFIXES)}, got {path.name!r}", field="image")
+        raise InvalidArgument(f"a frame must end in {' or '.join(SUFFIXES)}, got {str(path)!r}", field="image")
     try:
-        return np.load(path, allow_pickle=False) if suffix == ".npy" else read_png(path.read_bytes())
-    except (OSError, EOFError, ValueError) as error:
+        return map_npy(path) if suffix == ".npy" else read_png(path.read_bytes())
+    except (OSError, ValueError) as error:
         raise InvalidArgument(f"{path} cannot be read as a frame: {error}", field="image") from None
 
 

@@ -81,10 +81,10 @@ def localize(
 ) -> Localization:
     """The pose of a real frame [H, W] in a scene, from a start [4, 4] (mm, probe→scene) that is about right.
 
-    `image` is grey values, uint8 or in [0, 1], in the layout of the scene's frames: rows along depth, columns across
-    scan lines, not scan-converted. Its gain and contrast may differ from the scene's. `probe` took it (None: the one
-    that the scene was trained with). The start may be off by `within_mm` and `within_deg`: more than 3 mm and 5° costs
-    more time.
+    `image` is grey values, an array or a tensor, uint8 or in [0, 1], in the layout of the scene's frames: rows along
+    depth, columns across scan lines, not scan-converted. Its gain and contrast may differ from the scene's. `probe`
+    took it (None: the one that the scene was trained with). The start may be off by `within_mm` and `within_deg`: more
+    than 3 mm and 5° costs more time.
     Raises InvalidArgument for an image that is none or smaller than 32 pixels a side, InvalidPose, InvalidProbe, and
     what render() raises.
     """
@@ -265,7 +265,7 @@ def _within_reach(
 
 
 def _checked_image(image: Any) -> Tensor:  # [H, W] in [0, 1], float32
-    array = np.asarray(image)
+    array = np.asarray(image.detach().cpu() if isinstance(image, Tensor) else image)
     if array.ndim != 2 or array.dtype.kind not in "uf" or (array.dtype.kind == "u" and array.dtype != np.uint8):
         raise InvalidArgument(
             f"image must be grey values [H, W], uint8 or floating point, got {array.dtype} {list(array.shape)}",
@@ -279,7 +279,8 @@ def _checked_image(image: Any) -> Tensor:  # [H, W] in [0, 1], float32
         )
     grey = array.astype(np.float32) / (255.0 if array.dtype == np.uint8 else 1.0)
     if not np.isfinite(grey).all() or grey.min() < 0.0 or grey.max() > 1.0:
-        raise InvalidArgument("image must hold finite values in [0, 1], or uint8", field="image")
+        got = f"{array.dtype} from {grey.min():g} to {grey.max():g}"
+        raise InvalidArgument(f"image must hold finite values in [0, 1], or uint8, got {got}", field="image")
     return torch.from_numpy(grey)
 
 

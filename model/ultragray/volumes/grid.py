@@ -95,13 +95,15 @@ class VolumeGrid:
 
 
 def parse_numbers(text: str, count: int, field: str) -> tuple[float, ...]:
-    """`"1,2.5,-3"`: that many numbers. Raises InvalidArgument."""
+    """`"1,2.5,-3"`: that many finite numbers. Raises InvalidArgument."""
     try:
         numbers = tuple(float(word) for word in text.split(","))
     except ValueError:
         numbers = ()
-    if len(numbers) != count:
-        raise InvalidArgument(f"{field} must be {count} numbers with commas between, got {text[:80]!r}", field=field)
+    if len(numbers) != count or not all(map(math.isfinite, numbers)):
+        raise InvalidArgument(
+            f"{field} must be {count} finite numbers with commas between, got {text[:80]!r}", field=field
+        )
     return numbers
 
 

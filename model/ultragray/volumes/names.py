@@ -12,7 +12,7 @@ SLICE_SUFFIXES = (".png", ".npy")
 def check_field(field: str, *, has_labels: bool) -> None:
     """Raises InvalidArgument for a field that is none of VOLUME_FIELDS, and for labels of a scene without them."""
     if field not in VOLUME_FIELDS:
-        raise InvalidArgument(f"field must be {', '.join(VOLUME_FIELDS)}, got {field[:40]!r}", field="field")
+        raise InvalidArgument(f"field must be one of {', '.join(VOLUME_FIELDS)}, got {field[:40]!r}", field="field")
     if field == "labels" and not has_labels:
         raise InvalidArgument("labels are for scenes whose Gaussians carry them, this one's carry none", field="field")
 

@@ -13,6 +13,7 @@ from ultragray import ConvexProbe, GaussianScene, LinearProbe, Probe, render
 from ultragray.backends import cpu
 from ultragray.contact import MOST_COMPRESSION
 from ultragray.contact.compression import at_rest
+from ultragray.errors import InvalidArgument
 from ultragray.outputs import PLANES
 from ultragray.probe import FloatArray
 from ultragray.settings import Contact
@@ -129,3 +130,12 @@ def test_gradients_reach_the_scene_and_the_pose(scene: GaussianScene) -> None:
     assert leaf.sh0.grad is not None
     assert float(pose.grad[0, :3, 3].norm()) > 0
     assert float(leaf.sh0.grad.norm()) > 0
+
+
+def test_contact_is_also_known_by_its_word_and_others_are_refused(scene: GaussianScene) -> None:
+    for contact in Contact:
+        by_word = render(scene, None, at(z=5.0), **SIZE, contact=contact.value)
+        torch.testing.assert_close(by_word["bmode"], render(scene, None, at(z=5.0), **SIZE, contact=contact)["bmode"])
+    for wrong in ("gel", True, 1):
+        with pytest.raises(InvalidArgument, match=f"contact must be one of air, pressure, or None, got {wrong!r}"):
+            render(scene, None, at(), **SIZE, contact=wrong)

@@ -58,6 +58,14 @@ def test_frames_of_a_scene_are_found_from_3_mm_and_5_degrees_away(demo: Gaussian
         assert (found.shift_mm, found.turn_deg) == pytest.approx(distance(start, found.pose, probe))
 
 
+def test_a_frame_of_render_is_taken_as_it_is(demo: GaussianScene) -> None:
+    pose = demo_poses(3)[1]
+    frame = render(demo, None, pose, height=SIDE, width=SIDE, outputs=("bmode",))["bmode"][0]
+    start = displaced(pose, demo.info.probe_or(None), 1.0, 1.0, 0)
+    as_tensor = localize(demo, frame.clone().requires_grad_(), start)
+    np.testing.assert_allclose(as_tensor.pose, localize(demo, frame.detach().numpy(), start).pose, atol=1e-6)
+
+
 def test_gain_contrast_and_noise_do_not_matter(demo: GaussianScene) -> None:
     probe, pose = demo.info.probe_or(None), demo_poses(3)[1]
     noise = np.random.default_rng(0).normal(scale=0.02, size=(SIDE, SIDE))

@@ -197,7 +197,7 @@ def test_mistakes_are_told(scene: GaussianScene, tmp_path: Path, random_scene: C
         VolumeGrid.on_plane((0, 0, 0), (0, 0, 0), (1, 1, 0), (10, 10), 1.0)
     with pytest.raises(InvalidArgument, match="labels are for scenes whose Gaussians carry them"):
         sample_volume(random_scene(3), "labels", GRID)
-    with pytest.raises(InvalidArgument, match="field must be echo, coverage, attenuation, labels, got 'bmode'"):
+    with pytest.raises(InvalidArgument, match="field must be one of echo, coverage, attenuation, labels, got 'bmode'"):
         sample_volume(scene, "bmode", GRID)
     with pytest.raises(InvalidArgument, match=r"must end in \.nii\.gz, \.nii, \.nrrd, got 'v\.vtk'"):
         write_volume(tmp_path / "v.vtk", scene, "echo", GRID)

@@ -60,3 +60,8 @@ def test_mistakes_are_told_in_one_line(tmp_path: Path) -> None:
     assert "image must be a PNG file" in refused("localize", DEMO_FILE, tmp_path / "text.png", "--start", start)
     assert "must end in .png or .npy" in refused("localize", DEMO_FILE, tmp_path / "frame.dcm", "--start", start)
     assert "No such file" in refused("localize", DEMO_FILE, tmp_path / "gone.png", "--start", start)
+    np.save(tmp_path / "objects.npy", np.array([{}], dtype=object), allow_pickle=True)
+    assert "it holds Python objects" in refused("localize", DEMO_FILE, tmp_path / "objects.npy", "--start", start)
+    np.save(tmp_path / "bytes.npy", np.full((64, 64), 200.0))
+    told = refused("localize", DEMO_FILE, tmp_path / "bytes.npy", "--start", start)
+    assert "in [0, 1], or uint8, got float64 from 200 to 200" in told

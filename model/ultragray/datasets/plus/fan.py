@@ -201,7 +201,8 @@ class FanLines:
         self.share = float(within.mean())  # of the fan that lies in the image
         if self.share < SMALLEST_SHARE:
             raise InvalidArgument(
-                f"fan must lie in the image of {size[1]} x {size[0]} pixels, {self.share:.0%} of {fan.words} does",
+                f"fan must lie in the image of {size[1]} x {size[0]} pixels, of {pixel_mm[0]:.3g} x {pixel_mm[1]:.3g} "
+                f"mm each, at least by half: {self.share:.0%} of {fan.words} does",
                 field="fan",
             )
         places = (self._columns, size[1]), (self._rows, size[0])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from operator import gt, lt
 from pathlib import Path
 from typing import Annotated
 
@@ -13,8 +14,9 @@ from ultragray.volumes.names import SLICE_SUFFIXES, VOLUME_FIELDS, VOLUME_SUFFIX
 
 from ..output import check_file
 from ..progress import working
-from ..style import Force, Json, SceneFile, command_group, examples, output_option, tell
+from ..style import Force, Json, SceneFile, command_group, examples, output_option, tell, warn
 
+RIGHT, DOWN = "1,0,0", "0,0,1"
 command_app = command_group()
 
 
@@ -46,24 +48,36 @@ def voxelize(
     plane_mm: Annotated[
         str | None, typer.Option(help="Corner x,y,z of a slice, instead of a volume.", show_default=False)
     ] = None,
-    right: Annotated[str, typer.Option(help="Direction of the rows of the slice.")] = "1,0,0",
-    down: Annotated[str, typer.Option(help="Direction of its columns.")] = "0,0,1",
+    right: Annotated[str, typer.Option(help="Direction of the rows of the slice.")] = RIGHT,
+    down: Annotated[str, typer.Option(help="Direction of its columns.")] = DOWN,
     size_mm: Annotated[str | None, typer.Option(help="Its width,height.", show_default=False)] = None,
     force: Force = False,
     json: Json = False,
 ) -> None:
     """The scene without a probe, in its own frame, sampled on a regular grid."""
+    if plane_mm is None and output.name.endswith(SLICE_SUFFIXES):
+        raise InvalidArgument(
+            f"output {output.name!r} is for a slice: give plane_mm and size_mm, or a volume a name that ends in "
+            f"{', '.join(VOLUME_SUFFIXES)}",
+            field="output",
+        )
+    if plane_mm is None and (right, down) != (RIGHT, DOWN):
+        raise InvalidArgument("right and down are for a slice: give plane_mm, too", field="plane_mm")
     check_file(output, VOLUME_SUFFIXES if plane_mm is None else (*SLICE_SUFFIXES, *VOLUME_SUFFIXES), force=force)
     info = read_header(scene).info
 
     from ultragray import GaussianScene
     from ultragray.volumes.files import volume_facts, write_slice, write_volume
-    from ultragray.volumes.grid import VolumeGrid, parse_numbers
+    from ultragray.volumes.grid import VolumeGrid, parse_box, parse_numbers
 
     if plane_mm is None:
         if size_mm is not None:
             raise InvalidArgument("size_mm is for a slice: give plane_mm, too", field="size_mm")
         grid = VolumeGrid.over_scene(info, box_mm, spacing_mm)
+        low, high = (info.bounds_min_mm, info.bounds_max_mm) if box_mm is None else parse_box(box_mm)
+        if any(map(lt, high, info.bounds_min_mm)) or any(map(gt, low, info.bounds_max_mm)):
+            there = ",".join(f"{a:g}:{b:g}" for a, b in zip(info.bounds_min_mm, info.bounds_max_mm, strict=True))
+            warn(f"box_mm lies beyond all Gaussians, which are in {there}: is it in mm of the scene's frame?")
     else:
         if size_mm is None or box_mm is not None:
             raise InvalidArgument("a slice needs size_mm, its width,height, and takes no box_mm", field="size_mm")

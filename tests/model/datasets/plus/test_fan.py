@@ -105,7 +105,7 @@ def test_the_fan_that_plus_clips_to(tmp_path: Path, plus_files: SimpleNamespace,
         ("60,10,26,149.5,nan", "must be finite"),
         ("200,10,26,149.5,-40", "at most 175°, got 200"),
         ("60,30,26,149.5,-40", "the end beyond the face, got 30 and 26 mm"),
-        ("60,10,26,1490,-40", "fan must lie in the image of 300 x 240 pixels"),
+        ("60,10,26,1490,-40", r"image of 300 x 240 pixels, of 0\.2 x 0\.1 mm each, at least by half: 0%"),
     ],
 )
 def test_fans_that_cannot_be_are_refused(
