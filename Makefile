@@ -147,7 +147,7 @@ bench-record:  ## measure all that bench and bench-console do, and record it: al
 	@$(MAKE) --no-print-directory bench RECORD=1
 	@$(MAKE) --no-print-directory bench-console RECORD=1
 
-bench-console: $(VENV)/installed-dev $(CONSOLE)  ## frames a second, memory and first paint of the console in Debian's Chromium; takes six minutes
+bench-console: $(VENV)/installed-dev $(CONSOLE)  ## frames a second, memory and first paint of the console in Debian's Chromium; takes eleven minutes
 	$(READY)
 	node tests/console/measure.mjs > $(FIGURES)/console.json
 	$(KEEP) console

@@ -5,6 +5,7 @@ import { execFileSync } from "node:child_process";
 import path from "node:path";
 import { describe, it } from "node:test";
 
+import { clicksShownAfter_ms, watchDrawing } from "./drawing.mjs";
 import { canvasState, picture, PYTHON, ROOT, SOURCES, until } from "./harness.mjs";
 import { enterPose, IMAGE, openScan, poseOf } from "./scan_page.mjs";
 import { tested } from "./tested.mjs";
@@ -20,26 +21,6 @@ const at = tested({
     }
   },
 });
-
-/** Keeps what WebGL has drawn readable, and notes when each drawing began and ended. */
-function watchDrawing() {
-  const { getContext } = HTMLCanvasElement.prototype;
-  HTMLCanvasElement.prototype.getContext = function (kind, options) {
-    return getContext.call(this, kind, kind === "webgl2" ? { ...options, preserveDrawingBuffer: true } : options);
-  };
-  globalThis.drawings = [];
-  const { fenceSync, deleteSync } = WebGL2RenderingContext.prototype;
-  WebGL2RenderingContext.prototype.fenceSync = function (...given) {
-    const fence = fenceSync.apply(this, given);
-    globalThis.drawings.push({ fence, began: globalThis.drawing ?? performance.now(), ended: null });
-    return fence;
-  };
-  WebGL2RenderingContext.prototype.deleteSync = function (fence) {
-    const drawing = globalThis.drawings.find((one) => one.fence === fence);
-    if (drawing) [drawing.ended, drawing.fence] = [performance.now(), null];
-    return deleteSync.call(this, fence);
-  };
-}
 
 async function openRoom(options = {}) {
   const { page } = await openScan(at, { init: `(${watchDrawing})()`, ...options });
@@ -246,22 +227,7 @@ it("a click in space shows within 150 ms while the sweep plays, though the proce
   await options(page);
   await page.getByRole("button", { name: "Play the sweep" }).click();
   await page.waitForTimeout(3000);
-  const click = (label) =>
-    page.getByLabel(label, { exact: true }).evaluate(async (element) => {
-      const start = performance.now();
-      element.click();
-      for (;;) {
-        await new Promise((resolve) => requestAnimationFrame(resolve));
-        const shown = globalThis.drawings.find(({ began, ended }) => began >= start && ended !== null);
-        if (shown) return shown.ended - start;
-      }
-    });
-  const times = [];
-  for (let i = 0; i < 9; i++) {
-    times.push(await click(i % 2 ? "Sweep" : "Skin"));
-    await page.waitForTimeout(400);
-  }
-  times.sort((a, b) => a - b);
+  const times = await clicksShownAfter_ms(page, 9);
   assert.ok(times[times.length >> 1] < LATEST_MS, `shown after ${times.map(Math.round)} ms`);
 });
 
