@@ -259,12 +259,10 @@ def _quoted(text: str) -> str:
 
 def formatted(paths: list[Path]) -> list[Path]:
     """The files, in the project's format."""
-    configuration = ["--config", str(PACKAGE.parents[1] / "pyproject.toml"), "--quiet", *map(str, paths)]
-    subprocess.run(
-        [sys.executable, "-m", "ruff", "check", "--select=I", "--fix", *configuration],
-        check=True,
-    )
-    subprocess.run([sys.executable, "-m", "ruff", "format", *configuration], check=True)
+    root = PACKAGE.parents[1]  # from elsewhere the packages of the project are not known as such
+    configuration = ["--config", str(root / "pyproject.toml"), "--quiet", *(str(path.resolve()) for path in paths)]
+    for command in (["check", "--select=I", "--fix"], ["format"]):
+        subprocess.run([sys.executable, "-m", "ruff", *command, *configuration], check=True, cwd=root)
     return paths
 
 
