@@ -60,7 +60,7 @@ def test_frames_of_a_scene_are_found_from_3_mm_and_5_degrees_away(demo: Gaussian
 
 
 def test_frames_that_the_scene_was_not_trained_from_are_found(demo: GaussianScene) -> None:
-    """Of the phantom's own image formation, with speckle that the scene has never seen; `make localization` has more."""
+    """Of the phantom's own image formation, with speckle that the scene has never seen."""
     poses = freehand_poses(24, tilt_deg=5.0, offset_mm=1.0, unrest=3.0)[3:22:3]
     images = simulate(poses, probe=PHANTOM_PROBE, height=SIDE, width=SIDE)
     found = [
