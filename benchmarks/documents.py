@@ -19,6 +19,7 @@ from typing import Any, TypeAlias
 
 import ablations
 import confidence
+import localization
 import methods_tables
 import performance
 import poses
@@ -66,6 +67,7 @@ BLOCKS = {
     "methods": Block("methods_tables", methods_tables.tables),
     "ablations": Block("ablations", ablations.tables),
     "poses": Block("poses", poses.table),
+    "localization": Block("localization", localization.table),
     "confidence": Block("confidence", confidence.tables),
     "simulated costs": Block("simulation", tables.costs),
     "simulation against theory": Block("simulation", tables.checks),

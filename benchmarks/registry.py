@@ -88,6 +88,11 @@ _FILES = (
     Figures("benchmarks/ablations.json", "ablations", (*_TRAINED, "benchmarks/ablations.py")),
     Figures("benchmarks/poses.json", "poses", (*_TRAINED, "benchmarks/poses.py")),
     Figures(
+        "benchmarks/localization.json",
+        "localization",
+        (*_KERNEL, "model/ultragray/localization", "benchmarks/localization.py"),
+    ),
+    Figures(
         "benchmarks/confidence.json",
         "confidence",
         (*_TRAINED, "model/ultragray/confidence", "benchmarks/confidence.py", "benchmarks/in_silico.py"),

@@ -32,11 +32,14 @@ from mcap_ros2.decoder import DecoderFactory
 
 from ultragray import GaussianScene, read_header, render
 from ultragray.confidence import Assessor, supported
+from ultragray.datasets.phantom import PHANTOM_PROBE, freehand_poses, simulate
 from ultragray.demo import DEMO_FILE
 from ultragray.display import Display
 from ultragray.display.frames import show
 from ultragray.gym import StandardPlaneEnv
 from ultragray.interchange.rendering import render_to_file
+from ultragray.pose import pose_from_position_quaternion
+from ultragray.registration.frames import register_frames
 from ultragray.samplers import AroundSampler
 from ultragray.settings import Contact, Encoding, FrameSettings
 from ultragray.tools import DEFAULT_LABEL, Box, Cylinder, Needle, Tool, ToolFrame
@@ -68,6 +71,7 @@ def main() -> None:
     draw_slices(scene, IMAGES / "volume_slices.png")
     draw_recording(scene, IMAGES / "mcap_recording.png")
     draw_live_in_volume(scene, IMAGES / "slicer.png")
+    draw_registration(scene, IMAGES / "registration.png")
     for folder in sys.argv[1:]:
         shrink(Path(folder) / "sweep.png", IMAGES / "tutorial_sweep.png", width=1000)
         shrink(Path(folder) / "pictures" / "frame_00007.png", IMAGES / "tutorial_eval.png", width=1000)
@@ -373,6 +377,28 @@ def _draw_in_space(
     panel.imshow(pixels, cmap="gray", vmin=0, extent=extent, transform=place + panel.transData, zorder=layer)
     border = place.transform([(0, 0), (width, 0), (width, height), (0, height)])
     panel.add_patch(Polygon(border, fill=False, edgecolor=edge, linewidth=1.2, zorder=layer + 0.5))
+
+
+def draw_registration(scene: GaussianScene, path: Path) -> None:
+    """A real frame (of the phantom, which the scene was trained from), and what the scene shows where the robot says
+    that it was taken: before and after a registration from three frames.
+    """
+    poses = freehand_poses(24, tilt_deg=5.0, offset_mm=1.0, unrest=3.0)[6:18:4]
+    frames = simulate(poses, probe=PHANTOM_PROBE, height=SIDE, width=SIDE)
+    true = pose_from_position_quaternion((-400.0, 20.0, 168.0), (0.0, 1.0, 0.0, 0.0))  # base to scene
+    flanges = np.linalg.inv(true) @ poses
+    old = pose_from_position_quaternion((2.0, 1.0, -2.0), (0.9995, 0.0, 0.0, 0.0315)) @ true  # slipped since
+    fit = register_frames(scene, list(frames), flanges, old, within_mm=6.0, within_deg=8.0).fit
+    titles = ("real frame", "before", "after")
+    at = np.stack([old @ flanges[1], fit.base_to_scene @ flanges[1]])
+    shown = render(scene, None, at, height=SIDE, width=SIDE, outputs=("bmode",))["bmode"].detach().numpy()
+    edges = cv2.Canny(cv2.GaussianBlur(frames[1], (0, 0), 4.0), 30, 60)
+    figure, panels = panel_row(rows=1, columns=len(titles))
+    for panel, title, image in zip(panels, titles, (frames[1] / 255.0, *shown), strict=True):
+        panel.imshow(image, cmap="gray", vmin=0.0, vmax=1.0, extent=EXTENT_MM)
+        panel.contour(np.flipud(edges), levels=[128], colors="#edae49", linewidths=0.6, extent=EXTENT_MM)
+        panel.set_title(title)
+    save(figure, path)
 
 
 def panel_row(*, rows: int, columns: int) -> tuple[Figure, Sequence[Axes]]:

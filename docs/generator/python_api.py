@@ -24,6 +24,7 @@ LIBRARY_MODULES = (
     *("ultragray.evaluation.compounding", "ultragray.evaluation.baselines", "ultragray.confidence"),
     *("ultragray.contact", "ultragray.gym", "ultragray.tools"),
     *("ultragray.volumes.grid", "ultragray.volumes.fields", "ultragray.volumes.files"),
+    *(f"ultragray.registration.{name}" for name in ("registration", "points", "poses", "frames")),
     *("ultragray.samplers", "ultragray.contract", "ultragray.pose", "ultragray.rendering", "ultragray.demo"),
     *("ultragray.display.settings", "ultragray.display.frames", "ultragray.display.scan_conversion"),
     *("ultragray.interchange.rendering", "ultragray.interchange.exports", "ultragray.interchange.exports.png_folder"),
@@ -33,6 +34,7 @@ LIBRARY_MODULES = (
 CLIENT_GROUPS = (
     *("ultragray_client.sync.scenes.Scenes", "ultragray_client.sync.datasets.Datasets"),
     *("ultragray_client.sync.jobs.Jobs", "ultragray_client.sync.workers.Workers"),
+    "ultragray_client.sync.registrations.Registrations",
 )
 _ONLY = {"ultragray.contract": ("from_dict", "to_dict")}
 _OWN = ("ultragray", "ultragray_client")

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from ultragray import ConvexProbe, GaussianScene, Probe, localize, render
+from ultragray.datasets.phantom import PHANTOM_PROBE, freehand_poses, simulate
 from ultragray.demo import demo_poses, load_demo_scene
 from ultragray.errors import InvalidArgument, InvalidPose
 from ultragray.localization.motion import Motions
@@ -64,6 +65,17 @@ def test_a_frame_of_render_is_taken_as_it_is(demo: GaussianScene) -> None:
     start = displaced(pose, demo.info.probe_or(None), 1.0, 1.0, 0)
     as_tensor = localize(demo, frame.clone().requires_grad_(), start)
     np.testing.assert_allclose(as_tensor.pose, localize(demo, frame.detach().numpy(), start).pose, atol=1e-6)
+
+
+def test_frames_that_the_scene_was_not_trained_from_are_found(demo: GaussianScene) -> None:
+    """Of the phantom's own image formation, with speckle that the scene has never seen."""
+    poses = freehand_poses(24, tilt_deg=5.0, offset_mm=1.0, unrest=3.0)[3:22:3]
+    images = simulate(poses, probe=PHANTOM_PROBE, height=SIDE, width=SIDE)
+    found = [
+        is_found(localize(demo, image, displaced(pose, PHANTOM_PROBE, 3.0, 5.0, seed)).pose, pose, PHANTOM_PROBE)
+        for seed, (image, pose) in enumerate(zip(images, poses, strict=True))
+    ]
+    assert sum(found) >= len(found) - 1
 
 
 def test_gain_contrast_and_noise_do_not_matter(demo: GaussianScene) -> None:

@@ -46,13 +46,15 @@ def points(
     """From three or more points that are known in both frames, not on a line."""
     check_file(output, SUFFIXES, force=force)
     mounting = _mounting(probe_to_flange)
+    import numpy as np
+
     from ultragray.registration.points import register_points
     from ultragray.registration.registration import Registration, rows
 
     fit = register_points(_read_points(in_base), _read_points(in_scene))
     registration = Registration(
         base_to_scene=rows(fit.transform),
-        **({} if mounting is None else {"probe_to_flange": rows(mounting)}),
+        probe_to_flange=rows(np.eye(4) if mounting is None else mounting),
         residual_mm=fit.rms_mm,
         position_std_mm=fit.position_std_mm,
         angle_std_deg=fit.angle_std_deg,
