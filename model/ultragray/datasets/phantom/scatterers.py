@@ -22,7 +22,7 @@ Float32Array = npt.NDArray[np.float32]
 
 BLOCK_MM = 8.0
 PER_MM3 = 8.0  # about five in a cell of the beam's resolution: speckle is fully developed
-LAST_BLOCKS = 256  # kept for who simulates frame by frame, about 20 MB: neighbouring frames share most of some hundred
+LAST_BLOCKS = 256  # kept for calls of one frame each, about 20 MB: neighbouring frames share most of their blocks
 BAND_MM = 0.4  # scatterers this near to an interface are repeated on it
 FASCICLES_DB = 9.0  # by which bundles of muscle fibres are brighter or darker
 _SEED = 20261121
