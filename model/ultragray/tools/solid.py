@@ -23,9 +23,8 @@ class Span(NamedTuple):
     head_on: FloatArray  # cosine of the angle between the line and the normal of the side where it enters
 
 
-SpanOf = Callable[
-    [FloatArray, FloatArray], Span
-]  # points of lines [..., 3] and directions [..., 3], in the body's axes
+SpanOf = Callable[[FloatArray, FloatArray], Span]
+"""Of points of lines [..., 3] and their directions [..., 3], in the body's own axes."""
 
 
 def overlap(one: Span, other: Span) -> Span:
