@@ -1,16 +1,17 @@
 """The settings of a frame as ROS parameters: one for each field of RenderSettings, `display.` before those of Display.
 
-A parameter of ROS is never None: −1 and the empty text leave a setting to the scene, and [0.0] stands for no numbers. A
-probe is written as JSON, such as `{"kind": "convex", "opening_angle_deg": 60, "near_mm": 40, "far_mm": 95}`.
+A parameter of ROS is never None: −1 and the empty text leave a setting to the scene, [0.0] stands for no numbers. A
+probe is written as JSON, such as `{"kind": "convex", "opening_angle_deg": 60, "near_mm": 40, "far_mm": 95}`, and tools
+as a list of such objects.
 Free of ROS.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import MISSING, Field, fields, is_dataclass
-from enum import Enum
+from enum import Enum, EnumMeta
 from types import NoneType
 from typing import Any, TypeAlias, get_args, get_origin, get_type_hints
 
@@ -69,7 +70,12 @@ def _read(name: str, kind: Any, value: Any) -> Any:
     if NoneType in get_args(kind) and value == _left_open(kind):
         return None
     if is_dataclass(inner[0]):
-        return _probe(name, inner, value)
+        return _member(name, inner, _document(name, inner, value))
+    if get_origin(inner[0]) is tuple and is_dataclass((kinds := get_args(get_args(inner[0])[0]))[0]):
+        members = _document(name, kinds, value)
+        if not isinstance(members, list):
+            raise _not_json(name, kinds, value, "it is no list")
+        return tuple(_member(name, kinds, one) for one in members)
     if isinstance(inner[0], type) and issubclass(inner[0], Enum):
         return _word(name, inner[0], value)
     if get_origin(kind) is tuple:
@@ -85,14 +91,38 @@ def _word(name: str, kind: type[Enum], value: Any) -> Enum:
         raise InvalidArgument(f"{name} must be one of {words}, got {value!r}", field=name) from None
 
 
-def _probe(name: str, kinds: list[Any], text: str) -> Any:
-    by_kind = {cls.kind: cls for cls in kinds}
+def _document(name: str, kinds: Sequence[Any], text: str) -> Any:
     try:
-        given = json.loads(text)
-        return by_kind[given.pop("kind")](**given)
-    except (ValueError, TypeError, KeyError, AttributeError) as error:
-        raise InvalidArgument(
-            f'{name} must be JSON such as {{"kind": "linear", "width_mm": 40, "near_mm": 0, "far_mm": 60}} of a kind '
-            f"{', '.join(by_kind)}, got {text!r:.200} ({error})",
-            field=name,
-        ) from None
+        return json.loads(text)
+    except ValueError as error:
+        raise _not_json(name, kinds, text, error) from None
+
+
+def _member(name: str, kinds: Sequence[Any], given: Any) -> Any:
+    """The object of a family that a JSON object stands for, told by its kind."""
+    try:
+        numbers = dict(given)
+        cls = {cls.kind: cls for cls in kinds}[numbers.pop("kind")]
+        words = {key: hint for key, hint in get_type_hints(cls).items() if isinstance(hint, EnumMeta)}
+        return cls(
+            **{
+                key: _word(f"{name}: {key}", words[key], value) if key in words else _frozen(value)
+                for key, value in numbers.items()
+            }
+        )
+    except InvalidArgument:  # a word of it
+        raise
+    except (ValueError, TypeError, KeyError) as error:
+        raise _not_json(name, kinds, given, error) from None
+
+
+def _frozen(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list) else value
+
+
+def _not_json(name: str, kinds: Sequence[Any], given: Any, error: object) -> InvalidArgument:
+    return InvalidArgument(
+        f"{name} must be JSON with a kind, one of {', '.join(cls.kind for cls in kinds)}, and its numbers, got "
+        f"{given!r:.200} ({error})",
+        field=name,
+    )

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from ultragray_client import Below, Contact, ConvexProbe, Display, RenderSettings
+from ultragray_client import Below, Contact, ConvexProbe, Display, Needle, RenderSettings, ToolFrame
 from ultragray_client.errors import InvalidArgument
 from ultragray_ros.parameters import defaults, settings_of
 
@@ -45,6 +45,17 @@ def test_no_default_is_of_a_type_that_ros_lacks() -> None:
             {"probe": '{"kind": "convex", "opening_angle_deg": 60, "near_mm": 40, "far_mm": 95}'},
             RenderSettings(probe=ConvexProbe(60, 40, 95)),
         ),
+        (
+            {
+                "tools": '[{"kind": "needle", "tip_mm": [5, 0, 30], "hub_mm": [-9, 0, 4], "frame": "probe"}]',
+                "ghost": 0.5,
+            },
+            RenderSettings(
+                tools=(Needle(tip_mm=(5, 0, 30), hub_mm=(-9, 0, 4), frame=ToolFrame.PROBE),),
+                ghost=0.5,
+            ),
+        ),
+        ({"tools": "[]", "registration": "robot"}, RenderSettings(tools=(), registration="robot")),
     ],
 )
 def test_what_parameters_stand_for(given: dict[str, Any], expected: RenderSettings) -> None:
@@ -55,10 +66,17 @@ def test_what_parameters_stand_for(given: dict[str, Any], expected: RenderSettin
     ("given", "told"),
     [
         ({"contact": "firm"}, "contact must be one of air, pressure, got 'firm'"),
-        ({"probe": "convex"}, "probe must be JSON such as"),
-        ({"probe": '{"kind": "square"}'}, "of a kind convex, linear, phased, radial, steered"),
-        ({"probe": '{"kind": "linear"}'}, "probe must be JSON such as"),
-        ({"probe": "[]"}, "probe must be JSON such as"),
+        ({"probe": "convex"}, "probe must be JSON with a kind"),
+        ({"probe": '{"kind": "square"}'}, "one of convex, linear, phased, radial, steered, and its numbers"),
+        ({"probe": '{"kind": "linear"}'}, "probe must be JSON with a kind"),
+        ({"probe": "[]"}, "probe must be JSON with a kind"),
+        ({"tools": "needle"}, "tools must be JSON with a kind, one of box, cylinder, needle"),
+        ({"tools": '{"kind": "needle"}'}, "it is no list"),
+        ({"tools": '[{"kind": "scalpel"}]'}, "tools must be JSON with a kind"),
+        (
+            {"tools": '[{"kind": "needle", "tip_mm": [0, 0, 1], "hub_mm": [0, 0, 2], "frame": "base"}]'},
+            "tools: frame must be one of scene, probe, got 'base'",
+        ),
     ],
 )
 def test_a_word_that_does_not_exist_is_refused(given: dict[str, Any], told: str) -> None:
