@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import MISSING, Field, fields, is_dataclass
-from enum import Enum, EnumMeta
+from enum import Enum
 from types import NoneType
 from typing import Any, TypeAlias, get_args, get_origin, get_type_hints
 
@@ -103,7 +103,8 @@ def _member(name: str, kinds: Sequence[Any], given: Any) -> Any:
     try:
         numbers = dict(given)
         cls = {cls.kind: cls for cls in kinds}[numbers.pop("kind")]
-        words = {key: hint for key, hint in get_type_hints(cls).items() if isinstance(hint, EnumMeta)}
+        hints = get_type_hints(cls).items()
+        words = {key: hint for key, hint in hints if isinstance(hint, type) and issubclass(hint, Enum)}
         return cls(
             **{
                 key: _word(f"{name}: {key}", words[key], value) if key in words else _frozen(value)

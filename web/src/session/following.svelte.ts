@@ -98,6 +98,7 @@ function settingsOf(header: FrameHeader): StreamSettings {
     ghost,
     min_confidence: null,
     below_min_confidence: "mask",
+    registration: null, // the poses that are told lead into the scene
   };
 }
 

@@ -75,6 +75,7 @@ export class Session {
       contact,
       tools: null,
       ghost: null,
+      registration: null,
     };
   }
 

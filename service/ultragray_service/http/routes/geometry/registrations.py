@@ -31,7 +31,7 @@ async def list_registrations(
     return await service.registrations.page(page_size, page_token)
 
 
-@router.get("/{registration}", responses=problems(401, 404, 503))
+@router.get("/{registration}", responses=problems(401, 404, 422, 503))
 async def get_registration(service: ServiceDep, registration: Name) -> NamedRegistration:
     """One registration."""
     return await service.registrations.get(registration)
@@ -50,7 +50,7 @@ async def put_registration(request: Request, service: ServiceDep, registration: 
     return await service.registrations.put(registration, body.scene, from_dict(Registration, content))
 
 
-@router.delete("/{registration}", status_code=204, responses=problems(401, 403, 404, 503))
+@router.delete("/{registration}", status_code=204, responses=problems(401, 403, 404, 422, 503))
 async def delete_registration(service: ServiceDep, registration: Name) -> None:
     """Forgets a registration."""
     service.require_serving()
