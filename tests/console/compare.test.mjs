@@ -194,6 +194,18 @@ describe("compare", () => {
     await until(() => poseOf(page).catch(() => null), (pose) => pose !== null && isThere(pose), `Scan is not at ${wanted}`);
   });
 
+  it("leads to the comparison with other methods, on the same frames", async () => {
+    const page = await openPage(at, "#/compare/compared");
+    await page.getByTestId("comparison").waitFor();
+    await page.getByRole("link", { name: "Other methods" }).click();
+    const form = page.locator("details", { hasText: "Other jobs" });
+    await until(() => form.getByLabel("Kind").inputValue(), (kind) => kind === "compare", "another kind of job is begun");
+    await until(() => form.getByLabel("Dataset").inputValue(), (name) => name === "sweep", "another sweep is chosen");
+    await form.getByLabel("Methods").waitFor();
+    await picture(page, "compare-methods");
+    assert.deepEqual(page.faults, []);
+  });
+
   it("keeps its pictures in sight at 200 % zoom, on a tablet and on a phone", async () => {
     for (const [width, height] of [[640, 400], [1024, 768], [768, 1024], [390, 844]]) {
       const page = await openPage(at, "#/compare/compared", { width, height, touch: width > 640 });

@@ -73,7 +73,7 @@ describe("the pose panel", () => {
       const area = page.getByLabel(`Pose as ${name}, Enter applies`);
       const text = await area.inputValue();
       await page.getByLabel(`Copy the pose as ${name}`).click();
-      assert.equal(await page.evaluate(() => navigator.clipboard.readText()), text);
+      await until(() => page.evaluate(() => navigator.clipboard.readText()), (copied) => copied === text, `${name} was not copied`);
       await page.getByRole("button", { name: "Home", exact: true }).click();
       await until(() => area.inputValue(), (now) => now !== text, "Home is there already");
       await area.fill(text);

@@ -212,6 +212,9 @@ describe("the window", () => {
     const box = await until(() => page.locator(`${IMAGE} canvas`).boundingBox(), ({ height }) => height > 600, "it is not large");
     assert.ok(Math.max(box.width, box.height) >= 700, `${box.width} x ${box.height}`);
     assert.deepEqual(await overlapping(page), []);
+    await page.getByLabel("Flip", { exact: true }).check();
+    await page.locator('[data-testid="orientation-marker"][data-side="right"]').waitFor();
+    assert.deepEqual(await overlapping(page), [], "mirrored");
     await page.getByTestId("room").waitFor();
     await picture(page, "scan-large");
     assert.deepEqual(await seriousFindings(page), []);

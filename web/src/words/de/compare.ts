@@ -47,6 +47,7 @@ export const compare: Words["compare"] = {
   best: "Bestes",
   inScan: "Diese Lage in Schallen öffnen",
   csv: "Als CSV speichern",
+  methods: "Andere Verfahren",
   table: { label: "Tabelle der Maße", frame: "Dieses Bild", mean: "Mittel aller" },
   metric: "Maß",
   chart: { x: "zurückgehaltenes Bild", hint: (better) => `${better}; ein Klick geht zum Bild` },

@@ -47,6 +47,7 @@ export const compare = {
   best: "Best",
   inScan: "Open this pose in Scan",
   csv: "Save as CSV",
+  methods: "Other methods",
   table: { label: "Table of metrics", frame: "This frame", mean: "Mean of all" },
   metric: "Metric",
   chart: { x: "held-out frame", hint: (better: string): string => `${better}; a click goes to the frame` },
