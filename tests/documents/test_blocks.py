@@ -18,9 +18,17 @@ DOCUMENTS = sorted(
     if path.name not in ("CHANGELOG.md", TUTORIAL.name)  # no commands; in a test module of its own
 )
 
+LONG = {"docs/howto/compare.md"}  # a comparison as a job, and two by hand
+
 
 @pytest.mark.filterwarnings("ignore::ResourceWarning")  # what a snippet leaves open is closed with its page
-@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
+@pytest.mark.parametrize(
+    "path",
+    [
+        pytest.param(path, id=name, marks=[pytest.mark.long] if name in LONG else [])
+        for path, name in ((path, str(path.relative_to(ROOT))) for path in DOCUMENTS)
+    ],
+)
 def test_blocks_run(path: Path, run_page: RunPage) -> None:
     run_page(path)
 

@@ -21,7 +21,7 @@ from .data.sampling import PREDICTED_PIXELS
 from .data.shadows import LOOKED_AT_FRAMES
 from .poses import overlap
 
-BASE_BYTES = 440 << 20  # the process with torch loaded, and the scratch memory of its kernels
+BASE_BYTES = 512 << 20  # the process with torch loaded, and the scratch memory of its kernels (measured: up to 500)
 COPIES = 16  # parameters, gradients, moments; what refinements, checkpoints and the kernel copy (measured: 14)
 STATISTICS = 2
 PIXEL_FLOATS = 25  # of a pixel of a batch: the outputs and what the backward pass keeps of them (measured: 17)

@@ -31,17 +31,19 @@ T = TypeVar("T")
 
 
 class Owners:
-    """Knows whose datasets and scenes are without asking the database; those of jobs stand with their rows."""
+    """Knows whose datasets and scenes are without asking the database; those of other things stand with their rows."""
 
     def __init__(
-        self, job_ownership: Callable[[str], Awaitable[Ownership]], find: Mapping[Kind, Callable[[str], object]]
+        self,
+        kept_with_rows: Mapping[Kind, Callable[[str], Awaitable[Ownership]]],
+        find: Mapping[Kind, Callable[[str], object]],
     ) -> None:
-        """`job_ownership`: reads the owner of a job. Raises JobNotFound.
+        """`kept_with_rows`: reads the owner of a job or registration. Raises JobNotFound, RegistrationNotFound.
 
         `find`: raises DatasetNotFound or SceneNotFound where there is no such thing; it blocks.
         """
         self._known: dict[tuple[Kind, str], Ownership] = {}
-        self._job_ownership = job_ownership
+        self._kept_with_rows = kept_with_rows
         self._find = find
         self._changing = threading.Lock()  # of the table and its copy, so that no older copy follows a newer one
         self._engine: sa.Engine | None = None
@@ -66,8 +68,9 @@ class Owners:
             return [name for (one, name), whose in self._known.items() if one is kind and whose.owner == owner]
 
     async def of(self, kind: Kind, name: str) -> Ownership:
-        """Whose something is. Raises JobNotFound."""
-        return await self._job_ownership(name) if kind is Kind.JOB else self.known(kind, name)
+        """Whose something is. Raises JobNotFound, RegistrationNotFound."""
+        read = self._kept_with_rows.get(kind)
+        return self.known(kind, name) if read is None else await read(name)
 
     async def require_existing(self, kind: Kind, name: str) -> None:
         """Raises DatasetNotFound or SceneNotFound, also for what is hidden."""

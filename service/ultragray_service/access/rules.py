@@ -99,6 +99,7 @@ OPERATIONS = (
         ("DELETE /v1/registrations/{registration}",),
         ("RegistrationService/DeleteRegistration",),
         _REGISTRATION,
+        owned=True,
     ),
     Operation("dataset.list", _READER, ("GET /v1/datasets",), ("DatasetService/ListDatasets",)),
     Operation(

@@ -112,7 +112,10 @@ class Service:
             without_jobs=settings.ready_without_jobs,
         )
         self.owners = Owners(
-            lambda job_id: self.jobs.do(JobStore.ownership, job_id),
+            {
+                Kind.JOB: lambda job_id: self.jobs.do(JobStore.ownership, job_id),
+                Kind.REGISTRATION: lambda name: self.registrations.ownership(name),
+            },
             {Kind.SCENE: store.require, Kind.DATASET: self.datasets.get},
         )
         self.registrations = Registrations(self.catalog, self.owners)

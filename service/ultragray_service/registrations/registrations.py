@@ -15,7 +15,7 @@ from ultragray.contract import shown
 from ultragray.errors import InvalidArgument
 from ultragray.registration.registration import Registration
 from ultragray_workers.errors import RegistrationNotFound
-from ultragray_workers.jobs.queue.owners import Kind
+from ultragray_workers.jobs.queue.owners import Kind, Ownership
 from ultragray_workers.scene_names import base_name
 
 from ..access.owners import Owners
@@ -54,6 +54,10 @@ class Registrations:
             raise RegistrationNotFound(f"there is no registration {shown(name)}", field="registration")
         self._hold(found)
         return found
+
+    async def ownership(self, name: str) -> Ownership:
+        """Whose a registration is. Raises RegistrationNotFound, DatabaseUnavailable."""
+        return Ownership((await self.get(name)).owner)
 
     async def of_scene(self, name: str, scene: str) -> Registration:
         """The registration that a request for a scene names, at most a second old.

@@ -203,6 +203,6 @@ def test_mistakes_are_told(scene: GaussianScene, tmp_path: Path, random_scene: C
         write_volume(tmp_path / "v.vtk", scene, "echo", GRID)
     with pytest.raises(InvalidArgument, match="ranges of x, y and z"):
         parse_box("1:2,3:4")
-    with pytest.raises(InvalidArgument, match="right must be 3 numbers"):
+    with pytest.raises(InvalidArgument, match="right must be 3 finite numbers"):
         parse_numbers("1,2", 3, "right")
     assert parse_box("-1:2,3:4,5:6.5") == ((-1, 3, 5), (2, 4, 6.5))

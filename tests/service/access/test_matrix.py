@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import grpc
+import numpy as np
 import pytest
 from google.protobuf.descriptor import MethodDescriptor
 from google.protobuf.message_factory import GetMessageClass
@@ -60,12 +61,15 @@ def in_order(operations: Iterator[tuple[str, str, Operation]]) -> list[tuple[str
 
 @pytest.fixture
 def things(keyed: Keyed, scene_bytes: bytes, dataset_bytes: bytes) -> dict[str, str]:
-    """A scene, a dataset and a job of alice's; a test may delete them."""
+    """A scene, a dataset, a job and a registration of alice's; a test may delete them."""
     job = keyed.submit("alice")
     assert job.status_code == 201, job.text
     assert keyed.http("alice", "PUT", "/v1/scenes/hers", content=scene_bytes).status_code in (201, 409)
     assert keyed.http("alice", "PUT", "/v1/datasets/hers", content=dataset_bytes).status_code in (200, 201)
-    return {"scene": "hers", "dataset": "hers", "job": job.json()["id"], "worker": "absent", "stream": "absent"}
+    registration = {"scene": "hers", "base_to_scene": np.eye(4).tolist()}
+    assert keyed.http("alice", "PUT", "/v1/registrations/hers", json=registration).status_code == 200
+    named = dict.fromkeys(("scene", "dataset", "registration"), "hers") | dict.fromkeys(("worker", "stream"), "absent")
+    return {**named, "job": job.json()["id"]}
 
 
 def ask(keyed: Keyed, who: str, method: str, path: str) -> tuple[int, str | None]:

@@ -296,7 +296,7 @@ def test_threads_and_backend_are_used(scene_file: Path, tmp_path: Path) -> None:
         (["--gain-db", 1000], "gain_db must be a finite number from -100 to 100"),
         (["--below-min-confidence", "hide"], "below_min_confidence must be one of refuse, mask"),
         (["--scan-convert", 0.0, "--probe", CONVEX_JSON], "pixel_mm must be a finite number from"),
-        (["-o", "frames.png"], "end in .npz, .tar, .zarr.zip, .h5, .dcm or .igs.mha, or be a folder for PNGs"),
+        (["-o", "frames.png"], "end in .npz, .tar, .zarr.zip, .h5, .dcm, .igs.mha or .mcap, or be a folder for PNGs"),
         (["-o", "frames.foo"], "or be a folder for PNGs (a name without an ending), got 'frames.foo'"),
         (["-o", "frames.hdf5"], "got 'frames.hdf5'; did you mean .h5?"),
         (["-o", "frames.mha"], "got 'frames.mha'; did you mean .igs.mha?"),

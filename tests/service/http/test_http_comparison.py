@@ -158,6 +158,7 @@ def made_of(dataset: Dataset, artifacts: Path) -> int:
     return len([*artifacts.glob(f"dataset-views/*{dataset.sha256}"), *artifacts.glob(f"comparisons/*{dataset.sha256}")])
 
 
+@pytest.mark.long
 def test_nothing_stays_of_a_deleted_dataset(
     http: httpx.Client, service: RunningService, artifacts: Path, tmp_path: Path
 ) -> None:
@@ -187,6 +188,7 @@ def test_a_dataset_deleted_while_it_is_laid_out(
     assert made_of(doomed, artifacts) == len(list(artifacts.glob("dataset-views/.*"))) == 0
 
 
+@pytest.mark.long
 def test_a_service_that_stops_or_dies_while_it_lays_a_dataset_out(start_service: StartService, tmp_path: Path) -> None:
     with ThreadPoolExecutor(1) as executor:
 

@@ -66,6 +66,7 @@ def is_under_way(job: Job) -> bool:
     return (job.progress.frames_done or 0) > 0
 
 
+@pytest.mark.long
 def test_a_batch_goes_on_without_the_workers_that_die_and_has_each_frame_once(
     store: JobStore, scene: Path, start_worker: StartWorker, until: Until
 ) -> None:
