@@ -218,7 +218,7 @@ def test_the_node_is_a_lifecycle_node(start_node: Start, peer: Peer, ros_service
     [
         ({"source": "radio"}, "source must be pose or tf, got 'radio'"),
         ({"source": "tf"}, "source must be pose where tf2_ros is not installed"),
-        ({"probe": "'{}'"}, "probe must be JSON such as"),
+        ({"probe": "'{}'"}, "probe must be JSON with a kind"),
         ({"outputs": "['b mode']"}, "outputs must be words such as bmode, got 'b mode'"),
         ({"tls": "true", "root_certificates": "absent.pem"}, "absent.pem cannot be read"),
     ],
