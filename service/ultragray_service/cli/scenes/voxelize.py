@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from operator import gt, lt
 from pathlib import Path
 from typing import Annotated
@@ -9,7 +10,7 @@ from typing import Annotated
 import typer
 
 from ultragray.errors import InvalidArgument
-from ultragray.scene_info import read_header
+from ultragray.scene_info import SceneInfo, read_header
 from ultragray.volumes.names import SLICE_SUFFIXES, VOLUME_FIELDS, VOLUME_SUFFIXES
 
 from ..output import check_file
@@ -74,8 +75,7 @@ def voxelize(
         if size_mm is not None:
             raise InvalidArgument("size_mm is for a slice: give plane_mm, too", field="size_mm")
         grid = VolumeGrid.over_scene(info, box_mm, spacing_mm)
-        low, high = (info.bounds_min_mm, info.bounds_max_mm) if box_mm is None else parse_box(box_mm)
-        if any(map(lt, high, info.bounds_min_mm)) or any(map(gt, low, info.bounds_max_mm)):
+        if box_mm is not None and _is_beyond(info, *parse_box(box_mm)):
             there = ",".join(f"{a:g}:{b:g}" for a, b in zip(info.bounds_min_mm, info.bounds_max_mm, strict=True))
             warn(f"box_mm lies beyond all Gaussians, which are in {there}: is it in mm of the scene's frame?")
     else:
@@ -89,3 +89,8 @@ def voxelize(
         (write_slice if output.name.endswith(SLICE_SUFFIXES) else write_volume)(output, loaded, field, grid)
     document = {"file": str(output), **volume_facts(info, field, grid)}
     tell(f"wrote {output}: {field}, {' x '.join(map(str, grid.shape))} at {spacing_mm:g} mm", document, as_json=json)
+
+
+def _is_beyond(info: SceneInfo, low: Sequence[float], high: Sequence[float]) -> bool:  # [3] mm both
+    """Whether a box lies beyond the centres of all Gaussians."""
+    return any(map(lt, high, info.bounds_min_mm)) or any(map(gt, low, info.bounds_max_mm))
