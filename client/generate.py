@@ -24,6 +24,8 @@ import unasync
 from ultragray.contract import Contract, Family, annotated_fields
 from ultragray.datasets.source import SourceOptions
 from ultragray.errors import error_classes
+from ultragray.interchange import ros_messages, ros_recording
+from ultragray.pose import quaternion_from_pose
 from ultragray.probe import ElevationBeam
 from ultragray.settings import RenderSettings
 from ultragray.volumes.plane import SliceSettings
@@ -66,6 +68,12 @@ OWN_ERRORS = {  # of the client, by their reason: base, meaning
     "TLS_FAILED": ("ClientError", "The service shows no certificate to trust, or does not speak TLS."),
     "STREAM_ENDED": ("ClientError", "A stream of poses that is over was asked to go on."),
 }
+RECORDING = {"messages": ros_messages, "writer": ros_recording}  # modules that the client has as they are, by its names
+OWN_IMPORTS = {  # what they import, as the client has it
+    "from ..probe import FloatArray\n": "from ..geometry import FloatArray\n",
+    "from ..pose import quaternion_from_pose\n": "import numpy as np\n",  # the function stands at the end
+    "from . import ros_messages as ros\n": "from . import messages as ros\n",
+}
 _ALSO = {"InvalidArgument": ["ValueError"], "DeadlineExceeded": ["TimeoutError"]}  # what they are beside
 
 _ERRORS_HEADER = '''# Generated from the errors of the service by client/generate.py; change those.
@@ -94,6 +102,7 @@ from typing import Any, Literal, TypeAlias
 
 from .geometry import PoseLike
 '''
+_RECORDING_HEADER = "# Generated from {module} by client/generate.py; change that.\n"
 _RAISES = re.compile(r"\s*\bRaises\s.*?(?=\n\n|\Z)", flags=re.DOTALL)
 _HEADER = "# Generated from aio/{name}.py by client/generate.py; change that file.\n"
 _REPLACEMENTS = {"asyncio": "time", "aclosing": "closing"}  # of asyncio, `sleep` alone is used
@@ -190,6 +199,21 @@ def generate_contract(output_folder: Path) -> Path:
     return formatted([target])[0]
 
 
+def generate_recording(output_folder: Path) -> list[Path]:
+    """Writes the modules that write MCAP files, and returns their paths."""
+    written = []
+    for name, module in RECORDING.items():
+        text = _RECORDING_HEADER.format(module=module.__name__) + inspect.getsource(module)
+        if quaternion_from_pose.__name__ in text:
+            text += "\n\n" + inspect.getsource(quaternion_from_pose)
+        for theirs, own in OWN_IMPORTS.items():
+            text = text.replace(theirs, own)
+        target = output_folder / f"{name}.py"
+        target.write_text(text)
+        written.append(target)
+    return formatted(written)
+
+
 def _add(sources: dict[str, str], cls: Any, name: str) -> None:
     """Adds the source of a class under its name, after those of all that it is made of."""
     if name in sources:
@@ -273,4 +297,5 @@ def formatted(paths: list[Path]) -> list[Path]:
 if __name__ == "__main__":
     generate_errors(PACKAGE)
     generate_contract(PACKAGE)
+    generate_recording(PACKAGE / "recording")
     generate_sync(PACKAGE / "sync")

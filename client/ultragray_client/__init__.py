@@ -19,6 +19,7 @@ from .errors import ClientError
 from .frames import Extrapolation, Frame, Picture, Slice, Timings
 from .geometry import Placement, PoseLike, Quaternion
 from .jobs import Job, JobError, JobEvent, JobProgress, JobState
+from .recording.recording import Recording
 from .registrations import Registration
 from .scenes import ConfidenceFit, Scene, SceneEntry
 from .sync.client import Client
@@ -46,6 +47,7 @@ __all__ = [
     "Placement",
     "PoseLike",
     "Quaternion",
+    "Recording",
     "Registration",
     "Role",
     "Scene",

@@ -10,7 +10,6 @@ import io
 import json
 from array import array
 from dataclasses import asdict
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -21,7 +20,8 @@ from sensor_msgs.msg import CompressedImage, Image
 from std_msgs.msg import Header, String
 
 from ultragray_client import Frame, Placement, Quaternion
-from ultragray_client.errors import InvalidArgument
+from ultragray_client.recording.messages import geometry_document
+from ultragray_client.recording.recording import origin_of
 
 MM_PER_M = 1000.0
 JPEG_QUALITY = 95
@@ -83,31 +83,5 @@ def confidence(frame: Frame, header: Header, *, least: float | None, replaced: i
 
 
 def geometry(frame: Frame, frame_id: str) -> String:
-    """JSON: where the pixels lie in the frame of the probe, and what was rendered.
-
-    `pixel_to_probe_m` [4, 4] takes (column, row, k, 1) to metres, k metres against the elevation y; null where columns
-    are scan lines of a fan. `picture` describes the pixels in either case, in mm and degrees.
-    """
-    height, width = next(iter(frame.arrays.values())).shape
-    document = {
-        "frame_id": frame_id,
-        "height": height,
-        "width": width,
-        "pixel_to_probe_m": _pixel_to_probe_m(frame),
-        "picture": asdict(frame.picture),
-        "probe": asdict(frame.probe),
-        "slice_thickness_mm": frame.slice_thickness_mm,
-        "scene": frame.scene,
-        "scene_sha256": frame.scene_sha256,
-        "renderer": frame.renderer,
-    }
-    return String(data=json.dumps(document))
-
-
-def _pixel_to_probe_m(frame: Frame) -> Any:
-    try:
-        matrix = frame.picture.pixel_to_probe()
-    except InvalidArgument:  # columns are angles
-        return None
-    matrix[:3, [0, 1, 3]] /= MM_PER_M  # the third column is a direction, of metres as of mm
-    return matrix.tolist()
+    """JSON: where the pixels lie in the frame of the probe, and what was rendered (`geometry_document`)."""
+    return String(data=json.dumps(geometry_document(origin_of(frame), frame_id)))

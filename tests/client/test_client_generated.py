@@ -41,6 +41,12 @@ def test_the_errors_are_current(generator: ModuleType, tmp_path: Path) -> None:
     assert STATUSES.keys() > generator.NOT_OVER_GRPC
 
 
+def test_the_writer_of_recordings_is_current(generator: ModuleType, tmp_path: Path) -> None:
+    for path in generator.generate_recording(tmp_path):
+        committed = CLIENT / "ultragray_client" / "recording" / path.name
+        assert committed.read_text() == path.read_text()
+
+
 def test_the_contract_has_the_defaults_of_the_library() -> None:
     for own, library in ((RenderSettings(), settings.RenderSettings()), (Display(), AS_RENDERED)):
         assert asdict(own) == asdict(library)

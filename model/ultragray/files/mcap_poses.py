@@ -9,7 +9,8 @@ import numpy as np
 
 from ..errors import InvalidPose
 from ..installation import missing_extra
-from ..interchange.ros_messages import POSE, pose_of_message
+from ..interchange.ros_messages import POSE
+from ..interchange.ros_poses import pose_of_message
 from ..probe import FloatArray
 
 PREFERRED = "/probe_pose"  # the end of the topic of the ROS 2 node

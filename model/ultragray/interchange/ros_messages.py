@@ -1,17 +1,18 @@
 """Standard messages of ROS 2 as files hold them: their definitions, and what of ours becomes which. Needs no ROS.
 
-ROS speaks metres: poses are converted here, in both directions. A message is a dict of its fields.
+ROS speaks metres: poses are converted here. A message is a dict of its fields. The Python client has a copy of this
+module (client/generate.py), so it imports no more than that has, too.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
+import numpy.typing as npt
 
-from ..display.pixels import PixelArray
-from ..pose import pose_from_position_quaternion, quaternion_from_pose
+from ..pose import quaternion_from_pose
 from ..probe import FloatArray
 
 MM_PER_M = 1000.0
@@ -23,6 +24,7 @@ OK, WARN = 0, 1  # levels of DiagnosticStatus
 IMAGE = "sensor_msgs/msg/Image"
 POSE = "geometry_msgs/msg/PoseStamped"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
+TEXT = "std_msgs/msg/String"
 
 _SEPARATOR = "=" * 80
 _PARTS = {
@@ -54,6 +56,7 @@ DEFINITIONS = {
     ),
     POSE: _definition("geometry_msgs/Pose pose", *_OF_POSES),
     DIAGNOSTICS: _definition("diagnostic_msgs/DiagnosticStatus[] status", *_OF_DIAGNOSTICS),
+    TEXT: "string data\n",
 }
 
 
@@ -62,7 +65,7 @@ def header(time_ns: int, frame_id: str) -> dict[str, Any]:
     return {"stamp": {"sec": time_ns // NS_PER_S, "nanosec": time_ns % NS_PER_S}, "frame_id": frame_id}
 
 
-def image_message(pixels: PixelArray, time_ns: int) -> dict[str, Any]:  # [H, W] uint8 or little-endian float32
+def image_message(pixels: npt.NDArray[Any], time_ns: int) -> dict[str, Any]:  # [H, W] uint8 or little-endian float32
     """A sensor_msgs/Image in the frame of the probe."""
     height, width = pixels.shape
     return {
@@ -87,13 +90,6 @@ def pose_message(pose: FloatArray, time_ns: int) -> dict[str, Any]:  # [4, 4] mm
     }
 
 
-def pose_of_message(message: Any, *, field: str) -> FloatArray:  # [4, 4] mm
-    """The pose of a geometry_msgs/PoseStamped with attributes. Raises InvalidPose."""
-    position, turn = message.pose.position, message.pose.orientation
-    x, y, z = MM_PER_M * np.array([position.x, position.y, position.z])
-    return pose_from_position_quaternion((x, y, z), (turn.w, turn.x, turn.y, turn.z), field=field)
-
-
 def figures_message(
     figures: Mapping[str, float | None], time_ns: int, *, name: str, hardware_id: str
 ) -> dict[str, Any]:
@@ -108,3 +104,37 @@ def figures_message(
         "values": [{"key": key, "value": f"{value:g}"} for key, value in known.items()],
     }
     return {"header": header(time_ns, PROBE_FRAME), "status": [status]}
+
+
+def geometry_document(origin: Mapping[str, Any], frame_id: str) -> dict[str, Any]:
+    """Where the pixels lie in the frame of the probe, and what was rendered, from the origin of frames.
+
+    `pixel_to_probe_m` [4, 4] takes (column, row, k, 1) to metres, k metres against the elevation y; None where columns
+    are scan lines of a fan. `picture` describes the pixels in either case, in mm and degrees.
+    """
+    picture = origin["picture"]
+    (column, row), (column_step, row_step) = picture["first"], picture["step"]
+    matrix = None
+    if picture["column_unit"] == "mm":
+        across, down = [column_step / MM_PER_M, 0.0, 0.0, column / MM_PER_M], [0.0, row_step / MM_PER_M, 0.0]
+        matrix = [across, [0.0, 0.0, -1.0, 0.0], [*down, row / MM_PER_M], [0.0, 0.0, 0.0, 1.0]]
+    return {
+        "frame_id": frame_id,
+        "height": picture["height"],
+        "width": picture["width"],
+        "pixel_to_probe_m": matrix,
+        "picture": {
+            "column_unit": picture["column_unit"],
+            "first_column": column,
+            "first_row_mm": row,
+            "column_step": column_step,
+            "row_step_mm": row_step,
+        },
+        "probe": origin["probe"],
+        **{key: origin[key] for key in ("slice_thickness_mm", "scene", "scene_sha256", "renderer")},
+    }
+
+
+def geometry_message(origin: Mapping[str, Any]) -> dict[str, Any]:
+    """A std_msgs/String with the geometry of frames as JSON."""
+    return {"data": json.dumps(geometry_document(origin, PROBE_FRAME), sort_keys=True)}

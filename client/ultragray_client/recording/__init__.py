@@ -1,0 +1,1 @@
+"""Received frames in MCAP files. The extra `mcap`."""

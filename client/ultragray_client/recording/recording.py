@@ -1,0 +1,118 @@
+"""A recording of received frames: an MCAP file with the topics of those that the service's jobs write."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import secrets
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from ..contract import Display
+from ..errors import ExtraMissing, InvalidArgument
+from ..frames import Frame
+
+FRAME_TIME_NS = 40_000_000  # between frames without a time of their own, as in the files of jobs
+MAX_TIME_NS = 2**31 * 1_000_000_000  # the seconds of a stamp have 31 bits
+
+
+class Recording:
+    """Writer of an MCAP file of frames as they come, of either client; messages of ROS 2. The extra `mcap`.
+
+    The file takes its name when the recording is closed, whatever ended it: an error in the `with` keeps the frames
+    until then. Only a program that is killed, or a disk that is full, leaves no file of that name. A file that had the
+    name is replaced.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        """Begin a file. Raises ExtraMissing without the extra, OSError."""
+        try:
+            from .writer import RosRecording
+        except ImportError as error:
+            raise ExtraMissing(
+                f"a recording needs {error.name or 'mcap'}, which is not installed: "
+                "pip install 'ultragray-client[mcap]'"
+            ) from error
+        self._path = Path(path)
+        self._temporary = self._path.with_name(f".{self._path.name}.{secrets.token_hex(8)}.tmp")
+        self._file = self._temporary.open("xb")
+        self._next_ns = 0
+        self._is_writable = True
+        with self._giving_up_on_error():
+            self._writer = RosRecording(self._file)
+
+    def __enter__(self) -> Recording:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def add(self, frame: Frame, *, time_ns: int | None = None) -> None:
+        """Write a frame with its pose, its geometry and its confidence.
+
+        `time_ns`: the stamp of its pose, ns since 1970; None: 40 ms after the frame before, the first at 0, as frames
+        in the files of jobs. Blocks while a megabyte is compressed, now and then. Raises InvalidArgument for another
+        time and for a recording that is closed, OSError.
+        """
+        if not self._is_writable:
+            raise InvalidArgument(f"the recording {self._path} is closed")
+        stamp_ns = self._next_ns if time_ns is None else time_ns
+        if isinstance(stamp_ns, bool) or not isinstance(stamp_ns, int) or not 0 <= stamp_ns < MAX_TIME_NS:
+            raise InvalidArgument(
+                f"time_ns must be a whole number of nanoseconds from 0 to {MAX_TIME_NS - 1}, got {time_ns!r:.40}",
+                field="time_ns",
+            )
+        with self._giving_up_on_error():
+            self._writer.add(frame.arrays, frame.pose, asdict(frame.extrapolation), origin_of(frame), stamp_ns)
+            self._file.flush()  # a program that is killed loses no chunk that was complete
+        self._next_ns = stamp_ns + FRAME_TIME_NS
+
+    def close(self) -> None:
+        """Make the file whole and give it its name; a second time nothing. Raises OSError."""
+        if not self._is_writable:
+            return
+        with self._giving_up_on_error():
+            self._writer.finish()
+            self._file.flush()
+            os.fsync(self._file.fileno())
+            self._file.close()
+            self._temporary.replace(self._path)
+        self._is_writable = False
+
+    @contextlib.contextmanager
+    def _giving_up_on_error(self) -> Iterator[None]:
+        """Leaves no file where writing fails."""
+        try:
+            yield
+        except BaseException:
+            self._is_writable = False
+            with contextlib.suppress(OSError):  # on a full disk, closing fails as writing did
+                self._file.close()
+            self._temporary.unlink(missing_ok=True)
+            raise
+
+
+def origin_of(frame: Frame) -> dict[str, Any]:
+    """The origin of a frame and its display, as the files of jobs have it."""
+    height, width = next(iter(frame.arrays.values())).shape
+    picture = frame.picture
+    return {
+        "scene": frame.scene,
+        "scene_sha256": frame.scene_sha256,
+        "renderer": frame.renderer,
+        "probe": asdict(frame.probe),
+        "slice_thickness_mm": frame.slice_thickness_mm,
+        "display": asdict(frame.display or Display()),
+        "picture": {
+            "height": height,
+            "width": width,
+            "column_unit": picture.column_unit,
+            "first": (picture.first_column, picture.first_row_mm),
+            "step": (picture.column_step, picture.row_step_mm),
+        },
+        **({} if frame.contact is None else {"contact": frame.contact.value}),
+        **({"tools": [asdict(tool) for tool in frame.tools]} if frame.tools else {}),
+        **({"ghost": frame.ghost} if frame.ghost else {}),
+    }
