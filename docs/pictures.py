@@ -6,6 +6,7 @@ The README's pictures come from `make demo-scene` and `make console-picture`.
 
 from __future__ import annotations
 
+import json
 import runpy
 import sys
 import tempfile
@@ -29,14 +30,19 @@ from matplotlib.patches import Patch, Polygon
 from matplotlib.transforms import Affine2D
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
+from mcap_ros2.writer import Writer
 
 from ultragray import GaussianScene, read_header, render
 from ultragray.confidence import Assessor, supported
+from ultragray.contract import to_dict
+from ultragray.datasets.mcap import read_mcap_sweep
 from ultragray.datasets.phantom import PHANTOM_PROBE, freehand_poses, simulate
 from ultragray.demo import DEMO_FILE
 from ultragray.display import Display
 from ultragray.display.frames import show
+from ultragray.display.pixels import to_uint8
 from ultragray.gym import StandardPlaneEnv
+from ultragray.interchange import ros_messages as ros
 from ultragray.interchange.rendering import render_to_file
 from ultragray.pose import pose_from_position_quaternion
 from ultragray.registration.frames import register_frames
@@ -70,6 +76,7 @@ def main() -> None:
     draw_standard_plane(scene, IMAGES / "standard_plane.png")
     draw_slices(scene, IMAGES / "volume_slices.png")
     draw_recording(scene, IMAGES / "mcap_recording.png")
+    draw_recorded_sweep(scene, IMAGES / "mcap_sweep.png")
     draw_live_in_volume(scene, IMAGES / "slicer.png")
     draw_registration(scene, IMAGES / "registration.png")
     for folder in sys.argv[1:]:
@@ -309,6 +316,51 @@ def draw_recording(scene: GaussianScene, path: Path) -> None:
     below.plot([], [], color="#30a0e0", label="/ultragray/probe_pose")  # both curves in one legend
     below.legend(loc="center left", fontsize=8)
     save(figure, path)
+
+
+def draw_recorded_sweep(scene: GaussianScene, path: Path) -> None:
+    """What reading a robot's recording makes of images at 8 Hz and poses at 20 Hz of a tracker that is blind for a
+    while: the frames with the poses at their times, and the images that are left out."""
+    probe = scene.info.probe
+    assert probe is not None
+    image_s, pose_s = np.arange(0.17, 6.0, 1 / 8), np.arange(0.0, 5.5, 1 / 20)
+    pose_s = pose_s[(pose_s < 2.2) | (pose_s > 3.0)]
+    with tempfile.TemporaryDirectory() as folder:
+        recording = Path(folder, "robot.mcap")
+        with recording.open("wb") as file:
+            writer = Writer(file)
+            schemas = {name: writer.register_msgdef(name, text) for name, text in ros.DEFINITIONS.items()}
+            images = render(scene, None, np.stack([_at_time(t) for t in image_s]), height=SIDE, width=SIDE).bmode
+            for second, pixels in zip(image_s, to_uint8(images.numpy()), strict=True):
+                time_ns = round(second * ros.NS_PER_S)
+                writer.write_message("/us/image", schemas[ros.IMAGE], ros.image_message(pixels, time_ns), time_ns)
+            for second in pose_s:
+                time_ns = round(second * ros.NS_PER_S)
+                pose = ros.pose_message(_at_time(second), time_ns)
+                writer.write_message("/tracker/pose", schemas[ros.POSE], pose, time_ns)
+            writer.finish()
+        recording.with_name("robot.geometry.json").write_text(json.dumps({"probe": to_dict(probe)}))
+        sweep, _ = read_mcap_sweep(recording)
+    shown = range(0, len(sweep), len(sweep) // 4)
+    figure = plt.figure(figsize=(2.4 * len(shown), 4.4), layout="constrained")
+    grid = figure.add_gridspec(2, len(shown), height_ratios=(3, 2))
+    for column, place in enumerate(shown):
+        panel = figure.add_subplot(grid[0, column], xticks=[], yticks=[])
+        panel.imshow(sweep.images[place], cmap="gray", extent=EXTENT_MM)
+        number = sweep.frame_numbers[place]
+        panel.set_title(f"frame {number} at {image_s[number]:.2f} s", fontsize=8)
+    below = figure.add_subplot(grid[1, :], xlabel="time of the stamp, s", ylabel="y of the probe, mm")
+    left_out = np.setdiff1d(np.arange(len(image_s)), sweep.frame_numbers)
+    below.plot(pose_s, [_at_time(t)[1, 3] for t in pose_s], ".", color="#30a0e0", label="tracked poses")
+    below.plot(image_s[sweep.frame_numbers], sweep.poses[:, 1, 3], "+", color="0.1", label="frames, with their poses")
+    below.plot(image_s[left_out], np.zeros(len(left_out)), "x", color="#d1495b", label="images that are left out")
+    below.legend(loc="upper left", fontsize=8)
+    save(figure, path)
+
+
+def _at_time(second: float) -> Floats:  # [4, 4]
+    """A sweep along the spine in 6 s, as a hand does it: faster in the middle."""
+    return along_spine(21.0 * (1.0 - np.cos(np.pi * second / 6.0)))
 
 
 def _seconds(message: Any) -> float:

@@ -335,9 +335,15 @@ class DatasetOptions:
     and of the end (mm), column and row of the apex, such as 60,40,90,319.5,-120.
     """
     transform: str | None = None
-    """Tracked transform of a sequence to take, such as ProbeToTracker, where there are several."""
+    """Tracked transform of a sequence to take, such as ProbeToTracker, where there are several; of a recording two
+    frames of tf, such as probeTobase.
+    """
     image_size: str | None = None
     """Resize the frames: WIDTHxHEIGHT, such as 192x256."""
+    image_topic: str | None = None
+    """Topic of a recording to take images from, where there are several."""
+    pose_topic: str | None = None
+    """Topic of a recording to take poses from; /tf: from the transforms of tf."""
 
 
 @dataclass(frozen=True)
@@ -374,7 +380,9 @@ class Dataset:
     """Of letters, digits, '.', '_' and '-'."""
     kind: str
     """Its format: released, a folder with conf.json and .npy files (or its conf.json); plus, a PLUS sequence (.mha,
-    .mhd, .nrrd, .nhdr); dicom, a DICOM cine loop (.dcm) with its poses beside it (.poses.npy or .poses.json).
+    .mhd, .nrrd, .nhdr); dicom, a DICOM cine loop (.dcm) with its poses beside it (.poses.npy or .poses.json);
+    mcap, an MCAP recording of ROS 2 (.mcap) with images and poses, its geometry in it or beside it
+    (.geometry.json).
     """
     sha256: str
     """Of images, poses, probe and split, however they were sent."""

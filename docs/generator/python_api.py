@@ -18,7 +18,7 @@ from .markdown import prose, sections
 # Public modules beside the packages' own names. A module without __all__ makes public what it defines.
 LIBRARY_MODULES = (
     *("ultragray.datasets", "ultragray.datasets.source", "ultragray.datasets.released", "ultragray.datasets.plus"),
-    *("ultragray.datasets.dicom", "ultragray.datasets.phantom", "ultragray.datasets.checks"),
+    *("ultragray.datasets.dicom", "ultragray.datasets.mcap", "ultragray.datasets.phantom", "ultragray.datasets.checks"),
     *("ultragray.datasets.pictures", "ultragray.training", "ultragray.evaluation.metrics"),
     *("ultragray.evaluation.scoring", "ultragray.evaluation.speckle", "ultragray.evaluation.side_by_side"),
     *("ultragray.evaluation.compounding", "ultragray.evaluation.baselines", "ultragray.confidence"),

@@ -23,6 +23,7 @@ SECTIONS: Mapping[str, tuple[str, ...]] = {
         *("howto/robotics.md", "howto/ros.md", "howto/simulator.md", "howto/data-science.md", "howto/sonographer.md"),
         *(
             "howto/recording.md",
+            "howto/mcap.md",
             "howto/compare.md",
             "howto/contact.md",
             "howto/tools.md",

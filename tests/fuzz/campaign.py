@@ -37,6 +37,7 @@ SHARES = {  # of the inputs, by door: about as many as each takes in its part of
     "released folders": 0.01,
     "sequences": 0.02,
     "dicom": 0.01,
+    "mcap": 0.01,
     "archives": 0.03,
 }
 FAILED_FOLDER = ROOT / "build" / "fuzz"

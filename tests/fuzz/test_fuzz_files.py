@@ -18,6 +18,7 @@ import pydicom
 import pytest
 import torch
 from hypothesis import strategies as st
+from mcap.writer import CompressionType
 
 from ultragray import GaussianScene
 from ultragray.datasets import Dataset
@@ -27,6 +28,7 @@ from ultragray.training import train
 from ultragray.training.trainer import CHECKPOINT_FILE
 
 from ..dicom_files import FRAMES, write_cine
+from ..mcap_files import Bag
 from ..model.datasets.conftest import (
     DEVICE_SET,
     IMAGE_TO_PROBE,
@@ -268,6 +270,17 @@ def test_dicom(door: EnterDoor, open_reader: OpenReader, tmp_path: Path) -> None
     parts = {"sweep.dcm": mutated_cine(path), "sweep.poses.npy": mutated_array(poses)}
     reader = open_reader("folder")
     door("dicom").enter(chosen_parts(whole, parts), reader.read_files)
+
+
+def test_mcap(door: EnterDoor, open_reader: OpenReader, tmp_path: Path) -> None:
+    """Uncompressed chunks without checksums: changed bytes get as far as the messages."""
+    bag = Bag(tmp_path / "sweep.mcap", CompressionType.NONE, enable_crcs=False)
+    bag.geometry()
+    bag.poses()
+    bag.images()
+    whole = {"sweep.mcap": bag.finish().read_bytes()}
+    reader = open_reader("folder")
+    door("mcap").enter(mutated_bytes([whole["sweep.mcap"]]).map(lambda data: {"sweep.mcap": data}), reader.read_files)
 
 
 def packed(entries: list[tuple[str, bytes]], kind: str) -> bytes:

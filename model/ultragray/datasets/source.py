@@ -42,9 +42,13 @@ class SourceOptions(Contract):
         None,
     )
     transform: str | None = described(
-        "Tracked transform of a sequence to take, such as ProbeToTracker, where there are several.", None
+        "Tracked transform of a sequence to take, such as ProbeToTracker, where there are several; of a recording two "
+        "frames of tf, such as probeTobase.",
+        None,
     )
     image_size: str | None = described("Resize the frames: WIDTHxHEIGHT, such as 192x256.", None)
+    image_topic: str | None = described("Topic of a recording to take images from, where there are several.", None)
+    pose_topic: str | None = described("Topic of a recording to take poses from; /tf: from the transforms of tf.", None)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -99,8 +103,9 @@ def load_dataset(source: str | Path, options: SourceOptions | None = None) -> Da
     chosen = format_of(source)
     for item in fields(options):
         if getattr(options, item.name) is not None and item.name not in (*EVERY_FORMAT_TAKES, *chosen.options):
-            takers = " and ".join(f"{one.noun}s" for one in FORMATS.values() if item.name in one.options)
-            raise InvalidArgument(f"{item.name} is for {takers}, {Path(source).name} is none", field=item.name)
+            *takers, last = (f"{one.noun}s" for one in FORMATS.values() if item.name in one.options)
+            listed = f"{', '.join(takers)} and {last}" if takers else last
+            raise InvalidArgument(f"{item.name} is for {listed}, {Path(source).name} is none", field=item.name)
     dataset = chosen.load(str(source), options)
     if options.image_size is None:
         return dataset
@@ -181,6 +186,21 @@ def _load_dicom(source: str, options: SourceOptions) -> Dataset:
     return _split_sequence(path, options, *read)
 
 
+def _load_mcap(source: str, options: SourceOptions) -> Dataset:
+    from .mcap import read_mcap_sweep
+
+    path = Path(source)
+    read = read_mcap_sweep(
+        path,
+        frames=options.frames,
+        crop=options.crop,
+        transform=options.transform,
+        image_topic=options.image_topic,
+        pose_topic=options.pose_topic,
+    )
+    return _split_sequence(path, options, *read)
+
+
 PLUS_SUFFIXES = (".mha", ".mhd", ".nrrd", ".nhdr")
 FORMATS: Mapping[str, DatasetFormat] = {
     one.name: one
@@ -214,6 +234,17 @@ FORMATS: Mapping[str, DatasetFormat] = {
             files=("*.dcm",),
             options=("frames", "crop", "fan"),
             beside=(".poses.npy", ".poses.json"),
+        ),
+        DatasetFormat(
+            name="mcap",
+            noun="MCAP recording",
+            meaning="an MCAP recording of ROS 2 (.mcap) with images and poses, its geometry in it or beside it "
+            "(.geometry.json)",
+            is_source=lambda source: source.lower().endswith(".mcap"),
+            load=_load_mcap,
+            files=("*.mcap",),
+            options=("frames", "crop", "transform", "image_topic", "pose_topic"),
+            beside=(".geometry.json",),
         ),
         DatasetFormat(
             name=PHANTOM,

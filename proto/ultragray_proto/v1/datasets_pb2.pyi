@@ -30,7 +30,7 @@ class UploadHeader(_message.Message):
     def __init__(self, dataset: _Optional[str] = ..., options: _Optional[_Union[DatasetOptions, _Mapping]] = ..., archive: _Optional[bool] = ..., private: _Optional[bool] = ...) -> None: ...
 
 class DatasetOptions(_message.Message):
-    __slots__ = ("crop", "image_size", "frames", "train_frames", "val_frames", "fan", "transform")
+    __slots__ = ("crop", "image_size", "frames", "train_frames", "val_frames", "fan", "transform", "image_topic", "pose_topic")
     CROP_FIELD_NUMBER: _ClassVar[int]
     IMAGE_SIZE_FIELD_NUMBER: _ClassVar[int]
     FRAMES_FIELD_NUMBER: _ClassVar[int]
@@ -38,6 +38,8 @@ class DatasetOptions(_message.Message):
     VAL_FRAMES_FIELD_NUMBER: _ClassVar[int]
     FAN_FIELD_NUMBER: _ClassVar[int]
     TRANSFORM_FIELD_NUMBER: _ClassVar[int]
+    IMAGE_TOPIC_FIELD_NUMBER: _ClassVar[int]
+    POSE_TOPIC_FIELD_NUMBER: _ClassVar[int]
     crop: str
     image_size: str
     frames: str
@@ -45,7 +47,9 @@ class DatasetOptions(_message.Message):
     val_frames: str
     fan: str
     transform: str
-    def __init__(self, crop: _Optional[str] = ..., image_size: _Optional[str] = ..., frames: _Optional[str] = ..., train_frames: _Optional[str] = ..., val_frames: _Optional[str] = ..., fan: _Optional[str] = ..., transform: _Optional[str] = ...) -> None: ...
+    image_topic: str
+    pose_topic: str
+    def __init__(self, crop: _Optional[str] = ..., image_size: _Optional[str] = ..., frames: _Optional[str] = ..., train_frames: _Optional[str] = ..., val_frames: _Optional[str] = ..., fan: _Optional[str] = ..., transform: _Optional[str] = ..., image_topic: _Optional[str] = ..., pose_topic: _Optional[str] = ...) -> None: ...
 
 class UploadDatasetResponse(_message.Message):
     __slots__ = ("dataset", "created")

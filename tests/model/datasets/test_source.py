@@ -65,7 +65,8 @@ def test_sources_that_are_none_are_refused(folder: Path, tmp_path: Path) -> None
     with pytest.raises(DatasetInvalid, match=r"a\.txt: a dataset is a folder with conf\.json"):
         load_dataset(tmp_path / "a.txt")
     for options in (SourceOptions(crop="0:1,0:1"), SourceOptions(frames="0"), SourceOptions(device_set=folder)):
-        with pytest.raises(InvalidArgument, match=r"is for PLUS sequences( and DICOM cine loops)?, tiny is none"):
+        takers = r"PLUS sequences(, DICOM cine loops and MCAP recordings)?"
+        with pytest.raises(InvalidArgument, match=rf"is for {takers}, tiny is none"):
             load_dataset(folder, options)
 
 

@@ -24,6 +24,7 @@ from ultragray.training import TrainingConfig, trainer
 from ultragray.training.data.geometry import Geometry
 from ultragray_service.cli.app import app
 
+from ...mcap_files import PROBE, recorded
 from ...waiting import Deadline
 
 SMALL = ("--steps", 24, "--max-gaussians", 60, "--threads", 1)
@@ -81,6 +82,16 @@ def test_trains_a_scene(dataset: Path, tmp_path: Path) -> None:
     assert pictures[-2:] == ["validation_00000024.png", "validation_truth.png"]
     assert len((folder / "metrics.jsonl").read_text().splitlines()) == 24
     assert "the run is finished, all 24 steps are done" in refused(dataset, "-o", output, "--resume")
+
+
+def test_trains_a_scene_from_an_mcap_recording(tmp_path: Path) -> None:
+    sweep, output = recorded(tmp_path / "sweep.mcap"), tmp_path / "scene.ugr"
+    result = run(sweep, "-o", output, *SMALL)
+    assert result.exit_code == 0, result.output
+    scene = GaussianScene.load(output)
+    assert scene.info.probe == PROBE
+    assert len(scene.training_poses) == 10
+    assert scene.info.training["step"] == 24
 
 
 def test_settings_come_from_file_set_and_options(dataset: Path, tmp_path: Path) -> None:

@@ -24,6 +24,7 @@ from ultragray.datasets.released import write_released
 from ultragray_service.core.dataset_uploads import MAX_UPLOADS
 
 from ...dicom_files import write_cine
+from ...mcap_files import GEOMETRY, Bag
 from ...waiting import wait_until
 from ..conftest import RunningService, StartService
 
@@ -250,6 +251,21 @@ def test_a_dicom_cine_loop_with_its_poses(http: httpx.Client, tmp_path: Path) ->
     http.delete("/v1/datasets/cine")
     answer = put(http, "cine", zipped({path.name: files[path.name]}))
     assert_problem(answer, 422, "DATASET_INVALID", "must lie beside it in sweep.poses.npy or sweep.poses.json")
+
+
+def test_an_mcap_recording_with_its_geometry_beside_it(http: httpx.Client, tmp_path: Path) -> None:
+    bag = Bag(tmp_path / "sweep.mcap")
+    bag.poses("/goal", seconds=0.0)
+    bag.poses("/tracker/pose")
+    bag.images()
+    files = {"sweep.mcap": bag.finish().read_bytes(), "sweep.geometry.json": GEOMETRY.encode()}
+    dataset = put(http, "bag", zipped(files), pose_topic="/tracker/pose").json()
+    assert (dataset["kind"], dataset["train_frames"], dataset["val_frames"]) == ("mcap", 10, 2)
+    assert dataset["probe"] == {"kind": "linear", "width_mm": 32.0, "near_mm": 0.0, "far_mm": 24.0}
+    assert dataset["options"] == {"pose_topic": "/tracker/pose"}
+    http.delete("/v1/datasets/bag")
+    answer = put(http, "bag", zipped(files))
+    assert_problem(answer, 422, "DATASET_INVALID", "choose one with pose_topic: there are /goal, /tracker/pose")
 
 
 def test_what_cannot_be_used_is_refused_with_the_frame(http: httpx.Client, files: dict[str, bytes]) -> None:

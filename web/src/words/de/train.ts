@@ -16,7 +16,7 @@ export const train: Words["train"] = {
   startJobs: "Aufträge starten",
   existing: "Vorhandene Sweeps",
   firstSweep: "Noch kein Sweep",
-  firstSweepHint: "Ein Sweep ist eine Folge von B-Bildern mit der aufgezeichneten Lage jedes Bildes: eine Sequenz von PLUS oder 3D Slicer (.mha, .nrrd) mit ihrer Gerätedatei, eine DICOM-Schleife mit ihren Lagen oder ein Ordner mit conf.json.",
+  firstSweepHint: "Ein Sweep ist eine Folge von B-Bildern mit der aufgezeichneten Lage jedes Bildes: eine Sequenz von PLUS oder 3D Slicer (.mha, .nrrd) mit ihrer Gerätedatei, eine DICOM-Schleife mit ihren Lagen, eine Aufzeichnung von ROS 2 (.mcap) oder ein Ordner mit conf.json.",
   chooseFiles: "Einen hochladen",
   frames: (count, isPrivate) => `${count} Bilder${isPrivate ? ", privat" : ""}`,
   otherJobs: "Andere Aufträge",

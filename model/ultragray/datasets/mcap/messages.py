@@ -1,0 +1,113 @@
+"""The messages of an MCAP file one after another, as they lie in it: an unfinished file has no index to go by."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from ...errors import DatasetInvalid
+from ...installation import missing_extra
+
+MAX_RECORD_BYTES = 1 << 30  # of a chunk, compressed or not
+NS_PER_S = 1_000_000_000
+
+
+@dataclass(frozen=True)
+class StoredMessage:
+    """A message. `decode` gives its fields as attributes."""
+
+    topic: str
+    kind: str  # such as sensor_msgs/msg/Image
+    log_time_ns: int
+    decode: Callable[[], Any]
+
+
+class MessageFile:
+    """An MCAP file. `broke_off` says, once the messages were read, whether its end is missing."""
+
+    def __init__(self, path: Path) -> None:
+        """Raises ExtraMissing."""
+        try:
+            from mcap.stream_reader import StreamReader, breakup_chunk
+            from mcap_ros2.decoder import DecoderFactory
+        except ImportError as error:
+            raise missing_extra(error, "an MCAP file") from error
+        self.path, self.broke_off = path, False
+        self._reader, self._chunk_records = StreamReader, breakup_chunk
+        self._decoders = DecoderFactory()
+
+    def messages(self) -> Iterator[StoredMessage]:
+        """Every message, in the order of the file, as far as it goes. Raises DatasetInvalid, OSError."""
+        from mcap.records import Channel, Message, Schema
+
+        schemas: dict[int, Schema] = {}
+        channels: dict[int, Channel] = {}
+        for record in self._records():
+            if isinstance(record, Schema):
+                schemas[record.id] = record
+            elif isinstance(record, Channel):
+                channels[record.id] = record
+            elif isinstance(record, Message):
+                channel = channels.get(record.channel_id)
+                if channel is None:
+                    raise DatasetInvalid(f"{self.path}: a message is of channel {record.channel_id}, which it lacks")
+                schema = schemas.get(channel.schema_id)
+                yield StoredMessage(
+                    channel.topic,
+                    "" if schema is None else schema.name,
+                    record.log_time,
+                    partial(self._decoded, record.data, channel, schema),
+                )
+
+    def _records(self) -> Iterator[Any]:
+        from mcap.records import Chunk
+
+        with self.path.open("rb") as file:
+            records = self._reader(file, emit_chunks=True, record_size_limit=MAX_RECORD_BYTES).records
+            is_begun = False
+            while True:
+                try:
+                    record = next(records, None)
+                    if record is None:
+                        return
+                    if isinstance(record, Chunk) and record.uncompressed_size > MAX_RECORD_BYTES:
+                        raise DatasetInvalid(
+                            f"{self.path}: a chunk must have at most {MAX_RECORD_BYTES:,} bytes, it says "
+                            f"{record.uncompressed_size:,}"
+                        )
+                    inner = self._chunk_records(record, validate_crc=True) if isinstance(record, Chunk) else [record]
+                except (OSError, MemoryError, DatasetInvalid):
+                    raise
+                except Exception as error:  # the library has many kinds, for a file that is damaged or broke off
+                    if is_begun and file.tell() == os.fstat(file.fileno()).st_size:
+                        self.broke_off = True
+                        return
+                    raise DatasetInvalid(
+                        f"{self.path}: it cannot be read as MCAP: {error or type(error).__name__}"
+                    ) from error
+                is_begun = True
+                yield from inner
+
+    def _decoded(self, data: bytes, channel: Any, schema: Any) -> Any:
+        try:
+            decode = self._decoders.decoder_for(channel.message_encoding, schema)
+            if decode is not None:
+                return decode(data)
+        except MemoryError:
+            raise
+        except Exception as error:
+            raise DatasetInvalid(f"{self.path}: a message of {channel.topic} cannot be decoded: {error}") from error
+        raise DatasetInvalid(
+            f"{self.path}: messages of {channel.topic} must be of ROS 2 (cdr with a definition in ros2msg), they are "
+            f"{channel.message_encoding or 'of no encoding'} with {schema.encoding if schema else 'none'}"
+        )
+
+
+def time_of(header: Any, log_time_ns: int) -> int:
+    """The stamp of a std_msgs/Header, ns; where that was left at 0, when the message was written."""
+    stamp_ns = int(header.stamp.sec) * NS_PER_S + int(header.stamp.nanosec)
+    return stamp_ns or log_time_ns

@@ -1,0 +1,444 @@
+"""MCAP recordings as sweeps: our own, and such as other programs write."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from mcap.writer import CompressionType
+
+from ultragray import ConvexProbe, GaussianScene, LinearProbe, Probe, SteeredProbe
+from ultragray.confidence import Extrapolation
+from ultragray.contract import to_dict
+from ultragray.datasets import Dataset
+from ultragray.datasets.mcap import messages
+from ultragray.datasets.mcap import recording as mcap_recording
+from ultragray.datasets.source import SourceOptions, load_dataset
+from ultragray.display import Display
+from ultragray.errors import DatasetInvalid, ExtraMissing, InvalidArgument
+from ultragray.interchange import ros_messages as ros
+from ultragray.interchange.rendering import render_to_file
+from ultragray.pose import pose_from_position_quaternion
+from ultragray.settings import Resolved
+
+from ...mcap_files import (
+    COMPRESSED,
+    GEOMETRY,
+    PROBE,
+    SECOND,
+    START_NS,
+    TRANSFORM,
+    TRANSFORMS,
+    Bag,
+    image_at,
+    image_message,
+    image_time_ns,
+    moving_pose,
+    pose_message,
+    recorded,
+    transform_message,
+)
+
+COUNT = 12
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "sweep.mcap"
+
+
+def parts(dataset: Dataset) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Numbers, images and poses of all frames, in the order of the file."""
+    numbers = np.concatenate([dataset.train.frame_numbers, dataset.val.frame_numbers])
+    order = np.argsort(numbers)
+    images = np.concatenate([dataset.train.images, dataset.val.images])[order]
+    return numbers[order], images, np.concatenate([dataset.train.poses, dataset.val.poses])[order]
+
+
+def pose_at(number: int) -> np.ndarray:
+    return moving_pose((image_time_ns(number) - START_NS) / SECOND)
+
+
+def check_whole(dataset: Dataset, count: int = COUNT) -> None:
+    numbers, images, poses = parts(dataset)
+    assert numbers.tolist() == list(range(count))
+    np.testing.assert_array_equal(images, [image_at(number) for number in range(count)])
+    np.testing.assert_allclose(poses, [pose_at(number) for number in range(count)], atol=1e-9)
+
+
+def test_a_pose_lies_between_those_before_and_after_its_image(path: Path) -> None:
+    dataset = load_dataset(recorded(path))
+    check_whole(dataset)
+    assert (dataset.name, dataset.probe, dataset.train.notes) == ("sweep", PROBE, ())
+    assert dataset.val.frame_numbers.tolist() == [2, 7]
+
+
+@pytest.mark.parametrize("compression", CompressionType)
+def test_chunks_of_every_compression_and_unfinished_files_are_read(path: Path, compression: CompressionType) -> None:
+    bag = Bag(path, compression)
+    bag.geometry()
+    bag.poses()
+    bag.images()
+    bag.images("/other", count=40)  # fills the last chunk, which is lost
+    dataset = load_dataset(bag.leave(), SourceOptions(image_topic="/us/image"))
+    check_whole(dataset)
+    assert any("breaks off" in note for note in dataset.train.notes)
+    whole = path.read_bytes()
+    for length in range(len(whole) // 2, len(whole), len(whole) // 37):
+        path.write_bytes(whole[:length])
+        assert 2 <= len(parts(load_dataset(path, SourceOptions(image_topic="/us/image")))[0]) <= COUNT
+
+
+def test_images_that_no_poses_lie_around_are_left_out_and_named(path: Path) -> None:
+    bag = Bag(path)
+    bag.geometry()
+    for number in (*range(11), *range(25, 51)):  # none from 0.2 to 0.5 s, none after 1 s
+        time_ns = START_NS + number * SECOND // 50
+        bag.write("/pose", ros.POSE, pose_message(moving_pose(number / 50), time_ns), time_ns)
+    bag.images(count=20)
+    dataset = load_dataset(bag.finish())
+    assert parts(dataset)[0].tolist() == [0, 1, 2, 7, 8, 9, 10, 11, 12, 13, 14]
+    assert dataset.train.notes == (
+        "images without poses at most 200 ms apart around them were left out: "
+        "3, 4, 5, 6, 15, 16, 17, 18, 19 (9 in all)",
+    )
+
+
+def test_poses_of_a_lost_probe_are_gaps(path: Path) -> None:
+    bag = Bag(path)
+    bag.geometry()
+    for number in range(51):
+        time_ns = START_NS + number * SECOND // 50
+        message = pose_message(moving_pose(number / 50), time_ns)
+        if number == 10:
+            message["pose"]["position"]["x"] = float("nan")
+        if number == 20:
+            message["pose"]["orientation"] = {"x": 0.0, "y": 0.0, "z": 0.0, "w": 0.0}
+        bag.write("/pose", ros.POSE, message, time_ns)
+    bag.images()
+    dataset = load_dataset(bag.finish())
+    check_whole(dataset)
+    assert dataset.train.notes == ("2 poses of /pose are none, such as of a probe that was lost, and were passed over",)
+
+
+def test_the_time_of_writing_stands_for_a_stamp_that_is_missing(path: Path) -> None:
+    bag = Bag(path)
+    bag.geometry()
+    for number in range(51):
+        bag.write("/pose", ros.POSE, pose_message(moving_pose(number / 50), 0), START_NS + number * SECOND // 50)
+    for number in range(COUNT):
+        bag.write("/us/image", ros.IMAGE, image_message(image_at(number), 0), image_time_ns(number))
+    check_whole(load_dataset(bag.finish()))
+
+
+GREY = image_at(3)
+COLOUR = np.stack([GREY, GREY // 2, 255 - GREY], axis=-1)
+LUMA = cv2.cvtColor(COLOUR, cv2.COLOR_RGB2GRAY)
+ALPHA = np.full((*GREY.shape, 1), 9, np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("encoding", "stored", "expected"),
+    [
+        ("mono8", GREY, GREY),
+        ("8UC1", GREY, GREY),
+        ("rgb8", COLOUR, LUMA),
+        ("bgr8", COLOUR[..., ::-1], LUMA),
+        ("rgba8", np.concatenate([COLOUR, ALPHA], axis=-1), LUMA),
+        ("bgra8", np.concatenate([COLOUR[..., ::-1], ALPHA], axis=-1), LUMA),
+        ("32FC1", (GREY / 255).astype("<f4"), GREY),
+    ],
+)
+def test_every_encoding_becomes_grey(path: Path, encoding: str, stored: np.ndarray, expected: np.ndarray) -> None:
+    bag = Bag(path)
+    bag.geometry()
+    bag.poses()
+    for number in range(3):
+        time_ns = image_time_ns(number)
+        bag.write("/us/image", ros.IMAGE, image_message(stored, time_ns, encoding=encoding, padding=12), time_ns)
+    np.testing.assert_array_equal(parts(load_dataset(bag.finish()))[1], [expected] * 3)
+
+
+@pytest.mark.parametrize(("suffix", "tolerance"), [(".png", 0), (".jpg", 6)])
+def test_compressed_images_are_read(path: Path, suffix: str, tolerance: int) -> None:
+    bag = Bag(path)
+    bag.geometry(topic="/us/image/geometry")
+    bag.poses()
+    for number in range(COUNT):
+        time_ns = image_time_ns(number)
+        data = cv2.imencode(suffix, image_at(number))[1].tobytes()
+        message = {"header": ros.header(time_ns, "probe"), "format": f"mono8; {suffix[1:]} compressed ", "data": data}
+        bag.write("/us/image/compressed", COMPRESSED, message, time_ns)
+    images = parts(load_dataset(bag.finish()))[1]
+    truth = np.array([image_at(number) for number in range(COUNT)])
+    inner = np.s_[:, :6, :6], np.s_[:, 10:, 10:]  # a JPEG rings at the edge of the corner
+    for region in inner:
+        assert np.abs(images[region].astype(int) - truth[region]).max() <= tolerance
+
+
+FLANGE_TO_PROBE = pose_from_position_quaternion((0.0, 12.0, 80.0), (0.0, 1.0, 0.0, 0.0))
+
+
+def robot(bag: Bag) -> None:
+    """tf of a robot whose flange holds the probe: the arm moves, the mount is fixed, and a camera looks on."""
+    for number in range(51):
+        time_ns = START_NS + number * SECOND // 50
+        flange = moving_pose(number / 50) @ np.linalg.inv(FLANGE_TO_PROBE)
+        transforms = [
+            transform_message(flange, time_ns, "base", "flange"),
+            transform_message(np.eye(4), time_ns, "camera", "marker"),
+        ]
+        bag.write("/tf", TRANSFORMS, {"transforms": transforms}, time_ns)
+    fixed = [
+        transform_message(FLANGE_TO_PROBE, START_NS, "flange", "probe"),
+        transform_message(np.eye(4), START_NS, "world", "base"),
+    ]
+    bag.write("/tf_static", TRANSFORMS, {"transforms": fixed}, START_NS)
+
+
+def test_tf_leads_from_the_frame_of_the_images_to_its_root(path: Path) -> None:
+    bag = Bag(path)
+    bag.geometry()
+    robot(bag)
+    bag.images()
+    bag.finish()
+    dataset = load_dataset(path)
+    numbers, _, poses = parts(dataset)
+    assert len(numbers) == COUNT
+    # The flange goes straight between two poses where the probe, 80 mm beyond it, goes along an arc.
+    np.testing.assert_allclose(poses, [pose_at(number) for number in numbers], atol=1e-2)
+    assert dataset.train.notes == ("poses are taken from tf: probeToworld",)
+    named = load_dataset(path, SourceOptions(pose_topic="/tf", transform="probeTobase"))
+    np.testing.assert_allclose(parts(named)[2], poses, atol=1e-9)
+    assert named.train.notes == ()
+    inverted = load_dataset(path, SourceOptions(transform="baseToprobe"))
+    np.testing.assert_allclose(parts(inverted)[2], np.linalg.inv(poses), atol=1e-9)
+    for transform, told in (
+        ("probeTomars", r"there are base, camera, flange, marker, probe, world, got 'probeTomars'"),
+    ):
+        with pytest.raises(InvalidArgument, match=told):
+            load_dataset(path, SourceOptions(transform=transform))
+    for transform in ("probeTocamera", "worldTobase"):
+        with pytest.raises(DatasetInvalid, match="no tracked transforms of tf lead from"):
+            load_dataset(path, SourceOptions(transform=transform))
+
+
+def test_a_tracker_of_transforms_is_read(path: Path) -> None:
+    bag = Bag(path)
+    bag.geometry()
+    for number in range(51):
+        time_ns = START_NS + number * SECOND // 50
+        message = transform_message(moving_pose(number / 50), time_ns, "tracker", "probe")
+        bag.write("/ndi/probe", TRANSFORM, message, time_ns)
+    bag.images()
+    check_whole(load_dataset(bag.finish()))
+
+
+def test_topics_are_chosen_or_listed(path: Path) -> None:
+    bag = Bag(path)
+    bag.geometry(topic="/a/geometry")
+    for topic in ("/a/image", "/b/image"):
+        bag.images(topic)
+    bag.poses("/goal", seconds=0.0)
+    bag.poses("/tracker/pose")
+    robot(bag)
+    bag.finish()
+    with pytest.raises(DatasetInvalid, match=r"choose one with image_topic: there are /a/image, /b/image"):
+        load_dataset(path)
+    with pytest.raises(DatasetInvalid, match=r"choose one with pose_topic: there are /goal, /tracker/pose, /tf"):
+        load_dataset(path, SourceOptions(image_topic="/a/image"))
+    with pytest.raises(InvalidArgument, match=r"image_topic must be one of /a/image, /b/image, got '/c'"):
+        load_dataset(path, SourceOptions(image_topic="/c"))
+    chosen = SourceOptions(image_topic="/a/image", pose_topic="/tracker/pose")
+    check_whole(load_dataset(path, chosen))
+    with pytest.raises(InvalidArgument, match="transform is for the poses of /tf, these are of /tracker/pose"):
+        load_dataset(path, SourceOptions(image_topic="/a/image", pose_topic="/tracker/pose", transform="aTob"))
+
+
+def test_a_geometry_beside_the_file_goes_before_its_own(path: Path) -> None:
+    probe = LinearProbe(width_mm=16.0, near_mm=0.0, far_mm=12.0)
+    path.with_name("sweep.geometry.json").write_text(json.dumps({"probe": to_dict(probe)}))
+    assert load_dataset(recorded(path)).probe == probe
+
+
+def test_a_crop_moves_the_origin_to_its_own_top_centre(path: Path) -> None:
+    dataset = load_dataset(recorded(path), SourceOptions(crop="8:28,4:24", frames="0:6", val_frames="3"))
+    assert dataset.probe == LinearProbe(20.0, 0.0, 20.0)
+    np.testing.assert_array_equal(dataset.val.images[0], image_at(3)[4:24, 8:28])
+    np.testing.assert_allclose(dataset.val.poses[0, :, 3], pose_at(3) @ [2.0, 0.0, 4.0, 1.0], atol=1e-9)
+    assert dataset.train.region is not None
+    assert (dataset.train.region.left, dataset.train.region.top) == (8, 4)
+
+
+def changing(path: Path, *, size: bool) -> Path:
+    """From image 8 on of another size, or of another probe."""
+    bag = Bag(path)
+    bag.geometry()
+    bag.poses()
+    for number in range(COUNT):
+        time_ns = image_time_ns(number)
+        if number == 8 and not size:
+            bag.geometry(json.dumps({"probe": to_dict(LinearProbe(40.0, 0.0, 30.0))}), time_ns=time_ns)
+        image = image_at(number, width=40 if size and number >= 8 else 32)
+        bag.write("/us/image", ros.IMAGE, image_message(image, time_ns), time_ns)
+    return bag.finish()
+
+
+@pytest.mark.parametrize(
+    ("size", "told"),
+    [
+        (True, r"frame 8 has 40 x 24 pixels, frame 0 32 x 24: choose those of one size with frames, such as 0:8"),
+        (False, r"frame 8: its geometry is another one than that of frame 0: choose .* such as 0:8"),
+    ],
+)
+def test_what_changes_on_the_way_is_told_with_the_frames_to_choose(path: Path, size: bool, told: str) -> None:
+    changing(path, size=size)
+    with pytest.raises(DatasetInvalid, match=told):
+        load_dataset(path)
+    check_whole(load_dataset(path, SourceOptions(frames="0:8")), 8)
+    assert parts(load_dataset(path, SourceOptions(frames="8:12")))[0].tolist() == [8, 9, 10, 11]
+
+
+def small(**changes: Any) -> Callable[[Bag], None]:
+    """A recording with something else in it."""
+
+    def write(bag: Bag) -> None:
+        bag.geometry(changes.get("geometry", GEOMETRY))
+        bag.poses()
+        time_ns = image_time_ns(0) + changes.get("late_ns", 0)
+        message = image_message(image_at(0), time_ns) | changes.get("image", {})
+        bag.write("/us/image", ros.IMAGE, message, time_ns)
+
+    return write
+
+
+@pytest.mark.parametrize(
+    ("write", "told"),
+    [
+        (lambda bag: None, r"a sweep needs a topic of images: there are no messages"),
+        (Bag.poses, r"a sweep needs a topic of images: there are /tracker/pose \(geometry_msgs/msg/PoseStamped\)"),
+        (Bag.images, r"a sweep needs a topic of poses: there are /us/image \(sensor_msgs/msg/Image\)"),
+        (small(geometry="no JSON"), r"the geometry of its images cannot be read"),
+        (small(geometry='{"probe": {"kind": "lunar"}}'), r"the geometry of its images cannot be read"),
+        (small(geometry='{"frame_id": "probe"}'), r"it must be an object with a probe"),
+        (small(late_ns=90 * SECOND), r"none of 1 images has a pose: images are stamped .* were the clocks other ones"),
+        (small(image={"encoding": "bayer_rggb8"}), r"frame 0: its encoding must be one of mono8, .*got 'bayer_rggb8'"),
+        (small(image={"height": 2_000_000_000}), r"frame 0: 2000000000 rows of 32 bytes must hold 32 pixels"),
+        (small(image={"step": 8}), r"frame 0: 24 rows of 8 bytes must hold 32 pixels"),
+        (small(), r"at least two training frames, got 1"),
+    ],
+    ids=range(11),
+)
+def test_what_cannot_be_used_is_one_clear_error(path: Path, write: Callable[[Bag], None], told: str) -> None:
+    bag = Bag(path)
+    write(bag)
+    with pytest.raises(DatasetInvalid, match=told):
+        load_dataset(bag.finish())
+
+
+def test_images_without_a_geometry_say_where_to_put_it(path: Path) -> None:
+    bag = Bag(path)
+    bag.poses()
+    bag.images()
+    with pytest.raises(DatasetInvalid, match=r"does not say which probe .* say it in sweep\.geometry\.json beside"):
+        load_dataset(bag.finish())
+
+
+def test_files_that_are_no_mcap_or_damaged(path: Path) -> None:
+    path.write_bytes(b"no MCAP at all")
+    with pytest.raises(DatasetInvalid, match=r"sweep\.mcap: it cannot be read as MCAP"):
+        load_dataset(path)
+    path.write_bytes(b"")
+    with pytest.raises(DatasetInvalid, match=r"sweep\.mcap: "):
+        load_dataset(path)
+    whole = bytearray(recorded(path).read_bytes())
+    whole[2000:2100] = bytes(100)
+    path.write_bytes(whole)
+    with pytest.raises(DatasetInvalid, match=r"sweep\.mcap: it cannot be read as MCAP"):
+        load_dataset(path)
+
+
+def test_a_file_that_is_too_large_is_refused(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    recorded(path)
+    monkeypatch.setattr(mcap_recording, "MAX_PIXEL_BYTES", 5000)
+    with pytest.raises(DatasetInvalid, match=r"its frames must have at most 5,000 pixels, 12 of 32 x 24 have more"):
+        load_dataset(path)
+    monkeypatch.setattr(messages, "MAX_RECORD_BYTES", 3000)
+    with pytest.raises(DatasetInvalid, match=r"a chunk must have at most 3,000 bytes"):
+        load_dataset(path)
+
+
+def test_without_the_package_the_extra_is_named(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    recorded(path)
+    monkeypatch.setitem(sys.modules, "mcap_ros2.decoder", None)
+    with pytest.raises(ExtraMissing, match=r"ultragray\[mcap\]"):
+        load_dataset(path)
+
+
+def rendered_file(
+    path: Path, scene: GaussianScene, poses: np.ndarray, probe: Probe, display: Display, height: int, width: int
+) -> Path:
+    """Our own file of these frames."""
+    told = [Extrapolation(None, None, None, None)] * len(poses)
+    settings = Resolved(probe, height, width, ("bmode", "echo"), display=display)
+    render_to_file(path, "mcap", scene, settings, poses, told, scene_name="one", scene_sha256="0" * 64)
+    return path
+
+
+CONVEX = ConvexProbe(opening_angle_deg=50.0, near_mm=10.0, far_mm=40.0)
+LINEAR = LinearProbe(width_mm=30.0, near_mm=0.0, far_mm=40.0)
+
+
+@pytest.mark.parametrize(
+    ("probe", "display", "expected"),
+    [
+        (LINEAR, Display(), LINEAR),
+        (CONVEX, Display(), CONVEX),
+        (CONVEX, Display(flip=True), CONVEX),
+        (CONVEX, Display(depth_mm=15.0), ConvexProbe(50.0, 10.0, 25.0)),
+        (LINEAR, Display(depth_mm=20.0, flip=True), LinearProbe(30.0, 0.0, 20.0)),
+    ],
+)
+def test_our_own_frames_come_back_in_every_display(
+    path: Path, random_scene: Any, random_poses: Any, probe: Probe, display: Display, expected: Probe
+) -> None:
+    scene, poses = random_scene(80), random_poses(6)
+    numbers, images, found = parts(load_dataset(rendered_file(path, scene, poses, probe, display, 40, 30)))
+    plain = rendered_file(path.with_name("plain.mcap"), scene, poses, probe, Display(), 40, 30)
+    dataset = load_dataset(path)
+    assert numbers.tolist() == list(range(6))
+    assert dataset.probe == expected
+    np.testing.assert_allclose(found, poses, atol=1e-9)
+    truth = parts(load_dataset(plain))[1]
+    np.testing.assert_array_equal(images, truth[:, : images.shape[1]])
+
+
+@pytest.mark.parametrize(("probe", "size"), [(CONVEX, (200, 160)), (LINEAR, (100, 75))])
+def test_frames_that_were_scan_converted_are_scan_lines_again(
+    path: Path, random_scene: Any, random_poses: Any, probe: Probe, size: tuple[int, int]
+) -> None:
+    scene, poses = random_scene(80), random_poses(3)
+    dataset = load_dataset(rendered_file(path, scene, poses, probe, Display(pixel_mm=0.15), *size))
+    _, images, found = parts(dataset)
+    assert dataset.probe.box_mm == pytest.approx(probe.box_mm, abs=0.2)
+    np.testing.assert_allclose(found, poses, atol=1e-6)
+    truth = parts(load_dataset(rendered_file(path.with_name("plain.mcap"), scene, poses, probe, Display(), *size)))[1]
+    for image, expected in zip(images, truth, strict=True):
+        brought = cv2.resize(expected, image.shape[::-1], interpolation=cv2.INTER_LINEAR).astype(float)
+        assert np.abs(brought - image)[4:-4, 4:-4].mean() < 3.0
+
+
+def test_steered_lines_that_were_scan_converted_are_refused(path: Path, random_scene: Any, random_poses: Any) -> None:
+    steered = SteeredProbe(width_mm=30.0, steering_deg=10.0, near_mm=0.0, far_mm=40.0)
+    scene, poses = random_scene(40), random_poses(3)
+    with pytest.raises(DatasetInvalid, match=r"cannot be brought back to the scan lines of .*: record them without"):
+        load_dataset(rendered_file(path, scene, poses, steered, Display(pixel_mm=0.5), 40, 30))
+    assert load_dataset(rendered_file(path, scene, poses, steered, Display(), 40, 30)).probe == steered
+    with pytest.raises(InvalidArgument, match="crop is for the images of linear probes"):
+        load_dataset(path, SourceOptions(crop="0:9,0:9"))
