@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 from ..contract import Contract, described
 from ..errors import DatasetInvalid, InvalidArgument
+from ..installation import missing_extra
 
 if TYPE_CHECKING:
     from .sweep import Dataset, Sweep
@@ -187,7 +188,10 @@ def _load_dicom(source: str, options: SourceOptions) -> Dataset:
 
 
 def _load_mcap(source: str, options: SourceOptions) -> Dataset:
-    from .mcap import read_mcap_sweep
+    try:
+        from .mcap import read_mcap_sweep
+    except ImportError as error:
+        raise missing_extra(error, "an MCAP recording") from error
 
     path = Path(source)
     read = read_mcap_sweep(

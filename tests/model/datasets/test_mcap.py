@@ -376,6 +376,8 @@ def test_a_file_that_is_too_large_is_refused(path: Path, monkeypatch: pytest.Mon
 
 def test_without_the_package_the_extra_is_named(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     recorded(path)
+    for name in [one for one in sys.modules if one.startswith("ultragray.datasets.mcap")]:
+        monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "mcap_ros2.decoder", None)
     with pytest.raises(ExtraMissing, match=r"ultragray\[mcap\]"):
         load_dataset(path)

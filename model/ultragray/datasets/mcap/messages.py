@@ -9,8 +9,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from mcap.records import Channel, Chunk, McapRecord, Message, Schema
+from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap_ros2.decoder import DecoderFactory
+
 from ...errors import DatasetInvalid
-from ...installation import missing_extra
 
 MAX_RECORD_BYTES = 1 << 30  # of a chunk, compressed or not
 NS_PER_S = 1_000_000_000
@@ -30,20 +33,11 @@ class MessageFile:
     """An MCAP file. `broke_off` says, once the messages were read, whether its end is missing."""
 
     def __init__(self, path: Path) -> None:
-        """Raises ExtraMissing."""
-        try:
-            from mcap.stream_reader import StreamReader, breakup_chunk
-            from mcap_ros2.decoder import DecoderFactory
-        except ImportError as error:
-            raise missing_extra(error, "an MCAP file") from error
         self.path, self.broke_off = path, False
-        self._reader, self._chunk_records = StreamReader, breakup_chunk
         self._decoders = DecoderFactory()
 
     def messages(self) -> Iterator[StoredMessage]:
         """Every message, in the order of the file, as far as it goes. Raises DatasetInvalid, OSError."""
-        from mcap.records import Channel, Message, Schema
-
         schemas: dict[int, Schema] = {}
         channels: dict[int, Channel] = {}
         for record in self._records():
@@ -63,11 +57,9 @@ class MessageFile:
                     partial(self._decoded, record.data, channel, schema),
                 )
 
-    def _records(self) -> Iterator[Any]:
-        from mcap.records import Chunk
-
+    def _records(self) -> Iterator[McapRecord]:
         with self.path.open("rb") as file:
-            records = self._reader(file, emit_chunks=True, record_size_limit=MAX_RECORD_BYTES).records
+            records = StreamReader(file, emit_chunks=True, record_size_limit=MAX_RECORD_BYTES).records
             is_begun = False
             while True:
                 try:
@@ -79,7 +71,7 @@ class MessageFile:
                             f"{self.path}: a chunk must have at most {MAX_RECORD_BYTES:,} bytes, it says "
                             f"{record.uncompressed_size:,}"
                         )
-                    inner = self._chunk_records(record, validate_crc=True) if isinstance(record, Chunk) else [record]
+                    inner = breakup_chunk(record, validate_crc=True) if isinstance(record, Chunk) else [record]
                 except (OSError, MemoryError, DatasetInvalid):
                     raise
                 except Exception as error:  # the library has many kinds, for a file that is damaged or broke off
@@ -92,7 +84,7 @@ class MessageFile:
                 is_begun = True
                 yield from inner
 
-    def _decoded(self, data: bytes, channel: Any, schema: Any) -> Any:
+    def _decoded(self, data: bytes, channel: Channel, schema: Schema | None) -> Any:
         try:
             decode = self._decoders.decoder_for(channel.message_encoding, schema)
             if decode is not None:

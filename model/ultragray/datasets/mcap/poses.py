@@ -112,17 +112,20 @@ class TrackedPoses:
                 else:
                     self._transforms.setdefault(name, []).append(_stamped(transform, message))
 
-    def way_of(self, topic: str) -> Way:
-        """The poses of a topic. Raises DatasetInvalid where all of them are none."""
+    def way(self, topic: str, frame: str, transform: str | None) -> Way:
+        """The poses of a topic, or of tf those between two frames that `transform` names, such as probeTobase.
+
+        None: from `frame`, the one of the images, as far up as tf leads. Raises DatasetInvalid where there is no such
+        way, or all of its poses are none; InvalidArgument for a transform of a topic, and for frames that there are not.
+        """
+        if topic == TF:
+            return self._way_of_transforms(frame, transform)
+        if transform is not None:
+            raise InvalidArgument(f"transform is for the poses of {TF}, these are of {topic}", field="transform")
         track, lost = self._track(self._poses[topic], topic)
         return Way(topic, ((track, False),), lost)
 
-    def way_of_transforms(self, frame: str, transform: str | None) -> Way:
-        """The way of tf between two frames that `transform` names, such as probeTobase.
-
-        None: from `frame`, the one of the images, as far up as tf leads. Raises DatasetInvalid where there is no such
-        way, InvalidArgument for a transform between frames that there are not.
-        """
+    def _way_of_transforms(self, frame: str, transform: str | None) -> Way:
         names = {*self._transforms, *self._fixed}
         frames = sorted({one for name in names for one in name})
         example, known = "To".join(min(names)), ", ".join(frames)
@@ -155,14 +158,15 @@ class TrackedPoses:
 
     def _track(self, stamped: Sequence[_Stamped], name: str) -> tuple[PoseTrack, int]:
         """The poses over time, and how many are none."""
-        found, problem = {}, InvalidPose("")
+        found: dict[int, FloatArray] = {}
+        problems: list[str] = []
         for time_ns, position, turn in stamped:
             try:
                 found[time_ns] = pose_of_parts(position, turn, field="a pose")
             except InvalidPose as error:
-                problem = error
+                problems.append(error.detail)
         if not found:
-            raise DatasetInvalid(f"{self._path}: none of the {len(stamped)} poses of {name} is one: {problem.detail}")
+            raise DatasetInvalid(f"{self._path}: none of the {len(stamped)} poses of {name} is one: {problems[0]}")
         times = sorted(found)
         track = PoseTrack(np.array(times, np.int64), np.array([found[time_ns] for time_ns in times]))
         return track, len({time_ns for time_ns, _, _ in stamped} - set(times))
@@ -174,6 +178,7 @@ def _stamped(transform: Any, message: StoredMessage) -> _Stamped:
 
 
 def _root(frame: str, parents: Mapping[str, str]) -> str:
+    """The frame that tf leads up to from this one, by the parent of each."""
     seen = {frame}
     while (parent := parents.get(frame)) is not None and parent not in seen:
         seen.add(parent)

@@ -43,28 +43,23 @@ def read_mcap_sweep(
     `image_topic` and `pose_topic` name others; `/tf` stands for the transforms of tf, of which `transform`, such as
     probeTobase, names two frames. A pose lies between those before and after the image (position linear, orientation
     by slerp), at most 0.2 s apart; the notes say how many images have none. Raises DatasetInvalid, naming the file, the
-    frame and the reason; InvalidArgument for options that do not fit; ExtraMissing.
+    frame and the reason; InvalidArgument for options that do not fit.
     """
     file = MessageFile(path)
     contents = _Contents(file)
     topic = _chosen(path, "image_topic", image_topic, sorted(contents.image_counts), PREFERRED_IMAGES, contents)
     source = _chosen(path, "pose_topic", pose_topic, contents.poses.topics, PREFERRED_POSES, contents)
-    if transform is not None and source != TF:
-        raise InvalidArgument(f"transform is for the poses of {TF}, these are of {source}", field="transform")
     count = contents.image_counts[topic]
     numbers = range(count) if frames is None else parse_frame_ranges(frames, count, option="frames")
-    stamped = _Stamps(file, topic, numbers)
-    if source == TF:
-        way = contents.poses.way_of_transforms(stamped.frame_id, transform)
-    else:
-        way = contents.poses.way_of(source)
-    poses, known = way.at(stamped.times_ns)
+    times = _ImageTimes(file, topic, numbers)
+    way = contents.poses.way(source, times.frame_id, transform)
+    poses, known = way.at(times.times_ns)
     if not known.any():
-        raise DatasetInvalid(f"{path}: none of {len(known)} images has a pose: {_why_none(stamped.times_ns, way)}")
-    with_pose = stamped.numbers[known]
-    geometry = contents.geometry_of(topic, stamped.log_times_ns[known], with_pose)
+        raise DatasetInvalid(f"{path}: none of {len(known)} images has a pose: {_why_none(times.times_ns, way)}")
+    with_pose = times.numbers[known]
+    geometry = contents.geometry_of(topic, times.log_times_ns[known], with_pose)
     images = _read_images(file, topic, with_pose)
-    notes = _notes(file, way, source == TF and transform is None, stamped.numbers[~known])
+    notes = _notes(file, way, source == TF and transform is None, times.numbers[~known])
     return geometry.sweep(images, poses[known], with_pose, path, notes, crop), count
 
 
@@ -136,7 +131,7 @@ def _chosen_images(file: MessageFile, topic: str, numbers: Any) -> Iterator[tupl
             number += 1
 
 
-class _Stamps:
+class _ImageTimes:
     """The times of images, [F] each, and the frame that they are in."""
 
     def __init__(self, file: MessageFile, topic: str, numbers: Any) -> None:
