@@ -116,7 +116,7 @@ class TrackedPoses:
         """The poses of a topic, or of tf those between two frames that `transform` names, such as probeTobase.
 
         None: from `frame`, the one of the images, as far up as tf leads. Raises DatasetInvalid where there is no such
-        way, or all of its poses are none; InvalidArgument for a transform of a topic, and for frames that there are not.
+        way or all of its poses are none, InvalidArgument for a transform of a topic and for frames that there are not.
         """
         if topic == TF:
             return self._way_of_transforms(frame, transform)
