@@ -104,6 +104,37 @@ def test_what_came_before_an_error_is_kept(client: Any, tmp_path: Path) -> None:
     recording.close()
 
 
+INTERRUPTED = """
+import sys
+import numpy as np
+from ultragray_client import Client, Recording
+address, key, path = sys.argv[1:]
+with Client(address, api_key=key) as client:
+    frame = client.render("demo", np.eye(4))
+    with Recording(path) as recording:
+        recording.add(frame)
+        print("begun", flush=True)
+        while True:
+            recording.add(frame)
+"""
+
+
+@pytest.mark.slow
+def test_an_interrupt_in_the_middle_of_writing_leaves_a_whole_file(
+    client_service: RunningService, tmp_path: Path
+) -> None:
+    path = tmp_path / "interrupted.mcap"
+    command = [sys.executable, "-c", INTERRUPTED, client_service.grpc, KEY, str(path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == b"begun\n"
+        process.send_signal(signal.SIGINT)
+    counts = {len(decoded(path, f"/ultragray/{topic}")) for topic in ("bmode", "probe_pose", "confidence")}
+    assert len(counts) == 1
+    assert counts.pop() > 0
+    assert list(tmp_path.iterdir()) == [path]
+
+
 def test_times_that_no_stamp_can_hold_are_refused(client: Any, tmp_path: Path) -> None:
     frame = client.render("demo", POSES[0], RenderSettings(height=8, width=8))
     with Recording(tmp_path / "times.mcap") as recording:

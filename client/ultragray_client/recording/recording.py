@@ -6,6 +6,7 @@ import contextlib
 import os
 import secrets
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -42,6 +43,8 @@ class Recording:
         self._is_writable = True
         with self._giving_up_on_error():
             self._writer = RosRecording(self._file)
+        # Ctrl-C interrupts the caller, not this thread: no message is half written.
+        self._thread = ThreadPoolExecutor(1, "recording")
 
     def __enter__(self) -> Recording:
         return self
@@ -64,14 +67,22 @@ class Recording:
                 f"time_ns must be a whole number of nanoseconds from 0 to {MAX_TIME_NS - 1}, got {time_ns!r:.40}",
                 field="time_ns",
             )
-        with self._giving_up_on_error():
-            self._writer.add(frame.arrays, frame.pose, asdict(frame.extrapolation), origin_of(frame), stamp_ns)
-            self._file.flush()  # a program that is killed loses no chunk that was complete
         self._next_ns = stamp_ns + FRAME_TIME_NS
+        self._thread.submit(self._write, frame, stamp_ns).result()
 
     def close(self) -> None:
         """Make the file whole and give it its name; a second time nothing. Raises OSError."""
-        if not self._is_writable:
+        with self._thread as thread:
+            if self._is_writable:
+                thread.submit(self._finish).result()
+
+    def _write(self, frame: Frame, stamp_ns: int) -> None:
+        with self._giving_up_on_error():
+            self._writer.add(frame.arrays, frame.pose, asdict(frame.extrapolation), origin_of(frame), stamp_ns)
+            self._file.flush()  # a program that is killed loses no chunk that was complete
+
+    def _finish(self) -> None:
+        if not self._is_writable:  # the frame before could not be written
             return
         with self._giving_up_on_error():
             self._writer.finish()
