@@ -303,6 +303,7 @@ class Settings(Contract):
     key_running_jobs: int | None = of_key("running_jobs")
     key_compute_minutes_per_day: float | None = of_key("compute_minutes_per_day")
     key_stored_gb: float | None = of_key("stored_gb")
+    key_registrations: int | None = of_key("registrations")
     insecure: bool = described(
         "Whether other machines are served even without any API key: whoever reaches the address is an admin.",
         False,
