@@ -46,6 +46,11 @@ class Settings(Contract):
         "Port of OpenIGTLink, usually 18944; 0 takes a free one; none: off.", None, low=0, high=65535, topic=ADDRESSES
     )
     igtl_scene: str | None = described("Scene of OpenIGTLink devices whose names name none; none: the only one.", None)
+    igtl_registration: str | None = described(
+        "Registration that leads the poses of OpenIGTLink devices, marker to tracker, into its scene; none: they are "
+        "probe to scene.",
+        None,
+    )
     igtl_slice_thickness_mm: float | None = described(
         "Of frames over OpenIGTLink, mm: full width at half maximum along elevation at the focus of the scene's beam; "
         "0: a plane; none: as trained.",
