@@ -582,6 +582,10 @@ class RenderJob(FrameSettings):
     """Frames of a file: the job becomes many files, which all workers make. Default: one file, above 100,000 frames
     5,000 in each.
     """
+    registration: str | None = None
+    """Name of the registration by which the poses lead into the scene: they are then flange to base, or marker to
+    tracker. Default: they are probe to scene.
+    """
     kind: Literal["render"] = field_of(default="render", repr=False, kw_only=True)
     max_run_s: float | None = field_of(default=None, kw_only=True)
     """Longest time that the job may run in all, s; then it fails, and a retry goes on. None: the service's longest."""

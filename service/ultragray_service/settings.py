@@ -46,6 +46,11 @@ class Settings(Contract):
         "Port of OpenIGTLink, usually 18944; 0 takes a free one; none: off.", None, low=0, high=65535, topic=ADDRESSES
     )
     igtl_scene: str | None = described("Scene of OpenIGTLink devices whose names name none; none: the only one.", None)
+    igtl_registration: str | None = described(
+        "Registration that leads the poses of OpenIGTLink devices, marker to tracker, into its scene; none: they are "
+        "probe to scene.",
+        None,
+    )
     igtl_slice_thickness_mm: float | None = described(
         "Of frames over OpenIGTLink, mm: full width at half maximum along elevation at the focus of the scene's beam; "
         "0: a plane; none: as trained.",
@@ -303,6 +308,7 @@ class Settings(Contract):
     key_running_jobs: int | None = of_key("running_jobs")
     key_compute_minutes_per_day: float | None = of_key("compute_minutes_per_day")
     key_stored_gb: float | None = of_key("stored_gb")
+    key_registrations: int | None = of_key("registrations")
     insecure: bool = described(
         "Whether other machines are served even without any API key: whoever reaches the address is an admin.",
         False,

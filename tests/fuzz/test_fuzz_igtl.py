@@ -11,7 +11,7 @@ import pytest
 from hypothesis import strategies as st
 
 from ultragray_service.igtl.commands.contents import Command, pack_command
-from ultragray_service.igtl.contents import Tool, pack_position, pack_tools, pack_transform
+from ultragray_service.igtl.contents import Tool, pack_instruments, pack_position, pack_transform
 from ultragray_service.igtl.messages import HEADER_BYTES, Message, pack_message, unpack_header
 
 from .conftest import EnterDoor
@@ -28,8 +28,8 @@ COMMAND = '<Command Name="SetUsParameter"><Parameter Name="DepthMm" Value="20"/>
 VALID = (
     ("TRANSFORM", pack_transform(np.eye(4))),
     ("POSITION", pack_position(np.eye(4))),
-    ("TDATA", pack_tools("TDATA", [TOOL, TOOL])),
-    ("QTDATA", pack_tools("QTDATA", [TOOL])),
+    ("TDATA", pack_instruments("TDATA", [TOOL, TOOL])),
+    ("QTDATA", pack_instruments("QTDATA", [TOOL])),
     ("GET_STATUS", b""),
     ("GET_CAPABIL", b""),
     ("GET_IMAGE", b""),

@@ -103,6 +103,32 @@ def test_arrays_and_files_are_found_by_the_client(phantom: RunningService, pixel
     assert len(of_array.position_std_mm) == 3
 
 
+def test_start_and_answer_are_in_the_frame_of_a_registration(
+    phantom: RunningService, http: httpx.Client, pixels: Any, png: bytes
+) -> None:
+    base_to_scene, mounting = np.eye(4), np.eye(4)
+    base_to_scene[:3] = ((0, -1, 0, 400), (1, 0, 0, -30), (0, 0, 1, 5))
+    mounting[:3, 3] = (0, 0, 142)
+
+    def in_base(pose: FloatArray) -> FloatArray:
+        flange: FloatArray = np.linalg.inv(base_to_scene) @ pose @ np.linalg.inv(mounting)
+        return flange
+
+    with Client(phantom.grpc, timeout_s=120.0) as client:
+        client.registrations.put("robot", "spine", base_to_scene, mounting)
+        found = client.localize("spine", pixels, in_base(start()), registration="robot")
+        plain = client.localize("spine", pixels, start())
+    assert (found.is_found, found.registration) == (True, "robot")
+    np.testing.assert_allclose(found.pose, POSE, atol=0.2)
+    np.testing.assert_allclose(found.flange_to_base, in_base(found.pose), atol=1e-9)
+    assert (plain.registration, plain.flange_to_base) == (None, None)
+    asked = body(png, start={"matrix": in_base(start()).tolist()}, registration="robot")
+    told = http.post("/v1/scenes/spine:localize", json=asked).json()
+    np.testing.assert_allclose(told["flange_to_base"], found.flange_to_base, atol=1e-9)
+    refused = http.post("/v1/scenes/spine:localize", json=body(png, registration="nobody"))
+    assert (refused.status_code, refused.json()["field"]) == (404, "registration")
+
+
 def test_a_frame_of_something_else_is_told_as_not_found(http: httpx.Client) -> None:
     noise = np.random.default_rng(0).integers(0, 256, (SIDE, SIDE), dtype=np.uint8)
     asked = body(noise.tobytes(), image_height=SIDE, image_width=SIDE)

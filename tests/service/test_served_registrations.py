@@ -15,7 +15,7 @@ import pytest
 from websockets.sync.client import connect
 
 from ultragray.probe import FloatArray
-from ultragray_client import Client, RenderSettings, errors
+from ultragray_client import AroundSampler, Client, JobState, RenderJob, RenderSettings, errors
 from ultragray_service.access.keys import KeyStore
 from ultragray_service.access.principal import Role
 from ultragray_workers.jobs.queue.database import JobDatabase
@@ -198,3 +198,51 @@ def test_it_outlives_the_service(start_service: StartService, tmp_path: Path) ->
     first.terminate()
     with Client(start_service(artifact_folder=tmp_path).grpc, timeout_s=60.0) as client:
         np.testing.assert_allclose(client.registrations.get("robot").base_to_scene, BASE_TO_SCENE, atol=1e-12)
+
+
+def flange_job(**changes: Any) -> RenderJob:
+    asked = {**SIZE, "poses": [FLANGE], "registration": "robot", "dtype": "uint8", **changes}
+    return RenderJob(scene="demo", **asked)
+
+
+def test_a_job_keeps_the_registration_that_it_was_accepted_with(start_service: StartService, tmp_path: Path) -> None:
+    first = start_service(artifact_folder=tmp_path)
+    with Client(first.grpc, timeout_s=60.0) as client:
+        client.registrations.put("robot", "demo", BASE_TO_SCENE, MOUNTING)
+        plain = client.render("demo", POSE, RenderSettings(**SIZE))
+        job = client.jobs.submit(flange_job(), request_id="mine")
+        assert (job.specification.registration, job.pose_count) == ("robot", 1)
+        client.registrations.put("robot", "demo", np.eye(4))
+        assert client.jobs.submit(flange_job(), request_id="mine").id == job.id
+        with pytest.raises(errors.RequestIdConflict):
+            client.jobs.submit(flange_job(poses=[POSE]), request_id="mine")
+        client.registrations.delete("robot")
+        client.jobs.cancel(job.id)
+        retried = client.jobs.retry(job.id)
+        assert (retried.specification.registration, retried.pose_count) == ("robot", 1)
+    first.terminate()
+    with Client(start_service(artifact_folder=tmp_path, embedded_worker=True).grpc, timeout_s=120.0) as client:
+        assert client.jobs.wait(retried.id).state is JobState.SUCCEEDED
+        client.jobs.download(retried.id, "frames.npz", tmp_path / "frames.npz")
+    with np.load(tmp_path / "frames.npz") as archive:
+        np.testing.assert_allclose(archive["poses"], [POSE], atol=1e-9)
+        np.testing.assert_allclose(archive["bmode"][0].astype(int), plain["bmode"], atol=1)
+
+
+def test_estimates_and_samplers_are_led_as_well(http: httpx.Client) -> None:
+    sampler = {"kind": "around", "count": 3, "seed": 1}
+    specification = {"scene": "demo", **SIZE, "poses": [FLANGE.tolist()], "registration": "robot", "sampler": sampler}
+    led = http.post("/v1/jobs:estimate", json={"kind": "render", "specification": specification}).json()
+    specification |= {"poses": [POSE.tolist()], "registration": None}
+    plain = http.post("/v1/jobs:estimate", json={"kind": "render", "specification": specification}).json()
+    np.testing.assert_allclose(led["poses"], plain["poses"], atol=1e-9)
+
+
+def test_what_a_registration_cannot_lead_is_refused_at_the_submission(client: Client) -> None:
+    with pytest.raises(errors.RegistrationNotFound) as unknown:
+        client.jobs.submit(flange_job(registration="nobody"))
+    assert unknown.value.field == "render.registration"
+    with pytest.raises(errors.InvalidArgument, match="'robot' is of 'demo'"):
+        client.jobs.submit(RenderJob(scene="second", poses=[FLANGE], registration="robot"))
+    with pytest.raises(errors.InvalidArgument, match="poses must be given where a registration leads them"):
+        client.jobs.submit(flange_job(poses=None, sampler=AroundSampler(count=2)))

@@ -156,6 +156,7 @@ class AsyncClient:
         start: PoseLike,
         *,
         probe: Probe | None = None,
+        registration: str | None = None,
         within_mm: float = 3.0,
         within_deg: float = 5.0,
         timeout_s: float | None = None,
@@ -164,9 +165,10 @@ class AsyncClient:
 
         `image`: grey values [H, W], uint8 or in [0, 1], or the bytes of a PNG file; rows along depth, columns across
         scan lines, not scan-converted. `probe` took it (None: the scene's own). `is_found` of the answer says whether
-        its pose can be used. Raises SceneNotFound, InvalidArgument and its kinds, QueueFull, DeadlineExceeded.
+        its pose can be used. With a `registration` the start is a pose of the flange in its base, and the answer has
+        such a pose as well. Raises SceneNotFound, InvalidArgument and its kinds, QueueFull, DeadlineExceeded.
         """
-        request = localize_message(scene, image, start, probe, within_mm, within_deg)
+        request = localize_message(scene, image, start, probe, registration, within_mm, within_deg)
         answer = await self._connection.answer(self._calls.Localize, request, timeout_s)
         return from_message(answer, Localization)
 

@@ -40,8 +40,8 @@ class AsyncJobs:
         """Puts a job into the queue: `TrainJob(dataset="liver", scene="liver")` makes a scene that is served,
         `RenderJob(scene="demo", sampler=FanSampler(tilt_deg=10, step_deg=2))` an archive of frames.
 
-        Raises DatasetNotFound, SceneNotFound, SceneExists, JobQueueFull, ExtraMissing, StorageFull, LowConfidence and
-        other kinds of InvalidArgument.
+        Raises DatasetNotFound, SceneNotFound, RegistrationNotFound, SceneExists, JobQueueFull, ExtraMissing,
+        StorageFull, LowConfidence and other kinds of InvalidArgument.
         """
         request = submission(specification, request_id, priority, private)
         return job_from_message((await self._connection.answer(self._calls.SubmitJob, request, timeout_s)).job)

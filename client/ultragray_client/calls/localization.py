@@ -20,6 +20,8 @@ class Localization:
     """Where a real frame was taken, and how certain that is. The standard deviations hold where `is_found` does."""
 
     pose: FloatArray  # [4, 4] mm, probe to scene; not to be used where it is not found
+    flange_to_base: FloatArray | None  # [4, 4] mm, the same as the pose of the registration; None: none was named
+    registration: str | None  # that led the start into the scene
     similarity: float  # correlation of the structures of the frame and of the scene there, -1 to 1
     is_found: bool  # whether that is as high as only the right place has it
     position_std_mm: tuple[float, float, float]  # along the probe's lateral, elevation and axial axis
@@ -34,10 +36,16 @@ class Localization:
 
 
 def localize_message(
-    scene: str, image: npt.ArrayLike | bytes, start: PoseLike, probe: Probe | None, within_mm: float, within_deg: float
+    scene: str,
+    image: npt.ArrayLike | bytes,
+    start: PoseLike,
+    probe: Probe | None,
+    registration: str | None,
+    within_mm: float,
+    within_deg: float,
 ) -> rendering_pb2.LocalizeRequest:
     """The request of a search. Raises InvalidArgument for what is no grey image, and InvalidPose."""
-    asked = {"probe": probe, "within_mm": within_mm, "within_deg": within_deg}
+    asked = {"probe": probe, "registration": registration, "within_mm": within_mm, "within_deg": within_deg}
     request = message_of(asked, rendering_pb2.LocalizeRequest, scene=scene, start=pose_message(start, field="start"))
     if isinstance(image, bytes):
         request.image = image

@@ -50,7 +50,7 @@ class Registrations:
 
         Both links are [4, 4], mm; without `probe_to_flange` the probe's frame is the flange's. `quality` may hold
         residual_mm, residual_deg, position_std_mm and angle_std_deg, as the file of `ultragray calibrate` does.
-        Raises InvalidPose, SceneNotFound, PermissionDenied.
+        Raises InvalidPose, SceneNotFound, PermissionDenied, LimitReached.
         """
         links = {"base_to_scene": base_to_scene, "probe_to_flange": probe_to_flange}
         matrices = {link: _matrix(pose, link) for link, pose in links.items() if pose is not None}

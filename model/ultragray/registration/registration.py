@@ -67,6 +67,24 @@ class Registration(Contract):
         poses: FloatArray = base_to_scene @ flange_to_base @ probe_to_flange
         return poses
 
+    def marker_to_scene(self, marker_to_base: FloatArray) -> FloatArray:  # [..., 4, 4] mm, exact -> [..., 4, 4]
+        """The poses in the scene of something else in the base than the probe, such as a needle's marker."""
+        base_to_scene, _ = self._links
+        poses: FloatArray = base_to_scene @ marker_to_base
+        return poses
+
+    def in_base(self, to_scene: FloatArray) -> FloatArray:  # [..., 4, 4] mm -> [..., 4, 4]
+        """Transforms into the scene as such into the base."""
+        base_to_scene, _ = self._links
+        poses: FloatArray = np.linalg.inv(base_to_scene) @ to_scene
+        return poses
+
+    def flange_to_base(self, probe_to_scene: FloatArray) -> FloatArray:  # [..., 4, 4] mm, exact -> [..., 4, 4]
+        """The poses of the flange in the base, of poses of the probe in the scene."""
+        base_to_scene, probe_to_flange = self._links
+        poses: FloatArray = np.linalg.inv(base_to_scene) @ probe_to_scene @ np.linalg.inv(probe_to_flange)
+        return poses
+
 
 def rows(pose: FloatArray) -> Rows:  # [4, 4]
     """A pose as the contract holds it."""

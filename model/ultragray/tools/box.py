@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import reduce
 from typing import Literal
 
 import numpy as np
+from typing_extensions import Self
 
 from ..contract import described, kind_field
 from ..errors import InvalidArgument
-from ..pose import ROTATION_TOLERANCE, pose_from_position_quaternion
+from ..pose import ROTATION_TOLERANCE, pose_from_position_quaternion, quaternion_from_pose
 from ..probe import FloatArray
 from ..probe.probe import MAX_LENGTH_MM
 from .crossing import Crossing, ScanView
 from .solid import Span, between_planes, crossing_of_solid, overlap
-from .tool import LEAST_THICKNESS_MM, Tool, point_field
+from .tool import LEAST_THICKNESS_MM, Tool, ToolFrame, moved_point, point_field
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,6 +51,11 @@ class Box(Tool):
     @property
     def thickness_mm(self) -> float:
         return min(self.size_mm)
+
+    def moved(self, pose: FloatArray) -> Self:
+        box = pose_from_position_quaternion(self.centre_mm, self.quaternion)  # box→frame
+        centre_mm, quaternion = moved_point(pose, self.centre_mm), quaternion_from_pose(pose @ box)
+        return replace(self, frame=ToolFrame.SCENE, centre_mm=centre_mm, quaternion=quaternion)
 
     def crossing(self, view: ScanView) -> Crossing:
         pose = pose_from_position_quaternion(self.centre_mm, self.quaternion)  # box→frame

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+from typing_extensions import Self
 
 from ..errors import InvalidArgument
+from ..probe import FloatArray
 from ..probe.probe import length_field
-from .tool import LEAST_THICKNESS_MM, Tool, point_field
+from .tool import LEAST_THICKNESS_MM, Tool, ToolFrame, moved_point, point_field
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,3 +31,7 @@ class Shaft(Tool):
     @property
     def thickness_mm(self) -> float:
         return self.diameter_mm
+
+    def moved(self, pose: FloatArray) -> Self:
+        tip_mm, hub_mm = moved_point(pose, self.tip_mm), moved_point(pose, self.hub_mm)
+        return replace(self, frame=ToolFrame.SCENE, tip_mm=tip_mm, hub_mm=hub_mm)

@@ -8,6 +8,7 @@ from enum import Enum
 from typing import Any
 
 import numpy as np
+from typing_extensions import Self
 
 from ..contract import Family, described
 from ..pose import MAX_POSITION_MM
@@ -30,6 +31,12 @@ class ToolFrame(str, Enum):
 def point_field(meaning: str, **options: Any) -> Any:
     """A field for the x, y and z of a point, mm."""
     return described(meaning, low=-MAX_POSITION_MM, high=MAX_POSITION_MM, most=3, **options)
+
+
+def moved_point(pose: FloatArray, point: Sequence[float]) -> tuple[float, float, float]:  # [4, 4] mm, [3] mm
+    """A point as a pose leads it."""
+    x, y, z = (pose[:3, :3] @ np.array(point, np.float64) + pose[:3, 3]).tolist()
+    return x, y, z
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,6 +66,10 @@ class Tool(Family):
 
     def crossing(self, view: ScanView) -> Crossing:
         """Where the scan lines meet it."""
+        raise NotImplementedError
+
+    def moved(self, pose: FloatArray) -> Self:  # [4, 4] mm, exact
+        """The tool in the scene, where its points are in a frame that the pose leads into it."""
         raise NotImplementedError
 
     def stopped(self, path_mm: FloatArray) -> FloatArray:  # [...] -> [...]

@@ -69,7 +69,7 @@ class TrainJob(_message.Message):
     def __init__(self, dataset: _Optional[str] = ..., scene: _Optional[str] = ..., preset: _Optional[str] = ..., settings: _Optional[_Union[_struct_pb2.Struct, _Mapping]] = ..., device: _Optional[str] = ..., max_run_s: _Optional[float] = ..., min_memory_gb: _Optional[int] = ..., worker_labels: _Optional[_Mapping[str, str]] = ...) -> None: ...
 
 class RenderJob(_message.Message):
-    __slots__ = ("scene", "poses", "sampler", "height", "width", "outputs", "format", "pose_count", "dtype", "min_confidence", "probe", "display", "below_min_confidence", "slice_thickness_mm", "contact", "tools", "ghost", "max_run_s", "shard_frames", "device", "min_memory_gb", "worker_labels")
+    __slots__ = ("scene", "poses", "sampler", "height", "width", "outputs", "format", "pose_count", "dtype", "min_confidence", "probe", "display", "below_min_confidence", "slice_thickness_mm", "contact", "tools", "ghost", "max_run_s", "shard_frames", "device", "min_memory_gb", "worker_labels", "registration")
     class WorkerLabelsEntry(_message.Message):
         __slots__ = ("key", "value")
         KEY_FIELD_NUMBER: _ClassVar[int]
@@ -99,6 +99,7 @@ class RenderJob(_message.Message):
     DEVICE_FIELD_NUMBER: _ClassVar[int]
     MIN_MEMORY_GB_FIELD_NUMBER: _ClassVar[int]
     WORKER_LABELS_FIELD_NUMBER: _ClassVar[int]
+    REGISTRATION_FIELD_NUMBER: _ClassVar[int]
     scene: str
     poses: _containers.RepeatedCompositeFieldContainer[_geometry_pb2.Pose]
     sampler: PoseSampler
@@ -121,7 +122,8 @@ class RenderJob(_message.Message):
     device: str
     min_memory_gb: int
     worker_labels: _containers.ScalarMap[str, str]
-    def __init__(self, scene: _Optional[str] = ..., poses: _Optional[_Iterable[_Union[_geometry_pb2.Pose, _Mapping]]] = ..., sampler: _Optional[_Union[PoseSampler, _Mapping]] = ..., height: _Optional[int] = ..., width: _Optional[int] = ..., outputs: _Optional[_Iterable[_Union[_rendering_pb2.Output, str]]] = ..., format: _Optional[str] = ..., pose_count: _Optional[int] = ..., dtype: _Optional[str] = ..., min_confidence: _Optional[float] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., display: _Optional[_Union[_rendering_pb2.Display, _Mapping]] = ..., below_min_confidence: _Optional[_Union[_rendering_pb2.BelowConfidence, str]] = ..., slice_thickness_mm: _Optional[float] = ..., contact: _Optional[_Union[_rendering_pb2.Contact, str]] = ..., tools: _Optional[_Iterable[_Union[_geometry_pb2.Tool, _Mapping]]] = ..., ghost: _Optional[float] = ..., max_run_s: _Optional[float] = ..., shard_frames: _Optional[int] = ..., device: _Optional[str] = ..., min_memory_gb: _Optional[int] = ..., worker_labels: _Optional[_Mapping[str, str]] = ...) -> None: ...
+    registration: str
+    def __init__(self, scene: _Optional[str] = ..., poses: _Optional[_Iterable[_Union[_geometry_pb2.Pose, _Mapping]]] = ..., sampler: _Optional[_Union[PoseSampler, _Mapping]] = ..., height: _Optional[int] = ..., width: _Optional[int] = ..., outputs: _Optional[_Iterable[_Union[_rendering_pb2.Output, str]]] = ..., format: _Optional[str] = ..., pose_count: _Optional[int] = ..., dtype: _Optional[str] = ..., min_confidence: _Optional[float] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., display: _Optional[_Union[_rendering_pb2.Display, _Mapping]] = ..., below_min_confidence: _Optional[_Union[_rendering_pb2.BelowConfidence, str]] = ..., slice_thickness_mm: _Optional[float] = ..., contact: _Optional[_Union[_rendering_pb2.Contact, str]] = ..., tools: _Optional[_Iterable[_Union[_geometry_pb2.Tool, _Mapping]]] = ..., ghost: _Optional[float] = ..., max_run_s: _Optional[float] = ..., shard_frames: _Optional[int] = ..., device: _Optional[str] = ..., min_memory_gb: _Optional[int] = ..., worker_labels: _Optional[_Mapping[str, str]] = ..., registration: _Optional[str] = ...) -> None: ...
 
 class EvaluateJob(_message.Message):
     __slots__ = ("dataset", "scene", "baselines", "max_run_s", "device", "min_memory_gb", "worker_labels")

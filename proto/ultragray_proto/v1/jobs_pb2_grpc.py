@@ -91,7 +91,8 @@ class JobServiceServicer:
 
     def SubmitJob(self, request, context):
         """Puts a job into the queue. The same request_id with the same specification gives the same job, whatever its state;
-        with another one: REQUEST_ID_CONFLICT. DATASET_NOT_FOUND, SCENE_NOT_FOUND, SCENE_EXISTS, JOB_QUEUE_FULL.
+        with another one: REQUEST_ID_CONFLICT. DATASET_NOT_FOUND, SCENE_NOT_FOUND, REGISTRATION_NOT_FOUND, SCENE_EXISTS,
+        JOB_QUEUE_FULL.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')

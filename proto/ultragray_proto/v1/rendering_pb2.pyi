@@ -133,7 +133,7 @@ class AssessPosesResponse(_message.Message):
     def __init__(self, extrapolations: _Optional[_Iterable[_Union[Extrapolation, _Mapping]]] = ...) -> None: ...
 
 class LocalizeRequest(_message.Message):
-    __slots__ = ("scene", "image", "image_height", "image_width", "start", "probe", "within_mm", "within_deg")
+    __slots__ = ("scene", "image", "image_height", "image_width", "start", "probe", "within_mm", "within_deg", "registration")
     SCENE_FIELD_NUMBER: _ClassVar[int]
     IMAGE_FIELD_NUMBER: _ClassVar[int]
     IMAGE_HEIGHT_FIELD_NUMBER: _ClassVar[int]
@@ -142,6 +142,7 @@ class LocalizeRequest(_message.Message):
     PROBE_FIELD_NUMBER: _ClassVar[int]
     WITHIN_MM_FIELD_NUMBER: _ClassVar[int]
     WITHIN_DEG_FIELD_NUMBER: _ClassVar[int]
+    REGISTRATION_FIELD_NUMBER: _ClassVar[int]
     scene: str
     image: bytes
     image_height: int
@@ -150,7 +151,8 @@ class LocalizeRequest(_message.Message):
     probe: _geometry_pb2.Probe
     within_mm: float
     within_deg: float
-    def __init__(self, scene: _Optional[str] = ..., image: _Optional[bytes] = ..., image_height: _Optional[int] = ..., image_width: _Optional[int] = ..., start: _Optional[_Union[_geometry_pb2.Pose, _Mapping]] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., within_mm: _Optional[float] = ..., within_deg: _Optional[float] = ...) -> None: ...
+    registration: str
+    def __init__(self, scene: _Optional[str] = ..., image: _Optional[bytes] = ..., image_height: _Optional[int] = ..., image_width: _Optional[int] = ..., start: _Optional[_Union[_geometry_pb2.Pose, _Mapping]] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., within_mm: _Optional[float] = ..., within_deg: _Optional[float] = ..., registration: _Optional[str] = ...) -> None: ...
 
 class AlongAxes(_message.Message):
     __slots__ = ("lateral", "elevation", "axial")
@@ -163,7 +165,7 @@ class AlongAxes(_message.Message):
     def __init__(self, lateral: _Optional[float] = ..., elevation: _Optional[float] = ..., axial: _Optional[float] = ...) -> None: ...
 
 class LocalizeResponse(_message.Message):
-    __slots__ = ("scene", "scene_sha256", "renderer", "pose", "similarity", "is_found", "position_std_mm", "angle_std_deg", "shift_mm", "turn_deg", "queue_ms", "search_ms")
+    __slots__ = ("scene", "scene_sha256", "renderer", "pose", "similarity", "is_found", "position_std_mm", "angle_std_deg", "shift_mm", "turn_deg", "queue_ms", "search_ms", "flange_to_base", "registration")
     SCENE_FIELD_NUMBER: _ClassVar[int]
     SCENE_SHA256_FIELD_NUMBER: _ClassVar[int]
     RENDERER_FIELD_NUMBER: _ClassVar[int]
@@ -176,6 +178,8 @@ class LocalizeResponse(_message.Message):
     TURN_DEG_FIELD_NUMBER: _ClassVar[int]
     QUEUE_MS_FIELD_NUMBER: _ClassVar[int]
     SEARCH_MS_FIELD_NUMBER: _ClassVar[int]
+    FLANGE_TO_BASE_FIELD_NUMBER: _ClassVar[int]
+    REGISTRATION_FIELD_NUMBER: _ClassVar[int]
     scene: str
     scene_sha256: str
     renderer: str
@@ -188,7 +192,9 @@ class LocalizeResponse(_message.Message):
     turn_deg: float
     queue_ms: float
     search_ms: float
-    def __init__(self, scene: _Optional[str] = ..., scene_sha256: _Optional[str] = ..., renderer: _Optional[str] = ..., pose: _Optional[_Union[_geometry_pb2.Matrix, _Mapping]] = ..., similarity: _Optional[float] = ..., is_found: _Optional[bool] = ..., position_std_mm: _Optional[_Union[AlongAxes, _Mapping]] = ..., angle_std_deg: _Optional[_Union[AlongAxes, _Mapping]] = ..., shift_mm: _Optional[float] = ..., turn_deg: _Optional[float] = ..., queue_ms: _Optional[float] = ..., search_ms: _Optional[float] = ...) -> None: ...
+    flange_to_base: _geometry_pb2.Matrix
+    registration: str
+    def __init__(self, scene: _Optional[str] = ..., scene_sha256: _Optional[str] = ..., renderer: _Optional[str] = ..., pose: _Optional[_Union[_geometry_pb2.Matrix, _Mapping]] = ..., similarity: _Optional[float] = ..., is_found: _Optional[bool] = ..., position_std_mm: _Optional[_Union[AlongAxes, _Mapping]] = ..., angle_std_deg: _Optional[_Union[AlongAxes, _Mapping]] = ..., shift_mm: _Optional[float] = ..., turn_deg: _Optional[float] = ..., queue_ms: _Optional[float] = ..., search_ms: _Optional[float] = ..., flange_to_base: _Optional[_Union[_geometry_pb2.Matrix, _Mapping]] = ..., registration: _Optional[str] = ...) -> None: ...
 
 class Display(_message.Message):
     __slots__ = ("gain_db", "dynamic_range_db", "tgc_db", "depth_mm", "flip", "pixel_mm", "edge")

@@ -36,6 +36,7 @@ class _Commands(LazyGroup):
         Entry("bench", "studies.bench", _SWEEPS, "Measure the kernel and the service on this machine."),
         Entry("scenes", "remote.scenes", _REMOTE, "List, upload, download, delete and render scenes."),
         Entry("datasets", "remote.datasets", _REMOTE, "List, upload and delete the sweeps that trainings use."),
+        Entry("registrations", "remote.registrations", _REMOTE, "List, upload and delete registrations of robots."),
         Entry("jobs", "remote.jobs", _REMOTE, "Submit, watch and fetch trainings, evaluations and batch renderings."),
         Entry("workers", "remote.workers", _REMOTE, "List the workers of the jobs; pause, drain and resume them."),
         Entry("keys", "administration.keys", _INSTALLATION, "Make, list and revoke API keys."),

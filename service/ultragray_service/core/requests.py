@@ -35,6 +35,7 @@ class Plan(Generic[S]):
 
     settings: S
     version: FileVersion
+    registration: Registration | None  # that leads the poses into the scene
 
     def __init__(
         self,
@@ -50,11 +51,11 @@ class Plan(Generic[S]):
         self._catalog = catalog
         self._resolve = resolve
         self._path = path
-        self._registration = registration
+        self.registration = registration
 
     def placed(self, poses: FloatArray) -> FloatArray:  # [..., 4, 4] mm, exact, both
         """The poses probe→scene of those that the client sent."""
-        return poses if self._registration is None else self._registration.probe_to_scene(poses)
+        return poses if self.registration is None else self.registration.probe_to_scene(poses)
 
     async def renew(self) -> None:
         """Resolves the settings for the scene as it is now. Raises what RequestPlanner.plan raises."""

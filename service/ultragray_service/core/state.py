@@ -103,7 +103,9 @@ class Service:
         self.datasets = DatasetStore(
             settings.working_folder, shared_storage(settings.artifacts), settings.max_cache_bytes
         )
-        self.jobs = Jobs(settings, store, self.datasets)
+        self.jobs = Jobs(
+            settings, store, self.datasets, lambda name, scene: self.registrations.read_of_scene(name, scene)
+        )
         self.readiness = Readiness(
             lambda: self.jobs.database,
             require_serving=self._require_staying,
@@ -118,13 +120,13 @@ class Service:
             },
             {Kind.SCENE: store.require, Kind.DATASET: self.datasets.get},
         )
-        self.registrations = Registrations(self.catalog, self.owners)
-        self.planner = RequestPlanner(settings, self.catalog, self.registrations.of_scene)
         store.hides = partial(self.owners.hides, Kind.SCENE)
         self.datasets.hides = partial(self.owners.hides, Kind.DATASET)
         self.metrics = Metrics(self.pool, lambda: self.jobs.overview, self.places)
         self.streams = OpenStreams()
         self.limits = Limits(settings.allowance, self.metrics.count_limited)
+        self.registrations = Registrations(self.catalog, self.owners, self.limits)
+        self.planner = RequestPlanner(settings, self.catalog, self.registrations.of_scene)
         holdings = Holdings(self.limits, self.owners, self.datasets, store, self.jobs)
         self.jobs.admit = holdings.admit_job
         self.tracing = start_tracing("service")

@@ -21,14 +21,14 @@ from ..core.streams.open_streams import OpenStream
 from ..core.streams.unread import Unread
 from ..errors import IgtlMessageInvalid
 from .commands.answer import answer
-from .commands.scanner import Scanner
+from .commands.scanner import Scanner, Setup
 from .contents import (
     Status,
     pack_capability,
     pack_status,
+    unpack_instruments,
     unpack_interval_s,
     unpack_position,
-    unpack_tools,
     unpack_transform,
 )
 from .feed import Feed
@@ -46,6 +46,7 @@ SEND_TIMEOUT_S = 30.0
 _SKIP_BYTES = 64 * 1024
 
 _ACCEPTED, _REFUSED = b"\0", b"\1"
+_MANY_POSES = ("TDATA", "QTDATA")  # types that tell those of several instruments
 
 _log = logging.getLogger("ultragray.igtl")
 
@@ -78,13 +79,15 @@ class Connection:
         self._scenes = scenes
         self._frames = frames
         thickness_mm = service.settings.igtl_slice_thickness_mm
-        self._scanner = Scanner(scenes, FrameSettings(slice_thickness_mm=thickness_mm))
+        setup = Setup(FrameSettings(slice_thickness_mm=thickness_mm), service.settings.igtl_registration)
+        self._scanner = Scanner(scenes, service.registrations, setup)
         self._maker = FrameMaker(service, scenes, self._scanner)
         self._reader = reader
         self._writer = writer
         self._sending = asyncio.Lock()
         self._showing = asyncio.Lock()
         self._poses = WaitingPoses()
+        self._newest: PoseMessage | None = None  # of a probe
         hold_little(writer.transport)
         self._unread = Unread(writer.transport)
 
@@ -174,7 +177,7 @@ class Connection:
             self._service.require_frames()
             await self._send(_reply("STATUS", message, pack_status(Status(OK, 0, "OK", "ready"))))
         elif prefix == "GET_":
-            await self._send(self._newest(KINDS[suffix], message))
+            await self._send(self._newest_frame(KINDS[suffix], message))
         else:
             if prefix == "STT_":
                 self.feed.start(KINDS[suffix], message.device_name, unpack_interval_s(message.content), message.version)
@@ -182,7 +185,7 @@ class Connection:
                 self.feed.stop(KINDS[suffix])
             await self._send(_reply(f"RTS_{suffix}", message, _ACCEPTED))
 
-    def _newest(self, kind: str, query: Message) -> Message:
+    def _newest_frame(self, kind: str, query: Message) -> Message:
         """The newest frame as the query wants it; without content where there is none of that name."""
         frame = self._frames.newest()
         if frame is None or not frame.goes_by(query.device_name):
@@ -190,19 +193,32 @@ class Connection:
         return frame.message(kind, query.version, query.message_id, query.device_name)
 
     async def _take_poses(self, message: Message, arrived: float) -> None:
+        """Moves the tools of devices that do so, and takes the poses of the others.
+
+        Where only tools have moved, the frame of the pose before is rendered again.
+        """
         if message.type_name == "TRANSFORM":
             poses = [(message.device_name, unpack_transform(message.content))]
         elif message.type_name == "POSITION":
             poses = [(message.device_name, unpack_position(message.content))]
         else:
-            tools = unpack_tools(message.type_name, message.content)
-            named = [tool for tool in tools if await self._scenes.named(tool.name) is not None]
-            poses = [(tool.name, tool.pose) for tool in named or tools[:1]]
-        for device_name, pose in poses:
+            poses = [(one.name, one.pose) for one in unpack_instruments(message.type_name, message.content)]
+        tools = self._scanner.setup.tools
+        of_tools = [(name, pose) for name, pose in poses if tools.are_moved_by(name)]
+        of_probes = [(name, pose) for name, pose in poses if not tools.are_moved_by(name)]
+        if message.type_name in _MANY_POSES:
+            named = [(name, pose) for name, pose in of_probes if await self._scenes.named(name) is not None]
+            of_probes = named or of_probes[:1]
+        for device_name, pose in of_tools:
+            self._scanner.move(device_name, pose)
+        for device_name, pose in of_probes:
             self.noted.asked()
-            posed = PoseMessage(replace(message, device_name=device_name), pose, arrived)
-            if self._poses.put(posed, self._service.planner.deadline(None)):
+            self._newest = PoseMessage(replace(message, device_name=device_name), pose, arrived)
+            if self._poses.put(self._newest, self._service.planner.deadline(None), self._scanner.setup):
                 self._service.metrics.count_dropped()
+        if of_tools and not of_probes and self._newest is not None:
+            about = replace(message, device_name=self._newest.message.device_name)
+            self._poses.again(PoseMessage(about, self._newest.pose, arrived))
 
     @asynccontextmanager
     async def _turn(self) -> AsyncIterator[None]:

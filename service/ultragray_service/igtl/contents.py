@@ -1,4 +1,4 @@
-"""The contents of OpenIGTLink messages: poses, tracked tools, images, states, requests. All numbers are big-endian."""
+"""The contents of OpenIGTLink messages: poses, instruments, images, states, requests. All numbers are big-endian."""
 
 from __future__ import annotations
 
@@ -20,10 +20,13 @@ TYPE_NAME_BYTES = 12
 
 _MATRIX = np.dtype((">f4", 12))  # the columns of a [3, 4] matrix, one after another
 _POSITION = struct.Struct(">3f")
-_TOOL = struct.Struct(">20sBB")
-_TOOL_6D = 2  # both position and orientation are known
-MAX_TOOLS = 32  # of one message: checking more would keep others waiting
-_POSES_OF_TOOLS = {"TDATA": 48, "QTDATA": 28}  # bytes of a tool's pose: a matrix, or position and quaternion
+_INSTRUMENT = struct.Struct(">20sBB")
+_INSTRUMENT_6D = 2  # both position and orientation are known
+MAX_INSTRUMENTS = 32  # of one message: checking more would keep others waiting
+_POSES_OF_INSTRUMENTS = {
+    "TDATA": 48,
+    "QTDATA": 28,
+}  # bytes of a pose: a matrix, or position and quaternion
 _IMAGE = struct.Struct(">HBBBB3H48s6H")
 _IMAGE_VERSION, _SCALAR, _UINT8, _LITTLE_ENDIAN, _RAS = 1, 1, 3, 2, 1
 _STATUS = struct.Struct(">Hq20s")
@@ -31,8 +34,8 @@ _INTERVAL = struct.Struct(">I")
 
 
 @dataclass(frozen=True, eq=False)
-class Tool:
-    """A tracked instrument; `pose` [4, 4] is tool→tracker in mm, exact."""
+class Instrument:
+    """A tracked instrument; `pose` [4, 4] is instrument→tracker in mm, exact."""
 
     name: str
     pose: FloatArray
@@ -81,35 +84,37 @@ def pack_position(pose: FloatArray) -> bytes:  # [4, 4]
     return struct.pack(">7f", *pose[:3, 3], x, y, z, w)
 
 
-def unpack_tools(type_name: str, content: bytes) -> list[Tool]:
-    """The instruments of a TDATA or QTDATA, at most MAX_TOOLS, that have both position and orientation.
+def unpack_instruments(type_name: str, content: bytes) -> list[Instrument]:
+    """The instruments of a TDATA or QTDATA, at most MAX_INSTRUMENTS, that have both position and orientation.
 
     Raises IgtlMessageInvalid and InvalidPose, naming the instrument.
     """
-    size = _TOOL.size + _POSES_OF_TOOLS[type_name]
+    size = _INSTRUMENT.size + _POSES_OF_INSTRUMENTS[type_name]
     if len(content) % size:
         raise IgtlMessageInvalid(
             f"{type_name} must hold {size} bytes for each instrument, got {len(content)} bytes", field="body"
         )
-    if len(content) > MAX_TOOLS * size:
+    if len(content) > MAX_INSTRUMENTS * size:
         raise IgtlMessageInvalid(
-            f"{type_name} may hold at most {MAX_TOOLS} instruments, got {len(content) // size}", field="body"
+            f"{type_name} may hold at most {MAX_INSTRUMENTS} instruments, got {len(content) // size}", field="body"
         )
     unpack = _rigid if type_name == "TDATA" else _placed
-    tools = []
+    instruments = []
     for start in range(0, len(content), size):
-        name, kind, _ = _TOOL.unpack_from(content, start)
-        if kind == _TOOL_6D:
+        name, kind, _ = _INSTRUMENT.unpack_from(content, start)
+        if kind == _INSTRUMENT_6D:
             text = unpack_text(name)
-            tools.append(Tool(text, unpack(content[start + _TOOL.size : start + size], f"{type_name} of {text!r}")))
-    return tools
+            pose = unpack(content[start + _INSTRUMENT.size : start + size], f"{type_name} of {text!r}")
+            instruments.append(Instrument(text, pose))
+    return instruments
 
 
-def pack_tools(type_name: str, tools: Iterable[Tool]) -> bytes:
+def pack_instruments(type_name: str, instruments: Iterable[Instrument]) -> bytes:
     """The content of a TDATA or QTDATA."""
     pack = pack_transform if type_name == "TDATA" else pack_position
     return b"".join(
-        _TOOL.pack(pack_text(tool.name, DEVICE_NAME_BYTES), _TOOL_6D, 0) + pack(tool.pose) for tool in tools
+        _INSTRUMENT.pack(pack_text(one.name, DEVICE_NAME_BYTES), _INSTRUMENT_6D, 0) + pack(one.pose)
+        for one in instruments
     )
 
 

@@ -10,13 +10,15 @@ import numpy as np
 
 from ultragray.contract import to_dict
 from ultragray.display.settings import Display, true_to_scale
+from ultragray.registration.registration import Registration
 from ultragray.settings import Encoding, Resolved
+from ultragray.tools import Tool
 from ultragray_workers.jobs.queue.owners import Kind, Ownership
 from ultragray_workers.pool.types import RenderResult
 
 from ..core.state import Service
 from .commands.scanner import Scanner
-from .contents import Image, Tool, pack_image, pack_position, pack_tools, pack_transform
+from .contents import Image, Instrument, pack_image, pack_instruments, pack_position, pack_transform
 from .messages import Message
 from .routes import SceneChooser, image_name
 from .waiting import PoseMessage, Underway
@@ -32,6 +34,7 @@ class Frame:
     result: RenderResult
     image: Image
     ownership: Ownership  # of its scene when it was rendered
+    registration: Registration | None  # by which the client's poses lead into the scene; None: they are there
 
     def goes_by(self, name: str) -> bool:
         """Whether a query for `name` means this frame; a query without a name means any."""
@@ -40,10 +43,12 @@ class Frame:
     def message(self, kind: str, version: int, message_id: int = 0, name: str = "") -> Message:
         """The frame as an IMAGE, or its pose as a TRANSFORM, POSITION, TDATA or QTDATA; `name` in place of its own."""
         device_name, pose = self.posed.message.device_name, self.result.poses[0]
+        if self.registration is not None:
+            pose = self.registration.flange_to_base(pose)
         if kind == "IMAGE":
             content, own_name = pack_image(self.image), image_name(device_name)
         elif kind in ("TDATA", "QTDATA"):
-            content, own_name = pack_tools(kind, [Tool(device_name, pose)]), device_name
+            content, own_name = pack_instruments(kind, [Instrument(device_name, pose)]), device_name
         else:
             content, own_name = (pack_transform if kind == "TRANSFORM" else pack_position)(pose), device_name
         return Message(
@@ -58,12 +63,23 @@ class Frame:
             "scene_sha256": result.scene_sha256,
             "renderer": result.renderer,
             "slice_thickness_mm": repr(result.settings.beam.thickness_mm),
-            "display": _display_text(result.settings.display),
+            "display": _text(result.settings.display),
+            **self._placing(),
             "replaced_poses": str(self.posed.replaced),
             **{name: f"{value:.3f}" for name, value in asdict(result.extrapolations[0]).items() if value is not None},
             "queue_ms": f"{result.queue_ms:.3f}",
             "render_ms": f"{result.render_ms:.3f}",
         }
+
+    def _placing(self) -> dict[str, str]:
+        """What the frame can be rendered again with, beside its pose, where there is any."""
+        settings, found = self.result.settings, {}
+        if settings.registration is not None:
+            found["registration"] = settings.registration
+            found["probe_to_scene"] = json.dumps(self.result.poses[0].tolist(), separators=(",", ":"))
+        if settings.tools:
+            found["tools"] = f"[{','.join(map(_text, settings.tools))}]"
+        return found
 
 
 class FrameMaker:
@@ -78,17 +94,26 @@ class FrameMaker:
         """The frame of a pose, or of one that took its turn, as the scanner is set; else probe and size are those the
         scene was trained with, and its thickness is that of the service's setting, else that of the scene's beam.
 
-        Raises SceneNotFound, and what RequestPlanner.plan and Service.render raise.
+        Raises SceneNotFound, RegistrationNotFound, and what RequestPlanner.plan and Service.render raise.
         """
         self._service.require_serving()
         scene = await self._scenes.choose(underway.posed.message.device_name)
         ownership = self._service.owners.known(Kind.SCENE, scene)
+        setup, found = self._scanner.setup, None
+        if setup.registration is not None:
+            found = await self._service.registrations.of_scene(setup.registration, scene)
+        underway.setup, underway.registration = setup, found
+        asked = replace(setup.settings, tools=tools) if (tools := setup.tools.placed(found)) else setup.settings
+
+        def complete(settings: Resolved) -> Resolved:
+            return replace(self._true_to_scale(settings), registration=setup.registration)
+
         planner = self._service.planner
-        plan = await planner.plan(scene, self._scanner.settings, Encoding.UINT8, complete=self._true_to_scale)
+        plan = await planner.plan(scene, asked, Encoding.UINT8, complete=complete)
         result = await self._service.render(
-            plan, underway.posed.pose[None], deadline=planner.deadline(None), turn=underway.turn
+            plan, underway.pose[None], deadline=planner.deadline(None), turn=underway.turn
         )
-        return Frame(underway.posed, result, image_of(result), ownership)
+        return Frame(underway.posed, result, image_of(result, found), ownership, found)
 
     def _true_to_scale(self, settings: Resolved) -> Resolved:
         side = self._service.settings.max_image_side
@@ -97,13 +122,14 @@ class FrameMaker:
 
 
 @lru_cache(maxsize=256)
-def _display_text(display: Display) -> str:
-    """Settings of a display as JSON."""
-    return json.dumps(to_dict(display, with_none=False), separators=(",", ":"))
+def _text(part: Display | Tool) -> str:
+    """A part of the settings as JSON."""
+    return json.dumps(to_dict(part, with_none=False), separators=(",", ":"))
 
 
-def image_of(result: RenderResult) -> Image:
-    """The frame of a result of one pose, uint8 and B-mode with pixels in mm, as an image in the frame of its pose.
+def image_of(result: RenderResult, registration: Registration | None = None) -> Image:
+    """The frame of a result of one pose, uint8 and B-mode with pixels in mm, as an image in the frame that the client's
+    poses lead to: the base of the registration, else the scene.
 
     i runs along lateral x, j along depth z, k against elevation y, so that i, j, k is right-handed.
     """
@@ -113,4 +139,5 @@ def image_of(result: RenderResult) -> Image:
     in_probe[1, 2] = -_SLICE_MM
     in_probe[:, 3] = (picture.first[0], 0.0, picture.first[1], 1.0)
     pixels = np.frombuffer(result.data, np.uint8).reshape(picture.height, picture.width)
-    return Image(pixels, result.poses[0] @ in_probe)
+    to_scene = result.poses[0] @ in_probe
+    return Image(pixels, to_scene if registration is None else registration.in_base(to_scene))

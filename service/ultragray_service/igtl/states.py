@@ -8,6 +8,7 @@ from ultragray_workers.errors import (
     Draining,
     NotReady,
     QueueFull,
+    RegistrationNotFound,
     SceneNotFound,
     SceneTooLarge,
     StorageUnavailable,
@@ -29,6 +30,7 @@ CHECKSUM_ERROR, CONFIGURATION_ERROR, NO_RESOURCES, UNKNOWN_INSTRUCTION, NOT_READ
 
 _CODES: dict[type[UltragrayError], int] = {
     SceneNotFound: NOT_FOUND,
+    RegistrationNotFound: NOT_FOUND,
     PermissionDenied: ACCESS_DENIED,
     Unauthenticated: ACCESS_DENIED,
     QueueFull: BUSY,

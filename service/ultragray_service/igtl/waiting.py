@@ -6,9 +6,11 @@ import asyncio
 from dataclasses import dataclass, replace
 
 from ultragray.probe import FloatArray
+from ultragray.registration.registration import Registration
 from ultragray_workers.errors import QueueFull
 from ultragray_workers.pool.waiting import Turn
 
+from .commands.scanner import Setup
 from .messages import Message
 
 MAX_WAITING_DEVICES = 16
@@ -26,10 +28,27 @@ class PoseMessage:
 
 @dataclass(eq=False)
 class Underway:
-    """A request to the render pool; while it waits there, a newer pose takes its turn."""
+    """A request to the render pool; while it waits there, a newer pose takes its turn, unless the setup has changed."""
 
     posed: PoseMessage
     turn: Turn
+    setup: Setup | None = None  # that it is rendered with, once that is known
+    registration: Registration | None = None  # likewise
+
+    @property
+    def pose(self) -> FloatArray:  # [4, 4] mm, exact
+        """The pose of the probe in the scene."""
+        return self._placed(self.posed.pose)
+
+    def give_to(self, posed: PoseMessage, deadline: float, setup: Setup) -> bool:
+        """Whether a newer pose, of a client with that setup now, has taken the turn."""
+        if self.setup is not setup or not self.turn.give_to(self._placed(posed.pose)[None], deadline):
+            return False
+        self.posed = replace(posed, replaced=self.posed.replaced + 1)
+        return True
+
+    def _placed(self, pose: FloatArray) -> FloatArray:
+        return pose if self.registration is None else self.registration.probe_to_scene(pose)
 
 
 class WaitingPoses:
@@ -42,16 +61,16 @@ class WaitingPoses:
         self._settled = asyncio.Event()
         self._settled.set()
 
-    def put(self, posed: PoseMessage, deadline: float) -> bool:
-        """Takes a pose, to begin by `deadline` (time.monotonic(), s); whether it replaced an older one.
+    def put(self, posed: PoseMessage, deadline: float, setup: Setup) -> bool:
+        """Takes a pose, to begin by `deadline` (time.monotonic(), s), of a client with that setup now; whether it
+        replaced an older one.
 
         Raises QueueFull where too many devices wait.
         """
         name, underway = posed.message.device_name, self._underway
         older = self._poses.get(name)
         if older is None and underway is not None and underway.posed.message.device_name == name:
-            if underway.turn.give_to(posed.pose[None], deadline):
-                underway.posed = replace(posed, replaced=underway.posed.replaced + 1)
+            if underway.give_to(posed, deadline, setup):
                 return True
         elif older is None and len(self._poses) >= MAX_WAITING_DEVICES:
             raise QueueFull(f"at most {MAX_WAITING_DEVICES} devices of a client may wait for their frames")
@@ -59,6 +78,16 @@ class WaitingPoses:
         self._come.set()
         self._settled.clear()
         return older is not None
+
+    def again(self, posed: PoseMessage) -> None:
+        """Takes a pose that was there before and is to be rendered with another setup.
+
+        One of its device that still waits will be.
+        """
+        if posed.message.device_name not in self._poses:
+            self._poses[posed.message.device_name] = posed
+            self._come.set()
+            self._settled.clear()
 
     async def come(self) -> None:
         """Waits for a pose. What was given out before has its answer by now."""

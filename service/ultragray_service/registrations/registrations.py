@@ -18,10 +18,11 @@ from ultragray_workers.errors import RegistrationNotFound
 from ultragray_workers.jobs.queue.owners import Kind, Ownership
 from ultragray_workers.scene_names import base_name
 
+from ..access.limits.limits import Limits
 from ..access.owners import Owners
 from ..access.principal import acting
 from ..core.catalog import SceneCatalog, page_of_names
-from ..errors import PermissionDenied
+from ..errors import LimitReached, PermissionDenied
 from . import store
 from .named import NamedRegistration, RegistrationPage
 
@@ -36,8 +37,8 @@ T = TypeVar("T")
 class Registrations:
     """All registrations of the installation. Those of a scene that a caller may not see are not there for them."""
 
-    def __init__(self, catalog: SceneCatalog, owners: Owners) -> None:
-        self._catalog, self._owners = catalog, owners
+    def __init__(self, catalog: SceneCatalog, owners: Owners, limits: Limits) -> None:
+        self._catalog, self._owners, self._limits = catalog, owners, limits
         self._held: dict[str, tuple[float, NamedRegistration]] = {}  # by name, with time.monotonic() when it was read
         self._engine: sa.Engine | None = None
         self._threads: Executor | None = None
@@ -48,10 +49,8 @@ class Registrations:
 
     async def get(self, name: str) -> NamedRegistration:
         """A registration as it is kept now. Raises RegistrationNotFound, DatabaseUnavailable."""
-        found = await self._do(store.read_registration, name)
-        if found is None or self._owners.hides(Kind.SCENE, found.scene):
-            self._held.pop(name, None)
-            raise RegistrationNotFound(f"there is no registration {shown(name)}", field="registration")
+        self._held.pop(name, None)
+        found = self._seen(name, await self._do(store.read_registration, name))
         self._hold(found)
         return found
 
@@ -67,12 +66,11 @@ class Registrations:
         read_at, found = self._held.get(name, (0.0, None))
         if found is None or time.monotonic() - read_at > FRESH_S or self._owners.hides(Kind.SCENE, found.scene):
             found = await self.get(name)
-        if found.scene != base_name(scene):
-            raise InvalidArgument(
-                f"registration must be one of the scene {base_name(scene)!r}: {name!r} is of {found.scene!r}",
-                field="registration",
-            )
-        return found
+        return _of_scene(found, scene)
+
+    def read_of_scene(self, name: str, scene: str) -> Registration:
+        """As `of_scene`, as it is kept now. Blocks; may be called from any thread."""
+        return _of_scene(self._seen(name, store.read_registration(self._opened, name)), scene)
 
     async def page(self, page_size: int, page_token: str) -> RegistrationPage:
         """One page by name. Raises InvalidArgument, DatabaseUnavailable."""
@@ -85,7 +83,8 @@ class Registrations:
     async def put(self, name: str, scene: str, registration: Registration) -> NamedRegistration:
         """Keeps a registration, in place of one of the name that is the caller's.
 
-        Raises InvalidArgument for a name, SceneNotFound, SceneFileInvalid, PermissionDenied, DatabaseUnavailable.
+        Raises InvalidArgument for a name, SceneNotFound, SceneFileInvalid, PermissionDenied, LimitReached,
+        DatabaseUnavailable.
         """
         if NAME.fullmatch(name) is None:
             raise InvalidArgument(
@@ -94,7 +93,11 @@ class Registrations:
                 field="registration",
             )
         await self._catalog.header(scene)
-        kept = await self._do(store.write_registration, name, base_name(scene), registration, acting())
+        most = self._limits.mine.registrations
+        try:
+            kept = await self._do(store.write_registration, name, base_name(scene), registration, acting(), most)
+        except LimitReached as error:
+            raise self._limits.refused("registrations", error) from None
         if kept is None:
             raise _not_own(name)
         self._hold(kept)
@@ -107,18 +110,37 @@ class Registrations:
             raise _not_own(name)
         self._held.pop(name, None)
 
+    def _seen(self, name: str, found: NamedRegistration | None) -> NamedRegistration:
+        """What was read of a name, where the caller may see it. Raises RegistrationNotFound."""
+        if found is None or self._owners.hides(Kind.SCENE, found.scene):
+            raise RegistrationNotFound(f"there is no registration {shown(name)}", field="registration")
+        return found
+
     def _hold(self, registration: NamedRegistration) -> None:
         self._held.pop(registration.name, None)
         while len(self._held) >= MOST_HELD:
             self._held.pop(next(iter(self._held)))
         self._held[registration.name] = (time.monotonic(), registration)
 
-    async def _do(self, work: Callable[Concatenate[sa.Engine, P], T], *arguments: P.args, **options: P.kwargs) -> T:
+    @property
+    def _opened(self) -> sa.Engine:
         assert self._engine is not None
-        engine = self._engine
+        return self._engine
+
+    async def _do(self, work: Callable[Concatenate[sa.Engine, P], T], *arguments: P.args, **options: P.kwargs) -> T:
+        engine = self._opened
         return await asyncio.get_running_loop().run_in_executor(
             self._threads, lambda: work(engine, *arguments, **options)
         )
+
+
+def _of_scene(found: NamedRegistration, scene: str) -> NamedRegistration:
+    if found.scene != base_name(scene):
+        raise InvalidArgument(
+            f"registration must be one of the scene {base_name(scene)!r}: {found.name!r} is of {found.scene!r}",
+            field="registration",
+        )
+    return found
 
 
 def _not_own(name: str) -> PermissionDenied:

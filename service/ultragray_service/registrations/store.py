@@ -13,6 +13,7 @@ from ultragray.registration.registration import Registration
 from ultragray_workers.jobs.queue.tables import REGISTRATIONS
 
 from ..access.principal import Principal, Role, iso_time
+from ..errors import LimitReached
 from .named import NamedRegistration
 
 _COLUMNS = REGISTRATIONS.c
@@ -32,15 +33,20 @@ def read_scenes(engine: sa.Engine) -> dict[str, str]:
 
 
 def write_registration(
-    engine: sa.Engine, name: str, scene: str, registration: Registration, writer: Principal
+    engine: sa.Engine, name: str, scene: str, registration: Registration, writer: Principal, most: int | None
 ) -> NamedRegistration | None:
-    """The registration as it is kept from now on, its owner as before; None where it is another's than the writer's."""
+    """The registration as it is kept from now on, its owner as before; None where it is another's than the writer's.
+
+    Raises LimitReached for a new one of a writer who has `most` already; None: any number.
+    """
     values = {
         "scene": scene,
         "changed_at_s": time.time(),
         "document": json.dumps(to_dict(registration), allow_nan=False),
     }
     with engine.begin() as connection:
+        if most is not None:
+            _require_room(connection, name, writer, most)
         insert = (sqlite if connection.dialect.name == "sqlite" else postgresql).insert(REGISTRATIONS)
         kept = insert.values(name=name, owner=writer.name, **values).on_conflict_do_update(
             index_elements=[_COLUMNS.name], set_=values, where=_may_change(writer)
@@ -54,6 +60,15 @@ def delete_registration(engine: sa.Engine, name: str, remover: Principal) -> boo
     with engine.begin() as connection:
         gone = sa.delete(REGISTRATIONS).where(_COLUMNS.name == name, _may_change(remover))
         return connection.execute(gone).rowcount > 0
+
+
+def _require_room(connection: sa.Connection, name: str, writer: Principal, most: int) -> None:
+    """Raises LimitReached where the writer has `most` registrations, and none is there of that name."""
+    if connection.execute(sa.select(_COLUMNS.name).where(_COLUMNS.name == name)).one_or_none() is not None:
+        return
+    owned = sa.select(sa.func.count()).select_from(REGISTRATIONS).where(_COLUMNS.owner == writer.name)
+    if connection.execute(owned).scalar_one() >= most:
+        raise LimitReached(f"this key may keep {most} registrations (registrations): delete one first")
 
 
 def _may_change(principal: Principal) -> sa.ColumnElement[bool]:

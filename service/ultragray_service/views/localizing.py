@@ -16,6 +16,7 @@ from ..access.audit import account
 from ..access.principal import caller
 from ..core.catalog import scene_to_blame
 from ..core.poses import MatrixRows
+from ..core.requests import Plan
 from ..core.state import Service
 
 FRAMES_OF_A_SEARCH = 100  # that a search counts as: it takes as long, at 512x512
@@ -29,6 +30,10 @@ class Located:
     scene_sha256: str = described("Of the scene file.")
     renderer: str = described("Name, version and backend of the renderer.")
     pose: MatrixRows = described("Probe to scene, mm. Not to be used where is_found is false.")
+    flange_to_base: MatrixRows | None = described(
+        "The same as the pose of the registration, flange to base or marker to tracker, mm; null: none was named.", None
+    )
+    registration: str | None = described("That led the start into the scene; null: none, it was sent as it is.", None)
     similarity: float = described("Correlation of the structures of the frame and of the scene there, -1 to 1.")
     is_found: bool = described("Whether the similarity is as high as only the right place has it.")
     position_std_mm: tuple[float, float, float] = described(
@@ -41,14 +46,17 @@ class Located:
     search_ms: float = described("Time of the search.")
 
     @classmethod
-    def of(cls, result: LocalizeResult) -> Located:
-        """A result of the pool."""
+    def of(cls, result: LocalizeResult, plan: Plan) -> Located:
+        """A result of the pool, for a plan."""
         found = result.found
+        in_base = None if plan.registration is None else plan.registration.flange_to_base(found.pose)
         return cls(
             scene=result.scene,
             scene_sha256=result.scene_sha256,
             renderer=result.renderer,
             pose=found.pose.tolist(),
+            flange_to_base=None if in_base is None else in_base.tolist(),
+            registration=plan.settings.registration,
             similarity=found.similarity,
             is_found=found.is_found,
             position_std_mm=found.position_std_mm,
@@ -74,23 +82,28 @@ async def locate(
     service: Service,
     scene: str,
     sought: Sought,
-    start: FloatArray,
-    deadline: float,  # [4, 4] mm, exact
+    start: FloatArray,  # [4, 4] mm, exact
+    deadline: float,
+    registration: str | None,
 ) -> Located:
     """Where in a scene a frame was taken, looked for about `start` until the `deadline` (time.monotonic(), s).
+
+    `registration` leads the start into the scene, and the found pose back.
 
     It waits behind frames of interactive callers. Cancelling ends it. Raises what RenderPool.localize and
     RequestPlanner.plan raise, and RateLimited.
     """
     service.require_serving()
     account().target = scene
-    plan = await service.planner.plan(scene, FrameSettings(probe=sought.settings.probe), Encoding.UINT8)
+    plan = await service.planner.plan(
+        scene, FrameSettings(probe=sought.settings.probe), Encoding.UINT8, registration=registration
+    )
     await service.limits.take_frames(FRAMES_OF_A_SEARCH, deadline)
     for _ in range(MAX_SCENE_CHANGES):
         asked = RenderRequest(
             plan.scene,
             plan.settings,
-            start[None],
+            plan.placed(start)[None],
             Priority.BATCH,
             deadline,
             plan.version,
@@ -104,5 +117,5 @@ async def locate(
             await plan.renew()
         else:
             service.metrics.observe_search(result)
-            return Located.of(result)
+            return Located.of(result, plan)
     raise RenderFailed(f"scene {plan.scene!r} kept changing while the frame was looked for", field="scene")

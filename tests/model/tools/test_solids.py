@@ -10,6 +10,7 @@ import torch
 
 from ultragray import ElevationBeam, Frames, GaussianScene, LinearProbe, Probe, render
 from ultragray.errors import InvalidArgument
+from ultragray.pose import pose_from_position_quaternion
 from ultragray.tools import Box, Cylinder, ScanView, Tool, ToolFrame
 
 from .conftest import LINEAR, PROBES
@@ -51,6 +52,20 @@ def test_the_labels_of_a_turned_box_fill_it(empty_scene: GaussianScene, angle_de
     expected = (np.abs(own_x) < 10.0) & (np.abs(own_z) < 3.0)
     found = labelled(shown(empty_scene, box), box)
     assert (found != expected).sum() < 0.08 * expected.sum()
+
+
+@pytest.mark.parametrize("kind", [Box, Cylinder])
+def test_a_moved_tool_looks_as_its_frame_does_from_where_it_was(empty_scene: GaussianScene, kind: type[Tool]) -> None:
+    if kind is Box:
+        tool: Tool = Box(centre_mm=(3.0, 1.0, 25.0), size_mm=(16.0, 10.0, 6.0), quaternion=turn(20.0))
+    else:
+        tool = Cylinder(tip_mm=(4.0, 0.0, 25.0), hub_mm=(-9.0, 2.0, 20.0), diameter_mm=4.0)
+    pose = pose_from_position_quaternion((400.0, -30.0, 90.0), (0.5, 0.5, -0.1, math.sqrt(0.49)))
+    expected = shown(empty_scene, tool)
+    led = render(empty_scene, LINEAR, pose, height=SIDE, width=SIDE, outputs=OUTPUTS, tools=(tool.moved(pose),))
+    torch.testing.assert_close(led["labels"], expected["labels"])
+    torch.testing.assert_close(led["echo"], expected["echo"], atol=1e-4, rtol=1e-4)
+    assert labelled(led, tool).any()
 
 
 def test_the_near_side_is_bright_and_the_inside_dark(empty_scene: GaussianScene) -> None:

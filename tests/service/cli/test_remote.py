@@ -176,3 +176,25 @@ def test_a_large_upload_that_is_refused_at_once_tells_why(server: RunningService
     with large.open("wb") as file:
         file.truncate(2**27)
     assert "API key" in refused(server, "datasets", "upload", large, key="wrong-key-0123456789")
+
+
+def test_a_registration_goes_up_and_is_listed_shown_and_deleted(server: RunningService, tmp_path: Path) -> None:
+    base_to_scene = np.eye(4)
+    base_to_scene[:3, 3] = (1.0, 2.0, 3.0)
+    np.save(tmp_path / "flange.npy", np.eye(4)[None])
+    np.save(tmp_path / "probe.npy", base_to_scene[None])
+    file = tmp_path / "robot.json"
+    done(server, "calibrate", "poses", tmp_path / "flange.npy", tmp_path / "probe.npy", "-o", file)
+    assert done(server, "registrations", "upload", file, "--scene", "demo") == "uploaded robot, of the scene demo\n"
+    assert json.loads(done(server, "registrations", "upload", file, "--scene", "demo", "--json"))["name"] == "robot"
+    done(server, "registrations", "upload", file, "--scene", "second", "--name", "other")
+    assert [one["name"] for one in json.loads(done(server, "registrations", "list", "--json"))] == ["other", "robot"]
+    assert "second" in done(server, "registrations", "list")
+    shown = json.loads(done(server, "registrations", "show", "robot", "--json"))
+    np.testing.assert_allclose(shown["base_to_scene"], base_to_scene, atol=1e-9)
+    assert "base_to_scene" in done(server, "registrations", "show", "robot")
+    for name in ("robot", "other"):
+        assert done(server, "registrations", "delete", name) == f"{name} deleted\n"
+    assert "there is no registration 'robot'" in refused(server, "registrations", "show", "robot")
+    assert "there is no scene 'none'" in refused(server, "registrations", "upload", file, "--scene", "none")
+    assert "is no registration" in refused(server, "registrations", "upload", tmp_path / "probe.npy", "--scene", "demo")

@@ -153,6 +153,8 @@ def test_every_parameter_is_told_as_it_was_set(peer: Peer) -> None:
         "TimeGainCompensation": "-1 0 2.5 4",
         "Scene": "second",
         "Probe": '{"kind": "linear", "width_mm": 30.0, "near_mm": 0.0, "far_mm": 40.0}',
+        "Registration": "",
+        "Tools": "[]",
     }
     assert tuple(values) == PARAMETERS
     set_to(peer, **values)

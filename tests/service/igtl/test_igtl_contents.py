@@ -15,19 +15,19 @@ from ultragray.pose import check_poses
 from ultragray_service.errors import IgtlMessageInvalid
 from ultragray_service.igtl.contents import (
     Image,
+    Instrument,
     Status,
-    Tool,
     pack_capability,
     pack_image,
+    pack_instruments,
     pack_position,
     pack_status,
-    pack_tools,
     pack_transform,
     unpack_image,
+    unpack_instruments,
     unpack_interval_s,
     unpack_position,
     unpack_status,
-    unpack_tools,
     unpack_transform,
 )
 
@@ -69,18 +69,18 @@ def test_positions_and_tools_round_trip(seed: int) -> None:
     pose, other = check_poses(random_pose(seed))[0], check_poses(random_pose(seed + 1))[0]
     assert unpack_position(pack_position(pose)) == pytest.approx(pose, abs=1e-5)
     for type_name, element in (("TDATA", 70), ("QTDATA", 50)):
-        content = pack_tools(type_name, [Tool("Probe", pose), Tool("Needle", other)])
+        content = pack_instruments(type_name, [Instrument("Probe", pose), Instrument("Needle", other)])
         assert len(content) == 2 * element
-        tools = unpack_tools(type_name, content)
+        tools = unpack_instruments(type_name, content)
         assert [tool.name for tool in tools] == ["Probe", "Needle"]
         assert tools[0].pose == pytest.approx(pose, abs=1e-5)
         assert tools[1].pose == pytest.approx(other, abs=1e-5)
 
 
 def test_tools_without_orientation_are_left_out() -> None:
-    content = bytearray(pack_tools("QTDATA", [Tool("Tip", np.eye(4)), Tool("Probe", np.eye(4))]))
+    content = bytearray(pack_instruments("QTDATA", [Instrument("Tip", np.eye(4)), Instrument("Probe", np.eye(4))]))
     content[20] = 3  # a 3D instrument
-    assert [tool.name for tool in unpack_tools("QTDATA", bytes(content))] == ["Probe"]
+    assert [tool.name for tool in unpack_instruments("QTDATA", bytes(content))] == ["Probe"]
 
 
 def test_what_is_no_pose_is_refused() -> None:
@@ -94,14 +94,14 @@ def test_what_is_no_pose_is_refused() -> None:
     with pytest.raises(InvalidPose, match="norm 1"):
         unpack_position(struct.pack(">6f", 0, 0, 0, 1, 1, 1))
     with pytest.raises(InvalidPose, match="QTDATA of 'Probe'"):
-        unpack_tools("QTDATA", struct.pack(">20sBB7f", b"Probe", 2, 0, *[0.0] * 7))
+        unpack_instruments("QTDATA", struct.pack(">20sBB7f", b"Probe", 2, 0, *[0.0] * 7))
 
 
 UNPACKERS: list[Callable[[bytes], object]] = [
     unpack_transform,
     unpack_position,
-    lambda content: unpack_tools("TDATA", content),
-    lambda content: unpack_tools("QTDATA", content),
+    lambda content: unpack_instruments("TDATA", content),
+    lambda content: unpack_instruments("QTDATA", content),
     unpack_image,
     unpack_status,
     unpack_interval_s,

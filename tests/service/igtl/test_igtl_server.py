@@ -16,13 +16,13 @@ from ultragray.display.scan_conversion import scan_convert
 from ultragray.pose import check_poses
 from ultragray_proto.v1 import rendering_pb2, rendering_pb2_grpc
 from ultragray_service.igtl.contents import (
-    Tool,
+    Instrument,
+    pack_instruments,
     pack_position,
-    pack_tools,
     unpack_image,
+    unpack_instruments,
     unpack_position,
     unpack_status,
-    unpack_tools,
     unpack_transform,
 )
 
@@ -73,16 +73,16 @@ def test_every_type_of_pose_gets_the_same_frame(peer: Peer, igtl_service: Runnin
     peer.send("POSITION", "demo", struct.pack(">3f", 3, 0, 0))
     assert np.array_equal(peer.image().pixels, expected)
     for type_name in ("TDATA", "QTDATA"):
-        tools = [Tool("Probe", pose), Tool("Needle", np.eye(4))]  # no scene is named: the first
-        peer.send(type_name, "Tracker", pack_tools(type_name, tools))
+        tools = [Instrument("Probe", pose), Instrument("Needle", np.eye(4))]  # no scene is named: the first
+        peer.send(type_name, "Tracker", pack_instruments(type_name, tools))
         answer = peer.receive()
         assert answer.device_name == "Image_Probe"
         assert np.array_equal(unpack_image(answer.content).pixels, expected)
 
 
 def test_tools_named_like_scenes_get_a_frame_each(peer: Peer, igtl_service: RunningService) -> None:
-    tools = [Tool("Needle", moved(1)), Tool("second", moved(2)), Tool("ProbeTodemo", moved(3))]
-    peer.send("TDATA", "Tracker", pack_tools("TDATA", tools))
+    tools = [Instrument("Needle", moved(1)), Instrument("second", moved(2)), Instrument("ProbeTodemo", moved(3))]
+    peer.send("TDATA", "Tracker", pack_instruments("TDATA", tools))
     for name, pose in (("second", moved(2)), ("demo", moved(3))):
         answer = peer.receive()
         assert answer.device_name == f"Image_{name}"
@@ -168,7 +168,7 @@ def test_queries_tell_the_newest_frame_of_any_client(connect: Connect, igtl_serv
     for query in ("GET_TRANSFOR", "GET_TRANS"):
         assert unpack_transform(viewer.ask(query, "ProbeToReference").content) == pytest.approx(exact)
     assert unpack_position(viewer.ask("GET_POSITION", "").content) == pytest.approx(exact, abs=1e-6)
-    (tool,) = unpack_tools("QTDATA", viewer.ask("GET_QTDATA", "").content)
+    (tool,) = unpack_instruments("QTDATA", viewer.ask("GET_QTDATA", "").content)
     assert tool.name == "ProbeToReference"
     assert tool.pose == pytest.approx(exact, abs=1e-6)
 

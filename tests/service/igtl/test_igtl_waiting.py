@@ -8,9 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ultragray.registration.registration import Registration, rows
+from ultragray.settings import FrameSettings
+from ultragray_service.igtl.commands.scanner import Setup
 from ultragray_service.igtl.messages import Message
 from ultragray_service.igtl.waiting import MAX_WAITING_DEVICES, PoseMessage, Underway, WaitingPoses
 from ultragray_workers.errors import QueueFull
+
+SETUP = Setup(FrameSettings())
 
 
 @dataclass
@@ -44,7 +49,9 @@ def run(work: Callable[[WaitingPoses], Awaitable[None]]) -> None:
 
 def test_each_device_has_its_turn_with_its_newest_pose() -> None:
     async def work(waiting: WaitingPoses) -> None:
-        replaced = [waiting.put(posed(name, x_mm), 0.0) for name, x_mm in (("a", 1), ("b", 2), ("a", 3), ("a", 4))]
+        replaced = [
+            waiting.put(posed(name, x_mm), 0.0, SETUP) for name, x_mm in (("a", 1), ("b", 2), ("a", 3), ("a", 4))
+        ]
         assert replaced == [False, False, True, True]
         first, second = (await taken(waiting)).posed, (await taken(waiting)).posed
         assert (first.message.device_name, first.pose[0, 3], first.replaced) == ("a", 4, 2)
@@ -55,19 +62,50 @@ def test_each_device_has_its_turn_with_its_newest_pose() -> None:
 
 def test_a_newer_pose_takes_the_turn_of_one_that_waits_in_the_pool() -> None:
     async def work(waiting: WaitingPoses) -> None:
-        waiting.put(posed("a", 1), 0.0)
+        waiting.put(posed("a", 1), 0.0, SETUP)
         underway = await taken(waiting)
-        assert not waiting.put(posed("a", 2), 0.0)  # it is being rendered
-        underway.turn = turn = FakeTurn()  # type: ignore[assignment]
-        assert waiting.put(posed("a", 3), 0.0)  # of the two that wait here, the older one
+        assert not waiting.put(posed("a", 2), 0.0, SETUP)  # it is being rendered
+        underway.turn, underway.setup = (turn := FakeTurn()), SETUP  # type: ignore[assignment]
+        assert waiting.put(posed("a", 3), 0.0, SETUP)  # of the two that wait here, the older one
         assert turn.poses is None
         underway = await taken(waiting)
         assert underway.posed.pose[0, 3] == 3
-        underway.turn = turn = FakeTurn()  # type: ignore[assignment]
-        assert not waiting.put(posed("b", 4), 0.0)
-        assert waiting.put(posed("a", 5), 0.0)
+        underway.turn, underway.setup = (turn := FakeTurn()), SETUP  # type: ignore[assignment]
+        assert not waiting.put(posed("b", 4), 0.0, SETUP)
+        assert waiting.put(posed("a", 5), 0.0, SETUP)
         assert turn.poses[0, 0, 3] == 5
         assert (underway.posed.pose[0, 3], underway.posed.replaced) == (5, 2)
+
+    run(work)
+
+
+def test_a_pose_does_not_take_the_turn_of_one_with_another_setup() -> None:
+    async def work(waiting: WaitingPoses) -> None:
+        waiting.put(posed("a", 1), 0.0, SETUP)
+        underway = await taken(waiting)
+        underway.turn, underway.setup = (turn := FakeTurn()), SETUP  # type: ignore[assignment]
+        waiting.again(posed("a", 1))  # a tool has moved
+        waiting.again(posed("a", 1))
+        assert waiting.put(posed("a", 2), 0.0, Setup(FrameSettings()))
+        assert turn.poses is None
+        underway = await taken(waiting)
+        assert underway.posed.pose[0, 3] == 2
+        underway.turn, underway.setup = (turn := FakeTurn()), SETUP  # type: ignore[assignment]
+        assert not waiting.put(posed("a", 3), 0.0, Setup(FrameSettings()))
+        assert turn.poses is None
+
+    run(work)
+
+
+def test_a_pose_that_takes_a_turn_is_led_as_the_one_before() -> None:
+    async def work(waiting: WaitingPoses) -> None:
+        waiting.put(posed("a", 1), 0.0, SETUP)
+        underway = await taken(waiting)
+        underway.turn, underway.setup = (turn := FakeTurn()), SETUP  # type: ignore[assignment]
+        underway.registration = Registration(base_to_scene=rows(posed("a", 10).pose))
+        assert underway.pose[0, 3] == 11
+        assert waiting.put(posed("a", 5), 0.0, SETUP)
+        assert turn.poses[0, 0, 3] == 15
 
     run(work)
 
@@ -75,10 +113,10 @@ def test_a_newer_pose_takes_the_turn_of_one_that_waits_in_the_pool() -> None:
 def test_devices_without_end_are_refused() -> None:
     async def work(waiting: WaitingPoses) -> None:
         for number in range(MAX_WAITING_DEVICES):
-            waiting.put(posed(str(number)), 0.0)
-        assert waiting.put(posed("0"), 0.0)
+            waiting.put(posed(str(number)), 0.0, SETUP)
+        assert waiting.put(posed("0"), 0.0, SETUP)
         with pytest.raises(QueueFull, match="16 devices"):
-            waiting.put(posed("one more"), 0.0)
+            waiting.put(posed("one more"), 0.0, SETUP)
 
     run(work)
 
@@ -86,7 +124,7 @@ def test_devices_without_end_are_refused() -> None:
 def test_settled_is_when_nothing_waits_and_nothing_is_under_way() -> None:
     async def work(waiting: WaitingPoses) -> None:
         await waiting.settled()
-        waiting.put(posed("a"), 0.0)
+        waiting.put(posed("a"), 0.0, SETUP)
         await taken(waiting)
         settled = asyncio.ensure_future(waiting.settled())
         await asyncio.sleep(0)

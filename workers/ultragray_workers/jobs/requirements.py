@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from ultragray.files.atomic import sync
 from ultragray.files.link import link_or_copy
+from ultragray.registration.registration import Registration
 from ultragray.scene_info import SceneHeader, read_header
 
 from ..claims import storage_full
@@ -27,10 +29,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Requirements:
-    """The datasets and scenes that jobs name."""
+    """The datasets, scenes and registrations that jobs name."""
 
     datasets: DatasetStore
     scenes: SceneStore
+    registration: Callable[[str, str], Registration]  # finds that of a name, for a scene
     files: JobFiles
     artifact_folder: Path | None  # in which jobs work; None: in folders of other hosts
     max_image_side: int
@@ -64,6 +67,18 @@ class Requirements:
                 except FileNotFoundError:
                     self.scenes.path(name)  # raises SceneNotFound where the scene has just gone
                     raise
+
+    def led(self, specification: Specification) -> Specification:
+        """The job with its poses led into its scene by the registration that it names, as that is now.
+
+        Raises SceneNotFound, RegistrationNotFound, and InvalidArgument for one of another scene.
+        """
+        name = _named(specification, specification.needs_registration)
+        if name is None:
+            return specification
+        scene = _named(specification, specification.needs_scene)
+        self.scenes.path(scene)
+        return specification.led(self.registration(name, scene))
 
     def taken(self, specification: Specification, before: str | None) -> list[tuple[Kind, str]]:
         """The dataset and the scene that `provide` takes; not a scene that the job replaced has kept."""

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import re
 import threading
 import uuid
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
+from typing import Any
 
 import sqlalchemy as sa
 from dbos import EnqueueOptions, WorkflowSerializationFormat, WorkflowStatus
@@ -18,6 +20,7 @@ from dbos import error as dbos_error
 from ultragray.batches import stands_for
 from ultragray.errors import InvalidArgument
 from ultragray.image_size import MAX_IMAGE_SIDE
+from ultragray.registration.registration import Registration
 
 from ..claims import is_claimed
 from ..datasets.store import DatasetStore
@@ -29,6 +32,7 @@ from ..errors import (
     JobInUse,
     JobNotFinished,
     JobQueueFull,
+    RegistrationNotFound,
     SceneExists,
     SceneNotFound,
     job_not_found,
@@ -66,6 +70,7 @@ _JOB_ID = re.compile(r"[0-9a-f]{24}")
 _STORABLE = re.compile(r"[^\0\ud800-\udfff]*")  # PostgreSQL takes no NUL, and UTF-8 no surrogates
 _TAIL_BYTES = 8192
 _ASKED_PRIVATE = "asked_private"  # attribute of a job, which is also private where it takes something private
+_ASKED_SHA256 = "asked_sha256"  # attribute of a job that a registration led: of what it asked for
 
 
 Admit = Callable[["JobStore"], int | None]  # raises what keeps a new job out, else: how many may run at once
@@ -74,6 +79,10 @@ Admit = Callable[["JobStore"], int | None]  # raises what keeps a new job out, e
 def _admit_any(jobs: JobStore) -> int | None:
     """Keeps no job out, and has any number of them run."""
     return None
+
+
+def _no_registration(name: str, _: str) -> Registration:
+    raise RegistrationNotFound(f"there is no registration {name!r}", field="registration")
 
 
 Shown = Callable[[Ownership], bool]  # whether whoever asks may know of a job
@@ -94,12 +103,15 @@ class JobStore:
         *,
         scenes: SceneStore | None = None,
         datasets: DatasetStore | None = None,
+        registration: Callable[[str, str], Registration] = _no_registration,
         shared: Storage | None = None,
         max_image_side: int = MAX_IMAGE_SIDE,
     ) -> None:
         """`scenes`: those that jobs may need, and whose names they may not make. None: those that jobs made.
 
         `datasets`: those that jobs may need. None: those of the artifact folder.
+
+        `registration`: finds that of a name, for a scene; None is known without it.
 
         `shared`: the storage in which several hosts have the files of jobs; None: they are in the artifact folder.
 
@@ -118,6 +130,7 @@ class JobStore:
         self._requirements = Requirements(
             datasets=datasets or DatasetStore(self._artifact_folder, shared),
             scenes=scenes or SceneStore(self._artifact_folder / SCENES_FOLDER),
+            registration=registration,
             files=self.files,
             artifact_folder=self._artifact_folder if shared is None else None,
             max_image_side=max_image_side,
@@ -140,7 +153,7 @@ class JobStore:
         of the owner may run at once; None: any number.
 
         Raises JobConflict where that one asked for something else, JobQueueFull, ArtifactFolderUnavailable, and what
-        `Requirements.provide` raises.
+        `Requirements.led` and `Requirements.provide` raise.
         """
         if abs(priority) > MAX_PRIORITY:
             raise InvalidArgument(
@@ -164,9 +177,11 @@ class JobStore:
         *,
         request_id: str | None = None,
         retry_of: str | None = None,
+        told: Mapping[str, Any] | None = None,
         by: str | None = None,
     ) -> tuple[Job, bool]:
-        short, asked = in_short(specification), Ownership(owner, private)
+        """`told`: the specification as jobs tell it, where that of a predecessor was led; None: in short."""
+        short, asked = told or in_short(specification), Ownership(owner, private)
         made = value_in(short, "makes_scene")
         self.database.folder.check()
         with self._submitting:
@@ -175,8 +190,9 @@ class JobStore:
             if unfinished.count_waiting(self.database) >= self._queue_limit:
                 raise JobQueueFull(f"{self._queue_limit} jobs wait already: try again later, or cancel some")
             most_running = admit(self)
-            self._requirements.provide(specification, job_id, retry_of)
-            used = self._requirements.taken(specification, retry_of)
+            led = self._requirements.led(specification)
+            self._requirements.provide(led, job_id, retry_of)
+            used = self._requirements.taken(led, retry_of)
             private |= self._are_private(used, owner, by)
             options: EnqueueOptions = {
                 "workflow_name": specification.kind,
@@ -191,6 +207,7 @@ class JobStore:
                     "specification": short,
                     "private": private,
                     _ASKED_PRIVATE: asked.private,
+                    _ASKED_SHA256: None if led is specification else _sha256_of(specification),
                     MOST_RUNNING: most_running,
                     TRACE: current_trace(),
                 },
@@ -214,7 +231,7 @@ class JobStore:
             try:
                 self.database.enqueue(
                     options,
-                    {"specification": to_dict(specification), "retry_of": retry_of, "submission": uuid.uuid4().hex},
+                    {"specification": to_dict(led), "retry_of": retry_of, "submission": uuid.uuid4().hex},
                     also=claim_scene,
                 )
             except dbos_error.DBOSWorkflowIDInUseError:  # another service was quicker
@@ -258,7 +275,11 @@ class JobStore:
             raise JobConflict(f"the request_id {job.request_id!r} was used already: choose another", field="request_id")
         before = attribute(row, _ASKED_PRIVATE)
         is_same = (priority, asked.private) == (job.priority, job.private if before is None else before)
-        if not is_same or to_dict(_specification_of(row)) != to_dict(specification):
+        if (led := attribute(row, _ASKED_SHA256)) is not None:
+            is_same &= led == _sha256_of(specification)
+        else:
+            is_same &= to_dict(_specification_of(row)) == to_dict(specification)
+        if not is_same:
             raise JobConflict(
                 f"the request_id {job.request_id!r} was used for the job {job.id}, which asks for something else",
                 field="request_id",
@@ -337,6 +358,7 @@ class JobStore:
             job.private,
             admit,
             retry_of=job_id,
+            told={"kind": job.kind, **job.specification},
             by=by,
         )
 
@@ -475,6 +497,10 @@ def _check_request_id(request_id: str) -> None:
         raise InvalidArgument(
             "request_id must be text without NUL and without halves of characters", field="request_id"
         )
+
+
+def _sha256_of(specification: Specification) -> str:
+    return hashlib.sha256(json.dumps(to_dict(specification)).encode()).hexdigest()
 
 
 def _hashed(text: str) -> str:

@@ -60,6 +60,9 @@ class Allowance(Contract):
         low=0.0,
         high=1e9,
     )
+    registrations: int | None = described(
+        "Registrations that one key keeps; none: any number.", None, low=0, high=1_000_000
+    )
 
 
 def of_key(name: str) -> Any:

@@ -1,1 +1,1 @@
-"""Commands that ask a running service over HTTP: scenes, datasets, jobs."""
+"""Commands that ask a running service over HTTP: scenes, datasets, registrations, jobs."""

@@ -49,6 +49,9 @@ async def estimate(service: Service, specification: Specification, *, field: str
         )
     with under(field):
         plan = await service.planner.plan(specification.scene, specification, Encoding.UINT8)
+        if specification.registration is not None:
+            found = await service.registrations.of_scene(specification.registration, specification.scene)
+            specification = specification.led(found)
         _, header = await service.catalog.versioned_header(specification.scene)
         settings = plan.settings
         frames, poses = await asyncio.to_thread(specification.outlook, header, settings, MAX_POSES)

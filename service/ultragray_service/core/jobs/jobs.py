@@ -16,8 +16,16 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from ultragray.contract import described, under
 from ultragray.errors import DatasetInvalid, InvalidArgument, SceneFileInvalid, UltragrayError
+from ultragray.registration.registration import Registration
 from ultragray_workers.datasets.store import DatasetStore
-from ultragray_workers.errors import DatabaseUnavailable, DatasetNotFound, NotReady, SceneExists, SceneNotFound
+from ultragray_workers.errors import (
+    DatabaseUnavailable,
+    DatasetNotFound,
+    NotReady,
+    RegistrationNotFound,
+    SceneExists,
+    SceneNotFound,
+)
 from ultragray_workers.jobs.files import JobFiles
 from ultragray_workers.jobs.kinds import Specification
 from ultragray_workers.jobs.overview import JobsOverview
@@ -64,10 +72,18 @@ class WorkerList:
 class Jobs:
     """The jobs of one service."""
 
-    def __init__(self, settings: Settings, scenes: SceneStore, datasets: DatasetStore) -> None:
+    def __init__(
+        self,
+        settings: Settings,
+        scenes: SceneStore,
+        datasets: DatasetStore,
+        registration: Callable[[str, str], Registration],
+    ) -> None:
+        """`registration`: finds that of a name, for a scene; it blocks."""
         self._settings = settings
         self._scenes = scenes
         self._datasets = datasets
+        self._registration = registration
         self._opened: JobStore | None = None
         # Of their own, so that a database that does not answer keeps nobody else waiting.
         self._threads = ThreadPoolExecutor(_THREADS, "jobs")
@@ -92,6 +108,7 @@ class Jobs:
             settings.job_queue_limit,
             scenes=self._scenes,
             datasets=self._datasets,
+            registration=self._registration,
             shared=shared_storage(settings.artifacts, patience_s=_PATIENCE_S / 2),
             max_image_side=settings.max_image_side,
         )
@@ -136,7 +153,7 @@ class Jobs:
         """The job, and whether it is new. `field` is where the caller wrote the specification.
 
         Raises InvalidArgument, JobConflict, JobQueueFull, DatasetNotFound, DatasetInvalid, SceneNotFound,
-        SceneFileInvalid, SceneExists, LimitReached.
+        SceneFileInvalid, SceneExists, RegistrationNotFound, LimitReached.
         """
         with _specification_to_blame(field):
             job, is_new = await self.do(
@@ -215,6 +232,6 @@ def _specification_to_blame(field: str) -> Iterator[None]:
             raise
         with under(field):
             raise
-    except (DatasetInvalid, DatasetNotFound, SceneExists, SceneFileInvalid, SceneNotFound):
+    except (DatasetInvalid, DatasetNotFound, RegistrationNotFound, SceneExists, SceneFileInvalid, SceneNotFound):
         with under(field):
             raise

@@ -65,7 +65,7 @@ async def localize(request: Request, service: ServiceDep, scene: SceneName) -> L
     asked = LocalizationSettings(probe=body.probe, within_mm=body.within_mm, within_deg=body.within_deg)
     image = await asyncio.to_thread(_bytes_of, body.image)
     sought = sought_frame(image, body.image_height, body.image_width, asked)
-    work = locate(service, scene, sought, body.start.exact("start"), deadline)
+    work = locate(service, scene, sought, body.start.exact("start"), deadline, body.registration)
     return await finish_or_abandon(work, request.receive, deadline)
 
 

@@ -4,20 +4,22 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from ultragray.contract import from_dict, shown, to_dict
 from ultragray.display.settings import AS_RENDERED, FRAME_RANGE_DB
 from ultragray.errors import InvalidArgument, InvalidProbe
-from ultragray.probe import Probe
+from ultragray.probe import FloatArray, Probe
 from ultragray.settings import FrameSettings
 
+from ...registrations.registrations import Registrations
 from ..routes import SceneChooser
+from .tools import ClientTools, read_tools, tools_text
 
 _NO_GAIN_PERCENT = 50.0
 _DB_A_PERCENT = FRAME_RANGE_DB / 100.0
-_SCENE, _PROBE = "Scene", "Probe"
+_SCENE, _PROBE, _REGISTRATION, _TOOLS = "Scene", "Probe", "Registration", "Tools"
 
 
 @dataclass(frozen=True)
@@ -55,42 +57,70 @@ _DISPLAY: Mapping[str, _DisplayParameter] = {
         "tgc_db", lambda text: tuple(map(_number, text.split())), lambda gains: " ".join(map(_plain, gains))
     ),
 }
-PARAMETERS = (*_DISPLAY, _SCENE, _PROBE)
+PARAMETERS = (*_DISPLAY, _SCENE, _PROBE, _REGISTRATION, _TOOLS)
+
+
+@dataclass(frozen=True, eq=False)
+class Setup:
+    """All that the frames of a connection are rendered with; another object after each change."""
+
+    settings: FrameSettings
+    registration: str | None = None  # that leads the poses of devices into the scene
+    tools: ClientTools = field(default_factory=ClientTools)
 
 
 class Scanner:
-    """Settings of the frames of one connection, and the scene of its devices that name none."""
+    """The setup of the frames of one connection, and the scene of its devices that name none."""
 
-    def __init__(self, scenes: SceneChooser, settings: FrameSettings) -> None:
-        self.settings = settings
+    def __init__(self, scenes: SceneChooser, registrations: Registrations, setup: Setup) -> None:
+        self.setup = setup
         self._scenes = scenes
+        self._registrations = registrations
+
+    def move(self, device: str, pose: FloatArray) -> None:  # [4, 4] mm, exact
+        """Takes the pose of a device that moves tools, for the frames to come."""
+        self.setup = replace(self.setup, tools=self.setup.tools.moved(device, pose))
 
     async def set(self, parameter: str, value: str) -> None:
         """Sets a parameter for the frames to come.
 
-        Raises InvalidArgument for an unknown parameter and for a value that cannot be, InvalidProbe, SceneNotFound.
+        Raises InvalidArgument for an unknown parameter and for a value that cannot be, InvalidProbe, SceneNotFound,
+        RegistrationNotFound.
         """
         if parameter == _SCENE:
             await self._scenes.prefer(value)
+        elif parameter == _REGISTRATION:
+            if value:
+                await self._scenes.prefer((await self._registrations.get(value)).scene)
+            self.setup = replace(self.setup, registration=value or None)
+        elif parameter == _TOOLS:
+            self.setup = replace(self.setup, tools=read_tools(value, self.setup.tools))
         elif parameter == _PROBE:
-            self.settings = replace(self.settings, probe=_probe(value))
+            self._set(probe=_probe(value))
         else:
             of_display = _of_display(parameter)
-            display = self.settings.display or AS_RENDERED
-            display = replace(display, **{of_display.field: of_display.read(value)})
-            self.settings = replace(self.settings, display=display)
+            display = self.setup.settings.display or AS_RENDERED
+            self._set(display=replace(display, **{of_display.field: of_display.read(value)}))
+
+    def _set(self, **values: Any) -> None:
+        self.setup = replace(self.setup, settings=replace(self.setup.settings, **values))
 
     async def get(self, parameter: str) -> str:
         """The value of a parameter. Raises InvalidArgument for an unknown one and for one that is not set,
         SceneNotFound where no scene is chosen."""
         if parameter == _SCENE:
             return await self._scenes.choose("")
+        if parameter == _REGISTRATION:
+            return self.setup.registration or ""
+        if parameter == _TOOLS:
+            return tools_text(self.setup.tools)
+        settings = self.setup.settings
         write: Callable[[Any], str]
         if parameter == _PROBE:
-            value, write = self.settings.probe, _probe_text
+            value, write = settings.probe, _probe_text
         else:
             of_display = _of_display(parameter)
-            value, write = getattr(self.settings.display or AS_RENDERED, of_display.field), of_display.write
+            value, write = getattr(settings.display or AS_RENDERED, of_display.field), of_display.write
         if value is None:
             raise InvalidArgument("is not set: frames have that of their scene")
         return write(value)

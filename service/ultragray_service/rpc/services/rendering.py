@@ -134,7 +134,8 @@ class RenderService:
             raise InvalidArgument("start is required", field="start")
         start = read_pose(request.start, "start")
         sought = sought_frame(request.image, height, width, asked)
-        found = await locate(self._service, request.scene, sought, start, deadline)
+        registration = request.registration if request.HasField("registration") else None
+        found = await locate(self._service, request.scene, sought, start, deadline, registration)
         return to_message(found, rendering_pb2.LocalizeResponse)
 
     async def _plan(self, request: rendering_pb2.RenderRequest | rendering_pb2.RenderBatchRequest) -> Plan:

@@ -43,6 +43,7 @@ LIMITS = {  # by the name of the key
     "bytes": "stored_gb=0.000004",
     "unpacked": "stored_gb=0.000005",
     "full": "stored_gb=0",
+    "registrations": "registrations=2",
 }
 SMALL = {"height": 16, "width": 16}
 

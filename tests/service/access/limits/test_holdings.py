@@ -85,6 +85,19 @@ def test_uploads_end_where_the_bytes_of_a_key_end(limited: Limited, scene_bytes:
     assert is_limit(submit(limited, "full"), "stored_gb")
 
 
+def test_a_key_keeps_only_so_many_registrations(limited: Limited) -> None:
+    def put(who: str, name: str) -> httpx.Response:
+        body = {"scene": "demo", "base_to_scene": MATRIX}
+        return limited.http(who, "PUT", f"/v1/registrations/{name}", json=body)
+
+    assert [put("registrations", name).status_code for name in ("one", "two", "one")] == [200, 200, 200]
+    assert is_limit(put("registrations", "three"), "registrations")
+    assert put("unlimited", "three").status_code == 200
+    assert limited.http("registrations", "DELETE", "/v1/registrations/one").status_code == 204
+    assert put("registrations", "four").status_code == 200
+    assert limited.refusals("registrations") == 1
+
+
 def test_uploads_over_grpc_count_likewise(limited: Limited, dataset_bytes: bytes) -> None:
     stub = datasets_pb2_grpc.DatasetServiceStub(limited.channel)
     message = datasets_pb2.UploadDatasetRequest

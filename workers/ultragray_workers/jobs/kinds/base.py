@@ -8,6 +8,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from typing_extensions import Self
+
 from ultragray.contract import Family, described
 from ultragray.scene_info import SceneHeader
 
@@ -18,6 +20,8 @@ MAX_RUN_S = 31_536_000.0
 TOPIC = "Worker"
 
 if TYPE_CHECKING:
+    from ultragray.registration.registration import Registration
+
     from ..folder import Outcome
     from ..worker.job_run import JobRun
 
@@ -66,6 +70,7 @@ class Specification(Family):
     run_module: ClassVar[str]  # below this folder: its `run(job_run, specification)` does the work
     needs_dataset: ClassVar[str | None] = None  # field: the dataset stays while the job waits or runs
     needs_scene: ClassVar[str | None] = None  # field: the scene is kept for the job as it is at the submission
+    needs_registration: ClassVar[str | None] = None  # field: it leads the poses of the job as it is at the submission
     has_checkpoints: ClassVar[bool] = False  # interrupted, it goes on from where it was; others begin anew
     makes_scene: ClassVar[str | None] = None  # field: the scene among the artifacts is served when the job succeeds
 
@@ -80,6 +85,10 @@ class Specification(Family):
 
     def check(self, surroundings: Surroundings) -> None:
         """Raises what the job would fail with, as far as its submission can know."""
+
+    def led(self, registration: Registration) -> Self:
+        """The job with its poses led into its scene, which names no registration any more."""
+        raise NotImplementedError
 
     @classmethod
     def is_in_shards(cls, document: Mapping[str, Any]) -> bool:

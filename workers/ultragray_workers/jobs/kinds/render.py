@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
+from typing_extensions import Self
 
 from ultragray.batches import BatchPlan
 from ultragray.batches.plan import SHARD_FRAMES
@@ -22,6 +23,7 @@ from ultragray.interchange.exports.formats import DTYPES
 from ultragray.outputs import OUTPUTS
 from ultragray.pose import check_poses
 from ultragray.probe import FloatArray, Picture, Probe
+from ultragray.registration.registration import Registration
 from ultragray.samplers import (
     MAX_POSES,
     Assess,
@@ -32,7 +34,7 @@ from ultragray.samplers import (
 )
 from ultragray.samplers.confident import require_drawn
 from ultragray.scene_info import SceneHeader
-from ultragray.settings import Encoding, FrameSettings, Resolved
+from ultragray.settings import Encoding, FrameSettings, Resolved, registration_field
 
 from ...errors import StorageFull
 from .base import Specification, Surroundings
@@ -71,15 +73,19 @@ class RenderJob(FrameSettings, Specification):
         low=1,
         high=MAX_POSES,
     )
+    registration: str | None = registration_field()
     kind: Literal["render"] = kind_field("render")
 
     run_module = "render_run"
     needs_scene = "scene"
+    needs_registration = "registration"
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.poses is None and self.sampler is None:
             raise InvalidArgument("poses or sampler must be given", field="poses")
+        if self.poses is None and self.registration is not None:
+            raise InvalidArgument("poses must be given where a registration leads them", field="poses")
         if self.poses is not None and isinstance(self.sampler, TrainingSampler):
             raise InvalidArgument("poses must be left out where sampler is of kind training", field="poses")
         if self.poses is not None:
@@ -101,6 +107,9 @@ class RenderJob(FrameSettings, Specification):
         return isinstance(other, RenderJob) and to_dict(self) == to_dict(other)
 
     __hash__ = None  # type: ignore[assignment]
+
+    def led(self, registration: Registration) -> Self:
+        return replace(self, poses=registration.probe_to_scene(np.asarray(self.poses)), registration=None)
 
     @classmethod
     def is_in_shards(cls, document: Mapping[str, Any]) -> bool:

@@ -40,7 +40,7 @@ async def get_registration(service: ServiceDep, registration: Name) -> NamedRegi
 @router.put(
     "/{registration}",
     openapi_extra=body_schema(RegistrationBody),
-    responses=problems(401, 403, 404, 413, 415, 422, 503),
+    responses=problems(401, 403, 404, 413, 415, 422, 429, 503),
 )
 async def put_registration(request: Request, service: ServiceDep, registration: Name) -> NamedRegistration:
     """Keeps a registration, in place of one of that name which is the key's own."""
