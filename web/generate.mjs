@@ -8,7 +8,7 @@ import { existsSync, mkdirSync, readFileSync, writeFileSync } from "node:fs";
 import openapiTS, { astToString } from "openapi-typescript";
 
 const FOLDER = new URL("src/api/generated/", import.meta.url);
-const KEPT = ["description", "default", "minimum", "exclusiveMinimum", "maximum", "enum", "const", "examples", "x-numbers"];
+const KEPT = ["description", "default", "minimum", "exclusiveMinimum", "maximum", "maxItems", "enum", "const", "examples", "x-numbers"];
 
 const document = JSON.parse(readFileSync(new URL("openapi.json", import.meta.url), "utf8"));
 const { schemas } = document.components;

@@ -16,8 +16,9 @@ export class Rendering {
   async start(session: Session, poses: readonly Pose[], format: string): Promise<void> {
     this.problem = null;
     this.#sending = true;
-    const { height, width, probe, display, slice_thickness_mm } = session.settings(["bmode"]);
-    const specification = { scene: session.name, poses: inBase64(poses), format, height, width, probe, display, slice_thickness_mm };
+    const { height, width, probe, display, slice_thickness_mm, tools, ghost } = session.settings(["bmode"]);
+    const image = { height, width, probe, display, slice_thickness_mm, tools, ghost };
+    const specification = { scene: session.name, poses: inBase64(poses), format, ...image };
     try {
       this.job = await startJob("render", specification, false);
       this.#sending = false;

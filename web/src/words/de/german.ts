@@ -11,6 +11,7 @@ import { session } from "./session";
 import { shared } from "./shared";
 import { shell } from "./shell";
 import { space } from "./space";
+import { tools } from "./tools";
 import { train } from "./train";
 
-export const german: Words = { compare, connect, jobs, maps, scan, scenes, session, shared, shell, space, train };
+export const german: Words = { compare, connect, jobs, maps, scan, scenes, session, shared, shell, space, tools, train };

@@ -10,8 +10,9 @@ import { session } from "./session";
 import { shared } from "./shared";
 import { shell } from "./shell";
 import { space } from "./space";
+import { tools } from "./tools";
 import { train } from "./train";
 
-export const english = { compare, connect, jobs, maps, scan, scenes, session, shared, shell, space, train };
+export const english = { compare, connect, jobs, maps, scan, scenes, session, shared, shell, space, tools, train };
 
 export type Words = typeof english;
