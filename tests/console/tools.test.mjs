@@ -20,17 +20,18 @@ async function openWithNeedle(options) {
   return { page, first, needle };
 }
 
-/** Of the 3D view: how many pixels have the colour of tools. */
-function toolPixels(page) {
-  return page.locator('[data-testid="space"] canvas').evaluate(async (canvas) => {
-    await new Promise((resolve) => requestAnimationFrame(resolve));
-    const copy = new OffscreenCanvas(canvas.width, canvas.height).getContext("2d");
-    copy.drawImage(await createImageBitmap(canvas), 0, 0);
-    const { data } = copy.getImageData(0, 0, canvas.width, canvas.height);
+/** How many pixels of the 3D view have the orange of tools. */
+async function toolPixels(page) {
+  const bytes = [...(await page.getByTestId("room").screenshot())];
+  return page.evaluate(async (png) => {
+    const bitmap = await createImageBitmap(new Blob([new Uint8Array(png)], { type: "image/png" }));
+    const copy = new OffscreenCanvas(bitmap.width, bitmap.height).getContext("2d");
+    copy.drawImage(bitmap, 0, 0);
+    const { data } = copy.getImageData(0, 0, bitmap.width, bitmap.height);
     let count = 0;
-    for (let i = 0; i < data.length; i += 4) if (data[i] > 150 && data[i] - data[i + 2] > 70 && data[i] - data[i + 1] > 40) count += 1;
+    for (let i = 0; i < data.length; i += 4) if (data[i] > 150 && data[i] - data[i + 2] > 70 && data[i] - data[i + 1] > 50) count += 1;
     return count;
-  });
+  }, bytes);
 }
 
 describe("tools in the image", () => {
@@ -65,6 +66,7 @@ describe("tools in the image", () => {
   it("of every kind are seen in the image and in space, and fit their panel", async () => {
     const { page, needle } = await openWithNeedle();
     await page.getByTestId("legend").waitFor();
+    await page.getByText("refining …").waitFor({ state: "detached" });
     const thin = await until(() => toolPixels(page), (count) => count > 20, "no needle in space");
     await picture(page, "tools-needle");
     await page.getByRole("button", { name: "Add a box" }).click();
