@@ -58,6 +58,7 @@ export const trainingSettings: Described = ${JSON.stringify(described(schemas.Tr
 export const trainingPresets: Record<string, Record<string, unknown>> = ${JSON.stringify(schemas.TrainingConfig["x-presets"], null, 1)};
 export const uploadOptions: Record<string, Described> = ${JSON.stringify(queryOf(document.paths["/v1/datasets/{dataset}"].put), null, 1)};
 export const settings: Described = ${JSON.stringify(described(schemas.RenderSettings), null, 1)};
+export const localization: Described = ${JSON.stringify(described(schemas.LocalizeBody), null, 1)};
 export const scene: Described = ${JSON.stringify(described(schemas.Scene), null, 1)};
 export const roles = ${JSON.stringify(schemas.Role.enum)} as const;
 export const operations = ${JSON.stringify(operations(document.paths), null, 1)} as const;

@@ -4,6 +4,7 @@ import type { Words } from "../en/english";
 import { compare } from "./compare";
 import { connect } from "./connect";
 import { jobs } from "./jobs";
+import { locate } from "./locate";
 import { maps } from "./maps";
 import { scan } from "./scan";
 import { scenes } from "./scenes";
@@ -14,4 +15,4 @@ import { space } from "./space";
 import { tools } from "./tools";
 import { train } from "./train";
 
-export const german: Words = { compare, connect, jobs, maps, scan, scenes, session, shared, shell, space, tools, train };
+export const german: Words = { compare, connect, jobs, locate, maps, scan, scenes, session, shared, shell, space, tools, train };

@@ -3,6 +3,7 @@
 import { compare } from "./compare";
 import { connect } from "./connect";
 import { jobs } from "./jobs";
+import { locate } from "./locate";
 import { maps } from "./maps";
 import { scan } from "./scan";
 import { scenes } from "./scenes";
@@ -13,6 +14,6 @@ import { space } from "./space";
 import { tools } from "./tools";
 import { train } from "./train";
 
-export const english = { compare, connect, jobs, maps, scan, scenes, session, shared, shell, space, tools, train };
+export const english = { compare, connect, jobs, locate, maps, scan, scenes, session, shared, shell, space, tools, train };
 
 export type Words = typeof english;
