@@ -3,7 +3,7 @@
 const STORAGE = "ultragray.scan";
 export const SPEEDS = [0.25, 0.5, 1, 2, 4] as const;
 /** Groups that are closed until a person opens them. */
-const SELDOM = ["locate"];
+const SELDOM = ["locate", "registrations"];
 
 class ScanSettings {
   /** Whether the image has nearly all of the window. */

@@ -6,6 +6,7 @@ import { connect } from "./connect";
 import { jobs } from "./jobs";
 import { locate } from "./locate";
 import { maps } from "./maps";
+import { registrations } from "./registrations";
 import { scan } from "./scan";
 import { scenes } from "./scenes";
 import { session } from "./session";
@@ -15,4 +16,4 @@ import { space } from "./space";
 import { tools } from "./tools";
 import { train } from "./train";
 
-export const german: Words = { compare, connect, jobs, locate, maps, scan, scenes, session, shared, shell, space, tools, train };
+export const german: Words = { compare, connect, jobs, locate, maps, registrations, scan, scenes, session, shared, shell, space, tools, train };

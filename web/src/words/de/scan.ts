@@ -6,7 +6,7 @@ export const scan: Words["scan"] = {
   close: "Schließen",
   room: "Szene im Raum",
   group: (name) => `${name}: zeigen oder verbergen`,
-  groups: { confidence: "Verlässlichkeit", display: "Bild", tools: "Instrumente", pose: "Lage", locate: "Bildsuche", path: "Weg", connect: "Verbinden" },
+  groups: { confidence: "Verlässlichkeit", display: "Bild", tools: "Instrumente", pose: "Lage", locate: "Bildsuche", registrations: "Registrierungen", path: "Weg", connect: "Verbinden" },
   image: {
     label: "Livebild",
     of: (scene) => `B-Bild von ${scene}`,

@@ -5,6 +5,7 @@ import { connect } from "./connect";
 import { jobs } from "./jobs";
 import { locate } from "./locate";
 import { maps } from "./maps";
+import { registrations } from "./registrations";
 import { scan } from "./scan";
 import { scenes } from "./scenes";
 import { session } from "./session";
@@ -14,6 +15,6 @@ import { space } from "./space";
 import { tools } from "./tools";
 import { train } from "./train";
 
-export const english = { compare, connect, jobs, locate, maps, scan, scenes, session, shared, shell, space, tools, train };
+export const english = { compare, connect, jobs, locate, maps, registrations, scan, scenes, session, shared, shell, space, tools, train };
 
 export type Words = typeof english;
