@@ -2,7 +2,7 @@
 
 import { address, request, type Schemas } from "./client";
 import type { Described } from "./described";
-import { localization } from "./generated/contract";
+import { within } from "./generated/contract";
 import type { Probe } from "./probes";
 
 export type Located = Schemas["Located"];
@@ -14,7 +14,7 @@ export interface Within {
 }
 export const WITHIN: { name: keyof Within; field: Described }[] = (["within_mm", "within_deg"] as const).map((name) => ({
   name,
-  field: localization.properties![name]!,
+  field: within.properties![name]!,
 }));
 
 /** Looks for a frame, the base64 of a PNG file, about `start`: 16 numbers row by row, mm. `probe`: null for the scene's own. */

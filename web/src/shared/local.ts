@@ -11,6 +11,11 @@ export function fixed(value: number, digits: number): string {
   return value.toLocaleString(language.current, { minimumFractionDigits: digits, maximumFractionDigits: digits, useGrouping: false });
 }
 
+/** A number as a person types it, with a point or a comma; NaN: it is none. */
+export function numberOf(text: string): number {
+  return text.trim() === "" ? NaN : Number(text.trim().replace("−", "-").replace(",", "."));
+}
+
 export function localTime(iso: string): string {
   return new Date(iso).toLocaleString(language.current, { dateStyle: "short", timeStyle: "medium" });
 }

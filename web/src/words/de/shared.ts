@@ -2,11 +2,13 @@
 
 import type { Words } from "../en/english";
 
+const written = (value: number): string => String(value).replace(".", ",");
+
 function limits(least: number, most: number, unit: string): string {
   const mm = unit && ` ${unit}`;
-  if (Number.isFinite(least) && Number.isFinite(most)) return `eine Zahl von ${least} bis ${most}${mm}`;
-  if (Number.isFinite(least)) return `eine Zahl ab ${least}${mm}`;
-  return Number.isFinite(most) ? `eine Zahl bis ${most}${mm}` : "eine Zahl";
+  if (Number.isFinite(least) && Number.isFinite(most)) return `eine Zahl von ${written(least)} bis ${written(most)}${mm}`;
+  if (Number.isFinite(least)) return `eine Zahl ab ${written(least)}${mm}`;
+  return Number.isFinite(most) ? `eine Zahl bis ${written(most)}${mm}` : "eine Zahl";
 }
 
 const labels: Words["shared"]["field"]["labels"] = {
@@ -70,7 +72,7 @@ export const shared: Words["shared"] = {
   slider: {
     value: "Wert",
     outside: (least, most, unit) => `Hier passt nur ${limits(least, most, unit)}.`,
-    reset: (value, unit) => `Doppelklick: ${value}${unit && ` ${unit}`}`,
+    reset: (value, unit) => `Doppelklick: ${written(value)}${unit && ` ${unit}`}`,
   },
   field: {
     ofList: (label, place, count) => `${label} ${place} von ${count}`,
