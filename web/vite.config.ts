@@ -2,9 +2,10 @@ import { readFileSync } from "node:fs";
 import { svelte } from "@sveltejs/vite-plugin-svelte";
 import { defineConfig, type Plugin } from "vite";
 
-// `npm run dev` serves the sources and passes on what is asked of the API to a service that runs.
-const LEAST_CHUNK_BYTES = 20_000; // each request takes its time
+// What nearly all views need, as one file: each request takes its time.
+const COMMON = /\/src\/(api|geometry|session|shared)\/(?!generated\/work|job_kinds)/;
 const FIRST_VIEW = "/scan/Scan.svelte";
+// `npm run dev` serves the sources and passes on what is asked of the API to a service that runs.
 const service = process.env.ULTRAGRAY_ADDRESS ?? "http://127.0.0.1:8000";
 
 /** The licences of what is bundled, which ask to come along. */
@@ -26,11 +27,11 @@ function firstViewAhead(): Plugin {
     transformIndexHtml: {
       order: "post",
       handler(_, { bundle = {} }) {
-        const chunk = Object.values(bundle).find((one) => one.type === "chunk" && one.facadeModuleId?.endsWith(FIRST_VIEW));
-        if (chunk?.type !== "chunk") return [];
-        const isAsked = (name: string): boolean => bundle[name]?.type === "chunk" && bundle[name].isEntry;
-        const chunks = [chunk, ...chunk.imports.filter((name) => !isAsked(name)).map((name) => bundle[name])].filter((one) => one?.type === "chunk");
-        return chunks.map(({ fileName }) => ({ tag: "link", attrs: { rel: "modulepreload", crossorigin: true, href: `/${fileName}` }, injectTo: "head" }));
+        const chunks = Object.values(bundle).filter((one) => one.type === "chunk");
+        const first = chunks.find(({ facadeModuleId }) => facadeModuleId?.endsWith(FIRST_VIEW));
+        const asked = chunks.filter(({ isEntry }) => isEntry).flatMap(({ fileName, imports }) => [fileName, ...imports]);
+        const files = first === undefined ? [] : [first.fileName, ...first.imports].filter((file) => !asked.includes(file));
+        return files.map((file) => ({ tag: "link", attrs: { rel: "modulepreload", crossorigin: true, href: `/${file}` }, injectTo: "head" }));
       },
     },
   };
@@ -46,7 +47,7 @@ export default defineConfig({
     target: "es2022",
     cssCodeSplit: false, // one small file
     chunkSizeWarningLimit: 800,
-    rollupOptions: { output: { experimentalMinChunkSize: LEAST_CHUNK_BYTES } },
+    rollupOptions: { output: { manualChunks: (id) => (COMMON.test(id) ? "common" : undefined) } },
   },
   server: {
     host: "127.0.0.1",
