@@ -139,6 +139,14 @@ describe("tools in the image", () => {
     await page.reload();
     await page.getByTestId("tool-seen").getByText(/^Spitze: im Bild, \d+,\d mm tief$/).waitFor();
     await page.getByTestId("tool-seen").scrollIntoViewIfNeeded();
+    const tip = page.getByLabel("Spitze X, mm", { exact: true });
+    await tip.fill("7,5");
+    await tip.press("Enter");
+    await tip.press("ArrowUp");
+    await until(() => tip.inputValue(), (value) => value === "8,0", "it does not speak German");
+    await tip.fill("weit");
+    await tip.press("Enter");
+    await page.getByRole("alert").getByText("Hier passt nur eine Zahl").waitFor();
     await picture(page, "tools-touch-german");
     assert.deepEqual(await cut(page), []);
   });
