@@ -24,7 +24,7 @@ const HUB = [0.03, 0.1] as const;
 const MIDDLE = [0.5, 0.5] as const;
 
 export function isRod(tool: Tool): tool is Rod {
-  return tool.kind !== "box";
+  return "tip_mm" in tool;
 }
 
 /** The point by which a tool is placed: the tip of a rod, the middle of a box. */

@@ -34,6 +34,7 @@ export const locate: Words["locate"] = {
   angleStdMeans: "Standardabweichungen um die laterale, Elevations- und axiale Achse",
   fromStart: "Vom Start aus",
   took: "Dauer der Suche",
+  seconds: (amount) => `${amount} s`,
   take: "Dorthin",
   takeMeans: "Nimmt die gefundene Lage als die des Schallkopfs",
   frozen: "Das Bild ist eingefroren. Erst weiterlaufen lassen (F).",

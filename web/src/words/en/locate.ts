@@ -37,6 +37,7 @@ export const locate = {
   angleStdMeans: "Standard deviations about the lateral, elevation and axial axis",
   fromStart: "From the start",
   took: "Search took",
+  seconds: (amount: string): string => `${amount} s`,
   take: "Go there",
   takeMeans: "Takes the pose that was found as that of the probe",
   frozen: "The image is frozen. Unfreeze it first (F).",
