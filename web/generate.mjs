@@ -8,7 +8,7 @@ import { existsSync, mkdirSync, readFileSync, writeFileSync } from "node:fs";
 import openapiTS, { astToString } from "openapi-typescript";
 
 const FOLDER = new URL("src/api/generated/", import.meta.url);
-const KEPT = ["description", "default", "minimum", "exclusiveMinimum", "maximum", "enum", "const", "examples", "x-numbers"];
+const KEPT = ["description", "default", "minimum", "exclusiveMinimum", "maximum", "maxItems", "enum", "const", "examples", "x-numbers"];
 
 const document = JSON.parse(readFileSync(new URL("openapi.json", import.meta.url), "utf8"));
 const { schemas } = document.components;
@@ -27,6 +27,11 @@ function described({ $ref, anyOf, oneOf, properties, items, ...schema }) {
     properties: Object.fromEntries(Object.entries(properties).map(([name, value]) => [name, described(value)])),
   };
   return { ...type, ...kept, ...fields, ...(items && { items: described(items) }), ...(oneOf && { oneOf: oneOf.map(described) }) };
+}
+
+/** An object with some of its fields. */
+function only({ properties, ...schema }, names) {
+  return { ...schema, properties: Object.fromEntries(names.map((name) => [name, properties[name]])) };
 }
 
 /** The query parameters of a route. */
@@ -49,19 +54,22 @@ function operations(paths) {
   return Object.fromEntries(ruled.map(([name, told]) => [name, { role: told["x-role"], owned: told["x-owned"] }]));
 }
 
+const contract = (text) => `import type { Described } from "../described";\n\n${text}`;
+/** What every view needs is apart from what only some do, so that the page begins with less. */
 const texts = {
   "schema.d.ts": astToString(await openapiTS(structuredClone(document))),
-  "contract.ts": `import type { Described } from "../described";
-
-export const jobs: Record<string, Described> = ${JSON.stringify(jobKinds(schemas.JobBody.properties), null, 1)};
+  "contract.ts": contract(`export const settings: Described = ${JSON.stringify(described(schemas.RenderSettings), null, 1)};
+export const outputs: Described = ${JSON.stringify(described(schemas.Scene.properties.outputs), null, 1)};
+export const within: Described = ${JSON.stringify(described(only(schemas.LocalizeBody, ["within_mm", "within_deg"])), null, 1)};
+export const renderedAs: Described = ${JSON.stringify(described(schemas.RenderSpecification.properties.format), null, 1)};
+export const roles = ${JSON.stringify(schemas.Role.enum)} as const;
+export const operations = ${JSON.stringify(operations(document.paths), null, 1)} as const;
+`),
+  "work.ts": contract(`export const jobs: Record<string, Described> = ${JSON.stringify(jobKinds(schemas.JobBody.properties), null, 1)};
 export const trainingSettings: Described = ${JSON.stringify(described(schemas.TrainingConfig), null, 1)};
 export const trainingPresets: Record<string, Record<string, unknown>> = ${JSON.stringify(schemas.TrainingConfig["x-presets"], null, 1)};
 export const uploadOptions: Record<string, Described> = ${JSON.stringify(queryOf(document.paths["/v1/datasets/{dataset}"].put), null, 1)};
-export const settings: Described = ${JSON.stringify(described(schemas.RenderSettings), null, 1)};
-export const scene: Described = ${JSON.stringify(described(schemas.Scene), null, 1)};
-export const roles = ${JSON.stringify(schemas.Role.enum)} as const;
-export const operations = ${JSON.stringify(operations(document.paths), null, 1)} as const;
-`,
+`),
 };
 mkdirSync(FOLDER, { recursive: true });
 for (const [name, text] of Object.entries(texts)) {

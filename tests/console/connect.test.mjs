@@ -30,7 +30,7 @@ place, turn = stamped["pose"]["position"], stamped["pose"]["orientation"]
 pose = Placement(tuple(1000 * place[axis] for axis in "xyz"), Quaternion(**turn))
 with Client(given["address"]) as client:
     frame = client.render(given["scene"], pose, settings_of({**known, **given}))
-print(json.dumps([*frame["bmode"].shape, frame.display.gain_db, frame.probe.kind]))
+print(json.dumps([*frame["bmode"].shape, frame.display.gain_db, frame.probe.kind, [tool.kind for tool in frame.tools]]))
 `;
 /** What grpcurl does: reads the request as JSON, and calls the method. */
 const GRPCURL = `
@@ -42,7 +42,7 @@ assert words[0] == "grpcurl" and words[-1] == "ultragray.v1.RenderService/Render
 request = json_format.Parse(words[words.index("-d") + 1], rendering_pb2.RenderRequest())
 with grpc.insecure_channel(words[-2], options=[("grpc.max_receive_message_length", -1)]) as channel:
     frame = rendering_pb2_grpc.RenderServiceStub(channel).Render(request, timeout=60)
-print(frame.height, frame.width, len(frame.data))
+print(frame.height, frame.width, len(frame.data), [tool.WhichOneof("kind") for tool in frame.tools])
 `;
 
 const at = tested({ environment: { ULTRAGRAY_IGTL_PORT: "0" } });
@@ -95,19 +95,24 @@ describe("connect", () => {
     await page.getByLabel("Gain", { exact: true }).fill("6");
     await page.getByRole("combobox", { name: "Probe" }).selectOption("convex");
     await until(() => canvasState(page, IMAGE), ({ width }) => width === 640, "no sector came");
+    await page.getByRole("button", { name: "Add a needle" }).click();
+    await page.getByLabel("Frame of the tool").selectOption("probe");
+    await page.getByRole("button", { name: "Add a box" }).click();
     run("bash", written("ask.sh", await program(page, "curl")));
     const { width, height } = await canvasState(page, IMAGE);
     const png = readFileSync(path.join(folder, "frame.png"));
     assert.deepEqual([png.readUInt32BE(16), png.readUInt32BE(20)], [width, height]);
-    assert.match(run(PYTHON, written("ask.py", await program(page, "python"))), new RegExp(`bmode ${height}x${width}`));
+    const asking = await program(page, "python");
+    assert.match(asking, /tools=\(Needle\(.*frame=ToolFrame\.PROBE\), Box\(/);
+    assert.match(run(PYTHON, written("ask.py", asking)), new RegExp(`bmode ${height}x${width}`));
     const call = written("grpcurl.sh", await program(page, "grpc"));
-    assert.equal(run(PYTHON, "-c", GRPCURL, call).trim(), `${height} ${width} ${height * width}`);
+    assert.equal(run(PYTHON, "-c", GRPCURL, call).trim(), `${height} ${width} ${height * width} ['needle', 'box']`);
     const streamed = run(PYTHON, written("stream.py", await program(page, "websocket"))).trim().split("\n");
     assert.equal(streamed.length, 50);
     assert.match(streamed[49], new RegExp(`^49 \\(1, ${height}, ${width}\\)`));
     assert.match(run(PYTHON, written("igtl.py", await program(page, "igtl"))), /\(1, 256, 256\)/);
     const image = JSON.parse(run(PYTHON, "-c", ROS, written("node.sh", await program(page, "ros"))));
-    assert.deepEqual(image, [height, width, 6, "convex"]);
+    assert.deepEqual(image, [height, width, 6, "convex", ["needle", "box"]]);
     await picture(page, "connect");
     assert.deepEqual(page.faults, []);
   });

@@ -1,4 +1,4 @@
-/** Draws the documents' pictures of the console, on the demo scene: console.png (a steered array) and maps.png. */
+/** Draws the documents' pictures of the console, on the demo scene: a steered array, a needle, and Maps. */
 
 import path from "node:path";
 
@@ -18,10 +18,17 @@ try {
   await changed(page, print);
   await page.waitForTimeout(SETTLED_MS);
   await page.screenshot({ path: path.join(PICTURES, "console.png") });
+  const { page: tools, first } = await openScan({ browser, service });
+  await tools.getByRole("button", { name: "Confidence: show or hide" }).click();
+  await tools.getByRole("button", { name: "Image: show or hide" }).click();
+  await tools.getByRole("button", { name: "Add a needle" }).click();
+  await changed(tools, first.print);
+  await tools.waitForTimeout(SETTLED_MS);
+  await tools.screenshot({ path: path.join(PICTURES, "console_tools.png") });
   const maps = await openPage({ browser, service }, "#/maps/demo");
   await until(() => canvasState(maps, '[data-testid="map-echo"]'), ({ mean }) => mean > 1, "no map came");
   await maps.waitForTimeout(SETTLED_MS);
-  await maps.screenshot({ path: path.join(PICTURES, "maps.png") });
+  await maps.screenshot({ path: path.join(PICTURES, "console_maps.png") });
 } finally {
   await browser.close();
   await service.stop();

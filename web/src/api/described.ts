@@ -11,6 +11,7 @@ export interface Described {
   minimum?: number;
   exclusiveMinimum?: number;
   maximum?: number;
+  maxItems?: number;
   enum?: string[];
   const?: string;
   examples?: unknown[];

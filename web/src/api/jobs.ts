@@ -1,8 +1,6 @@
 /** Jobs: trainings above all, started and followed while they run. */
 
 import { address, getJson, postJson, remove, request, type Schemas } from "./client";
-import type { Described } from "./described";
-import { jobs } from "./generated/contract";
 
 /** The specifications of jobs have these beside what their kind needs. */
 export type Job = Schemas["Job"] & {
@@ -29,9 +27,6 @@ const FINAL: readonly JobState[] = ["succeeded", "failed", "cancelled"];
 export function isFinal(job: Job): boolean {
   return FINAL.includes(job.state);
 }
-
-/** What a job of each kind is specified by. */
-export const JOB_KINDS: ReadonlyMap<string, Described> = new Map(Object.entries(jobs));
 
 /** The jobs to list; what is empty passes all. */
 export interface JobFilter {

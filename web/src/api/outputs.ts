@@ -1,6 +1,6 @@
 /** What can be rendered of a scene, as the service describes it. */
 
-import { scene } from "./generated/contract";
+import { outputs } from "./generated/contract";
 import type { Schemas } from "./client";
 
 export type Output = Schemas["Scene"]["outputs"][number];
@@ -11,7 +11,7 @@ interface DescribedOutput {
 }
 
 export const OUTPUTS = Object.fromEntries(
-  (scene.properties?.outputs?.items?.oneOf ?? []).map((one) => [
+  (outputs.items?.oneOf ?? []).map((one) => [
     one.const,
     { isNumbers: one["x-numbers"] ?? false },
   ]),

@@ -4,6 +4,7 @@ import { cancelJob, followJob, isFinal, startJob, type Job } from "../api/jobs";
 import { explain, untilAnswered } from "../api/client";
 import type { Pose } from "../geometry/pose";
 import type { Session } from "../session/session.svelte";
+import { base64 } from "../shared/base64";
 
 export class Rendering {
   job = $state.raw<Job | null>(null);
@@ -16,8 +17,9 @@ export class Rendering {
   async start(session: Session, poses: readonly Pose[], format: string): Promise<void> {
     this.problem = null;
     this.#sending = true;
-    const { height, width, probe, display, slice_thickness_mm } = session.settings(["bmode"]);
-    const specification = { scene: session.name, poses: inBase64(poses), format, height, width, probe, display, slice_thickness_mm };
+    const { height, width, probe, display, slice_thickness_mm, tools, ghost } = session.settings(["bmode"]);
+    const image = { height, width, probe, display, slice_thickness_mm, tools, ghost };
+    const specification = { scene: session.name, poses: written(poses), format, ...image };
     try {
       this.job = await startJob("render", specification, false);
       this.#sending = false;
@@ -56,10 +58,6 @@ export class Rendering {
 }
 
 /** Row by row as float64, the low byte first. */
-function inBase64(poses: readonly Pose[]): string {
-  const bytes = new Uint8Array(new Float64Array(poses.flat()).buffer);
-  const pieces: string[] = [];
-  for (let start = 0; start < bytes.length; start += 0x8000)
-    pieces.push(String.fromCharCode(...bytes.subarray(start, start + 0x8000)));
-  return btoa(pieces.join(""));
+function written(poses: readonly Pose[]): string {
+  return base64(new Uint8Array(new Float64Array(poses.flat()).buffer));
 }

@@ -1,7 +1,9 @@
 /** The frame of now as programs in other languages ask for it: whole programs, which run as they stand. */
 
 import type { StreamSettings } from "../api/stream";
+import { differingFields, type Tool } from "../api/tools";
 import { entry, position, quaternion, type Pose } from "../geometry/pose";
+import { capital, keywords, literal } from "./python_literal";
 
 export const LANGUAGES = ["curl", "python", "grpc", "websocket", "igtl", "ros"] as const;
 export type Language = (typeof LANGUAGES)[number];
@@ -28,6 +30,8 @@ export interface Asked {
 }
 
 type Given = Record<string, unknown>;
+/** A tool without what is as usual. */
+type ToldTool = Given & Pick<Tool, "kind">;
 
 const KEY = "YOUR_KEY";
 const MOST_DEVICE_NAME = 20; // letters, in OpenIGTLink
@@ -63,7 +67,7 @@ function curl({ origin, scene, keyRequired }: Target, { pose, settings }: Asked)
 }
 
 function python(target: Target, { pose, settings }: Asked): string {
-  const { probe, display, ...plain } = known(settings) as Given & { probe?: Given; display?: Given };
+  const { probe, display, tools, ...plain } = known(settings) as Given & { probe?: Given; display?: Given; tools?: ToldTool[] };
   const parts = Object.entries(plain).map(([name, value]) => `${name}=${literal(value)}`);
   const classes = ["Client", "RenderSettings"];
   if (display !== undefined) {
@@ -75,6 +79,11 @@ function python(target: Target, { pose, settings }: Asked): string {
     const name = `${capital(String(kind))}Probe`;
     classes.push(name);
     parts.push(`probe=${name}(${keywords(numbers)})`);
+  }
+  if (tools !== undefined) {
+    parts.push(`tools=(${tools.map((tool) => `${pythonTool(tool)},`).join(" ")})`);
+    classes.push(...new Set(tools.map(({ kind }) => capital(kind))));
+    if (tools.some(({ frame }) => frame !== undefined)) classes.push("ToolFrame");
   }
   const options = [isSecure(target) ? ", tls=Tls()" : "", target.keyRequired ? `, api_key="${KEY}"` : ""].join("");
   if (isSecure(target)) classes.push("Tls");
@@ -91,7 +100,11 @@ np.save("frame.npy", frame["bmode"])
 }
 
 function grpc(target: Target, { pose, settings }: Asked): string {
-  const { probe, outputs, below_min_confidence, ...plain } = known(settings) as Given & { probe?: Given; outputs?: string[] };
+  const { probe, outputs, below_min_confidence, tools, ...plain } = known(settings) as Given & {
+    probe?: Given;
+    outputs?: string[];
+    tools?: ToldTool[];
+  };
   const message: Given = { scene: target.scene, ...plain };
   if (outputs !== undefined) message.outputs = outputs.map((output) => `OUTPUT_${output.toUpperCase()}`);
   if (below_min_confidence !== undefined)
@@ -100,6 +113,7 @@ function grpc(target: Target, { pose, settings }: Asked): string {
     const { kind, ...numbers } = probe;
     message.probe = { [String(kind)]: numbers };
   }
+  if (tools !== undefined) message.tools = tools.map(grpcTool);
   const request = JSON.stringify({ settings: message, pose: { matrix: { values: pose.map(short) } } });
   const key = target.keyRequired ? ` -H 'x-api-key: ${KEY}'` : "";
   return `grpcurl${isSecure(target) ? "" : " -plaintext"} -max-msg-sz ${LARGEST_MESSAGE}${key} \\
@@ -155,10 +169,11 @@ function ros(target: Target, { pose, settings }: Asked): string {
   const [x, y, z] = position(pose).map((value) => short(value / 1000));
   const [w, i, j, k] = quaternion(pose).map(short);
   const place = `position: {x: ${x}, y: ${y}, z: ${z}}, orientation: {x: ${i}, y: ${j}, z: ${k}, w: ${w}}`;
-  const { display, probe, encoding: _, ...plain } = known(settings) as Given & { display?: Given; probe?: Given };
+  const { display, probe, tools, encoding: _, ...plain } = known(settings) as Given & { display?: Given; probe?: Given; tools?: ToldTool[] };
   const given: Given = { address: `${target.host}:${target.grpcPort}`, scene: target.scene, ...plain };
   if (isSecure(target)) given.tls = true;
   if (probe !== undefined) given.probe = JSON.stringify(probe);
+  if (tools !== undefined) given.tools = JSON.stringify(tools);
   for (const [name, value] of Object.entries(display ?? {})) given[`display.${name}`] = value;
   const parameters = Object.entries(given)
     .filter(([, value]) => !(Array.isArray(value) && value.length === 0))
@@ -187,11 +202,29 @@ function isSecure({ origin }: Target): boolean {
 
 /** Settings without those that are left to the scene. */
 function known(settings: StreamSettings): Given {
-  const { display, ...others } = settings as Given & { display?: Given | null };
+  const { display, tools, ...others } = settings as Given & { display?: Given | null; tools?: Tool[] | null };
   const given = Object.fromEntries(Object.entries(others).filter(([, value]) => value !== null));
   if (given.min_confidence === undefined) delete given.below_min_confidence;
+  if (tools) given.tools = tools.map(differingFields);
   const shown = Object.entries(display ?? {}).filter(([, value]) => value !== null);
   return shown.length > 0 ? { ...given, display: Object.fromEntries(shown) } : given;
+}
+
+function pythonTool({ kind, frame, ...numbers }: ToldTool): string {
+  const parts = [keywords(numbers), ...(frame === undefined ? [] : [`frame=ToolFrame.${String(frame).toUpperCase()}`])];
+  return `${capital(kind)}(${parts.join(", ")})`;
+}
+
+/** Points and rotations have named parts in the messages of gRPC. */
+function grpcTool({ kind, frame, ...numbers }: ToldTool): Given {
+  const named = ([name, value]: [string, unknown]): [string, unknown] => {
+    if (!Array.isArray(value)) return [name, value];
+    const parts = value.length === 4 ? "wxyz" : "xyz";
+    return [name, Object.fromEntries(value.map((one, index) => [parts[index], one as unknown]))];
+  };
+  const message = Object.fromEntries(Object.entries(numbers).map(named));
+  if (frame !== undefined) message.frame = `TOOL_FRAME_${String(frame).toUpperCase()}`;
+  return { [kind]: message };
 }
 
 function placement(pose: Pose): Given {
@@ -208,22 +241,4 @@ function matrix(pose: Pose): string {
 /** Seven digits are enough for a rotation to be taken as one, and for nanometres. */
 function short(value: number): number {
   return Number(value.toFixed(7)) + 0;
-}
-
-function keywords(values: Given): string {
-  return Object.entries(values).map(([name, value]) => `${name}=${literal(value)}`).join(", ");
-}
-
-/** A value as Python writes it. */
-function literal(value: unknown): string {
-  if (value === null) return "None";
-  if (typeof value === "boolean") return value ? "True" : "False";
-  if (Array.isArray(value)) return `[${value.map(literal).join(", ")}]`;
-  if (typeof value === "object")
-    return `{${Object.entries(value as Given).map(([name, one]) => `${JSON.stringify(name)}: ${literal(one)}`).join(", ")}}`;
-  return JSON.stringify(value);
-}
-
-function capital(word: string): string {
-  return word.charAt(0).toUpperCase() + word.slice(1);
 }

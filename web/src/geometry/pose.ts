@@ -42,6 +42,19 @@ export function apply(pose: Pose, [x, y, z]: Vector): Vector {
   return [row(0), row(1), row(2)];
 }
 
+/** The rigid transform that leads back. */
+export function inverse(pose: Pose): Pose {
+  const back = fromPositionQuaternion([0, 0, 0], conjugate(quaternion(pose)));
+  const [x, y, z] = apply(back, position(pose));
+  return withPosition(back, [-x, -y, -z]);
+}
+
+/** First `inner`, then `outer`. */
+export function composed(outer: Pose, inner: Pose): Pose {
+  const turn = fromPositionQuaternion([0, 0, 0], multiply(quaternion(outer), quaternion(inner)));
+  return withPosition(turn, apply(outer, position(inner)));
+}
+
 /** The pose turned about the probe's own axes by small angles in degrees; the point `pivot_mm` deep on its axis stays. */
 export function rotated(pose: Pose, [x_deg, y_deg, z_deg]: Vector, pivot_mm: number): Pose {
   const turn = multiply(

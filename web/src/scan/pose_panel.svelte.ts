@@ -3,6 +3,7 @@
 import { fromPositionQuaternion, position, quaternion, withPosition, type Pose } from "../geometry/pose";
 import { placeIn, withPlaceIn, type Place, type Reference } from "../geometry/pose_frames";
 import type { PoseForm } from "../geometry/pose_text";
+import { flangePose, probePose, type Registered } from "../geometry/registered";
 import type { Session } from "../session/session.svelte";
 
 export const MOST_MM = 10_000; // beyond, a typed position is a slip
@@ -10,6 +11,8 @@ export const MOST_MM = 10_000; // beyond, a typed position is a slip
 export class PoseTelling {
   reference = $state<Reference>("absolute");
   form = $state<PoseForm>("json");
+  /** Tells poses as a robot or a tracker does; null: of the probe, in the scene. */
+  registered = $state.raw<Registered | null>(null);
   /** Whether relative poses are told against the mark; else against Home. */
   fromMark = $state(false);
   mark = $state.raw<Pose | null>(null);
@@ -23,14 +26,24 @@ export class PoseTelling {
     if (this.reference === "absolute") this.reference = "relativeProbe";
   }
 
+  /** A pose of the probe as it is shown: in the scene, or by the registration. */
+  told(pose: Pose): Pose {
+    return this.registered === null ? pose : flangePose(this.registered, pose);
+  }
+
+  /** Its inverse. */
+  meant(told: Pose): Pose {
+    return this.registered === null ? told : probePose(this.registered, told);
+  }
+
   place(pose: Pose): Place {
-    return placeIn(pose, this.reference, this.other);
+    return placeIn(this.told(pose), this.reference, this.told(this.other));
   }
 
   /** Moves the probe along one axis of what is told. */
   setPosition(index: number, value_mm: number): void {
     const place = this.place(this.session.pose);
-    const moved = withPlaceIn({ ...place, position_mm: replaced(place.position_mm, index, value_mm) }, this.reference, this.other);
+    const moved = this.#meantBy({ ...place, position_mm: replaced(place.position_mm, index, value_mm) });
     const turn = fromPositionQuaternion([0, 0, 0], quaternion(this.session.pose)); // its digits stay as they are
     this.session.pose = withPosition(turn, position(moved));
   }
@@ -38,8 +51,12 @@ export class PoseTelling {
   /** Turns the probe about its face. */
   setAngle(index: number, value_deg: number): void {
     const place = this.place(this.session.pose);
-    const turned = withPlaceIn({ ...place, angles_deg: replaced(place.angles_deg, index, value_deg) }, this.reference, this.other);
+    const turned = this.#meantBy({ ...place, angles_deg: replaced(place.angles_deg, index, value_deg) });
     this.session.turnTo(quaternion(turned));
+  }
+
+  #meantBy(place: Place): Pose {
+    return this.meant(withPlaceIn(place, this.reference, this.told(this.other)));
   }
 }
 

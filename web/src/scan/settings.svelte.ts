@@ -2,6 +2,8 @@
 
 const STORAGE = "ultragray.scan";
 export const SPEEDS = [0.25, 0.5, 1, 2, 4] as const;
+/** Groups that are closed until a person opens them. */
+const SELDOM = ["locate", "registrations"];
 
 class ScanSettings {
   /** Whether the image has nearly all of the window. */
@@ -11,7 +13,7 @@ class ScanSettings {
   /** Whether keys without Ctrl do something. */
   singleKeys = $state(true);
   /** Names of the groups of controls that are closed. */
-  closed = $state.raw<readonly string[]>([]);
+  closed = $state.raw<readonly string[]>(SELDOM);
 
   constructor() {
     try {

@@ -4,7 +4,7 @@ import { explain, mayPass, ServiceError, Unreachable } from "../api/client";
 import { exampleProbe, PROBE_KINDS, type Probe } from "../api/probes";
 import { describeScene, trainingPoses, type SceneDescription, type TrainingPoses } from "../api/scenes";
 import type { ImagePlane } from "../geometry/plane";
-import { IDENTITY, type Pose } from "../geometry/pose";
+import { IDENTITY, type Pose, type Vector } from "../geometry/pose";
 import { skinOf } from "../geometry/skin";
 import { planes } from "./planes.svelte";
 
@@ -21,6 +21,8 @@ const NOTHING: Held = {
   probe: SUBSTITUTE,
   plane: { face_depth_mm: 0, pivot_depth_mm: 0, lines_mm: [[-20, 0, -20, 50], [20, 0, 20, 50]] }, // prettier-ignore
 };
+
+const UNKNOWN_BOUNDS = { min_mm: { x: -50, y: -50, z: -50 }, max_mm: { x: 50, y: 50, z: 50 } };
 
 export class KnownScene {
   description = $state.raw<SceneDescription | null>(null);
@@ -40,6 +42,11 @@ export class KnownScene {
   readonly home = $derived(this.views[Math.floor(this.views.length / 2)] ?? middleOf(this.description));
   /** Through the faces of the views; null where they look in all directions. */
   readonly skin = $derived.by(() => skinOf(this.views, this.own.plane));
+  /** The box that it fills, mm; a guess until it is known. */
+  readonly bounds = $derived.by((): { low: Vector; high: Vector } => {
+    const { min_mm: low, max_mm: high } = this.description?.bounds ?? UNKNOWN_BOUNDS;
+    return { low: [low.x, low.y, low.z], high: [high.x, high.y, high.z] };
+  });
   #asking = false;
   #sha256: string | null = null;
 

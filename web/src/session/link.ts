@@ -9,15 +9,17 @@ import { fromPositionQuaternion, position, quaternion, type Pose, type Quaternio
 import type { Kept } from "../shell/router.svelte";
 import { words } from "../words/words.svelte";
 import { AS_RENDERED, CONTACTS, DISPLAY, SIZES } from "./image_settings.svelte";
+import { BETWEEN, numberWithin, oneOf, readField, written, type ValueReader } from "./link_values";
 import type { Session } from "./session.svelte";
+import { differingTools, readTools, TOOL_KEYS } from "./tools_link";
 
-const BETWEEN = "_"; // stands in addresses as it is
 const SLICE = settings.properties!.slice_thickness_mm!;
 /** What a person sets of the display; the size of a pixel follows from the probe. */
 const DISPLAY_FIELDS = Object.entries(DISPLAY.properties!).filter(([name]) => name !== "pixel_mm") as [keyof Display, Described][];
 const PROBE_NUMBERS = [...new Set([...PROBE_KINDS.values()].flatMap(numbersOf))];
 const KEYS = [
   ...["pose", "probe", "samples", "slice_mm", "contact", "lines", "unsupported"],
+  ...TOOL_KEYS,
   ...PROBE_NUMBERS.map((name) => `probe.${name}`),
   ...DISPLAY_FIELDS.map(([name]) => name),
 ];
@@ -54,7 +56,7 @@ export function linkOf(session: Session): Record<string, string | null> {
   link.contact = image.contact;
   link.lines = image.scanConverted ? null : "stored";
   link.unsupported = image.hidesUnsupported ? "black" : null;
-  return link;
+  return { ...link, ...differingTools(session.tools) };
 }
 
 /** Whether an address tells anything of that. */
@@ -87,12 +89,13 @@ export async function followLink(session: Session, kept: Kept): Promise<string[]
   session.image.contact = contact;
   session.image.scanConverted = stored === null;
   session.image.hidesUnsupported = unsupported !== null;
+  session.tools.take(...readTools(reader));
   session.jumpTo(pose ?? session.held(session.scene.home));
   return reader.refused;
 }
 
 /** Reads values of an address, and notes those that cannot be used. */
-class Reader {
+class Reader implements ValueReader {
   refused: string[] = [];
   constructor(private readonly kept: Kept) {}
 
@@ -142,33 +145,6 @@ function readSamples(text: string): number {
   return Number(oneOf(SIZES.map(String), text));
 }
 
-function readField(field: Described, text: string): unknown {
-  if (field.type === "boolean") return oneOf(["true", "false"], text) === "true";
-  if (field.type === "array") return text.split(BETWEEN).map((one) => numberWithin(field.items!, one));
-  if (field.enum) return oneOf(field.enum, text);
-  return numberWithin(field, text);
-}
-
-function numberWithin({ minimum = -Infinity, maximum = Infinity }: Described, text: string): number {
-  const number = Number(text);
-  if (text.trim() === "" || !Number.isFinite(number)) throw new Error(words.session.link.number);
-  if (number < minimum || number > maximum) throw new Error(words.session.link.within(minimum, maximum));
-  return number;
-}
-
-function oneOf<T extends string>(choices: readonly T[], text: string): T {
-  if (!isAmong(choices, text)) throw new Error(words.session.link.oneOf(choices));
-  return text;
-}
-
-function isAmong<T extends string>(choices: readonly T[], text: string): text is T {
-  return (choices as readonly string[]).includes(text);
-}
-
 function numbersOf({ properties = {} }: Described): string[] {
   return Object.keys(properties).filter((name) => name !== "kind");
-}
-
-function written(value: unknown): string {
-  return Array.isArray(value) ? value.join(BETWEEN) : String(value);
 }

@@ -19,6 +19,7 @@ import { History } from "./history.svelte";
 import { ImageSettings } from "./image_settings.svelte";
 import { KnownScene, type Held } from "./known_scene.svelte";
 import { planes } from "./planes.svelte";
+import { Tools } from "./tools.svelte";
 
 /** Poses to play, of the scene's own probe. */
 export interface Trajectory {
@@ -37,6 +38,7 @@ export class Session {
   jumps = $state(0);
   readonly history = new History();
   readonly image = new ImageSettings();
+  readonly tools = new Tools(this.history);
   /** What is played in place of the training sweep. */
   trajectory = $state.raw<Trajectory | null>(null);
   /** Where the probe was put last on the track, in its poses; between them too. */
@@ -73,8 +75,8 @@ export class Session {
       min_confidence: hidesUnsupported && this.scene.description?.confidence ? 1 : null,
       below_min_confidence: "mask",
       contact,
-      tools: null,
-      ghost: null,
+      tools: this.tools.all.length > 0 ? [...this.tools.all] : null,
+      ghost: this.tools.ghost > 0 ? this.tools.ghost : null,
       registration: null,
     };
   }
@@ -233,6 +235,7 @@ export class Session {
     this.#choices += 1;
     this.#chosen = this.trajectory = null;
     this.image.beginAnew();
+    this.tools.take([], 0);
     this.goHome();
     this.history.clear();
   }

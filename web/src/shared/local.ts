@@ -6,9 +6,22 @@ export function count(value: number): string {
   return value.toLocaleString(language.current);
 }
 
+const formats = new Map<string, Intl.NumberFormat>(); // making one takes longer than using it
+
 /** With so many digits after the point. */
 export function fixed(value: number, digits: number): string {
-  return value.toLocaleString(language.current, { minimumFractionDigits: digits, maximumFractionDigits: digits, useGrouping: false });
+  const key = `${language.current} ${digits}`;
+  let format = formats.get(key);
+  if (format === undefined) {
+    format = new Intl.NumberFormat(language.current, { minimumFractionDigits: digits, maximumFractionDigits: digits, useGrouping: false });
+    formats.set(key, format);
+  }
+  return format.format(value);
+}
+
+/** A number as a person types it, with a point or a comma; NaN: it is none. */
+export function numberOf(text: string): number {
+  return text.trim() === "" ? NaN : Number(text.trim().replace("−", "-").replace(",", "."));
 }
 
 export function localTime(iso: string): string {

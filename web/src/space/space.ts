@@ -4,6 +4,7 @@ import { AmbientLight, Color, DirectionalLight, Group, Mesh, Plane, Scene, Vecto
 
 import type { Gaussians } from "../api/gaussians";
 import type { Frame } from "../api/stream";
+import type { Tool } from "../api/tools";
 import type { Placed } from "../geometry/picture";
 import type { ImagePlane } from "../geometry/plane";
 import type { Pose, Vector } from "../geometry/pose";
@@ -20,6 +21,7 @@ import { pointedAt } from "./pointing";
 import { ProbeHandle, type Gizmo } from "./probe_handle";
 import { skinMesh } from "./skin_mesh";
 import { sweepPlanes } from "./sweep";
+import { ToolBodies } from "./tool_bodies";
 import type { Volume } from "./volume";
 import { lookFrom, type Box, type Look, type Sides, type Viewpoint } from "./viewpoints";
 
@@ -43,6 +45,8 @@ export class SpaceView {
   #probe: ProbeHandle;
   #image = new LiveImage();
   #imagePose: Pose | null = null;
+  #tools = new ToolBodies();
+  #toldTools = "";
   #cloud = new Cloud();
   #cutPlane = new Plane();
   #cut: Cut = { across: "image", at_mm: 0 };
@@ -88,7 +92,8 @@ export class SpaceView {
     this.#eye.camera.add(light);
     this.#scene.background = new Color(BACKGROUND);
     const lit = [new AmbientLight(0xffffff, 1.2), this.#eye.camera];
-    this.#scene.add(...lit, this.#probe.object, this.#probe.helper, this.#image.object, this.#cloud.object);
+    this.#scene.add(...lit, this.#probe.object, this.#probe.helper, this.#image.object);
+    this.#scene.add(this.#tools.object, this.#cloud.object);
   }
 
   dispose(): void {
@@ -97,6 +102,7 @@ export class SpaceView {
     this.#eye.dispose();
     this.#cloud.dispose();
     this.#image.dispose();
+    this.#tools.dispose();
     for (const object of [this.#sweep, this.#outline, this.#skin]) if (object) drop(object);
     this.#renderer.domElement.removeEventListener("webglcontextrestored", this.#restored);
     this.#renderer.dispose();
@@ -170,7 +176,14 @@ export class SpaceView {
 
   setPose(pose: Pose): void {
     this.#probe.setPose(pose);
+    this.#tools.setPose(pose);
     this.#loop.touch("frame");
+  }
+
+  setTools(tools: readonly Tool[]): void {
+    this.#tools.set(tools);
+    this.#toldTools = JSON.stringify(tools);
+    this.#acted();
   }
 
   setFrame(frame: Frame, placed: Placed): void {
@@ -216,7 +229,7 @@ export class SpaceView {
     const image = this.#image.object.visible ? this.#imagePose : null;
     placeCut(this.#cutPlane, this.#cut, image, new Vector3().setFromMatrixPosition(camera.matrixWorld));
     const { position, quaternion } = this.#probe.object;
-    const occludedBy = [...(image ?? []), ...position.toArray(), ...quaternion.toArray()].join();
+    const occludedBy = [...(image ?? []), ...position.toArray(), ...quaternion.toArray(), this.#toldTools].join();
     const sliced = this.#cut.across !== "image";
     return { renderer: this.#renderer, scene: this.#scene, camera, plane: this.#cutPlane, sliced, occludedBy };
   }

@@ -2,7 +2,8 @@
 
 import { explain, pauseAfter, mayPass } from "../api/client";
 import { defaultsOf, type Described } from "../api/described";
-import { estimateRendering, JOB_KINDS, startJob, type Job, type JobEstimate } from "../api/jobs";
+import { JOB_KINDS } from "../api/job_kinds";
+import { estimateRendering, startJob, type Job, type JobEstimate } from "../api/jobs";
 import { describeScene, type SceneDescription } from "../api/scenes";
 import { namedValues } from "../shared/local";
 

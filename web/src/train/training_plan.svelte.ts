@@ -1,7 +1,7 @@
 /** The training that is prepared: its name, preset and settings, and the earlier run that it repeats. It outlives the view. */
 
 import { labelOf, type Described } from "../api/described";
-import { trainingPresets, trainingSettings } from "../api/generated/contract";
+import { trainingPresets, trainingSettings } from "../api/generated/work";
 import { startJob, type Job } from "../api/jobs";
 
 export type Value = number | string | boolean | null;

@@ -22,7 +22,7 @@ function fault({ fault: found }: PoseError): string {
     case "number":
       return `„${found.text}“ ist keine Zahl.`;
     case "quaternion":
-      return `Das Quaternion muss die Länge 1 haben; dieses hat ${found.length.toFixed(3)}.`;
+      return `Das Quaternion muss die Länge 1 haben; dieses hat ${found.length.toFixed(3).replace(".", ",")}.`;
     case "rotation":
       return found.mirrors
         ? "Die Matrix muss eine Drehung enthalten; diese spiegelt."

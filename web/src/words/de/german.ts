@@ -4,13 +4,16 @@ import type { Words } from "../en/english";
 import { compare } from "./compare";
 import { connect } from "./connect";
 import { jobs } from "./jobs";
+import { locate } from "./locate";
 import { maps } from "./maps";
+import { registrations } from "./registrations";
 import { scan } from "./scan";
 import { scenes } from "./scenes";
 import { session } from "./session";
 import { shared } from "./shared";
 import { shell } from "./shell";
 import { space } from "./space";
+import { tools } from "./tools";
 import { train } from "./train";
 
-export const german: Words = { compare, connect, jobs, maps, scan, scenes, session, shared, shell, space, train };
+export const german: Words = { compare, connect, jobs, locate, maps, registrations, scan, scenes, session, shared, shell, space, tools, train };

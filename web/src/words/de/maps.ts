@@ -9,7 +9,7 @@ export const maps: Words["maps"] = {
     transmittance: { title: "Transmission", meaning: "Der Anteil des Schalls, der in dieser Tiefe noch da ist." },
     coverage: { title: "Abdeckung", meaning: "Wie gut Gelerntes den Bildpunkt stützt; unter 0,3 ist er vor allem geraten." },
     attenuation: { title: "Dämpfung", meaning: "Der Anteil des Schalls, der am Bildpunkt ankommt und dort endet." },
-    labels: { title: "Gewebe", meaning: "Das Gewebe, das im Bildpunkt am meisten wiegt." },
+    labels: { title: "Gewebe", meaning: "Das Gewebe, das im Bildpunkt am meisten wiegt, oder das Instrument dort." },
     uncertainty: { title: "Unsicherheit", meaning: "Der Fehler, der von der Helligkeit des Bildpunkts zu erwarten ist." },
   },
   group: "Karten; die Pfeiltasten bewegen das Fadenkreuz, mit der Umschalttaste schneller",

@@ -6,7 +6,7 @@ export const scan: Words["scan"] = {
   close: "Schließen",
   room: "Szene im Raum",
   group: (name) => `${name}: zeigen oder verbergen`,
-  groups: { confidence: "Verlässlichkeit", display: "Bild", pose: "Lage", path: "Weg", connect: "Verbinden" },
+  groups: { confidence: "Verlässlichkeit", display: "Bild", tools: "Instrumente", pose: "Lage", locate: "Bildsuche", registrations: "Registrierungen", path: "Weg", connect: "Verbinden" },
   image: {
     label: "Livebild",
     of: (scene) => `B-Bild von ${scene}`,
@@ -75,7 +75,7 @@ export const scan: Words["scan"] = {
     noPicture: "Dieser Browser kann das Bild nicht schreiben.",
     noVideo: "Dieser Browser kann kein Video aufnehmen. Auch DICOM kann den Loop aufnehmen.",
     simulated: "Simuliert, nicht zur Diagnose.",
-    slice: (thickness_mm) => `Schicht ${thickness_mm.toFixed(1)} mm`,
+    slice: (thickness_mm) => `Schicht ${thickness_mm.toFixed(1).replace(".", ",")} mm`,
     depthInCm: "Tiefe in cm",
   },
   link: {
@@ -157,7 +157,7 @@ export const scan: Words["scan"] = {
     depth: "Tiefe",
     slice: "Schicht",
     sliceThickness: "Schichtdicke",
-    trained: (thickness_mm) => `Wie trainiert: ${thickness_mm.toFixed(1)} mm.`,
+    trained: (thickness_mm) => `Wie trainiert: ${thickness_mm.toFixed(1).replace(".", ",")} mm.`,
     contact: "Abseits der Haut",
     contactMeans: "Was gezeigt wird, wo die Fläche des Schallkopfs nicht auf der Haut liegt, wie der Sweep sie zeigt",
     contactAssumed: "Wie auf ihr",

@@ -9,6 +9,7 @@ export const session: Words["session"] = {
     pose: "sieben Zahlen: x, y, z, w, i, j, k",
     quaternion: "das Quaternion muss die Länge 1 haben",
     number: "keine Zahl",
+    count: (count) => `${count} Zahlen`,
     within: (low, high) => `${low} bis ${high}`,
     oneOf: (choices) => `eines von ${choices.join(", ")}`,
   },

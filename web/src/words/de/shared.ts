@@ -2,16 +2,19 @@
 
 import type { Words } from "../en/english";
 
+const written = (value: number): string => String(value).replace(".", ",");
+
 function limits(least: number, most: number, unit: string): string {
   const mm = unit && ` ${unit}`;
-  if (Number.isFinite(least) && Number.isFinite(most)) return `eine Zahl von ${least} bis ${most}${mm}`;
-  if (Number.isFinite(least)) return `eine Zahl ab ${least}${mm}`;
-  return Number.isFinite(most) ? `eine Zahl bis ${most}${mm}` : "eine Zahl";
+  if (Number.isFinite(least) && Number.isFinite(most)) return `eine Zahl von ${written(least)} bis ${written(most)}${mm}`;
+  if (Number.isFinite(least)) return `eine Zahl ab ${written(least)}${mm}`;
+  return Number.isFinite(most) ? `eine Zahl bis ${written(most)}${mm}` : "eine Zahl";
 }
 
 const labels: Words["shared"]["field"]["labels"] = {
   baselines: "Klassische Verfahren",
   below_min_confidence: "Darunter",
+  brightness: "Helligkeit",
   budget: "Aufwand",
   contact: "Abseits der Haut",
   convex: "Konvex",
@@ -19,6 +22,7 @@ const labels: Words["shared"]["field"]["labels"] = {
   crop: "Ausschnitt",
   dataset: "Sweep",
   device: "Gerät",
+  diameter_mm: "Durchmesser",
   dtype: "Zahlen als",
   fan: "Fächer",
   far_mm: "Ende",
@@ -28,16 +32,20 @@ const labels: Words["shared"]["field"]["labels"] = {
   height: "Tiefenpunkte",
   image_size: "Bildgröße",
   kind: "Art",
+  label: "Label",
   linear: "Linear",
   max_run_s: "Längste Laufzeit",
   methods: "Verfahren",
   min_confidence: "Kleinste Konfidenz",
   min_memory_gb: "Kleinster Speicher",
   near_mm: "Beginn",
+  opacity: "Deckung",
   opening_angle_deg: "Öffnungswinkel",
   phased: "Phased Array",
   radial: "Radial",
+  reverberation: "Kometenschweif",
   rotation_deg: "Drehung",
+  roughness: "Rauheit",
   scene: "Szene",
   seed: "Startwert",
   shard_frames: "Bilder in einer Datei",
@@ -64,7 +72,7 @@ export const shared: Words["shared"] = {
   slider: {
     value: "Wert",
     outside: (least, most, unit) => `Hier passt nur ${limits(least, most, unit)}.`,
-    reset: (value, unit) => `Doppelklick: ${value}${unit && ` ${unit}`}`,
+    reset: (value, unit) => `Doppelklick: ${written(value)}${unit && ` ${unit}`}`,
   },
   field: {
     ofList: (label, place, count) => `${label} ${place} von ${count}`,

@@ -8,7 +8,7 @@ const outputs: Record<Output, { title: string; meaning: string }> = {
   transmittance: { title: "Transmittance", meaning: "The share of the beam that is left at that depth." },
   coverage: { title: "Coverage", meaning: "How well what was learned supports the pixel; below 0.3 it is mostly a guess." },
   attenuation: { title: "Attenuation", meaning: "The share of the beam that arrives at the pixel and ends there." },
-  labels: { title: "Labels", meaning: "The tissue that weighs most in the pixel." },
+  labels: { title: "Labels", meaning: "The tissue that weighs most in the pixel, or the tool that is there." },
   uncertainty: { title: "Uncertainty", meaning: "The error that the brightness of the pixel is expected to have." },
 };
 

@@ -7,6 +7,7 @@ export const session = {
     pose: "seven numbers: x, y, z, w, i, j, k",
     quaternion: "the quaternion must have length 1",
     number: "not a number",
+    count: (count: number): string => `${count} numbers`,
     within: (low: number, high: number): string => `${low} to ${high}`,
     oneOf: (choices: readonly string[]): string => `one of ${choices.join(", ")}`,
   },

@@ -15,6 +15,7 @@ const labels: Record<string, string | undefined> = {
   dtype: "Numbers as",
   height: "Depth samples",
   min_confidence: "Least confidence",
+  reverberation: "Comet tail",
   shard_frames: "Frames in a file",
   width: "Scan lines",
 };
