@@ -7,6 +7,7 @@ import pytest
 from .conftest import TUTORIAL, RunPage
 
 
+@pytest.mark.long
 @pytest.mark.lengthy
 @pytest.mark.filterwarnings("ignore::ResourceWarning")
 def test_the_tutorial_runs(run_page: RunPage) -> None:

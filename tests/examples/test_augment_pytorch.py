@@ -40,6 +40,7 @@ def test_labels_come_along_if_asked_for(augment: ModuleType, demo_service: Runni
     assert set(sample["labels"].unique().tolist()) <= {0, 1, 2, 3, 4}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("workers", ["0", pytest.param("2", marks=pytest.mark.long)])
 def test_as_a_program(demo_service: RunningService, workers: str) -> None:
     command = [sys.executable, EXAMPLES / "augment_pytorch.py", "--address", demo_service.grpc]

@@ -12,7 +12,6 @@ from .conftest import ROOT
 
 notebooks = loaded(ROOT / "docs" / "notebooks.py")
 NAMES = [path.stem for path in notebooks.notebooks()]
-SHORT = {"visual_servoing"}  # the others train for minutes
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -34,10 +33,8 @@ def test_outputs_and_names_of_cells_leave_no_trace_in_the_form() -> None:
     assert notebooks.in_form(notebook) == path.read_text(encoding="utf-8")
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "name", [name if name in SHORT else pytest.param(name, marks=pytest.mark.long) for name in NAMES]
-)
+@pytest.mark.long
+@pytest.mark.parametrize("name", NAMES)
 def test_it_runs_from_top_to_bottom(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setenv("OMP_NUM_THREADS", "1")  # other tests run beside it

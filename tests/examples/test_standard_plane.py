@@ -42,6 +42,7 @@ def test_it_comes_nearer_to_the_plane(example: ModuleType) -> None:
     assert np.mean(off[1]) < np.mean(off[0])
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_as_a_program() -> None:
     command = [sys.executable, EXAMPLES / "standard_plane.py", "--episodes", "1", "--start-mm", "2", "--start-deg", "2"]

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import strategies as st
 
 from ultragray_service.igtl.commands.contents import Command, pack_command
-from ultragray_service.igtl.contents import Tool, pack_instruments, pack_position, pack_transform
+from ultragray_service.igtl.contents import Instrument, pack_instruments, pack_position, pack_transform
 from ultragray_service.igtl.messages import HEADER_BYTES, Message, pack_message, unpack_header
 
 from .conftest import EnterDoor
@@ -23,7 +23,7 @@ pytestmark = pytest.mark.long
 GROUP = 20  # messages on one connection
 TIMEOUT_S = 60.0
 LAST = 2**33 + 77  # the time stamp of the question that must be answered after them
-TOOL = Tool("demo", np.eye(4))
+TOOL = Instrument("demo", np.eye(4))
 COMMAND = '<Command Name="SetUsParameter"><Parameter Name="DepthMm" Value="20"/></Command>'
 VALID = (
     ("TRANSFORM", pack_transform(np.eye(4))),

@@ -120,6 +120,7 @@ def test_a_training_goes_on_at_another_host_to_the_same_scene(
         assert len(get(http, f"jobs/{job}/curve").json()["points"]) == 500
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_rendering_is_made_on_one_host_and_downloaded_from_another(new_host: NewHost, bucket: str) -> None:
     one, two = new_host("one"), new_host("two")

@@ -93,6 +93,7 @@ def test_a_stream_whose_reader_stops_waits_for_him(service: RunningService, rend
     call.cancel()
 
 
+@pytest.mark.long
 def test_readers_that_stop_hold_little_and_give_it_back(start_service: StartService) -> None:
     service = start_service()
     large = {"height": 2048, "width": 2048, "encoding": "float32"}  # 16 MB a frame

@@ -63,6 +63,7 @@ def poses() -> Any:  # [POSES, 4, 4] mm
     return found
 
 
+@pytest.mark.long
 def test_json(ample: RunningService) -> None:
     body = json.dumps({"kind": "render", "specification": {"scene": "demo", "poses": poses().tolist()}}).encode()
     assert 3.5e6 < len(body) < 4.5e6
@@ -74,6 +75,7 @@ def test_json(ample: RunningService) -> None:
     assert longest_wait_s(ample, submit) < at_this_load(MOST_S)
 
 
+@pytest.mark.long
 def test_grpc(ample: RunningService) -> None:
     request = rendering_pb2.RenderBatchRequest(
         settings=rendering_pb2.RenderSettings(scene="demo", height=8, width=8),

@@ -61,6 +61,7 @@ def render(service: RunningService, scene: str, accept: str = "application/octet
     return httpx.post(f"{service.http}/v1/scenes/{scene}/render", json=body, headers={"Accept": accept}, timeout=60)
 
 
+@pytest.mark.long
 def test_frames_are_those_of_a_folder(
     replicas: list[RunningService], start_service: StartService, data_folder: Path
 ) -> None:
@@ -73,6 +74,7 @@ def test_frames_are_those_of_a_folder(
         assert answer.headers["x-ultragray-scene-sha256"] == local.headers["x-ultragray-scene-sha256"]
 
 
+@pytest.mark.long
 def test_a_scene_is_imported_listed_pinned_and_deleted(
     replicas: list[RunningService], scene_file: Path, tmp_path: Path
 ) -> None:

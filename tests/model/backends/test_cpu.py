@@ -67,6 +67,7 @@ def test_a_tensor_changed_in_place_is_noticed(random_scene: SceneMaker) -> None:
     assert after.mean() < before.mean() - 0.01
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("threads")
 def test_helpers_leave_the_caller_the_processors_it_may_run_on(random_scene: SceneMaker) -> None:
     scene, before = random_scene(count=50), os.sched_getaffinity(0)

@@ -252,6 +252,7 @@ for name, code in compiled.values():
 """
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("capability", "degrees"),
     [

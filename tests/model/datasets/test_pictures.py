@@ -19,6 +19,7 @@ def pixels_of(picture: np.ndarray, colour: tuple[int, int, int]) -> int:  # RGB
     return int((np.abs(picture.astype(int) - colour[::-1]).max(axis=-1) < 40).sum())
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "probe",

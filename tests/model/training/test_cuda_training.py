@@ -38,6 +38,7 @@ def learned(
     return train(dataset, config, report=seen.append, device=device, backend=backend), seen
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_learns_what_the_cpu_learns(dataset: Dataset, config: TrainingConfig) -> None:
     config = replace(config, refinements=0)  # whose random halves turn with quaternions that nothing decides yet

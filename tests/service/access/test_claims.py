@@ -92,6 +92,7 @@ def other_scene_bytes(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     return path.read_bytes()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("is_same_content", [False, True])
 @pytest.mark.parametrize("private", ["false", "true"])
 def test_a_slow_import_takes_nobodys_scene_over(
@@ -140,6 +141,7 @@ def test_a_training_takes_no_scene_over_that_is_being_imported(
     assert keyed.http("bob", "GET", "/v1/scenes/knee").json()["private"] is True
 
 
+@pytest.mark.long
 def test_of_two_uploads_of_one_dataset_the_first_to_finish_owns_it(
     keyed: Keyed, database: JobDatabase, dataset_bytes: bytes
 ) -> None:
@@ -158,6 +160,7 @@ def test_of_two_uploads_of_one_dataset_the_first_to_finish_owns_it(
     assert keyed.http(other, "GET", "/v1/datasets/race").status_code == 404
 
 
+@pytest.mark.long
 def test_a_claim_that_a_dead_service_left_keeps_nobody_out(
     keyed: Keyed, database: JobDatabase, dataset: str, scene_bytes: bytes, dataset_bytes: bytes
 ) -> None:
@@ -193,6 +196,7 @@ def test_an_upload_that_fails_leaves_no_claim(keyed: Keyed, database: JobDatabas
         path.unlink()
 
 
+@pytest.mark.long
 def test_a_training_that_is_cancelled_leaves_no_claim(keyed: Keyed, database: JobDatabase, dataset: str) -> None:
     job = train(keyed, "alice", dataset, "given-up", private=True).json()["id"]
     assert owner_of(database, "scene", "given-up") == "alice"

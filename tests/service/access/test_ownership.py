@@ -271,6 +271,7 @@ def test_a_job_on_something_private_is_private(keyed: Keyed, private: str) -> No
     assert keyed.submit("alice", scene="secret", request_id="on secret").status_code == 200
 
 
+@pytest.mark.long
 def test_a_retry_uses_nothing_that_the_owner_of_the_job_may_not_see(keyed: Keyed, dataset_bytes: bytes) -> None:
     assert keyed.http("bob", "PUT", "/v1/datasets/swap", content=dataset_bytes).status_code == 201
     body = {"kind": "train", "specification": {"dataset": "swap", "scene": "swapped"}}

@@ -54,6 +54,7 @@ def benched(tmp_path_factory: pytest.TempPathFactory) -> Benched:
     return printed, documents[0], documents[1]
 
 
+@pytest.mark.long
 def test_rates_stand_beside_the_limits(benched: Benched) -> None:
     printed, document, _ = benched
     *rendered, door = document["rows"]
@@ -80,6 +81,7 @@ def test_rates_stand_beside_the_limits(benched: Benched) -> None:
     assert f"{100 * rendered[0]['arithmetic_share']:.1f}%" in printed
 
 
+@pytest.mark.long
 def test_training_step(benched: Benched) -> None:
     printed, _, document = benched
     (row,) = document["rows"]

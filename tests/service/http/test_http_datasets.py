@@ -22,6 +22,7 @@ from ultragray import LinearProbe
 from ultragray.datasets import Dataset, Sweep
 from ultragray.datasets.released import write_released
 from ultragray_service.core.dataset_uploads import MAX_UPLOADS
+from ultragray_workers.claims import LOCK_NAME
 
 from ...dicom_files import write_cine
 from ...mcap_files import GEOMETRY, Bag
@@ -391,7 +392,7 @@ def test_a_check_that_is_killed(http: httpx.Client, service: RunningService, fil
 def test_a_service_that_dies_or_stops_leaves_nothing(start_service: StartService, tmp_path: Path) -> None:
     first = start_service(artifact_folder=tmp_path, api_keys=KEY)
     upload = HalfUpload(first, "half")
-    wait_until(lambda: uploads_under_way(tmp_path))
+    wait_until(lambda: list(tmp_path.glob(f"datasets/.*/{LOCK_NAME}")))
     first.process.kill()
     first.process.wait()
     upload.close()

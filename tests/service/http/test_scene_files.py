@@ -199,6 +199,7 @@ def test_what_did_not_change_is_not_sent_again(http: httpx.Client, artifacts: Pa
     assert http.delete("/v1/scenes/kept").status_code == 204
 
 
+@pytest.mark.long
 def test_a_scene_deleted_during_its_first_frame_leaves_no_memory(http: httpx.Client, service: RunningService) -> None:
     sent = make_scene(3000, probe=DEMO_PROBE, seed=7).to_bytes()
     assert http.put("/v1/scenes/brief", content=sent, headers=RAW).status_code == 201

@@ -85,6 +85,7 @@ def test_a_training_keeps_a_picture_of_each_validation(http: httpx.Client) -> No
     assert sizes == {"image/png"}
 
 
+@pytest.mark.long
 def test_the_phases_of_a_training_and_the_time_left_until_its_end(http: httpx.Client) -> None:
     job = train(http, "phased", steps=150, max_gaussians=50, confidence=False)
     told: dict[str, float | None] = {}

@@ -112,6 +112,7 @@ def test_database_with_jobs_is_not_overwritten_by_another_folder(
         restore(backups, elsewhere, database_url)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("step", ["_write_files", "_load_database", "_let_jobs_go_on"])
 def test_interrupted_restore_goes_on_and_is_seen_by_nobody_before(
     step: str,

@@ -64,6 +64,7 @@ def test_frames_are_learned_above_30_db(variant: str) -> None:
     assert psnr_db(frames, dataset.train.images / 255.0) > 30.0
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_a_killed_fit_ends_in_the_model_of_an_undisturbed_one(

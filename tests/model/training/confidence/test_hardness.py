@@ -23,6 +23,7 @@ def changing_sweep(count: int, side: int) -> Sweep:
     return Sweep(images, poses, PROBE, np.arange(count), "test")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("side", [32, 128])
 def test_hard_is_where_neighbours_do_not_tell(side: int) -> None:
     hardness = hardness_of_views(changing_sweep(24, side))

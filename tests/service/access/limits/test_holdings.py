@@ -67,6 +67,7 @@ def test_the_minutes_of_a_day_end_at_midnight(limited: Limited) -> None:
     assert submit(limited, "polite").status_code == 201
 
 
+@pytest.mark.long
 def test_uploads_end_where_the_bytes_of_a_key_end(limited: Limited, scene_bytes: bytes, dataset_bytes: bytes) -> None:
     def put(who: str, path: str, content: bytes) -> httpx.Response:
         return limited.http(who, "PUT", f"/v1/{path}", content=content)

@@ -7,6 +7,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import httpx
+import pytest
 
 from ultragray_service.core.scene_imports import MAX_IMPORTS
 
@@ -25,6 +26,7 @@ def begin_import(limited: Limited, who: str, name: str) -> socket.socket:
     return connection
 
 
+@pytest.mark.long
 def test_slow_imports_of_one_key_keep_nobody_else_out(limited: Limited, tmp_path: Path) -> None:
     make_scene(30, probe=DEMO_PROBE).save(tmp_path / "scene.ugr")
     content = (tmp_path / "scene.ugr").read_bytes()

@@ -48,6 +48,7 @@ for url in sys.argv[2:]:
 """
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["sqlite", "postgresql"])
 def test_workers_that_start_together_on_a_fresh_database(

@@ -32,6 +32,7 @@ def database_url(new_database: NewDatabase) -> str | None:
     return new_database()
 
 
+@pytest.mark.long
 def test_processes_that_open_a_new_database_at_once_all_find_its_tables(
     tmp_path: Path, database_url: str | None
 ) -> None:

@@ -101,6 +101,7 @@ def test_a_batch_goes_on_without_the_workers_that_die_and_has_each_frame_once(
         assert connection.execute(sa.select(sa.func.count()).select_from(WORKFLOWS)).scalar() == 0
 
 
+@pytest.mark.long
 def test_a_shard_that_cannot_be_made_fails_the_job_which_names_it_and_a_retry_goes_on(
     store: JobStore, scene: Path, start_worker: StartWorker, until: Until
 ) -> None:
@@ -138,6 +139,7 @@ def test_cancelling_ends_the_batch_and_its_shares(
     assert left == ["CANCELLED"]
 
 
+@pytest.mark.long
 def test_a_share_leaves_its_worker_to_other_jobs(
     store: JobStore, scene: Path, start_worker: StartWorker, until: Until
 ) -> None:

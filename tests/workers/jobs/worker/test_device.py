@@ -104,6 +104,7 @@ def test_who_waits_for_a_device_takes_no_job_and_another_host_does(
     assert (following.state, following.attempts) == (JobState.SUCCEEDED, 1)
 
 
+@pytest.mark.long
 def test_a_job_that_asks_for_a_device_in_use_waits_in_the_queue(
     store: JobStore, artifact_folder: Path, start_worker: StartWorker, until: Until
 ) -> None:
@@ -120,6 +121,7 @@ def test_a_job_that_asks_for_a_device_in_use_waits_in_the_queue(
     assert (job.state, job.attempts) == (JobState.SUCCEEDED, 1), job
 
 
+@pytest.mark.long
 def test_a_stopped_worker_loses_its_job_and_its_device(
     store: JobStore, start_worker: StartWorker, until: Until
 ) -> None:

@@ -98,6 +98,7 @@ def test_poisoned_datasets_and_diverging_trainings(
     assert [path.name for path in (artifact_folder / "scenes").iterdir()] == ["good.ugr"]
 
 
+@pytest.mark.long
 def test_dataset_deleted_while_it_is_trained_from_and_the_next_job_starts_within_a_second_of_a_cancel(
     store: JobStore, artifact_folder: Path, start_worker: StartWorker, until: Until
 ) -> None:

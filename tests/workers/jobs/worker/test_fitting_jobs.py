@@ -66,6 +66,7 @@ def test_each_job_goes_to_a_worker_that_fits_it_and_holds_nobody_up(
     assert until(elsewhere).worker == "third"
 
 
+@pytest.mark.long
 def test_a_job_that_nobody_can_take_says_so_and_starts_when_a_fitting_worker_comes(
     store: JobStore, start_worker: StartWorker, until: Until
 ) -> None:

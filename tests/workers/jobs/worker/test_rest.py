@@ -43,6 +43,7 @@ def render_job(frames: int) -> RenderJob:
     return RenderJob(scene="demo", poses=np.tile(np.eye(4), (frames, 1, 1)), height=64, width=64)
 
 
+@pytest.mark.long
 def test_worker_tells_who_it_is_and_what_it_does(store: JobStore, start_worker: StartWorker, until: Until) -> None:
     running = start_worker()
     reaches(store, "one", WorkerState.IDLE)
@@ -60,6 +61,7 @@ def test_worker_tells_who_it_is_and_what_it_does(store: JobStore, start_worker: 
         store.want("two", Wanted.PAUSE)
 
 
+@pytest.mark.long
 def test_paused_worker_ends_its_job_and_takes_no_other_until_it_is_resumed(
     store: JobStore, start_worker: StartWorker, until: Until
 ) -> None:

@@ -134,6 +134,7 @@ def test_a_cancellation_that_comes_first_serves_nothing(
     assert store.retry(job.id)[1]
 
 
+@pytest.mark.long
 def test_the_result_of_a_lost_database_is_not_the_result_of_another_request(
     store: JobStore, artifact_folder: Path, tmp_path: Path, start_worker: Callable[..., RunningWorker]
 ) -> None:

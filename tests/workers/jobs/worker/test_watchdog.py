@@ -58,6 +58,7 @@ def running(program: str) -> Iterator[int]:
     process.communicate()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("program", "gets_on"),
     [
@@ -97,6 +98,7 @@ def test_time_in_which_the_worker_itself_was_stopped_does_not_count(monkeypatch:
         assert not dog.is_stalled
 
 
+@pytest.mark.long
 def test_a_stopped_process_is_noticed_and_keeps_no_device(
     store: JobStore, start_worker: StartWorker, until: Until
 ) -> None:
@@ -121,6 +123,7 @@ def test_a_stopped_process_is_noticed_and_keeps_no_device(
     store.cancel(successor.id)
 
 
+@pytest.mark.long
 def test_a_process_that_waits_for_ever_is_noticed(
     store: JobStore, start_worker: StartWorker, until: Until, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -132,6 +135,7 @@ def test_a_process_that_waits_for_ever_is_noticed(
     assert until(good).state is JobState.SUCCEEDED
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("of", ["the request", "the worker"])
 def test_a_job_runs_for_its_longest_time_in_all_and_a_retry_goes_on(
     store: JobStore, start_worker: StartWorker, until: Until, of: str

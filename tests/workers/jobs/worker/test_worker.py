@@ -109,6 +109,7 @@ def test_name_of_a_worker_is_its_alone(tmp_path: Path) -> None:
         pass
 
 
+@pytest.mark.long
 def test_cancelled_within_a_second_and_retried_from_its_checkpoint(
     store: JobStore, artifact_folder: Path, start_worker: StartWorker, until: Until
 ) -> None:
@@ -155,6 +156,7 @@ def test_process_that_dies_again_and_again_is_given_up(
     assert len(ended) == 3
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_killed_worker_is_replaced_and_the_scene_is_that_of_an_undisturbed_run(
     store: JobStore, artifact_folder: Path, tmp_path: Path, start_worker: StartWorker, until: Until
