@@ -1,16 +1,20 @@
 """localize(): the pose at which a scene looks like a real frame, by Levenberg and Marquardt from coarse to fine.
 
 How each pixel changes with the pose comes from small frames on either side of it, twelve of them. (On one side only
-they mislead: of ten frames of a liver three were found in place of ten.) The steps that follow bring one frame each,
-which corrects the changes along the step (Broyden 1965); they are taken anew where such a step fails or has arrived,
-and after a few: of coarse frames, where the place is far, after each. A backward pass would tell how one number
-changes, the sum of all squares; to get on with that alone takes many times as many steps.
+they mislead: of ten frames of a liver three were found in place of ten.) Six are of motions within the image plane:
+these the frame at the pose tells itself, and only to say how certain the result is are they rendered. The steps that
+follow bring one frame each, which corrects the changes along the step (Broyden 1965); they are taken anew where such a
+step fails or has arrived, and after a few: of coarse frames, where the place is far, after each. A backward pass would
+tell how one number changes, the sum of all squares; to get on with that alone takes many times as many steps.
+
+Fine structures hold a search fast at places a millimetre beside the right one. So it goes back to smoother frames once
+before it ends: from such a place they lead on.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -29,6 +33,9 @@ from ..scene import GaussianScene
 from .appearance import Scale
 from .motion import Motions
 from .settings import NEAR_DEG, NEAR_MM, Localization, LocalizationSettings
+from .sliding import IN_PLANE, places_after, slid
+
+Rendered = Callable[[Tensor, int, int], Tensor]  # [C, 4, 4], rows, columns -> [C, rows, columns] in [0, 1]
 
 FOUND_SIMILARITY = 0.5
 SEED = 0
@@ -50,20 +57,18 @@ class Stage:
     steps: int
     probing_mm: float
     corrected: int
-    kept: int  # of the poses that it begins with
+    kept: int = 1  # of the poses that it begins with
 
 
-COARSE = Stage(64, 48, 3.0, 6, 1.0, 1, 2)
-FINER = (
-    Stage(64, 48, 1.5, 6, 0.6, 2, 1),
-    Stage(128, 96, 0.8, 8, 0.3, 4, 1),
-    Stage(128, 96, 0.5, 8, 0.2, 4, 1),
-)
+COARSE = Stage(64, 48, 3.0, 4, 1.0, 1, kept=2)
+MIDDLE = Stage(64, 48, 1.5, 5, 0.6, 2)
+FINE = Stage(128, 96, 0.8, 4, 0.3, 4)
+LAST = Stage(128, 96, 0.5, 6, 0.2, 4)
+STAGES = (COARSE, MIDDLE, FINE, MIDDLE, FINE, LAST)
 MOST_BEGUN = 6  # poses at the coarse stage
 MOST_TRIED = 64  # poses that are looked at before, where the start is less certain
 START_DAMPING, MORE_DAMPING, LESS_DAMPING = 1e-2, 6.0, 3.0
 LONGEST_STEP_MM = 4.0
-SHOWN_SIGMAS = 4.0  # of a Gaussian: what is farther from a plane does not show in it
 SHORT_STEP = 0.1  # of the smoothing: a stage whose steps are shorter has arrived
 SHORT_LAST_STEP = 0.02  # likewise, of the last stage
 
@@ -102,10 +107,9 @@ def localize(
         )
         return frames["bmode"].detach().cpu()
 
-    scene = _within_reach(scene, motions, first[0], within_mm, within_deg)
     search = _Search(frame, known, motions, rendered)
     poses = search.begin(_starts(first[0], motions, within_mm, within_deg))
-    for stage in (COARSE, *FINER):
+    for stage in STAGES:
         poses = search.improve(poses, stage)
     return search.result(poses[0], first[0])
 
@@ -153,9 +157,7 @@ class _Fit:
 class _Search:
     """One frame that is looked for."""
 
-    def __init__(
-        self, frame: Tensor, probe: Probe, motions: Motions, rendered: Callable[[Tensor, int, int], Tensor]
-    ) -> None:
+    def __init__(self, frame: Tensor, probe: Probe, motions: Motions, rendered: Rendered) -> None:
         self._frame, self._probe, self._motions, self._rendered = frame, probe, motions, rendered
 
     def begin(self, starts: Tensor) -> Tensor:  # [S, 4, 4] -> [K, 4, 4]
@@ -171,7 +173,7 @@ class _Search:
         scale, target = self._at(stage)
         fit = self._linearised(poses, stage, scale, target)
         damping = torch.full((len(poses),), START_DAMPING, dtype=torch.float64)
-        short_mm = stage.smoothing_mm * (SHORT_LAST_STEP if stage is FINER[-1] else SHORT_STEP)
+        short_mm = stage.smoothing_mm * (SHORT_LAST_STEP if stage is LAST else SHORT_STEP)
         for _ in range(stage.steps):
             steps = _step(fit, damping)
             has_arrived = steps.norm(dim=1) < short_mm
@@ -188,9 +190,9 @@ class _Search:
         return fit.poses[fit.error.argsort(stable=True)[: stage.kept]]
 
     def result(self, pose: Tensor, start: Tensor) -> Localization:
-        """What is told of the best pose, by the last stage."""
-        scale, target = self._at(FINER[-1])
-        fit = self._linearised(pose[None], FINER[-1], scale, target)
+        """What is told of the best pose, by the last stage; how certain it is, by frames of all motions."""
+        scale, target = self._at(LAST)
+        fit = self._linearised(pose[None], LAST, scale, target, slides=False)
         similarity = _correlation(fit.left[0] + target.reshape(-1), target.reshape(-1))
         deviations = _deviations(fit.left[0].reshape(target.shape), fit.changes[0].reshape(6, *target.shape))
         shift_mm, turn_deg = self._motions.step_between(start, pose)
@@ -211,17 +213,29 @@ class _Search:
         return scale, scale.appearance(scale.resized(self._frame)[None])[0]
 
     def _left(self, poses: Tensor, scale: Scale, target: Tensor) -> Tensor:  # [K, 4, 4] -> [K, pixels]
-        frames = self._rendered(poses, scale.rows, scale.columns)
-        return (scale.appearance(frames) - target).reshape(len(poses), -1).double()
+        return _missed(self._rendered(poses, scale.rows, scale.columns), scale, target)
 
-    def _linearised(self, poses: Tensor, stage: Stage, scale: Scale, target: Tensor) -> _Fit:  # [K, 4, 4]
-        """The fit at poses."""
+    def _linearised(
+        self, poses: Tensor, stage: Stage, scale: Scale, target: Tensor, slides: bool = True
+    ) -> _Fit:  # [K, 4, 4]
+        """The fit at poses; where the frame `slides`, it tells itself how motions within its plane change it."""
+        count, size = len(poses), (scale.rows, scale.columns)
         beside = stage.probing_mm * torch.eye(6, dtype=torch.float64)
         steps = torch.cat([torch.zeros(1, 6, dtype=torch.float64), beside, -beside])
-        around = self._motions.moved(poses[:, None].expand(-1, len(steps), -1, -1), steps.expand(len(poses), -1, -1))
-        left = self._left(around.reshape(-1, 4, 4), scale, target).reshape(len(poses), len(steps), -1)
+        sliding = steps[:, IN_PLANE].any(dim=1) & slides
+        around = self._motions.moved(poses[:, None], steps[~sliding])
+        frames = torch.empty(count, len(steps), *size)
+        frames[:, ~sliding] = self._rendered(around.reshape(-1, 4, 4), *size).reshape(count, -1, *size)
+        if slides:
+            frames[:, sliding] = slid(frames[:, 0], places_after(self._probe, self._motions, steps[sliding], *size))
+        left = _missed(frames.reshape(-1, *size), scale, target).reshape(count, len(steps), -1)
         changes = (left[:, 1:7] - left[:, 7:]) / (2.0 * stage.probing_mm)
-        return _Fit(poses, left[:, 0], changes, torch.zeros(len(poses), dtype=torch.int64))
+        return _Fit(poses, left[:, 0], changes, torch.zeros(count, dtype=torch.int64))
+
+
+def _missed(frames: Tensor, scale: Scale, target: Tensor) -> Tensor:  # [C, rows, columns] -> [C, pixels]
+    """What of the frame that is looked for frames do not explain."""
+    return (scale.appearance(frames) - target).reshape(len(frames), -1).double()
 
 
 def _step(fit: _Fit, damping: Tensor) -> Tensor:  # [K] -> [K, 6] mm
@@ -247,21 +261,6 @@ def _starts(start: Tensor, motions: Motions, within_mm: float, within_deg: float
     spread = 2.0 * even.draw(count, dtype=torch.float64) - 1.0
     reach = torch.tensor([within_mm] * 3 + [float(np.radians(within_deg)) * motions.lever_mm] * 3, dtype=torch.float64)
     return torch.cat([start[None], motions.moved(start.expand(count, -1, -1), spread * reach)])
-
-
-def _within_reach(
-    scene: GaussianScene, motions: Motions, start: Tensor, within_mm: float, within_deg: float
-) -> GaussianScene:
-    """The part of a scene that the frame can show: its Gaussians about the plane of the start. A beam may show all."""
-    if scene.info.beam is not None:
-        return scene
-    pose_cm = torch.from_numpy(scene.poses_to_scene_cm(start[None].numpy()))[0].to(scene.means)
-    beside_cm = ((scene.means.detach() - pose_cm[:3, 3]) @ pose_cm[:3, 1]).abs()
-    leeway_mm = 2.0 * within_mm + 4.0 * motions.lever_mm * float(np.radians(within_deg))
-    extent_cm = SHOWN_SIGMAS * scene.scales.detach().exp().max(dim=1).values
-    near = beside_cm <= 0.1 * leeway_mm + extent_cm
-    splats: dict[str, Any] = {name: raw.detach()[near] for name, raw in scene.splats.items()}
-    return GaussianScene(**splats, info=replace(scene.info, gaussian_count=int(near.sum()), label_names={}))
 
 
 def _checked_image(image: Any) -> Tensor:  # [H, W] in [0, 1], float32
