@@ -1,11 +1,11 @@
 """localize(): the pose at which a scene looks like a real frame, by Levenberg and Marquardt from coarse to fine.
 
-How each pixel changes with the pose comes from small frames on either side of it, twelve of them. (On one side only
-they mislead: of ten frames of a liver three were found in place of ten.) Six are of motions within the image plane:
-these the frame at the pose tells itself, and only to say how certain the result is are they rendered. The steps that
-follow bring one frame each, which corrects the changes along the step (Broyden 1965); they are taken anew where such a
-step fails or has arrived, and after a few: of coarse frames, where the place is far, after each. A backward pass would
-tell how one number changes, the sum of all squares; to get on with that alone takes many times as many steps.
+How each pixel changes with the pose comes from small frames on either side of it (on one side only they mislead),
+twelve of them. Six are of motions within the image plane: these the frame at the pose tells itself, and only to say
+how certain the result is are they rendered. The steps that follow bring one frame each, which corrects the changes
+along the step (Broyden 1965); they are taken anew where such a step fails or has arrived, and after a few: of coarse
+frames, where the place is far, after each. A backward pass would tell how one number changes, the sum of all squares;
+to get on with that alone takes many times as many steps.
 
 Fine structures hold a search fast at places a millimetre beside the right one. So it goes back to smoother frames once
 before it ends: from such a place they lead on.
@@ -215,10 +215,8 @@ class _Search:
     def _left(self, poses: Tensor, scale: Scale, target: Tensor) -> Tensor:  # [K, 4, 4] -> [K, pixels]
         return _missed(self._rendered(poses, scale.rows, scale.columns), scale, target)
 
-    def _linearised(
-        self, poses: Tensor, stage: Stage, scale: Scale, target: Tensor, slides: bool = True
-    ) -> _Fit:  # [K, 4, 4]
-        """The fit at poses; where the frame `slides`, it tells itself how motions within its plane change it."""
+    def _linearised(self, poses: Tensor, stage: Stage, scale: Scale, target: Tensor, slides: bool = True) -> _Fit:
+        """The fit at poses [K, 4, 4]; a frame that `slides` tells itself how motions within its plane change it."""
         count, size = len(poses), (scale.rows, scale.columns)
         beside = stage.probing_mm * torch.eye(6, dtype=torch.float64)
         steps = torch.cat([torch.zeros(1, 6, dtype=torch.float64), beside, -beside])

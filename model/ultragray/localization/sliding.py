@@ -38,10 +38,8 @@ def places_after(probe: Probe, motions: Motions, steps: Tensor, rows: int, colum
     return torch.from_numpy(places.reshape(len(steps), rows, columns, 2)).float()
 
 
-def slid(
-    frames: Tensor, places: Tensor
-) -> Tensor:  # [K, rows, columns], [S, rows, columns, 2] -> [K, S, rows, columns]
-    """Each frame after each step; what comes in from outside is as the edge was."""
+def slid(frames: Tensor, places: Tensor) -> Tensor:  # [K, H, W], [S, H, W, 2] -> [K, S, H, W]
+    """Each frame after each step, by places_after(); what comes in from outside is as the edge was."""
     count, rows, columns = frames.shape
     repeated = frames[:, None].expand(count, len(places), rows, columns).reshape(-1, 1, rows, columns)
     grid = places.repeat(count, 1, 1, 1)

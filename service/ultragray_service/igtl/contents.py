@@ -23,10 +23,7 @@ _POSITION = struct.Struct(">3f")
 _INSTRUMENT = struct.Struct(">20sBB")
 _INSTRUMENT_6D = 2  # both position and orientation are known
 MAX_INSTRUMENTS = 32  # of one message: checking more would keep others waiting
-_POSES_OF_INSTRUMENTS = {
-    "TDATA": 48,
-    "QTDATA": 28,
-}  # bytes of a pose: a matrix, or position and quaternion
+_POSE_BYTES = {"TDATA": 48, "QTDATA": 28}  # of an instrument: a matrix, or position and quaternion
 _IMAGE = struct.Struct(">HBBBB3H48s6H")
 _IMAGE_VERSION, _SCALAR, _UINT8, _LITTLE_ENDIAN, _RAS = 1, 1, 3, 2, 1
 _STATUS = struct.Struct(">Hq20s")
@@ -89,7 +86,7 @@ def unpack_instruments(type_name: str, content: bytes) -> list[Instrument]:
 
     Raises IgtlMessageInvalid and InvalidPose, naming the instrument.
     """
-    size = _INSTRUMENT.size + _POSES_OF_INSTRUMENTS[type_name]
+    size = _INSTRUMENT.size + _POSE_BYTES[type_name]
     if len(content) % size:
         raise IgtlMessageInvalid(
             f"{type_name} must hold {size} bytes for each instrument, got {len(content)} bytes", field="body"

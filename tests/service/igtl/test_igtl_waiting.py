@@ -29,6 +29,11 @@ class FakeTurn:
         return True
 
 
+def waits_in_the_pool(underway: Underway) -> FakeTurn:
+    underway.turn, underway.setup = (turn := FakeTurn()), SETUP  # type: ignore[assignment]
+    return turn
+
+
 def posed(device_name: str, x_mm: float = 0.0) -> PoseMessage:
     pose = np.eye(4)
     pose[0, 3] = x_mm
@@ -65,12 +70,12 @@ def test_a_newer_pose_takes_the_turn_of_one_that_waits_in_the_pool() -> None:
         waiting.put(posed("a", 1), 0.0, SETUP)
         underway = await taken(waiting)
         assert not waiting.put(posed("a", 2), 0.0, SETUP)  # it is being rendered
-        underway.turn, underway.setup = (turn := FakeTurn()), SETUP  # type: ignore[assignment]
+        turn = waits_in_the_pool(underway)
         assert waiting.put(posed("a", 3), 0.0, SETUP)  # of the two that wait here, the older one
         assert turn.poses is None
         underway = await taken(waiting)
         assert underway.posed.pose[0, 3] == 3
-        underway.turn, underway.setup = (turn := FakeTurn()), SETUP  # type: ignore[assignment]
+        turn = waits_in_the_pool(underway)
         assert not waiting.put(posed("b", 4), 0.0, SETUP)
         assert waiting.put(posed("a", 5), 0.0, SETUP)
         assert turn.poses[0, 0, 3] == 5
@@ -83,14 +88,14 @@ def test_a_pose_does_not_take_the_turn_of_one_with_another_setup() -> None:
     async def work(waiting: WaitingPoses) -> None:
         waiting.put(posed("a", 1), 0.0, SETUP)
         underway = await taken(waiting)
-        underway.turn, underway.setup = (turn := FakeTurn()), SETUP  # type: ignore[assignment]
+        turn = waits_in_the_pool(underway)
         waiting.again(posed("a", 1))  # a tool has moved
         waiting.again(posed("a", 1))
         assert waiting.put(posed("a", 2), 0.0, Setup(FrameSettings()))
         assert turn.poses is None
         underway = await taken(waiting)
         assert underway.posed.pose[0, 3] == 2
-        underway.turn, underway.setup = (turn := FakeTurn()), SETUP  # type: ignore[assignment]
+        turn = waits_in_the_pool(underway)
         assert not waiting.put(posed("a", 3), 0.0, Setup(FrameSettings()))
         assert turn.poses is None
 
@@ -101,7 +106,7 @@ def test_a_pose_that_takes_a_turn_is_led_as_the_one_before() -> None:
     async def work(waiting: WaitingPoses) -> None:
         waiting.put(posed("a", 1), 0.0, SETUP)
         underway = await taken(waiting)
-        underway.turn, underway.setup = (turn := FakeTurn()), SETUP  # type: ignore[assignment]
+        turn = waits_in_the_pool(underway)
         underway.registration = Registration(base_to_scene=rows(posed("a", 10).pose))
         assert underway.pose[0, 3] == 11
         assert waiting.put(posed("a", 5), 0.0, SETUP)
