@@ -2,7 +2,7 @@
 
 import assert from "node:assert/strict";
 import { execFileSync, spawn } from "node:child_process";
-import { mkdtempSync, readFileSync, rmSync, writeFileSync } from "node:fs";
+import { mkdtempSync, readFileSync, renameSync, rmSync, writeFileSync } from "node:fs";
 import { tmpdir } from "node:os";
 import path from "node:path";
 import { createInterface } from "node:readline";
@@ -30,7 +30,13 @@ place, turn = stamped["pose"]["position"], stamped["pose"]["orientation"]
 pose = Placement(tuple(1000 * place[axis] for axis in "xyz"), Quaternion(**turn))
 with Client(given["address"]) as client:
     frame = client.render(given["scene"], pose, settings_of({**known, **given}))
-print(json.dumps([*frame["bmode"].shape, frame.display.gain_db, frame.probe.kind, [tool.kind for tool in frame.tools]]))
+print(json.dumps([*frame["bmode"].shape, frame.display and frame.display.gain_db, frame.probe.kind, [tool.kind for tool in frame.tools]]))
+`;
+/** The brightest pixel of two pictures, and how far they are apart at most: poses are told to seven digits. */
+const APART = `
+import sys, cv2, numpy as np
+one, other = (cv2.imread(name, cv2.IMREAD_GRAYSCALE).astype(int) for name in sys.argv[1:])
+print([int(one.max()), int(np.abs(one - other).max())])
 `;
 /** What grpcurl does: reads the request as JSON, and calls the method. */
 const GRPCURL = `
@@ -95,6 +101,7 @@ describe("connect", () => {
     await page.getByLabel("Gain", { exact: true }).fill("6");
     await page.getByRole("combobox", { name: "Probe" }).selectOption("convex");
     await until(() => canvasState(page, IMAGE), ({ width }) => width === 640, "no sector came");
+    await page.getByLabel("Off the skin").selectOption({ index: 1 });
     await page.getByRole("button", { name: "Add a needle" }).click();
     await page.getByLabel("Frame of the tool").selectOption("probe");
     await page.getByRole("button", { name: "Add a box" }).click();
@@ -114,6 +121,37 @@ describe("connect", () => {
     const image = JSON.parse(run(PYTHON, "-c", ROS, written("node.sh", await program(page, "ros"))));
     assert.deepEqual(image, [height, width, 6, "convex", ["needle", "box"]]);
     await picture(page, "connect");
+    assert.deepEqual(page.faults, []);
+  });
+
+  it("gives the programs the poses of a robot where its registration is chosen, and they render the same image", async () => {
+    const flange = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 142], [0, 0, 0, 1]];
+    const base = [[1, 0, 0, -400], [0, -1, 0, 20], [0, 0, -1, 168], [0, 0, 0, 1]];
+    const body = JSON.stringify({ scene: "demo", base_to_scene: base, probe_to_flange: flange });
+    const kept = await fetch(`${at.service.url}/v1/registrations/arm`, { method: "PUT", body, headers: { "Content-Type": "application/json" } });
+    assert.ok(kept.ok, await kept.text());
+    const { page } = await openScan(at);
+    for (const name of ["of the probe, in the scene", "arm"]) {
+      if (name === "arm") {
+        await page.getByRole("button", { name: "Registrations: show or hide" }).click();
+        await page.getByRole("radio", { name }).check();
+        await page.getByText("The pose is flange to base; the service leads it into the scene by arm.").waitFor();
+      }
+      const asking = await program(page, "curl");
+      assert.equal(asking.includes('"registration": "arm"'), name === "arm");
+      run("bash", written("ask.sh", asking));
+      renameSync(path.join(folder, "frame.png"), path.join(folder, name === "arm" ? "arm.png" : "probe.png"));
+    }
+    const [most, apart] = JSON.parse(run(PYTHON, "-c", APART, "probe.png", "arm.png"));
+    assert.ok(most > 100 && apart <= 2, `the robot's pose shows another image: ${apart} grey values apart`);
+    const asking = await program(page, "python");
+    assert.match(asking, /registration="arm"/);
+    assert.match(run(PYTHON, written("ask.py", asking)), /bmode \d+x\d+/);
+    const call = written("grpcurl.sh", await program(page, "grpc"));
+    assert.match(run(PYTHON, "-c", GRPCURL, call), /^\d+ \d+ \d+ \[\]/);
+    assert.equal(JSON.parse(run(PYTHON, "-c", ROS, written("node.sh", await program(page, "ros"))))[3], "linear");
+    await program(page, "igtl");
+    await page.getByText("names a registration by the parameter Registration").waitFor();
     assert.deepEqual(page.faults, []);
   });
 

@@ -54,6 +54,24 @@ describe("the registrations", () => {
     assert.deepEqual([page.faults, page.foreign], [[], []]);
   });
 
+  it("are followed where they are changed at the service, and told where they are gone", async () => {
+    const address = `${at.service.url}/v1/registrations/moved`;
+    const put = async (base) => {
+      const body = JSON.stringify({ scene: "demo", base_to_scene: base, probe_to_flange: PROBE_TO_FLANGE });
+      assert.ok((await fetch(address, { method: "PUT", body, headers: { "Content-Type": "application/json" } })).ok);
+    };
+    await put(BASE_TO_SCENE);
+    const page = await openPanel();
+    await enterPose(page, '{"position_mm": {"x": 0, "y": 0, "z": 0}, "quaternion": {"w": 1, "x": 0, "y": 0, "z": 0}}');
+    await panelOf(page).getByRole("radio", { name: "moved" }).check();
+    await until(() => poseOf(page), ({ position_mm: { x } }) => x === 400, "not the flange in the base");
+    await put(BASE_TO_SCENE.map(([a, b, c, d], row) => [a, b, c, row === 0 ? d - 7 : d]));
+    await until(() => poseOf(page), ({ position_mm: { x } }) => x === 407, "the pose is still told by what was stored before", 20_000);
+    assert.ok((await fetch(address, { method: "DELETE" })).ok);
+    await panelOf(page).getByText("moved is not stored any more: poses are those of the probe again.").waitFor({ timeout: 20_000 });
+    await until(() => poseOf(page), ({ position_mm: { x } }) => x === 0, "the pose is still the flange's");
+  });
+
   it("move the probe by the numbers of the flange", async () => {
     const page = await openPanel();
     await enterPose(page, '{"position_mm": {"x": 0, "y": 0, "z": 0}, "quaternion": {"w": 1, "x": 0, "y": 0, "z": 0}}');

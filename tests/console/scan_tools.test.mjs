@@ -131,15 +131,19 @@ describe("the image", () => {
   it("is saved with all words of what it is, and its side", async () => {
     const { page, first } = await openScan(at, { init: watchWords });
     await page.getByRole("combobox", { name: "Probe" }).selectOption("linear"); // narrower than the words are long
-    await changed(page, first.print);
+    const narrow = await changed(page, first.print);
     await page.getByText("view 106 of 211").waitFor(); // the probe is where it was
+    await page.getByRole("button", { name: "Add a needle" }).click();
+    const needle = await changed(page, narrow.print);
+    await page.getByLabel("Ghost echoes", { exact: true }).fill("0.5");
+    await changed(page, needle.print);
     for (const side of ["left", "right"]) {
       await page.evaluate(() => (globalThis.words = []));
       const [download] = await Promise.all([page.waitForEvent("download"), page.getByRole("button", { name: "Save" }).click()]);
       assert.ok(readFileSync(await download.path()).length > 1000);
       const words = await page.evaluate(() => globalThis.words);
       assert.deepEqual(words.filter(({ fits }) => !fits), []);
-      assert.match(words.map(({ text }) => text).join("\n"), /Simulated, not for diagnosis\.[^]*demo[^]*slice 0\.0 mm[^]*"quaternion"/);
+      assert.match(words.map(({ text }) => text).join("\n"), /Simulated, not for diagnosis\.[^]*demo[^]*slice 0\.0 mm[^]*Drawn in: Needle[^]*Ghost echoes[^]*"quaternion"/);
       assert.equal(words.find(({ text }) => text === "U").left, side === "left");
       await page.getByLabel("Flip").check();
       await page.locator('[data-testid="orientation-marker"][data-side="right"]').waitFor();

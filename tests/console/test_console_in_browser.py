@@ -1,4 +1,4 @@
-"""The console in Debian's Chromium against a real service: one view in `make test`, the others in `make test-long`."""
+"""The console in Chromium against a real service: one view in `make test`, all of them in `make test-console`."""
 
 from __future__ import annotations
 
@@ -51,16 +51,10 @@ def test_bundle_is_small() -> None:
     assert 0 < total < MAX_BUNDLE_BYTES
 
 
-@pytest.mark.parametrize(
-    "view",
-    [
-        pytest.param(path.name, marks=pytest.mark.slow if path.name == IN_EVERY_RUN else pytest.mark.long)
-        for path in sorted(HERE.glob("*.test.mjs"))
-    ],
-)
-def test_view(view: str) -> None:
+@pytest.mark.slow
+def test_view_of_every_run() -> None:
     outcome = subprocess.run(
-        ["node", "--test", "--test-reporter=spec", str(HERE / view)],
+        ["node", "--test", "--test-reporter=spec", str(HERE / IN_EVERY_RUN)],
         env={**os.environ, "ULTRAGRAY_TEST_PYTHON": sys.executable},
         capture_output=True,
         text=True,

@@ -197,13 +197,14 @@ class Connection:
 
         Where only tools have moved, the frame of the pose before is rendered again.
         """
+        tools = self._scanner.setup.tools
         if message.type_name == "TRANSFORM":
             poses = [(message.device_name, unpack_transform(message.content))]
         elif message.type_name == "POSITION":
             poses = [(message.device_name, unpack_position(message.content))]
         else:
-            poses = [(one.name, one.pose) for one in unpack_instruments(message.type_name, message.content)]
-        tools = self._scanner.setup.tools
+            instruments = unpack_instruments(message.type_name, message.content, tools.are_moved_by)
+            poses = [(one.name, one.pose) for one in instruments]
         of_tools = [(name, pose) for name, pose in poses if tools.are_moved_by(name)]
         of_probes = [(name, pose) for name, pose in poses if not tools.are_moved_by(name)]
         if message.type_name in _MANY_POSES:

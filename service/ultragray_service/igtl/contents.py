@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
+from ultragray.errors import InvalidPose
 from ultragray.pose import check_poses, pose_from_position_quaternion, quaternion_from_pose
 from ultragray.probe import FloatArray
 
@@ -81,10 +82,13 @@ def pack_position(pose: FloatArray) -> bytes:  # [4, 4]
     return struct.pack(">7f", *pose[:3, 3], x, y, z, w)
 
 
-def unpack_instruments(type_name: str, content: bytes) -> list[Instrument]:
+def unpack_instruments(
+    type_name: str, content: bytes, may_be_unseen: Callable[[str], bool] = lambda name: False
+) -> list[Instrument]:
     """The instruments of a TDATA or QTDATA, at most MAX_INSTRUMENTS, that have both position and orientation.
 
-    Raises IgtlMessageInvalid and InvalidPose, naming the instrument.
+    Those of a name that `may_be_unseen` are left out where their pose is none, as trackers send it of what they lost.
+    Raises IgtlMessageInvalid and, naming the instrument, InvalidPose.
     """
     size = _INSTRUMENT.size + _POSE_BYTES[type_name]
     if len(content) % size:
@@ -101,8 +105,13 @@ def unpack_instruments(type_name: str, content: bytes) -> list[Instrument]:
         name, kind, _ = _INSTRUMENT.unpack_from(content, start)
         if kind == _INSTRUMENT_6D:
             text = unpack_text(name)
-            pose = unpack(content[start + _INSTRUMENT.size : start + size], f"{type_name} of {text!r}")
-            instruments.append(Instrument(text, pose))
+            try:
+                pose = unpack(content[start + _INSTRUMENT.size : start + size], f"{type_name} of {text!r}")
+            except InvalidPose:
+                if not may_be_unseen(text):
+                    raise
+            else:
+                instruments.append(Instrument(text, pose))
     return instruments
 
 

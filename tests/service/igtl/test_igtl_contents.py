@@ -83,6 +83,15 @@ def test_tools_without_orientation_are_left_out() -> None:
     assert [tool.name for tool in unpack_instruments("QTDATA", bytes(content))] == ["Probe"]
 
 
+@pytest.mark.parametrize("lost", [0.0, float("nan")])
+def test_a_tool_that_the_tracker_lost_costs_the_probe_nothing(lost: float) -> None:
+    content = pack_instruments("TDATA", [Instrument("Probe", np.eye(4))])
+    content += struct.pack(">20sBB12f", b"Needle", 2, 0, *[lost] * 12)
+    assert [one.name for one in unpack_instruments("TDATA", content, lambda name: name == "Needle")] == ["Probe"]
+    with pytest.raises(InvalidPose, match="TDATA of 'Needle'"):
+        unpack_instruments("TDATA", content)
+
+
 def test_what_is_no_pose_is_refused() -> None:
     mirror = np.diag([1.0, 1, -1, 1])
     with pytest.raises(InvalidPose, match="TRANSFORM must hold a rotation"):

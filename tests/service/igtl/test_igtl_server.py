@@ -284,7 +284,9 @@ class SlowPeer:
         return message.timestamp / 2**32
 
 
-@pytest.mark.parametrize("scene", ["demo", "medium", "large"])
+@pytest.mark.parametrize(
+    "scene", ["demo", *(pytest.param(scene, marks=pytest.mark.long) for scene in ("medium", "large"))]
+)
 def test_a_slow_reader_gets_no_old_image(peer: Peer, scene: str) -> None:
     check_fresh(SlowPeer(peer, scene))
 
@@ -309,6 +311,6 @@ class SlowViewer:
         return self._viewer.receive().timestamp / 2**32
 
 
-@pytest.mark.parametrize("scene", ["medium", "large"])
+@pytest.mark.parametrize("scene", ["medium", pytest.param("large", marks=pytest.mark.long)])
 def test_a_slow_subscriber_gets_no_image_from_before_its_last_two_readings(connect: Connect, scene: str) -> None:
     check_fresh(SlowViewer(connect(), connect(), scene), pauses=3)

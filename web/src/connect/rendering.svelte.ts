@@ -17,9 +17,7 @@ export class Rendering {
   async start(session: Session, poses: readonly Pose[], format: string): Promise<void> {
     this.problem = null;
     this.#sending = true;
-    const { height, width, probe, display, slice_thickness_mm, tools, ghost } = session.settings(["bmode"]);
-    const image = { height, width, probe, display, slice_thickness_mm, tools, ghost };
-    const specification = { scene: session.name, poses: written(poses), format, ...image };
+    const specification = { scene: session.name, poses: written(poses), format, ...session.settings(["bmode"]) };
     try {
       this.job = await startJob("render", specification, false);
       this.#sending = false;

@@ -23,6 +23,7 @@ export interface Target {
 
 /** What is asked for. */
 export interface Asked {
+  /** Probe to scene; flange to base where the settings name a registration. */
   pose: Pose;
   /** Of the probe that the scene was trained with, which OpenIGTLink takes. */
   trainedPose: Pose;
@@ -100,7 +101,7 @@ np.save("frame.npy", frame["bmode"])
 }
 
 function grpc(target: Target, { pose, settings }: Asked): string {
-  const { probe, outputs, below_min_confidence, tools, ...plain } = known(settings) as Given & {
+  const { probe, outputs, below_min_confidence, contact, tools, ...plain } = known(settings) as Given & {
     probe?: Given;
     outputs?: string[];
     tools?: ToldTool[];
@@ -109,6 +110,7 @@ function grpc(target: Target, { pose, settings }: Asked): string {
   if (outputs !== undefined) message.outputs = outputs.map((output) => `OUTPUT_${output.toUpperCase()}`);
   if (below_min_confidence !== undefined)
     message.below_min_confidence = `BELOW_CONFIDENCE_${String(below_min_confidence).toUpperCase()}`;
+  if (contact !== undefined) message.contact = `CONTACT_${String(contact).toUpperCase()}`;
   if (probe !== undefined) {
     const { kind, ...numbers } = probe;
     message.probe = { [String(kind)]: numbers };

@@ -7,12 +7,14 @@ import { length } from "./vector";
 /** What a registration makes of poses. */
 export interface Registered {
   name: string;
+  /** ISO 8601, UTC. */
+  changedAt: string;
   baseToScene: Pose;
   probeToFlange: Pose;
 }
 
-export function registeredBy({ name, base_to_scene, probe_to_flange }: Registration): Registered {
-  return { name, baseToScene: base_to_scene.flat(), probeToFlange: probe_to_flange.flat() };
+export function registeredBy({ name, changed_at, base_to_scene, probe_to_flange }: Registration): Registered {
+  return { name, changedAt: changed_at, baseToScene: base_to_scene.flat(), probeToFlange: probe_to_flange.flat() };
 }
 
 /** Flange to base of a pose of the probe in the scene. */

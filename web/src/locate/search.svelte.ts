@@ -18,6 +18,7 @@ export class Search {
   isRunning = $state(false);
   problem = $state<string | null>(null);
   #ending = new AbortController();
+  #newest: File | null = null;
 
   constructor(private readonly session: Session) {}
 
@@ -29,13 +30,16 @@ export class Search {
   async take(file: File): Promise<void> {
     this.stop();
     this.problem = null;
+    this.#newest = file;
     try {
       const frame = await readFrame(file);
+      if (this.#newest !== file) return; // another one was given meanwhile
+      this.stop();
       this.#forgetResult();
       this.frame = frame;
       this.#replace("given", file);
     } catch (error) {
-      this.problem = explain(error);
+      if (this.#newest === file) this.problem = explain(error);
     }
   }
 

@@ -29,14 +29,23 @@ FRAMES_FILE = "frames.json"
 
 @dataclass(frozen=True)
 class Wanted:
-    """What a command line asks for."""
+    """What a command line asks for. Raises InvalidArgument for a registration that has no poses to lead."""
 
     scene: str
     output: Path
     suffix: str | None  # of SUFFIXES; None: a folder of PNGs
     pose_file: Path | None
     sampler: Sampler | None
+    registration: str | None  # that leads the poses of the file into the scene
     settings: FrameSettings
+
+    def __post_init__(self) -> None:
+        if self.registration is not None and (self.pose_file is None or self.sampler is not None):
+            raise InvalidArgument(
+                "a registration leads the poses of a file, which must be given with --poses and without --sampler; "
+                "ultragray jobs submit render samples about such poses",
+                field="registration",
+            )
 
 
 def checked_kind(output: Path, settings: FrameSettings, *, force: bool) -> str | None:
@@ -65,6 +74,8 @@ def render_remotely(connection: Connection, wanted: Wanted) -> dict[str, Any]:
     scenes = Scenes(connection)
     poses = _poses(scenes, wanted, given)
     settings = to_dict(wanted.settings, with_none=False)
+    if wanted.registration is not None:
+        settings["registration"] = wanted.registration
     if wanted.suffix is None:
         shape = _write_folder(scenes, wanted, settings, poses)
     else:

@@ -9,9 +9,9 @@ import typer
 
 from ultragray.samplers import Sampler
 from ultragray.scene_info import read_header
-from ultragray.settings import FrameSettings
+from ultragray.settings import FrameSettings, RenderSettings
 
-from ..options import poses_option, with_options
+from ..options import FieldsOf, poses_option, with_options
 from ..output import SCENE_SUFFIX, check_file, print_table
 from ..progress import transferred
 from ..scenes.show import print_facts
@@ -105,6 +105,7 @@ def delete(connection: Connection, name: SceneName, json: Json = False) -> None:
     epilog=examples(
         "ultragray scenes render demo -o frame.png  # at the middle training pose",
         "ultragray scenes render demo -o frames.npz --poses path.npy --outputs bmode,echo",
+        "ultragray scenes render demo -o frames.npz --poses flange.npy --registration robot",
         "ultragray scenes render demo -o pictures/ --sampler fan --tilt-deg 20 --step-deg 2",
     )
 )
@@ -120,11 +121,13 @@ def render(
     *,
     sampler: Sampler | None,
     settings: FrameSettings,
+    of_poses: Annotated[dict[str, Any], FieldsOf(RenderSettings, "registration")],
 ) -> None:
     """Have the service render a frame or some frames. Many thousands are a job: `ultragray jobs submit render`."""
     from .rendering import render_remotely
 
-    wanted = Wanted(name, output, checked_kind(output, settings, force=force), poses, sampler, settings)
+    suffix = checked_kind(output, settings, force=force)
+    wanted = Wanted(name, output, suffix, poses, sampler, of_poses.get("registration"), settings)
     document = render_remotely(connection, wanted)
     size = f"{document['height']}x{document['width']}"
     tell(

@@ -74,9 +74,19 @@ export class Sheet {
   }
 
   #lines({ frame, marks }: Page): string[] {
-    const { scene, slice_thickness_mm, pose } = frame.header;
+    const { scene, slice_thickness_mm, pose, tools, ghost } = frame.header;
     const warning = confidenceWords(frame.header, this.description)?.warning ?? "";
-    const told = [words.scan.store.simulated, ...(warning === "" ? [] : [`${warning}.`]), scene, new Date().toISOString(), words.scan.store.slice(slice_thickness_mm), words.scan.store.depthInCm];
+    const said = words.scan.store;
+    const told = [
+      said.simulated,
+      ...(warning === "" ? [] : [`${warning}.`]),
+      scene,
+      new Date().toISOString(),
+      said.slice(slice_thickness_mm),
+      said.depthInCm,
+      ...(tools.length === 0 ? [] : [said.drawn(tools.map(({ kind }) => words.tools.kinds[kind]).join(", "))]),
+      ...(ghost === 0 ? [] : [words.tools.ghostMeans]),
+    ];
     const measured = marks.filter(({ kind }) => kind !== "text").map((mark) => `${this.marks.letterOf(mark.id)}  ${resultOf(mark)}`);
     return [
       ...this.#wrapped(measured, GAP),

@@ -221,6 +221,8 @@ export const connect: Words["connect"] = {
     copyShort: "Kopieren",
     selected: "Dieser Browser lässt die Seite nicht kopieren. Der Text ist ausgewählt: Strg+C drücken.",
     off: "Dieser Dienst hat keinen Port für OpenIGTLink. Wer ihn betreibt, kann einen öffnen.",
+    registered: (name) => `Die Lage ist die des Flansches zur Basis; der Dienst führt sie mit ${name} in die Szene.`,
+    notRegistered: "Die Lage ist die des Schallkopfs in der Szene; eine Verbindung über OpenIGTLink nennt eine Registrierung mit dem Parameter Registration.",
     localOnly: "OpenIGTLink antwortet nur Programmen auf dem Rechner des Dienstes.",
     ports: "Steht ein Proxy vor dem Dienst, kann sein gRPC-Port ein anderer sein.",
     key: "Setzen Sie Ihren API-Schlüssel an die Stelle von YOUR_KEY.",

@@ -20,6 +20,7 @@ export const registrations: Words["registrations"] = {
   angles: (name) => `Winkel gegen die Achsen von ${name}`,
   about: (axis) => `Um ${axis}`,
   form: (name) => `Flansch zu Basis, wie ${name} sie angibt`,
+  gone: (name) => `${name} ist nicht mehr gespeichert: Lagen sind wieder die des Schallkopfs.`,
   tag: (name) => `nach ${name}`,
   tagMeans: "Lagen werden nach dieser Registrierung angegeben; gewählt unten bei den Registrierungen",
 };

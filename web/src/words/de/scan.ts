@@ -75,6 +75,7 @@ export const scan: Words["scan"] = {
     noPicture: "Dieser Browser kann das Bild nicht schreiben.",
     noVideo: "Dieser Browser kann kein Video aufnehmen. Auch DICOM kann den Loop aufnehmen.",
     simulated: "Simuliert, nicht zur Diagnose.",
+    drawn: (tools) => `Eingezeichnet: ${tools}`,
     slice: (thickness_mm) => `Schicht ${thickness_mm.toFixed(1).replace(".", ",")} mm`,
     depthInCm: "Tiefe in cm",
   },

@@ -242,6 +242,8 @@ export const connect = {
     copyShort: "Copy",
     selected: "This browser does not let the page copy. The text is selected: press Ctrl+C.",
     off: "This service has no OpenIGTLink port. Whoever runs it can open one.",
+    registered: (name: string) => `The pose is flange to base; the service leads it into the scene by ${name}.`,
+    notRegistered: "The pose is that of the probe in the scene; a connection of OpenIGTLink names a registration by the parameter Registration.",
     localOnly: "OpenIGTLink answers only programs on the service's own machine.",
     ports: "Where a proxy stands in front of the service, its gRPC port may be another one.",
     key: "Put your API key in the place of YOUR_KEY.",

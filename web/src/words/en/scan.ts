@@ -137,6 +137,7 @@ export const scan = {
     noPicture: "This browser cannot write the picture.",
     noVideo: "This browser cannot record video. DICOM can hold the loop, too.",
     simulated: "Simulated, not for diagnosis.",
+    drawn: (tools: string): string => `Drawn in: ${tools}`,
     slice: (thickness_mm: number): string => `slice ${thickness_mm.toFixed(1)} mm`,
     depthInCm: "depth in cm",
   },
