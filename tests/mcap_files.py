@@ -107,6 +107,10 @@ class Bag:
             self._schemas[kind] = self._writer.register_msgdef(kind, DEFINITIONS[kind])
         self._writer.write_message(topic, self._schemas[kind], message, log_time=time_ns + 3_000_000)
 
+    def define(self, kind: str, fields: str) -> None:
+        """From here on a kind of message has these fields."""
+        self._schemas[kind] = self._writer.register_msgdef(kind, fields)
+
     def poses(self, topic: str = "/tracker/pose", *, rate_hz: float = 50.0, seconds: float = 1.0) -> None:
         """Poses of `moving_pose` from START_NS on."""
         for number in range(int(seconds * rate_hz) + 1):

@@ -9,6 +9,7 @@ import numpy as np
 
 from ..errors import InvalidPose
 from ..installation import missing_extra
+from ..interchange.ros_fields import check_fields
 from ..interchange.ros_messages import POSE
 from ..interchange.ros_poses import pose_of_message
 from ..probe import FloatArray
@@ -35,6 +36,8 @@ def read_mcap_poses(path: Path) -> FloatArray:  # [P, 4, 4]
             raise
         except Exception as error:  # the library has many kinds for a file that is not whole
             raise ValueError(f"it is no whole MCAP file ({error or type(error).__name__})") from error
+    for message in messages:
+        check_fields(message, POSE)
     try:
         poses = [pose_of_message(message, field=f"poses[{place}]") for place, message in enumerate(messages)]
     except InvalidPose as error:

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..errors import InvalidArgument
+from ..pose import MAX_POSITION_MM
 from ..probe import FloatArray
 from ..scene_info import SceneInfo
 
@@ -38,7 +39,7 @@ class VolumeGrid:
 
         Raises InvalidArgument, naming `spacing_mm` or `box_mm`, for a box without extent and for too many voxels.
         """
-        low, high = _vector(low_mm, "box_mm"), _vector(high_mm, "box_mm")
+        low, high = _lengths(low_mm, "box_mm"), _lengths(high_mm, "box_mm")
         _check_spacing(spacing_mm)
         if not (high > low).all():
             raise InvalidArgument(
@@ -70,14 +71,14 @@ class VolumeGrid:
         The directions may have any length and must be at a right angle. `size_mm`: width and height. Raises
         InvalidArgument, naming the argument.
         """
-        origin = _vector(origin_mm, "origin_mm")
+        origin = _lengths(origin_mm, "origin_mm")
         axes = np.stack([_direction(right, "right"), _direction(down, "down")])
         if abs(float(axes[0] @ axes[1])) > RIGHT_ANGLE_TOLERANCE:
             angle = math.degrees(math.acos(float(np.clip(axes[0] @ axes[1], -1, 1))))
             raise InvalidArgument(f"down must be at a right angle to right, the angle is {angle:.2f}°", field="down")
         axes[1] -= (axes[0] @ axes[1]) * axes[0]
         axes[1] /= np.linalg.norm(axes[1])
-        size = _vector(size_mm, "size_mm", 2)
+        size = _lengths(size_mm, "size_mm", 2)
         _check_spacing(spacing_mm)
         if not (size > 0).all():
             raise InvalidArgument(f"size_mm must be a width and a height above 0, got {_words(size)}", field="size_mm")
@@ -128,19 +129,28 @@ def _vector(values: Sequence[float], field: str, count: int = 3) -> FloatArray:
     return vector
 
 
+def _lengths(values: Sequence[float], field: str, count: int = 3) -> FloatArray:
+    vector = _vector(values, field, count)
+    if (np.abs(vector) > MAX_POSITION_MM).any():
+        raise InvalidArgument(f"{field} must be at most {MAX_POSITION_MM:g} mm, got {_words(vector)}", field=field)
+    return vector
+
+
 def _direction(values: Sequence[float], field: str) -> FloatArray:
     vector = _vector(values, field)
-    length = float(np.linalg.norm(vector))
-    if length == 0.0:
+    largest = float(np.abs(vector).max())
+    if largest == 0.0:
         raise InvalidArgument(f"{field} must be a direction, got {_words(vector)}", field=field)
-    unit: FloatArray = vector / length
+    vector = vector / largest  # of which the square is a number
+    unit: FloatArray = vector / np.linalg.norm(vector)
     return unit
 
 
 def _check_spacing(spacing_mm: float) -> None:
-    if not SMALLEST_SPACING_MM <= spacing_mm < math.inf:
+    if not SMALLEST_SPACING_MM <= spacing_mm <= MAX_POSITION_MM:
         raise InvalidArgument(
-            f"spacing_mm must be {SMALLEST_SPACING_MM:g} mm or more, got {spacing_mm:g}", field="spacing_mm"
+            f"spacing_mm must be {SMALLEST_SPACING_MM:g} to {MAX_POSITION_MM:g} mm, got {spacing_mm:g}",
+            field="spacing_mm",
         )
 
 

@@ -143,7 +143,7 @@ def test_poses_in_other_units_are_named(
     assert warnings == (() if told is None else (f"the poses of all 40 training frames {told}",))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["liver_convex", "nwire_phantom", "spine_phantom", "ultranerf_liver"])
 def test_real_units_are_usual(data_folder: Path, name: str) -> None:
     dataset = load_dataset(data_folder / name)

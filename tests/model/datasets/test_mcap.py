@@ -240,6 +240,19 @@ def test_a_tracker_of_transforms_is_read(path: Path) -> None:
     check_whole(load_dataset(bag.finish()))
 
 
+def test_one_topic_of_two_tracked_tools_is_refused(path: Path) -> None:
+    bag = Bag(path)
+    bag.geometry()
+    for number in range(51):
+        time_ns = START_NS + number * SECOND // 50
+        for tool in ("probe", "needle"):
+            message = transform_message(moving_pose(number / 50), time_ns, "tracker", tool)
+            bag.write("/ndi/transforms", TRANSFORM, message, time_ns)
+    bag.images()
+    with pytest.raises(DatasetInvalid, match=r"it tells those of 2: needleTotracker, probeTotracker; record"):
+        load_dataset(bag.finish())
+
+
 def test_topics_are_chosen_or_listed(path: Path) -> None:
     bag = Bag(path)
     bag.geometry(topic="/a/geometry")
@@ -305,6 +318,12 @@ def test_what_changes_on_the_way_is_told_with_the_frames_to_choose(path: Path, s
     assert parts(load_dataset(path, SourceOptions(frames="8:12")))[0].tolist() == [8, 9, 10, 11]
 
 
+STANDING = {
+    "probe": {"kind": "convex", "opening_angle_deg": 60, "near_mm": 40, "far_mm": 90},
+    "picture": {"column_unit": "mm", "first_column": -45, "first_row_mm": 34, "column_step": 0, "row_step_mm": 0.2},
+}
+
+
 def small(**changes: Any) -> Callable[[Bag], None]:
     """A recording with something else in it."""
 
@@ -327,18 +346,67 @@ def small(**changes: Any) -> Callable[[Bag], None]:
         (small(geometry="no JSON"), r"the geometry of its images cannot be read"),
         (small(geometry='{"probe": {"kind": "lunar"}}'), r"the geometry of its images cannot be read"),
         (small(geometry='{"frame_id": "probe"}'), r"it must be an object with a probe"),
+        (small(geometry=json.dumps(STANDING)), r"column_step must not be 0"),
         (small(late_ns=90 * SECOND), r"none of 1 images has a pose: images are stamped .* were the clocks other ones"),
         (small(image={"encoding": "bayer_rggb8"}), r"frame 0: its encoding must be one of mono8, .*got 'bayer_rggb8'"),
         (small(image={"height": 2_000_000_000}), r"frame 0: 2000000000 rows of 32 bytes must hold 32 pixels"),
         (small(image={"step": 8}), r"frame 0: 24 rows of 8 bytes must hold 32 pixels"),
         (small(), r"at least two training frames, got 1"),
     ],
-    ids=range(11),
+    ids=range(12),
 )
 def test_what_cannot_be_used_is_one_clear_error(path: Path, write: Callable[[Bag], None], told: str) -> None:
     bag = Bag(path)
     write(bag)
     with pytest.raises(DatasetInvalid, match=told):
+        load_dataset(bag.finish())
+
+
+STAMPED = (
+    "std_msgs/Header header\n{}\n====\nMSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n====\n"
+)
+STAMPED += "MSG: builtin_interfaces/Time\n{}\n"
+ORDINARY_TIME = "int32 sec\nuint32 nanosec"
+HEADER = {"stamp": {"sec": 1, "nanosec": 0}, "frame_id": "probe"}
+
+
+@pytest.mark.parametrize(
+    ("kind", "definition", "message", "field"),
+    [
+        (ros.IMAGE, "string text", {"text": "no pixels"}, "header.stamp.sec"),
+        (ros.IMAGE, STAMPED.format("string height", ORDINARY_TIME), {"header": HEADER, "height": "2"}, "height"),
+        (
+            ros.IMAGE,
+            STAMPED.format("uint32 height", "int64 sec\nuint32 nanosec"),
+            {"header": HEADER | {"stamp": {"sec": 1 << 40, "nanosec": 0}}, "height": 2},
+            "header.stamp.sec",
+        ),
+        (ros.POSE, STAMPED.format("float64 pose", ORDINARY_TIME), {"header": HEADER, "pose": 1.0}, "pose.position.x"),
+        (TRANSFORMS, "string[] transforms", {"transforms": ["up"]}, "transforms.header.stamp.sec"),
+        (TRANSFORMS, "string transforms", {"transforms": "up"}, "transforms"),
+        (ros.TEXT, "int32 data", {"data": 4}, "data"),
+    ],
+)
+def test_other_messages_under_the_names_of_those_that_are_read_are_told(
+    path: Path, kind: str, definition: str, message: dict[str, Any], field: str
+) -> None:
+    bag = Bag(path)
+    bag.define(kind, definition)
+    bag.write("/us/geometry", kind, message, START_NS)
+    if kind != ros.POSE:
+        bag.poses()
+    with pytest.raises(
+        DatasetInvalid, match=rf"what it calls {kind} is another kind of message: see its field {field}$"
+    ):
+        load_dataset(bag.finish())
+
+
+def test_a_time_of_writing_beyond_all_bounds_is_refused(path: Path) -> None:
+    bag = Bag(path)
+    bag.write("/us/geometry", ros.TEXT, {"data": GEOMETRY}, 1 << 63)
+    with pytest.raises(
+        DatasetInvalid, match=r"a message of /us/geometry was written 92\d+ ns after 1970, the limit is"
+    ):
         load_dataset(bag.finish())
 
 

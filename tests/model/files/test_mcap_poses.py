@@ -13,6 +13,8 @@ from ultragray.errors import InvalidPose
 from ultragray.files.poses import load_poses
 from ultragray.interchange.ros_messages import DEFINITIONS, IMAGE, POSE, pose_message
 
+from ...mcap_files import Bag
+
 
 def record(path: Path, topics: dict[str, list[tuple[int, Any]]], *, kind: str = POSE, finish: bool = True) -> Path:
     """A file with messages (time in ns, message) by topic."""
@@ -64,6 +66,14 @@ def test_a_file_of_images_alone_tells_what_it_has(tmp_path: Path) -> None:
     topics: dict[str, Any] = {"/camera": [(0, {**image, "step": 1, "data": b"0"})]}
     with pytest.raises(InvalidPose, match=r"it has: /camera \(sensor_msgs/msg/Image\)"):
         load_poses(record(tmp_path / "bag.mcap", topics, kind=IMAGE))
+
+
+def test_what_is_only_called_a_pose_is_told(tmp_path: Path) -> None:
+    bag = Bag(tmp_path / "bag.mcap")
+    bag.define(POSE, "string text")
+    bag.write("/a", POSE, {"text": "here"}, 0)
+    with pytest.raises(InvalidPose, match=r"bag\.mcap.*what it calls geometry_msgs/msg/PoseStamped is another kind"):
+        load_poses(bag.finish())
 
 
 def test_a_file_that_is_not_whole_is_refused(tmp_path: Path) -> None:

@@ -38,6 +38,9 @@ def test_the_pose_of_a_slice_leads_back_to_its_pixels() -> None:
         ({"right": (0, 0, 1)}, "down"),
         ({"down": (0, 0, 0)}, "down"),
         ({"size_mm": (0, 1)}, "size_mm"),
+        ({"size_mm": (3.8e16, 3.1e299)}, "size_mm"),
+        ({"size_mm": (1e6, 1e6)}, "spacing_mm"),
+        ({"origin_mm": (0, -1e308, 0)}, "origin_mm"),
         ({"spacing_mm": 1e-9}, "spacing_mm"),
         ({"origin_mm": (0, 0)}, "origin_mm"),
         ({"origin_mm": (0, 0, float("nan"))}, "origin_mm[2]"),
@@ -47,6 +50,12 @@ def test_planes_that_cannot_be_are_refused(changes: dict[str, Any], field: str) 
     with pytest.raises(InvalidArgument) as caught:
         SliceSettings(**{"origin_mm": (0, 0, 0), "size_mm": (10, 10), **changes})
     assert caught.value.field == field
+
+
+@pytest.mark.parametrize("length", [5e-324, 1e-200, 1e200, 1.7e308])
+def test_a_direction_may_have_any_length(length: float) -> None:
+    grid = SliceSettings(origin_mm=(0, 0, 0), size_mm=(10, 10), right=(0, length, 0), down=(length, 0, 0)).grid()
+    np.testing.assert_array_equal(grid.axes, [[0, 1, 0], [1, 0, 0], [0, 0, -1]])
 
 
 def test_a_slice_is_bound_by_its_cost_and_ends_where_it_is_given_up(

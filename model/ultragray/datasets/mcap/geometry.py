@@ -38,6 +38,11 @@ class PixelGrid(Contract):
     column_step: float = described("To the next column; negative where left and right are exchanged.")
     row_step_mm: float = described("To the next row.", above=0.0)
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.column_step == 0.0:
+            raise InvalidArgument("column_step must not be 0", field="column_step")
+
 
 @dataclass(frozen=True)
 class ImageGeometry:

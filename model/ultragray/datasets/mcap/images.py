@@ -8,10 +8,11 @@ import cv2
 import numpy as np
 
 from ...errors import DatasetInvalid
+from ...interchange.ros_fields import COMPRESSED
+from ...interchange.ros_messages import IMAGE
 from ..images import grey_frames
 from ..sweep import ByteArray
 
-IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 KINDS = (IMAGE, COMPRESSED)
 _FLAGS = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
 

@@ -14,14 +14,16 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap_ros2.decoder import DecoderFactory
 
 from ...errors import DatasetInvalid
+from ...interchange.ros_fields import check_fields
 
 MAX_RECORD_BYTES = 1 << 30  # of a chunk, compressed or not
+MAX_TIME_NS = (1 << 63) - 1
 NS_PER_S = 1_000_000_000
 
 
 @dataclass(frozen=True)
 class StoredMessage:
-    """A message. `decode` gives its fields as attributes."""
+    """A message. `decode` gives its fields as attributes, those of its kind. Raises DatasetInvalid."""
 
     topic: str
     kind: str  # such as sensor_msgs/msg/Image
@@ -49,6 +51,11 @@ class MessageFile:
                 channel = channels.get(record.channel_id)
                 if channel is None:
                     raise DatasetInvalid(f"{self.path}: a message is of channel {record.channel_id}, which it lacks")
+                if record.log_time > MAX_TIME_NS:
+                    raise DatasetInvalid(
+                        f"{self.path}: a message of {channel.topic} was written {record.log_time} ns after 1970, the "
+                        f"limit is {MAX_TIME_NS}"
+                    )
                 schema = schemas.get(channel.schema_id)
                 yield StoredMessage(
                     channel.topic,
@@ -87,8 +94,10 @@ class MessageFile:
     def _decoded(self, data: bytes, channel: Channel, schema: Schema | None) -> Any:
         try:
             decode = self._decoders.decoder_for(channel.message_encoding, schema)
-            if decode is not None:
-                return decode(data)
+            if decode is not None and schema is not None:
+                message = decode(data)
+                check_fields(message, schema.name)
+                return message
         except MemoryError:
             raise
         except Exception as error:

@@ -11,6 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from ...errors import DatasetInvalid, InvalidArgument, InvalidPose
+from ...interchange.ros_fields import TRANSFORM, TRANSFORMS
+from ...interchange.ros_messages import POSE
 from ...interchange.ros_poses import pose_of_parts
 from ...probe import FloatArray
 from ...samplers.rotations import blended
@@ -18,11 +20,6 @@ from ..plus.transforms import TransformName, find_path
 from ..sweep import IntArray
 from .messages import StoredMessage, time_of
 
-POSE, TRANSFORM, TRANSFORMS = (
-    "geometry_msgs/msg/PoseStamped",
-    "geometry_msgs/msg/TransformStamped",
-    "tf2_msgs/msg/TFMessage",
-)
 TF = "/tf"
 MAX_GAP_NS = 200_000_000  # a hand that moves on goes another way within a longer time
 
@@ -88,6 +85,7 @@ class TrackedPoses:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._poses: dict[str, list[_Stamped]] = {}
+        self._tracked: dict[str, set[TransformName]] = {}  # what the transforms of a topic are of, by topic
         self._transforms: dict[TransformName, list[_Stamped]] = {}  # from child to parent
         self._fixed: dict[TransformName, _Stamped] = {}
 
@@ -103,10 +101,12 @@ class TrackedPoses:
             parts = stamped.pose.position, stamped.pose.orientation
             self._poses.setdefault(message.topic, []).append((time_of(stamped.header, message.log_time_ns), *parts))
         elif message.kind == TRANSFORM:
-            self._poses.setdefault(message.topic, []).append(_stamped(message.decode(), message))
+            transform = message.decode()
+            self._poses.setdefault(message.topic, []).append(_stamped(transform, message))
+            self._tracked.setdefault(message.topic, set()).add(_name_of(transform))
         elif message.kind == TRANSFORMS:
             for transform in message.decode().transforms:
-                name = (transform.child_frame_id.lstrip("/"), transform.header.frame_id.lstrip("/"))
+                name = _name_of(transform)
                 if message.topic.endswith("_static"):
                     self._fixed[name] = _stamped(transform, message)
                 else:
@@ -122,6 +122,12 @@ class TrackedPoses:
             return self._way_of_transforms(frame, transform)
         if transform is not None:
             raise InvalidArgument(f"transform is for the poses of {TF}, these are of {topic}", field="transform")
+        if len(tracked := self._tracked.get(topic, set())) > 1:
+            names = ", ".join(sorted(map("To".join, tracked)))
+            raise DatasetInvalid(
+                f"{self._path}: {topic} must tell the poses of one thing, it tells those of {len(tracked)}: {names}; "
+                f"record them as tf, or on topics of their own"
+            )
         track, lost = self._track(self._poses[topic], topic)
         return Way(topic, ((track, False),), lost)
 
@@ -170,6 +176,11 @@ class TrackedPoses:
         times = sorted(found)
         track = PoseTrack(np.array(times, np.int64), np.array([found[time_ns] for time_ns in times]))
         return track, len({time_ns for time_ns, _, _ in stamped} - set(times))
+
+
+def _name_of(transform: Any) -> TransformName:
+    """Child and parent."""
+    return transform.child_frame_id.lstrip("/"), transform.header.frame_id.lstrip("/")
 
 
 def _stamped(transform: Any, message: StoredMessage) -> _Stamped:
