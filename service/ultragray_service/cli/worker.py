@@ -14,6 +14,7 @@ import typer
 
 from ultragray.errors import UltragrayError
 from ultragray_workers.errors import StartupFailed
+from ultragray_workers.niceness import let_frames_go_first
 from ultragray_workers.parent import end_with_parent
 
 from ..service_manager import ALIVE, READY, ServiceManager
@@ -124,7 +125,7 @@ def main(service_pid: str) -> int:
     if os.getppid() != int(service_pid):
         return 1
     try:
-        os.nice(load_settings().job_nice)  # its looks at the queue would hold up frames, as jobs would
+        let_frames_go_first(load_settings().job_nice)  # its looks at the queue would hold up frames, as jobs would
         run_worker({})
     except UltragrayError as error:
         sys.stderr.write(f"ultragray worker: {error.detail}\n")

@@ -8,7 +8,6 @@ must be until the work begins.
 from __future__ import annotations
 
 import json
-import os
 import resource
 import signal
 import sys
@@ -18,6 +17,7 @@ from pathlib import Path
 from ultragray.errors import MemoryExceeded, UltragrayError
 
 from ..claims import storage_full
+from ..niceness import let_frames_go_first
 from ..parent import end_with_parent
 
 PROGRESS_NAME = "progress"  # in the folder that a process fills
@@ -27,7 +27,7 @@ NICE_LEVEL = 10
 def answer_request(work: Callable[..., None]) -> None:
     """Do the work with the arguments on stdin. The process ends with its parent."""
     end_with_parent(signal.SIGKILL)
-    os.nice(NICE_LEVEL)
+    let_frames_go_first(NICE_LEVEL)
     request = json.loads(sys.stdin.buffer.read())
     memory_bytes, what = request["memory_bytes"], request["what"]
     resource.setrlimit(resource.RLIMIT_DATA, (memory_bytes, memory_bytes))

@@ -23,6 +23,7 @@ from pathlib import Path
 from ultragray.errors import InvalidArgument, MemoryExceeded, UltragrayError
 
 from ...claims import is_no_room, storage_full
+from ...niceness import let_frames_go_first
 from ...parent import end_with_parent
 from ..folder import JobFolder, Outcome
 from ..shards.channel import Channel
@@ -56,7 +57,7 @@ def main(folder_path: str, worker_pid: str, *descriptors: str) -> int:
         if folder.outcome() is not None:
             return 0
         request = folder.request()
-        os.nice(max(0, request.nice - os.nice(0)))  # a worker within the service is nice itself
+        let_frames_go_first(request.nice)
         Path("/proc/self/oom_score_adj").write_text(_OOM_SCORE_ADJ, encoding="ascii")
         channel = Channel(*map(int, descriptors)) if descriptors else None
         job_run = JobRun(folder, request, lambda: bool(received), channel)

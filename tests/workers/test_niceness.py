@@ -1,0 +1,45 @@
+"""Jobs and helpers let frames go first, also where the kernel shares processors among sessions."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+LEVEL = 7
+PROGRAM = (
+    f"import sys; sys.path[:] = {sys.path!r}; import os\n"
+    f"from ultragray_workers.niceness import let_frames_go_first; let_frames_go_first({LEVEL})\n"
+    "print(os.nice(0), open('/proc/self/autogroup').read() if os.path.exists('/proc/self/autogroup') else '')"
+)
+
+
+def told(*, in_its_own_session: bool, nice: int = 0) -> tuple[int, str]:
+    """The nice level of a process that gave way and, where the kernel knows one, its session with that one's level."""
+    output = subprocess.run(
+        [sys.executable, "-c", PROGRAM],
+        start_new_session=in_its_own_session,
+        preexec_fn=lambda: os.nice(nice),
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout
+    level, _, session = output.strip().partition(" ")
+    return int(level), session
+
+
+def test_a_process_that_is_nice_already_is_as_nice_as_it_was_told_to_be() -> None:
+    already = os.nice(0)
+    for nice in (0, 3):
+        assert told(in_its_own_session=False, nice=nice)[0] == max(LEVEL, already + nice)
+
+
+def test_a_session_is_as_nice_as_the_process_that_leads_it() -> None:
+    if not Path("/proc/self/autogroup").exists():
+        pytest.skip("this kernel shares its processors among processes, not sessions")
+    before = Path("/proc/self/autogroup").read_text()
+    assert told(in_its_own_session=True)[1].endswith(f"nice {LEVEL}")
+    assert told(in_its_own_session=False)[1] == before.strip()
