@@ -47,8 +47,8 @@ class Settings(Contract):
     )
     igtl_scene: str | None = described("Scene of OpenIGTLink devices whose names name none; none: the only one.", None)
     igtl_registration: str | None = described(
-        "Registration that leads the poses of OpenIGTLink devices, marker to tracker, into its scene; none: they are "
-        "probe to scene.",
+        "Registration that leads the poses of OpenIGTLink devices, marker to tracker, into its scene, which the "
+        "device or igtl_scene names where there are several; none: they are probe to scene.",
         None,
     )
     igtl_slice_thickness_mm: float | None = described(

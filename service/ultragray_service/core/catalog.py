@@ -78,7 +78,11 @@ class SceneCatalog:
 
     async def names(self) -> list[str]:
         """The names of the scenes that the caller may see, sorted."""
-        return await asyncio.to_thread(self._store.shown_names)
+        return await asyncio.to_thread(self.shown_names)
+
+    def shown_names(self) -> list[str]:
+        """Likewise. Blocks; may be called from any thread."""
+        return self._store.shown_names()
 
     async def page(self, page_size: int, page_token: str) -> tuple[list[CatalogEntry], str]:
         """One page of scenes by name and the token of the next (empty on the last).

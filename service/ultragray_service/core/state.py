@@ -193,7 +193,7 @@ class Service:
         await self.places.open()
         await self.jobs.open()
         self._snapshot = await asyncio.to_thread(Snapshot, self.jobs.database.engine, self._keys, self.owners)
-        self.owners.open(self.jobs.database.engine, self.jobs.threads)
+        self.owners.open(self.jobs.database.engine, self.jobs.threads.executor)
         self.registrations.open(self.jobs.database.engine, self.jobs.threads)
         self.audit.open(self.jobs.database.engine)
         self._following_sessions = asyncio.create_task(self.sessions.follow())

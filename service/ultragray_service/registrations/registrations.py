@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import re
 import time
 from collections.abc import Callable
-from concurrent.futures import Executor
+from dataclasses import dataclass
 from typing import Concatenate, ParamSpec, TypeVar
 
 import sqlalchemy as sa
@@ -14,43 +15,60 @@ import sqlalchemy as sa
 from ultragray.contract import shown
 from ultragray.errors import InvalidArgument
 from ultragray.registration.registration import Registration
-from ultragray_workers.errors import RegistrationNotFound
+from ultragray_workers.errors import DatabaseUnavailable, RegistrationNotFound
 from ultragray_workers.jobs.queue.owners import Kind, Ownership
 from ultragray_workers.scene_names import base_name
 
 from ..access.limits.limits import Limits
-from ..access.owners import Owners
+from ..access.owners import Owners, may_change
 from ..access.principal import acting
 from ..core.catalog import SceneCatalog, page_of_names
+from ..core.jobs.database_threads import DatabaseThreads
 from ..errors import LimitReached, PermissionDenied
 from . import store
 from .named import NamedRegistration, RegistrationPage
 
 FRESH_S = 1.0  # a registration that another service changed is used for so long
+RETRY_S = 5.0  # a registration is used for so long after the database did not tell it
+HELD_PATIENCE_S = 1.0  # with the database, of a frame whose registration is held
 MOST_HELD = 1024
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
+
+_log = logging.getLogger("ultragray.service")
 
 P = ParamSpec("P")
 T = TypeVar("T")
 
 
+@dataclass(frozen=True)
+class _Held:
+    registration: NamedRegistration
+    until_s: float  # of time.monotonic(): it is used without asking the database
+
+
 class Registrations:
-    """All registrations of the installation. Those of a scene that a caller may not see are not there for them."""
+    """All registrations of the installation.
+
+    Whoever put one sees it. For others it is there as long as its scene is, and they may see that: what leads into a
+    private scene stays private when the scene is deleted.
+    """
 
     def __init__(self, catalog: SceneCatalog, owners: Owners, limits: Limits) -> None:
         self._catalog, self._owners, self._limits = catalog, owners, limits
-        self._held: dict[str, tuple[float, NamedRegistration]] = {}  # by name, with time.monotonic() when it was read
+        self._held: dict[str, _Held] = {}  # by name
         self._engine: sa.Engine | None = None
-        self._threads: Executor | None = None
+        self._threads: DatabaseThreads | None = None
 
-    def open(self, engine: sa.Engine, threads: Executor) -> None:
+    def open(self, engine: sa.Engine, threads: DatabaseThreads) -> None:
         """From now on they are read and written by `engine`, in `threads`."""
         self._engine, self._threads = engine, threads
 
     async def get(self, name: str) -> NamedRegistration:
         """A registration as it is kept now. Raises RegistrationNotFound, DatabaseUnavailable."""
-        self._held.pop(name, None)
-        found = self._seen(name, await self._do(store.read_registration, name))
+        read = await self._do(store.read_registration, name)
+        if read is None:
+            self._held.pop(name, None)
+        found = await asyncio.to_thread(self._seen, name, read)
         self._hold(found)
         return found
 
@@ -61,11 +79,20 @@ class Registrations:
     async def of_scene(self, name: str, scene: str) -> Registration:
         """The registration that a request for a scene names, at most a second old.
 
-        Raises RegistrationNotFound, DatabaseUnavailable, and InvalidArgument for one of another scene.
+        While the database is away it is the one that this service last read, so that frames go on. Raises
+        RegistrationNotFound, DatabaseUnavailable where none was read yet, and InvalidArgument for one of another scene.
         """
-        read_at, found = self._held.get(name, (0.0, None))
-        if found is None or time.monotonic() - read_at > FRESH_S or self._owners.hides(Kind.SCENE, found.scene):
+        held = self._held.get(name)
+        if held is None:
             found = await self.get(name)
+        elif (
+            time.monotonic() > held.until_s
+            or held.registration.scene != base_name(scene)
+            or self._owners.hides(Kind.SCENE, held.registration.scene)
+        ):
+            found = await self._get_or_held(name, held.registration)
+        else:
+            found = held.registration
         return _of_scene(found, scene)
 
     def read_of_scene(self, name: str, scene: str) -> Registration:
@@ -74,8 +101,8 @@ class Registrations:
 
     async def page(self, page_size: int, page_token: str) -> RegistrationPage:
         """One page by name. Raises InvalidArgument, DatabaseUnavailable."""
-        scenes = await self._do(store.read_scenes)
-        seen = sorted(name for name, scene in scenes.items() if not self._owners.hides(Kind.SCENE, scene))
+        kept, there = await self._do(store.read_origins), set(await self._catalog.names())
+        seen = sorted(name for name, (owner, scene) in kept.items() if _is_own(owner) or scene in there)
         names, next_page_token = page_of_names(seen, page_size, page_token)
         read = [await self._do(store.read_registration, name) for name in names]
         return RegistrationPage([one for one in read if one is not None], next_page_token)
@@ -110,17 +137,26 @@ class Registrations:
             raise _not_own(name)
         self._held.pop(name, None)
 
+    async def _get_or_held(self, name: str, held: NamedRegistration) -> NamedRegistration:
+        try:
+            return await asyncio.wait_for(self.get(name), HELD_PATIENCE_S)
+        except (asyncio.TimeoutError, DatabaseUnavailable):
+            _log.warning(f"the database does not answer: the registration {name!r} is used as it was last read")
+            found = await asyncio.to_thread(self._seen, name, held)
+            self._hold(found, for_s=RETRY_S)
+            return found
+
     def _seen(self, name: str, found: NamedRegistration | None) -> NamedRegistration:
-        """What was read of a name, where the caller may see it. Raises RegistrationNotFound."""
-        if found is None or self._owners.hides(Kind.SCENE, found.scene):
+        """What was read of a name, where the caller may see it. Blocks. Raises RegistrationNotFound."""
+        if found is None or not (_is_own(found.owner) or found.scene in self._catalog.shown_names()):
             raise RegistrationNotFound(f"there is no registration {shown(name)}", field="registration")
         return found
 
-    def _hold(self, registration: NamedRegistration) -> None:
+    def _hold(self, registration: NamedRegistration, for_s: float = FRESH_S) -> None:
         self._held.pop(registration.name, None)
         while len(self._held) >= MOST_HELD:
             self._held.pop(next(iter(self._held)))
-        self._held[registration.name] = (time.monotonic(), registration)
+        self._held[registration.name] = _Held(registration, time.monotonic() + for_s)
 
     @property
     def _opened(self) -> sa.Engine:
@@ -128,10 +164,16 @@ class Registrations:
         return self._engine
 
     async def _do(self, work: Callable[Concatenate[sa.Engine, P], T], *arguments: P.args, **options: P.kwargs) -> T:
-        engine = self._opened
-        return await asyncio.get_running_loop().run_in_executor(
-            self._threads, lambda: work(engine, *arguments, **options)
-        )
+        assert self._threads is not None
+        return await self._threads.ask(work, self._opened, *arguments, **options)
+
+
+def _is_own(owner: str | None) -> bool:
+    """Whether a registration is the caller's, or the caller an admin or the service itself."""
+    try:
+        return may_change(acting(), Ownership(owner))
+    except LookupError:
+        return True
 
 
 def _of_scene(found: NamedRegistration, scene: str) -> NamedRegistration:

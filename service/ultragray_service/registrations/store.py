@@ -26,10 +26,11 @@ def read_registration(engine: sa.Engine, name: str) -> NamedRegistration | None:
     return None if row is None else _named(row)
 
 
-def read_scenes(engine: sa.Engine) -> dict[str, str]:
-    """The scenes of all registrations, by the names of these."""
+def read_origins(engine: sa.Engine) -> dict[str, tuple[str | None, str]]:
+    """Owner and scene of all registrations, by the names of these."""
+    wanted = sa.select(_COLUMNS.name, _COLUMNS.owner, _COLUMNS.scene)
     with engine.connect() as connection:
-        return {row.name: row.scene for row in connection.execute(sa.select(_COLUMNS.name, _COLUMNS.scene))}
+        return {row.name: (row.owner, row.scene) for row in connection.execute(wanted)}
 
 
 def write_registration(

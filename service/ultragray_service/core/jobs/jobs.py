@@ -5,9 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Callable, Iterator
-from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import contextmanager
-from contextvars import copy_context
 from dataclasses import dataclass
 from functools import partial
 from typing import Concatenate, ParamSpec, TypeVar
@@ -19,7 +17,6 @@ from ultragray.errors import DatasetInvalid, InvalidArgument, SceneFileInvalid, 
 from ultragray.registration.registration import Registration
 from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import (
-    DatabaseUnavailable,
     DatasetNotFound,
     NotReady,
     RegistrationNotFound,
@@ -41,12 +38,11 @@ from ...access.owners import may_see
 from ...access.principal import acting
 from ...settings import Settings
 from ..catalog import MAX_PAGE_SIZE, scene_to_blame
+from .database_threads import PATIENCE_S, DatabaseThreads
 from .hub import JobHub
 
 COUNT_INTERVAL_S = 10.0
 _BESIDE_SPECIFICATION = ("request_id", "priority")
-_THREADS = 4
-_PATIENCE_S = 10.0  # with a database that is there and says nothing
 
 _log = logging.getLogger("ultragray.service")
 
@@ -85,9 +81,10 @@ class Jobs:
         self._datasets = datasets
         self._registration = registration
         self._opened: JobStore | None = None
-        # Of their own, so that a database that does not answer keeps nobody else waiting.
-        self._threads = ThreadPoolExecutor(_THREADS, "jobs")
-        self.hub = JobHub(lambda job_id: self._store.get(job_id), lambda job_id: self.files.log(job_id), self._threads)
+        self.threads = DatabaseThreads()
+        self.hub = JobHub(
+            lambda job_id: self._store.get(job_id), lambda job_id: self.files.log(job_id), self.threads.executor
+        )
         self.admit: Admit = lambda jobs: None
         self.overview = JobsOverview()  # as it was up to COUNT_INTERVAL_S ago
         self._counting: asyncio.Task[None] | None = None
@@ -109,14 +106,9 @@ class Jobs:
             scenes=self._scenes,
             datasets=self._datasets,
             registration=self._registration,
-            shared=shared_storage(settings.artifacts, patience_s=_PATIENCE_S / 2),
+            shared=shared_storage(settings.artifacts, patience_s=PATIENCE_S / 2),
             max_image_side=settings.max_image_side,
         )
-
-    @property
-    def threads(self) -> Executor:
-        """The threads in which the database is asked."""
-        return self._threads
 
     @property
     def database(self) -> JobDatabase:
@@ -137,15 +129,7 @@ class Jobs:
 
         Raises what the method raises, NotReady before the start, DatabaseUnavailable where the database is silent.
         """
-        # In the context of the caller: what others have and keep to themselves is not found.
-        call = partial(copy_context().run, method, self._store, *arguments, **options)
-        answer = asyncio.get_running_loop().run_in_executor(self._threads, call)
-        try:
-            return await asyncio.wait_for(answer, _PATIENCE_S)
-        except asyncio.TimeoutError:
-            raise DatabaseUnavailable(
-                f"the database of the jobs has not answered for {_PATIENCE_S:g} s: try again later"
-            ) from None
+        return await self.threads.ask(method, self._store, *arguments, **options)
 
     async def submit(
         self, specification: Specification, *, field: str, request_id: str | None, priority: int, private: bool

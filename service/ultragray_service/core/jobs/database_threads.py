@@ -1,0 +1,41 @@
+"""Questions to the database of the jobs, asked in threads of their own: a silent one keeps nobody else waiting."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextvars import copy_context
+from functools import partial
+from typing import Concatenate, ParamSpec, TypeVar
+
+from ultragray_workers.errors import DatabaseUnavailable
+
+PATIENCE_S = 10.0  # with a database that is there and says nothing
+_THREADS = 4
+
+D = TypeVar("D")  # a store or an engine
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+class DatabaseThreads:
+    """The few threads that ask the database."""
+
+    def __init__(self) -> None:
+        self.executor = ThreadPoolExecutor(_THREADS, "database")
+
+    async def ask(self, question: Callable[Concatenate[D, P], T], whom: D, *details: P.args, **options: P.kwargs) -> T:
+        """Calls `question(whom, *details, **options)` in a thread, in the context of the caller: what others keep to
+        themselves is not found.
+
+        Raises what it raises, and DatabaseUnavailable where there is no answer within PATIENCE_S.
+        """
+        call = partial(copy_context().run, question, whom, *details, **options)
+        answer = asyncio.get_running_loop().run_in_executor(self.executor, call)
+        try:
+            return await asyncio.wait_for(answer, PATIENCE_S)
+        except asyncio.TimeoutError:
+            raise DatabaseUnavailable(
+                f"the database of the jobs has not answered for {PATIENCE_S:g} s: try again later"
+            ) from None

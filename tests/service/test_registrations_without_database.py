@@ -1,0 +1,61 @@
+"""Frames go on by a registration that the service has read, while the database that keeps it is away."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+
+from ..postgres import PostgresServer
+from ..waiting import wait_until
+from .conftest import StartService
+
+PATH = "/v1/registrations/robot"
+TOO_LATE_S = 30.0  # whoever waits for the database waits for ten
+
+
+def put(http: httpx.Client, shift_mm: float) -> None:
+    base_to_scene = np.eye(4)
+    base_to_scene[1, 3] = shift_mm
+    answer = http.put(PATH, json={"scene": "demo", "base_to_scene": base_to_scene.tolist()})
+    assert answer.status_code == 200, answer.text
+
+
+def render(http: httpx.Client, pose: dict[str, Any], registration: str) -> httpx.Response:
+    body = {"pose": pose, "height": 16, "width": 16, "registration": registration}
+    return http.post("/v1/scenes/demo/render", json=body)
+
+
+def assert_shifted(answer: httpx.Response, shift_mm: float) -> None:
+    assert answer.status_code == 200, answer.text
+    pose = json.loads(answer.headers["X-Ultragray-Pose"])  # [4, 4] mm, in the scene
+    assert pose[1][3] == shift_mm
+
+
+def assert_unavailable(answer: httpx.Response) -> None:
+    assert (answer.status_code, answer.json()["reason"]) == (503, "DATABASE_UNAVAILABLE"), answer.text
+
+
+@pytest.mark.parametrize("silent", [False, True], ids=["stopped", "silent"])
+def test_frames_go_on_by_a_registration_that_was_read_while_the_database_is_away(
+    start_service: StartService, postgres: PostgresServer, tmp_path: Path, pose_body: dict[str, Any], silent: bool
+) -> None:
+    service = start_service(artifact_folder=tmp_path, database_url=postgres.create_database())
+    take_away, give_back = (postgres.pause, postgres.resume) if silent else (postgres.stop, postgres.start)
+    with httpx.Client(base_url=service.http, timeout=TOO_LATE_S) as http:
+        put(http, 3.0)
+        take_away()
+        try:
+            for _ in range(2):
+                assert_shifted(render(http, pose_body, "robot"), 3.0)
+                assert_unavailable(http.get(PATH))  # is told from the database alone
+            assert_unavailable(render(http, pose_body, "another"))
+        finally:
+            give_back()
+        wait_until(lambda: http.get(PATH).status_code == 200)
+        put(http, 4.0)
+        assert_shifted(render(http, pose_body, "robot"), 4.0)
