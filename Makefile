@@ -4,7 +4,8 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 # A file of tests belongs to one process, which shares its services among them. Most of the time they wait for others: four fit two cores.
-PYTEST := $(BIN)/pytest --numprocesses 4 --dist loadfile --no-loadscope-reorder
+# As nice as the helpers of a service, for which they wait: those would get what is left over.
+PYTEST := nice -n 10 $(BIN)/pytest --numprocesses 4 --dist loadfile --no-loadscope-reorder
 KERNEL_SOURCES := $(wildcard model/kernels/*) CMakeLists.txt
 PACKAGES := . proto client ros
 PACKAGE_SOURCES := $(KERNEL_SOURCES) $(PACKAGES:%=%/pyproject.toml) $(wildcard distribution/*.py)
@@ -25,6 +26,8 @@ READY = @$(if $(RECORD),$(BIN)/python benchmarks/record.py --ready &&) mkdir -p 
 KEEP = @$(if $(RECORD),$(BIN)/python benchmarks/record.py,:)
 MINUTES ?= 30
 FRAMES ?= 100000
+# Hundreds of processes of the tests import the sources: the first one's bytecode is kept for the others.
+unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
 .PHONY: ALWAYS help serve console test test-fast test-long test-notebooks test-console test-faults test-fuzz test-soak test-overload test-shards test-image test-replicas test-ros test-newcomer check check-lint check-types check-generated check-web check-figures format bench bench-record bench-console console-picture bench-cuda results methods ablations poses localization confidence libraries environment ros simulation figures demo-scene docs generate packages clean
@@ -38,14 +41,14 @@ serve: $(VENV)/installed  ## set up, then serve the demo scene and every *.ugr i
 
 console: $(CONSOLE)  ## build the console, which the service serves at / (needs Node 20 or newer; serve does it where that is there)
 
-test: $(VENV)/installed-dev  ## set up, then run the tests in random order (ARGS="-k probe" for some, ARGS="--randomly-seed=N" for an order again)
+test: $(VENV)/collected  ## set up, then run the tests in random order (ARGS="-k probe" for some, ARGS="--randomly-seed=N" for an order again)
 	@$(CONSOLE_IF_POSSIBLE)
 	$(PYTEST) -m "not long" $(ARGS)
 
-test-fast: $(VENV)/installed-dev  ## those that take a minute together, for while one works: without processes of their own
+test-fast: $(VENV)/collected  ## those that take a minute together, for while one works: without processes of their own
 	$(PYTEST) -m "not slow and not long" $(ARGS)
 
-test-long: $(VENV)/installed-dev  ## those that make test leaves out (RECORD=1: what came of it to tests/long-run.json)
+test-long: $(VENV)/collected  ## those that make test leaves out (RECORD=1: what came of it to tests/long-run.json)
 	$(READY)
 	@$(CONSOLE_IF_POSSIBLE)
 	$(PYTEST) -m long --record-in $(FIGURES)/long-run.json $(ARGS)
@@ -264,6 +267,13 @@ $(VENV)/installed: $(VENV)/python $(VENV)/modules $(PACKAGE_SOURCES)
 $(VENV)/installed-dev: $(VENV)/installed
 	@echo "Installing the test and lint tools ..."
 	@$(PIP_INSTALL) 'ultragray[dev,docs]'
+	@touch $@
+
+# Else each of the processes of the first run would compile all the tests for itself, which takes it a minute.
+$(VENV)/collected: $(VENV)/installed-dev
+	@echo "Compiling the tests ..."
+	@printf '%s\n' "tests/model tests/workers" "$$(ls -d tests/*/ | grep -v -e /model/ -e /workers/ | tr '\n' ' ')" \
+		| xargs -P 2 -L 1 $(BIN)/pytest --collect-only --quiet > /dev/null
 	@touch $@
 
 web/node_modules/.package-lock.json: web/package-lock.json

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import hypothesis
 import hypothesis.configuration
 import numpy as np
 import pytest
@@ -44,6 +45,8 @@ if not torch.cuda.is_available():
 
 forget_the_users_environment()
 hypothesis.configuration.set_hypothesis_home_dir(ROOT / ".hypothesis")  # else it is in the working folder of a test
+hypothesis.settings.register_profile("untimed", deadline=None)  # others may keep the machine busy
+hypothesis.settings.load_profile("untimed")
 
 RUN = f"PYTEST_RUN={os.getpid()}\0"  # in the environment of every process that these tests start
 os.environ["PYTEST_RUN"] = str(os.getpid())

@@ -18,7 +18,7 @@ from ..surroundings import ROOT
 registry = benchmark("registry")
 FIGURES = registry.FIGURES
 TARGETS = sorted({file.target for file in FIGURES.values()})
-MAKES_OWN = ("MAKEFLAGS", "MFLAGS", "MAKELEVEL")
+MAKES_OWN = ("MAKEFLAGS", "MFLAGS", "MAKELEVEL", "RECORD", "ARGS")  # the last two: as it was called
 ABSOLUTE_PATH = re.compile(r"(?<![\w.:/])/[\w.-]+/[\w.-]+")
 NOT_MEASURED_YET = {"benchmarks/cuda.json", "benchmarks/cuda_training.json"}
 

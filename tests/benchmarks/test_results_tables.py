@@ -75,6 +75,7 @@ def test_runs_are_kept_one_by_one_and_tabled_together(
     assert tables.count("| nearest training frame |") == 2
 
 
+@pytest.mark.long
 def test_a_run_tells_the_steps_that_the_data_decided(
     script: ModuleType, monkeypatch: pytest.MonkeyPatch, data: Path
 ) -> None:

@@ -26,6 +26,16 @@ from .proxy import Proxy
 
 KEY = "0123456789abcdef-client"
 MAX_POSES = 40
+SETTINGS: dict[str, Any] = {"max_poses_per_request": MAX_POSES, "max_image_side": 600, "api_keys": KEY}
+
+# Of uploads and jobs, `make test` has those of the client for threads, which is made from the one for asyncio.
+UPLOADS_AND_JOBS = {"test_client_confidence.py", "test_client_recording.py", "test_client_resources.py"}
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        if item.path.name in UPLOADS_AND_JOBS and "[asyncio" in item.name:
+            item.add_marker(pytest.mark.long)
 
 
 class Blocking:
@@ -84,15 +94,15 @@ def event_loop_thread() -> Iterator[asyncio.AbstractEventLoop]:
 
 @pytest.fixture(scope="session")
 def client_service(start_shared_service: StartService, tmp_path_factory: pytest.TempPathFactory) -> RunningService:
-    """It takes few poses at a time, and has a worker for jobs."""
-    return start_shared_service(
-        artifact_folder=tmp_path_factory.mktemp("artifacts"),
-        max_poses_per_request=MAX_POSES,
-        max_image_side=600,
-        api_keys=KEY,
-        embedded_worker=True,
-        training_threads=1,
-    )
+    """It takes few poses at a time."""
+    return start_shared_service(artifact_folder=tmp_path_factory.mktemp("artifacts"), **SETTINGS)
+
+
+@pytest.fixture(scope="module")
+def working_service(start_service: StartService, tmp_path_factory: pytest.TempPathFactory) -> RunningService:
+    """The same with a worker for jobs."""
+    artifacts = tmp_path_factory.mktemp("artifacts")
+    return start_service(artifact_folder=artifacts, embedded_worker=True, training_threads=1, **SETTINGS)
 
 
 @pytest.fixture(params=["sync", "asyncio"])

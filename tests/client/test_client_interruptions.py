@@ -21,9 +21,16 @@ from ultragray_client.jobs import Watch
 from ultragray_client.sync.connection import Connection
 from ultragray_proto.v1 import jobs_pb2
 
+from ..service.conftest import RunningService
 from ..waiting import at_this_load
 from .proxy import Proxy
 from .test_client_errors import FailedCall
+
+
+@pytest.fixture(scope="module")
+def client_service(working_service: RunningService) -> RunningService:
+    """One with a worker."""
+    return working_service
 
 
 def test_a_batch_goes_on(far_client: Any, proxy: Proxy) -> None:
@@ -43,7 +50,7 @@ def test_a_download_goes_on_and_is_whole(far_client: Any, client: Any, proxy: Pr
     job = client.jobs.submit(
         RenderJob(scene="demo", poses=poses, height=200, width=200, dtype="float32", outputs=("bmode", "echo"))
     )
-    assert client.jobs.wait(job.id).state is JobState.SUCCEEDED
+    assert client.jobs.wait(job.id, timeout_s=120).state is JobState.SUCCEEDED
     client.jobs.download(job.id, "frames.npz", tmp_path / "straight.npz")
     proxy.cut_after(8_000_000)
     far_client.jobs.download(job.id, "frames.npz", tmp_path / "broken.npz")

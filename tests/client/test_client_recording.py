@@ -37,6 +37,12 @@ COUNT = 30
 POSES = np.stack([moved(x) for x in np.linspace(-4.0, 4.0, COUNT)])
 
 
+@pytest.fixture(scope="module")
+def client_service(working_service: RunningService) -> RunningService:
+    """One with a worker."""
+    return working_service
+
+
 def decoded(path: Path, topic: str) -> list[Any]:
     with path.open("rb") as file:
         reader = make_reader(file, decoder_factories=[DecoderFactory()])
@@ -105,9 +111,10 @@ def test_what_came_before_an_error_is_kept(client: Any, tmp_path: Path) -> None:
 
 
 INTERRUPTED = """
-import sys
+import signal, sys
 import numpy as np
 from ultragray_client import Client, Recording
+signal.signal(signal.SIGINT, signal.default_int_handler)  # tests in the background of a shell are begun with it ignored
 address, key, path = sys.argv[1:]
 with Client(address, api_key=key) as client:
     frame = client.render("demo", np.eye(4))

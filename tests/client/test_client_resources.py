@@ -33,10 +33,17 @@ from ultragray_client import (
     errors,
 )
 
+from ..service.conftest import RunningService
 from ..service.http.test_http_datasets import poisoned_files, released_files
 from ..waiting import wait_until
 
 SETTINGS = {"steps": 20, "max_gaussians": 40, "batch_size": 2}
+
+
+@pytest.fixture(scope="module")
+def client_service(working_service: RunningService) -> RunningService:
+    """One with a worker."""
+    return working_service
 
 
 @pytest.fixture

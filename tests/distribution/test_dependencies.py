@@ -131,7 +131,7 @@ def core_alone(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([sys.executable, "-c", CORE_ALONE, *arguments], capture_output=True, text=True, timeout=120)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_core_renders_without_any_extra(working_folder: Path) -> None:
     for arguments in (
         ("demo", "-o", "demo.ugr"),
@@ -143,7 +143,7 @@ def test_the_core_renders_without_any_extra(working_folder: Path) -> None:
     assert (working_folder / "frames.npz").stat().st_size > 0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("command", "extra"),
     [("serve", "serve"), ("worker", "serve"), ("keys list", "serve"), ("report absent -o r.html", "train")],

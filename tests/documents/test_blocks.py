@@ -18,15 +18,15 @@ DOCUMENTS = sorted(
     if path.name not in ("CHANGELOG.md", TUTORIAL.name)  # no commands; in a test module of its own
 )
 
-LONG = {"docs/howto/compare.md"}  # a comparison as a job, and two by hand
+HOW_TO = ROOT / "docs/howto"  # long, with services and jobs of their own
 
 
 @pytest.mark.filterwarnings("ignore::ResourceWarning")  # what a snippet leaves open is closed with its page
 @pytest.mark.parametrize(
     "path",
     [
-        pytest.param(path, id=name, marks=[pytest.mark.long] if name in LONG else [])
-        for path, name in ((path, str(path.relative_to(ROOT))) for path in DOCUMENTS)
+        pytest.param(path, id=str(path.relative_to(ROOT)), marks=[pytest.mark.long] if HOW_TO in path.parents else [])
+        for path in DOCUMENTS
     ],
 )
 def test_blocks_run(path: Path, run_page: RunPage) -> None:

@@ -87,6 +87,7 @@ def test_a_link_that_leads_nowhere_stops_the_build(
         site.build(tmp_path / "build")
 
 
+@pytest.mark.long
 def test_the_site_builds_and_loads_nothing_from_elsewhere(generator: Generator, tmp_path: Path) -> None:
     pytest.importorskip("zensical", reason="zensical is not installed: pip install '.[docs]'")
     site = generator("site").build(tmp_path)

@@ -56,7 +56,7 @@ def test_ignored_pixels_teach_nothing(unet: ModuleType) -> None:
     assert unet.dice(unet.segmented(net, frames), labels, 1) > 0.9
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_scene_is_served_for_as_long_as_the_block_runs(running_service: ModuleType, tmp_path: Path) -> None:
     scene_file = tmp_path / "spine.ugr"
     scene_file.symlink_to(DEMO_FILE)

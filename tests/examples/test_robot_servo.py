@@ -97,7 +97,7 @@ def test_as_a_program(demo_service: RunningService) -> None:
     assert "off centre by" in told
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("example", ["robot_servo", "augment_pytorch"])
 def test_without_a_service_it_ends_at_once_with_one_line(example: str) -> None:
     command = [sys.executable, str(EXAMPLES / f"{example}.py"), "--address", "127.0.0.1:9"]

@@ -48,6 +48,7 @@ class RunningService:
             "ULTRAGRAY_GRPC_PORT": "0",
             "ULTRAGRAY_THREADS_PER_PROCESS": "1",
             "ULTRAGRAY_EMBEDDED_WORKER": "false",
+            "ULTRAGRAY_JOB_NICE": "0",  # no frames wait for the processors
             "ULTRAGRAY_DEFAULT_TIMEOUT_S": "120",  # others may keep the machine busy
             "PYTHONPATH": os.pathsep.join(str(ROOT / folder) for folder in SOURCE_FOLDERS),
         }

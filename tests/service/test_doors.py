@@ -74,7 +74,7 @@ def read_until(terminal: int, wanted: str, process: subprocess.Popen[bytes]) -> 
     return said
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_on_a_terminal_it_speaks_to_people(tmp_path: Path) -> None:
     ours, theirs = pty.openpty()
     program = "from ultragray_service.cli.app import app; app()"

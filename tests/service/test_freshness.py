@@ -95,13 +95,15 @@ def open_grpc(renders: Any) -> Iterator[Any]:
         door.close()
 
 
-@pytest.mark.parametrize("settings", [SMALL, LARGE], ids=["small", "large"])
+@pytest.mark.parametrize("settings", [SMALL, pytest.param(LARGE, marks=pytest.mark.long)], ids=["small", "large"])
 def test_grpc(open_grpc: Any, settings: dict[str, Any]) -> None:
     check_fresh(open_grpc(settings))
 
 
-@pytest.mark.parametrize("window", [1, None], ids=["acknowledged", "unacknowledged"])
-@pytest.mark.parametrize("settings", [SMALL, LARGE], ids=["small", "large"])
+@pytest.mark.parametrize(
+    "window", [pytest.param(1, marks=pytest.mark.long), None], ids=["acknowledged", "unacknowledged"]
+)
+@pytest.mark.parametrize("settings", [SMALL, pytest.param(LARGE, marks=pytest.mark.long)], ids=["small", "large"])
 def test_websocket(service: RunningService, settings: dict[str, Any], window: int | None) -> None:
     address = f"{service.http.replace('http', 'ws', 1)}/v1/scenes/demo/stream"
     with connect(address, compression=None, max_size=None, close_timeout=0.2) as connection:

@@ -29,7 +29,7 @@ SLOW = {"backend": "reference", "max_batch_poses": 1}  # so that frames still wa
 
 
 def render(service: RunningService, client: httpx.Client, **body: Any) -> httpx.Response:
-    return client.post(f"{service.http}/v1/scenes/demo/render", json={"pose": IDENTITY, **body}, timeout=30)
+    return client.post(f"{service.http}/v1/scenes/demo/render", json={"pose": IDENTITY, **body}, timeout=120)
 
 
 def test_sigterm_answers_what_is_in_flight_and_exits_cleanly(start_service: StartService) -> None:
@@ -43,7 +43,7 @@ def test_sigterm_answers_what_is_in_flight_and_exits_cleanly(start_service: Star
             conversation.send(sequence, pose=moved(0))
         pending = [threads.submit(render, service, client, **SMALL) for _ in range(4)]
         request = rendering_pb2.RenderRequest(settings=frames, pose=moved(0))
-        unary = stub.Render.future(request, timeout=30)
+        unary = stub.Render.future(request, timeout=120)
         # All nine have come, of which one may be in neither number: being rendered.
         wait_until(lambda: service.metric("ultragray_frames_total") + service.metric(WAITING) >= 8)
         service.process.send_signal(signal.SIGTERM)

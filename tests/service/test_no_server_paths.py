@@ -96,7 +96,7 @@ def test_messages_of_streams(service: RunningService, text: str) -> None:
             with connect(address) as stream:
                 stream.send(text)
                 stream.send('{"pose": {"matrix": null}}')
-                check(service, str(stream.recv(timeout=30)))
+                check(service, str(stream.recv(timeout=120)))
         except Exception as error:
             check(service, str(error))
 

@@ -57,7 +57,7 @@ def strict(start_service: StartService, scenes: Path) -> RunningService:
 
 @pytest.mark.parametrize("scene", ["wide", "endless"])
 def test_a_scene_that_would_take_minutes_is_refused_by_both_doors(strict: RunningService, scene: str) -> None:
-    with httpx.Client(base_url=strict.http) as client, strict.channel() as channel:
+    with httpx.Client(base_url=strict.http, timeout=60) as client, strict.channel() as channel:
         refused = render(client, scene, **LARGE)
         assert (refused.status_code, refused.json()["reason"], refused.json()["field"]) == (
             422,
@@ -80,7 +80,7 @@ def test_a_scene_that_would_take_minutes_is_refused_by_both_doors(strict: Runnin
 
 def test_a_frame_past_its_deadline_frees_the_worker(start_service: StartService, scenes: Path) -> None:
     service = start_service(data_folder=scenes, max_footprint_pixels=2**62)
-    with httpx.Client(base_url=service.http) as client:
+    with httpx.Client(base_url=service.http, timeout=60) as client:
         assert render(client, "wide", height=16, width=16).status_code == 200
         began = time.monotonic()
         late = render(client, "wide", timeout_ms=500, **LARGE)
@@ -106,7 +106,7 @@ def test_a_request_names_how_long_it_waits_to_begin(start_service: StartService,
         with contextlib.suppress(httpx.HTTPError):  # the service stops before it is done
             httpx.post(f"{service.http}/v1/scenes/demo/render", json={"poses": poses, **size}, timeout=600)
 
-    with httpx.Client(base_url=service.http) as client, service.channel() as channel:
+    with httpx.Client(base_url=service.http, timeout=60) as client, service.channel() as channel:
         assert render(client, "demo", max_queue_ms=60_000, **size).status_code == 200
         threading.Thread(target=fill, daemon=True).start()
         wait_until(lambda: service.metric("ultragray_waiting_frames") > 0)

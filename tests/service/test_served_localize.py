@@ -200,7 +200,7 @@ def test_a_search_counts_as_many_frames_of_the_key(
         answer = client.post("/v1/scenes/spine:localize", json=body(png, timeout_ms=3000))
         assert answer.status_code == 422, answer.text
         assert "frames_per_s" in answer.json()["detail"]
-        assert httpx.post(f"{service.http}/v1/scenes/spine:localize", json=body(png)).status_code == 401
+        assert httpx.post(f"{service.http}/v1/scenes/spine:localize", json=body(png), timeout=60).status_code == 401
 
 
 def test_frames_are_rendered_between_searches(phantom: RunningService, png: bytes) -> None:

@@ -51,7 +51,7 @@ def volume_service(
     make_scene(20, probe=DEMO_PROBE).save(folder / "plain.ugr")
     limits = {"max_image_side": 600, "max_request_pixels": 200_000, "max_footprint_pixels": 2_000_000}
     artifacts = tmp_path_factory.mktemp("artifacts")
-    return start_service(data_folder=folder, artifact_folder=artifacts, embedded_worker=True, job_nice=0, **limits)
+    return start_service(data_folder=folder, artifact_folder=artifacts, embedded_worker=True, **limits)
 
 
 @pytest.fixture(scope="module")

@@ -79,7 +79,7 @@ def run_render(data_folder: Path, output: Path, interpret: str) -> subprocess.Co
     )
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(("interpret", "renderer"), WHERE)
 def test_the_command_line_renders_what_the_cpu_renders(
     data_folder: Path, demo_scene: GaussianScene, tmp_path: Path, interpret: str, renderer: str

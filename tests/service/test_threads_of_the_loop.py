@@ -77,7 +77,7 @@ def test_long_work_leaves_the_threads_of_the_loop(
         act_as(LOCAL, address="127.0.0.1", connection="test")
         service = Service(load_settings(data_folder=tmp_path))
         await service.jobs.open()
-        service.owners.open(service.jobs.database.engine, service.jobs.threads)
+        service.owners.open(service.jobs.database.engine, service.jobs.threads.executor)
         asyncio.get_running_loop().set_default_executor(ThreadPoolExecutor(1))
         task = asyncio.ensure_future(begin(service))
         while not begun.is_set():

@@ -53,9 +53,9 @@ def gradient(scene: GaussianScene, probe: Probe, poses: Any, backend: str) -> di
     return {name: leaf.grad.cpu().double().numpy() for name, leaf in leaves.items() if leaf.grad is not None}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.usefixtures("shapes_of_a_gpu")
-@pytest.mark.parametrize("probe", [pytest.param(LINEAR, marks=pytest.mark.long), CONVEX], ids=["linear", "convex"])
+@pytest.mark.parametrize("probe", [LINEAR, CONVEX], ids=["linear", "convex"])
 def test_cut_up_as_on_a_gpu(probe: Probe, random_scene: Callable[..., GaussianScene], random_poses: Any) -> None:
     """Several blocks, tiles and chunks; frames and gradients as the reference's in float64."""
     scene, poses = random_scene(150, transmittance_logit=(-4, 2)), random_poses(1, seed=8)

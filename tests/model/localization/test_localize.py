@@ -67,6 +67,7 @@ def test_a_frame_of_render_is_taken_as_it_is(demo: GaussianScene) -> None:
     np.testing.assert_allclose(as_tensor.pose, localize(demo, frame.detach().numpy(), start).pose, atol=1e-6)
 
 
+@pytest.mark.long
 def test_frames_that_the_scene_was_not_trained_from_are_found(demo: GaussianScene) -> None:
     """Of the phantom's own image formation, with speckle that the scene has never seen."""
     poses = freehand_poses(24, tilt_deg=5.0, offset_mm=1.0, unrest=3.0)[3:22:3]

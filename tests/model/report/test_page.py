@@ -131,6 +131,7 @@ def test_a_scene_from_a_file_without_ablations(content: ReportContent) -> None:
     assert re.findall(r"<h2>(.*?)</h2>", text) == ["Against the baselines", "Pictures"]
 
 
+@pytest.mark.long
 def test_a_scene_alone_with_frames_from_end_to_end(content: ReportContent) -> None:
     alone = replace(of_rows(content, SCENE), ablations=(), tilt=None, spread=2, scene_name="ball & <noise>")
     text = render_page(alone)
@@ -146,6 +147,7 @@ def test_a_scene_alone_with_frames_from_end_to_end(content: ReportContent) -> No
     assert everything.count("<img ") == len(content.dataset.val) * 5
 
 
+@pytest.mark.long
 def test_a_study_that_failed_says_why_in_place_of_its_figures(content: ReportContent) -> None:
     name = "half of the Gaussians"
     reason = "it needs 9 GB & more"
@@ -178,6 +180,7 @@ def test_the_plot_of_counts_holds_the_runs_that_differ_in_nothing_else(
     assert sorted(plotted) == [15, 30, 60, 120]
 
 
+@pytest.mark.long
 def test_what_the_data_decides_is_told_as_it_was_decided(turning_dataset: Dataset, tmp_path: Path) -> None:
     dataset = replace(turning_dataset, train=turning_dataset.train.select([3, 4]))
     trained = train_and_evaluate(dataset, TrainingConfig())

@@ -95,14 +95,14 @@ def width_across_mm(scene: GaussianScene, beam: ElevationBeam, places_mm: np.nda
     return float(np.median(widths))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("sweeps", "beam"),
     [
         ("crossing", FOCUSED),
-        pytest.param("crossing", CONSTANT, marks=pytest.mark.long),
-        pytest.param("tilted", FOCUSED, marks=pytest.mark.long),
-        pytest.param("tilted", CONSTANT, marks=pytest.mark.long),
+        ("crossing", CONSTANT),
+        ("tilted", FOCUSED),
+        ("tilted", CONSTANT),
     ],
 )
 def test_a_beam_that_nobody_gave_is_found(sweeps: str, beam: ElevationBeam) -> None:
@@ -122,7 +122,7 @@ def test_wherever_the_search_starts(start_mm: float) -> None:
     assert found.thickness_at_mm(12.0) == pytest.approx(2.0, rel=0.15)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_thin_slices_of_a_scene_trained_from_thick_ones_are_sharper_across_elevation() -> None:
     truth = phantom()
     points = replace(truth, **{name: raw[:POINTS] for name, raw in truth.splats.items()})

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from ultragray.datasets.sweep import Dataset
 from ultragray.evaluation.baselines import predict
@@ -68,6 +69,7 @@ def test_darkness_that_is_no_shadow_is_not_explained_by_absorption(
     assert render_sweep(scene, dataset.train, output="transmittance").mean() > 0.9
 
 
+@pytest.mark.long
 def test_absorption_costs_nothing_where_frames_show_a_shadow(tiny_dataset: Datasets, tiny_config: Configs) -> None:
     dataset = tiny_dataset(frames=16, height=60, width=48)
     speckle = np.random.default_rng(0).gamma(4.0, 22.0, (len(dataset.train), 60, 48))

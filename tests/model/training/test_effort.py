@@ -110,6 +110,7 @@ def trying(effort: float) -> str:
     return f"trying effort {effort:g} on a part of the frames"
 
 
+@pytest.mark.long
 def test_a_run_chooses_first_and_says_so(tiny_dataset: Datasets, tmp_path: Path) -> None:
     dataset, seen = tiny_dataset(frames=40), list[Progress]()
     config = TrainingConfig(effort=None, steps=12, batch_size=3)

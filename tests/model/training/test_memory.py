@@ -174,18 +174,14 @@ print(int(peak[1]) * 1024, memory.required_bytes(dataset, config))
 """
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.skipif(sys.platform != "linux", reason="the peak is read from /proc")
 @pytest.mark.parametrize(
     ("data", "settings"),
     [
         ({"height": 64, "width": 64}, {"max_gaussians": 200_000}),
-        pytest.param(  # all are in all planes
-            {"frames": 60, "spacing_mm": 0.005}, {"max_gaussians": 60_000, "batch_size": 64}, marks=pytest.mark.long
-        ),
-        pytest.param(  # measuring takes the most
-            {"frames": 80, "height": 192, "width": 192}, {"max_gaussians": 1_000}, marks=pytest.mark.long
-        ),
+        ({"frames": 60, "spacing_mm": 0.005}, {"max_gaussians": 60_000, "batch_size": 64}),  # all are in all planes
+        ({"frames": 80, "height": 192, "width": 192}, {"max_gaussians": 1_000}),  # measuring takes the most
     ],
     ids=["gaussians", "slices", "held-out"],
 )

@@ -108,7 +108,9 @@ def test_admins_read_the_log_at_both_doors(start_service: StartService, tmp_path
         headers = {"X-API-Key": keys[role]}
         return httpx.get(f"{service.http}/v1/audit", params=query, headers=headers, timeout=60)
 
-    assert httpx.post(f"{service.http}/v1/scenes/demo:load", headers={"X-API-Key": keys[Role.ADMIN]}).is_success
+    assert httpx.post(
+        f"{service.http}/v1/scenes/demo:load", headers={"X-API-Key": keys[Role.ADMIN]}, timeout=60
+    ).is_success
 
     def loads() -> list[dict[str, object]]:
         found: list[dict[str, object]] = read(Role.ADMIN, what="scene.load", who="admin").json()["entries"]
@@ -136,6 +138,7 @@ def test_admins_read_the_log_at_both_doors(start_service: StartService, tmp_path
         client.audit()
 
 
+@pytest.mark.long
 def test_entries_wait_for_the_database_and_what_is_lost_is_counted(tmp_path: Path, postgres: PostgresServer) -> None:
     database = JobDatabase(tmp_path, postgres.create_database())
     log = AuditLog()

@@ -125,6 +125,7 @@ def test_a_slow_import_takes_no_training_over(
     assert owner_of(database, "scene", "spine") == "alice"
 
 
+@pytest.mark.long
 def test_a_training_takes_no_scene_over_that_is_being_imported(
     keyed: Keyed, database: JobDatabase, dataset: str, scene_bytes: bytes
 ) -> None:

@@ -55,8 +55,8 @@ def refusal(operation: Operation, who: str) -> str | None:
 
 
 def in_order(operations: Iterator[tuple[str, str, Operation]]) -> list[tuple[str, str, Operation]]:
-    """What takes things away comes last, so that all else finds them."""
-    return sorted(operations, key=lambda one: (one[2].owned, one[0] == "DELETE" or "Delete" in one[1]))
+    """What takes things away comes last, so that all else finds them; scenes at the end, with which others hide."""
+    return sorted(operations, key=lambda one: (one[2].owned, one[0] == "DELETE", one[1].startswith("/v1/scenes")))
 
 
 @pytest.fixture
@@ -127,7 +127,7 @@ def call(channel: grpc.Channel, name: str, things: dict[str, str], metadata: Any
     invoke = getattr(channel, kind)(name, type(request).SerializeToString, answers.FromString)
     answer = None
     try:
-        answer = invoke(iter([request]) if method.client_streaming else request, metadata=metadata, timeout=30)
+        answer = invoke(iter([request]) if method.client_streaming else request, metadata=metadata, timeout=120)
         if method.server_streaming:
             next(answer, None)
     except grpc.RpcError as error:

@@ -80,6 +80,7 @@ def test_tokens_that_are_refused_say_why_at_the_doors(guarded: RunningService, p
     assert "eyJ" not in guarded.log_path.read_text(), "a token was logged"
 
 
+@pytest.mark.long
 def test_an_issuer_that_is_away_shuts_out_only_its_tokens(start_service: StartService) -> None:
     provider = IdentityProvider()
     provider.add_key("one")
@@ -107,6 +108,7 @@ def test_with_an_issuer_alone_nobody_passes_without_a_token(
     wait_until(lambda: ask(service, provider.token()).status_code == 200)
 
 
+@pytest.mark.long
 def test_a_rotation_of_keys_leaves_sessions_and_their_revocation_alone(
     start_service: StartService, tmp_path: Path
 ) -> None:

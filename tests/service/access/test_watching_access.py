@@ -13,6 +13,7 @@ from .conftest import Keyed
 POSE = {"position_mm": {"x": 0, "y": 0, "z": 0}, "quaternion": {"w": 1, "x": 0, "y": 0, "z": 0}}
 
 
+@pytest.mark.long
 def test_only_the_owner_and_admins_see_a_stream(keyed: Keyed, scene_bytes: bytes) -> None:
     keyed.http("alice", "PUT", "/v1/scenes/hers", content=scene_bytes)
     base = keyed.service.http.replace("http", "ws", 1)

@@ -247,7 +247,7 @@ def served(folder: Path, *arguments: object) -> Iterator[tuple[subprocess.Popen[
             assert service.stdout is not None
             yield service, next(m[0] for line in service.stdout if (m := re.search(r"http://127\.0\.0\.1:\d+", line)))
         finally:
-            service.kill()
+            service.terminate()  # it takes its folder of links with it
 
 
 def names_of_scenes(address: str) -> list[str]:
@@ -281,7 +281,7 @@ def test_serve_serves_the_given_file_alone_until_sigterm(scene_file: Path, used_
     assert sorted(used_folder.rglob("*")) == before
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_serve_serves_the_scenes_of_a_named_artifact_folder_too(scene_file: Path, used_folder: Path) -> None:
     with served(used_folder, scene_file, "--artifact-folder", "data/artifacts") as (_, address):
         assert names_of_scenes(address) == ["liver", "scene"]

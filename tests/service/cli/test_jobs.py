@@ -131,6 +131,7 @@ def test_a_scene_is_trained_watched_and_served(server: RunningService, client: h
     assert json.loads(events.rpartition("\ndata: ")[2])["state"] == "succeeded"
 
 
+@pytest.mark.long
 def test_methods_are_compared_and_their_page_is_shown_without_scripts(
     server: RunningService, client: httpx.Client
 ) -> None:

@@ -182,8 +182,8 @@ def wait_for_lines(path: Path, count: int, process: subprocess.Popen[str]) -> No
         time.sleep(0.002)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("number", [pytest.param(signal.SIGINT, marks=pytest.mark.long), signal.SIGTERM])
+@pytest.mark.long
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_stopped_run_leaves_a_scene_and_goes_on(dataset: Path, tmp_path: Path, number: signal.Signals) -> None:
     output, small = tmp_path / "scene.ugr", ("--steps", 300, "--max-gaussians", 60, "--threads", 1)
     process = start(dataset, "-o", output, *small)
@@ -202,7 +202,7 @@ def test_stopped_run_leaves_a_scene_and_goes_on(dataset: Path, tmp_path: Path, n
     assert output.read_bytes() == (tmp_path / "undisturbed.ugr").read_bytes()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_further_signals_do_not_stop_the_scene_from_being_written(dataset: Path, tmp_path: Path) -> None:
     output = tmp_path / "scene.ugr"
     process = start(dataset, "-o", output, "--steps", 3000, "--max-gaussians", 60, "--threads", 1)

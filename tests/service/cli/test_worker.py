@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import httpx
@@ -42,7 +43,8 @@ def children(pid: int) -> dict[int, str]:
     found = {}
     for path in Path(f"/proc/{pid}/task").glob("*/children"):
         for child in path.read_text().split():
-            found[int(child)] = Path(f"/proc/{child}/cmdline").read_text().replace("\0", " ")
+            with suppress(FileNotFoundError):  # it has ended
+                found[int(child)] = Path(f"/proc/{child}/cmdline").read_text().replace("\0", " ")
     return found
 
 
@@ -72,6 +74,7 @@ def test_worker_command_does_a_job_and_stops(demo_store: JobStore, tmp_path: Pat
     demo_store.close()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("options", "told"),
     [

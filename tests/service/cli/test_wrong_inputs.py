@@ -190,7 +190,7 @@ def test_one_line_tells_a_mistake(line: str, place: Path, monkeypatch: pytest.Mo
     assert contents(place) == before
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("line", AS_PROCESSES)
 def test_a_process_ends_with_one_line(line: str, place: Path, busy_port: int) -> None:
     before = contents(place)

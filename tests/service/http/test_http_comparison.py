@@ -118,6 +118,7 @@ def test_poses_and_frames_of_a_dataset(http: httpx.Client) -> None:
     assert http.get("/v1/datasets/nobody/poses").json()["reason"] == "DATASET_NOT_FOUND"
 
 
+@pytest.mark.long
 def test_a_scene_is_compared_with_the_frames_held_out_from_it(http: httpx.Client, artifacts: Path) -> None:
     assert http.get("/v1/scenes/of-tiny/comparison/0/truth.png").json()["reason"] == "ARTIFACT_NOT_FOUND"
     found = finished(http, "of-tiny")
@@ -175,6 +176,7 @@ def test_nothing_stays_of_a_deleted_dataset(
     assert made_of(doomed, artifacts) == 0
 
 
+@pytest.mark.long
 def test_a_dataset_deleted_while_it_is_laid_out(
     http: httpx.Client, service: RunningService, artifacts: Path, tmp_path: Path
 ) -> None:

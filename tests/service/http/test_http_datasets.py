@@ -171,7 +171,7 @@ def service(start_service: StartService, artifacts: Path) -> RunningService:
 
 @pytest.fixture(scope="module")
 def http(service: RunningService) -> Iterator[httpx.Client]:
-    with httpx.Client(base_url=service.http, headers=KEY_HEADER, timeout=30) as client:
+    with httpx.Client(base_url=service.http, headers=KEY_HEADER, timeout=120) as client:
         yield client
 
 

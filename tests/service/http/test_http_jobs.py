@@ -32,7 +32,7 @@ def jobs_service(start_service: StartService, tmp_path_factory: pytest.TempPathF
 
 @pytest.fixture(scope="module")
 def client(jobs_service: RunningService) -> Iterator[httpx.Client]:
-    with httpx.Client(base_url=jobs_service.http, timeout=30) as client:
+    with httpx.Client(base_url=jobs_service.http, timeout=120) as client:
         yield client
 
 

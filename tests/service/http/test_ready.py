@@ -140,6 +140,7 @@ def test_the_health_check_of_containers_follows(service: RunningService, folder:
 Change = Callable[[PostgresServer, str], None]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("take_away", "give_back", "said"),
     [

@@ -15,7 +15,7 @@ from ...waiting import wait_until
 from ..conftest import RunningService, StartService
 
 TOTAL, PER_ADDRESS = 40, 10
-TIMEOUT_S = 20.0
+TIMEOUT_S = 60.0
 PREFACE = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + b"\0\0\0\4\0\0\0\0\0"  # with empty SETTINGS
 
 

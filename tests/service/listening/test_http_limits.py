@@ -24,7 +24,7 @@ TOTAL, PER_ADDRESS = 40, 12
 REQUEST = b"GET /v1/health/live HTTP/1.1\r\nHost: localhost\r\n"
 CHUNKED = b"POST /v1/probes:plane HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\n"
 KEY = "a-key-of-these-tests"
-TIMEOUT_S = 20.0
+TIMEOUT_S = 60.0
 
 
 @pytest.fixture(scope="module")

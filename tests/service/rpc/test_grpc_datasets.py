@@ -64,7 +64,7 @@ def parts(files: dict[str, bytes], chunk_bytes: int = 1000) -> Iterator[Message]
 
 
 def upload(stub: datasets_pb2_grpc.DatasetServiceStub, *messages: Message) -> datasets_pb2.UploadDatasetResponse:
-    return stub.UploadDataset(iter(messages), metadata=METADATA, timeout=30)
+    return stub.UploadDataset(iter(messages), metadata=METADATA, timeout=120)
 
 
 def refusal(call: Any, *arguments: Any, **keywords: Any) -> tuple[grpc.StatusCode, str, str]:
@@ -73,6 +73,7 @@ def refusal(call: Any, *arguments: Any, **keywords: Any) -> tuple[grpc.StatusCod
     return caught.value.code(), error_info(caught.value)[0].reason, caught.value.details()
 
 
+@pytest.mark.long
 def test_the_life_of_a_dataset(datasets: datasets_pb2_grpc.DatasetServiceStub, files: dict[str, bytes]) -> None:
     first = upload(datasets, header("liver", train_frames="0:6"), *parts(files))
     assert first.created

@@ -26,5 +26,5 @@ def test_one_setting_bounds_bodies_and_messages(
         with pytest.raises(grpc.RpcError) as refused:
             list(render(request, timeout=60))
     assert refused.value.code() is grpc.StatusCode.RESOURCE_EXHAUSTED
-    answer = httpx.post(f"{service.http}/v1/scenes/demo/render", content=b" " * (limit_bytes + 1))
+    answer = httpx.post(f"{service.http}/v1/scenes/demo/render", content=b" " * (limit_bytes + 1), timeout=60)
     assert answer.json()["detail"] == f"the body must be at most {limit_bytes} bytes"

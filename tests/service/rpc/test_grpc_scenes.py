@@ -80,13 +80,13 @@ def test_health_and_reflection(channel: grpc.Channel) -> None:
         request = health_pb2.HealthCheckRequest(service=name)
 
         def is_serving(request: health_pb2.HealthCheckRequest = request) -> bool:
-            status = health.Check(request, timeout=5).status
+            status = health.Check(request, timeout=120).status
             return bool(status == health_pb2.HealthCheckResponse.SERVING)
 
         wait_until(is_serving)
     reflection = reflection_pb2_grpc.ServerReflectionStub(channel)
     request = reflection_pb2.ServerReflectionRequest(list_services="*")
-    (answer,) = reflection.ServerReflectionInfo(iter([request]), timeout=5)
+    (answer,) = reflection.ServerReflectionInfo(iter([request]), timeout=120)
     names = {service.name for service in answer.list_services_response.service}
     assert {"ultragray.v1.RenderService", "ultragray.v1.SceneService", "grpc.health.v1.Health"} <= names
 
@@ -112,7 +112,7 @@ def test_bytes_that_are_no_message_are_refused_in_our_words(
     garbage = b"\x0a\x05ab"  # a text of five bytes, of which two are there
     call = getattr(channel, kind)(f"/ultragray.v1.{method}")
     with pytest.raises(grpc.RpcError) as caught:
-        list(call(iter([garbage]) if kind.startswith("stream") else garbage, timeout=30))
+        list(call(iter([garbage]) if kind.startswith("stream") else garbage, timeout=120))
     assert caught.value.code() == grpc.StatusCode.INVALID_ARGUMENT
     assert error_info(caught.value)[0].reason == "INVALID_ARGUMENT"
     assert "DecodeError" not in str(caught.value.details())

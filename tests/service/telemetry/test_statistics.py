@@ -86,7 +86,7 @@ def test_many_requests_are_sampled(statistics: Statistics) -> None:
 def test_only_what_the_service_could_not_do_is_an_error(start_service: StartService) -> None:
     service = start_service()
     stream = f"{service.http.replace('http', 'ws', 1)}/v1/scenes/demo/stream"
-    with httpx.Client(base_url=service.http, timeout=30) as http, connect(stream) as websocket:
+    with httpx.Client(base_url=service.http, timeout=120) as http, connect(stream) as websocket:
 
         def errors() -> int:
             return sum(step["errors"] for step in http.get("/v1/statistics").json()["steps"])
@@ -110,7 +110,7 @@ def test_a_refused_message_is_one_error(tmp_path: Path) -> None:
 
 def test_over_http(start_service: StartService) -> None:
     service = start_service()
-    with httpx.Client(base_url=service.http, timeout=30) as http:
+    with httpx.Client(base_url=service.http, timeout=120) as http:
         for _ in range(3):
             assert http.post("/v1/scenes/demo/render", json={"pose": POSE}).status_code == 200
         late = http.post("/v1/scenes/demo/render", json={"pose": POSE, "timeout_ms": 0.001})

@@ -143,7 +143,7 @@ def test_health_is_not_traced_nor_a_service_without_an_endpoint(
     traced: RunningService, collector: Collector, service: RunningService, pose_body: dict[str, Any]
 ) -> None:
     for running in (traced, service):
-        assert httpx.get(f"{running.http}/v1/health/ready", headers=CALLER).status_code == 200
+        assert httpx.get(f"{running.http}/v1/health/ready", headers=CALLER, timeout=60).status_code == 200
     httpx.post(f"{service.http}/v1/scenes/demo/render", json={"pose": pose_body}, headers=CALLER, timeout=60)
     traced.terminate()  # sends what has not been sent
     assert collector.spans == []

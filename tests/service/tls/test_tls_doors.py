@@ -67,7 +67,7 @@ def check_health(service: RunningService, credentials: grpc.ChannelCredentials) 
     """Raises grpc.RpcError. Each call has a connection of its own."""
     options = [("grpc.use_local_subchannel_pool", 1)]
     with grpc.secure_channel(service.grpc, credentials, options=options) as channel:
-        health_pb2_grpc.HealthStub(channel).Check(health_pb2.HealthCheckRequest(), timeout=30)
+        health_pb2_grpc.HealthStub(channel).Check(health_pb2.HealthCheckRequest(), timeout=120)
 
 
 def errors_in(service: RunningService) -> list[str]:

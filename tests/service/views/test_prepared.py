@@ -82,6 +82,7 @@ def aged(tmp_path: Path, name: str, age_s: float, size_bytes: int = 0) -> Path:
     return folder
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("kept_folders", "size_bytes"), [(2, 0), (32, 600)], ids=["by number", "by bytes"])
 def test_the_folder_not_asked_for_the_longest_goes(
     tmp_path: Path,
@@ -157,6 +158,7 @@ def test_that_a_name_is_gone_says_nothing_of_the_content(tmp_path: Path, wanted:
     asyncio.run(ask())
 
 
+@pytest.mark.long
 def test_who_waits_for_what_is_being_made_sees_its_end(tmp_path: Path, wanted: Wanted) -> None:
     async def ask() -> None:
         made = views(tmp_path)
@@ -240,6 +242,7 @@ def test_what_dead_services_left_is_removed(tmp_path: Path, monkeypatch: pytest.
     assert names(tmp_path) == [".making-alive", "kept"]
 
 
+@pytest.mark.long
 def test_one_helper_process_at_a_time(tmp_path: Path, wanted: Wanted, monkeypatch: pytest.MonkeyPatch) -> None:
     started: list[subprocess.Popen[bytes]] = []
 
@@ -260,6 +263,7 @@ def test_one_helper_process_at_a_time(tmp_path: Path, wanted: Wanted, monkeypatc
     assert len(started) == 4
 
 
+@pytest.mark.long
 def test_memory_beyond_the_limit_is_one_clear_error(tmp_path: Path, wanted: Wanted) -> None:
     images = tmp_path / "datasets" / "tiny" / "files" / "images_train.npy"
     with images.open("wb") as file:
@@ -272,6 +276,7 @@ def test_memory_beyond_the_limit_is_one_clear_error(tmp_path: Path, wanted: Want
     assert "512 MiB" in caught.value.detail
 
 
+@pytest.mark.long
 def test_another_service_may_be_quicker(tmp_path: Path, wanted: Wanted) -> None:
     async def ask() -> list[Path]:
         return await asyncio.gather(*(views(tmp_path).path("key", **wanted) for _ in range(2)))

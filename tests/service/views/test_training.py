@@ -37,7 +37,7 @@ def http(
 ) -> Iterator[httpx.Client]:
     folder = tmp_path_factory.mktemp("dataset")
     write_released(DATASET, folder)
-    service = start_service(artifact_folder=artifacts, embedded_worker=True, training_threads=1, job_nice=0)
+    service = start_service(artifact_folder=artifacts, embedded_worker=True, training_threads=1)
     with httpx.Client(base_url=service.http, timeout=60) as client:
         packed = zipped({path.name: path.read_bytes() for path in folder.iterdir()})
         answer = client.put("/v1/datasets/tiny", content=packed, headers={"Content-Type": "application/zip"})
@@ -57,6 +57,7 @@ def test_the_names_of_the_files_of_a_run() -> None:
     assert (JOURNAL_NAME, CHECKPOINT_NAME, CONFIG_NAME) == (JOURNAL_FILE, CHECKPOINT_FILE, CONFIG_FILE)
 
 
+@pytest.mark.long
 def test_the_curve_of_a_finished_training_and_of_other_jobs(http: httpx.Client) -> None:
     job = train(http, "short", steps=30, max_gaussians=50, confidence=False)
     wait_until(lambda: http.get(f"/v1/jobs/{job}").json()["state"] == "succeeded")
@@ -74,6 +75,7 @@ def test_the_curve_of_a_finished_training_and_of_other_jobs(http: httpx.Client) 
     assert http.get("/v1/jobs/0123/curve").json()["reason"] == "JOB_NOT_FOUND"
 
 
+@pytest.mark.long
 def test_a_training_keeps_a_picture_of_each_validation(http: httpx.Client) -> None:
     job = train(http, "pictured", steps=30, max_gaussians=50, confidence=False)
     artifacts = wait_until(lambda: (told := http.get(f"/v1/jobs/{job}").json())["state"] == "succeeded" and told)[

@@ -84,6 +84,7 @@ def test_a_request_that_kills_every_worker_fails_alone(run, open_pool, random_po
     run(main())
 
 
+@pytest.mark.long
 def test_killed_templates_are_replaced(run, cold_templates, open_pool, random_poses, processes, until):
     async def main():
         async with open_pool() as pool:

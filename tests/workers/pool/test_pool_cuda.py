@@ -106,6 +106,7 @@ worker.render_device = take
 """
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("asked", "expected"), [(0, 3), (1, 1), (4, 4)])
 def test_each_gpu_gets_a_process_where_no_number_is_given(run, open_pool, patch_workers, tmp_path, asked, expected):
     (tmp_path / "taken").mkdir()

@@ -53,7 +53,7 @@ def psnr_db(got: np.ndarray, want: np.ndarray) -> float:
     return float(-10.0 * np.log10(np.square(got - want).mean()))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_frames_are_learned_above_30_db(variant: str) -> None:
     dataset = ball(2, 40, 32)

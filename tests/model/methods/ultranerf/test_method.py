@@ -193,7 +193,7 @@ def test_the_mean_variant_learns_a_single_frame_by_heart() -> None:
     assert -10.0 * math.log10(float(((frame - same.images[0] / 255.0) ** 2).mean())) > 30.0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @by_name
 def test_the_authors_own_data_are_learned(method: UltraNerf, data_folder: Path) -> None:
     """A few steps on one frame of the simulated liver, at half its size."""

@@ -108,6 +108,7 @@ def test_a_quarter_of_the_steps_and_fewer_gaussians(
     assert fewer.out_of_plane_mm == config.out_of_plane_mm
 
 
+@pytest.mark.long
 def test_it_can_be_left_out(tiny_dataset: Datasets, tiny_config: Configs) -> None:
     dataset = tiny_dataset(frames=40)
     without = train(dataset, tiny_config(confidence=False))
@@ -118,6 +119,7 @@ def test_it_can_be_left_out(tiny_dataset: Datasets, tiny_config: Configs) -> Non
     assert having.means.equal(without.means)
 
 
+@pytest.mark.long
 def test_the_time_left_holds_the_fit_and_the_fit_is_told(tiny_dataset: Datasets, tiny_config: Configs) -> None:
     seen: list[Progress] = []
     train(tiny_dataset(frames=40), tiny_config(), report=seen.append)

@@ -94,6 +94,7 @@ def test_the_queue_keeps_its_scene_and_its_dataset(
     store.close()
 
 
+@pytest.mark.long
 def test_a_worker_does_it(
     store: JobStore,
     artifact_folder: Path,

@@ -9,6 +9,7 @@ from ultragray_workers.jobs.kinds import TrainJob, train
 from ultragray_workers.jobs.kinds.base import Surroundings
 
 
+@pytest.mark.long
 def test_a_training_may_not_have_more_memory_than_the_host(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(train, "memory_bytes", lambda: 8 << 30)
 

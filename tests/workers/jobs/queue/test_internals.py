@@ -55,6 +55,7 @@ def test_only_a_running_job_of_that_worker_is_put_back(jobs: JobDatabase, store:
     assert store.get(job.id).state is JobState.CANCELLED
 
 
+@pytest.mark.long
 def test_an_owner_with_enough_running_jobs_waits_while_others_go_first(
     store: JobStore, start_worker: Callable[..., RunningWorker], until: Callable[..., Any]
 ) -> None:
@@ -85,6 +86,7 @@ def test_our_engine_is_set_up_like_the_one_that_dbos_makes(jobs: JobDatabase) ->
     theirs.destroy()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("new_database", ["sqlite"], indirect=True)
 def test_an_interrupted_execution_is_no_end_of_its_job(
     store: JobStore, start_worker: Callable[..., RunningWorker], until: Callable[..., Any]

@@ -123,6 +123,7 @@ def test_a_shard_that_cannot_be_made_fails_the_job_which_names_it_and_a_retry_go
     assert {path.name: path.stat().st_ino for path in taken.glob("*.tar")} == made
 
 
+@pytest.mark.long
 def test_cancelling_ends_the_batch_and_its_shares(
     store: JobStore, scene: Path, start_worker: StartWorker, until: Until
 ) -> None:

@@ -95,6 +95,7 @@ def test_a_job_that_nobody_can_take_says_so_and_starts_when_a_fitting_worker_com
     assert (job.state, job.worker, job.progress.waits_for) == (JobState.SUCCEEDED, "second", None), job
 
 
+@pytest.mark.long
 def test_workers_tell_their_devices_and_labels(store: JobStore, start_worker: StartWorker) -> None:
     start_worker("one", labels={"site": "lab1"})
     wait_until(is_there(store, "one"))

@@ -117,6 +117,7 @@ def test_a_cancellation_while_the_scene_is_published_is_refused(
     assert store.get(job.id).state is JobState.RUNNING  # DBOS writes the end
 
 
+@pytest.mark.long
 def test_a_cancellation_that_comes_first_serves_nothing(
     store: JobStore,
     artifact_folder: Path,

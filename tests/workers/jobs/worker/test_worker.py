@@ -35,6 +35,7 @@ def is_training(job: Job) -> bool:
     return job.state is JobState.RUNNING and (job.progress.step or 0) > 0
 
 
+@pytest.mark.long
 def test_good_jobs_run_in_order_and_bad_ones_fail_with_a_reason(
     store: JobStore, artifact_folder: Path, tmp_path: Path, start_worker: StartWorker, until: Until
 ) -> None:
