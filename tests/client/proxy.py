@@ -8,13 +8,13 @@ from contextlib import suppress
 
 
 class Proxy:
-    """Passes bytes on to a service; `cut_after` breaks a connection once so many came back over it."""
+    """Passes bytes on to a service; `cut_after` breaks a connection once so many bytes came back."""
 
     def __init__(self, target: str) -> None:
         self.lead_to(target)
         self._listener = socket.create_server(("127.0.0.1", 0))
         self._open: list[socket.socket] = [self._listener]
-        self._left: int | None = None
+        self._left: list[int] = []
         self.cuts = 0
         self.address = f"127.0.0.1:{self._listener.getsockname()[1]}"
         threading.Thread(target=self._accept, daemon=True).start()
@@ -24,8 +24,9 @@ class Proxy:
         host, _, port = target.rpartition(":")
         self._target = (host, int(port))
 
-    def cut_after(self, count: int) -> None:
-        self._left = count
+    def cut_after(self, *counts: int) -> None:
+        """Breaks the connection after so many bytes; the one that follows after as many as the next count says."""
+        self._left = list(counts)
 
     def close(self) -> None:
         for one in self._open:
@@ -52,10 +53,10 @@ class Proxy:
         try:
             while data := source.recv(16384):
                 sink.sendall(data)
-                if counted and self._left is not None:
-                    self._left -= len(data)
-                    if self._left < 0:
-                        self._left = None
+                if counted and self._left:
+                    self._left[0] -= len(data)
+                    if self._left[0] < 0:
+                        self._left.pop(0)
                         self.cuts += 1
                         break
         except OSError:

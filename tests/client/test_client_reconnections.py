@@ -31,6 +31,7 @@ RESUMES_WITHIN_S = 2.0
 def test_an_ordered_stream_gets_the_frame_of_each_pose_once(far_client: Any, proxy: Proxy) -> None:
     shifts = np.linspace(-4, 4, 300)
     with far_client.stream("demo", SMALL) as stream:
+        proxy.cut_after(3000, 10_000, 10_000)  # somewhere in a frame; the 300 have 76,800 pixels
 
         def send() -> None:
             for x in shifts:
@@ -39,11 +40,7 @@ def test_an_ordered_stream_gets_the_frame_of_each_pose_once(far_client: Any, pro
 
         sender = threading.Thread(target=send)
         sender.start()
-        frames = []
-        for frame in stream:
-            frames.append(frame)
-            if len(frames) in (30, 90, 200):
-                proxy.cut_after(3000)  # some frames later, in the middle of one
+        frames = list(stream)
         sender.join()
     assert [frame.sequence for frame in frames] == list(range(1, 301))
     assert [frame.pose[0, 3] for frame in frames] == shifts.tolist()

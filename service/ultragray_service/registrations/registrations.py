@@ -42,15 +42,15 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class _Held:
-    registration: NamedRegistration
+    kept: store.Kept
     until_s: float  # of time.monotonic(): it is used without asking the database
 
 
 class Registrations:
     """All registrations of the installation.
 
-    Whoever put one sees it. For others it is there as long as its scene is, and they may see that: what leads into a
-    private scene stays private when the scene is deleted.
+    Whoever put one sees it. One of a private scene is for that scene's owner besides, whatever takes the name of the
+    scene later; any other is there for all as long as they see its scene.
     """
 
     def __init__(self, catalog: SceneCatalog, owners: Owners, limits: Limits) -> None:
@@ -70,7 +70,7 @@ class Registrations:
             self._held.pop(name, None)
         found = await asyncio.to_thread(self._seen, name, read)
         self._hold(found)
-        return found
+        return found.registration
 
     async def ownership(self, name: str) -> Ownership:
         """Whose a registration is. Raises RegistrationNotFound, DatabaseUnavailable."""
@@ -87,25 +87,25 @@ class Registrations:
             found = await self.get(name)
         elif (
             time.monotonic() > held.until_s
-            or held.registration.scene != base_name(scene)
-            or self._owners.hides(Kind.SCENE, held.registration.scene)
+            or held.kept.origin.scene != base_name(scene)
+            or not _is_seen(held.kept.origin, lambda scene: not self._owners.hides(Kind.SCENE, scene))
         ):
-            found = await self._get_or_held(name, held.registration)
+            found = await self._get_or_held(name, held.kept)
         else:
-            found = held.registration
+            found = held.kept.registration
         return _of_scene(found, scene)
 
     def read_of_scene(self, name: str, scene: str) -> Registration:
         """As `of_scene`, as it is kept now. Blocks; may be called from any thread."""
-        return _of_scene(self._seen(name, store.read_registration(self._opened, name)), scene)
+        return _of_scene(self._seen(name, store.read_registration(self._opened, name)).registration, scene)
 
     async def page(self, page_size: int, page_token: str) -> RegistrationPage:
         """One page by name. Raises InvalidArgument, DatabaseUnavailable."""
-        kept, there = await self._do(store.read_origins), set(await self._catalog.names())
-        seen = sorted(name for name, (owner, scene) in kept.items() if _is_own(owner) or scene in there)
+        origins, there = await self._do(store.read_origins), set(await self._catalog.names())
+        seen = sorted(name for name, origin in origins.items() if _is_seen(origin, there.__contains__))
         names, next_page_token = page_of_names(seen, page_size, page_token)
         read = [await self._do(store.read_registration, name) for name in names]
-        return RegistrationPage([one for one in read if one is not None], next_page_token)
+        return RegistrationPage([one.registration for one in read if one is not None], next_page_token)
 
     async def put(self, name: str, scene: str, registration: Registration) -> NamedRegistration:
         """Keeps a registration, in place of one of the name that is the caller's.
@@ -120,15 +120,16 @@ class Registrations:
                 field="registration",
             )
         await self._catalog.header(scene)
-        most = self._limits.mine.registrations
+        most, whose = self._limits.mine.registrations, self._owners.known(Kind.SCENE, scene)
+        into = (base_name(scene), whose.owner if whose.private else None)
         try:
-            kept = await self._do(store.write_registration, name, base_name(scene), registration, acting(), most)
+            kept = await self._do(store.write_registration, name, *into, registration, acting(), most)
         except LimitReached as error:
             raise self._limits.refused("registrations", error) from None
         if kept is None:
             raise _not_own(name)
         self._hold(kept)
-        return kept
+        return kept.registration
 
     async def delete(self, name: str) -> None:
         """Forgets a registration. Raises RegistrationNotFound, PermissionDenied, DatabaseUnavailable."""
@@ -137,26 +138,27 @@ class Registrations:
             raise _not_own(name)
         self._held.pop(name, None)
 
-    async def _get_or_held(self, name: str, held: NamedRegistration) -> NamedRegistration:
+    async def _get_or_held(self, name: str, held: store.Kept) -> NamedRegistration:
         try:
             return await asyncio.wait_for(self.get(name), HELD_PATIENCE_S)
         except (asyncio.TimeoutError, DatabaseUnavailable):
             _log.warning(f"the database does not answer: the registration {name!r} is used as it was last read")
             found = await asyncio.to_thread(self._seen, name, held)
             self._hold(found, for_s=RETRY_S)
-            return found
+            return found.registration
 
-    def _seen(self, name: str, found: NamedRegistration | None) -> NamedRegistration:
+    def _seen(self, name: str, found: store.Kept | None) -> store.Kept:
         """What was read of a name, where the caller may see it. Blocks. Raises RegistrationNotFound."""
-        if found is None or not (_is_own(found.owner) or found.scene in self._catalog.shown_names()):
+        if found is None or not _is_seen(found.origin, lambda scene: scene in self._catalog.shown_names()):
             raise RegistrationNotFound(f"there is no registration {shown(name)}", field="registration")
         return found
 
-    def _hold(self, registration: NamedRegistration, for_s: float = FRESH_S) -> None:
-        self._held.pop(registration.name, None)
+    def _hold(self, kept: store.Kept, for_s: float = FRESH_S) -> None:
+        name = kept.registration.name
+        self._held.pop(name, None)
         while len(self._held) >= MOST_HELD:
             self._held.pop(next(iter(self._held)))
-        self._held[registration.name] = _Held(registration, time.monotonic() + for_s)
+        self._held[name] = _Held(kept, time.monotonic() + for_s)
 
     @property
     def _opened(self) -> sa.Engine:
@@ -168,8 +170,15 @@ class Registrations:
         return await self._threads.ask(work, self._opened, *arguments, **options)
 
 
+def _is_seen(origin: store.Origin, sees_scene: Callable[[str], bool]) -> bool:
+    """Whether the caller sees a registration; `sees_scene`: whether the caller sees a scene, by its name."""
+    if _is_own(origin.owner):
+        return True
+    return sees_scene(origin.scene) if origin.private_to is None else _is_own(origin.private_to)
+
+
 def _is_own(owner: str | None) -> bool:
-    """Whether a registration is the caller's, or the caller an admin or the service itself."""
+    """Whether something is the caller's, or the caller an admin or the service itself."""
     try:
         return may_change(acting(), Ownership(owner))
     except LookupError:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from dataclasses import dataclass
 
 import sqlalchemy as sa
 from sqlalchemy.dialects import postgresql, sqlite
@@ -19,29 +20,53 @@ from .named import NamedRegistration
 _COLUMNS = REGISTRATIONS.c
 
 
-def read_registration(engine: sa.Engine, name: str) -> NamedRegistration | None:
+@dataclass(frozen=True)
+class Origin:
+    """What decides who may see a registration."""
+
+    owner: str | None
+    scene: str
+    private_to: str | None  # the owner of the scene, where that was private when the registration was put
+
+
+@dataclass(frozen=True)
+class Kept:
+    """A registration as its row has it."""
+
+    registration: NamedRegistration
+    origin: Origin
+
+
+def read_registration(engine: sa.Engine, name: str) -> Kept | None:
     """The registration of a name; None where there is none."""
     with engine.connect() as connection:
         row = connection.execute(sa.select(REGISTRATIONS).where(_COLUMNS.name == name)).one_or_none()
-    return None if row is None else _named(row)
+    return None if row is None else _kept(row)
 
 
-def read_origins(engine: sa.Engine) -> dict[str, tuple[str | None, str]]:
-    """Owner and scene of all registrations, by the names of these."""
-    wanted = sa.select(_COLUMNS.name, _COLUMNS.owner, _COLUMNS.scene)
+def read_origins(engine: sa.Engine) -> dict[str, Origin]:
+    """The origins of all registrations, by the names of these."""
+    wanted = sa.select(_COLUMNS.name, _COLUMNS.owner, _COLUMNS.scene, _COLUMNS.private_to)
     with engine.connect() as connection:
-        return {row.name: (row.owner, row.scene) for row in connection.execute(wanted)}
+        return {row.name: Origin(row.owner, row.scene, row.private_to) for row in connection.execute(wanted)}
 
 
 def write_registration(
-    engine: sa.Engine, name: str, scene: str, registration: Registration, writer: Principal, most: int | None
-) -> NamedRegistration | None:
+    engine: sa.Engine,
+    name: str,
+    scene: str,
+    private_to: str | None,
+    registration: Registration,
+    writer: Principal,
+    most: int | None,
+) -> Kept | None:
     """The registration as it is kept from now on, its owner as before; None where it is another's than the writer's.
 
     Raises LimitReached for a new one of a writer who has `most` already; None: any number.
     """
     values = {
         "scene": scene,
+        "private_to": private_to,
         "changed_at_s": time.time(),
         "document": json.dumps(to_dict(registration), allow_nan=False),
     }
@@ -53,7 +78,7 @@ def write_registration(
             index_elements=[_COLUMNS.name], set_=values, where=_may_change(writer)
         )
         row = connection.execute(kept.returning(*_COLUMNS)).one_or_none()
-    return None if row is None else _named(row)
+    return None if row is None else _kept(row)
 
 
 def delete_registration(engine: sa.Engine, name: str, remover: Principal) -> bool:
@@ -76,7 +101,7 @@ def _may_change(principal: Principal) -> sa.ColumnElement[bool]:
     return sa.true() if principal.role is Role.ADMIN else _COLUMNS.owner == principal.name
 
 
-def _named(row: sa.Row[tuple[object, ...]]) -> NamedRegistration:
-    kept = from_dict(Registration, json.loads(row.document))
+def _kept(row: sa.Row[tuple[object, ...]]) -> Kept:
+    registration = from_dict(Registration, json.loads(row.document))
     facts = {"name": row.name, "scene": row.scene, "owner": row.owner, "changed_at": iso_time(row.changed_at_s)}
-    return NamedRegistration(**to_dict(kept), **facts)
+    return Kept(NamedRegistration(**to_dict(registration), **facts), Origin(row.owner, row.scene, row.private_to))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from .conftest import MATRIX, Keyed
 from .test_ownership import names
 
@@ -16,25 +18,41 @@ def seen(keyed: Keyed) -> dict[str, tuple[int, bool]]:
     }
 
 
-def test_it_stays_private_when_its_scene_is_deleted_and_its_owners_when_another_takes_the_name(
-    keyed: Keyed, scene_bytes: bytes
+@pytest.mark.parametrize("private", ["true", "false"])
+def test_it_stays_private_when_its_scene_is_deleted_and_another_takes_the_name(
+    keyed: Keyed, scene_bytes: bytes, private: str
 ) -> None:
     scene = "/v1/scenes/patient-42"
     assert keyed.http("alice", "PUT", f"{scene}?private=true", content=scene_bytes).status_code == 201
     body = {"scene": "patient-42", "base_to_scene": MATRIX, "probe_to_flange": MATRIX}
     assert keyed.http("alice", "PUT", ARM, json=body).status_code == 200
-    private = {"alice": (200, True), "admin": (200, True), "bob": (404, False), "reader": (404, False)}
-    assert seen(keyed) == private
+    as_before = {"alice": (200, True), "admin": (200, True), "bob": (404, False), "reader": (404, False)}
+    assert seen(keyed) == as_before
     assert keyed.http("alice", "DELETE", scene).status_code == 204
-    assert seen(keyed) == private
+    assert seen(keyed) == as_before
     request = {"pose": {"matrix": MATRIX}, "registration": "alices-arm"}
     refused = keyed.http("bob", "POST", "/v1/scenes/demo/render", json=request)
     assert (refused.status_code, refused.json()["reason"]) == (404, "REGISTRATION_NOT_FOUND")
     assert "patient-42" not in refused.text
-    assert keyed.http("bob", "PUT", f"{scene}?private=true", content=scene_bytes).status_code == 201
-    assert seen(keyed)["alice"] == (200, True)
+    assert keyed.http("bob", "PUT", f"{scene}?private={private}", content=scene_bytes).status_code == 201
+    assert seen(keyed) == as_before
+    for _ in range(2):  # the second time, the service has what it read
+        if private == "false":
+            assert keyed.http("alice", "POST", f"{scene}/render", json=request).status_code == 200
+        refused = keyed.http("bob", "POST", f"{scene}/render", json=request)
+        assert (refused.status_code, refused.json()["reason"]) == (404, "REGISTRATION_NOT_FOUND")
     assert keyed.http("alice", "DELETE", ARM).status_code == 204
     assert keyed.http("bob", "DELETE", scene).status_code == 204
+
+
+def test_one_that_an_admin_puts_for_a_private_scene_is_for_its_owner_too(keyed: Keyed, scene_bytes: bytes) -> None:
+    scene = "/v1/scenes/patient-43"
+    assert keyed.http("alice", "PUT", f"{scene}?private=true", content=scene_bytes).status_code == 201
+    body = {"scene": "patient-43", "base_to_scene": MATRIX, "probe_to_flange": MATRIX}
+    assert keyed.http("admin", "PUT", ARM, json=body).status_code == 200
+    assert seen(keyed) == {"alice": (200, True), "admin": (200, True), "bob": (404, False), "reader": (404, False)}
+    assert keyed.http("admin", "DELETE", ARM).status_code == 204
+    assert keyed.http("alice", "DELETE", scene).status_code == 204
 
 
 def test_one_of_a_scene_that_all_may_see_is_seen_by_all(keyed: Keyed) -> None:

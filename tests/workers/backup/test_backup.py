@@ -69,8 +69,9 @@ def test_everything_comes_back_and_what_ran_waits_again(
     (folder.run / "metrics.jsonl").write_text("{}\n")
     folder.lock.touch()
     folder.reserve.write_bytes(bytes(100))
-    (folder.path / "artifacts.partial").mkdir()
-    (folder.path / "artifacts.partial" / "half").write_text("half")
+    for name in ("artifacts.partial", "scratch.partial"):
+        (folder.path / name).mkdir()
+        (folder.path / name / "half").write_text("half")
     before, _ = store.list()
 
     report = back_up(folders, database_url, backups)

@@ -119,6 +119,7 @@ class JobFolder:
         self.artifacts = self.path / "artifacts"
         self.batch = self.path / BATCH
         self._partial = self.path / "artifacts.partial"
+        self._scratch = self.path / "scratch.partial"
         self._request = self.path / "job.json"
         self._progress = self.path / "progress.json"
         self._outcome = self.path / "outcome.json"
@@ -188,9 +189,20 @@ class JobFolder:
         finally:
             shutil.rmtree(self._partial, ignore_errors=True)
 
+    @contextlib.contextmanager
+    def scratch(self) -> Iterator[Path]:
+        """An empty folder for what is not kept, removed after the body. One at a time."""
+        shutil.rmtree(self._scratch, ignore_errors=True)
+        self._scratch.mkdir()
+        try:
+            yield self._scratch
+        finally:
+            shutil.rmtree(self._scratch, ignore_errors=True)
+
     def remove_leftovers(self) -> None:
         """Removes the half written files of killed processes; no process may be at the job meanwhile."""
         shutil.rmtree(self._partial, ignore_errors=True)
+        shutil.rmtree(self._scratch, ignore_errors=True)
         with contextlib.suppress(OSError):
             self.reserve.unlink(missing_ok=True)
             for path in (self._request, self._progress, self._outcome):

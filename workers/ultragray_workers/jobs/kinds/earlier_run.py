@@ -27,9 +27,8 @@ def take_over_run(job_run: JobRun, begun: str) -> None:
     outcome = old.outcome()
     if outcome is not None and outcome.error == TrainingStateInvalid.reason:
         return  # it cannot be resumed from: this job begins anew
-    partial = job_run.folder.path / "run.partial"
-    shutil.rmtree(partial, ignore_errors=True)
-    with suppress(FileNotFoundError), old.lock.open("a") as lock:  # it may be deleted meanwhile: then anew
+    # The run before may be deleted meanwhile: then this job begins anew.
+    with job_run.folder.scratch() as folder, suppress(FileNotFoundError), old.lock.open("a") as lock:
         fcntl.lockf(lock, fcntl.LOCK_EX)  # a process that was cancelled a moment ago may still write
-        shutil.copytree(old.run, partial, ignore=shutil.ignore_patterns(f".*{TEMPORARY_SUFFIX}"))
-        partial.rename(job_run.folder.run)
+        shutil.copytree(old.run, folder / "run", ignore=shutil.ignore_patterns(f".*{TEMPORARY_SUFFIX}"))
+        (folder / "run").rename(job_run.folder.run)

@@ -6,7 +6,6 @@ import json
 import math
 import shutil
 import sys
-import tempfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -142,9 +141,9 @@ def _finish(
 def _write_report(job_run: JobRun, job: TrainJob, dataset: Dataset, scene: GaussianScene, artifacts: Path) -> None:
     """Pictures of some held-out frames, and the page of the scene alone: a comparison of one method."""
     device = job_run.request.device
-    with tempfile.TemporaryDirectory(prefix="report-", dir=job_run.folder.path) as folder:
+    with job_run.folder.scratch() as folder:
         methods = {SCENE: GivenScene(scene)}
-        comparison = compare_methods(dataset, methods, ComparisonSettings(), folder=Path(folder), device=device)
+        comparison = compare_methods(dataset, methods, ComparisonSettings(), folder=folder, device=device)
         assert comparison is not None  # nothing tells it to stop
         evaluation = scene_evaluation(comparison)
         write_spread(scene, dataset.val, evaluation, artifacts, PICTURES)
@@ -152,7 +151,7 @@ def _write_report(job_run: JobRun, job: TrainJob, dataset: Dataset, scene: Gauss
             dataset,
             scene,
             comparison,
-            Path(folder),
+            folder,
             scene_name=job.scene,
             spread=REPORT_FRAMES,
             trained=trained_of_journal(scene, evaluation, artifacts / JOURNAL_FILE),

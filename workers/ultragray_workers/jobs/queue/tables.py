@@ -104,6 +104,7 @@ REGISTRATIONS = sa.Table(  # of robots and trackers to scenes
     sa.Column("owner", sa.Text, nullable=False),
     sa.Column("changed_at_s", sa.Double, nullable=False),
     sa.Column("document", sa.Text, nullable=False),  # JSON of an ultragray.registration.registration.Registration
+    sa.Column("private_to", sa.Text),  # the owner of the scene, which was private when this was put; NULL: it was not
 )
 SCHEMA_VERSION = sa.Table("ultragray_schema", TABLES, sa.Column("version", sa.Integer, nullable=False))
 
@@ -239,6 +240,11 @@ def _to_version_9(connection: sa.Connection) -> None:
     made.create_all(connection, checkfirst=False)
 
 
+def _to_version_10(connection: sa.Connection) -> None:
+    """Who may see a registration of a private scene."""
+    _add_columns(connection, "ultragray_registrations", {"private_to": "TEXT"})
+
+
 def _add_columns(connection: sa.Connection, table: str, types: dict[str, str]) -> None:
     place = table if connection.dialect.name == "sqlite" else f"{SCHEMA}.{table}"
     for name, kind in types.items():
@@ -257,6 +263,7 @@ STEPS: tuple[Callable[[sa.Connection], None], ...] = (
     _to_version_7,
     _to_version_8,
     _to_version_9,
+    _to_version_10,
 )
 VERSION = len(STEPS)
 
