@@ -1,8 +1,9 @@
-"""Frames go on by a registration that the service has read, while the database that keeps it is away."""
+"""Frames go on by the registrations that a service has copied, while the database that keeps them is away."""
 
 from __future__ import annotations
 
 import json
+import time
 from pathlib import Path
 from typing import Any
 
@@ -10,12 +11,15 @@ import httpx
 import numpy as np
 import pytest
 
+from ultragray_service.access.snapshot import INTERVAL_S
+
 from ..postgres import PostgresServer
-from ..waiting import wait_until
+from ..waiting import at_this_load, wait_until
 from .conftest import StartService
 
 PATH = "/v1/registrations/robot"
 TOO_LATE_S = 30.0  # whoever waits for the database waits for ten
+AT_ONCE_S = 5.0  # whoever does not
 
 
 def put(http: httpx.Client, shift_mm: float) -> None:
@@ -32,6 +36,7 @@ def render(http: httpx.Client, pose: dict[str, Any], registration: str) -> httpx
 
 def assert_shifted(answer: httpx.Response, shift_mm: float) -> None:
     assert answer.status_code == 200, answer.text
+    assert answer.elapsed.total_seconds() < at_this_load(AT_ONCE_S)
     pose = json.loads(answer.headers["X-Ultragray-Pose"])  # [4, 4] mm, in the scene
     assert pose[1][3] == shift_mm
 
@@ -44,18 +49,26 @@ def assert_unavailable(answer: httpx.Response) -> None:
 def test_frames_go_on_by_a_registration_that_was_read_while_the_database_is_away(
     start_service: StartService, postgres: PostgresServer, tmp_path: Path, pose_body: dict[str, Any], silent: bool
 ) -> None:
-    service = start_service(artifact_folder=tmp_path, database_url=postgres.create_database())
+    shared = {"artifact_folder": tmp_path, "database_url": postgres.create_database()}
+    service, other = (start_service(**shared) for _ in range(2))
     take_away, give_back = (postgres.pause, postgres.resume) if silent else (postgres.stop, postgres.start)
-    with httpx.Client(base_url=service.http, timeout=TOO_LATE_S) as http:
+    with (
+        httpx.Client(base_url=service.http, timeout=TOO_LATE_S) as http,
+        httpx.Client(base_url=other.http, timeout=TOO_LATE_S) as elsewhere,
+    ):
         put(http, 3.0)
+        assert_shifted(render(elsewhere, pose_body, "robot"), 3.0)
+        put(http, 4.0)
+        time.sleep(at_this_load(2 * INTERVAL_S))
         take_away()
         try:
             for _ in range(2):
-                assert_shifted(render(http, pose_body, "robot"), 3.0)
+                for one in (http, elsewhere):
+                    assert_shifted(render(one, pose_body, "robot"), 4.0)
                 assert_unavailable(http.get(PATH))  # is told from the database alone
             assert_unavailable(render(http, pose_body, "another"))
         finally:
             give_back()
         wait_until(lambda: http.get(PATH).status_code == 200)
-        put(http, 4.0)
-        assert_shifted(render(http, pose_body, "robot"), 4.0)
+        put(http, 5.0)
+        assert_shifted(render(http, pose_body, "robot"), 5.0)

@@ -3,19 +3,33 @@
 from __future__ import annotations
 
 import os
-from contextlib import suppress
+import random
+import time
 from pathlib import Path
 
 _OF_SESSION = Path("/proc/self/autogroup")  # sched(7), "The autogroup feature"
+_TRIES = 20
 
 
 def let_frames_go_first(level: int) -> None:
-    """Give this process a nice level from 0 to 19, where it has a lower one; and its session, where it leads one.
+    """Raise this process to a nice level from 0 to 19, and its session with it where it leads one.
 
     Linux on a desktop or a server without containers shares the processors among sessions first, and nice levels count
     within a session alone: a training in a session of its own would have as much as all of the service.
     """
     os.nice(max(0, level - os.nice(0)))
     if os.getsid(0) == os.getpid():
-        with suppress(OSError):  # there is no such sharing here
+        _raise_session(level)
+
+
+def _raise_session(level: int) -> None:
+    """Where Linux has no such sharing, or allows no change of it, the session stays as it is."""
+    for _ in range(_TRIES):
+        try:
             _OF_SESSION.write_text(str(level), encoding="ascii")
+        except BlockingIOError:  # of processes that may not administer Linux, one may write in a tenth of a second
+            time.sleep(random.uniform(0.05, 0.25))
+        except OSError:
+            return
+        else:
+            return

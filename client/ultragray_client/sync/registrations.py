@@ -26,7 +26,7 @@ class Registrations:
         self._calls = registrations_pb2_grpc.RegistrationServiceStub(connection.channel)
 
     def list(self, *, timeout_s: float | None = None) -> tuple[Registration, ...]:
-        """All registrations by name, but for those of scenes that the key may not see."""
+        """All registrations that the key may see, by name."""
         request = registrations_pb2.ListRegistrationsRequest()
         found = self._connection.listed(self._calls.ListRegistrations, request, "registrations", timeout_s)
         return tuple(from_message(one, Registration) for one in found)

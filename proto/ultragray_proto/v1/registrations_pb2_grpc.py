@@ -60,7 +60,8 @@ class RegistrationServiceServicer:
     """Missing associated documentation comment in .proto file."""
 
     def ListRegistrations(self, request, context):
-        """The registrations by name, a page at a time; not those of scenes that the key may not see.
+        """The registrations that the key may see, by name, a page at a time. One that was put while its scene was private is
+        seen by the owner of that scene and by admins alone; any other by who put it, and by all who see its scene.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')

@@ -192,7 +192,9 @@ class Service:
         """Opens the jobs' database, and reads who may do what; before any door opens. Raises StartupFailed."""
         await self.places.open()
         await self.jobs.open()
-        self._snapshot = await asyncio.to_thread(Snapshot, self.jobs.database.engine, self._keys, self.owners)
+        self._snapshot = await asyncio.to_thread(
+            Snapshot, self.jobs.database.engine, self._keys, (self.owners.read, self.registrations.read)
+        )
         self.owners.open(self.jobs.database.engine, self.jobs.threads.executor)
         self.registrations.open(self.jobs.database.engine, self.jobs.threads)
         self.audit.open(self.jobs.database.engine)

@@ -1,16 +1,17 @@
-"""The table of registrations. Its functions block, and each is one transaction."""
+"""The table of registrations. Its functions block; those that take an engine are one transaction each."""
 
 from __future__ import annotations
 
 import json
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import sqlalchemy as sa
 from sqlalchemy.dialects import postgresql, sqlite
 
 from ultragray.contract import from_dict, to_dict
 from ultragray.registration.registration import Registration
+from ultragray_workers.jobs.queue.owners import tell_change
 from ultragray_workers.jobs.queue.tables import REGISTRATIONS
 
 from ..access.principal import Principal, Role, iso_time
@@ -18,15 +19,7 @@ from ..errors import LimitReached
 from .named import NamedRegistration
 
 _COLUMNS = REGISTRATIONS.c
-
-
-@dataclass(frozen=True)
-class Origin:
-    """What decides who may see a registration."""
-
-    owner: str | None
-    scene: str
-    private_to: str | None  # the owner of the scene, where that was private when the registration was put
+_KNOWN = {item.name for item in fields(Registration)}  # a later release may write more
 
 
 @dataclass(frozen=True)
@@ -34,7 +27,7 @@ class Kept:
     """A registration as its row has it."""
 
     registration: NamedRegistration
-    origin: Origin
+    private_to: str | None  # the owner of the scene, where that was private when the registration was put
 
 
 def read_registration(engine: sa.Engine, name: str) -> Kept | None:
@@ -44,11 +37,9 @@ def read_registration(engine: sa.Engine, name: str) -> Kept | None:
     return None if row is None else _kept(row)
 
 
-def read_origins(engine: sa.Engine) -> dict[str, Origin]:
-    """The origins of all registrations, by the names of these."""
-    wanted = sa.select(_COLUMNS.name, _COLUMNS.owner, _COLUMNS.scene, _COLUMNS.private_to)
-    with engine.connect() as connection:
-        return {row.name: Origin(row.owner, row.scene, row.private_to) for row in connection.execute(wanted)}
+def read_registrations(connection: sa.Connection) -> dict[str, Kept]:
+    """All registrations, by name."""
+    return {row.name: _kept(row) for row in connection.execute(sa.select(REGISTRATIONS))}
 
 
 def write_registration(
@@ -78,14 +69,20 @@ def write_registration(
             index_elements=[_COLUMNS.name], set_=values, where=_may_change(writer)
         )
         row = connection.execute(kept.returning(*_COLUMNS)).one_or_none()
-    return None if row is None else _kept(row)
+        if row is None:
+            return None
+        tell_change(connection)
+    return _kept(row)
 
 
 def delete_registration(engine: sa.Engine, name: str, remover: Principal) -> bool:
     """Whether it was there and the remover's to delete."""
     with engine.begin() as connection:
         gone = sa.delete(REGISTRATIONS).where(_COLUMNS.name == name, _may_change(remover))
-        return connection.execute(gone).rowcount > 0
+        if not connection.execute(gone).rowcount:
+            return False
+        tell_change(connection)
+    return True
 
 
 def _require_room(connection: sa.Connection, name: str, writer: Principal, most: int) -> None:
@@ -102,6 +99,7 @@ def _may_change(principal: Principal) -> sa.ColumnElement[bool]:
 
 
 def _kept(row: sa.Row[tuple[object, ...]]) -> Kept:
-    registration = from_dict(Registration, json.loads(row.document))
+    document = {key: value for key, value in json.loads(row.document).items() if key in _KNOWN}
+    registration = from_dict(Registration, document)
     facts = {"name": row.name, "scene": row.scene, "owner": row.owner, "changed_at": iso_time(row.changed_at_s)}
-    return Kept(NamedRegistration(**to_dict(registration), **facts), Origin(row.owner, row.scene, row.private_to))
+    return Kept(NamedRegistration(**to_dict(registration), **facts), row.private_to)

@@ -14,14 +14,12 @@ from typer.testing import Result
 
 from ultragray.errors import InvalidArgument
 from ultragray_service.access.keys import KeyStore, KnownKeys
-from ultragray_service.access.owners import Owners
 from ultragray_service.access.principal import Principal, Role
 from ultragray_service.access.snapshot import Snapshot
 from ultragray_service.errors import Unauthenticated
-from ultragray_workers.errors import DatabaseUnavailable, job_not_found
+from ultragray_workers.errors import DatabaseUnavailable
 from ultragray_workers.jobs.queue import tables
 from ultragray_workers.jobs.queue.database import JobDatabase
-from ultragray_workers.jobs.queue.owners import Kind, Ownership
 
 from ...postgres import NewDatabase, PostgresServer
 from ...waiting import wait_until
@@ -39,10 +37,6 @@ def database(tmp_path: Path, database_url: str | None) -> Iterator[JobDatabase]:
     opened = JobDatabase(tmp_path, database_url)
     yield opened
     opened.close()
-
-
-async def unknown_job(job_id: str) -> Ownership:
-    raise job_not_found(job_id)
 
 
 def keys(folder: Path, *arguments: object) -> Result:
@@ -87,7 +81,7 @@ def test_names_that_other_sources_may_give_are_refused(database: JobDatabase, na
 
 def test_a_snapshot_follows_the_keys_and_writes_when_they_were_used(database: JobDatabase) -> None:
     store, known = KeyStore(database.engine), KnownKeys()
-    snapshot = Snapshot(database.engine, known, Owners({Kind.JOB: unknown_job}, {}))
+    snapshot = Snapshot(database.engine, known, ())
     try:
         assert not known.is_used
         key, secret = store.create("alice", Role.READER, None)
@@ -104,7 +98,7 @@ def test_a_snapshot_outlives_the_database(tmp_path: Path, postgres: PostgresServ
     database = JobDatabase(tmp_path, postgres.create_database())
     store, known = KeyStore(database.engine), KnownKeys()
     _, secret = store.create("alice", Role.READER, None)
-    snapshot = Snapshot(database.engine, known, Owners({Kind.JOB: unknown_job}, {}))
+    snapshot = Snapshot(database.engine, known, ())
     try:
         postgres.stop()
         try:

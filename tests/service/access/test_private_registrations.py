@@ -1,4 +1,4 @@
-"""Registrations of private scenes: others never see them, and whoever put one always does."""
+"""Registrations of private scenes: nobody sees them but the owner of the scene and admins."""
 
 from __future__ import annotations
 
@@ -52,6 +52,22 @@ def test_one_that_an_admin_puts_for_a_private_scene_is_for_its_owner_too(keyed: 
     assert keyed.http("admin", "PUT", ARM, json=body).status_code == 200
     assert seen(keyed) == {"alice": (200, True), "admin": (200, True), "bob": (404, False), "reader": (404, False)}
     assert keyed.http("admin", "DELETE", ARM).status_code == 204
+    assert keyed.http("alice", "DELETE", scene).status_code == 204
+
+
+def test_an_admin_who_puts_one_for_a_private_scene_hides_it_from_whom_the_name_was(
+    keyed: Keyed, scene_bytes: bytes
+) -> None:
+    scene = "/v1/scenes/patient-44"
+    assert keyed.http("alice", "PUT", f"{scene}?private=true", content=scene_bytes).status_code == 201
+    body = {"scene": "demo", "base_to_scene": MATRIX, "probe_to_flange": MATRIX}
+    assert keyed.http("bob", "PUT", ARM, json=body).status_code == 200
+    assert keyed.http("admin", "PUT", ARM, json={**body, "scene": "patient-44"}).status_code == 200
+    assert seen(keyed) == {"alice": (200, True), "admin": (200, True), "bob": (404, False), "reader": (404, False)}
+    assert keyed.http("bob", "DELETE", ARM).status_code == 404
+    assert keyed.http("bob", "PUT", ARM, json=body).status_code == 200  # the name is still his
+    assert set(seen(keyed).values()) == {(200, True)}
+    assert keyed.http("bob", "DELETE", ARM).status_code == 204
     assert keyed.http("alice", "DELETE", scene).status_code == 204
 
 

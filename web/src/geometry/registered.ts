@@ -7,14 +7,18 @@ import { length } from "./vector";
 /** What a registration makes of poses. */
 export interface Registered {
   name: string;
-  /** ISO 8601, UTC. */
-  changedAt: string;
   baseToScene: Pose;
   probeToFlange: Pose;
 }
 
-export function registeredBy({ name, changed_at, base_to_scene, probe_to_flange }: Registration): Registered {
-  return { name, changedAt: changed_at, baseToScene: base_to_scene.flat(), probeToFlange: probe_to_flange.flat() };
+export function registeredBy({ name, base_to_scene, probe_to_flange }: Registration): Registered {
+  return { name, baseToScene: base_to_scene.flat(), probeToFlange: probe_to_flange.flat() };
+}
+
+/** Whether the same is made of every pose. */
+export function leadAlike(one: Registered, other: Registered): boolean {
+  const same = (of: Pose, as: Pose): boolean => of.every((value, place) => value === as[place]);
+  return same(one.baseToScene, other.baseToScene) && same(one.probeToFlange, other.probeToFlange);
 }
 
 /** Flange to base of a pose of the probe in the scene. */

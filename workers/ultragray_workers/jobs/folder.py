@@ -10,6 +10,7 @@ reserve         room on the disk, given back when the process has ended
 artifacts/      what can be downloaded; appears whole
 batch/          of a job in shards: what can be downloaded instead, see `batches.place`; other hosts write to it, too
 outcome.json    how it ended: the last thing that the process writes
+scratch.partial files of a step that are not kept: see `JobFolder.scratch`
 """
 
 from __future__ import annotations

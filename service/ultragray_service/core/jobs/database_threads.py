@@ -25,13 +25,12 @@ class DatabaseThreads:
     def __init__(self) -> None:
         self.executor = ThreadPoolExecutor(_THREADS, "database")
 
-    async def ask(self, question: Callable[Concatenate[D, P], T], whom: D, *details: P.args, **options: P.kwargs) -> T:
-        """Calls `question(whom, *details, **options)` in a thread, in the context of the caller: what others keep to
-        themselves is not found.
+    async def ask(self, question: Callable[Concatenate[D, P], T], asked: D, *details: P.args, **options: P.kwargs) -> T:
+        """Calls `question(asked, *details, **options)` in a thread, for whom the running code works.
 
         Raises what it raises, and DatabaseUnavailable where there is no answer within PATIENCE_S.
         """
-        call = partial(copy_context().run, question, whom, *details, **options)
+        call = partial(copy_context().run, question, asked, *details, **options)
         answer = asyncio.get_running_loop().run_in_executor(self.executor, call)
         try:
             return await asyncio.wait_for(answer, PATIENCE_S)

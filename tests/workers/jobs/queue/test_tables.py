@@ -82,6 +82,34 @@ def test_tables_of_a_newer_queue_are_refused_in_words(tmp_path: Path, database_u
         JobDatabase(tmp_path, database_url)
 
 
+def test_registrations_of_private_scenes_stay_private_where_version_10_is_made(
+    tmp_path: Path, database_url: str | None
+) -> None:
+    jobs = JobDatabase(tmp_path, database_url)
+    place = "" if database_url is None else f"{SCHEMA}."
+    with jobs.engine.begin() as connection:
+        tables.TABLES.drop_all(connection)
+        tables.migrate_to(connection, 9)
+        for name, private in {"patient": True, "phantom": False}.items():
+            owner = {"kind": "scene", "name": name, "owner": "alice", "private": private}
+            connection.execute(sa.insert(tables.OWNERS).values(owner))
+            row = {"name": f"of-{name}", "scene": name, "owner": "bob", "changed_at_s": 0.0, "document": "{}"}
+            connection.execute(
+                sa.text(
+                    f"INSERT INTO {place}ultragray_registrations (name, scene, owner, changed_at_s, document) "
+                    "VALUES (:name, :scene, :owner, :changed_at_s, :document)"
+                ),
+                row,
+            )
+    jobs.close()
+    jobs = JobDatabase(tmp_path, database_url)
+    with jobs.engine.connect() as connection:
+        columns = tables.REGISTRATIONS.c
+        found = {row.name: row.private_to for row in connection.execute(sa.select(columns.name, columns.private_to))}
+    assert found == {"of-patient": "alice", "of-phantom": None}
+    jobs.close()
+
+
 def test_a_database_from_before_versions_is_brought_to_this_one(tmp_path: Path, database_url: str | None) -> None:
     jobs = JobDatabase(tmp_path, database_url)
     with jobs.engine.begin() as connection:

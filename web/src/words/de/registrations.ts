@@ -20,7 +20,8 @@ export const registrations: Words["registrations"] = {
   angles: (name) => `Winkel gegen die Achsen von ${name}`,
   about: (axis) => `Um ${axis}`,
   form: (name) => `Flansch zu Basis, wie ${name} sie angibt`,
-  gone: (name) => `${name} ist nicht mehr gespeichert: Lagen sind wieder die des Schallkopfs.`,
+  gone: (name, scene) =>
+    `${name} ${scene === null ? "ist nicht mehr gespeichert" : `gehört jetzt zur Szene ${scene}`}: Lagen sind wieder die des Schallkopfs.`,
   tag: (name) => `nach ${name}`,
   tagMeans: "Lagen werden nach dieser Registrierung angegeben; gewählt unten bei den Registrierungen",
 };

@@ -20,7 +20,8 @@ export const registrations = {
   angles: (name: string): string => `Angles against the axes of ${name}`,
   about: (axis: string): string => `About ${axis}`,
   form: (name: string): string => `Flange to base, as ${name} tells it`,
-  gone: (name: string): string => `${name} is not stored any more: poses are those of the probe again.`,
+  gone: (name: string, scene: string | null): string =>
+    `${name} ${scene === null ? "is not stored any more" : `is of the scene ${scene} now`}: poses are those of the probe again.`,
   tag: (name: string): string => `by ${name}`,
   tagMeans: "Poses are told by this registration; chosen below, among the registrations",
 };

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import shutil
 import sys
 import time
 from collections.abc import Iterator
@@ -72,10 +71,7 @@ def _complete(job_run: JobRun, plan: BatchPlan) -> Outcome:
 def _make_shards(job_run: JobRun, queue: ShardQueue, place: ShardPlace, scene_file: Path) -> None:
     renderer: ShardRenderer | None = None
     meter = _Meter(job_run, queue, place.plan)
-    folder = job_run.folder.path / "shards.partial"  # of files on their way to their place
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir()
-    with _Keeper(job_run, queue, place) as keeper:
+    with job_run.folder.scratch() as folder, _Keeper(job_run, queue, place) as keeper:
         while (shard := queue.take(meter.look)) is not None:
             if place.entry(shard) is not None:  # made by a process that died before it said so
                 queue.done(shard)
@@ -92,7 +88,6 @@ def _make_shards(job_run: JobRun, queue: ShardQueue, place: ShardPlace, scene_fi
             keeper.keep(path, shard, entry)
             meter.finished(entry.frames)
         keeper.wait()
-    shutil.rmtree(folder)
 
 
 @contextmanager

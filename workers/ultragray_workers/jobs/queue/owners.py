@@ -73,5 +73,5 @@ def _is(kind: Kind, name: str) -> tuple[sa.ColumnElement[bool], sa.ColumnElement
 
 
 def tell_change(connection: sa.Connection) -> None:
-    """Counts a change of keys or owners, in the transaction that makes it."""
+    """Counts a change of keys, owners or registrations, in the transaction that makes it."""
     connection.execute(sa.update(CHANGES).values(number=CHANGES.c.number + 1))

@@ -52,7 +52,7 @@ OWNERS = sa.Table(  # of datasets and scenes; jobs keep theirs with their row
     sa.Column("private", sa.Boolean, nullable=False),
     sa.Column("claim", sa.Text),  # what made the row, see `owners`; NULL: it is from before there were claims
 )
-CHANGES = sa.Table(  # one row: counts the changes of keys and owners, so that who keeps a copy sees when it is old
+CHANGES = sa.Table(  # one row: counts the changes of keys, owners and registrations: who has a copy sees when it is old
     "ultragray_changes", TABLES, sa.Column("number", sa.BigInteger, nullable=False)
 )
 AUDIT = sa.Table(  # append-only
@@ -243,12 +243,22 @@ def _to_version_9(connection: sa.Connection) -> None:
 def _to_version_10(connection: sa.Connection) -> None:
     """Who may see a registration of a private scene."""
     _add_columns(connection, "ultragray_registrations", {"private_to": "TEXT"})
+    registrations, owners = _place(connection, "ultragray_registrations"), _place(connection, "ultragray_owners")
+    connection.execute(
+        sa.text(
+            f"UPDATE {registrations} AS kept SET private_to = "
+            f"(SELECT owner FROM {owners} WHERE kind = 'scene' AND name = kept.scene AND private)"
+        )
+    )
 
 
 def _add_columns(connection: sa.Connection, table: str, types: dict[str, str]) -> None:
-    place = table if connection.dialect.name == "sqlite" else f"{SCHEMA}.{table}"
     for name, kind in types.items():
-        connection.execute(sa.text(f"ALTER TABLE {place} ADD COLUMN {name} {kind}"))
+        connection.execute(sa.text(f"ALTER TABLE {_place(connection, table)} ADD COLUMN {name} {kind}"))
+
+
+def _place(connection: sa.Connection, table: str) -> str:
+    return table if connection.dialect.name == "sqlite" else f"{SCHEMA}.{table}"
 
 
 # Each takes the tables from one version to the next. A step that has been released never changes: it says what it makes

@@ -27,7 +27,11 @@ PageToken = Annotated[str, Query(description="next_page_token of the page before
 async def list_registrations(
     service: ServiceDep, page_size: PageSize = DEFAULT_PAGE_SIZE, page_token: PageToken = ""
 ) -> RegistrationPage:
-    """The registrations by name; not those of scenes that the key may not see."""
+    """The registrations that the key may see, by name.
+
+    One that was put while its scene was private is seen by the owner of that scene and by admins alone; any other by
+    who put it, and by all who see its scene.
+    """
     return await service.registrations.page(page_size, page_token)
 
 
