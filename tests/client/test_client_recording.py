@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import resource
 import signal
 import subprocess
 import sys
@@ -29,6 +28,7 @@ from ultragray_client import (
     errors,
 )
 
+from ..file_sizes import files_of_at_most
 from ..service.conftest import RunningService
 from .conftest import KEY
 from .test_client_render import moved
@@ -182,13 +182,12 @@ def test_a_client_that_is_killed_leaves_no_file_of_that_name_and_what_it_wrote_c
 
 def test_a_file_that_cannot_grow_is_one_error_and_leaves_nothing(client: Any, tmp_path: Path) -> None:
     frame = client.render("demo", POSES[0], RenderSettings(height=64, width=64))
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (2000, before[1]))
-    try:
-        with pytest.raises(OSError, match="File too large"), Recording(tmp_path / "full.mcap") as recording:
-            recording.add(frame)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    with (
+        files_of_at_most(2000),
+        pytest.raises(OSError, match="File too large"),
+        Recording(tmp_path / "full.mcap") as recording,
+    ):
+        recording.add(frame)
     assert list(tmp_path.iterdir()) == []
 
 

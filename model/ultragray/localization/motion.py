@@ -33,14 +33,18 @@ class Motions:
         return cls(middle, float((positions - middle).square().sum(dim=1).mean().sqrt()))
 
     def moved(self, poses: Tensor, steps: Tensor) -> Tensor:  # [..., 4, 4], [..., 6] mm -> [..., 4, 4]
-        """Poses after steps: three shifts and three turns, about lateral, elevation and axial axis."""
+        """Poses after steps."""
+        return poses @ self.of_steps(steps)
+
+    def of_steps(self, steps: Tensor) -> Tensor:  # [..., 6] mm -> [..., 4, 4]
+        """In the probe frame: three shifts and three turns, about lateral, elevation and axial axis."""
         shifts, turns = steps[..., :3], steps[..., 3:] / self.lever_mm
         rotations = turned_by(turns.reshape(-1, 3)).reshape(*turns.shape[:-1], 3, 3)
         motions = torch.zeros(*steps.shape[:-1], 4, 4, dtype=steps.dtype)
         motions[..., :3, :3] = rotations
         motions[..., :3, 3] = self.middle_mm - rotations @ self.middle_mm + shifts
         motions[..., 3, 3] = 1.0
-        return poses @ motions
+        return motions
 
     def step_between(self, before: Tensor, after: Tensor) -> tuple[float, float]:  # [4, 4] both
         """How far the middle of the image moves, mm, and the image turns, degrees."""

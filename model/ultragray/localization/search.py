@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -218,17 +219,34 @@ class _Search:
     def _linearised(self, poses: Tensor, stage: Stage, scale: Scale, target: Tensor, slides: bool = True) -> _Fit:
         """The fit at poses [K, 4, 4]; a frame that `slides` tells itself how motions within its plane change it."""
         count, size = len(poses), (scale.rows, scale.columns)
-        beside = stage.probing_mm * torch.eye(6, dtype=torch.float64)
-        steps = torch.cat([torch.zeros(1, 6, dtype=torch.float64), beside, -beside])
-        sliding = steps[:, IN_PLANE].any(dim=1) & slides
-        around = self._motions.moved(poses[:, None], steps[~sliding])
-        frames = torch.empty(count, len(steps), *size)
-        frames[:, ~sliding] = self._rendered(around.reshape(-1, 4, 4), *size).reshape(count, -1, *size)
+        around = _around(self._probe, stage.probing_mm, *size)
+        is_slid = around.is_slid if slides else torch.zeros_like(around.is_slid)
+        rendered = poses[:, None] @ around.motions[~is_slid]
+        frames = torch.empty(count, len(is_slid), *size)
+        frames[:, ~is_slid] = self._rendered(rendered.reshape(-1, 4, 4), *size).reshape(count, -1, *size)
         if slides:
-            frames[:, sliding] = slid(frames[:, 0], places_after(self._probe, self._motions, steps[sliding], *size))
-        left = _missed(frames.reshape(-1, *size), scale, target).reshape(count, len(steps), -1)
+            frames[:, is_slid] = slid(frames[:, 0], around.places)
+        left = _missed(frames.reshape(-1, *size), scale, target).reshape(count, len(is_slid), -1)
         changes = (left[:, 1:7] - left[:, 7:]) / (2.0 * stage.probing_mm)
         return _Fit(poses, left[:, 0], changes, torch.zeros(count, dtype=torch.int64))
+
+
+@dataclass(frozen=True, eq=False)
+class _Around:
+    """Where frames are taken to tell how they change: at a pose, and a step on either side of it for each number."""
+
+    motions: Tensor  # [13, 4, 4]
+    is_slid: Tensor  # [13], whether the motion is within the image plane
+    places: Tensor  # [6, rows, columns, 2] of those, see `places_after`
+
+
+@lru_cache(maxsize=32)
+def _around(probe: Probe, step_mm: float, rows: int, columns: int) -> _Around:
+    beside = step_mm * torch.eye(6, dtype=torch.float64)
+    steps = torch.cat([torch.zeros(1, 6, dtype=torch.float64), beside, -beside])
+    is_slid = steps[:, IN_PLANE].any(dim=1)
+    motions = Motions.of(probe).of_steps(steps)
+    return _Around(motions, is_slid, places_after(probe, motions[is_slid], rows, columns))
 
 
 def _missed(frames: Tensor, scale: Scale, target: Tensor) -> Tensor:  # [C, rows, columns] -> [C, pixels]

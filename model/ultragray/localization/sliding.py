@@ -13,18 +13,17 @@ from torch.nn import functional
 
 from ..evaluation.compounding import pixel_positions_mm
 from ..probe import FloatArray, Probe
-from .motion import Motions
 
 IN_PLANE = (0, 2, 4)  # of the six numbers of a motion: shifts along lateral and axial axis, the turn about elevation
 
 
-def places_after(probe: Probe, motions: Motions, steps: Tensor, rows: int, columns: int) -> Tensor:
-    """Where in a frame [rows, columns] the pixels of frames after steps [S, 6] mm lie: [S, rows, columns, 2].
+def places_after(probe: Probe, motions: Tensor, rows: int, columns: int) -> Tensor:
+    """Where in a frame [rows, columns] the pixels of frames after motions [S, 4, 4] lie: [S, rows, columns, 2].
 
     The two numbers are column and row in [-1, 1], as functional.grid_sample() takes them.
     """
     pixels = pixel_positions_mm(probe, rows, columns)
-    moves = motions.moved(torch.eye(4, dtype=torch.float64).expand(len(steps), 4, 4), steps).numpy()
+    moves = motions.numpy()
     moved = pixels @ moves[:, :3, :3].transpose(0, 2, 1) + moves[:, None, :3, 3]
     depth, across = (share.reshape(rows, columns) for share in _coordinates(probe, pixels))
     rows_after, columns_after = _coordinates(probe, moved)
@@ -35,7 +34,7 @@ def places_after(probe: Probe, motions: Motions, steps: Tensor, rows: int, colum
         ],
         axis=-1,
     )
-    return torch.from_numpy(places.reshape(len(steps), rows, columns, 2)).float()
+    return torch.from_numpy(places.reshape(len(motions), rows, columns, 2)).float()
 
 
 def slid(frames: Tensor, places: Tensor) -> Tensor:  # [K, H, W], [S, H, W, 2] -> [K, S, H, W]

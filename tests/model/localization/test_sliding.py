@@ -23,8 +23,8 @@ def frames(count: int = 2) -> Tensor:
 
 
 def after(probe: Probe, *steps: tuple[float, ...]) -> Tensor:  # [6] mm each -> [K, S, ROWS, COLUMNS]
-    moves = torch.tensor(steps, dtype=torch.float64)
-    return slid(frames(), places_after(probe, Motions.of(probe), moves, ROWS, COLUMNS))
+    motions = Motions.of(probe).of_steps(torch.tensor(steps, dtype=torch.float64))
+    return slid(frames(), places_after(probe, motions, ROWS, COLUMNS))
 
 
 @pytest.mark.parametrize("probe", [LINEAR, CONVEX], ids=["linear", "convex"])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import resource
 import secrets
 import signal
 import subprocess
@@ -22,6 +21,7 @@ from ultragray_service.rpc.peers import address_of
 from ultragray_service.rpc.shared_memory import FOLDER, SharedMemory
 from ultragray_workers.pool.types import Place
 
+from ...file_sizes import files_of_at_most
 from ...waiting import wait_until
 from ..access.test_addresses import own_address
 from ..conftest import ROOT, RunningService, StartService
@@ -302,12 +302,8 @@ def test_a_slot_that_cannot_be_written_is_not_taken(memory: ClientMemory, tmp_pa
     source = (tmp_path / "frame").open("wb+", buffering=0)
     source.write(np.arange(8192, dtype=np.uint8).tobytes())
     shared = SharedMemory(memory.message, LOCAL_PEER)
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (HEADER_BYTES + 4096, before[1]))  # like a /dev/shm that is full
-    try:
+    with files_of_at_most(HEADER_BYTES + 4096):  # like a /dev/shm that is full
         assert shared.put(source.fileno(), 8192) is None
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert memory.flags == b"\1\1\1"
     assert shared.put(source.fileno(), 8192) == Place(0, 8192)
     assert shared.put(source.fileno(), 8193) is None  # the file has less

@@ -6,7 +6,6 @@ import asyncio
 import fcntl
 import json
 import os
-import resource
 import shutil
 import subprocess
 import time
@@ -28,6 +27,7 @@ from ultragray_workers.datasets.store import DatasetStore, write_manifest
 from ultragray_workers.errors import ArtifactNotFound, DatasetNotFound, DeadlineExceeded, Draining, StorageFull
 from ultragray_workers.helpers.dataset_view import lay_out
 
+from ...file_sizes import files_of_at_most
 from ..http.test_http_comparison import DATASET
 
 Wanted = dict[str, str]
@@ -192,12 +192,8 @@ def test_what_no_one_foresaw_is_a_failure_as_well(
 
 
 def test_a_disk_without_room_is_told(tmp_path: Path, wanted: Wanted) -> None:
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (DATASET.train.images.size, before[1]))
-    try:
+    with files_of_at_most(DATASET.train.images.size):
         failed = asyncio.run(asyncio.wait_for(end_of(views(tmp_path), wanted), 30))
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert isinstance(failed.error, StorageFull)
     assert names(tmp_path) == []
 
