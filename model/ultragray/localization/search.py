@@ -160,6 +160,7 @@ class _Search:
 
     def __init__(self, frame: Tensor, probe: Probe, motions: Motions, rendered: Rendered) -> None:
         self._frame, self._probe, self._motions, self._rendered = frame, probe, motions, rendered
+        self._known: dict[tuple[bytes, int, int], Tensor] = {}  # frames by pose, rows and columns
 
     def begin(self, starts: Tensor) -> Tensor:  # [S, 4, 4] -> [K, 4, 4]
         """The starts that look most like the frame, the given one first among equals."""
@@ -214,39 +215,49 @@ class _Search:
         return scale, scale.appearance(scale.resized(self._frame)[None])[0]
 
     def _left(self, poses: Tensor, scale: Scale, target: Tensor) -> Tensor:  # [K, 4, 4] -> [K, pixels]
-        return _missed(self._rendered(poses, scale.rows, scale.columns), scale, target)
+        return _missed(self._frames(poses, scale.rows, scale.columns), scale, target)
+
+    def _frames(self, poses: Tensor, rows: int, columns: int) -> Tensor:  # [K, 4, 4] -> [K, rows, columns]
+        """The frames at poses. Most poses are looked at twice, and rendered once."""
+        keys = [(pose.numpy().tobytes(), rows, columns) for pose in poses]
+        new = [index for index, key in enumerate(keys) if key not in self._known]
+        if new:
+            frames = self._rendered(poses[new], rows, columns)
+            self._known.update({keys[index]: frame for index, frame in zip(new, frames, strict=True)})
+        return torch.stack([self._known[key] for key in keys])
 
     def _linearised(self, poses: Tensor, stage: Stage, scale: Scale, target: Tensor, slides: bool = True) -> _Fit:
         """The fit at poses [K, 4, 4]; a frame that `slides` tells itself how motions within its plane change it."""
         count, size = len(poses), (scale.rows, scale.columns)
-        around = _around(self._probe, stage.probing_mm, *size)
-        is_slid = around.is_slid if slides else torch.zeros_like(around.is_slid)
-        rendered = poses[:, None] @ around.motions[~is_slid]
+        beside = _beside(self._probe, stage.probing_mm, *size)
+        is_slid = beside.is_slid if slides else torch.zeros_like(beside.is_slid)
+        here = self._frames(poses, *size)
+        rendered = poses[:, None] @ beside.motions[~is_slid]
         frames = torch.empty(count, len(is_slid), *size)
         frames[:, ~is_slid] = self._rendered(rendered.reshape(-1, 4, 4), *size).reshape(count, -1, *size)
         if slides:
-            frames[:, is_slid] = slid(frames[:, 0], around.places)
+            frames[:, is_slid] = slid(here, beside.places)
         left = _missed(frames.reshape(-1, *size), scale, target).reshape(count, len(is_slid), -1)
-        changes = (left[:, 1:7] - left[:, 7:]) / (2.0 * stage.probing_mm)
-        return _Fit(poses, left[:, 0], changes, torch.zeros(count, dtype=torch.int64))
+        changes = (left[:, :6] - left[:, 6:]) / (2.0 * stage.probing_mm)
+        return _Fit(poses, _missed(here, scale, target), changes, torch.zeros(count, dtype=torch.int64))
 
 
 @dataclass(frozen=True, eq=False)
-class _Around:
-    """Where frames are taken to tell how they change: at a pose, and a step on either side of it for each number."""
+class _Beside:
+    """Where frames are taken to tell how they change: a step on either side of a pose for each number."""
 
-    motions: Tensor  # [13, 4, 4]
-    is_slid: Tensor  # [13], whether the motion is within the image plane
+    motions: Tensor  # [12, 4, 4], those ahead first
+    is_slid: Tensor  # [12], whether the motion is within the image plane
     places: Tensor  # [6, rows, columns, 2] of those, see `places_after`
 
 
 @lru_cache(maxsize=32)
-def _around(probe: Probe, step_mm: float, rows: int, columns: int) -> _Around:
-    beside = step_mm * torch.eye(6, dtype=torch.float64)
-    steps = torch.cat([torch.zeros(1, 6, dtype=torch.float64), beside, -beside])
+def _beside(probe: Probe, step_mm: float, rows: int, columns: int) -> _Beside:
+    ahead = step_mm * torch.eye(6, dtype=torch.float64)
+    steps = torch.cat([ahead, -ahead])
     is_slid = steps[:, IN_PLANE].any(dim=1)
     motions = Motions.of(probe).of_steps(steps)
-    return _Around(motions, is_slid, places_after(probe, motions[is_slid], rows, columns))
+    return _Beside(motions, is_slid, places_after(probe, motions[is_slid], rows, columns))
 
 
 def _missed(frames: Tensor, scale: Scale, target: Tensor) -> Tensor:  # [C, rows, columns] -> [C, pixels]
