@@ -273,7 +273,7 @@ $(VENV)/installed-dev: $(VENV)/installed
 $(VENV)/collected: $(VENV)/installed-dev
 	@echo "Compiling the tests ..."
 	@printf '%s\n' "tests/model tests/workers" "$$(ls -d tests/*/ | grep -v -e /model/ -e /workers/ | tr '\n' ' ')" \
-		| xargs -P 2 -L 1 $(BIN)/pytest --collect-only --quiet > /dev/null
+		| xargs -P 2 -L 1 $(BIN)/pytest --collect-only --quiet > $@.log || { tail -n 40 $@.log; exit 1; }
 	@touch $@
 
 web/node_modules/.package-lock.json: web/package-lock.json

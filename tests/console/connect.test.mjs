@@ -23,9 +23,10 @@ comment, command = open(sys.argv[1]).read().split("ultragray-ros", 1)
 words = shlex.split(command.replace("\\\\\\n", " "))
 assert words[0] == "--ros-args" and set(words[1::2]) == {"-p"}, words
 given = {name: yaml.safe_load(value) for name, _, value in (word.partition(":=") for word in words[2::2])}
-known = {"address": "", "scene": "", **defaults()}
+known = {"address": "", "scene": "", "scene_frame": "scene", **defaults()}
 assert {name: type(value) for name, value in given.items()} == {name: type(known[name]) for name in given}, given
 stamped = yaml.safe_load(shlex.split(comment, comments=False)[-1])
+assert stamped["header"]["frame_id"] == {**known, **given}["scene_frame"], command
 place, turn = stamped["pose"]["position"], stamped["pose"]["orientation"]
 pose = Placement(tuple(1000 * place[axis] for axis in "xyz"), Quaternion(**turn))
 with Client(given["address"]) as client:
@@ -149,7 +150,9 @@ describe("connect", () => {
     assert.match(run(PYTHON, written("ask.py", asking)), /bmode \d+x\d+/);
     const call = written("grpcurl.sh", await program(page, "grpc"));
     assert.match(run(PYTHON, "-c", GRPCURL, call), /^\d+ \d+ \d+ \[\]/);
-    assert.equal(JSON.parse(run(PYTHON, "-c", ROS, written("node.sh", await program(page, "ros"))))[3], "linear");
+    const node = await program(page, "ros");
+    assert.match(node, /frame_id: base/);
+    assert.equal(JSON.parse(run(PYTHON, "-c", ROS, written("node.sh", node)))[3], "linear");
     await program(page, "igtl");
     await page.getByText("names a registration by the parameter Registration").waitFor();
     assert.deepEqual(page.faults, []);

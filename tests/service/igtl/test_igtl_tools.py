@@ -89,6 +89,20 @@ def test_probe_and_needle_in_one_message_give_one_frame(peer: Peer, igtl_service
     assert peer.ask("GET_STATUS").type_name == "STATUS"  # no second image came before
 
 
+@pytest.mark.parametrize("lost", [0.0, math.nan])
+def test_frames_go_on_while_the_tracker_does_not_see_the_needle(peer: Peer, lost: float) -> None:
+    set_to(peer, Tools=TRACKED)
+    for step, needle in enumerate((at(2.0, 18.0), np.full((4, 4), lost), at(5.0, 18.0))):
+        instruments = [Instrument("NeedleToReference", needle), Instrument("ProbeToReference", moved(step))]
+        peer.send("TDATA", "Tracker", pack_instruments("TDATA", instruments), version=2)
+        frame = peer.receive()
+        assert frame.type_name == "IMAGE"
+        corner_x = float(unpack_image(frame.content).matrix[0, 3])
+        assert corner_x == pytest.approx(step - 20.0 * 47 / 48, abs=1e-3)
+        tip_x = json.loads(frame.metadata["tools"])[0]["tip_mm"][0]
+        assert tip_x == (5.0 if step == 2 else 2.0)  # where it was last seen
+
+
 def test_the_last_frame_of_a_needle_that_is_moved_fast_has_its_last_place(peer: Peer) -> None:
     set_to(peer, Tools=TRACKED)
     peer.send_pose(at(0.0, 20.0), "NeedleToReference", version=2)

@@ -173,6 +173,8 @@ function ros(target: Target, { pose, settings }: Asked): string {
   const place = `position: {x: ${x}, y: ${y}, z: ${z}}, orientation: {x: ${i}, y: ${j}, z: ${k}, w: ${w}}`;
   const { display, probe, tools, encoding: _, ...plain } = known(settings) as Given & { display?: Given; probe?: Given; tools?: ToldTool[] };
   const given: Given = { address: `${target.host}:${target.grpcPort}`, scene: target.scene, ...plain };
+  const frame = settings.registration == null ? "scene" : "base";
+  if (frame !== "scene") given.scene_frame = frame;
   if (isSecure(target)) given.tls = true;
   if (probe !== undefined) given.probe = JSON.stringify(probe);
   if (tools !== undefined) given.tools = JSON.stringify(tools);
@@ -180,7 +182,7 @@ function ros(target: Target, { pose, settings }: Asked): string {
   const parameters = Object.entries(given)
     .filter(([, value]) => !(Array.isArray(value) && value.length === 0))
     .map(([name, value]) => ` \\\n  -p '${name}:=${parameter(name, value).replaceAll("'", "'\\''")}'`);
-  return `# Then publish the pose of now: ros2 topic pub --once /ultragray/probe_pose geometry_msgs/msg/PoseStamped '{header: {frame_id: scene}, pose: {${place}}}'
+  return `# Then publish the pose of now: ros2 topic pub --once /ultragray/probe_pose geometry_msgs/msg/PoseStamped '{header: {frame_id: ${frame}}, pose: {${place}}}'
 ${target.keyRequired ? `ULTRAGRAY_API_KEY=${KEY} ` : ""}ultragray-ros --ros-args${parameters.join("")}
 `;
 }
