@@ -1,6 +1,8 @@
 /** Registrations: listed, chosen so that poses are those of the robot, and deleted. */
 
 import assert from "node:assert/strict";
+import { copyFileSync } from "node:fs";
+import path from "node:path";
 import { describe, it } from "node:test";
 
 import { picture, seriousFindings, until } from "./harness.mjs";
@@ -14,6 +16,7 @@ const PROBE_TO_FLANGE = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 142], [0, 0, 0, 1
 
 const at = tested({
   prepare: async ({ service }) => {
+    copyFileSync(path.join(service.data, "demo.ugr"), path.join(service.data, "second.ugr"));
     const put = async (name, body) => {
       const answer = await fetch(`${service.url}/v1/registrations/${name}`, { method: "PUT", body: JSON.stringify(body), headers: { "Content-Type": "application/json" } });
       assert.ok(answer.ok, await answer.text());
@@ -56,8 +59,8 @@ describe("the registrations", () => {
 
   it("are followed where they are changed at the service, and told where they are gone", async () => {
     const address = `${at.service.url}/v1/registrations/moved`;
-    const put = async (base) => {
-      const body = JSON.stringify({ scene: "demo", base_to_scene: base, probe_to_flange: PROBE_TO_FLANGE });
+    const put = async (base, scene = "demo") => {
+      const body = JSON.stringify({ scene, base_to_scene: base, probe_to_flange: PROBE_TO_FLANGE });
       assert.ok((await fetch(address, { method: "PUT", body, headers: { "Content-Type": "application/json" } })).ok);
     };
     await put(BASE_TO_SCENE);
@@ -70,6 +73,15 @@ describe("the registrations", () => {
     assert.ok((await fetch(address, { method: "DELETE" })).ok);
     await panelOf(page).getByText("moved is not stored any more: poses are those of the probe again.").waitFor({ timeout: 20_000 });
     await until(() => poseOf(page), ({ position_mm: { x } }) => x === 0, "the pose is still the flange's");
+    await put(BASE_TO_SCENE);
+    await panelOf(page).getByRole("radio", { name: "moved" }).check({ timeout: 20_000 });
+    await until(() => poseOf(page), ({ position_mm: { x } }) => x === 400, "not the flange in the base");
+    await put(BASE_TO_SCENE, "second");
+    const elsewhere = panelOf(page).getByText("moved is of the scene second now: poses are those of the probe again.");
+    await elsewhere.waitFor({ timeout: 20_000 });
+    await until(() => poseOf(page), ({ position_mm: { x } }) => x === 0, "the pose is still the flange's");
+    await put(BASE_TO_SCENE);
+    await elsewhere.waitFor({ state: "detached", timeout: 20_000 });
   });
 
   it("move the probe by the numbers of the flange", async () => {

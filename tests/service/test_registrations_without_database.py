@@ -10,8 +10,12 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
+import sqlalchemy as sa
 
 from ultragray_service.access.snapshot import INTERVAL_S
+from ultragray_workers.jobs.queue.database import JobDatabase
+from ultragray_workers.jobs.queue.owners import tell_change
+from ultragray_workers.jobs.queue.tables import REGISTRATIONS
 
 from ..postgres import PostgresServer
 from ..waiting import at_this_load, wait_until
@@ -19,7 +23,7 @@ from .conftest import StartService
 
 PATH = "/v1/registrations/robot"
 TOO_LATE_S = 30.0  # whoever waits for the database waits for ten
-AT_ONCE_S = 5.0  # whoever does not
+AT_ONCE_S = 5.0  # a frame that does not wait for it
 
 
 def put(http: httpx.Client, shift_mm: float) -> None:
@@ -72,3 +76,23 @@ def test_frames_go_on_by_a_registration_that_was_read_while_the_database_is_away
         wait_until(lambda: http.get(PATH).status_code == 200)
         put(http, 5.0)
         assert_shifted(render(http, pose_body, "robot"), 5.0)
+        assert http.delete(PATH).status_code == 204
+        assert render(http, pose_body, "robot").status_code == 404
+        wait_until(lambda: render(elsewhere, pose_body, "robot").status_code == 404)
+
+
+def test_one_that_cannot_be_read_hinders_no_other(
+    start_service: StartService, tmp_path: Path, pose_body: dict[str, Any]
+) -> None:
+    service = start_service(artifact_folder=tmp_path)
+    with httpx.Client(base_url=service.http, timeout=TOO_LATE_S) as http:
+        put(http, 3.0)
+        database = JobDatabase(tmp_path, None)
+        with database.engine.begin() as connection:
+            row = {"name": "odd", "scene": "demo", "owner": "local:", "changed_at_s": 0.0, "document": '{"later": 1}'}
+            connection.execute(sa.insert(REGISTRATIONS).values(row))
+            tell_change(connection)
+        database.close()
+        wait_until(lambda: "the registration 'odd' cannot be read" in service.log_path.read_text())
+        assert [one["name"] for one in http.get("/v1/registrations").json()["registrations"]] == ["robot"]
+        assert_shifted(render(http, pose_body, "robot"), 3.0)

@@ -53,7 +53,7 @@ def test_a_session_is_as_nice_as_the_process_that_leads_it() -> None:
 
 @needs_sessions
 def test_sessions_that_begin_at_once_are_all_as_nice_as_they_were_told_to_be() -> None:
-    """Linux takes one such change in a tenth of a second from all processes that may not administer it."""
+    """Without CAP_SYS_ADMIN, Linux takes one write in 0.1 s from all processes together."""
     together = [
         subprocess.Popen(
             [*WITHOUT_CAPABILITY, sys.executable, "-c", PROGRAM],

@@ -23,11 +23,11 @@ def let_frames_go_first(level: int) -> None:
 
 
 def _raise_session(level: int) -> None:
-    """Where Linux has no such sharing, or allows no change of it, the session stays as it is."""
+    """Raise the session of this process, where Linux has such sharing and takes a change of it."""
     for _ in range(_TRIES):
         try:
             _OF_SESSION.write_text(str(level), encoding="ascii")
-        except BlockingIOError:  # of processes that may not administer Linux, one may write in a tenth of a second
+        except BlockingIOError:  # without CAP_SYS_ADMIN, one write in 0.1 s from all processes together
             time.sleep(random.uniform(0.05, 0.25))
         except OSError:
             return

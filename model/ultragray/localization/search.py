@@ -218,7 +218,7 @@ class _Search:
         return _missed(self._frames(poses, scale.rows, scale.columns), scale, target)
 
     def _frames(self, poses: Tensor, rows: int, columns: int) -> Tensor:  # [K, 4, 4] -> [K, rows, columns]
-        """The frames at poses. Most poses are looked at twice, and rendered once."""
+        """The frames at poses, each of which is rendered once in a search."""
         keys = [(pose.numpy().tobytes(), rows, columns) for pose in poses]
         new = [index for index, key in enumerate(keys) if key not in self._known]
         if new:
@@ -234,7 +234,7 @@ class _Search:
         here = self._frames(poses, *size)
         rendered = poses[:, None] @ beside.motions[~is_slid]
         frames = torch.empty(count, len(is_slid), *size)
-        frames[:, ~is_slid] = self._rendered(rendered.reshape(-1, 4, 4), *size).reshape(count, -1, *size)
+        frames[:, ~is_slid] = self._frames(rendered.reshape(-1, 4, 4), *size).reshape(count, -1, *size)
         if slides:
             frames[:, is_slid] = slid(here, beside.places)
         left = _missed(frames.reshape(-1, *size), scale, target).reshape(count, len(is_slid), -1)
@@ -244,11 +244,11 @@ class _Search:
 
 @dataclass(frozen=True, eq=False)
 class _Beside:
-    """Where frames are taken to tell how they change: a step on either side of a pose for each number."""
+    """The motions of the central differences: for each of the six numbers a step forwards and one backwards."""
 
-    motions: Tensor  # [12, 4, 4], those ahead first
+    motions: Tensor  # [12, 4, 4], those forwards first
     is_slid: Tensor  # [12], whether the motion is within the image plane
-    places: Tensor  # [6, rows, columns, 2] of those, see `places_after`
+    places: Tensor  # [6, rows, columns, 2] after the motions within the plane, see `places_after`
 
 
 @lru_cache(maxsize=32)

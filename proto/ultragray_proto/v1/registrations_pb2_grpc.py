@@ -76,7 +76,7 @@ class RegistrationServiceServicer:
 
     def PutRegistration(self, request, context):
         """Keeps a registration, in place of one of that name which is the key's own. Requests that name it follow at once, those
-        to other services of the installation within a second; streams with their next settings. SCENE_NOT_FOUND,
+        to other services of the installation within two seconds; streams with their next settings. SCENE_NOT_FOUND,
         INVALID_POSE, PERMISSION_DENIED, LIMIT_REACHED.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)

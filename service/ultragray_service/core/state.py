@@ -189,7 +189,10 @@ class Service:
             raise Draining("the service will stop; it still answers")
 
     async def open(self) -> None:
-        """Opens the jobs' database, and reads who may do what; before any door opens. Raises StartupFailed."""
+        """Opens the jobs' database, and reads keys, owners and registrations; before any door opens.
+
+        Raises StartupFailed.
+        """
         await self.places.open()
         await self.jobs.open()
         self._snapshot = await asyncio.to_thread(

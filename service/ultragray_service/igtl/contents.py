@@ -87,8 +87,8 @@ def unpack_instruments(
 ) -> list[Instrument]:
     """The instruments of a TDATA or QTDATA, at most MAX_INSTRUMENTS, that have both position and orientation.
 
-    Those of a name that `may_be_unseen` are left out where their pose is zeros or NaN: so trackers tell what they lost.
-    Raises IgtlMessageInvalid and, naming the instrument, InvalidPose.
+    Those of a name that `may_be_unseen` are left out where their pose is zeros or NaN: trackers send that for what
+    they lost. Raises IgtlMessageInvalid and, naming the instrument, InvalidPose.
     """
     size = _INSTRUMENT.size + _POSE_BYTES[type_name]
     if len(content) % size:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import re
 import threading
 from collections.abc import Callable
@@ -41,7 +42,9 @@ class Registrations:
     def __init__(self, catalog: SceneCatalog, owners: Owners, limits: Limits) -> None:
         self._catalog, self._owners, self._limits = catalog, owners, limits
         self._copy: dict[str, store.Kept] = {}  # by name
-        self._changing = threading.Lock()  # of the table and its copy, so that no older copy follows a newer one
+        self._changes = 0  # of the copy by this service, so that no older copy follows a newer one
+        self._copying = threading.Lock()  # of the copy and the number of its changes
+        self._writing = threading.Lock()  # one change of the table at a time: the copy has them in the same order
         self._engine: sa.Engine | None = None
         self._threads: DatabaseThreads | None = None
 
@@ -50,36 +53,42 @@ class Registrations:
         self._engine, self._threads = engine, threads
 
     def read(self, connection: sa.Connection) -> None:
-        """Copies them again. May be called from any thread."""
-        with self._changing:
-            self._copy = store.read_registrations(connection)
+        """Copies them again, waiting for no change that is under way. May be called from any thread."""
+        while True:
+            before, copy = self._changes, store.read_registrations(connection)
+            with self._copying:
+                if self._changes == before:
+                    self._copy = copy
+                    return
 
     async def get(self, name: str) -> NamedRegistration:
         """A registration as it is kept now. Raises RegistrationNotFound, DatabaseUnavailable."""
-        return await self._do(self._read, name)
+        kept = await self._do(store.read_registration, name)
+        return await asyncio.to_thread(self._seen, name, kept)
 
     async def ownership(self, name: str) -> Ownership:
         """Whose a registration is. Raises RegistrationNotFound, DatabaseUnavailable."""
         return Ownership((await self.get(name)).owner)
 
     async def of_scene(self, name: str, scene: str) -> Registration:
-        """The registration that a request for a scene names, by the copy where that has it.
+        """The registration that a request for a scene names, from the copy.
 
-        Raises RegistrationNotFound, DatabaseUnavailable where it is not in the copy, and InvalidArgument for one of
-        another scene.
+        The database is asked where the copy lacks it, has it for another scene or hides it from the caller: another
+        service may have changed it just now. Raises RegistrationNotFound, DatabaseUnavailable, and InvalidArgument for
+        one of another scene.
         """
         kept = self._copy.get(name)
         if (
             kept is None
             or kept.registration.scene != base_name(scene)
-            or not _is_seen(kept, lambda shown: not self._owners.hides(Kind.SCENE, shown))
-        ):  # what another service has changed just now may not be in the copy yet
+            or not _is_seen(kept, lambda one: not self._owners.hides(Kind.SCENE, one))
+        ):
             return _of_scene(await self.get(name), scene)
         return kept.registration
 
     def read_of_scene(self, name: str, scene: str) -> Registration:
         """As `of_scene`, as it is kept now. Blocks; may be called from any thread."""
-        return _of_scene(self._read(self._opened, name), scene)
+        return _of_scene(self._seen(name, store.read_registration(self._opened, name)), scene)
 
     async def page(self, page_size: int, page_token: str) -> RegistrationPage:
         """One page by name. Raises InvalidArgument, DatabaseUnavailable."""
@@ -105,13 +114,13 @@ class Registrations:
         private_to = whose.owner if whose.private else None
 
         def write(engine: sa.Engine) -> NamedRegistration:
-            with self._changing:
+            with self._writing:
                 kept = store.write_registration(
                     engine, name, base_name(scene), private_to, registration, acting(), most
                 )
                 if kept is None:
                     raise _not_own(name)
-                self._copy[name] = kept
+                self._change_copy(name, kept)
             return kept.registration
 
         try:
@@ -123,17 +132,24 @@ class Registrations:
         """Forgets a registration. Raises RegistrationNotFound, PermissionDenied, DatabaseUnavailable."""
 
         def forget(engine: sa.Engine) -> None:
-            self._read(engine, name)
-            with self._changing:
+            with self._writing:
                 if not store.delete_registration(engine, name, acting()):
                     raise _not_own(name)
-                self._copy.pop(name, None)
+                self._change_copy(name, None)
 
+        await self.get(name)
         await self._do(forget)
 
-    def _read(self, engine: sa.Engine, name: str) -> NamedRegistration:
-        """One as it is kept now, where the caller may see it. Blocks. Raises RegistrationNotFound."""
-        kept = store.read_registration(engine, name)
+    def _change_copy(self, name: str, kept: store.Kept | None) -> None:
+        with self._copying:
+            self._changes += 1
+            if kept is None:
+                self._copy.pop(name, None)
+            else:
+                self._copy[name] = kept
+
+    def _seen(self, name: str, kept: store.Kept | None) -> NamedRegistration:
+        """What was read of a name, where the caller may see it. Lists scenes: blocks. Raises RegistrationNotFound."""
         if kept is None or not _is_seen(kept, lambda scene: scene in self._catalog.shown_names()):
             raise RegistrationNotFound(f"there is no registration {shown(name)}", field="registration")
         return kept.registration

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import json
+import logging
 import time
 from dataclasses import dataclass, fields
+from functools import lru_cache
+from typing import Any
 
 import sqlalchemy as sa
 from sqlalchemy.dialects import postgresql, sqlite
 
 from ultragray.contract import from_dict, to_dict
+from ultragray.errors import UltragrayError
 from ultragray.registration.registration import Registration
 from ultragray_workers.jobs.queue.owners import tell_change
 from ultragray_workers.jobs.queue.tables import REGISTRATIONS
@@ -18,6 +22,7 @@ from ..access.principal import Principal, Role, iso_time
 from ..errors import LimitReached
 from .named import NamedRegistration
 
+_log = logging.getLogger("ultragray.service")
 _COLUMNS = REGISTRATIONS.c
 _KNOWN = {item.name for item in fields(Registration)}  # a later release may write more
 
@@ -34,12 +39,18 @@ def read_registration(engine: sa.Engine, name: str) -> Kept | None:
     """The registration of a name; None where there is none."""
     with engine.connect() as connection:
         row = connection.execute(sa.select(REGISTRATIONS).where(_COLUMNS.name == name)).one_or_none()
-    return None if row is None else _kept(row)
+    return None if row is None else _kept(*row)
 
 
 def read_registrations(connection: sa.Connection) -> dict[str, Kept]:
-    """All registrations, by name."""
-    return {row.name: _kept(row) for row in connection.execute(sa.select(REGISTRATIONS))}
+    """All registrations that can be read, by name."""
+    found = {}
+    for row in connection.execute(sa.select(REGISTRATIONS)):
+        try:
+            found[row.name] = _kept(*row)
+        except (UltragrayError, ValueError) as error:
+            _log.warning(f"the registration {row.name!r} cannot be read, and is left out: {error}")
+    return found
 
 
 def write_registration(
@@ -51,8 +62,9 @@ def write_registration(
     writer: Principal,
     most: int | None,
 ) -> Kept | None:
-    """The registration as it is kept from now on, its owner as before; None where it is another's than the writer's.
+    """The registration as it is kept from now on; None where it is another's than the writer's.
 
+    Its owner stays, unless an admin puts it for a private scene of somebody else's: then it is the admin's.
     Raises LimitReached for a new one of a writer who has `most` already; None: any number.
     """
     values = {
@@ -61,18 +73,21 @@ def write_registration(
         "changed_at_s": time.time(),
         "document": json.dumps(to_dict(registration), allow_nan=False),
     }
+    owner = (
+        _COLUMNS.owner if private_to is None else sa.case((_COLUMNS.owner == private_to, private_to), else_=writer.name)
+    )
     with engine.begin() as connection:
         if most is not None:
             _require_room(connection, name, writer, most)
         insert = (sqlite if connection.dialect.name == "sqlite" else postgresql).insert(REGISTRATIONS)
         kept = insert.values(name=name, owner=writer.name, **values).on_conflict_do_update(
-            index_elements=[_COLUMNS.name], set_=values, where=_may_change(writer)
+            index_elements=[_COLUMNS.name], set_={**values, "owner": owner}, where=_may_change(writer)
         )
         row = connection.execute(kept.returning(*_COLUMNS)).one_or_none()
         if row is None:
             return None
         tell_change(connection)
-    return _kept(row)
+    return _kept(*row)
 
 
 def delete_registration(engine: sa.Engine, name: str, remover: Principal) -> bool:
@@ -98,8 +113,9 @@ def _may_change(principal: Principal) -> sa.ColumnElement[bool]:
     return sa.true() if principal.role is Role.ADMIN else _COLUMNS.owner == principal.name
 
 
-def _kept(row: sa.Row[tuple[object, ...]]) -> Kept:
-    document = {key: value for key, value in json.loads(row.document).items() if key in _KNOWN}
-    registration = from_dict(Registration, document)
-    facts = {"name": row.name, "scene": row.scene, "owner": row.owner, "changed_at": iso_time(row.changed_at_s)}
-    return Kept(NamedRegistration(**to_dict(registration), **facts), row.private_to)
+@lru_cache(maxsize=4096)  # they are read again whenever one of them, a key or an owner changes
+def _kept(name: str, scene: str, owner: str, changed_at_s: float, document: str, private_to: str | None) -> Kept:
+    """The registration of a row, by its columns. Raises InvalidArgument, InvalidPose, ValueError."""
+    content = {key: value for key, value in json.loads(document).items() if key in _KNOWN}
+    facts: dict[str, Any] = {"name": name, "scene": scene, "owner": owner, "changed_at": iso_time(changed_at_s)}
+    return Kept(NamedRegistration(**to_dict(from_dict(Registration, content)), **facts), private_to)

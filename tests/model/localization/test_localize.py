@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
 from ultragray import ConvexProbe, GaussianScene, Probe, localize, render
 from ultragray.datasets.phantom import PHANTOM_PROBE, freehand_poses, simulate
 from ultragray.demo import demo_poses, load_demo_scene
 from ultragray.errors import InvalidArgument, InvalidPose
+from ultragray.localization import search
 from ultragray.localization.motion import Motions
 from ultragray.localization.search import _deviations
 from ultragray.pose import pose_from_position_quaternion
@@ -57,6 +61,20 @@ def test_frames_of_a_scene_are_found_from_3_mm_and_5_degrees_away(demo: Gaussian
         assert found.is_found
         assert is_found(found.pose, pose, probe), seed
         assert (found.shift_mm, found.turn_deg) == pytest.approx(distance(start, found.pose, probe))
+
+
+def test_a_search_renders_no_frame_twice(demo: GaussianScene, monkeypatch: pytest.MonkeyPatch) -> None:
+    rendered: Counter[tuple[bytes, int]] = Counter()
+
+    def counted(scene: GaussianScene, probe: Probe, poses: FloatArray, **how: Any) -> dict[str, Tensor]:
+        rendered.update((pose.tobytes(), how["height"]) for pose in poses)
+        return render(scene, probe, poses, **how)
+
+    monkeypatch.setattr(search, "render", counted)
+    pose = demo_poses(1)[0]
+    assert localize(demo, frame_of(demo, pose), displaced(pose, demo.info.probe_or(None), 3.0, 5.0, 0)).is_found
+    assert len(rendered) > 50
+    assert set(rendered.values()) == {1}
 
 
 def test_a_frame_of_render_is_taken_as_it_is(demo: GaussianScene) -> None:

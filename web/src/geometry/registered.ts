@@ -15,7 +15,7 @@ export function registeredBy({ name, base_to_scene, probe_to_flange }: Registrat
   return { name, baseToScene: base_to_scene.flat(), probeToFlange: probe_to_flange.flat() };
 }
 
-/** Whether the same is made of every pose. */
+/** Whether both convert every pose alike. */
 export function leadAlike(one: Registered, other: Registered): boolean {
   const same = (of: Pose, as: Pose): boolean => of.every((value, place) => value === as[place]);
   return same(one.baseToScene, other.baseToScene) && same(one.probeToFlange, other.probeToFlange);

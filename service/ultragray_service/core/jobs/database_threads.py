@@ -26,7 +26,9 @@ class DatabaseThreads:
         self.executor = ThreadPoolExecutor(_THREADS, "database")
 
     async def ask(self, question: Callable[Concatenate[D, P], T], asked: D, *details: P.args, **options: P.kwargs) -> T:
-        """Calls `question(asked, *details, **options)` in a thread, for whom the running code works.
+        """Calls `question(asked, *details, **options)` in a thread, in the caller's context.
+
+        What is hidden from the caller is not found.
 
         Raises what it raises, and DatabaseUnavailable where there is no answer within PATIENCE_S.
         """
