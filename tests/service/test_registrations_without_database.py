@@ -26,9 +26,9 @@ TOO_LATE_S = 30.0  # whoever waits for the database waits for ten
 AT_ONCE_S = 5.0  # a frame that does not wait for it
 
 
-def put(http: httpx.Client, shift_mm: float) -> None:
+def put(http: httpx.Client, by_mm: float) -> None:
     base_to_scene = np.eye(4)
-    base_to_scene[1, 3] = shift_mm
+    base_to_scene[1, 3] = by_mm
     answer = http.put(PATH, json={"scene": "demo", "base_to_scene": base_to_scene.tolist()})
     assert answer.status_code == 200, answer.text
 
@@ -38,11 +38,15 @@ def render(http: httpx.Client, pose: dict[str, Any], registration: str) -> httpx
     return http.post("/v1/scenes/demo/render", json=body)
 
 
-def assert_shifted(answer: httpx.Response, shift_mm: float) -> None:
+def shift_mm(answer: httpx.Response) -> float:
     assert answer.status_code == 200, answer.text
-    assert answer.elapsed.total_seconds() < at_this_load(AT_ONCE_S)
     pose = json.loads(answer.headers["X-Ultragray-Pose"])  # [4, 4] mm, in the scene
-    assert pose[1][3] == shift_mm
+    return float(pose[1][3])
+
+
+def assert_shifted(answer: httpx.Response, by_mm: float) -> None:
+    assert shift_mm(answer) == by_mm
+    assert answer.elapsed.total_seconds() < at_this_load(AT_ONCE_S)
 
 
 def assert_unavailable(answer: httpx.Response) -> None:
@@ -76,6 +80,7 @@ def test_frames_go_on_by_a_registration_that_was_read_while_the_database_is_away
         wait_until(lambda: http.get(PATH).status_code == 200)
         put(http, 5.0)
         assert_shifted(render(http, pose_body, "robot"), 5.0)
+        wait_until(lambda: shift_mm(render(elsewhere, pose_body, "robot")) == 5.0)
         assert http.delete(PATH).status_code == 204
         assert render(http, pose_body, "robot").status_code == 404
         wait_until(lambda: render(elsewhere, pose_body, "robot").status_code == 404)
