@@ -82,6 +82,7 @@ describe("the registrations", () => {
     await until(() => poseOf(page), ({ position_mm: { x } }) => x === 0, "the pose is still the flange's");
     await put(BASE_TO_SCENE);
     await elsewhere.waitFor({ state: "detached", timeout: 20_000 });
+    assert.ok((await fetch(address, { method: "DELETE" })).ok);
   });
 
   it("move the probe by the numbers of the flange", async () => {
