@@ -42,6 +42,7 @@ from .transforms import TransformedPoses
 API_KEY = "ULTRAGRAY_API_KEY"  # parameters are read by everybody on the network, the environment is not
 NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)  # fits publishers of either reliability
 CHECK_TIMEOUT_S = 2.0
+LOOK_EVERY_S = 1.0  # whether the node was told to stop: what rclpy wakes it by on a signal is lost now and then
 OWN_PARAMETERS: dict[str, tuple[Any, str]] = {
     "address": ("localhost:50051", "HOST:PORT of the service's gRPC"),
     "tls": (False, "whether the connection is encrypted"),
@@ -229,7 +230,10 @@ def main() -> None:
     try:
         if node.get_parameter("autostart").value and not _started(node):
             sys.exit(1)
-        rclpy.spin(node)
+        executor = rclpy.get_global_executor()
+        executor.add_node(node)
+        while executor.context.ok():
+            executor.spin_once(timeout_sec=LOOK_EVERY_S)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     finally:
