@@ -1,0 +1,40 @@
+"""The copy of the registrations in memory: what was read before a change never takes the place of the change."""
+
+from __future__ import annotations
+
+from typing import Any, cast
+
+import numpy as np
+import pytest
+import sqlalchemy as sa
+
+from ultragray_service.registrations import store
+from ultragray_service.registrations.named import NamedRegistration
+from ultragray_service.registrations.registrations import Registrations
+
+UNUSED: Any = None
+
+
+def kept(changed_at: str) -> store.Kept:
+    facts = {"name": "robot", "scene": "demo", "changed_at": changed_at}
+    return store.Kept(NamedRegistration(base_to_scene=cast(Any, np.eye(4).tolist()), **facts), None)
+
+
+@pytest.mark.parametrize("changed", [kept("2026-01-02T00:00:00Z"), None], ids=["replaced", "deleted"])
+def test_a_copy_is_read_again_where_the_service_changed_it_meanwhile(
+    changed: store.Kept | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    registrations = Registrations(UNUSED, UNUSED, UNUSED)
+    before, after = {"robot": kept("2026-01-01T00:00:00Z")}, {} if changed is None else {"robot": changed}
+    reads: list[dict[str, store.Kept]] = []
+
+    def read(connection: sa.Connection) -> dict[str, store.Kept]:
+        reads.append(after if reads else before)
+        if len(reads) == 1:
+            registrations._change_copy("robot", changed)  # after the rows were read, before they are copied
+        return reads[-1]
+
+    monkeypatch.setattr(store, "read_registrations", read)
+    registrations.read(UNUSED)
+    assert reads == [before, after]
+    assert registrations._copy == after
